@@ -1,0 +1,75 @@
+"""fingerspice: SPICE for the sliding fingertip.
+
+    import fingerspice as fs
+    circuit = fs.read_netlist("circuits/fingerpad.cir")
+    solution = fs.simulate(circuit)
+    solution.plot()
+
+Names are loaded on first use, so that importing the package costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from fingerspice.circuit.circuit import Circuit as Circuit
+    from fingerspice.circuit.netlist import parse_netlist as parse_netlist
+    from fingerspice.circuit.netlist import read_netlist as read_netlist
+    from fingerspice.circuit.ramps import PWL as PWL
+    from fingerspice.circuit.ramps import Pulse as Pulse
+    from fingerspice.circuit.ramps import Samples as Samples
+    from fingerspice.circuit.ramps import Sawtooth as Sawtooth
+    from fingerspice.circuit.ramps import Square as Square
+    from fingerspice.circuit.ramps import Triangle as Triangle
+    from fingerspice.circuit.sampling import Function as Function
+    from fingerspice.circuit.waveforms import AM as AM
+    from fingerspice.circuit.waveforms import DC as DC
+    from fingerspice.circuit.waveforms import Chirp as Chirp
+    from fingerspice.circuit.waveforms import Exp as Exp
+    from fingerspice.circuit.waveforms import Product as Product
+    from fingerspice.circuit.waveforms import Sine as Sine
+    from fingerspice.circuit.waveforms import Sum as Sum
+    from fingerspice.circuit.waveforms import Waveform as Waveform
+    from fingerspice.compare import Comparison as Comparison
+    from fingerspice.compare import compare as compare
+    from fingerspice.errors import FingerspiceError as FingerspiceError
+    from fingerspice.errors import FingerspiceWarning as FingerspiceWarning
+    from fingerspice.errors import InputError as InputError
+    from fingerspice.errors import SolveError as SolveError
+    from fingerspice.export import export_netlist as export_netlist
+    from fingerspice.phasors import phasor as phasor
+    from fingerspice.simulate import simulate as simulate
+    from fingerspice.solution import Solution as Solution
+    from fingerspice.solution import Status as Status
+
+_HOMES = {
+    "circuit.circuit": ("Circuit",),
+    "circuit.netlist": ("parse_netlist", "read_netlist"),
+    "circuit.ramps": ("PWL", "Pulse", "Samples", "Sawtooth", "Square", "Triangle"),
+    "circuit.sampling": ("Function",),
+    "circuit.waveforms": ("AM", "DC", "Chirp", "Exp", "Product", "Sine", "Sum", "Waveform"),
+    "compare": ("Comparison", "compare"),
+    "errors": ("FingerspiceError", "FingerspiceWarning", "InputError", "SolveError"),
+    "export": ("export_netlist",),
+    "phasors": ("phasor",),
+    "simulate": ("simulate",),
+    "solution": ("Solution", "Status"),
+}
+_HOME = {name: home for home, names in _HOMES.items() for name in names}
+__all__ = ["__version__", *sorted(_HOME)]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'fingerspice' has no attribute {name!r}")
+    value = getattr(import_module(f"fingerspice.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

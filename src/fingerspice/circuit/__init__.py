@@ -1,0 +1,1 @@
+"""Circuits: netlist text, devices, waveforms, state space."""

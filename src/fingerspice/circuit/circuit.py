@@ -1,0 +1,250 @@
+"""A circuit as data: elements with their values in the netlist's units, and the analyses its deck asks for."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from fingerspice.circuit.devices import DEVICES, DeviceSpec
+from fingerspice.circuit.waveforms import Waveform, as_waveform
+from fingerspice.errors import InputError, Where
+
+CHARGE_LAWS = ("local", "mobile")
+WORK_READINGS = ("gap", "total")
+
+
+@dataclass(frozen=True)
+class Element:
+    """One device of a circuit.
+
+    Attributes
+    ----------
+    name : str
+        As written; inside a subcircuit with the path, ``Xfinger.Xgap``.
+    device : str
+        Entry of `DEVICES`.
+    nodes, node_names : tuple of str
+        Canonical (lower case, ground is ``0``) and as written.
+    values : mapping of str to float
+        Every parameter of the device, in the netlist's units.
+    waveform : Waveform or None
+        Of a source.
+    initial : float or None
+        ``IC=`` of a capacitor, V.
+    where : Where or None
+        Place in the netlist.
+    """
+
+    name: str
+    device: str
+    nodes: tuple[str, ...]
+    node_names: tuple[str, ...]
+    values: Mapping[str, float]
+    waveform: Waveform | None = None
+    initial: float | None = None
+    where: Where | None = None
+
+    @property
+    def spec(self) -> DeviceSpec:
+        """The device's entry in the registry."""
+        return DEVICES[self.device]
+
+
+@dataclass(frozen=True)
+class Tran:
+    """``.tran TSTEP TSTOP [TSTART [TMAX]] [uic]``, in s; TSTEP is the output spacing, never the accuracy."""
+
+    step: float
+    stop: float
+    start: float = 0.0
+    max_step: float | None = None
+    uic: bool = False
+
+
+@dataclass(frozen=True)
+class AcSweep:
+    """``.ac DEC|OCT|LIN N FSTART FSTOP``: frequencies in Hz, N points per decade, per octave or in all."""
+
+    scale: str
+    points: int
+    start: float
+    stop: float
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Value and unit of one circuit parameter."""
+
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Circuit:
+    """A netlist, read.
+
+    Attributes
+    ----------
+    title : str
+    elements : tuple of Element
+    tran : Tran or None
+    ac : AcSweep or None
+    initial : mapping of str to float
+        ``.ic``: canonical node to V.
+    charge_law : str or None
+        Of the included library: ``local``, ``mobile`` or None.
+    work : str
+        Reading of Eq. 7: ``gap`` (gap voltage held) or ``total`` (total voltage held).
+    warnings : tuple of str
+        What the reader noticed.
+    unused : tuple of str
+        Directives accepted and not used here.
+    text : str
+        The deck.
+    path : Path or None
+    overrides : mapping of str to str
+        What `replace` changed, for the record.
+    """
+
+    title: str
+    elements: tuple[Element, ...]
+    tran: Tran | None = None
+    ac: AcSweep | None = None
+    initial: Mapping[str, float] = field(default_factory=dict)
+    charge_law: str | None = None
+    work: str = "gap"
+    warnings: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
+    text: str = ""
+    path: Path | None = None
+    overrides: Mapping[str, str] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> Element:
+        """The element of that name, whatever its case.
+
+        Raises
+        ------
+        InputError
+            With the nearest name.
+        """
+        for element in self.elements:
+            if element.name.lower() == name.lower():
+                return element
+        raise InputError(_unknown("element", name, [e.name for e in self.elements]))
+
+    def by_device(self, *devices: str) -> tuple[Element, ...]:
+        """Elements of the given devices, in deck order."""
+        return tuple(e for e in self.elements if e.device in devices)
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """Every parameter by path (``Xgap.d``, ``Vdrive.amplitude``), with value and unit of the netlist."""
+        return MappingProxyType(dict(self._parameters()))
+
+    def _parameters(self) -> Iterator[tuple[str, Parameter]]:
+        for element in self.elements:
+            for spec in element.spec.parameters:
+                yield f"{element.name}.{spec.name}", Parameter(element.values[spec.name], spec.unit)
+            if element.waveform is not None:
+                for name, unit in type(element.waveform).units.items():
+                    if hasattr(element.waveform, name):
+                        yield f"{element.name}.{name}", Parameter(getattr(element.waveform, name), unit)
+
+    def replace(self, changes: Mapping[str, float | Waveform | Callable[[float], float]]) -> Circuit:
+        """A changed circuit.
+
+        Parameters
+        ----------
+        changes : mapping
+            Path to value in the netlist's unit (``{"Xgap.d": 3e-6}``), or a source's name to a waveform.
+
+        Raises
+        ------
+        InputError
+            For an unknown path (with the nearest one) or a value out of range.
+        """
+        elements = {e.name.lower(): e for e in self.elements}
+        overrides = dict(self.overrides)
+        for path, value in changes.items():
+            name, _, parameter = path.rpartition(".")
+            if path.lower() in elements and elements[path.lower()].device in "VI":
+                element = elements[path.lower()]
+                elements[path.lower()] = dataclasses.replace(element, waveform=as_waveform(value))
+            elif name.lower() in elements and not isinstance(value, Waveform) and not callable(value):
+                elements[name.lower()] = _changed(elements[name.lower()], parameter.lower(), float(value), path)
+            else:
+                known = [*self.parameters, *(e.name for e in self.by_device("V", "I"))]
+                raise InputError(_unknown("parameter", path, known))
+            overrides[path] = value.__name__ if hasattr(value, "__name__") else repr(value)
+        changed = dataclasses.replace(self, elements=tuple(elements.values()), overrides=overrides)
+        check(changed)
+        return changed
+
+
+def _changed(element: Element, parameter: str, value: float, path: str) -> Element:
+    if parameter in element.values:
+        values = {**element.values, parameter: value}
+        return dataclasses.replace(element, values=MappingProxyType(values))
+    if element.waveform is not None and parameter in type(element.waveform).units:
+        waveform = dataclasses.replace(element.waveform, **{parameter: value})  # type: ignore[type-var]
+        return dataclasses.replace(element, waveform=waveform)
+    known = [*element.values, *(type(element.waveform).units if element.waveform else ())]
+    raise InputError(_unknown("parameter", path, [f"{element.name}.{name}" for name in known]))
+
+
+def _unknown(kind: str, given: str, known: list[str]) -> str:
+    lower = {k.lower(): k for k in known}
+    near = get_close_matches(given.lower(), lower, 1, 0.0)
+    text = f"unknown {kind} {given!r}"
+    return f"{text}; nearest: {lower[near[0]]!r}" if near else f"{text}; there is none"
+
+
+def check(circuit: Circuit) -> None:
+    """Refuse values out of range and contacts that cannot exist.
+
+    Raises
+    ------
+    InputError
+        One sentence: which parameter, what was given with its unit, what is allowed, where.
+    """
+    for element in circuit.elements:
+        for spec in element.spec.parameters:
+            value: Any = element.values[spec.name]
+            if not spec.accepts(value):
+                unit = f" {spec.unit}" if spec.unit else ""
+                raise InputError(
+                    f"{element.name} {spec.name} is {value:g}{unit}; allowed: {spec.allowed()}", element.where
+                )
+        if element.device == "GAP":
+            _check_contact(element)
+    if circuit.tran is not None and not circuit.tran.stop > 0.0:
+        raise InputError(f"t_stop is {circuit.tran.stop:g} s; allowed: more than 0")
+
+
+def _check_contact(gap: Element) -> None:
+    m, n = gap.values["m_exp"], gap.values["n_exp"]
+    if not 0.0 < m < n:
+        raise InputError(
+            f"{gap.name} exponents are m_exp={m:g}, n_exp={n:g}; allowed: 0 < m_exp < n_exp", gap.where
+        )
+    if not 1.0 / m + 1.0 / n > 1.0:
+        raise InputError(
+            f"{gap.name} exponents m_exp={m:g}, n_exp={n:g} give 1/m + 1/n = {1 / m + 1 / n:.4g}; allowed: more "
+            "than 1 (else Eq. 4 has no single root)",
+            gap.where,
+        )
+    area = gap.values["alpha"] * gap.values["fn"] ** m
+    loss = math.sqrt(gap.values["c2"]) * gap.values["mu"] * gap.values["fn"]
+    if gap.values["a_fix"] == 0.0 and not area > loss:
+        raise InputError(
+            f"{gap.name} has no contact: friction takes the whole ridge area at 0 V "
+            f"(A0 = alpha fn^m_exp = {area:.4g} mm^2, sqrt(c2) mu fn = {loss:.4g} mm^2); allowed: "
+            "A0^2 > c2 mu^2 fn^2, so less load fn, less friction mu or less c2",
+            gap.where,
+        )

@@ -1,0 +1,234 @@
+"""A user's function of time as a waveform, and any waveform as a table that compiled code can step through.
+
+A function is represented between its breakpoints by Chebyshev series, refined until they reproduce it at points
+they were not built from. What will not refine is a jump or a spike that was not declared: it is located,
+kept as a segment edge, and warned about.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fingerspice.circuit.waveforms import Waveform, blank_terms, require
+from fingerspice.errors import FingerspiceWarning, InputError
+from fingerspice.numerics import chebyshev
+
+FloatArray = NDArray[np.float64]
+
+_POINTS = 20
+# Points between the nodes at which a series has to prove itself; irregular, so that no period hides from them.
+_PROOF = 2.0 * np.modf(np.arange(1, 28) * 0.6180339887498949)[0] - 1.0
+
+
+class NotFiniteError(Exception):
+    """A source gave NaN or inf; `time` (s) is the first such time found."""
+
+    def __init__(self, time: float) -> None:
+        self.time = time
+        super().__init__(time)
+
+
+@dataclass(frozen=True, eq=False)
+class Function(Waveform):
+    """A Python function of time, U(t) in V, t in s; array-aware functions are called with arrays.
+
+    Parameters
+    ----------
+    function : callable
+        Takes a time or an array of times.
+    breaks : tuple of float
+        Times (s) at which it jumps or has a kink. With a period: within the first period.
+    repeat : float, optional
+        Its period, s, where it has one; the fundamental is then known.
+    """
+
+    function: Callable[..., object]
+    breaks: tuple[float, ...] = ()
+    repeat: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "breaks", tuple(sorted(float(b) for b in self.breaks)))
+        require(self.repeat is None or self.repeat > 0.0, "function period", self.repeat, "> 0 s")
+
+    @property
+    def period(self) -> float | None:  # type: ignore[override]
+        return self.repeat
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        t = np.asarray(t, float)
+        if side == "left":
+            t = np.where(np.isin(t, self.breakpoints(t.min(), t.max())) if t.size else False, np.nextafter(t, -1), t)
+        if t.ndim == 0:
+            return np.asarray(self._scalar(float(t)))
+        try:
+            # A function written for one number may misread an array without raising: prove the two agree.
+            out = np.asarray(self.function(t), float)
+            if out.shape == t.shape and (
+                t.size == 0 or np.array_equal(out.flat[t.size // 2], self._scalar(t.flat[t.size // 2]), True)
+            ):
+                return out
+        except (TypeError, ValueError):
+            pass
+        return np.array([self._scalar(x) for x in t.ravel()]).reshape(t.shape)
+
+    def _scalar(self, t: float) -> float:
+        value = self.function(t)
+        try:
+            return float(value)  # type: ignore[arg-type]
+        except (TypeError, ValueError):
+            raise InputError(f"the source function returned {value!r} at t = {t:g} s; allowed: one number") from None
+
+    def breakpoints(self, t0: float, t1: float) -> FloatArray:
+        times = np.asarray(self.breaks, float)
+        if self.repeat is not None and times.size:
+            runs = np.arange(math.floor(t0 / self.repeat) - 1.0, math.ceil(t1 / self.repeat) + 1.0)
+            times = np.unique((runs[:, None] * self.repeat + times).ravel())
+        return times[(times >= t0) & (times <= t1)]
+
+    def breakpoint_rate(self) -> float:
+        return len(self.breaks) / self.repeat if self.repeat else 0.0
+
+
+@dataclass(frozen=True)
+class SourceTable:
+    """A waveform on a window of time: what compiled code steps through.
+
+    Attributes
+    ----------
+    edges : ndarray, shape (m + 1,)
+        Segment edges, s.
+    terms : ndarray, shape (m, k, 6)
+    series : ndarray, shape (m, l)
+        Chebyshev coefficients of each segment; l = 0 where the terms say it all.
+    not_finite : float or None
+        Time (s) of the first NaN or inf; the table then ends just before it.
+    """
+
+    edges: FloatArray
+    terms: FloatArray
+    series: FloatArray
+    not_finite: float | None = None
+
+
+def source_table(waveform: Waveform, t0: float, t1: float, tol: float, step: float) -> SourceTable:
+    """Table of a waveform over [t0, t1].
+
+    Parameters
+    ----------
+    waveform : Waveform
+    t0, t1 : float
+        Window, s.
+    tol : float
+        Error allowed of a Chebyshev series relative to the largest |U| met.
+    step : float
+        Output step, s: a function is looked at no less finely than this.
+    """
+    inner = waveform.breakpoints(t0, t1)
+    inner = inner[(inner > t0) & (inner < t1)]
+    edges = np.concatenate([[t0], inner, [t1]])
+    terms = waveform.terms(edges[:-1], edges[1:])
+    if terms is not None:
+        return SourceTable(edges, np.ascontiguousarray(terms), np.zeros((edges.size - 1, 0)))
+    pieces = _Refiner(waveform, tol, step)
+    for a, b in zip(edges[:-1], edges[1:], strict=True):
+        if not pieces.cover(float(a), float(b)):
+            break
+    pieces.warn()
+    m = len(pieces.series)
+    return SourceTable(
+        np.array(pieces.edges) if m else np.array([t0]),
+        blank_terms(m, 1),
+        np.array(pieces.series).reshape(m, -1),
+        pieces.not_finite,
+    )
+
+
+@dataclass
+class _Refiner:
+    """Covers intervals with Chebyshev series by bisection."""
+
+    waveform: Waveform
+    tol: float
+    step: float
+    scale: float = 0.0
+    edges: list[float] = field(default_factory=list)
+    series: list[FloatArray] = field(default_factory=list)
+    jumps: list[tuple[float, float]] = field(default_factory=list)
+    narrow: list[float] = field(default_factory=list)
+    not_finite: float | None = None
+
+    def cover(self, a: float, b: float) -> bool:
+        """Add series for [a, b]; False where the waveform stops being finite inside."""
+        if not self.edges:
+            self.edges.append(a)
+        # A window between breakpoints is open at its ends: the series use inner points only.
+        longest = min(8.0 * self.step, 2.0 * self.waveform.shortest_time())
+        count = max(1, math.ceil((b - a) / longest))
+        cuts = np.linspace(a, b, count + 1)
+        stack = [(float(x), float(y), 0) for x, y in zip(cuts[:-1], cuts[1:], strict=True)][::-1]
+        while stack:
+            lo, hi, depth = stack.pop()
+            series, values = self._try(lo, hi)
+            if not np.all(np.isfinite(values)):
+                if hi - lo <= 1e-12 * max(abs(hi), self.step) or depth > 60:
+                    self.not_finite = hi
+                    return False
+                middle = 0.5 * (lo + hi)
+                stack += [(middle, hi, depth + 1), (lo, middle, depth + 1)]
+                continue
+            floor = max(4e-15 * max(abs(lo), abs(hi)), 1e-13 * self.step)
+            if series is None and hi - lo <= floor:
+                # What does not refine at this width is a jump (or a kink): an edge, not a steep ramp.
+                self.jumps.append((hi, float(values[-1] - values[0])))
+                if self.series:
+                    self.edges[-1] = hi
+                continue
+            if series is None:
+                middle = 0.5 * (lo + hi)
+                stack += [(middle, hi, depth + 1), (lo, middle, depth + 1)]
+                if hi - lo < 0.25 * self.step:
+                    self.narrow.append(middle)
+                continue
+            self.edges.append(hi)
+            self.series.append(series)
+        return True
+
+    def _try(self, lo: float, hi: float) -> tuple[FloatArray | None, FloatArray]:
+        """Series of one interval if it proves itself, and the values seen."""
+        x = np.concatenate([chebyshev.nodes(_POINTS, -1.0, 1.0), _PROOF])
+        values = self.waveform.value(0.5 * (lo + hi) + 0.5 * (hi - lo) * x)
+        if not np.all(np.isfinite(values)):
+            return None, values
+        self.scale = max(self.scale, float(np.abs(values).max()))
+        c = chebyshev.coefficients(values[:_POINTS])
+        proof = np.polynomial.chebyshev.chebval(_PROOF, c)
+        good = np.abs(proof - values[_POINTS:]).max() <= self.tol * self.scale
+        return (c if good else None), values[:_POINTS]
+
+    def warn(self) -> None:
+        """One warning for the jumps, one for the narrow features, found and not declared."""
+        real = [(t, dv) for t, dv in self.jumps if abs(dv) > 1e3 * self.tol * self.scale]
+        if real:
+            t, dv = real[0]
+            warnings.warn(
+                f"the source function jumps by {dv:.4g} V at t = {t:.9g} s"
+                + (f" and {len(real) - 1} more times" if len(real) > 1 else "")
+                + "; it was not declared: give Function(f, breaks=(...)) the times for exact edges",
+                FingerspiceWarning,
+                stacklevel=2,
+            )
+        apart = [t for t in self.narrow if all(abs(t - j) > self.step for j, _ in real)]
+        if apart:
+            warnings.warn(
+                f"the source function has a feature narrower than the output step {self.step:.3g} s "
+                f"near t = {apart[0]:.9g} s; it was resolved where it was seen, but others may be missed: "
+                "give Function(f, breaks=(...)) its edges",
+                FingerspiceWarning,
+                stacklevel=2,
+            )

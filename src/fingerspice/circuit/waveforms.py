@@ -1,0 +1,544 @@
+"""Source waveforms: value on either side of a jump, breakpoints, fundamental, and their form for compiled code.
+
+Between two breakpoints every library waveform is a short sum of terms
+
+    c tau^n exp(a tau) cos(phi + omega tau + beta tau^2 / 2),     tau = time since the segment's start,
+
+a form closed under sums and products. A waveform without such a form (a user's function) is represented by
+Chebyshev series instead: see `fingerspice.circuit.sampling`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from fractions import Fraction
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fingerspice.errors import InputError
+
+FloatArray = NDArray[np.float64]
+TAU = 2.0 * math.pi
+
+
+@dataclass(frozen=True)
+class Fundamental:
+    """Fundamental U_0 sin(2 pi f t + phase) of a waveform.
+
+    Attributes
+    ----------
+    frequency : float
+        Hz.
+    amplitude : float
+        V, not negative.
+    phase : float
+        rad.
+    """
+
+    frequency: float
+    amplitude: float
+    phase: float
+
+
+class Waveform:
+    """A voltage against time, defined for all times.
+
+    Subclasses give `value`, `breakpoints` and, where it exists, `terms`; and `period`, `tone` where they apply.
+    """
+
+    units: ClassVar[dict[str, str]] = {}
+    """Unit of each numeric field."""
+
+    period: float | None = None
+    """Period in s after any delay, or None."""
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        """Voltage (V) at times `t` (s); at a jump the limit from the `side` 'right' or 'left'."""
+        raise NotImplementedError
+
+    def __call__(self, t: ArrayLike) -> FloatArray:
+        """Voltage (V) at times `t` (s), right-hand at jumps."""
+        return self.value(t)
+
+    def breakpoints(self, t0: float, t1: float) -> FloatArray:
+        """Times in [t0, t1] (s, ascending) at which the waveform is not smooth."""
+        return np.empty(0)
+
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
+        """Terms (m, k, 6) on segments free of breakpoints inside; None where the waveform has no such form."""
+        return None
+
+    def tone(self) -> float | None:
+        """Frequency (Hz) of the fundamental, or None."""
+        return 1.0 / self.period if self.period else None
+
+    def shortest_time(self) -> float:
+        """Shortest time scale (s) on which a smooth piece varies, inf for constants and ramps."""
+        return math.inf
+
+    def breakpoint_rate(self) -> float:
+        """Breakpoints per second, an upper estimate that sizes the windows of a long run."""
+        return 0.0
+
+    @property
+    def settled(self) -> float:
+        """Time (s) from which the waveform is periodic."""
+        return 0.0
+
+    @property
+    def fundamental(self) -> Fundamental | None:
+        """Fundamental of the periodic part, where there is one: the Fourier integral over its period."""
+        frequency = self.tone()
+        if frequency is None:
+            return None
+        period = self.period or 1.0 / frequency
+        # Sine convention: U ~ Im(P exp(i Omega t)).
+        start = self.settled
+        p = 2j * fourier_integral(self, frequency, start, start + period) / period
+        if abs(p) <= 1e-12 * self.peak(start, start + period):
+            return None
+        return Fundamental(frequency, abs(p), math.atan2(p.imag, p.real))
+
+    def peak(self, t0: float, t1: float) -> float:
+        """Largest |U| (V) over [t0, t1], to a few parts in a thousand where it is not at a breakpoint."""
+        knots = np.unique(np.concatenate([self.breakpoints(t0, t1), np.linspace(t0, t1, 513)]))
+        return float(max(np.abs(self.value(knots)).max(), np.abs(self.value(knots, "left")).max()))
+
+    def __add__(self, other: Waveform | float) -> Waveform:
+        return Sum((self, as_waveform(other)))
+
+    def __radd__(self, other: float) -> Waveform:
+        return Sum((as_waveform(other), self))
+
+    def __mul__(self, other: Waveform | float) -> Waveform:
+        return Product((self, as_waveform(other)))
+
+    def __rmul__(self, other: float) -> Waveform:
+        return Product((as_waveform(other), self))
+
+
+def as_waveform(value: Waveform | float | Callable[[float], float]) -> Waveform:
+    """A waveform from itself, a number (constant voltage) or a plain function of time.
+
+    Raises
+    ------
+    InputError
+        For anything else.
+    """
+    if isinstance(value, Waveform):
+        return value
+    if isinstance(value, (int, float, np.floating, np.integer)):
+        return DC(float(value))
+    if callable(value):
+        from fingerspice.circuit.sampling import Function
+
+        return Function(value)
+    raise InputError(f"a source must be a waveform, a number or a function of time, got {type(value).__name__}")
+
+
+def require(condition: bool, what: str, given: Any, allowed: str) -> None:
+    """Raise the one sentence of a bad waveform argument."""
+    if not condition:
+        raise InputError(f"{what} is {given}; allowed: {allowed}")
+
+
+def check_finite(waveform: Waveform) -> None:
+    """Refuse NaN and inf in any numeric field of a waveform dataclass."""
+    for field in fields(waveform):  # type: ignore[arg-type]
+        value = getattr(waveform, field.name)
+        if isinstance(value, (float, int)):
+            require(math.isfinite(value), f"{type(waveform).__name__} {field.name}", value, "a finite number")
+
+
+def fourier_integral(waveform: Waveform, frequency: float, t0: float, t1: float) -> complex:
+    """Integral of U(t) exp(-i 2 pi f t) over [t0, t1], by Gauss-Legendre panels between breakpoints."""
+    inner = waveform.breakpoints(t0, t1)
+    edges = np.unique(np.concatenate([[t0], inner[(inner > t0) & (inner < t1)], [t1]]))
+    x, w = np.polynomial.legendre.leggauss(24)
+    panel = min(0.5 / frequency, waveform.shortest_time())
+    total = 0j
+    for a, b in zip(edges[:-1], edges[1:], strict=True):
+        cuts = np.linspace(a, b, max(1, math.ceil((b - a) / panel)) + 1)
+        half = 0.5 * np.diff(cuts)[:, None]
+        t = 0.5 * (cuts[1:] + cuts[:-1])[:, None] + half * x
+        total += complex(np.sum(half * w * waveform.value(t) * np.exp(-1j * TAU * frequency * t)))
+    return total
+
+
+def blank_terms(m: int, k: int) -> FloatArray:
+    """Terms (m, k, 6), all zero."""
+    return np.zeros((m, k, 6))
+
+
+@dataclass(frozen=True)
+class DC(Waveform):
+    """A constant voltage, V."""
+
+    level: float = 0.0
+    units: ClassVar[dict[str, str]] = {"level": "V"}
+
+    def __post_init__(self) -> None:
+        check_finite(self)
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        return np.full(np.shape(t), self.level)
+
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
+        out = blank_terms(start.size, 1)
+        out[:, 0, 0] = self.level
+        return out
+
+
+@dataclass(frozen=True)
+class Sine(Waveform):
+    """offset + amplitude exp(-damping (t - delay)) sin(2 pi f (t - delay) + phase); held before the delay.
+
+    Parameters
+    ----------
+    amplitude : float
+        V.
+    frequency : float
+        Hz, positive.
+    offset : float
+        V.
+    phase_deg : float
+        Degrees.
+    delay : float
+        s; before it the value is offset + amplitude sin(phase), as in SPICE.
+    damping : float
+        1/s, SPICE's THETA.
+    """
+
+    amplitude: float
+    frequency: float
+    offset: float = 0.0
+    phase_deg: float = 0.0
+    delay: float = 0.0
+    damping: float = 0.0
+    units: ClassVar[dict[str, str]] = {
+        "amplitude": "V",
+        "frequency": "Hz",
+        "offset": "V",
+        "phase_deg": "deg",
+        "delay": "s",
+        "damping": "1/s",
+    }
+
+    def __post_init__(self) -> None:
+        check_finite(self)
+        require(self.frequency > 0.0, "sine frequency", f"{self.frequency:g} Hz", "> 0")
+
+    @property
+    def period(self) -> float | None:  # type: ignore[override]
+        return 1.0 / self.frequency if self.damping == 0.0 else None
+
+    @property
+    def settled(self) -> float:
+        return max(0.0, self.delay)
+
+    def _turns(self, t: FloatArray) -> FloatArray:
+        turns = np.asarray(self.frequency * (t - self.delay))
+        return turns - np.floor(turns)
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        t = np.maximum(np.asarray(t, float), self.delay)
+        wave = np.sin(TAU * self._turns(t) + math.radians(self.phase_deg))
+        if self.damping:
+            wave = wave * np.exp(-self.damping * (t - self.delay))
+        return np.asarray(self.offset + self.amplitude * wave)
+
+    def breakpoints(self, t0: float, t1: float) -> FloatArray:
+        return np.array([self.delay]) if t0 <= self.delay <= t1 and self.delay > 0.0 else np.empty(0)
+
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
+        out = blank_terms(start.size, 2)
+        on = start >= self.delay if self.delay > 0.0 else np.ones(start.size, bool)
+        phase = math.radians(self.phase_deg)
+        out[:, 0, 0] = np.where(on, self.offset, self.offset + self.amplitude * math.sin(phase))
+        decay = np.exp(-self.damping * np.maximum(start - self.delay, 0.0))
+        out[:, 1, 0] = np.where(on, self.amplitude * decay, 0.0)
+        out[:, 1, 2] = -self.damping
+        out[:, 1, 3] = TAU * self.frequency
+        # A phase of exactly zero is how compiled code knows a term without a cosine: -pi/2 is not zero.
+        out[:, 1, 4] = TAU * self._turns(start) + phase - 0.5 * math.pi
+        return out
+
+    def shortest_time(self) -> float:
+        return 1.0 / self.frequency
+
+    @property
+    def fundamental(self) -> Fundamental | None:
+        if self.period is None or self.amplitude == 0.0:
+            return None
+        phase = math.radians(self.phase_deg) - TAU * self.frequency * self.delay
+        phase += math.pi if self.amplitude < 0.0 else 0.0
+        return Fundamental(self.frequency, abs(self.amplitude), math.remainder(phase, TAU))
+
+
+@dataclass(frozen=True)
+class Chirp(Waveform):
+    """amplitude sin(phi(t)) + offset, its frequency rising linearly from f0 to f1 over `duration`, then staying.
+
+    Parameters
+    ----------
+    amplitude : float
+        V.
+    f0, f1 : float
+        Hz, positive; at the start and from `duration` (s) on.
+    offset : float
+        V.
+    phase_deg : float
+        Degrees, at the start.
+    """
+
+    amplitude: float
+    f0: float
+    f1: float
+    duration: float
+    offset: float = 0.0
+    phase_deg: float = 0.0
+    units: ClassVar[dict[str, str]] = {
+        "amplitude": "V",
+        "f0": "Hz",
+        "f1": "Hz",
+        "duration": "s",
+        "offset": "V",
+        "phase_deg": "deg",
+    }
+
+    def __post_init__(self) -> None:
+        check_finite(self)
+        require(self.f0 > 0.0 and self.f1 > 0.0, "chirp frequencies", f"{self.f0:g}, {self.f1:g} Hz", "> 0")
+        require(self.duration > 0.0, "chirp duration", f"{self.duration:g} s", "> 0")
+
+    def _phase(self, t: FloatArray) -> FloatArray:
+        sweep = np.clip(t, 0.0, self.duration)
+        turns = (self.f0 + 0.5 * (self.f1 - self.f0) / self.duration * sweep) * sweep
+        turns = turns + self.f1 * np.maximum(t - self.duration, 0.0) + self.f0 * np.minimum(t, 0.0)
+        return np.asarray(TAU * (turns - np.floor(turns)) + math.radians(self.phase_deg))
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        return np.asarray(self.offset + self.amplitude * np.sin(self._phase(np.asarray(t, float))))
+
+    def breakpoints(self, t0: float, t1: float) -> FloatArray:
+        return np.array([t for t in (0.0, self.duration) if t0 <= t <= t1])
+
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
+        out = blank_terms(start.size, 2)
+        out[:, 0, 0] = self.offset
+        out[:, 1, 0] = self.amplitude
+        rate = (self.f1 - self.f0) / self.duration
+        inside = (start >= 0.0) & (start < self.duration)
+        out[:, 1, 3] = TAU * (self.f0 + rate * np.clip(start, 0.0, self.duration))
+        out[:, 1, 4] = self._phase(start) - 0.5 * math.pi
+        out[:, 1, 5] = np.where(inside, TAU * rate, 0.0)
+        return out
+
+    def shortest_time(self) -> float:
+        return 1.0 / max(self.f0, self.f1)
+
+
+@dataclass(frozen=True)
+class Exp(Waveform):
+    """SPICE's EXP: rises from v1 towards v2 from `td1` with time constant `tau1`, back from `td2` with `tau2`.
+
+    Voltages in V, times in s; the time constants are positive and td2 >= td1.
+    """
+
+    v1: float
+    v2: float
+    td1: float
+    tau1: float
+    td2: float
+    tau2: float
+    units: ClassVar[dict[str, str]] = {
+        "v1": "V",
+        "v2": "V",
+        "td1": "s",
+        "tau1": "s",
+        "td2": "s",
+        "tau2": "s",
+    }
+
+    def __post_init__(self) -> None:
+        check_finite(self)
+        require(self.tau1 > 0.0 and self.tau2 > 0.0, "EXP time constants", f"{self.tau1:g}, {self.tau2:g} s", "> 0")
+        require(self.td2 >= self.td1, "EXP td2", f"{self.td2:g} s", f">= td1 = {self.td1:g} s")
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        t = np.asarray(t, float)
+        rise = -np.expm1(-np.maximum(t - self.td1, 0.0) / self.tau1)
+        fall = -np.expm1(-np.maximum(t - self.td2, 0.0) / self.tau2)
+        return np.asarray(self.v1 + (self.v2 - self.v1) * (rise - fall))
+
+    def breakpoints(self, t0: float, t1: float) -> FloatArray:
+        return np.array([t for t in sorted({self.td1, self.td2}) if t0 <= t <= t1])
+
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
+        out = blank_terms(start.size, 3)
+        step = self.v2 - self.v1
+        first = start >= self.td1
+        second = start >= self.td2
+        out[:, 0, 0] = self.v1 + step * (first.astype(float) - second.astype(float))
+        out[:, 1, 0] = np.where(first, -step * np.exp(-np.maximum(start - self.td1, 0.0) / self.tau1), 0.0)
+        out[:, 1, 2] = -1.0 / self.tau1
+        out[:, 2, 0] = np.where(second, step * np.exp(-np.maximum(start - self.td2, 0.0) / self.tau2), 0.0)
+        out[:, 2, 2] = -1.0 / self.tau2
+        return out
+
+    def shortest_time(self) -> float:
+        return min(self.tau1, self.tau2)
+
+
+class _Combination(Waveform):
+    parts: tuple[Waveform, ...]
+
+    def breakpoints(self, t0: float, t1: float) -> FloatArray:
+        return np.unique(np.concatenate([part.breakpoints(t0, t1) for part in self.parts]))
+
+    def shortest_time(self) -> float:
+        rate = sum(1.0 / part.shortest_time() for part in self.parts)
+        return 1.0 / rate if rate else math.inf
+
+    def breakpoint_rate(self) -> float:
+        return sum(part.breakpoint_rate() for part in self.parts)
+
+    @property
+    def settled(self) -> float:
+        return max(part.settled for part in self.parts)
+
+    @property
+    def period(self) -> float | None:  # type: ignore[override]
+        """Least common period of the parts, where their ratio is a ratio of integers below 1000."""
+        total: float | None = None
+        for part in self.parts:
+            if isinstance(part, DC):
+                continue
+            if part.period is None:
+                return None
+            if total is None:
+                total = part.period
+                continue
+            ratio = total / part.period
+            fraction = Fraction(ratio).limit_denominator(1000)
+            if fraction.numerator > 1000 or abs(float(fraction) - ratio) > 1e-12 * ratio:
+                return None
+            total *= fraction.denominator
+        return total
+
+    def _tones(self) -> list[float]:
+        return [tone for part in self.parts if (tone := part.tone()) is not None]
+
+
+@dataclass(frozen=True)
+class Sum(_Combination):
+    """Sum of waveforms. Its fundamental is its lowest tone, where every other tone is a harmonic of it."""
+
+    parts: tuple[Waveform, ...]
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        return np.asarray(sum(part.value(t, side) for part in self.parts))
+
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
+        blocks = [part.terms(start, stop) for part in self.parts]
+        known = [block for block in blocks if block is not None]
+        return np.concatenate(known, axis=1) if len(known) == len(blocks) else None
+
+    def tone(self) -> float | None:
+        if self.period is None or any(
+            part.tone() is None and not isinstance(part, DC) for part in self.parts
+        ):
+            return None
+        tones = self._tones()
+        lowest = min(tones)
+        return lowest if all(abs(t / lowest - round(t / lowest)) < 1e-9 for t in tones) else None
+
+
+@dataclass(frozen=True)
+class Product(_Combination):
+    """Product of waveforms. Its fundamental is that of its fastest factor: the carrier."""
+
+    parts: tuple[Waveform, ...]
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        return np.asarray(math.prod(part.value(t, side) for part in self.parts))
+
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
+        out: FloatArray | None = None
+        for part in self.parts:
+            block = part.terms(start, stop)
+            if block is None:
+                return None
+            out = block if out is None else _multiply(out, block)
+        return out
+
+    def tone(self) -> float | None:
+        tones = self._tones()
+        return max(tones) if tones and self.period is not None else None
+
+
+def _multiply(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Product of two blocks of terms; cos x cos y = (cos(x + y) + cos(x - y)) / 2."""
+    a = a[:, np.any(a[:, :, 0] != 0.0, axis=0)]
+    b = b[:, np.any(b[:, :, 0] != 0.0, axis=0)]
+    columns = []
+    for i in range(a.shape[1]):
+        for j in range(b.shape[1]):
+            x, y = a[:, i], b[:, j]
+            base = x + y
+            base[:, 0] = x[:, 0] * y[:, 0]
+            if np.any(x[:, 3:] != 0.0) and np.any(y[:, 3:] != 0.0):
+                base[:, 0] *= 0.5
+                other = base.copy()
+                other[:, 3:] = x[:, 3:] - y[:, 3:]
+                columns.append(other)
+            columns.append(base)
+    return np.stack(columns, axis=1) if columns else blank_terms(a.shape[0], 1)
+
+
+@dataclass(frozen=True)
+class AM(_Combination):
+    """Amplitude-modulated carrier: amplitude (1 + depth sin(2 pi f_m t + phase)) / (1 + depth) sin(2 pi f_c t).
+
+    Parameters
+    ----------
+    amplitude : float
+        Largest value of the envelope, V.
+    carrier, modulation : float
+        Hz, positive.
+    depth : float
+        0 (plain carrier) to 1 (envelope falls to zero).
+    phase_deg : float
+        Phase of the envelope, degrees.
+    """
+
+    amplitude: float
+    carrier: float
+    modulation: float
+    depth: float = 1.0
+    phase_deg: float = 0.0
+    units: ClassVar[dict[str, str]] = {
+        "amplitude": "V",
+        "carrier": "Hz",
+        "modulation": "Hz",
+        "depth": "",
+        "phase_deg": "deg",
+    }
+
+    def __post_init__(self) -> None:
+        check_finite(self)
+        require(0.0 <= self.depth <= 1.0, "AM depth", f"{self.depth:g}", "0 to 1")
+
+    @property
+    def parts(self) -> tuple[Waveform, ...]:  # type: ignore[override]
+        share = self.amplitude / (1.0 + self.depth)
+        envelope = Sine(share * self.depth, self.modulation, offset=share, phase_deg=self.phase_deg)
+        return (envelope, Sine(1.0, self.carrier))
+
+    value = Product.value
+    terms = Product.terms
+    tone = Product.tone

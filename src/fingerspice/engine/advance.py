@@ -1,0 +1,344 @@
+"""The stepping loop: segments of the source, zeros of the gap voltage, step control, outputs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fingerspice.engine.model import (
+    Model,
+    Segment,
+    dot,
+    gap_voltage,
+    inverse_area,
+    jump_charge,
+    right_hand_side,
+    source,
+    write_row,
+)
+from fingerspice.engine.steps import Method, dense_polynomial, dense_state, take_step
+
+FloatArray = NDArray[np.float64]
+
+# Codes returned by `advance`.
+DONE, LOG_FULL, NO_SOLUTION, STEP_UNDERFLOW = 0, 1, 2, 3
+# Entries of `control`: time, next step (0: choose one), branch of the area (0: choose one), source voltage
+# just before the time reached, last gap voltage.
+T, H, SIGN, U_BEFORE, U_GAP = 0, 1, 2, 3, 4
+N_CONTROL = 5
+# Entries of `counters`: evaluations, steps accepted and rejected, zeros met, outputs written, log rows written.
+NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, LOGGED = 0, 1, 2, 3, 4, 5
+N_COUNTERS = 6
+
+
+@njit(cache=True)
+def enter(model: Model, segment: Segment, t0: float, y: FloatArray, control: FloatArray) -> tuple[float, float]:
+    """Source voltage and slope, `t0` s into a segment, after taking the jump that may stand there."""
+    u_source, du_source = source(segment, t0)
+    x_gap = dot(model.gap, y)
+    jump = u_source - control[U_BEFORE]
+    if t0 == 0.0 or control[SIGN] == 0.0:
+        if not model.mobile and jump != 0.0:
+            y[-1] += jump_charge(model, x_gap, control[U_BEFORE], u_source)
+        if not abs(jump) <= 1e-3 * (abs(u_source) + abs(control[U_BEFORE])):
+            control[H] = 0.0
+        control[U_BEFORE] = u_source
+        zero = model.k_gap * u_source + x_gap
+        control[SIGN] = 1.0 if zero >= 0.0 or not model.coupled else -1.0
+        if model.coupled and abs(zero) <= 1e-13 * (abs(model.k_gap * u_source) + abs(x_gap)):
+            # At a zero the branch is the one the voltage is about to take.
+            dy = np.empty(y.size)
+            right_hand_side(model, u_source, du_source, y, control[SIGN], control[U_GAP], dy)
+            control[SIGN] = 1.0 if model.k_gap * du_source + dot(model.gap, dy) >= 0.0 else -1.0
+    return u_source, du_source
+
+
+@njit(cache=True)
+def _zero_function(
+    model: Model, segment: Segment, t0: float, h: float, theta: float, y: FloatArray, poly: FloatArray
+) -> float:
+    """k U + x_gap: zero exactly where the gap voltage is, under both laws."""
+    u_source, _ = source(segment, t0 + theta * h)
+    value = model.k_gap * u_source
+    for j in range(model.gap.size):
+        x = 0.0
+        for d in range(poly.shape[1] - 1, -1, -1):
+            x = (x + poly[j, d]) * theta
+        value += model.gap[j] * (y[j] + x)
+    return value
+
+
+@njit(cache=True)
+def _first_zero(
+    model: Model, segment: Segment, t0: float, h: float, sign: float, y: FloatArray, poly: FloatArray
+) -> float:
+    """First fraction of the step at which the gap voltage leaves its branch, or 2 where it does not."""
+    lo = 0.0
+    f_lo = sign * _zero_function(model, segment, t0, h, 0.0, y, poly)
+    hi = 0.0
+    f_hi = 0.0
+    for i in range(1, 5):
+        hi = 0.25 * i
+        f_hi = sign * _zero_function(model, segment, t0, h, hi, y, poly)
+        if f_hi < 0.0:
+            break
+        lo = hi
+        f_lo = f_hi
+    if not f_hi < 0.0:
+        return 2.0
+    if not f_lo > 0.0:
+        return lo
+    # Illinois variant of regula falsi: superlinear, and the bracket never opens.
+    for _ in range(100):
+        mid = (lo * f_hi - hi * f_lo) / (f_hi - f_lo)
+        if not lo < mid < hi:
+            mid = 0.5 * (lo + hi)
+        if not lo < mid < hi:
+            break
+        f_mid = sign * _zero_function(model, segment, t0, h, mid, y, poly)
+        if f_mid < 0.0:
+            hi = mid
+            f_hi = f_mid
+            f_lo *= 0.5
+        else:
+            lo = mid
+            f_lo = f_mid
+            f_hi *= 0.5
+        if hi - lo <= 4e-16 or f_mid == 0.0:
+            break
+    return hi if f_hi < 0.0 and f_lo != 0.0 else lo
+
+
+@njit(cache=True)
+def _first_step(model: Model, method: Method, rate: float) -> float:
+    """A step to start with: the shortest time constant, less what the tolerance asks of a method of this order.
+
+    `rate` (1/s) is the speed of the state in units of the local error allowed.
+    """
+    h = min(method.h_max, model.tau)
+    if rate > 0.0 and h < math.inf:
+        h *= min(1.0, 2.0 * (1.0 / (rate * h)) ** (1.0 / (method.error_order + 1.0)))
+    return h
+
+
+@njit(cache=True)
+def _choose_step(
+    model: Model, method: Method, remaining: float, control: FloatArray, k0: FloatArray, scale: FloatArray
+) -> tuple[float, bool]:
+    """Next step, and whether it ends on the boundary `remaining` seconds away."""
+    h = method.h_fixed
+    if h <= 0.0:
+        h = control[H]
+        if h == 0.0:
+            rate = 0.0
+            for j in range(scale.size):
+                rate = max(rate, abs(k0[j]) / scale[j])
+            h = _first_step(model, method, rate)
+            control[H] = h
+        h = min(h, method.h_max)
+        if h < remaining < 2.0 * h:
+            return 0.5 * remaining, False
+    if h >= remaining * (1.0 - 1e-10):
+        return remaining, True
+    return h, False
+
+
+@njit(cache=True)
+def _controlled_step(
+    model: Model,
+    method: Method,
+    segment: Segment,
+    t: float,
+    remaining: float,
+    y: FloatArray,
+    scale: FloatArray,
+    control: FloatArray,
+    counters: NDArray[np.int64],
+    k: FloatArray,
+    y1: FloatArray,
+) -> tuple[float, bool]:
+    """Step until the error is met. Returns the step (0: none is small enough) and whether it ends the segment."""
+    t0 = t - segment.start
+    h, last = _choose_step(model, method, remaining, control, k[0], scale)
+    while True:
+        norm, nfev = take_step(
+            model, method, segment, t0, h, y, control[SIGN], control[U_GAP], scale, k, y1
+        )
+        counters[NFEV] += nfev
+        factor = 6.0
+        if norm > 0.0:
+            factor = 0.25 if norm == math.inf else 0.9 * norm ** (-1.0 / method.error_order)
+        if norm <= 1.0 or (method.h_fixed > 0.0 and norm < math.inf):
+            # A step cut short by a boundary says little about the next one.
+            proposed = h * min(6.0, max(0.3, factor))
+            control[H] = max(proposed, control[H]) if h < control[H] else proposed
+            return h, last
+        counters[REJECTED] += 1
+        h *= min(0.9, max(0.2, factor))
+        control[H] = h
+        last = False
+        if h <= 1e-15 * max(abs(t), 1e-3 * segment.length):
+            return 0.0, False
+
+
+@njit(cache=True)
+def _write_log(
+    model: Model,
+    segment: Segment,
+    t: float,
+    h: float,
+    reached: float,
+    y: FloatArray,
+    poly: FloatArray,
+    control: FloatArray,
+    counters: NDArray[np.int64],
+    log: FloatArray,
+) -> None:
+    """What the error estimate compares, in the middle and at the end of a step.
+
+    Columns: time, gap voltage, 1/A, and how far the rounding of the time itself moves the gap voltage (it matters
+    on an edge of 1 ns late in a run).
+    """
+    state = np.empty(y.size)
+    for i in range(1, 3):
+        theta = 0.5 * i * reached
+        dense_state(theta, y, poly, state)
+        u_source, du_source = source(segment, t - segment.start + theta * h)
+        u = gap_voltage(
+            model, model.k_gap * u_source, dot(model.gap, state), control[SIGN], control[U_GAP]
+        )
+        q, _ = inverse_area(control[SIGN] * u, model.curve)
+        row = log[counters[LOGGED]]
+        row[0] = t + theta * h
+        row[1] = u
+        row[2] = q
+        row[3] = 4.5e-16 * (abs(t) + h) * abs(model.k_gap * du_source)
+        counters[LOGGED] += 1
+
+
+@njit(cache=True)
+def _write_outputs(
+    model: Model,
+    segment: Segment,
+    t: float,
+    h: float,
+    reached: float,
+    t_new: float,
+    y: FloatArray,
+    poly: FloatArray,
+    control: FloatArray,
+    counters: NDArray[np.int64],
+    t_out: FloatArray,
+    left: NDArray[np.bool_],
+    rows: FloatArray,
+) -> None:
+    """Outputs of one step: right-hand ones in [t, t_new), left-hand ones in (t, t_new]."""
+    state = np.empty(y.size)
+    while counters[OUTPUT] < t_out.size:
+        i = counters[OUTPUT]
+        if t_out[i] > t_new or (t_out[i] == t_new and not left[i]):
+            return
+        theta = max(0.0, min((t_out[i] - t) / h, reached))
+        dense_state(theta, y, poly, state)
+        u_source, du_source = source(segment, t - segment.start + theta * h)
+        write_row(model, u_source, du_source, state, control[SIGN], control[U_GAP], rows[i])
+        counters[OUTPUT] += 1
+
+
+@njit(cache=True)
+def advance(
+    model: Model,
+    method: Method,
+    edges: FloatArray,
+    terms: FloatArray,
+    series: FloatArray,
+    t_end: float,
+    scale: FloatArray,
+    y: FloatArray,
+    control: FloatArray,
+    counters: NDArray[np.int64],
+    t_out: FloatArray,
+    left: NDArray[np.bool_],
+    rows: FloatArray,
+    log: FloatArray,
+) -> int:
+    """Step the model to `t_end` through the source's segments, writing outputs on the way.
+
+    Parameters
+    ----------
+    model, method
+        What to step, and how.
+    edges : ndarray, shape (m + 1,)
+        Segment edges, s; `terms` (m, k, 6) and `series` (m, l) hold the source on each (see `Segment`).
+    t_end : float
+        Where to stop, s; not past the last edge.
+    scale : ndarray, shape (n + 1,)
+        Local error allowed in a step, in V and C.
+    y, control, counters : ndarray
+        State and bookkeeping, updated in place.
+    t_out, left, rows : ndarray
+        Output times (ascending), whether the left-hand value is meant, and the rows to fill (`write_row`).
+    log : ndarray, shape (l, 4)
+        See `_write_log`; with no rows nothing is logged.
+
+    Returns
+    -------
+    int
+        DONE, LOG_FULL (call again), NO_SOLUTION (past a fold at the time reached) or STEP_UNDERFLOW.
+    """
+    k = np.zeros((method.a.shape[0], y.size))
+    poly = np.zeros((y.size, method.dense.shape[1]))
+    y1 = np.empty(y.size)
+    counters[LOGGED] = 0
+    flips = 0
+    index = np.searchsorted(edges, control[T], side="right") - 1
+    while control[T] < t_end:
+        t = control[T]
+        while edges[index + 1] <= t:
+            index += 1
+        segment = Segment(edges[index], edges[index + 1] - edges[index], terms[index], series[index])
+        u_source, du_source = enter(model, segment, t - segment.start, y, control)
+        u = right_hand_side(model, u_source, du_source, y, control[SIGN], control[U_GAP], k[0])
+        counters[NFEV] += 1
+        if u != u:
+            return NO_SOLUTION
+        control[U_GAP] = u
+        stop = min(edges[index + 1], t_end)
+        h, last = _controlled_step(model, method, segment, t, stop - t, y, scale, control, counters, k, y1)
+        if h == 0.0:
+            return STEP_UNDERFLOW
+        dense_polynomial(k, method.dense, h, poly)
+        theta = 2.0
+        if model.coupled and flips < 2:
+            theta = _first_zero(model, segment, t - segment.start, h, control[SIGN], y, poly)
+        t_new = stop if last else t + h
+        if theta < 1.0:
+            t_new = t + theta * h
+        if t_new <= t:
+            # The zero is here: change branch without advancing.
+            control[SIGN] = -control[SIGN]
+            flips += 1
+            continue
+        flips = 0
+        reached = min(theta, 1.0)
+        _write_outputs(
+            model, segment, t, h, reached, t_new, y, poly, control, counters, t_out, left, rows
+        )
+        if log.shape[0] > 0:
+            _write_log(model, segment, t, h, reached, y, poly, control, counters, log)
+            log[counters[LOGGED] - 1, 0] = t_new
+        if reached < 1.0:
+            dense_state(reached, y, poly, y1)
+        if theta <= 1.0:
+            control[SIGN] = -control[SIGN]
+            counters[ZEROS] += 1
+        y[:] = y1
+        control[T] = t_new
+        control[U_BEFORE], _ = source(segment, t_new - segment.start)
+        counters[ACCEPTED] += 1
+        if log.shape[0] > 0 and counters[LOGGED] + 2 > log.shape[0]:
+            return LOG_FULL
+    return DONE

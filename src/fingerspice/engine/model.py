@@ -1,0 +1,282 @@
+"""Stack, contact and source as one compiled right-hand side.
+
+State y = [x (n,) in volt, z in coulomb]. With q = 1/A, the reference area A_0 and layer voltages u = k U + E v,
+
+    local    v = x            x' = f          z' = A (lam + U'/S)    charge through the terminals
+    mobile   v = x A_0 q      x' = f A / A_0  z' = A lam             charge is A U / S + z
+
+where [f, lam] = (p1 + q p0) v + (b[0] + q b[1]) U. Only z' needs the slope of the source.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fingerspice.numerics import chebyshev
+from fingerspice.physics.contact import inverse_area
+
+FloatArray = NDArray[np.float64]
+
+
+class Model(NamedTuple):
+    """A reduced stack with its area curve, as numbers.
+
+    Attributes
+    ----------
+    mobile : bool
+        Charge law.
+    coupled : bool
+        Whether the area follows the gap voltage; then steps end on its zeros.
+    p1, p0 : ndarray, shape (n + 1, n)
+        Rates that do not depend on the area (1/s), and those over 1/A (m^2/s); last row: lam.
+    b : ndarray, shape (2, n + 1)
+        The same split of the columns that multiply U.
+    k_gap : float
+        Share of a jump of U that the gap takes.
+    gap : ndarray, shape (n,)
+        x_gap = gap @ x.
+    s : float
+        Sum of 1/c_x over the layers, m^2/F.
+    area0 : float
+        Reference area of the mobile state, m^2.
+    tau : float
+        Shortest time constant of the frozen stack, s (inf without leakage).
+    curve : ndarray
+        See `fingerspice.physics.contact.inverse_area`.
+    """
+
+    mobile: bool
+    coupled: bool
+    p1: FloatArray
+    p0: FloatArray
+    b: FloatArray
+    k_gap: float
+    gap: FloatArray
+    s: float
+    area0: float
+    tau: float
+    curve: FloatArray
+
+
+class Segment(NamedTuple):
+    """The source between two breakpoints.
+
+    Attributes
+    ----------
+    start, length : float
+        Seconds.
+    terms : ndarray, shape (k, 6)
+        c, n, a, omega, phi, beta of c tau^n exp(a tau) cos(phi + omega tau + beta tau^2 / 2), tau from the start.
+    series : ndarray, shape (l,)
+        Chebyshev coefficients over the segment, or empty.
+    """
+
+    start: float
+    length: float
+    terms: FloatArray
+    series: FloatArray
+
+
+# Gauss-Legendre rule for the charge of a jump under the local law: A is analytic on either side of 0 V.
+_GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(24)
+
+
+@njit(cache=True)
+def source(segment: Segment, tau: float) -> tuple[float, float]:
+    """Source voltage (V) and its slope (V/s), tau seconds into a segment."""
+    u = 0.0
+    du = 0.0
+    terms = segment.terms
+    for i in range(terms.shape[0]):
+        value = terms[i, 0]
+        if value == 0.0:
+            continue
+        slope = 0.0
+        n = terms[i, 1]
+        if n == 1.0:
+            slope = value
+            value *= tau
+        elif n > 1.0:
+            slope = value * n * tau ** (n - 1.0)
+            value *= tau**n
+        a = terms[i, 2]
+        if a != 0.0:
+            e = math.exp(a * tau)
+            slope = (slope + a * value) * e
+            value *= e
+        omega = terms[i, 3]
+        phi = terms[i, 4]
+        beta = terms[i, 5]
+        if omega != 0.0 or phi != 0.0 or beta != 0.0:
+            phase = phi + (omega + 0.5 * beta * tau) * tau
+            c = math.cos(phase)
+            slope = slope * c - value * (omega + beta * tau) * math.sin(phase)
+            value *= c
+        u += value
+        du += slope
+    if segment.series.size > 0:
+        value, slope = chebyshev.evaluate(segment.series, 2.0 * tau / segment.length - 1.0)
+        u += value
+        du += slope * 2.0 / segment.length
+    return u, du
+
+
+@njit(cache=True)
+def dot(a: FloatArray, x: FloatArray) -> float:
+    """a @ x[: a.size], for the few entries of a state."""
+    total = 0.0
+    for i in range(a.size):
+        total += a[i] * x[i]
+    return total
+
+
+@njit(cache=True)
+def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: float) -> float:
+    """Gap voltage (V): k U + x under `local`; under `mobile` the root of u = k U + x A_0 / A(|u|).
+
+    The root meant is the first one met from k U in the direction of x: the one connected to the uncharged
+    state. `guess` starts Newton; where that does not settle, the root is bracketed. NaN past the fold.
+    """
+    if not model.mobile or x_gap == 0.0:
+        return k_u + x_gap
+    b = x_gap * model.area0
+    u = guess
+    for _ in range(8):
+        q, dq = inverse_area(sign * u, model.curve)
+        slope = 1.0 - b * sign * dq
+        # Close to the fold Newton may cross to the other branch: leave it to the bracket.
+        if not slope > 0.2:
+            break
+        step = (u - k_u - b * q) / slope
+        u -= step
+        if abs(step) <= 4e-16 * (abs(u) + abs(k_u)):
+            if (u - k_u) * x_gap >= 0.0:
+                return u
+            break
+    return _bracketed_root(model, k_u, b, sign)
+
+
+@njit(cache=True)
+def _residual(model: Model, k_u: float, b: float, sign: float, r: float) -> tuple[float, float]:
+    """Residual of the mobile area equation r = |u - k U|, and its slope, walking from k U towards the root."""
+    direction = 1.0 if b > 0.0 else -1.0
+    q, dq = inverse_area(sign * (k_u + direction * r), model.curve)
+    return r - abs(b) * q, 1.0 - b * sign * dq
+
+
+@njit(cache=True)
+def _bracketed_root(model: Model, k_u: float, b: float, sign: float) -> float:
+    lo = 0.0
+    width = 0.05 * abs(b) / model.area0
+    hi = width
+    value, slope = _residual(model, k_u, b, sign, hi)
+    while value < 0.0 and slope > 0.0:
+        lo = hi
+        width *= 1.1
+        hi += width
+        value, slope = _residual(model, k_u, b, sign, hi)
+    if not value >= 0.0:
+        # The residual turns between lo and hi: a root exists only if its peak reaches zero.
+        for _ in range(60):
+            mid = 0.5 * (lo + hi)
+            value, slope = _residual(model, k_u, b, sign, mid)
+            if value >= 0.0:
+                hi = mid
+                break
+            if slope > 0.0:
+                lo = mid
+            else:
+                hi = mid
+        if not value >= 0.0:
+            return math.nan
+    for _ in range(100):
+        mid = 0.5 * (lo + hi)
+        if not lo < mid < hi:
+            break
+        value, slope = _residual(model, k_u, b, sign, mid)
+        if value >= 0.0:
+            hi = mid
+        else:
+            lo = mid
+    return k_u + (hi if b > 0.0 else -hi)
+
+
+@njit(cache=True)
+def fold_margin(model: Model, x_gap: float, u: float, sign: float) -> float:
+    """Distance to the fold of the `mobile` area equation: 1 without stored charge, 0 at the fold."""
+    if not model.mobile:
+        return 1.0
+    _, dq = inverse_area(sign * u, model.curve)
+    return 1.0 - x_gap * model.area0 * sign * dq
+
+
+@njit(cache=True)
+def right_hand_side(
+    model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, guess: float, out: FloatArray
+) -> float:
+    """Write y' into `out` (n + 1,), from the source's voltage and slope; return the gap voltage (V).
+
+    `sign` chooses the branch A(|u|) = A(sign u), continued analytically through 0 V.
+    """
+    n = model.gap.size
+    u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), sign, guess)
+    q, _ = inverse_area(sign * u, model.curve)
+    scale = model.area0 * q if model.mobile else 1.0
+    for i in range(n + 1):
+        value = 0.0
+        for j in range(n):
+            value += (model.p1[i, j] + q * model.p0[i, j]) * y[j]
+        out[i] = value + (model.b[0, i] + q * model.b[1, i]) * u_source / scale
+    if model.mobile:
+        out[n] *= model.area0
+    else:
+        out[n] = (out[n] + du_source / model.s) / q
+    return u
+
+
+@njit(cache=True)
+def write_row(
+    model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, guess: float, row: FloatArray
+) -> None:
+    """Fill one output row: U, gap voltage, 1/A, current, fold margin, then y."""
+    n = model.gap.size
+    dy = np.empty(n + 1)
+    u = right_hand_side(model, u_source, du_source, y, sign, guess, dy)
+    q, dq = inverse_area(sign * u, model.curve)
+    margin = fold_margin(model, dot(model.gap, y), u, sign)
+    current = dy[n]
+    if model.mobile:
+        # i = Q' with Q = A U / S + z, and u' from the area equation.
+        du = (model.k_gap * du_source + dot(model.gap, dy) * model.area0 * q) / margin
+        current += (du_source / q - sign * dq * du * u_source / (q * q)) / model.s
+    row[0] = u_source
+    row[1] = u
+    row[2] = q
+    row[3] = current
+    row[4] = margin
+    row[5:] = y
+
+
+@njit(cache=True)
+def jump_charge(model: Model, x_gap: float, u_from: float, u_to: float) -> float:
+    """Charge (C) through the terminals in a jump of the source under `local`: integral of A dD = A dU / S."""
+    edges = np.array([u_from, u_to, u_to])
+    pieces = 1
+    crossing = -x_gap / model.k_gap if model.k_gap != 0.0 else u_from
+    if min(u_from, u_to) < crossing < max(u_from, u_to):
+        edges[1] = crossing
+        pieces = 2
+    total = 0.0
+    for i in range(pieces):
+        half = 0.5 * (edges[i + 1] - edges[i])
+        middle = 0.5 * (edges[i + 1] + edges[i])
+        for g in range(_GAUSS_X.size):
+            u = abs(model.k_gap * (middle + half * _GAUSS_X[g]) + x_gap)
+            q, _ = inverse_area(u, model.curve)
+            total += half * _GAUSS_W[g] / q
+    return total / model.s

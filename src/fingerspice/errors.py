@@ -1,0 +1,55 @@
+"""The two ways a request can fail: the input is wrong, or the solve did not finish."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fingerspice.solution import Solution
+
+
+@dataclass(frozen=True)
+class Where:
+    """A place in a netlist: file name as shown to the user, line and column (both from 1)."""
+
+    file: str
+    line: int
+    column: int = 1
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}:{self.column}"
+
+
+class FingerspiceError(Exception):
+    """Base of every error this package raises on purpose."""
+
+
+class InputError(FingerspiceError, ValueError):
+    """The input is wrong: what is wrong, what was given, what is allowed, and where.
+
+    Parameters
+    ----------
+    message : str
+        One clear sentence.
+    where : Where, optional
+        The place in the netlist, where there is one.
+    """
+
+    def __init__(self, message: str, where: Where | None = None) -> None:
+        self.message = message
+        self.where = where
+        super().__init__(f"{where}: {message}" if where else message)
+
+
+class SolveError(FingerspiceError, RuntimeError):
+    """The solve did not reach its end; `solution` holds what came before."""
+
+    def __init__(self, message: str, solution: Solution | None = None) -> None:
+        self.message = message
+        self.solution = solution
+        super().__init__(message)
+
+
+class FingerspiceWarning(UserWarning):
+    """Something in the input is legal but probably not what was meant."""

@@ -1,0 +1,82 @@
+"""Chebyshev interpolation of smooth functions on an interval, and its compiled evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+def nodes(n: int, lo: float, hi: float) -> FloatArray:
+    """Chebyshev points of the first kind on [lo, hi], ascending, shape (n,)."""
+    angle = (np.arange(n)[::-1] + 0.5) * np.pi / n
+    return 0.5 * (lo + hi) + 0.5 * (hi - lo) * np.cos(angle)
+
+
+def coefficients(values: FloatArray) -> FloatArray:
+    """Chebyshev coefficients of the interpolant through `values` at `nodes`, along axis 0."""
+    n = values.shape[0]
+    return _transform(n) @ values
+
+
+_TRANSFORMS: dict[int, FloatArray] = {}
+
+
+def _transform(n: int) -> FloatArray:
+    if n not in _TRANSFORMS:
+        angle = (np.arange(n)[::-1] + 0.5) * np.pi / n
+        matrix = np.cos(np.outer(np.arange(n), angle)) * (2.0 / n)
+        matrix[0] *= 0.5
+        _TRANSFORMS[n] = matrix
+    return _TRANSFORMS[n]
+
+
+def fit(
+    function: Callable[[FloatArray], FloatArray], lo: float, hi: float, tol: float, sizes: tuple[int, ...]
+) -> FloatArray | None:
+    """Coefficients of the shortest interpolant, of the given sizes, whose tail is below `tol`.
+
+    Parameters
+    ----------
+    function : callable
+        Takes and returns arrays of shape (n,).
+    lo, hi : float
+        Interval.
+    tol : float
+        Bound of the last two coefficients relative to the largest.
+    sizes : tuple of int
+        Numbers of points to try, ascending.
+
+    Returns
+    -------
+    ndarray or None
+        None where no size met `tol`.
+    """
+    for size in sizes:
+        c = coefficients(function(nodes(size, lo, hi)))
+        magnitude = np.abs(c)
+        if np.all(np.isfinite(c)) and magnitude[-2:].max() <= tol * magnitude.max():
+            keep = np.flatnonzero(magnitude > 0.1 * tol * magnitude.max())
+            return np.ascontiguousarray(c[: (keep[-1] + 1 if keep.size else 1)])
+    return None
+
+
+@njit(cache=True)
+def evaluate(c: FloatArray, x: float) -> tuple[float, float]:
+    """Value and derivative at x in [-1, 1] of the series with coefficients c (Clenshaw)."""
+    b1 = 0.0
+    b2 = 0.0
+    d1 = 0.0
+    d2 = 0.0
+    for k in range(c.size - 1, 0, -1):
+        d0 = 2.0 * b1 + 2.0 * x * d1 - d2
+        b0 = c[k] + 2.0 * x * b1 - b2
+        d2 = d1
+        d1 = d0
+        b2 = b1
+        b1 = b0
+    return c[0] + x * b1 - b2, b1 + x * d1 - d2

@@ -1,0 +1,1 @@
+"""Physics of the sliding fingertip; knows no software: no netlist, no integrator."""

@@ -1,0 +1,207 @@
+"""Ridge contact area under electroadhesion and friction (Eqs. 1 to 7).
+
+With y = A_R0 / (alpha F_N^m) and p = (1 + 1/m - 1/n) / 2, Eq. 4 is one universal curve per pair of exponents,
+
+    y^(1/m) - X y^p = 1,        X = xi |u_gap|,
+
+and Eqs. 1 and 3 are then a quadratic in A_R. So A_R = g(|u_gap|) is one function of one number per contact.
+All functions take and return SI units.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from fingerspice.numerics import chebyshev
+from fingerspice.physics.materials import EPS0
+
+FloatArray = NDArray[np.float64]
+
+N_PACKED = 8
+"""Length of the parameter vector that the compiled functions take."""
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A fingerpad pressed on a screen across an air gap, in full slip (Table 1).
+
+    Parameters
+    ----------
+    d : float
+        Gap thickness, m.
+    eps_r : float
+        Relative permittivity of the gap.
+    f_n : float
+        Applied normal force, N.
+    mu : float
+        Friction coefficient.
+    alpha, m : float
+        Ridge area against normal force, A = alpha F^m (Eq. 5); alpha in m^2/N^m.
+    beta, n : float
+        Ridge area against indentation, A = beta delta^n (Eq. 6); beta in m^(2-n).
+    c2 : float
+        Loss of area under tangential load (Eq. 3), m^4/N^2.
+    work_ratio : float
+        Work of adhesion over sigma d: 1 with the gap voltage held (default), k of `total_work_ratio`
+        with the total voltage held.
+    """
+
+    d: float
+    eps_r: float
+    f_n: float
+    mu: float
+    alpha: float
+    m: float
+    beta: float
+    n: float
+    c2: float
+    work_ratio: float = 1.0
+
+    @property
+    def area_unloaded(self) -> float:
+        """Ridge area without voltage and friction, alpha F_N^m (Eq. 5), m^2."""
+        return self.alpha * self.f_n**self.m
+
+    @property
+    def exists(self) -> bool:
+        """Whether friction leaves an area at 0 V: A0^2 > c2 mu^2 F_N^2."""
+        return self.area_unloaded**2 > self.c2 * (self.mu * self.f_n) ** 2
+
+    def pack(self) -> FloatArray:
+        """Parameters as the compiled functions take them, shape (8,), SI."""
+        p = 0.5 * (1.0 + 1.0 / self.m - 1.0 / self.n)
+        area = self.area_unloaded
+        # Eq. 4 divided by F_N; w = sigma d k = eps0 eps_r k u^2 / (2 d), so X is proportional to |u|.
+        log_x2 = (
+            math.log(EPS0 * self.eps_r * self.work_ratio / self.d)
+            + math.log(self.n**2 / (self.n - self.m))
+            + math.log(self.beta) / self.n
+            - math.log(self.alpha) / self.m
+            + 2.0 * p * math.log(area)
+            - 2.0 * math.log(self.f_n)
+        )
+        stress = 0.5 * EPS0 * self.eps_r / self.d**2
+        return np.array(
+            [math.exp(0.5 * log_x2), area, 1.0 / self.m, p, stress, self.f_n, self.mu, self.c2 * self.mu**2]
+        )
+
+    def area(self, u_gap: ArrayLike) -> FloatArray:
+        """Ridge contact area in full slip, A_R (Eqs. 1 to 4), m^2, at gap voltage `u_gap` (V)."""
+        u = np.abs(np.asarray(u_gap, float))
+        return ridge_area_array(u.ravel(), self.pack()).reshape(u.shape)  # type: ignore[no-any-return]
+
+    def area_adhesive(self, u_gap: ArrayLike) -> FloatArray:
+        """Ridge contact area under normal load alone, A_R0 (Eq. 4), m^2, at gap voltage `u_gap` (V)."""
+        packed = self.pack()
+        x = packed[0] * np.abs(np.asarray(u_gap, float))
+        return packed[1] * universal_curve_array(x.ravel(), packed[2], packed[3]).reshape(x.shape)  # type: ignore[no-any-return]
+
+    def stress(self, u_gap: ArrayLike) -> FloatArray:
+        """Electroadhesive stress sigma_el (Eq. 2), Pa, at gap voltage `u_gap` (V)."""
+        return np.asarray(0.5 * EPS0 * self.eps_r / self.d**2 * np.asarray(u_gap, float) ** 2)
+
+    def with_total_voltage_held(self, d: ArrayLike, eps_r: ArrayLike) -> Contact:
+        """The same contact with w at total voltage held (Eq. 7, capacitive stack of layers d, eps_r)."""
+        thickness = float(np.sum(np.asarray(d, float) / np.asarray(eps_r, float)))
+        return replace(self, work_ratio=thickness / (self.d / self.eps_r))
+
+    def curve(self, u_max: float) -> FloatArray:
+        """1/A_R as one Chebyshev series over |u_gap| <= `u_max` (V), for `inverse_area`.
+
+        The series reaches a little past the kink at 0 V on its analytic continuation, so that a step across
+        the kink stays smooth. Where no short series reaches rounding, the exact solution is used instead.
+        """
+        packed = self.pack()
+        # The continuation exists while 1 + x y^p > 0; x = -0.2 is well inside for every legal exponent pair.
+        lo, hi = -min(0.1 * u_max, 0.2 / packed[0]), u_max
+        series = chebyshev.fit(
+            lambda u: 1.0 / np.asarray(ridge_area_array(u, packed)), lo, hi, 2e-15, (16, 24, 32, 48)
+        )
+        return np.concatenate([[lo, hi], packed, [] if series is None else series])
+
+
+def fixed_area_curve(area: float) -> FloatArray:
+    """The curve of an area that does not depend on the voltage, `area` in m^2, for `inverse_area`."""
+    return np.concatenate([[-math.inf, math.inf], np.zeros(N_PACKED), [1.0 / area]])
+
+
+@njit(cache=True)
+def universal_curve(x: float, inv_m: float, p: float) -> float:
+    """Root y of y^(1/m) - x y^p = 1 for one x (no unit); analytic through x = 0, so small x < 0 are allowed.
+
+    Newton on f(L) = L/m - log(1 + x e^(pL)), L = ln y. For x > 0, f is concave and rising (legal exponents), so
+    from the left of the root the iteration is monotone: no safeguard is needed. Both starting values are left of it.
+    """
+    log_y = 0.0
+    if x > 1.0:
+        log_y = math.log(x) / (inv_m - p)
+    for _ in range(60):
+        if x > 1.0:
+            # log(1 + x e^(pL)) without overflow: the exponential dominates here.
+            e = math.exp(-p * log_y) / x
+            share = 1.0 / (1.0 + e)
+            value = inv_m * log_y - (math.log(x) + p * log_y + math.log1p(e))
+        else:
+            e = x * math.exp(p * log_y)
+            share = e / (1.0 + e)
+            value = inv_m * log_y - math.log1p(e)
+        step = value / (inv_m - p * share)
+        log_y -= step
+        if abs(step) <= 1e-16 + 2e-16 * abs(log_y):
+            break
+    return math.exp(log_y)
+
+
+@njit(cache=True)
+def ridge_area(u: float, contact: FloatArray) -> float:
+    """A_R (m^2) at gap voltage u >= 0 (V); a small u < 0 gives the analytic continuation through the kink."""
+    a0 = contact[1] * universal_curve(contact[0] * u, contact[2], contact[3])
+    sigma = contact[4] * u * u
+    f_n = contact[5]
+    k = contact[7] / a0
+    # k s^2 A^2 + (1 + 2 k F s) A - (A0 - k F^2) = 0, in the form that is stable as s -> 0.
+    b = 1.0 + 2.0 * k * f_n * sigma
+    root = math.sqrt(1.0 + 4.0 * k * sigma * (f_n + sigma * a0))
+    return 2.0 * (a0 - k * f_n * f_n) / (b + root)
+
+
+@njit(cache=True)
+def ridge_area_array(u: FloatArray, contact: FloatArray) -> FloatArray:
+    """`ridge_area` over an array, shape (n,)."""
+    out = np.empty_like(u)
+    for i in range(u.size):
+        out[i] = ridge_area(u[i], contact)
+    return out
+
+
+@njit(cache=True)
+def universal_curve_array(x: FloatArray, inv_m: float, p: float) -> FloatArray:
+    """`universal_curve` over an array, shape (n,)."""
+    out = np.empty_like(x)
+    for i in range(x.size):
+        out[i] = universal_curve(x[i], inv_m, p)
+    return out
+
+
+@njit(cache=True)
+def inverse_area(u: float, curve: FloatArray) -> tuple[float, float]:
+    """1/A_R (1/m^2) and its slope (1/(m^2 V)) at gap voltage u >= 0 (V), or a little below on the continuation."""
+    n = curve.size - 2 - N_PACKED
+    if n == 1:
+        return curve[-1], 0.0
+    lo = curve[0]
+    hi = curve[1]
+    if n > 1 and lo <= u <= hi:
+        scale = 2.0 / (hi - lo)
+        value, slope = chebyshev.evaluate(curve[2 + N_PACKED :], (u - lo) * scale - 1.0)
+        return value, slope * scale
+    packed = curve[2 : 2 + N_PACKED]
+    step = 1e-4 * max(abs(u), 1e-3 / packed[0])
+    area = ridge_area(u, packed)
+    slope = (ridge_area(u + step, packed) - ridge_area(u - step, packed)) / (2.0 * step)
+    return 1.0 / area, -slope / (area * area)

@@ -1,0 +1,64 @@
+"""Phasor solution of layers in series (Eqs. 8 to 15), on plain arrays.
+
+Written from the impedances, in their own order, and sharing nothing with the state space: each is the other's test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+def layer_gains(admittance: ArrayLike) -> ComplexArray:
+    """Complex share of the source voltage across each layer (Eq. 11 before the modulus).
+
+    Parameters
+    ----------
+    admittance : array_like of complex, shape (..., n_layer)
+        1/Z_x = 1/R_x + i Omega C_x (Eq. 9), S. Zero is an open layer: it takes all the voltage.
+
+    Returns
+    -------
+    ndarray of complex, shape (..., n_layer)
+    """
+    y = np.asarray(admittance, complex)
+    # Impedances scaled by the smallest admittance: an open layer then needs no infinity.
+    smallest = np.take_along_axis(y, np.abs(y).argmin(-1)[..., None], -1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = np.where(y == 0.0, 1.0, smallest / np.where(y == 0.0, 1.0, y))
+        z = np.where((smallest == 0.0) & (y != 0.0), 0.0, z)
+    return np.asarray(z / z.sum(-1, keepdims=True))
+
+
+def coupled_area(area_of: Callable[[float], float], gain_of: Callable[[float], float], amplitude: float) -> float:
+    """Area A = g(U_gap / sqrt 2), coupled through the mean stress and iterated to rounding (m^2).
+
+    Parameters
+    ----------
+    area_of : callable
+        g: gap voltage (V) to ridge contact area (m^2).
+    gain_of : callable
+        Area (m^2) to |U_gap / U_0| (Eq. 11).
+    amplitude : float
+        U_0, V.
+
+    Notes
+    -----
+    The gain lies between 0 and 1, so the root of u - U_0 |gain(g(u / sqrt 2))| is bracketed by 0 and U_0.
+    """
+    lo, hi = 0.0, abs(amplitude)
+    u = hi
+    for _ in range(200):
+        new = abs(amplitude) * gain_of(area_of(u / np.sqrt(2.0)))
+        lo, hi = (u, hi) if new > u else (lo, u)
+        # The map contracts strongly; bisection guards the scenes where it does not.
+        nearer = new if lo <= new <= hi else 0.5 * (lo + hi)
+        if abs(nearer - u) <= 2e-16 * abs(u):
+            break
+        u = nearer
+    return float(area_of(u / np.sqrt(2.0)))

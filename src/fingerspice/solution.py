@@ -1,0 +1,328 @@
+"""The result of a run: read-only arrays with their status, error and provenance."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.files import write_aside
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.figure import Figure
+
+    from fingerspice.circuit.circuit import Circuit
+    from fingerspice.circuit.waveforms import Fundamental
+
+FloatArray = NDArray[np.float64]
+
+
+class Status(Enum):
+    """How a run ended; the text says what happened and what to do."""
+
+    SUCCESS = "success"
+    FOLD = (
+        "the mobile charge law has no solution past this time: with the charge stored on the interfaces, less area "
+        "means more voltage means less area; use less voltage, more load, or the local law"
+    )
+    SOURCE_NOT_FINITE = "a source gave NaN or inf; nothing after this time is a result"
+    STEP_UNDERFLOW = "no step is small enough for the error asked for; ask for a larger rtol, or check the source"
+    ERROR_NOT_MET = "the error estimate stayed above the error asked for; ask for a larger rtol"
+    METHOD_FAILED = "the chosen method gave up; use method='auto'"
+
+
+@dataclass(frozen=True)
+class ErrorEstimate:
+    """Estimated largest error over the run: of the gap voltage (V) and of the electroadhesive force (N).
+
+    Without a GAP, `u_gap` is that of the voltage of the layer with the smallest capacitance, and `f_el` is 0.
+    """
+
+    u_gap: float
+    f_el: float
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a run stopped, for another one to go on from."""
+
+    t: float
+    y: FloatArray
+    u_before: float
+    charge_offset: float
+    charge_law: str
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Time response of a circuit. Arrays are read-only; SI units; at a jump of the source two rows share a time.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n_t,)
+        s.
+    u_source : ndarray, shape (n_t,)
+        Voltage around the loop, V.
+    u_layer : ndarray, shape (n_t, n_layer)
+        Voltage of each layer from its p to its n node, V.
+    layers : tuple of str
+        Names of the columns of `u_layer`.
+    u_gap, area, sigma_el, f_el, f_t, friction : ndarray, shape (n_t,), or None
+        Gap voltage (V), ridge contact area (m^2), electroadhesive stress (Pa, Eq. 2) and force (N), friction
+        force (N, Eq. 1) and friction coefficient f_t / f_n. None for a circuit without GAP, except `area`.
+    node_voltages : dict of str to ndarray, shape (n_t,)
+        V, by node name.
+    q_source : ndarray, shape (n_t,)
+        Charge delivered by the source since the start, C; a jump adds its integral of A dD.
+    i_source : ndarray, shape (n_t,)
+        Regular part of the current, A, positive when delivered; a jump is an impulse, seen in `q_source` only.
+    fold_margin : ndarray, shape (n_t,)
+        Distance to the fold of the `mobile` law: 1 without stored charge, 0 at the fold; 1 under `local`.
+    status : Status
+    message : str
+    nfev : int
+        Evaluations of the right-hand side.
+    stats : dict
+        Steps, rejections, zeros met, method, wall time.
+    error : ErrorEstimate
+    rtol : float
+        Error asked for, relative to the peaks.
+    charge_law, area_mode, method : str
+    circuit : Circuit
+    state : State
+    """
+
+    t: FloatArray
+    u_source: FloatArray
+    u_layer: FloatArray
+    layers: tuple[str, ...]
+    u_gap: FloatArray | None
+    area: FloatArray
+    sigma_el: FloatArray | None
+    f_el: FloatArray | None
+    f_t: FloatArray | None
+    friction: FloatArray | None
+    node_voltages: dict[str, FloatArray]
+    q_source: FloatArray
+    i_source: FloatArray
+    fold_margin: FloatArray
+    status: Status
+    message: str
+    nfev: int
+    stats: dict[str, Any]
+    error: ErrorEstimate
+    rtol: float
+    charge_law: str
+    area_mode: str
+    method: str
+    circuit: Circuit
+    state: State
+    fundamental: Fundamental | None = None
+    period: float | None = None
+    warnings: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        for value in (*vars(self).values(), *self.node_voltages.values()):
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+
+    @property
+    def success(self) -> bool:
+        """Whether the run reached its end with the error met."""
+        return self.status is Status.SUCCESS
+
+    @property
+    def signals(self) -> dict[str, tuple[FloatArray, str, str]]:
+        """Every time series by name: values (n_t,), unit, long name."""
+        out: dict[str, tuple[FloatArray, str, str]] = {
+            "u_source": (self.u_source, "V", "source voltage"),
+        }
+        for i, name in enumerate(self.layers):
+            out[f"u_layer:{name}"] = (self.u_layer[:, i], "V", f"voltage of {name}")
+        for key, unit, text in (
+            ("u_gap", "V", "gap voltage"),
+            ("area", "m^2", "ridge contact area"),
+            ("sigma_el", "Pa", "electroadhesive stress"),
+            ("f_el", "N", "electroadhesive force"),
+            ("f_t", "N", "friction force"),
+            ("friction", "1", "friction coefficient f_t / f_n"),
+            ("q_source", "C", "charge delivered by the source"),
+            ("i_source", "A", "source current, regular part"),
+            ("fold_margin", "1", "distance to the fold of the mobile law"),
+        ):
+            value = getattr(self, key)
+            if value is not None:
+                out[key] = (value, unit, text)
+        for name, value in self.node_voltages.items():
+            out[f"v:{name}"] = (value, "V", f"voltage of node {name}")
+        return out
+
+    def summary(self) -> dict[str, Any]:
+        """Figures of the run: peak, rms, mean, ripple, amplitude and phase at the fundamental; SI units.
+
+        Means are trapezoidal over the output times. `f_el_mean` is over the whole run, `f_el_mean_periodic` over
+        the last period of the source; the entries of a period are None where the run holds none.
+        """
+        out: dict[str, Any] = {"t_stop": float(self.t[-1]) if self.t.size else None, "status": self.status.name}
+        out.update({f"error_{k}": v for k, v in vars(self.error).items()})
+        if self.t.size < 2:
+            return out
+        last = self._last_period()
+        for key in ("u_source", "u_gap", "area", "f_el", "f_t", "friction"):
+            x = getattr(self, key)
+            if x is None:
+                continue
+            out[f"{key}_max"] = float(x.max())
+            out[f"{key}_min"] = float(x.min())
+            out[f"{key}_mean"] = _mean(self.t, x)
+            out[f"{key}_mean_periodic"] = None
+            if last is not None:
+                periodic = _mean(last[0], last[1][key])
+                out[f"{key}_mean_periodic"] = periodic
+                if key in ("area", "f_el", "f_t", "friction"):
+                    out[f"{key}_ripple"] = float(np.ptp(last[1][key]))
+                else:
+                    out[f"{key}_rms_periodic"] = float(np.sqrt(_mean(last[0], last[1][key] ** 2)))
+        if last is not None and self.fundamental is not None:
+            f0 = self.fundamental
+            for key in ("u_source", "u_gap"):
+                if key in last[1]:
+                    p = _fundamental(last[0], last[1][key], f0.frequency)
+                    out[f"{key}_amplitude"] = abs(p)
+                    out[f"{key}_phase_deg"] = float(np.degrees(np.angle(p)))
+            out["fundamental"] = f0.frequency
+        if self.f_el is not None:
+            out["fold_margin_min"] = float(self.fold_margin.min())
+        return out
+
+    def _last_period(self) -> tuple[FloatArray, dict[str, FloatArray]] | None:
+        """Times and signals of the last period, with an interpolated first point; None where there is none."""
+        if self.period is None:
+            return None
+        start = self.t[-1] - self.period
+        tolerance = 1e-9 * self.period
+        if start < self.t[0] - tolerance or np.count_nonzero(self.t >= start) < 8:
+            return None
+        first = int(np.searchsorted(self.t, start - tolerance, side="right"))
+        exact = abs(self.t[first] - start) <= tolerance
+        if exact:
+            # At a jump the period starts with the right-hand value.
+            first = int(np.searchsorted(self.t, start + tolerance, side="right")) - 1
+        signals = {}
+        for key in ("u_source", "u_gap", "area", "f_el", "f_t", "friction"):
+            x = getattr(self, key)
+            if x is not None:
+                head = [] if exact else [np.interp(start, self.t, x)]
+                signals[key] = np.concatenate([head, x[first:]])
+        return np.concatenate([[] if exact else [start], self.t[first:]]), signals
+
+    def provenance(self) -> dict[str, str]:
+        """What it takes to repeat the run, as text."""
+        from fingerspice import __version__
+
+        return {
+            "program": f"fingerspice {__version__}",
+            "title": self.circuit.title,
+            "deck": self.circuit.text,
+            "overrides": json.dumps(dict(self.circuit.overrides)),
+            "charge_law": self.charge_law,
+            "area": self.area_mode,
+            "method": self.method,
+            "rtol": repr(self.rtol),
+            "error_u_gap_V": repr(self.error.u_gap),
+            "error_f_el_N": repr(self.error.f_el),
+            "status": self.status.name,
+            "message": self.message,
+        }
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write every signal as CSV, names and units in the header; both rows of a jump are kept.
+
+        Raises
+        ------
+        InputError
+            Where the folder cannot be written.
+        """
+        signals = self.signals
+        header = ["t [s]", *(f"{name} [{unit}]" for name, (_, unit, _) in signals.items())]
+        table = np.column_stack([self.t, *(value for value, _, _ in signals.values())])
+
+        def write(target: Path) -> None:
+            with target.open("w", newline="") as stream:
+                writer = csv.writer(stream)
+                writer.writerow(header)
+                writer.writerows([repr(float(x)) for x in row] for row in table)
+
+        return write_aside(Path(path), write)
+
+    def to_xarray(self, *, jumps: str = "right") -> xarray.Dataset:
+        """The run as an xarray Dataset with units and provenance.
+
+        Parameters
+        ----------
+        jumps : str
+            ``"right"``: times are unique, with the right-hand value at a jump; ``"both"``: as in the arrays.
+        """
+        import xarray
+
+        from fingerspice.circuit.waveforms import require
+
+        require(jumps in ("right", "both"), "jumps", repr(jumps), "'right' or 'both'")
+        keep = np.ones(self.t.size, bool)
+        if jumps == "right" and self.t.size:
+            keep[:-1] = np.diff(self.t) > 0.0
+        data: dict[str, Any] = {
+            "u_layer": (("time", "layer"), self.u_layer[keep], {"units": "V", "long_name": "layer voltage"})
+        }
+        for name, (value, unit, text) in self.signals.items():
+            if not name.startswith(("u_layer:", "v:")):
+                data[name] = ("time", value[keep], {"units": unit, "long_name": text})
+        data["v"] = (
+            ("time", "node"),
+            np.column_stack(list(self.node_voltages.values()))[keep],
+            {"units": "V", "long_name": "node voltage"},
+        )
+        return xarray.Dataset(
+            data,
+            coords={
+                "time": ("time", self.t[keep], {"units": "s", "long_name": "time"}),
+                "layer": list(self.layers),
+                "node": list(self.node_voltages),
+            },
+            attrs=self.provenance(),
+        )
+
+    def to_netcdf(self, path: str | Path, *, jumps: str = "right") -> Path:
+        """Write `to_xarray` as a NetCDF file.
+
+        Raises
+        ------
+        InputError
+            Where the folder cannot be written.
+        """
+        dataset = self.to_xarray(jumps=jumps)
+        return write_aside(Path(path), lambda target: dataset.to_netcdf(target, engine="h5netcdf"))
+
+    def plot(self) -> Figure:
+        """Source and gap voltage, force and area against time."""
+        from fingerspice.plotting import plot_solution
+
+        return plot_solution(self)
+
+
+def _mean(t: FloatArray, x: FloatArray) -> float:
+    span = t[-1] - t[0]
+    return float(np.trapezoid(x, t) / span) if span > 0.0 else float(x[-1])
+
+
+def _fundamental(t: FloatArray, x: FloatArray, frequency: float) -> complex:
+    """Complex amplitude P of x ~ Im(P exp(i 2 pi f t)) over the times given, a whole number of periods."""
+    weight = np.exp(-2j * np.pi * frequency * t)
+    return complex(2j * np.trapezoid(x * weight, t) / (t[-1] - t[0]))

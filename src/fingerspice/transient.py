@@ -1,0 +1,315 @@
+"""Own integration of a problem: windows of the source, a shadow run for the error, and global error control."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.circuit.sampling import SourceTable, source_table
+from fingerspice.circuit.waveforms import Waveform
+from fingerspice.engine import advance as loop
+from fingerspice.engine.model import Segment, write_row
+from fingerspice.engine.steps import Method
+from fingerspice.numerics.tableaus import TABLEAUS, Tableau
+from fingerspice.problem import Problem
+from fingerspice.solution import ErrorEstimate, State, Status
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+Progress = Callable[[float], None]
+
+LOG_ROWS = 4096
+# The shadow run's tolerance over the main run's: far enough that their difference is the main run's error.
+SHADOW = 0.03
+# The estimate is the largest difference met in the middle and at the end of steps; between them it may be larger.
+SAFETY = 3.0
+# The local error allowed in a step, over the global error asked for. Errors of the past decay in a leaky stack.
+LOCAL_SHARE = 0.2
+PERIODS_PER_WINDOW = 64.0
+BREAKPOINTS_PER_WINDOW = 2000.0
+
+
+@dataclass
+class Run:
+    """What one integration gives: output rows (see `write_row`) and how it went."""
+
+    rows: FloatArray
+    n_out: int
+    status: Status
+    error: ErrorEstimate
+    peak_u: float
+    peak_f: float
+    nfev: int
+    stats: dict[str, int]
+    state: State
+    t_failed: float | None = None
+    detail: str = ""
+
+
+@dataclass
+class _Track:
+    """One integration in progress."""
+
+    problem: Problem
+    method: Method
+    scale: FloatArray
+    t_out: FloatArray
+    left: BoolArray
+    rows: FloatArray
+    log: FloatArray
+    y: FloatArray = field(init=False)
+    control: FloatArray = field(init=False)
+    counters: NDArray[np.int64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        start = self.problem.initial
+        self.y = start.y.copy()
+        self.control = np.zeros(loop.N_CONTROL)
+        self.control[loop.T] = self.problem.t_start
+        self.control[loop.U_BEFORE] = start.u_before
+        self.counters = np.zeros(loop.N_COUNTERS, np.int64)
+
+    @property
+    def t(self) -> float:
+        return float(self.control[loop.T])
+
+    @property
+    def log_rows(self) -> FloatArray:
+        return self.log[: self.counters[loop.LOGGED]]
+
+    def advance(self, table: SourceTable, t_end: float) -> int:
+        return int(
+            loop.advance(
+                self.problem.model, self.method, table.edges, table.terms, table.series, t_end, self.scale,
+                self.y, self.control, self.counters, self.t_out, self.left, self.rows, self.log,
+            )
+        )  # fmt: skip
+
+    def follow(self, table: SourceTable, main: _Track) -> int:
+        """Go where `main` has gone, with outputs at its log times in `rows`."""
+        self.t_out = np.ascontiguousarray(main.log_rows[:, 0])
+        self.left = np.ones(self.t_out.size, bool)
+        self.rows = np.empty((self.t_out.size, self.rows.shape[1]))
+        self.counters[loop.OUTPUT] = 0
+        return self.advance(table, main.t)
+
+    def finish(self, table: SourceTable) -> None:
+        """Write the right-hand outputs at the very end of the run."""
+        pending = range(int(self.counters[loop.OUTPUT]), self.t_out.size)
+        if not pending:
+            return
+        segment = Segment(
+            float(table.edges[-2]), float(table.edges[-1] - table.edges[-2]), table.terms[-1], table.series[-1]
+        )
+        tau = self.t - segment.start
+        stop = self.problem.t_stop
+        if self.problem.waveform.breakpoints(stop, stop).size:
+            after = source_table(self.problem.waveform, stop, stop + self.problem.step, 1e-10, self.problem.step)
+            segment = Segment(
+                float(after.edges[0]), float(after.edges[1] - after.edges[0]), after.terms[0], after.series[0]
+            )
+            tau = 0.0
+        u, du = loop.enter(self.problem.model, segment, tau, self.y, self.control)
+        for i in pending:
+            write_row(
+                self.problem.model, u, du, self.y, self.control[loop.SIGN], self.control[loop.U_GAP], self.rows[i]
+            )
+            self.counters[loop.OUTPUT] += 1
+
+
+def method_from(tableau: Tableau, waveform: Waveform, h_fixed: float = 0.0) -> Method:
+    """A tableau as the compiled code takes it, its step bounded by the source's own time scale."""
+    # Zeros of the gap voltage are looked for at quarters of a step: four steps per period cannot hide one.
+    h_max = 0.25 * waveform.shortest_time()
+    return Method(
+        tableau.implicit, tableau.a, tableau.c, tableau.e, tableau.dense, tableau.n_end, tableau.error_order,
+        h_max, h_fixed,
+    )  # fmt: skip
+
+
+def row_width(problem: Problem) -> int:
+    """Columns of an output row."""
+    return 5 + problem.stack.c.size
+
+
+def windows(problem: Problem) -> list[float]:
+    """Edges of the windows the source is tabulated on: constant memory, and phases that stay exact."""
+    span = problem.t_stop - problem.t_start
+    rate = max(
+        problem.waveform.breakpoint_rate() / BREAKPOINTS_PER_WINDOW,
+        1.0 / (PERIODS_PER_WINDOW * problem.waveform.shortest_time()),
+        # A function is sampled at the output step.
+        1.0 / (4096.0 * problem.step) if problem.waveform.shortest_time() == np.inf else 0.0,
+    )
+    count = max(1, int(np.ceil(span * rate)))
+    return [problem.t_start + span * i / count for i in range(count)] + [problem.t_stop]
+
+
+def integrate(
+    problem: Problem,
+    tableau: Tableau,
+    tol: float,
+    u_scale: float,
+    t_out: FloatArray,
+    left: BoolArray,
+    *,
+    h_fixed: float = 0.0,
+    shadow: bool = True,
+    progress: Progress | None = None,
+) -> Run:
+    """Integrate once with local error `tol` * `u_scale` (V) per step.
+
+    Parameters
+    ----------
+    problem : Problem
+    tableau : Tableau
+    tol, u_scale : float
+        Local error over the voltage scale, and that scale in V.
+    t_out, left : ndarray, shape (n_out,)
+        Output times (s, ascending) and whether the left-hand value is meant.
+    h_fixed : float
+        Fixed step in s, without error control, if positive.
+    shadow : bool
+        Whether to run a second integration for the error estimate.
+    progress : callable, optional
+        Called with the fraction of the run that is done.
+    """
+    width = row_width(problem)
+    method = method_from(tableau, problem.waveform, h_fixed)
+    z_scale = u_scale * problem.model.area0 / problem.model.s
+    scale = tol * np.append(np.full(problem.stack.c.size - 1, u_scale), z_scale)
+    rows = np.full((t_out.size, width), np.nan)
+    log = np.empty((LOG_ROWS, 4))
+    main = _Track(problem, method, scale, t_out, left, rows, log)
+    other = _Track(problem, method, SHADOW * scale, t_out[:0], left[:0], rows[:0], log[:0])
+    meter = _Meter(problem)
+    status, detail, t_failed = Status.SUCCESS, "", None
+    edges = windows(problem)
+    table = None
+    for w0, w1 in zip(edges[:-1], edges[1:], strict=True):
+        table = source_table(problem.waveform, w0, w1, min(1e-3, max(0.05 * tol, 1e-14)), problem.step)
+        code = loop.LOG_FULL
+        while code == loop.LOG_FULL:
+            code = main.advance(table, float(table.edges[-1])) if table.edges.size > 1 else loop.DONE
+            if shadow:
+                other.follow(table, main)
+            meter.compare(main.log_rows, other.rows if shadow else None)
+            if progress is not None:
+                progress((main.t - problem.t_start) / (problem.t_stop - problem.t_start))
+        if code in (loop.NO_SOLUTION, loop.STEP_UNDERFLOW):
+            folding = problem.model.mobile and problem.model.coupled
+            status = Status.FOLD if folding else Status.STEP_UNDERFLOW
+            t_failed = main.t
+            break
+        if table.not_finite is not None:
+            status, t_failed = Status.SOURCE_NOT_FINITE, table.not_finite
+            break
+    if status is Status.SUCCESS and table is not None:
+        main.finish(table)
+    c = main.counters
+    return Run(
+        rows=rows,
+        n_out=int(c[loop.OUTPUT]),
+        status=status,
+        error=meter.error(),
+        peak_u=meter.peak_u,
+        peak_f=meter.peak_f,
+        nfev=int(c[loop.NFEV] + other.counters[loop.NFEV]),
+        stats={
+            "steps": int(c[loop.ACCEPTED]),
+            "rejected": int(c[loop.REJECTED]),
+            "zeros": int(c[loop.ZEROS]),
+            "nfev_solution": int(c[loop.NFEV]),
+        },
+        state=State(
+            main.t, main.y.copy(), float(main.control[loop.U_BEFORE]), problem.initial.charge_offset,
+            problem.charge_law,
+        ),  # fmt: skip
+        t_failed=t_failed,
+        detail=detail,
+    )
+
+
+@dataclass
+class _Meter:
+    """Peaks of the run, and the largest difference between it and its shadow."""
+
+    problem: Problem
+    peak_u: float = 0.0
+    peak_f: float = 0.0
+    diff_u: float = 0.0
+    diff_f: float = 0.0
+
+    def compare(self, log: FloatArray, shadow_rows: FloatArray | None) -> None:
+        if log.shape[0] == 0:
+            return
+        force = self.problem.force(log[:, 1], log[:, 2])
+        self.peak_u = max(self.peak_u, float(np.abs(log[:, 1]).max()))
+        self.peak_f = max(self.peak_f, float(force.max()))
+        if shadow_rows is None:
+            return
+        other = self.problem.force(shadow_rows[:, 1], shadow_rows[:, 2])
+        known = np.isfinite(shadow_rows[:, 1])
+        if np.any(known):
+            diff_u = np.abs(shadow_rows[known, 1] - log[known, 1]) - log[known, 3]
+            # F ~ u^2: what moves u by du moves F by 2 F du / u.
+            rounding = 2.0 * self.problem.force(log[known, 1], log[known, 2])
+            rounding *= log[known, 3] / np.maximum(np.abs(log[known, 1]), 1e-300)
+            self.diff_u = max(self.diff_u, float(diff_u.max()))
+            self.diff_f = max(self.diff_f, float((np.abs(other[known] - force[known]) - rounding).max()))
+
+    def error(self) -> ErrorEstimate:
+        # Rounding is an error too, and two runs may share it.
+        return ErrorEstimate(
+            SAFETY * self.diff_u + 4e-16 * self.peak_u, SAFETY * self.diff_f + 4e-16 * self.peak_f
+        )
+
+
+def choose_tableau(problem: Problem, rtol: float) -> Tableau:
+    """The own stepper for a problem: collocation where the explicit ones would be held by stability alone."""
+    span = problem.t_stop - problem.t_start
+    stable = span / (3.0 * problem.model.tau)
+    smooth = span / min(problem.waveform.shortest_time(), span)
+    pieces = 1.0 + problem.waveform.breakpoint_rate() * span
+    accurate = 20.0 * (smooth + pieces) * max(1.0, -np.log10(rtol) / 4.0)
+    if stable > 10.0 * accurate:
+        return TABLEAUS["radau9"]
+    return TABLEAUS["dp5" if rtol > 3e-5 else "dop853"]
+
+
+def solve(
+    problem: Problem,
+    rtol: float,
+    tableau: Tableau | None,
+    t_out: FloatArray,
+    left: BoolArray,
+    progress: Progress | None = None,
+) -> Run:
+    """Integrate until the estimated global error is within `rtol` of the peaks.
+
+    The first attempt's local tolerance is a guess; each further one follows from the error measured.
+    """
+    tableau = tableau or choose_tableau(problem, rtol)
+    u_scale = problem.waveform.peak(problem.t_start, problem.t_stop)
+    u_scale = u_scale * problem.model.k_gap if np.isfinite(u_scale) and u_scale > 0.0 else 1.0
+    u_scale = max(u_scale, float(np.abs(problem.initial.y[:-1]).max(initial=0.0)))
+    tol = LOCAL_SHARE * rtol
+    nfev = 0
+    for _attempt in range(6):
+        run = integrate(problem, tableau, tol, u_scale, t_out, left, progress=progress)
+        nfev += run.nfev
+        run.nfev = nfev
+        if run.status is not Status.SUCCESS:
+            return run
+        worst = max(
+            run.error.u_gap / (rtol * run.peak_u) if run.peak_u > 0.0 else 0.0,
+            run.error.f_el / (rtol * run.peak_f) if run.peak_f > 0.0 else 0.0,
+        )
+        if worst <= 1.0:
+            return run
+        tol = max(tol * min(0.3, 0.5 / worst), 1e-16)
+    run.status = Status.ERROR_NOT_MET
+    return run

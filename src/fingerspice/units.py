@@ -1,0 +1,161 @@
+"""SPICE numbers in, engineering notation out."""
+
+from __future__ import annotations
+
+import math
+import re
+
+#: Power of ten of each scale suffix. `mil` (25.4e-6) is the one suffix that is not a power of ten.
+SCALES = {"t": 12, "g": 9, "meg": 6, "k": 3, "m": -3, "u": -6, "µ": -6, "μ": -6, "n": -9, "p": -12, "f": -15}
+MIL = 25.4e-6
+
+#: Letters that may follow a number without a scale. A unit that begins with a scale letter (farad, newton,
+#: tesla ...) cannot be here, because SPICE takes that letter as the scale; nor can `a`, atto elsewhere.
+PLAIN_UNITS = frozenset(
+    (
+        *("v", "vdc", "vac", "vpp", "volt", "volts", "h", "henry", "hz", "hertz", "o", "ohm", "ohms", "ω"),
+        *("s", "sec", "second", "seconds", "c", "w", "watt", "watts"),
+        *("deg", "degree", "degrees", "rad", "radian", "radians"),
+    )
+)
+
+# Words whose first letters SPICE reads as something else than their writer means.
+_MISREAD = {
+    "milli": ("mil (25.4e-6)", "m"),
+    "micro": ("m (milli)", "u"),
+    "met": ("m (milli)", ""),
+    "min": ("m (milli)", ""),
+}
+_LETTERS = "a-zµμωΩ"
+_NUMBER = re.compile(rf"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?:e([+-]?[0-9]+))?([{_LETTERS}]*)", re.IGNORECASE)
+_LETTER_AS_POINT = re.compile(rf"([+-]?[0-9]+)([{_LETTERS}]+)([0-9]+)[{_LETTERS}]*", re.IGNORECASE)
+_MEGA = re.compile(rf"[+-]?[0-9.]+(?:e[+-]?[0-9]+)?(M(?!eg|il)[{_LETTERS}]*)", re.IGNORECASE)
+_MAX_LENGTH = 400
+_PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
+
+
+def parse_number(text: str) -> float:
+    """Value of one SPICE number such as ``3.5u``, ``1meg``, ``200Hz`` or ``1e-6``.
+
+    Parameters
+    ----------
+    text : str
+        The whole token; nothing before or after the number is allowed.
+
+    Returns
+    -------
+    float
+        The correctly rounded value (``3.5u`` is exactly ``3.5e-6``).
+
+    Raises
+    ------
+    ValueError
+        When the text is not a number, when simulators read it differently (``2k7``, ``1x``, ``1a``), or when
+        it lies outside the range of a double; the message says what to write instead.
+    """
+    if len(text) > _MAX_LENGTH:
+        raise ValueError(f"a number of {len(text)} characters: at most {_MAX_LENGTH} are allowed")
+    match = _NUMBER.fullmatch(text)
+    if match is None:
+        raise ValueError(_why_not_a_number(text))
+    mantissa, exponent, letters = match[1], int(match[2] or 0), match[3].lower()
+    if letters.startswith("mil") and not letters.startswith("milli"):
+        value = float(f"{mantissa}e{exponent}") * MIL
+    else:
+        value = float(f"{mantissa}e{exponent + _power_of_ten(letters, text, match[3])}")
+    if math.isinf(value):
+        raise ValueError(f"'{text}' is larger than the largest number (1.8e308)")
+    if value == 0.0 and mantissa.strip("+-0.") != "":
+        raise ValueError(f"'{text}' is smaller than the smallest number (4.9e-324)")
+    return value
+
+
+def suspicious_mega(text: str) -> bool:
+    """Whether a number is written with a capital M, which SPICE reads as milli and a reader as mega.
+
+    ``1M`` and ``0.2MOhm`` are; ``0.2meg``, ``1MEG``, ``1MIL`` and ``0.2mohm`` are not.
+    """
+    match = _MEGA.fullmatch(text)
+    return match is not None and match[1][0] == "M"
+
+
+def suggest_mega(text: str) -> str:
+    """The same digits with ``meg`` for the letters that follow them: ``0.2MOhm`` gives ``0.2meg``."""
+    match = _MEGA.fullmatch(text)
+    return text if match is None else f"{text[: match.start(1)]}meg"
+
+
+def unit_read_as_scale(text: str, unit: str, word: str = "") -> bool:
+    """Whether a number's only letters are a unit that SPICE takes for a scale.
+
+    Parameters
+    ----------
+    text : str
+        A number as written, such as ``1F``.
+    unit : str
+        The unit's symbol, compared with its case: ``1F`` is suspicious, ``1f`` an ordinary femto.
+    word : str
+        The unit's name, compared without case and with or without a plural s: ``1farad``.
+    """
+    match = _NUMBER.fullmatch(text)
+    if match is None:
+        return False
+    return match[3] == unit or (word != "" and match[3].lower() in (word.lower(), f"{word.lower()}s"))
+
+
+def format_si(value: float, unit: str, digits: int = 4) -> str:
+    """Engineering notation: ``format_si(3.5e-6, "m")`` is ``3.5 um``.
+
+    Parameters
+    ----------
+    value : float
+        The value in the unit without prefix; nan and infinities are written as such.
+    unit : str
+        The unit's symbol, or an empty string.
+    digits : int
+        Significant digits kept; trailing zeros are not written.
+    """
+    if not math.isfinite(value) or value == 0.0:
+        return f"{value + 0.0:g} {unit}".rstrip()
+    # Round first: 999.96 to four digits is 1 k, not 1000.
+    mantissa, _, exponent_text = f"{value:.{digits - 1}e}".partition("e")
+    exponent = int(exponent_text)
+    power = 3 * (exponent // 3)
+    if power not in _PREFIXES:
+        return f"{value:.{digits}g} {unit}".rstrip()
+    scaled = float(mantissa) * 10.0 ** (exponent - power)
+    return f"{scaled:.{max(digits, 3)}g} {_PREFIXES[power]}{unit}".rstrip()
+
+
+def _power_of_ten(letters: str, text: str, as_written: str) -> int:
+    """Power of ten that the lower-case letters after a number stand for."""
+    if letters == "":
+        return 0
+    digits = text[: len(text) - len(letters)]
+    if letters.startswith("meg"):
+        return SCALES["meg"]
+    for word, (read_as, scale) in _MISREAD.items():
+        if letters.startswith(word):
+            raise ValueError(f"'{text}' would be read as {digits}{read_as}: write {digits}{scale}")
+    if letters[0] in SCALES:
+        return SCALES[letters[0]]
+    if letters in PLAIN_UNITS:
+        return 0
+    if letters[0] in "ax":
+        meanings = {"a": f"atto ({digits}e-18) or ampere: write {digits}", "x": f"mega: write {digits}meg"}
+        raise ValueError(f"'{text}' differs between simulators: '{as_written}' may be {meanings[letters[0]]}")
+    raise ValueError(
+        f"'{as_written}' in '{text}' is neither a scale (t g meg k m mil u n p f) nor a known unit: "
+        f"write {digits}"
+    )
+
+
+def _why_not_a_number(text: str) -> str:
+    """Why a text that does not match the pattern of a number is none."""
+    match = _LETTER_AS_POINT.fullmatch(text)
+    if match is not None:
+        whole, letters, fraction = match.groups()
+        if letters.lower().startswith(tuple(SCALES)) or letters.lower() in ("r", "v"):
+            scale = "" if letters.lower() in ("r", "v") else letters
+            return f"'{text}' differs between simulators: write {whole}.{fraction}{scale}"
+    return f"'{text}' is not a number (examples: 10, 2.5, 1e-6, 3.5u, 0.2meg)"

@@ -1,0 +1,147 @@
+"""Run a netlist of `circuits/` in ngspice and read the transient back.
+
+Used by the tests that compare with ngspice. Nothing here knows the model.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+CIRCUITS = Path(__file__).resolve().parent.parent / "circuits"
+LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
+GAP_SIGNALS = ("v(top)-v(skin)", "v(area)")
+"""Gap voltage [V] and ridge contact area [mm^2] of the shipped decks."""
+
+
+class NgspiceError(RuntimeError):
+    """ngspice stopped before the end of the run; the text holds what it said."""
+
+
+def ngspice_available() -> bool:
+    """Whether an `ngspice` is on the path."""
+    return shutil.which("ngspice") is not None
+
+
+def with_charge_law(deck: str, law: str) -> str:
+    """Deck text that includes the library of the charge law `law` (`local` or `mobile`)."""
+    pattern = "|".join(re.escape(name) for name in LIBRARIES.values())
+    swapped, count = re.subn(rf"(?<![\w.-])(?:{pattern})(?![\w.-])", LIBRARIES[law], deck)
+    if count == 0:
+        raise ValueError(f"the deck includes none of {', '.join(LIBRARIES.values())}")
+    return swapped
+
+
+def with_max_step(deck: str, max_step: float) -> str:
+    """Deck text whose `.tran` line has `max_step` [s] as its TMAX."""
+
+    def rewrite(match: re.Match[str]) -> str:
+        words = match.group(2).split()
+        numbers = [word for word in words if word.lower() != "uic"]
+        start = numbers[2] if len(numbers) > 2 else "0"
+        uic = ["uic"] if len(numbers) < len(words) else []
+        return " ".join([match.group(1), *numbers[:2], start, repr(float(max_step)), *uic])
+
+    rewritten, count = re.subn(r"(?im)^[ \t]*(\.tran)\b([^;$\n]*).*$", rewrite, deck)
+    if count != 1:
+        raise ValueError(f"the deck has {count} .tran lines, one is needed")
+    return rewritten
+
+
+def run_ngspice(
+    deck: str | Path,
+    *,
+    signals: Sequence[str] = GAP_SIGNALS,
+    max_step: float | None = None,
+    reltol: float | None = None,
+    options: str = "",
+    charge_law: str | None = None,
+    folder: Path | None = None,
+    timeout: float = 300.0,
+) -> dict[str, NDArray[np.float64]]:
+    """Run the `.tran` of a deck in ngspice and return its own time points.
+
+    Parameters
+    ----------
+    deck : str or Path
+        Text of a deck (with its title line), or the path of one. A `.control` block in it
+        is left out.
+    signals : sequence of str
+        ngspice expressions of node voltages, for example ``v(top)-v(skin)``.
+    max_step : float, optional
+        Largest time step [s], in place of the deck's TMAX. The error follows it.
+    reltol : float, optional
+        ngspice's RELTOL, in place of the deck's.
+    options : str
+        Further words for an `.options` line, for example ``trtol=100``.
+    charge_law : {'local', 'mobile'}, optional
+        Swaps the included library.
+    folder : Path, optional
+        Where to run and to leave the files; a temporary folder otherwise. The libraries
+        of `circuits/` are copied there.
+    timeout : float
+        Wall-clock limit [s].
+
+    Returns
+    -------
+    dict
+        ``time`` [s] and each signal under its own expression, arrays of shape (points,).
+
+    Raises
+    ------
+    NgspiceError
+        If ngspice refuses the deck or stops before TSTOP.
+    """
+    text = deck.read_text(encoding="utf-8") if isinstance(deck, Path) else deck
+    if charge_law is not None:
+        text = with_charge_law(text, charge_law)
+    if max_step is not None:
+        text = with_max_step(text, max_step)
+    if reltol is not None:
+        options = f"{options} reltol={reltol!r}"
+    text = _with_control(text, signals, options)
+    if folder is not None:
+        return _run(text, signals, folder, timeout)
+    with tempfile.TemporaryDirectory(prefix="ngspice-") as temporary:
+        return _run(text, signals, Path(temporary), timeout)
+
+
+def _with_control(deck: str, signals: Sequence[str], options: str) -> str:
+    """Deck that runs, writes `signals` with all digits to `out.txt`, and exits with 0."""
+    deck = re.sub(r"(?ims)^[ \t]*\.control\b.*?^[ \t]*\.endc\b[^\n]*\n?", "", deck)
+    deck = re.sub(r"(?im)^[ \t]*\.end[ \t]*$.*", "", deck)
+    block = [".control", *(f"option {word}" for word in options.split()), "run"]
+    block += [f"let signal{i} = {signal}" for i, signal in enumerate(signals)]
+    block += ["set wr_singlescale", "set numdgt=15"]
+    block += ["wrdata out.txt " + " ".join(f"signal{i}" for i in range(len(signals)))]
+    return "\n".join([deck.rstrip("\n"), *block, "quit 0", ".endc", ".end", ""])
+
+
+def _run(text: str, signals: Sequence[str], folder: Path, timeout: float) -> dict[str, NDArray[np.float64]]:
+    for name in LIBRARIES.values():
+        shutil.copy(CIRCUITS / name, folder / name)
+    out = folder / "out.txt"
+    out.unlink(missing_ok=True)
+    (folder / "deck.cir").write_text(text, encoding="utf-8")
+    done = subprocess.run(
+        ["ngspice", "-b", "deck.cir"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=timeout,
+        check=False,
+    )
+    said = f"{done.stderr.strip()}\n{done.stdout.strip()}".strip()
+    table = np.loadtxt(out, ndmin=2) if out.exists() else np.empty((0, 1 + len(signals)))
+    if done.returncode != 0 or len(table) == 0 or "aborted" in said:
+        reached = f"at t = {table[-1, 0]:.9g} s" if len(table) else "before the first time point"
+        raise NgspiceError(f"ngspice stopped {reached} (exit {done.returncode}):\n{said}")
+    return {"time": table[:, 0], **{s: table[:, 1 + i] for i, s in enumerate(signals)}}

@@ -1,0 +1,460 @@
+"""Netlist text to flat, evaluated statements."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fingerspice.circuit import flatten
+from fingerspice.circuit.deck import Call, Deck, Number, Statement, Token, parse_deck, read_deck
+from fingerspice.errors import InputError, Where
+
+PAPER = """Fingerpad on a 3M-coated touchscreen, Table 1
+.include fingerspice.lib
+Vdrive  drive 0          SIN(0 200 100)
+Xcoat   drive top  area  LAYER d=1u eps_r=3.9 r=0.2meg
+Xgap    top   skin area  GAP   d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3 alpha=54.4
++ m_exp=0.52 beta=32 n_exp=1.41 c2=5000   ; Table 1
+Xskin   skin  gnd  AREA  SKIN  d=350u f=100
+.tran 10u 50m uic
+.nodeset v(area)=34.97
+.end
+"""
+
+
+def deck(*lines: str) -> Deck:
+    return parse_deck("\n".join(["title", *lines]))
+
+
+def only(*lines: str) -> Statement:
+    (statement,) = deck(*lines).statements
+    return statement
+
+
+def refusal(*lines: str) -> InputError:
+    with pytest.raises(InputError) as caught:
+        deck(*lines)
+    return caught.value
+
+
+def value(item: object) -> float:
+    assert isinstance(item, Number)
+    return item.value
+
+
+def test_the_paper_deck_is_read_as_written() -> None:
+    read = parse_deck(PAPER)
+    assert read.title == "Fingerpad on a 3M-coated touchscreen, Table 1"
+    assert [s.name for s in read.statements] == ["Vdrive", "Xcoat", "Xgap", "Xskin"]
+    assert [s.device for s in read.statements] == [None, "LAYER", "GAP", "SKIN"]
+    gap, skin = read.statements[2:]
+    given_values = "d=3.5e-6 eps_r=1 r=1e6 fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
+    expected = dict(pair.split("=") for pair in given_values.split())
+    assert list(gap.params) == list(expected)
+    assert [value(number) for number in gap.params.values()] == [float(x) for x in expected.values()]
+    assert skin.nodes == ("skin", "0", "area")
+    assert skin.node_names == ("skin", "gnd", "AREA")
+    assert read.tran is not None
+    assert [a.text if isinstance(a, Token) else value(a) for a in read.tran.args] == [1e-5, 0.05, "uic"]
+    assert read.includes == ("fingerspice.lib",)
+    assert read.unused == (".nodeset",)
+    assert read.warnings == ()
+    assert read.text == PAPER
+
+
+def test_places_are_physical_lines_and_columns_also_on_continuations() -> None:
+    gap = parse_deck(PAPER).statements[2]
+    assert gap.where == Where("<netlist>", 5, 1)
+    assert gap.param_where["m_exp"] == Where("<netlist>", 6, 3)
+    assert gap.params["c2"].where == Where("<netlist>", 6, 36)
+    error = refusal("R1 a 0 {2", "* between", "", "  + +thik}", ".param thick=1")
+    assert error.where == Where("<netlist>", 5, 6)
+    assert "did you mean 'thick'" in error.message
+
+
+def test_comments_of_every_kind_are_dropped() -> None:
+    read = deck(
+        "* R0 a 0 1", "R1 a 0 1 ; R", "R2 a 0 2 $ R", "   * R", 'V1 a 0 TABLE("a;b $ c.csv" 0 1);x', "", "$ x"
+    )
+    assert [s.name for s in read.statements] == ["R1", "R2", "V1"]
+    (call,) = read.statements[2].body
+    assert isinstance(call, Call)
+    assert call.args[0] == Token("a;b $ c.csv", Where("<netlist>", 6, 14), quoted=True)
+    assert "needs a blank" in refusal("R1 a 0 1 $comment").message
+
+
+def test_line_ends_of_every_system_count_alike() -> None:
+    for end in ("\n", "\r\n", "\r"):
+        assert parse_deck(end.join(["\ufefft", "R1 a 0 1", "R2 b 0 2"])).statements[1].where.line == 3
+
+
+def test_brackets_and_commas_are_separators_and_calls_are_kept() -> None:
+    for text in ("V1 a 0 SIN(0 200 {f})", "V1 (a 0) SIN ( 0, 200, 'f' )"):
+        (call,) = only(text, ".param f=100").body
+        assert isinstance(call, Call)
+        assert (call.name, [value(a) for a in call.args]) == ("SIN", [0.0, 200.0, 100.0])
+    bare = only("V1 a 0 SIN 0 200 100").body
+    assert isinstance(bare[0], Token)
+    assert [value(x) for x in bare[1:]] == [0.0, 200.0, 100.0]
+    mixed = only("V1 a 0 DC 1 PULSE(0 1) AC 1 0").body
+    assert [type(x) for x in mixed] == [Token, Number, Call, Token, Number, Number]
+
+
+def test_calls_hold_their_own_parameters() -> None:
+    (call,) = only("V1 a 0 PWL(0 0 1m 1 R=0 file=x.csv)").body
+    assert isinstance(call, Call)
+    assert value(call.params["r"]) == 0.0
+    assert call.params["file"] == Token("x.csv", Where("<netlist>", 2, 30))
+    assert call.param_where["r"] == Where("<netlist>", 2, 21)
+
+
+def test_numbers_keep_what_was_written() -> None:
+    statement = only("X1 a b c LAYER d = 'x * 2' r=INF eps_r={x}", ".param x=1u")
+    assert statement.params["d"] == Number(2e-6, "'x * 2'", Where("<netlist>", 2, 20))
+    assert statement.params["r"] == Token("INF", Where("<netlist>", 2, 30))
+
+
+def test_a_capital_m_is_remembered_through_parameters_and_subcircuits() -> None:
+    first, second = deck(
+        ".param r1={2*r0} r0=0.2MOhm",
+        ".subckt s a r=1",
+        "R1 a 0 {r}",
+        ".ends",
+        "X1 a s r=r1",
+        "R2 a 0 {r1 + 1meg}",
+    ).statements
+    for statement in (first, second):
+        (number,) = statement.body
+        assert isinstance(number, Number)
+        assert number.mega == Token("0.2MOhm", Where("<netlist>", 2, 21))
+    assert only("R1 a 0 1M").body[0].mega.text == "1M"  # type: ignore[union-attr]
+    assert only("R1 a 0 1meg").body[0].mega is None  # type: ignore[union-attr]
+
+
+def test_parameters_may_come_in_any_order_and_with_blanks() -> None:
+    read = deck("R1 a 0 {c}", ".param c = a + b * 2, B = {a^2}", ".PARAM A = 3 d=(a>2) ? 1 : 0")
+    assert read.params == {"c": 21.0, "b": 9.0, "a": 3.0, "d": 1.0}
+    assert value(read.statements[0].body[0]) == 21.0
+
+
+def test_what_ngspice_takes_without_braces_is_taken() -> None:
+    read = deck(
+        ".param w=2",
+        "R1 a 0 w",
+        "C1 a 0 1u ic=w",
+        "X1 a b c LAYER d=w eps_r=2*w+1 r=w1",
+    )
+    assert value(read.statements[0].body[0]) == 2.0
+    assert value(read.statements[1].params["ic"]) == 2.0
+    assert [value(read.statements[2].params[key]) for key in ("d", "eps_r")] == [2.0, 5.0]
+    assert isinstance(read.statements[2].params["r"], Token)
+    assert refusal(".param w=2", "R1 a 0 2*w").message == "arithmetic goes in braces: {2*w}"
+
+
+def test_subcircuits_are_flattened_with_their_parameters_and_nodes() -> None:
+    read = deck(
+        ".param d=9u",
+        "Xf drive gnd area finger params: d={d/3}",
+        ".subckt finger p n area d=1u w={d*2}",
+        "Xl P mid area LAYER d={d} r={q}",
+        "Rm mid n {w}",
+        "Xi mid inner",
+        ".param q=w*2",
+        ".subckt inner x",
+        "R1 x deep {q}",
+        "R2 deep 0 1",
+        ".ends inner",
+        ".ends",
+        ".ic v(xf.mid)=1",
+    )
+    assert [s.name for s in read.statements] == ["Xf.Xl", "Xf.Rm", "Xf.Xi.R1", "Xf.Xi.R2"]
+    layer, middle, first, second = read.statements
+    assert layer.nodes == ("drive", "xf.mid", "area")
+    assert layer.node_names == ("drive", "Xf.mid", "area")
+    assert middle.nodes == ("xf.mid", "0")
+    assert first.nodes == ("xf.mid", "xf.xi.deep")
+    assert second.nodes == ("xf.xi.deep", "0")
+    assert value(layer.params["d"]) == pytest.approx(3e-6)
+    assert value(middle.body[0]) == pytest.approx(6e-6)
+    assert value(first.body[0]) == pytest.approx(12e-6)
+    assert list(read.ic[0].params) == ["v(xf.mid)"]
+
+
+def test_a_native_device_wins_over_a_definition_of_its_name() -> None:
+    read = deck(".subckt GAP p n area", "B1 p n I='V(p)", ".model x", ".ends", "X1 a b c gap d=1u")
+    assert read.statements[0].device == "GAP"
+    assert "its .subckt is not read" in read.warnings[0]
+
+
+def test_directives_without_effect_are_listed_once() -> None:
+    read = deck(".print tran v(a", ".print 'x", ".control", "run 'it {", ".end", ".endc", ".meas x", ".plot")
+    assert read.unused == (".print", ".control", ".meas", ".plot")
+
+
+def test_directives_carry_words_pairs_and_their_text() -> None:
+    read = deck(
+        ".IC V(Area) = 34.97 v(b)={1+1}", ".option reltol=1e-4 dialect=ngspice noacct", ".ac dec 10 1 1meg"
+    )
+    assert {key: value(x) for key, x in read.ic[0].params.items()} == {"v(area)": 34.97, "v(b)": 2.0}
+    assert read.options[0].name == ".options"
+    assert read.options[0].params["dialect"] == Token("ngspice", Where("<netlist>", 3, 29))
+    assert read.ac is not None
+    assert read.ac.text == ".ac dec 10 1 1meg"
+
+
+@pytest.mark.parametrize(
+    ("title", "warned"),
+    [
+        ("R1 a 0 5", True),
+        ("V1 a 0 SIN(0 1 2)", True),
+        ("Xg a b area GAP d=1u", True),
+        (".tran 1u 1m", True),
+        ("Resistive coating in air", False),
+        ("Xray of the skin", False),
+        ("* a comment", False),
+        ("...", False),
+    ],
+)
+def test_a_title_that_reads_like_a_statement_is_warned_about(title: str, warned: bool) -> None:
+    assert bool(parse_deck(f"{title}\nR9 a 0 1\n").warnings) == warned
+
+
+def test_text_after_the_end_and_uncalled_subcircuits_are_warned_about() -> None:
+    read = deck(".subckt s a", "Q1 a", ".ends", ".end", "* comment", "Q1")
+    assert read.warnings == (
+        "<netlist>:7:1: text after .end is not read",
+        "<netlist>:2:1: subcircuit 's' is never called, and its body was not read",
+    )
+
+
+REFUSED = {
+    "L1 a b 1m": "is an inductor, which is not supported; elements are R, C, V, I",
+    "Layer1 a b area LAYER d=1": "as in XLayer1",
+    "tran 1u 1m": "begins with a dot",
+    "5 a b 1": "'5' is no element",
+    ",": "is no element",
+    "(": "is no element",
+    ".trann 1 2": "did you mean '.tran'",
+    ".step x 1 2 3": ".step is not supported; directives are",
+    ".model d d": ".model is not supported; directives are",
+    ".": "is not supported",
+    "R1": "missing node",
+    "R1 a": "missing node",
+    "R1 a b": "missing value",
+    "R1 = 5": "the name before '='",
+    "R1 a b (5": r"'\(' is never closed",
+    "R1 a b 5)": "without an opening",
+    "R1 a b {5": "'{' is never closed",
+    "R1 a b 5}": "without an opening",
+    "R1 a b '5": "' is never closed",
+    'V1 a b "x': '" is never closed',
+    "R1 a b 2k7": "write 2.7k",
+    "R1 a b {x}": "'x' is not defined",
+    "R1 a {b} 5": "where a node's name belongs",
+    "R1 a b 5\nr1 a c 5": "'r1' is defined twice, first at <netlist>:2:1",
+    "V1 a b SIN(0 sin(3) 1)": "arithmetic goes in braces",
+    "X1": "needs nodes",
+    "X1 a b area LAYRE d=1": "did you mean 'LAYER'",
+    "X1 a b area nothing d=1": "devices are LAYER SLAB",
+    "X1 a b area LAYER 1u": "follows the device LAYER",
+    "X1 a b LAYER d=1": r"missing value: X1: LAYER has 3 nodes \(p n area\), 2 given",
+    "X1 a b c d LAYER d=1": "has 3 nodes",
+    'X1 a b area "LAYER"': "where a device's name belongs",
+    "X1 a b area LAYER d=": "missing value of 'd'",
+    "X1 a b area LAYER d= r=2": "missing value of 'd'",
+    "X1 a b area LAYER d=1u D=2u": "given twice, first at <netlist>:2:19",
+    "X1 a b area LAYER d=1u foo": "follows the parameters",
+    "X1 a b area LAYER d=(1)": "goes in braces",
+    "X1 a b area LAYER 1d=1": "cannot be a parameter's name",
+    "+ foo": "there is none",
+    ".param": "write .param name=value",
+    ".param x": "write .param name=value",
+    ".param x=": "missing value of 'x'",
+    ".param =3": "name before '='",
+    ".param f(x)=x": "functions are not supported",
+    ".param x={1": "never closed",
+    ".param x={1}+2": "belongs inside",
+    ".param x=1 2": "operator is missing",
+    ".param x=1\n.param X=2": "defined twice, first at <netlist>:2:8",
+    ".param x=x": "in a circle: x -> x",
+    ".param a=b b=c c=d d=b": "in a circle: d -> b -> c -> d",
+    ".subckt": "write .subckt NAME",
+    ".subckt A a b": "without its .ends",
+    ".subckt A a a\n.ends": "given twice",
+    ".subckt A 0\n.ends": "ground",
+    ".subckt A a w=1 b\n.ends": "nodes come first",
+    ".subckt A a\n.ends B": "the names differ",
+    ".subckt A a\n.tran 1 2\n.ends": "does not belong inside",
+    ".subckt A a\n.ends\n.subckt a b\n.ends": "defined twice, first at <netlist>:2:1",
+    ".subckt A a\nX1 a B\n.ends\n.subckt B a\nX1 a A\n.ends\nX1 b A": "calls itself: A -> B -> A",
+    ".subckt A a wide=1\n.ends\nX1 b A wid=2": "did you mean 'wide'",
+    ".subckt A a b\n.ends\nX1 c A": r"A has 2 nodes \(a b\), 1 given",
+    ".ends": "without a .subckt",
+    ".include": "needs a file name",
+    ".include 'foo": "never closed",
+    ".include a b": "in quotes",
+    ".include foo.lib": "no folder to look in",
+    ".lib foo bar": "sections",
+    ".control\nfoo": "without its .endc",
+    ".endc": "without a .control",
+    ".tran 1 2\n.tran 1 3": "given twice, first at <netlist>:2:1",
+    ".ic v(a=3": "never closed",
+    ".ic v(a)=": "missing value of 'v",
+}
+
+
+@pytest.mark.parametrize(("text", "message"), REFUSED.items())
+def test_what_is_wrong_is_refused_with_its_place(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        parse_deck(f"title\n{text}\n")
+    assert caught.value.where is not None
+    assert caught.value.where.line >= 2
+
+
+def test_expansion_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flatten, "MAX_EXPANDED", 10_000)
+    definitions = [
+        line
+        for level in range(30)
+        for line in (f".subckt A{level} a", *(f"X{i} a A{level + 1}" for i in range(100)), ".ends")
+    ]
+    assert "expand to more than" in refusal(*definitions, ".subckt A30 a", ".ends", "X1 a A0").message
+    chain = [x for i in range(40) for x in (f".subckt A{i} a", f"X1 a A{i + 1}", ".ends")]
+    assert "deep" in refusal(*chain, ".subckt A40 a", ".ends", "X1 a A0").message
+
+
+def test_time_grows_with_the_deck_and_not_faster() -> None:
+    def seconds(count: int) -> float:
+        text = "".join(f"R{i} n{i} n{i + 1} {{p{i}}}\n.param p{i}={{p{i + 1}+1}}\n" for i in range(count))
+        start = time.process_time()
+        parse_deck(f"t\n{text}.param p{count}=1\n")
+        return time.process_time() - start
+
+    seconds(100)
+    assert seconds(8000) < 8 * seconds(2000)
+
+
+# Files
+
+
+def write(folder: Path, **files: str) -> Path:
+    for name, text in files.items():
+        path = folder / name.replace("__", ".")
+        path.write_text(text, encoding="utf-8")
+    return folder / "main.cir"
+
+
+def test_local_files_are_included_and_named_in_places(tmp_path: Path) -> None:
+    path = write(tmp_path, main__cir="t\n.inc 'my parts.lib'\nR1 a 0 {r}\n")
+    (tmp_path / "my parts.lib").write_text(".param r=5\n.lib FingerSpice_mobile.LIB\n")
+    read = read_deck(path)
+    assert value(read.statements[0].body[0]) == 5.0
+    assert read.files == (tmp_path.resolve() / "my parts.lib",)
+    assert read.includes == ("FingerSpice_mobile.LIB",)
+    assert read.path == path
+    (tmp_path / "my parts.lib").write_text("\n\nR1 a 0 2k7\n")
+    with pytest.raises(InputError, match=r"write 2\.7k") as caught:
+        read_deck(path)
+    assert caught.value.where == Where(str(tmp_path / "my parts.lib"), 3, 8)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("../secret.lib", "outside the netlist's folder"),
+        ("/etc/passwd", "outside the netlist's folder"),
+        ("link.lib", "outside the netlist's folder"),
+        ("missing.lib", "does not exist"),
+        ("part.lob", "did you mean 'part.lib'"),
+        ("main.cir", "includes itself"),
+        ("loop.lib", "includes itself"),
+        ("sub", "is a folder"),
+        ("end.lib", "not an included file, has .end"),
+        ("x" * 5000, "cannot be read|not a usable"),
+    ],
+)
+def test_other_files_are_refused_by_name(tmp_path: Path, name: str, message: str) -> None:
+    folder = tmp_path / "deck"
+    (folder / "sub").mkdir(parents=True)
+    (tmp_path / "secret.lib").write_text("R1 a 0 1\n")
+    (folder / "link.lib").symlink_to(tmp_path / "secret.lib")
+    path = write(
+        folder, main__cir=f"t\n.include {name}\n", loop__lib=".include loop.lib\n", end__lib=".end\n"
+    )
+    write(folder, part__lib="R1 a 0 1\n")
+    with pytest.raises(InputError, match=message) as caught:
+        read_deck(path)
+    assert caught.value.where is not None
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "is empty"),
+        (b" \n\n", "is empty"),
+        (b"t\nR1 a 0 1\0", "NUL"),
+        ("t\nR1 a 0 1\n".encode("utf-16"), "not a text file"),
+        (b"t\nC1 a 0 1\xb5\n", "not UTF-8 text .byte 0xb5 in line 2"),
+    ],
+)
+def test_files_that_are_no_netlists_are_refused(tmp_path: Path, data: bytes, message: str) -> None:
+    path = tmp_path / "main.cir"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=message):
+        read_deck(path)
+
+
+def test_missing_files_folders_and_huge_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "finger.cir").write_text("t\n")
+    with pytest.raises(InputError, match=r"does not exist; did you mean 'finger.cir'"):
+        read_deck(tmp_path / "fingr.cir")
+    with pytest.raises(InputError, match="is a folder"):
+        read_deck(tmp_path)
+    with (tmp_path / "huge.cir").open("wb") as huge:
+        huge.truncate(2**27)
+    with pytest.raises(InputError, match="larger than 64 MiB"):
+        read_deck(tmp_path / "huge.cir")
+
+
+def test_reading_a_deck_imports_nothing_heavy() -> None:
+    code = "import sys; import fingerspice.circuit.deck; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert not {"numba", "scipy", "torch", "matplotlib", "xarray"} & set(loaded.split())
+
+
+# Anything at all
+
+
+_PIECES = [
+    *("R1", "X1", "V1", "a", "b", "0", "LAYER", "SIN", "s", "d=", "=", "1u", "2k7", "{x}", "'x'", '"f"', "x"),
+    *("(", ")", "{", "}", "'", '"', ",", ";", "$", "+", "\n", "\n+", "\n*", "\n", " ", " ", " "),
+    *(".param ", ".subckt ", ".ends", ".ic v(a)=1", ".tran 1 2", ".control\n", ".endc", ".include ", ".end"),
+]
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.lists(st.sampled_from(_PIECES), max_size=30).map("".join))
+def test_any_words_give_a_deck_or_an_input_error(text: str) -> None:
+    with contextlib.suppress(InputError):
+        assert isinstance(parse_deck(f"t\n{text}"), Deck)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.text(max_size=60), st.sampled_from(["", "t\n", "t\nR1 a 0 ", "t\n.param ", "t\n.include "]))
+def test_any_text_gives_a_deck_or_an_input_error(text: str, before: str) -> None:
+    with contextlib.suppress(InputError):
+        assert isinstance(parse_deck(before + text, Path(__file__)), Deck)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(0, len(PAPER)), st.integers(0, 6), st.text(max_size=3))
+def test_a_damaged_paper_deck_gives_a_deck_or_an_input_error(at: int, cut: int, new: str) -> None:
+    with contextlib.suppress(InputError):
+        assert isinstance(parse_deck(PAPER[:at] + new + PAPER[at + cut :]), Deck)

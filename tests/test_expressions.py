@@ -1,0 +1,159 @@
+"""Arithmetic of netlists."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fingerspice.circuit.expressions import FUNCTIONS, evaluate
+from fingerspice.errors import InputError, Where
+
+HERE = Where("deck.cir", 3, 10)
+NAMES = {"thick": 2.0, "Rho": 3.0, "if": 5.0}
+
+# Values tried in ngspice 39.
+NGSPICE = {
+    "2*3.5u": 7e-6,
+    "1meg/2": 5e5,
+    "-2^2": -4.0,
+    "-2**2": -4.0,
+    "2^-1": 0.5,
+    "(-2)^2": 4.0,
+    "pow(-2,3)": -8.0,
+    "log(10)": math.log(10.0),
+    "log10(10)": 1.0,
+    "int(-2.7)": -2.0,
+    "nint(2.5)": 2.0,
+    "sqr(3)": 9.0,
+    "arctan(1)": math.atan(1.0),
+    "sgn(-3)": -1.0,
+    "2*-3": -6.0,
+    "--3": 3.0,
+    "2-3-4": -5.0,
+    "1>2?3:4": 4.0,
+    "(2>1)?3:4": 3.0,
+    "2>1": 1.0,
+    "1&&0": 0.0,
+    "1==1": 1.0,
+    "ternary_fcn(1,2,3)": 2.0,
+    "max(1,2)": 2.0,
+}
+
+
+@pytest.mark.parametrize(("text", "value"), NGSPICE.items())
+def test_arithmetic_means_what_ngspice_means(text: str, value: float) -> None:
+    assert evaluate(text, {}, HERE) == pytest.approx(value, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("THICK * rho", 6.0),
+        ("if + 1", 6.0),
+        ("PI", math.pi),
+        ("2*e", 2 * math.e),
+        ("0 ? 1 : 0 ? 2 : 3", 3.0),
+        ("1 ? 2 ? 3 : 4 : 5", 3.0),
+        ("max(1 > 2 ? 3 : 4, 1)", 4.0),
+        ("thick == 0 ? 1/0 : 7", 7.0),
+        ("(2^3)^2", 64.0),
+        ("2^3*2^2", 32.0),
+        ("1<2 && 2<3 || 0", 1.0),
+        ("atan2(1, 1)", math.pi / 4),
+        ("1+" * 900 + "1", 901.0),
+        ("(" * 25 + "-1" + ")" * 25, -1.0),
+    ],
+)
+def test_arithmetic_with_names_conditions_and_nesting(text: str, value: float) -> None:
+    assert evaluate(text, NAMES, HERE) == pytest.approx(value, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "column", "message"),
+    [
+        ("", 10, "empty"),
+        ("2*", 12, "value is missing at the end"),
+        ("*2", 10, "value is missing before"),
+        ("1 2", 12, "operator is missing before '2'"),
+        ("sqrt(2", 14, "never closed"),
+        ("2)", 11, "without an opening"),
+        ("1,2", 11, "outside the arguments"),
+        ("max((1,2),3)", 16, "outside the arguments"),
+        ("thik*2", 10, "'thik' is not defined; did you mean 'thick'"),
+        ("2*sqr t(2)", 16, "operator is missing"),
+        ("1+sqrtt(2)", 12, "not a function; did you mean 'sqrt'"),
+        ("zzz(2)", 10, "functions are sqrt"),
+        ("sqrt", 10, r"written sqrt\(\.\.\.\)"),
+        ("sin(1,2)", 10, "takes 1 argument, 2 given"),
+        ("min(1)", 10, "at least 2 arguments"),
+        ("1/0", 10, "divides by zero"),
+        ("exp(1e9)", 10, "too large"),
+        ("9.0**9e9", 10, "leaves the domain|too large"),
+        ("1e308*10", 10, "not a finite"),
+        ("1e308*10-1e308*10", 10, "not a finite"),
+        ("sqrt(-1)", 10, "domain"),
+        ("(-2)^3", 10, "negative base"),
+        ("pwr(-2,3)", 10, "differs between simulators"),
+        ("2^3^2", 13, "two readings"),
+        ("2^-3^2", 14, "two readings"),
+        ("1<2<3", 13, "two readings"),
+        ("1 ? 2", 12, "without its ':'"),
+        ("1 : 2", 12, r"without its '\?'"),
+        ("a=1", 11, "a comparison is =="),
+        ("1+2k7", 12, "write 2.7k"),
+        ("v(x)*2", 10, "'v' is not a function"),
+        ("-" * 4 + "1", 13, "signs in a row"),
+        ("(" * 500, 35, "nested deeper"),
+        ("1?" * 26 + "1" + ":1" * 26, 10, "side by side"),
+    ],
+)
+def test_what_is_not_arithmetic_is_refused_at_its_column(text: str, column: int, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        evaluate(text, NAMES, HERE)
+    assert caught.value.where == Where("deck.cir", 3, column)
+
+
+@pytest.mark.parametrize("text", ["(" * 100_000, "-" * 100_000, "1+" * 100_000, "x" * 100_000, "{" * 9])
+def test_expressions_of_any_size_are_refused_and_not_parsed(text: str) -> None:
+    with pytest.raises(InputError):
+        evaluate(text, {}, HERE)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["__import__('os')", "x.y", "[1]", "lambda: 1", "1 if 1 else 2", "f'1'", "1;2", "1j", "a:=1", "not 1"],
+)
+def test_python_is_not_arithmetic(text: str) -> None:
+    with pytest.raises(InputError):
+        evaluate(text, NAMES, HERE)
+
+
+@given(
+    st.recursive(
+        st.floats(0.1, 9.0).map(repr),
+        lambda x: st.tuples(x, st.sampled_from("+-*/"), x).map(lambda t: f"({t[0]}{t[1]}{t[2]})"),
+        max_leaves=8,
+    )
+)
+def test_plain_arithmetic_agrees_with_python(text: str) -> None:
+    try:
+        expected = eval(text)  # of digits and operators only
+    except ZeroDivisionError:
+        return
+    assert evaluate(text, {}, HERE) == expected
+
+
+_WORDS = ["1", "2.5u", "x", "thick", "(", ")", ",", "+", "-", "*", "/", "^", "**", "?", ":", "<", "==", "&&"]
+
+
+@settings(max_examples=300)
+@given(st.lists(st.sampled_from([*_WORDS, *FUNCTIONS, " ", "=", "'", "#"]), max_size=14).map("".join))
+def test_any_words_give_a_finite_number_or_an_input_error(text: str) -> None:
+    try:
+        value = evaluate(text, NAMES, HERE)
+    except InputError:
+        return
+    assert math.isfinite(value)
