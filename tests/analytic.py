@@ -313,8 +313,8 @@ def _quadrature() -> tuple[np.ndarray, np.ndarray]:
 def area_primitive(u: float, params: Parameters = TABLE1, k: float = 1.0) -> float:
     """Integral of A_R(|v|) dv from 0 to u, m^2 V, odd in u.
 
-    40-point Gauss on panels that double in length, the first as long as the voltage at which friction begins to
-    take area away or X = 0.5, whichever is less.
+    40-point Gauss on panels that double in length, the first as long as the voltage at which friction begins
+    to take area away or X = 0.5, whichever is less.
     """
     x, w = _quadrature()
     _, a_hertz, x_per_u, sigma_per_u2, c = _contact_constants(params, k)
@@ -1029,7 +1029,7 @@ class Transient:
         return (self.force_integral(t1) - self.force_integral(t0)) / (t1 - t0)
 
     def current(self, t: float, slope: float) -> float:
-        """Regular part of the current through the terminals at t (right-hand), A; `slope` is dU/dt there, V/s."""
+        """Regular part of the current through the terminals at t (right-hand), A; `slope` = dU/dt in V/s."""
         stack, step = self.stack, _find(self.steps, t, "right")
         u, a, da = (x[0] for x in _fields_on_step(stack, self.nodes, step, np.array([t])))
         j, c = stack.gap, stack.c[stack.gap]
@@ -1376,13 +1376,13 @@ def transient(
     Charge: i = A D' = c_a A u_a' + u_a / R_a, so q = c_a (G(u_a) - G(u_a before)) + int u_a / R_a dt with G
     the primitive of A(|u|), exact also across jumps (`local`); c_a A u_a replaces c_a G under `mobile`.
 
-    Accuracy, all relative to the peak (Table 1 at 200 V and 2 kV, 100 Hz and 5 kHz, sine, square and ramps with
-    jumps, both laws): Radau 12 against Gauss 16 and Radau 9 agree to 1.2e-15 in u, 3e-15 in q, 1.4e-15 in F_el;
-    against DOP853 at rtol 1e-13, in voltage form to 1.6e-13 and in leaked-charge form to 4e-13 (its own error: it
-    does not change with the collocation); against 30-digit extrapolation with Eq. 4 solved by mpmath, 6e-16;
-    frozen area against the mpmath exponentials, 5e-15 (R_i = 1 ohm included). 500 periods at 5 kHz: 4e-15 in u,
-    5e-12 in q near its zero. Zeros of u_a are hit to 1e-15 of the peak. Fold times: 1e-11 of the period where u_a
-    runs into the fold, 2e-7 of the period at F_N = 1e-4 N (slaved gap).
+    Accuracy, all relative to the peak (Table 1 at 200 V and 2 kV, 100 Hz and 5 kHz, sine, square and ramps
+    with jumps, both laws): Radau 12 against Gauss 16 and Radau 9 agree to 1.2e-15 in u, 3e-15 in q, 1.4e-15
+    in F_el; against DOP853 at rtol 1e-13, in voltage form to 1.6e-13 and in leaked-charge form to 4e-13 (its
+    own error: it does not change with the collocation); against 30-digit extrapolation with Eq. 4 solved by
+    mpmath, 6e-16; frozen area against the mpmath exponentials, 5e-15 (R_i = 1 ohm included). 500 periods at
+    5 kHz: 4e-15 in u, 5e-12 in q near its zero. Zeros of u_a are hit to 1e-15 of the peak. Fold times: 1e-11
+    of the period where u_a runs into the fold, 2e-7 of the period at F_N = 1e-4 N (slaved gap).
     """
     if layers is None:
         if freq is None:
@@ -1432,7 +1432,8 @@ def _hold(level: float) -> Waveform:
 def periodic_state(
     segments: Sequence[Segment], *, law: str = "local", params: Parameters = TABLE1,
     freq: float | None = None, layers: Sequence[Layer] | None = None, gap: int = GAP,
-    area_mode: str | float = "coupled", k: float = 1.0, warm_up: int = 2, t_out: Sequence[float] = (), **options: object,
+    area_mode: str | float = "coupled", k: float = 1.0, warm_up: int = 2, t_out: Sequence[float] = (),
+    **options: object,
 ) -> Transient:
     """Periodic steady state under a periodic source, as one period of a `Transient`.
 

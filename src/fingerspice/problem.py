@@ -34,8 +34,8 @@ class Problem:
     embedding : ndarray, shape (n_layer, n_layer - 1)
         v = embedding @ x.
     charge_law, area_mode : str
-    t_start, t_stop, step : float
-        s; `step` is the output spacing.
+    t_start, t_stop, first, step : float
+        s; outputs are spaced by `step` from `first` on.
     initial : State
     """
 
@@ -48,6 +48,7 @@ class Problem:
     area_mode: str
     t_start: float
     t_stop: float
+    first: float
     step: float
     initial: State
 
@@ -92,8 +93,9 @@ def prepare(
     model, embedding = _model(stack, law, fixed, _largest_voltage(waveform, t_stop, circuit))
     t_start = start.state.t if isinstance(start, Solution) else 0.0
     stop, step = _times(circuit, t_start, t_stop, t_eval)
+    first = t_start + (circuit.tran.start if circuit.tran else 0.0)
     initial = _initial_state(circuit, stack, waveform, model, law, start)
-    return Problem(circuit, stack, waveform, model, embedding, law, area_mode, t_start, stop, step, initial)
+    return Problem(circuit, stack, waveform, model, embedding, law, area_mode, t_start, stop, first, step, initial)
 
 
 def _largest_voltage(waveform: Waveform, t_stop: float | None, circuit: Circuit) -> float:
@@ -207,19 +209,31 @@ def _initial_state(
         inverse, _ = inverse_area(abs(float(u[stack.gap])), model.curve)
     _, _, _, embedding = stack.matrices()
     live = [int(np.argmax(embedding[:, j] == 1.0)) for j in range(n - 1)]
-    y = np.zeros(n)
-    y[:-1] = v[live] / (model.area0 * inverse if model.mobile else 1.0)
-    if stack.gap is not None and model.mobile:
-        k_u = model.k_gap * u_before
-        sign = 1.0 if u[stack.gap] >= 0.0 else -1.0
-        found = gap_voltage(model, k_u, float(model.gap @ y[:-1]), sign, float(u[stack.gap]))
+    x = v[live] / (model.area0 * inverse if model.mobile else 1.0)
+    state = state_from(model, 0.0, x, u_before, law)
+    if stack.gap is not None:
+        found = _gap_voltage(model, x, u_before)
         if not abs(found - u[stack.gap]) <= 1e-9 * abs(u[stack.gap]):
             raise InputError(
                 f"the start has {u[stack.gap]:.4g} V across the gap, past the fold of the mobile law; allowed: less "
                 "voltage, more load, or the local law"
             )
-    offset = u_before / inverse / stack.s if model.mobile else 0.0
-    return State(0.0, y, u_before, offset, law)
+    return state
+
+
+def _gap_voltage(model: Model, x: FloatArray, u_before: float) -> float:
+    k_u = model.k_gap * u_before
+    sign = 1.0 if k_u + model.gap @ x >= 0.0 else -1.0
+    return float(gap_voltage(model, k_u, float(model.gap @ x), sign, k_u))
+
+
+def state_from(model: Model, t: float, x: FloatArray, u_before: float, law: str) -> State:
+    """State with live voltages `x` (V) just before time t, the source at `u_before` (V), no charge delivered yet."""
+    offset = 0.0
+    if model.mobile:
+        inverse, _ = inverse_area(abs(_gap_voltage(model, x, u_before)), model.curve)
+        offset = u_before / inverse / model.s
+    return State(t, np.append(x, 0.0), u_before, offset, law)
 
 
 def _given_voltages(circuit: Circuit, stack: Stack) -> tuple[FloatArray, float]:

@@ -16,7 +16,7 @@ from fingerspice.errors import FingerspiceWarning, InputError, SolveError
 from fingerspice.numerics.tableaus import TABLEAUS
 from fingerspice.problem import Problem, prepare
 from fingerspice.solution import Solution, Status
-from fingerspice.transient import Progress, Run, solve
+from fingerspice.transient import Progress, Run, choose_tableau, solve
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -83,16 +83,26 @@ def simulate(
         circuit = _with_sources(circuit, sources)
     times = None if t_eval is None else np.asarray(t_eval, float)
     problem = prepare(circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=start)
-    t_out, left = (times, np.zeros(times.size, bool)) if times is not None else output_times(problem)
-    begin = time.perf_counter()
-    run, name = _run(problem, method, rtol, t_out, left, progress)
-    wall = time.perf_counter() - begin
-    solution = _solution(problem, run, rtol, name, t_out, wall)
+    solution = run_problem(problem, times, rtol, method, progress)
     if not solution.success and throw:
         raise SolveError(solution.message, solution)
     for text in solution.warnings:
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     return solution
+
+
+def run_problem(
+    problem: Problem,
+    t_eval: FloatArray | None = None,
+    rtol: float = 1e-8,
+    method: str = "auto",
+    progress: Progress | None = None,
+) -> Solution:
+    """Integrate a problem made ready; arguments as in `simulate`. Never raises for a failed run."""
+    t_out, left = (t_eval, np.zeros(t_eval.size, bool)) if t_eval is not None else output_times(problem)
+    begin = time.perf_counter()
+    run, name = _run(problem, method, rtol, t_out, left, progress)
+    return _solution(problem, run, rtol, name, t_out, time.perf_counter() - begin)
 
 
 def _with_sources(
@@ -115,17 +125,13 @@ def _run(
     if method != "auto" and method not in TABLEAUS:
         known = ["auto", *TABLEAUS, "scipy:NAME", "torchdiffeq:NAME"]
         raise InputError(f"unknown method {method!r}; allowed: {', '.join(known)}")
-    from fingerspice.transient import choose_tableau
-
     tableau = choose_tableau(problem, rtol) if method == "auto" else TABLEAUS[method]
     return solve(problem, rtol, tableau, t_out, left, progress), tableau.name
 
 
 def output_times(problem: Problem) -> tuple[FloatArray, BoolArray]:
     """TSTART:TSTEP:TSTOP with two entries (left, right) at each jump; t = 0 once, right-hand."""
-    tran = problem.circuit.tran
-    step = problem.step
-    first = problem.t_start + (tran.start if tran is not None else 0.0)
+    step, first = problem.step, problem.first
     count = int(np.floor((problem.t_stop - first) / step * (1.0 + 1e-12) + 1e-9))
     grid = first + step * np.arange(count + 1)
     if grid.size and abs(grid[-1] - problem.t_stop) <= 1e-9 * step:

@@ -124,10 +124,9 @@ def method_from(tableau: Tableau, waveform: Waveform, h_fixed: float = 0.0) -> M
     """A tableau as the compiled code takes it, its step bounded by the source's own time scale."""
     # Zeros of the gap voltage are looked for at quarters of a step: four steps per period cannot hide one.
     h_max = 0.25 * waveform.shortest_time()
-    return Method(
-        tableau.implicit, tableau.a, tableau.c, tableau.e, tableau.dense, tableau.n_end, tableau.error_order,
-        h_max, h_fixed,
-    )  # fmt: skip
+    # One memory layout for every tableau: another one would be another compilation.
+    a, c, e, dense = (np.ascontiguousarray(x) for x in (tableau.a, tableau.c, tableau.e, tableau.dense))
+    return Method(tableau.implicit, a, c, e, dense, tableau.n_end, tableau.error_order, h_max, h_fixed)
 
 
 def row_width(problem: Problem) -> int:
