@@ -1379,10 +1379,11 @@ def transient(
     Accuracy, all relative to the peak (Table 1 at 200 V and 2 kV, 100 Hz and 5 kHz, sine, square and ramps
     with jumps, both laws): Radau 12 against Gauss 16 and Radau 9 agree to 1.2e-15 in u, 3e-15 in q, 1.4e-15
     in F_el; against DOP853 at rtol 1e-13, in voltage form to 1.6e-13 and in leaked-charge form to 4e-13 (its
-    own error: it does not change with the collocation); against 30-digit extrapolation with Eq. 4 solved by
-    mpmath, 6e-16; frozen area against the mpmath exponentials, 5e-15 (R_i = 1 ohm included). 500 periods at
-    5 kHz: 4e-15 in u, 5e-12 in q near its zero. Zeros of u_a are hit to 1e-15 of the peak. Fold times: 1e-11
-    of the period where u_a runs into the fold, 2e-7 of the period at F_N = 1e-4 N (slaved gap).
+    own error, and 1.5e-11 where it crosses a 0.1 us ramp in one step: 1e-15 at rtol 3e-14); against 30-digit
+    extrapolation with Eq. 4 solved in mpmath (0.4 ms at 100 Hz, 80 us at 5 kHz), 1.5e-16; frozen area against
+    the mpmath exponentials, 5e-15 (R_i = 1 ohm included). 500 periods at 5 kHz: 4e-15 in u. Zeros of u_a are
+    hit to 1.2e-15 of the peak. Fold times: 1e-11 of the period where u_a runs into the fold (10 nm gap), 1e-7
+    of the period at F_N = 1e-4 N (slaved gap).
     """
     if layers is None:
         if freq is None:

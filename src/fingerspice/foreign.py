@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import SourceTable, source_table
 from fingerspice.engine import advance as loop
-from fingerspice.engine.model import Model, Segment, dot, right_hand_side, source, write_row
+from fingerspice.engine.model import Model, Segment, choose_branch, dot, right_hand_side, source, write_row
 from fingerspice.errors import InputError
 from fingerspice.problem import Problem
 from fingerspice.solution import ErrorEstimate, State, Status
@@ -44,7 +44,7 @@ def _slope(model: Model, segment: Segment, t: float, y: FloatArray, sign: float)
     u_source, du_source = source(segment, t - segment.start)
     zero = model.k_gap * u_source + dot(model.gap, y)
     if sign == 0.0:
-        sign = 1.0 if zero >= 0.0 else -1.0
+        sign = choose_branch(model, u_source, y)
     out = np.empty(y.size)
     right_hand_side(model, u_source, du_source, y, sign, zero, out)
     return out
@@ -164,7 +164,7 @@ def _integrate(
                     t_end, y_end, states, used = run_piece(piece, name)
                     for state in states:
                         u, du = source(segment, t_out[done] - start)
-                        here = sign if name in SCIPY_METHODS else np.copysign(1.0, model.k_gap * u + model.gap @ state[:-1])
+                        here = sign if name in SCIPY_METHODS else float(choose_branch(model, u, state))
                         write_row(model, u, du, np.ascontiguousarray(state), here, u, rows[done])
                         done += 1
                     y = np.ascontiguousarray(y_end)

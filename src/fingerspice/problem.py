@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.statespace import Stack, build_stack
 from fingerspice.circuit.waveforms import Waveform, require
-from fingerspice.engine.model import Model, gap_voltage
+from fingerspice.engine.model import Model, choose_branch, gap_voltage
 from fingerspice.errors import InputError
 from fingerspice.phasors import mean_area
 from fingerspice.physics.contact import fixed_area_curve, inverse_area
@@ -223,7 +223,7 @@ def _initial_state(
 
 def _gap_voltage(model: Model, x: FloatArray, u_before: float) -> float:
     k_u = model.k_gap * u_before
-    sign = 1.0 if k_u + model.gap @ x >= 0.0 else -1.0
+    sign = choose_branch(model, u_before, x)
     return float(gap_voltage(model, k_u, float(model.gap @ x), sign, k_u))
 
 

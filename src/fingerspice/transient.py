@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.circuit.sampling import SourceTable, source_table
+from fingerspice.circuit.sampling import SourceTable, is_sampled, source_table
 from fingerspice.circuit.waveforms import Waveform
 from fingerspice.engine import advance as loop
 from fingerspice.engine.model import Segment, write_row
@@ -141,7 +141,7 @@ def windows(problem: Problem) -> list[float]:
         problem.waveform.breakpoint_rate() / BREAKPOINTS_PER_WINDOW,
         1.0 / (PERIODS_PER_WINDOW * problem.waveform.shortest_time()),
         # A function is sampled at the output step.
-        1.0 / (4096.0 * problem.step) if problem.waveform.shortest_time() == np.inf else 0.0,
+        1.0 / (4096.0 * problem.step) if is_sampled(problem.waveform) else 0.0,
     )
     count = max(1, int(np.ceil(span * rate)))
     return [problem.t_start + span * i / count for i in range(count)] + [problem.t_stop]

@@ -116,6 +116,11 @@ class SourceTable:
     not_finite: float | None = None
 
 
+def is_sampled(waveform: Waveform) -> bool:
+    """Whether a waveform has no terms and is represented by series."""
+    return waveform.terms(np.zeros(1), np.ones(1)) is None
+
+
 def source_table(waveform: Waveform, t0: float, t1: float, tol: float, step: float) -> SourceTable:
     """Table of a waveform over [t0, t1].
 

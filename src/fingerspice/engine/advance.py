@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from fingerspice.engine.model import (
     Model,
     Segment,
+    branch_area,
+    choose_branch,
     dot,
     gap_voltage,
-    inverse_area,
     jump_charge,
     right_hand_side,
     source,
@@ -47,7 +48,7 @@ def enter(model: Model, segment: Segment, t0: float, y: FloatArray, control: Flo
             control[H] = 0.0
         control[U_BEFORE] = u_source
         zero = model.k_gap * u_source + x_gap
-        control[SIGN] = 1.0 if zero >= 0.0 or not model.coupled else -1.0
+        control[SIGN] = choose_branch(model, u_source, y)
         if model.coupled and abs(zero) <= 1e-13 * (abs(model.k_gap * u_source) + abs(x_gap)):
             # At a zero the branch is the one the voltage is about to take.
             dy = np.empty(y.size)
@@ -58,17 +59,22 @@ def enter(model: Model, segment: Segment, t0: float, y: FloatArray, control: Flo
 
 @njit(cache=True)
 def _zero_function(
-    model: Model, segment: Segment, t0: float, h: float, theta: float, y: FloatArray, poly: FloatArray
+    model: Model, segment: Segment, t0: float, h: float, theta: float, sign: float, y: FloatArray, poly: FloatArray
 ) -> float:
-    """k U + x_gap: zero exactly where the gap voltage is, under both laws."""
+    """A function with the sign of the gap voltage on its branch, and its zeros: k U + x_gap."""
     u_source, _ = source(segment, t0 + theta * h)
-    value = model.k_gap * u_source
+    x_gap = 0.0
     for j in range(model.gap.size):
         x = 0.0
         for d in range(poly.shape[1] - 1, -1, -1):
             x = (x + poly[j, d]) * theta
-        value += model.gap[j] * (y[j] + x)
-    return value
+        x_gap += model.gap[j] * (y[j] + x)
+    zero = model.k_gap * u_source + x_gap
+    if model.mobile and sign * zero < 0.0 and sign * model.k_gap * u_source > 0.0:
+        # Under `mobile` the voltage may keep its sign where this sum does not (see `choose_branch`).
+        u = gap_voltage(model, model.k_gap * u_source, x_gap, sign, model.k_gap * u_source)
+        return u if u == u else zero
+    return zero
 
 
 @njit(cache=True)
@@ -77,12 +83,12 @@ def _first_zero(
 ) -> float:
     """First fraction of the step at which the gap voltage leaves its branch, or 2 where it does not."""
     lo = 0.0
-    f_lo = sign * _zero_function(model, segment, t0, h, 0.0, y, poly)
+    f_lo = sign * _zero_function(model, segment, t0, h, 0.0, sign, y, poly)
     hi = 0.0
     f_hi = 0.0
     for i in range(1, 5):
         hi = 0.25 * i
-        f_hi = sign * _zero_function(model, segment, t0, h, hi, y, poly)
+        f_hi = sign * _zero_function(model, segment, t0, h, hi, sign, y, poly)
         if f_hi < 0.0:
             break
         lo = hi
@@ -98,7 +104,7 @@ def _first_zero(
             mid = 0.5 * (lo + hi)
         if not lo < mid < hi:
             break
-        f_mid = sign * _zero_function(model, segment, t0, h, mid, y, poly)
+        f_mid = sign * _zero_function(model, segment, t0, h, mid, sign, y, poly)
         if f_mid < 0.0:
             hi = mid
             f_hi = f_mid
@@ -210,7 +216,7 @@ def _write_log(
         u = gap_voltage(
             model, model.k_gap * u_source, dot(model.gap, state), control[SIGN], control[U_GAP]
         )
-        q, _ = inverse_area(control[SIGN] * u, model.curve)
+        q, _ = branch_area(model, control[SIGN], u)
         row = log[counters[LOGGED]]
         row[0] = t + theta * h
         row[1] = u

@@ -136,26 +136,39 @@ def dot(a: FloatArray, x: FloatArray) -> float:
 
 
 @njit(cache=True)
+def branch_area(model: Model, sign: float, u: float) -> tuple[float, float]:
+    """1/A and its slope d(1/A)/du on the branch A(|u|) = A(sign u), continued a little past 0 V.
+
+    Farther on the wrong side it is the true area, so that a walk towards the branch starts on solid ground.
+    """
+    if sign * u < model.curve[0]:
+        sign = -sign
+    q, dq = inverse_area(sign * u, model.curve)
+    return q, sign * dq
+
+
+@njit(cache=True)
 def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: float) -> float:
     """Gap voltage (V): k U + x under `local`; under `mobile` the root of u = k U + x A_0 / A(|u|).
 
     The root meant is the first one met from k U in the direction of x: the one connected to the uncharged
-    state. `guess` starts Newton; where that does not settle, the root is bracketed. NaN past the fold.
+    state. `guess` starts Newton; where that does not settle, the root is bracketed. NaN where the branch holds no
+    such root: past the fold.
     """
     if not model.mobile or x_gap == 0.0:
         return k_u + x_gap
     b = x_gap * model.area0
     u = guess
     for _ in range(8):
-        q, dq = inverse_area(sign * u, model.curve)
-        slope = 1.0 - b * sign * dq
-        # Close to the fold Newton may cross to the other branch: leave it to the bracket.
+        q, dq = branch_area(model, sign, u)
+        slope = 1.0 - b * dq
+        # Close to the fold Newton may cross to the other root: leave it to the bracket.
         if not slope > 0.2:
             break
         step = (u - k_u - b * q) / slope
         u -= step
         if abs(step) <= 4e-16 * (abs(u) + abs(k_u)):
-            if (u - k_u) * x_gap >= 0.0:
+            if (u - k_u) * x_gap >= 0.0 and sign * u >= model.curve[0]:
                 return u
             break
     return _bracketed_root(model, k_u, b, sign)
@@ -163,16 +176,16 @@ def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: floa
 
 @njit(cache=True)
 def _residual(model: Model, k_u: float, b: float, sign: float, r: float) -> tuple[float, float]:
-    """Residual of the mobile area equation r = |u - k U|, and its slope, walking from k U towards the root."""
+    """Residual of the mobile area equation at r = |u - k U|, and its slope, walking from k U towards the root."""
     direction = 1.0 if b > 0.0 else -1.0
-    q, dq = inverse_area(sign * (k_u + direction * r), model.curve)
-    return r - abs(b) * q, 1.0 - b * sign * dq
+    q, dq = branch_area(model, sign, k_u + direction * r)
+    return r - abs(b) * q, 1.0 - b * dq
 
 
 @njit(cache=True)
 def _bracketed_root(model: Model, k_u: float, b: float, sign: float) -> float:
     lo = 0.0
-    width = 0.05 * abs(b) / model.area0
+    width = 0.02 * abs(b) / model.area0
     hi = width
     value, slope = _residual(model, k_u, b, sign, hi)
     while value < 0.0 and slope > 0.0:
@@ -203,7 +216,24 @@ def _bracketed_root(model: Model, k_u: float, b: float, sign: float) -> float:
             hi = mid
         else:
             lo = mid
-    return k_u + (hi if b > 0.0 else -hi)
+    u = k_u + (hi if b > 0.0 else -hi)
+    return u if sign * u >= model.curve[0] else math.nan
+
+
+@njit(cache=True)
+def choose_branch(model: Model, u_source: float, y: FloatArray) -> float:
+    """Sign of the gap voltage; 1 at zero or where the area does not follow it."""
+    if not model.coupled:
+        return 1.0
+    k_u = model.k_gap * u_source
+    x_gap = dot(model.gap, y)
+    zero = k_u + x_gap
+    if model.mobile and zero * k_u < 0.0:
+        # Charge opposes U and would win at the area of 0 V; a larger area may still hold a root on U's own side.
+        sign = 1.0 if k_u > 0.0 else -1.0
+        if sign * gap_voltage(model, k_u, x_gap, sign, k_u) > 0.0:
+            return sign
+    return 1.0 if zero >= 0.0 else -1.0
 
 
 @njit(cache=True)
@@ -211,8 +241,8 @@ def fold_margin(model: Model, x_gap: float, u: float, sign: float) -> float:
     """Distance to the fold of the `mobile` area equation: 1 without stored charge, 0 at the fold."""
     if not model.mobile:
         return 1.0
-    _, dq = inverse_area(sign * u, model.curve)
-    return 1.0 - x_gap * model.area0 * sign * dq
+    _, dq = branch_area(model, sign, u)
+    return 1.0 - x_gap * model.area0 * dq
 
 
 @njit(cache=True)
@@ -225,7 +255,7 @@ def right_hand_side(
     """
     n = model.gap.size
     u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), sign, guess)
-    q, _ = inverse_area(sign * u, model.curve)
+    q, _ = branch_area(model, sign, u)
     scale = model.area0 * q if model.mobile else 1.0
     for i in range(n + 1):
         value = 0.0
@@ -240,6 +270,24 @@ def right_hand_side(
 
 
 @njit(cache=True)
+def jacobian(model: Model, u_source: float, y: FloatArray, sign: float, guess: float, out: FloatArray) -> None:
+    """Write d x'/d x (n, n) into `out`."""
+    n = model.gap.size
+    x_gap = dot(model.gap, y)
+    u = gap_voltage(model, model.k_gap * u_source, x_gap, sign, guess)
+    q, dq = branch_area(model, sign, u)
+    area0 = model.area0
+    du = area0 * q / (1.0 - x_gap * area0 * dq) if model.mobile else 1.0
+    for i in range(n):
+        # Sensitivity of x' to q at fixed x, then of q to x.
+        by_q = -model.b[0, i] * u_source / (q * q * area0) if model.mobile else model.b[1, i] * u_source
+        for j in range(n):
+            by_q += model.p0[i, j] * y[j]
+        for j in range(n):
+            out[i, j] = model.p1[i, j] + q * model.p0[i, j] + by_q * dq * du * model.gap[j]
+
+
+@njit(cache=True)
 def write_row(
     model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, guess: float, row: FloatArray
 ) -> None:
@@ -247,13 +295,13 @@ def write_row(
     n = model.gap.size
     dy = np.empty(n + 1)
     u = right_hand_side(model, u_source, du_source, y, sign, guess, dy)
-    q, dq = inverse_area(sign * u, model.curve)
+    q, dq = branch_area(model, sign, u)
     margin = fold_margin(model, dot(model.gap, y), u, sign)
     current = dy[n]
     if model.mobile:
         # i = Q' with Q = A U / S + z, and u' from the area equation.
         du = (model.k_gap * du_source + dot(model.gap, dy) * model.area0 * q) / margin
-        current += (du_source / q - sign * dq * du * u_source / (q * q)) / model.s
+        current += (du_source / q - dq * du * u_source / (q * q)) / model.s
     row[0] = u_source
     row[1] = u
     row[2] = q

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fingerspice.engine.model import Model, Segment, right_hand_side, source
+from fingerspice.engine.model import Model, Segment, jacobian, right_hand_side, source
 
 FloatArray = NDArray[np.float64]
 
@@ -124,29 +124,21 @@ def _newton_inverse(
     y: FloatArray,
     sign: float,
     guess: float,
-    scale: FloatArray,
     base: FloatArray,
 ) -> FloatArray:
-    """Inverse of I - h A (x) J with J by differences at the start of the step; `base` takes y' there."""
+    """Inverse of I - h A (x) J with J at the start of the step; `base` takes y' there."""
     n = y.size - 1
     stages = method.a.shape[0]
     u_source, du_source = source(segment, t0)
     guess = right_hand_side(model, u_source, du_source, y, sign, guess, base)
-    jacobian = np.empty((n, n))
-    moved = np.empty(n + 1)
-    probe = y.copy()
-    for j in range(n):
-        step = 1e-6 * max(abs(y[j]), scale[j], 1e-3 * abs(u_source))
-        probe[j] = y[j] + step
-        right_hand_side(model, u_source, du_source, probe, sign, guess, moved)
-        probe[j] = y[j]
-        jacobian[:, j] = (moved[:n] - base[:n]) / step
+    slope = np.empty((n, n))
+    jacobian(model, u_source, y, sign, guess, slope)
     matrix = np.eye(stages * n)
     for i in range(stages):
         for r in range(stages):
             for p in range(n):
                 for j in range(n):
-                    matrix[i * n + p, r * n + j] -= h * method.a[i, r] * jacobian[p, j]
+                    matrix[i * n + p, r * n + j] -= h * method.a[i, r] * slope[p, j]
     if not np.all(np.isfinite(matrix)):
         return np.full((1, 1), np.nan)
     return np.linalg.inv(matrix)
@@ -169,8 +161,8 @@ def _collocation_step(
     n = y.size - 1
     stages = method.a.shape[0]
     base = np.empty(n + 1)
-    inverse = _newton_inverse(model, method, segment, t0, h, y, sign, guess, scale, base)
-    nfev = n + 1
+    inverse = _newton_inverse(model, method, segment, t0, h, y, sign, guess, base)
+    nfev = 1
     if inverse[0, 0] != inverse[0, 0]:
         return math.inf, nfev
     for i in range(stages):

@@ -1,0 +1,66 @@
+"""Circuits for the tests: Table 1's deck, with what a test wants to be different."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import fingerspice as fs
+
+COAT = {"d": "1u", "eps_r": 3.9, "r": "0.2meg"}
+GAP = {
+    "d": "3.5u",
+    "eps_r": 1,
+    "r": "1meg",
+    "fn": 0.5,
+    "mu": 0.3,
+    "alpha": 54.4,
+    "m_exp": 0.52,
+    "beta": 32,
+    "n_exp": 1.41,
+    "c2": 5000,
+}
+
+
+def assignments(values: dict[str, Any]) -> str:
+    """``key=value`` pairs; a value of None leaves the parameter out."""
+    return " ".join(
+        f"{k}={v!r}" if isinstance(v, float) else f"{k}={v}" for k, v in values.items() if v is not None
+    )
+
+
+def table1_deck(
+    source: str = "SIN(0 200 100)",
+    f: float = 100.0,
+    *,
+    coat: dict[str, Any] | None = None,
+    gap: dict[str, Any] | None = None,
+    skin: dict[str, Any] | None = None,
+    tran: str = "10u 50m uic",
+    library: str = "fingerspice.lib",
+    extra: str = "",
+) -> str:
+    """Text of Table 1's deck; `coat`, `gap`, `skin` override parameters, `extra` adds lines."""
+    return "\n".join(
+        (
+            "Table 1",
+            f".include {library}",
+            f"Vdrive drive 0 {source}",
+            f"Xcoat drive top area LAYER {assignments(COAT | (coat or {}))}",
+            f"Xgap top skin area GAP {assignments(GAP | (gap or {}))}",
+            f"Xskin skin 0 area SKIN {assignments({'d': '350u', 'f': float(f)} | (skin or {}))}",
+            f".tran {tran}",
+            *([extra] if extra else []),
+            ".end",
+            "",
+        )
+    )
+
+
+def table1(source: str = "SIN(0 200 100)", f: float = 100.0, **changes: Any) -> fs.Circuit:
+    """Table 1's circuit; see `table1_deck`."""
+    return fs.parse_netlist(table1_deck(source, f, **changes))
+
+
+def deck(*lines: str) -> fs.Circuit:
+    """A circuit from element lines."""
+    return fs.parse_netlist("\n".join(("a deck", *lines, "")))

@@ -1,0 +1,353 @@
+"""Waveforms: value, either side of a jump, breakpoints, fundamental, and the table that compiled code steps on."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+
+import fingerspice as fs
+from fingerspice.circuit import ramps, sampling, waveforms
+from fingerspice.circuit.sampling import source_table
+from fingerspice.circuit.waveforms import as_waveform
+from fingerspice.engine.model import Segment, source
+from waveform_cases import CASES, Case, turns
+
+every_case = pytest.mark.parametrize("case", CASES, ids=lambda c: c.name)
+periodic_case = pytest.mark.parametrize("case", [c for c in CASES if c.tone], ids=lambda c: c.name)
+
+
+def pieces(case: Case) -> list[tuple[float, float]]:
+    """The smooth pieces of [0, end], by the formula's own edges."""
+    inner = [x for x in case.edges if 1e-12 < x < case.end - 1e-12]
+    return list(pairwise([0.0, *inner, case.end]))
+
+
+def inside(case: Case, count: int = 40, margin: float = 1e-6) -> np.ndarray:
+    """Times in every piece, none closer to an edge than `margin` of the piece."""
+    x = np.modf(np.arange(1, count + 1) * 0.618033988749895)[0]
+    x = margin + (1.0 - 2.0 * margin) * np.sort(x)
+    return np.concatenate([a + (b - a) * x for a, b in pieces(case)])
+
+
+def size(case: Case) -> float:
+    return float(np.abs(case.formula(inside(case))).max())
+
+
+def table_values(case: Case, t0: float, t1: float, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Voltage and slope by the compiled evaluation of the waveform's table."""
+    table = source_table(case.waveform, t0, t1, 1e-14, 1e-4)
+    index = np.clip(np.searchsorted(table.edges, t, side="right") - 1, 0, table.edges.size - 2)
+    pairs = []
+    for time, i in zip(t, index, strict=True):
+        a, b = table.edges[i], table.edges[i + 1]
+        pairs.append(source(Segment(a, b - a, table.terms[i], table.series[i]), time - a))
+    values, slopes = np.array(pairs).T
+    return values, slopes
+
+
+def test_every_waveform_class_is_in_the_registry() -> None:
+    named = {type(c.waveform) for c in CASES}
+    for module in (waveforms, ramps, sampling):
+        for name, item in vars(module).items():
+            if isinstance(item, type) and issubclass(item, fs.Waveform) and not name.startswith("_"):
+                assert item in named or item is fs.Waveform, f"{name} has no case"
+
+
+# Values -----------------------------------------------------------------------------------------------------
+
+
+@every_case
+def test_the_value_is_the_formulas_between_the_edges(case: Case) -> None:
+    t = inside(case)
+    np.testing.assert_allclose(case.waveform.value(t), case.formula(t), rtol=0, atol=1e-12 * size(case))
+    np.testing.assert_array_equal(case.waveform.value(t, "left"), case.waveform.value(t))
+    np.testing.assert_array_equal(case.waveform(t), case.waveform.value(t))
+
+
+@every_case
+def test_scalars_and_arrays_of_any_shape_give_the_same_values(case: Case) -> None:
+    t = inside(case, 4)[:4]
+    values = case.waveform.value(t)
+    for time, value in zip(t, values, strict=True):
+        alone = case.waveform.value(float(time))
+        assert alone.shape == ()
+        assert float(alone) == value
+    np.testing.assert_array_equal(case.waveform.value(t.reshape(2, 2)), values.reshape(2, 2))
+    assert case.waveform.value(np.empty(0)).shape == (0,)
+
+
+@every_case
+def test_the_two_sides_of_an_edge_are_the_limits_from_the_two_sides(case: Case) -> None:
+    edges = case.waveform.breakpoints(1e-9, case.end - 1e-9)
+    if not edges.size:
+        return
+    step = 1e-11
+    slope = np.abs(np.diff(case.formula(inside(case, 400)))).max() / np.diff(inside(case, 400)).min()
+    atol = min(2.0 * step * slope, 1e-5 * size(case)) + 1e-12 * size(case)
+    np.testing.assert_allclose(case.waveform.value(edges), case.formula(edges + step), rtol=0, atol=atol)
+    np.testing.assert_allclose(
+        case.waveform.value(edges, "left"), case.formula(edges - step), rtol=0, atol=atol
+    )
+
+
+@every_case
+def test_the_breakpoints_are_all_edges_of_the_formula_each_once_and_in_order(case: Case) -> None:
+    found = case.waveform.breakpoints(0.0, case.end)
+    assert np.all(np.diff(found) > 1e-12)
+    for edge in case.edges:
+        assert np.abs(found - edge).min() < 1e-15, f"{edge} s is not a breakpoint"
+    # what is no edge of the formula must be harmless: both sides alike
+    extra = np.array([b for b in found if all(abs(b - e) > 1e-12 for e in case.edges)])
+    for b in extra:
+        assert case.waveform.value(b) == pytest.approx(case.waveform.value(b, "left"), abs=1e-9 * size(case))
+
+
+@every_case
+def test_between_its_breakpoints_the_waveform_is_smooth(case: Case) -> None:
+    """A polynomial of degree 24 through short panels must reproduce what lies between its points."""
+    longest = min(2e-3, 0.5 * case.waveform.shortest_time())
+    edges = np.unique([0.0, *case.waveform.breakpoints(0.0, case.end), case.end])
+    x = np.cos((np.arange(25) + 0.5) * math.pi / 25)
+    proof = np.modf(np.arange(1, 14) * 0.618033988749895)[0] * 2.0 - 1.0
+    for a, b in pairwise(edges):
+        cuts = np.linspace(a, b, math.ceil((b - a) / longest) + 1)
+        for c, d in pairwise(cuts):
+            middle, half = 0.5 * (c + d), 0.5 * (d - c)
+            series = np.polynomial.chebyshev.chebfit(x, case.waveform.value(middle + half * x), 24)
+            between = np.polynomial.chebyshev.chebval(proof, series)
+            exact = case.waveform.value(middle + half * proof)
+            np.testing.assert_allclose(between, exact, rtol=0, atol=1e-10 * size(case))
+
+
+@every_case
+def test_a_window_has_the_breakpoints_of_a_larger_one_that_lie_in_it(case: Case) -> None:
+    large = case.waveform.breakpoints(0.0, 0.1)
+    for t0, t1 in ((0.0, 0.01), (0.0123, 0.0377), (0.02, 0.03)):
+        expected = large[(large >= t0) & (large <= t1)]
+        np.testing.assert_array_equal(case.waveform.breakpoints(t0, t1), expected)
+
+
+# The table --------------------------------------------------------------------------------------------------
+
+
+@every_case
+@pytest.mark.parametrize("window", [(0.0, 0.05), (0.0137, 0.0421)])
+def test_the_compiled_table_has_the_values_of_the_waveform(case: Case, window: tuple[float, float]) -> None:
+    t = inside(case, 15)
+    t = t[(t > window[0]) & (t < window[1])]
+    values, _ = table_values(case, *window, t)
+    np.testing.assert_allclose(values, case.waveform.value(t), rtol=0, atol=1e-12 * size(case))
+
+
+@every_case
+def test_the_compiled_slope_is_the_derivative_of_the_formula(case: Case) -> None:
+    t = inside(case, 9, margin=0.05)
+    h = 0.003 * min(case.waveform.shortest_time(), min(b - a for a, b in pieces(case)))
+    f = case.formula
+    numeric = (8.0 * (f(t + h) - f(t - h)) - (f(t + 2.0 * h) - f(t - 2.0 * h))) / (12.0 * h)
+    _, slopes = table_values(case, 0.0, case.end, t)
+    np.testing.assert_allclose(slopes, numeric, rtol=2e-7, atol=1e-10 * size(case) / h)
+
+
+@every_case
+def test_late_in_a_long_run_the_table_still_has_the_formulas_values(case: Case) -> None:
+    # 1000 s in, a time is known to 1e-13 s: the value to 1e-13 of what the slope makes of a second
+    t0 = 1000.0
+    t = t0 + np.linspace(0.0003, 0.0397, 60)
+    values, slopes = table_values(case, t0, t0 + 0.04, t)
+    far = np.abs(t[:, None] - case.waveform.breakpoints(t0, t0 + 0.04)[None, :]).min(1, initial=1.0) > 1e-9
+    allowed = 4e-13 * np.abs(slopes) + 4e-12 * size(case)
+    assert np.all((np.abs(values - case.waveform.value(t)) <= allowed)[far])
+
+
+# Period and fundamental -------------------------------------------------------------------------------------
+
+
+@every_case
+def test_the_period_is_the_one_of_the_formula(case: Case) -> None:
+    assert case.waveform.period == (None if case.period is None else pytest.approx(case.period, rel=1e-13))
+    assert case.waveform.settled == pytest.approx(case.settled, abs=1e-15)
+    if case.period is not None:
+        t = case.settled + np.linspace(0.0, 3.0, 211)[1:-1] * case.period + 1e-7 * case.period
+        np.testing.assert_allclose(
+            case.waveform.value(t + case.period), case.waveform.value(t), rtol=0, atol=1e-11 * size(case)
+        )
+        shorter = case.waveform.value(t + case.period / 2.0) - case.waveform.value(t)
+        thirds = case.waveform.value(t + case.period / 3.0) - case.waveform.value(t)
+        assert min(np.abs(shorter).max(), np.abs(thirds).max()) > 0.01 * size(case), (
+            "a shorter period would do"
+        )
+
+
+@periodic_case
+def test_the_fundamental_is_the_fourier_integral_of_the_formula(case: Case) -> None:
+    assert case.period is not None
+    assert case.tone is not None
+    start, omega = case.settled, 2.0 * math.pi * case.tone
+    edges = case.waveform.breakpoints(start, start + case.period)
+    cuts = np.unique([start, *edges, *np.linspace(start, start + case.period, 41), start + case.period])
+    total = 0j
+    for a, b in pairwise(cuts):
+        if b - a < 1e-14:
+            continue
+        for part, weight in ((1.0, np.cos), (-1j, np.sin)):
+            value, _ = quad(
+                lambda t, w=weight: float(case.formula(np.array([t]))[0] * w(omega * t)),
+                a,
+                b,
+                epsabs=1e-13,
+                limit=50,
+            )
+            total += part * value
+    # U = Im(P exp(i omega t))
+    expected = 2j * total / case.period
+    found = case.waveform.fundamental
+    assert found is not None
+    assert found.frequency == pytest.approx(case.tone, rel=1e-14)
+    assert found.amplitude == pytest.approx(abs(expected), rel=1e-9)
+    difference = found.phase - math.atan2(expected.imag, expected.real)
+    assert math.remainder(difference, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("waveform", "amplitude", "phase"),
+    [
+        (fs.Square(1.0, 100.0), 4.0 / math.pi, 0.0),
+        (fs.Triangle(1.0, 100.0), 8.0 / math.pi**2, 0.0),
+        (fs.Sawtooth(1.0, 100.0), 2.0 / math.pi, math.pi),
+        (fs.Square(1.0, 100.0, duty=0.25), 4.0 / math.pi * math.sin(math.pi / 4), math.pi / 4),
+        (fs.Sine(-3.0, 100.0), 3.0, math.pi),
+        (fs.Sine(3.0, 100.0, phase_deg=30.0), 3.0, math.pi / 6),
+        (fs.Sine(3.0, 100.0, delay=0.001), 3.0, -math.pi / 5),
+        (fs.AM(200.0, 5000.0, 100.0), 100.0, 0.0),
+    ],
+    ids=repr,
+)
+def test_fundamentals_have_their_textbook_amplitude_and_phase(
+    waveform: fs.Waveform, amplitude: float, phase: float
+) -> None:
+    found = waveform.fundamental
+    assert found is not None
+    assert found.amplitude == pytest.approx(amplitude, rel=1e-12)
+    assert math.remainder(found.phase - phase, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-11)
+
+
+@pytest.mark.parametrize(
+    "waveform",
+    [
+        fs.DC(3.0),
+        fs.Sine(0.0, 100.0),
+        fs.Sine(3.0, 100.0, damping=1.0),
+        fs.Chirp(1.0, 10.0, 100.0, 1.0),
+        fs.PWL((0.0, 1.0), (0.0, 1.0)),
+        fs.Pulse(0.0, 1.0, 0.001),
+        fs.Sine(1.0, 100.0) + fs.Sine(-1.0, 100.0),
+        fs.Sine(1.0, 100.0) + fs.Sine(1.0, 100.0 * math.pi),
+        fs.Sine(1.0, 200.0) + fs.Sine(1.0, 300.0),
+        fs.Sine(1.0, 100.0) + fs.Chirp(1.0, 10.0, 100.0, 1.0),
+        fs.Function(np.sin),
+    ],
+    ids=repr,
+)
+def test_what_has_no_fundamental_says_so(waveform: fs.Waveform) -> None:
+    assert waveform.fundamental is None
+
+
+# Combinations -----------------------------------------------------------------------------------------------
+
+simple = st.one_of(
+    st.builds(fs.DC, st.floats(-5.0, 5.0)),
+    st.builds(
+        fs.Sine, st.floats(-5.0, 5.0), st.floats(10.0, 500.0), st.floats(-2.0, 2.0), st.floats(-180.0, 180.0)
+    ),
+    st.builds(fs.Square, st.floats(0.1, 5.0), st.floats(10.0, 300.0), st.floats(0.1, 0.9)),
+    st.builds(fs.Sawtooth, st.floats(0.1, 5.0), st.floats(10.0, 300.0)),
+    st.builds(
+        fs.Chirp, st.floats(0.1, 5.0), st.floats(10.0, 300.0), st.floats(10.0, 300.0), st.floats(0.005, 0.1)
+    ),
+)
+
+
+@settings(max_examples=40, derandomize=True, deadline=None)
+@given(a=simple, b=simple, c=simple)
+def test_sums_and_products_are_sums_and_products_of_values_in_python_and_in_the_table(
+    a: fs.Waveform, b: fs.Waveform, c: fs.Waveform
+) -> None:
+    combined = (a + b) * c + a * b
+    t = np.sort(np.modf(np.arange(1, 30) * 0.618033988749895)[0]) * 0.04
+    expected = (a.value(t) + b.value(t)) * c.value(t) + a.value(t) * b.value(t)
+    np.testing.assert_allclose(combined.value(t), expected, rtol=0, atol=1e-13 * 150.0)
+    far = np.abs(t[:, None] - combined.breakpoints(0.0, 0.04)[None, :]).min(1, initial=1.0) > 1e-12
+    values, _ = table_values(Case("", combined, combined.value), 0.0, 0.04, t[far])
+    np.testing.assert_allclose(values, expected[far], rtol=0, atol=1e-12 * 150.0)
+
+
+def test_numbers_and_functions_become_waveforms_and_other_things_do_not() -> None:
+    assert as_waveform(3) == fs.DC(3.0)
+    assert isinstance(as_waveform(math.sin), fs.Function)
+    wave = fs.Sine(1.0, 10.0)
+    assert as_waveform(wave) is wave
+    assert float((2.0 + wave).value(0.025)) == pytest.approx(3.0)
+    assert float((2.0 * wave).value(0.025)) == pytest.approx(2.0)
+    with pytest.raises(
+        fs.InputError, match="a source must be a waveform, a number or a function of time, got str"
+    ):
+        as_waveform("SIN(0 1 1)")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("frequency", [7.0, 50.0, 60.0, 100.0, 5000.0])
+def test_an_edge_is_at_the_time_a_user_writes_for_it(frequency: float) -> None:
+    """k / f, rounded once: 0.075 s is an edge of 100 Hz, not a time just before one."""
+    square = fs.Square(1.0, frequency)
+    k = np.arange(400)
+    np.testing.assert_array_equal(square.value(k / frequency), 1.0)
+    np.testing.assert_array_equal(square.value(k / frequency, "left"), -1.0)
+    np.testing.assert_array_equal(square.value((k + 0.5) / frequency), -1.0)
+    np.testing.assert_array_equal(square.value((k + 0.5) / frequency, "left"), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: fs.DC(math.nan), "DC level is nan"),
+        (lambda: fs.Sine(1.0, 0.0), "sine frequency is 0 Hz; allowed: > 0"),
+        (lambda: fs.Sine(math.inf, 1.0), "Sine amplitude is inf; allowed: a finite number"),
+        (lambda: fs.Chirp(1.0, 0.0, 10.0, 1.0), "chirp frequencies"),
+        (lambda: fs.Chirp(1.0, 1.0, 10.0, 0.0), "chirp duration is 0 s"),
+        (lambda: fs.Exp(0.0, 1.0, 0.0, 0.0, 1.0, 1.0), "EXP time constants"),
+        (lambda: fs.Exp(0.0, 1.0, 2.0, 1.0, 1.0, 1.0), "EXP td2 is 1 s; allowed: >= td1 = 2 s"),
+        (lambda: fs.AM(1.0, 1000.0, 10.0, depth=1.5), "AM depth is 1.5; allowed: 0 to 1"),
+        (lambda: fs.Square(1.0, 10.0, duty=1.0), "square duty is 1; allowed: between 0 and 1"),
+        (lambda: fs.Triangle(1.0, -10.0), "triangle frequency is -10 Hz; allowed: > 0"),
+        (lambda: fs.Sawtooth(1.0, math.nan), "Sawtooth frequency is nan"),
+        (lambda: fs.Pulse(0.0, 1.0, rise=-1.0), "pulse rise is -1 s; allowed: >= 0"),
+        (lambda: fs.Pulse(0.0, 1.0, rise=1.0, width=1.0, pulse_period=1.5), "at most the period, 1.5 s"),
+        (lambda: fs.PWL((0.0, 2.0, 1.0), (0.0, 1.0, 2.0)), "PWL times decrease: 1 s follows 2 s"),
+        (lambda: fs.PWL((0.0, 1.0, 1.0, 1.0), (0.0, 1.0, 2.0, 3.0)), "PWL time 1 s stands three times"),
+        (lambda: fs.PWL((0.0, 1.0), (0.0, math.nan)), "PWL value number 2 is nan"),
+        (lambda: fs.PWL((0.0, 1.0), (0.0, 1.0), repeat=0.5), "PWL repeat time is 0.5 s"),
+        (lambda: fs.PWL((0.0, 1.0), (0.0,)), "2 times and 1 values"),
+        (lambda: fs.Samples(np.array([1.0, math.nan]), 10.0), "sample number 1 is nan"),
+        (lambda: fs.Samples(np.array([1.0]), 10.0), "samples"),
+        (lambda: fs.Samples(np.array([1.0, 2.0]), 0.0), "sample rate is 0 Hz"),
+        (lambda: fs.Function(math.sin, repeat=-1.0), "function period is -1.0; allowed: > 0 s"),
+    ],
+)
+def test_bad_arguments_are_refused_with_what_is_allowed(make, message: str) -> None:
+    with pytest.raises(fs.InputError) as caught:
+        make()
+    assert message in str(caught.value)
+    assert "allowed" in str(caught.value) or "follows" in message or "three times" in message
+
+
+def test_the_square_is_high_for_its_duty_at_any_phase() -> None:
+    for phase in (-400.0, -90.0, 0.0, 123.0, 360.0, 1000.0):
+        wave = fs.Square(1.0, 100.0, duty=0.2, phase_deg=phase)
+        t = (np.arange(1000) + 0.5) / 1000 * 0.01
+        np.testing.assert_array_equal(wave.value(t) > 0.0, turns(t, 100.0, 0.0, phase) < 0.2)

@@ -1,0 +1,296 @@
+"""Every waveform class beside an independent formula: the registry that tests iterate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+import fingerspice as fs
+
+TAU = 2.0 * math.pi
+Formula = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A waveform, its formula (for times off the edges), where it is not smooth in [0, end], and its period."""
+
+    name: str
+    waveform: fs.Waveform
+    formula: Formula
+    edges: tuple[float, ...] = ()
+    end: float = 0.05
+    period: float | None = None
+    tone: float | None = None
+    settled: float = 0.0
+
+
+def turns(t: np.ndarray, f: float, delay: float = 0.0, phase_deg: float = 0.0) -> np.ndarray:
+    """Fraction of the period passed, in [0, 1)."""
+    x = f * (t - delay) + phase_deg / 360.0
+    return x - np.floor(x)
+
+
+def sine(
+    t: np.ndarray, a: float, f: float, o: float = 0.0, deg: float = 0.0, td: float = 0.0, k: float = 0.0
+) -> np.ndarray:
+    """SPICE's SIN(o a f td k deg)."""
+    s = np.maximum(t - td, 0.0)
+    return o + a * np.exp(-k * s) * np.sin(TAU * f * s + math.radians(deg))
+
+
+def chirp(t: np.ndarray, a: float, f0: float, f1: float, duration: float, o: float, deg: float) -> np.ndarray:
+    """The phase is the integral of the frequency: f0, then rising, then f1."""
+    rising = np.clip(t, 0.0, duration)
+    phase = f0 * rising + (f1 - f0) / duration * rising**2 / 2.0 + f1 * np.maximum(t - duration, 0.0)
+    return o + a * np.sin(TAU * phase + math.radians(deg))
+
+
+def spice_exp(
+    t: np.ndarray, v1: float, v2: float, td1: float, tau1: float, td2: float, tau2: float
+) -> np.ndarray:
+    """SPICE's EXP as its manual writes it."""
+    rise = np.where(t > td1, (v2 - v1) * (1.0 - np.exp(-np.maximum(t - td1, 0.0) / tau1)), 0.0)
+    fall = np.where(t > td2, (v1 - v2) * (1.0 - np.exp(-np.maximum(t - td2, 0.0) / tau2)), 0.0)
+    return v1 + rise + fall
+
+
+def spice_pulse(
+    t: np.ndarray, v1: float, v2: float, td: float, tr: float, tf: float, pw: float, per: float
+) -> np.ndarray:
+    """SPICE's PULSE, one time after the other, as its manual tabulates it."""
+    out = []
+    for time in np.atleast_1d(t):
+        s = time - td
+        if s > 0.0 and math.isfinite(per):
+            s = math.fmod(s, per)
+        if s <= 0.0:
+            v = v1
+        elif s < tr:
+            v = v1 + (v2 - v1) * s / tr
+        elif s < tr + pw:
+            v = v2
+        elif s < tr + pw + tf:
+            v = v2 + (v1 - v2) * (s - tr - pw) / tf
+        else:
+            v = v1
+        out.append(v)
+    return np.array(out)
+
+
+def pwl(t: np.ndarray, *points: tuple[float, float], repeat: float | None = None) -> np.ndarray:
+    """Straight lines, one time after the other; held outside, or the stretch from `repeat` on runs again."""
+    out = []
+    first, last = points[0], points[-1]
+    for time in np.atleast_1d(t):
+        s = float(time)
+        if repeat is not None and s > last[0]:
+            s = repeat + math.fmod(s - repeat, last[0] - repeat)
+        v = first[1] if s <= first[0] else last[1]
+        for (t0, v0), (t1, v1) in zip(points[:-1], points[1:], strict=True):
+            if t0 < s <= t1:
+                v = v0 + (v1 - v0) * (s - t0) / (t1 - t0)
+        out.append(v)
+    return np.array(out)
+
+
+def am(t: np.ndarray, a: float, fc: float, fm: float, depth: float, deg: float) -> np.ndarray:
+    """Largest envelope `a`."""
+    envelope = (1.0 + depth * np.sin(TAU * fm * t + math.radians(deg))) / (1.0 + depth)
+    return a * envelope * np.sin(TAU * fc * t)
+
+
+def comb(first: float, step: float, end: float) -> tuple[float, ...]:
+    """first, first + step, ... within [0, end]."""
+    return tuple(x for x in (first + step * k for k in range(-5, 2000)) if -1e-12 <= x <= end + 1e-12)
+
+
+def merge(*lists: tuple[float, ...]) -> tuple[float, ...]:
+    """Distinct times, ascending; equal up to rounding counts once."""
+    out: list[float] = []
+    for x in sorted(x for xs in lists for x in xs):
+        if not out or x - out[-1] > 1e-12:
+            out.append(x)
+    return tuple(out)
+
+
+SAMPLED = np.array([0.0, 3.0, -2.0, 5.0, 5.0, 1.0, 0.5, -4.0])
+POINTS = ((0.004, 1.0), (0.01, 5.0), (0.01, -3.0), (0.022, -3.0), (0.03, 2.0))
+
+CASES = (
+    Case("dc", fs.DC(12.5), lambda t: 12.5 + 0.0 * t),
+    Case("sine", fs.Sine(200.0, 100.0), lambda t: sine(t, 200.0, 100.0), period=0.01, tone=100.0),
+    Case(
+        "sine with everything",
+        fs.Sine(-20.0, 130.0, offset=3.0, phase_deg=40.0, delay=0.0071),
+        lambda t: sine(t, -20.0, 130.0, 3.0, 40.0, 0.0071),
+        (0.0071,),
+        period=1.0 / 130.0,
+        tone=130.0,
+        settled=0.0071,
+    ),
+    Case(
+        "damped sine",
+        fs.Sine(20.0, 130.0, offset=3.0, phase_deg=40.0, delay=0.0071, damping=90.0),
+        lambda t: sine(t, 20.0, 130.0, 3.0, 40.0, 0.0071, 90.0),
+        (0.0071,),
+    ),
+    Case(
+        "chirp",
+        fs.Chirp(7.0, 50.0, 900.0, 0.03, offset=-1.0, phase_deg=30.0),
+        lambda t: chirp(t, 7.0, 50.0, 900.0, 0.03, -1.0, 30.0),
+        (0.0, 0.03),
+    ),
+    Case(
+        "falling chirp",
+        fs.Chirp(7.0, 900.0, 50.0, 0.03),
+        lambda t: chirp(t, 7.0, 900.0, 50.0, 0.03, 0.0, 0.0),
+        (0.0, 0.03),
+    ),
+    Case(
+        "exp",
+        fs.Exp(1.0, 9.0, 0.005, 0.002, 0.02, 0.007),
+        lambda t: spice_exp(t, 1.0, 9.0, 0.005, 0.002, 0.02, 0.007),
+        (0.005, 0.02),
+    ),
+    Case(
+        "am",
+        fs.AM(200.0, 2000.0, 100.0, depth=0.7, phase_deg=25.0),
+        lambda t: am(t, 200.0, 2000.0, 100.0, 0.7, 25.0),
+        period=0.01,
+        tone=2000.0,
+    ),
+    Case(
+        "square",
+        fs.Square(200.0, 100.0),
+        lambda t: np.where(turns(t, 100.0) < 0.5, 200.0, -200.0),
+        comb(0.0, 0.005, 0.05),
+        period=0.01,
+        tone=100.0,
+    ),
+    Case(
+        "square with everything",
+        fs.Square(20.0, 130.0, duty=0.3, offset=2.0, phase_deg=50.0, delay=0.0011),
+        lambda t: np.where(turns(t, 130.0, 0.0011, 50.0) < 0.3, 22.0, -18.0),
+        merge(
+            comb(0.0011 - 50.0 / 360.0 / 130.0, 1.0 / 130.0, 0.05),
+            comb(0.0011 - 50.0 / 360.0 / 130.0 + 0.3 / 130.0, 1.0 / 130.0, 0.05),
+        ),
+        period=1.0 / 130.0,
+        tone=130.0,
+    ),
+    Case(
+        "triangle",
+        fs.Triangle(20.0, 130.0, offset=2.0, phase_deg=50.0, delay=0.0011),
+        lambda t: 2.0 + 40.0 / math.pi * np.arcsin(np.sin(TAU * (130.0 * (t - 0.0011) + 50.0 / 360.0))),
+        comb(0.0011 + (0.25 - 50.0 / 360.0) / 130.0, 0.5 / 130.0, 0.05),
+        period=1.0 / 130.0,
+        tone=130.0,
+    ),
+    Case(
+        "sawtooth",
+        fs.Sawtooth(20.0, 130.0, offset=2.0, phase_deg=50.0, delay=0.0011),
+        lambda t: 2.0 + 20.0 * (2.0 * turns(t, 130.0, 0.0011, 50.0) - 1.0),
+        comb(0.0011 - 50.0 / 360.0 / 130.0, 1.0 / 130.0, 0.05),
+        period=1.0 / 130.0,
+        tone=130.0,
+    ),
+    Case(
+        "pulse train",
+        fs.Pulse(-1.0, 5.0, 0.003, 0.001, 0.002, 0.004, 0.012),
+        lambda t: spice_pulse(t, -1.0, 5.0, 0.003, 0.001, 0.002, 0.004, 0.012),
+        merge(
+            *(comb(0.003 + x + k * 0.012, 1.0, 0.05) for x in (0.0, 0.001, 0.005, 0.007) for k in range(5))
+        ),
+        period=0.012,
+        tone=1.0 / 0.012,
+        settled=0.003,
+    ),
+    Case(
+        "ideal pulses without a pause",
+        fs.Pulse(-1.0, 5.0, 0.003, 0.0, 0.002, 0.010, 0.012),
+        lambda t: spice_pulse(t, -1.0, 5.0, 0.003, 0.0, 0.002, 0.010, 0.012),
+        merge(comb(0.003, 0.012, 0.05), comb(0.013, 0.012, 0.05)),
+        period=0.012,
+        tone=1.0 / 0.012,
+        settled=0.003,
+    ),
+    Case(
+        "one pulse",
+        fs.Pulse(-1.0, 5.0, 0.003, 0.001, 0.002, 0.004),
+        lambda t: spice_pulse(t, -1.0, 5.0, 0.003, 0.001, 0.002, 0.004, math.inf),
+        (0.003, 0.004, 0.008, 0.010),
+    ),
+    Case(
+        "step",
+        fs.Pulse(-1.0, 5.0, 0.003),
+        lambda t: np.where(t < 0.003, -1.0, 5.0),
+        (0.003,),
+    ),
+    Case(
+        "pwl",
+        fs.PWL(*zip(*POINTS, strict=True)),
+        lambda t: pwl(t, *POINTS),
+        (0.004, 0.01, 0.022, 0.03),
+    ),
+    Case(
+        "repeated pwl",
+        fs.PWL(*zip(*POINTS, strict=True), repeat=0.022),
+        lambda t: pwl(t, *POINTS, repeat=0.022),
+        (0.004, 0.01, 0.022, 0.03, 0.038, 0.046),
+        period=0.008,
+        tone=125.0,
+        settled=0.03,
+    ),
+    Case(
+        "samples",
+        fs.Samples(SAMPLED, 250.0, start=0.002),
+        lambda t: np.interp(t, 0.002 + np.arange(8) / 250.0, SAMPLED),
+        tuple(0.002 + np.arange(8) / 250.0),
+    ),
+    Case(
+        "sum",
+        fs.Sine(20.0, 100.0, phase_deg=10.0) + fs.Square(5.0, 300.0) + 4.0,
+        lambda t: sine(t, 20.0, 100.0, 0.0, 10.0) + np.where(turns(t, 300.0) < 0.5, 9.0, -1.0),
+        comb(0.0, 1.0 / 600.0, 0.05),
+        period=0.01,
+        tone=100.0,
+    ),
+    Case(
+        "product",
+        fs.Sine(20.0, 1000.0, phase_deg=10.0) * fs.Triangle(1.0, 100.0, offset=1.5) * 2.0,
+        lambda t: (
+            2.0
+            * sine(t, 20.0, 1000.0, 0.0, 10.0)
+            * (1.5 + 2.0 / math.pi * np.arcsin(np.sin(TAU * 100.0 * t)))
+        ),
+        comb(0.0025, 0.005, 0.05),
+        period=0.01,
+        tone=1000.0,
+    ),
+    Case(
+        "product of a chirp, a ramp and an exponential",
+        fs.Chirp(7.0, 50.0, 400.0, 0.03)
+        * fs.PWL((0.0, 0.05), (1.0, 3.0))
+        * fs.Exp(1.0, 2.0, 0.0, 0.01, 0.02, 0.01),
+        lambda t: (
+            chirp(t, 7.0, 50.0, 400.0, 0.03, 0.0, 0.0)
+            * (1.0 + 40.0 * t)
+            * spice_exp(t, 1.0, 2.0, 0.0, 0.01, 0.02, 0.01)
+        ),
+        (0.0, 0.02, 0.03, 0.05),
+    ),
+    Case(
+        "function",
+        fs.Function(
+            lambda t: np.where(t % 0.02 < 0.013, np.exp(-30.0 * (t % 0.02)), -1.0), (0.0, 0.013), 0.02
+        ),
+        lambda t: np.where(t % 0.02 < 0.013, np.exp(-30.0 * (t % 0.02)), -1.0),
+        (0.0, 0.013, 0.02, 0.033, 0.04),
+        period=0.02,
+        tone=50.0,
+    ),
+)
