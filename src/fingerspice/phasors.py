@@ -96,7 +96,10 @@ def phasor(circuit: Circuit, frequency: ArrayLike | None = None, *, area: str | 
         frequency = fundamental.frequency
     f = np.atleast_1d(np.asarray(frequency, float))
     require(
-        f.ndim == 1 and bool(np.all(np.isfinite(f) & (f > 0.0))), "frequency", f"{frequency} Hz", "positive numbers"
+        f.ndim == 1 and bool(np.all(np.isfinite(f) & (f > 0.0))),
+        "frequency",
+        f"{frequency} Hz",
+        "positive numbers",
     )
     areas = _areas(stack, f, area, None if fundamental is None else fundamental.amplitude)
     gains = layer_gains(stack.admittance(f, areas))

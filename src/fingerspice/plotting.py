@@ -74,7 +74,7 @@ def new_figure(rows: int, columns: int = 1, height: float = 3.0, **options: Any)
 
 
 def dress(ax: Axes, ylabel: str = "", xlabel: str = "") -> None:
-    """Labels (plain text), light grid, no box."""
+    """Labels, light grid, no box."""
     if ylabel:
         ax.set_ylabel(ylabel, fontsize=FONT)
     if xlabel:
@@ -88,23 +88,16 @@ def dress(ax: Axes, ylabel: str = "", xlabel: str = "") -> None:
 
 def legend_above(ax: Axes, columns: int = 4, *, right: bool = False, math: bool = False) -> None:
     """A legend over the panel, where it covers no data; without `math` names keep their ``$``."""
-    x = 1.0 if right else 0.0
-    legend = ax.legend(
-        loc="lower right" if right else "lower left",
-        bbox_to_anchor=(x, 1.0),
-        ncols=columns,
-        fontsize=FONT - 0.5,
-        frameon=False,
-        borderaxespad=0.1,
-        borderpad=0.2,
-    )
+    place: dict[str, Any] = {"loc": "lower right" if right else "lower left", "bbox_to_anchor": (right, 1.0)}
+    space = {"borderaxespad": 0.1, "borderpad": 0.2}
+    legend = ax.legend(ncols=columns, fontsize=FONT - 0.5, frameon=False, **place, **space)
     for text in legend.get_texts():
         text.set_parse_math(math)
 
 
 def caption(figure: Figure, text: str, color: str = GREY) -> None:
     """Small print under the figure, wrapped to its width."""
-    small = figure.supxlabel(textwrap.fill(text, 128), x=0.012, ha="left", fontsize=SMALL, color=color)
+    small = figure.supxlabel(textwrap.fill(text, 140), x=0.012, ha="left", fontsize=SMALL, color=color)
     small.set_parse_math(False)
 
 
@@ -150,9 +143,8 @@ def thin(t: FloatArray, x: FloatArray, bins: int = MAX_BINS) -> tuple[FloatArray
     blocks = x[: width * bins].reshape(bins, width)
     start = width * np.arange(bins)
     tail = np.arange(width * bins, t.size)
-    keep = np.unique(
-        np.concatenate([start, start + width - 1, start + blocks.argmin(1), start + blocks.argmax(1), tail])
-    )
+    ends = (start, start + width - 1, start + blocks.argmin(1), start + blocks.argmax(1))
+    keep = np.unique(np.concatenate([*ends, tail]))
     return t[keep], x[keep]
 
 
@@ -169,11 +161,8 @@ def plot_solution(solution: Solution) -> Figure:
     Figure
     """
     contact = solution.f_el is not None
-    figure, axes = (
-        new_figure(4, height=6.2, sharex=True, height_ratios=[1.5, 1.2, 1.0, 1.0])
-        if contact
-        else new_figure(1, height=3.4)
-    )
+    rows: dict[str, Any] = {"height": 6.2, "height_ratios": [1.5, 1.2, 1.0, 1.0]} if contact else {"height": 3.4}
+    figure, axes = new_figure(4 if contact else 1, sharex=True, **rows)
     _voltages(axes[0], solution)
     if contact:
         _force(axes[1], solution)
@@ -204,7 +193,7 @@ def _end(solution: Solution) -> float:
 
 
 def _voltages(ax: Axes, solution: Solution) -> None:
-    factor, unit = engineering(_peak(solution.u_source), "V", 0.5)
+    factor, unit = engineering(_peak(solution.u_source), "V", 2.0)
     source = {"color": GREY, "linewidth": 1.0, "linestyle": DASHES[1], "label": "source"}
     _curve(ax, solution, factor * solution.u_source, **source)
     if solution.u_gap is not None:
@@ -247,9 +236,7 @@ def _friction(ax: Axes, solution: Solution) -> None:
     dress(ax, f"Friction [{unit}]")
     _from_zero(ax)
     load = factor * solution.circuit.by_device("GAP")[0].values["fn"]
-    right = ax.secondary_yaxis(
-        "right", functions=(partial(np.multiply, 1.0 / load), partial(np.multiply, load))
-    )
+    right = ax.secondary_yaxis("right", functions=(partial(np.multiply, 1.0 / load), partial(np.multiply, load)))
     right.set_ylabel("coefficient", fontsize=FONT, color=GREY)
     right.tick_params(labelsize=FONT - 0.5, color="#999999", labelcolor=GREY)
     right.spines["right"].set_color("#999999")
@@ -273,17 +260,15 @@ def _time_axis(axes: Sequence[Axes], solution: Solution) -> None:
             ax.axvspan(factor * stop, factor * (start + 1.08 * span), color="#EEEEEE", zorder=0.5)
             ax.axvline(factor * stop, color=VERMILION, linewidth=1.2, linestyle=DASHES[3])
     if early:
-        axes[0].annotate(
-            "stopped ", (factor * stop, 1.0), xycoords=("data", "axes fraction"), ha="right", va="bottom",
-            fontsize=FONT - 0.5, color=VERMILION,
-        )  # fmt: skip
+        place: dict[str, Any] = {"transform": axes[0].get_xaxis_transform(), "ha": "right", "va": "bottom"}
+        axes[0].text(factor * stop, 1.0, "stopped ", fontsize=FONT - 0.5, color=VERMILION, **place)
     axes[-1].set_xlabel(f"Time [{unit}]", fontsize=FONT)
 
 
 def _about(solution: Solution) -> str:
-    error = f"error at most {solution.error.u_gap:.2g} V"
+    error = f"error estimate {solution.error.u_gap:.2g} V"
     if solution.f_el is not None:
-        error += f" and {solution.error.f_el:.2g} N (estimate)"
+        error += f", {solution.error.f_el:.2g} N"
     parts = [solution.circuit.title, f"{solution.charge_law} charge law"]
     if solution.f_el is not None:
         parts.append(f"area: {solution.area_mode}")
@@ -316,18 +301,15 @@ def plot_phasor(result: PhasorSolution, circuit: Circuit) -> Figure:
         (axes[2], factor * result.f_el_mean, f"Mean electroadhesive force [{unit}]", VERMILION),
         (axes[3], 1e6 * result.area, "Ridge area [mm²]", GREEN),
     ):
-        ax.plot(
-            f, values[order], color=color, linewidth=1.5, marker="o" if f.size < 12 else "", markersize=3.5
-        )
+        ax.plot(f, values[order], color=color, linewidth=1.5, marker="o" if f.size < 12 else "", markersize=3.5)
         dress(ax, label)
         ax.set_xscale("log")
+        ax.set_xlim(*((f[0], f[-1]) if f[0] < f[-1] else (0.1 * f[0], 10.0 * f[0])))
         ax.ticklabel_format(axis="y", useOffset=False)
     for ax in (axes[0], axes[2]):
         _from_zero(ax)
     if not np.isfinite(result.amplitude):
-        axes[2].text(
-            0.5, 0.5, "the source has no fundamental", transform=axes[2].transAxes, ha="center", fontsize=FONT
-        )
+        axes[2].text(0.5, 0.5, "the source has no fundamental", transform=axes[2].transAxes, ha="center", fontsize=FONT)
     _flat(axes[3], 1e6 * result.area)
     outside = _mark_extrapolation(axes, f, circuit)
     for ax in axes[2:]:
@@ -373,7 +355,7 @@ def plot_comparison(comparison: Comparison) -> Figure:
     source_phase = solution.fundamental.phase if solution.fundamental else 0.0
     angle = 2.0 * np.pi * comparison.frequency * solution.t + source_phase + np.radians(p.phase_deg)
     _voltages(axes[0], solution)
-    per_volt = engineering(_peak(solution.u_source), "V", 0.5)[0]
+    per_volt = engineering(_peak(solution.u_source), "V", 2.0)[0]
     dashed = {"color": BLACK, "linestyle": DASHES[3], "linewidth": 1.5, "label": "gap, phasor"}
     _curve(axes[0], solution, per_volt * p.amplitude * np.sin(angle), **dashed)
     legend_above(axes[0])
@@ -386,7 +368,7 @@ def plot_comparison(comparison: Comparison) -> Figure:
     legend_above(axes[1])
     _time_axis(axes[:2], solution)
     _table(axes[2], comparison)
-    caption(figure, f"{_about(solution)} · periodic state")
+    caption(figure, f"{_about(solution)} · periodic state; the phasor is of the fundamental alone")
     figure.align_ylabels(axes[:2])
     return figure
 
@@ -398,28 +380,19 @@ def _table(ax: Axes, comparison: Comparison) -> None:
         "f_el_mean": "Mean electroadhesive force",
         "area_mean": "Mean ridge area",
     }
-    head = [
-        "",
-        "phasor",
-        "transient,\nmean area",
-        "transient,\ncoupled",
-        "coupled −\nphasor",
-        "of it, ripple\nof the area",
-    ]
+    text = "|phasor|transient,\nmean area|transient,\ncoupled|coupled −\nphasor|of it, ripple\nof the area"
+    head = text.split("|")
     cells = [
-        [names[row[0]], *(f"{x:.5g}" for x in row[2:5]), *(f"{x:+.2g}" for x in row[5:])]
+        [
+            f"{names[row[0]]} [{row[1].replace('deg', '°').replace('^2', '²')}]",
+            *(f"{x:.5g}".replace("-", "−") for x in row[2:5]),
+            *(f"{x:+.2g}".replace("-", "−") for x in row[5:]),
+        ]
         for row in comparison.rows()
     ]
-    for line, (_, unit, *_) in zip(cells, comparison.rows(), strict=True):
-        line[0] += f" [{'°' if unit == 'deg' else unit.replace('^2', '²')}]"
     ax.axis("off")
-    table = ax.table(
-        cellText=[head, *cells],
-        cellLoc="right",
-        loc="center",
-        edges="horizontal",
-        colWidths=[0.36, *[0.128] * 5],
-    )
+    widths = [0.36, *[0.128] * 5]
+    table = ax.table([head, *cells], cellLoc="right", loc="center", edges="horizontal", colWidths=widths)
     table.auto_set_font_size(False)
     table.set_fontsize(FONT - 0.5)
     for (row, column), cell in table.get_celld().items():

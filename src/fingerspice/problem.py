@@ -104,9 +104,7 @@ def _largest_voltage(waveform: Waveform, t_stop: float | None, circuit: Circuit)
     return peak if math.isfinite(peak) else 0.0
 
 
-def _times(
-    circuit: Circuit, t_start: float, t_stop: float | None, t_eval: FloatArray | None
-) -> tuple[float, float]:
+def _times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: FloatArray | None) -> tuple[float, float]:
     """End of the run and output spacing, s."""
     tran = circuit.tran
     if t_stop is None:
@@ -255,9 +253,7 @@ def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
     InputError
         Where two or more layers do not leak: the node between them has no DC voltage.
     """
-    insulating = [
-        e.name for e, g in zip(stack.layers, stack.g_total + stack.g_area, strict=True) if g == 0.0
-    ]
+    insulating = [e.name for e, g in zip(stack.layers, stack.g_total + stack.g_area, strict=True) if g == 0.0]
     if len(insulating) > 1:
         raise InputError(
             f"no DC operating point: {' and '.join(insulating)} do not leak, so the nodes between them are reached "

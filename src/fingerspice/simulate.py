@@ -78,7 +78,12 @@ def simulate(
     SolveError
         Where the run failed and `throw` is set; its `solution` holds what came before.
     """
-    require(isinstance(rtol, (int, float)) and RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-13 to 0.1")
+    require(
+        isinstance(rtol, (int, float)) and RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1],
+        "rtol",
+        rtol,
+        "1e-13 to 0.1",
+    )
     if sources:
         circuit = _with_sources(circuit, sources)
     times = None if t_eval is None else np.asarray(t_eval, float)
@@ -105,9 +110,7 @@ def run_problem(
     return _solution(problem, run, rtol, name, t_out, time.perf_counter() - begin)
 
 
-def _with_sources(
-    circuit: Circuit, sources: Mapping[str, Waveform | float | Callable[[float], float]]
-) -> Circuit:
+def _with_sources(circuit: Circuit, sources: Mapping[str, Waveform | float | Callable[[float], float]]) -> Circuit:
     for name in sources:
         if circuit[name].device != "V":
             raise InputError(f"sources names {name!r}, which is a {circuit[name].device}; allowed: a V element")

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from fingerspice.circuit.waveforms import Fundamental
 
 FloatArray = NDArray[np.float64]
+# Dimensions, values, attributes: what both xarray and NetCDF take.
+_Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]
 
 
 class Status(Enum):
@@ -170,7 +172,10 @@ class Solution:
         Means are trapezoidal over the output times. `f_el_mean` is over the whole run, `f_el_mean_periodic` over
         the last period of the source; the entries of a period are None where the run holds none.
         """
-        out: dict[str, Any] = {"t_stop": float(self.t[-1]) if self.t.size else None, "status": self.status.name}
+        out: dict[str, Any] = {
+            "t_stop": float(self.t[-1]) if self.t.size else None,
+            "status": self.status.name,
+        }
         out.update({f"error_{k}": v for k, v in vars(self.error).items()})
         if self.t.size < 2:
             return out
@@ -262,6 +267,29 @@ class Solution:
 
         return write_aside(Path(path), write)
 
+    def _dataset(self, jumps: str) -> tuple[dict[str, _Variable], dict[str, _Variable]]:
+        """Variables and coordinates of the data files, as (dimensions, values, attributes)."""
+        from fingerspice.circuit.waveforms import require
+
+        require(jumps in ("right", "both"), "jumps", repr(jumps), "'right' or 'both'")
+        keep = np.ones(self.t.size, bool)
+        if jumps == "right" and self.t.size:
+            keep[:-1] = np.diff(self.t) > 0.0
+        data: dict[str, _Variable] = {
+            name: (("time",), value[keep], {"units": unit, "long_name": text})
+            for name, (value, unit, text) in self.signals.items()
+            if not name.startswith(("u_layer:", "v:"))
+        }
+        data["u_layer"] = (("time", "layer"), self.u_layer[keep], {"units": "V", "long_name": "layer voltage"})
+        nodes = np.column_stack(list(self.node_voltages.values()))[keep]
+        data["v"] = (("time", "node"), nodes, {"units": "V", "long_name": "node voltage"})
+        coords: dict[str, _Variable] = {
+            "time": (("time",), self.t[keep], {"units": "s", "long_name": "time"}),
+            "layer": (("layer",), np.array(self.layers, dtype=object), {}),
+            "node": (("node",), np.array(list(self.node_voltages), dtype=object), {}),
+        }
+        return data, coords
+
     def to_xarray(self, *, jumps: str = "right") -> xarray.Dataset:
         """The run as an xarray Dataset with units and provenance.
 
@@ -269,46 +297,42 @@ class Solution:
         ----------
         jumps : str
             ``"right"``: times are unique, with the right-hand value at a jump; ``"both"``: as in the arrays.
-        """
-        import xarray
-
-        from fingerspice.circuit.waveforms import require
-
-        require(jumps in ("right", "both"), "jumps", repr(jumps), "'right' or 'both'")
-        keep = np.ones(self.t.size, bool)
-        if jumps == "right" and self.t.size:
-            keep[:-1] = np.diff(self.t) > 0.0
-        data: dict[str, Any] = {
-            "u_layer": (("time", "layer"), self.u_layer[keep], {"units": "V", "long_name": "layer voltage"})
-        }
-        for name, (value, unit, text) in self.signals.items():
-            if not name.startswith(("u_layer:", "v:")):
-                data[name] = ("time", value[keep], {"units": unit, "long_name": text})
-        data["v"] = (
-            ("time", "node"),
-            np.column_stack(list(self.node_voltages.values()))[keep],
-            {"units": "V", "long_name": "node voltage"},
-        )
-        return xarray.Dataset(
-            data,
-            coords={
-                "time": ("time", self.t[keep], {"units": "s", "long_name": "time"}),
-                "layer": list(self.layers),
-                "node": list(self.node_voltages),
-            },
-            attrs=self.provenance(),
-        )
-
-    def to_netcdf(self, path: str | Path, *, jumps: str = "right") -> Path:
-        """Write `to_xarray` as a NetCDF file.
 
         Raises
         ------
         InputError
-            Where the folder cannot be written.
+            For another value of `jumps`.
         """
-        dataset = self.to_xarray(jumps=jumps)
-        return write_aside(Path(path), lambda target: dataset.to_netcdf(target, engine="h5netcdf"))
+        import xarray
+
+        data, coords = self._dataset(jumps)
+        return xarray.Dataset(data, coords=coords, attrs=self.provenance())
+
+    def to_netcdf(self, path: str | Path, *, jumps: str = "right") -> Path:
+        """Write `to_xarray` as a NetCDF file, without the cost of loading xarray.
+
+        Raises
+        ------
+        InputError
+            Where the folder cannot be written, or for another value of `jumps`.
+        """
+        import h5netcdf
+        import h5py
+
+        data, coords = self._dataset(jumps)
+
+        def write(target: Path) -> None:
+            with h5netcdf.File(target, "w") as file:
+                for name, (_, values, _) in coords.items():
+                    file.dimensions[name] = values.size
+                for name, (dimensions, values, attributes) in {**coords, **data}.items():
+                    kind = h5py.string_dtype() if values.dtype == object else values.dtype
+                    variable = file.create_variable(name, dimensions, dtype=kind, data=values)
+                    variable.attrs.update(attributes)
+                for key, text in self.provenance().items():
+                    file.attrs[key] = text
+
+        return write_aside(Path(path), write)
 
     def plot(self) -> Figure:
         """Source and gap voltage, force and area against time."""

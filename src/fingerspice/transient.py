@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -102,7 +103,10 @@ class _Track:
         if not pending:
             return
         segment = Segment(
-            float(table.edges[-2]), float(table.edges[-1] - table.edges[-2]), table.terms[-1], table.series[-1]
+            float(table.edges[-2]),
+            float(table.edges[-1] - table.edges[-2]),
+            table.terms[-1],
+            table.series[-1],
         )
         tau = self.t - segment.start
         stop = self.problem.t_stop
@@ -115,7 +119,13 @@ class _Track:
         u, du = loop.enter(self.problem.model, segment, tau, self.y, self.control)
         for i in pending:
             write_row(
-                self.problem.model, u, du, self.y, self.control[loop.SIGN], self.control[loop.U_GAP], self.rows[i]
+                self.problem.model,
+                u,
+                du,
+                self.y,
+                self.control[loop.SIGN],
+                self.control[loop.U_GAP],
+                self.rows[i],
             )
             self.counters[loop.OUTPUT] += 1
 
@@ -188,7 +198,7 @@ def integrate(
     status, detail, t_failed = Status.SUCCESS, "", None
     edges = windows(problem)
     table = None
-    for w0, w1 in zip(edges[:-1], edges[1:], strict=True):
+    for w0, w1 in itertools.pairwise(edges):
         table = source_table(problem.waveform, w0, w1, min(1e-3, max(0.05 * tol, 1e-14)), problem.step)
         code = loop.LOG_FULL
         while code == loop.LOG_FULL:
@@ -224,9 +234,12 @@ def integrate(
             "nfev_solution": int(c[loop.NFEV]),
         },
         state=State(
-            main.t, main.y.copy(), float(main.control[loop.U_BEFORE]), problem.initial.charge_offset,
+            main.t,
+            main.y.copy(),
+            float(main.control[loop.U_BEFORE]),
+            problem.initial.charge_offset,
             problem.charge_law,
-        ),  # fmt: skip
+        ),
         t_failed=t_failed,
         detail=detail,
     )
@@ -262,9 +275,7 @@ class _Meter:
 
     def error(self) -> ErrorEstimate:
         # Rounding is an error too, and two runs may share it.
-        return ErrorEstimate(
-            SAFETY * self.diff_u + 4e-16 * self.peak_u, SAFETY * self.diff_f + 4e-16 * self.peak_f
-        )
+        return ErrorEstimate(SAFETY * self.diff_u + 4e-16 * self.peak_u, SAFETY * self.diff_f + 4e-16 * self.peak_f)
 
 
 def choose_tableau(problem: Problem, rtol: float) -> Tableau:

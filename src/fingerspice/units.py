@@ -145,8 +145,7 @@ def _power_of_ten(letters: str, text: str, as_written: str) -> int:
         meanings = {"a": f"atto ({digits}e-18) or ampere: write {digits}", "x": f"mega: write {digits}meg"}
         raise ValueError(f"'{text}' differs between simulators: '{as_written}' may be {meanings[letters[0]]}")
     raise ValueError(
-        f"'{as_written}' in '{text}' is neither a scale (t g meg k m mil u n p f) nor a known unit: "
-        f"write {digits}"
+        f"'{as_written}' in '{text}' is neither a scale (t g meg k m mil u n p f) nor a known unit: write {digits}"
     )
 
 

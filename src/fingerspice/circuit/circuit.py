@@ -230,9 +230,7 @@ def check(circuit: Circuit) -> None:
 def _check_contact(gap: Element) -> None:
     m, n = gap.values["m_exp"], gap.values["n_exp"]
     if not 0.0 < m < n:
-        raise InputError(
-            f"{gap.name} exponents are m_exp={m:g}, n_exp={n:g}; allowed: 0 < m_exp < n_exp", gap.where
-        )
+        raise InputError(f"{gap.name} exponents are m_exp={m:g}, n_exp={n:g}; allowed: 0 < m_exp < n_exp", gap.where)
     if not 1.0 / m + 1.0 / n > 1.0:
         raise InputError(
             f"{gap.name} exponents m_exp={m:g}, n_exp={n:g} give 1/m + 1/n = {1 / m + 1 / n:.4g}; allowed: more "

@@ -409,10 +409,7 @@ def _look_up(name: str, names: Mapping[str, float], expression: Expression) -> f
         return names[name]
     if name in CONSTANTS:
         return CONSTANTS[name]
-    if name in FUNCTIONS:
-        hint = f": the function is written {name}(...)"
-    else:
-        hint = nearest(name, {**names, **CONSTANTS})
+    hint = f": the function is written {name}(...)" if name in FUNCTIONS else nearest(name, {**names, **CONSTANTS})
     position = expression.positions[name]
     written = expression.text[position : position + len(name)]
     raise _Problem(f"parameter '{written}' is not defined{hint}", position)

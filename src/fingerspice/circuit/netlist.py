@@ -21,10 +21,10 @@ from fingerspice.units import suggest_mega, unit_read_as_scale
 
 _UNIT_TRAPS = {"F": "farad", "N": "newton"}
 _NGSPICE_OPTIONS = frozenset(
-    "abstol acct bypass chgtol defad defas defl defw gmin gminsteps interp itl1 itl2 itl3 itl4 itl5 itl6 keepopinfo"
-    " klu list maxevtiter maxopalter maxord method minbreak noacct noinit nomod nopage node noopalter numdgt opts"
-    " pivrel pivtol ramptime reltol rshunt savecurrents seed seedinfo sparse srcsteps temp tnom trtol"
-    " trytocompact vntol warn xmu".split()
+    """abstol acct bypass chgtol defad defas defl defw gmin gminsteps interp itl1 itl2 itl3 itl4 itl5 itl6 keepopinfo
+    klu list maxevtiter maxopalter maxord method minbreak noacct noinit nomod nopage node noopalter numdgt opts
+    pivrel pivtol ramptime reltol rshunt savecurrents seed seedinfo sparse srcsteps temp tnom trtol trytocompact
+    vntol warn xmu""".split()  # noqa: SIM905
 )
 
 
@@ -100,7 +100,8 @@ def _element(statement: Statement, timing: Timing, notes: list[str]) -> Element:
         device = statement.device or ""
         if (device, "") in LATER:
             raise InputError(
-                f"{statement.name}: {device} ({LATER[device, '']}) is not simulated by this version", statement.where
+                f"{statement.name}: {device} ({LATER[device, '']}) is not simulated by this version",
+                statement.where,
             )
         values = _device_values(statement, device, notes)
     elif statement.letter in "VI":
@@ -163,7 +164,8 @@ def _value(name: str, spec: ParameterSpec, given: Number | Token, notes: list[st
     _catch_traps(name, spec, given, notes)
     if not spec.accepts(given.value):
         raise InputError(
-            f"{name} {spec.name} is {given.text}{unit} ({given.value:g}{unit}); allowed: {spec.allowed()}", given.where
+            f"{name} {spec.name} is {given.text}{unit} ({given.value:g}{unit}); allowed: {spec.allowed()}",
+            given.where,
         )
     return given.value
 
@@ -240,7 +242,11 @@ def _tran(directive: Directive) -> Tran:
         "at most 1e8 output steps in a run",
     )
     return Tran(
-        step.value, stop.value, start.value if start else 0.0, longest.value if longest else None, "uic" in words
+        step.value,
+        stop.value,
+        start.value if start else 0.0,
+        longest.value if longest else None,
+        "uic" in words,
     )
 
 
@@ -316,3 +322,17 @@ def source_from_text(text: str, circuit: Circuit) -> Waveform:
         raise InputError(f"--source {text!r} is not one source")
     timing = Timing(tran.step if tran else None, tran.stop if tran else None)
     return read_source("--source", deck.statements[0].body, timing, deck.statements[0].where)
+
+
+def sweep_from_text(text: str) -> AcSweep:
+    """A sweep from text such as ``dec 10 10 100k``.
+
+    Raises
+    ------
+    InputError
+        When the text is not a sweep.
+    """
+    deck = parse_deck(f"sweep\n.ac {text}\n", Path("--sweep"))
+    if deck.ac is None:
+        raise InputError(f"--sweep {text!r} is not understood; allowed: DEC|OCT|LIN N FSTART FSTOP")
+    return _ac(deck.ac)

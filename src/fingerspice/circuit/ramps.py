@@ -360,7 +360,12 @@ class Samples(_Ramps):
         values = np.array(self.values, float)
         values.flags.writeable = False
         object.__setattr__(self, "values", values)
-        require(values.ndim == 1 and values.size >= 2, "samples", f"shape {values.shape}", "one row of two or more")
+        require(
+            values.ndim == 1 and values.size >= 2,
+            "samples",
+            f"shape {values.shape}",
+            "one row of two or more",
+        )
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
             raise InputError(f"sample number {bad[0]} is {values[bad[0]]}; allowed: finite numbers")

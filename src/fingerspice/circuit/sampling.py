@@ -7,6 +7,7 @@ kept as a segment edge, and warned about.
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections.abc import Callable
@@ -141,7 +142,7 @@ def source_table(waveform: Waveform, t0: float, t1: float, tol: float, step: flo
     if terms is not None:
         return SourceTable(edges, np.ascontiguousarray(terms), np.zeros((edges.size - 1, 0)))
     pieces = _Refiner(waveform, tol, step)
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in itertools.pairwise(edges):
         if not pieces.cover(float(a), float(b)):
             break
     pieces.warn()
@@ -176,7 +177,7 @@ class _Refiner:
         longest = min(8.0 * self.step, 2.0 * self.waveform.shortest_time())
         count = max(1, math.ceil((b - a) / longest))
         cuts = np.linspace(a, b, count + 1)
-        stack = [(float(x), float(y), 0) for x, y in zip(cuts[:-1], cuts[1:], strict=True)][::-1]
+        stack = [(float(x), float(y), 0) for x, y in itertools.pairwise(cuts)][::-1]
         while stack:
             lo, hi, depth = stack.pop()
             series, values = self._try(lo, hi)

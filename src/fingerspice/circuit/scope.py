@@ -253,9 +253,7 @@ class Scope:
         values = {key: self.value(line, pair.value, bare) for key, pair in group.params.items()}
         return values, {key: line.where(pair.key.position) for key, pair in group.params.items()}
 
-    def words(
-        self, line: Line, words: list[Lexeme | Group], bare: Bare = "nothing"
-    ) -> tuple[Value | Call, ...]:
+    def words(self, line: Line, words: list[Lexeme | Group], bare: Bare = "nothing") -> tuple[Value | Call, ...]:
         """Values of positional words."""
         return tuple(
             self.value(line, word, bare)

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.topology import Hop, find_loop
 from fingerspice.circuit.waveforms import DC, Product, Sum, Waveform
-from fingerspice.errors import InputError
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 

@@ -102,7 +102,8 @@ def _area_from_source(layers: list[Element], sources: list[Element]) -> tuple[fl
     source = sources[0]
     if not isinstance(source.waveform, DC) or source.nodes[1] != "0" or not source.waveform.level > 0.0:
         raise InputError(
-            f"{source.name} drives an area: allowed is a DC value above 0 (mm^2) from the area node to 0", source.where
+            f"{source.name} drives an area: allowed is a DC value above 0 (mm^2) from the area node to 0",
+            source.where,
         )
     return source.waveform.level * 1e-6, source
 
@@ -145,7 +146,8 @@ def _refuse_floating(branches: list[Element]) -> None:
         if node not in reached:
             e = elements[0]
             raise InputError(
-                f"node {_as_written(node, e)!r} ({e.name}) is floating: nothing connects it to ground", e.where
+                f"node {_as_written(node, e)!r} ({e.name}) is floating: nothing connects it to ground",
+                e.where,
             )
 
 

@@ -10,6 +10,7 @@ Chebyshev series instead: see `fingerspice.circuit.sampling`.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -161,7 +162,7 @@ def fourier_integral(waveform: Waveform, frequency: float, t0: float, t1: float)
     x, w = np.polynomial.legendre.leggauss(24)
     panel = min(0.5 / frequency, waveform.shortest_time())
     total = 0j
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in itertools.pairwise(edges):
         cuts = np.linspace(a, b, max(1, math.ceil((b - a) / panel)) + 1)
         half = 0.5 * np.diff(cuts)[:, None]
         t = 0.5 * (cuts[1:] + cuts[:-1])[:, None] + half * x
@@ -245,10 +246,10 @@ class Sine(Waveform):
         return turns - np.floor(turns)
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
-        t = np.maximum(np.asarray(t, float), self.delay)
-        wave = np.sin(TAU * self._turns(t) + math.radians(self.phase_deg))
+        since = np.maximum(np.asarray(t, float), self.delay)
+        wave = np.sin(TAU * self._turns(since) + math.radians(self.phase_deg))
         if self.damping:
-            wave = wave * np.exp(-self.damping * (t - self.delay))
+            wave = wave * np.exp(-self.damping * (since - self.delay))
         return np.asarray(self.offset + self.amplitude * wave)
 
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
@@ -366,7 +367,12 @@ class Exp(Waveform):
 
     def __post_init__(self) -> None:
         check_finite(self)
-        require(self.tau1 > 0.0 and self.tau2 > 0.0, "EXP time constants", f"{self.tau1:g}, {self.tau2:g} s", "> 0")
+        require(
+            self.tau1 > 0.0 and self.tau2 > 0.0,
+            "EXP time constants",
+            f"{self.tau1:g}, {self.tau2:g} s",
+            "> 0",
+        )
         require(self.td2 >= self.td1, "EXP td2", f"{self.td2:g} s", f">= td1 = {self.td1:g} s")
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
@@ -449,9 +455,7 @@ class Sum(_Combination):
         return np.concatenate(known, axis=1) if len(known) == len(blocks) else None
 
     def tone(self) -> float | None:
-        if self.period is None or any(
-            part.tone() is None and not isinstance(part, DC) for part in self.parts
-        ):
+        if self.period is None or any(part.tone() is None and not isinstance(part, DC) for part in self.parts):
             return None
         tones = self._tones()
         lowest = min(tones)

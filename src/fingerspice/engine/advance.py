@@ -59,7 +59,14 @@ def enter(model: Model, segment: Segment, t0: float, y: FloatArray, control: Flo
 
 @njit(cache=True)
 def _zero_function(
-    model: Model, segment: Segment, t0: float, h: float, theta: float, sign: float, y: FloatArray, poly: FloatArray
+    model: Model,
+    segment: Segment,
+    t0: float,
+    h: float,
+    theta: float,
+    sign: float,
+    y: FloatArray,
+    poly: FloatArray,
 ) -> float:
     """A function with the sign of the gap voltage on its branch, and its zeros: k U + x_gap."""
     u_source, _ = source(segment, t0 + theta * h)
@@ -170,9 +177,7 @@ def _controlled_step(
     t0 = t - segment.start
     h, last = _choose_step(model, method, remaining, control, k[0], scale)
     while True:
-        norm, nfev = take_step(
-            model, method, segment, t0, h, y, control[SIGN], control[U_GAP], scale, k, y1
-        )
+        norm, nfev = take_step(model, method, segment, t0, h, y, control[SIGN], control[U_GAP], scale, k, y1)
         counters[NFEV] += nfev
         factor = 6.0
         if norm > 0.0:
@@ -213,9 +218,7 @@ def _write_log(
         theta = 0.5 * i * reached
         dense_state(theta, y, poly, state)
         u_source, du_source = source(segment, t - segment.start + theta * h)
-        u = gap_voltage(
-            model, model.k_gap * u_source, dot(model.gap, state), control[SIGN], control[U_GAP]
-        )
+        u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, state), control[SIGN], control[U_GAP])
         q, _ = branch_area(model, control[SIGN], u)
         row = log[counters[LOGGED]]
         row[0] = t + theta * h
@@ -330,9 +333,7 @@ def advance(
             continue
         flips = 0
         reached = min(theta, 1.0)
-        _write_outputs(
-            model, segment, t, h, reached, t_new, y, poly, control, counters, t_out, left, rows
-        )
+        _write_outputs(model, segment, t, h, reached, t_new, y, poly, control, counters, t_out, left, rows)
         if log.shape[0] > 0:
             _write_log(model, segment, t, h, reached, y, poly, control, counters, log)
             log[counters[LOGGED] - 1, 0] = t_new

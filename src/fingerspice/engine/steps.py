@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fingerspice.engine.model import Model, Segment, jacobian, right_hand_side, source
+from fingerspice.numerics.small import inverse
 
 FloatArray = NDArray[np.float64]
 
@@ -85,9 +86,7 @@ def _explicit_step(
 
 
 @njit(cache=True)
-def _stage_state(
-    a: FloatArray, i: int, upto: int, h: float, y: FloatArray, k: FloatArray, out: FloatArray
-) -> None:
+def _stage_state(a: FloatArray, i: int, upto: int, h: float, y: FloatArray, k: FloatArray, out: FloatArray) -> None:
     for j in range(out.size):
         value = 0.0
         for r in range(upto):
@@ -139,9 +138,7 @@ def _newton_inverse(
             for p in range(n):
                 for j in range(n):
                     matrix[i * n + p, r * n + j] -= h * method.a[i, r] * slope[p, j]
-    if not np.all(np.isfinite(matrix)):
-        return np.full((1, 1), np.nan)
-    return np.linalg.inv(matrix)
+    return inverse(matrix)
 
 
 @njit(cache=True)
@@ -161,9 +158,9 @@ def _collocation_step(
     n = y.size - 1
     stages = method.a.shape[0]
     base = np.empty(n + 1)
-    inverse = _newton_inverse(model, method, segment, t0, h, y, sign, guess, base)
+    newton = _newton_inverse(model, method, segment, t0, h, y, sign, guess, base)
     nfev = 1
-    if inverse[0, 0] != inverse[0, 0]:
+    if newton[0, 0] != newton[0, 0]:
         return math.inf, nfev
     for i in range(stages):
         k[i] = base
@@ -183,7 +180,7 @@ def _collocation_step(
         for i in range(stages * n):
             value = 0.0
             for j in range(stages * n):
-                value += inverse[i, j] * residual[j]
+                value += newton[i, j] * residual[j]
             k[i // n, i % n] += value
             value = abs(h * value) / scale[i % n]
             if not value <= change:

@@ -65,7 +65,7 @@ class Contact:
     @property
     def area_unloaded(self) -> float:
         """Ridge area without voltage and friction, alpha F_N^m (Eq. 5), m^2."""
-        return self.alpha * self.f_n**self.m
+        return float(self.alpha * self.f_n**self.m)
 
     @property
     def exists(self) -> bool:
@@ -93,7 +93,7 @@ class Contact:
     def area(self, u_gap: ArrayLike) -> FloatArray:
         """Ridge contact area in full slip, A_R (Eqs. 1 to 4), m^2, at gap voltage `u_gap` (V)."""
         u = np.abs(np.asarray(u_gap, float))
-        return ridge_area_array(u.ravel(), self.pack()).reshape(u.shape)  # type: ignore[no-any-return]
+        return np.asarray(ridge_area_array(u.ravel(), self.pack())).reshape(u.shape)
 
     def area_adhesive(self, u_gap: ArrayLike) -> FloatArray:
         """Ridge contact area under normal load alone, A_R0 (Eq. 4), m^2, at gap voltage `u_gap` (V)."""
@@ -119,9 +119,7 @@ class Contact:
         packed = self.pack()
         # The continuation exists while 1 + x y^p > 0; x = -0.2 is well inside for every legal exponent pair.
         lo, hi = -min(0.1 * u_max, 0.2 / packed[0]), u_max
-        series = chebyshev.fit(
-            lambda u: 1.0 / np.asarray(ridge_area_array(u, packed)), lo, hi, 2e-15, (16, 24, 32, 48)
-        )
+        series = chebyshev.fit(lambda u: 1.0 / np.asarray(ridge_area_array(u, packed)), lo, hi, 2e-15, (16, 24, 32, 48))
         return np.concatenate([[lo, hi], packed, [] if series is None else series])
 
 
@@ -167,7 +165,8 @@ def ridge_area(u: float, contact: FloatArray) -> float:
     # k s^2 A^2 + (1 + 2 k F s) A - (A0 - k F^2) = 0, in the form that is stable as s -> 0.
     b = 1.0 + 2.0 * k * f_n * sigma
     root = math.sqrt(1.0 + 4.0 * k * sigma * (f_n + sigma * a0))
-    return 2.0 * (a0 - k * f_n * f_n) / (b + root)
+    area: float = 2.0 * (a0 - k * f_n * f_n) / (b + root)
+    return area
 
 
 @njit(cache=True)

@@ -1,0 +1,368 @@
+"""Command line: run, ac, compare, export, figures. Exit 0 done, 1 the solve failed, 2 bad input."""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from fingerspice.errors import FingerspiceWarning, InputError, SolveError
+from fingerspice.units import parse_number
+
+if TYPE_CHECKING:
+    from fingerspice.circuit.circuit import Circuit
+    from fingerspice.solution import Solution
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="SPICE for the sliding fingertip: voltages, contact area and friction on an electroadhesive touchscreen.",
+)
+
+Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir).")]
+Out = Annotated[Path, typer.Option("--out", metavar="FOLDER", help="Where the files go.")]
+Rtol = Annotated[float, typer.Option(help="Largest error of gap voltage and force, relative to their peaks.")]
+ChargeLaw = Annotated[str | None, typer.Option(help="local or mobile; the included library's by default.")]
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Change a value: Xgap.d=3u.")]
+Source = Annotated[str | None, typer.Option("--source", metavar="SPEC", help="Replace the source: 'SQUARE(200 100)'.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the figures as JSON, nothing else on stdout.")]
+NoPlot = Annotated[bool, typer.Option("--no-plot", help="Write no picture.")]
+
+
+def main() -> None:
+    """Entry point of the `fingerspice` command."""
+    with _plain_errors():
+        app(standalone_mode=True)
+
+
+@contextmanager
+def _plain_errors() -> Iterator[None]:
+    """One sentence instead of a traceback, and the exit code that says which kind."""
+    try:
+        yield
+    except InputError as error:
+        _fail(str(error), 2)
+    except SolveError as error:
+        _fail(str(error), 1)
+    except KeyboardInterrupt:
+        _fail("interrupted; nothing half-written is left", 130)
+    except BrokenPipeError:
+        # The reader of our output (head, less) has gone: not our failure to report.
+        sys.stderr.close()
+        raise SystemExit(0) from None
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    print(f"fingerspice: {message}", file=sys.stderr)
+    raise SystemExit(code)
+
+
+@contextmanager
+def _warnings_as_lines() -> Iterator[None]:
+    """Our own warnings as plain lines on stderr, each once."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", FingerspiceWarning)
+        seen: set[str] = set()
+
+        def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+            text = str(message)
+            if text not in seen:
+                seen.add(text)
+                print(f"fingerspice: warning: {text}", file=sys.stderr)
+
+        warnings.showwarning = show
+        yield
+
+
+def _read(deck: Path, changes: list[str] | None, source: str | None) -> Circuit:
+    from fingerspice.circuit.netlist import read_netlist, source_from_text
+
+    circuit = read_netlist(deck)
+    for change in changes or []:
+        path, equals, value = change.partition("=")
+        if not equals:
+            raise InputError(f"--set {change!r} is not understood; allowed: PATH=VALUE, such as Xgap.d=3u")
+        try:
+            number = float("inf") if value.strip().lower() == "inf" else parse_number(value.strip())
+        except ValueError as error:
+            raise InputError(f"--set {change!r}: {error}") from None
+        circuit = circuit.replace({path.strip(): number})
+    if source is not None:
+        from fingerspice.circuit.statespace import build_stack
+
+        sources = build_stack(circuit).sources
+        if len(sources) != 1:
+            raise InputError("--source needs a circuit with one voltage source")
+        circuit = circuit.replace({sources[0][0].name: source_from_text(source, circuit)})
+    for directive in circuit.unused:
+        print(f"fingerspice: note: {directive} has no effect here", file=sys.stderr)
+    return circuit
+
+
+def _note_skin_frequency(circuit: Circuit) -> None:
+    """Warn where a SKIN's data are not taken at the source's fundamental."""
+    from fingerspice.circuit.statespace import build_stack
+
+    fundamental = build_stack(circuit).waveform.fundamental
+    for skin in circuit.by_device("SKIN"):
+        f = skin.values["f"]
+        if fundamental is None:
+            text = f"{skin.name} takes its data at {f:g} Hz, and the source has no fundamental"
+        elif abs(f / fundamental.frequency - 1.0) > 1e-9:
+            text = (
+                f"{skin.name} takes its data at f = {f:g} Hz, the source's fundamental is "
+                f"{fundamental.frequency:g} Hz; --set {skin.name}.f={fundamental.frequency:g} would match"
+            )
+        else:
+            continue
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+
+
+def _area(text: str) -> str | float:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[float], None] | None]:
+    """A bar on a terminal, shown only once a run takes more than a second."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    import time
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    bar = Progress(console=Console(stderr=True), transient=True)
+    begin = time.perf_counter()
+    task = bar.add_task("simulating", total=1.0)
+
+    def update(done: float) -> None:
+        if time.perf_counter() - begin > 1.0:
+            if not bar.live.is_started:
+                bar.start()
+            bar.update(task, completed=done)
+
+    try:
+        yield update
+    finally:
+        if bar.live.is_started:
+            bar.stop()
+
+
+@app.command()
+def run(
+    deck: Deck,
+    out: Out = Path(),
+    rtol: Rtol = 1e-8,
+    charge_law: ChargeLaw = None,
+    area: Annotated[str, typer.Option(help="coupled, mean, frozen, or an area in m^2.")] = "coupled",
+    method: Annotated[
+        str, typer.Option(help="auto, dp5, dop853, radau9, scipy:LSODA, torchdiffeq:dopri5, ...")
+    ] = "auto",
+    changes: Set = None,
+    source: Source = None,
+    csv: Annotated[bool, typer.Option("--csv", help="Write CSV instead of NetCDF.")] = False,
+    as_json: AsJson = False,
+    no_plot: NoPlot = False,
+) -> None:
+    """Simulate DECK in time: a summary, a data file and a picture.
+
+    Examples:
+
+      fingerspice run circuits/fingerpad.cir --out out
+
+      fingerspice run circuits/fingerpad.cir --source 'SQUARE(200 100)' --set Xgap.d=3u --csv
+
+      fingerspice run circuits/fingerpad.cir --charge-law mobile --rtol 1e-6 --json --no-plot
+    """
+    from fingerspice.report import summary_table
+    from fingerspice.simulate import simulate
+
+    with _warnings_as_lines():
+        circuit = _read(deck, changes, source)
+        _note_skin_frequency(circuit)
+        _check_folder(out)
+        with _progress() as progress:
+            solution = simulate(
+                circuit, charge_law=charge_law, area=_area(area), rtol=rtol, method=method, throw=False,
+                progress=progress,
+            )  # fmt: skip
+        for text in solution.warnings:
+            warnings.warn(text, FingerspiceWarning, stacklevel=1)
+    files = _write_run(solution, out / deck.stem, csv, no_plot) if solution.t.size else []
+    if as_json:
+        report = {**solution.summary(), "success": solution.success, "message": solution.message}
+        print(json.dumps({**report, "files": [str(f) for f in files]}, indent=2))
+    else:
+        print(summary_table(solution))
+        for file in files:
+            print(f"wrote {file}")
+    if not solution.success:
+        raise SolveError(solution.message, solution)
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse an output folder that cannot be written before spending time on the run."""
+    from fingerspice.files import write_aside
+
+    probe = folder / ".fingerspice-probe"
+    write_aside(probe, lambda path: path.write_bytes(b""))
+    probe.unlink(missing_ok=True)
+
+
+def _write_run(solution: Solution, stem: Path, csv: bool, no_plot: bool) -> list[Path]:
+    files = [solution.to_csv(stem.with_suffix(".csv")) if csv else solution.to_netcdf(stem.with_suffix(".nc"))]
+    if not no_plot:
+        from fingerspice.plotting import save
+
+        files.append(save(solution.plot(), stem.with_suffix(".png")))
+    return files
+
+
+@app.command()
+def ac(
+    deck: Deck,
+    out: Out = Path(),
+    sweep: Annotated[
+        str | None, typer.Option(metavar="'dec N F1 F2'", help="Sweep; the deck's .ac line by default.")
+    ] = None,
+    area: Annotated[str, typer.Option(help="mean, frozen, or an area in m^2.")] = "mean",
+    changes: Set = None,
+    source: Source = None,
+    as_json: AsJson = False,
+    no_plot: NoPlot = False,
+) -> None:
+    """Phasor sweep of DECK: gap voltage, phase, area and mean force against frequency.
+
+    Examples:
+
+      fingerspice ac circuits/fingerpad.cir --sweep 'dec 10 10 100k' --out out
+
+      fingerspice ac circuits/fingerpad.cir --area frozen --json
+    """
+    from fingerspice.phasors import phasor, sweep_frequencies
+    from fingerspice.report import phasor_csv, phasor_dict, phasor_table
+
+    with _warnings_as_lines():
+        circuit = _read(deck, changes, source)
+        _check_folder(out)
+        if sweep is not None:
+            from fingerspice.circuit.netlist import sweep_from_text
+
+            frequencies = sweep_frequencies(sweep_from_text(sweep))
+        elif circuit.ac is not None:
+            frequencies = sweep_frequencies(circuit.ac)
+        else:
+            from fingerspice.circuit.circuit import AcSweep
+
+            frequencies = sweep_frequencies(AcSweep("dec", 20, 10.0, 1e5))
+        result = phasor(circuit, frequencies, area=_area(area))
+    stem = out / f"{deck.stem}_ac"
+    files = [phasor_csv(result, stem.with_suffix(".csv"))]
+    if not no_plot:
+        from fingerspice.plotting import plot_phasor, save
+
+        files.append(save(plot_phasor(result, circuit), stem.with_suffix(".png")))
+    print(json.dumps(phasor_dict(result), indent=2) if as_json else phasor_table(result))
+    if not as_json:
+        for file in files:
+            print(f"wrote {file}")
+
+
+@app.command()
+def compare(
+    deck: Deck,
+    out: Out = Path(),
+    rtol: Rtol = 1e-8,
+    charge_law: ChargeLaw = None,
+    changes: Set = None,
+    source: Source = None,
+    as_json: AsJson = False,
+    no_plot: NoPlot = False,
+) -> None:
+    """Set the transient's periodic state of DECK beside the phasor, and say what the area's ripple does.
+
+    Examples:
+
+      fingerspice compare circuits/fingerpad.cir
+
+      fingerspice compare circuits/fingerpad_5khz.cir --json --no-plot
+    """
+    from fingerspice.compare import compare as run_comparison
+    from fingerspice.report import comparison_table
+
+    with _warnings_as_lines():
+        circuit = _read(deck, changes, source)
+        _note_skin_frequency(circuit)
+        _check_folder(out)
+        result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
+    print(json.dumps(result.to_dict(), indent=2) if as_json else comparison_table(result))
+    if not no_plot:
+        from fingerspice.plotting import plot_comparison, save
+
+        file = save(plot_comparison(result), out / f"{deck.stem}_compare.png")
+        if not as_json:
+            print(f"wrote {file}")
+
+
+@app.command()
+def export(
+    deck: Deck,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The ngspice deck to write.")],
+    charge_law: ChargeLaw = None,
+    changes: Set = None,
+    source: Source = None,
+) -> None:
+    """Write DECK as one self-contained ngspice deck: bodies included, parameters folded in.
+
+    Example:
+
+      fingerspice export circuits/fingerpad.cir -o fingerpad_ngspice.cir
+    """
+    from fingerspice.export import export_netlist
+    from fingerspice.files import write_aside
+
+    with _warnings_as_lines():
+        circuit = _read(deck, changes, source)
+    text = export_netlist(circuit, charge_law=charge_law)
+    print(f"wrote {write_aside(output, lambda path: path.write_text(text))}")
+
+
+@app.command()
+def figures(
+    out: Out = Path("out"),
+    only: Annotated[list[int] | None, typer.Option(help="Only these of the paper's figures 2 to 5.")] = None,
+) -> None:
+    """Draw the paper's Figs. 2 to 5 from scratch, each as PNG with its data as CSV.
+
+    Example:
+
+      fingerspice figures --out out --only 4 --only 5
+    """
+    from fingerspice.figures import make_figures
+
+    for file in make_figures(out, only=only):
+        print(f"wrote {file}")
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False,
+) -> None:
+    if version:
+        from fingerspice import __version__
+
+        print(f"fingerspice {__version__}")
+        raise typer.Exit

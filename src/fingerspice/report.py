@@ -1,0 +1,165 @@
+"""Tables and data files for people: what the command line prints."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fingerspice.files import write_aside
+from fingerspice.units import format_si
+
+if TYPE_CHECKING:
+    from fingerspice.compare import Comparison
+    from fingerspice.phasors import PhasorSolution
+    from fingerspice.solution import Solution
+
+
+def _aligned(rows: Sequence[tuple[str, ...]], head: tuple[str, ...]) -> str:
+    """Rows as text columns, the first left-aligned."""
+    table = [head, *rows]
+    widths = [max(len(r[i]) for r in table) for i in range(len(head))]
+    lines = []
+    for r in table:
+        cells = [r[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(r[1:], widths[1:], strict=True))]
+        lines.append("  ".join(cells).rstrip())
+    lines.insert(1, "-" * max(map(len, lines)))
+    return "\n".join(lines)
+
+
+def _value(value: float | None, unit: str, factor: float = 1.0, peak: float = 0.0) -> str:
+    if value is None:
+        return "-"
+    # Rounding of a mean that is zero would otherwise read as a figure.
+    value = 0.0 if abs(value) <= 1e-12 * peak else value
+    if unit in ("mm^2", "", "deg"):
+        return f"{value * factor:.4g} {unit}".rstrip()
+    return format_si(value * factor, unit)
+
+
+def summary_table(solution: Solution) -> str:
+    """The figures of a run as a table."""
+    s = solution.summary()
+    out = [solution.circuit.title, _scene(solution), ""]
+    if solution.t.size >= 2:
+        rows = []
+        for key, label, unit, factor in (
+            ("u_source", "source voltage", "V", 1.0),
+            ("u_gap", "gap voltage", "V", 1.0),
+            ("f_el", "electroadhesive force", "N", 1.0),
+            ("f_t", "friction force", "N", 1.0),
+            ("friction", "friction coefficient", "", 1.0),
+            ("area", "ridge contact area", "mm^2", 1e6),
+        ):
+            if f"{key}_max" in s:
+                rows.append(
+                    (
+                        label,
+                        *(
+                            _value(
+                                s.get(f"{key}_{part}"), unit, factor, max(abs(s[f"{key}_max"]), abs(s[f"{key}_min"]))
+                            )
+                            for part in ("min", "max", "mean", "mean_periodic", "rms_periodic", "ripple")
+                        ),
+                    )
+                )
+        out.append(_aligned(rows, ("", "min", "max", "mean", "last period", "rms", "ripple")))
+        if "u_gap_amplitude" in s:
+            lead = s["u_gap_phase_deg"] - s["u_source_phase_deg"]
+            lead = (lead + 180.0) % 360.0 - 180.0
+            share = s["u_gap_amplitude"] / s["u_source_amplitude"] if s["u_source_amplitude"] else float("nan")
+            out.append("")
+            out.append(
+                f"at {format_si(s['fundamental'], 'Hz')}: gap voltage {format_si(s['u_gap_amplitude'], 'V')}, "
+                f"{100.0 * share:.2f} % of the source, leading by {lead:.2f} deg"
+            )
+    out.append("")
+    out.append(f"estimated error: gap voltage {solution.error.u_gap:.2g} V, force {solution.error.f_el:.2g} N")
+    out.append(f"status: {solution.message}")
+    return "\n".join(out)
+
+
+def _scene(solution: Solution) -> str:
+    end = format_si(float(solution.t[-1]), "s") if solution.t.size else "nothing"
+    return (
+        f"{end} simulated; charge law {solution.charge_law}, area {solution.area_mode}, method {solution.method}, "
+        f"rtol {solution.rtol:g}"
+    )
+
+
+def comparison_table(comparison: Comparison) -> str:
+    """A comparison as a table, with what it says in words."""
+    names = {
+        "amplitude": "gap voltage amplitude",
+        "phase_deg": "lead over the source",
+        "f_el_mean": "mean force",
+        "area_mean": "mean area",
+    }
+    rows = []
+    for name, unit, p, m, c, difference, ripple in comparison.rows():
+        rows.append((f"{names[name]} [{unit}]", *(f"{x:.6g}" for x in (p, m, c, difference, ripple))))
+    head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
+    reference = comparison.phasor.f_el_mean
+    total = 100.0 * (comparison.coupled.f_el_mean / reference - 1.0)
+    waveform = 100.0 * (comparison.mean.f_el_mean / reference - 1.0)
+    return "\n".join(
+        [
+            comparison.solution.circuit.title,
+            f"periodic state at {format_si(comparison.frequency, 'Hz')}, charge law {comparison.solution.charge_law}",
+            "",
+            _aligned(rows, head),
+            "",
+            f"mean force: {total:+.2f} % against the phasor; {total - waveform:+.2f} % of that is the ripple of the "
+            f"area, {waveform:+.2f} % is the waveform's (zero for a sine)",
+        ]
+    )
+
+
+def phasor_dict(result: PhasorSolution) -> dict[str, Any]:
+    """A sweep as plain data, SI units."""
+    return {
+        "frequency": result.frequency.tolist(),
+        "gain": np.abs(result.gain).tolist(),
+        "phase_deg": np.degrees(np.angle(result.gain)).tolist(),
+        "u_gap": np.abs(result.u_gap).tolist(),
+        "area": result.area.tolist(),
+        "f_el_mean": result.f_el_mean.tolist(),
+        "amplitude": result.amplitude,
+    }
+
+
+def phasor_table(result: PhasorSolution, most: int = 40) -> str:
+    """A sweep as a table, thinned to about `most` rows."""
+    data = phasor_dict(result)
+    keep = range(0, result.frequency.size, max(1, -(-result.frequency.size // most)))
+    rows = [
+        (
+            f"{data['frequency'][i]:.6g}",
+            f"{data['gain'][i]:.5f}",
+            f"{data['phase_deg'][i]:.3f}",
+            f"{data['u_gap'][i]:.5g}",
+            f"{1e6 * data['area'][i]:.5g}",
+            f"{data['f_el_mean'][i]:.5g}",
+        )
+        for i in keep
+    ]
+    head = ("frequency [Hz]", "|u_gap/U|", "phase [deg]", "u_gap [V]", "area [mm^2]", "mean force [N]")
+    return f"source amplitude {format_si(result.amplitude, 'V')}\n" + _aligned(rows, head)
+
+
+def phasor_csv(result: PhasorSolution, path: Path) -> Path:
+    """Write a sweep as CSV."""
+    data = phasor_dict(result)
+    columns = ("frequency", "gain", "phase_deg", "u_gap", "area", "f_el_mean")
+    units = ("Hz", "1", "deg", "V", "m^2", "N")
+
+    def write(target: Path) -> None:
+        with target.open("w", newline="") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(f"{c} [{u}]" for c, u in zip(columns, units, strict=True))
+            writer.writerows(zip(*(map(repr, data[c]) for c in columns), strict=True))
+
+    return write_aside(path, write)
