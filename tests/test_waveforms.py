@@ -16,6 +16,7 @@ from fingerspice.circuit import ramps, sampling, waveforms
 from fingerspice.circuit.sampling import source_table
 from fingerspice.circuit.waveforms import as_waveform
 from fingerspice.engine.model import Segment, source
+from scenes import table1
 from waveform_cases import CASES, Case, turns
 
 every_case = pytest.mark.parametrize("case", CASES, ids=lambda c: c.name)
@@ -300,6 +301,14 @@ def test_an_edge_is_at_the_time_a_user_writes_for_it(frequency: float) -> None:
     np.testing.assert_array_equal(square.value(k / frequency, "left"), -1.0)
     np.testing.assert_array_equal(square.value((k + 0.5) / frequency), -1.0)
     np.testing.assert_array_equal(square.value((k + 0.5) / frequency, "left"), 1.0)
+
+
+def test_a_run_gives_the_right_hand_value_at_a_time_that_is_an_edge_up_to_rounding() -> None:
+    """The second edge is at 0.01 + 0.05 = 0.060000000000000005 s; the user writes 0.06."""
+    circuit = table1("PULSE(0 8 10m 0 0 20m 50m)", tran="1m 70m uic")
+    solution = fs.simulate(circuit, t_eval=[0.01, 0.03, 0.06], rtol=1e-6)
+    np.testing.assert_array_equal(solution.t, [0.01, 0.03, 0.06])
+    np.testing.assert_array_equal(solution.u_source, [8.0, 0.0, 8.0])
 
 
 @pytest.mark.parametrize(

@@ -34,15 +34,15 @@ if TYPE_CHECKING:
     from fingerspice.circuit.waveforms import Sine as Sine
     from fingerspice.circuit.waveforms import Sum as Sum
     from fingerspice.circuit.waveforms import Waveform as Waveform
-    from fingerspice.compare import Comparison as Comparison
-    from fingerspice.compare import compare as compare
+    from fingerspice.comparison import Comparison as Comparison
+    from fingerspice.comparison import compare as compare
     from fingerspice.errors import FingerspiceError as FingerspiceError
     from fingerspice.errors import FingerspiceWarning as FingerspiceWarning
     from fingerspice.errors import InputError as InputError
     from fingerspice.errors import SolveError as SolveError
     from fingerspice.export import export_netlist as export_netlist
     from fingerspice.phasors import phasor as phasor
-    from fingerspice.simulate import simulate as simulate
+    from fingerspice.simulation import simulate as simulate
     from fingerspice.solution import Solution as Solution
     from fingerspice.solution import Status as Status
 
@@ -52,11 +52,11 @@ _HOMES = {
     "circuit.ramps": ("PWL", "Pulse", "Samples", "Sawtooth", "Square", "Triangle"),
     "circuit.sampling": ("Function",),
     "circuit.waveforms": ("AM", "DC", "Chirp", "Exp", "Product", "Sine", "Sum", "Waveform"),
-    "compare": ("Comparison", "compare"),
+    "comparison": ("Comparison", "compare"),
     "errors": ("FingerspiceError", "FingerspiceWarning", "InputError", "SolveError"),
     "export": ("export_netlist",),
     "phasors": ("phasor",),
-    "simulate": ("simulate",),
+    "simulation": ("simulate",),
     "solution": ("Solution", "Status"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}

@@ -188,7 +188,7 @@ def run(
       fingerspice run circuits/fingerpad.cir --charge-law mobile --rtol 1e-6 --json --no-plot
     """
     from fingerspice.report import summary_table
-    from fingerspice.simulate import simulate
+    from fingerspice.simulation import simulate
 
     with _warnings_as_lines():
         circuit = _read(deck, changes, source)
@@ -300,7 +300,7 @@ def compare(
 
       fingerspice compare circuits/fingerpad_5khz.cir --json --no-plot
     """
-    from fingerspice.compare import compare as run_comparison
+    from fingerspice.comparison import compare as run_comparison
     from fingerspice.report import comparison_table
 
     with _warnings_as_lines():

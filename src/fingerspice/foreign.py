@@ -5,7 +5,6 @@ Their error is measured against our own stepper at a tighter tolerance, and met 
 
 from __future__ import annotations
 
-import itertools
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,13 +13,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fingerspice.circuit.sampling import SourceTable, source_table
+from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
 from fingerspice.engine import advance as loop
 from fingerspice.engine.model import Model, Segment, choose_branch, dot, right_hand_side, source, write_row
 from fingerspice.errors import InputError
 from fingerspice.problem import Problem
 from fingerspice.solution import ErrorEstimate, State, Status
-from fingerspice.transient import Run, choose_tableau, row_width, solve, windows
+from fingerspice.transient import Run, Tables, choose_tableau, row_width, solve
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -147,10 +146,8 @@ def _integrate(
     done, nfev, pieces = 0, 0, 0
     status, detail, t_failed = Status.SUCCESS, "", None
     table: SourceTable | None = None
-    edges = windows(problem)
     try:
-        for w0, w1 in itertools.pairwise(edges):
-            table = source_table(problem.waveform, w0, w1, max(0.05 * tol, 1e-14), problem.step)
+        for table in Tables(problem, tol):
             for i in range(table.edges.size - 1):
                 start, stop = float(table.edges[i]), float(table.edges[i + 1])
                 segment = Segment(start, stop - start, table.terms[i], table.series[i])
@@ -207,7 +204,7 @@ def _finish(
     stop = problem.t_stop
     start = float(table.edges[-2])
     segment = Segment(start, float(table.edges[-1]) - start, table.terms[-1], table.series[-1])
-    if problem.waveform.breakpoints(stop, stop).size:
+    if breakpoints_at(problem.waveform, stop).size:
         table = source_table(problem.waveform, stop, stop + problem.step, 1e-10, problem.step)
         segment = Segment(stop, float(table.edges[1]) - stop, table.terms[0], table.series[0])
     u, du = loop.enter(problem.model, segment, stop - segment.start, y, control)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.errors import InputError, SolveError
 from fingerspice.problem import Problem, prepare, state_from
-from fingerspice.simulate import run_problem
+from fingerspice.simulation import run_problem
 from fingerspice.solution import Solution, Status
 from fingerspice.transient import choose_tableau, integrate
 

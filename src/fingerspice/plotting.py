@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from fingerspice.circuit.circuit import Circuit
-    from fingerspice.compare import Comparison
+    from fingerspice.comparison import Comparison
     from fingerspice.phasors import PhasorSolution
     from fingerspice.solution import Solution
 
@@ -89,8 +89,8 @@ def dress(ax: Axes, ylabel: str = "", xlabel: str = "") -> None:
 def legend_above(ax: Axes, columns: int = 4, *, right: bool = False, math: bool = False) -> None:
     """A legend over the panel, where it covers no data; without `math` names keep their ``$``."""
     place: dict[str, Any] = {"loc": "lower right" if right else "lower left", "bbox_to_anchor": (right, 1.0)}
-    space = {"borderaxespad": 0.1, "borderpad": 0.2}
-    legend = ax.legend(ncols=columns, fontsize=FONT - 0.5, frameon=False, **place, **space)
+    place |= {"borderaxespad": 0.1, "borderpad": 0.2}
+    legend = ax.legend(ncols=columns, fontsize=FONT - 0.5, frameon=False, **place)
     for text in legend.get_texts():
         text.set_parse_math(math)
 

@@ -13,7 +13,7 @@ from fingerspice.files import write_aside
 from fingerspice.units import format_si
 
 if TYPE_CHECKING:
-    from fingerspice.compare import Comparison
+    from fingerspice.comparison import Comparison
     from fingerspice.phasors import PhasorSolution
     from fingerspice.solution import Solution
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.circuit.sampling import SourceTable, is_sampled, source_table
+from fingerspice.circuit.sampling import SourceTable, breakpoints_at, is_sampled, source_table
 from fingerspice.circuit.waveforms import Waveform
 from fingerspice.engine import advance as loop
 from fingerspice.engine.model import Segment, write_row
@@ -93,7 +93,7 @@ class _Track:
         """Go where `main` has gone, with outputs at its log times in `rows`."""
         self.t_out = np.ascontiguousarray(main.log_rows[:, 0])
         self.left = np.ones(self.t_out.size, bool)
-        self.rows = np.empty((self.t_out.size, self.rows.shape[1]))
+        self.rows = np.full((self.t_out.size, self.rows.shape[1]), np.nan)
         self.counters[loop.OUTPUT] = 0
         return self.advance(table, main.t)
 
@@ -110,7 +110,7 @@ class _Track:
         )
         tau = self.t - segment.start
         stop = self.problem.t_stop
-        if self.problem.waveform.breakpoints(stop, stop).size:
+        if breakpoints_at(self.problem.waveform, stop).size:
             after = source_table(self.problem.waveform, stop, stop + self.problem.step, 1e-10, self.problem.step)
             segment = Segment(
                 float(after.edges[0]), float(after.edges[1] - after.edges[0]), after.terms[0], after.series[0]
@@ -139,6 +139,37 @@ def method_from(tableau: Tableau, waveform: Waveform, h_fixed: float = 0.0) -> M
     return Method(tableau.implicit, a, c, e, dense, tableau.n_end, tableau.error_order, h_max, h_fixed)
 
 
+class Tables:
+    """Tables of a problem's source, window by window.
+
+    A user's function is expensive to look at, so its tables are kept; those of library waveforms are made anew,
+    which keeps a long run's memory constant.
+    """
+
+    def __init__(self, problem: Problem, tol: float) -> None:
+        self.problem = problem
+        self.tol = min(1e-3, max(0.05 * tol, 1e-14))
+        self.edges = windows(problem)
+        self.kept: dict[int, SourceTable] | None = {} if is_sampled(problem.waveform) else None
+
+    def __iter__(self) -> Iterator[SourceTable]:
+        for i, (w0, w1) in enumerate(itertools.pairwise(self.edges)):
+            table = self.kept.get(i) if self.kept is not None else None
+            if table is None:
+                table = source_table(self.problem.waveform, w0, w1, self.tol, self.problem.step)
+                if self.kept is not None:
+                    self.kept[i] = table
+            yield table
+            if table.not_finite is not None:
+                return
+
+    def peak(self) -> float:
+        """Largest |U| (V) of the run."""
+        if self.kept is None:
+            return self.problem.waveform.peak(self.problem.t_start, self.problem.t_stop)
+        return max(table.scale for table in self)
+
+
 def row_width(problem: Problem) -> int:
     """Columns of an output row."""
     return 5 + problem.stack.c.size
@@ -165,6 +196,7 @@ def integrate(
     t_out: FloatArray,
     left: BoolArray,
     *,
+    tables: Tables | None = None,
     h_fixed: float = 0.0,
     shadow: bool = True,
     progress: Progress | None = None,
@@ -179,6 +211,8 @@ def integrate(
         Local error over the voltage scale, and that scale in V.
     t_out, left : ndarray, shape (n_out,)
         Output times (s, ascending) and whether the left-hand value is meant.
+    tables : Tables, optional
+        The source's, where they are made already.
     h_fixed : float
         Fixed step in s, without error control, if positive.
     shadow : bool
@@ -186,6 +220,7 @@ def integrate(
     progress : callable, optional
         Called with the fraction of the run that is done.
     """
+    tables = tables or Tables(problem, tol)
     width = row_width(problem)
     method = method_from(tableau, problem.waveform, h_fixed)
     z_scale = u_scale * problem.model.area0 / problem.model.s
@@ -196,10 +231,8 @@ def integrate(
     other = _Track(problem, method, SHADOW * scale, t_out[:0], left[:0], rows[:0], log[:0])
     meter = _Meter(problem)
     status, detail, t_failed = Status.SUCCESS, "", None
-    edges = windows(problem)
     table = None
-    for w0, w1 in itertools.pairwise(edges):
-        table = source_table(problem.waveform, w0, w1, min(1e-3, max(0.05 * tol, 1e-14)), problem.step)
+    for table in tables:
         code = loop.LOG_FULL
         while code == loop.LOG_FULL:
             code = main.advance(table, float(table.edges[-1])) if table.edges.size > 1 else loop.DONE
@@ -263,15 +296,14 @@ class _Meter:
         self.peak_f = max(self.peak_f, float(force.max()))
         if shadow_rows is None:
             return
-        other = self.problem.force(shadow_rows[:, 1], shadow_rows[:, 2])
-        known = np.isfinite(shadow_rows[:, 1])
-        if np.any(known):
-            diff_u = np.abs(shadow_rows[known, 1] - log[known, 1]) - log[known, 3]
+        # The shadow may have stopped at a fold before the end of the log.
+        n = int(np.count_nonzero(np.isfinite(shadow_rows[:, 1])))
+        if n:
+            other = self.problem.force(shadow_rows[:n, 1], shadow_rows[:n, 2])
             # F ~ u^2: what moves u by du moves F by 2 F du / u.
-            rounding = 2.0 * self.problem.force(log[known, 1], log[known, 2])
-            rounding *= log[known, 3] / np.maximum(np.abs(log[known, 1]), 1e-300)
-            self.diff_u = max(self.diff_u, float(diff_u.max()))
-            self.diff_f = max(self.diff_f, float((np.abs(other[known] - force[known]) - rounding).max()))
+            rounding = 2.0 * force[:n] * log[:n, 3] / np.maximum(np.abs(log[:n, 1]), 1e-300)
+            self.diff_u = max(self.diff_u, float((np.abs(shadow_rows[:n, 1] - log[:n, 1]) - log[:n, 3]).max()))
+            self.diff_f = max(self.diff_f, float((np.abs(other - force[:n]) - rounding).max()))
 
     def error(self) -> ErrorEstimate:
         # Rounding is an error too, and two runs may share it.
@@ -303,13 +335,14 @@ def solve(
     The first attempt's local tolerance is a guess; each further one follows from the error measured.
     """
     tableau = tableau or choose_tableau(problem, rtol)
-    u_scale = problem.waveform.peak(problem.t_start, problem.t_stop)
+    tables = Tables(problem, LOCAL_SHARE * rtol)
+    u_scale = tables.peak()
     u_scale = u_scale * problem.model.k_gap if np.isfinite(u_scale) and u_scale > 0.0 else 1.0
     u_scale = max(u_scale, float(np.abs(problem.initial.y[:-1]).max(initial=0.0)))
     tol = LOCAL_SHARE * rtol
     nfev = 0
     for _attempt in range(6):
-        run = integrate(problem, tableau, tol, u_scale, t_out, left, progress=progress)
+        run = integrate(problem, tableau, tol, u_scale, t_out, left, tables=tables, progress=progress)
         nfev += run.nfev
         run.nfev = nfev
         if run.status is not Status.SUCCESS:

@@ -107,6 +107,8 @@ class SourceTable:
     terms : ndarray, shape (m, k, 6)
     series : ndarray, shape (m, l)
         Chebyshev coefficients of each segment; l = 0 where the terms say it all.
+    scale : float
+        Largest |U| (V) seen in making a table of series; 0 where there are none.
     not_finite : float or None
         Time (s) of the first NaN or inf; the table then ends just before it.
     """
@@ -114,7 +116,18 @@ class SourceTable:
     edges: FloatArray
     terms: FloatArray
     series: FloatArray
+    scale: float = 0.0
     not_finite: float | None = None
+
+
+def same_time(t: float) -> float:
+    """Distance (s) within which a time near `t` is that time: a few roundings of t."""
+    return 8e-16 * abs(t)
+
+
+def breakpoints_at(waveform: Waveform, t: float) -> FloatArray:
+    """Breakpoints that are at `t` (s) but for rounding."""
+    return waveform.breakpoints(t - same_time(t), t + same_time(t))
 
 
 def is_sampled(waveform: Waveform) -> bool:
@@ -136,7 +149,8 @@ def source_table(waveform: Waveform, t0: float, t1: float, tol: float, step: flo
         Output step, s: a function is looked at no less finely than this.
     """
     inner = waveform.breakpoints(t0, t1)
-    inner = inner[(inner > t0) & (inner < t1)]
+    # A breakpoint that misses the window's edge by rounding is at the edge: no segment is shorter than that.
+    inner = inner[(inner > t0 + same_time(t0)) & (inner < t1 - same_time(t1))]
     edges = np.concatenate([[t0], inner, [t1]])
     terms = waveform.terms(edges[:-1], edges[1:])
     if terms is not None:
@@ -150,7 +164,8 @@ def source_table(waveform: Waveform, t0: float, t1: float, tol: float, step: flo
     return SourceTable(
         np.array(pieces.edges) if m else np.array([t0]),
         blank_terms(m, 1),
-        np.array(pieces.series).reshape(m, -1),
+        np.array(pieces.series).reshape(m, _POINTS),
+        pieces.scale,
         pieces.not_finite,
     )
 
@@ -183,7 +198,7 @@ class _Refiner:
             series, values = self._try(lo, hi)
             if not np.all(np.isfinite(values)):
                 if hi - lo <= 1e-12 * max(abs(hi), self.step) or depth > 60:
-                    self.not_finite = hi
+                    self.not_finite = lo if lo == self.edges[0] else hi
                     return False
                 middle = 0.5 * (lo + hi)
                 stack += [(middle, hi, depth + 1), (lo, middle, depth + 1)]
@@ -198,9 +213,9 @@ class _Refiner:
             if series is None:
                 middle = 0.5 * (lo + hi)
                 stack += [(middle, hi, depth + 1), (lo, middle, depth + 1)]
-                if hi - lo < 0.25 * self.step:
-                    self.narrow.append(middle)
                 continue
+            if hi - lo < 0.75 * self.step:
+                self.narrow.append(0.5 * (lo + hi))
             self.edges.append(hi)
             self.series.append(series)
         return True
@@ -229,7 +244,8 @@ class _Refiner:
                 FingerspiceWarning,
                 stacklevel=2,
             )
-        apart = [t for t in self.narrow if all(abs(t - j) > self.step for j, _ in real)]
+        # Around a jump or a kink short series are natural.
+        apart = [t for t in self.narrow if all(abs(t - j) > 8.0 * self.step for j, _ in self.jumps)]
         if apart:
             warnings.warn(
                 f"the source function has a feature narrower than the output step {self.step:.3g} s "

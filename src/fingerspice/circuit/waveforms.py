@@ -257,7 +257,7 @@ class Sine(Waveform):
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         out = blank_terms(start.size, 2)
-        on = start >= self.delay if self.delay > 0.0 else np.ones(start.size, bool)
+        on = 0.5 * (start + stop) >= self.delay if self.delay > 0.0 else np.ones(start.size, bool)
         phase = math.radians(self.phase_deg)
         out[:, 0, 0] = np.where(on, self.offset, self.offset + self.amplitude * math.sin(phase))
         decay = np.exp(-self.damping * np.maximum(start - self.delay, 0.0))
@@ -333,7 +333,8 @@ class Chirp(Waveform):
         out[:, 0, 0] = self.offset
         out[:, 1, 0] = self.amplitude
         rate = (self.f1 - self.f0) / self.duration
-        inside = (start >= 0.0) & (start < self.duration)
+        middle = 0.5 * (start + stop)
+        inside = (middle >= 0.0) & (middle < self.duration)
         out[:, 1, 3] = TAU * (self.f0 + rate * np.clip(start, 0.0, self.duration))
         out[:, 1, 4] = self._phase(start) - 0.5 * math.pi
         out[:, 1, 5] = np.where(inside, TAU * rate, 0.0)
@@ -387,8 +388,8 @@ class Exp(Waveform):
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         out = blank_terms(start.size, 3)
         step = self.v2 - self.v1
-        first = start >= self.td1
-        second = start >= self.td2
+        first = 0.5 * (start + stop) >= self.td1
+        second = 0.5 * (start + stop) >= self.td2
         out[:, 0, 0] = self.v1 + step * (first.astype(float) - second.astype(float))
         out[:, 1, 0] = np.where(first, -step * np.exp(-np.maximum(start - self.td1, 0.0) / self.tau1), 0.0)
         out[:, 1, 2] = -1.0 / self.tau1

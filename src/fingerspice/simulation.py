@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.sampling import breakpoints_at, same_time
 from fingerspice.circuit.waveforms import Waveform, as_waveform, require
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError
 from fingerspice.numerics.tableaus import TABLEAUS
@@ -104,10 +105,24 @@ def run_problem(
     progress: Progress | None = None,
 ) -> Solution:
     """Integrate a problem made ready; arguments as in `simulate`. Never raises for a failed run."""
-    t_out, left = (t_eval, np.zeros(t_eval.size, bool)) if t_eval is not None else output_times(problem)
+    if t_eval is None:
+        t_out, left = output_times(problem)
+        run_at = t_out
+    else:
+        t_out, left = t_eval, np.zeros(t_eval.size, bool)
+        run_at = _at_breakpoints(problem, t_eval)
     begin = time.perf_counter()
-    run, name = _run(problem, method, rtol, t_out, left, progress)
+    run, name = _run(problem, method, rtol, run_at, left, progress)
     return _solution(problem, run, rtol, name, t_out, time.perf_counter() - begin)
+
+
+def _at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
+    """Times moved onto the breakpoint they miss by rounding, so that 5 ms means the jump at 5 ms."""
+    edges = problem.waveform.breakpoints(problem.t_start, problem.t_stop)
+    if not edges.size:
+        return t
+    nearest = edges[np.clip(np.searchsorted(edges, t), 0, edges.size - 1)]
+    return np.ascontiguousarray(np.where(np.abs(nearest - t) <= same_time(1.0) * np.abs(t), nearest, t))
 
 
 def _with_sources(circuit: Circuit, sources: Mapping[str, Waveform | float | Callable[[float], float]]) -> Circuit:
@@ -139,11 +154,13 @@ def output_times(problem: Problem) -> tuple[FloatArray, BoolArray]:
     grid = first + step * np.arange(count + 1)
     if grid.size and abs(grid[-1] - problem.t_stop) <= 1e-9 * step:
         grid[-1] = problem.t_stop
-    edges = problem.waveform.breakpoints(problem.t_start, problem.t_stop)
-    edges = edges[(edges > problem.t_start) & (edges >= first)]
+    rounding = same_time(problem.t_stop)
+    edges = problem.waveform.breakpoints(problem.t_start, problem.t_stop + rounding)
+    edges = edges[(edges > problem.t_start + same_time(problem.t_start)) & (edges >= first)]
     size = np.abs(problem.waveform.value(edges) - problem.waveform.value(edges, "left"))
     level = np.maximum(np.abs(problem.waveform.value(edges)), np.abs(problem.waveform.value(edges, "left")))
     jumps = edges[size > 1e-12 * level]
+    jumps = np.where(jumps > problem.t_stop - rounding, problem.t_stop, jumps)
     if jumps.size:
         near = np.clip(np.searchsorted(jumps, grid), 1, max(jumps.size - 1, 1))
         distance = np.minimum(np.abs(grid - jumps[near - 1]), np.abs(grid - jumps[np.minimum(near, jumps.size - 1)]))
@@ -229,6 +246,8 @@ def _message(problem: Problem, run: Run) -> str:
             text += f" (source {names})"
         elif run.status is Status.FOLD and run.n_out:
             last = run.rows[run.n_out - 1]
+            if breakpoints_at(problem.waveform, run.t_failed).size:
+                text += "; the source jumps past the fold at this time"
             text += (
                 f" (last output: {last[1]:.4g} V across the gap, area {1e6 / last[2]:.4g} mm^2, "
                 f"distance to the fold {last[4]:.3g})"

@@ -1,0 +1,177 @@
+"""The paper's figures from scratch, and what its text says about them."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import fingerspice as fs
+from fingerspice import figures
+from fingerspice.simulation import simulate
+from fingerspice.table1 import TABLE1_DECK, table1_circuit
+from scenes import table1
+
+F = ("10Hz", "100Hz", "1000Hz", "10000Hz")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("figures")
+    written = figures.make_figures(out)
+    assert written == [out / f"fig{n}.{kind}" for n in (2, 3, 4, 5) for kind in ("png", "csv")]
+    return out
+
+
+@pytest.fixture(scope="module")
+def numbers() -> dict[str, float]:
+    return figures.figure_numbers()
+
+
+def read(path: Path) -> dict[str, np.ndarray]:
+    with path.open(newline="", encoding="utf-8") as stream:
+        header, *rows = csv.reader(stream)
+    return dict(zip(header, np.array(rows, float).T, strict=True))
+
+
+def test_the_deck_in_the_package_is_table_1() -> None:
+    ours, test = table1_circuit(), table1()
+    assert dict(ours.parameters) == dict(test.parameters)
+    assert ours.tran == test.tran
+    shipped = Path(__file__).parents[1] / "circuits" / "fingerpad.cir"
+    assert dict(fs.read_netlist(shipped).parameters) == dict(ours.parameters)
+    assert fs.parse_netlist(TABLE1_DECK).title == fs.read_netlist(shipped).title
+
+
+def test_every_figure_is_a_picture_with_its_data(folder: Path) -> None:
+    assert sorted(p.name for p in folder.iterdir()) == [
+        f"fig{n}.{kind}" for n in (2, 3, 4, 5) for kind in ("csv", "png")
+    ]
+    for path in folder.glob("*.png"):
+        with Image.open(path) as image:
+            assert image.width >= 150 * 7
+    for path in folder.glob("*.csv"):
+        data = read(path)
+        assert all(name.count("[") == 1 for name in data)
+        assert all(np.isfinite(column).all() for column in data.values())
+
+
+def test_one_figure_can_be_asked_for(tmp_path: Path) -> None:
+    assert [p.name for p in figures.make_figures(tmp_path, only=2)] == ["fig2.png", "fig2.csv"]
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_figure_the_model_does_not_make_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(fs.InputError, match=r"figure is 1; allowed: 2, 3, 4, 5"):
+        figures.make_figures(tmp_path / "out", only=[2, 1])
+    assert not (tmp_path / "out").exists()
+
+
+def test_fig_2_is_the_cubic_and_eq_19(folder: Path) -> None:
+    data = read(folder / "fig2.csv")
+    f = data["frequency [Hz]"]
+    assert (f[0], f[-1]) == (10.0, 1e5)
+    # Eq. 18 at z = 1 and 5, by hand: exponents 4.7661 and 2.9689.
+    np.testing.assert_allclose(data["rho_sc [ohm m]"][[0, -1]], [10**4.7661, 10**2.9689], rtol=1e-8)
+    # Eq. 19 at z = 1: exponent 3.75086.
+    np.testing.assert_allclose(data["eps_r_sc [1]"][0], 10**3.75086, rtol=1e-8)
+
+
+def test_fig_3_has_the_papers_curves(folder: Path) -> None:
+    data = read(folder / "fig3.csv")
+    assert list(data)[1:] == [
+        "f_el_mean [N] Table 1",
+        "f_el_mean [N] d_sc=200 um",
+        "f_el_mean [N] d_sc=450 um",
+        "f_el_mean [N] area=30 mm^2",
+        "f_el_mean [N] area=45 mm^2",
+        "f_el_mean [N] r_a=0.5 Mohm",
+        "f_el_mean [N] r_a=2 Mohm",
+        "f_el_mean [N] r_a=7 Mohm",
+        "f_el_mean [N] d_a=2 um",
+        "f_el_mean [N] d_a=5 um",
+    ]
+    f, base = data["frequency [Hz]"], data["f_el_mean [N] Table 1"]
+    changed = table1().replace({"Vdrive.amplitude": 140.0, "Xgap.d": 2e-6})
+    np.testing.assert_allclose(data["f_el_mean [N] d_a=2 um"], fs.phasor(changed, f).f_el_mean, rtol=1e-9)
+    for more, less in (("d_sc=200 um", "d_sc=450 um"), ("area=45 mm^2", "area=30 mm^2"), ("d_a=2 um", "d_a=5 um")):
+        assert np.all(data[f"f_el_mean [N] {more}"] > base)
+        assert np.all(data[f"f_el_mean [N] {less}"] < base)
+
+
+def test_scaling_the_area_scales_what_the_paper_calls_the_area() -> None:
+    variation = figures.variations()[1]
+    values = variation.apply(table1_circuit(), 45.0)["Xgap"].values
+    assert values["alpha"] * 0.5 ** values["m_exp"] == pytest.approx(45.0, rel=1e-13)
+    assert values["beta"] / values["alpha"] == pytest.approx(32.0 / 54.4, rel=1e-13)
+    assert (values["m_exp"], values["n_exp"]) == (0.52, 1.41)
+
+
+@pytest.mark.parametrize("number", [4, 5])
+def test_figs_4_and_5_are_two_periods_of_the_periodic_state(folder: Path, number: int) -> None:
+    data = read(folder / f"fig{number}.csv")
+    for frequency in (100.0, 5000.0):
+        part = {k: v[data["frequency [Hz]"] == frequency] for k, v in data.items()}
+        t, u, force = part["t [s]"], part["u_gap [V]"], part["f_el [N]"]
+        assert np.all(np.diff(t) >= 0.0)
+        assert (t[0], t[-1]) == (0.0, pytest.approx(2.0 / frequency, rel=1e-9))
+        middle = np.flatnonzero(np.isclose(t, 1.0 / frequency, rtol=1e-9))[-1]
+        assert u[middle] == pytest.approx(u[0], abs=1e-5)
+        assert u[-1] == pytest.approx(u[middle - 1] if number == 5 else u[0], abs=1e-5)
+        stress = 8.854e-12 * u**2 / (2.0 * 3.5e-6**2)
+        np.testing.assert_allclose(force, stress * part["area [m^2]"], rtol=1e-7, atol=1e-12)
+        # Half a period later everything is turned over: rows of equal time apart from the jumps.
+        assert u.max() == pytest.approx(-u.min(), rel=1e-4)
+        jumps = np.count_nonzero(np.diff(t) == 0.0)
+        assert jumps == (3 if number == 5 else 0)
+
+
+def test_numbers_of_the_time_responses_are_those_of_a_long_run(numbers: dict[str, float]) -> None:
+    solution = simulate(table1(), t_stop=0.1, rtol=1e-8)
+    assert numbers["sine_100Hz_mean"] == pytest.approx(solution.summary()["f_el_mean_periodic"], rel=1e-5)
+
+
+def test_what_the_papers_text_claims(numbers: dict[str, float]) -> None:
+    """Claims that hold as they stand; where ours differ (66.5 % for 60 %, 72 % for 80 %) ours is held."""
+    n = numbers
+    assert n["area_unloaded"] == pytest.approx(37.94e-6, rel=1e-4)
+    assert n["gain_100Hz"] == pytest.approx(0.6653, abs=5e-5)
+    assert n["lead_100Hz"] == pytest.approx(7.94, abs=0.01)
+    assert n["gain_5000Hz"] == pytest.approx(0.8768, abs=5e-5)
+    assert n["lead_5000Hz"] == pytest.approx(1.37, abs=0.005)
+    assert n["rise"] == pytest.approx(1.724, abs=5e-4)
+    assert n["rise_above_2kHz"] == pytest.approx(1.03, abs=5e-3)
+    rises = [n[f"rise_r_a_{r:g}"] for r in (0.5, 1.0, 2.0, 7.0)]
+    np.testing.assert_allclose(rises, [3.06, 1.72, 1.21, 0.91], atol=5e-3)
+
+
+def test_the_square_waves_force_is_volatile_at_100_hz_and_nearly_constant_at_5_khz(
+    numbers: dict[str, float],
+) -> None:
+    found = [[numbers[f"square_{f}_{what}"] for what in ("min", "max", "mean")] for f in ("100Hz", "5000Hz")]
+    np.testing.assert_allclose(found, [[0.1845, 0.5826, 0.2278], [0.3326, 0.3829, 0.3550]], atol=5.1e-5)
+
+
+@pytest.mark.parametrize("f", F)
+def test_the_force_is_about_linear_in_skin_thickness_and_in_area(numbers: dict[str, float], f: str) -> None:
+    """Off the best straight line by 6 % of the change at most for the skin (at 10 Hz), 1.2 % for the area."""
+    assert numbers[f"bend_d_sc_{f}"] < 0.06
+    assert numbers[f"bend_area_{f}"] < 0.012
+    assert numbers[f"bend_d_a_{f}"] > 0.19  # The gap thickness goes in about as its inverse square instead.
+
+
+@pytest.mark.parametrize("f", F)
+def test_area_matters_more_than_skin_thickness(numbers: dict[str, float], f: str) -> None:
+    """Per relative change: 3.0 times at 10 Hz, 4.1 at 100 Hz, 10 at 1 kHz, 11 at 10 kHz."""
+    area, skin = numbers[f"elasticity_area_{f}"], numbers[f"elasticity_d_sc_{f}"]
+    assert skin < 0.0 < area
+    expected = {"10Hz": 3.04, "100Hz": 4.07, "1000Hz": 10.05, "10000Hz": 10.93}[f]
+    assert area / -skin == pytest.approx(expected, abs=0.01)
+
+
+def test_force_goes_about_as_the_inverse_square_of_the_gap_thickness(numbers: dict[str, float]) -> None:
+    found = [numbers[f"elasticity_d_a_{f}"] for f in F]
+    np.testing.assert_allclose(found, [-1.97, -1.95, -1.79, -1.71], atol=5e-3)

@@ -1,0 +1,176 @@
+"""Laws every result obeys, whatever its numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.polynomial import chebyshev
+from numpy.testing import assert_allclose
+
+import analytic as ref
+import fingerspice as fs
+from scenes import deck, table1
+
+EPS0 = 8.854e-12
+SOURCES = {
+    "sine": fs.Sine(200.0, 100.0),
+    "square": fs.Square(200.0, 100.0),
+    "mixed": fs.Sine(120.0, 100.0, offset=30.0) + fs.Triangle(60.0, 300.0),
+}
+
+
+def run(waveform, law="local", **options):
+    options = {"t_stop": 0.02, "rtol": 1e-9, "charge_law": law} | options
+    return fs.simulate(table1(), sources={"Vdrive": waveform}, **options)
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+@pytest.mark.parametrize("source", SOURCES)
+def test_layer_voltages_sum_to_the_source(source, law):
+    solution = run(SOURCES[source], law)
+    peak = np.abs(solution.u_source).max()
+    assert np.abs(solution.u_layer.sum(axis=1) - solution.u_source).max() <= 1e-13 * peak
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+@pytest.mark.parametrize("source", SOURCES)
+def test_reversing_the_source_reverses_every_voltage_and_no_force(source, law):
+    plus = run(SOURCES[source], law)
+    minus = run(SOURCES[source] * -1.0, law)
+    peak = np.abs(plus.u_gap).max()
+    assert np.abs(plus.u_layer + minus.u_layer).max() <= 1e-12 * peak
+    assert_allclose(minus.f_el, plus.f_el, rtol=0.0, atol=1e-12 * plus.f_el.max())
+    assert np.abs(plus.q_source + minus.q_source).max() <= 1e-12 * np.abs(plus.q_source).max()
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_a_later_source_gives_the_same_response_later(law):
+    # An uncharged stack at 0 V stays so: the sine may as well begin 3 ms later.
+    t = np.linspace(0.0, 0.017, 341)
+    now = run(fs.Sine(200.0, 100.0), law, t_eval=t, t_stop=0.02)
+    later = run(fs.Sine(200.0, 100.0, delay=0.003), law, t_eval=t + 0.003, t_stop=0.023)
+    assert np.abs(now.u_gap - later.u_gap).max() <= 2e-9 * np.abs(now.u_gap).max()
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_a_run_in_two_halves_equals_the_whole(law):
+    whole = run(SOURCES["square"], law)
+    first = run(SOURCES["square"], law, t_stop=0.0123)
+    second = fs.simulate(
+        table1(), sources={"Vdrive": SOURCES["square"]}, charge_law=law, start=first, t_stop=0.02,
+        t_eval=whole.t[whole.t > 0.0123][1:], rtol=1e-9,
+    )  # fmt: skip
+    keep = np.searchsorted(whole.t, second.t, side="right") - 1
+    assert np.abs(whole.u_gap[keep] - second.u_gap).max() <= 3e-9 * np.abs(whole.u_gap).max()
+    assert np.abs(whole.q_source[keep] - second.q_source).max() <= 3e-9 * np.abs(whole.q_source).max()
+
+
+def permuted(order):
+    layers = {
+        "c": "Xcoat {} {} area LAYER d=1u eps_r=3.9 r=0.2meg",
+        "g": "Xgap {} {} area GAP d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000",
+        "s": "Xskin {} {} area SKIN d=350u f=100",
+    }
+    nodes = ["drive", "n1", "n2", "0"]
+    lines = [layers[x].format(nodes[i], nodes[i + 1]) for i, x in enumerate(order)]
+    return deck("Vdrive drive 0 SIN(0 200 100)", *lines, ".tran 10u 20m uic")
+
+
+@pytest.mark.parametrize("order", ["gcs", "scg", "csg", "sgc", "gsc"])
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_the_order_of_the_layers_does_not_matter(order, law):
+    usual = fs.simulate(permuted("cgs"), charge_law=law)
+    other = fs.simulate(permuted(order), charge_law=law)
+    assert np.abs(usual.u_gap - other.u_gap).max() <= 2e-8 * np.abs(usual.u_gap).max()
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_charge_bookkeeping_closes_to_1e_12(law):
+    """The current through each layer, C u' or (C u)' plus its leak, is the source's: integrated over smooth stretches.
+
+    Per layer, the charge through it is computed from the layer's own voltage and the area by spectral quadrature on
+    stretches between the kinks, so nothing of the engine's own charge is used.
+    """
+    base = fs.simulate(table1(), charge_law=law, rtol=1e-12, t_stop=0.02)
+    sign = np.sign(base.u_gap[1:])
+    zeros = base.t[1:][np.flatnonzero(np.diff(sign) != 0.0)]
+    zeros = np.unique(np.round(zeros, 6))
+    nodes = 64
+    x = np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)[::-1]
+    c = EPS0 * np.array([3.9 / 1e-6, 1.0 / 3.5e-6, ref.eps_sc(100.0) / 350e-6])
+    for t0, t1 in zip(zeros[:-1] + 3e-5, zeros[1:] - 3e-5, strict=True):
+        t = 0.5 * (t0 + t1) + 0.5 * (t1 - t0) * x
+        s = fs.simulate(table1(), charge_law=law, rtol=1e-12, t_eval=np.concatenate([[t0], t, [t1]]), t_stop=0.02)
+        delivered = s.q_source[-1] - s.q_source[0]
+        u, area = s.u_layer[1:-1], s.area[1:-1]
+        leak = u * np.column_stack([np.full(nodes, 1 / 2e5), np.full(nodes, 1e-6), area / (ref.rho_sc(100.0) * 350e-6)])
+        for i in range(3):
+            stored = c[i] * u[:, i] * (area if law == "mobile" else 1.0)
+            rate = chebyshev.chebval(x, chebyshev.chebder(_series(stored, x))) / (0.5 * (t1 - t0))
+            current = rate * (1.0 if law == "mobile" else area) + leak[:, i]
+            integral = chebyshev.chebint(_series(current, x))
+            through = 0.5 * (t1 - t0) * (chebyshev.chebval(1.0, integral) - chebyshev.chebval(-1.0, integral))
+            assert abs(through - delivered) <= 1e-12 * np.abs(base.q_source).max()
+
+
+def _series(values, x):
+    # Interpolation at Chebyshev points of the first kind, by the discrete cosine sums.
+    n = x.size
+    theta = np.arccos(x)
+    out = 2.0 / n * np.array([np.sum(values * np.cos(k * theta)) for k in range(n)])
+    out[0] *= 0.5
+    return out
+
+
+def test_a_jump_delivers_its_integral_of_a_dd():
+    # Uncharged, local: D = U / S, so the charge of the first jump is the integral of A over U, over S.
+    solution = run(fs.DC(200.0), t_stop=1e-3)
+    c = EPS0 * np.array([3.9 / 1e-6, 1.0 / 3.5e-6, ref.eps_sc(100.0) / 350e-6])
+    s = np.sum(1.0 / c)
+    share = 1.0 / (c[1] * s)
+    u = np.linspace(0.0, 200.0, 20001)
+    area = np.asarray(ref.area(share * u))
+    simpson = (u[1] / 3.0) * (area[0] + area[-1] + 4.0 * area[1::2].sum() + 2.0 * area[2:-1:2].sum())
+    assert solution.q_source[0] == pytest.approx(simpson / s, rel=1e-9)
+
+
+def test_force_vanishes_with_the_voltage_as_its_square():
+    forces = [run(fs.Sine(u, 100.0)).f_el.max() for u in (1e-3, 1e-6, 1e-9)]
+    assert_allclose(forces[1] / forces[0], 1e-6, rtol=1e-6)
+    assert_allclose(forces[2] / forces[1], 1e-6, rtol=1e-7)
+
+
+def test_nothing_happens_at_zero_volt():
+    solution = run(fs.DC(0.0))
+    for value in (solution.u_layer, solution.f_el, solution.q_source, solution.i_source):
+        assert np.all(value == 0.0)
+    assert_allclose(solution.f_t, 0.3 * 0.5, rtol=1e-15)
+
+
+@pytest.mark.filterwarnings("ignore:the gap voltage reaches")
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(
+    amplitude=st.floats(1.0, 250.0),
+    frequency=st.floats(20.0, 5000.0),
+    d_gap=st.floats(2e-6, 1e-5),
+    r_gap=st.floats(1e5, 1e8),
+    load=st.floats(0.1, 1.0),
+    law=st.sampled_from(["local", "mobile"]),
+)
+def test_random_scenes_obey_kirchhoff_and_amontons(amplitude, frequency, d_gap, r_gap, load, law):
+    circuit = table1().replace({"Xgap.d": d_gap, "Xgap.r": r_gap, "Xgap.fn": load})
+    s = fs.simulate(circuit, sources={"Vdrive": fs.Square(amplitude, frequency)}, t_stop=3.0 / frequency,
+                    charge_law=law, rtol=1e-6, throw=False)  # fmt: skip
+    assert s.success or s.status is fs.Status.FOLD
+    assert np.abs(s.u_layer.sum(axis=1) - s.u_source).max() <= 1e-12 * amplitude
+    assert_allclose(s.sigma_el, EPS0 * s.u_gap**2 / (2.0 * d_gap**2), rtol=1e-12)
+    assert_allclose(s.f_t, 0.3 * (load + s.sigma_el * s.area), rtol=1e-12)
+    assert_allclose(s.area, ref.area(s.u_gap, _parameters(d_gap, load)), rtol=1e-11)
+
+
+def _parameters(d_gap, load):
+    return dataclasses.replace(ref.TABLE1, d_a=d_gap, force_normal=load)

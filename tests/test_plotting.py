@@ -1,0 +1,237 @@
+"""Pictures: they show what the results hold, in any state a result can be in, and touch nothing global."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import fingerspice as fs
+from fingerspice import plotting
+from fingerspice.comparison import compare
+from fingerspice.simulation import simulate
+from scenes import deck, table1
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def labels(figure: Figure) -> list[str]:
+    return [ax.get_ylabel() for ax in figure.axes if ax.axison]
+
+
+def curve(ax: Axes, label: str) -> tuple[np.ndarray, np.ndarray]:
+    line = next(line for line in ax.lines if line.get_label() == label)
+    return np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
+
+
+def small_print(figure: Figure) -> str:
+    return " ".join(figure.get_supxlabel().split())
+
+
+def with_source(value: fs.Waveform, **options: object) -> fs.Solution:
+    """A run under `value`, whatever comes of it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", fs.FingerspiceWarning)
+        return simulate(table1(), sources={"Vdrive": value}, throw=False, **options)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def sine() -> fs.Solution:
+    return simulate(table1())
+
+
+def test_a_run_is_shown_in_four_panels_with_units(sine: fs.Solution) -> None:
+    figure = plotting.plot_solution(sine)
+    assert labels(figure) == ["Voltage [V]", "Force [N]", "Ridge area [mm²]", "Friction [N]"]
+    assert figure.axes[3].get_xlabel() == "Time [ms]"
+    t, u = curve(figure.axes[0], "gap")
+    np.testing.assert_allclose(t, 1e3 * sine.t)
+    np.testing.assert_array_equal(u, sine.u_gap)
+    np.testing.assert_allclose(figure.axes[2].lines[0].get_ydata(), 1e6 * sine.area)
+
+
+def test_the_mean_shown_is_that_of_the_last_period(sine: fs.Solution) -> None:
+    ax = plotting.plot_solution(sine).axes[1]
+    _, level = curve(ax, "mean of the last period, 0.109 N")
+    np.testing.assert_allclose(level, sine.summary()["f_el_mean_periodic"])
+
+
+def test_the_small_print_says_how_it_was_made(sine: fs.Solution) -> None:
+    text = small_print(plotting.plot_solution(sine))
+    for part in ("Table 1", "local charge law", "area: coupled", "rtol 1e-08", f"{sine.error.u_gap:.2g} V"):
+        assert part in text
+
+
+def test_the_friction_coefficient_is_the_right_scale_of_the_friction_panel(sine: fs.Solution) -> None:
+    figure = plotting.plot_solution(sine)
+    figure.canvas.draw()
+    force, right = figure.axes[3].get_ylim(), figure.axes[3].child_axes[0].get_ylim()
+    np.testing.assert_allclose(right, np.array(force) / 0.5)
+
+
+def test_both_sides_of_a_jump_are_drawn() -> None:
+    solution = simulate(table1(), sources={"Vdrive": fs.Square(200.0, 100.0)}, t_stop=0.01, rtol=1e-6)
+    t, u = curve(plotting.plot_solution(solution).axes[0], "source")
+    np.testing.assert_array_equal(u[np.isclose(t, 5.0)], [200.0, -200.0])
+
+
+def test_without_a_gap_the_layers_voltages_are_shown_alone() -> None:
+    circuit = deck(
+        "V1 a 0 SIN(0 200 100)", "Xc$x$ a b area LAYER d=1u eps_r=3.9 r=0.2meg",
+        "Xs b 0 area SKIN d=350u f=100", "Varea area 0 35", ".tran 10u 20m",
+    )  # fmt: skip
+    solution = simulate(circuit)
+    figure = plotting.plot_solution(solution)
+    assert labels(figure) == ["Voltage [V]"]
+    legend = figure.axes[0].get_legend()
+    assert legend is not None
+    assert [t.get_text() for t in legend.get_texts()] == ["source", "layer Xc$x$", "layer Xs"]
+    assert not any(t.get_parse_math() for t in legend.get_texts())
+    np.testing.assert_array_equal(curve(figure.axes[0], "layer Xs")[1], solution.u_layer[:, 1])
+
+
+def test_a_run_that_stopped_shows_where_and_why() -> None:
+    source = fs.Function(lambda t: 1e4 * t if t < 0.0123 else math.nan)
+    solution = with_source(source, t_stop=0.02)
+    assert not solution.success
+    figure = plotting.plot_solution(solution)
+    assert [t.get_text().strip() for t in figure.axes[0].texts] == ["stopped"]
+    for ax in figure.axes:
+        assert any(np.allclose(line.get_xdata(), 12.3) for line in ax.lines)
+        assert ax.get_xlim()[1] > 12.3
+    assert "NaN" in small_print(figure)
+
+
+@pytest.mark.parametrize("rows", [0, 1, 2])
+def test_a_run_that_stopped_at_once_still_makes_a_picture(sine: fs.Solution, rows: int, tmp_path: Path) -> None:
+    cut = {k: v[:rows] for k, v in vars(sine).items() if isinstance(v, np.ndarray)}
+    state = dataclasses.replace(sine.state, t=float(sine.t[max(rows - 1, 0)]))
+    solution = dataclasses.replace(sine, **cut, state=state, status=fs.Status.SOURCE_NOT_FINITE)
+    figure = plotting.plot_solution(solution)
+    assert "stopped" in figure.axes[0].texts[0].get_text()
+    assert plotting.save(figure, tmp_path / "x.png").stat().st_size > 0
+
+
+def test_a_fixed_area_is_drawn_flat_not_as_its_rounding() -> None:
+    figure = plotting.plot_solution(simulate(table1(), area="frozen", t_stop=0.01))
+    low, high = figure.axes[2].get_ylim()
+    assert low < 34.0 < 36.0 < high
+
+
+def test_no_voltage_is_no_force_and_still_a_picture(tmp_path: Path) -> None:
+    figure = plotting.plot_solution(with_source(fs.DC(0.0), t_stop=0.01))
+    assert figure.axes[1].get_ylim() == pytest.approx((0.0, figure.axes[1].get_ylim()[1]))
+    plotting.save(figure, tmp_path / "x.png")
+
+
+def test_a_sweep_shows_gain_phase_force_and_area() -> None:
+    circuit = table1()
+    result = fs.phasor(circuit, np.geomspace(1.0, 1e4, 21))
+    figure = plotting.plot_phasor(result, circuit)
+    assert len(labels(figure)) == 4
+    assert all(ax.get_xscale() == "log" for ax in figure.axes)
+    for ax, values in zip(
+        figure.axes,
+        (abs(result.gain), np.degrees(np.angle(result.gain)), result.f_el_mean, 1e6 * result.area),
+        strict=True,
+    ):
+        np.testing.assert_allclose(ax.lines[0].get_ydata(), values)
+    assert "outside the skin data" in small_print(figure)
+
+
+def test_within_the_skin_data_nothing_is_shaded() -> None:
+    circuit = table1()
+    figure = plotting.plot_phasor(fs.phasor(circuit, np.geomspace(10.0, 1e5, 9)), circuit)
+    assert "outside" not in small_print(figure)
+    assert not any(ax.patches for ax in figure.axes)
+
+
+def test_a_single_frequency_and_a_source_without_fundamental_are_drawn_too(tmp_path: Path) -> None:
+    circuit = table1().replace({"Vdrive": fs.DC(100.0)})
+    figure = plotting.plot_phasor(fs.phasor(circuit, 100.0, area="frozen"), circuit)
+    assert figure.axes[2].texts[0].get_text() == "the source has no fundamental"
+    plotting.save(figure, tmp_path / "x.png")
+
+
+@pytest.mark.parametrize("phase", [0.0, 70.0])
+def test_the_phasor_lies_on_the_transient_where_the_area_is_fixed(phase: float) -> None:
+    circuit = table1(f"SIN(0 200 100 0 0 {phase})", gap={"a_fix": 35})
+    figure = plotting.plot_comparison(compare(circuit))
+    for ax, transient, p, scale in (
+        (figure.axes[0], "gap", "gap, phasor", 200.0),
+        (figure.axes[1], "electroadhesive force", "electroadhesive force, phasor", 0.2),
+    ):
+        np.testing.assert_allclose(curve(ax, transient)[1], curve(ax, p)[1], atol=1e-6 * scale)
+
+
+def test_the_comparison_shows_its_table() -> None:
+    comparison = compare(table1())
+    table = plotting.plot_comparison(comparison).axes[2].tables[0].get_celld()
+    assert table[1, 0].get_text().get_text() == "Gap voltage at the fundamental [V]"
+    assert table[3, 3].get_text().get_text() == f"{comparison.coupled.f_el_mean:.5g}"
+
+
+def test_a_picture_has_150_dots_an_inch_or_more(sine: fs.Solution, tmp_path: Path) -> None:
+    figure = plotting.plot_solution(sine)
+    with Image.open(plotting.save(figure, tmp_path / "new" / "run.png")) as image:
+        assert image.format == "PNG"
+        assert image.width >= 150 * figure.get_size_inches()[0]
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["run.png"]
+
+
+def test_a_folder_that_cannot_be_written_is_bad_input(sine: fs.Solution, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(fs.InputError, match="cannot write"):
+        plotting.save(plotting.plot_solution(sine), tmp_path / "file" / "run.png")
+
+
+@pytest.mark.parametrize(
+    ("peak", "unit", "least", "expected"),
+    [
+        (0.05, "s", 1.0, (1e3, "ms")),
+        (2e-4, "s", 1.0, (1e6, "µs")),
+        (1e-3, "s", 1.0, (1e3, "ms")),
+        (1.0, "s", 1.0, (1.0, "s")),
+        (0.21, "N", 0.05, (1.0, "N")),
+        (0.004, "N", 0.05, (1e3, "mN")),
+        (200.0, "V", 2.0, (1.0, "V")),
+        (0.0, "V", 2.0, (1.0, "V")),
+        (math.nan, "V", 2.0, (1.0, "V")),
+    ],
+)
+def test_engineering_units(peak: float, unit: str, least: float, expected: tuple[float, str]) -> None:
+    factor, name = plotting.engineering(peak, unit, least)
+    assert (factor, name) == (pytest.approx(expected[0]), expected[1])
+
+
+def test_thinning_keeps_every_extreme_and_both_ends() -> None:
+    t = np.linspace(0.0, 1.0, 123_457)
+    x = np.sin(2e4 * t)
+    x[77_777] = 9.0
+    thin_t, thin_x = plotting.thin(t, x)
+    assert thin_t.size < 5 * plotting.MAX_BINS
+    assert np.all(np.diff(thin_t) > 0.0)
+    assert (thin_t[0], thin_t[-1]) == (0.0, 1.0)
+    assert thin_x.max() == 9.0
+    assert thin_x.min() == x.min()
+
+
+def test_pictures_need_no_pyplot_and_their_module_no_matplotlib() -> None:
+    code = (
+        "import sys, numpy, fingerspice as fs\n"
+        "from fingerspice import figures, plotting\n"
+        "assert not any(m.startswith('matplotlib') for m in sys.modules)\n"
+        "plotting.new_figure(1)\n"
+        "assert 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=60)

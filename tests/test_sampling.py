@@ -1,0 +1,207 @@
+"""A user's function as a source: declared breaks are exact, undeclared ones are found and warned about."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import fingerspice as fs
+from fingerspice.circuit.sampling import SourceTable, source_table
+from fingerspice.engine.model import Segment, source
+from scenes import table1
+
+STEP = 1e-5
+TOL = 1e-10
+
+
+def read(table: SourceTable, t: np.ndarray) -> np.ndarray:
+    """Voltage of a table at times t, right-hand at its edges."""
+    index = np.clip(np.searchsorted(table.edges, t, side="right") - 1, 0, table.edges.size - 2)
+    out = []
+    for time, i in zip(t, index, strict=True):
+        a, b = table.edges[i], table.edges[i + 1]
+        out.append(source(Segment(a, b - a, table.terms[i], table.series[i]), time - a)[0])
+    return np.array(out)
+
+
+def step_at(time: float):
+    return lambda t: np.where(np.asarray(t) < time, 50.0, 200.0) + 30.0 * np.sin(2.0 * math.pi * 100.0 * np.asarray(t))
+
+
+def spike_at(time: float, width: float):
+    """A bell of that full width at half maximum, on a slow sine."""
+    return lambda t: 100.0 * 0.5 ** (2.0 * (t - time) / width) ** 2 + 50.0 * np.sin(2.0 * math.pi * 100.0 * t)
+
+
+# Smooth functions -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda t: 200.0 * np.sin(2.0 * math.pi * 100.0 * t) ** 3,
+        lambda t: 200.0 * np.exp(-t / 3e-3) * np.cos(2.0 * math.pi * 5000.0 * t),
+        lambda t: 200.0 / (1.0 + ((t - 0.007) / 1e-3) ** 2),
+        lambda t: 200.0 * np.sin(2.0 * math.pi * (100.0 + 1e5 * t) * t),
+    ],
+)
+def test_a_smooth_function_is_met_to_the_tolerance_without_a_warning(function) -> None:
+    table = source_table(fs.Function(function), 0.0, 0.02, TOL, STEP)
+    t = np.sort(np.random.default_rng(3).uniform(0.0, 0.02, 1000))
+    np.testing.assert_allclose(read(table, t), function(t), rtol=0, atol=2.0 * TOL * 200.0)
+
+
+def test_functions_of_a_number_and_of_arrays_give_the_same_table() -> None:
+    def of_arrays(t):
+        return 3.0 * np.sin(700.0 * t)
+
+    def of_numbers(t):
+        return 3.0 * math.sin(700.0 * t)
+
+    def with_a_branch(t):
+        return 3.0 * math.sin(700.0 * t) if t >= 0.0 else 0.0
+
+    tables = [source_table(fs.Function(f), 0.0, 0.01, TOL, STEP) for f in (of_arrays, of_numbers, with_a_branch)]
+    for table in tables[1:]:
+        np.testing.assert_array_equal(table.edges, tables[0].edges)
+        np.testing.assert_allclose(table.series, tables[0].series, rtol=0, atol=1e-14)
+
+
+def test_a_function_that_misreads_arrays_without_raising_is_called_with_numbers() -> None:
+    def by_the_first(t):
+        late = np.ravel(t)[0] > 0.005
+        return np.full(np.shape(t), 2.0 if late else 1.0)
+
+    np.testing.assert_array_equal(fs.Function(by_the_first).value([0.004, 0.006, 0.007]), [1.0, 2.0, 2.0])
+
+
+@pytest.mark.parametrize("given", ["a", None, 1j, [1.0, 2.0]])
+def test_a_function_that_returns_no_number_is_refused_with_what_it_returned(given: object) -> None:
+    with pytest.raises(fs.InputError, match="the source function returned .* allowed: one number"):
+        fs.Function(lambda t: given).value([0.001, 0.002])
+
+
+def test_what_cannot_be_called_is_refused_at_once() -> None:
+    with pytest.raises(fs.InputError):
+        fs.Function(3.0)  # type: ignore[arg-type]
+
+
+# Declared breaks --------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=25, derandomize=True, deadline=None)
+@given(time=st.floats(1e-4, 0.0199))
+def test_a_declared_jump_is_an_edge_of_the_table_with_both_sides_right(time: float) -> None:
+    wave = fs.Function(step_at(time), breaks=(time,))
+    table = source_table(wave, 0.0, 0.02, TOL, STEP)
+    assert time in table.edges
+    t = np.array([0.0, time - 1e-9, time, time + 1e-9, 0.02])
+    t = t[t >= 0.0]
+    np.testing.assert_allclose(read(table, t), wave.value(t), rtol=0, atol=2e-8)
+    assert float(wave.value(time) - wave.value(time, "left")) == pytest.approx(150.0, abs=1e-9)
+
+
+def test_breaks_of_a_periodic_function_come_back_in_every_period_each_once() -> None:
+    wave = fs.Function(lambda t: np.where(t % 0.01 < 0.004, 1.0, -1.0), breaks=(0.0, 0.004), repeat=0.01)
+    expected = np.sort(np.concatenate([np.arange(10) * 0.01, np.arange(10) * 0.01 + 0.004]))
+    np.testing.assert_allclose(wave.breakpoints(0.0, 0.095), expected, rtol=1e-15)
+    # its end named as well as its start, which is the same edge
+    both = fs.Function(wave.function, breaks=(0.0, 0.004, 0.01), repeat=0.01)
+    np.testing.assert_allclose(both.breakpoints(0.0, 0.095), expected, rtol=1e-15)
+
+
+# Undeclared jumps and spikes --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("time", [0.0123456789, 0.0031, 0.012, 0.01234])
+def test_an_undeclared_jump_is_found_and_warned_about_with_its_time_and_size(time: float) -> None:
+    with pytest.warns(fs.FingerspiceWarning) as caught:
+        table = source_table(fs.Function(step_at(time)), 0.0, 0.02, TOL, STEP)
+    (message,) = [str(w.message) for w in caught]
+    assert "jumps by 150 V" in message
+    assert f"at t = {time:.9g} s" in message
+    assert "breaks=" in message
+    assert np.abs(table.edges - time).min() < 1e-13
+    t = np.array([time - 1e-9, time + 1e-9, 0.001, 0.0199])
+    np.testing.assert_allclose(read(table, t), step_at(time)(t), rtol=0, atol=1e-7)
+
+
+def test_several_undeclared_jumps_are_counted_in_one_warning() -> None:
+    def square(t):
+        return np.where(np.floor((t - 0.000123) / 0.005) % 2.0 == 0.0, 200.0, -200.0)
+
+    with pytest.warns(fs.FingerspiceWarning) as caught:
+        source_table(fs.Function(square), 0.0, 0.02, TOL, STEP)
+    (message,) = [str(w.message) for w in caught]
+    assert "at t = 0.000123 s and 3 more times" in message
+
+
+@pytest.mark.parametrize("width", [0.5, 0.2])
+@pytest.mark.parametrize("time", [0.0020037, 0.0123456, 0.0179911])
+def test_a_spike_narrower_than_the_step_is_resolved_and_warned_about_with_its_time(width: float, time: float) -> None:
+    wave = fs.Function(spike_at(time, width * STEP))
+    with pytest.warns(fs.FingerspiceWarning, match="narrower than the output step 1e-05 s") as caught:
+        table = source_table(wave, 0.0, 0.02, TOL, STEP)
+    (message,) = [str(w.message) for w in caught]
+    seen = float(message.partition("near t = ")[2].partition(" s")[0])
+    assert seen == pytest.approx(time, abs=2.0 * STEP)
+    t = time + np.linspace(-2.0, 2.0, 81) * STEP
+    np.testing.assert_allclose(read(table, t), wave.value(t), rtol=0, atol=2.0 * TOL * 150.0)
+
+
+@settings(max_examples=25, derandomize=True, deadline=None)
+@given(time=st.floats(1e-4, 0.0015))
+def test_a_rectangular_pulse_of_half_a_step_is_never_missed(time: float) -> None:
+    wave = fs.Function(lambda t: np.where((t >= time) & (t < time + 0.5 * STEP), 100.0, 0.0) + 10.0)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        table = source_table(wave, 0.0, 0.002, TOL, STEP)
+    assert len(caught) >= 1
+    t = time + np.array([-0.3, 0.1, 0.25, 0.4, 0.8]) * STEP
+    np.testing.assert_allclose(read(table, t), wave.value(t), rtol=0, atol=1e-7)
+
+
+def test_a_function_known_only_to_the_rounding_of_its_phase_costs_no_more_for_it() -> None:
+    """5 kHz near one second: the phase is 3e4 rad, known to 3e-12. A finer tolerance cannot be proved."""
+    seen = 0
+
+    def sine(t):
+        nonlocal seen
+        seen += np.size(t)
+        assert seen < 200_000, "refining noise"
+        return 200.0 * np.sin(2.0 * math.pi * 5000.0 * t)
+
+    table = source_table(fs.Function(sine), 1.0, 1.01, 1e-12, STEP)
+    t = np.linspace(1.0, 1.01, 500)[:-1]
+    np.testing.assert_allclose(read(table, t), sine(t), rtol=0, atol=200.0 * 2e-11)
+
+
+# What is not finite -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("start", [0.003, 0.0030001234, 0.0])
+def test_nan_and_inf_end_the_table_where_they_begin(bad: float, start: float) -> None:
+    wave = fs.Function(lambda t: np.where(t < start, np.sin(700.0 * t), bad))
+    table = source_table(wave, 0.0, 0.02, TOL, STEP)
+    assert table.not_finite == pytest.approx(start, abs=1e-11)
+    assert table.edges[-1] <= start + 1e-11
+    if start > 0.0:
+        assert table.edges[-1] >= start - 1e-11
+        t = np.linspace(0.0, 0.999 * start, 50)
+        np.testing.assert_allclose(read(table, t), np.sin(700.0 * t), rtol=0, atol=2.0 * TOL)
+
+
+def test_a_run_names_the_time_and_the_source_of_a_nan_and_keeps_what_came_before() -> None:
+    with pytest.raises(fs.SolveError, match=r"t = 0\.003.* s: a source gave NaN or inf.*Vdrive") as caught:
+        fs.simulate(table1(), sources={"Vdrive": lambda t: np.where(t < 0.003, 10.0 * t, math.nan)}, rtol=1e-6)
+    partial = caught.value.solution
+    assert partial is not None
+    assert not partial.success
+    assert 0.0029 < partial.t[-1] <= 0.003
+    assert np.isfinite(partial.u_gap).all()

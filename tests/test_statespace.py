@@ -1,0 +1,261 @@
+"""From nodes to matrices: any series stack, written in any order and direction, against a dense formulation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import fingerspice as fs
+from analytic import GAP, TABLE1, eps_sc, rho_sc, table1_layers
+from fingerspice.circuit.statespace import Stack, build_stack
+from scenes import deck, table1
+
+SEARCH = settings(max_examples=50, derandomize=True, deadline=None)
+EPS0 = 8.854e-12
+AREA = 35e-6
+
+
+@dataclass(frozen=True)
+class Slice:
+    """One layer of a random stack: thickness (m), permittivity, and r (ohm), rho (ohm m), or neither."""
+
+    d: float
+    eps_r: float
+    r: float | None = None
+    rho: float | None = None
+
+    def line(self, name: str, p: str, n: str) -> str:
+        if self.rho is not None:
+            return f"{name} {p} {n} area SLAB d={self.d!r} eps_r={self.eps_r!r} rho={self.rho!r}"
+        leak = "" if self.r is None else f" r={self.r!r}"
+        return f"{name} {p} {n} area LAYER d={self.d!r} eps_r={self.eps_r!r}{leak}"
+
+    @property
+    def c(self) -> float:
+        return EPS0 * self.eps_r / self.d
+
+    def leak(self, area: float) -> float:
+        """Leak current density over voltage at that area, S/m^2."""
+        if self.rho is not None:
+            return 1.0 / (self.rho * self.d)
+        return 0.0 if self.r is None else 1.0 / (self.r * area)
+
+
+logs = st.floats(-7.0, -4.0).map(lambda x: 10.0**x)
+slices = st.one_of(
+    st.builds(Slice, logs, st.floats(1.0, 50.0)),
+    st.builds(Slice, logs, st.floats(1.0, 50.0), st.floats(3.0, 8.0).map(lambda x: 10.0**x)),
+    st.builds(Slice, logs, st.floats(1.0, 50.0), st.none(), st.floats(2.0, 7.0).map(lambda x: 10.0**x)),
+)
+
+
+def chain(layers: list[Slice], turned: list[bool], order: list[int], source: str = "Vdrive n0 0 200") -> fs.Circuit:
+    """Layers X0, X1, ... in series from node n0 to ground; `order` shuffles the lines, `turned` swaps p and n."""
+    lines = []
+    for i, layer in enumerate(layers):
+        p, n = f"n{i}", "0" if i == len(layers) - 1 else f"n{i + 1}"
+        lines.append(layer.line(f"X{i}", *((n, p) if turned[i] else (p, n))))
+    lines += [source, f"Varea area 0 {AREA * 1e6!r}"]
+    return deck(*(lines[i] for i in order), ".tran 1u 1m uic")
+
+
+@st.composite
+def chains(draw: st.DrawFn) -> tuple[list[Slice], list[bool], list[int]]:
+    layers = draw(st.lists(slices, min_size=1, max_size=8))
+    turned = draw(st.lists(st.booleans(), min_size=len(layers), max_size=len(layers)))
+    return layers, turned, draw(st.permutations(range(len(layers) + 2)))
+
+
+def dense_rates(layers: list[Slice], u: np.ndarray) -> tuple[np.ndarray, float]:
+    """Rates of the layer voltages under a constant source, and of sum(lambda/c)/S, by the leaked charges.
+
+    d lambda_x / dt = leak_x u_x; u_x = (D - lambda_x) / c_x; D = (U + sum lambda/c) / S. Nothing is reduced.
+    """
+    c = np.array([x.c for x in layers])
+    rate = np.array([x.leak(AREA) for x in layers]) * u
+    d_rate = np.sum(rate / c) / np.sum(1.0 / c)
+    return (d_rate - rate) / c, d_rate
+
+
+# Incidence --------------------------------------------------------------------------------------------------
+
+
+@SEARCH
+@given(chains())
+def test_layers_come_in_loop_order_whatever_the_order_of_lines_and_the_direction_of_each(made) -> None:
+    layers, turned, order = made
+    stack = build_stack(chain(layers, turned, order))
+    assert [e.name for e in stack.layers] == [f"X{i}" for i in range(len(layers))]
+    np.testing.assert_array_equal(stack.sign, [-1.0 if x else 1.0 for x in turned])
+    np.testing.assert_allclose(stack.c, [x.c for x in layers], rtol=1e-15)
+    assert stack.area_given == pytest.approx(AREA, rel=1e-15)
+    assert stack.gap is None
+    assert float(stack.waveform.value(0.0)) == 200.0
+
+
+@SEARCH
+@given(chains(), st.integers(0, 2**32 - 1))
+def test_the_reduced_system_has_the_rates_of_the_dense_one(made, seed: int) -> None:
+    layers, turned, order = made
+    stack = build_stack(chain(layers, turned, order))
+    n = len(layers)
+    p1, p0, b, embedding = stack.matrices()
+    assert p1.shape == p0.shape == embedding.shape == (n, n - 1)
+    x = np.random.default_rng(seed).uniform(-100.0, 100.0, n - 1)
+    u_source = 137.0
+    u = stack.k * u_source + embedding @ x
+    assert u.sum() == pytest.approx(u_source, abs=1e-10)
+    reduced = (p1 + p0 / AREA) @ x + (b[0] + b[1] / AREA) * u_source
+    rates, d_rate = dense_rates(layers, u)
+    scale = np.abs(rates).max() + 1e-300
+    np.testing.assert_allclose(embedding @ reduced[:-1], rates, rtol=0, atol=1e-12 * scale)
+    assert reduced[-1] == pytest.approx(d_rate, rel=1e-11, abs=1e-13 * float((stack.c * scale).max()))
+
+
+@SEARCH
+@given(chains())
+def test_the_fastest_rate_is_the_largest_eigenvalue_of_the_dense_matrix(made) -> None:
+    layers, turned, order = made
+    stack = build_stack(chain(layers, turned, order))
+    dense = np.column_stack([dense_rates(layers, e)[0] for e in np.eye(len(layers))])
+    expected = np.abs(np.linalg.eigvals(dense)).max()
+    assert stack.fastest_rate(AREA) == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(dense).max())
+
+
+@pytest.mark.parametrize("n", range(1, 9))
+def test_n_layers_have_n_voltages_and_n_minus_one_live_states(n: int) -> None:
+    layers = [Slice(1e-6 * (i + 1), 2.0 + i, r=1e6) for i in range(n)]
+    circuit = chain(layers, [False] * n, list(range(n + 2)), "Vdrive n0 0 SIN(0 10 1k)")
+    solution = fs.simulate(circuit, rtol=1e-6)
+    assert solution.u_layer.shape == (solution.t.size, n)
+    assert solution.state.y.size == n, "n - 1 voltages and the charge"
+    np.testing.assert_allclose(solution.u_layer.sum(1), solution.u_source, rtol=0, atol=1e-12 * 10.0)
+
+
+@pytest.mark.parametrize("n", [1, 3, 8])
+def test_without_resistors_the_voltages_split_by_the_inverse_capacitances_for_ever(n: int) -> None:
+    layers = [Slice(1e-6 * (i + 1), 2.0 + i) for i in range(n)]
+    circuit = chain(layers, [False] * n, list(range(n + 2)), "Vdrive n0 0 SQUARE(10 1k)")
+    solution = fs.simulate(circuit)
+    share = np.array([1.0 / x.c for x in layers]) / sum(1.0 / x.c for x in layers)
+    np.testing.assert_allclose(solution.u_layer, np.outer(solution.u_source, share), rtol=0, atol=1e-14 * 10.0)
+    assert build_stack(circuit).fastest_rate(AREA) == 0.0
+
+
+# Sources ----------------------------------------------------------------------------------------------------
+
+
+def test_a_source_written_backwards_drives_backwards() -> None:
+    layers = [Slice(1e-6, 3.9, r=2e5), Slice(3.5e-6, 1.0, r=1e6)]
+    plain = build_stack(chain(layers, [False, False], [0, 1, 2, 3]))
+    back = build_stack(chain(layers, [False, False], [0, 1, 2, 3], "Vdrive 0 n0 200"))
+    assert float(plain.waveform.value(0.0)) == 200.0
+    # the loop is walked from the source's positive side: the layers are met the other way round
+    assert [e.name for e in back.layers] == ["X1", "X0"]
+    np.testing.assert_array_equal(back.sign, [-1.0, -1.0])
+    drives = [float(s.waveform.value(0.0) * s.sign[0]) for s in (plain, back)]
+    assert drives == [200.0, -200.0]
+
+
+def test_sources_in_series_add_with_their_directions_and_their_nodes_have_their_potentials() -> None:
+    circuit = deck(
+        "Va n0 0 7",
+        "Vb n1 n0 3",
+        "Xcoat n1 n2 area LAYER d=1u eps_r=3.9 r=0.2meg",
+        "Vc n2 n3 SIN(0 2 1k)",
+        "Xair n3 0 area LAYER d=3.5u eps_r=1 r=1meg",
+        "Varea area 0 35",
+        ".tran 20u 1m uic",
+    )
+    stack = build_stack(circuit)
+    t = np.linspace(0.0, 1e-3, 11)
+    np.testing.assert_allclose(stack.waveform.value(t), 10.0 - 2.0 * np.sin(2e3 * math.pi * t), atol=1e-13)
+    solution = fs.simulate(circuit, rtol=1e-6)
+    v = solution.node_voltages | {"0": np.zeros(solution.t.size)}
+    np.testing.assert_allclose(v["n0"], 7.0)
+    np.testing.assert_allclose(v["n1"] - v["n0"], 3.0)
+    np.testing.assert_allclose(v["n2"] - v["n3"], 2.0 * np.sin(2e3 * math.pi * solution.t), atol=1e-12)
+    assert_every_layer_spans_its_nodes(circuit, solution)
+
+
+def assert_every_layer_spans_its_nodes(circuit: fs.Circuit, solution: fs.Solution) -> None:
+    v = {k.lower(): x for k, x in solution.node_voltages.items()} | {"0": np.zeros(solution.t.size)}
+    for name, u in zip(solution.layers, solution.u_layer.T, strict=True):
+        p, n = circuit[name].nodes[:2]
+        np.testing.assert_allclose(v[p] - v[n], u, rtol=0, atol=1e-11)
+
+
+@settings(max_examples=12, derandomize=True, deadline=None)
+@given(chains(), st.booleans())
+def test_every_layer_spans_its_own_nodes_and_turning_one_turns_its_sign(made, backwards: bool) -> None:
+    layers, turned, order = made
+    n = len(layers)
+    source = "Vdrive 0 n0 SIN(0 10 1k)" if backwards else "Vdrive n0 0 SIN(0 10 1k)"
+    circuit = chain(layers, turned, order, source)
+    straight = chain(layers, [False] * n, list(range(n + 2)), "Vdrive n0 0 SIN(0 10 1k)")
+    t = [1e-5, 1e-4, 2e-4]
+    a, b = (fs.simulate(x, t_eval=t, rtol=1e-8) for x in (circuit, straight))
+    assert_every_layer_spans_its_nodes(circuit, a)
+    for i in range(n):
+        sign = (-1.0 if turned[i] else 1.0) * (-1.0 if backwards else 1.0)
+        mine, reference = (s.u_layer[:, s.layers.index(f"X{i}")] for s in (a, b))
+        np.testing.assert_allclose(sign * mine, reference, rtol=0, atol=2e-7)
+
+
+# Table 1 ----------------------------------------------------------------------------------------------------
+
+
+def same_layers(stack: Stack, f: float) -> None:
+    layers = table1_layers(f)
+    np.testing.assert_allclose(stack.c, [x.c for x in layers], rtol=1e-14)
+    np.testing.assert_allclose(stack.g_total, [1.0 / x.r_total for x in layers], rtol=1e-14)
+    np.testing.assert_allclose(stack.g_area, [1.0 / x.r_area for x in layers], rtol=1e-13)
+
+
+@pytest.mark.parametrize("f", [10.0, 100.0, 5000.0, 1e5])
+def test_table_1_becomes_three_layers_with_equations_16_to_19(f: float) -> None:
+    stack = build_stack(table1(f=f))
+    same_layers(stack, f)
+    assert stack.gap == GAP
+    assert stack.area_given is None
+    p = TABLE1
+    assert stack.contact is not None
+    got = stack.contact
+    for name, value in {"d": p.d_a, "f_n": p.force_normal, "mu": p.mu0, "alpha": p.alpha, "m": p.m}.items():
+        assert getattr(got, name) == pytest.approx(value, rel=1e-14)
+    for name, value in {"beta": p.beta, "n": p.n, "c2": p.c2, "eps_r": p.eps_a}.items():
+        assert getattr(got, name) == pytest.approx(value, rel=1e-14)
+
+
+def test_the_gap_voltage_is_a_live_state_of_its_own() -> None:
+    stack = build_stack(table1())
+    *_, embedding = stack.matrices()
+    assert sorted(embedding[GAP]) == [0.0, 1.0]
+
+
+def test_the_skin_is_evaluated_at_each_frequency_of_an_admittance_and_the_rest_is_not() -> None:
+    f = np.array([10.0, 100.0, 3e4])
+    a = np.array([30e-6, 35e-6, 36e-6])
+    y = build_stack(table1(f=700.0)).admittance(f, a)
+    skin = a / (rho_sc_of(f) * TABLE1.d_sc) + 2j * math.pi * f * EPS0 * eps_sc_of(f) * a / TABLE1.d_sc
+    np.testing.assert_allclose(y[:, 2], skin, rtol=1e-13)
+    np.testing.assert_allclose(y[:, 1], 1e-6 + 2j * math.pi * f * EPS0 * a / TABLE1.d_a, rtol=1e-13)
+    np.testing.assert_allclose(y[:, 0], 5e-6 + 2j * math.pi * f * EPS0 * 3.9 * a / TABLE1.d_i, rtol=1e-13)
+
+
+def rho_sc_of(f: np.ndarray) -> np.ndarray:
+    return np.array([rho_sc(float(x)) for x in f])
+
+
+def eps_sc_of(f: np.ndarray) -> np.ndarray:
+    return np.array([eps_sc(float(x)) for x in f])
+
+
+def test_an_area_fixed_by_the_gap_or_by_a_source_is_the_stacks_area() -> None:
+    assert build_stack(table1(gap={"a_fix": 30})).area_given == pytest.approx(30e-6, rel=1e-15)
+    assert build_stack(table1(gap={"a_fix": 0})).area_given is None

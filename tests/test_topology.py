@@ -1,0 +1,209 @@
+"""What is not a series stack is refused with the names of the elements at fault; circuits as data."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+from scenes import deck, table1
+
+V = "Vdrive n0 0 SIN(0 200 100)"
+COAT = "Xcoat n0 n1 area LAYER d=1u eps_r=3.9 r=0.2meg"
+SLAB = "Xslab n1 0 area SLAB d=350u eps_r=1000 rho=1e4"
+GAP_VALUES = "GAP d=3.5u eps_r=1 fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
+GAP = f"Xgap n1 0 area {GAP_VALUES}"
+AREA = "Varea area 0 35"
+
+REFUSALS = {
+    "no source": ([COAT, GAP], "the circuit has no source"),
+    "no layer": ([V, "Vother n0 0 5"], "the circuit has no layer"),
+    "two gaps one area": (
+        [V, f"Xone n0 n1 area {GAP_VALUES}", f"Xtwo n1 0 area {GAP_VALUES}"],
+        "Xone and Xtwo both drive the area node 'area'; allowed: one GAP per area",
+    ),
+    "two gaps two areas": (
+        [V, f"Xone n0 n1 left {GAP_VALUES}", f"Xtwo n1 0 right {GAP_VALUES}"],
+        "Xone and Xtwo: circuits with several gaps are not solved by this version",
+    ),
+    "a layer on another area": (
+        [V, COAT.replace(" area ", " Elsewhere "), GAP],
+        "Xcoat takes its area from node 'Elsewhere', which no GAP drives; Xgap drives 'area'",
+    ),
+    "gap and source on one area": ([V, COAT, GAP, AREA], "Varea and Xgap both drive the area node 'area'"),
+    "area driven by nothing": ([V, COAT, SLAB], "node 'area' gives Xcoat its area, but no GAP and no DC source"),
+    "area driven twice": ([V, COAT, SLAB, AREA, "Vmore area 0 35"], "more than one source drives it"),
+    "layers on two areas": (
+        [V, COAT, SLAB.replace(" area ", " other "), AREA],
+        "the layers of a loop must share one area node",
+    ),
+    "area that varies": ([V, COAT, SLAB, "Varea area 0 SIN(35 1 100)"], "Varea drives an area: allowed is a DC value"),
+    "area upside down": ([V, COAT, SLAB, "Varea 0 area 35"], "Varea drives an area: allowed is a DC value"),
+    "area of zero": ([V, COAT, SLAB, "Varea area 0 0"], "Varea drives an area: allowed is a DC value above 0"),
+    "area below zero": ([V, COAT, SLAB, "Varea area 0 -35"], "Varea drives an area"),
+    "dangling end": (
+        [V, COAT, GAP.replace("n1 0", "n1 Loose")],
+        "node 'Loose' is floating: only Xgap touches it",
+    ),
+    "open circuit": ([V, COAT, GAP.replace("n1", "n2")], "is floating: only"),
+    "island": (
+        [V, COAT, GAP, "Xlost q r area LAYER d=1u eps_r=2", "Xmore q r area LAYER d=1u eps_r=2"],
+        "is floating: nothing connects it to ground",
+    ),
+    "no ground": (
+        [V.replace(" 0 ", " n9 ", 1), COAT, GAP.replace("n1 0", "n1 n9")],
+        "no element touches ground",
+    ),
+    "area node as a conductor": ([V, "Xcoat n0 area area LAYER d=1u eps_r=3.9", GAP], "is floating"),
+    "both ends on one node": (
+        [V, COAT, GAP, "Xloop n1 n1 area LAYER d=1u eps_r=2"],
+        "Xloop has both ends on node 'n1'",
+    ),
+    "parallel sources": ([V, "Vsecond n0 0 5", COAT, GAP], "Vdrive and Vsecond are voltage sources in parallel"),
+    "antiparallel sources": ([V, "Vsecond 0 n0 5", COAT, GAP], "Vdrive and Vsecond are voltage sources in parallel"),
+    "source loop": (
+        [V, "Vb n0 n5 5", "Vc n5 0 5", COAT, GAP],
+        "Vc closes a loop of voltage sources",
+    ),
+    "resistor": ([V, COAT, GAP, "Rbody n1 0 1k"], "Rbody: R elements are read, but not solved by this version"),
+    "capacitor": ([V, COAT, GAP, "Cbody n1 0 100p"], "Cbody: C elements are read, but not solved by this version"),
+    "current source": (["Idrive n0 0 1u", COAT, GAP], "Idrive: I elements are read, but not solved"),
+    "resistor in series": (
+        [V.replace("n0", "n7"), "Rline n7 n0 1k", COAT, GAP],
+        "Rline: R elements are read, but not solved by this version",
+    ),
+    "parallel layers": (
+        [V, COAT, GAP, "Xside n0 n1 area LAYER d=1u eps_r=2"],
+        "node 'n0' joins 3 elements (Vdrive, Xcoat, Xside)",
+    ),
+    "two loops": (
+        [V, COAT, GAP, "Vb m0 0 5", "Xb m0 0 area LAYER d=1u eps_r=2"],
+        "joins 4 elements",
+    ),
+    "no source in the loop": ([COAT.replace("n0", "0"), SLAB, AREA], "the loop has no voltage source"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_a_topology_that_is_not_a_driven_stack_is_refused_by_name(case: str) -> None:
+    lines, message = REFUSALS[case]
+    with pytest.raises(fs.InputError) as caught:
+        deck(*lines)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("case", [c for c, (_, m) in REFUSALS.items() if "X" in m or "V" in m[:6]])
+def test_a_refusal_that_names_an_element_says_where_it_stands(case: str) -> None:
+    lines, message = REFUSALS[case]
+    with pytest.raises(fs.InputError) as caught:
+        deck(*lines)
+    where = caught.value.where
+    if message.startswith("the circuit"):
+        return
+    assert where is not None
+    name = lines[where.line - 2].split()[0]
+    assert name in str(caught.value), f"line {where.line} is {name}"
+
+
+def test_these_stacks_are_accepted() -> None:
+    deck(V, COAT, GAP)
+    deck(V, COAT, SLAB, AREA)
+    deck(V, GAP.replace("n1", "n0"))
+    deck(V.replace("n0 0", "n0 gnd"), COAT, GAP.replace(" 0 ", " GND "))
+
+
+# Circuits as data -------------------------------------------------------------------------------------------
+
+
+def test_every_parameter_is_listed_by_path_with_value_and_unit() -> None:
+    parameters = table1().parameters
+    expected = {
+        "Vdrive.amplitude": (200.0, "V"),
+        "Vdrive.frequency": (100.0, "Hz"),
+        "Vdrive.offset": (0.0, "V"),
+        "Xcoat.d": (1e-6, "m"),
+        "Xcoat.eps_r": (3.9, ""),
+        "Xcoat.r": (2e5, "ohm"),
+        "Xgap.d": (3.5e-6, "m"),
+        "Xgap.r": (1e6, "ohm"),
+        "Xgap.fn": (0.5, "N"),
+        "Xgap.mu": (0.3, ""),
+        "Xgap.alpha": (54.4, "mm^2/N^m"),
+        "Xgap.m_exp": (0.52, ""),
+        "Xgap.beta": (32.0, "mm^(2-n)"),
+        "Xgap.n_exp": (1.41, ""),
+        "Xgap.c2": (5000.0, "mm^4/N^2"),
+        "Xgap.a_fix": (0.0, "mm^2"),
+        "Xskin.d": (350e-6, "m"),
+        "Xskin.f": (100.0, "Hz"),
+    }
+    for path, (value, unit) in expected.items():
+        assert (parameters[path].value, parameters[path].unit) == (value, unit), path
+    with pytest.raises(TypeError):
+        parameters["Xgap.d"] = 1.0  # type: ignore[index]
+
+
+@pytest.mark.parametrize(
+    "source",
+    ["SIN(1 200 100 1m 3 20)", "SQUARE(200 100 0.3)", "PULSE(0 5 1m 1u 1u 2m 10m)", "EXP(0 1 1m 1m 5m 1m)", "5"],
+)
+def test_replace_changes_one_parameter_and_changing_it_back_restores_the_circuit(source: str) -> None:
+    circuit = table1(source)
+    for path, parameter in circuit.parameters.items():
+        changed = circuit.replace({path: parameter.value * 1.01 if parameter.value else 1e-4})
+        assert changed.parameters[path].value != parameter.value
+        others = {p: v for p, v in changed.parameters.items() if p != path}
+        assert others == {p: v for p, v in circuit.parameters.items() if p != path}
+        assert changed.replace({path: parameter.value}).elements == circuit.elements
+        assert circuit.parameters[path].value == parameter.value
+        assert path in changed.overrides
+
+
+def test_replace_takes_names_in_any_case_and_several_at_once() -> None:
+    changed = table1().replace({"xGAP.D": 3e-6, "XSKIN.f": 200.0})
+    assert changed.parameters["Xgap.d"].value == 3e-6
+    assert changed.parameters["Xskin.f"].value == 200.0
+
+
+def test_a_source_is_replaced_by_a_waveform_a_number_or_a_function() -> None:
+    circuit = table1()
+    assert circuit.replace({"Vdrive": fs.Square(200.0, 50.0)})["Vdrive"].waveform == fs.Square(200.0, 50.0)
+    assert circuit.replace({"vdrive": 5})["Vdrive"].waveform == fs.DC(5.0)
+    changed = circuit.replace({"Vdrive": np.sin})["Vdrive"].waveform
+    assert isinstance(changed, fs.Function)
+    duty = circuit.replace({"Vdrive": fs.Square(200.0, 50.0)}).replace({"Vdrive.duty": 0.3})
+    assert duty["Vdrive"].waveform == fs.Square(200.0, 50.0, duty=0.3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"Xgap.dd": 1e-6}, "unknown parameter 'Xgap.dd'; nearest: 'Xgap.d'"),
+        ({"Xgp.d": 1e-6}, "unknown parameter 'Xgp.d'; nearest: 'Xgap.d'"),
+        ({"Vdrive.amplitud": 1.0}, "nearest: 'Vdrive.amplitude'"),
+        ({"Vdrive.duty": 0.3}, "unknown parameter 'Vdrive.duty'"),
+        ({"Xgap": 1.0}, "unknown parameter 'Xgap'"),
+        ({"Xgap.d": 0.0}, "Xgap d is 0 m; allowed: more than 0"),
+        ({"Xgap.d": -3e-6}, "Xgap d is -3e-06 m; allowed: more than 0"),
+        ({"Xgap.d": math.nan}, "Xgap d is nan m; allowed: more than 0"),
+        ({"Xgap.d": math.inf}, "Xgap d is inf m; allowed: more than 0"),
+        ({"Xcoat.r": 0.0}, "Xcoat r is 0 ohm; allowed: more than 0 or inf"),
+        ({"Xgap.mu": -0.1}, "Xgap mu is -0.1; allowed: 0 or more"),
+        ({"Xgap.n_exp": 0.4}, "0 < m_exp < n_exp"),
+        ({"Xgap.mu": 3.0}, "Xgap has no contact"),
+        ({"Vdrive.frequency": 0.0}, "sine frequency is 0 Hz"),
+        ({"Xgap.d": "3u"}, "Xgap"),
+    ],
+)
+def test_a_bad_replacement_is_refused_with_what_is_allowed(changes: dict, message: str) -> None:
+    with pytest.raises(fs.InputError) as caught:
+        table1().replace(changes)
+    assert message in str(caught.value)
+
+
+def test_an_element_is_found_in_any_case_and_an_unknown_one_has_its_nearest_named() -> None:
+    assert table1()["XGAP"].name == "Xgap"
+    with pytest.raises(fs.InputError, match="unknown element 'Xgop'; nearest: 'Xgap'"):
+        table1()["Xgop"]

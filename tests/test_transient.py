@@ -1,0 +1,174 @@
+"""The coupled transient against the independent reference of `analytic.py`, and the orders of its error control."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import analytic as ref
+import fingerspice as fs
+from scenes import table1
+
+CHIRP_T = 0.02
+
+
+def chirp_segments():
+    rate = (2000.0 - 50.0) / CHIRP_T
+
+    def phase(t):
+        return 2.0 * math.pi * (50.0 + 0.5 * rate * t) * t
+
+    def slope(t):
+        return 150.0 * np.cos(phase(t)) * 2.0 * math.pi * (50.0 + rate * t)
+
+    return [(0.0, CHIRP_T, lambda t: 150.0 * np.sin(phase(t)), slope)]
+
+
+POINTS = [(0.0, 20.0), (2e-3, 150.0), (2e-3, -120.0), (5e-3, -40.0), (7e-3, 90.0), (7.3e-3, -60.0), (12e-3, -60.0)]
+SCENES = {
+    "sine 100 Hz": (fs.Sine(200.0, 100.0), ref.sine_segments(200.0, 100.0, 0.03), 100.0),
+    "sine 5 kHz with offset": (
+        fs.Sine(150.0, 5000.0, offset=40.0, phase_deg=30.0),
+        ref.sine_segments(150.0, 5000.0, 2e-3, phase=math.radians(30.0), offset=40.0),
+        5000.0,
+    ),
+    "square 100 Hz": (fs.Square(200.0, 100.0), ref.square_segments(200.0, 100.0, 3), 100.0),
+    "square 5 kHz, duty 0.3": (
+        fs.Square(200.0, 5000.0, duty=0.3),
+        ref.square_segments(200.0, 5000.0, 8, duty=0.3),
+        5000.0,
+    ),
+    "chirp 50 Hz to 2 kHz": (fs.Chirp(150.0, 50.0, 2000.0, CHIRP_T), chirp_segments(), 500.0),
+    "PWL with a jump": (
+        fs.PWL(tuple(t for t, _ in POINTS), tuple(v for _, v in POINTS)),
+        ref.pwl_segments(POINTS),
+        100.0,
+    ),
+}
+
+
+def output_times(segments):
+    # Off the grid of periods, plus both sides of every jump (whose own time the two sides round differently).
+    end = segments[-1][1]
+    edges = np.array([s[0] for s in segments[1:]])
+    grid = np.linspace(0.0, end, 301)[:-1] + 1e-3 * end / 301.0
+    return np.unique(np.concatenate([[0.0], grid, edges - 1e-12, edges + 1e-12]))
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+@pytest.mark.parametrize("scene", SCENES)
+def test_coupled_response_equals_the_reference_to_1e_9(scene, law):
+    waveform, segments, f = SCENES[scene]
+    t = output_times(segments)
+    expected = ref.transient(segments, t, law=law, freq=f)
+    circuit = table1(f=f)
+    solution = fs.simulate(
+        circuit, sources={"Vdrive": waveform}, t_eval=t, t_stop=segments[-1][1], charge_law=law, rtol=1e-10
+    )
+    peak_u, peak_f = np.abs(expected.u_gap).max(), expected.force.max()
+    assert expected.fold is None
+    assert np.abs(solution.u_layer - expected.u).max() <= 1e-9 * peak_u
+    assert np.abs(solution.f_el - expected.force).max() <= 1e-9 * peak_f
+    assert_allclose(solution.area, expected.area, rtol=1e-9)
+    assert np.abs(solution.q_source - expected.q).max() <= 1e-9 * np.abs(expected.q).max()
+    assert solution.error.u_gap <= 1e-10 * np.abs(solution.u_gap).max() * 1.001
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_source_current_equals_the_reference(law):
+    segments = ref.sine_segments(200.0, 100.0, 0.02)
+    t = np.linspace(1e-5, 0.0199, 57)
+    expected = ref.transient(segments, t, law=law, freq=100.0)
+    current = np.array([expected.current(x, float(segments[0][3](x))) for x in t])
+    solution = fs.simulate(table1(), t_eval=t, t_stop=0.02, charge_law=law, rtol=1e-10)
+    assert np.abs(solution.i_source - current).max() <= 1e-8 * np.abs(current).max()
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_start_from_the_dc_operating_point(law):
+    segments = ref.sine_segments(100.0, 100.0, 0.02, offset=80.0)
+    t = np.linspace(0.0, 0.0199, 57)
+    expected = ref.transient(segments, t, law=law, freq=100.0, start="dc", source_before=80.0)
+    waveform = fs.Sine(100.0, 100.0, offset=80.0)
+    circuit = table1(tran="10u 20m")
+    solution = fs.simulate(circuit, sources={"Vdrive": waveform}, t_eval=t, charge_law=law, rtol=1e-10)
+    assert np.abs(solution.u_layer - expected.u).max() <= 1e-9 * np.abs(expected.u_gap).max()
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_work_of_adhesion_at_total_voltage_held(law):
+    t = np.linspace(0.0, 0.0199, 57)
+    k = ref.work_factor(100.0)
+    expected = ref.transient(ref.sine_segments(200.0, 100.0, 0.02), t, law=law, freq=100.0, k=k)
+    circuit = table1(extra=".options work=total")
+    solution = fs.simulate(circuit, t_eval=t, t_stop=0.02, charge_law=law, rtol=1e-10)
+    assert np.abs(solution.u_gap - expected.u_gap).max() <= 1e-9 * np.abs(expected.u_gap).max()
+    plain = fs.simulate(table1(), t_eval=t, t_stop=0.02, charge_law=law, rtol=1e-10)
+    assert np.abs(solution.u_gap - plain.u_gap).max() > 1e-5 * np.abs(expected.u_gap).max()
+
+
+@pytest.mark.parametrize("shape", ["sine", "square"])
+def test_two_kilovolt_local_is_solved(shape):
+    segments = {"sine": ref.sine_segments(2000.0, 100.0, 0.02), "square": ref.square_segments(2000.0, 100.0, 2)}[shape]
+    waveform = {"sine": fs.Sine(2000.0, 100.0), "square": fs.Square(2000.0, 100.0)}[shape]
+    t = output_times(segments)
+    expected = ref.transient(segments, t, law="local", freq=100.0)
+    with pytest.warns(fs.FingerspiceWarning, match="air breaks down"):
+        solution = fs.simulate(table1(), sources={"Vdrive": waveform}, t_eval=t, t_stop=0.02, rtol=1e-10)
+    assert np.abs(solution.u_gap - expected.u_gap).max() <= 1e-9 * np.abs(expected.u_gap).max()
+
+
+@pytest.mark.parametrize(("changes", "share"), [({"Xgap.fn": 1e-4}, 0.0822404), ({"Xgap.d": 10e-9}, 0.02332418286)])
+def test_mobile_law_stops_at_its_fold_and_says_where(changes, share):
+    circuit = table1().replace(changes)
+    solution = fs.simulate(circuit, charge_law="mobile", throw=False)
+    assert solution.status is fs.Status.FOLD
+    assert not solution.success
+    assert "success" not in solution.message
+    assert solution.state.t == pytest.approx(share * 0.01, rel=1e-6)
+    assert solution.t[-1] <= solution.state.t
+    assert solution.t.size > 10
+    assert np.all(np.isfinite(solution.u_gap))
+    with pytest.raises(fs.SolveError, match="no solution past this time") as caught:
+        fs.simulate(circuit, charge_law="mobile")
+    assert caught.value.solution.t.size == solution.t.size
+
+
+def test_mobile_square_of_two_kilovolt_folds_at_its_first_reversal():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", fs.FingerspiceWarning)
+        solution = fs.simulate(table1(), sources={"Vdrive": fs.Square(2000.0, 100.0)}, charge_law="mobile", throw=False)
+    assert solution.status is fs.Status.FOLD
+    assert solution.state.t == pytest.approx(0.005, rel=1e-12)
+
+
+@pytest.mark.parametrize("r_coat", ["1", "1e15", "inf"])
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_extreme_coatings_equal_the_reference(r_coat, law):
+    t = np.linspace(0.0, 0.0199, 57)
+    plain = ref.table1_layers(100.0)
+    layers = (ref.Layer(plain[0].c, r_total=float(r_coat)), *plain[1:])
+    expected = ref.transient(ref.sine_segments(200.0, 100.0, 0.02), t, law=law, layers=layers)
+    circuit = table1(coat={"r": r_coat})
+    solution = fs.simulate(circuit, t_eval=t, t_stop=0.02, charge_law=law, rtol=1e-8)
+    assert np.abs(solution.u_gap - expected.u_gap).max() <= 1e-8 * np.abs(expected.u_gap).max()
+    assert solution.stats["steps"] < 5000
+
+
+@pytest.mark.parametrize("method", ["dp5", "dop853", "radau9"])
+@pytest.mark.parametrize("rtol", [1e-3, 1e-5, 1e-7, 1e-9])
+def test_the_error_asked_for_is_met_by_every_own_stepper(method, rtol):
+    if method == "dp5" and rtol < 1e-8:
+        rtol = 1e-8
+    segments = ref.square_segments(200.0, 100.0, 2)
+    t = output_times(segments)
+    expected = ref.transient(segments, t, law="local", freq=100.0)
+    solution = fs.simulate(
+        table1(), sources={"Vdrive": fs.Square(200.0, 100.0)}, t_eval=t, t_stop=0.02, rtol=rtol, method=method
+    )
+    assert np.abs(solution.u_gap - expected.u_gap).max() <= rtol * np.abs(expected.u_gap).max()
+    assert np.abs(solution.f_el - expected.force).max() <= rtol * expected.force.max()
