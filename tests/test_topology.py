@@ -194,7 +194,6 @@ def test_a_source_is_replaced_by_a_waveform_a_number_or_a_function() -> None:
         ({"Xgap.n_exp": 0.4}, "0 < m_exp < n_exp"),
         ({"Xgap.mu": 3.0}, "Xgap has no contact"),
         ({"Vdrive.frequency": 0.0}, "sine frequency is 0 Hz"),
-        ({"Xgap.d": "3u"}, "Xgap"),
     ],
 )
 def test_a_bad_replacement_is_refused_with_what_is_allowed(changes: dict, message: str) -> None:

@@ -109,7 +109,10 @@ def _torch_piece(piece: _Piece, name: str) -> _Result:
         counts[0] += 1
         # The state is in units of its scale: torchdiffeq takes one atol for all.
         state = y.numpy() * piece.scale
-        return torch.from_numpy(_slope(piece.model, piece.segment, float(t), state, 0.0) / piece.scale)
+        rate = _slope(piece.model, piece.segment, float(t), state, 0.0) / piece.scale
+        # Past a fold there is no slope, and torchdiffeq turns a NaN into a step of NaN; a huge slope is refused.
+        rate = np.where(np.isfinite(rate), rate, 1e9 / (piece.t1 - piece.t0))
+        return torch.from_numpy(rate)
 
     times = np.unique(np.concatenate([[piece.t0], piece.times, [piece.t1]]))
     options = {}

@@ -1,0 +1,118 @@
+"""The paper's claims (its section 4), computed; what is not reproduced is a strict xfail with its reason."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+from fingerspice.periodic import periodic_solution
+from scenes import table1
+
+
+@functools.cache
+def phasor_at(f, amplitude=200.0, **changes):
+    circuit = table1(f"SIN(0 {amplitude} 100)")
+    if changes:
+        circuit = circuit.replace({k.replace("__", "."): v for k, v in changes.items()})
+    return fs.phasor(circuit, f)
+
+
+@functools.cache
+def square(f):
+    return periodic_solution(table1(f"SQUARE(200 {f!r})", f), rtol=1e-9, points=2000)
+
+
+def rise(low=100.0, high=1e4, **changes):
+    return float(phasor_at(high, 140.0, **changes).f_el_mean[0] / phasor_at(low, 140.0, **changes).f_el_mean[0])
+
+
+def test_gap_voltage_at_100_hz_leads_by_some_degrees():
+    p = phasor_at(100.0)
+    assert abs(p.gain[0]) == pytest.approx(0.6653, abs=5e-5)
+    assert np.degrees(np.angle(p.gain[0])) == pytest.approx(7.94, abs=5e-3)
+
+
+@pytest.mark.xfail(reason="no physical rho(100 Hz) gives less than 64.6 % at this area; ours is 66.5 %")
+def test_gap_voltage_at_100_hz_is_approximately_60_percent():
+    assert abs(phasor_at(100.0).gain[0]) == pytest.approx(0.60, abs=0.03)
+
+
+def test_gap_voltage_at_5_khz_is_more_than_80_percent_and_in_phase():
+    p = phasor_at(5000.0)
+    assert abs(p.gain[0]) == pytest.approx(0.8768, abs=5e-5)
+    assert abs(p.gain[0]) > 0.8
+    assert np.degrees(np.angle(p.gain[0])) == pytest.approx(1.37, abs=5e-3)
+
+
+def test_force_rises_by_72_percent_from_100_hz_to_10_khz():
+    assert rise() == pytest.approx(1.724, abs=5e-4)
+
+
+@pytest.mark.xfail(reason="with Table 1 the mean force rises by 72 %; other gap resistances give 3.1 to 0.9 times")
+def test_force_rises_by_80_percent_with_table_1():
+    assert rise() == pytest.approx(1.80, abs=0.03)
+
+
+@pytest.mark.parametrize(("r_gap", "expected"), [(0.5e6, 3.1), (1e6, 1.7), (2e6, 1.2), (7e6, 0.9)])
+def test_rise_of_the_force_depends_on_the_gap_resistance(r_gap, expected):
+    assert rise(Xgap__r=r_gap) == pytest.approx(expected, abs=0.05)
+
+
+def test_capacitive_above_2_khz():
+    assert rise(low=2000.0) == pytest.approx(1.03, abs=5e-3)
+
+
+def test_ridge_area_without_adhesion_is_about_37_square_millimetres():
+    area = 54.4 * 0.5**0.52
+    assert area == pytest.approx(37.94, abs=5e-3)
+    assert table1().parameters["Xgap.alpha"].value * 0.5**0.52 == area
+
+
+def test_square_of_100_hz_gives_a_very_volatile_force():
+    s = square(100.0)
+    assert s.f_el.min() == pytest.approx(0.1845, abs=5e-5)
+    assert s.f_el.max() == pytest.approx(0.5826, abs=5e-5)
+    assert s.summary()["f_el_mean_periodic"] == pytest.approx(0.2278, abs=6e-5)
+
+
+def test_square_of_5_khz_gives_an_almost_constant_force():
+    s = square(5000.0)
+    assert s.f_el.min() == pytest.approx(0.3326, abs=5e-5)
+    assert s.f_el.max() == pytest.approx(0.3829, abs=5e-5)
+    assert s.summary()["f_el_mean_periodic"] == pytest.approx(0.3550, abs=5e-5)
+    assert np.ptp(s.f_el) < 0.15 * s.f_el.mean()
+
+
+@pytest.mark.parametrize(
+    ("f", "transient", "phasor", "share"), [(100.0, 0.1090, 0.1113, -0.021), (5000.0, 0.1833, 0.1893, -0.032)]
+)
+def test_the_transient_s_mean_force_is_below_the_phasor_s_by_the_ripple(f, transient, phasor, share):
+    result = fs.compare(table1(f"SIN(0 200 {f!r})", f))
+    assert result.coupled.f_el_mean == pytest.approx(transient, abs=5.5e-5)
+    assert result.phasor.f_el_mean == pytest.approx(phasor, abs=5.5e-5)
+    assert result.coupled.f_el_mean / result.phasor.f_el_mean - 1.0 == pytest.approx(share, abs=5e-4)
+    # With the phasor's area held, nothing of the difference is left.
+    assert result.mean.f_el_mean == pytest.approx(result.phasor.f_el_mean, rel=1e-9)
+    assert result.mean.amplitude == pytest.approx(result.phasor.amplitude, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("source", "f", "share"),
+    [("SIN(0 200 100)", 100.0, -0.0019), ("SIN(0 200 5k)", 5000.0, -0.0001), ("SQUARE(200 5k)", 5000.0, 0.0006),
+     ("SQUARE(200 100)", 100.0, 0.063)],
+)  # fmt: skip
+def test_peak_gap_voltage_of_the_mobile_law_against_the_local(source, f, share):
+    circuit = table1(source, f)
+    peaks = [np.abs(periodic_solution(circuit, charge_law=law, points=4000).u_gap).max() for law in ("local", "mobile")]
+    assert peaks[1] / peaks[0] - 1.0 == pytest.approx(share, abs=6e-5 if abs(share) < 0.01 else 5e-4)
+
+
+def test_dc_divides_by_the_resistances():
+    with pytest.warns(fs.FingerspiceWarning, match="outside 10 Hz to 100 kHz"):
+        circuit = table1("DC 1", 1.0)
+    solution = fs.simulate(circuit, start="dc", t_stop=1e-3)
+    assert solution.u_gap[-1] == pytest.approx(0.49, abs=5e-3)
+    assert fs.simulate(table1("DC 1", 10.0), start="dc", t_stop=1e-3).u_gap[-1] == pytest.approx(0.56, abs=5e-3)

@@ -1,0 +1,258 @@
+"""Phasors: gains against Eqs. 11 to 15 written out, the coupled figures, sweeps, and what is refused."""
+
+from __future__ import annotations
+
+import cmath
+import math
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import fingerspice as fs
+from analytic import (
+    GAP,
+    TABLE1,
+    area_mp,
+    coupled_phasor,
+    gap_gain_eq12,
+    gap_limit_eq14,
+    gap_limit_eq15,
+    gap_phase_eq13,
+    phasor_gains,
+    table1_layers,
+    work_factor,
+)
+from fingerspice.circuit.circuit import AcSweep
+from fingerspice.phasors import sweep_frequencies
+from fingerspice.physics.phasor import coupled_area, layer_gains
+from scenes import deck, table1, table1_deck
+
+MM2 = 1e6
+FREQUENCIES = [1.0, 10.0, 100.0, 700.0, 5000.0, 1e5]
+AREAS = [10e-6, 34.97e-6]
+
+
+# Gains at a given area --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("a", AREAS)
+@pytest.mark.parametrize("f", FREQUENCIES)
+def test_the_gain_is_equation_11_and_the_repaired_equations_12_and_13(f: float, a: float) -> None:
+    solution = fs.phasor(table1(), f, area=a)
+    (gain,) = solution.gain
+    expected = phasor_gains(f, a, table1_layers(f))
+    assert abs(gain / expected[GAP] - 1.0) < 1e-13
+    np.testing.assert_allclose(solution.layer_gain[0], expected, rtol=1e-13)
+    assert abs(gain) == pytest.approx(gap_gain_eq12(f, a), rel=1e-12)
+    assert cmath.phase(gain) == pytest.approx(gap_phase_eq13(f, a), abs=1e-12)
+
+
+def with_materials_fixed(f_skin: float) -> fs.Circuit:
+    """Table 1 with the skin as a SLAB of its values at `f_skin`: the limits are of a stack that stays."""
+    skin = table1_layers(f_skin)[2]
+    values = f"d=350u eps_r={skin.c * TABLE1.d_sc / TABLE1.eps0!r} rho={skin.r_area / TABLE1.d_sc!r}"
+    return fs.parse_netlist(re.sub(r"SKIN .*", f"SLAB {values}", table1_deck()))
+
+
+def test_the_gain_falls_to_the_resistive_limit_and_rises_to_the_capacitive_one() -> None:
+    a = 34.97e-6
+    low, high = fs.phasor(with_materials_fixed(100.0), [1e-6, 1e11], area=a).gain
+    assert low.real == pytest.approx(gap_limit_eq14(100.0, a), rel=1e-12)
+    assert high.real == pytest.approx(gap_limit_eq15(100.0), rel=1e-12)
+    assert low.imag == pytest.approx(0.0, abs=1e-7)
+    assert high.imag == pytest.approx(0.0, abs=1e-7)
+
+
+@pytest.mark.parametrize(("f_skin", "share"), [(1.0, 0.49), (10.0, 0.56)])
+def test_at_dc_the_gap_has_about_half_the_voltage(f_skin: float, share: float) -> None:
+    assert abs(fs.phasor(with_materials_fixed(f_skin), 1e-6).gain[0]) == pytest.approx(share, abs=5e-3)
+
+
+def test_the_skin_is_evaluated_at_each_frequency_of_a_sweep_whatever_its_own_f() -> None:
+    f = np.geomspace(10.0, 1e5, 9)
+    sweep = fs.phasor(table1(f=100.0), f, area=35e-6)
+    np.testing.assert_array_equal(sweep.frequency, f)
+    assert sweep.gain.shape == sweep.u_gap.shape == sweep.area.shape == sweep.f_el_mean.shape == (9,)
+    for i, x in enumerate(f):
+        alone = fs.phasor(table1(f=float(x)), x, area=35e-6)
+        assert alone.gain[0] == pytest.approx(sweep.gain[i], rel=1e-14)
+        assert sweep.gain[i] == pytest.approx(phasor_gains(x, 35e-6, table1_layers(float(x)))[GAP], rel=1e-13)
+
+
+@settings(max_examples=50, derandomize=True, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.floats(-12.0, -3.0), st.floats(-12.0, -3.0)).map(lambda x: complex(10.0 ** x[0], 10.0 ** x[1])),
+        min_size=1,
+        max_size=8,
+    )
+)
+def test_layer_gains_share_the_source_in_the_ratio_of_the_impedances(y: list[complex]) -> None:
+    gains = layer_gains(y)
+    assert abs(gains.sum() - 1.0) < 1e-14
+    current = gains * np.array(y)
+    np.testing.assert_allclose(current, current[0], rtol=1e-13)
+    total = sum(1.0 / x for x in y)
+    np.testing.assert_allclose(gains, [1.0 / x / total for x in y], rtol=1e-13)
+
+
+def test_an_open_layer_takes_all_the_voltage() -> None:
+    np.testing.assert_array_equal(layer_gains([1e-6, 0.0, 1e-3]), [0.0, 1.0, 0.0])
+    np.testing.assert_array_equal(layer_gains([0.0, 1e-6, 0.0]), [0.5, 0.0, 0.5])
+
+
+def test_a_gap_or_a_source_turned_round_turns_the_phasor() -> None:
+    plain = fs.phasor(table1(), 100.0)
+    text = table1().text
+    turned = fs.phasor(fs.parse_netlist(text.replace("Xgap top skin", "Xgap skin top")), 100.0)
+    driven = fs.phasor(fs.parse_netlist(text.replace("Vdrive drive 0", "Vdrive 0 drive")), 100.0)
+    assert turned.u_gap[0] == pytest.approx(-plain.u_gap[0], rel=1e-13)
+    assert driven.u_gap[0] == pytest.approx(-plain.u_gap[0], rel=1e-13)
+    assert turned.f_el_mean[0] == pytest.approx(plain.f_el_mean[0], rel=1e-13)
+    assert driven.f_el_mean[0] == pytest.approx(plain.f_el_mean[0], rel=1e-13)
+
+
+# Coupled ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("f", [10.0, 100.0, 5000.0, 1e4])
+@pytest.mark.parametrize("amplitude", [1e-3, 140.0, 200.0, 1000.0])
+def test_the_coupled_phasor_is_the_reference_iterated_to_rounding(f: float, amplitude: float) -> None:
+    solution = fs.phasor(table1(f"SIN(0 {amplitude!r} {f!r})", f=f))
+    expected = coupled_phasor(f, amplitude)
+    assert solution.area[0] == pytest.approx(expected.area, rel=1e-13)
+    assert solution.gain[0] == pytest.approx(expected.gap_gain, rel=1e-13)
+    assert solution.f_el_mean[0] == pytest.approx(expected.mean_force, rel=1e-13)
+    assert solution.u_gap[0] == pytest.approx(amplitude * expected.gap_gain, rel=1e-13)
+    assert solution.amplitude == amplitude
+    assert solution.layers == ("Xcoat", "Xgap", "Xskin")
+
+
+def test_the_coupled_area_is_the_contacts_at_the_rms_gap_voltage_to_40_digits() -> None:
+    solution = fs.phasor(table1())
+    _, a, _, _ = area_mp(abs(solution.u_gap[0]) / math.sqrt(2.0))
+    assert abs(solution.area[0] / a - 1) < 1e-14
+
+
+def test_table_1_at_200_volts_has_the_golden_gains() -> None:
+    low, high = (fs.phasor(table1(f"SIN(0 200 {f})", f=f)) for f in (100.0, 5000.0))
+    assert abs(low.gain[0]) == pytest.approx(0.6653, abs=5e-5)
+    assert math.degrees(cmath.phase(low.gain[0])) == pytest.approx(7.9, abs=0.05)
+    assert abs(high.gain[0]) == pytest.approx(0.8768, abs=5e-5)
+    assert math.degrees(cmath.phase(high.gain[0])) == pytest.approx(1.37, abs=5e-3)
+    assert low.f_el_mean[0] == pytest.approx(0.1113, abs=5e-5)
+    assert high.f_el_mean[0] == pytest.approx(0.1893, abs=5e-5)
+
+
+def test_at_140_volts_the_mean_force_rises_1_724_times_from_100_hz_to_10_khz() -> None:
+    force = fs.phasor(table1("SIN(0 140 100)"), [100.0, 2000.0, 10000.0]).f_el_mean
+    assert force[2] / force[0] == pytest.approx(1.724, abs=5e-4)
+    assert force[2] / force[1] == pytest.approx(1.03, abs=5e-3)
+
+
+def test_the_reading_of_equation_7_reaches_the_coupled_area() -> None:
+    held = fs.phasor(table1(extra=".options work=total"))
+    assert held.area[0] == pytest.approx(coupled_phasor(100.0, 200.0, k=work_factor(100.0)).area, rel=1e-13)
+    assert held.area[0] > fs.phasor(table1()).area[0]
+
+
+@settings(max_examples=40, derandomize=True, deadline=None)
+@given(amplitude=st.floats(0.0, 1e4), steepness=st.floats(-0.9, 3.0), reach=st.floats(1.0, 1e3))
+def test_the_coupled_area_solves_its_equation_for_any_monotone_area_and_gain(
+    amplitude: float, steepness: float, reach: float
+) -> None:
+    def area_of(u: float) -> float:
+        return 1.0 / (1.0 + (u / reach) ** 2)
+
+    def gain_of(area: float) -> float:
+        return 0.2 + 0.7 * area ** (1.0 + steepness)
+
+    a = coupled_area(area_of, gain_of, amplitude)
+    assert area_of(amplitude * gain_of(a) / math.sqrt(2.0)) == pytest.approx(a, rel=1e-12)
+
+
+# Areas and sources ------------------------------------------------------------------------------------------
+
+
+def test_frozen_and_given_areas_are_used_as_they_are() -> None:
+    frozen = fs.phasor(table1(), area="frozen")
+    assert frozen.area[0] * MM2 == pytest.approx(34.9715871843, abs=5.1e-11)
+    given_area = fs.phasor(table1(), area=20e-6)
+    assert given_area.area[0] == 20e-6
+    u = abs(given_area.u_gap[0])
+    assert given_area.f_el_mean[0] == pytest.approx(8.854e-12 * u**2 * 20e-6 / (4.0 * 3.5e-6**2), rel=1e-13)
+
+
+def test_an_area_fixed_by_the_deck_comes_before_mean_and_frozen_but_not_before_a_number() -> None:
+    circuit = table1(gap={"a_fix": 30})
+    for mode in ("mean", "frozen"):
+        assert fs.phasor(circuit, area=mode).area[0] == pytest.approx(30e-6, rel=1e-15)
+    assert fs.phasor(circuit, area=20e-6).area[0] == 20e-6
+
+
+def test_a_source_that_is_no_sine_has_its_fundamentals_amplitude_and_phase() -> None:
+    square = fs.phasor(table1("SQUARE(200 100)"))
+    sine = fs.phasor(table1(f"SIN(0 {800.0 / math.pi!r} 100)"))
+    assert square.frequency[0] == 100.0
+    assert square.amplitude == pytest.approx(800.0 / math.pi, rel=1e-12)
+    assert square.u_gap[0] == pytest.approx(sine.u_gap[0], rel=1e-11)
+    assert square.area[0] == pytest.approx(sine.area[0], rel=1e-12)
+    shifted = fs.phasor(table1("SIN(0 200 100 0 0 35)"))
+    plain = fs.phasor(table1())
+    assert shifted.gain[0] == pytest.approx(plain.gain[0], rel=1e-13)
+    assert shifted.u_gap[0] == pytest.approx(plain.u_gap[0] * cmath.exp(1j * math.radians(35.0)), rel=1e-13)
+
+
+def test_with_a_given_area_the_gain_is_defined_for_a_source_without_fundamental() -> None:
+    circuit = table1("PWL(0 0 1m 100)")
+    for area in (35e-6, "frozen"):
+        solution = fs.phasor(circuit, [100.0, 5000.0], area=area)
+        expected = [phasor_gains(f, solution.area[0], table1_layers(f))[GAP] for f in (100.0, 5000.0)]
+        np.testing.assert_allclose(solution.gain, expected, rtol=1e-13)
+        assert np.isnan(solution.u_gap).all()
+        assert math.isnan(solution.amplitude)
+
+
+@pytest.mark.parametrize(
+    ("source", "frequency", "area", "message"),
+    [
+        ("PWL(0 0 1m 100)", None, 35e-6, "the source has no fundamental: give the frequencies in Hz"),
+        ("PWL(0 0 1m 100)", 100.0, "mean", "area='mean' needs the amplitude of the source's fundamental"),
+        ("5", 100.0, "mean", "area='mean' needs the amplitude"),
+        ("SIN(0 200 100)", 0.0, "mean", "frequency is 0.0 Hz; allowed: positive numbers"),
+        ("SIN(0 200 100)", [100.0, -5.0], "mean", "allowed: positive numbers"),
+        ("SIN(0 200 100)", math.nan, "mean", "frequency is nan Hz; allowed: positive numbers"),
+        ("SIN(0 200 100)", math.inf, "mean", "allowed: positive numbers"),
+        ("SIN(0 200 100)", [[100.0]], "mean", "allowed: positive numbers"),
+        ("SIN(0 200 100)", 100.0, "coupled", "area is 'coupled'; allowed: 'mean', 'frozen' or a number in m^2"),
+        ("SIN(0 200 100)", 100.0, 0.0, "area is 0 m^2; allowed: a positive area in m^2"),
+        ("SIN(0 200 100)", 100.0, math.nan, "area is nan m^2"),
+    ],
+)
+def test_what_has_no_phasor_is_refused_with_what_is_allowed(source, frequency, area, message: str) -> None:
+    with pytest.raises(fs.InputError) as caught:
+        fs.phasor(table1(source), frequency, area=area)
+    assert message in str(caught.value)
+
+
+def test_a_stack_without_a_gap_is_refused() -> None:
+    circuit = deck("Vdrive a 0 SIN(0 1 100)", "Xcoat a 0 area LAYER d=1u eps_r=3.9", "Varea area 0 35")
+    with pytest.raises(fs.InputError, match="needs a GAP"):
+        fs.phasor(circuit)
+
+
+@pytest.mark.parametrize(
+    ("sweep", "expected"),
+    [
+        (AcSweep("lin", 5, 10.0, 50.0), [10.0, 20.0, 30.0, 40.0, 50.0]),
+        (AcSweep("dec", 1, 10.0, 1e4), [10.0, 100.0, 1e3, 1e4]),
+        (AcSweep("oct", 1, 10.0, 80.0), [10.0, 20.0, 40.0, 80.0]),
+        (AcSweep("dec", 2, 10.0, 200.0), [10.0, 10.0**1.5, 100.0, 200.0]),
+        (AcSweep("dec", 3, 100.0, 100.0), [100.0]),
+    ],
+)
+def test_the_frequencies_of_an_ac_line_run_from_start_to_stop(sweep: AcSweep, expected: list[float]) -> None:
+    np.testing.assert_allclose(sweep_frequencies(sweep), expected, rtol=1e-12)
