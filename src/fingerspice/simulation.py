@@ -174,6 +174,10 @@ def output_times(problem: Problem) -> tuple[FloatArray, BoolArray]:
 def _solution(problem: Problem, run: Run, rtol: float, method: str, t_out: FloatArray, wall: float) -> Solution:
     rows = run.rows[: run.n_out]
     t = t_out[: run.n_out].copy()
+    if run.last is not None and (t.size == 0 or run.state.t > t[-1]):
+        # A failed run's arrays end at the time it reached.
+        rows = np.vstack([rows, run.last])
+        t = np.append(t, run.state.t)
     stack, model = problem.stack, problem.model
     u_source, probe, inverse, current, margin, z = (rows[:, i].copy() for i in range(6))
     # Rows hold y = [x, z] after five columns; z is the last.
@@ -244,12 +248,12 @@ def _message(problem: Problem, run: Run) -> str:
         if run.status is Status.SOURCE_NOT_FINITE:
             names = ", ".join(e.name for e, _ in problem.stack.sources)
             text += f" (source {names})"
-        elif run.status is Status.FOLD and run.n_out:
-            last = run.rows[run.n_out - 1]
+        elif run.status is Status.FOLD and run.last is not None:
+            last = run.last
             if breakpoints_at(problem.waveform, run.t_failed).size:
                 text += "; the source jumps past the fold at this time"
             text += (
-                f" (last output: {last[1]:.4g} V across the gap, area {1e6 / last[2]:.4g} mm^2, "
+                f" (just before: {last[1]:.4g} V across the gap, area {1e6 / last[2]:.4g} mm^2, "
                 f"distance to the fold {last[4]:.3g})"
             )
     if run.detail:

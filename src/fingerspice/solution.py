@@ -141,6 +141,16 @@ class Solution:
         return self.status is Status.SUCCESS
 
     @property
+    def f_el_mean(self) -> float | None:
+        """Mean electroadhesive force over the run, N; None without a GAP."""
+        return self.summary().get("f_el_mean")
+
+    @property
+    def f_el_mean_periodic(self) -> float | None:
+        """Mean electroadhesive force over the source's last period, N; None where the run holds none."""
+        return self.summary().get("f_el_mean_periodic")
+
+    @property
     def signals(self) -> dict[str, tuple[FloatArray, str, str]]:
         """Every time series by name: values (n_t,), unit, long name."""
         out: dict[str, tuple[FloatArray, str, str]] = {
@@ -186,7 +196,9 @@ class Solution:
                 continue
             out[f"{key}_max"] = float(x.max())
             out[f"{key}_min"] = float(x.min())
+            out[f"{key}_peak"] = float(np.abs(x).max())
             out[f"{key}_mean"] = _mean(self.t, x)
+            out[f"{key}_rms"] = float(np.sqrt(_mean(self.t, x**2)))
             out[f"{key}_mean_periodic"] = None
             if last is not None:
                 periodic = _mean(last[0], last[1][key])

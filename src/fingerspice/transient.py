@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import SourceTable, breakpoints_at, is_sampled, source_table
-from fingerspice.circuit.waveforms import Waveform
 from fingerspice.engine import advance as loop
-from fingerspice.engine.model import Segment, write_row
+from fingerspice.engine.model import Segment, choose_branch, source, write_row
 from fingerspice.engine.steps import Method
 from fingerspice.numerics.tableaus import TABLEAUS, Tableau
 from fingerspice.problem import Problem
@@ -48,6 +47,8 @@ class Run:
     state: State
     t_failed: float | None = None
     detail: str = ""
+    last: FloatArray | None = None
+    """Row at the time a failed run reached, left-hand."""
 
 
 @dataclass
@@ -97,6 +98,20 @@ class _Track:
         self.counters[loop.OUTPUT] = 0
         return self.advance(table, main.t)
 
+    def here(self, table: SourceTable) -> FloatArray | None:
+        """Row at the time reached, left-hand; None before the first step."""
+        if self.t <= self.problem.t_start:
+            return None
+        i = max(int(np.searchsorted(table.edges, self.t, side="left")) - 1, 0)
+        start = float(table.edges[i])
+        segment = Segment(start, float(table.edges[i + 1]) - start, table.terms[i], table.series[i])
+        row = np.empty(row_width(self.problem))
+        u, du = source(segment, self.t - start)
+        # A jump that failed has left its own branch in `control`.
+        sign = choose_branch(self.problem.model, u, self.y)
+        write_row(self.problem.model, u, du, self.y, sign, self.problem.model.k_gap * u, row)
+        return row if np.all(np.isfinite(row)) else None
+
     def finish(self, table: SourceTable) -> None:
         """Write the right-hand outputs at the very end of the run."""
         pending = range(int(self.counters[loop.OUTPUT]), self.t_out.size)
@@ -130,10 +145,12 @@ class _Track:
             self.counters[loop.OUTPUT] += 1
 
 
-def method_from(tableau: Tableau, waveform: Waveform, h_fixed: float = 0.0) -> Method:
-    """A tableau as the compiled code takes it, its step bounded by the source's own time scale."""
+def method_from(tableau: Tableau, problem: Problem, h_fixed: float = 0.0) -> Method:
+    """A tableau as the compiled code takes it, its step bounded by the source's own time scale and the deck's TMAX."""
     # Zeros of the gap voltage are looked for at quarters of a step: four steps per period cannot hide one.
-    h_max = 0.25 * waveform.shortest_time()
+    h_max = 0.25 * problem.waveform.shortest_time()
+    if problem.circuit.tran is not None and problem.circuit.tran.max_step is not None:
+        h_max = min(h_max, problem.circuit.tran.max_step)
     # One memory layout for every tableau: another one would be another compilation.
     a, c, e, dense = (np.ascontiguousarray(x) for x in (tableau.a, tableau.c, tableau.e, tableau.dense))
     return Method(tableau.implicit, a, c, e, dense, tableau.n_end, tableau.error_order, h_max, h_fixed)
@@ -222,7 +239,7 @@ def integrate(
     """
     tables = tables or Tables(problem, tol)
     width = row_width(problem)
-    method = method_from(tableau, problem.waveform, h_fixed)
+    method = method_from(tableau, problem, h_fixed)
     z_scale = u_scale * problem.model.area0 / problem.model.s
     scale = tol * np.append(np.full(problem.stack.c.size - 1, u_scale), z_scale)
     rows = np.full((t_out.size, width), np.nan)
@@ -230,7 +247,7 @@ def integrate(
     main = _Track(problem, method, scale, t_out, left, rows, log)
     other = _Track(problem, method, SHADOW * scale, t_out[:0], left[:0], rows[:0], log[:0])
     meter = _Meter(problem)
-    status, detail, t_failed = Status.SUCCESS, "", None
+    status, t_failed, last = Status.SUCCESS, None, None
     table = None
     for table in tables:
         code = loop.LOG_FULL
@@ -251,6 +268,8 @@ def integrate(
             break
     if status is Status.SUCCESS and table is not None:
         main.finish(table)
+    elif table is not None and table.edges.size > 1:
+        last = main.here(table)
     c = main.counters
     return Run(
         rows=rows,
@@ -274,7 +293,7 @@ def integrate(
             problem.charge_law,
         ),
         t_failed=t_failed,
-        detail=detail,
+        last=last,
     )
 
 

@@ -17,7 +17,7 @@ from fingerspice.circuit.statespace import build_stack
 from fingerspice.circuit.waveforms import Waveform
 from fingerspice.errors import FingerspiceWarning, InputError, Where
 from fingerspice.physics.materials import SKIN_BAND
-from fingerspice.units import suggest_mega, unit_read_as_scale
+from fingerspice.units import parse_number, suggest_mega, suspicious_mega, unit_read_as_scale
 
 _UNIT_TRAPS = {"F": "farad", "N": "newton"}
 _NGSPICE_OPTIONS = frozenset(
@@ -62,6 +62,23 @@ def parse_netlist(text: str, path: str | Path | None = None) -> Circuit:
 
 def _circuit(deck: Deck) -> Circuit:
     notes: list[str] = list(deck.warnings)
+    try:
+        circuit = _read(deck, notes)
+    except InputError as error:
+        raise _in_deck(error, deck) from None
+    for note in notes:
+        warnings.warn(note, FingerspiceWarning, stacklevel=3)
+    return circuit
+
+
+def _in_deck(error: InputError, deck: Deck) -> InputError:
+    """A refusal with the file where it has no place of its own, and with a title that swallowed a statement."""
+    text = error.message if error.where else f"{deck.path or '<netlist>'}: {error.message}"
+    title = [note for note in deck.warnings if "the first line is the title" in note]
+    return InputError("; note ".join([text, *title]), error.where)
+
+
+def _read(deck: Deck, notes: list[str]) -> Circuit:
     tran = _tran(deck.tran) if deck.tran else None
     timing = Timing(tran.step if tran else None, tran.stop if tran else None)
     elements = tuple(_element(statement, timing, notes) for statement in deck.statements)
@@ -71,7 +88,7 @@ def _circuit(deck: Deck) -> Circuit:
         elements=elements,
         tran=tran,
         ac=_ac(deck.ac) if deck.ac else None,
-        initial=_initial(deck.ic, {e.nodes[2] for e in elements if e.spec.is_layer}),
+        initial=_initial(deck.ic, elements),
         charge_law=_charge_law(deck.includes),
         work=work,
         warnings=tuple(notes),
@@ -81,8 +98,6 @@ def _circuit(deck: Deck) -> Circuit:
     )
     check(circuit)
     build_stack(circuit)
-    for note in notes:
-        warnings.warn(note, FingerspiceWarning, stacklevel=3)
     return circuit
 
 
@@ -134,8 +149,10 @@ def _device_values(statement: Statement, device: str, notes: list[str]) -> dict[
                 raise InputError(
                     f"{statement.name} {key} ({LATER[device, key]}) is not simulated by this version", place
                 )
+            # ngspice reads m=... on an X line as so many copies.
+            hint = "; the exponent is m_exp" if key == "m" and "m_exp" in known else nearest(key, known)
             raise InputError(
-                f"{device} has no parameter {key!r}{nearest(key, known)}; allowed: {', '.join(known)}", place
+                f"{statement.name}: {device} has no parameter {key!r}{hint}; allowed: {', '.join(known)}", place
             )
     out = {}
     for name, spec in known.items():
@@ -161,30 +178,66 @@ def _value(name: str, spec: ParameterSpec, given: Number | Token, notes: list[st
         if spec.may_be_infinite and given.text.lower() in ("inf", "none"):
             return math.inf
         raise InputError(f"{name} {spec.name} is {given.text!r}; allowed: a number{unit}", given.where)
-    _catch_traps(name, spec, given, notes)
+    trap = _unit_trap(spec, given.text)
+    if trap:
+        raise InputError(f"{name} {spec.name} {trap}", given.where)
+    if given.mega is not None and spec.unit in ("ohm", "ohm m"):
+        notes.append(f"{given.mega.where}: {name} {spec.name}: {_mega_note(given.mega.text, given.value, spec)}")
     if not spec.accepts(given.value):
-        raise InputError(
-            f"{name} {spec.name} is {given.text}{unit} ({given.value:g}{unit}); allowed: {spec.allowed()}",
-            given.where,
-        )
+        plain = f"{given.value:g}{unit}"
+        written = plain if given.text == f"{given.value:g}" else f"{given.text} ({plain})"
+        raise InputError(f"{name} {spec.name} is {written}; allowed: {spec.allowed()}", given.where)
     return given.value
 
 
-def _catch_traps(name: str, spec: ParameterSpec, given: Number, notes: list[str]) -> None:
+def _unit_trap(spec: ParameterSpec, text: str) -> str | None:
+    """Why a number whose unit SPICE takes for a scale is refused."""
     word = _UNIT_TRAPS.get(spec.unit)
-    if word and unit_read_as_scale(given.text, spec.unit, word):
-        prefix = {"F": "femto (1e-15)", "N": "nano (1e-9)"}[spec.unit]
-        raise InputError(
-            f"{name} {spec.name} is {given.text!r}: SPICE reads {spec.unit} as {prefix}; write the number alone, in "
-            f"{word}",
-            given.where,
-        )
-    if spec.unit == "ohm" and given.mega is not None:
-        mega = given.mega
-        notes.append(
-            f"{mega.where}: {name} {spec.name}: {mega.text!r} is milli ({given.value:g} ohm), as everywhere in SPICE; "
-            f"for megohm write {suggest_mega(mega.text)}"
-        )
+    if not word or not unit_read_as_scale(text, spec.unit, word):
+        return None
+    prefix = {"F": "femto (1e-15)", "N": "nano (1e-9)"}[spec.unit]
+    return f"is {text!r}: SPICE reads {spec.unit} as {prefix}; write the number alone, in {word}"
+
+
+def _mega_note(text: str, value: float, spec: ParameterSpec) -> str:
+    """What to say where a resistance holds a capital M."""
+    return (
+        f"{text!r} is milli ({value:g} {spec.unit}), as everywhere in SPICE; for mega{spec.unit.partition(' ')[0]} "
+        f"write {suggest_mega(text)}"
+    ).replace("megaohm", "megohm")
+
+
+def value_from_text(circuit: Circuit, path: str, text: str) -> tuple[float, str | None]:
+    """A parameter's new value from text such as ``3u``, the unit traps of the netlist caught; and a warning.
+
+    Parameters
+    ----------
+    circuit : Circuit
+    path : str
+        Such as ``Xgap.d``; of an unknown path only the number is read.
+    text : str
+
+    Raises
+    ------
+    InputError
+        When the text is not a number, or its unit is one that SPICE takes for a scale.
+    """
+    if text.lower() in ("inf", "none"):
+        return math.inf, None
+    try:
+        value = parse_number(text)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    name, _, parameter = path.lower().rpartition(".")
+    element = next((e for e in circuit.elements if e.name.lower() == name), None)
+    spec = next((p for p in element.spec.parameters if p.name == parameter), None) if element else None
+    if spec is None:
+        return value, None
+    trap = _unit_trap(spec, text)
+    if trap:
+        raise InputError(f"{path} {trap}")
+    mega = spec.unit in ("ohm", "ohm m") and suspicious_mega(text)
+    return value, f"{path}: {_mega_note(text, value, spec)}" if mega else None
 
 
 def _passive_value(statement: Statement, notes: list[str]) -> tuple[dict[str, float], float | None]:
@@ -233,6 +286,7 @@ def _tran(directive: Directive) -> Tran:
     longest = numbers[3] if len(numbers) > 3 else None
     _require(step.value > 0.0, "TSTEP", step, "more than 0 s")
     _require(stop.value > 0.0, "TSTOP", stop, "more than 0 s")
+    _require(step.value <= stop.value, "TSTEP", step, f"at most TSTOP = {stop.text} (the output step comes first)")
     _require(start is None or 0.0 <= start.value < stop.value, "TSTART", start, f"0 to TSTOP = {stop.text}")
     _require(longest is None or longest.value > 0.0, "TMAX", longest, "more than 0 s")
     _require(
@@ -269,17 +323,28 @@ def _ac(directive: Directive) -> AcSweep:
     return AcSweep(scale, int(n.value), low.value, high.value)
 
 
-def _initial(directives: tuple[Directive, ...], area_nodes: set[str]) -> dict[str, float]:
-    out = {}
+def _initial(directives: tuple[Directive, ...], elements: tuple[Element, ...]) -> dict[str, float]:
+    usage = "allowed: .ic v(node)=value"
+    nodes = list(dict.fromkeys(node for e in elements for node in e.nodes))
+    area_nodes = {e.nodes[2] for e in elements if e.spec.is_layer}
+    out: dict[str, float] = {}
     for directive in directives:
+        if directive.args or not directive.params:
+            raise InputError(f"{directive.text.strip()!r} is not understood; {usage}", directive.where)
         for key, value in directive.params.items():
             place = directive.param_where[key]
             if not (key.startswith("v(") and key.endswith(")")):
-                raise InputError(f".ic {key!r} is not understood; allowed: .ic v(node)=value", place)
+                raise InputError(f".ic {key!r} is not understood; {usage}", place)
             if not isinstance(value, Number):
                 raise InputError(f".ic {key} is {value.text!r}; allowed: a number V", place)
             node = key[2:-1].strip()
             node = "0" if node == "gnd" else node
+            if node not in nodes:
+                raise InputError(f".ic names node {node!r}, which is not in the circuit{nearest(node, nodes)}", place)
+            if node in out:
+                raise InputError(f".ic gives node {node!r} twice", place)
+            if node == "0" and value.value != 0.0:
+                raise InputError(f".ic {key} is {value.text} V; allowed: 0, it is ground", place)
             # ngspice needs a start value for the area; here the area follows from the state.
             if node not in area_nodes:
                 out[node] = value.value
@@ -288,23 +353,31 @@ def _initial(directives: tuple[Directive, ...], area_nodes: set[str]) -> dict[st
 
 def _options(directives: tuple[Directive, ...]) -> tuple[str, tuple[str, ...]]:
     """The reading of Eq. 7, and the ngspice options that have no meaning here."""
-    work, unused = "gap", []
+    work, unused = None, []
     for directive in directives:
         names: list[tuple[str, Number | Token | None, Where]] = [
             (key, value, directive.param_where[key]) for key, value in directive.params.items()
         ]
-        names += [(a.text.lower(), None, a.where) for a in directive.args if isinstance(a, Token)]
+        for arg in directive.args:
+            if not isinstance(arg, Token):
+                text = arg.text if isinstance(arg, Number) else arg.name
+                raise InputError(f".options {text!r} is not understood; allowed: .options name=value", arg.where)
+            names.append((arg.text.lower(), None, arg.where))
         for key, value, place in names:
             if key == "work":
                 text = value.text.lower() if value is not None else ""
                 if text not in WORK_READINGS:
                     raise InputError(f".options work is {text!r}; allowed: {' or '.join(WORK_READINGS)}", place)
+                if work not in (None, text):
+                    raise InputError(f".options work is given twice, first {work}, then {text}", place)
                 work = text
             elif key in _NGSPICE_OPTIONS:
                 unused.append(f".options {key}")
             else:
-                raise InputError(f"unknown option {key!r}{nearest(key, [*_NGSPICE_OPTIONS, 'work'])}", place)
-    return work, tuple(dict.fromkeys(unused))
+                hint = nearest(key, [*_NGSPICE_OPTIONS, "work"])
+                known = f"work={'|'.join(WORK_READINGS)}, and ngspice's own, which have no effect here"
+                raise InputError(f"unknown option {key!r}{hint}; allowed: {known}", place)
+    return work or "gap", tuple(dict.fromkeys(unused))
 
 
 def source_from_text(text: str, circuit: Circuit) -> Waveform:
@@ -317,11 +390,14 @@ def source_from_text(text: str, circuit: Circuit) -> Waveform:
     """
     tran = circuit.tran
     line = f".tran {tran.step!r} {tran.stop!r}\n" if tran else ""
-    deck = parse_deck(f"source\nVsource a 0 {text}\n{line}", Path("--source"))
-    if len(deck.statements) != 1:
-        raise InputError(f"--source {text!r} is not one source")
     timing = Timing(tran.step if tran else None, tran.stop if tran else None)
-    return read_source("--source", deck.statements[0].body, timing, deck.statements[0].where)
+    try:
+        deck = parse_deck(f"source\nVsource a 0 {text}\n{line}")
+        if len(deck.statements) != 1 or deck.statements[0].params:
+            raise InputError("not one source; allowed: such as SQUARE(200 100)")
+        return read_source("source", deck.statements[0].body, timing, deck.statements[0].where)
+    except InputError as error:
+        raise InputError(f"{text!r}: {error.message}") from None
 
 
 def sweep_from_text(text: str) -> AcSweep:
@@ -332,7 +408,10 @@ def sweep_from_text(text: str) -> AcSweep:
     InputError
         When the text is not a sweep.
     """
-    deck = parse_deck(f"sweep\n.ac {text}\n", Path("--sweep"))
-    if deck.ac is None:
-        raise InputError(f"--sweep {text!r} is not understood; allowed: DEC|OCT|LIN N FSTART FSTOP")
-    return _ac(deck.ac)
+    try:
+        deck = parse_deck(f"sweep\n.ac {text}\n")
+        if deck.ac is None:
+            raise InputError("not a sweep")
+        return _ac(deck.ac)
+    except InputError as error:
+        raise InputError(f"{text!r}: {error.message}") from None

@@ -77,8 +77,8 @@ class _Ramps(Waveform):
         middle = 0.5 * (start + stop)
         run, tau = self._phase(np.where(np.isfinite(middle), middle, 0.0))
         index = np.searchsorted(times, tau, side="right")
-        before = (index == 0) | (start == -math.inf)
-        after = (index == times.size) | (stop == math.inf)
+        before = np.where(np.isfinite(middle), index == 0, start == -math.inf)
+        after = np.where(np.isfinite(middle), index == times.size, start != -math.inf)
         j = np.clip(index, 1, times.size - 1)
         width = times[j] - times[j - 1]
         inside = ~before & ~after & (width > 0.0)
