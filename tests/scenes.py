@@ -23,9 +23,7 @@ GAP = {
 
 def assignments(values: dict[str, Any]) -> str:
     """``key=value`` pairs; a value of None leaves the parameter out."""
-    return " ".join(
-        f"{k}={v!r}" if isinstance(v, float) else f"{k}={v}" for k, v in values.items() if v is not None
-    )
+    return " ".join(f"{k}={v!r}" if isinstance(v, float) else f"{k}={v}" for k, v in values.items() if v is not None)
 
 
 def table1_deck(

@@ -7,6 +7,10 @@ import math
 import mpmath as mp
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+import fingerspice as fs
 from analytic import (
     TABLE1,
     Parameters,
@@ -16,13 +20,9 @@ from analytic import (
     jkr_parameters,
     work_factor,
 )
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
-from scenes import table1
-
-import fingerspice as fs
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.physics.contact import Contact, fixed_area_curve, inverse_area, ridge_area, universal_curve
+from scenes import table1
 
 SEARCH = settings(max_examples=60, derandomize=True, deadline=None)
 MM2 = 1e6
@@ -52,9 +52,7 @@ def curve_mp(x: float, inv_m: float, p: float, dps: int = 35) -> mp.mpf:
             low, high = (middle, high) if residual(middle) < 0 else (low, middle)
         if x == 0:
             return mp.mpf(1)
-        log_y = mp.findroot(
-            residual, (low, high), solver="anderson", tol=mp.mpf(10) ** (-2 * dps), verify=False
-        )
+        log_y = mp.findroot(residual, (low, high), solver="anderson", tol=mp.mpf(10) ** (-2 * dps), verify=False)
         assert low <= log_y <= high
         assert abs(residual(log_y)) < mp.mpf(10) ** (-dps) * (inv_m * log_y + mp.mpf(10) ** -320)
         return mp.exp(log_y)
@@ -79,9 +77,7 @@ def test_the_universal_curve_of_the_papers_exponents_is_exact_to_1e_13_over_its_
     over=st.floats(1.01, 40.0),
     log_x=st.floats(-12.0, 6.0),
 )
-def test_the_universal_curve_is_exact_to_1e_13_for_any_legal_exponents(
-    m: float, over: float, log_x: float
-) -> None:
+def test_the_universal_curve_is_exact_to_1e_13_for_any_legal_exponents(m: float, over: float, log_x: float) -> None:
     n = m * over
     inv_m = 1.0 / m
     p = 0.5 * (1.0 + inv_m - 1.0 / n)
@@ -143,11 +139,7 @@ def test_area_leaves_zero_volts_with_a_slope_of_13_11_square_millimetres_per_kil
     p = 0.5 * (1.0 + 1.0 / 0.52 - 1.0 / 1.41)
     a0 = 54.4 * 0.5**0.52
     w = 0.5 * 8.854e-12 / 3.5e-6 / 1000.0
-    x = (
-        math.sqrt(2.0 * w * 1.41**2 / (1.41 - 0.52) * 32.0 ** (1.0 / 1.41) * 54.4 ** (-1.0 / 0.52))
-        * a0**p
-        / 0.5
-    )
+    x = math.sqrt(2.0 * w * 1.41**2 / (1.41 - 0.52) * 32.0 ** (1.0 / 1.41) * 54.4 ** (-1.0 / 0.52)) * a0**p / 0.5
     slope = 0.52 * x * a0 * (1.0 + 5000.0 * (0.3 * 0.5 / a0) ** 2)
     assert slope * 1000.0 == pytest.approx(13.11, abs=5e-3)
     _, d_inverse = inverse_area(0.0, PAPER.curve(200.0))
@@ -182,9 +174,7 @@ fingers = st.builds(
 
 @settings(max_examples=25, derandomize=True, deadline=None)
 @given(p=fingers, u=st.floats(0.0, 1000.0), k=st.sampled_from([1.0, 1.1, 1.5]))
-def test_any_fingers_area_agrees_with_equation_four_solved_to_40_digits(
-    p: Parameters, u: float, k: float
-) -> None:
+def test_any_fingers_area_agrees_with_equation_four_solved_to_40_digits(p: Parameters, u: float, k: float) -> None:
     c = from_parameters(p, k)
     assume(c.exists)
     a0, a, f_el, _ = area_mp(u, p, k=k)
@@ -195,9 +185,7 @@ def test_any_fingers_area_agrees_with_equation_four_solved_to_40_digits(
 
 @SEARCH
 @given(p=fingers, u=st.floats(-500.0, 500.0))
-def test_any_fingers_area_satisfies_equations_one_and_three_and_is_even_in_the_voltage(
-    p: Parameters, u: float
-) -> None:
+def test_any_fingers_area_satisfies_equations_one_and_three_and_is_even_in_the_voltage(p: Parameters, u: float) -> None:
     c = from_parameters(p)
     assume(c.exists)
     a0, a = float(c.area_adhesive(u)), float(c.area(u))

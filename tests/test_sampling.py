@@ -82,7 +82,7 @@ def test_a_function_that_misreads_arrays_without_raising_is_called_with_numbers(
 
 @pytest.mark.parametrize("given", ["a", None, 1j, [1.0, 2.0]])
 def test_a_function_that_returns_no_number_is_refused_with_what_it_returned(given: object) -> None:
-    with pytest.raises(fs.InputError, match="the source function returned .* allowed: one number"):
+    with pytest.raises(fs.InputError, match=r"the source function returned .* allowed: one number"):
         fs.Function(lambda t: given).value([0.001, 0.002])
 
 

@@ -17,6 +17,9 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit as Circuit
+    from fingerspice.circuit.combinations import AM as AM
+    from fingerspice.circuit.combinations import Product as Product
+    from fingerspice.circuit.combinations import Sum as Sum
     from fingerspice.circuit.netlist import parse_netlist as parse_netlist
     from fingerspice.circuit.netlist import read_netlist as read_netlist
     from fingerspice.circuit.ramps import PWL as PWL
@@ -26,13 +29,10 @@ if TYPE_CHECKING:
     from fingerspice.circuit.ramps import Square as Square
     from fingerspice.circuit.ramps import Triangle as Triangle
     from fingerspice.circuit.sampling import Function as Function
-    from fingerspice.circuit.waveforms import AM as AM
     from fingerspice.circuit.waveforms import DC as DC
     from fingerspice.circuit.waveforms import Chirp as Chirp
     from fingerspice.circuit.waveforms import Exp as Exp
-    from fingerspice.circuit.waveforms import Product as Product
     from fingerspice.circuit.waveforms import Sine as Sine
-    from fingerspice.circuit.waveforms import Sum as Sum
     from fingerspice.circuit.waveforms import Waveform as Waveform
     from fingerspice.comparison import Comparison as Comparison
     from fingerspice.comparison import compare as compare
@@ -51,7 +51,8 @@ _HOMES = {
     "circuit.netlist": ("parse_netlist", "read_netlist"),
     "circuit.ramps": ("PWL", "Pulse", "Samples", "Sawtooth", "Square", "Triangle"),
     "circuit.sampling": ("Function",),
-    "circuit.waveforms": ("AM", "DC", "Chirp", "Exp", "Product", "Sine", "Sum", "Waveform"),
+    "circuit.combinations": ("AM", "Product", "Sum"),
+    "circuit.waveforms": ("DC", "Chirp", "Exp", "Sine", "Waveform"),
     "comparison": ("Comparison", "compare"),
     "errors": ("FingerspiceError", "FingerspiceWarning", "InputError", "SolveError"),
     "export": ("export_netlist",),

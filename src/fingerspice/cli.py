@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -13,14 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from fingerspice import options
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError
-from fingerspice.units import parse_number
+from fingerspice.options import area_from_text, check_output, json_text, note_skin_frequency, read_circuit
 
 if TYPE_CHECKING:
-    from fingerspice.circuit.circuit import Circuit
     from fingerspice.solution import Solution
 
 app = typer.Typer(
+    context_settings={"help_option_names": ["--help", "-h"]},
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -85,57 +85,6 @@ def _warnings_as_lines() -> Iterator[None]:
         yield
 
 
-def _read(deck: Path, changes: list[str] | None, source: str | None) -> Circuit:
-    from fingerspice.circuit.netlist import read_netlist, source_from_text
-
-    circuit = read_netlist(deck)
-    for change in changes or []:
-        path, equals, value = change.partition("=")
-        if not equals:
-            raise InputError(f"--set {change!r} is not understood; allowed: PATH=VALUE, such as Xgap.d=3u")
-        try:
-            number = float("inf") if value.strip().lower() == "inf" else parse_number(value.strip())
-        except ValueError as error:
-            raise InputError(f"--set {change!r}: {error}") from None
-        circuit = circuit.replace({path.strip(): number})
-    if source is not None:
-        from fingerspice.circuit.statespace import build_stack
-
-        sources = build_stack(circuit).sources
-        if len(sources) != 1:
-            raise InputError("--source needs a circuit with one voltage source")
-        circuit = circuit.replace({sources[0][0].name: source_from_text(source, circuit)})
-    for directive in circuit.unused:
-        print(f"fingerspice: note: {directive} has no effect here", file=sys.stderr)
-    return circuit
-
-
-def _note_skin_frequency(circuit: Circuit) -> None:
-    """Warn where a SKIN's data are not taken at the source's fundamental."""
-    from fingerspice.circuit.statespace import build_stack
-
-    fundamental = build_stack(circuit).waveform.fundamental
-    for skin in circuit.by_device("SKIN"):
-        f = skin.values["f"]
-        if fundamental is None:
-            text = f"{skin.name} takes its data at {f:g} Hz, and the source has no fundamental"
-        elif abs(f / fundamental.frequency - 1.0) > 1e-9:
-            text = (
-                f"{skin.name} takes its data at f = {f:g} Hz, the source's fundamental is "
-                f"{fundamental.frequency:g} Hz; --set {skin.name}.f={fundamental.frequency:g} would match"
-            )
-        else:
-            continue
-        warnings.warn(text, FingerspiceWarning, stacklevel=2)
-
-
-def _area(text: str) -> str | float:
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
 @contextmanager
 def _progress() -> Iterator[Callable[[float], None] | None]:
     """A bar on a terminal, shown only once a run takes more than a second."""
@@ -194,20 +143,24 @@ def run(
     from fingerspice.simulation import simulate
 
     with _warnings_as_lines():
-        circuit = _read(deck, changes, source)
-        _note_skin_frequency(circuit)
-        _check_folder(out)
+        circuit = read_circuit(deck, changes, source)
+        if circuit.tran is None:
+            raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic]")
+        note_skin_frequency(circuit)
+        data = out / f"{deck.stem}.{'csv' if csv else 'nc'}"
+        check_output(data, deck)
         with _progress() as progress:
             solution = simulate(
-                circuit, charge_law=charge_law, area=_area(area), rtol=rtol, method=method, throw=False,
+                circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method, throw=False,
                 progress=progress,
             )  # fmt: skip
         for text in solution.warnings:
             warnings.warn(text, FingerspiceWarning, stacklevel=1)
-    files = _write_run(solution, out / deck.stem, csv, no_plot) if solution.t.size else []
+    picture = None if no_plot else out / f"{deck.stem}.png"
+    files = _write_run(solution, data, picture) if solution.t.size else []
     if as_json:
         report = {**solution.summary(), "success": solution.success, "message": solution.message}
-        print(json.dumps({**report, "files": [str(f) for f in files]}, indent=2))
+        print(json_text({**report, "files": [str(f) for f in files]}))
     else:
         print(summary_table(solution))
         for file in files:
@@ -216,21 +169,12 @@ def run(
         raise SolveError(solution.message, solution)
 
 
-def _check_folder(folder: Path) -> None:
-    """Refuse an output folder that cannot be written before spending time on the run."""
-    from fingerspice.files import write_aside
-
-    probe = folder / ".fingerspice-probe"
-    write_aside(probe, lambda path: path.write_bytes(b""))
-    probe.unlink(missing_ok=True)
-
-
-def _write_run(solution: Solution, stem: Path, csv: bool, no_plot: bool) -> list[Path]:
-    files = [solution.to_csv(stem.with_suffix(".csv")) if csv else solution.to_netcdf(stem.with_suffix(".nc"))]
-    if not no_plot:
+def _write_run(solution: Solution, data: Path, picture: Path | None) -> list[Path]:
+    files = [solution.to_csv(data) if data.suffix == ".csv" else solution.to_netcdf(data)]
+    if picture is not None:
         from fingerspice.plotting import save
 
-        files.append(save(solution.plot(), stem.with_suffix(".png")))
+        files.append(save(solution.plot(), picture))
     return files
 
 
@@ -259,27 +203,26 @@ def ac(
     from fingerspice.report import phasor_csv, phasor_dict, phasor_table
 
     with _warnings_as_lines():
-        circuit = _read(deck, changes, source)
-        _check_folder(out)
+        circuit = read_circuit(deck, changes, source)
+        check_output(out / f"{deck.stem}_ac.csv", deck)
         if sweep is not None:
-            from fingerspice.circuit.netlist import sweep_from_text
-
-            frequencies = sweep_frequencies(sweep_from_text(sweep))
+            frequencies = sweep_frequencies(options.sweep(sweep))
         elif circuit.ac is not None:
             frequencies = sweep_frequencies(circuit.ac)
         else:
             from fingerspice.circuit.circuit import AcSweep
 
             frequencies = sweep_frequencies(AcSweep("dec", 20, 10.0, 1e5))
-        result = phasor(circuit, frequencies, area=_area(area))
-    stem = out / f"{deck.stem}_ac"
-    files = [phasor_csv(result, stem.with_suffix(".csv"))]
+        result = phasor(circuit, frequencies, area=area_from_text(area))
+    files = [phasor_csv(result, out / f"{deck.stem}_ac.csv")]
     if not no_plot:
         from fingerspice.plotting import plot_phasor, save
 
-        files.append(save(plot_phasor(result, circuit), stem.with_suffix(".png")))
-    print(json.dumps(phasor_dict(result), indent=2) if as_json else phasor_table(result))
-    if not as_json:
+        files.append(save(plot_phasor(result, circuit), out / f"{deck.stem}_ac.png"))
+    if as_json:
+        print(json_text({**phasor_dict(result), "files": [str(f) for f in files]}))
+    else:
+        print(phasor_table(result))
         for file in files:
             print(f"wrote {file}")
 
@@ -307,17 +250,22 @@ def compare(
     from fingerspice.report import comparison_table
 
     with _warnings_as_lines():
-        circuit = _read(deck, changes, source)
-        _note_skin_frequency(circuit)
-        _check_folder(out)
+        circuit = read_circuit(deck, changes, source)
+        note_skin_frequency(circuit)
+        picture = out / f"{deck.stem}_compare.png"
+        if not no_plot:
+            check_output(picture, deck)
         result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
-    print(json.dumps(result.to_dict(), indent=2) if as_json else comparison_table(result))
     if not no_plot:
         from fingerspice.plotting import plot_comparison, save
 
-        file = save(plot_comparison(result), out / f"{deck.stem}_compare.png")
-        if not as_json:
-            print(f"wrote {file}")
+        save(plot_comparison(result), picture)
+    if as_json:
+        print(json_text({**result.to_dict(), "files": [] if no_plot else [str(picture)]}))
+        return
+    print(comparison_table(result))
+    if not no_plot:
+        print(f"wrote {picture}")
 
 
 @app.command()
@@ -338,7 +286,8 @@ def export(
     from fingerspice.files import write_aside
 
     with _warnings_as_lines():
-        circuit = _read(deck, changes, source)
+        circuit = read_circuit(deck, changes, source)
+        check_output(output, deck)
     text = export_netlist(circuit, charge_law=charge_law)
     print(f"wrote {write_aside(output, lambda path: path.write_text(text))}")
 
@@ -356,8 +305,9 @@ def figures(
     """
     from fingerspice.figures import make_figures
 
-    for file in make_figures(out, only=only):
-        print(f"wrote {file}")
+    with _warnings_as_lines():
+        for file in make_figures(out, only=only):
+            print(f"wrote {file}")
 
 
 @app.callback(invoke_without_command=True)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.statespace import build_stack
 from fingerspice.errors import InputError, SolveError
 from fingerspice.problem import Problem, prepare, state_from
 from fingerspice.simulation import run_problem
@@ -48,11 +49,12 @@ def periodic_solution(
     SolveError
         Where a period cannot be integrated, or the iteration does not close it.
     """
-    problem = prepare(circuit, t_stop=None, t_eval=None, charge_law=charge_law, area=area, start="uncharged")
-    period = problem.waveform.period
+    waveform = build_stack(circuit).waveform
+    period = waveform.period
     if period is None:
         raise InputError("the source has no period, so there is no periodic state to compare")
-    begin = period * np.ceil(problem.waveform.settled / period)
+    begin = period * np.ceil(waveform.settled / period)
+    problem = prepare(circuit, t_stop=begin + period, t_eval=None, charge_law=charge_law, area=area, start="uncharged")
     before = float(problem.waveform.value(begin, "left"))
     problem = dataclasses.replace(problem, t_start=begin, t_stop=begin + period, first=begin, step=period / points)
     x = _close(problem, before, rtol)

@@ -49,6 +49,7 @@ def summary_table(solution: Solution) -> str:
         for key, label, unit, factor in (
             ("u_source", "source voltage", "V", 1.0),
             ("u_gap", "gap voltage", "V", 1.0),
+            *((f"u_layer:{name}", f"{name} voltage", "V", 1.0) for name in solution.layers),
             ("f_el", "electroadhesive force", "N", 1.0),
             ("f_t", "friction force", "N", 1.0),
             ("friction", "friction coefficient", "", 1.0),
@@ -77,7 +78,10 @@ def summary_table(solution: Solution) -> str:
                 f"{100.0 * share:.2f} % of the source, leading by {lead:.2f} deg"
             )
     out.append("")
-    out.append(f"estimated error: gap voltage {solution.error.u_gap:.2g} V, force {solution.error.f_el:.2g} N")
+    if solution.u_gap is None:
+        out.append(f"no GAP, no forces; estimated error: layer voltage {solution.error.u_gap:.2g} V")
+    else:
+        out.append(f"estimated error: gap voltage {solution.error.u_gap:.2g} V, force {solution.error.f_el:.2g} N")
     out.append(f"status: {solution.message}")
     return "\n".join(out)
 
@@ -103,8 +107,9 @@ def comparison_table(comparison: Comparison) -> str:
         rows.append((f"{names[name]} [{unit}]", *(f"{x:.6g}" for x in (p, m, c, difference, ripple))))
     head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
     reference = comparison.phasor.f_el_mean
-    total = 100.0 * (comparison.coupled.f_el_mean / reference - 1.0)
-    waveform = 100.0 * (comparison.mean.f_el_mean / reference - 1.0)
+    # Rounded here, and 0.0 added: -0.00 is not a figure.
+    total = round(100.0 * (comparison.coupled.f_el_mean / reference - 1.0), 2) + 0.0
+    waveform = round(100.0 * (comparison.mean.f_el_mean / reference - 1.0), 2) + 0.0
     return "\n".join(
         [
             comparison.solution.circuit.title,

@@ -180,7 +180,8 @@ class Solution:
         """Figures of the run: peak, rms, mean, ripple, amplitude and phase at the fundamental; SI units.
 
         Means are trapezoidal over the output times. `f_el_mean` is over the whole run, `f_el_mean_periodic` over
-        the last period of the source; the entries of a period are None where the run holds none.
+        the last period of the source; the entries of a period are None where the run holds none. A circuit without
+        GAP has its layer voltages (``u_layer:Xcoat_max``) in place of gap voltage and forces.
         """
         out: dict[str, Any] = {
             "t_stop": float(self.t[-1]) if self.t.size else None,
@@ -190,10 +191,7 @@ class Solution:
         if self.t.size < 2:
             return out
         last = self._last_period()
-        for key in ("u_source", "u_gap", "area", "f_el", "f_t", "friction"):
-            x = getattr(self, key)
-            if x is None:
-                continue
+        for key, x in self._summarised().items():
             out[f"{key}_max"] = float(x.max())
             out[f"{key}_min"] = float(x.min())
             out[f"{key}_peak"] = float(np.abs(x).max())
@@ -219,6 +217,14 @@ class Solution:
             out["fold_margin_min"] = float(self.fold_margin.min())
         return out
 
+    def _summarised(self) -> dict[str, FloatArray]:
+        """What the summary gives figures of; without a gap, every layer."""
+        if self.u_gap is None:
+            layers = {f"u_layer:{name}": self.u_layer[:, i] for i, name in enumerate(self.layers)}
+            return {"u_source": self.u_source, **layers, "area": self.area}
+        keys = ("u_source", "u_gap", "area", "f_el", "f_t", "friction")
+        return {key: getattr(self, key) for key in keys}
+
     def _last_period(self) -> tuple[FloatArray, dict[str, FloatArray]] | None:
         """Times and signals of the last period, with an interpolated first point; None where there is none."""
         if self.period is None:
@@ -233,11 +239,9 @@ class Solution:
             # At a jump the period starts with the right-hand value.
             first = int(np.searchsorted(self.t, start + tolerance, side="right")) - 1
         signals = {}
-        for key in ("u_source", "u_gap", "area", "f_el", "f_t", "friction"):
-            x = getattr(self, key)
-            if x is not None:
-                head = [] if exact else [np.interp(start, self.t, x)]
-                signals[key] = np.concatenate([head, x[first:]])
+        for key, x in self._summarised().items():
+            head = [] if exact else [np.interp(start, self.t, x)]
+            signals[key] = np.concatenate([head, x[first:]])
         return np.concatenate([[] if exact else [start], self.t[first:]]), signals
 
     def provenance(self) -> dict[str, str]:

@@ -4,28 +4,23 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
 
-from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Circuit, Element, Tran, check
-from fingerspice.circuit.deck import Deck, Directive, Number, Statement, Token, parse_deck, read_deck
+from fingerspice.circuit.circuit import Circuit, Element, check
+from fingerspice.circuit.deck import Call, Deck, Number, Statement, Token, parse_deck, read_deck
 from fingerspice.circuit.devices import DEVICES, LATER, ParameterSpec
+from fingerspice.circuit.directives import read_ac, read_initial, read_options, read_tran
 from fingerspice.circuit.expressions import nearest
 from fingerspice.circuit.sources import Timing, read_source
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.circuit.waveforms import Waveform
-from fingerspice.errors import FingerspiceWarning, InputError, Where
+from fingerspice.errors import FingerspiceWarning, InputError
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.units import parse_number, suggest_mega, suspicious_mega, unit_read_as_scale
 
 _UNIT_TRAPS = {"F": "farad", "N": "newton"}
-_NGSPICE_OPTIONS = frozenset(
-    """abstol acct bypass chgtol defad defas defl defw gmin gminsteps interp itl1 itl2 itl3 itl4 itl5 itl6 keepopinfo
-    klu list maxevtiter maxopalter maxord method minbreak noacct noinit nomod nopage node noopalter numdgt opts
-    pivrel pivtol ramptime reltol rshunt savecurrents seed seedinfo sparse srcsteps temp tnom trtol trytocompact
-    vntol warn xmu""".split()  # noqa: SIM905
-)
 
 
 def read_netlist(path: str | Path) -> Circuit:
@@ -79,16 +74,16 @@ def _in_deck(error: InputError, deck: Deck) -> InputError:
 
 
 def _read(deck: Deck, notes: list[str]) -> Circuit:
-    tran = _tran(deck.tran) if deck.tran else None
+    tran = read_tran(deck.tran) if deck.tran else None
     timing = Timing(tran.step if tran else None, tran.stop if tran else None)
     elements = tuple(_element(statement, timing, notes) for statement in deck.statements)
-    work, unused = _options(deck.options)
+    work, unused = read_options(deck.options)
     circuit = Circuit(
         title=deck.title,
         elements=elements,
         tran=tran,
-        ac=_ac(deck.ac) if deck.ac else None,
-        initial=_initial(deck.ic, elements),
+        ac=read_ac(deck.ac) if deck.ac else None,
+        initial=read_initial(deck.ic, elements),
         charge_law=_charge_law(deck.includes),
         work=work,
         warnings=tuple(notes),
@@ -121,10 +116,7 @@ def _element(statement: Statement, timing: Timing, notes: list[str]) -> Element:
         values = _device_values(statement, device, notes)
     elif statement.letter in "VI":
         device = statement.letter
-        if statement.params:
-            key = next(iter(statement.params))
-            raise InputError(f"{statement.name} takes no parameter {key!r}", statement.param_where[key])
-        waveform = read_source(statement.name, statement.body, timing, statement.where)
+        waveform = _source(statement, timing)
     else:
         device = statement.letter
         values, initial = _passive_value(statement, notes)
@@ -138,6 +130,22 @@ def _element(statement: Statement, timing: Timing, notes: list[str]) -> Element:
         initial,
         statement.where,
     )
+
+
+def _source(statement: Statement, timing: Timing) -> Waveform:
+    body = list(statement.body)
+    if statement.params:
+        last = body[-1] if body else None
+        if not isinstance(last, Call) or last.name.lower() != "pwl" or set(last.params) & set(statement.params):
+            key = next(iter(statement.params))
+            raise InputError(f"{statement.name} takes no parameter {key!r}", statement.param_where[key])
+        # ngspice takes PWL(...) r=10m as well as PWL(... r=10m).
+        body[-1] = replace(
+            last,
+            params={**last.params, **statement.params},
+            param_where={**last.param_where, **statement.param_where},
+        )
+    return read_source(statement.name, body, timing, statement.where)
 
 
 def _device_values(statement: Statement, device: str, notes: list[str]) -> dict[str, float]:
@@ -259,127 +267,6 @@ def _passive_value(statement: Statement, notes: list[str]) -> tuple[dict[str, fl
     return {"value": _value(name, spec, word, notes)}, None if initial is None else initial.value
 
 
-def _numbers(directive: Directive, usage: str) -> tuple[list[Number], list[str]]:
-    """Numbers and bare words of a directive's line."""
-    numbers: list[Number] = []
-    words: list[str] = []
-    for arg in directive.args:
-        if isinstance(arg, Number):
-            numbers.append(arg)
-        elif isinstance(arg, Token):
-            words.append(arg.text.lower())
-        else:
-            raise InputError(f"{directive.name}: {arg.name!r} is not understood; allowed: {usage}", arg.where)
-    if directive.params:
-        key = next(iter(directive.params))
-        raise InputError(f"{directive.name} takes no {key!r}; allowed: {usage}", directive.param_where[key])
-    return numbers, words
-
-
-def _tran(directive: Directive) -> Tran:
-    usage = ".tran TSTEP TSTOP [TSTART [TMAX]] [uic]"
-    numbers, words = _numbers(directive, usage)
-    if any(w != "uic" for w in words) or not 2 <= len(numbers) <= 4:
-        raise InputError(f"{directive.text.strip()!r} is not understood; allowed: {usage}", directive.where)
-    step, stop = numbers[0], numbers[1]
-    start = numbers[2] if len(numbers) > 2 else None
-    longest = numbers[3] if len(numbers) > 3 else None
-    _require(step.value > 0.0, "TSTEP", step, "more than 0 s")
-    _require(stop.value > 0.0, "TSTOP", stop, "more than 0 s")
-    _require(step.value <= stop.value, "TSTEP", step, f"at most TSTOP = {stop.text} (the output step comes first)")
-    _require(start is None or 0.0 <= start.value < stop.value, "TSTART", start, f"0 to TSTOP = {stop.text}")
-    _require(longest is None or longest.value > 0.0, "TMAX", longest, "more than 0 s")
-    _require(
-        (stop.value - (start.value if start else 0.0)) / step.value <= 1e8,
-        "TSTEP",
-        step,
-        "at most 1e8 output steps in a run",
-    )
-    return Tran(
-        step.value,
-        stop.value,
-        start.value if start else 0.0,
-        longest.value if longest else None,
-        "uic" in words,
-    )
-
-
-def _require(condition: bool, what: str, given: Number | None, allowed: str) -> None:
-    if not condition:
-        assert given is not None
-        raise InputError(f"{what} is {given.text}; allowed: {allowed}", given.where)
-
-
-def _ac(directive: Directive) -> AcSweep:
-    usage = ".ac DEC|OCT|LIN N FSTART FSTOP"
-    numbers, words = _numbers(directive, usage)
-    if len(words) != 1 or words[0] not in ("dec", "oct", "lin") or len(numbers) != 3:
-        raise InputError(f"{directive.text.strip()!r} is not understood; allowed: {usage}", directive.where)
-    n, low, high = numbers
-    _require(n.value >= 1 and n.value == int(n.value) and n.value <= 1e6, "N", n, "a whole number, 1 to 1e6")
-    _require(low.value > 0.0, "FSTART", low, "more than 0 Hz")
-    _require(high.value >= low.value, "FSTOP", high, f"at least FSTART = {low.text}")
-    scale: Literal["dec", "oct", "lin"] = words[0]  # type: ignore[assignment]
-    return AcSweep(scale, int(n.value), low.value, high.value)
-
-
-def _initial(directives: tuple[Directive, ...], elements: tuple[Element, ...]) -> dict[str, float]:
-    usage = "allowed: .ic v(node)=value"
-    nodes = list(dict.fromkeys(node for e in elements for node in e.nodes))
-    area_nodes = {e.nodes[2] for e in elements if e.spec.is_layer}
-    out: dict[str, float] = {}
-    for directive in directives:
-        if directive.args or not directive.params:
-            raise InputError(f"{directive.text.strip()!r} is not understood; {usage}", directive.where)
-        for key, value in directive.params.items():
-            place = directive.param_where[key]
-            if not (key.startswith("v(") and key.endswith(")")):
-                raise InputError(f".ic {key!r} is not understood; {usage}", place)
-            if not isinstance(value, Number):
-                raise InputError(f".ic {key} is {value.text!r}; allowed: a number V", place)
-            node = key[2:-1].strip()
-            node = "0" if node == "gnd" else node
-            if node not in nodes:
-                raise InputError(f".ic names node {node!r}, which is not in the circuit{nearest(node, nodes)}", place)
-            if node in out:
-                raise InputError(f".ic gives node {node!r} twice", place)
-            if node == "0" and value.value != 0.0:
-                raise InputError(f".ic {key} is {value.text} V; allowed: 0, it is ground", place)
-            # ngspice needs a start value for the area; here the area follows from the state.
-            if node not in area_nodes:
-                out[node] = value.value
-    return out
-
-
-def _options(directives: tuple[Directive, ...]) -> tuple[str, tuple[str, ...]]:
-    """The reading of Eq. 7, and the ngspice options that have no meaning here."""
-    work, unused = None, []
-    for directive in directives:
-        names: list[tuple[str, Number | Token | None, Where]] = [
-            (key, value, directive.param_where[key]) for key, value in directive.params.items()
-        ]
-        for arg in directive.args:
-            if not isinstance(arg, Token):
-                text = arg.text if isinstance(arg, Number) else arg.name
-                raise InputError(f".options {text!r} is not understood; allowed: .options name=value", arg.where)
-            names.append((arg.text.lower(), None, arg.where))
-        for key, value, place in names:
-            if key == "work":
-                text = value.text.lower() if value is not None else ""
-                if text not in WORK_READINGS:
-                    raise InputError(f".options work is {text!r}; allowed: {' or '.join(WORK_READINGS)}", place)
-                if work not in (None, text):
-                    raise InputError(f".options work is given twice, first {work}, then {text}", place)
-                work = text
-            elif key in _NGSPICE_OPTIONS:
-                unused.append(f".options {key}")
-            else:
-                hint = nearest(key, [*_NGSPICE_OPTIONS, "work"])
-                known = f"work={'|'.join(WORK_READINGS)}, and ngspice's own, which have no effect here"
-                raise InputError(f"unknown option {key!r}{hint}; allowed: {known}", place)
-    return work or "gap", tuple(dict.fromkeys(unused))
-
-
 def source_from_text(text: str, circuit: Circuit) -> Waveform:
     """A waveform from netlist text such as ``SQUARE(200 100)``, with SPICE's defaults from the circuit's .tran.
 
@@ -396,22 +283,5 @@ def source_from_text(text: str, circuit: Circuit) -> Waveform:
         if len(deck.statements) != 1 or deck.statements[0].params:
             raise InputError("not one source; allowed: such as SQUARE(200 100)")
         return read_source("source", deck.statements[0].body, timing, deck.statements[0].where)
-    except InputError as error:
-        raise InputError(f"{text!r}: {error.message}") from None
-
-
-def sweep_from_text(text: str) -> AcSweep:
-    """A sweep from text such as ``dec 10 10 100k``.
-
-    Raises
-    ------
-    InputError
-        When the text is not a sweep.
-    """
-    try:
-        deck = parse_deck(f"sweep\n.ac {text}\n")
-        if deck.ac is None:
-            raise InputError("not a sweep")
-        return _ac(deck.ac)
     except InputError as error:
         raise InputError(f"{text!r}: {error.message}") from None

@@ -202,6 +202,14 @@ class _Periodic(_Ramps):
     def period(self) -> float | None:  # type: ignore[override]
         return 1.0 / self.frequency
 
+    def _times(self, t0: float, t1: float) -> FloatArray:
+        # (k + x) / f rounds to the time a user writes; k (1 / f) + x (1 / f) often misses it.
+        x = self._knots()[0] * self.frequency
+        shift = self.delay - self.phase_deg / 360.0 / self.frequency
+        low = math.floor((t0 - shift) * self.frequency) - 1.0
+        high = math.ceil((t1 - shift) * self.frequency) + 1.0
+        return np.asarray(((np.arange(low, high + 1.0)[:, None] + x) / self.frequency + shift).ravel())
+
     @property
     def _first(self) -> float:  # type: ignore[override]
         # A whole number of periods early enough that the shape covers t = 0 and the delay only shifts it.

@@ -24,6 +24,7 @@ FloatArray = NDArray[np.float64]
 
 _POINTS = 20
 # Points between the nodes at which a series has to prove itself; irregular, so that no period hides from them.
+_AT_START = (-1.0) ** np.arange(_POINTS)
 _PROOF = 2.0 * np.modf(np.arange(1, 28) * 0.6180339887498949)[0] - 1.0
 
 
@@ -54,8 +55,13 @@ class Function(Waveform):
     repeat: float | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "breaks", tuple(sorted(float(b) for b in self.breaks)))
+        require(callable(self.function), "source function", repr(self.function), "a function of time in s")
         require(self.repeat is None or self.repeat > 0.0, "function period", self.repeat, "> 0 s")
+        breaks = {float(b) for b in self.breaks}
+        if self.repeat is not None:
+            # The end of a period is the start of the next.
+            breaks = {math.fmod(b, self.repeat) if b >= self.repeat else b for b in breaks}
+        object.__setattr__(self, "breaks", tuple(sorted(breaks)))
 
     @property
     def period(self) -> float | None:  # type: ignore[override]
@@ -178,9 +184,11 @@ class _Refiner:
     tol: float
     step: float
     scale: float = 0.0
+    steepest: float = 0.0
     edges: list[float] = field(default_factory=list)
     series: list[FloatArray] = field(default_factory=list)
     jumps: list[tuple[float, float]] = field(default_factory=list)
+    located: list[float] = field(default_factory=list)
     narrow: list[float] = field(default_factory=list)
     not_finite: float | None = None
 
@@ -195,7 +203,7 @@ class _Refiner:
         stack = [(float(x), float(y), 0) for x, y in itertools.pairwise(cuts)][::-1]
         while stack:
             lo, hi, depth = stack.pop()
-            series, values = self._try(lo, hi)
+            series, values = self._try(lo, hi, depth)
             if not np.all(np.isfinite(values)):
                 if hi - lo <= 1e-12 * max(abs(hi), self.step) or depth > 60:
                     self.not_finite = lo if lo == self.edges[0] else hi
@@ -207,6 +215,7 @@ class _Refiner:
             if series is None and hi - lo <= floor:
                 # What does not refine at this width is a jump (or a kink): an edge, not a steep ramp.
                 self.jumps.append((hi, float(values[-1] - values[0])))
+                self.located.append(hi)
                 if self.series:
                     self.edges[-1] = hi
                 continue
@@ -216,11 +225,14 @@ class _Refiner:
                 continue
             if hi - lo < 0.75 * self.step:
                 self.narrow.append(0.5 * (lo + hi))
+            if self.series and lo > a and not (self.jumps and self.jumps[-1][0] >= lo):
+                # A jump that happens to stand on a cut needs no refining: look across every cut.
+                self.jumps.append((lo, float(series @ _AT_START - self.series[-1].sum())))
             self.edges.append(hi)
             self.series.append(series)
         return True
 
-    def _try(self, lo: float, hi: float) -> tuple[FloatArray | None, FloatArray]:
+    def _try(self, lo: float, hi: float, depth: int) -> tuple[FloatArray | None, FloatArray]:
         """Series of one interval if it proves itself, and the values seen."""
         x = np.concatenate([chebyshev.nodes(_POINTS, -1.0, 1.0), _PROOF])
         values = self.waveform.value(0.5 * (lo + hi) + 0.5 * (hi - lo) * x)
@@ -229,7 +241,12 @@ class _Refiner:
         self.scale = max(self.scale, float(np.abs(values).max()))
         c = chebyshev.coefficients(values[:_POINTS])
         proof = np.polynomial.chebyshev.chebval(_PROOF, c)
-        good = np.abs(proof - values[_POINTS:]).max() <= self.tol * self.scale
+        if depth == 0:
+            nodes = 0.5 * (hi - lo) * x[:_POINTS]
+            self.steepest = float(np.abs(np.diff(values[:_POINTS]) / np.diff(nodes)).max())
+        # A function cannot be smoother than the rounding of its own argument lets it be.
+        noise = 2e-15 * max(abs(lo), abs(hi)) * self.steepest
+        good = np.abs(proof - values[_POINTS:]).max() <= max(self.tol * self.scale, noise)
         return (c if good else None), values[:_POINTS]
 
     def warn(self) -> None:
@@ -244,8 +261,9 @@ class _Refiner:
                 FingerspiceWarning,
                 stacklevel=2,
             )
-        # Around a jump or a kink short series are natural.
-        apart = [t for t in self.narrow if all(abs(t - j) > 8.0 * self.step for j, _ in self.jumps)]
+        # Around a jump, a kink or the end of what is finite, short series are natural.
+        known = [*self.located, *(t for t, _ in real), *([] if self.not_finite is None else [self.not_finite])]
+        apart = [t for t in self.narrow if all(abs(t - k) > 8.0 * self.step for k in known)]
         if apart:
             warnings.warn(
                 f"the source function has a feature narrower than the output step {self.step:.3g} s "

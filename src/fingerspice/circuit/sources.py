@@ -168,8 +168,10 @@ def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -
     while words:
         word = words.pop(0)
         if isinstance(word, Number):
-            if level is not None:
-                raise InputError(f"{name}: a second value {word.text!r}", word.where)
+            if level is not None or waveform is not None:
+                raise InputError(
+                    f"{name}: a second value {word.text!r}; allowed: one value or source function", word.where
+                )
             level = word.value
             continue
         key = (word.text if isinstance(word, Token) else word.name).lower()

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.combinations import Product, Sum
 from fingerspice.circuit.topology import Hop, find_loop
-from fingerspice.circuit.waveforms import DC, Product, Sum, Waveform
+from fingerspice.circuit.waveforms import DC, Waveform
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 

@@ -39,7 +39,9 @@ def find_loop(circuit: Circuit) -> Loop:
         Naming the elements or nodes at fault.
     """
     if not circuit.by_device("V", "I"):
-        raise InputError("the circuit has no source; a V element must drive the stack")
+        raise InputError(
+            "the circuit has no source; allowed: a V element that drives the stack, such as V1 drive 0 SIN(0 200 100)"
+        )
     gap, area_given, area_source = _area(circuit)
     branches = [e for e in circuit.elements if e is not area_source]
     _refuse_floating(branches)
@@ -125,7 +127,8 @@ def _refuse_floating(branches: list[Element]) -> None:
     for element in branches:
         if element.nodes[0] == element.nodes[1]:
             raise InputError(f"{element.name} has both ends on node {element.node_names[0]!r}", element.where)
-    for node, elements in at.items():
+    # Ground last: a chain that misses it dangles at its own end too, and that is the node to name.
+    for node, elements in sorted(at.items(), key=lambda item: item[0] == "0"):
         if len(elements) == 1:
             e = elements[0]
             raise InputError(

@@ -139,9 +139,10 @@ def dot(a: FloatArray, x: FloatArray) -> float:
 def branch_area(model: Model, sign: float, u: float) -> tuple[float, float]:
     """1/A and its slope d(1/A)/du on the branch A(|u|) = A(sign u), continued a little past 0 V.
 
-    Farther on the wrong side it is the true area, so that a walk towards the branch starts on solid ground.
+    Under `mobile`, farther on the wrong side it is the true area, so that a walk towards the branch starts on solid
+    ground; under `local` nothing walks, and a step across 0 V must see no kink.
     """
-    if sign * u < model.curve[0]:
+    if model.mobile and sign * u < model.curve[0]:
         sign = -sign
     q, dq = inverse_area(sign * u, model.curve)
     return q, sign * dq

@@ -390,7 +390,7 @@ def _radau(stages: int) -> Tableau:
     shifted = np.array([legendre.poly2leg(_on_symmetric_interval(top[:, i]))[s] for i in range(s)])
     e = np.zeros((2, s))
     e[0] = shifted
-    return Tableau(f"radau{2 * s - 1}", 2 * s - 1, s + 1, s, True, a, c, e, dense, s - 1)
+    return Tableau(f"radau{2 * s - 1}", 2 * s - 1, s, s, True, a, c, e, dense, s - 1)
 
 
 def _on_symmetric_interval(coefficients: FloatArray) -> FloatArray:

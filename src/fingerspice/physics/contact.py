@@ -199,8 +199,24 @@ def inverse_area(u: float, curve: FloatArray) -> tuple[float, float]:
         scale = 2.0 / (hi - lo)
         value, slope = chebyshev.evaluate(curve[2 + N_PACKED :], (u - lo) * scale - 1.0)
         return value, slope * scale
-    packed = curve[2 : 2 + N_PACKED]
-    step = 1e-4 * max(abs(u), 1e-3 / packed[0])
-    area = ridge_area(u, packed)
-    slope = (ridge_area(u + step, packed) - ridge_area(u - step, packed)) / (2.0 * step)
+    area, slope = _ridge_area_slope(u, curve[2 : 2 + N_PACKED])
     return 1.0 / area, -slope / (area * area)
+
+
+@njit(cache=True)
+def _ridge_area_slope(u: float, contact: FloatArray) -> tuple[float, float]:
+    """A_R (m^2) and dA_R/du (m^2/V): `ridge_area` differentiated."""
+    x = contact[0] * u
+    y = universal_curve(x, contact[2], contact[3])
+    a0 = contact[1] * y
+    power = y ** contact[3]
+    # From y^(1/m) - x y^p = 1, with e = y^p / y^(1/m): d ln y / dx = e / (1/m - p x e).
+    e = power / (1.0 + x * power)
+    a0_slope = a0 * contact[0] * e / (contact[2] - contact[3] * x * e)
+    sigma = contact[4] * u * u
+    area = ridge_area(u, contact)
+    load = contact[5] + sigma * area
+    k = contact[7] / a0
+    # From A = A0 - (c2 mu^2 / A0) (F + sigma A)^2.
+    rise = a0_slope * (1.0 + contact[7] * (load / a0) ** 2) - 4.0 * k * load * area * contact[4] * u
+    return area, rise / (1.0 + 2.0 * k * sigma * load)

@@ -1,0 +1,143 @@
+"""What the command line's options mean, and the checks before a run: nothing here writes a file."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fingerspice.errors import FingerspiceWarning, InputError
+from fingerspice.units import parse_number
+
+if TYPE_CHECKING:
+    from fingerspice.circuit.circuit import AcSweep, Circuit
+
+LARGEST_AREA = 0.01
+"""m^2; an area above it was probably given in mm^2."""
+
+
+def read_circuit(deck: Path, changes: list[str] | None, source: str | None) -> Circuit:
+    """The deck's circuit with ``--set`` and ``--source``; what has no effect here is noted on stderr."""
+    from fingerspice.circuit.netlist import read_netlist
+
+    circuit = read_netlist(deck)
+    circuit = _with_changes(circuit, changes or [])
+    if source is not None:
+        circuit = _with_source(circuit, source)
+    for directive in circuit.unused:
+        print(f"fingerspice: note: {directive} has no effect here", file=sys.stderr)
+    return circuit
+
+
+def _with_changes(circuit: Circuit, changes: list[str]) -> Circuit:
+    """The circuit with every ``--set``, all at once: exponents may have to change together."""
+    from fingerspice.circuit.netlist import value_from_text
+
+    values: dict[str, float] = {}
+    for change in changes:
+        path, equals, text = (part.strip() for part in change.partition("="))
+        if not equals or not path:
+            raise InputError(f"--set {change!r} is not understood; allowed: PATH=VALUE, such as Xgap.d=3u")
+        try:
+            values[path], warning = value_from_text(circuit, path, text)
+        except InputError as error:
+            raise InputError(f"--set {change!r}: {error.message}") from None
+        if warning:
+            warnings.warn(f"--set {warning}", FingerspiceWarning, stacklevel=2)
+    if not values:
+        return circuit
+    try:
+        return circuit.replace(values)
+    except InputError as error:
+        # The deck's line is not at fault.
+        raise InputError(f"--set {' '.join(map(repr, changes))}: {error.message}") from None
+
+
+def _with_source(circuit: Circuit, text: str) -> Circuit:
+    from fingerspice.circuit.netlist import source_from_text
+    from fingerspice.circuit.statespace import build_stack
+
+    sources = build_stack(circuit).sources
+    if len(sources) != 1:
+        names = ", ".join(e.name for e, _ in sources)
+        raise InputError(f"--source needs a circuit with one voltage source; this one has {names}")
+    try:
+        return circuit.replace({sources[0][0].name: source_from_text(text, circuit)})
+    except InputError as error:
+        raise InputError(f"--source {error.message}") from None
+
+
+def note_skin_frequency(circuit: Circuit) -> None:
+    """Warn where a SKIN's data are not taken at the source's fundamental."""
+    from fingerspice.circuit.statespace import build_stack
+
+    fundamental = build_stack(circuit).waveform.fundamental
+    for skin in circuit.by_device("SKIN"):
+        f = skin.values["f"]
+        if fundamental is None:
+            text = f"{skin.name} takes its data at {f:g} Hz, and the source has no fundamental"
+        elif abs(f / fundamental.frequency - 1.0) > 1e-9:
+            text = (
+                f"{skin.name} takes its data at f = {f:g} Hz, the source's fundamental is "
+                f"{fundamental.frequency:g} Hz; --set {skin.name}.f={fundamental.frequency:g} would match"
+            )
+        else:
+            continue
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+
+
+def area_from_text(text: str) -> str | float:
+    """A mode's name, or an area in m^2."""
+    try:
+        area = parse_number(text)
+    except ValueError:
+        return text
+    if area > LARGEST_AREA:
+        warnings.warn(
+            f"--area {text} is in m^2, {area * 1e6:g} mm^2; a fingerpad has tens of mm^2, which is 35e-6 or 35u here",
+            FingerspiceWarning,
+            stacklevel=2,
+        )
+    return area
+
+
+def json_text(data: dict[str, Any]) -> str:
+    """JSON with null for what is not a number: NaN is no JSON."""
+
+    def clean(x: Any) -> Any:
+        if isinstance(x, dict):
+            return {k: clean(v) for k, v in x.items()}
+        if isinstance(x, list | tuple):
+            return [clean(v) for v in x]
+        return None if isinstance(x, float) and not math.isfinite(x) else x
+
+    return json.dumps(clean(data), indent=2, allow_nan=False)
+
+
+def check_output(file: Path, deck: Path) -> None:
+    """Refuse an output that cannot be written, or is the deck, before spending time on the run; writes nothing."""
+    folder = file.parent
+    while not folder.exists() and folder != folder.parent and not folder.is_symlink():
+        folder = folder.parent
+    if not folder.is_dir():
+        raise InputError(f"cannot write {file}: {folder} is not a folder; allowed: a folder that can be written")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"cannot write {file}: no permission in {folder}; allowed: a folder that can be written")
+    if file.is_dir():
+        raise InputError(f"cannot write {file}: it is a folder; allowed: a file's name")
+    if file.exists() and deck.exists() and file.samefile(deck):
+        raise InputError(f"cannot write {file}: it is the deck itself; allowed: another name or folder")
+
+
+def sweep(text: str) -> AcSweep:
+    """The sweep of ``--sweep``."""
+    from fingerspice.circuit.directives import sweep_from_text
+
+    try:
+        return sweep_from_text(text)
+    except InputError as error:
+        raise InputError(f"--sweep {error.message}") from None

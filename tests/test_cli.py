@@ -1,0 +1,215 @@
+"""The command: what it writes, prints and exits with; bad input gets one sentence and leaves nothing behind."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray
+
+import fingerspice as fs
+from commands import QUICK, Command, Result, tree
+from deck_edits import edited
+
+
+def figures(result: Result) -> Any:
+    assert result.code == 0
+    return json.loads(result.out)
+
+
+# run
+
+
+def test_run_writes_data_and_picture_and_prints_a_table_that_names_the_gap_voltage(
+    command: Command, tmp_path: Path
+) -> None:
+    result = command("run", "pad.cir", "--out", "new/folder")
+    assert result.code == 0
+    assert result.err == ""
+    table = result.out.splitlines()
+    assert table[0] == "Fingerpad"
+    expected = fs.simulate(fs.read_netlist("pad.cir"))
+    row = next(line for line in table if line.startswith("gap voltage"))
+    assert f"{expected.u_gap.max():.1f} V" in row  # type: ignore[union-attr]
+    assert "status: success" in table
+    assert table[-2:] == [f"wrote new/folder/pad.{kind}" for kind in ("nc", "png")]
+    assert set(tree(tmp_path)) == {"pad.cir", "new", "new/folder", "new/folder/pad.nc", "new/folder/pad.png"}
+    with xarray.open_dataset("new/folder/pad.nc") as data:
+        xarray.testing.assert_identical(data.load(), expected.to_xarray())
+    assert Path("new/folder/pad.png").read_bytes().startswith(b"\x89PNG\r\n")
+
+
+def test_json_is_all_that_is_printed_and_null_stands_for_no_number(command: Command) -> None:
+    report = figures(command("run", "pad.cir", "--json", "--no-plot", "--csv"))
+    solution = fs.simulate(fs.read_netlist("pad.cir"))
+    assert report["success"] is True
+    assert report["u_gap_amplitude"] == solution.summary()["u_gap_amplitude"]
+    assert report["files"] == ["pad.csv"]
+    assert set(tree(Path())) == {"pad.cir", "pad.csv"}
+    frozen = figures(command("ac", "pad.cir", "--area", "frozen", "--source", "DC 5", "--json", "--no-plot"))
+    assert frozen["amplitude"] is None
+    assert frozen["u_gap"][0] is None
+    assert frozen["gain"][0] > 0.0
+
+
+def test_two_decks_that_differ_after_a_dot_do_not_share_their_files(command: Command) -> None:
+    for name in ("pad.v1.cir", "pad.v2.cir"):
+        Path(name).write_text(edited(QUICK))
+        assert command("run", name, "--no-plot").code == 0
+    assert {"pad.v1.nc", "pad.v2.nc"} <= set(tree(Path()))
+
+
+def test_set_changes_values_all_at_once_with_units_and_in_any_case(command: Command) -> None:
+    # Either exponent alone would be out of range on its way.
+    changes = ["--set", "Xgap.m_exp=1.5", "--set", "xgap.N_EXP = 1.9", "--set", "Xcoat.r=inf"]
+    report = figures(command("run", "pad.cir", "--json", "--no-plot", *changes))
+    circuit = fs.read_netlist("pad.cir").replace({"Xgap.m_exp": 1.5, "Xgap.n_exp": 1.9, "Xcoat.r": float("inf")})
+    assert report["f_el_mean"] == fs.simulate(circuit).summary()["f_el_mean"]
+    with xarray.open_dataset("pad.nc") as data:
+        assert json.loads(data.attrs["overrides"])["Xgap.m_exp"] == "1.5"
+
+
+def test_source_area_method_law_and_rtol_are_those_of_the_interface(command: Command) -> None:
+    words = ["--source", "PULSE(-150 150 0 0 0 2m 10m)", "--area", "30u", "--method", "dp5"]
+    report = figures(
+        command("run", "pad.cir", "--json", "--no-plot", *words, "--charge-law", "mobile", "--rtol", "1e-6")
+    )
+    circuit = fs.read_netlist("pad.cir").replace({"Vdrive": fs.Pulse(-150, 150, 0, 0, 0, 2e-3, 0.01)})
+    solution = fs.simulate(circuit, area=30e-6, method="dp5", charge_law="mobile", rtol=1e-6)
+    assert report["u_gap_max"] == solution.summary()["u_gap_max"]
+    with xarray.open_dataset("pad.nc") as data:
+        used = {key: data.attrs[key] for key in ("method", "charge_law", "rtol", "area")}
+    assert used == {"method": "dp5", "charge_law": "mobile", "rtol": "1e-06", "area": "3e-05 m^2"}
+
+
+def test_a_deck_without_gap_prints_its_layers_and_no_forces(command: Command) -> None:
+    Path("flat.cir").write_text(
+        "t\nV1 a 0 SIN(0 10 100)\nXcoat a 0 area LAYER d=1u eps_r=2 r=1k\nVarea area 0 35\n.tran 100u 20m uic\n"
+    )
+    result = command("run", "flat.cir", "--no-plot")
+    assert result.code == 0
+    assert re.search(r"^Xcoat voltage +-10 V +10 V", result.out, re.MULTILINE)
+    assert "force " not in result.out
+    assert "gap voltage" not in result.out
+    assert "no GAP, no forces" in result.out
+
+
+def test_a_solve_that_fails_keeps_what_it_has_and_says_when_and_how_close(command: Command) -> None:
+    words = ["run", "pad.cir", "--charge-law", "mobile", "--set", "Xgap.d=10n", "--no-plot"]
+    result = command(*words, "--json")
+    assert result.code == 1
+    report = json.loads(result.out)
+    assert report["success"] is False
+    assert report["status"] == "FOLD"
+    (line,) = result.lines
+    said = re.fullmatch(
+        r"fingerspice: stopped at t = (\S+) s: the mobile charge law .* use less voltage, more load, or the local law "
+        r"\(just before: (\S+) V across the gap, area \S+ mm\^2, distance to the fold \S+\)",
+        line,
+    )
+    assert said
+    with xarray.open_dataset("pad.nc") as data:
+        assert data.attrs["status"] == "FOLD"
+        assert float(data.time[-1]) == pytest.approx(float(said[1]), rel=1e-9)
+        assert f"{float(data.u_gap[-1]):.4g}" == said[2]
+    assert f"status: {report['message']}" in command(*words).out
+
+
+# Warnings and notes
+
+
+@pytest.mark.parametrize("name", ["run", "compare"])
+def test_a_skin_at_another_frequency_than_the_source_is_warned_about_once(command: Command, name: str) -> None:
+    result = command(name, "pad.cir", "--no-plot", "--set", "Xskin.f=200")
+    assert result.code == 0
+    (line,) = result.lines
+    assert line.startswith(
+        "fingerspice: warning: Xskin takes its data at f = 200 Hz, the source's fundamental is 100 Hz"
+    )
+    assert line.endswith("--set Xskin.f=100 would match")
+    assert command(name, "pad.cir", "--no-plot").err == ""
+
+
+def test_a_voltage_that_air_does_not_bear_is_warned_about_once(command: Command) -> None:
+    result = command("run", "pad.cir", "--no-plot", "--set", "Vdrive.amplitude=500")
+    (line,) = result.lines
+    assert re.search(r"warning: the gap voltage reaches \d+(\.\d+)? V; air breaks down above about 300 V", line)
+
+
+def test_what_the_reader_notices_is_printed_once_with_its_line(command: Command) -> None:
+    Path("pad.cir").write_text(edited(QUICK, ("r=1meg", "r=1MOhm"), (".end", ".nodeset v(area)=35\n.end")))
+    first, second = command("ac", "pad.cir", "--no-plot", "--sweep", "lin 2 100 200").lines
+    assert first.startswith("fingerspice: warning: pad.cir:5:41: Xgap r: '1MOhm' is milli (0.001 ohm)")
+    assert second == "fingerspice: note: .nodeset has no effect here"
+
+
+def test_values_on_the_command_line_have_the_traps_of_the_deck(command: Command) -> None:
+    words = ["ac", "pad.cir", "--no-plot", "--sweep", "lin 2 100 200"]
+    (line,) = command(*words, "--set", "Xcoat.r=0.2M").lines
+    assert line.startswith("fingerspice: warning: --set Xcoat.r: '0.2M' is milli (0.0002 ohm)")
+    (line,) = command(*words, "--area", "35").lines
+    assert line.startswith("fingerspice: warning: --area 35 is in m^2, 3.5e+07 mm^2")
+    assert command(*words, "--area", "35u").err == ""
+
+
+# ac, compare, export, figures
+
+
+def test_ac_sweeps_the_decks_line_or_the_one_given(command: Command) -> None:
+    Path("pad.cir").write_text(edited((".end", ".ac dec 2 10 1k\n.end")))
+    result = command("ac", "pad.cir")
+    assert result.code == 0
+    assert set(tree(Path())) == {"pad.cir", "pad_ac.csv", "pad_ac.png"}
+    with Path("pad_ac.csv").open(newline="") as stream:
+        head, *body = csv.reader(stream)
+    assert head == ["frequency [Hz]", "gain [1]", "phase_deg [deg]", "u_gap [V]", "area [m^2]", "f_el_mean [N]"]
+    table = np.array(body, float)
+    np.testing.assert_allclose(table[:, 0], 10.0 ** np.arange(1.0, 3.01, 0.5), rtol=1e-12)
+    expected = fs.phasor(fs.read_netlist("pad.cir"), table[:, 0])
+    np.testing.assert_array_equal(table[:, 5], expected.f_el_mean)
+    given = figures(command("ac", "pad.cir", "--sweep", "LIN 3 100 300", "--area", "frozen", "--json", "--no-plot"))
+    assert given["frequency"] == [100.0, 200.0, 300.0]
+    assert given["files"] == ["pad_ac.csv"]
+
+
+def test_compare_sets_the_transient_beside_the_phasor(command: Command) -> None:
+    # Also of a deck that has no .tran line: a period needs none.
+    Path("pad.cir").write_text(edited((".tran 10u 50m uic", "*")))
+    result = command("compare", "pad.cir", "--rtol", "1e-7")
+    assert result.code == 0
+    assert "gap voltage amplitude [V]" in result.out
+    assert "-0.00 %" not in result.out
+    assert set(tree(Path())) == {"pad.cir", "pad_compare.png"}
+    report = figures(command("compare", "pad.cir", "--json", "--no-plot"))
+    assert report["transient_mean_area"]["f_el_mean"] == pytest.approx(report["phasor"]["f_el_mean"], rel=1e-5)
+    assert report["transient_coupled"]["f_el_mean"] < 0.99 * report["phasor"]["f_el_mean"]
+
+
+def test_export_writes_one_deck_with_the_changes_in_it(command: Command) -> None:
+    result = command("export", "pad.cir", "-o", "sub/x.cir", "--set", "Xgap.d=4u", "--source", "SIN(0 50 70)")
+    assert (result.code, result.out) == (0, "wrote sub/x.cir\n")
+    text = Path("sub/x.cir").read_text()
+    assert "d=4e-06" in text
+    assert "SIN(0.0 50.0 70.0 0.0 0.0 0.0)" in text
+    assert "fingerspice.lib - layers" in text
+    assert "mobile - " not in text
+    assert command("export", "pad.cir", "-o", "sub/y.cir", "--charge-law", "mobile").code == 0
+    assert "* fingerspice_mobile.lib - " in Path("sub/y.cir").read_text()
+
+
+@pytest.mark.parametrize("name", ["run", "ac", "compare", "export", "figures"])
+@pytest.mark.parametrize("flag", ["--help", "-h"])
+def test_help_of_every_command_shows_an_example(command: Command, name: str, flag: str) -> None:
+    result = command(name, flag)
+    assert result.code == 0
+    assert "Example" in result.out
+    assert f"fingerspice {name} " in result.out.partition("Example")[2]
+
+
+def test_version_is_the_packages(command: Command) -> None:
+    assert command("--version") == Result(0, f"fingerspice {fs.__version__}\n", "")

@@ -1,0 +1,201 @@
+"""Bad input on the command line: one sentence on stderr, exit 2, nothing written, nothing left."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fingerspice as fs
+from commands import Command, tree
+from deck_edits import edited
+
+FINGERSPICE = str(Path(sys.executable).with_name("fingerspice"))
+
+OPTIONS = [
+    (["--set", "Xgap.d"], "--set 'Xgap.d' is not understood; allowed: PATH=VALUE, such as Xgap.d=3u"),
+    (["--set", "=3u"], "--set '=3u' is not understood"),
+    (["--set", "Xgap.d="], "--set 'Xgap.d=': '' is not a number (examples: 10, 2.5, 1e-6, 3.5u, 0.2meg)"),
+    (["--set", "Xgap.d=thick"], "--set 'Xgap.d=thick': 'thick' is not a number"),
+    (["--set", "Xgap.d=3x"], "--set 'Xgap.d=3x': '3x' differs between simulators"),
+    (["--set", "Xgap.d=nan"], "'nan' is not a number"),
+    (["--set", "Xgap.d=inf"], "--set 'Xgap.d=inf': Xgap d is inf m; allowed: more than 0"),
+    (["--set", "Xgap.d=-3u"], "--set 'Xgap.d=-3u': Xgap d is -3e-06 m; allowed: more than 0"),
+    (["--set", "Xgap.dd=3u"], "unknown parameter 'Xgap.dd'; nearest: 'Xgap.d'"),
+    (["--set", "gap.d=3u"], "unknown parameter 'gap.d'; nearest: 'Xgap.d'"),
+    (["--set", "Vdrive.freq=3"], "unknown parameter 'Vdrive.freq'; nearest: 'Vdrive.frequency'"),
+    (["--set", "Vdrive.frequency=0"], "--set 'Vdrive.frequency=0': sine frequency is 0 Hz; allowed: > 0"),
+    (["--set", "Xgap.fn=0.5N"], "--set 'Xgap.fn=0.5N': Xgap.fn is '0.5N': SPICE reads N as nano"),
+    (["--set", "Xgap.mu=2"], "--set 'Xgap.mu=2': Xgap has no contact"),
+    (["--source", ""], "--source '': missing value"),
+    (["--source", "SQUARE(200 100"], "--source 'SQUARE(200 100': '(' is never closed"),
+    (["--source", "SQARE(200 100)"], "did you mean 'square'"),
+    (["--source", "SQUARE(200)"], "SQUARE needs 2 values, 1 given; allowed: SQUARE(amplitude frequency duty)"),
+    (["--source", "SQUARE(200 100)+1"], "a second value '+1'"),
+    (["--source", "SIN(0 200 {f})"], "parameter 'f' is not defined"),
+    (["--source", "PWL(0 0 2m 1 1m 2)"], "PWL times decrease: 0.001 s follows 0.002 s"),
+    (["--source", "5\nR1 drive 0 1k"], "not one source"),
+    (["--charge-law", "moble"], "charge_law is 'moble'; allowed: 'local' or 'mobile'"),
+    (["--rtol", "0"], "rtol is 0.0; allowed: 1e-13 to 0.1"),
+    (["--rtol", "nan"], "rtol is nan; allowed: 1e-13 to 0.1"),
+    (["--method", "rk4"], "unknown method 'rk4'; allowed: auto, dp5, dop853, radau9, scipy:NAME, torchdiffeq:NAME"),
+    (["--method", "scipy:RK4"], "unknown method 'scipy:RK4'; allowed: scipy:RK23"),
+    (["--area", "frozn"], "area is 'frozn'; allowed: 'coupled', 'mean', 'frozen' or m^2"),
+    (["--area", "-1u"], "area is -1e-06 m^2; allowed: a positive area in m^2"),
+    (["--area", "nan"], "area is 'nan'; allowed"),
+]
+
+OTHERS = [
+    (["run", "missing.cir"], "'missing.cir' does not exist"),
+    (["run", "pat.cir"], "'pat.cir' does not exist; did you mean 'pad.cir'?"),
+    (["run", "folder"], "'folder' is a folder, not a netlist"),
+    (["ac", "empty.cir"], "'empty.cir' is empty: a netlist begins with a title line"),
+    (["compare", "binary.cir"], "'binary.cir' is not a text file (it holds NUL bytes): save it as UTF-8"),
+    (["export", "latin.cir", "-o", "x.cir"], "'latin.cir' is not UTF-8 text (byte 0xb5 in line 2)"),
+    (["run", "wrong.cir"], "wrong.cir:4:30: Xcoat d is -1u (-1e-06 m); allowed: more than 0"),
+    (["run", "endless.cir"], "endless.cir has no .tran line; allowed: .tran TSTEP TSTOP"),
+    (["run", "pad.cir", "--out", "file"], "cannot write file/pad.nc: file is not a folder; allowed: a folder"),
+    (["run", "pad.cir", "--out", "file/deeper"], "cannot write file/deeper/pad.nc: file is not a folder"),
+    (["ac", "pad.cir", "--out", "file"], "cannot write file/pad_ac.csv: file is not a folder"),
+    (["compare", "pad.cir", "--out", "file"], "cannot write file/pad_compare.png: file is not a folder"),
+    (["export", "pad.cir", "-o", "file/x.cir"], "cannot write file/x.cir: file is not a folder"),
+    (["export", "pad.cir", "-o", "folder"], "cannot write folder: it is a folder; allowed: a file's name"),
+    (["export", "pad.cir", "-o", "./folder/../pad.cir"], "it is the deck itself; allowed: another name or folder"),
+    (["run", "deck.csv", "--csv"], "cannot write deck.csv: it is the deck itself"),
+    (["export", "pad.cir", "-o", "x.cir", "--charge-law", "both"], "charge_law is 'both'"),
+    (["ac", "pad.cir", "--sweep", "dec 10 10"], "--sweep 'dec 10 10': '.ac dec 10 10' is not understood; allowed: .ac"),
+    (["ac", "pad.cir", "--sweep", ""], "--sweep '': '.ac' is not understood"),
+    (["ac", "pad.cir", "--sweep", "lin 5 10 1"], "FSTOP is 1; allowed: at least FSTART = 10"),
+    (["ac", "pad.cir", "--area", "coupled"], "area is 'coupled'; allowed: 'mean', 'frozen' or a number in m^2"),
+    (["ac", "pad.cir", "--source", "DC 5"], "area='mean' needs the amplitude of the source's fundamental"),
+    (["compare", "pad.cir", "--source", "DC 5"], "compare needs a source with a fundamental"),
+    (["figures", "--only", "9"], "figure is 9; allowed: 2, 3, 4, 5"),
+]
+
+USAGE = [
+    (["run"], "Missing argument 'DECK'"),
+    (["export", "pad.cir"], "Missing option '--output'"),
+    (["rnu", "pad.cir"], "No such command 'rnu'"),
+    (["run", "pad.cir", "--plott"], "No such option"),
+    (["run", "pad.cir", "pad.cir"], "unexpected extra argument"),
+    (["run", "pad.cir", "--rtol", "small"], "--rtol"),
+    (["figures", "--only", "two"], "--only"),
+]
+
+
+@pytest.fixture
+def folder(command: Command, tmp_path: Path) -> Path:
+    """The command's folder with every kind of file that is no deck."""
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("")
+    (tmp_path / "empty.cir").write_text("")
+    (tmp_path / "binary.cir").write_bytes(b"title\n\0\1\2")
+    (tmp_path / "latin.cir").write_bytes(b"title\nC1 a 0 1\xb5\n")
+    (tmp_path / "wrong.cir").write_text(edited(("d=1u", "d=-1u")))
+    (tmp_path / "endless.cir").write_text(edited((".tran 10u 50m uic", "*")))
+    (tmp_path / "deck.csv").write_text(edited())
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [*((["run", "pad.cir", "--out", "new", *words], said) for words, said in OPTIONS), *OTHERS],
+    ids=lambda x: " ".join(x) if isinstance(x, list) else "",
+)
+def test_bad_input_gets_one_sentence_and_leaves_nothing(
+    command: Command, folder: Path, arguments: list[str], said: str
+) -> None:
+    before = tree(folder)
+    result = command(*arguments)
+    assert result.code == 2
+    assert result.out == ""
+    lines = [line for line in result.lines if not line.startswith("fingerspice: warning: Xskin takes its data")]
+    assert len(lines) == 1
+    assert lines[0].startswith("fingerspice: ")
+    assert said in lines[0]
+    assert tree(folder) == before
+
+
+@pytest.mark.parametrize(("arguments", "said"), USAGE, ids=lambda x: " ".join(x) if isinstance(x, list) else "")
+def test_a_command_that_is_none_is_refused_with_where_to_look(
+    command: Command, folder: Path, arguments: list[str], said: str
+) -> None:
+    before = tree(folder)
+    result = command(*arguments)
+    assert result.code == 2
+    assert result.out == ""
+    assert said in result.err
+    assert "--help" in result.err
+    assert tree(folder) == before
+
+
+def test_a_folder_without_permission_is_refused_before_the_run(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Root may write anywhere, so the answer of the system is put in its mouth.
+    monkeypatch.setattr("fingerspice.options.os.access", lambda path, mode: not mode & os.W_OK)
+    monkeypatch.setattr("fingerspice.simulation.simulate", lambda *a, **k: pytest.fail("it ran"))
+    before = tree(tmp_path)
+    result = command("run", "pad.cir", "--out", "x/y")
+    assert result.code == 2
+    assert result.lines == [
+        "fingerspice: cannot write x/y/pad.nc: no permission in .; allowed: a folder that can be written"
+    ]
+    assert tree(tmp_path) == before
+
+
+def test_a_disk_that_is_full_is_told_and_leaves_no_half_file(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(self: Path, target: Any) -> Path:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    before = tree(tmp_path)
+    monkeypatch.setattr(Path, "replace", full)
+    result = command("run", "pad.cir", "--no-plot")
+    assert result.code == 2
+    assert result.lines == ["fingerspice: cannot write pad.nc: No space left on device"]
+    assert tree(tmp_path) == before
+
+
+def test_an_interrupt_is_one_line_and_code_130(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fingerspice.simulation.simulate", interrupt)
+    result = command("run", "pad.cir")
+    assert result.code == 130
+    assert set(tree(Path())) == {"pad.cir"}
+
+
+# The command itself, in its own process
+
+
+def process(*arguments: str, folder: Path, module: bool = False) -> subprocess.CompletedProcess[str]:
+    program = [sys.executable, "-m", "fingerspice"] if module else [FINGERSPICE]
+    return subprocess.run([*program, *arguments], cwd=folder, capture_output=True, text=True, timeout=60)
+
+
+def test_the_installed_command_exits_with_0_1_and_2(tmp_path: Path) -> None:
+    (tmp_path / "pad.cir").write_text(edited())
+    done = process("run", "pad.cir", "--no-plot", folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "wrote pad.nc" in done.stdout
+    failed = process("run", "pad.cir", "--no-plot", "--charge-law", "mobile", "--set", "Xgap.d=10n", folder=tmp_path)
+    assert failed.returncode == 1
+    assert failed.stderr.startswith("fingerspice: stopped at t = ")
+    wrong = process("run", "nothing.cir", folder=tmp_path)
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+    for text in (failed.stderr, wrong.stderr):
+        assert text.count("\n") == 1
+        assert "Traceback" not in text
+
+
+def test_the_package_runs_as_a_module(tmp_path: Path) -> None:
+    done = process("--version", folder=tmp_path, module=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"fingerspice {fs.__version__}\n", "")

@@ -1,0 +1,238 @@
+"""Decks to circuits: what devices, parameters and directives mean, the unit traps, and warnings."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+from deck_edits import DECK, edited
+from fingerspice.circuit.circuit import AcSweep, Tran
+from fingerspice.circuit.netlist import value_from_text
+
+
+def read(*changes: tuple[str, str]) -> fs.Circuit:
+    return fs.parse_netlist(edited(*changes), "deck.cir")
+
+
+def refusal(text: str) -> str:
+    with pytest.raises(fs.InputError) as caught:
+        fs.parse_netlist(text, "deck.cir")
+    return str(caught.value)
+
+
+def warned(text: str) -> list[str]:
+    """The reader's warnings; they are also in the circuit."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        circuit = fs.parse_netlist(text, "deck.cir")
+    assert all(w.category is fs.FingerspiceWarning for w in caught)
+    said = [str(w.message) for w in caught]
+    assert said == list(circuit.warnings)
+    return said
+
+
+# What is right
+
+
+def test_the_papers_deck_is_its_devices_and_its_parameters() -> None:
+    circuit = read()
+    assert [(e.name, e.device) for e in circuit.elements] == [
+        ("Vdrive", "V"),
+        ("Xcoat", "LAYER"),
+        ("Xgap", "GAP"),
+        ("Xskin", "SKIN"),
+    ]
+    assert circuit["Vdrive"].waveform == fs.Sine(200.0, 100.0)
+    assert dict(circuit["Xcoat"].values) == {"d": 1e-6, "eps_r": 3.9, "r": 2e5}
+    assert dict(circuit["Xskin"].values) == {"d": 350e-6, "f": 100.0}
+    gap = {"d": 3.5e-6, "eps_r": 1.0, "r": 1e6, "fn": 0.5, "mu": 0.3, "alpha": 54.4, "m_exp": 0.52}
+    assert dict(circuit["Xgap"].values) == gap | {"beta": 32.0, "n_exp": 1.41, "c2": 5000.0, "a_fix": 0.0}
+    assert circuit["xGAP"].nodes == ("top", "skin", "area")
+    assert circuit.title == "Fingerpad"
+    assert circuit.warnings == circuit.unused == ()
+    assert circuit.text == DECK
+
+
+@pytest.mark.parametrize("written", ["", "r=inf", "r=INF", "r=none", "r=None"])
+def test_a_layer_without_leakage_has_an_infinite_resistance(written: str) -> None:
+    assert read(("r=0.2meg", written))["Xcoat"].values["r"] == math.inf
+
+
+def test_a_slab_has_a_resistivity_that_may_be_infinite() -> None:
+    assert dict(read(("LAYER d=1u eps_r=3.9 r=0.2meg", "SLAB d=1u eps_r=3.9 rho=7"))["Xcoat"].values) == {
+        "d": 1e-6,
+        "eps_r": 3.9,
+        "rho": 7.0,
+    }
+    slab = read(("LAYER d=1u eps_r=3.9 r=0.2meg", "SLAB d=1u eps_r=3.9 rho=inf"))
+    assert slab["Xcoat"].values["rho"] == math.inf
+
+
+@pytest.mark.parametrize(("given", "ohm"), [("0.2MEG", 2e5), ("0.2megohm", 2e5), ("2e5", 2e5), ("200kOhm", 2e5)])
+def test_the_papers_coating_may_be_written_in_any_right_way(given: str, ohm: float) -> None:
+    assert read(("r=0.2meg", f"r={given}"))["Xcoat"].values["r"] == ohm
+
+
+def test_names_are_read_in_any_case_and_shown_as_written() -> None:
+    lower, upper = read(), fs.parse_netlist("\n".join([DECK.split("\n")[0], *DECK.upper().split("\n")[1:]]))
+    assert [e.name for e in upper.elements] == ["VDRIVE", "XCOAT", "XGAP", "XSKIN"]
+    assert upper["Xgap"].node_names == ("TOP", "SKIN", "AREA")
+    for a, b in zip(lower.elements, upper.elements, strict=True):
+        assert (a.nodes, dict(a.values), a.waveform) == (b.nodes, dict(b.values), b.waveform)
+    assert upper.tran == lower.tran
+    assert upper.charge_law == "local"
+
+
+def test_subcircuits_with_parameters_give_the_circuit_of_the_flat_deck() -> None:
+    stack = """\
+Fingerpad
+.include fingerspice.lib
+.param f0=100 u0={2*100}
+.subckt finger in out area d_gap=9u f={f0}
+Xgap in inner area GAP d={d_gap} eps_r=1 r=1meg fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000
+Xskin inner out area SKIN d=350u f={f}
+.ends
+Vdrive drive 0 SIN(0 {u0} {f0})
+Xcoat drive top area LAYER d=1u eps_r=3.9 r={0.2*1meg}
+Xf top 0 area finger d_gap={7u/2}
+.tran 10u 50m uic
+"""
+    nested, flat = fs.parse_netlist(stack), read()
+    assert [e.name for e in nested.elements] == ["Vdrive", "Xcoat", "Xf.Xgap", "Xf.Xskin"]
+    for a, b in zip(nested.elements, flat.elements, strict=True):
+        assert a.device == b.device
+        assert dict(a.values) == pytest.approx(dict(b.values), rel=1e-15)
+        assert a.waveform == b.waveform
+    ours, theirs = fs.simulate(nested, t_stop=2e-3), fs.simulate(flat, t_stop=2e-3)
+    assert ours.u_gap is not None
+    assert theirs.u_gap is not None
+    np.testing.assert_allclose(ours.u_gap, theirs.u_gap, rtol=0, atol=1e-9)
+    assert nested.replace({"Xf.Xgap.d": 5e-6})["Xf.Xgap"].values["d"] == 5e-6
+
+
+@pytest.mark.parametrize(
+    ("line", "tran"),
+    [
+        (".tran 10u 50m", Tran(1e-5, 0.05)),
+        (".tran 10u 50m uic", Tran(1e-5, 0.05, uic=True)),
+        (".tran 10us 50ms 5m", Tran(1e-5, 0.05, 0.005)),
+        (".tran 10u 50m 0 1u UIC", Tran(1e-5, 0.05, 0.0, 1e-6, True)),
+        (".tran {1/1e5} '5*10m'", Tran(1e-5, 0.05)),
+    ],
+)
+def test_tran_has_spices_four_numbers_and_uic(line: str, tran: Tran) -> None:
+    assert read((".tran 10u 50m uic", line)).tran == tran
+
+
+def test_ac_asks_for_a_sweep() -> None:
+    for word in ("dec", "OCT", "Lin"):
+        circuit = read((".end", f".ac {word} 10 1 100k"))
+        assert circuit.ac == AcSweep(word.lower(), 10, 1.0, 1e5)
+    assert read().ac is None
+
+
+def test_start_values_are_kept_by_node_and_those_of_the_area_are_not_used() -> None:
+    circuit = read((".end", ".ic V(Top)=3 v(skin)={1+1} v(area)=34.97\n.ic v(drive)=5 v(gnd)=0"))
+    assert circuit.initial == {"top": 3.0, "skin": 2.0, "drive": 5.0, "0": 0.0}
+
+
+def test_the_included_library_says_which_charge_law() -> None:
+    assert read().charge_law == "local"
+    assert read(("fingerspice.lib", "FingerSpice_mobile.lib")).charge_law == "mobile"
+    assert read((".include fingerspice.lib", "* nothing")).charge_law is None
+    both = refusal(edited((".include fingerspice.lib", ".include fingerspice.lib\n.lib fingerspice_mobile.lib")))
+    assert both.startswith("deck.cir: both fingerspice.lib (local law) and fingerspice_mobile.lib (mobile law)")
+
+
+def test_the_reading_of_eq_7_is_an_option() -> None:
+    assert read().work == "gap"
+    assert read((".end", ".options work=total")).work == "total"
+    assert read((".end", ".option WORK=Gap")).work == "gap"
+
+
+def test_what_ngspice_needs_and_we_do_not_is_listed_once() -> None:
+    circuit = read(
+        (".end", ".options reltol=1e-4 trtol=7\n.options reltol=1e-3\n.nodeset v(area)=35\n.nodeset v(top)=1")
+    )
+    assert circuit.unused == (".nodeset", ".options reltol", ".options trtol")
+
+
+def test_a_deck_without_gap_has_voltages_and_no_forces() -> None:
+    circuit = fs.parse_netlist(
+        "t\nV1 a 0 SIN(0 10 100)\nX1 a b area LAYER d=1u eps_r=2 r=1meg\nX2 b 0 area SLAB d=2u eps_r=3 rho=1e6\n"
+        "Varea area 0 35\n.tran 100u 20m uic\n"
+    )
+    solution = fs.simulate(circuit)
+    assert solution.u_gap is solution.f_el is solution.f_t is solution.friction is None
+    np.testing.assert_array_equal(solution.area, 35e-6)
+    np.testing.assert_allclose(solution.u_layer.sum(axis=1), solution.u_source, rtol=0, atol=1e-12)
+    assert set(solution.node_voltages) == {"a", "b"}
+
+
+# What is legal and probably not meant
+
+
+@pytest.mark.parametrize("written", ["0.2MOhm", "0.2M", "0.2Mohm"])
+def test_a_capital_m_on_a_resistance_is_milli_and_warned_about(written: str) -> None:
+    (said,) = warned(edited(("r=0.2meg", f"r={written}")))
+    assert said.startswith("deck.cir:4:45: Xcoat r: ")
+    assert written in said
+    assert "(0.0002 ohm)" in said
+    assert said.endswith("write 0.2meg")
+    with pytest.warns(fs.FingerspiceWarning):
+        assert read(("r=0.2meg", f"r={written}"))["Xcoat"].values["r"] == 2e-4
+
+
+def test_a_capital_m_is_warned_about_through_a_parameter_and_on_a_resistivity() -> None:
+    (said,) = warned(edited(("r=0.2meg", "r={rc}"), (".end", ".param rc=0.2M")))
+    assert said.startswith("deck.cir:8:11: Xcoat r: '0.2M' is milli")
+    (said,) = warned(edited(("LAYER d=1u eps_r=3.9 r=0.2meg", "SLAB d=1u eps_r=3.9 rho=1M")))
+    assert "rho: '1M' is milli (0.001 ohm m)" in said
+    for text in ("r=0.2m", "r=200k", "r=0.2MEG"):
+        assert warned(edited(("r=0.2meg", text))) == []
+
+
+@pytest.mark.parametrize("f", ["9.99", "100.1k", "1M"])
+def test_a_skin_outside_the_measured_band_is_warned_about(f: str) -> None:
+    (said,) = warned(edited(("f=100", f"f={f}")))
+    assert said.startswith("deck.cir:6:1: Xskin f = ")
+    assert "outside 10 Hz to 100 kHz" in said
+
+
+@pytest.mark.parametrize("f", ["10", "100k"])
+def test_the_ends_of_the_measured_band_are_inside(f: str) -> None:
+    assert warned(edited(("f=100", f"f={f}"))) == []
+
+
+def test_a_title_that_swallows_the_source_is_named_with_the_error_it_causes() -> None:
+    text = DECK.split("\n", 2)[2]
+    said = refusal(text)
+    assert said.startswith("deck.cir: the circuit has no source")
+    assert "the first line is the title, but 'Vdrive drive 0 SIN(0 200 100)' reads like a statement" in said
+
+
+def test_values_given_as_text_have_the_traps_of_the_netlist() -> None:
+    circuit = read()
+    assert value_from_text(circuit, "Xgap.d", "3u") == (3e-6, None)
+    assert value_from_text(circuit, "Xcoat.r", "inf") == (math.inf, None)
+    value, warning = value_from_text(circuit, "Xcoat.R", "0.2M")
+    assert value == 2e-4
+    assert warning is not None
+    assert "write 0.2meg" in warning
+    with pytest.raises(fs.InputError, match=r"write the number alone, in newton"):
+        value_from_text(circuit, "Xgap.fn", "0.5N")
+    with pytest.raises(fs.InputError, match="'3x' differs between simulators"):
+        value_from_text(circuit, "Xgap.d", "3x")
+
+
+def test_a_circuit_cannot_be_changed_in_place() -> None:
+    circuit = read()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        circuit.title = "another"  # type: ignore[misc]
+    with pytest.raises(TypeError):
+        circuit["Xgap"].values["d"] = 1.0  # type: ignore[index]

@@ -1,0 +1,316 @@
+"""The result of a run: its arrays, its figures against plain numpy, and its files."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import errno
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray
+
+import fingerspice as fs
+from fingerspice import files
+from fingerspice.files import write_aside
+from scenes import deck, table1
+
+SQUARE = "SQUARE(200 100)"
+T_STOP, STEP = 0.03, 1e-4
+
+
+@pytest.fixture(scope="module")
+def square() -> fs.Solution:
+    """Three periods of an ideal square, 100 points each: jumps at every 5 ms."""
+    return fs.simulate(table1(SQUARE, tran="100u 30m uic"), rtol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def sine() -> fs.Solution:
+    """Five periods of the paper's sine, in its periodic state to about 1e-7 of peak."""
+    return fs.simulate(table1(), rtol=1e-9)
+
+
+def load(path: Path) -> xarray.Dataset:
+    with xarray.open_dataset(path) as dataset:
+        return dataset.load()
+
+
+def rows(path: Path) -> tuple[list[str], np.ndarray]:
+    with path.open(newline="") as stream:
+        head, *body = csv.reader(stream)
+    return head, np.array(body, float)
+
+
+# Times and arrays
+
+
+def test_times_are_the_output_grid_with_two_rows_at_each_jump_after_the_start(square: fs.Solution) -> None:
+    jumps = np.array([0.005, 0.01, 0.015, 0.02, 0.025, 0.03])
+    grid = STEP * np.arange(301)
+    np.testing.assert_allclose(square.t, np.sort(np.concatenate([grid, jumps])), rtol=1e-12)
+    twice = np.flatnonzero(np.diff(square.t) == 0.0)
+    np.testing.assert_allclose(square.t[twice], jumps, rtol=1e-12)
+    before = np.array([200.0, -200.0] * 3)
+    np.testing.assert_array_equal(square.u_source[twice], before)
+    np.testing.assert_array_equal(square.u_source[twice + 1], -before)
+    # A jump of U splits over the layers at once, in the ratio of 1/c.
+    split = (square.u_layer[twice + 1] - square.u_layer[twice]) / (-2.0 * before[:, None])
+    np.testing.assert_allclose(split, np.broadcast_to(split[0], split.shape), rtol=1e-12)
+    np.testing.assert_allclose(split.sum(axis=1), 1.0, rtol=1e-13)
+    assert square.t[0] == 0.0
+    assert square.u_source[0] == 200.0
+
+
+def test_tstart_leaves_out_what_comes_before_it(square: fs.Solution) -> None:
+    late = fs.simulate(table1(SQUARE, tran="100u 30m 12m uic"), rtol=1e-9)
+    assert late.t[0] == 0.012
+    keep = square.t >= 0.012 - 1e-9
+    np.testing.assert_allclose(late.t, square.t[keep], rtol=1e-12)
+    np.testing.assert_allclose(late.u_gap, square.u_gap[keep], rtol=0, atol=1e-6)  # type: ignore[index]
+
+
+def test_with_t_eval_times_are_exactly_those_and_right_hand_at_jumps() -> None:
+    asked = np.array([0.0, 1.23456e-3, 0.005, 0.0149999, 0.015, 0.021])
+    solution = fs.simulate(table1(SQUARE), t_eval=asked, t_stop=T_STOP)
+    np.testing.assert_array_equal(solution.t, asked)
+    np.testing.assert_array_equal(solution.u_source, [200.0, 200.0, -200.0, 200.0, -200.0, 200.0])
+    assert solution.u_layer.shape == (6, 3)
+
+
+def test_arrays_are_read_only_and_the_result_is_frozen(square: fs.Solution) -> None:
+    arrays = [value for value, _, _ in square.signals.values()]
+    for array in (square.t, square.u_layer, *arrays, *square.node_voltages.values()):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        square.rtol = 1.0  # type: ignore[misc]
+
+
+def test_every_signal_has_its_unit(square: fs.Solution) -> None:
+    units = {name: unit for name, (_, unit, _) in square.signals.items()}
+    assert units == {
+        "u_source": "V",
+        "u_layer:Xcoat": "V",
+        "u_layer:Xgap": "V",
+        "u_layer:Xskin": "V",
+        "u_gap": "V",
+        "area": "m^2",
+        "sigma_el": "Pa",
+        "f_el": "N",
+        "f_t": "N",
+        "friction": "1",
+        "q_source": "C",
+        "i_source": "A",
+        "fold_margin": "1",
+        "v:drive": "V",
+        "v:top": "V",
+        "v:skin": "V",
+    }
+    assert square.layers == ("Xcoat", "Xgap", "Xskin")
+    np.testing.assert_array_equal(square.signals["u_layer:Xgap"][0], square.u_gap)
+
+
+# Figures
+
+
+def test_figures_of_a_sine_equal_plain_numpy(sine: fs.Solution) -> None:
+    s = sine.summary()
+    t, u, f = sine.t, sine.u_gap, sine.f_el
+    assert u is not None
+    assert f is not None
+    assert s["u_gap_max"] == u.max()
+    assert s["u_gap_min"] == u.min()
+    assert s["u_gap_peak"] == np.abs(u).max()
+    assert s["f_el_mean"] == pytest.approx(np.sum(0.5 * (f[1:] + f[:-1]) * np.diff(t)) / t[-1], rel=1e-12)
+    # The last of the five periods holds 1000 steps: without its last point, sums over it are exact means.
+    last = slice(t.size - 1001, t.size - 1)
+    assert t[last][0] == pytest.approx(0.04, rel=1e-12)
+    assert s["f_el_mean_periodic"] == pytest.approx(f[last].mean(), rel=1e-6)
+    assert s["u_gap_rms_periodic"] == pytest.approx(np.sqrt(np.mean(u[last] ** 2)), rel=1e-6)
+    assert s["area_ripple"] == pytest.approx(np.ptp(sine.area[last]), rel=1e-9)
+    spectrum = np.fft.rfft(u[last]) / 500.0
+    assert s["u_gap_amplitude"] == pytest.approx(abs(spectrum[1]), rel=1e-6)
+    phase = np.degrees(np.angle(1j * spectrum[1]))
+    assert s["u_gap_phase_deg"] == pytest.approx(phase, abs=1e-4)
+    assert s["u_source_amplitude"] == pytest.approx(200.0, rel=1e-9)
+    assert s["u_source_phase_deg"] == pytest.approx(0.0, abs=1e-9)
+    assert s["fundamental"] == 100.0
+    assert s["t_stop"] == 0.05
+    assert s["status"] == "SUCCESS"
+
+
+def test_figures_of_a_square_equal_plain_numpy(square: fs.Solution) -> None:
+    s = square.summary()
+    f = square.f_el
+    assert f is not None
+    # Trapezoids from jump to jump, one-sided values at both ends.
+    cuts = np.flatnonzero(np.diff(square.t) == 0.0) + 1
+    parts = zip(np.split(square.t, cuts), np.split(f, cuts), strict=True)
+    total = sum(STEP * (y.sum() - 0.5 * (y[0] + y[-1])) for t, y in parts if t.size > 1)
+    assert s["f_el_mean"] == pytest.approx(total / T_STOP, rel=1e-12)
+    fine = fs.simulate(table1(SQUARE, tran="2u 30m uic"), rtol=1e-9).summary()
+    assert s["f_el_mean"] == pytest.approx(fine["f_el_mean"], rel=1e-3)
+    assert s["f_el_max"] == pytest.approx(fine["f_el_max"], rel=1e-6)
+    assert s["u_source_rms"] == pytest.approx(200.0, rel=1e-12)
+    assert s["u_source_mean_periodic"] == pytest.approx(0.0, abs=1e-9)
+    assert s["u_source_amplitude"] == pytest.approx(200.0 * 4.0 / np.pi, rel=1e-3)
+
+
+def test_a_run_shorter_than_a_period_has_no_periodic_figures() -> None:
+    s = fs.simulate(table1(), t_stop=6e-3).summary()
+    assert s["f_el_mean_periodic"] is None
+    assert "u_gap_amplitude" not in s
+    assert s["f_el_mean"] > 0.0
+
+
+def test_a_circuit_without_gap_has_figures_of_its_layers(tmp_path: Path) -> None:
+    solution = fs.simulate(
+        deck(
+            "V1 a 0 SIN(0 10 100)",
+            "X1 a b area LAYER d=1u eps_r=2 r=1meg",
+            "X2 b 0 area LAYER d=2u eps_r=3 r=1meg",
+            "Varea area 0 35",
+            ".tran 100u 20m uic",
+        )
+    )
+    s = solution.summary()
+    assert s["u_layer:X1_max"] == solution.u_layer[:, 0].max()
+    assert not [key for key in s if key.startswith(("f_el", "u_gap", "friction"))]
+    assert load(solution.to_netcdf(tmp_path / "a.nc")).identical(solution.to_xarray())
+    assert "f_el" not in solution.to_xarray()
+
+
+# Files
+
+
+@pytest.mark.parametrize("jumps", ["right", "both"])
+def test_netcdf_holds_what_to_xarray_gives(square: fs.Solution, jumps: str, tmp_path: Path) -> None:
+    path = square.to_netcdf(tmp_path / "run.nc", jumps=jumps)
+    dataset = square.to_xarray(jumps=jumps)
+    xarray.testing.assert_identical(load(path), dataset)
+    unique = np.unique(square.t)
+    assert dataset.sizes == {"time": unique.size if jumps == "right" else square.t.size, "layer": 3, "node": 3}
+    if jumps == "right":
+        np.testing.assert_array_equal(dataset.time, unique)
+        at = dataset.sel(time=0.005, method="nearest")
+        assert float(at.u_source) == -200.0
+        assert float(at.u_layer.sum()) == pytest.approx(-200.0, rel=1e-12)
+    assert dataset.u_gap.attrs == {"units": "V", "long_name": "gap voltage"}
+    assert dataset.area.attrs["units"] == "m^2"
+    assert dataset.time.attrs["units"] == "s"
+    np.testing.assert_array_equal(dataset.u_layer.sel(layer="Xgap"), dataset.u_gap)
+    np.testing.assert_allclose(dataset.v.sel(node="drive"), dataset.u_source, rtol=1e-12)
+
+
+def test_another_word_for_jumps_is_refused(square: fs.Solution, tmp_path: Path) -> None:
+    for call in (square.to_xarray, lambda **k: square.to_netcdf(tmp_path / "x.nc", **k)):
+        with pytest.raises(fs.InputError, match=r"jumps is 'left'; allowed: 'right' or 'both'"):
+            call(jumps="left")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_csv_reads_back_every_bit_and_names_its_units(square: fs.Solution, tmp_path: Path) -> None:
+    head, table = rows(square.to_csv(tmp_path / "run.csv"))
+    assert head[0] == "t [s]"
+    assert head[1:] == [f"{name} [{unit}]" for name, (_, unit, _) in square.signals.items()]
+    np.testing.assert_array_equal(table[:, 0], square.t)
+    for i, (value, _, _) in enumerate(square.signals.values()):
+        np.testing.assert_array_equal(table[:, 1 + i], value)
+
+
+def test_files_say_what_it_takes_to_repeat_the_run(tmp_path: Path) -> None:
+    circuit = table1(library="fingerspice_mobile.lib").replace({"Xgap.d": 4e-6, "Vdrive": fs.Sine(150.0, 100.0)})
+    solution = fs.simulate(circuit, t_stop=2e-3, rtol=1e-7, method="dp5", area="coupled")
+    attrs = load(solution.to_netcdf(tmp_path / "run.nc")).attrs
+    assert attrs == solution.provenance()
+    assert attrs["program"] == f"fingerspice {fs.__version__}"
+    assert attrs["deck"] == circuit.text
+    overrides = json.loads(attrs["overrides"])
+    assert float(overrides["Xgap.d"]) == 4e-6
+    assert "150" in overrides["Vdrive"]
+    expected = {"charge_law": "mobile", "area": "coupled", "method": "dp5", "rtol": "1e-07", "status": "SUCCESS"}
+    assert {key: attrs[key] for key in expected} == expected
+    assert float(attrs["error_u_gap_V"]) == solution.error.u_gap > 0.0
+    assert float(attrs["error_f_el_N"]) == solution.error.f_el > 0.0
+    # The text read again, with the overrides named, is the same scene.
+    again = fs.parse_netlist(attrs["deck"]).replace({"Xgap.d": float(overrides["Xgap.d"])})
+    assert dict(again["Xgap"].values) == dict(circuit["Xgap"].values)
+
+
+def test_a_deck_of_more_than_64_kib_is_kept_whole(tmp_path: Path) -> None:
+    # HDF5 has a limit of 64 KiB for an attribute written the compact way.
+    points = " ".join(f"{i}u {100.0 * np.sin(i / 300.0):.9f}" for i in range(6000))
+    circuit = table1(f"PWL({points})", tran="100u 2m uic")
+    assert len(circuit.text) > 65536
+    solution = fs.simulate(circuit, rtol=1e-5)
+    assert load(solution.to_netcdf(tmp_path / "run.nc")).attrs["deck"] == circuit.text
+
+
+def test_a_failed_run_keeps_what_came_before_it(tmp_path: Path) -> None:
+    circuit = table1().replace({"Xgap.d": 10e-9})
+    with pytest.raises(fs.SolveError) as caught:
+        fs.simulate(circuit, charge_law="mobile")
+    partial = fs.simulate(circuit, charge_law="mobile", throw=False)
+    assert not partial.success
+    assert partial.status is fs.Status.FOLD
+    assert partial.message == str(caught.value)
+    assert caught.value.solution is not None
+    np.testing.assert_array_equal(caught.value.solution.t, partial.t)
+    assert 0 < partial.t.size < 100
+    assert all(value.shape[0] == partial.t.size for value, _, _ in partial.signals.values())
+    assert all(np.isfinite(value).all() for value, _, _ in partial.signals.values())
+    dataset = load(partial.to_netcdf(tmp_path / "run.nc"))
+    assert dataset.attrs["status"] == "FOLD"
+    assert dataset.attrs["message"] == partial.message
+    assert rows(partial.to_csv(tmp_path / "run.csv"))[1].shape[0] == partial.t.size
+    assert partial.summary()["status"] == "FOLD"
+
+
+def test_only_success_says_success() -> None:
+    assert [s.name for s in fs.Status if "success" in s.value] == ["SUCCESS"]
+
+
+@pytest.mark.parametrize("write", ["to_csv", "to_netcdf"])
+@pytest.mark.parametrize("there", [False, True])
+def test_a_file_is_whole_or_as_it_was_when_the_disk_is_full(
+    square: fs.Solution, write: str, there: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.dat"
+    if there:
+        path.write_text("before")
+
+    def full(path: Path, write_to: Any) -> Path:
+        def half(target: Path) -> None:
+            target.write_text("half of a file")
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        return write_aside(path, half)
+
+    monkeypatch.setattr("fingerspice.solution.write_aside", full)
+    with pytest.raises(fs.InputError, match=r"cannot write .*run\.dat: No space left on device"):
+        getattr(square, write)(path)
+    assert [p.name for p in tmp_path.iterdir()] == (["run.dat"] if there else [])
+    assert not there or path.read_text() == "before"
+
+
+def test_nothing_is_left_when_writing_breaks_off_for_any_reason(tmp_path: Path) -> None:
+    def interrupted(target: Path) -> None:
+        target.write_text("half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_aside(tmp_path / "x.csv", interrupted)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_made_is_refused(square: fs.Solution, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file" / "run.nc", tmp_path / "file" / "deeper" / "run.nc"):
+        with pytest.raises(fs.InputError, match=r"cannot write .*allowed: a folder that can be written"):
+            square.to_netcdf(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+    assert files.write_aside(tmp_path / "new" / "x.txt", lambda p: p.write_text("x")).read_text() == "x"
