@@ -54,7 +54,9 @@ def ten_periods(path: Path, rtol: float, repeats: int) -> dict[str, Any]:
 
 def command_seconds(arguments: list[str], repeats: int) -> float:
     """Median wall time of a Python command in a fresh process, s."""
-    return median_seconds(lambda: subprocess.run([sys.executable, *arguments], check=True, capture_output=True), repeats)
+    return median_seconds(
+        lambda: subprocess.run([sys.executable, *arguments], check=True, capture_output=True), repeats
+    )
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:

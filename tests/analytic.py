@@ -53,9 +53,21 @@ from scipy.special import roots_jacobi, roots_legendre
 # ----------------------------------------------------------------------------------------------------------
 
 PAPER_TABLE1 = {
-    "mu0": 0.3, "F_N_N": 0.5, "eps_r_i": 3.9, "eps_r_a": 1.0, "eps0": 8.854e-12,
-    "d_i_um": 1.0, "d_a_um": 3.5, "d_sc_um": 350.0, "R_a_ohm": 1e6, "R_i_ohm": 2e5,
-    "m": 0.52, "n": 1.41, "alpha_mm2_per_Nm": 54.4, "beta_mm_2mn": 32.0, "c2_mm4_per_N2": 5000.0,
+    "mu0": 0.3,
+    "F_N_N": 0.5,
+    "eps_r_i": 3.9,
+    "eps_r_a": 1.0,
+    "eps0": 8.854e-12,
+    "d_i_um": 1.0,
+    "d_a_um": 3.5,
+    "d_sc_um": 350.0,
+    "R_a_ohm": 1e6,
+    "R_i_ohm": 2e5,
+    "m": 0.52,
+    "n": 1.41,
+    "alpha_mm2_per_Nm": 54.4,
+    "beta_mm_2mn": 32.0,
+    "c2_mm4_per_N2": 5000.0,
 }
 """Table 1 exactly as printed, the printed unit in each key."""
 
@@ -98,10 +110,18 @@ class Parameters:
 def parameters_from_paper(table: dict[str, float]) -> Parameters:
     """`Parameters` from a table in the paper's units (keys of `PAPER_TABLE1`): the only conversion."""
     return Parameters(
-        mu0=table["mu0"], force_normal=table["F_N_N"], eps0=table["eps0"],
-        eps_i=table["eps_r_i"], eps_a=table["eps_r_a"],
-        d_i=table["d_i_um"] / 1e6, d_a=table["d_a_um"] / 1e6, d_sc=table["d_sc_um"] / 1e6,
-        r_i=table["R_i_ohm"], r_a=table["R_a_ohm"], m=table["m"], n=table["n"],
+        mu0=table["mu0"],
+        force_normal=table["F_N_N"],
+        eps0=table["eps0"],
+        eps_i=table["eps_r_i"],
+        eps_a=table["eps_r_a"],
+        d_i=table["d_i_um"] / 1e6,
+        d_a=table["d_a_um"] / 1e6,
+        d_sc=table["d_sc_um"] / 1e6,
+        r_i=table["R_i_ohm"],
+        r_a=table["R_a_ohm"],
+        m=table["m"],
+        n=table["n"],
         alpha=table["alpha_mm2_per_Nm"] / 1e6,
         beta=table["beta_mm_2mn"] / 10.0 ** (3.0 * (2.0 - table["n"])),
         c2=table["c2_mm4_per_N2"] / 1e12,
@@ -193,9 +213,7 @@ def ridge_area_unloaded_mp(u: float, params: Parameters = TABLE1, dps: int = 40,
         w = k * sigma * mp.mpf(params.d_a) / 1000  # N/mm
 
         def residual(a: mp.mpf) -> mp.mpf:
-            adhesion = mp.sqrt(
-                2 * w * n**2 / (n - m) * beta ** (1 / n) * alpha ** (-1 / m) * a ** (1 + 1 / m - 1 / n)
-            )
+            adhesion = mp.sqrt(2 * w * n**2 / (n - m) * beta ** (1 / n) * alpha ** (-1 / m) * a ** (1 + 1 / m - 1 / n))
             return alpha ** (-1 / m) * a ** (1 / m) - adhesion - force
 
         low = alpha * force**m
@@ -253,9 +271,11 @@ def _contact_constants(params: Parameters, k: float) -> tuple[float, float, floa
     p = 0.5 * (1.0 + 1.0 / p_.m - 1.0 / p_.n)
     a_hertz = p_.alpha * p_.force_normal**p_.m  # A_R0 at 0 V
     w_per_u2 = k * p_.eps0 * p_.eps_a / (2.0 * p_.d_a)  # w / u^2, N/m/V^2
-    x_per_u = math.sqrt(
-        2.0 * w_per_u2 * p_.n**2 / (p_.n - p_.m) * p_.beta ** (1.0 / p_.n) * p_.alpha ** (-1.0 / p_.m)
-    ) * a_hertz**p / p_.force_normal
+    x_per_u = (
+        math.sqrt(2.0 * w_per_u2 * p_.n**2 / (p_.n - p_.m) * p_.beta ** (1.0 / p_.n) * p_.alpha ** (-1.0 / p_.m))
+        * a_hertz**p
+        / p_.force_normal
+    )
     sigma_per_u2 = p_.eps0 * p_.eps_a / (2.0 * p_.d_a**2)
     if a_hertz**2 <= p_.c2 * p_.mu0**2 * p_.force_normal**2:
         raise ValueError(
@@ -380,8 +400,12 @@ def _table1_rc(f: float, a: float, params: Parameters) -> tuple[float, ...]:
     """(R_i, R_a, R_sc, C_i, C_a, C_sc) of Table 1 at frequency f and area a (Eqs. 16, 17)."""
     p = params
     return (
-        p.r_i, p.r_a, rho_sc(f) * p.d_sc / a,
-        p.eps0 * p.eps_i * a / p.d_i, p.eps0 * p.eps_a * a / p.d_a, p.eps0 * eps_sc(f) * a / p.d_sc,
+        p.r_i,
+        p.r_a,
+        rho_sc(f) * p.d_sc / a,
+        p.eps0 * p.eps_i * a / p.d_i,
+        p.eps0 * p.eps_a * a / p.d_a,
+        p.eps0 * eps_sc(f) * a / p.d_sc,
     )
 
 
@@ -485,7 +509,12 @@ class FrozenSine:
 
 
 def periodic_sine_frozen(
-    f: float, u0: float, a: float, params: Parameters = TABLE1, *, layers: Sequence[Layer] | None = None,
+    f: float,
+    u0: float,
+    a: float,
+    params: Parameters = TABLE1,
+    *,
+    layers: Sequence[Layer] | None = None,
     phase: float = 0.0,
 ) -> FrozenSine:
     """Periodic response to U0 sin(2 pi f t + phase) at frozen area a (m^2), by Eqs. 9 and 11."""
@@ -536,8 +565,15 @@ def _as_float(u: mp.matrix) -> list[float]:
 
 
 def piecewise_constant_frozen(
-    edges: Sequence[float], levels: Sequence[float], t_out: Sequence[float], a: float,
-    layers: Sequence[Layer], *, u_start: Sequence[float] | None = None, periodic: bool = False, dps: int = 40,
+    edges: Sequence[float],
+    levels: Sequence[float],
+    t_out: Sequence[float],
+    a: float,
+    layers: Sequence[Layer],
+    *,
+    u_start: Sequence[float] | None = None,
+    periodic: bool = False,
+    dps: int = 40,
 ) -> np.ndarray:
     """Exact layer voltages of the frozen stack under a piecewise-constant source.
 
@@ -586,8 +622,15 @@ def piecewise_constant_frozen(
 
 
 def square_frozen(
-    f: float, u0: float, a: float, t_out: Sequence[float], params: Parameters = TABLE1, *,
-    layers: Sequence[Layer] | None = None, duty: float = 0.5, dps: int = 40,
+    f: float,
+    u0: float,
+    a: float,
+    t_out: Sequence[float],
+    params: Parameters = TABLE1,
+    *,
+    layers: Sequence[Layer] | None = None,
+    duty: float = 0.5,
+    dps: int = 40,
 ) -> np.ndarray:
     """Exact periodic layer voltages (len(t_out), n) under a square wave +-u0 at f Hz, +u0 on [0, duty/f)."""
     layers = tuple(layers) if layers is not None else table1_layers(f, params)
@@ -599,7 +642,13 @@ def square_frozen(
 
 
 def sine_frozen_from_rest(
-    f: float, u0: float, a: float, t_out: Sequence[float], layers: Sequence[Layer], *, phase: float = 0.0,
+    f: float,
+    u0: float,
+    a: float,
+    t_out: Sequence[float],
+    layers: Sequence[Layer],
+    *,
+    phase: float = 0.0,
     dps: int = 40,
 ) -> np.ndarray:
     """Exact layer voltages (len(t_out), n) under u0 sin(2 pi f t + phase) from the uncharged state at t = 0.
@@ -630,6 +679,7 @@ Segment = tuple[float, float, Waveform, Waveform]
 
 def constant_segments(edges: Sequence[float], levels: Sequence[float]) -> list[Segment]:
     """Piecewise-constant source: levels[k] V on [edges[k], edges[k+1]) s."""
+
     def hold(level: float) -> Waveform:
         return lambda t: level + 0.0 * np.asarray(t)
 
@@ -641,11 +691,14 @@ def sine_segments(
 ) -> list[Segment]:
     """One segment of offset + u0 sin(2 pi f t + phase), V; phase in rad, times in s."""
     om = 2.0 * math.pi * f
-    return [(
-        t_start, t_end,
-        lambda t: offset + u0 * np.sin(om * np.asarray(t) + phase),
-        lambda t: u0 * om * np.cos(om * np.asarray(t) + phase),
-    )]
+    return [
+        (
+            t_start,
+            t_end,
+            lambda t: offset + u0 * np.sin(om * np.asarray(t) + phase),
+            lambda t: u0 * om * np.cos(om * np.asarray(t) + phase),
+        )
+    ]
 
 
 def square_segments(u0: float, f: float, periods: int, *, duty: float = 0.5) -> list[Segment]:
@@ -659,6 +712,7 @@ def square_segments(u0: float, f: float, periods: int, *, duty: float = 0.5) -> 
 
 def pwl_segments(points: Sequence[tuple[float, float]]) -> list[Segment]:
     """Piecewise-linear source through (t in s, U in V); two equal times are an ideal jump."""
+
     def ramp(t0: float, v0: float, slope: float) -> tuple[Waveform, Waveform]:
         return (lambda t: v0 + slope * (np.asarray(t) - t0)), (lambda t: slope + 0.0 * np.asarray(t))
 
@@ -827,9 +881,7 @@ class _Stack:
             last = size
         raise _NoStep("fold")
 
-    def fields(
-        self, source: np.ndarray, w: np.ndarray, s: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def fields(self, source: np.ndarray, w: np.ndarray, s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """u (m, n), A (m,), dA/dv (m,) for source (m,), w (m, n) and the sign s of u_a on this piece."""
         b = w @ self.b_of_w.T
         free = source[:, None] * self.share
@@ -848,9 +900,7 @@ class _Stack:
             return u * (self.g_total + a[:, None] * self.g_area)
         return u * (self.g_total / a[:, None] + self.g_area)
 
-    def rates_jacobian(
-        self, w: np.ndarray, u: np.ndarray, a: np.ndarray, da: np.ndarray, s: float
-    ) -> np.ndarray:
+    def rates_jacobian(self, w: np.ndarray, u: np.ndarray, a: np.ndarray, da: np.ndarray, s: float) -> np.ndarray:
         """d w' / d w, (m, n, n)."""
         j = self.gap
         if self.mobile:
@@ -1153,9 +1203,7 @@ def _collocate(
     raise _NoStep("newton")
 
 
-def _first_zero(
-    stack: _Stack, nodes: _Nodes, step: _Step, scale: float, us: np.ndarray
-) -> float | None:
+def _first_zero(stack: _Stack, nodes: _Nodes, step: _Step, scale: float, us: np.ndarray) -> float | None:
     """Fraction of the step at which s u_a first falls through zero, or None."""
     j, tau = stack.gap, np.linspace(0.0, 1.0, 2 * len(nodes.tau) + 1)[1:]
     noise = 1e-12 * scale
@@ -1187,16 +1235,22 @@ class _Run:
         self.q_leak = self.force_integral = 0.0
         self.fold: Fold | None = None
 
-    def attempt(
-        self, t: float, h: float, u: np.ndarray, source: Waveform, s: float
-    ) -> tuple[_Step, np.ndarray]:
+    def attempt(self, t: float, h: float, u: np.ndarray, source: Waveform, s: float) -> tuple[_Step, np.ndarray]:
         """One collocation step, not yet accepted."""
         stack = self.stack
         w, us, a = _collocate(stack, self.nodes, t, h, u, source, s, self.scale)
         g = stack.g_total[stack.gap] + a * stack.g_area[stack.gap]
         ua = us[:, stack.gap]
         step = _Step(
-            t, h, s, source, w, g * ua, stack.sigma_per_u2 * ua**2 * a, self.q_leak, self.force_integral,
+            t,
+            h,
+            s,
+            source,
+            w,
+            g * ua,
+            stack.sigma_per_u2 * ua**2 * a,
+            self.q_leak,
+            self.force_integral,
             us[-1],
         )
         end = _on_step(stack, self.nodes, step, np.array([t + h]))[0][0]
@@ -1312,7 +1366,12 @@ class _Run:
 
 
 def dc_operating_point(
-    source: float, layers: Sequence[Layer], params: Parameters = TABLE1, *, gap: int = GAP, k: float = 1.0,
+    source: float,
+    layers: Sequence[Layer],
+    params: Parameters = TABLE1,
+    *,
+    gap: int = GAP,
+    k: float = 1.0,
     frozen: float | None = None,
 ) -> np.ndarray:
     """Layer voltages at DC, V: resistances in series, R = r_area / A for area-scaled leakage, A = g(|u_a|).
@@ -1332,18 +1391,36 @@ def dc_operating_point(
     if frozen is not None or any(blocked):
         return divide(frozen if frozen is not None else 1.0)
     sign = 1.0 if source >= 0.0 else -1.0
-    v = brentq(
-        lambda v: v - sign * divide(float(area(v, params, k)))[gap], 0.0, abs(source) + 1e-300,
-        xtol=1e-15 * abs(source) + 1e-300, rtol=1e-15,
-    ) if source else 0.0
+    v = (
+        brentq(
+            lambda v: v - sign * divide(float(area(v, params, k)))[gap],
+            0.0,
+            abs(source) + 1e-300,
+            xtol=1e-15 * abs(source) + 1e-300,
+            rtol=1e-15,
+        )
+        if source
+        else 0.0
+    )
     return divide(float(area(v, params, k)))
 
 
 def transient(
-    segments: Sequence[Segment], t_out: Sequence[float], *, law: str = "local", params: Parameters = TABLE1,
-    freq: float | None = None, layers: Sequence[Layer] | None = None, gap: int = GAP,
-    area_mode: str | float = "coupled", k: float = 1.0, start: str | Sequence[float] = "uncharged",
-    source_before: float | None = None, method: str = "radau", stages: int = 12, tol: float = 1e-14,
+    segments: Sequence[Segment],
+    t_out: Sequence[float],
+    *,
+    law: str = "local",
+    params: Parameters = TABLE1,
+    freq: float | None = None,
+    layers: Sequence[Layer] | None = None,
+    gap: int = GAP,
+    area_mode: str | float = "coupled",
+    k: float = 1.0,
+    start: str | Sequence[float] = "uncharged",
+    source_before: float | None = None,
+    method: str = "radau",
+    stages: int = 12,
+    tol: float = 1e-14,
 ) -> Transient:
     """Transient of N layers in series under an ideal source, to about 1e-13 of the peak voltage.
 
@@ -1401,8 +1478,10 @@ def transient(
         if start not in ("uncharged", "dc"):
             raise ValueError(f"start must be 'uncharged', 'dc' or voltages, got {start!r}")
         before = first if source_before is None else source_before
-        u = np.zeros(stack.n) if start == "uncharged" else dc_operating_point(
-            before, layers, params, gap=gap, k=k, frozen=frozen
+        u = (
+            np.zeros(stack.n)
+            if start == "uncharged"
+            else dc_operating_point(before, layers, params, gap=gap, k=k, frozen=frozen)
         )
     else:
         u = np.asarray(start, dtype=float)
@@ -1420,7 +1499,16 @@ def transient(
             break
     empty = np.empty(0)
     result = Transient(
-        empty, empty, empty, empty, empty, run.fold, tuple(run.zeros), stack, nodes, tuple(run.steps),
+        empty,
+        empty,
+        empty,
+        empty,
+        empty,
+        run.fold,
+        tuple(run.zeros),
+        stack,
+        nodes,
+        tuple(run.steps),
         u_before,
     )
     return result.at(t_out)
@@ -1431,9 +1519,17 @@ def _hold(level: float) -> Waveform:
 
 
 def periodic_state(
-    segments: Sequence[Segment], *, law: str = "local", params: Parameters = TABLE1,
-    freq: float | None = None, layers: Sequence[Layer] | None = None, gap: int = GAP,
-    area_mode: str | float = "coupled", k: float = 1.0, warm_up: int = 2, t_out: Sequence[float] = (),
+    segments: Sequence[Segment],
+    *,
+    law: str = "local",
+    params: Parameters = TABLE1,
+    freq: float | None = None,
+    layers: Sequence[Layer] | None = None,
+    gap: int = GAP,
+    area_mode: str | float = "coupled",
+    k: float = 1.0,
+    warm_up: int = 2,
+    t_out: Sequence[float] = (),
     **options: object,
 ) -> Transient:
     """Periodic steady state under a periodic source, as one period of a `Transient`.
@@ -1493,7 +1589,12 @@ def periodic_state(
 def _dop_pieces(
     rhs: Callable[[float, np.ndarray, float], np.ndarray],
     gap_voltage: Callable[[float, np.ndarray, float], float],
-    t: float, y: np.ndarray, stops: Sequence[float], rtol: float, atol: np.ndarray, scale: float,
+    t: float,
+    y: np.ndarray,
+    stops: Sequence[float],
+    rtol: float,
+    atol: np.ndarray,
+    scale: float,
 ) -> list[np.ndarray]:
     """States at `stops`, by DOP853, restarted on every stop and on every zero of the gap voltage.
 
@@ -1507,7 +1608,12 @@ def _dop_pieces(
 def _dop_loop(
     rhs: Callable[[float, np.ndarray, float], np.ndarray],
     gap_voltage: Callable[[float, np.ndarray, float], float],
-    t: float, y: np.ndarray, stops: Sequence[float], rtol: float, atol: np.ndarray, scale: float,
+    t: float,
+    y: np.ndarray,
+    stops: Sequence[float],
+    rtol: float,
+    atol: np.ndarray,
+    scale: float,
 ) -> list[np.ndarray]:
     out, first = [], None
     ua = gap_voltage(t, y, 1.0)
@@ -1517,8 +1623,15 @@ def _dop_loop(
         s = 1.0 if gap_voltage(t_try, y + (t_try - t) * rhs(t, y, 1.0), 1.0) >= 0.0 else -1.0
     for stop in stops:
         while t < stop:
-            solver = DOP853(lambda t, y, s=s: rhs(t, y, s), t, y, stop, rtol=rtol, atol=atol, first_step=(
-                None if first is None else min(first, stop - t)))
+            solver = DOP853(
+                lambda t, y, s=s: rhs(t, y, s),
+                t,
+                y,
+                stop,
+                rtol=rtol,
+                atol=atol,
+                first_step=(None if first is None else min(first, stop - t)),
+            )
             while solver.status == "running":
                 message = solver.step()
                 if solver.status == "failed":
@@ -1534,8 +1647,7 @@ def _dop_loop(
             dense, t_old = solver.dense_output(), solver.t_old
             y_old = dense(t_old)
             zero = brentq(
-                lambda t, s=s, dense=dense: gap_voltage(t, dense(t), s), t_old, solver.t, xtol=1e-18,
-                rtol=1e-15
+                lambda t, s=s, dense=dense: gap_voltage(t, dense(t), s), t_old, solver.t, xtol=1e-18, rtol=1e-15
             )
             for tries in range(4):  # land on the zero by steps, not by the (less accurate) dense output
                 cut = DOP853(lambda t, y, s=s: rhs(t, y, s), t_old, y_old, zero, rtol=rtol, atol=atol)
@@ -1553,8 +1665,13 @@ def _dop_loop(
 
 
 def dop853_voltage(
-    segments: Sequence[Segment], t_out: Sequence[float], *, params: Parameters = TABLE1, freq: float,
-    rtol: float = 1e-13, u_start: Sequence[float] | None = None,
+    segments: Sequence[Segment],
+    t_out: Sequence[float],
+    *,
+    params: Parameters = TABLE1,
+    freq: float,
+    rtol: float = 1e-13,
+    u_start: Sequence[float] | None = None,
 ) -> np.ndarray:
     """`local` law in voltage form, C_x(A) u_x' = i - u_x/R_x with sum u_x' = U', by DOP853.
 
@@ -1592,8 +1709,13 @@ def dop853_voltage(
 
 
 def dop853_leak(
-    segments: Sequence[Segment], t_out: Sequence[float], *, params: Parameters = TABLE1, freq: float,
-    law: str = "local", rtol: float = 1e-13,
+    segments: Sequence[Segment],
+    t_out: Sequence[float],
+    *,
+    params: Parameters = TABLE1,
+    freq: float,
+    law: str = "local",
+    rtol: float = 1e-13,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Leaked-charge form of either law by DOP853, from the uncharged state, in an absolute gauge.
 

@@ -13,6 +13,8 @@ from pathlib import Path
 import mpmath as mp
 import numpy as np
 import pytest
+from scipy.optimize import brentq
+
 from analytic import (
     GAP,
     PAPER_TABLE1,
@@ -53,7 +55,6 @@ from analytic import (
     transient,
     work_factor,
 )
-from scipy.optimize import brentq
 
 MM2 = 1e6
 TINY_LOAD = replace(TABLE1, force_normal=1e-4)
@@ -76,9 +77,7 @@ def test_skin_is_the_cubic_reading_of_eq_18_and_eq_19_as_printed():
     assert rho_sc(10.0) == pytest.approx(10 ** (-0.023 + 0.0795 - 0.2133 + 4.9229), rel=1e-15)
     assert rho_sc(1e4) == pytest.approx(10 ** (-0.023 * 64 + 0.0795 * 16 - 0.2133 * 4 + 4.9229), rel=1e-14)
     assert eps_sc(1.0) == pytest.approx(10**4.1598, rel=1e-15)
-    assert eps_sc(10.0) == pytest.approx(
-        10 ** (-0.00286 + 0.03564 - 0.15785 + 0.33963 - 0.6235 + 4.1598), rel=1e-15
-    )
+    assert eps_sc(10.0) == pytest.approx(10 ** (-0.00286 + 0.03564 - 0.15785 + 0.33963 - 0.6235 + 4.1598), rel=1e-15)
 
 
 # contact --------------------------------------------------------------------------------------------------
@@ -144,8 +143,9 @@ def test_area_derivative_and_primitive_are_those_of_the_area():
     for params in (TABLE1, TINY_LOAD, THIN_GAP):
         for u in (0.5, 30.0, 150.0, 900.0):
             d = 1e-4 * u
-            slope = (area(u - 2 * d, params) - 8 * area(u - d, params) + 8 * area(u + d, params)
-                     - area(u + 2 * d, params)) / (12 * d)
+            slope = (
+                area(u - 2 * d, params) - 8 * area(u - d, params) + 8 * area(u + d, params) - area(u + 2 * d, params)
+            ) / (12 * d)
             assert contact(u, params)[2] == pytest.approx(slope, rel=1e-7)
             mean = (area_primitive(u + d, params) - area_primitive(u - d, params)) / (2 * d)
             assert mean == pytest.approx(float(area(u, params)), rel=1e-6)
@@ -188,7 +188,8 @@ def test_equations_12_and_13_repaired_are_equation_11(f):
 def test_gain_limits_14_and_15():
     layers = table1_layers(100.0)
     assert abs(phasor_gains(0.0, AREA_AT_REST, layers)[GAP]) == pytest.approx(
-        gap_limit_eq14(100.0, AREA_AT_REST), rel=1e-14)
+        gap_limit_eq14(100.0, AREA_AT_REST), rel=1e-14
+    )
     fast = abs(phasor_gains(1e12, AREA_AT_REST, layers)[GAP])
     assert fast == pytest.approx(gap_limit_eq15(100.0), rel=1e-9)
     assert gap_limit_eq14(1.0, AREA_AT_REST) == pytest.approx(0.49, abs=0.005)
@@ -282,9 +283,17 @@ SCENES = {
     "sine 2 kV": (sine_segments(2000.0, 100.0, 0.01), 100.0),
     "square 2 kV": (square_segments(2000.0, 100.0, 1), 100.0),
     "ramps and a jump": (
-        pwl_segments([
-            (0, 0), (1e-3, 150), (1e-3, -80), (2e-3, 0), (2.5e-3, 0), (2.5001e-3, 200), (3e-3, 200),
-        ]),
+        pwl_segments(
+            [
+                (0, 0),
+                (1e-3, 150),
+                (1e-3, -80),
+                (2e-3, 0),
+                (2.5e-3, 0),
+                (2.5001e-3, 200),
+                (3e-3, 200),
+            ]
+        ),
         100.0,
     ),
 }
@@ -363,7 +372,8 @@ def mp_voltages(u0, f, phase, t_end, steps, freq):
             leak = [u[0] / p.r_i, u[1] / p.r_a, u[2] * a / mp.mpf(layers[2].r_area)]
             slope = u0 * om * mp.cos(om * t + phase)
             current = (slope + mp.fsum(x / (a * y) for x, y in zip(leak, c, strict=True))) / mp.fsum(
-                1 / (a * y) for y in c)
+                1 / (a * y) for y in c
+            )
             return [(current - x) / (a * y) for x, y in zip(leak, c, strict=True)]
 
         def midpoint(t, u, h, count):
@@ -471,8 +481,9 @@ def settled(wave, f, law="local"):
     return run, run.extremes(0.0, 1.0 / f), run.mean_force(0.0, 1.0 / f)
 
 
-@pytest.mark.parametrize(("f", "low", "high", "mean"), [
-    (100.0, 0.1845, 0.5826, 0.2278), (5000.0, 0.3326, 0.3829, 0.3550)])
+@pytest.mark.parametrize(
+    ("f", "low", "high", "mean"), [(100.0, 0.1845, 0.5826, 0.2278), (5000.0, 0.3326, 0.3829, 0.3550)]
+)
 def test_square_wave_forces_of_the_claims_table(f, low, high, mean):
     _, ends, force = settled("square", f)
     assert ends["force_min"] == pytest.approx(low, abs=5e-5)
@@ -487,13 +498,16 @@ def test_mean_force_of_the_transient_sine_lies_below_the_phasor(f, mean, below_p
     assert 1.0 - force / coupled_phasor(f, 200.0).mean_force == pytest.approx(below_phasor, abs=5e-4)
 
 
-@pytest.mark.parametrize(("wave", "f", "percent"), [
-    ("sine", 100.0, -0.19), ("sine", 5000.0, -0.01), ("square", 5000.0, 0.06), ("square", 100.0, 6.3)])
+@pytest.mark.parametrize(
+    ("wave", "f", "percent"),
+    [("sine", 100.0, -0.19), ("sine", 5000.0, -0.01), ("square", 5000.0, 0.06), ("square", 100.0, 6.3)],
+)
 def test_peak_gap_voltage_of_the_mobile_law_against_the_local_law(wave, f, percent):
     _, local, _ = settled(wave, f)
     _, mobile, _ = settled(wave, f, "mobile")
     assert 100.0 * (mobile["u_gap_max"] / local["u_gap_max"] - 1.0) == pytest.approx(
-        percent, abs=0.05 if percent > 1 else 0.005)
+        percent, abs=0.05 if percent > 1 else 0.005
+    )
     if (wave, f) == ("square", 100.0):
         assert local["u_gap_max"] == pytest.approx(239.4, abs=0.05)
         assert mobile["u_gap_max"] == pytest.approx(254.4, abs=0.05)
@@ -538,8 +552,7 @@ def test_the_bracketed_gap_voltage_solves_its_equation_on_the_branch_connected_t
         assert np.abs(np.diff(path)).max() < 0.1 * max(abs(x) for x in path)
 
 
-@pytest.mark.parametrize(("params", "period", "close"), [
-    (TINY_LOAD, 0.0822404, 1e-6), (THIN_GAP, 0.0233241829, 2e-9)])
+@pytest.mark.parametrize(("params", "period", "close"), [(TINY_LOAD, 0.0822404, 1e-6), (THIN_GAP, 0.0233241829, 2e-9)])
 def test_the_mobile_sine_folds_where_the_hard_cases_say(params, period, close):
     segments = sine_segments(200.0, 100.0, 0.01)
     run = transient(segments, [1e-4, 9e-3], freq=100.0, law="mobile", params=params)

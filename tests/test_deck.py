@@ -80,9 +80,7 @@ def test_places_are_physical_lines_and_columns_also_on_continuations() -> None:
 
 
 def test_comments_of_every_kind_are_dropped() -> None:
-    read = deck(
-        "* R0 a 0 1", "R1 a 0 1 ; R", "R2 a 0 2 $ R", "   * R", 'V1 a 0 TABLE("a;b $ c.csv" 0 1);x', "", "$ x"
-    )
+    read = deck("* R0 a 0 1", "R1 a 0 1 ; R", "R2 a 0 2 $ R", "   * R", 'V1 a 0 TABLE("a;b $ c.csv" 0 1);x', "", "$ x")
     assert [s.name for s in read.statements] == ["R1", "R2", "V1"]
     (call,) = read.statements[2].body
     assert isinstance(call, Call)
@@ -199,9 +197,7 @@ def test_directives_without_effect_are_listed_once() -> None:
 
 
 def test_directives_carry_words_pairs_and_their_text() -> None:
-    read = deck(
-        ".IC V(Area) = 34.97 v(b)={1+1}", ".option reltol=1e-4 dialect=ngspice noacct", ".ac dec 10 1 1meg"
-    )
+    read = deck(".IC V(Area) = 34.97 v(b)={1+1}", ".option reltol=1e-4 dialect=ngspice noacct", ".ac dec 10 1 1meg")
     assert {key: value(x) for key, x in read.ic[0].params.items()} == {"v(area)": 34.97, "v(b)": 2.0}
     assert read.options[0].name == ".options"
     assert read.options[0].params["dialect"] == Token("ngspice", Where("<netlist>", 3, 29))
@@ -385,9 +381,7 @@ def test_other_files_are_refused_by_name(tmp_path: Path, name: str, message: str
     (folder / "sub").mkdir(parents=True)
     (tmp_path / "secret.lib").write_text("R1 a 0 1\n")
     (folder / "link.lib").symlink_to(tmp_path / "secret.lib")
-    path = write(
-        folder, main__cir=f"t\n.include {name}\n", loop__lib=".include loop.lib\n", end__lib=".end\n"
-    )
+    path = write(folder, main__cir=f"t\n.include {name}\n", loop__lib=".include loop.lib\n", end__lib=".end\n")
     write(folder, part__lib="R1 a 0 1\n")
     with pytest.raises(InputError, match=message) as caught:
         read_deck(path)

@@ -10,10 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
+from fingerspice.compiled import jit
 from fingerspice.engine import advance as loop
 from fingerspice.engine.model import Model, Segment, choose_branch, dot, right_hand_side, source, write_row
 from fingerspice.errors import InputError
@@ -38,7 +38,7 @@ class _FailedError(Exception):
         super().__init__(text)
 
 
-@njit(cache=True)
+@jit
 def _slope(model: Model, segment: Segment, t: float, y: FloatArray, sign: float) -> FloatArray:
     """y' at time t; sign 0 takes the branch of the gap voltage itself."""
     u_source, du_source = source(segment, t - segment.start)
@@ -50,7 +50,7 @@ def _slope(model: Model, segment: Segment, t: float, y: FloatArray, sign: float)
     return out
 
 
-@njit(cache=True)
+@jit
 def _zero(model: Model, segment: Segment, t: float, y: FloatArray) -> float:
     u_source, _ = source(segment, t - segment.start)
     return model.k_gap * u_source + dot(model.gap, y)

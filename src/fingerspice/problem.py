@@ -171,11 +171,18 @@ def _model(stack: Stack, law: str, fixed: float | None, u_peak: float) -> tuple[
         k_gap=float(stack.k[probe]),
         gap=np.ascontiguousarray(embedding[probe]),
         s=stack.s,
+        slow=_slowest_layer(stack, embedding, area0),
         area0=area0,
         tau=1.0 / rate if rate > 0.0 else math.inf,
         curve=curve,
     )
     return model, embedding
+
+
+def _slowest_layer(stack: Stack, embedding: FloatArray, area: float) -> FloatArray:
+    """See `Model.slow`."""
+    i = int(np.argmin((stack.g_total / area + stack.g_area) / stack.c))
+    return np.append(embedding[i], [stack.k[i], stack.c[i], stack.g_area[i], stack.g_total[i]])
 
 
 def _initial_state(

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fingerspice.compiled import jit
 from fingerspice.engine.model import (
     Model,
     Segment,
@@ -35,7 +35,7 @@ NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, LOGGED = 0, 1, 2, 3, 4, 5
 N_COUNTERS = 6
 
 
-@njit(cache=True)
+@jit
 def enter(model: Model, segment: Segment, t0: float, y: FloatArray, control: FloatArray) -> tuple[float, float]:
     """Source voltage and slope, `t0` s into a segment, after taking the jump that may stand there."""
     u_source, du_source = source(segment, t0)
@@ -57,7 +57,7 @@ def enter(model: Model, segment: Segment, t0: float, y: FloatArray, control: Flo
     return u_source, du_source
 
 
-@njit(cache=True)
+@jit
 def _zero_function(
     model: Model,
     segment: Segment,
@@ -85,7 +85,7 @@ def _zero_function(
     return zero
 
 
-@njit(cache=True)
+@jit
 def _first_zero(
     model: Model, segment: Segment, t0: float, h: float, sign: float, y: FloatArray, poly: FloatArray
 ) -> float:
@@ -126,7 +126,7 @@ def _first_zero(
     return hi if f_hi < 0.0 and f_lo != 0.0 else lo
 
 
-@njit(cache=True)
+@jit
 def _first_step(model: Model, method: Method, rate: float) -> float:
     """A step to start with: the shortest time constant, less what the tolerance asks of a method of this order.
 
@@ -138,7 +138,7 @@ def _first_step(model: Model, method: Method, rate: float) -> float:
     return h
 
 
-@njit(cache=True)
+@jit
 def _choose_step(
     model: Model, method: Method, remaining: float, control: FloatArray, k0: FloatArray, scale: FloatArray
 ) -> tuple[float, bool]:
@@ -160,7 +160,7 @@ def _choose_step(
     return h, False
 
 
-@njit(cache=True)
+@jit
 def _controlled_step(
     model: Model,
     method: Method,
@@ -196,7 +196,7 @@ def _controlled_step(
             return 0.0, False
 
 
-@njit(cache=True)
+@jit
 def _write_log(
     model: Model,
     segment: Segment,
@@ -231,7 +231,7 @@ def _write_log(
         counters[LOGGED] += 1
 
 
-@njit(cache=True)
+@jit
 def _write_outputs(
     model: Model,
     segment: Segment,
@@ -260,7 +260,7 @@ def _write_outputs(
         counters[OUTPUT] += 1
 
 
-@njit(cache=True)
+@jit
 def advance(
     model: Model,
     method: Method,

@@ -14,9 +14,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fingerspice.compiled import jit
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area
 
@@ -42,6 +42,9 @@ class Model(NamedTuple):
         x_gap = gap @ x.
     s : float
         Sum of 1/c_x over the layers, m^2/F.
+    slow : ndarray, shape (n + 4,)
+        The layer that leaks slowest: its row of the embedding, share k, capacitance c (F/m^2), and leak per area
+        (S/m^2) as a constant and over 1/A. The current through it suffers least from cancellation.
     area0 : float
         Reference area of the mobile state, m^2.
     tau : float
@@ -58,6 +61,7 @@ class Model(NamedTuple):
     k_gap: float
     gap: FloatArray
     s: float
+    slow: FloatArray
     area0: float
     tau: float
     curve: FloatArray
@@ -86,7 +90,7 @@ class Segment(NamedTuple):
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(24)
 
 
-@njit(cache=True)
+@jit
 def source(segment: Segment, tau: float) -> tuple[float, float]:
     """Source voltage (V) and its slope (V/s), tau seconds into a segment."""
     u = 0.0
@@ -126,7 +130,7 @@ def source(segment: Segment, tau: float) -> tuple[float, float]:
     return u, du
 
 
-@njit(cache=True)
+@jit
 def dot(a: FloatArray, x: FloatArray) -> float:
     """a @ x[: a.size], for the few entries of a state."""
     total = 0.0
@@ -135,7 +139,7 @@ def dot(a: FloatArray, x: FloatArray) -> float:
     return total
 
 
-@njit(cache=True)
+@jit
 def branch_area(model: Model, sign: float, u: float) -> tuple[float, float]:
     """1/A and its slope d(1/A)/du on the branch A(|u|) = A(sign u), continued a little past 0 V.
 
@@ -148,7 +152,7 @@ def branch_area(model: Model, sign: float, u: float) -> tuple[float, float]:
     return q, sign * dq
 
 
-@njit(cache=True)
+@jit
 def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: float) -> float:
     """Gap voltage (V): k U + x under `local`; under `mobile` the root of u = k U + x A_0 / A(|u|).
 
@@ -175,7 +179,7 @@ def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: floa
     return _bracketed_root(model, k_u, b, sign)
 
 
-@njit(cache=True)
+@jit
 def _residual(model: Model, k_u: float, b: float, sign: float, r: float) -> tuple[float, float]:
     """Residual of the mobile area equation at r = |u - k U|, and its slope, walking from k U towards the root."""
     direction = 1.0 if b > 0.0 else -1.0
@@ -183,7 +187,7 @@ def _residual(model: Model, k_u: float, b: float, sign: float, r: float) -> tupl
     return r - abs(b) * q, 1.0 - b * dq
 
 
-@njit(cache=True)
+@jit
 def _bracketed_root(model: Model, k_u: float, b: float, sign: float) -> float:
     lo = 0.0
     width = 0.02 * abs(b) / model.area0
@@ -221,7 +225,7 @@ def _bracketed_root(model: Model, k_u: float, b: float, sign: float) -> float:
     return u if sign * u >= model.curve[0] else math.nan
 
 
-@njit(cache=True)
+@jit
 def choose_branch(model: Model, u_source: float, y: FloatArray) -> float:
     """Sign of the gap voltage; 1 at zero or where the area does not follow it."""
     if not model.coupled:
@@ -237,7 +241,7 @@ def choose_branch(model: Model, u_source: float, y: FloatArray) -> float:
     return 1.0 if zero >= 0.0 else -1.0
 
 
-@njit(cache=True)
+@jit
 def fold_margin(model: Model, x_gap: float, u: float, sign: float) -> float:
     """Distance to the fold of the `mobile` area equation: 1 without stored charge, 0 at the fold."""
     if not model.mobile:
@@ -246,7 +250,7 @@ def fold_margin(model: Model, x_gap: float, u: float, sign: float) -> float:
     return 1.0 - x_gap * model.area0 * dq
 
 
-@njit(cache=True)
+@jit
 def right_hand_side(
     model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, guess: float, out: FloatArray
 ) -> float:
@@ -270,7 +274,27 @@ def right_hand_side(
     return u
 
 
-@njit(cache=True)
+@jit
+def charge_rate(
+    model: Model, u_source: float, du_source: float, y: FloatArray, dy: FloatArray, sign: float, u: float
+) -> float:
+    """z' from x' (given, with the gap voltage u), through the layer that leaks slowest: lam = c v' + g u there.
+
+    In a stiff stack the sum over all leaks, which `right_hand_side` takes, is a small difference of large currents.
+    """
+    n = model.gap.size
+    q, _ = branch_area(model, sign, u)
+    scale = model.area0 * q if model.mobile else 1.0
+    rate = 0.0
+    voltage = model.slow[n] * u_source
+    for j in range(n):
+        rate += model.slow[j] * dy[j] * scale
+        voltage += model.slow[j] * y[j] * scale
+    lam: float = model.slow[n + 1] * rate + (model.slow[n + 2] + q * model.slow[n + 3]) * voltage
+    return lam / q if model.mobile else (lam + du_source / model.s) / q
+
+
+@jit
 def jacobian(model: Model, u_source: float, y: FloatArray, sign: float, guess: float, out: FloatArray) -> None:
     """Write d x'/d x (n, n) into `out`."""
     n = model.gap.size
@@ -288,7 +312,7 @@ def jacobian(model: Model, u_source: float, y: FloatArray, sign: float, guess: f
             out[i, j] = model.p1[i, j] + q * model.p0[i, j] + by_q * dq * du * model.gap[j]
 
 
-@njit(cache=True)
+@jit
 def write_row(
     model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, guess: float, row: FloatArray
 ) -> None:
@@ -311,7 +335,7 @@ def write_row(
     row[5:] = y
 
 
-@njit(cache=True)
+@jit
 def jump_charge(model: Model, x_gap: float, u_from: float, u_to: float) -> float:
     """Charge (C) through the terminals in a jump of the source under `local`: integral of A dD = A dU / S."""
     edges = np.array([u_from, u_to, u_to])

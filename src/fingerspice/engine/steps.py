@@ -6,10 +6,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from fingerspice.engine.model import Model, Segment, jacobian, right_hand_side, source
+from fingerspice.compiled import jit
+from fingerspice.engine.model import Model, Segment, charge_rate, jacobian, right_hand_side, source
 from fingerspice.numerics.small import inverse
 
 FloatArray = NDArray[np.float64]
@@ -32,7 +32,7 @@ class Method(NamedTuple):
     h_fixed: float
 
 
-@njit(cache=True)
+@jit
 def take_step(
     model: Model,
     method: Method,
@@ -55,7 +55,7 @@ def take_step(
     return _explicit_step(model, method, segment, t0, h, y, sign, guess, scale, k, y1)
 
 
-@njit(cache=True)
+@jit
 def _explicit_step(
     model: Model,
     method: Method,
@@ -85,7 +85,7 @@ def _explicit_step(
     return norm, stages - 1
 
 
-@njit(cache=True)
+@jit
 def _stage_state(a: FloatArray, i: int, upto: int, h: float, y: FloatArray, k: FloatArray, out: FloatArray) -> None:
     for j in range(out.size):
         value = 0.0
@@ -94,7 +94,7 @@ def _stage_state(a: FloatArray, i: int, upto: int, h: float, y: FloatArray, k: F
         out[j] = y[j] + h * value
 
 
-@njit(cache=True)
+@jit
 def _error_norm(h: float, e: FloatArray, k: FloatArray, stages: int, scale: FloatArray) -> float:
     """Largest local error over `scale`; with a companion row, DOP853's combination of both. NaN is infinite."""
     norm = 0.0
@@ -113,7 +113,7 @@ def _error_norm(h: float, e: FloatArray, k: FloatArray, stages: int, scale: Floa
     return norm if norm == norm else math.inf
 
 
-@njit(cache=True)
+@jit
 def _newton_inverse(
     model: Model,
     method: Method,
@@ -141,7 +141,7 @@ def _newton_inverse(
     return inverse(matrix)
 
 
-@njit(cache=True)
+@jit
 def _collocation_step(
     model: Model,
     method: Method,
@@ -174,7 +174,7 @@ def _collocation_step(
             u_source, du_source = source(segment, t0 + method.c[i] * h)
             guess = right_hand_side(model, u_source, du_source, stage, sign, guess, moved)
             residual[i * n : (i + 1) * n] = moved[:n] - k[i, :n]
-            k[i, n] = moved[n]
+            k[i, n] = charge_rate(model, u_source, du_source, stage, k[i], sign, guess)
         nfev += stages
         change = 0.0
         for i in range(stages * n):
@@ -195,7 +195,7 @@ def _collocation_step(
     return _error_norm(h, method.e, k, stages, scale), nfev
 
 
-@njit(cache=True)
+@jit
 def dense_polynomial(k: FloatArray, dense: FloatArray, h: float, poly: FloatArray) -> None:
     """Coefficients (n + 1, degree) of theta, theta^2, ... of the state's increment inside the step."""
     for j in range(poly.shape[0]):
@@ -206,7 +206,7 @@ def dense_polynomial(k: FloatArray, dense: FloatArray, h: float, poly: FloatArra
             poly[j, d] = h * value
 
 
-@njit(cache=True)
+@jit
 def dense_state(theta: float, y: FloatArray, poly: FloatArray, out: FloatArray) -> None:
     """State at fraction `theta` of the step that starts at `y`."""
     for j in range(y.size):

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from fingerspice.compiled import jit
 
 FloatArray = NDArray[np.float64]
 
@@ -65,7 +66,7 @@ def fit(
     return None
 
 
-@njit(cache=True)
+@jit
 def evaluate(c: FloatArray, x: float) -> tuple[float, float]:
     """Value and derivative at x in [-1, 1] of the series with coefficients c (Clenshaw)."""
     b1 = 0.0

@@ -6,13 +6,14 @@ LAPACK through numba would cost a fifth of a second at start-up to load, for mat
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from fingerspice.compiled import jit
 
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True)
+@jit
 def inverse(matrix: FloatArray) -> FloatArray:
     """Inverse of a square matrix (n, n) by Gauss-Jordan elimination with row pivoting; NaN where it is singular."""
     n = matrix.shape[0]

@@ -14,9 +14,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice.compiled import jit
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.materials import EPS0
 
@@ -128,7 +128,7 @@ def fixed_area_curve(area: float) -> FloatArray:
     return np.concatenate([[-math.inf, math.inf], np.zeros(N_PACKED), [1.0 / area]])
 
 
-@njit(cache=True)
+@jit
 def universal_curve(x: float, inv_m: float, p: float) -> float:
     """Root y of y^(1/m) - x y^p = 1 for one x (no unit); analytic through x = 0, so small x < 0 are allowed.
 
@@ -155,7 +155,7 @@ def universal_curve(x: float, inv_m: float, p: float) -> float:
     return math.exp(log_y)
 
 
-@njit(cache=True)
+@jit
 def ridge_area(u: float, contact: FloatArray) -> float:
     """A_R (m^2) at gap voltage u >= 0 (V); a small u < 0 gives the analytic continuation through the kink."""
     a0 = contact[1] * universal_curve(contact[0] * u, contact[2], contact[3])
@@ -169,7 +169,7 @@ def ridge_area(u: float, contact: FloatArray) -> float:
     return area
 
 
-@njit(cache=True)
+@jit
 def ridge_area_array(u: FloatArray, contact: FloatArray) -> FloatArray:
     """`ridge_area` over an array, shape (n,)."""
     out = np.empty_like(u)
@@ -178,7 +178,7 @@ def ridge_area_array(u: FloatArray, contact: FloatArray) -> FloatArray:
     return out
 
 
-@njit(cache=True)
+@jit
 def universal_curve_array(x: FloatArray, inv_m: float, p: float) -> FloatArray:
     """`universal_curve` over an array, shape (n,)."""
     out = np.empty_like(x)
@@ -187,7 +187,7 @@ def universal_curve_array(x: FloatArray, inv_m: float, p: float) -> FloatArray:
     return out
 
 
-@njit(cache=True)
+@jit
 def inverse_area(u: float, curve: FloatArray) -> tuple[float, float]:
     """1/A_R (1/m^2) and its slope (1/(m^2 V)) at gap voltage u >= 0 (V), or a little below on the continuation."""
     n = curve.size - 2 - N_PACKED
@@ -203,7 +203,7 @@ def inverse_area(u: float, curve: FloatArray) -> tuple[float, float]:
     return 1.0 / area, -slope / (area * area)
 
 
-@njit(cache=True)
+@jit
 def _ridge_area_slope(u: float, contact: FloatArray) -> tuple[float, float]:
     """A_R (m^2) and dA_R/du (m^2/V): `ridge_area` differentiated."""
     x = contact[0] * u
