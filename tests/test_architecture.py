@@ -17,7 +17,7 @@ MAX_LINES = 450
 
 # From the bottom up: a part imports its own files and the parts above it in this list, nothing below.
 ORDER = (
-    *("errors", "units", "files", "numerics", "physics", "engine", "circuit"),
+    *("errors", "units", "files", "compiled", "numerics", "physics", "engine", "circuit"),
     *("solution", "phasors", "export", "table1", "plotting", "problem", "transient", "foreign", "simulation"),
     *("periodic", "comparison", "report", "figures", "options", "cli", "__main__"),
 )
@@ -34,6 +34,7 @@ THIRD_PARTY = {
     "physics": {"numpy", "numba"},
     "engine": {"numpy", "numba"},
     "circuit": {"numpy"},
+    "compiled": {"numba"},
     "errors": set(),
     "units": set(),
     "files": set(),

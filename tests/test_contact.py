@@ -173,7 +173,8 @@ fingers = st.builds(
 
 
 @settings(max_examples=25, derandomize=True, deadline=None)
-@given(p=fingers, u=st.floats(0.0, 1000.0), k=st.sampled_from([1.0, 1.1, 1.5]))
+# Below 1e-100 V the square of the voltage underflows, and with it the force.
+@given(p=fingers, u=st.just(0.0) | st.floats(1e-100, 1000.0), k=st.sampled_from([1.0, 1.1, 1.5]))
 def test_any_fingers_area_agrees_with_equation_four_solved_to_40_digits(p: Parameters, u: float, k: float) -> None:
     c = from_parameters(p, k)
     assume(c.exists)

@@ -151,7 +151,8 @@ def _fixed_area(circuit: Circuit, stack: Stack, area: str | float) -> tuple[floa
 
 
 def _model(stack: Stack, law: str, fixed: float | None, u_peak: float) -> tuple[Model, FloatArray]:
-    p1, p0, b, embedding = stack.matrices()
+    embedding = stack.matrices()[-1]
+    order = _state_order(embedding)
     if fixed is not None:
         area0 = fixed
         curve = fixed_area_curve(fixed)
@@ -165,9 +166,9 @@ def _model(stack: Stack, law: str, fixed: float | None, u_peak: float) -> tuple[
     model = Model(
         mobile=law == "mobile",
         coupled=fixed is None,
-        p1=np.ascontiguousarray(p1),
-        p0=np.ascontiguousarray(p0),
-        b=np.ascontiguousarray(b),
+        k=np.ascontiguousarray(stack.k[order]),
+        rate=np.ascontiguousarray((stack.g_area / stack.c)[order]),
+        rate0=np.ascontiguousarray((stack.g_total / stack.c)[order]),
         k_gap=float(stack.k[probe]),
         gap=np.ascontiguousarray(embedding[probe]),
         s=stack.s,
@@ -177,6 +178,12 @@ def _model(stack: Stack, law: str, fixed: float | None, u_peak: float) -> tuple[
         curve=curve,
     )
     return model, embedding
+
+
+def _state_order(embedding: FloatArray) -> list[int]:
+    """Layers in the order of the states, the layer left out last."""
+    live = [int(np.argmax(column == 1.0)) for column in embedding.T]
+    return [*live, next(i for i in range(embedding.shape[0]) if i not in live)]
 
 
 def _slowest_layer(stack: Stack, embedding: FloatArray, area: float) -> FloatArray:
@@ -212,8 +219,7 @@ def _initial_state(
     inverse = 1.0 / model.area0
     if stack.gap is not None:
         inverse, _ = inverse_area(abs(float(u[stack.gap])), model.curve)
-    _, _, _, embedding = stack.matrices()
-    live = [int(np.argmax(embedding[:, j] == 1.0)) for j in range(n - 1)]
+    live = _state_order(stack.matrices()[-1])[:-1]
     x = v[live] / (model.area0 * inverse if model.mobile else 1.0)
     state = state_from(model, 0.0, x, u_before, law)
     if stack.gap is not None:

@@ -5,7 +5,9 @@ State y = [x (n,) in volt, z in coulomb]. With q = 1/A, the reference area A_0 a
     local    v = x            x' = f          z' = A (lam + U'/S)    charge through the terminals
     mobile   v = x A_0 q      x' = f A / A_0  z' = A lam             charge is A U / S + z
 
-where [f, lam] = (p1 + q p0) v + (b[0] + q b[1]) U. Only z' needs the slope of the source.
+where h_x = (rate_x + q rate0_x) u_x is the leak of layer x over its capacitance, f_x = k_x sum(h) - h_x and
+lam = sum(h) / S. Leaks are taken from layer voltages, not from one matrix: what cancels in a layer that leaks fast
+then cancels in every row alike. Only z' needs the slope of the source.
 """
 
 from __future__ import annotations
@@ -32,10 +34,11 @@ class Model(NamedTuple):
         Charge law.
     coupled : bool
         Whether the area follows the gap voltage; then steps end on its zeros.
-    p1, p0 : ndarray, shape (n + 1, n)
-        Rates that do not depend on the area (1/s), and those over 1/A (m^2/s); last row: lam.
-    b : ndarray, shape (2, n + 1)
-        The same split of the columns that multiply U.
+    k : ndarray, shape (n + 1,)
+        Share of a jump of U that each layer takes. The first n layers' voltages over k U are the state; the last
+        layer's is minus their sum.
+    rate, rate0 : ndarray, shape (n + 1,)
+        Leak rate of each layer: the part that does not depend on the area (1/s), and that over 1/A (m^2/s).
     k_gap : float
         Share of a jump of U that the gap takes.
     gap : ndarray, shape (n,)
@@ -55,9 +58,9 @@ class Model(NamedTuple):
 
     mobile: bool
     coupled: bool
-    p1: FloatArray
-    p0: FloatArray
-    b: FloatArray
+    k: FloatArray
+    rate: FloatArray
+    rate0: FloatArray
     k_gap: float
     gap: FloatArray
     s: float
@@ -262,15 +265,18 @@ def right_hand_side(
     u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), sign, guess)
     q, _ = branch_area(model, sign, u)
     scale = model.area0 * q if model.mobile else 1.0
-    for i in range(n + 1):
-        value = 0.0
-        for j in range(n):
-            value += (model.p1[i, j] + q * model.p0[i, j]) * y[j]
-        out[i] = value + (model.b[0, i] + q * model.b[1, i]) * u_source / scale
-    if model.mobile:
-        out[n] *= model.area0
-    else:
-        out[n] = (out[n] + du_source / model.s) / q
+    rest = 0.0
+    total = 0.0
+    for i in range(n):
+        rest -= y[i]
+        leak = (model.rate[i] + q * model.rate0[i]) * (model.k[i] * u_source + y[i] * scale)
+        out[i] = -leak
+        total += leak
+    total += (model.rate[n] + q * model.rate0[n]) * (model.k[n] * u_source + rest * scale)
+    for i in range(n):
+        out[i] = (out[i] + model.k[i] * total) / scale
+    lam = total / model.s
+    out[n] = lam / q if model.mobile else (lam + du_source / model.s) / q
     return u
 
 
@@ -301,15 +307,27 @@ def jacobian(model: Model, u_source: float, y: FloatArray, sign: float, guess: f
     x_gap = dot(model.gap, y)
     u = gap_voltage(model, model.k_gap * u_source, x_gap, sign, guess)
     q, dq = branch_area(model, sign, u)
-    area0 = model.area0
-    du = area0 * q / (1.0 - x_gap * area0 * dq) if model.mobile else 1.0
+    scale = model.area0 * q if model.mobile else 1.0
+    # dq/dx_j = slope gap_j, through the area equation under `mobile`.
+    slope = dq * (scale / (1.0 - x_gap * model.area0 * dq) if model.mobile else 1.0)
+    by_q = np.empty(n + 1)
+    total = 0.0
+    rest = 0.0
+    for i in range(n + 1):
+        x = y[i] if i < n else rest
+        rest -= x
+        voltage = model.k[i] * u_source + x * scale
+        # d(leak / scale)/dq at fixed x; leak / scale = rate (k U / scale + x).
+        by_q[i] = model.rate0[i] * voltage / scale
+        if model.mobile:
+            by_q[i] -= (model.rate[i] + q * model.rate0[i]) * model.k[i] * u_source / (scale * q)
+        total += by_q[i]
+    last = model.rate[n] + q * model.rate0[n]
     for i in range(n):
-        # Sensitivity of x' to q at fixed x, then of q to x.
-        by_q = -model.b[0, i] * u_source / (q * q * area0) if model.mobile else model.b[1, i] * u_source
+        sensitivity = (model.k[i] * total - by_q[i]) * slope
         for j in range(n):
-            by_q += model.p0[i, j] * y[j]
-        for j in range(n):
-            out[i, j] = model.p1[i, j] + q * model.p0[i, j] + by_q * dq * du * model.gap[j]
+            out[i, j] = model.k[i] * (model.rate[j] + q * model.rate0[j] - last) + sensitivity * model.gap[j]
+        out[i, i] -= model.rate[i] + q * model.rate0[i]
 
 
 @jit

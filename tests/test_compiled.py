@@ -1,0 +1,43 @@
+"""The cache of compiled code: a change of any source empties it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import fingerspice
+
+PACKAGE = Path(fingerspice.__file__).parent
+
+
+def area_at_zero_volt(folder):
+    # numba would look in the user's own cache where the package's cannot be written; here it can.
+    code = (
+        "from fingerspice.physics.contact import ridge_area, Contact\n"
+        "c = Contact(3.5e-6, 1.0, 0.5, 0.3, 54.4e-6, 0.52, 32e-6 * 1e3**1.41, 1.41, 5e-9)\n"
+        "print(repr(ridge_area(0.0, c.pack())))"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {"PYTHONPATH": str(folder)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    return float(done.stdout)
+
+
+def test_a_change_of_one_source_reaches_the_compiled_code_of_another(tmp_path):
+    copy = tmp_path / "fingerspice"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    before = area_at_zero_volt(tmp_path)
+    assert list(copy.rglob("*.nbc")), "nothing was cached, so this test would prove nothing"
+    # `ridge_area` stays as it is; only the decorator's module changes, as any other might.
+    stamp = copy / "__pycache__" / "compiled.stamp"
+    with (copy / "numerics" / "small.py").open("a") as source:
+        source.write("\n# changed\n")
+    written = stamp.stat().st_mtime_ns
+    assert area_at_zero_volt(tmp_path) == before
+    assert stamp.stat().st_mtime_ns > written
+    newest = max(p.stat().st_mtime_ns for p in copy.rglob("*.nbc"))
+    oldest = min(p.stat().st_mtime_ns for p in copy.rglob("*.nbc"))
+    assert oldest > written, "a cache file from before the change is still there"
+    assert newest >= oldest
