@@ -149,6 +149,7 @@ def run(
         note_skin_frequency(circuit)
         data = out / f"{deck.stem}.{'csv' if csv else 'nc'}"
         check_output(data, deck)
+        _announce_compilation()
         with _progress() as progress:
             solution = simulate(
                 circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method, throw=False,
@@ -167,6 +168,14 @@ def run(
             print(f"wrote {file}")
     if not solution.success:
         raise SolveError(solution.message, solution)
+
+
+def _announce_compilation() -> None:
+    """Say why the first run takes long."""
+    from fingerspice.compiled import is_first_use
+
+    if is_first_use():
+        print("fingerspice: first use here: compiling, about 20 s; later runs take 2 s", file=sys.stderr)
 
 
 def _write_run(solution: Solution, data: Path, picture: Path | None) -> list[Path]:
@@ -255,6 +264,7 @@ def compare(
         picture = out / f"{deck.stem}_compare.png"
         if not no_plot:
             check_output(picture, deck)
+        _announce_compilation()
         result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
     if not no_plot:
         from fingerspice.plotting import plot_comparison, save

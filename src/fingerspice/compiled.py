@@ -6,6 +6,7 @@ a change of one file it would go on running the old code of the others.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from numba import njit
@@ -33,3 +34,8 @@ def _drop_stale_cache() -> None:
 _drop_stale_cache()
 # A division by zero is an infinity that the step control refuses, not an exception out of compiled code.
 jit = njit(cache=True, error_model="numpy")
+
+
+def is_first_use() -> bool:
+    """Whether nothing has been compiled here yet: the first run then takes about 20 s longer."""
+    return os.access(_PACKAGE, os.W_OK) and not any((_PACKAGE / "engine").rglob("*.nbc"))

@@ -101,7 +101,7 @@ def caption(figure: Figure, text: str, color: str = GREY) -> None:
     small.set_parse_math(False)
 
 
-def save(figure: Figure, path: str | Path, *, dpi: float = 200.0) -> Path:
+def save(figure: Figure, path: str | Path, *, dpi: float = 160.0) -> Path:
     """Write a figure as PNG; the file is whole or absent.
 
     Parameters
@@ -116,7 +116,9 @@ def save(figure: Figure, path: str | Path, *, dpi: float = 200.0) -> Path:
     InputError
         Where the folder cannot be written.
     """
-    return write_aside(Path(path), lambda target: figure.savefig(target, format="png", dpi=dpi))
+    return write_aside(
+        Path(path), lambda target: figure.savefig(target, format="png", dpi=dpi, pil_kwargs={"compress_level": 3})
+    )
 
 
 def engineering(peak: float, unit: str, least: float = 1.0) -> tuple[float, str]:
