@@ -259,7 +259,13 @@ def _message(problem: Problem, run: Run) -> str:
     if run.detail:
         text += f" ({run.detail})"
     if run.status is Status.ERROR_NOT_MET:
-        text += f" (estimate {run.error.u_gap:.3g} V of {run.peak_u:.3g} V peak)"
+        text += f" (estimate {run.error.u_gap:.3g} V of {run.peak_u:.3g} V peak"
+        source = problem.waveform.peak(problem.t_start, problem.t_stop)
+        if run.peak_u < 1e-4 * source:
+            text += (
+                f"; the gap takes almost nothing of the {source:.3g} V of the source, and rounding of these limits it"
+            )
+        text += ")"
     return text
 
 
