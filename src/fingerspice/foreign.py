@@ -258,10 +258,7 @@ def solve_foreign(problem: Problem, library: str, name: str, rtol: float, t_out:
             if reference.status is Status.FOLD:
                 run.status, run.t_failed = reference.status, reference.t_failed
             return run
-        worst = max(
-            run.error.u_gap / (rtol * run.peak_u) if run.peak_u > 0.0 else 0.0,
-            run.error.f_el / (rtol * run.peak_f) if run.peak_f > 0.0 else 0.0,
-        )
+        worst = run.excess(rtol)
         if worst <= 1.0:
             return run
         tol = max(tol * min(0.3, 0.5 / worst), 1e-16)

@@ -52,6 +52,13 @@ class Run:
     last: FloatArray | None = None
     """Row at the time a failed run reached, left-hand."""
 
+    def excess(self, rtol: float) -> float:
+        """Estimated error over the one asked for, the larger of voltage and force."""
+        return max(
+            self.error.u_gap / (rtol * self.peak_u) if self.peak_u > 0.0 else 0.0,
+            self.error.f_el / (rtol * self.peak_f) if self.peak_f > 0.0 else 0.0,
+        )
+
 
 @dataclass
 class _Track:
@@ -368,10 +375,7 @@ def solve(
         run.nfev = nfev
         if run.status is not Status.SUCCESS:
             return run
-        worst = max(
-            run.error.u_gap / (rtol * run.peak_u) if run.peak_u > 0.0 else 0.0,
-            run.error.f_el / (rtol * run.peak_f) if run.peak_f > 0.0 else 0.0,
-        )
+        worst = run.excess(rtol)
         if worst <= 1.0:
             return run
         if rtol * run.peak_u < ROUNDING * u_scale:
