@@ -8,8 +8,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 from numba import njit
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -34,6 +38,28 @@ def _drop_stale_cache() -> None:
 _drop_stale_cache()
 # A division by zero is an infinity that the step control refuses, not an exception out of compiled code.
 jit = njit(cache=True, error_model="numpy")
+# For loops over the rows of a step: fused, so that they vectorise; and where sums may be reordered (always alike).
+jit_fused = njit(cache=True, error_model="numpy", fastmath={"contract"})
+jit_rows = njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+# Put into its caller before compilation: handing over twenty arrays would cost as much as the work.
+jit_inline = njit(cache=True, error_model="numpy", inline="always")
+
+
+@intrinsic
+def borrow(typing: Any, array: Any) -> Any:
+    """The same array without a count of its users, which would be an atomic operation at every view.
+
+    The array given must outlive the one returned: borrow only arguments of the function, never what it allocates,
+    for that is freed after its last use by name.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        view = make_array(signature.args[0])(context, builder, values[0])
+        view.meminfo = cgutils.get_null_value(view.meminfo.type)
+        view.parent = cgutils.get_null_value(view.parent.type)
+        return view._getvalue()
+
+    return array(array), generate
 
 
 def is_first_use() -> bool:

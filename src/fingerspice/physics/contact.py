@@ -118,7 +118,7 @@ class Contact:
         """
         packed = self.pack()
         # The continuation exists while 1 + x y^p > 0; x = -0.2 is well inside for every legal exponent pair.
-        lo, hi = -min(0.1 * u_max, 0.2 / packed[0]), u_max
+        lo, hi = -min(0.3 * u_max, 0.2 / packed[0]), u_max
         series = chebyshev.fit(lambda u: 1.0 / np.asarray(ridge_area_array(u, packed)), lo, hi, 2e-15, (16, 24, 32, 48))
         return np.concatenate([[lo, hi], packed, [] if series is None else series])
 

@@ -1,0 +1,93 @@
+"""diffrax on JAX in double precision: the whole run in one compiled function, its compilation timed apart.
+
+Source jumps are segments of a scan; zeros of the gap voltage are `jump_ts` of the step controller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from peers.contest import Contestant, NotSolvedError, Outcome, Plan, installed, tolerances
+from problems import AMPLITUDE
+from right_hand_side import compiled, local_rates
+
+LIBRARY = "diffrax"
+MAX_STEPS = 3_000_000
+"""Of a run: at most, a method that is not for stiff problems then gives up within the time limit."""
+
+
+def version() -> str | None:
+    """Installed versions of diffrax and jaxlib."""
+    found, jaxlib = installed("diffrax"), installed("jaxlib")
+    return None if found is None or jaxlib is None else f"diffrax {found}, jaxlib {jaxlib}"
+
+
+def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
+    def setup(plan: Plan) -> Callable[[float], Outcome]:
+        import diffrax
+        import jax
+        import jax.numpy as jnp
+
+        jax.config.update("jax_enable_x64", True)
+        rates, _ = local_rates(plan.problem.constants, plan.problem.drive, jnp.sin)
+        solver = getattr(diffrax, method)()
+        # Where the source jumps the gap voltage does, and passes no zero in between.
+        segments = plan.problem.pieces(plan.periods)
+        zeros = jnp.asarray(plan.zeros) if plan.zeros and len(segments) == 1 else None
+
+        def rhs(t, x, level):  # type: ignore[no-untyped-def]
+            return jnp.stack(rates(t, x[0], x[1], 0.0, level))
+
+        term = diffrax.ODETerm(rhs)
+
+        @jax.jit
+        def solve(rtol, starts, stops, levels, times):  # type: ignore[no-untyped-def]
+            def piece(x, given):  # type: ignore[no-untyped-def]
+                start, stop, level, t = given
+                control = diffrax.PIDController(rtol=rtol, atol=rtol * AMPLITUDE)
+                if zeros is not None:
+                    control = diffrax.ClipStepSizeController(control, jump_ts=zeros)
+                run = diffrax.diffeqsolve(
+                    term, solver, start, stop, None, x, level, stepsize_controller=control, throw=False,
+                    saveat=diffrax.SaveAt(ts=t, t1=True), max_steps=MAX_STEPS,
+                )  # fmt: skip
+                good = diffrax.is_okay(run.result)
+                return run.ys[-1], (run.ys[:-1], run.stats["num_steps"], good)
+
+            return jax.lax.scan(piece, jnp.zeros(2), (starts, stops, levels, times))
+
+        given = (
+            np.array([p.t0 for p in segments]),
+            np.array([p.t1 for p in segments]),
+            np.array([p.level for p in segments]),
+            plan.t_eval.reshape(len(segments), -1),
+        )
+        observe = compiled(plan.problem).observe
+        # Evaluations of a step: stages, less the one that first-same-as-last methods keep. Those of Newton's
+        # iterations are not counted by diffrax.
+        per_step = {"Tsit5": 6, "Dopri8": 13}.get(method)
+
+        def run(rtol: float) -> Outcome:
+            _, (states, steps, good) = solve(rtol, *given)
+            if not bool(good.all()):
+                raise NotSolvedError(f"gave up (most steps allowed: {MAX_STEPS})")
+            nfev = None if per_step is None else per_step * int(steps.sum())
+            return Outcome(*observe(plan.u_source, np.asarray(states).reshape(-1, 2)), nfev)
+
+        return run
+
+    return setup
+
+
+def contestants() -> list[Contestant]:
+    """Two explicit methods and a stiff one, each also restarted at the zeros of the gap voltage."""
+    ranges = {"Tsit5": (2, 12), "Dopri8": (2, 13), "Kvaerno5": (2, 11)}
+    return [
+        Contestant(
+            f"diffrax {method}" + (" +kinks" if kinks else ""), LIBRARY, tolerances(*span), _setup(method), kinks=kinks
+        )
+        for method, span in ranges.items()
+        for kinks in (False, True)
+    ]

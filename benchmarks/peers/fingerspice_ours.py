@@ -1,0 +1,46 @@
+"""This package, as a user calls it: preparation, error estimate and every output array included."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import fingerspice as fs
+from peers.contest import Contestant, Outcome, Plan, installed, tolerances
+from problems import Problem
+
+LIBRARY = "fingerspice"
+METHODS = ("auto",)
+
+
+def version() -> str | None:
+    """Installed version."""
+    return installed("fingerspice")
+
+
+def ours(problem: Problem, rtol: float, method: str, plan: Plan, circuit: fs.Circuit) -> Outcome:
+    """One run of a problem."""
+    run = fs.simulate(
+        circuit, t_stop=plan.t_stop, t_eval=plan.t_eval, rtol=rtol, method=method, charge_law=problem.law
+    )
+    assert run.u_gap is not None
+    assert run.f_el is not None
+    return Outcome(run.u_gap, run.f_el, run.nfev)
+
+
+def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
+    def setup(plan: Plan) -> Callable[[float], Outcome]:
+        circuit = plan.problem.circuit()
+        return lambda rtol: ours(plan.problem, rtol, method, plan, circuit)
+
+    return setup
+
+
+def contestants() -> list[Contestant]:
+    """Our methods; `auto` is what a user gets without asking."""
+    return [
+        Contestant(
+            "fingerspice" if method == "auto" else f"fingerspice {method}",
+            LIBRARY, tolerances(2, 12), _setup(method), mobile=True,
+        )
+        for method in METHODS
+    ]  # fmt: skip

@@ -1,0 +1,91 @@
+"""scipy: solve_ivp on the compiled right-hand side, one call a piece; LSODA through odeint, which is the faster way."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+from scipy.integrate import odeint, solve_ivp
+
+from peers.contest import Contestant, NotSolvedError, Outcome, Plan, installed, tolerances
+from problems import AMPLITUDE
+from right_hand_side import compiled
+
+LIBRARY = "scipy"
+IMPLICIT = ("Radau", "BDF")
+
+
+def version() -> str | None:
+    """Installed version."""
+    return installed("scipy")
+
+
+def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
+    def setup(plan: Plan) -> Callable[[float], Outcome]:
+        rhs = compiled(plan.problem)
+        extra = {"jac": rhs.jacobian} if method in IMPLICIT else {}
+        times = [np.append(plan.t_eval[p.first : p.last], p.t1) for p in plan.pieces]
+
+        def run(rtol: float) -> Outcome:
+            states = np.empty((plan.t_eval.size, 2))
+            x, nfev = np.zeros(2), 0
+            for piece, t in zip(plan.pieces, times, strict=True):
+                # A trial step far too long may overflow; its step control shortens it.
+                with np.errstate(all="ignore"):
+                    result = solve_ivp(
+                        rhs.rates, (piece.t0, piece.t1), x, method, t, args=(piece.sign, piece.level),
+                        rtol=max(rtol, 3e-14), atol=rtol * AMPLITUDE, **extra,
+                    )  # fmt: skip
+                if not result.success:
+                    raise NotSolvedError(result.message)
+                states[piece.first : piece.last] = result.y.T[:-1]
+                x = result.y[:, -1]
+                # The differences of a Jacobian beside the rate itself.
+                nfev += result.nfev + 3 * result.njev
+            return Outcome(*rhs.observe(plan.u_source, states), nfev)
+
+        return run
+
+    return setup
+
+
+def _setup_odeint(plan: Plan) -> Callable[[float], Outcome]:
+    rhs = compiled(plan.problem)
+    times = [np.concatenate([[p.t0], plan.t_eval[p.first : p.last], [p.t1]]) for p in plan.pieces]
+
+    def run(rtol: float) -> Outcome:
+        states = np.empty((plan.t_eval.size, 2))
+        x, nfev = np.zeros(2), 0
+        for piece, t in zip(plan.pieces, times, strict=True):
+            with warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always")
+                y, info = odeint(
+                    rhs.rates, x, t, args=(piece.sign, piece.level), tfirst=True, full_output=True,
+                    rtol=rtol, atol=rtol * AMPLITUDE, mxstep=10_000_000,
+                )  # fmt: skip
+            if said:
+                raise NotSolvedError(str(said[0].message).splitlines()[0])
+            states[piece.first : piece.last] = y[1:-1]
+            x = y[-1]
+            nfev += int(info["nfe"][-1])
+        return Outcome(*rhs.observe(plan.u_source, states), nfev)
+
+    return run
+
+
+def contestants() -> list[Contestant]:
+    """Five methods, each also restarted at the zeros of the gap voltage."""
+    ranges = {"RK45": (2, 11), "DOP853": (2, 12.5), "Radau": (2, 11), "BDF": (2, 11), "LSODA": (2, 12.5)}
+    return [
+        Contestant(
+            f"scipy {method}" + (" +kinks" if kinks else ""),
+            LIBRARY,
+            tolerances(*span, 2 / 3),
+            _setup_odeint if method == "LSODA" else _setup(method),
+            kinks=kinks,
+            mobile=True,
+        )
+        for method, span in ranges.items()
+        for kinks in (False, True)
+    ]

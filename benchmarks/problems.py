@@ -1,0 +1,324 @@
+"""The problems of the benchmarks, each defined once: scene, source, outputs, and where to split.
+
+All start uncharged at t = 0 with Table 1's finger and the skin frozen at one frequency. Squares have ideal jumps.
+Outputs stand half an output spacing beside the jumps, so that no contestant is asked which side it means.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import chebyshev, polynomial
+from numpy.typing import NDArray
+
+import fingerspice as fs
+from fingerspice.circuit.statespace import build_stack
+
+FloatArray = NDArray[np.float64]
+DECK = Path(__file__).resolve().parent.parent / "circuits" / "fingerpad.cir"
+AMPLITUDE = 200.0
+OUTPUTS_PER_PERIOD = 100
+SERIES_ERROR = 1e-14
+
+Drive = Callable[[Callable[[Any], Any]], Callable[[Any, Any], Any]]
+"""Takes a library's sine and returns U(t, level) in V for it; `level` (V) is what a square holds on a piece."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A smooth stretch of a run, as peers are given it.
+
+    Attributes
+    ----------
+    t0, t1 : float
+        s.
+    level : float
+        Voltage of a square on it, V.
+    sign : float
+        Sign of the gap voltage where the piece ends on its zeros; 0 where it may cross them.
+    first, last : int
+        Its outputs are t_eval[first:last].
+    """
+
+    t0: float
+    t1: float
+    level: float
+    sign: float
+    first: int
+    last: int
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A scene to be integrated.
+
+    Attributes
+    ----------
+    name, title : str
+        Key in the results, and what it is called in tables.
+    waveform : fs.Waveform
+        Of the source, V.
+    drive : Drive
+        The same for peers.
+    ngspice : str
+        The same as ngspice's source.
+    skin_frequency : float
+        Where the skin is evaluated, Hz.
+    period : float
+        What one period is in "per period", s.
+    periods : int
+        Length of the run.
+    law : str
+        Charge law.
+    r_coat : float
+        Resistance of the coating, ohm.
+    divisible : bool
+        Whether a shorter run costs the same per period, so that slow peers may be given one.
+    stiff : bool
+    reach : float
+        No gap voltage of the problem is larger, V.
+    """
+
+    name: str
+    title: str
+    waveform: fs.Waveform
+    drive: Drive
+    ngspice: str
+    skin_frequency: float
+    period: float
+    periods: int
+    law: str = "local"
+    r_coat: float = 2e5
+    divisible: bool = True
+    stiff: bool = False
+    reach: float = AMPLITUDE
+
+    def t_stop(self, periods: int) -> float:
+        """End of a run of so many periods, s."""
+        return periods * self.period
+
+    def t_eval(self, periods: int) -> FloatArray:
+        """Output times, s, shape (periods * OUTPUTS_PER_PERIOD,)."""
+        return (np.arange(periods * OUTPUTS_PER_PERIOD) + 0.5) * (self.period / OUTPUTS_PER_PERIOD)
+
+    def circuit(self) -> fs.Circuit:
+        """The netlist of this problem."""
+        text = DECK.read_text(encoding="utf-8")
+        if self.law == "mobile":
+            text = text.replace(".include fingerspice.lib", ".include fingerspice_mobile.lib")
+        circuit = fs.parse_netlist(text)
+        return circuit.replace(
+            {"Vdrive": self.waveform, "Xskin.f": self.skin_frequency, "Xcoat.r": self.r_coat},
+        )
+
+    @cached_property
+    def constants(self) -> Constants:
+        """What a right-hand side needs to know."""
+        return constants(self.circuit(), self.reach)
+
+    def pieces(self, periods: int, zeros: Sequence[float] = (), signs: Sequence[float] = ()) -> tuple[Piece, ...]:
+        """The run, split at the source's jumps and, where they are given, at the zeros of the gap voltage.
+
+        `signs` holds the sign of the gap voltage on every piece of the whole run.
+        """
+        stop = self.t_stop(periods)
+        edges = split_times(self, periods, zeros)
+        outputs = np.searchsorted(self.t_eval(periods), edges)
+        level = self.waveform.value(0.5 * (edges[1:] + edges[:-1]))
+        side = list(signs) if len(signs) else [0.0] * (edges.size - 1)
+        return tuple(
+            Piece(float(edges[i]), min(float(edges[i + 1]), stop), float(level[i]), float(side[i]),
+                  int(outputs[i]), int(outputs[i + 1]))
+            for i in range(edges.size - 1)
+        )  # fmt: skip
+
+
+def split_times(problem: Problem, periods: int, zeros: Sequence[float] = ()) -> FloatArray:
+    """Start, jumps, zeros of the gap voltage inside, and end of a run, s, ascending."""
+    stop = problem.t_stop(periods)
+    jumps = problem.waveform.breakpoints(0.0, stop)
+    inner = np.unique(np.concatenate([jumps, np.asarray(zeros, float)]))
+    # A zero within rounding of a jump or an end is that jump or end.
+    inner = inner[(inner > 1e-12 * stop) & (inner < stop * (1.0 - 1e-12))]
+    keep = np.concatenate([[True], np.diff(inner) > 1e-12 * stop]) if inner.size else np.empty(0, bool)
+    return np.concatenate([[0.0], inner[keep], [stop]])
+
+
+@dataclass(frozen=True)
+class Constants:
+    """A three-layer stack (coating, gap, skin) as numbers.
+
+    Attributes
+    ----------
+    k : tuple of float
+        Share of a jump of the source that each layer takes.
+    fixed, per_area : tuple of float
+        Rates at which each layer leaks: fixed + per_area / A_R, 1/s and m^2/s.
+    series : tuple of float
+        Power series of 1/A_R (1/m^2) in 2 |u_gap| / `reach` - 1, within `SERIES_ERROR` to `reach`.
+    reach : float
+        V.
+    area0 : float
+        A_R at 0 V, m^2.
+    stress : float
+        sigma_el / u_gap^2, Pa/V^2.
+    """
+
+    k: tuple[float, float, float]
+    fixed: tuple[float, float, float]
+    per_area: tuple[float, float, float]
+    series: tuple[float, ...]
+    reach: float
+    area0: float
+    stress: float
+
+
+def constants(circuit: fs.Circuit, reach: float) -> Constants:
+    """Numbers of a circuit's stack, taken from the package; the area's series reaches to `reach` (V).
+
+    Raises
+    ------
+    ValueError
+        Where no series up to degree 24 reaches `SERIES_ERROR`.
+    """
+    stack = build_stack(circuit)
+    assert stack.contact is not None
+    assert stack.gap == 1
+    contact = stack.contact
+    check = np.linspace(-1.0, 1.0, 4001)
+    exact = 1.0 / contact.area(0.5 * reach * (check + 1.0))
+    for degree in range(8, 25):
+        fit = chebyshev.chebinterpolate(lambda x: 1.0 / contact.area(0.5 * reach * (x + 1.0)), degree)
+        # Powers for Horner's rule, which compilers do best: on [-1, 1], with decaying coefficients, no digit is lost.
+        series = chebyshev.cheb2poly(fit)
+        if np.abs(polynomial.polyval(check, series) / exact - 1.0).max() <= SERIES_ERROR:
+            return Constants(
+                k=tuple(stack.k.tolist()),
+                fixed=tuple((stack.g_area / stack.c).tolist()),
+                per_area=tuple((stack.g_total / stack.c).tolist()),
+                series=tuple(series.tolist()),
+                reach=reach,
+                area0=float(contact.area(0.0)),
+                stress=float(contact.stress(1.0)),
+            )
+    raise ValueError(f"1/A_R has no series of degree 24 or less within {SERIES_ERROR:g} to {reach:g} V")
+
+
+def _sine(frequency: float) -> Drive:
+    omega = 2.0 * math.pi * frequency
+
+    def bind(sin: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
+        def u(t: Any, level: Any) -> Any:
+            return AMPLITUDE * sin(omega * t)
+
+        return u
+
+    return bind
+
+
+def _held(sin: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
+    def u(t: Any, level: Any) -> Any:
+        return level
+
+    return u
+
+
+def _modulated(carrier: float, envelope: float) -> Drive:
+    fast, slow = 2.0 * math.pi * carrier, 2.0 * math.pi * envelope
+
+    def bind(sin: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
+        def u(t: Any, level: Any) -> Any:
+            return 0.5 * AMPLITUDE * (1.0 + sin(slow * t)) * sin(fast * t)
+
+        return u
+
+    return bind
+
+
+def _chirp(f0: float, f1: float, duration: float) -> Drive:
+    start, rise = 2.0 * math.pi * f0, math.pi * (f1 - f0) / duration
+
+    def bind(sin: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
+        def u(t: Any, level: Any) -> Any:
+            return AMPLITUDE * sin((start + rise * t) * t)
+
+        return u
+
+    return bind
+
+
+def _square_text(frequency: float) -> str:
+    # Edges of 1 ns centred on the jumps: 1e-9 of the peak away from ideal ones.
+    half, edge = 0.5 / frequency, 1e-9
+    times = f"{half - 0.5 * edge!r} {edge!r} {edge!r} {half - edge!r} {2.0 * half!r}"
+    return f"PULSE({AMPLITUDE!r} {-AMPLITUDE!r} {times})"
+
+
+def _scene(kind: str, frequency: float, law: str = "local") -> Problem:
+    square = kind == "square"
+    label = f"{frequency:g} Hz" if frequency < 1e3 else f"{frequency / 1e3:g} kHz"
+    return Problem(
+        name=f"{kind}_{label.replace(' ', '')}" + ("" if law == "local" else f"_{law}"),
+        title=f"{kind} {label}",
+        waveform=fs.Square(AMPLITUDE, frequency) if square else fs.Sine(AMPLITUDE, frequency),
+        drive=_held if square else _sine(frequency),
+        ngspice=_square_text(frequency) if square else f"SIN(0 {AMPLITUDE!r} {frequency!r})",
+        skin_frequency=frequency,
+        period=1.0 / frequency,
+        periods=20 if frequency < 1e3 else 100,
+        law=law,
+        # After a jump the gap holds what it was charged to, and more.
+        reach=1.3 * AMPLITUDE if square else AMPLITUDE,
+    )
+
+
+SCENES = (("sine", 100.0), ("square", 100.0), ("sine", 5000.0), ("square", 5000.0))
+_AM = Problem(
+    name="am_5kHz",
+    title="5 kHz, envelope 50 Hz",
+    waveform=fs.AM(AMPLITUDE, 5000.0, 50.0),
+    drive=_modulated(5000.0, 50.0),
+    ngspice=f"{{{0.5 * AMPLITUDE!r}*(1+sin({2 * math.pi * 50.0!r}*time))*sin({2 * math.pi * 5000.0!r}*time)}}",
+    skin_frequency=5000.0,
+    period=2e-4,
+    periods=100,
+    divisible=False,
+)
+_CHIRP = Problem(
+    name="chirp",
+    title="chirp 20 Hz to 20 kHz",
+    waveform=fs.Chirp(AMPLITUDE, 20.0, 20e3, 0.04),
+    drive=_chirp(20.0, 20e3, 0.04),
+    ngspice=f"{{{AMPLITUDE!r}*sin(({2 * math.pi * 20.0!r}+{math.pi * 19980.0 / 0.04!r}*time)*time)}}",
+    skin_frequency=1000.0,
+    period=1e-3,
+    periods=40,
+    divisible=False,
+)
+_STIFF = Problem(
+    name="stiff",
+    title="sine 100 Hz, R_i = 1 ohm",
+    waveform=fs.Sine(AMPLITUDE, 100.0),
+    drive=_sine(100.0),
+    ngspice=f"SIN(0 {AMPLITUDE!r} 100.0)",
+    skin_frequency=100.0,
+    period=0.01,
+    periods=20,
+    r_coat=1.0,
+    stiff=True,
+)
+
+LOCAL = (*(_scene(*scene) for scene in SCENES), _AM, _CHIRP, _STIFF)
+MOBILE = tuple(_scene(*scene, law="mobile") for scene in SCENES)
+
+
+@lru_cache(maxsize=1)
+def by_name() -> dict[str, Problem]:
+    """All problems, `local` ones first."""
+    return {problem.name: problem for problem in (*LOCAL, *MOBILE)}

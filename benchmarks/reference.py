@@ -1,0 +1,139 @@
+"""Reference solutions of the benchmark problems, by two methods that share no formula.
+
+One is the collocation of `tests/analytic.py`, written from the paper's equations. The other integrates the peers'
+right-hand side, split at jumps and at the zeros of the gap voltage, at the tightest tolerance: DOP853, or Radau where
+the problem is stiff. Where they disagree, both may be wrong by that much: no error below it is claimed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import sys
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from problems import Problem, split_times
+from right_hand_side import compiled
+
+FloatArray = NDArray[np.float64]
+HERE = Path(__file__).resolve().parent
+ANALYTIC = HERE.parent / "tests" / "analytic.py"
+CACHE = HERE / ".cache"
+AGREEMENT = 1e-12
+"""Relative to the peak: what two methods are asked to agree to."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What is right, at the outputs of a problem's whole run.
+
+    Attributes
+    ----------
+    u_gap, f_el : ndarray, shape (n,)
+        V and N.
+    zeros : ndarray
+        Times of the zeros of the gap voltage, s.
+    signs : ndarray
+        Its sign on each of the pieces between jumps and zeros.
+    agreement : float
+        Largest difference of the two methods over the peak, of voltage or force.
+    second : str
+        The method beside the collocation.
+    """
+
+    u_gap: FloatArray
+    f_el: FloatArray
+    zeros: FloatArray
+    signs: FloatArray
+    agreement: float
+    second: str
+
+    def errors(self, u_gap: FloatArray, f_el: FloatArray) -> tuple[float, float]:
+        """Largest errors of voltage and force over their peaks, of a run that may be shorter than this one."""
+        n = u_gap.size
+        return (
+            float(np.abs(u_gap - self.u_gap[:n]).max() / np.abs(self.u_gap).max()),
+            float(np.abs(f_el - self.f_el[:n]).max() / np.abs(self.f_el).max()),
+        )
+
+
+@lru_cache(maxsize=1)
+def _analytic() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("benchmark_analytic", ANALYTIC)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    # Its dataclasses look their module up by name.
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def _collocation(problem: Problem) -> Reference:
+    analytic = _analytic()
+    u = problem.drive(np.sin)
+    segments = [
+        (piece.t0, piece.t1, lambda t, level=piece.level: u(np.asarray(t), level) + 0.0 * np.asarray(t))
+        for piece in problem.pieces(problem.periods)
+    ]
+    run = analytic.transient(
+        segments,
+        problem.t_eval(problem.periods),
+        law=problem.law,
+        freq=problem.skin_frequency,
+        params=replace(analytic.TABLE1, r_i=problem.r_coat),
+    )
+    zeros = np.asarray(run.zeros)
+    edges = split_times(problem, problem.periods, zeros)
+    signs = np.sign(run.at(0.5 * (edges[1:] + edges[:-1])).u_gap)
+    return Reference(run.u_gap, run.force, zeros, signs, np.inf, "")
+
+
+def _peers_way(problem: Problem, zeros: FloatArray, signs: FloatArray) -> tuple[FloatArray, FloatArray, str]:
+    rhs = compiled(problem)
+    method = "Radau" if problem.stiff else "DOP853"
+    rtol = 1e-13 if problem.stiff else 3e-14
+    t_eval = problem.t_eval(problem.periods)
+    states = np.empty((t_eval.size, 2))
+    x = np.zeros(2)
+    for piece in problem.pieces(problem.periods, zeros, signs):
+        times = np.append(t_eval[piece.first : piece.last], piece.t1)
+        args = (piece.sign, piece.level)
+        extra = {"jac": rhs.jacobian} if problem.stiff else {}
+        # Short steps, because outputs come from the interpolant, whose order is lower than the steps'.
+        run = solve_ivp(rhs.rates, (piece.t0, piece.t1), x, method, times, args=args, rtol=rtol, atol=1e-14 * 200.0,
+                        max_step=(piece.t1 - piece.t0) / 12.0, **extra)  # fmt: skip
+        states[piece.first : piece.last] = run.y.T[:-1]
+        x = run.y[:, -1]
+    u_source = problem.waveform.value(t_eval)
+    return (*rhs.observe(u_source, states), f"{method} at rtol {rtol:g}")
+
+
+def reference(problem: Problem, second: bool = True) -> Reference:
+    """The reference of a problem, from the cache where nothing that decides it has changed.
+
+    `second` False leaves the second method out (for short checks); nothing is kept then.
+    """
+    if not second:
+        return _collocation(problem)
+    files = (ANALYTIC, HERE / "problems.py", HERE / "right_hand_side.py", Path(__file__))
+    text = "\n".join([problem.name, repr(problem), *(f.read_text(encoding="utf-8") for f in files)])
+    path = CACHE / f"{problem.name}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
+    if path.is_file():
+        with np.load(path) as kept:
+            return Reference(kept["u_gap"], kept["f_el"], kept["zeros"], kept["signs"], float(kept["agreement"]),
+                             str(kept["second"]))  # fmt: skip
+    found = _collocation(problem)
+    u_gap, f_el, name = _peers_way(problem, found.zeros, found.signs)
+    found = replace(found, agreement=max(found.errors(u_gap, f_el)), second=name)
+    CACHE.mkdir(exist_ok=True)
+    (CACHE / ".gitignore").write_text("*\n")
+    np.savez(path, **{name: np.asarray(value) for name, value in vars(found).items()})
+    return found

@@ -1,0 +1,167 @@
+"""The right-hand side that peers integrate: written once, for numba and, under `local`, for any array library.
+
+State x (V): coating and gap of the layer voltages over their capacitive share k U of the source; under `mobile` times
+A_R/A_R(0 V), which no jump of the source changes. The skin's is minus their sum.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from problems import Constants, Drive, Problem, by_name
+
+FloatArray = NDArray[np.float64]
+
+
+def local_rates(
+    constants: Constants, drive: Drive, sin: Callable[[Any], Any], compile_part: Callable[[Any], Any] = lambda f: f
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """rates(t, x0, x1, sign, level) -> (x0', x1') and gap(U, x0, x1, sign) -> (u_gap, 1/A_R) of the `local` law.
+
+    sign 0 takes |u_gap|; +-1 the branch of that sign and its continuation through zero.
+    """
+    (k0, k1, k2), (f0, f1, f2), (p0, p1, p2) = constants.k, constants.fixed, constants.per_area
+    series, scale = constants.series[::-1], 2.0 / constants.reach
+    source = compile_part(drive(sin))
+
+    @compile_part
+    def gap(u_source, x0, x1, sign):  # type: ignore[no-untyped-def]
+        u = k1 * u_source + x1
+        s = scale * (abs(u) if sign == 0.0 else sign * u) - 1.0
+        inverse = series[0] + 0.0 * s
+        for c in series[1:]:
+            inverse = inverse * s + c
+        return u, inverse
+
+    @compile_part
+    def rates(t, x0, x1, sign, level):  # type: ignore[no-untyped-def]
+        u_source = source(t, level)
+        u, inverse = gap(u_source, x0, x1, sign)
+        leak0 = (f0 + p0 * inverse) * (k0 * u_source + x0)
+        leak1 = (f1 + p1 * inverse) * u
+        leak = leak0 + leak1 + (f2 + p2 * inverse) * (k2 * u_source - x0 - x1)
+        return k0 * leak - leak0, k1 * leak - leak1
+
+    return rates, gap
+
+
+def _mobile_rates(
+    constants: Constants, drive: Drive, sin: Callable[[Any], Any], compile_part: Callable[[Any], Any]
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """The same under `mobile`: u_gap = k U + x1 A(0)/A(|u_gap|) is solved by Newton's method at every evaluation."""
+    (k0, k1, k2), (f0, f1, f2), (p0, p1, p2) = constants.k, constants.fixed, constants.per_area
+    series, scale, area0 = constants.series[::-1], 2.0 / constants.reach, constants.area0
+    source = compile_part(drive(sin))
+
+    @compile_part
+    def gap(u_source, x0, x1, sign):  # type: ignore[no-untyped-def]
+        share = k1 * u_source
+        u = share + x1
+        inverse = 1.0 / area0
+        # From the root at A(0) Newton converges on every scene here, all of them off the fold.
+        for _ in range(30):
+            side = sign if sign != 0.0 else (1.0 if u >= 0.0 else -1.0)
+            s = scale * side * u - 1.0
+            inverse = series[0]
+            slope = 0.0
+            for c in series[1:]:
+                slope = slope * s + inverse
+                inverse = inverse * s + c
+            step = (u - share - x1 * area0 * inverse) / (1.0 - x1 * area0 * slope * scale * side)
+            u -= step
+            if abs(step) <= 4e-16 * (abs(share) + abs(x1)):
+                break
+        return u, inverse
+
+    @compile_part
+    def rates(t, x0, x1, sign, level):  # type: ignore[no-untyped-def]
+        u_source = source(t, level)
+        u, inverse = gap(u_source, x0, x1, sign)
+        growth = area0 * inverse
+        leak0 = (f0 + p0 * inverse) * (k0 * u_source + growth * x0)
+        leak1 = (f1 + p1 * inverse) * u
+        leak = leak0 + leak1 + (f2 + p2 * inverse) * (k2 * u_source - growth * (x0 + x1))
+        return (k0 * leak - leak0) / growth, (k1 * leak - leak1) / growth
+
+    return rates, gap
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """numba's right-hand side of a problem.
+
+    Attributes
+    ----------
+    scalar_rates : callable
+        (t, x0, x1, sign, level) -> (x0', x1').
+    rates : callable
+        (t, x, sign, level) -> x', shape (2,).
+    fill : callable
+        (t, x, out, [sign, level]): the same into `out`.
+    jacobian : callable
+        (t, x, sign, level) -> (2, 2), by differences: two evaluations.
+    observe : callable
+        (U, x) of shapes (n,), (n, 2) -> u_gap in V and F_el in N, shape (n,).
+    """
+
+    scalar_rates: Callable[..., tuple[float, float]]
+    rates: Callable[..., FloatArray]
+    fill: Callable[..., None]
+    jacobian: Callable[..., FloatArray]
+    observe: Callable[..., tuple[FloatArray, FloatArray]]
+
+
+def compiled(problem: Problem) -> Compiled:
+    """The compiled right-hand side of a problem; compiled once in a process."""
+    return _compiled(problem.name)
+
+
+@lru_cache(maxsize=32)
+def _compiled(name: str) -> Compiled:
+    problem = by_name()[name]
+    constants = problem.constants
+    build = _mobile_rates if problem.law == "mobile" else local_rates
+    rates, gap = build(constants, problem.drive, math.sin, njit(error_model="numpy"))
+    stress = constants.stress
+
+    @njit(error_model="numpy")
+    def array_rates(t, x, sign, level):  # type: ignore[no-untyped-def]
+        out = np.empty(2)
+        out[0], out[1] = rates(t, x[0], x[1], sign, level)
+        return out
+
+    @njit(error_model="numpy")
+    def fill(t, x, out, piece):  # type: ignore[no-untyped-def]
+        out[0], out[1] = rates(t, x[0], x[1], piece[0], piece[1])
+
+    @njit(error_model="numpy")
+    def jacobian(t, x, sign, level):  # type: ignore[no-untyped-def]
+        out = np.empty((2, 2))
+        base0, base1 = rates(t, x[0], x[1], sign, level)
+        # About the square root of rounding times the voltages at hand.
+        d = 1e-6 * (1.0 + abs(x[0]) + abs(x[1]))
+        right0, right1 = rates(t, x[0] + d, x[1], sign, level)
+        out[0, 0], out[1, 0] = (right0 - base0) / d, (right1 - base1) / d
+        right0, right1 = rates(t, x[0], x[1] + d, sign, level)
+        out[0, 1], out[1, 1] = (right0 - base0) / d, (right1 - base1) / d
+        return out
+
+    @njit(error_model="numpy")
+    def observe(u_source, x):  # type: ignore[no-untyped-def]
+        u_gap = np.empty(u_source.size)
+        force = np.empty(u_source.size)
+        for i in range(u_source.size):
+            u, inverse = gap(u_source[i], x[i, 0], x[i, 1], 0.0)
+            u_gap[i] = u
+            force[i] = stress * u * u / inverse
+        return u_gap, force
+
+    return Compiled(rates, array_rates, fill, jacobian, observe)

@@ -1,0 +1,261 @@
+"""What a step evaluates at all its rows at once: the source, the area and the nonlinear term.
+
+These functions take plain arrays: a tuple of arrays handed to a compiled function costs more than the work done here.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.compiled import jit, jit_fused, jit_inline, jit_rows
+from fingerspice.engine.system import DEGREE
+from fingerspice.numerics import chebyshev
+from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
+from fingerspice.physics.contact import inverse_area
+
+FloatArray = NDArray[np.float64]
+
+# Rows of the work array `r` (N_FLAT, ROWS): source (V) and its slope (V/s), k_gap U, gap voltage and its guess (V),
+# gap w, 1/A (1/m^2), its slope by the gap voltage, two for passing use.
+SOURCE, SLOPE, FREE, U, GUESS, X_GAP, Q, DQ, SCRATCH, MORE = range(10)
+N_FLAT = 10
+
+_PI_HIGH = 3.141592653589793
+_PI_LOW = 1.2246467991473532e-16
+_PER_PI = 1.0 / _PI_HIGH
+# Taylor coefficients of cos in x^2, to 1e-17 on |x| <= pi/2.
+_COS = np.array([(-1.0) ** i / math.factorial(2 * i) for i in range(11)])
+_LAST = _COS.size - 1
+
+
+@jit_fused
+def _add_cosines(amplitude: float, phase: FloatArray, out: FloatArray) -> None:
+    """out += amplitude cos(phase), to 2e-16 of the amplitude and of the phase.
+
+    The library's cosine is exact to half a rounding and does not vectorise; this one does.
+    """
+    for i in range(ROWS):
+        turns = np.rint(phase[i] * _PER_PI)
+        x = (phase[i] - turns * _PI_HIGH) - turns * _PI_LOW
+        x *= x
+        value = _COS[_LAST]
+        for d in range(_LAST - 1, -1, -1):
+            value = value * x + _COS[d]
+        half = 0.5 * turns
+        sign = 1.0 - 4.0 * (half - np.floor(half))
+        out[i] += amplitude * sign * value
+
+
+@jit
+def source_rows(
+    terms: FloatArray, series: FloatArray, length: float, t0: float, h: float, want_slope: bool, r: FloatArray
+) -> None:
+    """Fill source, and its slope if wanted, for a step of length h that starts t0 into a segment (see `Segment`)."""
+    out = r[SOURCE]
+    slope = r[SLOPE]
+    phase = r[SCRATCH]
+    for i in range(ROWS):
+        out[i] = 0.0
+        slope[i] = 0.0
+    for m in range(terms.shape[0]):
+        c = terms[m, 0]
+        if c == 0.0:
+            continue
+        omega = terms[m, 3]
+        phi = terms[m, 4]
+        beta = terms[m, 5]
+        waves = omega != 0.0 or phi != 0.0 or beta != 0.0
+        if waves and terms[m, 1] == 0.0 and terms[m, 2] == 0.0:
+            for i in range(ROWS):
+                tau = t0 + POINTS[i] * h
+                phase[i] = phi + (omega + 0.5 * beta * tau) * tau
+            _add_cosines(c, phase, out)
+            if want_slope:
+                rate = r[MORE]
+                for i in range(ROWS):
+                    phase[i] += 0.5 * _PI_HIGH
+                    rate[i] = 0.0
+                _add_cosines(c, phase, rate)
+                for i in range(ROWS):
+                    slope[i] += rate[i] * (omega + beta * (t0 + POINTS[i] * h))
+        elif waves or terms[m, 1] != 0.0 or terms[m, 2] != 0.0:
+            _add_general(terms[m], waves, t0, h, out, slope)
+        else:
+            for i in range(ROWS):
+                out[i] += c
+    if series.size > 0:
+        for i in range(ROWS):
+            tau = t0 + POINTS[i] * h
+            value, rate_here = chebyshev.evaluate(series, 2.0 * tau / length - 1.0)
+            out[i] += value
+            slope[i] += rate_here * 2.0 / length
+
+
+@jit
+def _add_general(term: FloatArray, waves: bool, t0: float, h: float, out: FloatArray, slope: FloatArray) -> None:
+    """Add one term with a power or an exponential in it."""
+    n = term[1]
+    a = term[2]
+    for i in range(ROWS):
+        tau = t0 + POINTS[i] * h
+        value = term[0]
+        rate = 0.0
+        if n == 1.0:
+            rate = value
+            value *= tau
+        elif n > 1.0:
+            rate = value * n * tau ** (n - 1.0)
+            value *= tau**n
+        if a != 0.0:
+            e = math.exp(a * tau)
+            rate = (rate + a * value) * e
+            value *= e
+        if waves:
+            phase = term[4] + (term[3] + 0.5 * term[5] * tau) * tau
+            c = math.cos(phase)
+            rate = rate * c - value * (term[3] + term[5] * tau) * math.sin(phase)
+            value *= c
+        out[i] += value
+        slope[i] += rate
+
+
+@jit_rows
+def _polynomial(powers: FloatArray, lo: float, scale: float, u: FloatArray, sign: float, out: FloatArray) -> None:
+    """The polynomial in (sign u - lo) scale - 1 at every row."""
+    for i in range(ROWS):
+        x = (sign * u[i] - lo) * scale - 1.0
+        # Outside, anything finite: a step that needs it is refused.
+        x = min(max(x, -1.0), 1.0)
+        value = powers[DEGREE]
+        for d in range(DEGREE - 1, -1, -1):
+            value = value * x + powers[d]
+        out[i] = value
+
+
+@jit
+def _long_area(curve: FloatArray, sign: float, r: FloatArray) -> None:
+    """1/A and its slope from the model's own curve, where the polynomial does not reach."""
+    for i in range(ROWS):
+        value, slope = inverse_area(max(sign * r[U, i], curve[0]), curve)
+        r[Q, i] = value
+        r[DQ, i] = slope * sign
+
+
+@jit_rows
+def _gap_voltage(k_gap: float, gap: FloatArray, w: FloatArray, source: FloatArray, x: FloatArray, u: FloatArray) -> None:
+    """x = gap w and u = k_gap U + gap w."""
+    for i in range(ROWS):
+        x[i] = 0.0
+    for k in range(w.shape[0]):
+        share = gap[k]
+        for i in range(ROWS):
+            x[i] += share * w[k, i]
+    for i in range(ROWS):
+        u[i] = k_gap * source[i] + x[i]
+
+
+@jit_rows
+def _turned(turn: FloatArray, w: FloatArray, pull: FloatArray) -> None:
+    """pull = turn w."""
+    for k in range(w.shape[0]):
+        for i in range(ROWS):
+            pull[k, i] = 0.0
+        for j in range(w.shape[0]):
+            factor = turn[k, j]
+            for i in range(ROWS):
+                pull[k, i] += factor * w[j, i]
+
+
+@jit_rows
+def _pull_local(push: FloatArray, q0: float, source: FloatArray, q: FloatArray, pull: FloatArray) -> None:
+    for k in range(pull.shape[0]):
+        factor = push[k]
+        for i in range(ROWS):
+            pull[k, i] = (q[i] - q0) * (pull[k, i] + factor * source[i])
+
+
+@jit_rows
+def _pull_mobile(
+    push: FloatArray, q0: float, area0: float, source: FloatArray, q: FloatArray, pull: FloatArray
+) -> None:
+    for k in range(pull.shape[0]):
+        factor = push[k] / area0
+        for i in range(ROWS):
+            pull[k, i] = (q[i] - q0) * pull[k, i] + (1.0 / q[i] - 1.0 / q0) * factor * source[i]
+
+
+@jit_inline
+def evaluate(
+    mobile: bool, k_gap: float, area0: float, q0: float, gap: FloatArray, push: FloatArray, turn: FloatArray,
+    powers: FloatArray, slopes: FloatArray, lo: float, scale: float, curve: FloatArray, sign: float,
+    w: FloatArray, pull: FloatArray, r: FloatArray,
+) -> bool:  # fmt: skip
+    """Gap voltage, 1/A and nonlinear term from the modes w (see `fingerspice.engine.system.System`).
+
+    With `scale` 0 the area comes from `curve`, else from the polynomial. Under `mobile`, r[GUESS] holds a guess of the
+    gap voltage; False where the area equation was not solved on the branch connected to it.
+    """
+    _gap_voltage(k_gap, gap, w, r[SOURCE], r[X_GAP], r[U])
+    _turned(turn, w, pull)
+    if mobile:
+        if not _solve_mobile(area0, powers, slopes, lo, scale, curve, sign, r):
+            return False
+        _pull_mobile(push, q0, area0, r[SOURCE], r[Q], pull)
+        return True
+    if scale > 0.0:
+        _polynomial(powers, lo, scale, r[U], sign, r[Q])
+    else:
+        _long_area(curve, sign, r)
+    _pull_local(push, q0, r[SOURCE], r[Q], pull)
+    return True
+
+
+@jit
+def _solve_mobile(
+    area0: float, powers: FloatArray, slopes: FloatArray, lo: float, scale: float, curve: FloatArray, sign: float,
+    r: FloatArray,
+) -> bool:  # fmt: skip
+    """u = k U + b q(u) at all rows at once, by Newton; r[U] holds k U + x on entry."""
+    size = 0.0
+    for i in range(ROWS):
+        r[FREE, i] = r[U, i] - r[X_GAP, i]
+        r[U, i] = r[GUESS, i]
+        size = max(size, abs(r[FREE, i]) + abs(r[X_GAP, i]))
+    for _ in range(30):
+        if scale > 0.0:
+            _polynomial(powers, lo, scale, r[U], sign, r[Q])
+            _polynomial(slopes, lo, scale, r[U], sign, r[DQ])
+            for i in range(ROWS):
+                r[DQ, i] *= scale * sign
+        else:
+            _long_area(curve, sign, r)
+        worst = 0.0
+        lowest = 1.0
+        for i in range(ROWS):
+            b = r[X_GAP, i] * area0
+            margin = 1.0 - b * r[DQ, i]
+            step = (r[U, i] - r[FREE, i] - b * r[Q, i]) / margin
+            r[U, i] -= step
+            worst = max(worst, abs(step))
+            lowest = min(lowest, margin)
+        # Past the fold the slope has turned: that root is not connected to the uncharged state.
+        if not lowest > 0.0 or not worst < math.inf:
+            return False
+        if worst <= 1e-15 * size:
+            return True
+    return False
+
+
+@jit_rows
+def moved(u: FloatArray, before: FloatArray) -> float:
+    """Root of the summed squares of u - before; `before` becomes u."""
+    total = 0.0
+    for i in range(NODES):
+        change = u[i] - before[i]
+        total += change * change
+    for i in range(ROWS):
+        before[i] = u[i]
+    return math.sqrt(total)

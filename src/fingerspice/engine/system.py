@@ -1,0 +1,140 @@
+"""A stack in modal form around reference areas, for the exponential steps.
+
+With q = 1/A near a reference q0, every stack is a linear system with one nonlinear term:
+
+    w' = -rates w + gain U + (q - q0) (push U + turn w)                          local
+    w' = -rates w + gain U / (A0 q0) + (1/q - 1/q0) push U / A0 + (q - q0) turn w   mobile
+
+u_gap = k_gap U + gap w under `local`, and k_gap U + A0 q gap w under `mobile`. The linear part is solved exactly;
+only what the area moves is left to iterate on.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from fingerspice.engine.model import Model
+from fingerspice.numerics.modes import modes
+from fingerspice.physics.contact import N_PACKED, inverse_area
+
+FloatArray = NDArray[np.float64]
+
+DEGREE = 27
+"""Of the polynomial for 1/A; where it does not reach rounding, the long series of the model serves."""
+# Ratio of neighbouring reference values of 1/A: the nonlinear term is at most an eighth of what it perturbs.
+_LEVEL_RATIO = 1.28
+
+
+class System(NamedTuple):
+    """See the module; arrays have one row per reference area.
+
+    Attributes
+    ----------
+    model : Model
+    q0 : ndarray, shape (n_level,)
+        Reference values of 1/A, 1/m^2, ascending.
+    rates, gain, push, gap, slow : ndarray, shape (n_level, n)
+        `slow` holds the slowest layer's share of each mode (see `Model.slow`).
+    turn, live, project : ndarray, shape (n_level, n, n)
+        x = live @ w for the live voltages, w = project @ x.
+    powers, slopes : ndarray, shape (DEGREE + 1,)
+        1/A as a polynomial in (u - lo) * scale - 1, and its derivative.
+    lo, scale : float
+        Lowest gap voltage (V) of the branch's continuation, and 1/V; scale is 0 where the model's curve serves instead.
+    u_top : float
+        Largest gap voltage (V) that the model's curve covers.
+    stress : float
+        Force per area and squared gap voltage, Pa/V^2.
+    """
+
+    model: Model
+    q0: FloatArray
+    rates: FloatArray
+    gain: FloatArray
+    push: FloatArray
+    gap: FloatArray
+    slow: FloatArray
+    turn: FloatArray
+    live: FloatArray
+    project: FloatArray
+    powers: FloatArray
+    slopes: FloatArray
+    lo: float
+    scale: float
+    u_top: float
+    stress: float
+
+
+def build_system(model: Model, tol: float, q_range: tuple[float, float]) -> System:
+    """Modal form of a model.
+
+    Parameters
+    ----------
+    model : Model
+    tol : float
+        Relative error allowed of 1/A.
+    q_range : tuple of float
+        Smallest and largest 1/A (1/m^2) to expect.
+    """
+    lowest, highest = q_range
+    count = max(1, math.ceil(math.log(highest / lowest) / math.log(_LEVEL_RATIO)))
+    q0 = lowest * (highest / lowest) ** ((np.arange(count) + 0.5) / count)
+    forms = [modes(model.rate + q * model.rate0, model.k) for q in q0]
+    rates, gain, feed, shape = (np.ascontiguousarray(np.stack(x)) for x in zip(*forms, strict=True))
+    n = model.gap.size
+    share = 1.0 / (model.area0 * q0) if model.mobile else np.ones(count)
+    live = np.ascontiguousarray(shape[:, :n])
+    # `feed` takes -p + k sum(p) to modes; x is that of p = -x, as it sums to zero.
+    project = np.ascontiguousarray(np.swapaxes(feed[:, n:] - feed[:, :n], 1, 2))
+    push_rate = model.rate if model.mobile else model.rate0
+    powers, slopes, lo, scale = _polynomial(model, tol)
+    return System(
+        model,
+        q0,
+        rates,
+        gain * share[:, None],
+        np.einsum("lik,i->lk", feed, push_rate * model.k),
+        np.einsum("lik,i->lk", live, model.gap),
+        np.einsum("lik,i->lk", live, model.slow[:n]),
+        np.ascontiguousarray(np.einsum("lik,i,lij->lkj", feed, model.rate0, shape)),
+        live,
+        project,
+        powers,
+        slopes,
+        lo,
+        scale,
+        float(model.curve[1]),
+        float(model.curve[2 + 4]),
+    )
+
+
+def _polynomial(model: Model, tol: float) -> tuple[FloatArray, FloatArray, float, float]:
+    """1/A as a polynomial of `DEGREE` over the model's own range, where it is good enough."""
+    powers = np.zeros(DEGREE + 1)
+    slopes = np.zeros(DEGREE + 1)
+    if not model.coupled:
+        powers[0] = 1.0 / model.area0
+        return powers, slopes, 0.0, 1.0
+    lo, hi = float(model.curve[0]), float(model.curve[1])
+    series = model.curve[2 + N_PACKED :]
+    kept = series[: DEGREE + 1]
+    if series.size == 0 or np.abs(series[DEGREE + 1 :]).sum() > tol * abs(series[0]):
+        return powers, slopes, lo, 0.0
+    powers[: kept.size] = chebyshev.cheb2poly(kept)
+    slopes[:-1] = np.arange(1, DEGREE + 1) * powers[1:]
+    x = np.linspace(-1.0, 1.0, 33)
+    miss = np.abs(np.polynomial.polynomial.polyval(x, powers) - chebyshev.chebval(x, series)).max()
+    return powers, slopes, lo, (2.0 / (hi - lo) if miss <= max(2.0 * tol, 4e-15) * abs(series[0]) else 0.0)
+
+
+def area_range(model: Model, u_max: float) -> tuple[float, float]:
+    """Smallest and largest 1/A (1/m^2) for gap voltages up to `u_max` (V)."""
+    if not model.coupled:
+        return 1.0 / model.area0, 1.0 / model.area0
+    values = [inverse_area(u, model.curve)[0] for u in np.linspace(0.0, u_max, 17)]
+    return min(values), max(values)

@@ -1,0 +1,107 @@
+"""Collocation at Gauss-Lobatto points against an exact exponential: nodes, bases and tables, compiled.
+
+On a step of length h a mode w' = -rate w + g(t) has, with g interpolated at the nodes, the exact solution
+
+    w(c_i h) = exp(-rate c_i h) w(0) + h sum_j phi_ij g(c_j h),
+    phi_ij = integral over [0, c_i] of exp(-rate h (c_i - s)) l_j(s) ds
+
+(Hochbruck and Ostermann 2010, exponential Runge-Kutta methods of collocation type). Two points between the nodes
+are rows of the tables too: what a solution misses there is its error.
+
+The sizes are constants, so that the compiler unrolls every inner loop.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.polynomial import chebyshev, legendre
+from numpy.typing import NDArray
+
+from fingerspice.compiled import jit
+
+FloatArray = NDArray[np.float64]
+
+NODES = 14
+ROWS = 16
+"""The nodes, ascending from 0 to 1, and two points between them."""
+FIRST, SECOND, END = NODES, NODES + 1, NODES - 1
+"""Rows of the points between, and of the end of the step."""
+
+
+def _nodes() -> FloatArray:
+    inner = legendre.Legendre.basis(NODES - 1).deriv().roots()
+    x = np.concatenate([[-1.0], np.sort(inner.real), [1.0]])
+    return np.asarray(0.5 * (0.5 * (x - x[::-1]) + 1.0))
+
+
+def _lagrange(at: FloatArray, nodes: FloatArray, weights: FloatArray) -> FloatArray:
+    """Basis polynomials (n_at, n) at points off the nodes."""
+    q = weights / (at[:, None] - nodes)
+    return np.asarray(q / q.sum(axis=1, keepdims=True))
+
+
+_X = _nodes()
+BARYCENTRIC = 1.0 / np.array([np.prod(4.0 * (x - np.delete(_X, i))) for i, x in enumerate(_X)])
+"""Barycentric weights of the nodes (times a constant), shape (NODES,)."""
+# The middle, where an error of the next order is largest, and one where an odd one is.
+_BETWEEN = np.array([0.5, 0.5 * (_X[9] + _X[10])])
+POINTS = np.concatenate([_X, _BETWEEN])
+"""Fractions of the step, shape (ROWS,)."""
+BETWEEN = np.ascontiguousarray(_lagrange(_BETWEEN, _X, BARYCENTRIC).T)
+"""Interpolation from the nodes to the two points between, shape (NODES, 2)."""
+_SCALE = float(np.abs(np.prod(_BETWEEN[:, None] - _X, axis=1)).max())
+MISS = np.prod(_BETWEEN[:, None] - _X, axis=1) / _SCALE
+"""The node polynomial, of largest size 1, at the points between, shape (2,)."""
+TO_SERIES = np.ascontiguousarray(np.linalg.inv(chebyshev.chebvander(2.0 * _X - 1.0, NODES - 1)).T)
+"""From values at the nodes to Chebyshev coefficients, shape (NODES, NODES): coefficients = values @ TO_SERIES."""
+_GAUSS_X, _GAUSS_W = legendre.leggauss(32)
+_GAUSS_X, _GAUSS_W = 0.5 * (_GAUSS_X + 1.0), 0.5 * _GAUSS_W
+# exp(-45) of the largest value is below rounding.
+_REACH = 45.0
+_INVERSE_SCALE = 1.0 / _SCALE
+
+
+@jit
+def fill_table(z: float, decay: FloatArray, phi: FloatArray, miss: FloatArray) -> None:
+    """Tables of one mode for z = rate * h >= 0, in units of h.
+
+    Fills `decay` (ROWS,), exp(-z c_i); `phi` (NODES, ROWS); and `miss` (ROWS,), the response to a forcing that is
+    the node polynomial, of largest size 1.
+    """
+    basis = np.empty(NODES)
+    for i in range(ROWS):
+        x = z * POINTS[i]
+        # Denormal numbers would slow every later product down.
+        decay[i] = math.exp(-x) if x < 690.0 else 0.0
+        miss[i] = 0.0
+        for j in range(NODES):
+            phi[j, i] = 0.0
+        reach = POINTS[i]
+        if reach * z > _REACH:
+            reach = _REACH / z
+        if reach == 0.0:
+            continue
+        for g in range(_GAUSS_X.size):
+            back = reach * _GAUSS_X[g]
+            s = POINTS[i] - back
+            weight = reach * _GAUSS_W[g] * math.exp(-z * back)
+            total = 0.0
+            product = 1.0
+            for j in range(NODES):
+                distance = s - POINTS[j]
+                product *= distance
+                basis[j] = BARYCENTRIC[j] / distance if distance != 0.0 else 1e300
+                total += basis[j]
+            weight_over = weight / total
+            for j in range(NODES):
+                phi[j, i] += weight_over * basis[j]
+            miss[i] += weight * product * _INVERSE_SCALE
+
+
+def integral_table() -> FloatArray:
+    """`phi` of a mode with rate zero: integrals over [0, c_i] of the interpolant, shape (NODES, ROWS)."""
+    phi = np.empty((NODES, ROWS))
+    fill_table(0.0, np.empty(ROWS), phi, np.empty(ROWS))
+    return phi

@@ -1,0 +1,133 @@
+"""Modes of relaxation elements that share one constraint, by their secular equation.
+
+Elements x' = -h + k sum(h), h_l = r_l (x_l + k_l U), with sum(k) = 1 and sum(x) = 0, have as rates the roots of
+
+    sum_l k_l / (r_l - rate) = 0,
+
+one between any two neighbouring r. Every difference r_l - rate is kept to full relative precision (as divide and
+conquer eigensolvers do: Gu and Eisenstat 1995), so rates twelve decades apart do not spoil each other.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.compiled import jit
+
+FloatArray = NDArray[np.float64]
+
+
+@jit
+def _root_between(r: FloatArray, k: FloatArray, i: int) -> tuple[int, float]:
+    """Root between the ascending poles r[i] < r[i + 1], as the index of the nearer pole and the distance from it."""
+    gap = r[i + 1] - r[i]
+    middle = 0.0
+    for j in range(r.size):
+        middle += k[j] / (r[j] - r[i] - 0.5 * gap)
+    # The function rises from -inf to inf between the poles: its sign in the middle names the nearer one.
+    origin = i if middle >= 0.0 else i + 1
+    lo = 0.0 if middle >= 0.0 else -0.5 * gap
+    hi = 0.5 * gap if middle >= 0.0 else 0.0
+    # Start from the two neighbouring poles alone, then Newton inside a bracket that only closes.
+    share = k[i] / (k[i] + k[i + 1])
+    x = share * gap if middle >= 0.0 else (share - 1.0) * gap
+    for _ in range(200):
+        if not lo < x < hi:
+            x = 0.5 * (lo + hi)
+        value = 0.0
+        slope = 0.0
+        for j in range(r.size):
+            term = 1.0 / (r[j] - r[origin] - x)
+            value += k[j] * term
+            slope += k[j] * term * term
+        if value >= 0.0:
+            hi = x
+        else:
+            lo = x
+        # Newton on x * value, which has no pole at x = 0.
+        turn = value + x * slope
+        step = -x * value / turn if turn != 0.0 else math.inf
+        if abs(step) <= 2e-16 * abs(x) or hi - lo <= 2e-16 * max(abs(lo), abs(hi)):
+            break
+        x += step
+    return origin, x
+
+
+@jit
+def modes(r: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Modal form of x' = -h + k sum(h) + (-p + k sum(p)).
+
+    Parameters
+    ----------
+    r, k : ndarray, shape (n + 1,)
+        Rates (1/s, >= 0) and shares (> 0, of sum 1).
+
+    Returns
+    -------
+    rates : ndarray, shape (n,)
+        w' = -rates w + gain U + p @ feed.
+    gain : ndarray, shape (n,)
+    feed : ndarray, shape (n + 1, n)
+    shape : ndarray, shape (n + 1, n)
+        x = shape @ w.
+    """
+    n = r.size - 1
+    order = np.argsort(r)
+    rates = np.zeros(n)
+    gain = np.zeros(n)
+    feed = np.zeros((n + 1, n))
+    shape = np.zeros((n + 1, n))
+    # Equal rates act as one element on the rest; between themselves they relax with that very rate.
+    poles = np.empty(n + 1)
+    shares = np.empty(n + 1)
+    group = np.empty(n + 1, np.int64)
+    count = 0
+    found = 0
+    for i in order:
+        if count > 0 and r[i] <= poles[count - 1] * (1.0 + 4e-16):
+            share = shares[count - 1]
+            # Mode of this element against the group so far, orthogonal in 1/k.
+            for j in range(n + 1):
+                if group[j] == count - 1 and j != i and _seen(order, j, i):
+                    shape[j, found] = k[j] / share
+            shape[i, found] = -1.0
+            norm = 1.0 / share + 1.0 / k[i]
+            for j in range(n + 1):
+                feed[j, found] = -shape[j, found] / k[j] / norm
+            rates[found] = r[i]
+            found += 1
+            shares[count - 1] += k[i]
+        else:
+            poles[count] = r[i]
+            shares[count] = k[i]
+            count += 1
+        group[i] = count - 1
+    poles = poles[:count]
+    shares = shares[:count]
+    for i in range(count - 1):
+        origin, x = _root_between(poles, shares, i)
+        rates[found] = poles[origin] + x
+        norm = 0.0
+        for g in range(count):
+            norm += shares[g] / (poles[g] - poles[origin] - x) ** 2
+        gain[found] = -1.0 / norm
+        for j in range(n + 1):
+            inverse = 1.0 / (poles[group[j]] - poles[origin] - x)
+            shape[j, found] = k[j] * inverse
+            feed[j, found] = -inverse / norm
+        found += 1
+    return rates, gain, feed, shape
+
+
+@jit
+def _seen(order: NDArray[np.int64], j: int, i: int) -> bool:
+    """Whether j comes before i in `order`."""
+    for m in order:
+        if m == j:
+            return True
+        if m == i:
+            return False
+    return False
