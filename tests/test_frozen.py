@@ -7,7 +7,7 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.periodic import periodic_solution
+from fingerspice.periodic import steady_state
 from scenes import deck, table1
 
 AREA = 34.9715871843e-6
@@ -23,7 +23,7 @@ def fundamental(solution, x, f):
 @pytest.mark.parametrize("law", ["local", "mobile"])
 def test_periodic_sine_equals_eq_11_in_amplitude_and_phase(f, law):
     circuit = table1(f"SIN(0 200 {f!r})", f, skin={"f": f}) if 10.0 <= f <= 1e5 else outside_band(f)
-    solution = periodic_solution(circuit, area=AREA, charge_law=law, rtol=1e-12, points=400)
+    solution = steady_state(circuit, area=AREA, charge_law=law, rtol=1e-12, points=400).solution
     gains = ref.phasor_gains(f, AREA, ref.table1_layers(f))
     got = fundamental(solution, solution.u_gap, f) / 200.0
     assert abs(got - gains[ref.GAP]) <= 1e-10 * abs(gains[ref.GAP])
@@ -41,7 +41,7 @@ def outside_band(f):
 @pytest.mark.parametrize("law", ["local", "mobile"])
 def test_periodic_square_equals_the_matrix_exponential(f, duty, law):
     circuit = table1(f"SQUARE(200 {f!r} {duty!r})", f)
-    solution = periodic_solution(circuit, area=AREA, charge_law=law, rtol=1e-12, points=200)
+    solution = steady_state(circuit, area=AREA, charge_law=law, rtol=1e-12, points=200).solution
     inside = np.ones(solution.t.size, bool)
     inside[:-1] &= np.diff(solution.t) > 0.0
     inside[1:] &= np.diff(solution.t) > 0.0
@@ -70,14 +70,14 @@ def test_mean_and_frozen_areas_are_what_their_names_say():
 def test_low_frequency_limit_is_resistive_eq_14():
     with pytest.warns(fs.FingerspiceWarning, match="outside 10 Hz to 100 kHz"):
         circuit = table1("SIN(0 200 0.01)", 1.0)
-    solution = periodic_solution(circuit, area=AREA, rtol=1e-10, points=200)
+    solution = steady_state(circuit, area=AREA, rtol=1e-10, points=200).solution
     got = abs(fundamental(solution, solution.u_gap, 0.01)) / 200.0
     assert got == pytest.approx(ref.gap_limit_eq14(1.0, AREA), rel=1e-6)
 
 
 def test_high_frequency_limit_is_capacitive_eq_15():
     circuit = table1("SIN(0 200 1e8)", 1e5)
-    solution = periodic_solution(circuit, area=AREA, rtol=1e-10, points=200)
+    solution = steady_state(circuit, area=AREA, rtol=1e-10, points=200).solution
     got = abs(fundamental(solution, solution.u_gap, 1e8)) / 200.0
     assert got == pytest.approx(ref.gap_limit_eq15(1e5), rel=1e-6)
 

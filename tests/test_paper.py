@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.periodic import periodic_solution
+from fingerspice.periodic import steady_state
 from scenes import table1
 
 
@@ -22,7 +22,7 @@ def phasor_at(f, amplitude=200.0, **changes):
 
 @functools.cache
 def square(f):
-    return periodic_solution(table1(f"SQUARE(200 {f!r})", f), rtol=1e-9, points=2000)
+    return steady_state(table1(f"SQUARE(200 {f!r})", f), rtol=1e-9, points=2000).solution
 
 
 def rise(low=100.0, high=1e4, **changes):
@@ -106,7 +106,9 @@ def test_the_transient_s_mean_force_is_below_the_phasor_s_by_the_ripple(f, trans
 )  # fmt: skip
 def test_peak_gap_voltage_of_the_mobile_law_against_the_local(source, f, share):
     circuit = table1(source, f)
-    peaks = [np.abs(periodic_solution(circuit, charge_law=law, points=4000).u_gap).max() for law in ("local", "mobile")]
+    peaks = [
+        np.abs(steady_state(circuit, charge_law=law, points=4000).solution.u_gap).max() for law in ("local", "mobile")
+    ]
     assert peaks[1] / peaks[0] - 1.0 == pytest.approx(share, abs=6e-5 if abs(share) < 0.01 else 5e-4)
 
 

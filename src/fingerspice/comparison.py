@@ -10,7 +10,7 @@ import numpy as np
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.errors import InputError
-from fingerspice.periodic import periodic_solution
+from fingerspice.periodic import steady_state
 from fingerspice.phasors import phasor
 from fingerspice.solution import Solution
 
@@ -111,8 +111,8 @@ def compare(circuit: Circuit, *, charge_law: str | None = None, rtol: float = 1e
     if fundamental is None:
         raise InputError("compare needs a source with a fundamental: a periodic one; this source has none")
     p = phasor(circuit)
-    coupled = periodic_solution(circuit, charge_law=charge_law, rtol=rtol, points=2000)
-    mean = periodic_solution(circuit, charge_law=charge_law, area=float(p.area[0]), rtol=rtol, points=2000)
+    coupled = steady_state(circuit, charge_law=charge_law, rtol=rtol, points=2000).solution
+    mean = steady_state(circuit, charge_law=charge_law, area=float(p.area[0]), rtol=rtol, points=2000).solution
     lead = float(np.degrees(np.angle(p.gain[0])))
     return Comparison(
         Figures(float(abs(p.u_gap[0])), lead, float(p.f_el_mean[0]), float(p.area[0])),

@@ -7,14 +7,17 @@ a change of one file it would go on running the old code of the others.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
+import numpy as np
 from numba import njit
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
+Array = TypeVar("Array", bound=np.ndarray)
 _PACKAGE = Path(__file__).resolve().parent
 
 
@@ -46,20 +49,25 @@ jit_inline = njit(cache=True, error_model="numpy", inline="always")
 
 
 @intrinsic
-def borrow(typing: Any, array: Any) -> Any:
+def _borrow(typing: Any, array: Any) -> Any:
     """The same array without a count of its users, which would be an atomic operation at every view.
 
     The array given must outlive the one returned: borrow only arguments of the function, never what it allocates,
     for that is freed after its last use by name.
     """
 
+    make: Any = make_array
+    null: Any = cgutils.get_null_value
+
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        view = make_array(signature.args[0])(context, builder, values[0])
-        view.meminfo = cgutils.get_null_value(view.meminfo.type)
-        view.parent = cgutils.get_null_value(view.parent.type)
+        view = make(signature.args[0])(context, builder, values[0])
+        view.meminfo, view.parent = null(view.meminfo.type), null(view.parent.type)
         return view._getvalue()
 
     return array(array), generate
+
+
+borrow: Callable[[Array], Array] = cast(Any, _borrow)
 
 
 def is_first_use() -> bool:

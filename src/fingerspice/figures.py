@@ -22,7 +22,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.ramps import Square
 from fingerspice.circuit.waveforms import Sine, require
 from fingerspice.files import write_aside
-from fingerspice.periodic import periodic_solution
+from fingerspice.periodic import steady_state
 from fingerspice.phasors import phasor
 from fingerspice.physics.materials import SKIN_BAND, skin_permittivity, skin_resistivity
 from fingerspice.solution import Solution
@@ -213,7 +213,7 @@ def _ascii(unit: str) -> str:
 def time_response(shape: type[Sine] | type[Square], frequency: float) -> Solution:
     """One period of the periodic state of Table 1 at 200 V, its skin taken at `frequency` (Hz)."""
     source = shape(U0_TIME, frequency)
-    return periodic_solution(table1_circuit().replace({"Vdrive": source, "Xskin.f": frequency}))
+    return steady_state(table1_circuit().replace({"Vdrive": source, "Xskin.f": frequency}), points=1000).solution
 
 
 def two_periods(solution: Solution) -> dict[str, FloatArray]:

@@ -12,14 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
+from fingerspice.circuit.sampling import SourceTable
 from fingerspice.compiled import jit
 from fingerspice.engine import advance as loop
 from fingerspice.engine.model import Model, Segment, choose_branch, dot, right_hand_side, source, write_row
 from fingerspice.errors import InputError
+from fingerspice.marching import solve as solve_marching
 from fingerspice.problem import Problem
+from fingerspice.runs import Run, Tables, after_the_end, from_rows, row_width
 from fingerspice.solution import ErrorEstimate, State, Status
-from fingerspice.transient import Run, Tables, choose_tableau, row_width, solve
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -179,41 +180,28 @@ def _integrate(
                 break
     except _FailedError as error:
         status, detail, t_failed = Status.METHOD_FAILED, error.text, error.t
-    if status is Status.SUCCESS and table is not None:
-        done = _finish(problem, table, y, control, rows, done)
+    if status is Status.SUCCESS and table is not None and done < t_out.size:
+        segment, tau = after_the_end(problem, table)
+        u, du = loop.enter(model, segment, tau, y, control)
+        for i in range(done, t_out.size):
+            write_row(model, u, du, y, control[loop.SIGN], u, rows[i])
+        done = t_out.size
     state = State(float(control[loop.T]), y, float(control[loop.U_BEFORE]), problem.initial.charge_offset,
-                  problem.charge_law)  # fmt: skip
+                  problem.scene.charge_law)  # fmt: skip
     return Run(
-        rows,
-        done,
-        status,
-        ErrorEstimate(0.0, 0.0),
-        0.0,
-        0.0,
-        nfev,
-        {"pieces": pieces},
-        state,
-        t_failed,
-        detail,
+        t_out[:done],
+        left[:done],
+        *from_rows(problem, rows[:done]),
+        status=status,
+        error=ErrorEstimate(0.0, 0.0),
+        peak_u=0.0,
+        peak_f=0.0,
+        nfev=nfev,
+        stats={"pieces": pieces},
+        state=state,
+        t_failed=t_failed,
+        detail=detail,
     )
-
-
-def _finish(
-    problem: Problem, table: SourceTable, y: FloatArray, control: FloatArray, rows: FloatArray, done: int
-) -> int:
-    """Right-hand outputs at the very end."""
-    if done == rows.shape[0]:
-        return done
-    stop = problem.t_stop
-    start = float(table.edges[-2])
-    segment = Segment(start, float(table.edges[-1]) - start, table.terms[-1], table.series[-1])
-    if breakpoints_at(problem.waveform, stop).size:
-        table = source_table(problem.waveform, stop, stop + problem.step, 1e-10, problem.step)
-        segment = Segment(stop, float(table.edges[1]) - stop, table.terms[0], table.series[0])
-    u, du = loop.enter(problem.model, segment, stop - segment.start, y, control)
-    for i in range(done, rows.shape[0]):
-        write_row(problem.model, u, du, y, control[loop.SIGN], u, rows[i])
-    return int(rows.shape[0])
 
 
 def solve_foreign(problem: Problem, library: str, name: str, rtol: float, t_out: FloatArray, left: BoolArray) -> Run:
@@ -237,22 +225,21 @@ def solve_foreign(problem: Problem, library: str, name: str, rtol: float, t_out:
             ) from None
     run_piece = _scipy_piece if library == "scipy" else _torch_piece
     fine = max(0.03 * rtol, 1e-13)
-    reference = solve(problem, fine, choose_tableau(problem, fine), t_out, left)
-    n = reference.n_out
+    reference = solve_marching(problem, fine, t_out, left)
     z_scale = reference.peak_u * problem.model.area0 / problem.model.s
     scale = np.append(np.full(problem.stack.c.size - 1, reference.peak_u), z_scale)
     scale = np.where(scale > 0.0, scale, 1.0)
+    ours_u, ours_f = _gap(problem, reference)
     tol, nfev = 0.1 * rtol, 0
     for _attempt in range(6):
         run = _integrate(problem, run_piece, name, tol, scale, t_out, left)
         nfev += run.nfev
         run.nfev, run.peak_u, run.peak_f = nfev, reference.peak_u, reference.peak_f
-        n = min(run.n_out, reference.n_out)
-        ours, theirs = reference.rows[:n], run.rows[:n]
-        force = problem.force(theirs[:, 1], theirs[:, 2]) - problem.force(ours[:, 1], ours[:, 2])
+        theirs_u, theirs_f = _gap(problem, run)
+        n = min(ours_u.size, theirs_u.size)
         run.error = ErrorEstimate(
-            float(np.abs(theirs[:, 1] - ours[:, 1]).max(initial=0.0)) + reference.error.u_gap,
-            float(np.abs(force).max(initial=0.0)) + reference.error.f_el,
+            float(np.abs(theirs_u[:n] - ours_u[:n]).max(initial=0.0)) + reference.error.u_gap,
+            float(np.abs(theirs_f[:n] - ours_f[:n]).max(initial=0.0)) + reference.error.f_el,
         )
         if run.status is not Status.SUCCESS:
             if reference.status is Status.FOLD:
@@ -264,3 +251,11 @@ def solve_foreign(problem: Problem, library: str, name: str, rtol: float, t_out:
         tol = max(tol * min(0.3, 0.5 / worst), 1e-16)
     run.status = Status.ERROR_NOT_MET
     return run
+
+
+def _gap(problem: Problem, run: Run) -> tuple[FloatArray, FloatArray]:
+    """Voltage of the layer that errors are measured on, and the force."""
+    record = run.record(problem)
+    if problem.stack.contact is None:
+        return record.u_layer[:, problem.scene.probe], np.zeros(run.t.size)
+    return record.u_gap, np.asarray(problem.stack.contact.stress(record.u_gap) * record.area)

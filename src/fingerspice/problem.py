@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.statespace import Stack, build_stack
-from fingerspice.circuit.waveforms import Waveform, require
+from fingerspice.circuit.waveforms import Fundamental, Waveform, require
 from fingerspice.engine.model import Model, choose_branch, gap_voltage
 from fingerspice.errors import InputError
+from fingerspice.numerics.modes import modes
 from fingerspice.phasors import mean_area
 from fingerspice.physics.contact import fixed_area_curve, inverse_area
 from fingerspice.solution import Solution, State
@@ -20,53 +23,94 @@ from fingerspice.solution import Solution, State
 FloatArray = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Problem:
-    """What an integrator needs, as numbers.
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A circuit under one charge law and area mode, as numbers; kept with the circuit from run to run.
 
     Attributes
     ----------
-    circuit : Circuit
     stack : Stack
     waveform : Waveform
         Voltage around the loop.
     model : Model
-    embedding : ndarray, shape (n_layer, n_layer - 1)
-        v = embedding @ x.
     charge_law, area_mode : str
-    t_start, t_stop, first, step : float
-        s; outputs are spaced by `step` from `first` on.
-    initial : State
+    u_peak : float
+        Largest |U|, V; 0 where it is not known.
+    prepared : dict
+        What integrators made ready for this scene.
     """
 
-    circuit: Circuit
     stack: Stack
     waveform: Waveform
     model: Model
-    embedding: FloatArray
     charge_law: str
     area_mode: str
-    t_start: float
-    t_stop: float
-    first: float
-    step: float
-    initial: State
+    u_peak: float
+    prepared: dict[Any, Any] = field(default_factory=dict)
+
+    @cached_property
+    def fundamental(self) -> Fundamental | None:
+        """The source's."""
+        return self.waveform.fundamental
 
     @property
     def probe(self) -> int:
         """Layer whose voltage the error is measured on: the gap, or the one with the smallest capacitance."""
-        return int(np.argmin(self.stack.c)) if self.stack.gap is None else self.stack.gap
+        return probe_layer(self.stack)
 
-    def layer_voltages(self, u_source: FloatArray, inverse: FloatArray, x: FloatArray) -> FloatArray:
-        """Voltages along the loop (n_t, n_layer) from U, 1/A and the states (n_t, n_layer - 1)."""
+    def live_voltages(self, u_source: FloatArray, inverse: FloatArray, x: FloatArray) -> FloatArray:
+        """Voltages (n_layer - 1, n_t) of the live layers from U, 1/A (n_t,) and the states (n_t, n_layer - 1)."""
         scale = self.model.area0 * inverse if self.model.mobile else np.ones_like(inverse)
-        return np.asarray(np.outer(u_source, self.stack.k) + (x * scale[:, None]) @ self.embedding.T)
+        return np.ascontiguousarray((np.outer(u_source, self.model.k[:-1]) + x * scale[:, None]).T)
 
     def force(self, u_gap: FloatArray, inverse: FloatArray) -> FloatArray:
         """Electroadhesive force (N) from the gap voltage (V) and 1/A (1/m^2); zero without a gap."""
         if self.stack.contact is None:
             return np.zeros_like(u_gap)
         return np.asarray(self.stack.contact.stress(u_gap) / inverse)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What an integrator needs.
+
+    Attributes
+    ----------
+    circuit : Circuit
+    scene : Scene
+    t_start, t_stop, first, step : float
+        s; outputs are spaced by `step` from `first` on.
+    initial : State
+    charge : bool
+        Whether charge and current are wanted.
+    """
+
+    circuit: Circuit
+    scene: Scene
+    t_start: float
+    t_stop: float
+    first: float
+    step: float
+    initial: State
+    charge: bool = True
+
+    @property
+    def stack(self) -> Stack:
+        return self.scene.stack
+
+    @property
+    def waveform(self) -> Waveform:
+        return self.scene.waveform
+
+    @property
+    def model(self) -> Model:
+        return self.scene.model
+
+    @property
+    def max_step(self) -> float:
+        """Longest step (s) that the deck's .tran line allows."""
+        tran = self.circuit.tran
+        return math.inf if tran is None or tran.max_step is None else tran.max_step
 
 
 def prepare(
@@ -77,6 +121,7 @@ def prepare(
     charge_law: str | None,
     area: str | float,
     start: str | Solution,
+    charge: bool = True,
 ) -> Problem:
     """Make a scene ready, or refuse it.
 
@@ -85,22 +130,43 @@ def prepare(
     InputError
         For anything in the request that cannot be run.
     """
-    law = charge_law or circuit.charge_law or "local"
-    require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
-    stack = build_stack(circuit)
-    waveform = stack.waveform
-    fixed, area_mode = _fixed_area(circuit, stack, area)
-    model, embedding = _model(stack, law, fixed, _largest_voltage(waveform, t_stop, circuit))
     t_start = start.state.t if isinstance(start, Solution) else 0.0
+    scene = scene_of(circuit, charge_law, area, t_stop)
     stop, step = _times(circuit, t_start, t_stop, t_eval)
     first = t_start + (circuit.tran.start if circuit.tran else 0.0)
-    initial = _initial_state(circuit, stack, waveform, model, law, start)
-    return Problem(circuit, stack, waveform, model, embedding, law, area_mode, t_start, stop, first, step, initial)
+    initial = _initial_state(circuit, scene, start)
+    return Problem(circuit, scene, t_start, stop, first, step, initial, charge)
 
 
-def _largest_voltage(waveform: Waveform, t_stop: float | None, circuit: Circuit) -> float:
+def scene_of(circuit: Circuit, charge_law: str | None, area: str | float, t_stop: float | None) -> Scene:
+    """The circuit's scene under a charge law and area mode, made on first use.
+
+    Raises
+    ------
+    InputError
+        As `prepare`.
+    """
+    law = charge_law or circuit.charge_law or "local"
+    require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
     stop = t_stop or (circuit.tran.stop if circuit.tran else 1.0)
-    peak = waveform.peak(0.0, stop) if math.isfinite(stop) and stop > 0.0 else 0.0
+
+    def make() -> Scene:
+        stack = build_stack(circuit)
+        waveform = stack.waveform
+        u_peak = _largest_voltage(waveform, stop)
+        fixed, area_mode = _fixed_area(stack, area)
+        return Scene(stack, waveform, _model(stack, law, fixed, u_peak), law, area_mode, u_peak)
+
+    scene: Scene = circuit.remember(("scene", law, area, stop), make)
+    return scene
+
+
+def _largest_voltage(waveform: Waveform, stop: float) -> float:
+    if not (math.isfinite(stop) and stop > 0.0):
+        return 0.0
+    if waveform.period is not None:
+        stop = min(stop, waveform.settled + waveform.period)
+    peak = waveform.peak(0.0, stop)
     return peak if math.isfinite(peak) else 0.0
 
 
@@ -128,7 +194,7 @@ def _times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: Float
     return t_stop, step
 
 
-def _fixed_area(circuit: Circuit, stack: Stack, area: str | float) -> tuple[float | None, str]:
+def _fixed_area(stack: Stack, area: str | float) -> tuple[float | None, str]:
     """The area (m^2) that does not follow the voltage, or None, and the mode's name."""
     if not isinstance(area, str):
         require(math.isfinite(area) and area > 0.0, "area", f"{area:g} m^2", "a positive area in m^2")
@@ -150,9 +216,12 @@ def _fixed_area(circuit: Circuit, stack: Stack, area: str | float) -> tuple[floa
     return mean_area(stack, fundamental.frequency, fundamental.amplitude), area
 
 
-def _model(stack: Stack, law: str, fixed: float | None, u_peak: float) -> tuple[Model, FloatArray]:
-    embedding = stack.matrices()[-1]
-    order = _state_order(embedding)
+def probe_layer(stack: Stack) -> int:
+    """The gap, or without one the layer with the smallest capacitance."""
+    return int(np.argmin(stack.c)) if stack.gap is None else stack.gap
+
+
+def _model(stack: Stack, law: str, fixed: float | None, u_peak: float) -> Model:
     if fixed is not None:
         area0 = fixed
         curve = fixed_area_curve(fixed)
@@ -161,41 +230,39 @@ def _model(stack: Stack, law: str, fixed: float | None, u_peak: float) -> tuple[
         area0 = float(stack.contact.area(0.0))
         # Discharging layers add to the gap's share of a jump: the curve covers a little more than U itself.
         curve = stack.contact.curve(max(1.3 * u_peak, 1e-30))
-    probe = int(np.argmin(stack.c)) if stack.gap is None else stack.gap
-    rate = stack.fastest_rate(area0)
-    model = Model(
+    order = list(stack.state_order)
+    probe = probe_layer(stack)
+    k = stack.k[order]
+    leaks = stack.leak_rates(area0)
+    slow = int(np.argmin(leaks))
+    rates, _, _, _ = modes(np.ascontiguousarray(leaks[order]), np.ascontiguousarray(k))
+    fastest = float(rates.max(initial=0.0))
+    return Model(
         mobile=law == "mobile",
         coupled=fixed is None,
-        k=np.ascontiguousarray(stack.k[order]),
+        k=np.ascontiguousarray(k),
         rate=np.ascontiguousarray((stack.g_area / stack.c)[order]),
         rate0=np.ascontiguousarray((stack.g_total / stack.c)[order]),
         k_gap=float(stack.k[probe]),
-        gap=np.ascontiguousarray(embedding[probe]),
+        gap=_row(order, probe),
         s=stack.s,
-        slow=_slowest_layer(stack, embedding, area0),
+        slow=np.append(_row(order, slow), [stack.k[slow], stack.c[slow], stack.g_area[slow], stack.g_total[slow]]),
         area0=area0,
-        tau=1.0 / rate if rate > 0.0 else math.inf,
+        tau=1.0 / fastest if fastest > 0.0 else math.inf,
         curve=curve,
     )
-    return model, embedding
 
 
-def _state_order(embedding: FloatArray) -> list[int]:
-    """Layers in the order of the states, the layer left out last."""
-    live = [int(np.argmax(column == 1.0)) for column in embedding.T]
-    return [*live, next(i for i in range(embedding.shape[0]) if i not in live)]
+def _row(order: list[int], layer: int) -> FloatArray:
+    """How a layer's voltage over k U follows from the states, shape (n_layer - 1,)."""
+    place = order.index(layer)
+    n = len(order) - 1
+    return np.full(n, -1.0) if place == n else np.eye(n)[place]
 
 
-def _slowest_layer(stack: Stack, embedding: FloatArray, area: float) -> FloatArray:
-    """See `Model.slow`."""
-    i = int(np.argmin((stack.g_total / area + stack.g_area) / stack.c))
-    return np.append(embedding[i], [stack.k[i], stack.c[i], stack.g_area[i], stack.g_total[i]])
-
-
-def _initial_state(
-    circuit: Circuit, stack: Stack, waveform: Waveform, model: Model, law: str, start: str | Solution
-) -> State:
+def _initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> State:
     """State just before the start."""
+    stack, model, law = scene.stack, scene.model, scene.charge_law
     n = stack.c.size
     if isinstance(start, Solution):
         if start.layers != tuple(e.name for e in stack.layers) or start.charge_law != law:
@@ -213,14 +280,13 @@ def _initial_state(
     if start == "given":
         u, u_before = _given_voltages(circuit, stack)
     else:
-        u_before = float(waveform.value(0.0, "left"))
+        u_before = float(scene.waveform.value(0.0, "left"))
         u = dc_voltages(stack, u_before, model)
     v = u - stack.k * u_before
     inverse = 1.0 / model.area0
     if stack.gap is not None:
         inverse, _ = inverse_area(abs(float(u[stack.gap])), model.curve)
-    live = _state_order(stack.matrices()[-1])[:-1]
-    x = v[live] / (model.area0 * inverse if model.mobile else 1.0)
+    x = v[list(stack.state_order[:-1])] / (model.area0 * inverse if model.mobile else 1.0)
     state = state_from(model, 0.0, x, u_before, law)
     if stack.gap is not None:
         found = _gap_voltage(model, x, u_before)

@@ -6,6 +6,7 @@ import csv
 import json
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.files import write_aside
+from fingerspice.numerics.cubics import fundamental, mean
+from fingerspice.record import Record, sealed
 
 if TYPE_CHECKING:
     import xarray
@@ -64,29 +67,17 @@ class State:
 
 @dataclass(frozen=True)
 class Solution:
-    """Time response of a circuit. Arrays are read-only; SI units; at a jump of the source two rows share a time.
+    """Time response of a circuit.
+
+    Signals are read-only arrays in SI units, computed when first asked for; at a jump of the source two rows share a
+    time.
 
     Attributes
     ----------
     t : ndarray, shape (n_t,)
         s.
-    u_source : ndarray, shape (n_t,)
-        Voltage around the loop, V.
-    u_layer : ndarray, shape (n_t, n_layer)
-        Voltage of each layer from its p to its n node, V.
-    layers : tuple of str
-        Names of the columns of `u_layer`.
-    u_gap, area, sigma_el, f_el, f_t, friction : ndarray, shape (n_t,), or None
-        Gap voltage (V), ridge contact area (m^2), electroadhesive stress (Pa, Eq. 2) and force (N), friction
-        force (N, Eq. 1) and friction coefficient f_t / f_n. None for a circuit without GAP, except `area`.
-    node_voltages : dict of str to ndarray, shape (n_t,)
-        V, by node name.
-    q_source : ndarray, shape (n_t,)
-        Charge delivered by the source since the start, C; a jump adds its integral of A dD.
-    i_source : ndarray, shape (n_t,)
-        Regular part of the current, A, positive when delivered; a jump is an impulse, seen in `q_source` only.
-    fold_margin : ndarray, shape (n_t,)
-        Distance to the fold of the `mobile` law: 1 without stored charge, 0 at the fold; 1 under `local`.
+    record : Record
+        What the run wrote down.
     status : Status
     message : str
     nfev : int
@@ -102,19 +93,7 @@ class Solution:
     """
 
     t: FloatArray
-    u_source: FloatArray
-    u_layer: FloatArray
-    layers: tuple[str, ...]
-    u_gap: FloatArray | None
-    area: FloatArray
-    sigma_el: FloatArray | None
-    f_el: FloatArray | None
-    f_t: FloatArray | None
-    friction: FloatArray | None
-    node_voltages: dict[str, FloatArray]
-    q_source: FloatArray
-    i_source: FloatArray
-    fold_margin: FloatArray
+    record: Record
     status: Status
     message: str
     nfev: int
@@ -131,9 +110,78 @@ class Solution:
     warnings: tuple[str, ...] = field(default=())
 
     def __post_init__(self) -> None:
-        for value in (*vars(self).values(), *self.node_voltages.values()):
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
+        sealed(self.t)
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the columns of `u_layer`."""
+        return tuple(e.name for e in self.record.stack.layers)
+
+    @property
+    def u_source(self) -> FloatArray:
+        """Voltage around the loop, V, shape (n_t,)."""
+        return self.record.u_source
+
+    @property
+    def u_layer(self) -> FloatArray:
+        """Voltage of each layer from its p to its n node, V, shape (n_t, n_layer)."""
+        return self.record.u_layer
+
+    @property
+    def node_voltages(self) -> dict[str, FloatArray]:
+        """Node name to its voltage, V, shape (n_t,)."""
+        return self.record.node_voltages
+
+    @property
+    def area(self) -> FloatArray:
+        """Ridge contact area, m^2, shape (n_t,)."""
+        return self.record.area
+
+    @property
+    def q_source(self) -> FloatArray | None:
+        """Charge delivered by the source since the start, C, shape (n_t,); a jump adds its integral of A dD.
+
+        None where the run was asked to leave it out.
+        """
+        return self.record.charge
+
+    @property
+    def i_source(self) -> FloatArray | None:
+        """Regular part of the source's current, A, shape (n_t,); a jump is an impulse, seen in `q_source` only."""
+        return self.record.current
+
+    @property
+    def fold_margin(self) -> FloatArray:
+        """Distance to the fold of the `mobile` law: 1 without stored charge, 0 at the fold; 1 under `local`."""
+        return self.record.fold_margin
+
+    @property
+    def u_gap(self) -> FloatArray | None:
+        """Gap voltage, V, shape (n_t,); None for a circuit without GAP."""
+        return None if self.record.stack.gap is None else self.record.u_gap
+
+    @cached_property
+    def sigma_el(self) -> FloatArray | None:
+        """Electroadhesive stress (Eq. 2), Pa, shape (n_t,); None for a circuit without GAP."""
+        contact = self.record.stack.contact
+        return None if contact is None else sealed(contact.stress(self.record.u_gap))
+
+    @cached_property
+    def f_el(self) -> FloatArray | None:
+        """Electroadhesive force, N, shape (n_t,); None for a circuit without GAP."""
+        return None if self.sigma_el is None else sealed(self.sigma_el * self.area)
+
+    @cached_property
+    def f_t(self) -> FloatArray | None:
+        """Friction force (Eq. 1), N, shape (n_t,); None for a circuit without GAP."""
+        contact = self.record.stack.contact
+        return None if contact is None or self.f_el is None else sealed(contact.mu * (contact.f_n + self.f_el))
+
+    @cached_property
+    def friction(self) -> FloatArray | None:
+        """Friction coefficient f_t / f_n, shape (n_t,); None for a circuit without GAP."""
+        contact = self.record.stack.contact
+        return None if contact is None or self.f_t is None else sealed(self.f_t / contact.f_n)
 
     @property
     def success(self) -> bool:
@@ -141,7 +189,7 @@ class Solution:
         return self.status is Status.SUCCESS
 
     @property
-    def f_el_mean(self) -> float | None:
+    def f_elmean(self) -> float | None:
         """Mean electroadhesive force over the run, N; None without a GAP."""
         return self.summary().get("f_el_mean")
 
@@ -195,21 +243,21 @@ class Solution:
             out[f"{key}_max"] = float(x.max())
             out[f"{key}_min"] = float(x.min())
             out[f"{key}_peak"] = float(np.abs(x).max())
-            out[f"{key}_mean"] = _mean(self.t, x)
-            out[f"{key}_rms"] = float(np.sqrt(_mean(self.t, x**2)))
+            out[f"{key}_mean"] = mean(self.t, x)
+            out[f"{key}_rms"] = float(np.sqrt(mean(self.t, x**2)))
             out[f"{key}_mean_periodic"] = None
             if last is not None:
-                periodic = _mean(last[0], last[1][key])
+                periodic = mean(last[0], last[1][key])
                 out[f"{key}_mean_periodic"] = periodic
                 if key in ("area", "f_el", "f_t", "friction"):
                     out[f"{key}_ripple"] = float(np.ptp(last[1][key]))
                 else:
-                    out[f"{key}_rms_periodic"] = float(np.sqrt(_mean(last[0], last[1][key] ** 2)))
+                    out[f"{key}_rms_periodic"] = float(np.sqrt(mean(last[0], last[1][key] ** 2)))
         if last is not None and self.fundamental is not None:
             f0 = self.fundamental
             for key in ("u_source", "u_gap"):
                 if key in last[1]:
-                    p = _fundamental(last[0], last[1][key], f0.frequency)
+                    p = fundamental(last[0], last[1][key], f0.frequency)
                     out[f"{key}_amplitude"] = abs(p)
                     out[f"{key}_phase_deg"] = float(np.degrees(np.angle(p)))
             out["fundamental"] = f0.frequency
@@ -355,40 +403,3 @@ class Solution:
         from fingerspice.plotting import plot_solution
 
         return plot_solution(self)
-
-
-def _mean(t: FloatArray, x: FloatArray) -> float:
-    """Mean of x over t: cubics through neighbouring outputs on every stretch between two jumps."""
-    span = t[-1] - t[0]
-    if span <= 0.0:
-        return float(x[-1])
-    cuts = np.flatnonzero(np.diff(t) == 0.0) + 1
-    pieces = zip(np.split(t, cuts), np.split(x, cuts), strict=True)
-    return float(sum(_integral(a, b) for a, b in pieces) / span)
-
-
-def _integral(t: FloatArray, x: FloatArray) -> Any:
-    """Integral of x over t, exact for cubics; trapezoidal where there are too few points."""
-    if t.size < 4:
-        return np.trapezoid(x, t)
-    first = np.clip(np.arange(t.size - 1) - 1, 0, t.size - 4)
-    index = first[:, None] + np.arange(4)
-    nodes, values = t[index], x[index]
-    half, middle = 0.5 * np.diff(t), 0.5 * (t[1:] + t[:-1])
-    total = 0.0
-    # Two Gauss points integrate a cubic; Lagrange's form gives it there.
-    for at in (middle - half / np.sqrt(3.0), middle + half / np.sqrt(3.0)):
-        for i in range(4):
-            weight = np.ones(at.size)
-            for j in range(4):
-                if j != i:
-                    weight *= (at - nodes[:, j]) / (nodes[:, i] - nodes[:, j])
-            total = total + np.sum(half * weight * values[:, i])
-    return total
-
-
-def _fundamental(t: FloatArray, x: FloatArray, frequency: float) -> complex:
-    """Complex amplitude P of x ~ Im(P exp(i 2 pi f t)) over the times given, a whole number of periods."""
-    phase = 2.0 * np.pi * frequency * t
-    # The mean of x exp(-i phase), in its two real parts.
-    return 2j * complex(_mean(t, x * np.cos(phase)), -_mean(t, x * np.sin(phase)))

@@ -124,6 +124,19 @@ class Circuit:
     text: str = ""
     path: Path | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
+    _memory: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_memory": {}}
+
+    def remember(self, key: Any, make: Callable[[], Any]) -> Any:
+        """What `make` gives, kept for the next call with the same key: circuits do not change."""
+        if key not in self._memory:
+            # The oldest goes: a sweep over stop times must not fill the memory.
+            if len(self._memory) >= 16:
+                self._memory.pop(next(iter(self._memory)))
+            self._memory[key] = make()
+        return self._memory[key]
 
     def __getitem__(self, name: str) -> Element:
         """The element of that name, whatever its case.

@@ -23,6 +23,7 @@ from fingerspice.numerics import chebyshev
 FloatArray = NDArray[np.float64]
 
 _POINTS = 20
+_PERIODS_PER_SEGMENT = 64.0
 # Points between the nodes at which a series has to prove itself; irregular, so that no period hides from them.
 _AT_START = (-1.0) ** np.arange(_POINTS)
 _PROOF = 2.0 * np.modf(np.arange(1, 28) * 0.6180339887498949)[0] - 1.0
@@ -158,8 +159,10 @@ def source_table(waveform: Waveform, t0: float, t1: float, tol: float, step: flo
     # A breakpoint that misses the window's edge by rounding is at the edge: no segment is shorter than that.
     inner = inner[(inner > t0 + same_time(t0)) & (inner < t1 - same_time(t1))]
     edges = np.concatenate([[t0], inner, [t1]])
-    terms = waveform.terms(edges[:-1], edges[1:])
-    if terms is not None:
+    if not is_sampled(waveform):
+        edges = _rephased(edges, waveform.shortest_time())
+        terms = waveform.terms(edges[:-1], edges[1:])
+        assert terms is not None
         return SourceTable(edges, np.ascontiguousarray(terms), np.zeros((edges.size - 1, 0)))
     pieces = _Refiner(waveform, tol, step)
     for a, b in itertools.pairwise(edges):
@@ -174,6 +177,15 @@ def source_table(waveform: Waveform, t0: float, t1: float, tol: float, step: flo
         pieces.scale,
         pieces.not_finite,
     )
+
+
+def _rephased(edges: FloatArray, period: float) -> FloatArray:
+    """Edges with more between them, so that no phase inside a segment grows to where its rounding shows."""
+    longest = _PERIODS_PER_SEGMENT * period
+    if not np.any(np.diff(edges) > longest):
+        return edges
+    pieces = [np.linspace(a, b, max(1, math.ceil((b - a) / longest)) + 1)[:-1] for a, b in itertools.pairwise(edges)]
+    return np.concatenate([*pieces, edges[-1:]])
 
 
 @dataclass

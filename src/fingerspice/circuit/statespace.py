@@ -96,31 +96,18 @@ class Stack:
             parts.append(element.waveform if sign > 0 else Product((DC(-1.0), element.waveform)))
         return parts[0] if len(parts) == 1 else Sum(tuple(parts))
 
-    def matrices(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Reduced system: p1, p0 (n_layer, n_layer - 1), b (2, n_layer) and the embedding (n_layer, n_layer - 1).
+    @property
+    def state_order(self) -> tuple[int, ...]:
+        """Layers in the order of the states; the last one's voltage is what the others leave of the source's.
 
-        Rows of p and b: the live states' rates, then lam, the rate of sum(lambda/c)/S; p1 and b[0] do not depend
-        on the area, p0 and b[1] multiply 1/A. v = embedding @ x.
+        The layer left out is never the gap, so that the gap's voltage is a state of its own.
         """
-        n_layer = self.c.size
-        # The layer left out is never the gap, so that the gap's voltage is a state of its own.
-        left_out = next((i for i in reversed(range(n_layer)) if i != self.gap), 0)
-        live = [i for i in range(n_layer) if i != left_out]
-        embedding = np.zeros((n_layer, n_layer - 1))
-        embedding[live, np.arange(n_layer - 1)] = 1.0
-        embedding[left_out] = -1.0
-        full = np.outer(self.k, np.ones(n_layer)) - np.eye(n_layer)
-        rows = np.vstack([full[live], np.full((1, n_layer), 1.0 / self.s)])
-        fixed = rows * (self.g_area / self.c)
-        scaled = rows * (self.g_total / self.c)
-        b = np.stack([fixed @ self.k, scaled @ self.k])
-        return fixed @ embedding, scaled @ embedding, b, embedding
+        left_out = next((i for i in reversed(range(self.c.size)) if i != self.gap), 0)
+        return (*(i for i in range(self.c.size) if i != left_out), left_out)
 
-    def fastest_rate(self, area: float) -> float:
-        """Largest rate of the stack with its area frozen at `area` (m^2), 1/s."""
-        fixed, scaled, _, _ = self.matrices()
-        matrix = (fixed + scaled / area)[:-1]
-        return float(np.abs(np.linalg.eigvals(matrix)).max()) if matrix.size else 0.0
+    def leak_rates(self, area: float) -> FloatArray:
+        """Leak rate of each layer, g/c, at an area (m^2), 1/s, shape (n_layer,)."""
+        return np.asarray((self.g_total / area + self.g_area) / self.c)
 
     def admittance(self, frequency: FloatArray, area: FloatArray) -> FloatArray:
         """Complex layer admittances (n_frequency, n_layer) in S, SKIN at each frequency (Eqs. 9, 16 to 19)."""

@@ -1,4 +1,4 @@
-"""One exponential collocation step: the linear part exact, the area's part by iteration, the error from what it misses."""
+"""One step of exponential collocation: the linear part exact, the area's by iteration, the error by what it misses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import jit, jit_inline, jit_rows
-from fingerspice.engine.rows import DQ, GUESS, Q, SOURCE, U, X_GAP, evaluate, moved
+from fingerspice.engine.rows import DQ, GUESS, SOURCE, X_GAP, Q, U, evaluate, moved
 from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, fill_table
 
 FloatArray = NDArray[np.float64]
@@ -27,7 +27,7 @@ class Tables(NamedTuple):
     ----------
     h : ndarray, shape (N_SLOTS,)
         Step length of each slot, s.
-    level, count : ndarray of int
+    level, used : ndarray of int
         Reference area of each slot, and [slots in use, slot used last].
     decay, phi, miss : ndarray, shape (N_SLOTS, n, ...)
         See `fill_table`; `phi` and `miss` times h.
@@ -35,7 +35,7 @@ class Tables(NamedTuple):
 
     h: FloatArray
     level: IntArray
-    count: IntArray
+    used: IntArray
     decay: FloatArray
     phi: FloatArray
     miss: FloatArray
@@ -63,7 +63,7 @@ def make_tables(
         if keys_h[slot] == h and keys_level[slot] == level:
             count[1] = slot
             return slot
-    slot = count[0] % N_SLOTS
+    slot = int(count[0] % N_SLOTS)
     count[0] += 1
     # Beyond twice the slots the count means only "all in use" and where to go on.
     if count[0] >= 2 * N_SLOTS:

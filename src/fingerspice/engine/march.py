@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fingerspice.compiled import borrow, jit, jit_fused, jit_rows
 from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables
 from fingerspice.engine.model import Model, Segment, branch_area, choose_branch, dot, gap_voltage, jump_charge, source
-from fingerspice.engine.rows import DQ, GUESS, N_FLAT, SLOPE, SOURCE, Q, U, X_GAP, source_rows
+from fingerspice.engine.rows import DQ, GUESS, N_FLAT, SLOPE, SOURCE, X_GAP, Q, U, source_rows
 from fingerspice.engine.system import System
 from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, SECOND, TO_SERIES
 
@@ -41,8 +41,8 @@ class Pace(NamedTuple):
     ----------
     tol : float
         Error of the gap voltage allowed in a step, V.
-    h_top, h_max : float
-        Top of the ladder of step lengths, and the longest step, s.
+    h_max : float
+        Longest step, s.
     controlled : bool
         Whether the error governs the step; else every step is `h_max` (for measuring orders).
     charge : bool
@@ -50,7 +50,6 @@ class Pace(NamedTuple):
     """
 
     tol: float
-    h_top: float
     h_max: float
     controlled: bool
     charge: bool
@@ -73,10 +72,12 @@ class Work(NamedTuple):
 
 def new_work(n: int) -> Work:
     """Work arrays for n modes."""
-    deep = [np.zeros((n, ROWS)) for _ in range(4)]
     return Work(
         np.zeros((N_FLAT, ROWS)),
-        *deep,
+        np.zeros((n, ROWS)),
+        np.zeros((n, ROWS)),
+        np.zeros((n, ROWS)),
+        np.zeros((n, ROWS)),
         np.zeros(n),
         np.zeros((n, N_PLACES)),
         np.zeros((n + 2, NODES)),
@@ -135,16 +136,17 @@ def _choose_step(
         # A series is worthless past its end: the last step of a segment has its exact length.
         if h >= remaining * (1.0 - 1e-9):
             return remaining
-        h = _rung(pace.h_top, h)
+        h = _rung(h)
         return h if h < remaining else remaining
-    return _rung(pace.h_top, h)
+    h = _rung(h)
+    return h if h <= pace.h_max else _rung(0.95 * pace.h_max)
 
 
 @jit
-def _rung(h_top: float, h: float) -> float:
+def _rung(h: float) -> float:
     """The shortest step of the ladder that is not shorter than h."""
-    rung = math.floor(_RUNGS * math.log2(h_top / h) + 1e-9)
-    return h_top * 2.0 ** (-rung / _RUNGS)
+    out: float = 2.0 ** (math.ceil(_RUNGS * math.log2(h) - 1e-9) / _RUNGS)
+    return out
 
 
 @jit_rows
@@ -177,12 +179,12 @@ def _value_and_slope(series: FloatArray, x: float) -> tuple[float, float]:
 @jit
 def _zero(u: FloatArray, sign: float, last: int, series: FloatArray) -> float:
     """Fraction of the step at which the gap voltage leaves its branch, between nodes `last` - 1 and `last`."""
-    lo = POINTS[last - 1]
-    hi = POINTS[last]
+    lo: float = POINTS[last - 1]
+    hi: float = POINTS[last]
     if not sign * u[last - 1] > 0.0:
         return lo
     _series_of(u, series)
-    theta = lo + (hi - lo) * u[last - 1] / (u[last - 1] - u[last])
+    theta: float = lo + (hi - lo) * u[last - 1] / (u[last - 1] - u[last])
     # Newton, in a bracket that only closes.
     for _ in range(60):
         value, slope = _value_and_slope(series, 2.0 * theta - 1.0)
@@ -219,7 +221,8 @@ def _at(values: FloatArray, theta: float) -> float:
     for j in range(NODES):
         distance = theta - POINTS[j]
         if distance == 0.0:
-            return values[j]
+            value: float = values[j]
+            return value
         weight = BARYCENTRIC[j] / distance
         top += weight * values[j]
         bottom += weight
@@ -442,7 +445,7 @@ def march(
         borrow(system.slow), borrow(system.turn), borrow(system.live), borrow(system.project)
     )  # fmt: skip
     lo, scale, stress, u_top = system.lo, system.scale, system.stress, system.u_top
-    keys_h, keys_level, count = borrow(tables.h), borrow(tables.level), borrow(tables.count)
+    keys_h, keys_level, count = borrow(tables.h), borrow(tables.level), borrow(tables.used)
     all_decay, all_phi, all_miss = borrow(tables.decay), borrow(tables.phi), borrow(tables.miss)
     tol, charge, controlled = pace.tol, pace.charge, pace.controlled
     terms, series, y, error, control = borrow(terms), borrow(series), borrow(y), borrow(error), borrow(control)
@@ -545,9 +548,9 @@ def march(
             counters[REJECTED] += 1
             if wrong > 1 and sign * u_rows[END] < lo:
                 # It went far over a zero, where the branch has no meaning: end soon after the zero.
-                h = _rung(pace.h_top, h * min(0.9, 1.1 * POINTS[wrong]))
+                h = _rung(h * min(0.9, 1.1 * POINTS[wrong]))
             else:
-                h = _rung(pace.h_top, h * min(0.9, max(0.25, factor)))
+                h = _rung(h * min(0.9, max(0.25, factor)))
                 wanted = h
         if flip:
             control[SIGN] = -control[SIGN]

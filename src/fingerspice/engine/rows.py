@@ -145,7 +145,9 @@ def _long_area(curve: FloatArray, sign: float, r: FloatArray) -> None:
 
 
 @jit_rows
-def _gap_voltage(k_gap: float, gap: FloatArray, w: FloatArray, source: FloatArray, x: FloatArray, u: FloatArray) -> None:
+def _gap_voltage(
+    k_gap: float, gap: FloatArray, w: FloatArray, source: FloatArray, x: FloatArray, u: FloatArray
+) -> None:
     """x = gap w and u = k_gap U + gap w."""
     for i in range(ROWS):
         x[i] = 0.0

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.compiled import jit, jit_rows
 
 FloatArray = NDArray[np.float64]
 
@@ -81,3 +81,29 @@ def evaluate(c: FloatArray, x: float) -> tuple[float, float]:
         b2 = b1
         b1 = b0
     return c[0] + x * b1 - b2, b1 + x * d1 - d2
+
+
+_BLOCK = 32
+
+
+@jit_rows
+def evaluate_array(c: FloatArray, x: FloatArray) -> FloatArray:
+    """Values of the series at many places in [-1, 1], shape (n,); several at once in a processor's vector."""
+    out = np.empty(x.size)
+    here = np.empty(_BLOCK)
+    b1 = np.empty(_BLOCK)
+    b2 = np.empty(_BLOCK)
+    for first in range(0, x.size, _BLOCK):
+        count = min(_BLOCK, x.size - first)
+        for i in range(_BLOCK):
+            here[i] = x[first + min(i, count - 1)]
+            b1[i] = 0.0
+            b2[i] = 0.0
+        for k in range(c.size - 1, 0, -1):
+            for i in range(_BLOCK):
+                b0 = c[k] + 2.0 * here[i] * b1[i] - b2[i]
+                b2[i] = b1[i]
+                b1[i] = b0
+        for i in range(count):
+            out[first + i] = c[0] + here[i] * b1[i] - b2[i]
+    return out

@@ -203,6 +203,27 @@ def inverse_area(u: float, curve: FloatArray) -> tuple[float, float]:
     return 1.0 / area, -slope / (area * area)
 
 
+def areas(u: FloatArray, curve: FloatArray) -> FloatArray:
+    """A_R (m^2) at gap voltages |u| (V), shape (n,), from a `Contact.curve`."""
+    u = np.abs(u)
+    lo, hi, series = curve[0], curve[1], curve[2 + N_PACKED :]
+    if series.size == 1:
+        return np.full(u.shape, 1.0 / series[0])
+    if series.size and u.max(initial=0.0) <= hi:
+        return np.asarray(1.0 / chebyshev.evaluate_array(series, (u - lo) * (2.0 / (hi - lo)) - 1.0))
+    return np.asarray(1.0 / inverse_area_array(u, curve)[0])
+
+
+@jit
+def inverse_area_array(u: FloatArray, curve: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """`inverse_area` over an array, shape (n,)."""
+    q = np.empty_like(u)
+    slope = np.empty_like(u)
+    for i in range(u.size):
+        q[i], slope[i] = inverse_area(u[i], curve)
+    return q, slope
+
+
 @jit
 def _ridge_area_slope(u: float, contact: FloatArray) -> tuple[float, float]:
     """A_R (m^2) and dA_R/du (m^2/V): `ridge_area` differentiated."""

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.circuit.sampling import SourceTable, breakpoints_at, is_sampled, source_table
+from fingerspice.circuit.sampling import SourceTable
 from fingerspice.engine import advance as loop
 from fingerspice.engine.model import Segment, choose_branch, source, write_row
 from fingerspice.engine.steps import Method
-from fingerspice.numerics.tableaus import TABLEAUS, Tableau
+from fingerspice.numerics.tableaus import Tableau
 from fingerspice.problem import Problem
+from fingerspice.runs import ROUNDING, BoolArray, FloatArray, Progress, Run, Tables, after_the_end, from_rows, row_width
 from fingerspice.solution import ErrorEstimate, State, Status
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-Progress = Callable[[float], None]
 
 LOG_ROWS = 4096
 # The shadow run's tolerance over the main run's: far enough that their difference is the main run's error.
@@ -28,40 +23,10 @@ SHADOW = 0.03
 SAFETY = 3.0
 # The local error allowed in a step, over the global error asked for. Errors of the past decay in a leaky stack.
 LOCAL_SHARE = 0.2
-# An error below this share of the voltages that cancel in the gap's is rounding: finer steps would not reach it.
-ROUNDING = 2e-14
-PERIODS_PER_WINDOW = 64.0
-BREAKPOINTS_PER_WINDOW = 2000.0
 
 
 @dataclass
-class Run:
-    """What one integration gives: output rows (see `write_row`) and how it went."""
-
-    rows: FloatArray
-    n_out: int
-    status: Status
-    error: ErrorEstimate
-    peak_u: float
-    peak_f: float
-    nfev: int
-    stats: dict[str, int]
-    state: State
-    t_failed: float | None = None
-    detail: str = ""
-    last: FloatArray | None = None
-    """Row at the time a failed run reached, left-hand."""
-
-    def excess(self, rtol: float) -> float:
-        """Estimated error over the one asked for, the larger of voltage and force."""
-        return max(
-            self.error.u_gap / (rtol * self.peak_u) if self.peak_u > 0.0 else 0.0,
-            self.error.f_el / (rtol * self.peak_f) if self.peak_f > 0.0 else 0.0,
-        )
-
-
-@dataclass
-class _Track:
+class Track:
     """One integration in progress."""
 
     problem: Problem
@@ -99,7 +64,7 @@ class _Track:
             )
         )  # fmt: skip
 
-    def follow(self, table: SourceTable, main: _Track) -> int:
+    def follow(self, table: SourceTable, main: Track) -> int:
         """Go where `main` has gone, with outputs at its log times in `rows`."""
         self.t_out = np.ascontiguousarray(main.log_rows[:, 0])
         self.left = np.ones(self.t_out.size, bool)
@@ -126,20 +91,7 @@ class _Track:
         pending = range(int(self.counters[loop.OUTPUT]), self.t_out.size)
         if not pending:
             return
-        segment = Segment(
-            float(table.edges[-2]),
-            float(table.edges[-1] - table.edges[-2]),
-            table.terms[-1],
-            table.series[-1],
-        )
-        tau = self.t - segment.start
-        stop = self.problem.t_stop
-        if breakpoints_at(self.problem.waveform, stop).size:
-            after = source_table(self.problem.waveform, stop, stop + self.problem.step, 1e-10, self.problem.step)
-            segment = Segment(
-                float(after.edges[0]), float(after.edges[1] - after.edges[0]), after.terms[0], after.series[0]
-            )
-            tau = 0.0
+        segment, tau = after_the_end(self.problem, table)
         u, du = loop.enter(self.problem.model, segment, tau, self.y, self.control)
         for i in pending:
             write_row(
@@ -157,61 +109,10 @@ class _Track:
 def method_from(tableau: Tableau, problem: Problem, h_fixed: float = 0.0) -> Method:
     """A tableau as the compiled code takes it, its step bounded by the source's own time scale and the deck's TMAX."""
     # Zeros of the gap voltage are looked for at quarters of a step: four steps per period cannot hide one.
-    h_max = 0.25 * problem.waveform.shortest_time()
-    if problem.circuit.tran is not None and problem.circuit.tran.max_step is not None:
-        h_max = min(h_max, problem.circuit.tran.max_step)
+    h_max = min(0.25 * problem.waveform.shortest_time(), problem.max_step)
     # One memory layout for every tableau: another one would be another compilation.
     a, c, e, dense = (np.ascontiguousarray(x) for x in (tableau.a, tableau.c, tableau.e, tableau.dense))
     return Method(tableau.implicit, a, c, e, dense, tableau.n_end, tableau.error_order, h_max, h_fixed)
-
-
-class Tables:
-    """Tables of a problem's source, window by window.
-
-    A user's function is expensive to look at, so its tables are kept; those of library waveforms are made anew,
-    which keeps a long run's memory constant.
-    """
-
-    def __init__(self, problem: Problem, tol: float) -> None:
-        self.problem = problem
-        self.tol = min(1e-3, max(0.05 * tol, 1e-14))
-        self.edges = windows(problem)
-        self.kept: dict[int, SourceTable] | None = {} if is_sampled(problem.waveform) else None
-
-    def __iter__(self) -> Iterator[SourceTable]:
-        for i, (w0, w1) in enumerate(itertools.pairwise(self.edges)):
-            table = self.kept.get(i) if self.kept is not None else None
-            if table is None:
-                table = source_table(self.problem.waveform, w0, w1, self.tol, self.problem.step)
-                if self.kept is not None:
-                    self.kept[i] = table
-            yield table
-            if table.not_finite is not None:
-                return
-
-    def peak(self) -> float:
-        """Largest |U| (V) of the run."""
-        if self.kept is None:
-            return self.problem.waveform.peak(self.problem.t_start, self.problem.t_stop)
-        return max(table.scale for table in self)
-
-
-def row_width(problem: Problem) -> int:
-    """Columns of an output row."""
-    return 5 + problem.stack.c.size
-
-
-def windows(problem: Problem) -> list[float]:
-    """Edges of the windows the source is tabulated on: constant memory, and phases that stay exact."""
-    span = problem.t_stop - problem.t_start
-    rate = max(
-        problem.waveform.breakpoint_rate() / BREAKPOINTS_PER_WINDOW,
-        1.0 / (PERIODS_PER_WINDOW * problem.waveform.shortest_time()),
-        # A function is sampled at the output step.
-        1.0 / (4096.0 * problem.step) if is_sampled(problem.waveform) else 0.0,
-    )
-    count = max(1, int(np.ceil(span * rate)))
-    return [problem.t_start + span * i / count for i in range(count)] + [problem.t_stop]
 
 
 def integrate(
@@ -253,8 +154,8 @@ def integrate(
     scale = tol * np.append(np.full(problem.stack.c.size - 1, u_scale), z_scale)
     rows = np.full((t_out.size, width), np.nan)
     log = np.empty((LOG_ROWS, 4))
-    main = _Track(problem, method, scale, t_out, left, rows, log)
-    other = _Track(problem, method, SHADOW * scale, t_out[:0], left[:0], rows[:0], log[:0])
+    main = Track(problem, method, scale, t_out, left, rows, log)
+    other = Track(problem, method, SHADOW * scale, t_out[:0], left[:0], rows[:0], log[:0])
     meter = _Meter(problem)
     status, t_failed, last = Status.SUCCESS, None, None
     table = None
@@ -280,9 +181,15 @@ def integrate(
     elif table is not None and table.edges.size > 1:
         last = main.here(table)
     c = main.counters
+    n_out = int(c[loop.OUTPUT])
+    t, side, rows = t_out[:n_out], left[:n_out], main.rows[:n_out]
+    if last is not None and (n_out == 0 or main.t > t[-1]):
+        # A failed run's arrays end at the time it reached.
+        t, side, rows = np.append(t, main.t), np.append(side, True), np.vstack([rows, last])
     return Run(
-        rows=rows,
-        n_out=int(c[loop.OUTPUT]),
+        t,
+        side,
+        *from_rows(problem, rows),
         status=status,
         error=meter.error(),
         peak_u=meter.peak_u,
@@ -299,10 +206,9 @@ def integrate(
             main.y.copy(),
             float(main.control[loop.U_BEFORE]),
             problem.initial.charge_offset,
-            problem.charge_law,
+            problem.scene.charge_law,
         ),
         t_failed=t_failed,
-        last=last,
     )
 
 
@@ -319,7 +225,7 @@ class _Meter:
     def compare(self, log: FloatArray, shadow_rows: FloatArray | None) -> None:
         if log.shape[0] == 0:
             return
-        force = self.problem.force(log[:, 1], log[:, 2])
+        force = self.problem.scene.force(log[:, 1], log[:, 2])
         self.peak_u = max(self.peak_u, float(np.abs(log[:, 1]).max()))
         self.peak_f = max(self.peak_f, float(force.max()))
         if shadow_rows is None:
@@ -327,7 +233,7 @@ class _Meter:
         # The shadow may have stopped at a fold before the end of the log.
         n = int(np.count_nonzero(np.isfinite(shadow_rows[:, 1])))
         if n:
-            other = self.problem.force(shadow_rows[:n, 1], shadow_rows[:n, 2])
+            other = self.problem.scene.force(shadow_rows[:n, 1], shadow_rows[:n, 2])
             # F ~ u^2: what moves u by du moves F by 2 F du / u.
             rounding = 2.0 * force[:n] * log[:n, 3] / np.maximum(np.abs(log[:n, 1]), 1e-300)
             self.diff_u = max(self.diff_u, float((np.abs(shadow_rows[:n, 1] - log[:n, 1]) - log[:n, 3]).max()))
@@ -338,22 +244,10 @@ class _Meter:
         return ErrorEstimate(SAFETY * self.diff_u + 4e-16 * self.peak_u, SAFETY * self.diff_f + 4e-16 * self.peak_f)
 
 
-def choose_tableau(problem: Problem, rtol: float) -> Tableau:
-    """The own stepper for a problem: collocation where the explicit ones would be held by stability alone."""
-    span = problem.t_stop - problem.t_start
-    stable = span / (3.0 * problem.model.tau)
-    smooth = span / min(problem.waveform.shortest_time(), span)
-    pieces = 1.0 + problem.waveform.breakpoint_rate() * span
-    accurate = 20.0 * (smooth + pieces) * max(1.0, -np.log10(rtol) / 4.0)
-    if stable > 10.0 * accurate:
-        return TABLEAUS["radau9"]
-    return TABLEAUS["dp5" if rtol > 3e-5 else "dop853"]
-
-
 def solve(
     problem: Problem,
     rtol: float,
-    tableau: Tableau | None,
+    tableau: Tableau,
     t_out: FloatArray,
     left: BoolArray,
     progress: Progress | None = None,
@@ -362,7 +256,6 @@ def solve(
 
     The first attempt's local tolerance is a guess; each further one follows from the error measured.
     """
-    tableau = tableau or choose_tableau(problem, rtol)
     tables = Tables(problem, LOCAL_SHARE * rtol)
     u_scale = tables.peak()
     u_scale = u_scale * problem.model.k_gap if np.isfinite(u_scale) and u_scale > 0.0 else 1.0

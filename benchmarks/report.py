@@ -1,0 +1,244 @@
+"""Tables and picture of the work-precision results, from results/work_precision.json alone.
+
+Run: python benchmarks/report.py [--results FILE] [--readme FILE]. Writes results/work_precision.md (every contestant),
+results/work_precision.png, and the README's table between its `speed` markers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+RESULTS = HERE / "results" / "work_precision.json"
+README = HERE.parent / "README.md"
+BEGIN, END = "<!-- speed:begin -->", "<!-- speed:end -->"
+TARGETS = (1e-3, 1e-6, 1e-10)
+NGSPICE_TARGET = 1e-4
+OURS = "fingerspice"
+# Okabe and Ito's palette, and markers, so that colour is never alone.
+LOOK = {
+    "fingerspice": ("#000000", "o"),
+    "numbalsoda": ("#D55E00", "s"),
+    "diffrax": ("#0072B2", "D"),
+    "scipy": ("#009E73", "^"),
+    "CVODE": ("#CC79A7", "v"),
+    "torchdiffeq": ("#E69F00", "P"),
+    "ngspice": ("#56B4E9", "X"),
+}
+Report = dict[str, Any]
+
+
+def good(results: Report, problem: str, **wanted: str) -> list[Report]:
+    """Points of a problem that gave a solution, of a library or contestant."""
+    return [
+        p for p in results["points"]
+        if p["problem"] == problem and p["status"] == "ok" and all(p[k] == v for k, v in wanted.items())
+    ]  # fmt: skip
+
+
+def cheapest(points: list[Report], error: float) -> Report | None:
+    """The point of least time among those that meet an error."""
+    met = [p for p in points if p["error"] <= error]
+    return min(met, key=lambda p: p["us_per_period"]) if met else None
+
+
+def number(value: float) -> str:
+    """Three digits, or whole thousands."""
+    return f"{value:,.0f}" if value >= 100.0 else f"{value:.2g}" if value < 10.0 else f"{value:.0f}"
+
+
+def cell(points: list[Report], targets: tuple[float, ...]) -> str:
+    """Times of the cheapest settings that meet the errors, us per period."""
+    found = [cheapest(points, target) for target in targets]
+    return " / ".join("-" if p is None else number(p["us_per_period"]) for p in found)
+
+
+def libraries(results: Report) -> list[str]:
+    """Libraries in the results, ours first."""
+    return list(dict.fromkeys(p["library"] for p in results["points"]))
+
+
+def lead(results: Report, problem: str) -> str:
+    """How many times our time the best of all peers takes, at each error."""
+    ours = good(results, problem, library=OURS)
+    theirs = [p for p in good(results, problem) if p["library"] != OURS]
+    ratios = []
+    for target in TARGETS:
+        a, b = cheapest(ours, target), cheapest(theirs, target)
+        ratios.append("-" if a is None or b is None else f"{b['us_per_period'] / a['us_per_period']:.2g}")
+    return " / ".join(ratios)
+
+
+def short_table(results: Report, law: str) -> list[str]:
+    """Best of each library on each problem of a charge law."""
+    names = [n for n, p in results["problems"].items() if p["charge_law"] == law]
+    rows = [["us per period", *(results["problems"][n]["title"] for n in names)]]
+    for library in libraries(results):
+        targets = (NGSPICE_TARGET,) if library == "ngspice" else TARGETS
+        cells = [cell(good(results, n, library=library), targets) for n in names]
+        if any(good(results, n, library=library) for n in names):
+            label = "**fingerspice**" if library == OURS else library + (" (1e-4)" if library == "ngspice" else "")
+            rows.append([label, *cells])
+    rows.append(["best peer over ours, times", *(lead(results, n) for n in names)])
+    return markdown(rows)
+
+
+def markdown(rows: list[list[str]]) -> list[str]:
+    """A table from rows of cells, the first its head."""
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    return [lines[0], "|" + "---|" * len(rows[0]), *lines[1:]]
+
+
+def long_table(results: Report, problem: str) -> list[str]:
+    """Every contestant on a problem: time, and how many times ours, at each error; and what failed."""
+    targets = (TARGETS[0], NGSPICE_TARGET, *TARGETS[1:])
+    ours = good(results, problem, library=OURS)
+    rows = [["contestant", *(f"{t:.0e}: us (times ours)" for t in targets), "did not run"]]
+    for name in dict.fromkeys(p["contestant"] for p in results["points"] if p["problem"] == problem):
+        cells = []
+        for target in targets:
+            a, b = cheapest(ours, target), cheapest(good(results, problem, contestant=name), target)
+            ratio = "" if a is None or b is None else f" ({b['us_per_period'] / a['us_per_period']:.2g})"
+            cells.append("-" if b is None else number(b["us_per_period"]) + ratio)
+        mine = [p for p in results["points"] if p["problem"] == problem and p["contestant"] == name]
+        failed = [f"{p['setting']:.0e}: {p['status']}" for p in mine if p["status"] != "ok"]
+        rows.append([name, *cells, "; ".join(failed[:2])])
+    return markdown(rows)
+
+
+def conditions(results: Report) -> str:
+    """Machine and versions in one sentence."""
+    versions = [v if any(c.isalpha() for c in v) else f"{k} {v}" for k, v in results["versions"].items() if v != "absent"]
+    absent = [k for k, v in results["versions"].items() if v == "absent"]
+    text = f"{results['machine']}; {', '.join(versions)}"
+    return text + (f"; absent: {', '.join(absent)}" if absent else "")
+
+
+def readme_text(results: Report) -> str:
+    """What stands between the README's markers."""
+    spread = max(p["reference_agreement"] for p in results["problems"].values())
+    return "\n".join(
+        [
+            f"Wall time per simulated period (of the chirp: per ms), in us, for an error of {TARGETS[0]:g} / "
+            f"{TARGETS[1]:g} / {TARGETS[2]:g} of the peak in gap voltage and force",
+            "(100 outputs a period included; the cheapest setting that meets it; the best method of each library, with",
+            "a compiled right-hand side, split at the source's jumps and told the zeros of the gap voltage where that "
+            "helps).",
+            f"Errors are against two independent references that agree to {spread:.0e}. Medians of {results['repeats']}, ",
+            f"{conditions(results)}. Every method: [`work_precision.md`](benchmarks/results/work_precision.md).",
+            "",
+            *short_table(results, "local"),
+            "",
+            "The same under the law `mobile`:",
+            "",
+            *short_table(results, "mobile"),
+            "",
+            "![Error against time and against evaluations](benchmarks/results/work_precision.png)",
+        ]
+    )
+
+
+def details(results: Report) -> str:
+    """The whole of the results as Markdown."""
+    lines = ["# Work and precision", "", f"{conditions(results)}. Made by `benchmarks/report.py`.", ""]
+    for name, problem in results["problems"].items():
+        law = "" if problem["charge_law"] == "local" else ", law `mobile`"
+        lines += [
+            f"## {problem['title']}{law}", "",
+            f"{problem['periods']} periods of {problem['period_s']:g} s; {problem['reference']} agree to "
+            f"{problem['reference_agreement']:.1e} of the peak ({problem['peak_u_gap_V']:.4g} V).", "",
+            *long_table(results, name), "",
+        ]  # fmt: skip
+    compile_s: dict[str, float] = {}
+    for p in results["points"]:
+        compile_s[p["contestant"]] = max(compile_s.get(p["contestant"], 0.0), p["compile_s"] or 0.0)
+    slow = [f"{name} {seconds:.1f} s" for name, seconds in compile_s.items() if seconds >= 0.1]
+    lines += ["## Compilation", "", "Longest first call beyond a second one: " + ", ".join(slow) + ".", ""]
+    return "\n".join(lines)
+
+
+def front(points: list[Report], cost: str) -> tuple[list[float], list[float]]:
+    """Costs and errors of the points that no other point beats in both."""
+    best: list[tuple[float, float]] = []
+    for p in sorted((p for p in points if p[cost] is not None), key=lambda p: p[cost]):
+        if not best or p["error"] < best[-1][1]:
+            best.append((p[cost], p["error"]))
+    return [x for x, _ in best], [y for _, y in best]
+
+
+def picture(results: Report, path: Path) -> None:
+    """Error against time and against evaluations on the four scenes of Table 1, the front of each library."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    names = [n for n, p in results["problems"].items() if p["charge_law"] == "local"][:4]
+    costs = {"us_per_period": "time per period / µs", "nfev_per_period": "right-hand-side evaluations per period"}
+    style = {"font.size": 8, "axes.titlesize": 8.5, "axes.labelsize": 8, "xtick.labelsize": 7, "ytick.labelsize": 7}
+    with plt.rc_context(style):
+        figure, axes = plt.subplots(2, len(names), figsize=(7.6, 4.8), sharey=True, sharex="row", squeeze=False)
+        for column, name in enumerate(names):
+            floor = results["problems"][name]["error_floor"]
+            for row, cost in enumerate(costs):
+                ax = axes[row][column]
+                for library in reversed(libraries(results)):
+                    x, y = front(good(results, name, library=library), cost)
+                    if x:
+                        colour, marker = LOOK[library]
+                        wide = library == OURS
+                        ax.plot(
+                            x, [max(v, floor) for v in y], color=colour, marker=marker, markersize=4 if wide else 3.5,
+                            linewidth=1.8 if wide else 1.0, label=library,
+                            markeredgewidth=0.0, zorder=3 if wide else 2,
+                        )  # fmt: skip
+                ax.set(xscale="log", yscale="log")
+                ax.grid(True, which="major", color="0.88", linewidth=0.5)
+                ax.set_axisbelow(True)
+                ax.spines[["top", "right"]].set_visible(False)
+            axes[0][column].set_title(results["problems"][name]["title"])
+        axes[0][0].set_ylim(1e-13, 1e-1)
+        for row, label in enumerate(costs.values()):
+            axes[row][0].set_ylabel("largest error / peak")
+            box = [a.get_position() for a in axes[row]]
+            del box
+            axes[row][0].set_xlabel(label)
+        handles, labels = axes[0][0].get_legend_handles_labels()
+        figure.legend(handles[::-1], labels[::-1], loc="outside upper center", ncols=len(labels), frameon=False)
+        figure.savefig(path, dpi=200)
+        plt.close(figure)
+
+
+def into_readme(text: str, readme: Path) -> None:
+    """Put the text between the markers of a README.
+
+    Raises
+    ------
+    ValueError
+        Where it has no markers.
+    """
+    page = readme.read_text(encoding="utf-8")
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"{readme} has no lines {BEGIN} and {END}")
+    readme.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", encoding="utf-8")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Write tables and picture."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--readme", type=Path, default=README)
+    options = parser.parse_args(arguments)
+    results = json.loads(options.results.read_text(encoding="utf-8"))
+    options.results.with_suffix(".md").write_text(details(results), encoding="utf-8")
+    picture(results, options.results.with_suffix(".png"))
+    into_readme(readme_text(results), options.readme)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,268 @@
+"""Own integration by exponential collocation: the coupled tier, with its error followed step by step."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from fingerspice.circuit.sampling import SourceTable
+from fingerspice.engine import advance, march
+from fingerspice.engine.exponential import Tables as StepTables
+from fingerspice.engine.exponential import new_tables
+from fingerspice.engine.march import Pace, Work
+from fingerspice.engine.model import Segment, choose_branch, source, write_row
+from fingerspice.engine.system import System, area_range, build_system
+from fingerspice.numerics.lobatto import integral_table
+from fingerspice.problem import Problem, Scene
+from fingerspice.runs import (
+    ROUNDING,
+    BoolArray,
+    FloatArray,
+    Progress,
+    Run,
+    Tables,
+    after_the_end,
+    from_rows,
+    row_width,
+)  # fmt: skip
+from fingerspice.solution import ErrorEstimate, State, Status
+
+# The largest error between nodes may stand beside the two points where it is looked for, and signs may cancel there.
+SAFETY = 2.5
+# The error allowed in a step, over the one asked for: the force doubles it, and steps add up.
+LOCAL_SHARE = 0.1
+# Steps per shortest time scale of the source: the points of a step must not alias it.
+LONGEST_STEP = 0.6
+
+
+@dataclasses.dataclass(frozen=True)
+class Prepared:
+    """A scene's system with the tables it has needed so far, and arrays to work in."""
+
+    system: System
+    tables: StepTables
+    work: Work
+    integral: FloatArray
+
+
+def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
+    """The modal system of a scene, made on first use; with the area's curve up to `u_top` (V) if that is given."""
+    # One system serves a decade of tolerances.
+    decade = int(np.floor(np.log10(rtol)))
+    key = ("system", decade, u_top)
+    if key not in scene.prepared:
+        model = scene.model
+        if u_top > 0.0:
+            assert scene.stack.contact is not None
+            model = model._replace(curve=scene.stack.contact.curve(u_top))
+        reach = max(model.k_gap * scene.u_peak, 0.7 * u_top)
+        system = build_system(model, 1e-3 * 10.0**decade, area_range(model, reach))
+        n = model.gap.size
+        scene.prepared[key] = Prepared(system, new_tables(n), march.new_work(n), integral_table())
+    prepared: Prepared = scene.prepared[key]
+    return prepared
+
+
+@dataclasses.dataclass
+class Track:
+    """One integration in progress; see `engine.march.march`."""
+
+    problem: Problem
+    prepared: Prepared
+    pace: Pace
+    t_out: FloatArray
+    left: BoolArray
+
+    def __post_init__(self) -> None:
+        start = self.problem.initial
+        n = self.problem.model.gap.size
+        self.y = start.y.copy()
+        self.error = np.zeros(n + 1)
+        self.control = np.zeros(march.N_CONTROL)
+        self.control[march.T] = self.problem.t_start
+        self.control[march.U_BEFORE] = start.u_before
+        self.control[march.BRANCH_LENGTH] = np.inf
+        self.counters = np.zeros(march.N_COUNTERS, np.int64)
+        self.out = np.empty((n + 2 if self.pace.charge else n, self.t_out.size))
+
+    @property
+    def t(self) -> float:
+        return float(self.control[march.T])
+
+    def advance(self, table: SourceTable) -> int:
+        """March to the end of a table."""
+        p = self.prepared
+        p, mine = self.prepared, (self.y, self.error, self.control, self.counters)
+        source_of = (table.edges, table.terms, table.series, float(table.edges[-1]))
+        return int(
+            march.march(
+                p.system, self.pace, p.tables, p.work, p.integral, *source_of, *mine, self.t_out, self.left, self.out
+            )
+        )
+
+    def row(self, segment: Segment, tau: float) -> FloatArray:
+        """A row of `write_row` from the state reached, `tau` s into a segment."""
+        model = self.prepared.system.model
+        row = np.empty(row_width(self.problem))
+        u, du = source(segment, tau)
+        write_row(model, u, du, self.y, choose_branch(model, u, self.y), model.k_gap * u, row)
+        return row
+
+    def finish(self, table: SourceTable) -> None:
+        """Write the right-hand outputs at the very end of the run."""
+        first = int(self.counters[march.OUTPUT])
+        if first == self.t_out.size:
+            return
+        segment, tau = after_the_end(self.problem, table)
+        control = np.zeros(advance.N_CONTROL)
+        control[advance.U_BEFORE] = self.control[march.U_BEFORE]
+        # Takes the charge of a jump that stands at the end.
+        advance.enter(self.prepared.system.model, segment, tau, self.y, control)
+        live, z, current = from_rows(self.problem, self.row(segment, tau)[None, :])
+        n = live.shape[0]
+        self.out[:n, first:] = live
+        if self.pace.charge:
+            self.out[n, first:] = z
+            self.out[n + 1, first:] = current
+        self.counters[march.OUTPUT] = self.t_out.size
+
+    def last(self, table: SourceTable) -> FloatArray | None:
+        """Row at the time a failed run reached, left-hand; None before the first step."""
+        if self.t <= self.problem.t_start:
+            return None
+        i = max(int(np.searchsorted(table.edges, self.t, side="left")) - 1, 0)
+        start = float(table.edges[i])
+        segment = Segment(start, float(table.edges[i + 1]) - start, table.terms[i], table.series[i])
+        row = self.row(segment, self.t - start)
+        return row if np.all(np.isfinite(row)) else None
+
+
+def integrate(
+    problem: Problem,
+    prepared: Prepared,
+    tol: float,
+    t_out: FloatArray,
+    left: BoolArray,
+    tables: Tables,
+    *,
+    h_fixed: float = 0.0,
+    progress: Progress | None = None,
+) -> Run | None:
+    """Integrate once with an error of the gap voltage of `tol` (V) in every step.
+
+    Parameters
+    ----------
+    problem : Problem
+    prepared : Prepared
+    tol : float
+        V.
+    t_out, left : ndarray, shape (n_out,)
+        Output times (s, ascending) and whether the left-hand value is meant.
+    tables : Tables
+        The source's.
+    h_fixed : float
+        Fixed step in s, without error control, if positive.
+    progress : callable, optional
+        Called with the fraction of the run that is done.
+
+    Returns
+    -------
+    Run or None
+        None where the gap voltage left the range of the area's curve.
+    """
+    span = problem.t_stop - problem.t_start
+    longest = h_fixed or min(LONGEST_STEP * problem.waveform.shortest_time(), span, problem.max_step)
+    track = Track(problem, prepared, Pace(tol, longest, h_fixed == 0.0, problem.charge), t_out, left)
+    status, t_failed, last = Status.SUCCESS, None, None
+    table = None
+    for table in tables:
+        code = track.advance(table) if table.edges.size > 1 else march.DONE
+        if progress is not None:
+            progress((track.t - problem.t_start) / span)
+        if code == march.OUT_OF_RANGE:
+            return None
+        if code == march.NO_STEP:
+            folding = problem.model.mobile and problem.model.coupled
+            status = Status.FOLD if folding else Status.STEP_UNDERFLOW
+            t_failed = track.t
+            break
+        if table.not_finite is not None:
+            status, t_failed = Status.SOURCE_NOT_FINITE, table.not_finite
+            break
+    if status is Status.SUCCESS and table is not None:
+        track.finish(table)
+    elif table is not None and table.edges.size > 1:
+        last = track.last(table)
+    return _run(problem, track, status, t_failed, last)
+
+
+def _run(problem: Problem, track: Track, status: Status, t_failed: float | None, last: FloatArray | None) -> Run:
+    c, control = track.counters, track.control
+    n, n_out = problem.model.gap.size, int(c[march.OUTPUT])
+    t, side, out = track.t_out[:n_out], track.left[:n_out], track.out[:, :n_out]
+    if last is not None and (n_out == 0 or track.t > t[-1]):
+        # A failed run's arrays end at the time it reached.
+        live, z, current = from_rows(problem, last[None, :])
+        extra = np.vstack([live, z, current]) if track.pace.charge else live
+        t, side, out = np.append(t, track.t), np.append(side, True), np.hstack([out, extra])
+    peak_u, peak_f = float(control[march.PEAK_U]), float(control[march.PEAK_F])
+    # Rounding is an error too.
+    floor = 4e-16 * (peak_u + problem.model.k_gap * problem.scene.u_peak)
+    return Run(
+        t,
+        side,
+        out[:n],
+        out[n] if track.pace.charge else None,
+        out[n + 1] if track.pace.charge else None,
+        status=status,
+        error=ErrorEstimate(
+            SAFETY * float(control[march.ERROR_U]) + floor,
+            SAFETY * float(control[march.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f,
+        ),
+        peak_u=peak_u,
+        peak_f=peak_f,
+        nfev=int(c[march.NFEV]),
+        stats={
+            "steps": int(c[march.ACCEPTED]),
+            "rejected": int(c[march.REJECTED]),
+            "zeros": int(c[march.ZEROS]),
+        },
+        state=State(
+            track.t,
+            track.y.copy(),
+            float(control[march.U_BEFORE]),
+            problem.initial.charge_offset,
+            problem.scene.charge_law,
+        ),
+        t_failed=t_failed,
+    )
+
+
+def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None = None) -> Run:
+    """Integrate until the estimated global error is within `rtol` of the peaks.
+
+    The first attempt's tolerance is a guess; each further one follows from the error estimated.
+    """
+    scene, model = problem.scene, problem.model
+    tables = Tables(problem, LOCAL_SHARE * rtol)
+    peak = scene.u_peak or tables.peak()
+    start = float(np.abs(problem.initial.y[:-1]).max(initial=0.0))
+    u_scale = max(peak * model.k_gap if np.isfinite(peak) else 0.0, start) or 1.0
+    tol = LOCAL_SHARE * rtol
+    prepared, nfev = prepare_system(scene, rtol), 0
+    for _attempt in range(6):
+        while (run := integrate(problem, prepared, tol * u_scale, t_out, left, tables, progress=progress)) is None:
+            prepared = prepare_system(scene, rtol, 1.5 * prepared.system.u_top)
+        nfev += run.nfev
+        run.nfev = nfev
+        if run.status is not Status.SUCCESS:
+            return run
+        worst = run.excess(rtol)
+        if worst <= 1.0:
+            return run
+        if rtol * run.peak_u < ROUNDING * u_scale or tol <= 1e-16:
+            break
+        tol = max(tol * min(0.3, 0.5 / worst), 1e-16)
+    run.status = Status.ERROR_NOT_MET
+    return run

@@ -1,0 +1,253 @@
+"""Linear systems in modal form, w_k' = -rate_k w_k + gain_k U(t), driven by samples joined by straight lines.
+
+The recursion w <- exp(-rate dt) w + input waits for itself at every sample. Eight stretches of each block are therefore
+advanced side by side, all from zero; what each inherits from the one before, a decaying exponential, is added after.
+Blocks are counted from the first sample, so that an input that comes in whole blocks gives the bits of a single call.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fingerspice.compiled import jit
+
+FloatArray = NDArray[np.float64]
+Lanes: TypeAlias = tuple[float, float, float, float, float, float, float, float]
+
+# Not a power of two: eight stretches that far apart would meet in the same sets of the cache.
+_STRETCH = 125
+_LANES = 8
+BLOCK = _LANES * _STRETCH
+"""Samples: an input streamed in multiples of this gives the same bits as in one call."""
+# Samples taken at a time, so that converting an input that is no plain array needs little memory.
+_PIECE = 250 * BLOCK
+_SMALLEST = 1e-300
+
+
+@jit
+def hold_weights(z: float) -> tuple[float, float]:
+    """Weights of the samples at the start and the end of a step, of the integral of exp(-z (1 - x)) U(x) over [0, 1].
+
+    They are (1 - (1 + z) exp(-z)) / z^2 and (z - 1 + exp(-z)) / z^2, for z >= 0, to full precision.
+    """
+    if z >= 1.0:
+        fall = math.exp(-z)
+        return (1.0 - (1.0 + z) * fall) / z / z, (1.0 - (1.0 - fall) / z) / z
+    start = 0.0
+    end = 0.0
+    for k in range(20, -1, -1):
+        # Sums of (-z)^k / (k! (k + 2)) and of 2 (-z)^k / (k + 2)!, as nested products.
+        start = 1.0 / (k + 2) - z / (k + 1) * start
+        end = 1.0 - z / (k + 3) * end
+    return start, 0.5 * end
+
+
+@jit
+def _load(x: FloatArray, i: int) -> Lanes:
+    n = _STRETCH
+    return (x[i], x[n + i], x[2 * n + i], x[3 * n + i], x[4 * n + i], x[5 * n + i], x[6 * n + i], x[7 * n + i])
+
+
+@jit
+def _step(v: Lanes, e: float, x: Lanes) -> Lanes:
+    return (
+        e * v[0] + x[0],
+        e * v[1] + x[1],
+        e * v[2] + x[2],
+        e * v[3] + x[3],
+        e * v[4] + x[4],
+        e * v[5] + x[5],
+        e * v[6] + x[6],
+        e * v[7] + x[7],
+    )
+
+
+@jit
+def _add(y: FloatArray, i: int, g: float, v: Lanes, h: float, w: Lanes) -> None:
+    n = _STRETCH
+    y[i] += g * v[0] + h * w[0]
+    y[n + i] += g * v[1] + h * w[1]
+    y[2 * n + i] += g * v[2] + h * w[2]
+    y[3 * n + i] += g * v[3] + h * w[3]
+    y[4 * n + i] += g * v[4] + h * w[4]
+    y[5 * n + i] += g * v[5] + h * w[5]
+    y[6 * n + i] += g * v[6] + h * w[6]
+    y[7 * n + i] += g * v[7] + h * w[7]
+
+
+@jit
+def _sweep(
+    x: FloatArray, y: FloatArray, i0: int, i1: int, e: float, f: float, g: float, h: float, v: Lanes, w: Lanes
+) -> tuple[Lanes, Lanes]:
+    """Advance two modes over the samples i0 to i1 of every stretch, adding g and h times their states to y."""
+    for i in range(i0, i1):
+        sample = _load(x, i)
+        _add(y, i, g, v, h, w)
+        v = _step(v, e, sample)
+        w = _step(w, f, sample)
+    return v, w
+
+
+@jit
+def _flushed(x: float) -> float:
+    """Zero in place of what would soon be a (slow) denormal number; NaN stays."""
+    return 0.0 if abs(x) < _SMALLEST else x
+
+
+@jit
+def _hold(
+    u: FloatArray,
+    count: int,
+    z: FloatArray,
+    gains: FloatArray,
+    direct: float,
+    weights: FloatArray,
+    state: FloatArray,
+    is_first: bool,
+    y: FloatArray,
+) -> None:
+    """Outputs y of whole blocks u of which `count` samples are real; the number of modes is even.
+
+    `z` is rate dt and `gains` gain dt. `state` (n + 1,) holds w, then the sample, at the last time before u, and is
+    taken to the last of u; with `is_first`, w is that at the first sample of u.
+    """
+    n = z.size
+    # w <- exp(-z) w + start u_before + end u. With v = w - end u each sample enters once, v <- exp(-z) v + once u, and
+    # y = through u + sum of weight v. In a sweep v is in units of `once`.
+    start = np.empty(n)
+    end = np.empty(n)
+    once = np.empty(n)
+    fall = np.empty((n, _STRETCH))
+    # 1 - exp(-z m) for m stretches and, last, for one sample: a slow mode keeps its digits where this is taken off.
+    loss = np.empty((n, _LANES + 1))
+    through = direct
+    for k in range(n):
+        start[k], end[k] = hold_weights(z[k])
+        start[k] *= gains[k]
+        end[k] *= gains[k]
+        once[k] = start[k] + math.exp(-z[k]) * end[k]
+        through += weights[k] * end[k]
+        for i in range(_STRETCH):
+            fall[k, i] = _flushed(math.exp(-z[k] * i))
+        for c in range(_LANES):
+            loss[k, c] = -math.expm1(-z[k] * (_STRETCH * c))
+        loss[k, _LANES] = -math.expm1(-z[k])
+    inherited = np.empty((2, _LANES))
+    last = np.empty(2)
+    for s in range(0, u.size, BLOCK):
+        x = u[s : s + BLOCK]
+        out = y[s : s + BLOCK]
+        # The state goes over to the next block at the last real sample of this one.
+        stop = min(BLOCK, count - s) - 1
+        lane = stop // _STRETCH
+        depth = stop % _STRETCH
+        for i in range(BLOCK):
+            out[i] = through * x[i]
+        for pair in range(0, n, 2):
+            e = fall[pair, 1]
+            f = fall[pair + 1, 1]
+            g = weights[pair] * once[pair]
+            h = weights[pair + 1] * once[pair + 1]
+            v = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            v, w = _sweep(x, out, 0, depth, e, f, g, h, v, v)
+            last[0] = v[lane]
+            last[1] = w[lane]
+            v, w = _sweep(x, out, depth, _STRETCH, e, f, g, h, v, w)
+            for j in range(2):
+                k = pair + j
+                first = state[k] - end[k] * x[0]
+                if not (is_first and s == 0):
+                    first = state[k] + (start[k] * state[n] - loss[k, _LANES] * state[k])
+                own = 0.0
+                for c in range(_LANES):
+                    inherited[j, c] = _flushed(first + (own - loss[k, c] * first))
+                    own += once[k] * (v[c] if j == 0 else w[c]) - loss[k, 1] * own
+                begin = inherited[j, lane]
+                state[k] = begin + (math.expm1(-z[k] * depth) * begin + once[k] * last[j] + end[k] * x[stop])
+            for c in range(_LANES):
+                part = out[c * _STRETCH : (c + 1) * _STRETCH]
+                g = weights[pair] * inherited[0, c]
+                h = weights[pair + 1] * inherited[1, c]
+                for i in range(_STRETCH):
+                    part[i] += g * fall[pair, i] + h * fall[pair + 1, i]
+        state[n] = x[stop]
+
+
+def first_order_hold(
+    u: ArrayLike,
+    dt: float,
+    rates: ArrayLike,
+    gains: ArrayLike,
+    direct: float,
+    weights: ArrayLike,
+    w0: ArrayLike,
+    u_before: float | None = None,
+    out: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Output of a linear system for a sampled input, exact for the straight lines that join the samples.
+
+    Solves w_k' = -rate_k w_k + gain_k U(t) and gives y = direct U + sum of weight_k w_k at the samples. Nothing in y
+    depends on later samples; a sample that is not finite leaves nothing finite from there on.
+
+    Parameters
+    ----------
+    u : array_like, shape (m,)
+        Samples, real. Any strides; what is not double precision is converted piece by piece.
+    dt : float
+        Time between samples, s.
+    rates, gains, weights : array_like, shape (n,)
+        Decay rates (>= 0, 1/s), input gains (1/s for a w in the unit of U) and output weights of the modes.
+    direct : float
+        What passes without delay.
+    w0 : array_like, shape (n,)
+        State at the first sample or, with `u_before`, one step before it.
+    u_before : float, optional
+        Sample one step before the first: with it and the state returned for the input so far, an input may be given
+        in parts. Parts that are multiples of `BLOCK` give the same bits as the whole.
+    out : ndarray, shape (m,), optional
+        Where to write y: double precision, contiguous.
+
+    Returns
+    -------
+    y : ndarray, shape (m,)
+    w_end : ndarray, shape (n,)
+        State at the last sample.
+    """
+    u = np.asarray(u)
+    if u.ndim != 1 or not np.can_cast(u.dtype, np.float64, "same_kind"):
+        raise ValueError(f"samples of shape {u.shape} and type {u.dtype}; allowed: a row of real numbers")
+    given = np.array([rates, gains, weights, w0], dtype=float)
+    if given.ndim != 2:
+        raise ValueError(f"rates, gains, weights and state of shape {given.shape[1:]}; allowed: (n,)")
+    n = given.shape[1]
+    # Modes are advanced in pairs: a last one without gain or weight completes an odd number.
+    modes = np.zeros((4, n + n % 2))
+    modes[:, :n] = given
+    if not (0.0 < dt < math.inf and np.all((modes[0] >= 0.0) & (modes[0] < math.inf))):
+        raise ValueError(f"time step {dt!r} s, rates {given[0]} 1/s; allowed: finite, > 0 and >= 0")
+    if out is None:
+        out = np.empty(u.size)
+    elif out.shape != u.shape or out.dtype != np.float64 or not out.flags.carray or np.may_share_memory(out, u):
+        raise ValueError(
+            f"output of shape {out.shape}, type {out.dtype}; allowed: its own contiguous float64 {u.shape}"
+        )
+    state = np.append(modes[3], 0.0 if u_before is None else u_before)
+    for s in range(0, u.size, _PIECE):
+        piece = u[s : s + _PIECE]
+        whole = piece.size - piece.size % BLOCK
+        tail = np.zeros(BLOCK)
+        tail[: piece.size - whole] = piece[whole:]
+        y_tail = np.empty(BLOCK)
+        for x, count, y in ((piece[:whole], whole, out[s : s + whole]), (tail, piece.size - whole, y_tail)):
+            if count > 0:
+                x = np.require(x, float, ["C", "A"]).view()
+                # Constant arrays and others alike: one compiled form.
+                x.flags.writeable = False
+                _hold(x, count, modes[0] * dt, modes[1] * dt, float(direct), modes[2], state, u_before is None, y)
+                u_before = state[-1]
+        out[s + whole : s + piece.size] = y_tail[: piece.size - whole]
+    return out, state[:n].copy()

@@ -1,0 +1,376 @@
+"""Linear systems in modal form, w_k' = -rate_k w_k + gain_k U(t), answered in closed form.
+
+The input is given on segments: between two edges, with tau the time since the first, it is
+
+    U = sum over i of c tau^p exp(a tau) cos(phi + omega tau)  +  a Chebyshev series in 2 tau / length - 1.
+
+Nothing is stepped: the response at a time depends on the segment's start and on that time alone, and its error is a few
+roundings of the largest |w| for any rate and any length, on and off resonance.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fingerspice.compiled import jit
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# exp(-690) = 2e-300: beyond, an exponential is zero, before any product with it can become a (slow) denormal number.
+_LAST_EXPONENT = 690.0
+_SMALLEST = 1e-300
+# A mean input below this part of the largest is the rounding of a mean of zero.
+_ZERO_MEAN = 1e-12
+
+
+@jit
+def _exp(x: float) -> float:
+    return math.exp(x) if x > -_LAST_EXPONENT else 0.0
+
+
+@jit
+def _difference(a: float, b: float) -> tuple[float, float]:
+    """a - b rounded, and what the rounding left out."""
+    d = a - b
+    back = d - a
+    return d, (a - (d - back)) - (b + back)
+
+
+@jit
+def _turn(omega: float, tau: float, rest: float) -> complex:
+    """exp(i omega (tau + rest)), the product taken to twice the working precision: omega tau may be 1e9 rad."""
+    angle = omega * tau
+    # Dekker's exact product, from halves of 26 bits.
+    split = 134217729.0 * omega
+    omega_high = split - (split - omega)
+    omega_low = omega - omega_high
+    split = 134217729.0 * tau
+    tau_high = split - (split - tau)
+    tau_low = tau - tau_high
+    lost = (omega_high * tau_high - angle) + omega_high * tau_low + omega_low * tau_high + omega_low * tau_low
+    lost += omega * rest
+    c = math.cos(angle)
+    s = math.sin(angle)
+    shrink = 1.0 - 0.5 * lost * lost
+    return complex(c * shrink - s * lost, s * shrink + c * lost)
+
+
+@jit
+def _convolution(
+    p: int, exponent: complex, size: float, inverse: complex, tau: float, decay: float, wave: complex
+) -> complex:
+    """Integral over s in [0, tau] of exp(-rate (tau - s)) s^p exp(sigma s): real where sigma is.
+
+    Parameters
+    ----------
+    p : int
+    exponent : float or complex
+        rate + sigma; its magnitude is `size` and its inverse `inverse`.
+    tau : float
+    decay : float
+        exp(-rate tau).
+    wave : float or complex
+        exp(sigma tau).
+    """
+    reach = size * tau
+    if reach <= p + 1:
+        # Sum of (-z)^j / ((p + 1) ... (p + 1 + j)), z = exponent tau: its terms fall from the first on, so that near
+        # a resonance nothing cancels.
+        step = -exponent * tau
+        term = wave * (tau / (p + 1))
+        for _ in range(p):
+            term *= tau
+        total = term
+        bound = 1.0
+        j = p + 1
+        while bound > 1e-17:
+            j += 1
+            part = 1.0 / j
+            bound *= reach * part
+            term *= step * part
+            total += term
+        return total
+    # By parts, upward in p: stable as each step divides an error by exponent tau / p > 1.
+    total = (wave - decay) * inverse
+    power = 1.0
+    for j in range(1, p + 1):
+        power *= tau
+        total = (power * wave - j * total) * inverse
+    return total
+
+
+@jit
+def _clenshaw(c: FloatArray, row: int, count: int, s: float) -> float:
+    """Chebyshev series c[row, :count] in 2 s - 1, the digits of a small s kept (Reinsch's form of the recurrence)."""
+    b = 0.0
+    d = 0.0
+    for k in range(count - 1, 0, -1):
+        d = (c[row, k] - d) + 4.0 * s * b
+        b = d - b
+    value: float = (c[row, 0] - d) + 2.0 * s * b
+    return value
+
+
+@jit
+def _inverse(z: complex) -> complex:
+    size = z.real * z.real + z.imag * z.imag
+    return complex(z.real / size, -z.imag / size) if size > 0.0 else 0j
+
+
+@jit
+def _room(count: int) -> int:
+    """Coefficients that `_particular` may need for a series of `count`."""
+    return int(math.sqrt(count**2 + 80.0 * max(8.0, 0.25 * count**2))) + 16
+
+
+@jit
+def _particular(f: FloatArray, count: int, kappa: float, pivot: FloatArray, w: FloatArray) -> int:
+    """Chebyshev series of one solution of dw/dx + kappa w = f on [-1, 1]; f has `count` coefficients.
+
+    Writes the coefficients into w (`pivot` is work space of the same size) and returns their number. The series of
+    dw/dx and w are tied by w'_{k-1} - w'_{k+1} = 2 k w_k (w'_0 counts twice), which makes the equation tridiagonal.
+    """
+    if kappa > max(8.0, 0.25 * count**2):
+        # Fast decay: the polynomial solution, from its highest coefficient down.
+        above = 0.0
+        w[count - 1] = f[count - 1] / kappa
+        for k in range(count - 1, 0, -1):
+            twice = 2.0 if k == 1 else 1.0
+            f_above = f[k + 1] if k + 1 < count else 0.0
+            w[k - 1] = f[k - 1] / kappa + (above - (f_above + 2.0 * k * w[k]) / kappa) / twice
+            above = w[k]
+        return count
+    # Slow decay: the solution without a constant, which takes up some of exp(-kappa x) and needs more coefficients.
+    # Eliminated downward, from where the diagonal is largest, all pivots are near k + sqrt(k^2 + kappa^2).
+    last = int(math.sqrt(count**2 + 80.0 * kappa)) + 14
+    carried = 0.0
+    for k in range(last, 0, -1):
+        pivot[k] = 1.0 / (2.0 * k + (kappa * kappa * pivot[k + 1] if k < last else 0.0))
+        if k - 1 < count:
+            carried += f[k - 1] if k > 1 else 2.0 * f[0]
+        if k + 1 < count:
+            carried -= f[k + 1]
+        w[k] = carried
+        carried *= kappa * pivot[k]
+    w[0] = 0.0
+    for k in range(1, last + 1):
+        w[k] = (w[k] - kappa * w[k - 1]) * pivot[k]
+    return last + 1
+
+
+@jit
+def _prepare_series(
+    rates: FloatArray, gains: FloatArray, series: FloatArray, s: int, length: float, count: IntArray, out: FloatArray
+) -> None:
+    """Write Chebyshev series of solutions for the input series[s] into out (n + 2, room), their lengths into count."""
+    n = rates.size
+    size = series.shape[1]
+    while size > 1 and series[s, size - 1] == 0.0:
+        size -= 1
+    for k in range(n):
+        for j in range(size):
+            out[n, j] = 0.5 * length * gains[k] * series[s, j]
+        count[k] = _particular(out[n], size, 0.5 * length * rates[k], out[n + 1], out[k])
+
+
+@jit
+def respond_into(
+    rates: FloatArray,
+    gains: FloatArray,
+    edges: FloatArray,
+    terms: FloatArray,
+    series: FloatArray,
+    w: FloatArray,
+    t_out: FloatArray,
+    left: NDArray[np.bool_],
+    rows: FloatArray,
+) -> None:
+    """`respond` for compiled code: arguments unchecked, outputs written into `rows`, w taken from start to end.
+
+    Arrays are C-contiguous and writeable. Rows of times outside the segments become NaN.
+    """
+    n = rates.size
+    n_terms = terms.shape[1]
+    decay = np.zeros(n)
+    kept = np.zeros(n)
+    new = np.zeros(n)
+    amplitude = np.zeros(n_terms, np.complex128)
+    inverse = np.zeros((n_terms, n), np.complex128)
+    size = np.zeros((n_terms, n))
+    count = np.zeros(n, np.int64)
+    at_start = np.zeros(n)
+    poly = np.zeros((n + 2, _room(series.shape[1])))
+    i = 0
+    while i < t_out.size and not t_out[i] >= edges[0]:
+        for k in range(n):
+            rows[i, k] = np.nan
+        i += 1
+    for s in range(edges.size - 1):
+        stop = edges[s + 1]
+        length, length_rest = _difference(stop, edges[s])
+        if not length > 0.0:
+            continue
+        for j in range(n_terms):
+            phi = terms[s, j, 4]
+            amplitude[j] = terms[s, j, 0] * (complex(math.cos(phi), math.sin(phi)) if phi != 0.0 else 1.0)
+            for k in range(n):
+                exponent = complex(rates[k] + terms[s, j, 2], terms[s, j, 3])
+                size[j, k] = math.sqrt(exponent.real**2 + exponent.imag**2)
+                inverse[j, k] = _inverse(exponent)
+        if series.shape[1] > 0:
+            _prepare_series(rates, gains, series, s, length, count, poly)
+            for k in range(n):
+                at_start[k] = _clenshaw(poly, k, count[k], 0.0)
+        inside = True
+        while inside:
+            inside = i < t_out.size and (t_out[i] < stop or (left[i] and t_out[i] == stop))
+            tau, rest = _difference(t_out[i], edges[s]) if inside else (length, length_rest)
+            for k in range(n):
+                reach = rates[k] * tau
+                if reach < 0.5:
+                    # What changes is summed apart: over many segments the rounding of decays near 1 would add up.
+                    loss = -math.expm1(-reach)
+                    decay[k] = 1.0 - loss
+                    kept[k] = w[k]
+                    new[k] = -loss * w[k]
+                else:
+                    decay[k] = _exp(-reach)
+                    kept[k] = 0.0
+                    new[k] = decay[k] * w[k]
+            for j in range(n_terms):
+                if terms[s, j, 0] == 0.0:
+                    continue
+                p = int(terms[s, j, 1])
+                a = terms[s, j, 2]
+                omega = terms[s, j, 3]
+                growth = _exp(a * tau) if a != 0.0 else 1.0
+                if omega == 0.0:
+                    for k in range(n):
+                        real = inverse[j, k].real
+                        forced = _convolution(p, rates[k] + a, size[j, k], real, tau, decay[k], growth)
+                        new[k] += gains[k] * (amplitude[j].real * forced.real)
+                else:
+                    wave = growth * _turn(omega, tau, rest)
+                    for k in range(n):
+                        exponent = complex(rates[k] + a, omega)
+                        turned = _convolution(p, exponent, size[j, k], inverse[j, k], tau, decay[k], wave)
+                        new[k] += gains[k] * (amplitude[j] * turned).real
+            if series.shape[1] > 0:
+                x = tau / length
+                for k in range(n):
+                    new[k] += _clenshaw(poly, k, count[k], x) - decay[k] * at_start[k]
+            for k in range(n):
+                new[k] += kept[k]
+                if inside:
+                    rows[i, k] = new[k]
+            if inside:
+                i += 1
+        for k in range(n):
+            w[k] = new[k] if abs(new[k]) >= _SMALLEST else 0.0
+    while i < t_out.size:
+        for k in range(n):
+            rows[i, k] = w[k] if t_out[i] == edges[-1] else np.nan
+        i += 1
+
+
+def respond(
+    rates: ArrayLike,
+    gains: ArrayLike,
+    edges: ArrayLike,
+    terms: ArrayLike,
+    series: ArrayLike,
+    w0: ArrayLike,
+    t_out: ArrayLike,
+    left: ArrayLike | None = None,
+    rows: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """State of the modes at given times, and at the end.
+
+    Parameters
+    ----------
+    rates, gains : array_like, shape (n,)
+        Decay rates (>= 0, 1/s) and input gains (1/s for a w in the unit of U).
+    edges : array_like, shape (m + 1,)
+        Segment edges, ascending, s.
+    terms : array_like, shape (m, k, 6)
+        c, p, a, omega, phi, beta of each term; p is a whole number, beta is 0. c = 0 is no term.
+    series : array_like, shape (m, l)
+        Chebyshev coefficients of the input on each segment; l = 0 for none.
+    w0 : array_like, shape (n,)
+        State at edges[0].
+    t_out : array_like, shape (n_out,)
+        Output times, ascending, in [edges[0], edges[-1]], s.
+    left : array_like of bool, shape (n_out,), optional
+        Whether an output on an edge belongs to the segment that ends there. The state is the same to the bit.
+    rows : ndarray, shape (n_out, n), optional
+        Where to write the outputs: double precision, contiguous.
+
+    Returns
+    -------
+    rows : ndarray, shape (n_out, n)
+        State at the output times. None depends on which other times are asked for.
+    w_end : ndarray, shape (n,)
+        State at edges[-1].
+    """
+    rates, gains, edges, terms, series, w, t_out = (_plain(x) for x in (rates, gains, edges, terms, series, w0, t_out))
+    w = w.copy()
+    n, m = rates.size, edges.size - 1
+    left = np.zeros(t_out.size, bool) if left is None else np.require(left, bool, ["C", "W"])
+    if rows is None:
+        rows = np.empty((t_out.size, n))
+    shapes = (rates, (n,)), (gains, (n,)), (w, (n,)), (edges, (m + 1,)), (t_out, (t_out.size,)), (left, t_out.shape)
+    tables = (terms, (m, *terms.shape[1:2], 6)), (series, (m, *series.shape[1:2])), (rows, (t_out.size, n))
+    for array, shape in (*shapes, *tables):
+        if array.shape != shape:
+            raise ValueError(f"an array of shape {array.shape} where {shape} is due")
+    if not (rows.dtype == np.float64 and rows.flags.carray):
+        raise ValueError("rows that are no contiguous double precision")
+    if not np.all((rates >= 0.0) & (rates < math.inf)):
+        raise ValueError(f"rates {rates} 1/s; allowed: finite, >= 0")
+    if not (np.all(np.diff(edges) >= 0.0) and np.all(np.diff(t_out) >= 0.0)):
+        raise ValueError("edges and output times must ascend")
+    if t_out.size and not (t_out[0] >= edges[0] and t_out[-1] <= edges[-1]):
+        raise ValueError(f"outputs from {t_out[0]} to {t_out[-1]} s; allowed: {edges[0]} to {edges[-1]} s")
+    if np.any(terms[..., 5] != 0.0) or np.any((terms[..., 1] < 0.0) | (terms[..., 1] % 1.0 != 0.0)):
+        raise ValueError("a term with beta, or with p that is no whole number; neither has a closed form here")
+    respond_into(rates, gains, edges, terms, series, w, t_out, left, rows)
+    return rows, w
+
+
+def periodic_state(
+    rates: ArrayLike, gains: ArrayLike, edges: ArrayLike, terms: ArrayLike, series: ArrayLike
+) -> FloatArray:
+    """State at edges[0] to which one pass over the segments leads back.
+
+    A mode without decay has one only where its mean input is zero, and then has many: it starts from 0. With an input
+    whose mean is not zero it has none: NaN. The error of a slow mode is that of the mean input over rate x period.
+
+    Parameters
+    ----------
+    rates, gains, edges, terms, series
+        As for `respond`.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+    """
+    rates, gains, edges, terms, series = (_plain(x) for x in (rates, gains, edges, terms, series))
+    _, w = respond(rates, gains, edges, terms, series, np.zeros(rates.size), np.empty(0))
+    length = np.diff(edges)
+    c, p, a = terms[..., 0], terms[..., 1], terms[..., 2]
+    largest = np.abs(c) * length[:, None] ** p * np.exp(np.maximum(a * length[:, None], 0.0))
+    bound = largest.sum(axis=1) + np.abs(series).sum(axis=1)
+    # The lengths are as uncertain as the edges are rounded.
+    zero = bound @ (_ZERO_MEAN * length + 1e-15 * (np.abs(edges[:-1]) + np.abs(edges[1:])))
+    kept = -np.expm1(-rates * (edges[-1] - edges[0]))
+    neutral = np.where(np.abs(w) <= zero * np.abs(gains), 0.0, np.nan)
+    return np.where(kept > 0.0, w / np.where(kept > 0.0, kept, 1.0), neutral)
+
+
+def _plain(x: ArrayLike) -> FloatArray:
+    """As the one kind of array that the compiled code is compiled for."""
+    return np.require(x, float, ["C", "W"])

@@ -1,0 +1,121 @@
+"""What a run wrote down, and every signal that follows from it, each made when first asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.circuit.statespace import Stack
+from fingerspice.circuit.waveforms import Waveform
+from fingerspice.engine.model import Model
+from fingerspice.physics.contact import areas, inverse_area_array
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+def sealed(x: FloatArray) -> FloatArray:
+    """The same array, read-only."""
+    x.flags.writeable = False
+    return x
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Outputs of a run as they were computed, and what they mean.
+
+    Attributes
+    ----------
+    stack : Stack
+    waveform : Waveform
+        Voltage around the loop.
+    model : Model
+    t : ndarray, shape (n_t,)
+        s; at a jump two entries share a time.
+    left : ndarray of bool, shape (n_t,)
+        Whether the left-hand value at a jump is meant.
+    live : ndarray, shape (n_layer - 1, n_t)
+        Voltages of all layers along the loop but the last of `stack.state_order`, V.
+    z, current : ndarray, shape (n_t,), or None
+        The charge's own state (C) and the source's regular current (A), where they were asked for.
+    charge_offset : float
+        C, taken off so that the charge starts at zero.
+    """
+
+    stack: Stack
+    waveform: Waveform
+    model: Model
+    t: FloatArray
+    left: BoolArray
+    live: FloatArray
+    z: FloatArray | None
+    current: FloatArray | None
+    charge_offset: float = 0.0
+
+    def _sided(self, waveform: Waveform) -> FloatArray:
+        out = np.array(waveform.value(self.t), float)
+        if self.left.any():
+            out[self.left] = waveform.value(self.t[self.left], "left")
+        return sealed(out)
+
+    @cached_property
+    def u_source(self) -> FloatArray:
+        """Voltage around the loop, V, shape (n_t,)."""
+        return self._sided(self.waveform)
+
+    @cached_property
+    def u_layer(self) -> FloatArray:
+        """Layer voltages from p to n (n_t, n_layer), V."""
+        *live, last = self.stack.state_order
+        out = np.empty((self.t.size, len(live) + 1))
+        out[:, live] = self.live.T
+        # The layers add up to the source exactly.
+        out[:, last] = self.u_source - self.live.sum(axis=0)
+        return sealed(out * self.stack.sign)
+
+    @cached_property
+    def u_gap(self) -> FloatArray:
+        """Gap voltage, V, shape (n_t,)."""
+        gap = self.stack.gap
+        assert gap is not None
+        *live, _ = self.stack.state_order
+        if gap in live:
+            return sealed(self.live[live.index(gap)] * self.stack.sign[gap])
+        return sealed(self.u_layer[:, gap].copy())
+
+    @cached_property
+    def area(self) -> FloatArray:
+        """Ridge contact area, m^2, shape (n_t,)."""
+        if not self.model.coupled:
+            return sealed(np.full(self.t.size, self.model.area0))
+        return sealed(areas(self.u_gap, self.model.curve))
+
+    @cached_property
+    def charge(self) -> FloatArray | None:
+        """Charge delivered by the source, C, shape (n_t,)."""
+        if self.z is None:
+            return None
+        held = self.area * self.u_source / self.model.s if self.model.mobile else 0.0
+        return sealed(held + self.z - self.charge_offset)
+
+    @cached_property
+    def fold_margin(self) -> FloatArray:
+        """Distance to the fold of the `mobile` area equation, 1 without stored charge, shape (n_t,)."""
+        if not (self.model.mobile and self.model.coupled):
+            return sealed(np.ones(self.t.size))
+        u = self.u_gap * self.stack.sign[self.stack.gap]
+        q, slope = inverse_area_array(np.abs(u), self.model.curve)
+        return sealed(1.0 - (u - self.model.k_gap * self.u_source) / q * slope * np.sign(u))
+
+    @cached_property
+    def node_voltages(self) -> dict[str, FloatArray]:
+        """Voltage of every node against ground, V, shape (n_t,) each."""
+        sources = {}
+        for element, sign in self.stack.sources:
+            assert element.waveform is not None
+            single = len(self.stack.sources) == 1
+            sources[element.name] = sign * self.u_source if single else self._sided(element.waveform)
+        return {k: sealed(v) for k, v in self.stack.node_voltages(self.u_layer, sources).items()}

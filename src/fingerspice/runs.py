@@ -1,0 +1,130 @@
+"""What every integrator shares: the source window by window, the end of a run, and what a run gives back."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.circuit.sampling import SourceTable, breakpoints_at, is_sampled, source_table
+from fingerspice.engine.model import Segment
+from fingerspice.problem import Problem
+from fingerspice.record import Record
+from fingerspice.solution import ErrorEstimate, State, Status
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+Progress = Callable[[float], None]
+
+# An error below this share of the voltages that cancel in the gap's is rounding: finer steps would not reach it.
+ROUNDING = 2e-14
+PERIODS_PER_WINDOW = 4096.0
+BREAKPOINTS_PER_WINDOW = 2000.0
+
+
+@dataclass
+class Run:
+    """What one integration gives, and how it went.
+
+    `t`, `left`, `live`, `z`, `current` are as in `Record`, up to the time reached.
+    """
+
+    t: FloatArray
+    left: BoolArray
+    live: FloatArray
+    z: FloatArray | None
+    current: FloatArray | None
+    status: Status
+    error: ErrorEstimate
+    peak_u: float
+    peak_f: float
+    nfev: int
+    stats: dict[str, int]
+    state: State
+    t_failed: float | None = None
+    detail: str = ""
+
+    def record(self, problem: Problem) -> Record:
+        """The outputs with what they mean."""
+        return Record(
+            problem.stack, problem.waveform, problem.model, self.t, self.left, self.live, self.z, self.current,
+            self.state.charge_offset,
+        )  # fmt: skip
+
+    def excess(self, rtol: float) -> float:
+        """Estimated error over the one asked for, the larger of voltage and force."""
+        return max(
+            self.error.u_gap / (rtol * self.peak_u) if self.peak_u > 0.0 else 0.0,
+            self.error.f_el / (rtol * self.peak_f) if self.peak_f > 0.0 else 0.0,
+        )
+
+
+class Tables:
+    """Tables of a problem's source, window by window.
+
+    A user's function is expensive to look at, so its tables are kept; those of library waveforms are made anew,
+    which keeps a long run's memory constant.
+    """
+
+    def __init__(self, problem: Problem, tol: float) -> None:
+        self.problem = problem
+        self.tol = min(1e-3, max(0.05 * tol, 1e-14))
+        self.edges = windows(problem)
+        self.kept: dict[int, SourceTable] | None = {} if is_sampled(problem.waveform) else None
+
+    def __iter__(self) -> Iterator[SourceTable]:
+        for i, (w0, w1) in enumerate(itertools.pairwise(self.edges)):
+            table = self.kept.get(i) if self.kept is not None else None
+            if table is None:
+                table = source_table(self.problem.waveform, w0, w1, self.tol, self.problem.step)
+                if self.kept is not None:
+                    self.kept[i] = table
+            yield table
+            if table.not_finite is not None:
+                return
+
+    def peak(self) -> float:
+        """Largest |U| (V) of the run."""
+        if self.kept is None:
+            return self.problem.waveform.peak(self.problem.t_start, self.problem.t_stop)
+        return max(table.scale for table in self)
+
+
+def windows(problem: Problem) -> list[float]:
+    """Edges of the windows the source is tabulated on: constant memory, and phases that stay exact."""
+    span = problem.t_stop - problem.t_start
+    rate = max(
+        problem.waveform.breakpoint_rate() / BREAKPOINTS_PER_WINDOW,
+        1.0 / (PERIODS_PER_WINDOW * problem.waveform.shortest_time()),
+        # A function is sampled at the output step.
+        1.0 / (4096.0 * problem.step) if is_sampled(problem.waveform) else 0.0,
+    )
+    count = max(1, int(np.ceil(span * rate)))
+    return [problem.t_start + span * i / count for i in range(count)] + [problem.t_stop]
+
+
+def after_the_end(problem: Problem, table: SourceTable) -> tuple[Segment, float]:
+    """The segment that right-hand outputs at the very end of a run belong to, and how far into it they are, s."""
+    stop = problem.t_stop
+    if breakpoints_at(problem.waveform, stop).size:
+        table = source_table(problem.waveform, stop, stop + problem.step, 1e-10, problem.step)
+        length = float(table.edges[1] - table.edges[0])
+        return Segment(float(table.edges[0]), length, table.terms[0], table.series[0]), 0.0
+    start = float(table.edges[-2])
+    segment = Segment(start, float(table.edges[-1]) - start, table.terms[-1], table.series[-1])
+    return segment, stop - start
+
+
+def from_rows(problem: Problem, rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Live layer voltages, z and current from rows of `engine.model.write_row`."""
+    # Rows hold y = [x, z] after five columns; z is the last.
+    live = problem.scene.live_voltages(rows[:, 0], rows[:, 2], rows[:, 5:-1])
+    return live, rows[:, -1].copy(), rows[:, 3].copy()
+
+
+def row_width(problem: Problem) -> int:
+    """Columns of a row of `engine.model.write_row`."""
+    return 5 + problem.stack.c.size

@@ -1,0 +1,422 @@
+"""Closed-form response of linear modes, against closed forms and quadrature at 40 to 600 digits and matrix exponentials."""
+
+from __future__ import annotations
+
+import mpmath as mp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from fingerspice.numerics.linear import periodic_state, respond, respond_into
+
+NO_SERIES = np.zeros((1, 0))
+
+
+def term(c=1.0, p=0, a=0.0, omega=0.0, phi=0.0):
+    return [c, p, a, omega, phi, 0.0]
+
+
+def integrals(count, rate, sigma, tau):
+    """Integrals of exp(-rate (tau - s)) s^p exp(sigma s) over [0, tau] for p < count, to working precision."""
+    rate, sigma, tau = mp.mpf(rate), mp.mpmathify(sigma), mp.mpf(tau)
+    mu = rate + sigma
+    if mu == 0:
+        return [mp.exp(sigma * tau) * tau ** (p + 1) / (p + 1) for p in range(count)]
+    wave = mp.exp(sigma * tau)
+    out = [(wave - mp.exp(-rate * tau)) / mu]
+    for p in range(1, count):
+        out.append((tau**p * wave - p * out[-1]) / mu)
+    return out
+
+
+def exact_term(rate, row, tau):
+    """Response from rest to one term; parts may cancel over a hundred digits near a resonance."""
+    c, p, a, omega, phi, _ = row
+    with mp.workdps(150):
+        turned = integrals(int(p) + 1, rate, mp.mpc(a, omega), tau)[-1] * mp.expj(mp.mpf(phi))
+        return float(c * turned.real)
+
+
+def exact_series(rate, coefficients, length, tau):
+    """Response from rest to a Chebyshev series on [0, length]."""
+    with mp.workdps(600):
+        x = [mp.mpf(-1), 2 / mp.mpf(length)]
+        polynomials = [[mp.mpf(1)], x]
+        while len(polynomials) < len(coefficients):
+            twice = [mp.mpf(0)] * (len(polynomials[-1]) + 1)
+            for i, v in enumerate(polynomials[-1]):
+                twice[i] += 2 * v * x[0]
+                twice[i + 1] += 2 * v * x[1]
+            for i, v in enumerate(polynomials[-2]):
+                twice[i] -= v
+            polynomials.append(twice)
+        parts = integrals(len(coefficients), rate, 0, tau)
+        total = mp.mpf(0)
+        for c, polynomial in zip(coefficients, polynomials, strict=False):
+            total += mp.mpf(float(c)) * sum(v * part for v, part in zip(polynomial, parts, strict=False))
+        return float(total)
+
+
+def one_segment(rates, rows, length, t, w0=None):
+    w0 = np.zeros(len(rates)) if w0 is None else w0
+    return respond(rates, np.ones(len(rates)), [0.0, length], [rows], NO_SERIES, w0, t)
+
+
+def times(length, rate, rng):
+    """Outputs over the segment, close to its start, and on the scale of the decay."""
+    scale = [] if rate == 0.0 else np.minimum(length, 10.0 ** rng.uniform(-3.0, 1.5, 3) / rate)
+    return np.unique(
+        np.concatenate([length * rng.random(3), length * 10.0 ** rng.uniform(-9.0, 0.0, 3), [length], scale])
+    )
+
+
+def error(rows, expected):
+    """Largest error relative to the peak, by mode."""
+    return (np.abs(rows - expected).max(axis=0) / np.abs(expected).max(axis=0)).max()
+
+
+RATES = [0.0, 1e-3, 1.0, 40.0, 1e6, 1e15]
+WAVES = [
+    (0.0, 0.0),
+    (0.0, 30.0),
+    (0.0, 1e-6),
+    (0.0, 1e5),
+    (-3.0, 0.0),
+    (-40.0, 7.0),
+    (-1e9, 0.0),
+    (2.0, 500.0),
+    (20.0, 0.0),
+]
+
+
+@pytest.mark.parametrize("p", range(5))
+@pytest.mark.parametrize("wave", WAVES)
+def test_every_kind_of_term_from_rest(p, wave):
+    rng = np.random.default_rng(p)
+    row = term(3.0, p, *wave, phi=0.7)
+    for rate in RATES:
+        t = times(1.3, rate, rng)
+        rows, w_end = one_segment([rate], [row], 1.3, t)
+        expected = np.array([exact_term(rate, row, x) for x in t])
+        assert error(rows, expected[:, None]) <= 1e-14
+        assert w_end[0] == rows[-1, 0]
+
+
+def test_the_reference_itself_equals_quadrature():
+    for rate, row in (
+        (3.0, term(2.0, 3, -1.5, 4.0, 0.3)),
+        (0.5, term(1.0, 1, -0.5, 0.0)),
+        (8.0, term(1.0, 4, 0.5, 9.0, -2.0)),
+    ):
+        c, p, a, omega, phi, _ = row
+        with mp.workdps(30):
+            quadrature = mp.quad(
+                lambda s, z=(rate, c, p, a, omega, phi): (
+                    mp.exp(-z[0] * (mp.mpf(2) - s)) * z[1] * s ** z[2] * mp.exp(z[3] * s) * mp.cos(z[5] + z[4] * s)
+                ),
+                mp.linspace(0, 2, 9),
+            )
+        assert float(quadrature) == pytest.approx(exact_term(rate, row, 2.0), rel=1e-15)
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-15, 1e-12, 1e-9, 1e-6, 1e-3, 0.1, 1.0, 3.0])
+@pytest.mark.parametrize("p", [0, 1, 4])
+def test_a_wave_that_decays_as_the_mode_does(p, off):
+    for rate in (2.0, 300.0):
+        for omega in (0.0, off):
+            row = term(1.0, p, -rate * (1.0 + off), omega, 0.4)
+            t = np.array([1e-4, 1e-2, 0.3, 1.0]) * 5.0 / rate
+            rows, _ = one_segment([rate], [row], t[-1], t)
+            expected = np.array([exact_term(rate, row, x) for x in t])
+            assert error(rows, expected[:, None]) <= 1e-14
+
+
+rates_strategy = st.one_of(
+    st.sampled_from([0.0, 1.0, 1.0 + 1e-12, 1e3, 1e12, 5e-324, 1e-300]),
+    st.floats(-6.0, 15.0).map(lambda x: 10.0**x),
+)
+exponents = st.one_of(
+    st.just(0.0), st.floats(-3.0, 1.5).map(lambda x: 10.0**x), st.floats(-3.0, 9.0).map(lambda x: -(10.0**x))
+)
+frequencies = st.one_of(st.just(0.0), st.floats(-9.0, 7.0).map(lambda x: 10.0**x))
+rows_strategy = st.tuples(st.floats(-2.0, 2.0), st.integers(0, 4), exponents, frequencies, st.floats(-7.0, 7.0)).map(
+    lambda x: term(*x)
+)
+
+
+@settings(max_examples=80, deadline=None, derandomize=True)
+@given(
+    st.lists(rates_strategy, min_size=1, max_size=3),
+    st.lists(rows_strategy, min_size=1, max_size=3),
+    st.floats(-6.0, 1.0),
+)
+def test_any_rates_terms_and_lengths(rates, rows, decades):
+    length = 10.0**decades
+    t = length * np.array([1e-7, 1e-3, 0.11, 0.5, 1.0])
+    w0 = np.linspace(1.0, 2.0, len(rates)) * length
+    got, w_end = one_segment(rates, rows, length, t, w0)
+    parts = np.array([[[exact_term(r, row, x) for r in rates] for x in t] for row in rows])
+    free = np.exp(-np.outer(t, rates)) * w0
+    scale = np.abs(parts).max(axis=1).sum(axis=0) + np.abs(w0)
+    assert np.all(np.abs(got - parts.sum(axis=0) - free).max(axis=0) <= 1e-14 * scale)
+    assert np.array_equal(w_end, got[-1])
+
+
+def test_a_frequency_of_a_billion_radians_keeps_its_phase():
+    start, omega, rate = 1e-3, 2.0 * np.pi * 5000.0, 800.0
+    t = np.array([0.7, 1999.987654321, 2e4, 31830.9])
+    rows, _ = respond([rate], [1.0], [start, 4e4], [[term(1.0, 0, 0.0, omega, 0.2)]], NO_SERIES, [0.0], t)
+    with mp.workdps(40):
+        tau = [mp.mpf(x) - mp.mpf(start) for x in t]
+    expected = np.array([exact_term(rate, term(1.0, 0, 0.0, omega, 0.2), x) for x in tau])
+    assert np.abs(rows[:, 0] - expected).max() <= 1e-15 * 3.0 / omega
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 20, 33])
+def test_a_chebyshev_series_at_any_rate(count):
+    rng = np.random.default_rng(count)
+    switch = 0.5 * count**2
+    for reach in (0.0, 1e-12, 1e-5, 0.03, 1.0, 8.0, 15.9, 16.1, 0.97 * switch, 1.03 * switch, 500.0, 1e4, 1e8, 1e12):
+        c = rng.standard_normal(count)
+        length = 10.0 ** rng.uniform(-4.0, 1.0)
+        rate = reach / length
+        t = times(length, rate, rng)
+        rows, _ = respond([rate], [1.0], [0.0, length], [[term(0.0)]], [c], [0.0], t)
+        expected = np.array([exact_series(rate, c, length, x) for x in t])
+        assert error(rows, expected[:, None]) <= 3e-14
+
+
+def test_series_and_terms_add_and_trailing_zeros_change_nothing():
+    rates, gains, edges, t = [0.0, 3.0, 1e4], [1.0, 2.0, 3.0], [0.0, 0.5, 1.25], np.linspace(0.0, 1.25, 21)
+    terms = np.array([[term(2.0), term(1.0, 1)], [term(0.0), term(1.5, 0, 0.0, 9.0)]])
+    series = np.array([[1.0, 0.5, 0.25], [0.3, 0.0, 0.0]])
+    w0 = np.array([1.0, -1.0, 0.5])
+    both = respond(rates, gains, edges, terms, series, w0, t)[0]
+    apart = respond(rates, gains, edges, terms, np.zeros((2, 0)), w0, t)[0]
+    apart = apart + respond(rates, gains, edges, 0.0 * terms, series, 0.0 * w0, t)[0]
+    longer = respond(rates, gains, edges, terms, np.pad(series, ((0, 0), (0, 6))), w0, t)[0]
+    assert np.abs(both - apart).max() <= 1e-15 * np.abs(both).max()
+    assert np.abs(both - longer).max() <= 1e-15 * np.abs(both).max()
+    # The same input as a series alone: tau = (T_0 + T_1) length / 2.
+    ramp = respond(rates, gains, edges, [[term(2.0), term(1.0, 1)]] * 2, np.zeros((2, 0)), w0, t)[0]
+    half = 0.5 * np.diff(edges)
+    as_series = respond(rates, gains, edges, [[term(0.0)]] * 2, np.stack([2.0 + half, half], axis=1), w0, t)[0]
+    assert np.abs(ramp - as_series).max() <= 1e-15 * np.abs(ramp).max()
+
+
+def test_a_chain_of_segments_equals_the_matrix_exponential():
+    rates = np.array([0.0, 0.0, 2.0, 2.0, 2.0 + 1e-12, 900.0, 1e12])
+    gains = np.array([1.0, -2.0, 3.0, 1.0, 1.0, 900.0, 1e12])
+    edges = np.array([0.5, 0.6, 1.6, 1.601, 3.0])
+    rng = np.random.default_rng(0)
+    omega, a = 11.0, -0.8
+    terms = np.array([[term(c[0]), term(c[1], 1), term(c[2], 0, a, omega, 0.3)] for c in rng.standard_normal((4, 3))])
+    w0 = rng.standard_normal(rates.size)
+    t = np.sort(np.concatenate([edges, rng.uniform(0.5, 3.0, 20)]))
+    rows, w_end = respond(rates, gains, edges, terms, np.zeros((4, 0)), w0, t)
+    # The input is the output of 4 more states: 1, tau, and the two of a decaying wave.
+    n = 6
+    full = np.zeros((n + 4, n + 4))
+    full[:n, :n] = -np.diag(rates[:n])
+    full[n + 1, n] = 1.0
+    full[n + 2 :, n + 2 :] = [[a, -omega], [omega, a]]
+    w = w0[:n]
+    expected = []
+    for s in range(4):
+        full[:n, n:] = np.outer(gains[:n], [terms[s, 0, 0], terms[s, 1, 0], terms[s, 2, 0], 0.0])
+        y = np.concatenate([w, [1.0, 0.0, np.cos(0.3), np.sin(0.3)]])
+        here = t[(t >= edges[s]) & ((t < edges[s + 1]) | (s == 3))]
+        expected += [(expm(full * (x - edges[s])) @ y)[:n] for x in here]
+        w = (expm(full * (edges[s + 1] - edges[s])) @ y)[:n]
+    assert np.all(np.abs(rows[:, :n] - expected) <= 1e-12 * np.abs(expected).max(axis=0))
+    assert np.all(np.abs(w_end[:n] - w) <= 1e-12 * np.abs(expected).max(axis=0))
+    # The fastest mode is the input itself, but for its slope over the rate.
+    tau = t[-1] - edges[3]
+    u = terms[3, 0, 0] + terms[3, 1, 0] * tau + terms[3, 2, 0] * np.exp(a * tau) * np.cos(0.3 + omega * tau)
+    assert rows[-1, n] == pytest.approx(u, abs=1e-10)
+
+
+def test_outputs_on_edges_are_the_same_to_the_bit_on_either_side():
+    edges = np.array([0.0, 0.3, 0.3, 1.0])
+    terms = np.array([[term(2.0, 0, 0.0, 40.0)], [term(1.0)], [term(-1.0, 1, 0.5)]])
+    t = np.array([0.0, 0.3, 0.3, 1.0, 1.0])
+    left = np.array([True, True, False, True, False])
+    w0 = np.array([0.7, -0.2])
+    rows, w_end = respond([1.0, 1e3], [1.0, 1e3], edges, terms, np.zeros((3, 0)), w0, t, left)
+    assert np.array_equal(rows[0], w0)
+    assert np.array_equal(rows[1], rows[2])
+    assert np.array_equal(rows[3], rows[4])
+    assert np.array_equal(rows[4], w_end)
+
+
+def test_no_output_depends_on_which_others_are_asked_for():
+    rng = np.random.default_rng(1)
+    edges = np.linspace(0.0, 1.0, 6)
+    terms = np.array([[term(c, 0, 0.0, 30.0, c)] for c in rng.standard_normal(5)])
+    series = rng.standard_normal((5, 7))
+    arguments = [0.0, 5.0, 1e5], [1.0, 5.0, 1e5], edges, terms, series, [1.0, 2.0, 3.0]
+    t = np.sort(np.concatenate([edges, rng.random(40)]))
+    rows, w_end = respond(*arguments, t)
+    few, same_end = respond(*arguments, t[::3])
+    assert np.array_equal(few, rows[::3])
+    assert np.array_equal(same_end, w_end)
+    assert np.array_equal(rows[-1], w_end)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(rates_strategy, exponents.filter(lambda a: a > -1e3), st.floats(-3.0, 4.0), st.floats(0.05, 0.95))
+def test_a_segment_split_in_two_gives_the_same(rate, a, decades, at):
+    omega = 10.0**decades
+    whole = [term(2.0, 0, a, omega, 0.4), term(1.0, 1), term(0.5)]
+    rest = [term(2.0 * np.exp(a * at), 0, a, omega, 0.4 + omega * at), term(1.0, 1), term(0.5 + at)]
+    t = np.linspace(0.0, 1.0, 8)
+    once, end_once = respond([rate], [1.0], [0.0, 1.0], [whole], NO_SERIES, [0.3], t)
+    twice, end_twice = respond([rate], [1.0], [0.0, at, 1.0], [whole, rest], np.zeros((2, 0)), [0.3], t)
+    tolerance = (1e-14 + 1e-15 * omega) * max(np.abs(once).max(), np.abs(end_once).max())
+    assert np.abs(once - twice).max() <= tolerance
+    assert abs(end_once - end_twice)[0] <= tolerance
+
+
+def test_the_response_is_linear_in_input_and_state():
+    rng = np.random.default_rng(2)
+    rates, gains, edges = 10.0 ** rng.uniform(-2.0, 8.0, 6), rng.standard_normal(6), np.array([0.0, 0.4, 1.0])
+    terms = np.zeros((2, 4, 6))
+    terms[:, :, 0] = rng.standard_normal((2, 4))
+    terms[:, :, 1:5] = [[0, 0.0, 20.0, 1.0], [2, -3.0, 0.0, 0.0], [1, -300.0, 4.0, 0.0], [0, 0.0, 0.0, 0.0]]
+    series, w0, t = rng.standard_normal((2, 9)), rng.standard_normal(6), np.sort(rng.random(30))
+    whole = respond(rates, gains, edges, terms, series, w0, t)[0]
+    total = respond(rates, gains, edges, 0.0 * terms, 0.0 * series, w0, t)[0]
+    total += respond(rates, gains, edges, 0.0 * terms, series, 0.0 * w0, t)[0]
+    for i in range(4):
+        only = np.zeros_like(terms)
+        only[:, i] = -2.0 * np.eye(6)[0] * terms[:, i, :1] + terms[:, i] * (np.arange(6) > 0)
+        total += -0.5 * respond(rates, gains, edges, only, 0.0 * series, 0.0 * w0, t)[0]
+    assert np.all(np.abs(whole - total) <= 1e-14 * np.abs(whole).max(axis=0))
+
+
+def test_a_hundred_thousand_segments_add_up_no_rounding():
+    m = 100_000
+    edges = np.arange(m + 1) * 1e-4
+    terms = np.zeros((m, 1, 6))
+    terms[:, 0, 0] = np.where(np.arange(m) % 2 == 0, 200.0, -60.0)
+    rates = np.array([0.0, 1e-3, 1e-2, 0.1, 1.0])
+    _, w_end = respond(rates, np.ones(5), edges, terms, np.zeros((m, 0)), np.zeros(5), [])
+    exact = edges.astype(np.longdouble)
+    for rate, w in zip(rates, w_end, strict=True):
+        until = np.exp(-np.longdouble(rate) * (exact[-1] - exact[1:]))
+        gained = (
+            -np.expm1(-np.longdouble(rate) * np.diff(exact)) / np.longdouble(rate) if rate > 0.0 else np.diff(exact)
+        )
+        assert abs(w / np.sum(until * gained * terms[:, 0, 0]) - 1.0) <= 2e-13
+
+
+def test_decayed_states_are_zero_and_never_denormal():
+    edges = np.array([0.0, 1.0, 2.0, 3.0])
+    t = np.linspace(0.0, 3.0, 2001)
+    for rate in (300.0, 400.0, 650.0, 1e6, 1e15):
+        terms = [[term(1.0, 0, -2.0 * rate)], [term(0.0)], [term(0.0)]]
+        rows, w_end = respond([rate], [1.0], edges, terms, np.zeros((3, 0)), [1.0], t)
+        assert np.all(rows[t >= 2.5] == 0.0)
+        assert w_end[0] == 0.0
+        assert not np.any((rows != 0.0) & (np.abs(rows) < 2.3e-308))
+
+
+def test_the_periodic_state_of_a_sine_is_its_phasor():
+    f, rates = 50.0, np.array([1e-2, 3.0, 500.0, 1e6, 1e12])
+    omega = 2.0 * np.pi * f
+    w0 = periodic_state(rates, rates, [0.0, 1.0 / f], [[term(3.0, 0, 0.0, omega, 0.4)]], NO_SERIES)
+    expected = (3.0 * np.exp(0.4j) * rates / (rates + 1j * omega)).real
+    # The slowest keeps the rounding of the mean, over what is lost in a period.
+    assert np.all(
+        np.abs(w0 - expected) <= 1e-15 * (10.0 + 1.0 / (rates / f)) * 3.0 * rates / np.hypot(rates, omega) + 1e-15
+    )
+
+
+def test_the_periodic_state_closes():
+    rng = np.random.default_rng(3)
+    rates = np.array([1e-3, 1.0, 1.0, 1.0 + 1e-12, 70.0, 1e5, 1e12])
+    edges = np.array([2.0, 2.1, 2.7, 3.0])
+    terms = np.array([[term(c, 1, -1.0, 6.0, c), term(c)] for c in rng.standard_normal(3)])
+    series = rng.standard_normal((3, 5))
+    w0 = periodic_state(rates, rates, edges, terms, series)
+    rows, w_end = respond(rates, rates, edges, terms, series, w0, np.linspace(2.0, 3.0, 50))
+    assert np.all(np.abs(w_end - w0) <= 1e-14 * np.abs(rows).max(axis=0))
+
+
+@pytest.mark.parametrize("start", [0.0, 1e3])
+def test_a_mode_without_decay_has_a_periodic_state_where_the_mean_is_zero(start):
+    edges = start + np.array([0.0, 0.3e-3, 1e-3, 1.7e-3, 2e-3])
+    square = np.array([[term(c)] for c in (200.0, -200.0, 200.0, -200.0)])
+    gains = [1e4, -3e4]
+    none = np.zeros((4, 0))
+    assert np.array_equal(periodic_state([0.0, 0.0], gains, edges, square, none), [0.0, 0.0])
+    rows, w_end = respond([0.0, 0.0], gains, edges, square, none, [0.0, 0.0], edges)
+    assert np.all(np.abs(w_end) <= 1e-9 * np.abs(rows).max(axis=0))
+    square[0, 0, 0] *= 1.0 + 1e-6
+    assert np.all(np.isnan(periodic_state([0.0, 0.0], gains, edges, square, none)))
+    sine = [[term(5.0, 0, 0.0, 2.0 * np.pi * 100.0, 1.1)]]
+    got = periodic_state([0.0, 100.0], [1.0, 1.0], [0.0, 0.03], sine, NO_SERIES)
+    assert got[0] == 0.0
+    assert np.isfinite(got[1])
+
+
+def test_constant_and_integer_arguments_and_a_given_place_for_the_rows():
+    edges = np.array([0.0, 1.0])
+    edges.flags.writeable = False
+    place = np.full((3, 2), np.nan)
+    terms = np.broadcast_to(np.array(term(1.0)), (1, 2, 6))
+    rows, w_end = respond((0, 1), np.array([1, 1]), edges, terms, NO_SERIES, [0, 0], [0, 0.5, 1], rows=place)
+    assert rows is place
+    expected = np.array([[0.0, 0.0], [1.0, -2.0 * np.expm1(-0.5)], [2.0, -2.0 * np.expm1(-1.0)]])
+    assert np.abs(rows - expected).max() <= 1e-15
+    assert np.array_equal(w_end, rows[-1])
+
+
+def test_compiled_code_gets_nan_for_times_outside():
+    t = np.array([-1.0, 0.0, 1.0, 1.5])
+    rows, w = np.empty((4, 1)), np.array([2.0])
+    terms = np.array([[term(1.0)]])
+    respond_into(np.zeros(1), np.ones(1), np.array([0.0, 1.0]), terms, NO_SERIES, w, t, np.zeros(4, bool), rows)
+    assert np.array_equal(rows[:, 0], [np.nan, 2.0, 3.0, np.nan], equal_nan=True)
+    assert w[0] == 3.0
+
+
+def test_a_window_without_segments_keeps_the_state():
+    rows, w_end = respond([1.0], [1.0], [2.0], np.zeros((0, 1, 6)), np.zeros((0, 0)), [0.5], [2.0])
+    assert rows[0, 0] == w_end[0] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rates": [-1.0]}, "rates"),
+        ({"rates": [np.inf]}, "rates"),
+        ({"rates": [1.0, 2.0]}, "shape"),
+        ({"terms": [[[1.0, 0.0, 0.0, 0.0, 0.0]]]}, "shape"),
+        ({"terms": [[[1.0, 0.0, 0.0, 1.0, 0.0, 2.0]]]}, "beta"),
+        ({"terms": [[term(1.0, 0.5)]]}, "whole number"),
+        ({"terms": [[term(1.0, -1)]]}, "whole number"),
+        ({"edges": [1.0, 0.0]}, "ascend"),
+        ({"t_out": [0.5, 0.2]}, "ascend"),
+        ({"t_out": [np.nan]}, "outputs"),
+        ({"t_out": [-0.1, 0.2]}, "outputs from -0.1"),
+        ({"t_out": [0.2, 1.1]}, "outputs"),
+        ({"left": [True]}, "shape"),
+        ({"rows": np.empty((2, 1), np.float32)}, "double precision"),
+        ({"rows": np.empty((2, 2))[:, :1]}, "contiguous"),
+    ],
+)
+def test_what_cannot_be_answered_is_refused(change, message):
+    arguments = {
+        "rates": [1.0],
+        "gains": [1.0],
+        "edges": [0.0, 1.0],
+        "terms": [[term(1.0)]],
+        "series": NO_SERIES,
+        "w0": [0.0],
+        "t_out": [0.2, 0.5],
+    }
+    with pytest.raises(ValueError, match=message):
+        respond(**(arguments | change))
