@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -73,9 +74,11 @@ def lead(results: Report, problem: str) -> str:
 
 
 def short_table(results: Report, law: str) -> list[str]:
-    """Best of each library on each problem of a charge law."""
+    """Best of each library on each problem of a charge law; empty where there is none."""
     names = [n for n, p in results["problems"].items() if p["charge_law"] == law]
-    rows = [["us per period", *(results["problems"][n]["title"] for n in names)]]
+    if not names:
+        return []
+    rows = [["µs per period", *(results["problems"][n]["title"] for n in names)]]
     for library in libraries(results):
         targets = (NGSPICE_TARGET,) if library == "ngspice" else TARGETS
         cells = [cell(good(results, n, library=library), targets) for n in names]
@@ -96,12 +99,12 @@ def long_table(results: Report, problem: str) -> list[str]:
     """Every contestant on a problem: time, and how many times ours, at each error; and what failed."""
     targets = (TARGETS[0], NGSPICE_TARGET, *TARGETS[1:])
     ours = good(results, problem, library=OURS)
-    rows = [["contestant", *(f"{t:.0e}: us (times ours)" for t in targets), "did not run"]]
+    rows = [["contestant", *(f"{t:.0e}: µs (times ours)" for t in targets), "did not run"]]
     for name in dict.fromkeys(p["contestant"] for p in results["points"] if p["problem"] == problem):
         cells = []
         for target in targets:
             a, b = cheapest(ours, target), cheapest(good(results, problem, contestant=name), target)
-            ratio = "" if a is None or b is None else f" ({b['us_per_period'] / a['us_per_period']:.2g})"
+            ratio = "" if a is None or b is None else f" ({number(b['us_per_period'] / a['us_per_period'])})"
             cells.append("-" if b is None else number(b["us_per_period"]) + ratio)
         mine = [p for p in results["points"] if p["problem"] == problem and p["contestant"] == name]
         failed = [f"{p['setting']:.0e}: {p['status']}" for p in mine if p["status"] != "ok"]
@@ -111,7 +114,9 @@ def long_table(results: Report, problem: str) -> list[str]:
 
 def conditions(results: Report) -> str:
     """Machine and versions in one sentence."""
-    versions = [v if any(c.isalpha() for c in v) else f"{k} {v}" for k, v in results["versions"].items() if v != "absent"]
+    present = {k: v for k, v in results["versions"].items() if v != "absent"}
+    # Some give the name of the package before its version.
+    versions = [f"{k} {v}" if v[0].isdigit() else v for k, v in present.items()]
     absent = [k for k, v in results["versions"].items() if v == "absent"]
     text = f"{results['machine']}; {', '.join(versions)}"
     return text + (f"; absent: {', '.join(absent)}" if absent else "")
@@ -119,22 +124,22 @@ def conditions(results: Report) -> str:
 
 def readme_text(results: Report) -> str:
     """What stands between the README's markers."""
+    aims = " / ".join(f"{t:.0e}".replace("e-0", "e-") for t in TARGETS)
     spread = max(p["reference_agreement"] for p in results["problems"].values())
+    text = (
+        f"Wall time per simulated period (of the chirp: per ms), µs, for an error of {aims} of the peak in gap voltage "
+        "and force, 100 outputs a period included. Of each library the best method and setting, found by comparing "
+        "with the reference, on a compiled right-hand side, split at the source's jumps, and told the gap voltage's "
+        "zeros where that helps; fingerspice finds these itself, estimates its error and meets the one asked for. Two "
+        f"independent references agree to {spread:.0e}. Medians of {results['repeats']} (slow peers: fewer) by "
+        f"`python benchmarks/work_precision.py` on {conditions(results)}. Every method, what failed, and the law "
+        "`mobile`: [`work_precision.md`](benchmarks/results/work_precision.md)."
+    )
     return "\n".join(
         [
-            f"Wall time per simulated period (of the chirp: per ms), in us, for an error of {TARGETS[0]:g} / "
-            f"{TARGETS[1]:g} / {TARGETS[2]:g} of the peak in gap voltage and force",
-            "(100 outputs a period included; the cheapest setting that meets it; the best method of each library, with",
-            "a compiled right-hand side, split at the source's jumps and told the zeros of the gap voltage where that "
-            "helps).",
-            f"Errors are against two independent references that agree to {spread:.0e}. Medians of {results['repeats']}, ",
-            f"{conditions(results)}. Every method: [`work_precision.md`](benchmarks/results/work_precision.md).",
+            *textwrap.wrap(text, 118, break_long_words=False, break_on_hyphens=False),
             "",
             *short_table(results, "local"),
-            "",
-            "The same under the law `mobile`:",
-            "",
-            *short_table(results, "mobile"),
             "",
             "![Error against time and against evaluations](benchmarks/results/work_precision.png)",
         ]
@@ -144,6 +149,11 @@ def readme_text(results: Report) -> str:
 def details(results: Report) -> str:
     """The whole of the results as Markdown."""
     lines = ["# Work and precision", "", f"{conditions(results)}. Made by `benchmarks/report.py`.", ""]
+    aims = " / ".join(f"{t:.0e}" for t in TARGETS)
+    for law in ("local", "mobile"):
+        table = short_table(results, law)
+        if table:
+            lines += [f"Law `{law}`, the best of each library, µs per period at an error of {aims}:", "", *table, ""]
     for name, problem in results["problems"].items():
         law = "" if problem["charge_law"] == "local" else ", law `mobile`"
         lines += [
@@ -177,10 +187,12 @@ def picture(results: Report, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     names = [n for n, p in results["problems"].items() if p["charge_law"] == "local"][:4]
-    costs = {"us_per_period": "time per period / µs", "nfev_per_period": "right-hand-side evaluations per period"}
+    costs = {"us_per_period": "time per period / µs", "nfev_per_period": "evaluations per period"}
     style = {"font.size": 8, "axes.titlesize": 8.5, "axes.labelsize": 8, "xtick.labelsize": 7, "ytick.labelsize": 7}
     with plt.rc_context(style):
-        figure, axes = plt.subplots(2, len(names), figsize=(7.6, 4.8), sharey=True, sharex="row", squeeze=False)
+        figure, axes = plt.subplots(
+            2, len(names), figsize=(7.6, 4.8), sharey=True, sharex="row", squeeze=False, layout="constrained"
+        )
         for column, name in enumerate(names):
             floor = results["problems"][name]["error_floor"]
             for row, cost in enumerate(costs):
@@ -203,11 +215,13 @@ def picture(results: Report, path: Path) -> None:
         axes[0][0].set_ylim(1e-13, 1e-1)
         for row, label in enumerate(costs.values()):
             axes[row][0].set_ylabel("largest error / peak")
-            box = [a.get_position() for a in axes[row]]
-            del box
-            axes[row][0].set_xlabel(label)
+            for ax in axes[row]:
+                ax.set_xlabel(label)
         handles, labels = axes[0][0].get_legend_handles_labels()
-        figure.legend(handles[::-1], labels[::-1], loc="outside upper center", ncols=len(labels), frameon=False)
+        figure.legend(
+            handles[::-1], labels[::-1], loc="outside upper center", ncols=len(labels), frameon=False,
+            columnspacing=1.2, handlelength=1.6,
+        )  # fmt: skip
         figure.savefig(path, dpi=200)
         plt.close(figure)
 

@@ -19,14 +19,21 @@ from numpy.typing import NDArray
 from problems import Constants, Drive, Problem, by_name
 
 FloatArray = NDArray[np.float64]
+BELOW = 1.1
+"""Minus the series' argument where the continuation below 0 V ends; 0 V is at 1."""
 
 
 def local_rates(
-    constants: Constants, drive: Drive, sin: Callable[[Any], Any], compile_part: Callable[[Any], Any] = lambda f: f
+    constants: Constants,
+    drive: Drive,
+    sin: Callable[[Any], Any],
+    least: Callable[[Any, Any], Any],
+    compile_part: Callable[[Any], Any] = lambda f: f,
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """rates(t, x0, x1, sign, level) -> (x0', x1') and gap(U, x0, x1, sign) -> (u_gap, 1/A_R) of the `local` law.
 
-    sign 0 takes |u_gap|; +-1 the branch of that sign and its continuation through zero.
+    `sin` and `least` are the library's. sign 0 takes |u_gap|; +-1 the branch of that sign and its continuation through
+    zero. Past both ends of the series the area stands still, so that no wild trial step overflows.
     """
     (k0, k1, k2), (f0, f1, f2), (p0, p1, p2) = constants.k, constants.fixed, constants.per_area
     series, scale = constants.series[::-1], 2.0 / constants.reach
@@ -35,7 +42,8 @@ def local_rates(
     @compile_part
     def gap(u_source, x0, x1, sign):  # type: ignore[no-untyped-def]
         u = k1 * u_source + x1
-        s = scale * (abs(u) if sign == 0.0 else sign * u) - 1.0
+        s = least(scale * (abs(u) if sign == 0.0 else sign * u) - 1.0, 1.0)
+        s = -least(-s, BELOW)
         inverse = series[0] + 0.0 * s
         for c in series[1:]:
             inverse = inverse * s + c
@@ -54,7 +62,11 @@ def local_rates(
 
 
 def _mobile_rates(
-    constants: Constants, drive: Drive, sin: Callable[[Any], Any], compile_part: Callable[[Any], Any]
+    constants: Constants,
+    drive: Drive,
+    sin: Callable[[Any], Any],
+    least: Callable[[Any, Any], Any],
+    compile_part: Callable[[Any], Any],
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """The same under `mobile`: u_gap = k U + x1 A(0)/A(|u_gap|) is solved by Newton's method at every evaluation."""
     (k0, k1, k2), (f0, f1, f2), (p0, p1, p2) = constants.k, constants.fixed, constants.per_area
@@ -69,12 +81,14 @@ def _mobile_rates(
         # From the root at A(0) Newton converges on every scene here, all of them off the fold.
         for _ in range(30):
             side = sign if sign != 0.0 else (1.0 if u >= 0.0 else -1.0)
-            s = scale * side * u - 1.0
+            s = -least(-least(scale * side * u - 1.0, 1.0), BELOW)
             inverse = series[0]
             slope = 0.0
             for c in series[1:]:
                 slope = slope * s + inverse
                 inverse = inverse * s + c
+            if s == 1.0 or s == -BELOW:
+                slope = 0.0
             step = (u - share - x1 * area0 * inverse) / (1.0 - x1 * area0 * slope * scale * side)
             u -= step
             if abs(step) <= 4e-16 * (abs(share) + abs(x1)):
@@ -129,7 +143,7 @@ def _compiled(name: str) -> Compiled:
     problem = by_name()[name]
     constants = problem.constants
     build = _mobile_rates if problem.law == "mobile" else local_rates
-    rates, gap = build(constants, problem.drive, math.sin, njit(error_model="numpy"))
+    rates, gap = build(constants, problem.drive, math.sin, min, njit(error_model="numpy"))
     stress = constants.stress
 
     @njit(error_model="numpy")

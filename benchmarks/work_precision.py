@@ -1,6 +1,6 @@
 """Error against time of this package and of everything else that could solve the same scenes.
 
-Run: python benchmarks/work_precision.py [--quick] [--repeats 7] [--limit 60] [--problems NAME ...]
+Run: python benchmarks/work_precision.py [--quick] [--repeats 7] [--limit 30] [--problems NAME ...]
 [--contestants WORD ...] [--output FILE], then python benchmarks/report.py. A full run takes about an hour and writes
 results/work_precision.json; a selection is only printed, unless --output says where to keep it.
 
@@ -35,8 +35,11 @@ from right_hand_side import compiled
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "work_precision.json"
-REPEATS, LIMIT = 7, 60.0
+REPEATS, LIMIT = 7, 30.0
 QUICK_RTOL, QUICK_STEPS = 1e-6, 200.0
+TOO_LONG = "took too long"
+FAILURES = (NotSolvedError, ArithmeticError, AssertionError, RuntimeError, ValueError)
+"""How libraries fail; SolveError of this package is a RuntimeError."""
 Report = dict[str, Any]
 
 
@@ -68,19 +71,20 @@ def timed(run: Callable[[float], Outcome], setting: float) -> tuple[float, Outco
     return (seconds if outcome.seconds is None else outcome.seconds), outcome
 
 
-def point(run: Callable[[float], Outcome], setting: float, plan: Plan, truth: Reference, repeats: int, limit: float) -> (
-    Report
-):  # fmt: skip
+def point(
+    run: Callable[[float], Outcome], setting: float, plan: Plan, truth: Reference, repeats: int, limit: float
+) -> Report:
     """One setting of a contestant: errors, median time, evaluations; or, in `status`, why there are none."""
     found: Report = {"setting": setting, "status": "ok"}
     try:
         with at_most(limit):
             first, outcome = timed(run, setting)
     except TooLongError:
-        return found | {"status": f"more than {limit:g} s"}
-    except (NotSolvedError, ArithmeticError, AssertionError, RuntimeError, ValueError) as error:
-        said = str(error).strip().splitlines()
-        return found | {"status": f"{type(error).__name__}: {said[0][:200] if said else ''}"}
+        return found | {"status": TOO_LONG}
+    except FAILURES as error:
+        said = (str(error).strip().splitlines() or [""])[0][:200]
+        own = isinstance(error, NotSolvedError)
+        return found | {"status": said if own else f"{type(error).__name__}: {said}"}
     if not (np.all(np.isfinite(outcome.u_gap)) and np.all(np.isfinite(outcome.f_el))):
         return found | {"status": "NaN, called a success"}
     # Slow runs are repeated less; the first is the warm-up of the others, and counts only where it is alone.
@@ -109,35 +113,35 @@ def race(
     stop = problem.t_stop(periods)
     plan = Plan(problem, periods, tuple(z for z in zeros if z < stop), tuple(signs))
     run = contestant.setup(plan)
-    compile_s, late = None, False
+    compile_s, late = warm_up(run, settings[0], limit, contestant.compile_limit)
     for setting in settings:
         if late:
-            found: Report = {"setting": setting, "status": "not tried: a looser setting took too long"}
+            found: Report = {"setting": setting, "status": TOO_LONG}
         else:
-            if compile_s is None:
-                compile_s = warm_up(run, setting, limit)
             found = point(run, setting, plan, truth, repeats, limit)
-            late = found["status"].startswith("more than")
+            late = found["status"] == TOO_LONG
         yield {
             "problem": problem.name, "contestant": contestant.name, "library": contestant.library,
             "what": contestant.what, "periods": periods, "compile_s": compile_s, **found,
         }  # fmt: skip
 
 
-def warm_up(run: Callable[[float], Outcome], setting: float, limit: float) -> float | None:
-    """What the first run takes longer than the second, s: compilation; None where they fail."""
+def warm_up(
+    run: Callable[[float], Outcome], setting: float, limit: float, compile_limit: float
+) -> tuple[float | None, bool]:
+    """What the first run takes longer than the second, s: compilation (None where unknown); and whether to give up."""
     try:
+        with at_most(limit + compile_limit):
+            first = timed(run, setting)[0]
+        if first > limit:
+            return None, False
         with at_most(limit):
-            begin = time.perf_counter()
-            run(setting)
-            middle = time.perf_counter()
-            if middle - begin > 5.0:
-                return None
-            run(setting)
-            return max(0.0, 2.0 * middle - begin - time.perf_counter())
-    except (TooLongError, ArithmeticError, AssertionError, RuntimeError, ValueError):
+            return max(0.0, first - timed(run, setting)[0]), False
+    except TooLongError:
+        return None, True
+    except FAILURES:
         # The measured run meets the same and says so.
-        return None
+        return None, False
 
 
 def describe(problem: Problem, truth: Reference) -> Report:
@@ -180,9 +184,14 @@ def warm(problem: Problem) -> float:
 
 
 def measure(
-    problems: list[Problem], field: list[Contestant], versions: dict[str, str], repeats: int, limit: float
+    problems: list[Problem],
+    field: list[Contestant],
+    versions: dict[str, str],
+    repeats: int,
+    limit: float,
+    path: Path | None,
 ) -> Report:
-    """Run everything, printing a line a point."""
+    """Run everything, printing a line a point; what there is by then is written after every problem."""
     import fingerspice
 
     results: Report = {
@@ -200,8 +209,21 @@ def measure(
             for found in race(contestant, problem, truth, contestant.settings, repeats, limit):
                 results["points"].append(found)
                 print(line(found), flush=True)
-    results["load_average"] = os.getloadavg()
+        results["load_average"] = os.getloadavg()
+        if path is not None:
+            write(results, path)
     return results
+
+
+def write(results: Report, path: Path) -> None:
+    """Results as JSON, a point a line, numbers to five digits."""
+    points = [
+        json.dumps({k: float(f"{v:.5g}") if isinstance(v, float) else v for k, v in p.items()})
+        for p in results["points"]
+    ]
+    head = json.dumps({**results, "points": []}, indent=1)
+    assert head.count('"points": []') == 1
+    path.write_text(head.replace('"points": []', '"points": [\n' + ",\n".join(points) + "\n]") + "\n", encoding="utf-8")
 
 
 def line(found: Report) -> str:
@@ -247,11 +269,9 @@ def main(arguments: list[str] | None = None) -> list[Report]:
         if options.contestants:
             field = [c for c in field if c.name.startswith(tuple(options.contestants))]
         problems = [by_name()[name] for name in options.problems] if options.problems else [*LOCAL, *MOBILE]
-        results = measure(problems, field, versions, options.repeats, options.limit)
-    whole = not (options.problems or options.contestants)
-    path = options.output or (RESULTS if whole else None)
-    if path is not None:
-        path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+        whole = not (options.problems or options.contestants)
+        path = options.output or (RESULTS if whole else None)
+        results = measure(problems, field, versions, options.repeats, options.limit, path)
     return list(results["points"])
 
 

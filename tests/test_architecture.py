@@ -18,8 +18,9 @@ MAX_LINES = 450
 # From the bottom up: a part imports its own files and the parts above it in this list, nothing below.
 ORDER = (
     *("errors", "units", "files", "compiled", "numerics", "physics", "engine", "circuit"),
-    *("solution", "phasors", "export", "table1", "plotting", "problem", "transient", "foreign", "simulation"),
-    *("periodic", "comparison", "report", "figures", "options", "cli", "__main__"),
+    *("record", "solution", "phasors", "export", "table1", "plotting", "problem", "runs", "stepping", "marching"),
+    *("direct", "foreign", "periodic", "plan", "simulation", "steady", "comparison", "report", "figures"),
+    *("options", "cli", "__main__"),
 )
 # Beside each other, not one on the other.
 STRANGERS = (
@@ -34,7 +35,7 @@ THIRD_PARTY = {
     "physics": {"numpy", "numba"},
     "engine": {"numpy", "numba"},
     "circuit": {"numpy"},
-    "compiled": {"numba"},
+    "compiled": {"numba", "numpy"},
     "errors": set(),
     "units": set(),
     "files": set(),

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
+import json
 from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fingerspice.circuit.statespace import build_stack
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 
@@ -18,3 +25,65 @@ def test_run_times_runs_and_writes_nothing_when_quick(capsys):
     assert {row["deck"] for row in results["ten_periods"]} == {p.stem for p in FOLDER.parent.glob("circuits/*.cir")}
     assert all(row["error_over_peak"] <= row["rtol"] for row in results["ten_periods"])
     assert written.stat().st_mtime_ns == before
+
+
+@pytest.fixture
+def work_precision(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    return importlib.import_module("work_precision")
+
+
+def test_every_contestant_is_as_right_as_its_setting_promises(work_precision, capsys):
+    written = FOLDER / "results" / "work_precision.json"
+    before = written.stat().st_mtime_ns if written.exists() else None
+    points = work_precision.main(["--quick"])
+    assert {p["library"] for p in points} >= {"fingerspice", "scipy"}
+    for point in points:
+        assert point["status"] == "ok", point
+        # Ours bounds the error of the result. The others bound each step's: what adds up was measured, 1.4e-8 to 2.3e-5
+        # at 1e-6; ngspice's error follows its step.
+        allowed = {"fingerspice": 1e-6, "ngspice": 2e-4}.get(point["library"], 5e-5)
+        assert point["error"] <= allowed, point
+    assert (written.stat().st_mtime_ns if written.exists() else None) == before
+
+
+def test_the_peers_area_series_and_rates_are_the_packages_model(work_precision):
+    problems = importlib.import_module("problems")
+    right_hand_side = importlib.import_module("right_hand_side")
+    for problem in (problems.by_name()["square_100Hz"], problems.by_name()["square_100Hz_mobile"]):
+        stack = build_stack(problem.circuit())
+        u_gap, f_el = right_hand_side.compiled(problem).observe(np.linspace(-200.0, 200.0, 41), np.zeros((41, 2)))
+        np.testing.assert_allclose(f_el, stack.contact.stress(u_gap) * stack.contact.area(u_gap), rtol=2e-14)
+
+
+def test_the_report_needs_nothing_but_the_results(work_precision, tmp_path):
+    report = importlib.import_module("report")
+    results = {
+        "machine": "a machine",
+        "versions": {"fingerspice": "1", "numbalsoda": "absent"},
+        "repeats": 7,
+        "problems": {
+            "sine": {
+                "title": "sine", "charge_law": "local", "periods": 2, "period_s": 0.01, "reference": "two ways",
+                "reference_agreement": 1e-14, "error_floor": 1e-14, "peak_u_gap_V": 100.0,
+            }
+        },
+        "points": [
+            {
+                "problem": "sine", "contestant": name, "library": library, "setting": error, "status": "ok",
+                "error": error, "us_per_period": cost, "nfev_per_period": 10.0, "compile_s": None,
+            }
+            for name, library, cost in (("fingerspice", "fingerspice", 2.0), ("scipy LSODA", "scipy", 30.0))
+            for error in (1e-4, 1e-7, 1e-11)
+        ],
+    }  # fmt: skip
+    path, readme = tmp_path / "work_precision.json", tmp_path / "README.md"
+    path.write_text(json.dumps(results))
+    readme.write_text(f"before\n{report.BEGIN}\nstale\n{report.END}\nafter\n")
+    report.main(["--results", str(path), "--readme", str(readme)])
+    page = readme.read_text()
+    assert page.startswith("before\n")
+    assert page.endswith("\nafter\n")
+    assert "stale" not in page
+    assert "| best peer over ours, times | 15 / 15 / 15 |" in page
+    assert path.with_suffix(".png").stat().st_size > 0

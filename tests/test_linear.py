@@ -1,4 +1,4 @@
-"""Closed-form response of linear modes, against closed forms and quadrature at 40 to 600 digits and matrix exponentials."""
+"""Closed-form response of linear modes, against closed forms and quadrature at 30 to 600 digits and expm."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def term(c=1.0, p=0, a=0.0, omega=0.0, phi=0.0):
 
 
 def integrals(count, rate, sigma, tau):
-    """Integrals of exp(-rate (tau - s)) s^p exp(sigma s) over [0, tau] for p < count, to working precision."""
+    """Integrals of exp(-rate (tau - s)) s^p exp(sigma s) over [0, tau] for p < count, to 40 digits."""
     rate, sigma, tau = mp.mpf(rate), mp.mpmathify(sigma), mp.mpf(tau)
     mu = rate + sigma
-    if mu == 0:
+    if abs(mu * tau) < 1e-40:
         return [mp.exp(sigma * tau) * tau ** (p + 1) / (p + 1) for p in range(count)]
     wave = mp.exp(sigma * tau)
     out = [(wave - mp.exp(-rate * tau)) / mu]
@@ -32,11 +32,10 @@ def integrals(count, rate, sigma, tau):
 
 
 def exact_term(rate, row, tau):
-    """Response from rest to one term; parts may cancel over a hundred digits near a resonance."""
+    """Response from rest to one term: the real part of this. Near a resonance a hundred digits cancel."""
     c, p, a, omega, phi, _ = row
     with mp.workdps(150):
-        turned = integrals(int(p) + 1, rate, mp.mpc(a, omega), tau)[-1] * mp.expj(mp.mpf(phi))
-        return float(c * turned.real)
+        return complex(c * integrals(int(p) + 1, rate, mp.mpc(a, omega), tau)[-1] * mp.expj(mp.mpf(phi)))
 
 
 def exact_series(rate, coefficients, length, tau):
@@ -73,26 +72,17 @@ def times(length, rate, rng):
 
 
 def error(rows, expected):
-    """Largest error relative to the peak, by mode."""
-    return (np.abs(rows - expected).max(axis=0) / np.abs(expected).max(axis=0)).max()
+    """Largest error of one mode relative to the peak; of what a turning phase lets through, of all of it."""
+    return np.abs(rows[:, 0] - np.real(expected)).max() / np.abs(expected).max()
 
 
 RATES = [0.0, 1e-3, 1.0, 40.0, 1e6, 1e15]
-WAVES = [
-    (0.0, 0.0),
-    (0.0, 30.0),
-    (0.0, 1e-6),
-    (0.0, 1e5),
-    (-3.0, 0.0),
-    (-40.0, 7.0),
-    (-1e9, 0.0),
-    (2.0, 500.0),
-    (20.0, 0.0),
-]
+STEADY = [(0.0, 0.0), (0.0, 30.0), (0.0, 1e-6), (0.0, 1e5)]
+DAMPED = [(-3.0, 0.0), (-40.0, 7.0), (-1e9, 0.0), (2.0, 500.0), (20.0, 0.0)]
 
 
 @pytest.mark.parametrize("p", range(5))
-@pytest.mark.parametrize("wave", WAVES)
+@pytest.mark.parametrize("wave", STEADY + DAMPED)
 def test_every_kind_of_term_from_rest(p, wave):
     rng = np.random.default_rng(p)
     row = term(3.0, p, *wave, phi=0.7)
@@ -100,25 +90,21 @@ def test_every_kind_of_term_from_rest(p, wave):
         t = times(1.3, rate, rng)
         rows, w_end = one_segment([rate], [row], 1.3, t)
         expected = np.array([exact_term(rate, row, x) for x in t])
-        assert error(rows, expected[:, None]) <= 1e-14
+        assert error(rows, expected) <= 1e-14
         assert w_end[0] == rows[-1, 0]
 
 
-def test_the_reference_itself_equals_quadrature():
-    for rate, row in (
-        (3.0, term(2.0, 3, -1.5, 4.0, 0.3)),
-        (0.5, term(1.0, 1, -0.5, 0.0)),
-        (8.0, term(1.0, 4, 0.5, 9.0, -2.0)),
-    ):
-        c, p, a, omega, phi, _ = row
-        with mp.workdps(30):
-            quadrature = mp.quad(
-                lambda s, z=(rate, c, p, a, omega, phi): (
-                    mp.exp(-z[0] * (mp.mpf(2) - s)) * z[1] * s ** z[2] * mp.exp(z[3] * s) * mp.cos(z[5] + z[4] * s)
-                ),
-                mp.linspace(0, 2, 9),
-            )
-        assert float(quadrature) == pytest.approx(exact_term(rate, row, 2.0), rel=1e-15)
+@pytest.mark.parametrize(
+    ("rate", "row"),
+    [(3.0, term(2.0, 3, -1.5, 4.0, 0.3)), (0.5, term(1.0, 1, -0.5)), (8.0, term(1.0, 4, 0.5, 9.0, -2.0))],
+)
+def test_the_reference_itself_equals_quadrature(rate, row):
+    c, p, a, omega, phi, _ = row
+    with mp.workdps(30):
+        value = mp.quad(
+            lambda s: c * mp.exp(-rate * (2 - s)) * s**p * mp.exp(a * s) * mp.cos(phi + omega * s), mp.linspace(0, 2, 9)
+        )
+    assert float(value) == pytest.approx(exact_term(rate, row, 2.0).real, rel=1e-15)
 
 
 @pytest.mark.parametrize("off", [0.0, 1e-15, 1e-12, 1e-9, 1e-6, 1e-3, 0.1, 1.0, 3.0])
@@ -130,7 +116,7 @@ def test_a_wave_that_decays_as_the_mode_does(p, off):
             t = np.array([1e-4, 1e-2, 0.3, 1.0]) * 5.0 / rate
             rows, _ = one_segment([rate], [row], t[-1], t)
             expected = np.array([exact_term(rate, row, x) for x in t])
-            assert error(rows, expected[:, None]) <= 1e-14
+            assert error(rows, expected) <= 1e-14
 
 
 rates_strategy = st.one_of(
@@ -160,7 +146,7 @@ def test_any_rates_terms_and_lengths(rates, rows, decades):
     parts = np.array([[[exact_term(r, row, x) for r in rates] for x in t] for row in rows])
     free = np.exp(-np.outer(t, rates)) * w0
     scale = np.abs(parts).max(axis=1).sum(axis=0) + np.abs(w0)
-    assert np.all(np.abs(got - parts.sum(axis=0) - free).max(axis=0) <= 1e-14 * scale)
+    assert np.all(np.abs(got - parts.sum(axis=0).real - free).max(axis=0) <= 1e-14 * scale)
     assert np.array_equal(w_end, got[-1])
 
 
@@ -171,7 +157,7 @@ def test_a_frequency_of_a_billion_radians_keeps_its_phase():
     with mp.workdps(40):
         tau = [mp.mpf(x) - mp.mpf(start) for x in t]
     expected = np.array([exact_term(rate, term(1.0, 0, 0.0, omega, 0.2), x) for x in tau])
-    assert np.abs(rows[:, 0] - expected).max() <= 1e-15 * 3.0 / omega
+    assert np.abs(rows[:, 0] - expected.real).max() <= 1e-15 / omega
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 20, 33])
@@ -185,7 +171,7 @@ def test_a_chebyshev_series_at_any_rate(count):
         t = times(length, rate, rng)
         rows, _ = respond([rate], [1.0], [0.0, length], [[term(0.0)]], [c], [0.0], t)
         expected = np.array([exact_series(rate, c, length, x) for x in t])
-        assert error(rows, expected[:, None]) <= 3e-14
+        assert error(rows, expected) <= 3e-14
 
 
 def test_series_and_terms_add_and_trailing_zeros_change_nothing():
@@ -207,35 +193,28 @@ def test_series_and_terms_add_and_trailing_zeros_change_nothing():
 
 
 def test_a_chain_of_segments_equals_the_matrix_exponential():
-    rates = np.array([0.0, 0.0, 2.0, 2.0, 2.0 + 1e-12, 900.0, 1e12])
-    gains = np.array([1.0, -2.0, 3.0, 1.0, 1.0, 900.0, 1e12])
+    rates, gains = np.array([0.0, 0.0, 2.0, 2.0, 2.0 + 1e-12, 900.0]), np.array([1.0, -2.0, 3.0, 1.0, 1.0, 900.0])
     edges = np.array([0.5, 0.6, 1.6, 1.601, 3.0])
     rng = np.random.default_rng(0)
-    omega, a = 11.0, -0.8
+    n, omega, a = rates.size, 11.0, -0.8
     terms = np.array([[term(c[0]), term(c[1], 1), term(c[2], 0, a, omega, 0.3)] for c in rng.standard_normal((4, 3))])
-    w0 = rng.standard_normal(rates.size)
+    w0 = rng.standard_normal(n)
     t = np.sort(np.concatenate([edges, rng.uniform(0.5, 3.0, 20)]))
     rows, w_end = respond(rates, gains, edges, terms, np.zeros((4, 0)), w0, t)
     # The input is the output of 4 more states: 1, tau, and the two of a decaying wave.
-    n = 6
     full = np.zeros((n + 4, n + 4))
-    full[:n, :n] = -np.diag(rates[:n])
+    full[:n, :n] = -np.diag(rates)
     full[n + 1, n] = 1.0
     full[n + 2 :, n + 2 :] = [[a, -omega], [omega, a]]
-    w = w0[:n]
-    expected = []
+    w, expected = w0, []
     for s in range(4):
-        full[:n, n:] = np.outer(gains[:n], [terms[s, 0, 0], terms[s, 1, 0], terms[s, 2, 0], 0.0])
+        full[:n, n:] = np.outer(gains, [*terms[s, :, 0], 0.0])
         y = np.concatenate([w, [1.0, 0.0, np.cos(0.3), np.sin(0.3)]])
         here = t[(t >= edges[s]) & ((t < edges[s + 1]) | (s == 3))]
         expected += [(expm(full * (x - edges[s])) @ y)[:n] for x in here]
         w = (expm(full * (edges[s + 1] - edges[s])) @ y)[:n]
-    assert np.all(np.abs(rows[:, :n] - expected) <= 1e-12 * np.abs(expected).max(axis=0))
-    assert np.all(np.abs(w_end[:n] - w) <= 1e-12 * np.abs(expected).max(axis=0))
-    # The fastest mode is the input itself, but for its slope over the rate.
-    tau = t[-1] - edges[3]
-    u = terms[3, 0, 0] + terms[3, 1, 0] * tau + terms[3, 2, 0] * np.exp(a * tau) * np.cos(0.3 + omega * tau)
-    assert rows[-1, n] == pytest.approx(u, abs=1e-10)
+    assert np.all(np.abs(rows - expected) <= 1e-12 * np.abs(expected).max(axis=0))
+    assert np.all(np.abs(w_end - w) <= 1e-12 * np.abs(expected).max(axis=0))
 
 
 def test_outputs_on_edges_are_the_same_to_the_bit_on_either_side():
@@ -309,7 +288,7 @@ def test_a_hundred_thousand_segments_add_up_no_rounding():
         gained = (
             -np.expm1(-np.longdouble(rate) * np.diff(exact)) / np.longdouble(rate) if rate > 0.0 else np.diff(exact)
         )
-        assert abs(w / np.sum(until * gained * terms[:, 0, 0]) - 1.0) <= 2e-13
+        assert abs(w / np.sum(until * gained * terms[:, 0, 0]) - 1.0) <= 1e-15
 
 
 def test_decayed_states_are_zero_and_never_denormal():
@@ -366,7 +345,8 @@ def test_constant_and_integer_arguments_and_a_given_place_for_the_rows():
     edges = np.array([0.0, 1.0])
     edges.flags.writeable = False
     place = np.full((3, 2), np.nan)
-    terms = np.broadcast_to(np.array(term(1.0)), (1, 2, 6))
+    # The second term has no coefficient: what else it says does not matter.
+    terms = np.broadcast_to(np.array([[term(2), [0, -1, 0.5, 3, 4, 5]]]), (1, 2, 6))
     rows, w_end = respond((0, 1), np.array([1, 1]), edges, terms, NO_SERIES, [0, 0], [0, 0.5, 1], rows=place)
     assert rows is place
     expected = np.array([[0.0, 0.0], [1.0, -2.0 * np.expm1(-0.5)], [2.0, -2.0 * np.expm1(-1.0)]])
@@ -395,7 +375,7 @@ def test_a_window_without_segments_keeps_the_state():
         ({"rates": [np.inf]}, "rates"),
         ({"rates": [1.0, 2.0]}, "shape"),
         ({"terms": [[[1.0, 0.0, 0.0, 0.0, 0.0]]]}, "shape"),
-        ({"terms": [[[1.0, 0.0, 0.0, 1.0, 0.0, 2.0]]]}, "beta"),
+        ({"terms": [[[1.0, 0.0, 0.0, 1.0, 0.0, 2.0]]]}, "with beta"),
         ({"terms": [[term(1.0, 0.5)]]}, "whole number"),
         ({"terms": [[term(1.0, -1)]]}, "whole number"),
         ({"edges": [1.0, 0.0]}, "ascend"),
@@ -409,14 +389,7 @@ def test_a_window_without_segments_keeps_the_state():
     ],
 )
 def test_what_cannot_be_answered_is_refused(change, message):
-    arguments = {
-        "rates": [1.0],
-        "gains": [1.0],
-        "edges": [0.0, 1.0],
-        "terms": [[term(1.0)]],
-        "series": NO_SERIES,
-        "w0": [0.0],
-        "t_out": [0.2, 0.5],
-    }
+    modes = {"rates": [1.0], "gains": [1.0], "w0": [0.0]}
+    source = {"edges": [0.0, 1.0], "terms": [[term(1.0)]], "series": NO_SERIES}
     with pytest.raises(ValueError, match=message):
-        respond(**(arguments | change))
+        respond(**(modes | source | {"t_out": [0.2, 0.5]} | change))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.periodic import steady_state
+from fingerspice.steady import steady_state
 from scenes import table1
 
 

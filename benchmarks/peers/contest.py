@@ -96,6 +96,8 @@ class Contestant:
         Whether it takes part under the `mobile` law.
     slow : bool
         Whether it is given a fifth of the periods where that costs the same per period.
+    compile_limit : float
+        What its first run may take longer than others because it compiles, s.
     """
 
     name: str
@@ -106,6 +108,7 @@ class Contestant:
     kinks: bool = False
     mobile: bool = False
     slow: bool = False
+    compile_limit: float = 0.0
 
     @property
     def adaptive(self) -> bool:

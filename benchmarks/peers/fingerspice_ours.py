@@ -19,9 +19,7 @@ def version() -> str | None:
 
 def ours(problem: Problem, rtol: float, method: str, plan: Plan, circuit: fs.Circuit) -> Outcome:
     """One run of a problem."""
-    run = fs.simulate(
-        circuit, t_stop=plan.t_stop, t_eval=plan.t_eval, rtol=rtol, method=method, charge_law=problem.law
-    )
+    run = fs.simulate(circuit, t_stop=plan.t_stop, t_eval=plan.t_eval, rtol=rtol, method=method, charge_law=problem.law)
     assert run.u_gap is not None
     assert run.f_el is not None
     return Outcome(run.u_gap, run.f_el, run.nfev)
@@ -40,7 +38,7 @@ def contestants() -> list[Contestant]:
     return [
         Contestant(
             "fingerspice" if method == "auto" else f"fingerspice {method}",
-            LIBRARY, tolerances(2, 12), _setup(method), mobile=True,
+            LIBRARY, tolerances(2, 12), _setup(method), mobile=True, compile_limit=120.0,
         )
         for method in METHODS
     ]  # fmt: skip

@@ -70,7 +70,13 @@ def contestants() -> list[Contestant]:
     """One method, also restarted at the zeros of the gap voltage."""
     return [
         Contestant(
-            "numbalsoda" + (" +kinks" if kinks else ""), LIBRARY, tolerances(2, 12.5), _setup, kinks=kinks, mobile=True
+            "numbalsoda" + (" +kinks" if kinks else ""),
+            LIBRARY,
+            tolerances(2, 13),
+            _setup,
+            kinks=kinks,
+            mobile=True,
+            compile_limit=60.0,
         )
         for kinks in (False, True)
     ]

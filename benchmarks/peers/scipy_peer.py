@@ -85,6 +85,7 @@ def contestants() -> list[Contestant]:
             _setup_odeint if method == "LSODA" else _setup(method),
             kinks=kinks,
             mobile=True,
+            slow=method in IMPLICIT,
         )
         for method, span in ranges.items()
         for kinks in (False, True)

@@ -1,6 +1,7 @@
 """torchdiffeq in double precision.
 
-Its right-hand side is the compiled one behind `torch.from_numpy`, some forty times cheaper than the same in eager torch.
+Its right-hand side is the compiled one behind `torch.from_numpy`: some forty times cheaper than the same in eager
+torch.
 """
 
 from __future__ import annotations
@@ -30,9 +31,7 @@ def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
         from torchdiffeq import odeint
 
         rhs = compiled(plan.problem)
-        times = [
-            torch.from_numpy(np.concatenate([[p.t0], plan.t_eval[p.first : p.last], [p.t1]])) for p in plan.pieces
-        ]
+        times = [torch.from_numpy(np.concatenate([[p.t0], plan.t_eval[p.first : p.last], [p.t1]])) for p in plan.pieces]
 
         def run(setting: float) -> Outcome:
             states = np.empty((plan.t_eval.size, 2))

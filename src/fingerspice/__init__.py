@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from fingerspice.simulation import simulate as simulate
     from fingerspice.solution import Solution as Solution
     from fingerspice.solution import Status as Status
+    from fingerspice.steady import SteadyState as SteadyState
+    from fingerspice.steady import steady_state as steady_state
 
 _HOMES = {
     "circuit.circuit": ("Circuit",),
@@ -59,6 +61,7 @@ _HOMES = {
     "phasors": ("phasor",),
     "simulation": ("simulate",),
     "solution": ("Solution", "Status"),
+    "steady": ("SteadyState", "steady_state"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = ["__version__", *sorted(_HOME)]

@@ -10,9 +10,9 @@ import numpy as np
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.errors import InputError
-from fingerspice.periodic import steady_state
 from fingerspice.phasors import phasor
 from fingerspice.solution import Solution
+from fingerspice.steady import steady_state
 
 
 @dataclass(frozen=True)

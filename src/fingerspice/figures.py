@@ -22,10 +22,10 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.ramps import Square
 from fingerspice.circuit.waveforms import Sine, require
 from fingerspice.files import write_aside
-from fingerspice.periodic import steady_state
 from fingerspice.phasors import phasor
 from fingerspice.physics.materials import SKIN_BAND, skin_permittivity, skin_resistivity
 from fingerspice.solution import Solution
+from fingerspice.steady import steady_state
 from fingerspice.table1 import table1_circuit
 
 if TYPE_CHECKING:

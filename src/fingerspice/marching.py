@@ -250,19 +250,19 @@ def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, pro
     start = float(np.abs(problem.initial.y[:-1]).max(initial=0.0))
     u_scale = max(peak * model.k_gap if np.isfinite(peak) else 0.0, start) or 1.0
     tol = LOCAL_SHARE * rtol
-    prepared, nfev = prepare_system(scene, rtol), 0
-    for _attempt in range(6):
-        while (run := integrate(problem, prepared, tol * u_scale, t_out, left, tables, progress=progress)) is None:
+    prepared, nfev, attempts = prepare_system(scene, rtol), 0, 0
+    while True:
+        run = integrate(problem, prepared, tol * u_scale, t_out, left, tables, progress=progress)
+        if run is None:
             prepared = prepare_system(scene, rtol, 1.5 * prepared.system.u_top)
+            continue
         nfev += run.nfev
         run.nfev = nfev
-        if run.status is not Status.SUCCESS:
-            return run
+        attempts += 1
         worst = run.excess(rtol)
-        if worst <= 1.0:
+        if run.status is not Status.SUCCESS or worst <= 1.0:
             return run
-        if rtol * run.peak_u < ROUNDING * u_scale or tol <= 1e-16:
-            break
+        if rtol * run.peak_u < ROUNDING * u_scale or tol <= 1e-16 or attempts == 6:
+            run.status = Status.ERROR_NOT_MET
+            return run
         tol = max(tol * min(0.3, 0.5 / worst), 1e-16)
-    run.status = Status.ERROR_NOT_MET
-    return run

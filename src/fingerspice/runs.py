@@ -69,7 +69,10 @@ class Tables:
     which keeps a long run's memory constant.
     """
 
-    def __init__(self, problem: Problem, tol: float) -> None:
+    def __init__(self, problem: Problem, tol: float, *, no_chirps: bool = False) -> None:
+        self.no_chirps = no_chirps
+        # Time at which the source stopped being finite, once that has been met.
+        self.not_finite: float | None = None
         self.problem = problem
         self.tol = min(1e-3, max(0.05 * tol, 1e-14))
         self.edges = windows(problem)
@@ -79,9 +82,12 @@ class Tables:
         for i, (w0, w1) in enumerate(itertools.pairwise(self.edges)):
             table = self.kept.get(i) if self.kept is not None else None
             if table is None:
-                table = source_table(self.problem.waveform, w0, w1, self.tol, self.problem.step)
+                table = source_table(
+                    self.problem.waveform, w0, w1, self.tol, self.problem.step, no_chirps=self.no_chirps
+                )
                 if self.kept is not None:
                     self.kept[i] = table
+            self.not_finite = table.not_finite
             yield table
             if table.not_finite is not None:
                 return

@@ -12,9 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.sampling import breakpoints_at, same_time
 from fingerspice.circuit.waveforms import Waveform, as_waveform, require
+from fingerspice.direct import solve_algebraic, solve_linear
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError
 from fingerspice.marching import solve as solve_marching
 from fingerspice.numerics.tableaus import TABLEAUS
+from fingerspice.periodic import close_period
+from fingerspice.plan import Plan, make_plan
 from fingerspice.problem import Problem, prepare
 from fingerspice.record import Record
 from fingerspice.runs import Progress, Run
@@ -37,6 +40,7 @@ def simulate(
     area: str | float = "coupled",
     rtol: float = 1e-8,
     method: str = "auto",
+    tier: str = "auto",
     start: str | Solution = "deck",
     charge: bool = True,
     throw: bool = True,
@@ -64,8 +68,11 @@ def simulate(
     method : str
         ``"auto"``, an own stepper (``"exponential"``, ``"dp5"``, ``"dop853"``, ``"radau9"``), ``"scipy:NAME"`` or
         ``"torchdiffeq:NAME"``.
+    tier : str
+        ``"auto"``, or the model to take: ``"algebraic"``, ``"linear"`` or ``"coupled"`` (see `Plan`).
     start : str or Solution
-        ``"deck"`` (as its .tran says), ``"uncharged"``, ``"dc"``, or a Solution to go on from.
+        ``"deck"`` (as its .tran says), ``"uncharged"``, ``"dc"``, ``"periodic"`` (the periodic state, solved for
+        directly), or a Solution to go on from.
     charge : bool
         Whether `q_source` and `i_source` are wanted; leaving them out saves a fifth of the time.
     throw : bool
@@ -94,9 +101,12 @@ def simulate(
         circuit = _with_sources(circuit, sources)
     times = None if t_eval is None else np.asarray(t_eval, float)
     problem = prepare(
-        circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=start, charge=charge
-    )
-    solution = run_problem(problem, times, rtol, method, progress)
+        circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area,
+        start="uncharged" if start == "periodic" else start, charge=charge,
+    )  # fmt: skip
+    if start == "periodic":
+        problem = close_period(problem, rtol).problem
+    solution = run_problem(problem, times, rtol, method, progress, tier, start if isinstance(start, str) else "given")
     if not solution.success and throw:
         raise SolveError(solution.message, solution)
     for text in solution.warnings:
@@ -110,8 +120,12 @@ def run_problem(
     rtol: float = 1e-8,
     method: str = "auto",
     progress: Progress | None = None,
+    tier: str = "auto",
+    start: str = "deck",
 ) -> Solution:
     """Integrate a problem made ready; arguments as in `simulate`. Never raises for a failed run."""
+    # A method steps, and what is stepped is the coupled model.
+    plan = make_plan(problem, rtol, "coupled" if tier == "auto" and method != "auto" else tier, start)
     if t_eval is None:
         t_out, left = output_times(problem)
         run_at = t_out
@@ -119,8 +133,15 @@ def run_problem(
         t_out, left = t_eval, np.zeros(t_eval.size, bool)
         run_at = _at_breakpoints(problem, t_eval)
     begin = time.perf_counter()
-    run, name = _run(problem, method, rtol, run_at, left, progress)
-    return _solution(problem, run, rtol, name, t_out, time.perf_counter() - begin)
+    if plan.tier == "algebraic":
+        run, name = solve_algebraic(problem, run_at, left), plan.tier
+    elif plan.tier == "linear":
+        run, name = solve_linear(problem, run_at, left, plan.area, plan.sensitivity), plan.tier
+    else:
+        run, name = _run(problem, method, rtol, run_at, left, progress)
+    if run.status is Status.SUCCESS and run.excess(rtol) > 1.0:
+        run.status = Status.ERROR_NOT_MET
+    return _solution(problem, run, rtol, name, t_out, time.perf_counter() - begin, plan)
 
 
 def _at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
@@ -148,7 +169,11 @@ def _run(
 
         return solve_foreign(problem, library, name, rtol, t_out, left), method
     if method in ("auto", "exponential"):
-        return solve_marching(problem, rtol, t_out, left, progress), "exponential"
+        run = solve_marching(problem, rtol, t_out, left, progress)
+        if run.status is not Status.FOLD or method == "exponential":
+            return run, "exponential"
+        # The time and place of a fold are for a method that solves the area equation at every evaluation.
+        method = "dop853"
     if method not in TABLEAUS:
         known = ["auto", "exponential", *TABLEAUS, "scipy:NAME", "torchdiffeq:NAME"]
         raise InputError(f"unknown method {method!r}; allowed: {', '.join(known)}")
@@ -181,7 +206,9 @@ def output_times(problem: Problem) -> tuple[FloatArray, BoolArray]:
     return np.ascontiguousarray(t[order]), np.ascontiguousarray(left[order])
 
 
-def _solution(problem: Problem, run: Run, rtol: float, method: str, t_out: FloatArray, wall: float) -> Solution:
+def _solution(
+    problem: Problem, run: Run, rtol: float, method: str, t_out: FloatArray, wall: float, plan: Plan
+) -> Solution:
     scene, record = problem.scene, run.record(problem)
     # The times asked for, not those that rounding moved onto a breakpoint.
     t = np.concatenate([t_out[: run.t.size], run.t[t_out.size :]]) if run.status is Status.SUCCESS else run.t.copy()
@@ -197,6 +224,7 @@ def _solution(problem: Problem, run: Run, rtol: float, method: str, t_out: Float
         charge_law=scene.charge_law,
         area_mode=scene.area_mode,
         method=method,
+        plan=plan,
         circuit=problem.circuit,
         state=run.state,
         fundamental=scene.fundamental,

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.circuit.waveforms import Fundamental
+    from fingerspice.plan import Plan
 
 FloatArray = NDArray[np.float64]
 # Dimensions, values, attributes: what both xarray and NetCDF take.
@@ -88,6 +89,8 @@ class Solution:
     rtol : float
         Error asked for, relative to the peaks.
     charge_law, area_mode, method : str
+    plan : Plan
+        Which model was run, and why.
     circuit : Circuit
     state : State
     """
@@ -103,6 +106,7 @@ class Solution:
     charge_law: str
     area_mode: str
     method: str
+    plan: Plan
     circuit: Circuit
     state: State
     fundamental: Fundamental | None = None

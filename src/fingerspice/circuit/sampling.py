@@ -142,7 +142,9 @@ def is_sampled(waveform: Waveform) -> bool:
     return waveform.terms(np.zeros(1), np.ones(1)) is None
 
 
-def source_table(waveform: Waveform, t0: float, t1: float, tol: float, step: float) -> SourceTable:
+def source_table(
+    waveform: Waveform, t0: float, t1: float, tol: float, step: float, *, no_chirps: bool = False
+) -> SourceTable:
     """Table of a waveform over [t0, t1].
 
     Parameters
@@ -154,6 +156,8 @@ def source_table(waveform: Waveform, t0: float, t1: float, tol: float, step: flo
         Error allowed of a Chebyshev series relative to the largest |U| met.
     step : float
         Output step, s: a function is looked at no less finely than this.
+    no_chirps : bool
+        Whether a term with a changing frequency, which has no closed-form response, becomes a series too.
     """
     inner = waveform.breakpoints(t0, t1)
     # A breakpoint that misses the window's edge by rounding is at the edge: no segment is shorter than that.
@@ -163,12 +167,16 @@ def source_table(waveform: Waveform, t0: float, t1: float, tol: float, step: flo
         edges = _rephased(edges, waveform.shortest_time())
         terms = waveform.terms(edges[:-1], edges[1:])
         assert terms is not None
-        return SourceTable(edges, np.ascontiguousarray(terms), np.zeros((edges.size - 1, 0)))
+        if no_chirps and np.any(terms[:, :, 5] != 0.0):
+            step = min(step, 0.1 * waveform.shortest_time())
+        else:
+            return SourceTable(edges, np.ascontiguousarray(terms), np.zeros((edges.size - 1, 0)))
     pieces = _Refiner(waveform, tol, step)
     for a, b in itertools.pairwise(edges):
         if not pieces.cover(float(a), float(b)):
             break
-    pieces.warn()
+    if is_sampled(waveform):
+        pieces.warn()
     m = len(pieces.series)
     return SourceTable(
         np.array(pieces.edges) if m else np.array([t0]),

@@ -508,8 +508,6 @@ def march(
         flip = False
         wanted = control[H]
         while True:
-            if h <= 1e-15 * max(abs(t), 1e-3 * (edge - start)):
-                return NO_STEP
             if h != h_slot:
                 slot = make_tables(
                     rates, level, h, keys_h, keys_level, count, all_decay, all_phi, all_miss
@@ -546,6 +544,13 @@ def march(
                 control[H] = max(h * min(6.0, max(0.5, factor)), wanted if h < wanted else 0.0)
                 break
             counters[REJECTED] += 1
+            # Refused at this length: a singularity, of which rounding hides the last bit.
+            if h <= 1e-13 * max(abs(t), 1e-3 * (edge - start)):
+                return NO_STEP
+            # Close to a fold the iteration closes on short steps only: methods that solve the area equation at
+            # every evaluation get there sooner.
+            if mobile and 1.0 - area0 * r[X_GAP, 0] * r[DQ, 0] < 0.01:
+                return NO_STEP
             if wrong > 1 and sign * u_rows[END] < lo:
                 # It went far over a zero, where the branch has no meaning: end soon after the zero.
                 h = _rung(h * min(0.9, 1.1 * POINTS[wrong]))

@@ -246,7 +246,8 @@ def _solve_mobile(
         # Past the fold the slope has turned: that root is not connected to the uncharged state.
         if not lowest > 0.0 or not worst < math.inf:
             return False
-        if worst <= 1e-15 * size:
+        # Close to the fold the voltage is as uncertain as rounding over the distance to it.
+        if worst * lowest <= 1e-15 * size:
             return True
     return False
 

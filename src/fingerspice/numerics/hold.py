@@ -99,6 +99,12 @@ def _flushed(x: float) -> float:
 
 
 @jit
+def _decay(z: float) -> tuple[float, float]:
+    """exp(-z) as 1 or 0 and the rest: x exp(-z) = whole x + rest x keeps the digits of a decay fast or slow."""
+    return (1.0, math.expm1(-z)) if z < 0.5 else (0.0, math.exp(-z))
+
+
+@jit
 def _hold(
     u: FloatArray,
     count: int,
@@ -122,8 +128,9 @@ def _hold(
     end = np.empty(n)
     once = np.empty(n)
     fall = np.empty((n, _STRETCH))
-    # 1 - exp(-z m) for m stretches and, last, for one sample: a slow mode keeps its digits where this is taken off.
-    loss = np.empty((n, _LANES + 1))
+    # The decay over c stretches.
+    whole = np.empty((n, _LANES))
+    rest = np.empty((n, _LANES))
     through = direct
     for k in range(n):
         start[k], end[k] = hold_weights(z[k])
@@ -134,8 +141,7 @@ def _hold(
         for i in range(_STRETCH):
             fall[k, i] = _flushed(math.exp(-z[k] * i))
         for c in range(_LANES):
-            loss[k, c] = -math.expm1(-z[k] * (_STRETCH * c))
-        loss[k, _LANES] = -math.expm1(-z[k])
+            whole[k, c], rest[k, c] = _decay(z[k] * (_STRETCH * c))
     inherited = np.empty((2, _LANES))
     last = np.empty(2)
     for s in range(0, u.size, BLOCK):
@@ -159,15 +165,27 @@ def _hold(
             v, w = _sweep(x, out, depth, _STRETCH, e, f, g, h, v, w)
             for j in range(2):
                 k = pair + j
-                first = state[k] - end[k] * x[0]
-                if not (is_first and s == 0):
-                    first = state[k] + (start[k] * state[n] - loss[k, _LANES] * state[k])
+                kept, left = _decay(z[k])
+                to_first = left * state[k] + start[k] * state[n]
+                if is_first and s == 0:
+                    kept, to_first = 1.0, -end[k] * x[0]
+                first = kept * state[k] + to_first
                 own = 0.0
+                to_lane = 0.0
                 for c in range(_LANES):
-                    inherited[j, c] = _flushed(first + (own - loss[k, c] * first))
-                    own += once[k] * (v[c] if j == 0 else w[c]) - loss[k, 1] * own
+                    change = rest[k, c] * first + own
+                    inherited[j, c] = _flushed(whole[k, c] * first + change)
+                    own = whole[k, 1] * own + (rest[k, 1] * own + once[k] * (v[c] if j == 0 else w[c]))
+                    if c == lane:
+                        to_lane = change
                 begin = inherited[j, lane]
-                state[k] = begin + (math.expm1(-z[k] * depth) * begin + once[k] * last[j] + end[k] * x[stop])
+                kept, left = _decay(z[k] * depth)
+                to_last = left * begin + (once[k] * last[j] + end[k] * x[stop])
+                if z[k] * BLOCK < 0.5:
+                    # Rounded once in a block: a slow mode adds up thousands of them.
+                    state[k] += to_first + to_lane + to_last
+                else:
+                    state[k] = kept * begin + to_last
             for c in range(_LANES):
                 part = out[c * _STRETCH : (c + 1) * _STRETCH]
                 g = weights[pair] * inherited[0, c]
@@ -220,10 +238,10 @@ def first_order_hold(
     u = np.asarray(u)
     if u.ndim != 1 or not np.can_cast(u.dtype, np.float64, "same_kind"):
         raise ValueError(f"samples of shape {u.shape} and type {u.dtype}; allowed: a row of real numbers")
-    given = np.array([rates, gains, weights, w0], dtype=float)
-    if given.ndim != 2:
-        raise ValueError(f"rates, gains, weights and state of shape {given.shape[1:]}; allowed: (n,)")
-    n = given.shape[1]
+    given = [np.asarray(x, float) for x in (rates, gains, weights, w0)]
+    n = given[0].size
+    if any(x.shape != (n,) for x in given):
+        raise ValueError(f"rates, gains, weights and state of shape {[x.shape for x in given]}; allowed: (n,) all")
     # Modes are advanced in pairs: a last one without gain or weight completes an odd number.
     modes = np.zeros((4, n + n % 2))
     modes[:, :n] = given
@@ -232,9 +250,7 @@ def first_order_hold(
     if out is None:
         out = np.empty(u.size)
     elif out.shape != u.shape or out.dtype != np.float64 or not out.flags.carray or np.may_share_memory(out, u):
-        raise ValueError(
-            f"output of shape {out.shape}, type {out.dtype}; allowed: its own contiguous float64 {u.shape}"
-        )
+        raise ValueError(f"output of shape {out.shape}, type {out.dtype}; allowed: contiguous float64 {u.shape}, not u")
     state = np.append(modes[3], 0.0 if u_before is None else u_before)
     for s in range(0, u.size, _PIECE):
         piece = u[s : s + _PIECE]

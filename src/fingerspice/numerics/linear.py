@@ -197,6 +197,8 @@ def respond_into(
     n_terms = terms.shape[1]
     decay = np.zeros(n)
     kept = np.zeros(n)
+    # What rounding w at the end of a segment left out.
+    carry = np.zeros(n)
     new = np.zeros(n)
     amplitude = np.zeros(n_terms, np.complex128)
     inverse = np.zeros((n_terms, n), np.complex128)
@@ -232,11 +234,11 @@ def respond_into(
             for k in range(n):
                 reach = rates[k] * tau
                 if reach < 0.5:
-                    # What changes is summed apart: over many segments the rounding of decays near 1 would add up.
+                    # The change is summed apart: over many segments the rounding of decays near 1 would add up.
                     loss = -math.expm1(-reach)
                     decay[k] = 1.0 - loss
                     kept[k] = w[k]
-                    new[k] = -loss * w[k]
+                    new[k] = carry[k] - loss * w[k]
                 else:
                     decay[k] = _exp(-reach)
                     kept[k] = 0.0
@@ -264,13 +266,16 @@ def respond_into(
                 for k in range(n):
                     new[k] += _clenshaw(poly, k, count[k], x) - decay[k] * at_start[k]
             for k in range(n):
-                new[k] += kept[k]
+                total, lost = _difference(kept[k], -new[k])
+                if abs(total) < _SMALLEST:
+                    total = lost = 0.0
                 if inside:
-                    rows[i, k] = new[k]
+                    rows[i, k] = total
+                else:
+                    w[k] = total
+                    carry[k] = lost
             if inside:
                 i += 1
-        for k in range(n):
-            w[k] = new[k] if abs(new[k]) >= _SMALLEST else 0.0
     while i < t_out.size:
         for k in range(n):
             rows[i, k] = w[k] if t_out[i] == edges[-1] else np.nan
@@ -335,7 +340,8 @@ def respond(
         raise ValueError("edges and output times must ascend")
     if t_out.size and not (t_out[0] >= edges[0] and t_out[-1] <= edges[-1]):
         raise ValueError(f"outputs from {t_out[0]} to {t_out[-1]} s; allowed: {edges[0]} to {edges[-1]} s")
-    if np.any(terms[..., 5] != 0.0) or np.any((terms[..., 1] < 0.0) | (terms[..., 1] % 1.0 != 0.0)):
+    c, p, beta = terms[..., 0], terms[..., 1], terms[..., 5]
+    if np.any((c != 0.0) & ((beta != 0.0) | (p < 0.0) | (p % 1.0 != 0.0))):
         raise ValueError("a term with beta, or with p that is no whole number; neither has a closed form here")
     respond_into(rates, gains, edges, terms, series, w, t_out, left, rows)
     return rows, w
@@ -362,7 +368,7 @@ def periodic_state(
     _, w = respond(rates, gains, edges, terms, series, np.zeros(rates.size), np.empty(0))
     length = np.diff(edges)
     c, p, a = terms[..., 0], terms[..., 1], terms[..., 2]
-    largest = np.abs(c) * length[:, None] ** p * np.exp(np.maximum(a * length[:, None], 0.0))
+    largest = np.where(c != 0.0, np.abs(c) * length[:, None] ** p * np.exp(np.maximum(a * length[:, None], 0.0)), 0.0)
     bound = largest.sum(axis=1) + np.abs(series).sum(axis=1)
     # The lengths are as uncertain as the edges are rounded.
     zero = bound @ (_ZERO_MEAN * length + 1e-15 * (np.abs(edges[:-1]) + np.abs(edges[1:])))

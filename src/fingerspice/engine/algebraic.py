@@ -1,0 +1,41 @@
+"""Outputs of a stack that does not leak: its voltages follow the source at once."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.compiled import jit
+from fingerspice.engine.model import Model, Segment, choose_branch, dot, jump_charge, source, write_row
+
+FloatArray = NDArray[np.float64]
+
+
+@jit
+def source_at(
+    edges: FloatArray, terms: FloatArray, series: FloatArray, t: FloatArray, left: NDArray[np.bool_]
+) -> tuple[FloatArray, FloatArray]:
+    """Source voltage (V) and slope (V/s) at times t (ascending, inside the edges), shape (n,) each."""
+    u = np.empty(t.size)
+    slope = np.empty(t.size)
+    index = 0
+    for i in range(t.size):
+        while index < edges.size - 2 and (t[i] > edges[index + 1] or (t[i] == edges[index + 1] and not left[i])):
+            index += 1
+        segment = Segment(edges[index], edges[index + 1] - edges[index], terms[index], series[index])
+        u[i], slope[i] = source(segment, t[i] - edges[index])
+    return u, slope
+
+
+@jit
+def follow(model: Model, u: FloatArray, slope: FloatArray, y: FloatArray, u_before: float, rows: FloatArray) -> None:
+    """Fill `rows` (see `write_row`) for source voltages u and slopes, from state y at source voltage `u_before`.
+
+    The charge of the path from one voltage to another depends on these two alone.
+    """
+    here = y.copy()
+    for i in range(u.size):
+        if not model.mobile:
+            here[-1] = y[-1] + jump_charge(model, dot(model.gap, y), u_before, u[i])
+        sign = choose_branch(model, u[i], here)
+        write_row(model, u[i], slope[i], here, sign, model.k_gap * u[i], rows[i])

@@ -1,0 +1,137 @@
+"""Which model a scene needs, and why: the lightest that is right for what is asked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fingerspice.errors import InputError
+from fingerspice.numerics.modes import modes
+from fingerspice.physics.contact import areas
+from fingerspice.problem import Problem
+
+TIERS = ("algebraic", "linear", "coupled")
+# A frozen stack this many times faster than its source would hold an explicit method back by stability alone.
+STIFF = 300.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The model chosen for a run.
+
+    Attributes
+    ----------
+    tier : str
+        ``algebraic``: the voltages follow the source at once; ``linear``: closed form at one area; ``coupled``: stepped,
+        the area followed at every instant.
+    reasons : tuple of str
+        Why, one sentence each.
+    start : str
+        ``periodic`` where the run starts from the periodic state, which is solved for directly; else how it starts.
+    rates : tuple of float
+        Rates of the stack with its area frozen, 1/s, ascending.
+    stiff : bool
+        Whether an explicit method would be held back by stability.
+    sensitivity : float
+        Largest relative change of the leak rates that the area causes over the run; the error of a `linear` tier.
+    area : float
+        Area of the `linear` tier, m^2.
+    """
+
+    tier: str
+    reasons: tuple[str, ...]
+    start: str
+    rates: tuple[float, ...]
+    stiff: bool
+    sensitivity: float
+    area: float
+
+    def to_dict(self) -> dict[str, object]:
+        """The plan as plain data."""
+        return {**vars(self), "reasons": list(self.reasons), "rates": list(self.rates)}
+
+
+def make_plan(problem: Problem, rtol: float, tier: str = "auto", start: str = "deck") -> Plan:
+    """Choose the model for a problem.
+
+    Parameters
+    ----------
+    problem : Problem
+    rtol : float
+        Error asked for.
+    tier : str
+        ``"auto"``, or the tier to force.
+    start : str
+        How the run starts.
+
+    Raises
+    ------
+    InputError
+        For an unknown tier, or one that cannot describe the circuit at all.
+    """
+    if tier not in ("auto", *TIERS):
+        raise InputError(f"unknown tier {tier!r}; allowed: auto, {', '.join(TIERS)}")
+    key = ("plan", rtol, tier, start, problem.charge, bool(np.any(problem.initial.y[:-1])))
+    if key not in problem.scene.prepared:
+        problem.scene.prepared[key] = _choose(problem, rtol, tier, start)
+    plan: Plan = problem.scene.prepared[key]
+    return plan
+
+
+def _choose(problem: Problem, rtol: float, tier: str, start: str) -> Plan:
+    stack, model = problem.stack, problem.model
+    leaking = [e.name for e, g in zip(stack.layers, stack.g_total + stack.g_area, strict=True) if g > 0.0]
+    sensitivity, area = _sensitivity(problem)
+    best, reasons = _lightest(problem, rtol, leaking, sensitivity)
+    if tier == "algebraic" and best != "algebraic":
+        raise InputError(f"the algebraic tier needs a stack without leaks; here {', '.join(leaking)} leak" if leaking else
+                         "the algebraic tier needs a start without stored charge under the mobile law")  # fmt: skip
+    if tier == "linear" and model.coupled and (model.mobile or problem.charge):
+        what = "the mobile law" if model.mobile else "the charge (charge=False leaves it out)"
+        raise InputError(f"the linear tier takes the area as fixed, and {what} needs the one that follows the voltage")
+    if tier != "auto" and tier != best:
+        reasons = (f"asked for; the lightest that is right would be {best}: {reasons[0]}",)
+    chosen = best if tier == "auto" else tier
+    rates, _, _, _ = modes(np.ascontiguousarray(model.rate + model.rate0 / model.area0), model.k)
+    fastest = float(rates.max(initial=0.0))
+    shortest = min(problem.waveform.shortest_time(), problem.t_stop - problem.t_start)
+    stiff = fastest * shortest > STIFF
+    if stiff:
+        reasons = (
+            *reasons,
+            f"stiff: the fastest rate {fastest:.3g} 1/s against {1.0 / shortest:.3g} 1/s of the source",
+        )
+    needed = sensitivity if chosen == "linear" and model.coupled and np.any(model.rate0 > 0.0) else 0.0
+    return Plan(chosen, reasons, start, tuple(sorted(map(float, rates))), stiff, needed, area)
+
+
+def _lightest(problem: Problem, rtol: float, leaking: list[str], sensitivity: float) -> tuple[str, tuple[str, ...]]:
+    model = problem.model
+    stored = model.mobile and model.coupled and bool(np.any(problem.initial.y[:-1]))
+    if not leaking and not stored:
+        return "algebraic", ("no layer leaks, so the voltages follow the source at once",)
+    if not model.coupled:
+        return "linear", (f"the area is {problem.scene.area_mode}, so the circuit is linear",)
+    if not model.mobile:
+        free = not np.any(model.rate0 > 0.0)
+        if free and not problem.charge:
+            return "linear", ("every leak scales with the area, so under the local law no voltage feels it",)
+        if sensitivity <= 0.2 * rtol and not problem.charge:
+            return "linear", (f"the area changes the leaks by {sensitivity:.2g} at most, against rtol = {rtol:g}",)
+        if free or sensitivity <= 0.2 * rtol:
+            return "coupled", ("only the charge needs the area at every instant; charge=False leaves it out",)
+    return "coupled", (f"the area follows the voltage and moves the leaks by up to {100.0 * sensitivity:.2g} %",)
+
+
+def _sensitivity(problem: Problem) -> tuple[float, float]:
+    """Largest relative change of 1/A over the run's voltages, from the area in the middle, and that area (m^2)."""
+    model = problem.model
+    if not model.coupled:
+        return 0.0, model.area0
+    highest = model.k_gap * problem.scene.u_peak
+    # Layers that discharge add to the gap's share of a jump: twice the peak is never exceeded.
+    u = np.linspace(0.0, min(2.0 * highest, float(model.curve[1])), 65)
+    a = areas(u, model.curve)
+    middle = 2.0 / (1.0 / a.min() + 1.0 / a.max())
+    return float(max(a.max() / middle, middle / a.min()) - 1.0), float(middle)

@@ -1,0 +1,93 @@
+"""Periodic state of a circuit under a periodic source, found directly, with its certificate and its stability."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.statespace import build_stack
+from fingerspice.circuit.waveforms import require
+from fingerspice.errors import InputError, SolveError
+from fingerspice.periodic import close_period
+from fingerspice.problem import prepare
+from fingerspice.simulation import RTOL_RANGE, run_problem
+from fingerspice.solution import Solution
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SteadyState:
+    """One period of the periodic state, and what vouches for it.
+
+    Attributes
+    ----------
+    solution : Solution
+        Over one period, from the first whole period after the source has settled.
+    defect : float
+        Largest change of a layer voltage over a further period, V.
+    multipliers : ndarray, shape (n_layer - 1,)
+        Sizes of the Floquet multipliers: what a period leaves of a small disturbance, by mode, to about 1e-3.
+    periods : int
+        Periods integrated to find it.
+    """
+
+    solution: Solution
+    defect: float
+    multipliers: FloatArray
+    periods: int
+
+    @property
+    def stability_margin(self) -> float:
+        """One less the largest multiplier: 0 where a disturbance stays for ever."""
+        return 1.0 - float(self.multipliers.max(initial=0.0))
+
+
+def steady_state(
+    circuit: Circuit,
+    *,
+    charge_law: str | None = None,
+    area: str | float = "coupled",
+    rtol: float = 1e-8,
+    points: int = 200,
+    charge: bool = True,
+) -> SteadyState:
+    """Periodic state of a circuit, by Newton's method on the map of one period.
+
+    Parameters
+    ----------
+    circuit : Circuit
+        With a periodic source.
+    charge_law, area, rtol, charge
+        As in `simulate`.
+    points : int
+        Output steps in the period.
+
+    Returns
+    -------
+    SteadyState
+
+    Raises
+    ------
+    InputError
+        For a source without a period.
+    SolveError
+        Where a period cannot be integrated, or the iteration does not close it.
+    """
+    require(RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-13 to 0.1")
+    require(points >= 1, "points", points, "1 or more")
+    waveform = circuit.remember("waveform", lambda: build_stack(circuit).waveform)
+    if waveform.period is None:
+        raise InputError("the source has no period, so there is no periodic state to find")
+    problem = prepare(
+        circuit, t_stop=waveform.period, t_eval=None, charge_law=charge_law, area=area, start="uncharged", charge=charge
+    )
+    closed = close_period(dataclasses.replace(problem, first=0.0, step=waveform.period / points), rtol)
+    solution = run_problem(closed.problem, rtol=rtol, start="periodic")
+    if not solution.success:
+        raise SolveError(solution.message, solution)
+    return SteadyState(solution, closed.defect, closed.multipliers, closed.periods)
