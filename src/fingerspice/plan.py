@@ -23,8 +23,8 @@ class Plan:
     Attributes
     ----------
     tier : str
-        ``algebraic``: the voltages follow the source at once; ``linear``: closed form at one area; ``coupled``: stepped,
-        the area followed at every instant.
+        ``algebraic``: the voltages follow the source at once; ``linear``: closed form at one area; ``coupled``:
+        stepped, the area followed at every instant.
     reasons : tuple of str
         Why, one sentence each.
     start : str
@@ -85,8 +85,8 @@ def _choose(problem: Problem, rtol: float, tier: str, start: str) -> Plan:
     sensitivity, area = _sensitivity(problem)
     best, reasons = _lightest(problem, rtol, leaking, sensitivity)
     if tier == "algebraic" and best != "algebraic":
-        raise InputError(f"the algebraic tier needs a stack without leaks; here {', '.join(leaking)} leak" if leaking else
-                         "the algebraic tier needs a start without stored charge under the mobile law")  # fmt: skip
+        what = f"a stack without leaks; here {', '.join(leaking)} leak"
+        raise InputError(f"the algebraic tier needs {what if leaking else 'a start without stored charge'}")
     if tier == "linear" and model.coupled and (model.mobile or problem.charge):
         what = "the mobile law" if model.mobile else "the charge (charge=False leaves it out)"
         raise InputError(f"the linear tier takes the area as fixed, and {what} needs the one that follows the voltage")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,8 +66,8 @@ class Run:
 class Tables:
     """Tables of a problem's source, window by window.
 
-    A user's function is expensive to look at, so its tables are kept; those of library waveforms are made anew,
-    which keeps a long run's memory constant.
+    A user's function is expensive to look at, so its tables are kept for the run. Those of library waveforms are made
+    anew, which keeps a long run's memory constant, but for a run of one window: its table stays with the scene.
     """
 
     def __init__(self, problem: Problem, tol: float, *, no_chirps: bool = False) -> None:
@@ -76,17 +77,22 @@ class Tables:
         self.problem = problem
         self.tol = min(1e-3, max(0.05 * tol, 1e-14))
         self.edges = windows(problem)
-        self.kept: dict[int, SourceTable] | None = {} if is_sampled(problem.waveform) else None
+        self.kept: dict[Any, SourceTable] | None = {} if is_sampled(problem.waveform) else None
+        if self.kept is None and len(self.edges) == 2:
+            self.kept = problem.scene.prepared.setdefault("tables", {})
+            if len(self.kept) > 16:
+                self.kept.clear()
 
     def __iter__(self) -> Iterator[SourceTable]:
-        for i, (w0, w1) in enumerate(itertools.pairwise(self.edges)):
-            table = self.kept.get(i) if self.kept is not None else None
+        for w0, w1 in itertools.pairwise(self.edges):
+            key = (w0, w1, self.no_chirps)
+            table = self.kept.get(key) if self.kept is not None else None
             if table is None:
                 table = source_table(
                     self.problem.waveform, w0, w1, self.tol, self.problem.step, no_chirps=self.no_chirps
                 )
                 if self.kept is not None:
-                    self.kept[i] = table
+                    self.kept[key] = table
             self.not_finite = table.not_finite
             yield table
             if table.not_finite is not None:
@@ -116,7 +122,11 @@ def after_the_end(problem: Problem, table: SourceTable) -> tuple[Segment, float]
     """The segment that right-hand outputs at the very end of a run belong to, and how far into it they are, s."""
     stop = problem.t_stop
     if breakpoints_at(problem.waveform, stop).size:
-        table = source_table(problem.waveform, stop, stop + problem.step, 1e-10, problem.step)
+        kept = problem.scene.prepared.setdefault("after", {})
+        if kept.get("stop") != (stop, problem.step):
+            kept["stop"] = (stop, problem.step)
+            kept["table"] = source_table(problem.waveform, stop, stop + problem.step, 1e-10, problem.step)
+        table = kept["table"]
         length = float(table.edges[1] - table.edges[0])
         return Segment(float(table.edges[0]), length, table.terms[0], table.series[0]), 0.0
     start = float(table.edges[-2])

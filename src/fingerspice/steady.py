@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from fingerspice.circuit.statespace import build_stack
 from fingerspice.circuit.waveforms import require
 from fingerspice.errors import InputError, SolveError
 from fingerspice.periodic import close_period
-from fingerspice.problem import prepare
+from fingerspice.problem import Problem, prepare
 from fingerspice.simulation import RTOL_RANGE, run_problem
 from fingerspice.solution import Solution
 
@@ -22,29 +23,50 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SteadyState:
-    """One period of the periodic state, and what vouches for it.
+    """The periodic state, and what vouches for it.
 
     Attributes
     ----------
-    solution : Solution
-        Over one period, from the first whole period after the source has settled.
+    problem : Problem
+        One period from the periodic state on, at the first whole period after the source has settled.
+    rtol : float
     defect : float
         Largest change of a layer voltage over a further period, V.
-    multipliers : ndarray, shape (n_layer - 1,)
-        Sizes of the Floquet multipliers: what a period leaves of a small disturbance, by mode, to about 1e-3.
+    map_slope : ndarray, shape (n_layer - 1, n_layer - 1)
+        Derivative of the live layer voltages after a period by those before it, to about 1e-3.
     periods : int
         Periods integrated to find it.
     """
 
-    solution: Solution
+    problem: Problem
+    rtol: float
     defect: float
-    multipliers: FloatArray
+    map_slope: FloatArray
     periods: int
+
+    @property
+    def multipliers(self) -> FloatArray:
+        """Sizes of the Floquet multipliers: what a period leaves of a small disturbance, shape (n_layer - 1,)."""
+        return np.abs(np.linalg.eigvals(self.map_slope)) if self.map_slope.size else np.zeros(0)
 
     @property
     def stability_margin(self) -> float:
         """One less the largest multiplier: 0 where a disturbance stays for ever."""
         return 1.0 - float(self.multipliers.max(initial=0.0))
+
+    @cached_property
+    def solution(self) -> Solution:
+        """The period's signals, integrated when first asked for.
+
+        Raises
+        ------
+        SolveError
+            Where that fails.
+        """
+        solution = run_problem(self.problem, rtol=self.rtol, start="periodic")
+        if not solution.success:
+            raise SolveError(solution.message, solution)
+        return solution
 
 
 def steady_state(
@@ -87,7 +109,4 @@ def steady_state(
         circuit, t_stop=waveform.period, t_eval=None, charge_law=charge_law, area=area, start="uncharged", charge=charge
     )
     closed = close_period(dataclasses.replace(problem, first=0.0, step=waveform.period / points), rtol)
-    solution = run_problem(closed.problem, rtol=rtol, start="periodic")
-    if not solution.success:
-        raise SolveError(solution.message, solution)
-    return SteadyState(solution, closed.defect, closed.multipliers, closed.periods)
+    return SteadyState(closed.problem, rtol, closed.defect, closed.map_slope, closed.periods)
