@@ -43,7 +43,10 @@ OPTIONS = [
     (["--charge-law", "moble"], "charge_law is 'moble'; allowed: 'local' or 'mobile'"),
     (["--rtol", "0"], "rtol is 0.0; allowed: 1e-13 to 0.1"),
     (["--rtol", "nan"], "rtol is nan; allowed: 1e-13 to 0.1"),
-    (["--method", "rk4"], "unknown method 'rk4'; allowed: auto, dp5, dop853, radau9, scipy:NAME, torchdiffeq:NAME"),
+    (
+        ["--method", "rk4"],
+        "unknown method 'rk4'; allowed: auto, exponential, dp5, dop853, radau9, scipy:NAME, torchdiffeq:NAME",
+    ),
     (["--method", "scipy:RK4"], "unknown method 'scipy:RK4'; allowed: scipy:RK23"),
     (["--area", "frozn"], "area is 'frozn'; allowed: 'coupled', 'mean', 'frozen' or m^2"),
     (["--area", "-1u"], "area is -1e-06 m^2; allowed: a positive area in m^2"),

@@ -8,9 +8,9 @@ import pytest
 import fingerspice as fs
 from fingerspice.foreign import SCIPY_METHODS, TORCH_METHODS
 from fingerspice.numerics.tableaus import TABLEAUS
-from scenes import table1
+from scenes import deck, table1
 
-OWN = tuple(TABLEAUS)
+OWN = ("exponential", *TABLEAUS)
 FOREIGN = tuple(f"scipy:{m}" for m in SCIPY_METHODS) + tuple(f"torchdiffeq:{m}" for m in TORCH_METHODS)
 # First- and second-order methods get a tolerance they can meet in reasonable time.
 LOOSE = {"scipy:RK23", "torchdiffeq:bosh3", "torchdiffeq:adaptive_heun", "torchdiffeq:midpoint", "torchdiffeq:euler"}
@@ -52,10 +52,29 @@ def test_unknown_methods_are_refused_with_what_is_allowed(method):
         fs.simulate(table1(), method=method)
 
 
-def test_automatic_choice_is_explicit_where_it_may_and_stiff_where_it_must():
-    assert fs.simulate(table1(), rtol=1e-3, t_stop=1e-3).method == "dp5"
-    assert fs.simulate(table1(), rtol=1e-8, t_stop=1e-3).method == "dop853"
-    assert fs.simulate(table1(coat={"r": 1})).method == "radau9"
+@pytest.mark.parametrize("rtol", [1e-3, 1e-8, 1e-12])
+@pytest.mark.parametrize("r_coat", ["1", "0.2meg", "1e15"])
+def test_the_automatic_method_of_a_coupled_scene_is_exponential_however_stiff(rtol, r_coat):
+    solution = fs.simulate(table1(coat={"r": r_coat}), rtol=rtol, t_stop=1e-3)
+    assert solution.method == "exponential"
+    assert solution.plan.tier == "coupled"
+    assert solution.plan.stiff == (r_coat == "1")
+
+
+def test_what_needs_no_steps_is_not_stepped():
+    frozen = fs.simulate(table1(), area="frozen", t_stop=1e-3)
+    assert (frozen.method, frozen.plan.tier, frozen.nfev) == ("linear", "linear", 0)
+    free = fs.simulate(table1(gap={"r": "inf"}, coat={"r": "inf"}, skin=None), t_stop=1e-3)
+    assert free.method == "exponential", "the skin leaks"
+    lines = ("V1 in 0 SIN(0 10 500)", "X1 in m area LAYER d=1u eps_r=4", "X2 m 0 area LAYER d=3u eps_r=1")
+    dry = fs.simulate(deck(*lines, "Varea area 0 40", ".tran 10u 1m uic"))
+    assert (dry.method, dry.plan.tier, dry.nfev) == ("algebraic", "algebraic", 0)
+
+
+def test_a_method_that_is_named_steps_the_coupled_model_whatever_the_scene():
+    solution = fs.simulate(table1(), area="frozen", t_stop=1e-3, method="dp5")
+    assert (solution.method, solution.plan.tier) == ("dp5", "coupled")
+    assert solution.nfev > 0
 
 
 def test_an_explicit_method_of_torchdiffeq_that_gives_up_is_explained(monkeypatch):

@@ -114,9 +114,18 @@ def test_a_run_that_stopped_shows_where_and_why() -> None:
 
 @pytest.mark.parametrize("rows", [0, 1, 2])
 def test_a_run_that_stopped_at_once_still_makes_a_picture(sine: fs.Solution, rows: int, tmp_path: Path) -> None:
-    cut = {k: v[:rows] for k, v in vars(sine).items() if isinstance(v, np.ndarray)}
+    whole = sine.record
+    assert whole.z is not None
+    assert whole.current is not None
+    record = dataclasses.replace(
+        whole, t=whole.t[:rows], left=whole.left[:rows], live=whole.live[:, :rows], z=whole.z[:rows],
+        current=whole.current[:rows],
+    )  # fmt: skip
     state = dataclasses.replace(sine.state, t=float(sine.t[max(rows - 1, 0)]))
-    solution = dataclasses.replace(sine, **cut, state=state, status=fs.Status.SOURCE_NOT_FINITE)
+    status = fs.Status.SOURCE_NOT_FINITE
+    solution = dataclasses.replace(sine, t=sine.t[:rows].copy(), record=record, state=state, status=status)
+    assert solution.u_gap is not None
+    assert solution.u_gap.size == rows
     figure = plotting.plot_solution(solution)
     assert "stopped" in figure.axes[0].texts[0].get_text()
     assert plotting.save(figure, tmp_path / "x.png").stat().st_size > 0

@@ -179,7 +179,7 @@ def errors(tableau: Tableau, wave: str, law: str, steps: int) -> tuple[float, fl
     end, inside = [], []
     for problem, exact in scenes(wave, law):
         run = integrate(problem, tableau, NEWTON, U0, TIMES, LEFT, h_fixed=1.0 / (F * steps), shadow=False)
-        u = problem.layer_voltages(run.rows[:, 0], run.rows[:, 2], run.rows[:, 5:-1])
+        u = run.record(problem).u_layer
         difference = np.abs(u - exact).max(1) / U0
         end.append(difference[-1])
         inside.append(difference[:-1].max())

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from fingerspice.circuit.sampling import SourceTable
-from fingerspice.engine import advance, march
+from fingerspice.engine import advance, march, readout
 from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
 from fingerspice.engine.march import Pace, Work
@@ -79,16 +79,16 @@ class Track:
         n = self.problem.model.gap.size
         self.y = start.y.copy()
         self.error = np.zeros(n + 1)
-        self.control = np.zeros(march.N_CONTROL)
-        self.control[march.T] = self.problem.t_start
-        self.control[march.U_BEFORE] = start.u_before
-        self.control[march.BRANCH_LENGTH] = np.inf
-        self.counters = np.zeros(march.N_COUNTERS, np.int64)
+        self.control = np.zeros(readout.N_CONTROL)
+        self.control[readout.T] = self.problem.t_start
+        self.control[readout.U_BEFORE] = start.u_before
+        self.control[readout.BRANCH_LENGTH] = np.inf
+        self.counters = np.zeros(readout.N_COUNTERS, np.int64)
         self.out = np.empty((n + 2 if self.pace.charge else n, self.t_out.size))
 
     @property
     def t(self) -> float:
-        return float(self.control[march.T])
+        return float(self.control[readout.T])
 
     def advance(self, table: SourceTable) -> int:
         """March to the end of a table."""
@@ -111,12 +111,12 @@ class Track:
 
     def finish(self, table: SourceTable) -> None:
         """Write the right-hand outputs at the very end of the run."""
-        first = int(self.counters[march.OUTPUT])
+        first = int(self.counters[readout.OUTPUT])
         if first == self.t_out.size:
             return
         segment, tau = after_the_end(self.problem, table)
         control = np.zeros(advance.N_CONTROL)
-        control[advance.U_BEFORE] = self.control[march.U_BEFORE]
+        control[advance.U_BEFORE] = self.control[readout.U_BEFORE]
         # Takes the charge of a jump that stands at the end.
         advance.enter(self.prepared.system.model, segment, tau, self.y, control)
         live, z, current = from_rows(self.problem, self.row(segment, tau)[None, :])
@@ -125,7 +125,7 @@ class Track:
         if self.pace.charge:
             self.out[n, first:] = z
             self.out[n + 1, first:] = current
-        self.counters[march.OUTPUT] = self.t_out.size
+        self.counters[readout.OUTPUT] = self.t_out.size
 
     def last(self, table: SourceTable) -> FloatArray | None:
         """Row at the time a failed run reached, left-hand; None before the first step."""
@@ -199,14 +199,14 @@ def integrate(
 
 def _run(problem: Problem, track: Track, status: Status, t_failed: float | None, last: FloatArray | None) -> Run:
     c, control = track.counters, track.control
-    n, n_out = problem.model.gap.size, int(c[march.OUTPUT])
+    n, n_out = problem.model.gap.size, int(c[readout.OUTPUT])
     t, side, out = track.t_out[:n_out], track.left[:n_out], track.out[:, :n_out]
     if last is not None and (n_out == 0 or track.t > t[-1]):
         # A failed run's arrays end at the time it reached.
         live, z, current = from_rows(problem, last[None, :])
         extra = np.vstack([live, z, current]) if track.pace.charge else live
         t, side, out = np.append(t, track.t), np.append(side, True), np.hstack([out, extra])
-    peak_u, peak_f = float(control[march.PEAK_U]), float(control[march.PEAK_F])
+    peak_u, peak_f = float(control[readout.PEAK_U]), float(control[readout.PEAK_F])
     # Rounding is an error too.
     floor = 4e-16 * (peak_u + problem.model.k_gap * problem.scene.u_peak)
     return Run(
@@ -217,21 +217,21 @@ def _run(problem: Problem, track: Track, status: Status, t_failed: float | None,
         out[n + 1] if track.pace.charge else None,
         status=status,
         error=ErrorEstimate(
-            SAFETY * float(control[march.ERROR_U]) + floor,
-            SAFETY * float(control[march.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f,
+            SAFETY * float(control[readout.ERROR_U]) + floor,
+            SAFETY * float(control[readout.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f,
         ),
         peak_u=peak_u,
         peak_f=peak_f,
-        nfev=int(c[march.NFEV]),
+        nfev=int(c[readout.NFEV]),
         stats={
-            "steps": int(c[march.ACCEPTED]),
-            "rejected": int(c[march.REJECTED]),
-            "zeros": int(c[march.ZEROS]),
+            "steps": int(c[readout.ACCEPTED]),
+            "rejected": int(c[readout.REJECTED]),
+            "zeros": int(c[readout.ZEROS]),
         },
         state=State(
             track.t,
             track.y.copy(),
-            float(control[march.U_BEFORE]),
+            float(control[readout.U_BEFORE]),
             problem.initial.charge_offset,
             problem.scene.charge_law,
         ),

@@ -83,7 +83,8 @@ class Record:
         assert gap is not None
         *live, _ = self.stack.state_order
         if gap in live:
-            return sealed(self.live[live.index(gap)] * self.stack.sign[gap])
+            along = self.live[live.index(gap)]
+            return sealed(along if self.stack.sign[gap] > 0.0 else -along)
         return sealed(self.u_layer[:, gap].copy())
 
     @cached_property

@@ -149,8 +149,18 @@ def _at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
     edges = problem.waveform.breakpoints(problem.t_start, problem.t_stop)
     if not edges.size:
         return t
-    nearest = edges[np.clip(np.searchsorted(edges, t), 0, edges.size - 1)]
-    return np.ascontiguousarray(np.where(np.abs(nearest - t) <= same_time(1.0) * np.abs(t), nearest, t))
+    # Only the neighbours of an edge can be that close to it.
+    place = np.searchsorted(t, edges)
+    moved = t
+    for near in (place - 1, place):
+        near = np.clip(near, 0, t.size - 1)
+        close = (np.abs(t[near] - edges) <= same_time(1.0) * np.abs(edges)) & (t[near] != edges)
+        if close.any():
+            moved = t.copy() if moved is t else moved
+            # Several outputs may stand at the same time.
+            for edge, old in zip(edges[close], t[near[close]], strict=True):
+                moved[t == old] = edge
+    return moved
 
 
 def _with_sources(circuit: Circuit, sources: Mapping[str, Waveform | float | Callable[[float], float]]) -> Circuit:

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from fingerspice.compiled import jit, jit_inline, jit_rows
 from fingerspice.engine.rows import DQ, GUESS, SOURCE, X_GAP, Q, U, evaluate, moved
-from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, fill_table
+from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 N_SLOTS = 48
-# Places between which the error is followed: start, the two points between nodes, end.
-N_PLACES = 4
+# Places between which the error is followed: start, the points between nodes, end.
+N_PLACES = 5
 
 
 class Tables(NamedTuple):
@@ -109,19 +109,13 @@ def _linear(
             w[k, i] = base[k, i]
 
 
-@jit_rows
-def _copy(a: FloatArray, b: FloatArray) -> None:
-    for k in range(a.shape[0]):
-        for i in range(ROWS):
-            b[k, i] = a[k, i]
-
-
 @jit_inline
 def converge(
     mobile: bool, coupled: bool, k_gap: float, area0: float, q0: float, gain: FloatArray, gap: FloatArray,
     push: FloatArray, turn: FloatArray, powers: FloatArray, slopes: FloatArray, lo: float, scale: float,
     curve: FloatArray, sign: float, decay: FloatArray, phi: FloatArray, w0: FloatArray, tol: float,
-    base: FloatArray, w: FloatArray, pull: FloatArray, used: FloatArray, r: FloatArray,
+    base: FloatArray, w: FloatArray, pull: FloatArray, used: FloatArray,
+    pull_before: FloatArray, left_before: FloatArray, r: FloatArray,
 ) -> tuple[int, bool]:  # fmt: skip
     """Fill `w` with the collocation solution of a step, iterating on the nonlinear term.
 
@@ -140,60 +134,123 @@ def converge(
         return 1, True
     for i in range(ROWS):
         r[GUESS, i] = r[U, i]
-    earlier = 0.0
+    slow = False
     for iteration in range(2, 41):
-        _copy(pull, used)
+        if slow:
+            moved_by = _mix(pull, used, pull_before, left_before)
+        else:
+            moved_by = _plain(pull, used, pull_before, left_before)
         _respond(used, phi, base, w)
         if not evaluate(
             mobile, k_gap, area0, q0, gap, push, turn, powers, slopes, lo, scale, curve, sign, w, pull, r
         ):  # fmt: skip
             return iteration, False
+        # What the gap voltage would move next, by what it moved for the last change of the nonlinear term.
         change = moved(r[U], r[GUESS])
-        if not change < math.inf:
+        left = _distance(pull, used)
+        if not left < math.inf:
             return iteration, False
-        if iteration == 2:
-            if change <= 0.1 * tol:
-                return iteration, True
-        else:
-            ratio = change / earlier if earlier > 0.0 else 0.0
-            if ratio < 0.9 and change * ratio <= tol * (1.0 - ratio):
-                return iteration, True
-            if iteration > 5 and ratio > 0.8:
-                return iteration, change <= tol
-        earlier = change
+        if change * left <= tol * moved_by:
+            return iteration, True
+        slow = left > 0.15 * moved_by
     return 40, False
 
 
 @jit_rows
-def _between(values: FloatArray) -> tuple[float, float]:
-    """What the polynomial through values at the nodes misses at the two points between."""
-    first = 0.0
-    second = 0.0
-    for j in range(NODES):
-        first += BETWEEN[j, 0] * values[j]
-        second += BETWEEN[j, 1] * values[j]
-    return values[FIRST] - first, values[SECOND] - second
+def _plain(pull: FloatArray, used: FloatArray, pull_before: FloatArray, left_before: FloatArray) -> float:
+    """Plain step of the iteration, remembered for a mixed one; returns the size of the move."""
+    total = 0.0
+    for k in range(pull.shape[0]):
+        for i in range(ROWS):
+            left = pull[k, i] - used[k, i]
+            total += left * left
+            left_before[k, i] = left
+            pull_before[k, i] = pull[k, i]
+            used[k, i] = pull[k, i]
+    return math.sqrt(total)
 
 
 @jit_rows
-def _left_over(phi: FloatArray, pull: FloatArray, used: FloatArray) -> tuple[float, float, float]:
+def _mix(pull: FloatArray, used: FloatArray, pull_before: FloatArray, left_before: FloatArray) -> float:
+    """Next nonlinear term from the last two (Anderson 1965, one step back), into `used`; returns the size of the move.
+
+    What the iteration leaves decays by the area's share of the leak in a stiff stack: mixing squares that share.
+    """
+    across = 0.0
+    along = 0.0
+    for k in range(pull.shape[0]):
+        for i in range(ROWS):
+            left = pull[k, i] - used[k, i]
+            difference = left - left_before[k, i]
+            across += left * difference
+            along += difference * difference
+    share = across / along if along > 0.0 else 0.0
+    share = min(max(share, -1.0), 0.9)
+    total = 0.0
+    for k in range(pull.shape[0]):
+        for i in range(ROWS):
+            left_before[k, i] = pull[k, i] - used[k, i]
+            new = pull[k, i] - share * (pull[k, i] - pull_before[k, i])
+            pull_before[k, i] = pull[k, i]
+            move = new - used[k, i]
+            total += move * move
+            used[k, i] = new
+    return math.sqrt(total)
+
+
+@jit_rows
+def _distance(a: FloatArray, b: FloatArray) -> float:
+    total = 0.0
+    for k in range(a.shape[0]):
+        for i in range(ROWS):
+            total += (a[k, i] - b[k, i]) ** 2
+    return math.sqrt(total)
+
+
+@jit_rows
+def _between(values: FloatArray) -> tuple[float, float, float]:
+    """What the polynomial through values at the nodes misses at the points between."""
+    first = 0.0
+    second = 0.0
+    third = 0.0
+    for j in range(NODES):
+        first += BETWEEN[j, 0] * values[j]
+        second += BETWEEN[j, 1] * values[j]
+        third += BETWEEN[j, 2] * values[j]
+    return values[FIRST] - first, values[SECOND] - second, values[THIRD] - third
+
+
+@jit_rows
+def _left_over(phi: FloatArray, pull: FloatArray, used: FloatArray, at: FloatArray) -> None:
     """Response to what the iteration left, at the points between and the end."""
     first = 0.0
     second = 0.0
+    third = 0.0
     end = 0.0
     for j in range(NODES):
         left = pull[j] - used[j]
         first += phi[j, FIRST] * left
         second += phi[j, SECOND] * left
+        third += phi[j, THIRD] * left
         end += phi[j, END] * left
-    return first, second, end
+    at[0] = first
+    at[1] = second
+    at[2] = third
+    at[3] = end
+
+
+@jit
+def _largest(first: float, second: float, third: float) -> float:
+    """The entry of largest size."""
+    out = first if abs(first) > abs(second) else second
+    return out if abs(out) > abs(third) else third
 
 
 @jit_inline
 def assess(
     mobile: bool, area0: float, gain: FloatArray, gap: FloatArray, decay: FloatArray, phi: FloatArray,
     miss: FloatArray, error: FloatArray, w: FloatArray, pull: FloatArray, used: FloatArray, r: FloatArray,
-    places: FloatArray,
+    places: FloatArray, sums: FloatArray,
 ) -> tuple[float, float]:  # fmt: skip
     """Error of a converged step, from what its polynomial misses between nodes and what its iteration left.
 
@@ -203,6 +260,8 @@ def assess(
         Error of the modes at the start of the step, signed.
     places : ndarray, shape (n, N_PLACES)
         Filled with the error of the modes at the start, the points between and the end; dense output included.
+    sums : ndarray, shape (4, 4)
+        Work.
 
     Returns
     -------
@@ -210,52 +269,45 @@ def assess(
         Largest error of the gap voltage in the step, V: what the polynomial of this step misses (a longer or shorter
         one misses more or less), and all of it with what the iteration left and what came before.
     """
-    source_first, source_second = _between(r[SOURCE])
+    source_first, source_second, source_third = _between(r[SOURCE])
     # The outputs are read off the polynomial through the nodes' gap voltages.
-    dense_first, dense_second = _between(r[U])
-    step_first = 0.0
-    step_second = 0.0
-    step_end = 0.0
-    run_first = 0.0
-    run_second = 0.0
-    run_end = 0.0
+    sums[0, 0], sums[0, 1], sums[0, 2] = _between(r[U])
+    sums[0, 3] = 0.0
+    for p in range(4):
+        sums[1, p] = 0.0
+        sums[2, p] = 0.0
     for k in range(gain.size):
-        pull_first, pull_second = _between(pull[k])
-        mode_first, mode_second = _between(w[k])
-        first = (gain[k] * source_first + pull_first) / MISS[0]
-        second = (gain[k] * source_second + pull_second) / MISS[1]
-        missed = first if abs(first) > abs(second) else second
-        left_first, left_second, left_end = _left_over(phi[k], pull[k], used[k])
-        all_first = decay[k, FIRST] * error[k] + left_first + miss[k, FIRST] * missed
-        all_second = decay[k, SECOND] * error[k] + left_second + miss[k, SECOND] * missed
+        pull_first, pull_second, pull_third = _between(pull[k])
+        mode_first, mode_second, mode_third = _between(w[k])
+        missed = _largest(
+            (gain[k] * source_first + pull_first) / MISS[0],
+            (gain[k] * source_second + pull_second) / MISS[1],
+            (gain[k] * source_third + pull_third) / MISS[2],
+        )
+        left = sums[3]
+        _left_over(phi[k], pull[k], used[k], left)
         places[k, 0] = error[k]
-        places[k, 1] = all_first + mode_first
-        places[k, 2] = all_second + mode_second
-        places[k, 3] = decay[k, END] * error[k] + left_end + miss[k, END] * missed
-        step_first += gap[k] * miss[k, FIRST] * missed
-        step_second += gap[k] * miss[k, SECOND] * missed
-        step_end += gap[k] * miss[k, END] * missed
-        run_first += gap[k] * all_first
-        run_second += gap[k] * all_second
-        run_end += gap[k] * places[k, 3]
-    by_first = 1.0
-    by_second = 1.0
-    by_end = 1.0
-    if mobile:
-        # The gap's part of the voltages is over A, and the fold magnifies its error.
-        by_first = area0 * r[Q, FIRST] / max(1.0 - area0 * r[X_GAP, FIRST] * r[DQ, FIRST], 1e-12)
-        by_second = area0 * r[Q, SECOND] / max(1.0 - area0 * r[X_GAP, SECOND] * r[DQ, SECOND], 1e-12)
-        by_end = area0 * r[Q, END] / max(1.0 - area0 * r[X_GAP, END] * r[DQ, END], 1e-12)
+        for p in range(4):
+            row = FIRST + p if p < 3 else END
+            fresh = miss[k, row] * missed
+            places[k, p + 1] = decay[k, row] * error[k] + left[p] + fresh
+            sums[1, p] += gap[k] * fresh
+            sums[2, p] += gap[k] * places[k, p + 1]
+        places[k, 1] += mode_first
+        places[k, 2] += mode_second
+        places[k, 3] += mode_third
+    step = 0.0
+    run = 0.0
+    for p in range(4):
+        row = FIRST + p if p < 3 else END
+        factor = 1.0
+        if mobile:
+            # The gap's part of the voltages is over A, and the fold magnifies its error.
+            factor = area0 * r[Q, row] / max(1.0 - area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
+        step = max(step, abs(factor * sums[1, p] + sums[0, p]))
+        run = max(run, abs(factor * sums[2, p] + sums[0, p]))
     # The charge is the integral of A dU among others: what the polynomial misses of 1/A counts with the source's move.
-    area_first, area_second = _between(r[Q])
+    area_first, area_second, area_third = _between(r[Q])
     swing = 0.3 * abs(r[SOURCE, END] - r[SOURCE, 0])
-    charged = swing * max(abs(area_first), abs(area_second)) / r[Q, 0]
-    return (
-        max(
-            abs(by_first * step_first + dense_first),
-            abs(by_second * step_second + dense_second),
-            abs(by_end * step_end),
-            charged,
-        ),
-        max(abs(by_first * run_first + dense_first), abs(by_second * run_second + dense_second), abs(by_end * run_end)),
-    )
+    charged = swing * abs(_largest(area_first, area_second, area_third)) / r[Q, 0]
+    return max(step, charged), run

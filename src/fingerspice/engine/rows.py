@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fingerspice.compiled import jit, jit_fused, jit_inline, jit_rows
 from fingerspice.engine.system import DEGREE
 from fingerspice.numerics import chebyshev
-from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import POINTS, ROWS
 from fingerspice.physics.contact import inverse_area
 
 FloatArray = NDArray[np.float64]
@@ -256,9 +256,8 @@ def _solve_mobile(
 def moved(u: FloatArray, before: FloatArray) -> float:
     """Root of the summed squares of u - before; `before` becomes u."""
     total = 0.0
-    for i in range(NODES):
+    for i in range(ROWS):
         change = u[i] - before[i]
         total += change * change
-    for i in range(ROWS):
         before[i] = u[i]
     return math.sqrt(total)

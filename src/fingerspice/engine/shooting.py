@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from fingerspice.compiled import jit
 from fingerspice.engine.exponential import Tables
-from fingerspice.engine.march import BRANCH_LENGTH, DONE, N_CONTROL, N_COUNTERS, NFEV, U_BEFORE, Pace, T, Work, march
+from fingerspice.engine.march import DONE, Pace, Work, march
+from fingerspice.engine.readout import BRANCH_LENGTH, N_CONTROL, N_COUNTERS, NFEV, U_BEFORE, T
 from fingerspice.engine.system import System
 
 FloatArray = NDArray[np.float64]

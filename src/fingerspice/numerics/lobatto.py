@@ -5,7 +5,7 @@ On a step of length h a mode w' = -rate w + g(t) has, with g interpolated at the
     w(c_i h) = exp(-rate c_i h) w(0) + h sum_j phi_ij g(c_j h),
     phi_ij = integral over [0, c_i] of exp(-rate h (c_i - s)) l_j(s) ds
 
-(Hochbruck and Ostermann 2010, exponential Runge-Kutta methods of collocation type). Two points between the nodes
+(Hochbruck and Ostermann 2010, exponential Runge-Kutta methods of collocation type). Three points between the nodes
 are rows of the tables too: what a solution misses there is its error.
 
 The sizes are constants, so that the compiler unrolls every inner loop.
@@ -23,10 +23,10 @@ from fingerspice.compiled import jit
 
 FloatArray = NDArray[np.float64]
 
-NODES = 14
+NODES = 13
 ROWS = 16
-"""The nodes, ascending from 0 to 1, and two points between them."""
-FIRST, SECOND, END = NODES, NODES + 1, NODES - 1
+"""The nodes, ascending from 0 to 1, and three points between them."""
+FIRST, SECOND, THIRD, END = NODES, NODES + 1, NODES + 2, NODES - 1
 """Rows of the points between, and of the end of the step."""
 
 
@@ -45,17 +45,20 @@ def _lagrange(at: FloatArray, nodes: FloatArray, weights: FloatArray) -> FloatAr
 _X = _nodes()
 BARYCENTRIC = 1.0 / np.array([np.prod(4.0 * (x - np.delete(_X, i))) for i, x in enumerate(_X)])
 """Barycentric weights of the nodes (times a constant), shape (NODES,)."""
-# The middle, where an error of the next order is largest, and one where an odd one is.
-_BETWEEN = np.array([0.5, 0.5 * (_X[9] + _X[10])])
+# Midway between neighbours, at three distances from the middle: no error of the next few orders is small at all.
+_BETWEEN = np.array([0.5 * (_X[i] + _X[i + 1]) for i in (3, 6, 8)])
 POINTS = np.concatenate([_X, _BETWEEN])
 """Fractions of the step, shape (ROWS,)."""
 BETWEEN = np.ascontiguousarray(_lagrange(_BETWEEN, _X, BARYCENTRIC).T)
-"""Interpolation from the nodes to the two points between, shape (NODES, 2)."""
+"""Interpolation from the nodes to the points between, shape (NODES, 3)."""
 _SCALE = float(np.abs(np.prod(_BETWEEN[:, None] - _X, axis=1)).max())
 MISS = np.prod(_BETWEEN[:, None] - _X, axis=1) / _SCALE
-"""The node polynomial, of largest size 1, at the points between, shape (2,)."""
-TO_SERIES = np.ascontiguousarray(np.linalg.inv(chebyshev.chebvander(2.0 * _X - 1.0, NODES - 1)).T)
-"""From values at the nodes to Chebyshev coefficients, shape (NODES, NODES): coefficients = values @ TO_SERIES."""
+"""The node polynomial, of largest size 1, at the points between, shape (3,)."""
+TO_SERIES = np.zeros((NODES, ROWS))
+"""From values at the nodes to Chebyshev coefficients, shape (NODES, ROWS): coefficients = values @ TO_SERIES.
+
+The last columns are zero, for loops over whole vectors."""
+TO_SERIES[:, :NODES] = np.linalg.inv(chebyshev.chebvander(2.0 * _X - 1.0, NODES - 1)).T
 _GAUSS_X, _GAUSS_W = legendre.leggauss(32)
 _GAUSS_X, _GAUSS_W = 0.5 * (_GAUSS_X + 1.0), 0.5 * _GAUSS_W
 # exp(-45) of the largest value is below rounding.

@@ -205,13 +205,15 @@ def inverse_area(u: float, curve: FloatArray) -> tuple[float, float]:
 
 def areas(u: FloatArray, curve: FloatArray) -> FloatArray:
     """A_R (m^2) at gap voltages |u| (V), shape (n,), from a `Contact.curve`."""
-    u = np.abs(u)
-    lo, hi, series = curve[0], curve[1], curve[2 + N_PACKED :]
+    u = np.ascontiguousarray(u)
+    lo, hi, series = float(curve[0]), float(curve[1]), curve[2 + N_PACKED :]
     if series.size == 1:
         return np.full(u.shape, 1.0 / series[0])
-    if series.size and u.max(initial=0.0) <= hi:
-        return np.asarray(1.0 / chebyshev.evaluate_array(series, (u - lo) * (2.0 / (hi - lo)) - 1.0))
-    return np.asarray(1.0 / inverse_area_array(u, curve)[0])
+    if series.size and max(u.max(initial=0.0), -u.min(initial=0.0)) <= hi:
+        out = np.empty(u.size)
+        chebyshev.evaluate_array(series, u, lo, 2.0 / (hi - lo), out)
+        return np.divide(1.0, out, out=out)
+    return np.asarray(1.0 / inverse_area_array(np.abs(u), curve)[0])
 
 
 @jit

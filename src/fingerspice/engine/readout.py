@@ -1,0 +1,268 @@
+"""What is read off a finished step: zeros of the gap voltage, state and error inside it, charge, outputs, peaks."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.compiled import jit, jit_fused, jit_rows
+from fingerspice.engine.model import Model
+from fingerspice.engine.rows import DQ, SLOPE, SOURCE, X_GAP, Q
+from fingerspice.numerics.lobatto import BARYCENTRIC, FIRST, NODES, POINTS, ROWS, SECOND, THIRD, TO_SERIES
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# Entries of `control`.
+T, H, SIGN, U_BEFORE, U_GAP = 0, 1, 2, 3, 4
+BRANCH_START, BRANCH_LENGTH, PEAK_U, PEAK_F, ERROR_U, ERROR_F = 5, 6, 7, 8, 9, 10
+# A length found too long not long ago, s.
+TOO_LONG = 11
+# The first step taken after an edge of the source, s.
+H_AFTER_EDGE = 12
+N_CONTROL = 13
+# Entries of `counters`: rows evaluated, steps accepted and refused, zeros met, outputs written.
+NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT = 0, 1, 2, 3, 4
+N_COUNTERS = 5
+# Outputs read at once.
+BLOCK = 32
+
+
+@jit_rows
+def series_of(values: FloatArray, out: FloatArray) -> None:
+    """Chebyshev coefficients (ROWS,) of the polynomial through values at the nodes."""
+    for d in range(ROWS):
+        total = 0.0
+        for j in range(NODES):
+            total += TO_SERIES[j, d] * values[j]
+        out[d] = total
+
+
+@jit_fused
+def _value_and_slope(series: FloatArray, x: float) -> tuple[float, float]:
+    """Value and derivative of a Chebyshev series at x in [-1, 1] (Clenshaw)."""
+    b1 = 0.0
+    b2 = 0.0
+    d1 = 0.0
+    d2 = 0.0
+    for d in range(NODES - 1, 0, -1):
+        d0 = 2.0 * (b1 + x * d1) - d2
+        b0 = 2.0 * x * b1 + (series[d] - b2)
+        d2 = d1
+        d1 = d0
+        b2 = b1
+        b1 = b0
+    return x * b1 + (series[0] - b2), b1 + x * d1 - d2
+
+
+@jit
+def zero(u: FloatArray, sign: float, last: int, series: FloatArray) -> float:
+    """Fraction of the step at which the gap voltage leaves its branch, between nodes `last` - 1 and `last`."""
+    lo: float = POINTS[last - 1]
+    hi: float = POINTS[last]
+    if not sign * u[last - 1] > 0.0:
+        return lo
+    series_of(u, series)
+    theta: float = lo + (hi - lo) * u[last - 1] / (u[last - 1] - u[last])
+    # Newton, in a bracket that only closes; after a move of 1e-9 its next one is below rounding.
+    for _ in range(60):
+        value, slope = _value_and_slope(series, 2.0 * theta - 1.0)
+        if sign * value > 0.0:
+            lo = theta
+        else:
+            hi = theta
+        new = theta - 0.5 * value / slope if slope != 0.0 else lo
+        if not lo <= new <= hi:
+            new = 0.5 * (lo + hi)
+            if not lo < new < hi:
+                break
+        moved = abs(new - theta)
+        theta = new
+        if moved <= 1e-9 * (hi - lo) or hi - lo <= 4e-16:
+            break
+    return theta
+
+
+@jit
+def first_wrong(u: FloatArray, sign: float) -> int:
+    """First node past the start at which the gap voltage is off its branch, or 0."""
+    for j in range(1, NODES):
+        if sign * u[j] < 0.0:
+            return j
+    return 0
+
+
+@jit
+def at(values: FloatArray, theta: float) -> float:
+    """The polynomial through values at the nodes, at fraction `theta` of the step."""
+    top = 0.0
+    bottom = 0.0
+    for j in range(NODES):
+        distance = theta - POINTS[j]
+        if distance == 0.0:
+            value: float = values[j]
+            return value
+        weight = BARYCENTRIC[j] / distance
+        top += weight * values[j]
+        bottom += weight
+    return top / bottom
+
+
+@jit
+def error_at(places: FloatArray, theta: float, error: FloatArray) -> None:
+    """Error of the modes where a step is cut short: between the places it is known at."""
+    p = 0
+    left = 0.0
+    right = POINTS[FIRST]
+    if theta > POINTS[THIRD]:
+        p = 3
+        left = POINTS[THIRD]
+        right = 1.0
+    elif theta > POINTS[SECOND]:
+        p = 2
+        left = POINTS[SECOND]
+        right = POINTS[THIRD]
+    elif theta > POINTS[FIRST]:
+        p = 1
+        left = POINTS[FIRST]
+        right = POINTS[SECOND]
+    share = (theta - left) / (right - left)
+    for k in range(places.shape[0]):
+        error[k] = (1.0 - share) * places[k, p] + share * places[k, p + 1]
+
+
+@jit
+def charge_rates(
+    model: Model, rates: FloatArray, gain: FloatArray, gap: FloatArray, slow_share: FloatArray, w: FloatArray,
+    pull: FloatArray, r: FloatArray, rate: FloatArray, current: FloatArray,
+) -> None:  # fmt: skip
+    """z' and the current at the nodes, through the layer that leaks slowest (see `model.charge_rate`)."""
+    n = rates.size
+    slow = model.slow
+    for j in range(NODES):
+        dv = 0.0
+        v = 0.0
+        dx_gap = 0.0
+        for k in range(n):
+            dw = -rates[k] * w[k, j] + gain[k] * r[SOURCE, j] + pull[k, j]
+            dv += slow_share[k] * dw
+            v += slow_share[k] * w[k, j]
+            dx_gap += gap[k] * dw
+        q = r[Q, j]
+        scale = model.area0 * q if model.mobile else 1.0
+        voltage = slow[n] * r[SOURCE, j] + v * scale
+        lam = slow[n + 1] * dv * scale + (slow[n + 2] + q * slow[n + 3]) * voltage
+        if model.mobile:
+            rate[j] = lam / q
+            # i = Q' with Q = A U / S + z, and u' from the area equation.
+            margin = 1.0 - r[X_GAP, j] * model.area0 * r[DQ, j]
+            du = (model.k_gap * r[SLOPE, j] + dx_gap * scale) / margin
+            current[j] = rate[j] + (r[SLOPE, j] / q - r[DQ, j] * du * r[SOURCE, j] / (q * q)) / model.s
+        else:
+            rate[j] = (lam + r[SLOPE, j] / model.s) / q
+            current[j] = rate[j]
+
+
+@jit_rows
+def integrate(integral: FloatArray, h: float, z0: float, rate: FloatArray, z: FloatArray) -> None:
+    """z at the nodes from z' there; in place is allowed."""
+    total = np.zeros(NODES)
+    for m in range(NODES):
+        for j in range(NODES):
+            total[j] += integral[m, j] * rate[m]
+    for j in range(NODES):
+        z[j] = z0 + h * total[j]
+
+
+@jit_rows
+def layers(
+    mobile: bool, area0: float, k_layer: FloatArray, live: FloatArray, w: FloatArray, source: FloatArray, q: FloatArray,
+    values: FloatArray,
+) -> None:  # fmt: skip
+    """Live layer voltages at all rows."""
+    for i in range(w.shape[0]):
+        for j in range(ROWS):
+            values[i, j] = 0.0
+        for k in range(w.shape[0]):
+            share = live[i, k]
+            for j in range(ROWS):
+                values[i, j] += share * w[k, j]
+        if mobile:
+            for j in range(ROWS):
+                values[i, j] *= area0 * q[j]
+        share = k_layer[i]
+        for j in range(ROWS):
+            values[i, j] += share * source[j]
+
+
+@jit_rows
+def _clenshaw_block(series: FloatArray, x: FloatArray, out: FloatArray) -> None:
+    """The series at BLOCK places at once: the inner loop is unrolled, the outer one a processor's vector."""
+    for i in range(BLOCK):
+        b1 = 0.0
+        b2 = 0.0
+        for d in range(NODES - 1, 0, -1):
+            b0 = series[d] + 2.0 * x[i] * b1 - b2
+            b2 = b1
+            b1 = b0
+        out[i] = series[0] + x[i] * b1 - b2
+
+
+@jit_rows
+def _places(t_out: FloatArray, t: float, scale: float, top: float, x: FloatArray) -> None:
+    """BLOCK output times as places in [-1, top] of a step."""
+    for i in range(BLOCK):
+        x[i] = min(max((t_out[i] - t) * scale - 1.0, -1.0), top)
+
+
+@jit
+def write_outputs(
+    t: float, h: float, reached: float, t_new: float, series: FloatArray, x: FloatArray, values: FloatArray,
+    first: int, t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray,
+) -> int:  # fmt: skip
+    """Outputs of one step from number `first` on: right-hand ones in [t, t_new), left-hand ones in (t, t_new].
+
+    Returns the number of the first output that is left.
+    """
+    scale = 2.0 / h
+    top = 2.0 * reached - 1.0
+    while first < t_out.size:
+        count = 0
+        if first + BLOCK <= t_out.size and t_out[first + BLOCK - 1] < t_new:
+            count = BLOCK
+            _places(t_out[first:], t, scale, top, x)
+        else:
+            while count < BLOCK and first + count < t_out.size:
+                time = t_out[first + count]
+                if time > t_new or (time == t_new and not left[first + count]):
+                    break
+                x[count] = min(max((time - t) * scale - 1.0, -1.0), top)
+                count += 1
+        if count == 0:
+            break
+        for column in range(out.shape[0]):
+            _clenshaw_block(series[column], x, values)
+            for i in range(count):
+                out[column, first + i] = values[i]
+        first += count
+    return first
+
+
+@jit_rows
+def account(stress: float, u: FloatArray, q: FloatArray, theta: float, run_error: float, control: FloatArray) -> None:
+    """Peaks of gap voltage and force, and the largest error of each, over the part of a step that counts."""
+    peak_u = control[PEAK_U]
+    peak_f = control[PEAK_F]
+    steepest = 0.0
+    for j in range(NODES):
+        if POINTS[j] <= theta:
+            size = abs(u[j])
+            pressure = stress * size / q[j]
+            peak_u = max(peak_u, size)
+            peak_f = max(peak_f, pressure * size)
+            # F ~ u^2 A: what moves u by du moves F by at most 2 F du / u, as the area falls with u.
+            steepest = max(steepest, 2.0 * pressure)
+    control[PEAK_U] = peak_u
+    control[PEAK_F] = peak_f
+    control[ERROR_U] = max(control[ERROR_U], run_error)
+    control[ERROR_F] = max(control[ERROR_F], run_error * steepest)

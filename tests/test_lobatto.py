@@ -1,0 +1,181 @@
+"""Tables of the exponential steps against integrals taken in many digits."""
+
+from __future__ import annotations
+
+import mpmath as mp
+import numpy as np
+import pytest
+from numpy.polynomial import chebyshev
+
+from fingerspice.numerics.lobatto import (
+    BETWEEN,
+    END,
+    FIRST,
+    MISS,
+    NODES,
+    POINTS,
+    ROWS,
+    TO_SERIES,
+    fill_table,
+    integral_table,
+)
+from fingerspice.runs import ROUNDING
+
+DIGITS = 60
+# From no decay in a step to one that is over within a rounding of its start, past every change of branch.
+Z = (0.0, 1e-12, 1e-3, 0.1, 1.0, 5.0, 20.0, 44.0, 46.0, 100.0, 689.0, 691.0, 1e4, 1e8, 1e12)
+
+
+def rounding(z: float) -> float:
+    """Error of a table over the largest entry that is no error: with decay, the engine's own floor."""
+    return 1e-15 if z <= 1.0 else ROUNDING
+
+
+def table(z: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    decay, phi, miss = np.full(ROWS, np.nan), np.full((NODES, ROWS), np.nan), np.full(ROWS, np.nan)
+    fill_table(z, decay, phi, miss)
+    return decay, phi, miss
+
+
+def moment(z: float, c: float, degree: int) -> mp.mpf:
+    """Integral over [0, c] of exp(-z (c - s)) s^degree ds."""
+    z, c = mp.mpf(z), mp.mpf(c)
+    if z * c < 1:
+        # sum of (-z)^k c^(degree + 1 + k) / ((degree + 1) ... (degree + 1 + k))
+        term = c ** (degree + 1) / (degree + 1)
+        total, k = term, degree + 1
+        while abs(term) > abs(total) * mp.mpf(10) ** -DIGITS:
+            k += 1
+            term *= -z * c / k
+            total += term
+        return total
+    with mp.extradps(DIGITS):
+        total = (1 - mp.exp(-z * c)) / z
+        for d in range(1, degree + 1):
+            total = (c**d - d * total) / z
+        return +total
+
+
+def node_polynomial() -> list[mp.mpf]:
+    """Coefficients, ascending, of the product of (s - c_j) over the nodes as rounded, of largest size 1 at 1/2."""
+    out = [mp.mpf(1)]
+    for c in POINTS[:NODES]:
+        out = [a - mp.mpf(float(c)) * b for a, b in zip([mp.mpf(0), *out], [*out, mp.mpf(0)], strict=True)]
+    size = abs(mp.polyval(out[::-1], mp.mpf(1) / 2))
+    return [x / size for x in out]
+
+
+def test_the_nodes_are_those_of_gauss_and_lobatto_and_symmetric() -> None:
+    with mp.workdps(40):
+        inner = mp.polyroots(mp.taylor(lambda x: mp.diff(lambda y: mp.legendre(NODES - 1, y), x), 0, NODES - 2)[::-1])
+        exact = sorted([mp.mpf(0), mp.mpf(1), *((1 + mp.re(x)) / 2 for x in inner)])
+        worst = max(abs(mp.mpf(float(a)) - b) for a, b in zip(POINTS[:NODES], exact, strict=True))
+    assert worst <= 1e-15
+    assert POINTS[0] == 0.0
+    assert POINTS[END] == 1.0
+    np.testing.assert_allclose(POINTS[:NODES] + POINTS[NODES - 1 :: -1], 1.0, rtol=0, atol=2e-16)
+
+
+@pytest.mark.parametrize("z", Z)
+def test_a_forcing_that_is_a_polynomial_of_the_nodes_degree_is_answered_exactly(z: float) -> None:
+    _, phi, _ = table(z)
+    with mp.workdps(DIGITS):
+        for i, c in enumerate(POINTS):
+            size = float(moment(z, c, 0))
+            for degree in range(NODES):
+                powers = [mp.mpf(float(x)) ** degree for x in POINTS[:NODES]]
+                got = mp.fsum(mp.mpf(float(a)) * b for a, b in zip(phi[:, i], powers, strict=True))
+                assert abs(got - moment(z, c, degree)) <= rounding(z) * size, (i, degree)
+
+
+@pytest.mark.parametrize("z", Z)
+def test_every_entry_is_the_integral_of_its_own_basis_polynomial(z: float) -> None:
+    _, phi, _ = table(z)
+    nodes = [mp.mpf(float(x)) for x in POINTS[:NODES]]
+    with mp.workdps(DIGITS):
+        for j in range(NODES):
+            basis = [mp.mpf(1)]
+            for m, c in enumerate(nodes):
+                if m != j:
+                    scaled = [x / (nodes[j] - c) for x in basis]
+                    shifted = zip([mp.mpf(0), *scaled], [*scaled, mp.mpf(0)], strict=True)
+                    basis = [a - c * b for a, b in shifted]
+            for i, c in enumerate(POINTS):
+                exact = mp.fsum(b * moment(z, c, d) for d, b in enumerate(basis))
+                size = float(moment(z, c, 0))
+                assert abs(mp.mpf(float(phi[j, i])) - exact) <= rounding(z) * size
+
+
+@pytest.mark.parametrize("z", Z)
+def test_the_decay_is_the_exponential_and_never_a_denormal(z: float) -> None:
+    decay, _, _ = table(z)
+    for value, c in zip(decay, POINTS, strict=True):
+        exact = float(mp.exp(-mp.mpf(z) * mp.mpf(float(c))))
+        # The product z c is rounded, by half a unit in its last place.
+        assert value == pytest.approx(exact, rel=3e-16 * (1.0 + z * c), abs=1e-299)
+        assert value == 0.0 or value > 1e-300
+
+
+@pytest.mark.parametrize("z", Z)
+def test_miss_is_the_answer_to_the_node_polynomial_of_size_one(z: float) -> None:
+    _, _, miss = table(z)
+    with mp.workdps(DIGITS):
+        polynomial = node_polynomial()
+        for i, c in enumerate(POINTS):
+            exact = mp.fsum(b * moment(z, c, d) for d, b in enumerate(polynomial))
+            size = float(moment(z, c, 0))
+            assert abs(mp.mpf(float(miss[i])) - exact) <= rounding(z) * size
+
+
+def test_without_decay_a_step_s_end_is_gauss_and_lobatto_s_rule() -> None:
+    phi = integral_table()
+    _, zero, _ = table(0.0)
+    np.testing.assert_array_equal(phi, zero)
+    weights = phi[:, END]
+    assert np.all(weights > 0.0)
+    for degree in range(2 * NODES - 2):
+        assert weights @ POINTS[:NODES] ** degree == pytest.approx(1.0 / (degree + 1), rel=2e-15)
+    for i in range(ROWS):
+        for degree in range(NODES):
+            exact = POINTS[i] ** (degree + 1) / (degree + 1)
+            assert phi[:, i] @ POINTS[:NODES] ** degree == pytest.approx(exact, rel=0, abs=1e-15)
+
+
+def test_the_points_between_see_what_the_nodes_miss_in_the_ratio_of_miss() -> None:
+    between = POINTS[FIRST:]
+    assert between.size == MISS.size == BETWEEN.shape[1] == ROWS - NODES
+    assert np.all((between > 0.0) & (between < 1.0))
+    assert not np.isin(between, POINTS[:NODES]).any()
+    with mp.workdps(DIGITS):
+        polynomial = node_polynomial()[::-1]
+        exact = [float(mp.polyval(polynomial, mp.mpf(float(x)))) for x in between]
+        everywhere = max(abs(float(mp.polyval(polynomial, mp.mpf(x) / 997))) for x in range(998))
+    np.testing.assert_allclose(MISS, exact, rtol=1e-12)
+    assert abs(MISS[0]) == np.abs(MISS).max() == pytest.approx(1.0, rel=1e-14)
+    assert everywhere <= 1.0 + 1e-12, "the first point is where the node polynomial is largest"
+    # x^14 is missed by the node polynomial times the scale of its highest coefficient, and nothing else.
+    x = 2.0 * POINTS - 1.0
+    missed = chebyshev.chebval(x, np.eye(NODES + 1)[NODES])
+    seen = missed[FIRST:] - missed[:NODES] @ BETWEEN
+    np.testing.assert_allclose(seen / MISS, seen[0] / MISS[0], rtol=1e-12)
+    # The next, an odd one, is zero in the middle: another point sees it.
+    odd = chebyshev.chebval(x, np.eye(NODES + 2)[NODES + 1])
+    seen = odd[FIRST:] - odd[:NODES] @ BETWEEN
+    assert abs(seen[0]) <= 1e-14
+    assert np.abs(seen[1:]).max() > 0.1
+
+
+@pytest.mark.parametrize("degree", range(NODES))
+def test_interpolation_to_the_points_between_is_exact_up_to_the_nodes_degree(degree: int) -> None:
+    values = chebyshev.chebval(2.0 * POINTS - 1.0, np.eye(NODES)[degree])
+    np.testing.assert_allclose(values[:NODES] @ BETWEEN, values[FIRST:], rtol=0, atol=2e-15)
+
+
+def test_a_series_gives_back_its_values_and_values_their_series() -> None:
+    rng = np.random.default_rng(1)
+    coefficients = rng.uniform(-1.0, 1.0, (50, NODES))
+    values = chebyshev.chebval(2.0 * POINTS[:NODES] - 1.0, coefficients.T)
+    np.testing.assert_allclose(values @ TO_SERIES, coefficients, rtol=0, atol=5e-15)
+    values = rng.uniform(-1.0, 1.0, (50, NODES))
+    back = chebyshev.chebval(2.0 * POINTS[:NODES] - 1.0, (values @ TO_SERIES).T)
+    np.testing.assert_allclose(back, values, rtol=0, atol=5e-15)
