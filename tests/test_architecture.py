@@ -19,8 +19,8 @@ MAX_LINES = 450
 ORDER = (
     *("errors", "units", "files", "compiled", "numerics", "physics", "engine", "circuit"),
     *("record", "solution", "phasors", "export", "table1", "plotting", "problem", "runs", "stepping", "marching"),
-    *("direct", "foreign", "periodic", "plan", "simulation", "steady", "comparison", "report", "figures"),
-    *("options", "cli", "__main__"),
+    *("direct", "foreign", "periodic", "planning", "simulation", "steady", "largesignal", "comparison", "report"),
+    *("figures", "options", "cli", "__main__"),
 )
 # Beside each other, not one on the other.
 STRANGERS = (

@@ -146,7 +146,7 @@ def test_no_voltage_is_no_force_and_still_a_picture(tmp_path: Path) -> None:
 def test_a_sweep_shows_gain_phase_force_and_area() -> None:
     circuit = table1()
     result = fs.phasor(circuit, np.geomspace(1.0, 1e4, 21))
-    figure = plotting.plot_phasor(result, circuit)
+    figure = plotting.plot_phasor((result,), circuit)
     assert len(labels(figure)) == 4
     assert all(ax.get_xscale() == "log" for ax in figure.axes)
     for ax, values in zip(
@@ -160,14 +160,14 @@ def test_a_sweep_shows_gain_phase_force_and_area() -> None:
 
 def test_within_the_skin_data_nothing_is_shaded() -> None:
     circuit = table1()
-    figure = plotting.plot_phasor(fs.phasor(circuit, np.geomspace(10.0, 1e5, 9)), circuit)
+    figure = plotting.plot_phasor((fs.phasor(circuit, np.geomspace(10.0, 1e5, 9)),), circuit)
     assert "outside" not in small_print(figure)
     assert not any(ax.patches for ax in figure.axes)
 
 
 def test_a_single_frequency_and_a_source_without_fundamental_are_drawn_too(tmp_path: Path) -> None:
     circuit = table1().replace({"Vdrive": fs.DC(100.0)})
-    figure = plotting.plot_phasor(fs.phasor(circuit, 100.0, area="frozen"), circuit)
+    figure = plotting.plot_phasor((fs.phasor(circuit, 100.0, area="frozen"),), circuit)
     assert figure.axes[2].texts[0].get_text() == "the source has no fundamental"
     plotting.save(figure, tmp_path / "x.png")
 

@@ -41,7 +41,10 @@ if TYPE_CHECKING:
     from fingerspice.errors import InputError as InputError
     from fingerspice.errors import SolveError as SolveError
     from fingerspice.export import export_netlist as export_netlist
+    from fingerspice.largesignal import large_signal as large_signal
     from fingerspice.phasors import phasor as phasor
+    from fingerspice.planning import Plan as Plan
+    from fingerspice.simulation import plan as plan
     from fingerspice.simulation import simulate as simulate
     from fingerspice.solution import Solution as Solution
     from fingerspice.solution import Status as Status
@@ -58,8 +61,10 @@ _HOMES = {
     "comparison": ("Comparison", "compare"),
     "errors": ("FingerspiceError", "FingerspiceWarning", "InputError", "SolveError"),
     "export": ("export_netlist",),
+    "largesignal": ("large_signal",),
     "phasors": ("phasor",),
-    "simulation": ("simulate",),
+    "planning": ("Plan",),
+    "simulation": ("plan", "simulate"),
     "solution": ("Solution", "Status"),
     "steady": ("SteadyState", "steady_state"),
 }

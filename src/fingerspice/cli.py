@@ -194,7 +194,12 @@ def ac(
     sweep: Annotated[
         str | None, typer.Option(metavar="'dec N F1 F2'", help="Sweep; the deck's .ac line by default.")
     ] = None,
-    area: Annotated[str, typer.Option(help="mean, frozen, or an area in m^2.")] = "mean",
+    area: Annotated[str, typer.Option(help="mean, frozen, coupled (large signal), or an area in m^2.")] = "mean",
+    amplitude: Annotated[
+        list[float] | None, typer.Option(help="With --area coupled: source amplitude in V; may be repeated.")
+    ] = None,
+    charge_law: ChargeLaw = None,
+    rtol: Rtol = 1e-8,
     changes: Set = None,
     source: Source = None,
     as_json: AsJson = False,
@@ -207,9 +212,11 @@ def ac(
       fingerspice ac circuits/fingerpad.cir --sweep 'dec 10 10 100k' --out out
 
       fingerspice ac circuits/fingerpad.cir --area frozen --json
+
+      fingerspice ac circuits/fingerpad.cir --area coupled --amplitude 50 --amplitude 200
     """
     from fingerspice.phasors import phasor, sweep_frequencies
-    from fingerspice.report import phasor_csv, phasor_dict, phasor_table
+    from fingerspice.report import phasor_csv, phasor_dict, phasor_tables
 
     with _warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
@@ -222,18 +229,57 @@ def ac(
             from fingerspice.circuit.circuit import AcSweep
 
             frequencies = sweep_frequencies(AcSweep("dec", 20, 10.0, 1e5))
-        result = phasor(circuit, frequencies, area=area_from_text(area))
-    files = [phasor_csv(result, out / f"{deck.stem}_ac.csv")]
+        if area == "coupled":
+            from fingerspice.largesignal import large_signal
+
+            _announce_compilation()
+            results = large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol)
+        elif amplitude:
+            raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
+        else:
+            results = (phasor(circuit, frequencies, area=area_from_text(area)),)
+    files = [phasor_csv(results, out / f"{deck.stem}_ac.csv")]
     if not no_plot:
         from fingerspice.plotting import plot_phasor, save
 
-        files.append(save(plot_phasor(result, circuit), out / f"{deck.stem}_ac.png"))
+        files.append(save(plot_phasor(results, circuit), out / f"{deck.stem}_ac.png"))
     if as_json:
-        print(json_text({**phasor_dict(result), "files": [str(f) for f in files]}))
+        sweeps = [phasor_dict(r) for r in results]
+        report = sweeps[0] if len(sweeps) == 1 else {"sweeps": sweeps}
+        print(json_text({**report, "files": [str(f) for f in files]}))
     else:
-        print(phasor_table(result))
+        print(phasor_tables(results))
         for file in files:
             print(f"wrote {file}")
+
+
+@app.command()
+def plan(
+    deck: Deck,
+    rtol: Rtol = 1e-8,
+    charge_law: ChargeLaw = None,
+    area: Annotated[str, typer.Option(help="coupled, mean, frozen, or an area in m^2.")] = "coupled",
+    charge: Annotated[bool, typer.Option(help="Whether the source's charge and current are wanted.")] = True,
+    changes: Set = None,
+    source: Source = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say which model DECK needs for the error asked for, and why, without running it.
+
+    Examples:
+
+      fingerspice plan circuits/fingerpad.cir
+
+      fingerspice plan circuits/fingerpad.cir --area frozen --rtol 1e-6 --json
+    """
+    from fingerspice.report import plan_text
+    from fingerspice.simulation import plan as make
+
+    with _warnings_as_lines():
+        circuit = read_circuit(deck, changes, source)
+        note_skin_frequency(circuit)
+        result = make(circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge)
+    print(json_text(result.to_dict()) if as_json else plan_text(result, circuit))
 
 
 @app.command()

@@ -279,45 +279,54 @@ def _about(solution: Solution) -> str:
     return text if solution.success else f"{text} · {solution.message}"
 
 
-def plot_phasor(result: PhasorSolution, circuit: Circuit) -> Figure:
-    """Gain, phase, mean force and area against frequency.
+def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Figure:
+    """Gain, phase, mean force and area against frequency, a line per amplitude.
 
     Parameters
     ----------
-    result : PhasorSolution
-        Of a sweep; a single frequency is shown as points.
+    results : sequence of PhasorSolution
+        Of sweeps; a single frequency is shown as points.
     circuit : Circuit
-        It was made from.
+        They were made from.
 
     Returns
     -------
     Figure
     """
     figure, axes = new_figure(2, 2, height=4.6, sharex=True)
-    factor, unit = engineering(_peak(result.f_el_mean[np.isfinite(result.f_el_mean)]), "N", 0.05)
-    order = np.argsort(result.frequency)
-    f = result.frequency[order]
-    for ax, values, label, color in (
-        (axes[0], np.abs(result.gain), "|gap voltage / source|", BLUE),
-        (axes[1], np.degrees(np.angle(result.gain)), "Lead of the gap voltage [°]", PURPLE),
-        (axes[2], factor * result.f_el_mean, f"Mean electroadhesive force [{unit}]", VERMILION),
-        (axes[3], 1e6 * result.area, "Ridge area [mm²]", GREEN),
-    ):
-        ax.plot(f, values[order], color=color, linewidth=1.5, marker="o" if f.size < 12 else "", markersize=3.5)
-        dress(ax, label)
-        ax.set_xscale("log")
-        ax.set_xlim(*((f[0], f[-1]) if f[0] < f[-1] else (0.1 * f[0], 10.0 * f[0])))
-        ax.ticklabel_format(axis="y", useOffset=False)
+    forces = np.concatenate([r.f_el_mean for r in results])
+    factor, unit = engineering(_peak(forces[np.isfinite(forces)]), "N", 0.05)
+    for number, result in enumerate(results):
+        order = np.argsort(result.frequency)
+        f = result.frequency[order]
+        for ax, values, label, color in (
+            (axes[0], np.abs(result.gain), "|gap voltage / source|", BLUE),
+            (axes[1], np.degrees(np.angle(result.gain)), "Lead of the gap voltage [°]", PURPLE),
+            (axes[2], factor * result.f_el_mean, f"Mean electroadhesive force [{unit}]", VERMILION),
+            (axes[3], 1e6 * result.area, "Ridge area [mm²]", GREEN),
+        ):
+            ax.plot(
+                f, values[order], color=color, linewidth=1.5, marker="o" if f.size < 12 else "", markersize=3.5,
+                linestyle=("-", "--", ":", "-.")[number % 4], label=f"{result.amplitude:.4g} V",
+            )  # fmt: skip
+            dress(ax, label)
+            ax.set_xscale("log")
+            ax.set_xlim(*((f[0], f[-1]) if f[0] < f[-1] else (0.1 * f[0], 10.0 * f[0])))
+            ax.ticklabel_format(axis="y", useOffset=False)
     for ax in (axes[0], axes[2]):
         _from_zero(ax)
-    if not np.isfinite(result.amplitude):
+    amplitude = results[0].amplitude
+    if not np.isfinite(amplitude):
         axes[2].text(0.5, 0.5, "the source has no fundamental", transform=axes[2].transAxes, ha="center", fontsize=FONT)
-    _flat(axes[3], 1e6 * result.area)
-    outside = _mark_extrapolation(axes, f, circuit)
+    if len(results) > 1:
+        axes[0].legend(fontsize=FONT, frameon=False, loc="lower right", handlelength=3.0)
+    _flat(axes[3], 1e6 * np.concatenate([r.area for r in results]))
+    outside = _mark_extrapolation(axes, np.sort(results[0].frequency), circuit)
     for ax in axes[2:]:
         ax.set_xlabel("Frequency [Hz]", fontsize=FONT)
-    drive = f"{result.amplitude:.4g} V" if np.isfinite(result.amplitude) else "no fundamental"
-    caption(figure, " · ".join(p for p in (circuit.title, f"phasor, source amplitude {drive}", outside) if p))
+    drive = f"{amplitude:.4g} V" if np.isfinite(amplitude) else "no fundamental"
+    how = f"source amplitude {drive}" if len(results) == 1 else "several source amplitudes"
+    caption(figure, " · ".join(p for p in (circuit.title, how, outside) if p))
     return figure
 
 

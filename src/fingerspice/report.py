@@ -13,8 +13,10 @@ from fingerspice.files import write_aside
 from fingerspice.units import format_si
 
 if TYPE_CHECKING:
+    from fingerspice.circuit.circuit import Circuit
     from fingerspice.comparison import Comparison
     from fingerspice.phasors import PhasorSolution
+    from fingerspice.planning import Plan
     from fingerspice.solution import Solution
 
 
@@ -94,6 +96,15 @@ def _scene(solution: Solution) -> str:
     )
 
 
+def plan_text(plan: Plan, circuit: Circuit) -> str:
+    """A plan in words."""
+    rates = ", ".join(f"{r:.4g}" for r in plan.rates) or "none"
+    lines = [circuit.title, "", f"model: {plan.tier}", *(f"  because {r}" for r in plan.reasons)]
+    lines.append(f"rates of the stack, area frozen: {rates} 1/s ({'' if plan.stiff else 'not '}stiff for this source)")
+    lines.append(f"the area moves the leaks by at most {100.0 * plan.sensitivity:.3g} %")
+    return "\n".join(lines)
+
+
 def comparison_table(comparison: Comparison) -> str:
     """A comparison as a table, with what it says in words."""
     names = {
@@ -136,6 +147,11 @@ def phasor_dict(result: PhasorSolution) -> dict[str, Any]:
     }
 
 
+def phasor_tables(results: Sequence[PhasorSolution]) -> str:
+    """Sweeps at several amplitudes as tables."""
+    return "\n\n".join(phasor_table(r) for r in results)
+
+
 def phasor_table(result: PhasorSolution, most: int = 40) -> str:
     """A sweep as a table, thinned to about `most` rows."""
     data = phasor_dict(result)
@@ -155,16 +171,19 @@ def phasor_table(result: PhasorSolution, most: int = 40) -> str:
     return f"source amplitude {format_si(result.amplitude, 'V')}\n" + _aligned(rows, head)
 
 
-def phasor_csv(result: PhasorSolution, path: Path) -> Path:
-    """Write a sweep as CSV."""
-    data = phasor_dict(result)
+def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:
+    """Write sweeps as CSV, one after the other where there are several amplitudes."""
     columns = ("frequency", "gain", "phase_deg", "u_gap", "area", "f_el_mean")
     units = ("Hz", "1", "deg", "V", "m^2", "N")
 
     def write(target: Path) -> None:
         with target.open("w", newline="") as stream:
             writer = csv.writer(stream)
-            writer.writerow(f"{c} [{u}]" for c, u in zip(columns, units, strict=True))
-            writer.writerows(zip(*(map(repr, data[c]) for c in columns), strict=True))
+            head = [f"{c} [{u}]" for c, u in zip(columns, units, strict=True)]
+            writer.writerow([*head, "amplitude [V]"])
+            for result in results:
+                data = phasor_dict(result)
+                for row in zip(*(data[c] for c in columns), strict=True):
+                    writer.writerow([*map(repr, row), repr(result.amplitude)])
 
     return write_aside(path, write)

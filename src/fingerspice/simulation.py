@@ -17,7 +17,7 @@ from fingerspice.errors import FingerspiceWarning, InputError, SolveError
 from fingerspice.marching import solve as solve_marching
 from fingerspice.numerics.tableaus import TABLEAUS
 from fingerspice.periodic import close_period
-from fingerspice.plan import Plan, make_plan
+from fingerspice.planning import Plan, make_plan
 from fingerspice.problem import Problem, prepare
 from fingerspice.record import Record
 from fingerspice.runs import Progress, Run
@@ -114,6 +114,31 @@ def simulate(
     return solution
 
 
+def plan(
+    circuit: Circuit,
+    *,
+    t_stop: float | None = None,
+    charge_law: str | None = None,
+    area: str | float = "coupled",
+    rtol: float = 1e-8,
+    tier: str = "auto",
+    charge: bool = True,
+) -> Plan:
+    """Which model a run would take, and why; arguments as in `simulate`.
+
+    Raises
+    ------
+    InputError
+        For a request that cannot be run.
+    """
+    if t_stop is None and circuit.tran is None:
+        t_stop = 1.0
+    problem = prepare(
+        circuit, t_stop=t_stop, t_eval=None, charge_law=charge_law, area=area, start="deck", charge=charge
+    )  # fmt: skip
+    return make_plan(problem, rtol, tier)
+
+
 def run_problem(
     problem: Problem,
     t_eval: FloatArray | None = None,
@@ -136,7 +161,7 @@ def run_problem(
     if plan.tier == "algebraic":
         run, name = solve_algebraic(problem, run_at, left), plan.tier
     elif plan.tier == "linear":
-        run, name = solve_linear(problem, run_at, left, plan.area, plan.sensitivity), plan.tier
+        run, name = solve_linear(problem, run_at, left, plan.area, plan.error_bound), plan.tier
     else:
         run, name = _run(problem, method, rtol, run_at, left, progress)
     if run.status is Status.SUCCESS and run.excess(rtol) > 1.0:

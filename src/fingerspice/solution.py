@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.circuit.waveforms import Fundamental
-    from fingerspice.plan import Plan
+    from fingerspice.planning import Plan
 
 FloatArray = NDArray[np.float64]
 # Dimensions, values, attributes: what both xarray and NetCDF take.

@@ -136,10 +136,7 @@ def converge(
         r[GUESS, i] = r[U, i]
     slow = False
     for iteration in range(2, 41):
-        if slow:
-            moved_by = _mix(pull, used, pull_before, left_before)
-        else:
-            moved_by = _plain(pull, used, pull_before, left_before)
+        step = _mix(pull, used, pull_before, left_before) if slow else _plain(pull, used, pull_before, left_before)
         _respond(used, phi, base, w)
         if not evaluate(
             mobile, k_gap, area0, q0, gap, push, turn, powers, slopes, lo, scale, curve, sign, w, pull, r
@@ -150,9 +147,9 @@ def converge(
         left = _distance(pull, used)
         if not left < math.inf:
             return iteration, False
-        if change * left <= tol * moved_by:
+        if change * left <= tol * step:
             return iteration, True
-        slow = left > 0.15 * moved_by
+        slow = left > 0.15 * step
     return 40, False
 
 

@@ -34,7 +34,9 @@ class Plan:
     stiff : bool
         Whether an explicit method would be held back by stability.
     sensitivity : float
-        Largest relative change of the leak rates that the area causes over the run; the error of a `linear` tier.
+        Largest relative change of the leak rates that the area causes over the run.
+    error_bound : float
+        What taking one area costs, relative to the peaks; 0 in a tier that does not.
     area : float
         Area of the `linear` tier, m^2.
     """
@@ -45,6 +47,7 @@ class Plan:
     rates: tuple[float, ...]
     stiff: bool
     sensitivity: float
+    error_bound: float
     area: float
 
     def to_dict(self) -> dict[str, object]:
@@ -103,7 +106,7 @@ def _choose(problem: Problem, rtol: float, tier: str, start: str) -> Plan:
             f"stiff: the fastest rate {fastest:.3g} 1/s against {1.0 / shortest:.3g} 1/s of the source",
         )
     needed = sensitivity if chosen == "linear" and model.coupled and np.any(model.rate0 > 0.0) else 0.0
-    return Plan(chosen, reasons, start, tuple(sorted(map(float, rates))), stiff, needed, area)
+    return Plan(chosen, reasons, start, tuple(sorted(map(float, rates))), stiff, sensitivity, needed, area)
 
 
 def _lightest(problem: Problem, rtol: float, leaking: list[str], sensitivity: float) -> tuple[str, tuple[str, ...]]:

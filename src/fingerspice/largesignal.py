@@ -1,0 +1,96 @@
+"""Response to sines of given amplitude, the area coupled at every instant: a phasor's figures without its mean area."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.statespace import build_stack
+from fingerspice.circuit.waveforms import Sine, Waveform, require
+from fingerspice.errors import InputError
+from fingerspice.numerics.cubics import fundamental, mean
+from fingerspice.phasors import PhasorSolution
+from fingerspice.steady import steady_state
+
+FloatArray = NDArray[np.float64]
+# Outputs in a period: cubics through them are good to 1e-9 of a sine.
+POINTS = 400
+
+
+def large_signal(
+    circuit: Circuit,
+    frequency: ArrayLike,
+    amplitude: ArrayLike | None = None,
+    *,
+    charge_law: str | None = None,
+    rtol: float = 1e-8,
+) -> tuple[PhasorSolution, ...]:
+    """Periodic states under sines, by frequency and amplitude; SKIN evaluated at each frequency.
+
+    Parameters
+    ----------
+    circuit : Circuit
+        With a GAP and one source.
+    frequency : array_like
+        Hz, positive.
+    amplitude : array_like, optional
+        V, positive; the fundamental's of the circuit's own source by default.
+    charge_law, rtol
+        As in `simulate`.
+
+    Returns
+    -------
+    tuple of PhasorSolution
+        One per amplitude. Gains are those of the fundamental; area and force are means over the period.
+
+    Raises
+    ------
+    InputError
+        For a circuit without GAP or with several sources, or frequencies or amplitudes that are not positive.
+    SolveError
+        Where there is no periodic state.
+    """
+    stack = build_stack(circuit)
+    if stack.gap is None:
+        raise InputError("a large-signal sweep needs a GAP; this circuit has none")
+    if len(stack.sources) != 1:
+        names = ", ".join(e.name for e, _ in stack.sources)
+        raise InputError(f"a large-signal sweep drives one source, and this circuit has {names}")
+    own = stack.waveform.fundamental
+    if amplitude is None:
+        if own is None:
+            raise InputError("the source has no fundamental to take the amplitude of: give the amplitudes in V")
+        amplitude = own.amplitude
+    f = np.atleast_1d(np.asarray(frequency, float))
+    for what, values, unit in (("frequency", f, "Hz"), ("amplitude", np.atleast_1d(amplitude), "V")):
+        good = bool(np.all(np.isfinite(values) & (np.asarray(values) > 0.0)))
+        require(good, what, f"{values} {unit}", "positive numbers")
+    return tuple(_sweep(circuit, f, float(a), charge_law, rtol) for a in np.atleast_1d(amplitude))
+
+
+def _sweep(
+    circuit: Circuit, frequency: FloatArray, amplitude: float, charge_law: str | None, rtol: float
+) -> PhasorSolution:
+    (source, sign), *_ = build_stack(circuit).sources
+    skins = [e.name for e in circuit.by_device("SKIN")]
+    gains, areas, forces = [], [], []
+    for f in frequency:
+        changes: dict[str, float | Waveform] = {f"{name}.f": float(f) for name in skins}
+        changes[source.name] = Sine(amplitude, float(f))
+        state = steady_state(
+            circuit.replace(changes), charge_law=charge_law, rtol=rtol, points=POINTS, charge=False
+        )  # fmt: skip
+        s = state.solution
+        # The start of the period is a multiple of it: phases are those of the source.
+        t = s.t - s.t[0]
+        gains.append([fundamental(t, s.u_layer[:, i], float(f)) * sign / amplitude for i in range(len(s.layers))])
+        areas.append(mean(t, s.area))
+        assert s.f_el is not None
+        forces.append(mean(t, s.f_el))
+    gain = np.array(gains, np.complex128)
+    gap = build_stack(circuit).gap
+    assert gap is not None
+    return PhasorSolution(
+        frequency, gain[:, gap], gain, gain[:, gap] * amplitude, np.array(areas), np.array(forces), amplitude, s.layers
+    )
