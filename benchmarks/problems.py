@@ -271,7 +271,7 @@ def _scene(kind: str, frequency: float, law: str = "local") -> Problem:
         ngspice=_square_text(frequency) if square else f"SIN(0 {AMPLITUDE!r} {frequency!r})",
         skin_frequency=frequency,
         period=1.0 / frequency,
-        periods=20 if frequency < 1e3 else 100,
+        periods=200 if frequency < 1e3 else 500,
         law=law,
         # After a jump the gap holds what it was charged to, and more.
         reach=1.3 * AMPLITUDE if square else AMPLITUDE,
