@@ -31,7 +31,7 @@ from fingerspice.solution import ErrorEstimate, State, Status
 # The largest error between nodes may stand beside the two points where it is looked for, and signs may cancel there.
 SAFETY = 2.5
 # The error allowed in a step, over the one asked for: the force doubles it, and steps add up.
-LOCAL_SHARE = 0.1
+LOCAL_SHARE = 0.15
 # Steps per shortest time scale of the source: the points of a step must not alias it.
 LONGEST_STEP = 0.6
 

@@ -341,7 +341,7 @@ def march(
                     r[GUESS, i] = control[U_GAP]
             passes, closed = converge(
                 mobile, coupled, k_gap, area0, q0[level], gain, gap, push, turn, powers, slopes, lo, scale, curve, sign,
-                decay, phi, w0, 0.1 * tol, base, w, pull, used, pull_before, left_before, r,
+                decay, phi, w0, 0.3 * tol, base, w, pull, used, pull_before, left_before, r,
             )  # fmt: skip
             counters[NFEV] += passes * NODES
             wrong = first_wrong(u_rows, sign) if coupled else 0
@@ -364,7 +364,7 @@ def march(
                 proposed = max(h * min(6.0, max(0.5, factor)), wanted if h < wanted else 0.0)
                 if control[TOO_LONG] > 0.0:
                     proposed = min(proposed, 0.93 * control[TOO_LONG])
-                    control[TOO_LONG] *= 1.1
+                    control[TOO_LONG] *= 1.03
                 if fresh and h >= wanted:
                     control[H_AFTER_EDGE] = h * min(1.0, factor)
                 fresh = False
