@@ -167,7 +167,8 @@ def test_ac_sweeps_the_decks_line_or_the_one_given(command: Command) -> None:
     assert set(tree(Path())) == {"pad.cir", "pad_ac.csv", "pad_ac.png"}
     with Path("pad_ac.csv").open(newline="") as stream:
         head, *body = csv.reader(stream)
-    assert head == ["frequency [Hz]", "gain [1]", "phase_deg [deg]", "u_gap [V]", "area [m^2]", "f_el_mean [N]"]
+    assert head[:5] == ["frequency [Hz]", "gain [1]", "phase_deg [deg]", "u_gap [V]", "area [m^2]"]
+    assert head[5:] == ["f_el_mean [N]", "amplitude [V]"]
     table = np.array(body, float)
     np.testing.assert_allclose(table[:, 0], 10.0 ** np.arange(1.0, 3.01, 0.5), rtol=1e-12)
     expected = fs.phasor(fs.read_netlist("pad.cir"), table[:, 0])
@@ -213,3 +214,28 @@ def test_help_of_every_command_shows_an_example(command: Command, name: str, fla
 
 def test_version_is_the_packages(command: Command) -> None:
     assert command("--version") == Result(0, f"fingerspice {fs.__version__}\n", "")
+
+
+def test_ac_with_the_area_coupled_sweeps_amplitudes_too(command: Command) -> None:
+    Path("pad.cir").write_text(edited())
+    result = command(
+        "ac", "pad.cir", "--area", "coupled", "--sweep", "LIN 2 100 5000", "--amplitude", "1", "--amplitude", "200",
+        "--json",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    low, high = figures(result)["sweeps"]
+    assert (low["amplitude"], high["amplitude"]) == (1.0, 200.0)
+    # A small signal has the frozen area's gain; a large one its mean force, less than the phasor's by the ripple.
+    frozen = fs.phasor(fs.read_netlist("pad.cir"), [100.0, 5000.0], area="frozen")
+    np.testing.assert_allclose(low["gain"], np.abs(frozen.gain), rtol=1e-3)
+    np.testing.assert_allclose(high["f_el_mean"], [0.1090, 0.1833], rtol=1e-3)
+    assert set(tree(Path())) == {"pad.cir", "pad_ac.csv", "pad_ac.png"}
+
+
+def test_plan_says_which_model_and_why(command: Command) -> None:
+    Path("pad.cir").write_text(edited())
+    assert "model: coupled" in command("plan", "pad.cir").out
+    frozen = figures(command("plan", "pad.cir", "--area", "frozen", "--json"))
+    assert frozen["tier"] == "linear"
+    assert frozen["reasons"]
+    assert set(tree(Path())) == {"pad.cir"}

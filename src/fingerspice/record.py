@@ -55,6 +55,11 @@ class Record:
     current: FloatArray | None
     charge_offset: float = 0.0
 
+    def __post_init__(self) -> None:
+        for array in (self.t, self.left, self.live, self.z, self.current):
+            if array is not None:
+                array.flags.writeable = False
+
     def _sided(self, waveform: Waveform) -> FloatArray:
         out = np.array(waveform.value(self.t), float)
         if self.left.any():

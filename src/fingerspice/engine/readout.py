@@ -209,10 +209,10 @@ def _clenshaw_block(series: FloatArray, x: FloatArray, out: FloatArray) -> None:
 
 
 @jit_rows
-def _places(t_out: FloatArray, t: float, scale: float, top: float, x: FloatArray) -> None:
-    """BLOCK output times as places in [-1, top] of a step."""
+def _place(t: float, scale: float, top: float, x: FloatArray) -> None:
+    """BLOCK output times in place as places in [-1, top] of a step; always all of them, so that all round alike."""
     for i in range(BLOCK):
-        x[i] = min(max((t_out[i] - t) * scale - 1.0, -1.0), top)
+        x[i] = min(max((x[i] - t) * scale - 1.0, -1.0), top)
 
 
 @jit
@@ -224,22 +224,21 @@ def write_outputs(
 
     Returns the number of the first output that is left.
     """
-    scale = 2.0 / h
-    top = 2.0 * reached - 1.0
     while first < t_out.size:
         count = 0
         if first + BLOCK <= t_out.size and t_out[first + BLOCK - 1] < t_new:
             count = BLOCK
-            _places(t_out[first:], t, scale, top, x)
         else:
             while count < BLOCK and first + count < t_out.size:
                 time = t_out[first + count]
                 if time > t_new or (time == t_new and not left[first + count]):
                     break
-                x[count] = min(max((time - t) * scale - 1.0, -1.0), top)
                 count += 1
         if count == 0:
             break
+        for i in range(count):
+            x[i] = t_out[first + i]
+        _place(t, 2.0 / h, 2.0 * reached - 1.0, x)
         for column in range(out.shape[0]):
             _clenshaw_block(series[column], x, values)
             for i in range(count):

@@ -1,0 +1,340 @@
+"""Tiers without steps, linear and algebraic, against closed forms and the independent reference."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+
+import analytic as ref
+import fingerspice as fs
+from fingerspice import direct
+from scenes import deck, table1
+
+AREA = 34.9715871843e-6
+F = 100.0
+every_law = pytest.mark.parametrize("law", ["local", "mobile"])
+
+
+def linear(source: fs.Waveform | str, t: np.ndarray, stop: float, f: float = F, **options: Any) -> fs.Solution:
+    circuit = table1(source, f) if isinstance(source, str) else table1(f=f).replace({"Vdrive": source})
+    solution = fs.simulate(circuit, **({"t_eval": t, "t_stop": stop, "area": AREA} | options))
+    assert (solution.plan.tier, solution.method, solution.nfev) == ("linear", "linear", 0)
+    assert solution.success
+    return solution
+
+
+# Closed forms -----------------------------------------------------------------------------------------------
+
+
+@every_law
+@pytest.mark.parametrize("f", [10.0, 100.0, 5e3, 1e5])
+@pytest.mark.parametrize("phase", [0.0, 1.1])
+def test_a_sine_from_rest_is_its_phasor_and_what_decays(f: float, phase: float, law: str) -> None:
+    t = np.linspace(0.0, 2.5 / f, 67)
+    expected = ref.sine_frozen_from_rest(f, 200.0, AREA, t, ref.table1_layers(f), phase=phase)
+    source = fs.Sine(200.0, f, phase_deg=math.degrees(phase))
+    solution = linear(source, t, 2.5 / f, f, charge_law=law)
+    assert np.abs(solution.u_layer - expected).max() <= 1e-12 * 200.0
+    assert solution.error.u_gap <= 1e-12 * 200.0
+
+
+@pytest.mark.parametrize("f", [10.0, 100.0, 5e3, 1e5])
+def test_a_sine_settles_at_equation_11(f: float) -> None:
+    # Whole periods of the settled state: 45 time constants of the slowest mode, 1.1 kHz at least.
+    first = math.ceil(0.05 * f)
+    t = (first + np.linspace(0.0, 1.0, 41)) / f
+    solution = linear(f"SIN(0 200 {f!r})", t, (first + 1.0) / f, f)
+    expected = ref.periodic_sine_frozen(f, 200.0, AREA).u(within_a_period(t, f))
+    assert np.abs(solution.u_layer - expected).max() <= (1e-12 + rounded_phase(t, f)) * 200.0
+
+
+def within_a_period(t: np.ndarray, f: float) -> np.ndarray:
+    """Times since the last whole period, without the rounding of a long phase."""
+    return np.array([float((Fraction(float(x)) * Fraction(f)) % 1) / f for x in t])
+
+
+def rounded_phase(t: np.ndarray, f: float) -> float:
+    """Radians that one rounding of the phase f t is worth."""
+    return float(2.0 * math.pi * np.spacing(f * t.max()))
+
+
+@every_law
+def test_the_periodic_start_is_equation_11_at_once(law: str) -> None:
+    t = np.linspace(0.0, 0.01, 41)
+    solution = linear("SIN(0 200 100)", t, 0.01, start="periodic", rtol=1e-12, charge_law=law)
+    expected = ref.periodic_sine_frozen(F, 200.0, AREA).u(t)
+    assert np.abs(solution.u_layer - expected).max() <= 1e-12 * 200.0
+
+
+@every_law
+@pytest.mark.parametrize(("f", "duty"), [(100.0, 0.5), (5000.0, 0.3)])
+def test_a_square_is_its_matrix_exponential_on_both_sides_of_every_jump(f: float, duty: float, law: str) -> None:
+    edges, levels = [0.0], []
+    for k in range(4):
+        edges += [(k + duty) / f, (k + 1.0) / f]
+        levels += [200.0, -200.0]
+    solution = fs.simulate(table1(f"SQUARE(200 {f!r} {duty!r})", f), t_stop=4.0 / f, area=AREA, charge_law=law)
+    assert solution.method == "linear"
+    layers = ref.table1_layers(f)
+    jump = np.flatnonzero(np.diff(solution.t) == 0.0)
+    assert jump.size == 8
+    np.testing.assert_allclose(solution.t[jump], edges[1:], rtol=1e-14)
+    # Levels as they are just before, and just after, each edge.
+    before = [
+        ref.piecewise_constant_frozen(edges[: i + 2], levels[: i + 1], [edges[i + 1]], AREA, layers)[0]
+        for i in range(8)
+    ]
+    divider = 1.0 / np.array([x.c for x in layers])
+    divider /= divider.sum()
+    assert np.abs(solution.u_layer[jump] - before).max() <= 1e-12 * 200.0
+    change = np.array([-2.0 * level for level in levels])
+    assert np.abs(solution.u_layer[jump + 1] - before - change[:, None] * divider).max() <= 1e-12 * 200.0
+    inside = np.setdiff1d(np.arange(0, solution.t.size, 97), [*jump, *(jump + 1)])
+    expected = ref.piecewise_constant_frozen(edges, levels, solution.t[inside], AREA, layers)
+    assert np.abs(solution.u_layer[inside] - expected).max() <= 1e-12 * 200.0
+
+
+def test_a_square_settles_at_its_periodic_matrix_exponential() -> None:
+    phase = (np.arange(40) + 0.31) / 40 * 0.01
+    solution = linear("SQUARE(200 100 0.3)", 0.05 + phase, 0.06)
+    expected = ref.square_frozen(F, 200.0, AREA, phase, duty=0.3)
+    assert np.abs(solution.u_layer - expected).max() <= 1e-12 * 200.0
+
+
+# The independent reference ----------------------------------------------------------------------------------
+
+
+def smooth(stop: float, u: Callable[[np.ndarray], np.ndarray], *cuts: float) -> list[tuple[Any, ...]]:
+    edges = [0.0, *cuts, stop]
+    return [(a, b, u) for a, b in itertools.pairwise(edges)]
+
+
+def chirp(t: np.ndarray) -> np.ndarray:
+    return 150.0 * np.sin(2.0 * math.pi * (50.0 + 0.5 * 1950.0 / 0.02 * t) * t)
+
+
+def envelope(t: np.ndarray) -> np.ndarray:
+    return 120.0 * (1.0 + 0.8 * np.sin(200.0 * math.pi * t)) / 1.8 * np.sin(2000.0 * math.pi * t)
+
+
+def rise(t: np.ndarray) -> np.ndarray:
+    up = -np.expm1(-np.maximum(t - 1e-3, 0.0) / 4e-4)
+    down = -np.expm1(-np.maximum(t - 6e-3, 0.0) / 3e-3)
+    return 10.0 + 140.0 * (up - down)
+
+
+def bell(t: np.ndarray) -> np.ndarray:
+    return 100.0 / (1.0 + (np.asarray(t) - 8e-3) ** 2 / 1e-6) + 20.0 * np.cos(900.0 * np.asarray(t))
+
+
+POINTS = [(0.0, 20.0), (2e-3, 150.0), (2e-3, -120.0), (5e-3, -40.0), (7e-3, 90.0), (7.3e-3, -60.0), (15e-3, -60.0)]
+SCENES = {
+    "chirp": (fs.Chirp(150.0, 50.0, 2000.0, 0.02), smooth(0.02, chirp), 0.02),
+    "AM": (fs.AM(120.0, 1000.0, 100.0, depth=0.8), smooth(0.012, envelope), 0.012),
+    "Exp": (fs.Exp(10.0, 150.0, 1e-3, 4e-4, 6e-3, 3e-3), smooth(0.015, rise, 1e-3, 6e-3), 0.015),
+    "PWL": (fs.PWL(*zip(*POINTS, strict=True)), ref.pwl_segments(POINTS), 0.015),
+    "function": (fs.Function(bell), smooth(0.015, bell), 0.015),
+    "sum": (fs.Sine(80.0, 300.0) + fs.Square(40.0, 100.0), None, 0.012),
+}
+_STEPS = ref.square_segments(40.0, 100.0, 2)
+SCENES["sum"] = (
+    SCENES["sum"][0],
+    [(a, min(b, 0.012), lambda t, x=x: 80.0 * np.sin(600.0 * math.pi * np.asarray(t)) + x(t)) for a, b, x, _ in _STEPS][
+        :3
+    ],
+    0.012,
+)
+
+
+@every_law
+@pytest.mark.parametrize("name", SCENES)
+def test_any_source_gives_the_reference_s_voltages_charge_and_current(name: str, law: str) -> None:
+    source, segments, stop = SCENES[name]
+    t = np.sort(np.append(np.random.default_rng(2).uniform(0.0, stop, 80), [0.0, 0.999 * stop]))
+    expected = ref.transient(segments, t, freq=F, law=law, area_mode=AREA)
+    solution = linear(source, t, stop, charge_law=law)
+    peak = np.abs(expected.u).sum(axis=1).max()
+    assert np.abs(solution.u_layer - expected.u).max() <= 1e-11 * peak
+    assert np.abs(solution.q_source - expected.q).max() <= 1e-11 * np.abs(expected.q).max()
+    assert np.abs(solution.f_el - expected.force).max() <= 1e-11 * expected.force.max()
+    if name in ("chirp", "AM", "Exp", "function"):
+        slope = [(segments[0][2](x + 1e-7) - segments[0][2](x - 1e-7)) / 2e-7 for x in t[1:]]
+        current = np.array([expected.current(float(x), float(s)) for x, s in zip(t[1:], slope, strict=True)])
+        assert np.abs(solution.i_source[1:] - current).max() <= 1e-6 * np.abs(current).max()
+
+
+# Charge -----------------------------------------------------------------------------------------------------
+
+
+@every_law
+@pytest.mark.parametrize("r_coat", ["0.2meg", "1", "inf"])
+@pytest.mark.parametrize("name", ["chirp", "AM", "Exp"])
+def test_the_charge_is_what_every_layer_stores_and_leaks(name: str, r_coat: str, law: str) -> None:
+    source, segments, stop = SCENES[name]
+    x, w = np.polynomial.legendre.leggauss(20)
+    # Finer and finer towards the start of a segment, where fast modes are.
+    graded = np.unique(np.concatenate([[0.0], np.geomspace(1e-9, 0.02, 40), np.linspace(0.02, 1.0, 41)]))
+    cuts = np.concatenate([a + (b - a) * graded[:-1] for a, b, _ in segments] + [[stop]])
+    half, middle = 0.5 * np.diff(cuts)[:, None], 0.5 * (cuts[1:] + cuts[:-1])[:, None]
+    times = (middle + half * x).ravel()
+    circuit = table1(coat={"r": r_coat}).replace({"Vdrive": source})
+    given = {"t_stop": stop, "area": AREA, "charge_law": law}
+    inside = fs.simulate(circuit, t_eval=times, charge=False, **given).u_layer.reshape(half.size, x.size, 3)
+    ends = fs.simulate(circuit, t_eval=cuts, **given)
+    plain = ref.table1_layers(F)
+    layers = (ref.Layer(plain[0].c, r_total=float(r_coat.replace("meg", "e6"))), *plain[1:])
+    for i, layer in enumerate(layers):
+        if layer.r_total < 1e3:
+            # Through a near short circuit the leak is a small difference: its charge comes from the others.
+            continue
+        conductance = 1.0 / layer.r_total + AREA / layer.r_area
+        leaked = conductance * np.cumsum((half * w * inside[:, :, i]).sum(axis=1))
+        q = AREA * layer.c * ends.u_layer[1:, i] + leaked
+        assert np.abs(ends.q_source[1:] - q).max() <= 1e-12 * np.abs(q).max()
+
+
+# Samples ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def held(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Lengths of the inputs given to the hold recursion."""
+    calls: list[int] = []
+    recursion = direct.hold.first_order_hold
+
+    def counted(u: Any, *arguments: Any, **options: Any) -> Any:
+        calls.append(len(u))
+        return recursion(u, *arguments, **options)
+
+    monkeypatch.setattr(direct.hold, "first_order_hold", counted)
+    return calls
+
+
+@every_law
+@pytest.mark.parametrize("rate", [1e4, 48e3, 1e6])
+def test_samples_at_their_own_times_are_the_closed_form_by_a_recursion(rate: float, law: str, held: list[int]) -> None:
+    values = np.random.default_rng(8).normal(0.0, 60.0, 400)
+    stop = 399 / rate
+    t = np.arange(400) / rate
+    source = fs.Samples(values, rate)
+    quick = linear(source, t, stop, charge=False, charge_law=law)
+    assert held == [400, 400]
+    slow = linear(source, t, stop, charge_law=law)
+    assert held == [400, 400]
+    scale = np.abs(values).max()
+    assert np.abs(quick.u_layer - slow.u_layer).max() <= 1e-12 * scale
+    segments = ref.pwl_segments([*zip(t.tolist(), values.tolist(), strict=True)])
+    expected = ref.transient(segments, t[:-1], freq=F, law=law, area_mode=AREA)
+    assert np.abs(quick.u_layer[:-1] - expected.u).max() <= 1e-12 * scale
+    assert np.abs(quick.u_layer[-1] - expected.at([stop], "left").u).max() <= 1e-12 * scale
+    for name in ("u_source", "f_el", "area"):
+        np.testing.assert_allclose(getattr(quick, name), getattr(slow, name), rtol=0, atol=1e-11 * scale)
+    later = linear(source, np.array([1.1 * stop]), 1.1 * stop, charge=False, charge_law=law, start=quick)
+    whole = linear(source, np.array([1.1 * stop]), 1.1 * stop, charge=False, charge_law=law)
+    assert np.abs(later.u_layer - whole.u_layer).max() <= 1e-12 * scale
+
+
+@pytest.mark.parametrize("shift", [1e-9, 4e-7, 1e-5, 0.3])
+def test_samples_at_other_times_are_taken_there(shift: float) -> None:
+    values = np.random.default_rng(8).normal(0.0, 60.0, 400)
+    t = np.arange(400) / 48e3
+    t[1:-1] += shift / 48e3
+    source = fs.Samples(values, 48e3)
+    quick, slow = (linear(source, t, 399 / 48e3, charge=x) for x in (False, True))
+    assert np.abs(quick.u_layer - slow.u_layer).max() <= quick.error.u_gap + slow.error.u_gap + 1e-12 * 60.0
+
+
+@pytest.mark.parametrize("keep", [slice(0, 200), slice(1, None), slice(0, None, 2)])
+def test_some_of_the_samples_times_are_as_good_as_all(keep: slice) -> None:
+    values = np.random.default_rng(8).normal(0.0, 60.0, 401)
+    t = np.arange(401) / 48e3
+    source = fs.Samples(values, 48e3)
+    whole = linear(source, t, 400 / 48e3, charge=False)
+    some = linear(source, t[keep], float(t[keep][-1]), charge=False)
+    assert np.abs(some.u_layer - whole.u_layer[keep]).max() <= 1e-12 * np.abs(values).max()
+
+
+# Ends and starts --------------------------------------------------------------------------------------------
+
+DRY = (
+    "X1 in m area LAYER d=1u eps_r=4",
+    "X2 m 0 area LAYER d=3u eps_r=1",
+    "Varea area 0 40",
+    ".tran 10u 12m uic",
+)
+LEAKY = (
+    "X1 in m area LAYER d=1u eps_r=4 r=0.3meg",
+    "X2 m 0 area LAYER d=3u eps_r=1 r=1meg",
+    "Varea area 0 40",
+    ".tran 10u 12m uic",
+)
+CIRCUITS = {"algebraic": DRY, "linear": LEAKY}
+
+
+@every_law
+@pytest.mark.parametrize("tier", CIRCUITS)
+def test_a_jump_at_the_very_end_has_both_sides(tier: str, law: str) -> None:
+    circuit = deck("V1 in 0 SQUARE(10 100)", *CIRCUITS[tier])
+    ending = fs.simulate(circuit, t_stop=0.005, charge_law=law)
+    passing = fs.simulate(circuit, t_stop=0.006, charge_law=law)
+    assert ending.method == tier
+    at = np.flatnonzero(passing.t == 0.005)
+    assert at.size == 2
+    assert ending.t[-2:].tolist() == [0.005, 0.005]
+    assert ending.u_source[-2:].tolist() == [10.0, -10.0]
+    for name in ("u_layer", "q_source", "i_source"):
+        whole = getattr(passing, name)
+        got = getattr(ending, name)
+        np.testing.assert_allclose(got[-2:], whole[at], rtol=0, atol=1e-13 * np.abs(whole).max(), err_msg=name)
+    # Asked for by its time alone it is the right-hand value.
+    asked = fs.simulate(circuit, t_eval=np.array([0.002, 0.005]), charge_law=law)
+    np.testing.assert_array_equal(asked.u_layer[-1], ending.u_layer[-1])
+    assert asked.q_source[-1] == ending.q_source[-1]
+
+
+@every_law
+@pytest.mark.parametrize("tier", CIRCUITS)
+@pytest.mark.parametrize("cut", [0.0032, 0.005], ids=["between jumps", "at a jump"])
+@pytest.mark.parametrize("start", ["uncharged", "dc"])
+def test_a_run_goes_on_from_where_another_stopped(tier: str, cut: float, start: str, law: str) -> None:
+    if (tier, start) == ("algebraic", "dc"):
+        pytest.skip("two layers without a leak have no operating point")
+    circuit = deck("V1 in 0 1", *CIRCUITS[tier]).replace({"V1": fs.Square(10.0, 100.0, offset=3.0)})
+    t = np.linspace(0.0, 0.012, 121)
+    whole = fs.simulate(circuit, t_eval=t, charge_law=law, start=start)
+    first = fs.simulate(circuit, t_stop=cut, charge_law=law, start=start)
+    second = fs.simulate(circuit, t_eval=t[t >= cut], t_stop=0.012, charge_law=law, start=first)
+    assert first.method == second.method == tier
+    assert np.abs(second.u_layer - whole.u_layer[t >= cut]).max() <= 1e-12 * 13.0
+    q = np.abs(whole.q_source).max()
+    assert np.abs(second.q_source - whole.q_source[t >= cut]).max() <= 1e-12 * q
+
+
+@pytest.mark.parametrize("tier", CIRCUITS)
+def test_a_source_that_stops_being_finite_ends_the_run_there(tier: str) -> None:
+    def source(t: Any) -> Any:
+        return np.where(np.asarray(t) < 0.00412345, np.sin(2e3 * np.asarray(t)), np.nan)
+
+    circuit = deck("V1 in 0 1", *CIRCUITS[tier])
+    solution = fs.simulate(circuit, sources={"V1": source}, throw=False)
+    assert solution.method == tier
+    assert solution.status is fs.Status.SOURCE_NOT_FINITE
+    assert 0.0041 <= solution.t[-1] <= 0.0041235
+    assert solution.state.t == pytest.approx(0.00412345, abs=1e-9)
+    assert np.all(np.isfinite(solution.u_layer))
+    want = fs.simulate(circuit, sources={"V1": lambda t: np.sin(2e3 * np.asarray(t))})
+    np.testing.assert_allclose(solution.u_layer, want.u_layer[: solution.t.size], rtol=0, atol=1e-10)
+
+
+def test_a_hundred_thousand_cycles_are_as_exact_as_one() -> None:
+    f = 5000.0
+    phase = np.linspace(0.0, 1.0, 33)
+    solution = linear(f"SIN(0 200 {f!r})", (99_999.0 + phase) / f, 1e5 / f, f, charge=False)
+    expected = ref.periodic_sine_frozen(f, 200.0, AREA).u(within_a_period(solution.t, f))
+    assert np.abs(solution.u_layer - expected).max() <= (1e-12 + rounded_phase(solution.t, f)) * 200.0
