@@ -87,3 +87,13 @@ def test_the_report_needs_nothing_but_the_results(work_precision, tmp_path):
     assert "stale" not in page
     assert "| best peer over ours, times | 15 / 15 / 15 |" in page
     assert path.with_suffix(".png").stat().st_size > 0
+
+
+def test_throughput_compares_the_same_response_and_writes_nothing_when_quick(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    written = FOLDER / "results" / "throughput.json"
+    before = written.stat().st_mtime_ns if written.exists() else None
+    results = importlib.import_module("throughput").main(["--quick"])
+    assert results["samples"]["difference_over_peak"] <= 1e-12, "the filter beside ours solves the same system"
+    assert all(row["stated_error"] <= row["rtol"] for row in results["tolerances"])
+    assert (written.stat().st_mtime_ns if written.exists() else None) == before

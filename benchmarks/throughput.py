@@ -1,0 +1,180 @@
+"""How fast the tiers are where they scale: samples, run length, layers, tolerance.
+
+Run: python benchmarks/throughput.py [--quick]. Medians of 9 in one process, compile time apart; writes
+results/throughput.json. A sampled source through the linear tier is set beside scipy's lfilter on the equivalent filter
+(the same two poles), dlsim, and a plain copy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import signal
+
+import fingerspice as fs
+from fingerspice.numerics.hold import first_order_hold, hold_weights
+
+HERE = Path(__file__).resolve().parent
+DECK = HERE.parent / "circuits" / "fingerpad.cir"
+DT = 1e-5
+Report = dict[str, Any]
+
+
+def median_seconds(action: Callable[[], object], repeats: int) -> float:
+    """Median wall time of `action`, s, after one run that is not counted."""
+    action()
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        action()
+        times.append(time.perf_counter() - begin)
+    return statistics.median(times)
+
+
+def modal_gap(area: float) -> tuple[list[float], list[float], float, list[float]]:
+    """Rates, gains, direct share and weights of the gap voltage of Table 1's stack at one area (m^2)."""
+    from fingerspice.engine.system import build_system
+    from fingerspice.problem import scene_of
+
+    scene = scene_of(fs.read_netlist(DECK), "local", area, 1.0)
+    system = build_system(scene.model, 1e-13, (1.0 / area, 1.0 / area))
+    gap = scene.stack.state_order.index(scene.probe)
+    return list(system.rates[0]), list(system.gain[0]), float(scene.model.k[gap]), list(system.live[0, gap])
+
+
+def equivalent_filter(rates: list[float], gains: list[float], direct: float, weights: list[float]) -> tuple[Any, Any]:
+    """Numerator and denominator of the same first-order-hold response, for lfilter."""
+    b, a = np.array([direct]), np.array([1.0])
+    for rate, gain, weight in zip(rates, gains, weights, strict=True):
+        before, here = hold_weights(rate * DT)
+        pole = np.array([1.0, -np.exp(-rate * DT)])
+        part = weight * gain * DT * np.array([here, before])
+        b = np.polyadd(np.convolve(b, pole), np.convolve(part, a))
+        a = np.convolve(a, pole)
+    return b, a
+
+
+def samples(count: int, repeats: int) -> Report:
+    """ns per sample of the recursion, its peers and a copy, and how far the first two differ."""
+    rng = np.random.default_rng(1)
+    u = np.cumsum(rng.standard_normal(count)) / np.sqrt(count)
+    rates, gains, direct, weights = modal_gap(35e-6)
+    b, a = equivalent_filter(rates, gains, direct, weights)
+    out = np.empty_like(u)
+    rest = np.zeros(len(rates))
+    # Both from a source that was zero one sample before the first.
+    ours = first_order_hold(u, DT, rates, gains, direct, weights, rest, u_before=0.0)[0]
+    theirs = signal.lfilter(b, a, u)
+    figures = {
+        "copy": median_seconds(lambda: np.copyto(out, u), repeats),
+        "fingerspice": median_seconds(
+            lambda: first_order_hold(u, DT, rates, gains, direct, weights, rest, out=out), repeats
+        ),
+        "lfilter": median_seconds(lambda: signal.lfilter(b, a, u), repeats),
+    }
+    few = min(count, 20_000)
+    system = signal.dlti(b, a, dt=DT)
+    figures["dlsim"] = median_seconds(lambda: signal.dlsim(system, u[:few]), max(1, repeats // 3)) * count / few
+    return {
+        "samples": count,
+        "ns_per_sample": {name: 1e9 * seconds / count for name, seconds in figures.items()},
+        "ours_over_lfilter": figures["fingerspice"] / figures["lfilter"],
+        "difference_over_peak": float(np.abs(ours - theirs).max() / np.abs(theirs).max()),
+    }
+
+
+def lengths(counts: list[int], repeats: int) -> list[Report]:
+    """ns per sample of the recursion against run length."""
+    rates, gains, direct, weights = modal_gap(35e-6)
+    out = []
+    for count in counts:
+        u = np.sin(np.arange(count) * 0.01)
+        y = np.empty_like(u)
+        rest = np.zeros(len(rates))
+
+        def run(u: Any = u, y: Any = y, rest: Any = rest) -> object:
+            return first_order_hold(u, DT, rates, gains, direct, weights, rest, out=y)
+
+        seconds = median_seconds(run, repeats if count < 1e7 else 1)
+        out.append({"samples": count, "ns_per_sample": 1e9 * seconds / count})
+    return out
+
+
+def chain(layers: int) -> fs.Circuit:
+    """A gap among `layers` - 1 leaky layers, driven by a sine of 1 kHz."""
+    gap = "d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
+    lines = ["a chain", "V1 n0 0 SIN(0 200 1k)", f"Xgap n0 {'0' if layers == 1 else 'n1'} a GAP {gap}"]
+    for i in range(1, layers):
+        node = "0" if i == layers - 1 else f"n{i + 1}"
+        lines.append(f"X{i} n{i} {node} a LAYER d={1.0 + 0.1 * i!r}u eps_r=3.9 r={0.1 + 0.05 * i!r}meg")
+    return fs.parse_netlist("\n".join([*lines, ".tran 10u 20m uic", ""]))
+
+
+def layers(numbers: list[int], repeats: int) -> list[Report]:
+    """us per period against the number of layers, closed form and coupled, at 1e-6."""
+    out = []
+    for number in numbers:
+        circuit = chain(number)
+        t = np.arange(2000) * 1e-5
+
+        def run(area: str, circuit: fs.Circuit = circuit, t: Any = t) -> object:
+            return fs.simulate(circuit, t_stop=0.02, t_eval=t, rtol=1e-6, area=area, charge=False).u_gap
+
+        out.append(
+            {
+                "layers": number,
+                "linear_us_per_period": 1e6 * median_seconds(lambda run=run: run("frozen"), repeats) / 20,
+                "coupled_us_per_period": 1e6 * median_seconds(lambda run=run: run("coupled"), repeats) / 20,
+            }
+        )
+    return out
+
+
+def tolerances(exponents: range, repeats: int) -> list[Report]:
+    """us per period of Table 1's 100 Hz sine against the error asked for."""
+    circuit = fs.read_netlist(DECK)
+    t = (np.arange(10_000) + 0.5) * 1e-4
+    out = []
+    for exponent in exponents:
+        rtol = 10.0**-exponent
+
+        def run(rtol: float = rtol) -> fs.Solution:
+            return fs.simulate(circuit, t_stop=1.0, t_eval=t, rtol=rtol, charge=False)
+
+        solution = run()
+        assert solution.u_gap is not None
+        stated = solution.error.u_gap / float(np.abs(solution.u_gap).max())
+        out.append({"rtol": rtol, "stated_error": stated, "us_per_period": 1e6 * median_seconds(run, repeats) / 100})
+    return out
+
+
+def main(arguments: list[str] | None = None) -> Report:
+    """Measure, print and, unless quick, write the results."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="small sizes, one repeat, nothing written")
+    quick = parser.parse_args(arguments).quick
+    repeats = 1 if quick else 9
+    results = {
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
+        "samples": samples(20_000 if quick else 1_000_000, repeats),
+        "lengths": lengths([10**i for i in range(3, 5 if quick else 9)], repeats),
+        "layers": layers([1, 2, 8] if quick else [1, 2, 4, 8, 16, 32, 64], repeats),
+        "tolerances": tolerances(range(3, 5) if quick else range(2, 13), repeats),
+    }
+    print(json.dumps(results, indent=2))
+    if not quick:
+        (HERE / "results" / "throughput.json").write_text(json.dumps(results, indent=2) + "\n")
+    return results
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,312 @@
+"""Periodic states found directly: the state, its certificate and its stability."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import analytic as ref
+import fingerspice as fs
+from scenes import deck, table1
+
+CIRCUITS = Path(__file__).parents[1] / "circuits"
+AREA = 34.9715871843e-6
+every_law = pytest.mark.parametrize("law", ["local", "mobile"])
+
+
+def trapezoids(f: float) -> list[Any]:
+    """The shipped decks' square with edges of 1 ns, from a falling edge's end of period on."""
+    half = 0.5 / f
+    points = [(0.0, -200.0), (1e-9, 200.0), (half, 200.0), (half + 1e-9, -200.0), (2.0 * half, -200.0)]
+    return ref.pwl_segments(points)
+
+
+SHIPPED = {
+    "fingerpad.cir": (ref.sine_segments(200.0, 100.0, 0.01), 100.0),
+    "fingerpad_5khz.cir": (ref.sine_segments(200.0, 5000.0, 2e-4), 5000.0),
+    "fingerpad_square.cir": (trapezoids(100.0), 100.0),
+    "fingerpad_square_5khz.cir": (trapezoids(5000.0), 5000.0),
+}
+
+
+def outside_ramps(phase: np.ndarray, segments: list[Any]) -> np.ndarray:
+    """Which outputs are off the edges of 1 ns, on whose ramps a rounding of the time is some microvolts."""
+    edges = np.array([s[0] for s in segments] + [segments[-1][1]])
+    if len(segments) == 1:
+        return np.ones(phase.size, bool)
+    return np.abs(phase[:, None] - edges).min(axis=1) > 2e-9
+
+
+@every_law
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_shipped_decks_have_the_reference_s_periodic_state(name: str, law: str) -> None:
+    segments, f = SHIPPED[name]
+    state = fs.steady_state(fs.read_netlist(CIRCUITS / name), charge_law=law, rtol=1e-11)
+    solution = state.solution
+    assert solution.t[-1] - solution.t[0] == pytest.approx(1.0 / f, rel=1e-12)
+    phase = solution.t - solution.t[0]
+    kept = outside_ramps(phase, segments)
+    assert kept.sum() >= 195
+    want = ref.periodic_state(segments, law=law, freq=f, t_out=np.minimum(phase[kept], (1.0 - 1e-15) / f))
+    peak = np.abs(want.u_gap).max()
+    assert np.abs(solution.u_layer[kept] - want.u).max() <= 1e-10 * peak
+    assert np.abs(solution.f_el[kept] - want.force).max() <= 1e-10 * want.force.max()
+    q = solution.q_source[kept] - solution.q_source[kept][0]
+    assert np.abs(q - (want.q - want.q[0])).max() <= 1e-9 * np.abs(want.q - want.q[0]).max()
+    assert state.defect <= 1e-11 * 200.0
+    assert state.periods <= 12
+
+
+SCENES: dict[str, tuple[fs.Waveform, Any]] = {
+    "offset": (
+        fs.Sine(120.0, 300.0, offset=70.0, phase_deg=40.0),
+        ref.sine_segments(120.0, 300.0, 1 / 300.0, phase=math.radians(40.0), offset=70.0),
+    ),
+    "duty": (fs.Square(180.0, 200.0, duty=0.2), ref.square_segments(180.0, 200.0, 1, duty=0.2)),
+    "delay": (
+        fs.Sine(150.0, 200.0, delay=0.0125),
+        # From the first whole period after the delay, 15 ms: half a period into the sine.
+        ref.sine_segments(150.0, 200.0, 5e-3, phase=math.pi),
+    ),
+    "AM": (
+        fs.AM(200.0, 1000.0, 200.0, depth=0.7),
+        [(0.0, 5e-3, lambda t: 200.0 / 1.7 * (1.0 + 0.7 * np.sin(400.0 * np.pi * t)) * np.sin(2e3 * np.pi * t))],
+    ),
+    "sum": (
+        fs.Sine(150.0, 200.0) + fs.Sine(60.0, 600.0, phase_deg=90.0),
+        [(0.0, 5e-3, lambda t: 150.0 * np.sin(400.0 * np.pi * t) + 60.0 * np.cos(1200.0 * np.pi * t))],
+    ),
+    "triangle": (
+        fs.Triangle(200.0, 200.0),
+        ref.pwl_segments([(0.0, 0.0), (1.25e-3, 200.0), (3.75e-3, -200.0), (5e-3, 0.0)]),
+    ),
+    "function": (
+        fs.Function(lambda t: 150.0 * np.sin(400.0 * np.pi * t) / (1.2 + np.cos(400.0 * np.pi * t)), repeat=5e-3),
+        [(0.0, 5e-3, lambda t: 150.0 * np.sin(400.0 * np.pi * t) / (1.2 + np.cos(400.0 * np.pi * t)))],
+    ),
+}
+
+
+@every_law
+@pytest.mark.parametrize("name", SCENES)
+def test_any_periodic_source_has_the_reference_s_periodic_state(name: str, law: str) -> None:
+    waveform, segments = SCENES[name]
+    solution = fs.steady_state(table1().replace({"Vdrive": waveform}), charge_law=law, rtol=1e-11).solution
+    assert waveform.period is not None
+    assert solution.t[0] == pytest.approx(waveform.period * math.ceil(waveform.settled / waveform.period), rel=1e-12)
+    phase = solution.t - solution.t[0]
+    # Left-hand and right-hand values of a jump share a time: the reference has the right-hand ones.
+    kept = np.append(np.diff(phase) > 0.0, False)
+    kept[1:] &= np.diff(phase) > 0.0
+    want = ref.periodic_state(segments, law=law, freq=100.0, t_out=phase[kept])
+    peak = np.abs(want.u_gap).max()
+    assert np.abs(solution.u_layer[kept] - want.u).max() <= 1e-10 * peak
+    assert np.abs(solution.f_el[kept] - want.force).max() <= 1e-10 * want.force.max()
+
+
+# The certificate --------------------------------------------------------------------------------------------
+
+
+@every_law
+@pytest.mark.parametrize("name", ["offset", "duty", "AM"])
+@pytest.mark.parametrize("rtol", [1e-6, 1e-10])
+def test_another_period_by_another_method_changes_no_more_than_the_defect_says(
+    name: str, law: str, rtol: float
+) -> None:
+    waveform, _ = SCENES[name]
+    circuit = table1().replace({"Vdrive": waveform})
+    state = fs.steady_state(circuit, charge_law=law, rtol=rtol)
+    solution = state.solution
+    assert waveform.period is not None
+    stop = solution.state.t + waveform.period
+    given = {"charge_law": law, "start": solution, "t_stop": stop, "rtol": 1e-12}
+    t = solution.t[1:-1] + waveform.period
+    more = fs.simulate(circuit, method="dop853", t_eval=t[t <= stop], **given)
+    smooth = (np.diff(solution.t)[:-1] > 0.0) & (np.diff(solution.t)[1:] > 0.0)
+    allowed = 2.0 * (state.defect + solution.error.u_gap + more.error.u_gap)
+    assert np.abs(more.u_gap - solution.u_gap[1:-1])[smooth].max() <= allowed
+    assert state.defect <= rtol * 200.0
+
+
+@every_law
+@pytest.mark.parametrize("r", ["1e6", "1e9", "1e12"])
+def test_the_error_stated_holds_though_a_disturbance_would_outlast_many_periods(r: str, law: str) -> None:
+    # What a period's steps miss, a slow mode collects over as many periods as it remembers.
+    plain = ref.table1_layers(100.0)
+    layers = (*(ref.Layer(x.c, r_total=float(r)) for x in plain[:2]), plain[2])
+    state = fs.steady_state(table1(coat={"r": r}, gap={"r": r}), charge_law=law, rtol=1e-9)
+    phase = (state.solution.t - state.solution.t[0])[:-1]
+    segments = ref.sine_segments(200.0, 100.0, 0.01)
+    want = ref.periodic_state(segments, law=law, layers=layers, t_out=phase)
+    true = np.abs(state.solution.u_gap[:-1] - want.u_gap).max()
+    assert true <= state.solution.error.u_gap
+    assert true <= 1e-9 * np.abs(want.u_gap).max()
+
+
+@every_law
+@pytest.mark.parametrize("f", [10.0, 100.0, 5e3, 1e5])
+def test_a_frozen_circuit_has_the_multipliers_of_its_rates(f: float, law: str) -> None:
+    circuit = table1(f"SIN(0 200 {f!r})", f)
+    state = fs.steady_state(circuit, area=AREA, charge_law=law)
+    rates = np.array(fs.plan(circuit, area=AREA, charge_law=law).rates)
+    np.testing.assert_allclose(np.sort(state.multipliers)[::-1], np.exp(-rates / f), rtol=0, atol=1e-8)
+    assert state.stability_margin == pytest.approx(-math.expm1(-rates[0] / f), rel=1e-7)
+    phase = state.solution.t - state.solution.t[0]
+    want = ref.periodic_sine_frozen(f, 200.0, AREA).u(phase)
+    assert np.abs(state.solution.u_layer - want).max() <= 1e-12 * 200.0
+
+
+@every_law
+def test_the_multipliers_are_the_eigenvalues_of_the_map_of_one_period(law: str) -> None:
+    segments = ref.sine_segments(200.0, 1000.0, 1e-3)
+    state = fs.steady_state(table1("SIN(0 200 1k)"), charge_law=law, rtol=1e-9)
+    base = ref.periodic_state(segments, law=law, freq=100.0, t_out=[0.0])
+    moves = np.array([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0]]).T * 1e-2
+    start = base.u[0]
+    ends = []
+    for move in moves.T:
+        pair = [
+            ref.transient(segments, [], law=law, freq=100.0, start=start + s * move).steps[-1].u_end for s in (1, -1)
+        ]
+        ends.append((pair[0] - pair[1]) / 2.0)
+    slope = np.linalg.lstsq(moves, np.array(ends).T, rcond=None)[0]
+    want = np.sort(np.abs(np.linalg.eigvals(slope)))
+    np.testing.assert_allclose(np.sort(state.multipliers), want, rtol=0, atol=1e-3)
+
+
+# Starts and neighbours --------------------------------------------------------------------------------------
+
+
+@every_law
+@pytest.mark.parametrize("name", ["offset", "duty", "AM"])
+def test_a_run_started_from_the_periodic_state_is_it(name: str, law: str) -> None:
+    waveform, _ = SCENES[name]
+    circuit = table1().replace({"Vdrive": waveform})
+    assert waveform.period is not None
+    period = waveform.period
+    state = fs.steady_state(circuit, charge_law=law, rtol=1e-10)
+    t = np.linspace(0.0, 3.0 * period, 61)
+    run = fs.simulate(circuit, start="periodic", t_eval=t, t_stop=3.0 * period, charge_law=law, rtol=1e-10)
+    assert run.plan.start == "periodic"
+    peak = np.abs(run.u_gap).max()
+    first, second, third = (run.u_layer[i : i + 20] for i in (0, 20, 40))
+    inside = np.abs(np.modf(t[:20] / period / 0.1)[0] - 0.5) < 0.4
+    assert np.abs(second - first)[inside].max() <= 3e-10 * peak
+    assert np.abs(third - first)[inside].max() <= 3e-10 * peak
+    whole = fs.simulate(
+        circuit, start="periodic", t_eval=state.solution.t[:-1], t_stop=period, charge_law=law, rtol=1e-10
+    )
+    unique = np.append(np.diff(state.solution.t[:-1]) > 0.0, True)
+    unique[1:] &= np.diff(state.solution.t[:-1]) > 0.0
+    assert np.abs(whole.u_layer - state.solution.u_layer[:-1])[unique].max() <= 2e-10 * peak
+
+
+def test_a_long_run_from_rest_ends_in_the_periodic_state() -> None:
+    circuit = table1("SIN(0 200 100)")
+    state = fs.steady_state(circuit, rtol=1e-10)
+    run = fs.simulate(circuit, t_eval=0.1 + state.solution.t, t_stop=0.11, rtol=1e-10)
+    assert np.abs(run.u_layer - state.solution.u_layer).max() <= 3e-10 * 200.0
+
+
+@pytest.mark.parametrize("times", ["given", "the deck's"])
+def test_a_source_that_settles_late_starts_its_periodic_run_where_it_says(times: str) -> None:
+    # The sine is held until 12.5 ms: its periodic state exists from 15 ms on, and no output may be before it.
+    circuit = table1(tran="1m 40m uic").replace({"Vdrive": SCENES["delay"][0]})
+    if times == "given":
+        t = np.linspace(0.0, 0.04, 41)
+        try:
+            run = fs.simulate(circuit, start="periodic", t_eval=t)
+        except fs.InputError:
+            return
+    else:
+        run = fs.simulate(circuit, start="periodic")
+    assert run.t[-1] == pytest.approx(0.04, rel=1e-12), "t_stop is the time to stop at"
+    want = fs.simulate(circuit, start=fs.steady_state(circuit, rtol=1e-10).solution, t_stop=0.06, t_eval=run.t + 0.02)
+    assert np.abs(run.u_layer - want.u_layer).max() <= 1e-7 * 150.0
+
+
+@every_law
+def test_a_stack_without_leaks_is_in_its_periodic_state_from_the_start(law: str) -> None:
+    lines = ("X1 in m area LAYER d=1u eps_r=4", "X2 m 0 area LAYER d=3u eps_r=1", "Varea area 0 40")
+    state = fs.steady_state(deck("V1 in 0 SIN(3 10 500)", *lines), charge_law=law)
+    np.testing.assert_allclose(state.multipliers, 1.0, rtol=0, atol=1e-12)
+    assert state.stability_margin == pytest.approx(0.0, abs=1e-12)
+    assert state.defect <= 1e-12
+    assert state.solution.method == "algebraic"
+    share = np.array([0.25e-6, 3e-6]) / 3.25e-6
+    np.testing.assert_allclose(state.solution.u_layer, np.outer(state.solution.u_source, share), rtol=0, atol=1e-12)
+
+
+@every_law
+def test_two_layers_without_a_leak_leave_a_direction_that_nothing_decides(law: str) -> None:
+    # The charge between coating and gap stays as it was at the start: none.
+    circuit = table1("SIN(0 200 100)", coat={"r": "inf"}, gap={"r": "inf"})
+    state = fs.steady_state(circuit, charge_law=law, rtol=1e-10)
+    assert state.multipliers.max() == pytest.approx(1.0, abs=1e-3)
+    assert state.defect <= 1e-10 * 200.0
+    plain = ref.table1_layers(100.0)
+    coat, gap = state.solution.u_layer[:, 0] * plain[0].c, state.solution.u_layer[:, 1] * plain[1].c
+    assert np.abs(coat - gap).max() <= 1e-9 * np.abs(gap).max(), "the same charge on either side of the node"
+
+
+@every_law
+@pytest.mark.parametrize("layers", [1, 2, 6])
+def test_any_number_of_layers_has_a_periodic_state(layers: int, law: str) -> None:
+    rng = np.random.default_rng(layers)
+    nodes = ["in", *(f"n{i}" for i in range(layers - 1)), "0"]
+    d, eps, r = rng.uniform(1e-6, 1e-4, layers), rng.uniform(1.0, 50.0, layers), 10.0 ** rng.uniform(5.0, 7.0, layers)
+    lines = [
+        f"X{i} {nodes[i]} {nodes[i + 1]} area LAYER d={d[i]:.17g} eps_r={eps[i]:.17g} r={r[i]:.17g}"
+        for i in range(layers)
+    ]
+    state = fs.steady_state(deck("V1 in 0 SIN(0 10 500)", *lines, "Varea area 0 40"), charge_law=law)
+    assert state.multipliers.shape == (layers - 1,)
+    stack = [ref.Layer(8.854e-12 * e / x, r_total=y) for e, x, y in zip(eps, d, r, strict=True)]
+    want = ref.periodic_sine_frozen(500.0, 10.0, 40e-6, layers=stack).u(state.solution.t)
+    assert np.abs(state.solution.u_layer - want).max() <= 1e-12 * 10.0
+
+
+# What has none ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "waveform",
+    [
+        fs.DC(100.0),
+        fs.Chirp(100.0, 50.0, 500.0, 0.02),
+        fs.Exp(0.0, 100.0, 0.0, 1e-3, 5e-3, 1e-3),
+        fs.PWL((0.0, 1e-3), (0.0, 10.0)),
+        fs.Function(lambda t: 100.0 * np.sin(300.0 * np.asarray(t))),
+        fs.Sine(100.0, 100.0) + fs.Sine(50.0, 100.0 * math.sqrt(2.0)),
+        fs.Sine(100.0, 100.0, damping=3.0),
+    ],
+    ids=lambda w: type(w).__name__,
+)
+def test_a_source_without_a_period_has_no_periodic_state(waveform: fs.Waveform) -> None:
+    circuit = table1().replace({"Vdrive": waveform})
+    with pytest.raises(fs.InputError, match="the source has no period, so there is no periodic state to find"):
+        fs.steady_state(circuit)
+    with pytest.raises(fs.InputError, match="the source has no period"):
+        fs.simulate(circuit, start="periodic")
+
+
+@pytest.mark.parametrize("changes", [{"Xgap.fn": 1e-4}, {"Xgap.d": 10e-9}, {"Vdrive.amplitude": 2000.0}])
+@pytest.mark.parametrize("source", ["SIN(0 200 100)", "SQUARE(200 100)"])
+def test_past_the_fold_there_is_no_periodic_state_and_a_sentence_says_so(
+    source: str, changes: dict[str, float]
+) -> None:
+    circuit = table1(source).replace(changes)
+    with pytest.raises(fs.SolveError, match="no periodic state was reached: the mobile charge law has no solution"):
+        fs.steady_state(circuit, charge_law="mobile")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"), [({"points": 0}, "points"), ({"rtol": 0.5}, "rtol"), ({"rtol": 0.0}, "rtol")]
+)
+def test_what_cannot_be_asked_for_is_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(fs.InputError, match=message):
+        fs.steady_state(table1(), **options)
