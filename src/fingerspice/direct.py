@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fingerspice.circuit.ramps import Samples
-from fingerspice.circuit.sampling import SourceTable
+from fingerspice.circuit.sampling import SourceTable, same_time
 from fingerspice.engine.algebraic import follow, source_at
 from fingerspice.engine.model import Model
 from fingerspice.engine.system import System, build_system
@@ -54,9 +54,10 @@ def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run
         follow(model, np.repeat(u, count), np.repeat(slope, count), start.y, start.u_before, rows[done:])
         done = t_out.size
     live, z, current = from_rows(problem, rows[:done])
-    y = start.y.copy()
-    if done:
-        y[-1] = z[-1]
+    # The state is that before a jump at the end.
+    ended = np.empty((1, rows.shape[1]))
+    follow(model, np.array([u_end]), np.zeros(1), start.y, start.u_before, ended)
+    y = np.append(start.y[:-1], ended[0, -1])
     u_gap = rows[:done, 1]
     force = problem.scene.force(u_gap, rows[:done, 2])
     end = failed if failed is not None else problem.t_stop
@@ -116,21 +117,26 @@ def solve_linear(problem: Problem, t_out: FloatArray, left: BoolArray, area: flo
     w = system.project[0] @ start.y[:-1]
     wave, failed = problem.waveform, None
     z = current = None
+    z_end = float(start.y[-1])
     if _is_sample_by_sample(problem, t_out):
         live, w_end = _at_samples(problem, system, w)
         t, side = t_out, left
         u_source = wave.value(t)
     else:
         flow = _Charge(system, w, problem.t_start, start.u_before, float(start.y[-1]))
-        t, side, modes, slope, w_end, failed = _closed_form(problem, system, w, t_out, left)
+        t, side, modes, slope, at_end, failed = _closed_form(problem, system, w, t_out, left)
+        w_end = at_end[:-1]
         u_source = np.array(wave.value(t))
         u_source[side] = wave.value(t[side], "left")
         live = np.ascontiguousarray(np.outer(model.k[:-1], u_source) + system.live[0] @ modes[:, :-1].T)
         if problem.charge:
             z, current = flow.at(t, u_source, slope, modes)
+            # The state is that before a jump at the end.
+            before = np.array([float(wave.value(problem.t_stop, "left"))])
+            z_end = flow.at(np.array([problem.t_stop]), before, np.zeros(1), at_end[None, :])[0][0]
     u_gap = _probe_voltage(problem, live, u_source)
     inverse = 1.0 / areas(u_gap, problem.model.curve) if problem.model.coupled else np.full(u_gap.size, 1.0 / area)
-    y = np.append(system.live[0] @ w_end, z[-1] if z is not None and z.size else start.y[-1])
+    y = np.append(system.live[0] @ w_end, z_end)
     end, u_end = (
         (failed, start.u_before) if failed is not None else (problem.t_stop, wave.value(problem.t_stop, "left"))
     )
@@ -143,7 +149,7 @@ def solve_linear(problem: Problem, t_out: FloatArray, left: BoolArray, area: flo
 def _closed_form(
     problem: Problem, system: System, w: FloatArray, t_out: FloatArray, left: BoolArray
 ) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray, FloatArray, float | None]:
-    """Outputs reached, the modes there with the source's integral, its slope there, the modes at the end."""
+    """Outputs reached, the modes there with the source's integral last, its slope there, the modes at the end."""
     n = w.size
     # The source's integral rides along as a mode of rate zero, for the charge.
     rates, gains = np.append(system.rates[0], 0.0), np.append(system.gain[0], 1.0)
@@ -166,7 +172,7 @@ def _closed_form(
         if problem.charge:
             slope[done:] = _after(problem, table)[1]
         done = t_out.size
-    return t_out[:done], left[:done], modes[:done], slope[:done], state[:n], failed
+    return t_out[:done], left[:done], modes[:done], slope[:done], state, failed
 
 
 def _after(problem: Problem, table: SourceTable) -> tuple[FloatArray, FloatArray]:
@@ -185,8 +191,8 @@ def _is_sample_by_sample(problem: Problem, t_out: FloatArray) -> bool:
         return False
     if wave.start != problem.t_start or t_out[-1] < problem.t_stop * (1.0 - 1e-12):
         return False
-    places = (t_out - wave.start) * wave.rate
-    return bool(np.all(np.abs(places - np.arange(t_out.size)) <= 1e-6))
+    grid = wave.start + np.arange(t_out.size) / wave.rate
+    return bool(np.all(np.abs(t_out - grid) <= same_time(problem.t_stop)))
 
 
 def _at_samples(problem: Problem, system: System, w: FloatArray) -> tuple[FloatArray, FloatArray]:

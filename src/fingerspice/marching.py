@@ -56,8 +56,9 @@ def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
         if u_top > 0.0:
             assert scene.stack.contact is not None
             model = model._replace(curve=scene.stack.contact.curve(u_top))
-        reach = max(model.k_gap * scene.u_peak, 0.7 * u_top)
-        system = build_system(model, 1e-3 * 10.0**decade, area_range(model, reach))
+        contact = scene.stack.contact
+        stress = 0.0 if contact is None else float(contact.stress(1.0))
+        system = build_system(model, 1e-3 * 10.0**decade, area_range(model, max(scene.u_peak, u_top)), stress)
         n = model.gap.size
         scene.prepared[key] = Prepared(system, new_tables(n), march.new_work(n), integral_table())
     prepared: Prepared = scene.prepared[key]
@@ -101,12 +102,12 @@ class Track:
             )
         )
 
-    def row(self, segment: Segment, tau: float) -> FloatArray:
-        """A row of `write_row` from the state reached, `tau` s into a segment."""
+    def row(self, segment: Segment, tau: float, y: FloatArray) -> FloatArray:
+        """A row of `write_row` from a state, `tau` s into a segment."""
         model = self.prepared.system.model
         row = np.empty(row_width(self.problem))
         u, du = source(segment, tau)
-        write_row(model, u, du, self.y, choose_branch(model, u, self.y), model.k_gap * u, row)
+        write_row(model, u, du, y, choose_branch(model, u, y), model.k_gap * u, row)
         return row
 
     def finish(self, table: SourceTable) -> None:
@@ -117,9 +118,10 @@ class Track:
         segment, tau = after_the_end(self.problem, table)
         control = np.zeros(advance.N_CONTROL)
         control[advance.U_BEFORE] = self.control[readout.U_BEFORE]
-        # Takes the charge of a jump that stands at the end.
-        advance.enter(self.prepared.system.model, segment, tau, self.y, control)
-        live, z, current = from_rows(self.problem, self.row(segment, tau)[None, :])
+        # Takes the charge of a jump that stands at the end; the state itself stays before it.
+        y = self.y.copy()
+        advance.enter(self.prepared.system.model, segment, tau, y, control)
+        live, z, current = from_rows(self.problem, self.row(segment, tau, y)[None, :])
         n = live.shape[0]
         self.out[:n, first:] = live
         if self.pace.charge:
@@ -134,7 +136,7 @@ class Track:
         i = max(int(np.searchsorted(table.edges, self.t, side="left")) - 1, 0)
         start = float(table.edges[i])
         segment = Segment(start, float(table.edges[i + 1]) - start, table.terms[i], table.series[i])
-        row = self.row(segment, self.t - start)
+        row = self.row(segment, self.t - start, self.y)
         return row if np.all(np.isfinite(row)) else None
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import SourceTable, source_table
 from fingerspice.engine import march, shooting
+from fingerspice.engine.system import System
 from fingerspice.errors import InputError, SolveError
 from fingerspice.marching import LOCAL_SHARE, LONGEST_STEP, prepare_system
 from fingerspice.problem import Problem, state_from
@@ -29,7 +30,9 @@ class Closed:
     defect : float
         Largest change of a live voltage over a further period, V.
     map_slope : ndarray, shape (n_layer - 1, n_layer - 1)
-        Derivative of the live voltages after a period by those before it, to about 1e-3.
+        Derivative of the modes after a period by those before it, to about 1e-6.
+    memory : float
+        Error of the periodic state over that of one period: what a slow mode collects over the periods it remembers.
     periods : int
         Periods integrated.
     """
@@ -37,6 +40,7 @@ class Closed:
     problem: Problem
     defect: float
     map_slope: FloatArray
+    memory: float
     periods: int
 
 
@@ -58,39 +62,60 @@ def close_period(problem: Problem, rtol: float) -> Closed:
     if key not in scene.prepared:
         scene.prepared[key] = source_table(waveform, begin, begin + waveform.period, 1e-13, problem.step)
     before = float(waveform.value(begin, "left"))
-    x, defect, slope, counts = _close(problem, scene.prepared[key], before, rtol)
+    x, defect, slope, memory, periods = _close(problem, scene.prepared[key], before, rtol)
     moved = begin - problem.t_start
     initial = state_from(problem.model, begin, x, before, scene.charge_law)
     problem = dataclasses.replace(
         problem, t_start=begin, t_stop=problem.t_stop + moved, first=problem.first + moved, initial=initial
     )
-    return Closed(problem, defect, slope, int(counts[1]))
+    return Closed(problem, defect, slope, memory, periods)
 
 
 def _close(
     problem: Problem, table: SourceTable, before: float, rtol: float
-) -> tuple[FloatArray, float, FloatArray, NDArray[np.int64]]:
-    """Live voltages (V) that a period leads back to, their change over it, the map's derivative, and the work."""
+) -> tuple[FloatArray, float, FloatArray, float, int]:
+    """Live voltages (V) that a period leads back to; see `Closed` for the rest."""
     scene = problem.scene
     n = problem.model.gap.size
-    x, slope, counts = np.zeros(n), np.zeros((n, n)), np.zeros(2, np.int64)
+    w, slope, counts = np.zeros(n), np.zeros((n, n)), np.zeros(2, np.int64)
     scale = scene.u_peak or 1.0
     longest = min(LONGEST_STEP * problem.waveform.shortest_time(), float(table.edges[-1] - table.edges[0]))
-    pace = march.Pace(LOCAL_SHARE * rtol * scale * problem.model.k_gap, longest, True, False)
     prepared = prepare_system(scene, rtol)
-    code, defect = march.OUT_OF_RANGE, 0.0
-    while code == march.OUT_OF_RANGE:
+    # Largest V that the state itself is allowed to be off.
+    tol = LOCAL_SHARE * rtol * scale * problem.model.k_gap
+    share = 1.0
+    while True:
+        system = prepared.system
+        pace = march.Pace(max(share * tol, 1e-15 * scale), longest, True, False)
         code, defect = shooting.close_period(
-            prepared.system, pace, prepared.tables, prepared.work, prepared.integral, table.edges, table.terms,
-            table.series, before, scale, x, slope, counts,
+            system, pace, prepared.tables, prepared.work, prepared.integral, table.edges, table.terms, table.series,
+            before, scale, w, slope, counts,
         )  # fmt: skip
         if code == march.OUT_OF_RANGE:
-            prepared = prepare_system(scene, rtol, 1.5 * prepared.system.u_top)
-            x[:] = 0.0
+            prepared = prepare_system(scene, rtol, 1.5 * system.u_top)
+            w[:] = 0.0
+            continue
+        memory = _memory(system, slope)
+        if code != shooting.CLOSED or share * memory <= 2.0 or pace.tol <= 1e-15 * scale:
+            break
+        share = 1.0 / memory
     if code == shooting.NOT_CLOSED:
         raise SolveError(f"the periodic state did not close: {defect:.3g} V are left after a period")
     if code != shooting.CLOSED:
         folding = problem.model.mobile and problem.model.coupled
         status = Status.FOLD if folding else Status.STEP_UNDERFLOW
         raise SolveError(f"no periodic state was reached: {status.value}")
-    return x, float(defect), slope, counts
+    return system.live[0] @ w, float(defect), slope, memory, int(counts[1])
+
+
+def _memory(system: System, slope: FloatArray) -> float:
+    """Largest factor by which an error of the live voltages made in every period grows until it is periodic.
+
+    Modes that do not decay keep what they start with: nothing is collected there.
+    """
+    decaying = system.rates[0] > 0.0
+    if not decaying.any():
+        return 1.0
+    solver = np.linalg.inv(np.eye(int(decaying.sum())) - slope[np.ix_(decaying, decaying)])
+    in_volts = system.live[0][:, decaying] @ solver @ system.project[0][decaying]
+    return max(1.0, float(np.abs(in_volts).sum(axis=1).max()))

@@ -132,9 +132,8 @@ def _sensitivity(problem: Problem) -> tuple[float, float]:
     model = problem.model
     if not model.coupled:
         return 0.0, model.area0
-    highest = model.k_gap * problem.scene.u_peak
-    # Layers that discharge add to the gap's share of a jump: twice the peak is never exceeded.
-    u = np.linspace(0.0, min(2.0 * highest, float(model.curve[1])), 65)
+    # A gap may take all of the voltage, and as much again where charge is stored when the source turns.
+    u = np.linspace(0.0, 2.0 * problem.scene.u_peak, 65)
     a = areas(u, model.curve)
     middle = 2.0 / (1.0 / a.min() + 1.0 / a.max())
     return float(max(a.max() / middle, middle / a.min()) - 1.0), float(middle)

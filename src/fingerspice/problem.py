@@ -165,7 +165,7 @@ def _largest_voltage(waveform: Waveform, stop: float) -> float:
     if not (math.isfinite(stop) and stop > 0.0):
         return 0.0
     if waveform.period is not None:
-        stop = min(stop, waveform.settled + waveform.period)
+        stop = waveform.settled + waveform.period
     peak = waveform.peak(0.0, stop)
     return peak if math.isfinite(peak) else 0.0
 

@@ -64,6 +64,10 @@ class Record:
         out = np.array(waveform.value(self.t), float)
         if self.left.any():
             out[self.left] = waveform.value(self.t[self.left], "left")
+        lost = ~np.isfinite(out)
+        if lost.any():
+            # A run ends where the source stops being finite, found to 1e-12 of the time: just before, it was.
+            out[lost] = waveform.value(self.t[lost] * (1.0 - 4e-12))
         return sealed(out)
 
     @cached_property

@@ -106,6 +106,11 @@ def simulate(
     )  # fmt: skip
     if start == "periodic":
         problem = close_period(problem, rtol).problem
+        if times is not None and times[0] < problem.t_start:
+            raise InputError(
+                f"t_eval starts at {times[0]:g} s; allowed: from {problem.t_start:g} s on, where the source has "
+                "settled and its periodic state exists"
+            )
     solution = run_problem(problem, times, rtol, method, progress, tier, start if isinstance(start, str) else "given")
     if not solution.success and throw:
         raise SolveError(solution.message, solution)

@@ -50,6 +50,12 @@ class Element:
     initial: float | None = None
     where: Where | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "values": dict(self.values)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update({**state, "values": MappingProxyType(state["values"])})
+
     @property
     def spec(self) -> DeviceSpec:
         """The device's entry in the registry."""

@@ -10,87 +10,52 @@ from fingerspice.engine.exponential import Tables
 from fingerspice.engine.march import DONE, Pace, Work, march
 from fingerspice.engine.readout import BRANCH_LENGTH, N_CONTROL, N_COUNTERS, NFEV, U_BEFORE, T
 from fingerspice.engine.system import System
+from fingerspice.numerics.small import inverse
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 CLOSED, NOT_CLOSED = 100, 101
 """Codes of `close_period` beside those of `march`."""
-# Tolerance of the first approach and of the map's derivative, over the voltage scale.
-_ROUGH = 1e-4
+# Tolerance of the map's derivative, over the voltage scale: a mode that a period hardly moves must show in it.
+_SLOPE_TOL = 1e-9
 
 
 @jit
 def _map(
     system: System, pace: Pace, tables: Tables, work: Work, integral: FloatArray, edges: FloatArray, terms: FloatArray,
-    series: FloatArray, u_before: float, x: FloatArray, counters: IntArray, y: FloatArray,
+    series: FloatArray, u_before: float, w: FloatArray, counters: IntArray, end: FloatArray,
 ) -> int:  # fmt: skip
-    """One period from live voltages x; y takes the state at its end."""
-    n = x.size
+    """One period from modes w; `end` takes the modes at its end."""
+    n = w.size
     control = np.zeros(N_CONTROL)
     control[T] = edges[0]
     control[U_BEFORE] = u_before
     control[BRANCH_LENGTH] = np.inf
-    y[:n] = x
-    y[n] = 0.0
-    none = np.zeros(0)
+    y = np.zeros(n + 1)
+    for i in range(n):
+        for k in range(n):
+            y[i] += system.live[0, i, k] * w[k]
     count = np.zeros(N_COUNTERS, np.int64)
     code = march(
         system, pace, tables, work, integral, edges, terms, series, edges[-1], y, np.zeros(n + 1), control, count,
-        none, np.zeros(0, np.bool_), np.zeros((n, 0)),
+        np.zeros(0), np.zeros(0, np.bool_), np.zeros((n, 0)),
     )  # fmt: skip
+    for k in range(n):
+        end[k] = 0.0
+        for i in range(n):
+            end[k] += system.project[0, k, i] * y[i]
     counters[NFEV] += count[NFEV]
     counters[1] += 1
     return code
 
 
 @jit
-def solve_live(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solution of a small square system; directions without a pivot, which nothing decides, stay at zero."""
-    n = right.size
-    a = matrix.copy()
-    b = right.copy()
-    columns = np.arange(n)
-    rank = 0
-    for step in range(n):
-        best = 0.0
-        row = step
-        column = step
-        for i in range(step, n):
-            for j in range(step, n):
-                if abs(a[i, j]) > best:
-                    best = abs(a[i, j])
-                    row = i
-                    column = j
-        if best < 1e-9:
-            break
-        rank += 1
-        for j in range(n):
-            a[step, j], a[row, j] = a[row, j], a[step, j]
-        b[step], b[row] = b[row], b[step]
-        for i in range(n):
-            a[i, step], a[i, column] = a[i, column], a[i, step]
-        columns[step], columns[column] = columns[column], columns[step]
-        for i in range(step + 1, n):
-            factor = a[i, step] / a[step, step]
-            for j in range(step, n):
-                a[i, j] -= factor * a[step, j]
-            b[i] -= factor * b[step]
-    out = np.zeros(n)
-    for i in range(rank - 1, -1, -1):
-        value = b[i]
-        for j in range(i + 1, rank):
-            value -= a[i, j] * out[columns[j]]
-        out[columns[i]] = value / a[i, i]
-    return out
-
-
-@jit
 def close_period(
     system: System, pace: Pace, tables: Tables, work: Work, integral: FloatArray, edges: FloatArray, terms: FloatArray,
-    series: FloatArray, u_before: float, scale: float, x: FloatArray, slope: FloatArray, counters: IntArray,
+    series: FloatArray, u_before: float, scale: float, w: FloatArray, slope: FloatArray, counters: IntArray,
 ) -> tuple[int, float]:  # fmt: skip
-    """Find live voltages that a period leads back to.
+    """Find modes that a period leads back to. A mode that does not decay keeps what it starts with.
 
     Parameters
     ----------
@@ -100,10 +65,10 @@ def close_period(
         Source voltage just before the period, V.
     scale : float
         Voltage scale, V.
-    x : ndarray, shape (n,)
-        First guess, V; the solution on return.
+    w : ndarray, shape (n,)
+        First guess of the modes of the first reference area; the solution on return.
     slope : ndarray, shape (n, n)
-        Takes the derivative of the period map, to about 1e-3.
+        Takes the derivative of the period map of the modes, to about 1e-6.
     counters : ndarray of int, shape (2,)
         Evaluations and periods, added to.
 
@@ -112,44 +77,76 @@ def close_period(
     code : int
         CLOSED, NOT_CLOSED, or what `march` returned.
     defect : float
-        Largest change of a live voltage over a further period from the solution, V.
+        Largest change of a live voltage over the last period integrated, V.
     """
-    n = x.size
-    y = np.zeros(n + 1)
-    shifted = np.zeros(n)
+    n = w.size
     end = np.zeros(n)
+    out = np.zeros(n)
     move = np.zeros(n)
-    rough = Pace(max(pace.tol, _ROUGH * scale), pace.h_max, pace.controlled, False)
-    tight = Pace(pace.tol, pace.h_max, pace.controlled, False)
-    left = np.zeros((n, n))
+    shifted = np.zeros(n)
+    fine = Pace(_SLOPE_TOL * scale, pace.h_max, pace.controlled, False)
+    plain = Pace(pace.tol, pace.h_max, pace.controlled, False)
+    solver = np.zeros((n, n))
     worst = 0.0
     for round_ in range(40):
-        here = rough if round_ < 2 else tight
-        code = _map(system, here, tables, work, integral, edges, terms, series, u_before, x, counters, y)
+        code = _map(system, plain, tables, work, integral, edges, terms, series, u_before, w, counters, end)
         if code != DONE:
             return code, worst
         before = worst
-        worst = 0.0
-        for i in range(n):
-            end[i] = y[i]
-            move[i] = end[i] - x[i]
-            worst = max(worst, abs(move[i]))
-        if round_ >= 2 and worst <= pace.tol:
-            return CLOSED, worst
+        for k in range(n):
+            move[k] = end[k] - w[k] if system.rates[0, k] > 0.0 else 0.0
+        worst = _largest_voltage(system, move)
         if round_ == 0 or (round_ > 3 and worst > 0.3 * before):
+            code = _map(system, fine, tables, work, integral, edges, terms, series, u_before, w, counters, end)
+            if code != DONE:
+                return code, worst
             for j in range(n):
-                for i in range(n):
-                    shifted[i] = x[i]
-                shifted[j] += 0.01 * scale
-                code = _map(system, here, tables, work, integral, edges, terms, series, u_before, shifted, counters, y)
+                for k in range(n):
+                    slope[k, j] = 1.0 if k == j else 0.0
+                    shifted[k] = w[k]
+                if system.rates[0, j] <= 0.0:
+                    continue
+                # A hundredth of the scale in the largest voltage of the mode.
+                move_by = 0.01 * scale / max(np.abs(system.live[0, :, j]).max(), 1e-300)
+                shifted[j] += move_by
+                code = _map(
+                    system, fine, tables, work, integral, edges, terms, series, u_before, shifted, counters, moved
+                )
                 if code != DONE:
                     return code, worst
-                for i in range(n):
-                    slope[i, j] = (y[i] - end[i]) / (0.01 * scale)
-            for i in range(n):
-                for j in range(n):
-                    left[i, j] = (1.0 if i == j else 0.0) - slope[i, j]
-        step = solve_live(left, move)
-        for i in range(n):
-            x[i] += step[i]
+                for k in range(n):
+                    slope[k, j] = (out[k] - end[k]) / move_by
+            solver = _solver(slope, system.rates[0])
+        step = np.zeros(n)
+        for k in range(n):
+            for j in range(n):
+                step[k] += solver[k, j] * move[j]
+            w[k] += step[k]
+        # What the last step moved, the next would move by the error of the slope only.
+        if round_ > 0 and (_largest_voltage(system, step) <= pace.tol or worst <= 1e-15 * scale):
+            return CLOSED, worst
     return NOT_CLOSED, worst
+
+
+@jit
+def _largest_voltage(system: System, w: FloatArray) -> float:
+    """Largest live voltage of modes w, V."""
+    worst = 0.0
+    for i in range(w.size):
+        x = 0.0
+        for k in range(w.size):
+            x += system.live[0, i, k] * w[k]
+        worst = max(worst, abs(x))
+    return worst
+
+
+@jit
+def _solver(slope: FloatArray, rates: FloatArray) -> FloatArray:
+    """Inverse of 1 - slope on the modes that decay, the identity on the others."""
+    n = rates.size
+    matrix = np.eye(n)
+    for k in range(n):
+        for j in range(n):
+            if rates[k] > 0.0 and rates[j] > 0.0:
+                matrix[k, j] -= slope[k, j]
+    return inverse(matrix)

@@ -70,7 +70,7 @@ class System(NamedTuple):
     stress: float
 
 
-def build_system(model: Model, tol: float, q_range: tuple[float, float]) -> System:
+def build_system(model: Model, tol: float, q_range: tuple[float, float], stress: float = 0.0) -> System:
     """Modal form of a model.
 
     Parameters
@@ -80,6 +80,8 @@ def build_system(model: Model, tol: float, q_range: tuple[float, float]) -> Syst
         Relative error allowed of 1/A.
     q_range : tuple of float
         Smallest and largest 1/A (1/m^2) to expect.
+    stress : float
+        Force per area and squared gap voltage, Pa/V^2.
     """
     lowest, highest = q_range
     count = max(1, math.ceil(math.log(highest / lowest) / math.log(_LEVEL_RATIO)))
@@ -109,7 +111,7 @@ def build_system(model: Model, tol: float, q_range: tuple[float, float]) -> Syst
         lo,
         scale,
         float(model.curve[1]),
-        float(model.curve[2 + 4]),
+        stress,
     )
 
 
