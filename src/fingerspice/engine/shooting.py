@@ -110,7 +110,7 @@ def close_period(
                 move_by = 0.01 * scale / max(np.abs(system.live[0, :, j]).max(), 1e-300)
                 shifted[j] += move_by
                 code = _map(
-                    system, fine, tables, work, integral, edges, terms, series, u_before, shifted, counters, moved
+                    system, fine, tables, work, integral, edges, terms, series, u_before, shifted, counters, out
                 )
                 if code != DONE:
                     return code, worst

@@ -46,7 +46,7 @@ _X = _nodes()
 BARYCENTRIC = 1.0 / np.array([np.prod(4.0 * (x - np.delete(_X, i))) for i, x in enumerate(_X)])
 """Barycentric weights of the nodes (times a constant), shape (NODES,)."""
 # Midway between neighbours, at three distances from the middle: no error of the next few orders is small at all.
-_BETWEEN = np.array([0.5 * (_X[i] + _X[i + 1]) for i in (3, 6, 8)])
+_BETWEEN = np.array([0.5 * (_X[i] + _X[i + 1]) for i in (3, 6, 9)])
 POINTS = np.concatenate([_X, _BETWEEN])
 """Fractions of the step, shape (ROWS,)."""
 BETWEEN = np.ascontiguousarray(_lagrange(_BETWEEN, _X, BARYCENTRIC).T)
