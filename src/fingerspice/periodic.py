@@ -13,6 +13,7 @@ from fingerspice.engine import march, shooting
 from fingerspice.engine.system import System
 from fingerspice.errors import InputError, SolveError
 from fingerspice.marching import LOCAL_SHARE, LONGEST_STEP, prepare_system
+from fingerspice.numerics import linear
 from fingerspice.problem import Problem, state_from
 from fingerspice.solution import Status
 
@@ -60,9 +61,14 @@ def close_period(problem: Problem, rtol: float) -> Closed:
     begin = waveform.period * float(np.ceil(max(waveform.settled, problem.t_start) / waveform.period))
     key = ("period", begin)
     if key not in scene.prepared:
-        scene.prepared[key] = source_table(waveform, begin, begin + waveform.period, 1e-13, problem.step)
+        scene.prepared[key] = source_table(
+            waveform, begin, begin + waveform.period, 1e-13, problem.step, no_chirps=not problem.model.coupled
+        )
     before = float(waveform.value(begin, "left"))
-    x, defect, slope, memory, periods = _close(problem, scene.prepared[key], before, rtol)
+    if problem.model.coupled:
+        x, defect, slope, memory, periods = _close(problem, scene.prepared[key], before, rtol)
+    else:
+        x, defect, slope, memory, periods = _close_linear(problem, scene.prepared[key], rtol)
     moved = begin - problem.t_start
     initial = state_from(problem.model, begin, x, before, scene.charge_law)
     problem = dataclasses.replace(
@@ -106,6 +112,21 @@ def _close(
         status = Status.FOLD if folding else Status.STEP_UNDERFLOW
         raise SolveError(f"no periodic state was reached: {status.value}")
     return system.live[0] @ w, float(defect), slope, memory, int(counts[1])
+
+
+def _close_linear(
+    problem: Problem, table: SourceTable, rtol: float
+) -> tuple[FloatArray, float, FloatArray, float, int]:
+    """As `_close`, in closed form, for an area that does not follow the voltage."""
+    system = prepare_system(problem.scene, rtol).system
+    rates, gains = system.rates[0], system.gain[0]
+    w = linear.periodic_state(rates, gains, table.edges, table.terms, table.series)
+    # A mode that does not decay keeps what it starts with.
+    w = np.where(rates > 0.0, w, 0.0)
+    _, end = linear.respond(rates, gains, table.edges, table.terms, table.series, w, np.empty(0))
+    live = system.live[0]
+    defect = float(np.abs(live @ (end - w)).max(initial=0.0))
+    return live @ w, defect, np.diag(np.exp(-rates * (table.edges[-1] - table.edges[0]))), 1.0, 1
 
 
 def _memory(system: System, slope: FloatArray) -> float:
