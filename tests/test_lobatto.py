@@ -58,7 +58,7 @@ def moment(z: float, c: float, degree: int) -> mp.mpf:
 
 
 def node_polynomial() -> list[mp.mpf]:
-    """Coefficients, ascending, of the product of (s - c_j) over the nodes as rounded, of size 1 at the second point between."""
+    """Coefficients, ascending, of the product of (s - c_j) over the nodes as rounded; size 1 at the second between."""
     out = [mp.mpf(1)]
     for c in POINTS[:NODES]:
         out = [a - mp.mpf(float(c)) * b for a, b in zip([mp.mpf(0), *out], [*out, mp.mpf(0)], strict=True)]

@@ -128,7 +128,8 @@ def solve_linear(problem: Problem, t_out: FloatArray, left: BoolArray, area: flo
         w_end = at_end[:-1]
         u_source = np.array(wave.value(t))
         u_source[side] = wave.value(t[side], "left")
-        live = np.ascontiguousarray(np.outer(model.k[:-1], u_source) + system.live[0] @ modes[:, :-1].T)
+        # Not by BLAS, whose threads cost more than the product and may round otherwise.
+        live = np.outer(model.k[:-1], u_source) + np.einsum("lk,tk->lt", system.live[0], modes[:, :-1])
         if problem.charge:
             z, current = flow.at(t, u_source, slope, modes)
             # The state is that before a jump at the end.

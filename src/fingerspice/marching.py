@@ -32,6 +32,10 @@ from fingerspice.solution import ErrorEstimate, State, Status
 SAFETY = 2.5
 # The error allowed in a step, over the one asked for: the force doubles it, and steps add up.
 LOCAL_SHARE = 0.15
+# The smallest error of a step that is more than rounding, over the voltage scale.
+FINEST = 4e-15
+# Of 1/A, relative: finer, the polynomial would give way to the long series, which nobody's voltage can tell.
+AREA_ROUNDING = 2e-14
 # Steps per shortest time scale of the source: the points of a step must not alias it.
 LONGEST_STEP = 0.6
 
@@ -58,7 +62,9 @@ def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
             model = model._replace(curve=scene.stack.contact.curve(u_top))
         contact = scene.stack.contact
         stress = 0.0 if contact is None else float(contact.stress(1.0))
-        system = build_system(model, 1e-3 * 10.0**decade, area_range(model, max(scene.u_peak, u_top)), stress)
+        system = build_system(
+            model, max(1e-3 * 10.0**decade, AREA_ROUNDING), area_range(model, max(scene.u_peak, u_top)), stress
+        )
         n = model.gap.size
         scene.prepared[key] = Prepared(system, new_tables(n), march.new_work(n), integral_table())
     prepared: Prepared = scene.prepared[key]
@@ -254,7 +260,7 @@ def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, pro
     tol = LOCAL_SHARE * rtol
     prepared, nfev, attempts = prepare_system(scene, rtol), 0, 0
     while True:
-        run = integrate(problem, prepared, tol * u_scale, t_out, left, tables, progress=progress)
+        run = integrate(problem, prepared, max(tol, FINEST) * u_scale, t_out, left, tables, progress=progress)
         if run is None:
             prepared = prepare_system(scene, rtol, 1.5 * prepared.system.u_top)
             continue
@@ -264,7 +270,7 @@ def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, pro
         worst = run.excess(rtol)
         if run.status is not Status.SUCCESS or worst <= 1.0:
             return run
-        if rtol * run.peak_u < ROUNDING * u_scale or tol <= 1e-16 or attempts == 6:
+        if rtol * run.peak_u < ROUNDING * u_scale or tol <= FINEST or attempts == 6:
             run.status = Status.ERROR_NOT_MET
             return run
-        tol = max(tol * min(0.3, 0.5 / worst), 1e-16)
+        tol = tol * min(0.3, 0.5 / worst)
