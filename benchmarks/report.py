@@ -65,7 +65,7 @@ def libraries(results: Report) -> list[str]:
 def lead(results: Report, problem: str) -> str:
     """How many times our time the best of all peers takes, at each error."""
     ours = good(results, problem, library=OURS)
-    theirs = [p for p in good(results, problem) if p["library"] != OURS]
+    theirs = [p for p in good(results, problem) if not p["library"].startswith(OURS)]
     ratios = []
     for target in TARGETS:
         a, b = cheapest(ours, target), cheapest(theirs, target)
@@ -197,7 +197,7 @@ def picture(results: Report, path: Path) -> None:
             floor = results["problems"][name]["error_floor"]
             for row, cost in enumerate(costs):
                 ax = axes[row][column]
-                for library in reversed(libraries(results)):
+                for library in reversed([x for x in libraries(results) if x in LOOK]):
                     x, y = front(good(results, name, library=library), cost)
                     if x:
                         colour, marker = LOOK[library]

@@ -1,26 +1,76 @@
-"""The error that comes with a result: at least the true one on 95 % of random scenes, and at most 30 times it."""
+"""The error that comes with a result: at least the true one, and at most 10 times it, on 95 % of random scenes."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
+import analytic as ref
 import fingerspice as fs
 from scenes import table1
 
-N = 50
+N = 100
+PERIODS = 2
 
 
-def random_scene(rng):
+@dataclass(frozen=True)
+class Scene:
+    """A random scene, its source twice: for the package and for the reference."""
+
+    changes: dict[str, float]
+    waveform: fs.Waveform
+    segments: list[ref.Segment]
+    stop: float
+    rtol: float
+    law: str
+
+    def reference(self, t: np.ndarray) -> ref.Transient:
+        """The independent solution, to 1e-13 of the peak."""
+        v = self.changes
+        params = replace(ref.TABLE1, r_a=v["Xgap.r"], d_a=v["Xgap.d"], force_normal=v["Xgap.fn"], r_i=v["Xcoat.r"])
+        params = replace(params, d_sc=v["Xskin.d"])
+        return ref.transient(self.segments, t, law=self.law, params=params, freq=100.0, stages=16, tol=1e-13)
+
+
+def smooth(stop: float, u: Callable[[np.ndarray], np.ndarray]) -> list[ref.Segment]:
+    return [(0.0, stop, u, u)]
+
+
+def triangle(amplitude: float, f: float) -> list[ref.Segment]:
+    times = [0.0, *((k + x) / f for k in range(PERIODS) for x in (0.25, 0.75)), PERIODS / f]
+    return ref.pwl_segments(
+        [(t, amplitude * v) for t, v in zip(times, [0.0, *(1.0, -1.0) * PERIODS, 0.0], strict=True)]
+    )
+
+
+def random_scene(rng: np.random.Generator) -> Scene:
     f = 10.0 ** rng.uniform(1.5, 4.0)
-    amplitude = rng.uniform(20.0, 220.0)
-    waveform = [
-        fs.Sine(amplitude, f, offset=rng.uniform(-30.0, 30.0)),
-        fs.Square(amplitude, f, duty=rng.uniform(0.2, 0.8)),
-        fs.Triangle(amplitude, f),
-        fs.AM(amplitude, 5.0 * f, f, depth=rng.uniform(0.2, 1.0)),
-        fs.Sine(0.7 * amplitude, f) + fs.Sine(0.3 * amplitude, 3.0 * f, phase_deg=rng.uniform(0.0, 360.0)),
-    ][rng.integers(5)]
+    u = rng.uniform(20.0, 220.0)
+    kind = rng.integers(5)
+    offset, duty, depth, phase = (
+        rng.uniform(-30.0, 30.0),
+        rng.uniform(0.2, 0.8),
+        rng.uniform(0.2, 1.0),
+        rng.uniform(0.0, 360.0),
+    )
+    stop, w, shift = PERIODS / f, 2.0 * math.pi * f, math.radians(phase)
+    waveform, segments = [
+        (fs.Sine(u, f, offset=offset), ref.sine_segments(u, f, stop, offset=offset)),
+        (fs.Square(u, f, duty=duty), ref.square_segments(u, f, PERIODS, duty=duty)),
+        (fs.Triangle(u, f), triangle(u, f)),
+        (
+            fs.AM(u, 5.0 * f, f, depth=depth),
+            smooth(stop, lambda t: u / (1.0 + depth) * (1.0 + depth * np.sin(w * t)) * np.sin(5.0 * w * t)),
+        ),
+        (
+            fs.Sine(0.7 * u, f) + fs.Sine(0.3 * u, 3.0 * f, phase_deg=phase),
+            smooth(stop, lambda t: 0.7 * u * np.sin(w * t) + 0.3 * u * np.sin(3.0 * w * t + shift)),
+        ),
+    ][kind]
     changes = {
         "Xgap.r": 10.0 ** rng.uniform(5.5, 8.0),
         "Xgap.d": rng.uniform(2.5e-6, 6e-6),
@@ -29,47 +79,43 @@ def random_scene(rng):
         "Xskin.d": rng.uniform(2e-4, 4.5e-4),
     }
     rtol = 10.0 ** rng.uniform(-9.0, -3.0)
-    law = ["local", "mobile"][rng.integers(2)]
-    return table1().replace(changes), waveform, 4.0 / f, rtol, law
+    return Scene(changes, waveform, segments, stop, rtol, ["local", "mobile"][rng.integers(2)])
 
 
 @pytest.fixture(scope="module")
-def ratios():
+def ratios() -> np.ndarray:
     rng = np.random.default_rng(20261121)
     out = []
     for _ in range(N):
-        circuit, waveform, stop, rtol, law = random_scene(rng)
+        scene = random_scene(rng)
         # Times that are no step ends and no multiples of the period.
-        t = np.sort(rng.uniform(0.0, stop, 400))
-        options = {"sources": {"Vdrive": waveform}, "t_stop": stop, "t_eval": t, "charge_law": law}
-        solution = fs.simulate(circuit, rtol=rtol, **options)
-        exact = fs.simulate(circuit, rtol=max(1e-4 * rtol, 2e-13), method="dop853", **options)
+        t = np.sort(rng.uniform(0.0, scene.stop, 400))
+        solution = fs.simulate(
+            table1().replace(scene.changes), sources={"Vdrive": scene.waveform}, t_stop=scene.stop, t_eval=t,
+            charge_law=scene.law, rtol=scene.rtol,
+        )  # fmt: skip
+        exact = scene.reference(t)
+        assert exact.fold is None
         true_u = np.abs(solution.u_gap - exact.u_gap).max()
-        true_f = np.abs(solution.f_el - exact.f_el).max()
-        peak_u, peak_f = np.abs(exact.u_gap).max(), exact.f_el.max()
-        out.append(
-            (
-                solution.error.u_gap / true_u,
-                solution.error.f_el / true_f,
-                true_u / peak_u / rtol,
-                true_f / peak_f / rtol,
-            )
-        )
+        true_f = np.abs(solution.f_el - exact.force).max()
+        asked_u, asked_f = scene.rtol * np.abs(exact.u_gap).max(), scene.rtol * exact.force.max()
+        stated = solution.error
+        out.append((stated.u_gap / true_u, stated.f_el / true_f, true_u / asked_u, true_f / asked_f))
     return np.array(out)
 
 
 @pytest.mark.filterwarnings("ignore:the gap voltage reaches")
-def test_the_estimate_covers_the_true_error_on_95_percent_of_scenes(ratios):
+def test_the_estimate_covers_the_true_error_on_95_percent_of_scenes(ratios: np.ndarray) -> None:
     assert np.mean(ratios[:, 0] >= 1.0) >= 0.95
     assert np.mean(ratios[:, 1] >= 1.0) >= 0.95
 
 
 @pytest.mark.filterwarnings("ignore:the gap voltage reaches")
-def test_the_estimate_is_at_most_thirty_times_the_true_error(ratios):
-    assert np.mean(ratios[:, 0] <= 30.0) == 1.0
-    assert np.mean(ratios[:, 1] <= 30.0) == 1.0
+def test_the_estimate_is_at_most_ten_times_the_true_error_on_95_percent_of_scenes(ratios: np.ndarray) -> None:
+    assert np.mean(ratios[:, 0] <= 10.0) >= 0.95
+    assert np.mean(ratios[:, 1] <= 10.0) >= 0.95
 
 
 @pytest.mark.filterwarnings("ignore:the gap voltage reaches")
-def test_the_error_asked_for_is_met(ratios):
+def test_the_error_asked_for_is_met(ratios: np.ndarray) -> None:
     assert ratios[:, 2:].max() <= 1.0
