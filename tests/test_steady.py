@@ -148,6 +148,20 @@ def test_the_error_stated_holds_though_a_disturbance_would_outlast_many_periods(
 
 
 @every_law
+@pytest.mark.parametrize("r", ["1e8", "1e9"])
+def test_a_run_from_the_periodic_state_states_the_error_of_its_start_too(r: str, law: str) -> None:
+    plain = ref.table1_layers(100.0)
+    layers = (*(ref.Layer(x.c, r_total=float(r)) for x in plain[:2]), plain[2])
+    circuit = table1("SQUARE(60 4k 0.3)", coat={"r": r}, gap={"r": r})
+    t = (np.arange(40) + 0.5) / 40.0 / 4e3
+    want = ref.periodic_state(ref.square_segments(60.0, 4e3, 1, duty=0.3), law=law, layers=layers, t_out=t).u_gap
+    run = fs.simulate(circuit, start="periodic", t_eval=t, t_stop=2.5e-4, charge_law=law, rtol=1e-6)
+    true = np.abs(run.u_gap - want).max()
+    assert true <= 1e-6 * np.abs(want).max()
+    assert true <= run.error.u_gap
+
+
+@every_law
 @pytest.mark.parametrize("f", [10.0, 100.0, 5e3, 1e5])
 def test_a_frozen_circuit_has_the_multipliers_of_its_rates(f: float, law: str) -> None:
     circuit = table1(f"SIN(0 200 {f!r})", f)
