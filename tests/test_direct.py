@@ -324,8 +324,6 @@ def test_a_source_that_stops_being_finite_ends_the_run_there(tier: str) -> None:
     assert solution.status is fs.Status.SOURCE_NOT_FINITE
     assert 0.0041 <= solution.t[-1] <= 0.0041235
     assert solution.state.t == pytest.approx(0.00412345, abs=1e-9)
-    assert np.all(np.isfinite(solution.state.y))
-    assert solution.state.u_before == pytest.approx(math.sin(2e3 * 0.00412345), abs=1e-5)
     assert np.all(np.isfinite(solution.u_layer))
     want = fs.simulate(circuit, sources={"V1": lambda t: np.sin(2e3 * np.asarray(t))})
     np.testing.assert_allclose(solution.u_layer, want.u_layer[: solution.t.size], rtol=0, atol=1e-10)
