@@ -6,12 +6,14 @@ import dataclasses
 
 import numpy as np
 
-from fingerspice.circuit.sampling import SourceTable
+from fingerspice.circuit.sampling import SourceTable, same_time
 from fingerspice.engine import advance, march, readout
+from fingerspice.engine import repeat as repetition
 from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
-from fingerspice.engine.march import Pace, Work
+from fingerspice.engine.march import Work
 from fingerspice.engine.model import Segment, choose_branch, source, write_row
+from fingerspice.engine.pace import Pace
 from fingerspice.engine.system import System, area_range, build_system
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.problem import Problem, Scene
@@ -26,6 +28,7 @@ from fingerspice.runs import (
     from_rows,
     row_width,
 )  # fmt: skip
+from fingerspice.settling import Settling
 from fingerspice.solution import ErrorEstimate, State, Status
 
 # The largest error between nodes may stand beside the two points where it is looked for, and signs may cancel there.
@@ -38,6 +41,8 @@ FINEST = 4e-15
 AREA_ROUNDING = 2e-14
 # Steps per shortest time scale of the source: the points of a step must not alias it.
 LONGEST_STEP = 0.6
+# Steps of a period that is kept, at most: 1 MB.
+KEPT_STEPS = 2000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,21 +97,56 @@ class Track:
         self.control[readout.BRANCH_LENGTH] = np.inf
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
         self.out = np.empty((n + 2 if self.pace.charge else n, self.t_out.size))
+        self.repeated = 0
+        self.forget()
 
     @property
     def t(self) -> float:
         return float(self.control[readout.T])
 
-    def advance(self, table: SourceTable) -> int:
-        """March to the end of a table."""
+    def advance(self, table: SourceTable, t_end: float) -> int:
+        """March to `t_end` (s) through a table."""
         p = self.prepared
-        p, mine = self.prepared, (self.y, self.error, self.control, self.counters)
-        source_of = (table.edges, table.terms, table.series, float(table.edges[-1]))
+        mine = (self.y, self.error, self.control, self.counters)
         return int(
             march.march(
-                p.system, self.pace, p.tables, p.work, p.integral, *source_of, *mine, self.t_out, self.left, self.out
+                p.system, self.pace, p.tables, p.work, p.integral, table.edges, table.terms, table.series, t_end,
+                *mine, self.t_out, self.left, self.out, self.kept,
             )
+        )  # fmt: skip
+
+    def forget(self) -> None:
+        """Keep no steps."""
+        self.kept = repetition.new_kept(0, self.out.shape[0])
+
+    def keep(self) -> None:
+        """Keep the steps that follow."""
+        self.kept = repetition.new_kept(KEPT_STEPS, self.out.shape[0])
+        self.counters[readout.KEPT] = 0
+        self.charge_before = float(self.y[-1])
+
+    @property
+    def keeps_all(self) -> bool:
+        """Whether all steps since `keep` are kept."""
+        return 0 < int(self.counters[readout.KEPT]) <= len(self.kept.times)
+
+    def repeat(self, settling: Settling) -> None:
+        """Let the period that is kept stand for the whole ones that follow."""
+        periods, period = settling.periods_left(self.t), settling.period
+        drift = float(self.y[-1]) - self.charge_before
+        first, kept = int(self.counters[readout.OUTPUT]), int(self.counters[readout.KEPT])
+        self.counters[readout.OUTPUT] = repetition.repeat(
+            self.kept, kept, period, periods, drift, first, self.t_out, self.left, self.out
         )
+        self.y[-1] += periods * drift
+        self.control[readout.T] += periods * period
+        self.control[readout.BRANCH_START] += periods * period
+        self.control[readout.ERROR_U] += settling.remaining
+        if self.control[readout.PEAK_U] > 0.0:
+            steepest = 2.0 * self.control[readout.PEAK_F] / self.control[readout.PEAK_U]
+            self.control[readout.ERROR_F] += settling.remaining * steepest
+        self.repeated = periods
+        self.forget()
 
     def row(self, segment: Segment, tau: float, y: FloatArray) -> FloatArray:
         """A row of `write_row` from a state, `tau` s into a segment."""
@@ -155,6 +195,7 @@ def integrate(
     tables: Tables,
     *,
     h_fixed: float = 0.0,
+    repeat: bool = True,
     progress: Progress | None = None,
 ) -> Run | None:
     """Integrate once with an error of the gap voltage of `tol` (V) in every step.
@@ -171,6 +212,8 @@ def integrate(
         The source's.
     h_fixed : float
         Fixed step in s, without error control, if positive.
+    repeat : bool
+        Whether one period may stand for those after it, once the state no longer changes from one to the next.
     progress : callable, optional
         Called with the fraction of the run that is done.
 
@@ -182,10 +225,15 @@ def integrate(
     span = problem.t_stop - problem.t_start
     longest = h_fixed or min(LONGEST_STEP * problem.waveform.shortest_time(), span, problem.max_step)
     track = Track(problem, prepared, Pace(tol, longest, h_fixed == 0.0, problem.charge), t_out, left)
+    settling = Settling(problem, prepared.system.rates, tol)
+    if h_fixed > 0.0 or not repeat:
+        settling.next = np.inf
     status, t_failed, last = Status.SUCCESS, None, None
+    tables.done = -np.inf
     table = None
     for table in tables:
-        code = track.advance(table) if table.edges.size > 1 else march.DONE
+        code = _through(track, table, settling) if table.edges.size > 1 else march.DONE
+        tables.done = track.t
         if progress is not None:
             progress((track.t - problem.t_start) / span)
         if code == march.OUT_OF_RANGE:
@@ -203,6 +251,29 @@ def integrate(
     elif table is not None and table.edges.size > 1:
         last = track.last(table)
     return _run(problem, track, status, t_failed, last)
+
+
+def _through(track: Track, table: SourceTable, settling: Settling) -> int:
+    """To the end of a table, or past it where a settled run repeats its last period."""
+    end = float(table.edges[-1])
+    while True:
+        stop = min(settling.snapped(table), end)
+        code = track.advance(table, stop)
+        if code != march.DONE or stop < settling.next - same_time(stop):
+            return code
+        if not settling.look(track.y[:-1], float(track.control[readout.MAGNIFIED])):
+            track.forget()
+        elif track.keeps_all:
+            track.repeat(settling)
+            settling.next = np.inf
+        elif track.kept.times.size:
+            # Too many steps to keep: it goes on as it is.
+            track.forget()
+            settling.next = np.inf
+        else:
+            track.keep()
+        if track.t >= end:
+            return code
 
 
 def _run(problem: Problem, track: Track, status: Status, t_failed: float | None, last: FloatArray | None) -> Run:
@@ -235,6 +306,7 @@ def _run(problem: Problem, track: Track, status: Status, t_failed: float | None,
             "steps": int(c[readout.ACCEPTED]),
             "rejected": int(c[readout.REJECTED]),
             "zeros": int(c[readout.ZEROS]),
+            "repeated": track.repeated,
         },
         state=State(
             track.t,
@@ -247,7 +319,15 @@ def _run(problem: Problem, track: Track, status: Status, t_failed: float | None,
     )
 
 
-def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None = None) -> Run:
+def solve(
+    problem: Problem,
+    rtol: float,
+    t_out: FloatArray,
+    left: BoolArray,
+    progress: Progress | None = None,
+    *,
+    repeat: bool = True,
+) -> Run:
     """Integrate until the estimated global error is within `rtol` of the peaks.
 
     The first attempt's tolerance is a guess; each further one follows from the error estimated.
@@ -260,7 +340,8 @@ def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, pro
     tol = LOCAL_SHARE * rtol
     prepared, nfev, attempts = prepare_system(scene, rtol), 0, 0
     while True:
-        run = integrate(problem, prepared, max(tol, FINEST) * u_scale, t_out, left, tables, progress=progress)
+        local = max(tol, FINEST) * u_scale
+        run = integrate(problem, prepared, local, t_out, left, tables, repeat=repeat, progress=progress)
         if run is None:
             prepared = prepare_system(scene, rtol, 1.5 * prepared.system.u_top)
             continue

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import SourceTable, source_table
 from fingerspice.engine import march, shooting
+from fingerspice.engine.pace import Pace
 from fingerspice.engine.system import System
 from fingerspice.errors import InputError, SolveError
 from fingerspice.marching import LOCAL_SHARE, LONGEST_STEP, prepare_system
@@ -92,7 +93,7 @@ def _close(
     share = 1.0
     while True:
         system = prepared.system
-        pace = march.Pace(max(share * tol, 1e-15 * scale), longest, True, False)
+        pace = Pace(max(share * tol, 1e-15 * scale), longest, True, False)
         code, defect = shooting.close_period(
             system, pace, prepared.tables, prepared.work, prepared.integral, table.edges, table.terms, table.series,
             before, scale, w, slope, counts,

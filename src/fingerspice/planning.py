@@ -10,6 +10,7 @@ from fingerspice.errors import InputError
 from fingerspice.numerics.modes import modes
 from fingerspice.physics.contact import areas
 from fingerspice.problem import Problem
+from fingerspice.settling import FEWEST_PERIODS
 
 TIERS = ("algebraic", "linear", "coupled")
 # A frozen stack this many times faster than its source would hold an explicit method back by stability alone.
@@ -105,6 +106,9 @@ def _choose(problem: Problem, rtol: float, tier: str, start: str) -> Plan:
             *reasons,
             f"stiff: the fastest rate {fastest:.3g} 1/s against {1.0 / shortest:.3g} 1/s of the source",
         )
+    period = problem.waveform.period
+    if chosen == "coupled" and period and (problem.t_stop - problem.t_start) / period >= FEWEST_PERIODS:
+        reasons = (*reasons, "periodic: once a period no longer changes the state, later ones repeat it")
     needed = sensitivity if chosen == "linear" and model.coupled and np.any(model.rate0 > 0.0) else 0.0
     return Plan(chosen, reasons, start, tuple(sorted(map(float, rates))), stiff, sensitivity, needed, area)
 

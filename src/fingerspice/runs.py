@@ -77,6 +77,8 @@ class Tables:
         self.problem = problem
         self.tol = min(1e-3, max(0.05 * tol, 1e-14))
         self.edges = windows(problem)
+        # Windows that end by this time (s) are done with, but for the last.
+        self.done = -np.inf
         self.kept: dict[Any, SourceTable] | None = {} if is_sampled(problem.waveform) else None
         if self.kept is None and len(self.edges) == 2:
             self.kept = problem.scene.prepared.setdefault("tables", {})
@@ -85,6 +87,8 @@ class Tables:
 
     def __iter__(self) -> Iterator[SourceTable]:
         for w0, w1 in itertools.pairwise(self.edges):
+            if w1 <= self.done and w1 < self.edges[-1]:
+                continue
             key = (w0, w1, self.no_chirps)
             table = self.kept.get(key) if self.kept is not None else None
             if table is None:

@@ -68,7 +68,8 @@ def simulate(
         Largest error of the gap voltage relative to its peak over the run, and of the force likewise.
     method : str
         ``"auto"``, an own stepper (``"exponential"``, ``"dp5"``, ``"dop853"``, ``"radau9"``), ``"scipy:NAME"`` or
-        ``"torchdiffeq:NAME"``.
+        ``"torchdiffeq:NAME"``. ``"auto"`` steps as ``"exponential"`` does, and once a period of the source no longer
+        changes the state it lets that period stand for those that follow; the others step every period.
     tier : str
         ``"auto"``, or the model to take: ``"algebraic"``, ``"linear"`` or ``"coupled"`` (see `Plan`).
     start : str or Solution
@@ -217,7 +218,7 @@ def _run(
 
         return solve_foreign(problem, library, name, rtol, t_out, left), method
     if method in ("auto", "exponential"):
-        run = solve_marching(problem, rtol, t_out, left, progress)
+        run = solve_marching(problem, rtol, t_out, left, progress, repeat=method == "auto")
         if run.status is not Status.FOLD or method == "exponential":
             return run, "exponential"
         # The time and place of a fold are for a method that solves the area equation at every evaluation.

@@ -170,10 +170,10 @@ class Solution:
         contact = self.record.stack.contact
         return None if contact is None else sealed(contact.stress(self.record.u_gap))
 
-    @cached_property
+    @property
     def f_el(self) -> FloatArray | None:
         """Electroadhesive force, N, shape (n_t,); None for a circuit without GAP."""
-        return None if self.sigma_el is None else sealed(self.sigma_el * self.area)
+        return None if self.record.stack.contact is None else self.record.force
 
     @cached_property
     def f_t(self) -> FloatArray | None:

@@ -251,7 +251,7 @@ def assess(
     mobile: bool, area0: float, gain: FloatArray, gap: FloatArray, decay: FloatArray, phi: FloatArray,
     miss: FloatArray, error: FloatArray, w: FloatArray, pull: FloatArray, used: FloatArray, r: FloatArray,
     places: FloatArray, sums: FloatArray,
-) -> tuple[float, float]:  # fmt: skip
+) -> tuple[float, float, float]:  # fmt: skip
     """Error of a converged step, from what its polynomial misses between nodes and what its iteration left.
 
     Parameters
@@ -265,9 +265,10 @@ def assess(
 
     Returns
     -------
-    step, run : float
+    step, run, magnified : float
         Largest error of the gap voltage in the step, V: what the polynomial of this step misses (a longer or shorter
-        one misses more or less), and all of it with what the iteration left and what came before.
+        one misses more or less), and all of it with what the iteration left and what came before. Largest move of the
+        gap voltage for a move of a live one.
     """
     source_first, source_second, source_third = _between(r[SOURCE])
     # The outputs are read off the polynomial through the nodes' gap voltages.
@@ -298,16 +299,18 @@ def assess(
         places[k, 3] += mode_third
     step = 0.0
     run = 0.0
+    magnified = 1.0
     for p in range(4):
         row = FIRST + p if p < 3 else END
         factor = 1.0
         if mobile:
             # The gap's part of the voltages is over A, and the fold magnifies its error.
             factor = area0 * r[Q, row] / max(1.0 - area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
+            magnified = max(magnified, factor)
         step = max(step, abs(factor * sums[1, p] + sums[0, p]))
         run = max(run, abs(factor * sums[2, p] + sums[0, p]))
     # The charge is the integral of A dU among others: what the polynomial misses of 1/A counts with the source's move.
     area_first, area_second, area_third = _between(r[Q])
     swing = 0.3 * abs(r[SOURCE, END] - r[SOURCE, 0])
     charged = swing * abs(_largest(area_first, area_second, area_third)) / r[Q, 0]
-    return max(step, charged), run
+    return max(step, charged), run, magnified

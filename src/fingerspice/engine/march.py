@@ -10,13 +10,16 @@ from numpy.typing import NDArray
 
 from fingerspice.compiled import borrow, jit
 from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables
-from fingerspice.engine.model import Model, Segment, branch_area, choose_branch, dot, gap_voltage, jump_charge, source
+from fingerspice.engine.model import Segment, branch_area, source
+from fingerspice.engine.pace import Pace, change_level, choose_step, enter, nearest_level, rung, take_branch
 from fingerspice.engine.readout import (
     ACCEPTED,
     BLOCK,
     BRANCH_LENGTH,
     BRANCH_START,
     H_AFTER_EDGE,
+    KEPT,
+    MAGNIFIED,
     NFEV,
     OUTPUT,
     PEAK_U,
@@ -39,6 +42,7 @@ from fingerspice.engine.readout import (
     write_outputs,
     zero,
 )  # fmt: skip
+from fingerspice.engine.repeat import Kept
 from fingerspice.engine.rows import DQ, GUESS, N_FLAT, SOURCE, X_GAP, Q, U, source_rows
 from fingerspice.engine.system import System
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
@@ -48,31 +52,6 @@ IntArray = NDArray[np.int64]
 
 # Codes returned by `march`.
 DONE, NO_STEP, OUT_OF_RANGE = 0, 1, 2
-# Neighbouring step lengths of the ladder, as a power of two: fine enough to waste little, coarse enough to recur.
-_RUNGS = 16.0
-# A step meant to reach a zero of the gap voltage goes this much farther.
-_BEYOND = 1.02
-
-
-class Pace(NamedTuple):
-    """How steps are chosen.
-
-    Attributes
-    ----------
-    tol : float
-        Error of the gap voltage allowed in a step, V.
-    h_max : float
-        Longest step, s.
-    controlled : bool
-        Whether the error governs the step; else every step is `h_max` (for measuring orders).
-    charge : bool
-        Whether charge and current are wanted.
-    """
-
-    tol: float
-    h_max: float
-    controlled: bool
-    charge: bool
 
 
 class Work(NamedTuple):
@@ -115,85 +94,6 @@ def new_work(n: int) -> Work:
 
 
 @jit
-def _nearest_level(q0: FloatArray, q: float) -> int:
-    """Reference area nearest to 1/A = q, by ratio."""
-    best = 0
-    distance = math.inf
-    for i in range(q0.size):
-        d = max(q0[i] / q, q / q0[i])
-        if d < distance:
-            distance = d
-            best = i
-    return best
-
-
-@jit
-def _enter(model: Model, charge: bool, u_source: float, y: FloatArray, control: FloatArray) -> None:
-    """Take the jump of the source that may stand here, and choose the branch after it."""
-    x_gap = dot(model.gap, y)
-    if not model.mobile and u_source != control[U_BEFORE] and charge:
-        y[-1] += jump_charge(model, x_gap, control[U_BEFORE], u_source)
-    _turn(choose_branch(model, u_source, y), control)
-    control[U_GAP] = gap_voltage(model, model.k_gap * u_source, x_gap, control[SIGN], model.k_gap * u_source)
-
-
-@jit
-def _turn(sign: float, control: FloatArray) -> None:
-    """Take the branch of a sign; one that is new starts here, and how long it will be is not known."""
-    if sign != control[SIGN]:
-        control[BRANCH_START] = control[T]
-        control[BRANCH_LENGTH] = math.inf
-    control[SIGN] = sign
-
-
-@jit
-def _choose_step(
-    pace: Pace, tau: float, coupled: bool, is_series: bool, t: float, remaining: float, control: FloatArray
-) -> float:
-    """Length of the next step, s: on the ladder, or to the very end of a segment that cannot be continued."""
-    if not pace.controlled:
-        return pace.h_max
-    h = control[H]
-    if h == 0.0:
-        h = 4.0 * tau
-    h = min(h, pace.h_max)
-    ahead = control[BRANCH_START] + _BEYOND * control[BRANCH_LENGTH] - t
-    target = remaining
-    if coupled and 0.0 < ahead < remaining:
-        target = ahead
-    h = target / math.ceil(target / h) if h < target else target
-    if is_series:
-        # A series is worthless past its end: the last step of a segment has its exact length.
-        if h >= remaining * (1.0 - 1e-9):
-            return remaining
-        h = _rung(h)
-        return h if h < remaining else remaining
-    h = _rung(h)
-    return h if h <= pace.h_max else _rung(0.95 * pace.h_max)
-
-
-@jit
-def _rung(h: float) -> float:
-    """The shortest step of the ladder that is not shorter than h."""
-    out: float = 2.0 ** (math.ceil(_RUNGS * math.log2(h) - 1e-9) / _RUNGS)
-    return out
-
-
-@jit
-def _change_level(live: FloatArray, project: FloatArray, old: int, new: int, error: FloatArray) -> None:
-    """Carry the modes' error from one reference area to another."""
-    n = live.shape[1]
-    x = np.zeros(n)
-    for i in range(n):
-        for k in range(n):
-            x[i] += live[old, i, k] * error[k]
-    for k in range(n):
-        error[k] = 0.0
-        for i in range(n):
-            error[k] += project[new, k, i] * x[i]
-
-
-@jit
 def march(
     system: System,
     pace: Pace,
@@ -211,6 +111,7 @@ def march(
     t_out: FloatArray,
     left: NDArray[np.bool_],
     out: FloatArray,
+    kept: Kept,
 ) -> int:
     """Step to `t_end` through the source's segments, writing outputs on the way.
 
@@ -231,6 +132,8 @@ def march(
     t_out, left, out : ndarray
         Output times (ascending), whether the left-hand value is meant, and the columns to fill: live layer voltages
         (n), then charge and current if wanted.
+    kept : Kept
+        Takes the steps, as long as there is room (none: nothing is kept); `counters` holds how many there were.
 
     Returns
     -------
@@ -261,6 +164,7 @@ def march(
     x_out, at_out = borrow(work.x_out), borrow(work.at_out)
     t_out, left, out = borrow(t_out), borrow(left), borrow(out)
     values, coefficients = borrow(work.values), borrow(work.coefficients)
+    kept_times, kept_series = borrow(kept.times), borrow(kept.series)
     u_rows, q_rows, source_row = r[U], r[Q], r[SOURCE]
     n = model.gap.size
     columns = out.shape[0]
@@ -290,12 +194,12 @@ def march(
             segment_terms, segment_series = terms[index], series[index]
             u_source, _ = source(Segment(start, edge - start, segment_terms, segment_series), t - start)
             if mobile or charge:
-                _enter(model, charge, u_source, y, control)
+                enter(model, charge, u_source, y, control)
             else:
                 control[U_GAP] = k_gap * u_source
                 for i in range(n):
                     control[U_GAP] += gap_share[i] * y[i]
-                _turn(1.0 if control[U_GAP] >= 0.0 or not coupled else -1.0, control)
+                take_branch(1.0 if control[U_GAP] >= 0.0 or not coupled else -1.0, control)
             # The steps after a jump are often those after the one before.
             control[H] = control[H_AFTER_EDGE]
             control[TOO_LONG] = 0.0
@@ -308,10 +212,10 @@ def march(
             now = 0
             if q0.size > 1:
                 q, _ = branch_area(model, control[SIGN], control[U_GAP])
-                now = _nearest_level(q0, q)
+                now = nearest_level(q0, q)
             if now != level:
                 if error[n] != now:
-                    _change_level(all_live, all_project, int(error[n]), now, error)
+                    change_level(all_live, all_project, int(error[n]), now, error)
                     error[n] = now
                 level = now
                 h_slot = 0.0
@@ -322,8 +226,9 @@ def march(
             w0[k] = 0.0
             for i in range(n):
                 w0[k] += project[k, i] * y[i]
-        h = _choose_step(pace, tau, coupled, segment_series.size > 0, t, stop - t, control)
+        h = choose_step(pace, tau, coupled, segment_series.size > 0, t, stop - t, control)
         run_error = 0.0
+        magnified = 1.0
         wrong = 0
         flip = False
         wanted = control[H]
@@ -351,7 +256,7 @@ def march(
                 break
             step_error = math.inf
             if closed:
-                step_error, run_error = assess(
+                step_error, run_error, magnified = assess(
                     mobile, area0, gain, gap, decay, phi, miss, error, w, pull, used, r, places, sums
                 )
             if not controlled and closed:
@@ -380,10 +285,10 @@ def march(
                 return NO_STEP
             if wrong > 1 and sign * u_rows[END] < lo:
                 # It went far over a zero, where the branch has no meaning: end soon after the zero.
-                h = _rung(h * min(0.9, 1.1 * POINTS[wrong]))
+                h = rung(h * min(0.9, 1.1 * POINTS[wrong]))
             else:
                 control[TOO_LONG] = h
-                h = _rung(h * min(0.9, max(0.25, factor)))
+                h = rung(h * min(0.9, max(0.25, factor)))
                 wanted = h
         if flip:
             control[SIGN] = -control[SIGN]
@@ -409,13 +314,24 @@ def march(
         if charge:
             charge_rates(model, rates, gain, gap, slow_share, w, pull, r, values[n], values[n + 1])
             integrate(integral, h, y[n], values[n], values[n])
-        if next_out <= t_new:
+        if next_out <= t_new or kept_times.size > 0:
             layers(mobile, area0, k_layer, live, w, source_row, q_rows, values)
             for c in range(columns):
                 series_of(values[c], coefficients[c])
-            first_out = write_outputs(t, h, theta, t_new, coefficients, x_out, at_out, first_out, t_out, left, out)
+            place = counters[KEPT]
+            counters[KEPT] += 1
+            if place < kept_times.shape[0]:
+                kept_times[place, 0], kept_times[place, 1], kept_times[place, 2] = t, h, t_new
+                for c in range(columns):
+                    for d in range(ROWS):
+                        kept_series[place, c, d] = coefficients[c, d]
+        if next_out <= t_new:
+            first_out = write_outputs(
+                t, h, theta, t_new, 0.0, coefficients, x_out, at_out, first_out, t_out, left, out
+            )  # fmt: skip
             counters[OUTPUT] = first_out
             next_out = t_out[first_out] if first_out < t_out.size else math.inf
+        control[MAGNIFIED] = max(control[MAGNIFIED], magnified)
         account(stress, u_rows, q_rows, theta, run_error, control)
         if theta < 1.0:
             for k in range(n):

@@ -20,12 +20,15 @@ BRANCH_START, BRANCH_LENGTH, PEAK_U, PEAK_F, ERROR_U, ERROR_F = 5, 6, 7, 8, 9, 1
 TOO_LONG = 11
 # The first step taken after an edge of the source, s.
 H_AFTER_EDGE = 12
-N_CONTROL = 13
-# Entries of `counters`: rows evaluated, steps accepted and refused, zeros met, outputs written.
-NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT = 0, 1, 2, 3, 4
-N_COUNTERS = 5
-# Outputs read at once.
+# Largest move of the gap voltage for a move of a live one.
+MAGNIFIED = 13
+N_CONTROL = 14
+# Entries of `counters`: rows evaluated, steps accepted and refused, zeros met, outputs written, steps kept.
+NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT = 0, 1, 2, 3, 4, 5
+N_COUNTERS = 6
+# Outputs read at once, in groups of a processor's vectors: a step may hold few.
 BLOCK = 32
+_GROUP = 8
 
 
 @jit_rows
@@ -196,51 +199,55 @@ def layers(
 
 
 @jit_rows
-def _clenshaw_block(series: FloatArray, x: FloatArray, out: FloatArray) -> None:
-    """The series at BLOCK places at once: the inner loop is unrolled, the outer one a processor's vector."""
-    for i in range(BLOCK):
+def _clenshaw_groups(series: FloatArray, x: FloatArray, groups: int, out: FloatArray) -> None:
+    """The series at whole groups of places, so that all round alike: the inner loop is unrolled, the outer a vector."""
+    for i in range(_GROUP * groups):
+        twice = 2.0 * x[i]
         b1 = 0.0
         b2 = 0.0
         for d in range(NODES - 1, 0, -1):
-            b0 = series[d] + 2.0 * x[i] * b1 - b2
+            b0 = twice * b1 + (series[d] - b2)
             b2 = b1
             b1 = b0
         out[i] = series[0] + x[i] * b1 - b2
 
 
 @jit_rows
-def _place(t: float, scale: float, top: float, x: FloatArray) -> None:
-    """BLOCK output times in place as places in [-1, top] of a step; always all of them, so that all round alike."""
-    for i in range(BLOCK):
+def _place(t: float, scale: float, top: float, groups: int, x: FloatArray) -> None:
+    """Output times in place as places in [-1, top] of a step."""
+    for i in range(_GROUP * groups):
         x[i] = min(max((x[i] - t) * scale - 1.0, -1.0), top)
 
 
 @jit
 def write_outputs(
-    t: float, h: float, reached: float, t_new: float, series: FloatArray, x: FloatArray, values: FloatArray,
-    first: int, t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray,
+    t: float, h: float, reached: float, t_new: float, slack: float, series: FloatArray, x: FloatArray,
+    values: FloatArray, first: int, t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray,
 ) -> int:  # fmt: skip
     """Outputs of one step from number `first` on: right-hand ones in [t, t_new), left-hand ones in (t, t_new].
 
-    Returns the number of the first output that is left.
+    Times within `slack` of t_new are t_new. Returns the number of the first output that is left.
     """
+    low = t_new - slack
+    high = t_new + slack
     while first < t_out.size:
         count = 0
-        if first + BLOCK <= t_out.size and t_out[first + BLOCK - 1] < t_new:
+        if first + BLOCK <= t_out.size and t_out[first + BLOCK - 1] < low:
             count = BLOCK
         else:
             while count < BLOCK and first + count < t_out.size:
                 time = t_out[first + count]
-                if time > t_new or (time == t_new and not left[first + count]):
+                if time >= low and (time > high or not left[first + count]):
                     break
                 count += 1
         if count == 0:
             break
         for i in range(count):
             x[i] = t_out[first + i]
-        _place(t, 2.0 / h, 2.0 * reached - 1.0, x)
+        groups = (count + _GROUP - 1) // _GROUP
+        _place(t, 2.0 / h, 2.0 * reached - 1.0, groups, x)
         for column in range(out.shape[0]):
-            _clenshaw_block(series[column], x, values)
+            _clenshaw_groups(series[column], x, groups, values)
             for i in range(count):
                 out[column, first + i] = values[i]
         first += count

@@ -7,9 +7,12 @@ from numpy.typing import NDArray
 
 from fingerspice.compiled import jit
 from fingerspice.engine.exponential import Tables
-from fingerspice.engine.march import DONE, Pace, Work, march
+from fingerspice.engine.march import DONE, Work, march
+from fingerspice.engine.pace import Pace
 from fingerspice.engine.readout import BRANCH_LENGTH, N_CONTROL, N_COUNTERS, NFEV, U_BEFORE, T
+from fingerspice.engine.repeat import Kept
 from fingerspice.engine.system import System
+from fingerspice.numerics.lobatto import ROWS
 from fingerspice.numerics.small import inverse
 
 FloatArray = NDArray[np.float64]
@@ -40,6 +43,7 @@ def _map(
     code = march(
         system, pace, tables, work, integral, edges, terms, series, edges[-1], y, np.zeros(n + 1), control, count,
         np.zeros(0), np.zeros(0, np.bool_), np.zeros((n, 0)),
+        Kept(np.zeros((0, 3)), np.zeros((0, n, ROWS))),
     )  # fmt: skip
     for k in range(n):
         end[k] = 0.0

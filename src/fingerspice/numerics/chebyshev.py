@@ -89,24 +89,36 @@ _BLOCK = 64
 @jit_rows
 def evaluate_array(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatArray) -> None:
     """The series at (|x| - lo) scale - 1 into `out`, both of shape (n,); several at once in a processor's vector."""
-    here = np.empty(_BLOCK)
+    twice = np.empty(_BLOCK)
     b1 = np.empty(_BLOCK)
     b2 = np.empty(_BLOCK)
     for first in range(0, x.size, _BLOCK):
         count = min(_BLOCK, x.size - first)
         if count < _BLOCK:
             for i in range(_BLOCK):
-                here[i] = 0.0
+                twice[i] = 0.0
         for i in range(count):
-            here[i] = (abs(x[first + i]) - lo) * scale - 1.0
+            twice[i] = 2.0 * ((abs(x[first + i]) - lo) * scale - 1.0)
         for i in range(_BLOCK):
             b1[i] = 0.0
             b2[i] = 0.0
-        for k in range(c.size - 1, 0, -1):
-            here_c = c[k]
+        k = c.size - 1
+        # Four steps of Clenshaw's recurrence for each pass through memory.
+        while k >= 4:
+            c0, c1, c2, c3 = c[k], c[k - 1], c[k - 2], c[k - 3]
             for i in range(_BLOCK):
-                b0 = here_c + 2.0 * here[i] * b1[i] - b2[i]
+                step = twice[i]
+                older = step * b1[i] + (c0 - b2[i])
+                newer = step * older + (c1 - b1[i])
+                older = step * newer + (c2 - older)
+                b1[i] = step * older + (c3 - newer)
+                b2[i] = older
+            k -= 4
+        for last in range(k, 0, -1):
+            c0 = c[last]
+            for i in range(_BLOCK):
+                newer = twice[i] * b1[i] + (c0 - b2[i])
                 b2[i] = b1[i]
-                b1[i] = b0
+                b1[i] = newer
         for i in range(count):
-            out[first + i] = c[0] + here[i] * b1[i] - b2[i]
+            out[first + i] = c[0] + 0.5 * twice[i] * b1[i] - b2[i]

@@ -203,17 +203,23 @@ def inverse_area(u: float, curve: FloatArray) -> tuple[float, float]:
     return 1.0 / area, -slope / (area * area)
 
 
-def areas(u: FloatArray, curve: FloatArray) -> FloatArray:
-    """A_R (m^2) at gap voltages |u| (V), shape (n,), from a `Contact.curve`."""
+def inverse_areas(u: FloatArray, curve: FloatArray) -> FloatArray:
+    """1/A_R (1/m^2) at gap voltages |u| (V), shape (n,), from a `Contact.curve`."""
     u = np.ascontiguousarray(u)
     lo, hi, series = float(curve[0]), float(curve[1]), curve[2 + N_PACKED :]
     if series.size == 1:
-        return np.full(u.shape, 1.0 / series[0])
+        return np.full(u.shape, series[0])
     if series.size and max(u.max(initial=0.0), -u.min(initial=0.0)) <= hi:
         out = np.empty(u.size)
         chebyshev.evaluate_array(series, u, lo, 2.0 / (hi - lo), out)
-        return np.divide(1.0, out, out=out)
-    return np.asarray(1.0 / inverse_area_array(np.abs(u), curve)[0])
+        return out
+    return np.asarray(inverse_area_array(np.abs(u), curve)[0])
+
+
+def areas(u: FloatArray, curve: FloatArray) -> FloatArray:
+    """A_R (m^2) at gap voltages |u| (V), shape (n,), from a `Contact.curve`."""
+    q = inverse_areas(u, curve)
+    return np.divide(1.0, q, out=q)
 
 
 @jit

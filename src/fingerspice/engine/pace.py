@@ -1,0 +1,120 @@
+"""How the exponential steps are paced: their lengths, and what happens where the source or the gap voltage turns."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.compiled import jit
+from fingerspice.engine.model import Model, choose_branch, dot, gap_voltage, jump_charge
+from fingerspice.engine.readout import BRANCH_LENGTH, BRANCH_START, SIGN, U_BEFORE, U_GAP, H, T
+
+FloatArray = NDArray[np.float64]
+
+# Neighbouring step lengths of the ladder, as a power of two: fine enough to waste little, coarse enough to recur.
+_RUNGS = 16.0
+# A step meant to reach a zero of the gap voltage goes this much farther.
+_BEYOND = 1.02
+
+
+class Pace(NamedTuple):
+    """How steps are chosen.
+
+    Attributes
+    ----------
+    tol : float
+        Error of the gap voltage allowed in a step, V.
+    h_max : float
+        Longest step, s.
+    controlled : bool
+        Whether the error governs the step; else every step is `h_max` (for measuring orders).
+    charge : bool
+        Whether charge and current are wanted.
+    """
+
+    tol: float
+    h_max: float
+    controlled: bool
+    charge: bool
+
+
+@jit
+def nearest_level(q0: FloatArray, q: float) -> int:
+    """Reference area nearest to 1/A = q, by ratio."""
+    best = 0
+    distance = math.inf
+    for i in range(q0.size):
+        d = max(q0[i] / q, q / q0[i])
+        if d < distance:
+            distance = d
+            best = i
+    return best
+
+
+@jit
+def enter(model: Model, charge: bool, u_source: float, y: FloatArray, control: FloatArray) -> None:
+    """Take the jump of the source that may stand here, and choose the branch after it."""
+    x_gap = dot(model.gap, y)
+    if not model.mobile and u_source != control[U_BEFORE] and charge:
+        y[-1] += jump_charge(model, x_gap, control[U_BEFORE], u_source)
+    take_branch(choose_branch(model, u_source, y), control)
+    control[U_GAP] = gap_voltage(model, model.k_gap * u_source, x_gap, control[SIGN], model.k_gap * u_source)
+
+
+@jit
+def take_branch(sign: float, control: FloatArray) -> None:
+    """Take the branch of a sign; one that is new starts here, and how long it will be is not known."""
+    if sign != control[SIGN]:
+        control[BRANCH_START] = control[T]
+        control[BRANCH_LENGTH] = math.inf
+    control[SIGN] = sign
+
+
+@jit
+def choose_step(
+    pace: Pace, tau: float, coupled: bool, is_series: bool, t: float, remaining: float, control: FloatArray
+) -> float:
+    """Length of the next step, s: on the ladder, or to the very end of a segment that cannot be continued."""
+    if not pace.controlled:
+        return pace.h_max
+    h = control[H]
+    if h == 0.0:
+        h = 4.0 * tau
+    h = min(h, pace.h_max)
+    ahead = control[BRANCH_START] + _BEYOND * control[BRANCH_LENGTH] - t
+    target = remaining
+    if coupled and 0.0 < ahead < remaining:
+        target = ahead
+    h = target / math.ceil(target / h) if h < target else target
+    if is_series:
+        # A series is worthless past its end: the last step of a segment has its exact length.
+        if h >= remaining * (1.0 - 1e-9):
+            return remaining
+        h = rung(h)
+        return h if h < remaining else remaining
+    h = rung(h)
+    return h if h <= pace.h_max else rung(0.95 * pace.h_max)
+
+
+@jit
+def rung(h: float) -> float:
+    """The shortest step of the ladder that is not shorter than h."""
+    out: float = 2.0 ** (math.ceil(_RUNGS * math.log2(h) - 1e-9) / _RUNGS)
+    return out
+
+
+@jit
+def change_level(live: FloatArray, project: FloatArray, old: int, new: int, error: FloatArray) -> None:
+    """Carry the modes' error from one reference area to another."""
+    n = live.shape[1]
+    x = np.zeros(n)
+    for i in range(n):
+        for k in range(n):
+            x[i] += live[old, i, k] * error[k]
+    for k in range(n):
+        error[k] = 0.0
+        for i in range(n):
+            error[k] += project[new, k, i] * x[i]

@@ -1,0 +1,88 @@
+"""A period kept as polynomials, and its outputs written again: what a periodic scene needs once it has settled."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.compiled import borrow, jit
+from fingerspice.engine.readout import BLOCK, write_outputs
+from fingerspice.numerics.lobatto import ROWS
+
+FloatArray = NDArray[np.float64]
+
+# A boundary of a step, moved by whole periods, is one of the times asked for if it is this near, relative.
+_SLACK = 8e-16
+
+
+class Kept(NamedTuple):
+    """Steps kept for repetition.
+
+    Attributes
+    ----------
+    times : ndarray, shape (n_step, 3)
+        Start, length and reached end of each step, s.
+    series : ndarray, shape (n_step, n_column, ROWS)
+        Chebyshev coefficients of the output columns over the whole length.
+    """
+
+    times: FloatArray
+    series: FloatArray
+
+
+def new_kept(steps: int, columns: int) -> Kept:
+    """Room for so many steps."""
+    return Kept(np.zeros((steps, 3)), np.zeros((steps, columns, ROWS)))
+
+
+@jit
+def repeat(
+    kept: Kept, count: int, period: float, periods: int, drift: float, first: int, t_out: FloatArray,
+    left: NDArray[np.bool_], out: FloatArray,
+) -> int:  # fmt: skip
+    """Write the outputs of the periods that follow the kept one.
+
+    Parameters
+    ----------
+    kept : Kept
+        `count` steps that make one period.
+    period : float
+        s.
+    periods : int
+        How often to repeat it.
+    drift : float
+        What the charge, the last but one column of `out` where there is one, gains in a period, C.
+    first, t_out, left, out
+        As `readout.write_outputs`.
+
+    Returns
+    -------
+    int
+        The first output that is left.
+    """
+    times, series = borrow(kept.times), borrow(kept.series)
+    t_out, left, out = borrow(t_out), borrow(left), borrow(out)
+    x = np.zeros(BLOCK)
+    values = np.zeros(BLOCK)
+    row = out.shape[0] - 2
+    for k in range(1, periods + 1):
+        shift = k * period
+        before = first
+        for i in range(count):
+            if first >= t_out.size:
+                break
+            end = times[i, 2] + shift
+            slack = _SLACK * abs(end)
+            if t_out[first] > end + slack:
+                continue
+            h = times[i, 1]
+            reached = (times[i, 2] - times[i, 0]) / h
+            first = write_outputs(
+                times[i, 0] + shift, h, min(reached, 1.0), end, slack, series[i], x, values, first, t_out, left, out
+            )
+        if drift != 0.0:
+            for i in range(before, first):
+                out[row, i] += k * drift
+    return first

@@ -1,0 +1,119 @@
+"""A settled run repeats its period: the same answer as stepping every one, at any output, for either law."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import analytic as ref
+import fingerspice as fs
+from scenes import table1
+
+every_law = pytest.mark.parametrize("law", ["local", "mobile"])
+SOURCES = {
+    "sine": fs.Sine(200.0, 100.0),
+    "offset": fs.Sine(120.0, 300.0, offset=60.0),
+    "square": fs.Square(200.0, 1000.0),
+    "pulse": fs.Pulse(-50.0, 200.0, delay=1e-3, rise=2e-5, fall=1e-5, width=3e-4, pulse_period=1e-3),
+    "late": fs.Sine(200.0, 500.0, delay=3.3e-3),
+    "two tones": fs.Sine(100.0, 200.0) + fs.Sine(80.0, 300.0),
+}
+every_source = pytest.mark.parametrize("source", SOURCES.values(), ids=SOURCES.keys())
+
+
+def both(source: fs.Waveform, periods: float, law: str, rtol: float, t: np.ndarray | None = None, **changes: str):
+    """The run that may repeat, and the one that steps every period."""
+    circuit = table1().replace({"Vdrive": source, **changes})
+    assert source.period is not None
+    stop = periods * source.period
+    times = np.linspace(0.0, stop, 4001) if t is None else t
+    options = {"t_stop": stop, "t_eval": times, "rtol": rtol, "charge_law": law}
+    return fs.simulate(circuit, **options), fs.simulate(circuit, method="exponential", **options)
+
+
+@every_law
+@every_source
+@pytest.mark.parametrize("rtol", [1e-4, 1e-9])
+def test_a_repeated_period_is_the_one_that_would_have_been_stepped(source: fs.Waveform, law: str, rtol: float) -> None:
+    run, stepped = both(source, 60.4, law, rtol)
+    assert run.stats["repeated"] > 20
+    assert stepped.stats["repeated"] == 0
+    assert run.stats["steps"] < 0.7 * stepped.stats["steps"]
+    for name in ("u_gap", "f_el", "area", "i_source", "q_source"):
+        a, b = getattr(run, name), getattr(stepped, name)
+        # A current is a slope, and a charge adds up what every period is off.
+        assert np.abs(a - b).max() <= (1.0 if name in ("u_gap", "f_el") else 10.0) * rtol * np.abs(b).max(), name
+    assert np.abs(run.u_gap - stepped.u_gap).max() <= run.error.u_gap + stepped.error.u_gap
+
+
+@every_law
+def test_late_outputs_are_those_of_the_independent_reference(law: str) -> None:
+    f, periods = 1000.0, 40
+    run = fs.simulate(
+        table1(f=f).replace({"Vdrive": fs.Sine(200.0, f)}),
+        t_stop=periods / f, t_eval=np.linspace(35.0, 40.0, 301)[:-1] / f, rtol=1e-10, charge_law=law,
+    )  # fmt: skip
+    assert run.stats["repeated"] > 5
+    exact = ref.transient(ref.sine_segments(200.0, f, periods / f), run.t, freq=f, law=law)
+    gap = exact.u[:, 1]
+    assert np.abs(run.u_gap - gap).max() <= 1e-10 * np.abs(gap).max()
+
+
+@every_law
+def test_both_sides_of_every_jump_are_right_in_repeated_periods(law: str) -> None:
+    f = 700.0
+    deck = table1().replace({"Vdrive": fs.Square(200.0, f)})
+    run = fs.simulate(deck, t_stop=100.5 / f, rtol=1e-6, charge_law=law)
+    assert run.stats["repeated"] > 50
+    twice = np.flatnonzero(np.diff(run.t) == 0.0)
+    assert twice.size >= 200
+    k = run.record.model.k_gap
+    jump = run.u_gap[twice + 1] - run.u_gap[twice]
+    # Under `local` the gap takes its share of the 400 V at once; `mobile` adds what the area moves.
+    assert np.all(np.sign(jump) == np.sign(run.u_source[twice + 1]))
+    if law == "local":
+        assert np.abs(np.abs(jump) - 400.0 * k).max() <= 1e-12 * 400.0
+
+
+def test_outputs_anywhere_are_of_one_curve() -> None:
+    rng = np.random.default_rng(5)
+    stop = 50.0 / 100.0
+    scattered = np.sort(rng.uniform(0.0, stop, 3000))
+    run, stepped = both(SOURCES["sine"], 50.0, "local", 1e-8, scattered)
+    assert np.abs(run.u_gap - stepped.u_gap).max() <= 1e-8 * np.abs(run.u_gap).max()
+    few, _ = both(SOURCES["sine"], 50.0, "local", 1e-8, scattered[1::7])
+    assert np.array_equal(few.u_gap, run.u_gap[1::7])
+
+
+@every_law
+@pytest.mark.parametrize("leak", ["1e10", "1e13", "none"])
+def test_a_state_that_creeps_is_not_taken_for_settled(leak: str, law: str) -> None:
+    # The coating's charge follows an offset over seconds to hours: 200 periods of it move the mean.
+    source = fs.Sine(100.0, 1000.0, offset=80.0)
+    r = {"Xcoat.r": float("inf") if leak == "none" else float(leak)}
+    run, stepped = both(source, 200.0, law, 1e-7, **r)
+    peak = np.abs(stepped.u_gap).max()
+    assert np.abs(run.u_gap - stepped.u_gap).max() <= 1e-7 * peak
+
+
+@every_law
+def test_a_run_goes_on_from_the_end_of_a_repeated_one(law: str) -> None:
+    source = SOURCES["square"]
+    circuit = table1().replace({"Vdrive": source})
+    first = fs.simulate(circuit, t_stop=0.0503, rtol=1e-8, charge_law=law)
+    assert first.stats["repeated"] > 20
+    rest = fs.simulate(circuit, t_stop=0.0603, rtol=1e-8, charge_law=law, start=first)
+    whole = fs.simulate(circuit, t_stop=0.0603, rtol=1e-8, charge_law=law, method="exponential")
+    assert rest.t[-1] == whole.t[-1]
+    assert rest.u_gap[-1] == pytest.approx(whole.u_gap[-1], abs=1e-8 * 200.0)
+    assert rest.q_source[-1] == pytest.approx(whole.q_source[-1], abs=1e-7 * np.abs(whole.q_source).max())
+
+
+def test_a_source_without_a_period_is_stepped() -> None:
+    circuit = table1().replace({"Vdrive": fs.Chirp(200.0, 50.0, 500.0, 0.1)})
+    assert fs.simulate(circuit, t_stop=0.1, rtol=1e-4).stats["repeated"] == 0
+
+
+def test_a_short_run_is_stepped() -> None:
+    circuit = table1().replace({"Vdrive": fs.Sine(200.0, 100.0)})
+    assert fs.simulate(circuit, t_stop=0.05, rtol=1e-4).stats["repeated"] == 0
