@@ -36,10 +36,11 @@ def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
 
 
 def contestants() -> list[Contestant]:
-    """Our methods; `auto` is what a user gets without asking."""
-    auto = Contestant(
-        "fingerspice", LIBRARY, tolerances(2, 12), _setup("auto"), mobile=True, compile_limit=120.0
-    )  # fmt: skip
+    """Our methods; `auto` is what a user gets without asking, `exponential` the same without repeating a period."""
+    auto, stepped = (
+        Contestant(library, library, tolerances(2, 12), _setup(method), mobile=True, compile_limit=120.0)
+        for library, method in ((LIBRARY, "auto"), (f"{LIBRARY}, every period", "exponential"))
+    )
     others = [
         Contestant(
             f"fingerspice {method}", f"{LIBRARY}, Runge-Kutta", (1e-3, 1e-6, 1e-9), _setup(method),
@@ -47,4 +48,4 @@ def contestants() -> list[Contestant]:
         )
         for method in METHODS
     ]  # fmt: skip
-    return [auto, *others]
+    return [auto, stepped, *others]

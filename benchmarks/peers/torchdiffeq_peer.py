@@ -1,7 +1,7 @@
 """torchdiffeq in double precision.
 
-Its right-hand side is the compiled one behind `torch.from_numpy`: some forty times cheaper than the same in eager
-torch.
+Its right-hand side is the compiled one behind `torch.from_numpy`, some forty times cheaper than the same in eager torch;
+`eager` is what a torch user would write.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from peers.contest import Contestant, NotSolvedError, Outcome, Plan, installed, tolerances
 from problems import AMPLITUDE
-from right_hand_side import compiled
+from right_hand_side import compiled, local_rates
 
 LIBRARY = "torchdiffeq"
 
@@ -23,7 +23,7 @@ def version() -> str | None:
     return None if found is None or torch is None else f"torchdiffeq {found}, torch {torch}"
 
 
-def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
+def _setup(method: str, eager: bool = False) -> Callable[[Plan], Callable[[float], Outcome]]:
     fixed = method == "rk4"
 
     def setup(plan: Plan) -> Callable[[float], Outcome]:
@@ -31,6 +31,9 @@ def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
         from torchdiffeq import odeint
 
         rhs = compiled(plan.problem)
+        torch_rates, _ = local_rates(
+            plan.problem.constants, plan.problem.drive, torch.sin, lambda x, top: torch.clamp(x, max=top)
+        )
         times = [torch.from_numpy(np.concatenate([[p.t0], plan.t_eval[p.first : p.last], [p.t1]])) for p in plan.pieces]
 
         def run(setting: float) -> Outcome:
@@ -42,6 +45,8 @@ def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
                 def slope(t: torch.Tensor, x: torch.Tensor, piece=piece) -> torch.Tensor:  # type: ignore[no-untyped-def]
                     nonlocal nfev
                     nfev += 1
+                    if eager:
+                        return torch.stack(torch_rates(t, x[0], x[1], piece.sign, piece.level))
                     return torch.from_numpy(rhs.rates(t.item(), x.numpy(), piece.sign, piece.level))
 
                 if fixed:
@@ -65,7 +70,7 @@ def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
 
 
 def contestants() -> list[Contestant]:
-    """Two adaptive methods, also restarted at the zeros of the gap voltage, and fixed steps of order 4."""
+    """Two adaptive methods, also restarted at the zeros of the gap voltage, one in eager torch, and fixed steps."""
     ranges = {"dopri5": (2, 9.5), "dopri8": (2, 11)}
     adaptive = [
         Contestant(
@@ -75,5 +80,10 @@ def contestants() -> list[Contestant]:
         for method, span in ranges.items()
         for kinks in (False, True)
     ]  # fmt: skip
+    eager = Contestant("torchdiffeq dopri5, eager", LIBRARY, tolerances(3, 7, 1 / 2), _setup("dopri5", True), slow=True)
     steps = (50.0, 100.0, 200.0, 500.0, 1000.0)
-    return [*adaptive, Contestant("torchdiffeq rk4", LIBRARY, steps, _setup("rk4"), "steps per period", slow=True)]
+    return [
+        *adaptive,
+        eager,
+        Contestant("torchdiffeq rk4", LIBRARY, steps, _setup("rk4"), "steps per period", slow=True),
+    ]
