@@ -1,7 +1,7 @@
 """torchdiffeq in double precision.
 
-Its right-hand side is the compiled one behind `torch.from_numpy`, some forty times cheaper than the same in eager torch;
-`eager` is what a torch user would write.
+Its right-hand side is the compiled one behind `torch.from_numpy`, some forty times cheaper than the same in eager
+torch; `eager` is what a torch user would write.
 """
 
 from __future__ import annotations
