@@ -257,6 +257,37 @@ def test_a_coating_may_be_anything_from_a_wire_to_a_perfect_insulator(r_coat: st
     assert solution.stats["steps"] < 5000
 
 
+CHARGED_T = np.linspace(1e-5, 1 / 150.0 - 1e-5, 71)
+CHARGED = {
+    "sine": (fs.Sine(120.0, 300.0, offset=25.0), ref.sine_segments(120.0, 300.0, 1 / 150.0, offset=25.0)),
+    "square": (fs.Square(100.0, 300.0, duty=0.3), ref.square_segments(100.0, 300.0, 2, duty=0.3)),
+}
+
+
+@lru_cache(None)
+def charged(shape: str, r_coat: float, r_gap: float, law: str) -> ref.Transient:
+    plain = ref.table1_layers(100.0)
+    layers = (ref.Layer(plain[0].c, r_total=r_coat), ref.Layer(plain[1].c, r_total=r_gap), plain[2])
+    return ref.transient(CHARGED[shape][1], CHARGED_T, law=law, layers=layers, stages=16, tol=1e-13)
+
+
+@every_law
+@pytest.mark.parametrize("shape", CHARGED)
+@pytest.mark.parametrize("r_gap", [1e6, 1e10])
+@pytest.mark.parametrize("r_coat", [3.0, 1e3, 2e5])
+@pytest.mark.parametrize("rtol", [1e-4, 1e-8, 1e-11])
+def test_the_charge_is_as_exact_as_the_voltages_whatever_the_leaks(
+    rtol: float, r_coat: float, r_gap: float, shape: str, law: str
+) -> None:
+    expected = charged(shape, r_coat, r_gap, law)
+    solution = fs.simulate(
+        table1(coat={"r": r_coat}, gap={"r": r_gap}), sources={"Vdrive": CHARGED[shape][0]}, t_eval=CHARGED_T,
+        t_stop=1 / 150.0, charge_law=law, rtol=rtol,
+    )  # fmt: skip
+    assert np.abs(solution.u_gap - expected.u_gap).max() <= rtol * np.abs(expected.u_gap).max()
+    assert np.abs(solution.q_source - expected.q).max() <= rtol * np.abs(expected.q).max()
+
+
 @pytest.mark.parametrize("shape", ["sine", "square"])
 def test_two_kilovolt_are_stepped_through(shape: str) -> None:
     source, segments = {

@@ -30,10 +30,9 @@ from fingerspice.engine.readout import (
     T,
     account,
     at,
-    charge_rates,
+    charge_nodes,
     error_at,
     first_wrong,
-    integrate,
     layers,
     series_of,
     write_outputs,
@@ -407,8 +406,9 @@ def march(
                     continue
         flips = 0
         if charge:
-            charge_rates(model, rates, gain, gap, slow_share, w, pull, r, values[n], values[n + 1])
-            integrate(integral, h, y[n], values[n], values[n])
+            charge_nodes(
+                model, rates, gain, gap, slow_share, w, pull, r, integral, h, y[n], values[n], values[n + 1]
+            )  # fmt: skip
         if next_out <= t_new:
             layers(mobile, area0, k_layer, live, w, source_row, q_rows, values)
             for c in range(columns):

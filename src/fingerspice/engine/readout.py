@@ -26,6 +26,12 @@ NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT = 0, 1, 2, 3, 4
 N_COUNTERS = 5
 # Outputs read at once.
 BLOCK = 32
+# Slope at each node, per step length, of the polynomial through values at the nodes.
+DERIVATIVE = np.zeros((NODES, NODES))
+for _i in range(NODES):
+    for _j in set(range(NODES)) - {_i}:
+        DERIVATIVE[_i, _j] = BARYCENTRIC[_j] / BARYCENTRIC[_i] / (POINTS[_i] - POINTS[_j])
+    DERIVATIVE[_i, _i] = -DERIVATIVE[_i].sum()
 
 
 @jit_rows
@@ -132,13 +138,19 @@ def error_at(places: FloatArray, theta: float, error: FloatArray) -> None:
 
 
 @jit
-def charge_rates(
+def charge_nodes(
     model: Model, rates: FloatArray, gain: FloatArray, gap: FloatArray, slow_share: FloatArray, w: FloatArray,
-    pull: FloatArray, r: FloatArray, rate: FloatArray, current: FloatArray,
+    pull: FloatArray, r: FloatArray, integral: FloatArray, h: float, z0: float, z: FloatArray, current: FloatArray,
 ) -> None:  # fmt: skip
-    """z' and the current at the nodes, through the layer that leaks slowest (see `model.charge_rate`)."""
+    """z and the current at the nodes of a step of length h that starts with z0.
+
+    Both go through the layer that leaks slowest (see `model.charge_rate`). What that layer stores is taken from its
+    voltages themselves: in w' a fast mode that has died away still holds its rate times the error of w, which a sum
+    over a step much longer than the mode would turn into charge.
+    """
     n = rates.size
     slow = model.slow
+    voltage = np.empty(NODES)
     for j in range(NODES):
         dv = 0.0
         v = 0.0
@@ -150,26 +162,44 @@ def charge_rates(
             dx_gap += gap[k] * dw
         q = r[Q, j]
         scale = model.area0 * q if model.mobile else 1.0
-        voltage = slow[n] * r[SOURCE, j] + v * scale
-        lam = slow[n + 1] * dv * scale + (slow[n + 2] + q * slow[n + 3]) * voltage
+        lam = slow[n + 1] * dv * scale + (slow[n + 2] + q * slow[n + 3]) * (slow[n] * r[SOURCE, j] + v * scale)
+        # What the layer stores, over its capacitance: A_0 x under `mobile`; under `local` its voltage moves at A.
+        voltage[j] = v if model.mobile else slow[n] * r[SOURCE, j] + v
+        # The leak alone, for the integral.
+        z[j] = (slow[n + 2] / q + slow[n + 3]) * (slow[n] * r[SOURCE, j] + v * scale)
         if model.mobile:
-            rate[j] = lam / q
             # i = Q' with Q = A U / S + z, and u' from the area equation.
             margin = 1.0 - r[X_GAP, j] * model.area0 * r[DQ, j]
             du = (model.k_gap * r[SLOPE, j] + dx_gap * scale) / margin
-            current[j] = rate[j] + (r[SLOPE, j] / q - r[DQ, j] * du * r[SOURCE, j] / (q * q)) / model.s
+            current[j] = lam / q + (r[SLOPE, j] / q - r[DQ, j] * du * r[SOURCE, j] / (q * q)) / model.s
         else:
-            rate[j] = (lam + r[SLOPE, j] / model.s) / q
-            current[j] = rate[j]
+            current[j] = (lam + r[SLOPE, j] / model.s) / q
+    start = model.area0 if model.mobile else 1.0 / r[Q, 0]
+    if not model.mobile and model.coupled:
+        # A c du, of which A at the start of the step is taken exactly and the rest along the polynomial.
+        _add_moves(slow[n + 1] / h, voltage, r[Q], z)
+    _integrate(integral, h, z0, z)
+    for j in range(NODES):
+        z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
 
 
 @jit_rows
-def integrate(integral: FloatArray, h: float, z0: float, rate: FloatArray, z: FloatArray) -> None:
-    """z at the nodes from z' there; in place is allowed."""
+def _add_moves(factor: float, voltage: FloatArray, q: FloatArray, rate: FloatArray) -> None:
+    """Add factor (A - A at the start) times the slope of the voltage's polynomial, per step length."""
+    for j in range(NODES):
+        slope = 0.0
+        for m in range(NODES):
+            slope += DERIVATIVE[j, m] * voltage[m]
+        rate[j] += factor * (1.0 / q[j] - 1.0 / q[0]) * slope
+
+
+@jit_rows
+def _integrate(integral: FloatArray, h: float, z0: float, z: FloatArray) -> None:
+    """z at the nodes from z' there, in place."""
     total = np.zeros(NODES)
     for m in range(NODES):
         for j in range(NODES):
-            total[j] += integral[m, j] * rate[m]
+            total[j] += integral[m, j] * z[m]
     for j in range(NODES):
         z[j] = z0 + h * total[j]
 
