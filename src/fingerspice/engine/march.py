@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import borrow, jit
+from fingerspice.engine.charge import charge_step
 from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables
 from fingerspice.engine.model import Model, Segment, branch_area, choose_branch, dot, gap_voltage, jump_charge, source
 from fingerspice.engine.readout import (
@@ -30,7 +31,6 @@ from fingerspice.engine.readout import (
     T,
     account,
     at,
-    charge_nodes,
     error_at,
     first_wrong,
     layers,
@@ -406,8 +406,8 @@ def march(
                     continue
         flips = 0
         if charge:
-            charge_nodes(
-                model, rates, gain, gap, slow_share, w, pull, r, integral, h, y[n], values[n], values[n + 1]
+            charge_step(
+                model, rates, gain, gap, slow_share, w, pull, r, integral, h, y[n], places, theta, control, values
             )  # fmt: skip
         if next_out <= t_new:
             layers(mobile, area0, k_layer, live, w, source_row, q_rows, values)

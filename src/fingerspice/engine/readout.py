@@ -1,4 +1,4 @@
-"""What is read off a finished step: zeros of the gap voltage, state and error inside it, charge, outputs, peaks."""
+"""What is read off a finished step: zeros of the gap voltage, state and error inside it, outputs, peaks."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import jit, jit_fused, jit_rows
-from fingerspice.engine.model import Model
-from fingerspice.engine.rows import DQ, SLOPE, SOURCE, X_GAP, Q
 from fingerspice.numerics.lobatto import BARYCENTRIC, FIRST, NODES, POINTS, ROWS, SECOND, THIRD, TO_SERIES
 
 FloatArray = NDArray[np.float64]
@@ -20,18 +18,16 @@ BRANCH_START, BRANCH_LENGTH, PEAK_U, PEAK_F, ERROR_U, ERROR_F = 5, 6, 7, 8, 9, 1
 TOO_LONG = 11
 # The first step taken after an edge of the source, s.
 H_AFTER_EDGE = 12
-N_CONTROL = 13
+# Error of the charge, C: the largest so far, what has been collected, and the squares of what each step added, C^2.
+ERROR_Q, COLLECTED, SPREAD = 13, 14, 15
+# 1/A where the last step ended, 1/m^2.
+LAST_Q = 16
+N_CONTROL = 17
 # Entries of `counters`: rows evaluated, steps accepted and refused, zeros met, outputs written.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT = 0, 1, 2, 3, 4
 N_COUNTERS = 5
 # Outputs read at once.
 BLOCK = 32
-# Slope at each node, per step length, of the polynomial through values at the nodes.
-DERIVATIVE = np.zeros((NODES, NODES))
-for _i in range(NODES):
-    for _j in set(range(NODES)) - {_i}:
-        DERIVATIVE[_i, _j] = BARYCENTRIC[_j] / BARYCENTRIC[_i] / (POINTS[_i] - POINTS[_j])
-    DERIVATIVE[_i, _i] = -DERIVATIVE[_i].sum()
 
 
 @jit_rows
@@ -135,73 +131,6 @@ def error_at(places: FloatArray, theta: float, error: FloatArray) -> None:
     share = (theta - left) / (right - left)
     for k in range(places.shape[0]):
         error[k] = (1.0 - share) * places[k, p] + share * places[k, p + 1]
-
-
-@jit
-def charge_nodes(
-    model: Model, rates: FloatArray, gain: FloatArray, gap: FloatArray, slow_share: FloatArray, w: FloatArray,
-    pull: FloatArray, r: FloatArray, integral: FloatArray, h: float, z0: float, z: FloatArray, current: FloatArray,
-) -> None:  # fmt: skip
-    """z and the current at the nodes of a step of length h that starts with z0.
-
-    Both go through the layer that leaks slowest (see `model.charge_rate`). What that layer stores is taken from its
-    voltages themselves: in w' a fast mode that has died away still holds its rate times the error of w, which a sum
-    over a step much longer than the mode would turn into charge.
-    """
-    n = rates.size
-    slow = model.slow
-    voltage = np.empty(NODES)
-    for j in range(NODES):
-        dv = 0.0
-        v = 0.0
-        dx_gap = 0.0
-        for k in range(n):
-            dw = -rates[k] * w[k, j] + gain[k] * r[SOURCE, j] + pull[k, j]
-            dv += slow_share[k] * dw
-            v += slow_share[k] * w[k, j]
-            dx_gap += gap[k] * dw
-        q = r[Q, j]
-        scale = model.area0 * q if model.mobile else 1.0
-        lam = slow[n + 1] * dv * scale + (slow[n + 2] + q * slow[n + 3]) * (slow[n] * r[SOURCE, j] + v * scale)
-        # What the layer stores, over its capacitance: A_0 x under `mobile`; under `local` its voltage moves at A.
-        voltage[j] = v if model.mobile else slow[n] * r[SOURCE, j] + v
-        # The leak alone, for the integral.
-        z[j] = (slow[n + 2] / q + slow[n + 3]) * (slow[n] * r[SOURCE, j] + v * scale)
-        if model.mobile:
-            # i = Q' with Q = A U / S + z, and u' from the area equation.
-            margin = 1.0 - r[X_GAP, j] * model.area0 * r[DQ, j]
-            du = (model.k_gap * r[SLOPE, j] + dx_gap * scale) / margin
-            current[j] = lam / q + (r[SLOPE, j] / q - r[DQ, j] * du * r[SOURCE, j] / (q * q)) / model.s
-        else:
-            current[j] = (lam + r[SLOPE, j] / model.s) / q
-    start = model.area0 if model.mobile else 1.0 / r[Q, 0]
-    if not model.mobile and model.coupled:
-        # A c du, of which A at the start of the step is taken exactly and the rest along the polynomial.
-        _add_moves(slow[n + 1] / h, voltage, r[Q], z)
-    _integrate(integral, h, z0, z)
-    for j in range(NODES):
-        z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
-
-
-@jit_rows
-def _add_moves(factor: float, voltage: FloatArray, q: FloatArray, rate: FloatArray) -> None:
-    """Add factor (A - A at the start) times the slope of the voltage's polynomial, per step length."""
-    for j in range(NODES):
-        slope = 0.0
-        for m in range(NODES):
-            slope += DERIVATIVE[j, m] * voltage[m]
-        rate[j] += factor * (1.0 / q[j] - 1.0 / q[0]) * slope
-
-
-@jit_rows
-def _integrate(integral: FloatArray, h: float, z0: float, z: FloatArray) -> None:
-    """z at the nodes from z' there, in place."""
-    total = np.zeros(NODES)
-    for m in range(NODES):
-        for j in range(NODES):
-            total[j] += integral[m, j] * z[m]
-    for j in range(NODES):
-        z[j] = z0 + h * total[j]
 
 
 @jit_rows
