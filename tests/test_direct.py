@@ -324,9 +324,45 @@ def test_a_source_that_stops_being_finite_ends_the_run_there(tier: str) -> None:
     assert solution.status is fs.Status.SOURCE_NOT_FINITE
     assert 0.0041 <= solution.t[-1] <= 0.0041235
     assert solution.state.t == pytest.approx(0.00412345, abs=1e-9)
+    assert np.all(np.isfinite(solution.state.y))
+    assert solution.state.u_before == pytest.approx(math.sin(2e3 * 0.00412345), abs=1e-5)
     assert np.all(np.isfinite(solution.u_layer))
     want = fs.simulate(circuit, sources={"V1": lambda t: np.sin(2e3 * np.asarray(t))})
     np.testing.assert_allclose(solution.u_layer, want.u_layer[: solution.t.size], rtol=0, atol=1e-10)
+
+
+@every_law
+@pytest.mark.parametrize("at", [0.004, 0.00412345, 0.011], ids=["on an output", "between", "late"])
+@pytest.mark.parametrize("tier", [*CIRCUITS, "coupled"])
+def test_a_run_goes_on_from_where_the_source_stopped_being_finite(tier: str, at: float, law: str) -> None:
+    def broken(t: Any) -> Any:
+        return np.where(np.asarray(t) < at, 3.0 + np.sin(2e3 * np.asarray(t)), np.nan)
+
+    def whole(t: Any) -> Any:
+        return 3.0 + np.sin(2e3 * np.asarray(t))
+
+    circuit = table1() if tier == "coupled" else deck("V1 in 0 1", *CIRCUITS[tier])
+    name = "Vdrive" if tier == "coupled" else "V1"
+    given = {"charge_law": law, "rtol": 1e-11}
+    first = fs.simulate(circuit, sources={name: broken}, t_stop=0.012, throw=False, **given)
+    assert first.status is fs.Status.SOURCE_NOT_FINITE
+    t = np.linspace(at + 1e-6, 0.012, 37)
+    later = fs.simulate(circuit, sources={name: whole}, start=first, t_eval=t, t_stop=0.012, **given)
+    want = fs.simulate(circuit, sources={name: whole}, t_eval=t, t_stop=0.012, **given)
+    assert np.abs(later.u_layer - want.u_layer).max() <= 1e-9 * 4.0
+    assert np.abs(later.q_source - want.q_source).max() <= 1e-9 * np.abs(want.q_source).max()
+
+
+@pytest.mark.parametrize("tier", [*CIRCUITS, "coupled"])
+def test_a_source_that_is_never_finite_leaves_the_state_as_it_was(tier: str) -> None:
+    circuit = table1() if tier == "coupled" else deck("V1 in 0 1", *CIRCUITS[tier])
+    source = {"Vdrive" if tier == "coupled" else "V1": lambda t: np.full(np.shape(t), np.nan)}
+    solution = fs.simulate(circuit, sources=source, t_stop=0.012, throw=False)
+    assert solution.status is fs.Status.SOURCE_NOT_FINITE
+    assert solution.t.size == 0
+    assert solution.state.t == 0.0
+    assert solution.state.u_before == 0.0
+    assert not solution.state.y.any()
 
 
 def test_a_hundred_thousand_cycles_are_as_exact_as_one() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import tracemalloc
 import warnings
@@ -129,7 +130,7 @@ def test_leaving_the_charge_out_changes_nothing_else(source: fs.Waveform, law: s
     assert "q_source" not in without.signals
     np.testing.assert_array_equal(without.u_layer, full.u_layer)
     np.testing.assert_array_equal(without.f_el, full.f_el)
-    assert without.error == full.error
+    assert without.error == dataclasses.replace(full.error, q_source=None)
 
 
 # Places it must not miss ------------------------------------------------------------------------------------
@@ -255,6 +256,65 @@ def test_a_coating_may_be_anything_from_a_wire_to_a_perfect_insulator(r_coat: st
     solution = fs.simulate(table1(coat={"r": r_coat}), t_eval=t, t_stop=0.02, charge_law=law, rtol=1e-11)
     assert np.abs(solution.u_layer - expected.u).max() <= 1e-11 * np.abs(expected.u_gap).max()
     assert solution.stats["steps"] < 5000
+
+
+CHARGED_T = np.linspace(1e-5, 1 / 150.0 - 1e-5, 71)
+CHARGED = {
+    "sine": (fs.Sine(120.0, 300.0, offset=25.0), ref.sine_segments(120.0, 300.0, 1 / 150.0, offset=25.0)),
+    "square": (fs.Square(100.0, 300.0, duty=0.3), ref.square_segments(100.0, 300.0, 2, duty=0.3)),
+}
+
+
+@lru_cache(None)
+def charged(shape: str, r_coat: float, r_gap: float, law: str) -> ref.Transient:
+    plain = ref.table1_layers(100.0)
+    layers = (ref.Layer(plain[0].c, r_total=r_coat), ref.Layer(plain[1].c, r_total=r_gap), plain[2])
+    return ref.transient(CHARGED[shape][1], CHARGED_T, law=law, layers=layers, stages=16, tol=1e-13)
+
+
+@every_law
+@pytest.mark.parametrize("shape", CHARGED)
+@pytest.mark.parametrize("r_gap", [1e6, 1e10])
+@pytest.mark.parametrize("r_coat", [3.0, 1e3, 2e5])
+@pytest.mark.parametrize("rtol", [1e-4, 1e-8, 1e-11])
+def test_the_charge_is_as_exact_as_the_voltages_whatever_the_leaks(
+    rtol: float, r_coat: float, r_gap: float, shape: str, law: str
+) -> None:
+    expected = charged(shape, r_coat, r_gap, law)
+    solution = fs.simulate(
+        table1(coat={"r": r_coat}, gap={"r": r_gap}), sources={"Vdrive": CHARGED[shape][0]}, t_eval=CHARGED_T,
+        t_stop=1 / 150.0, charge_law=law, rtol=rtol,
+    )  # fmt: skip
+    assert np.abs(solution.u_gap - expected.u_gap).max() <= rtol * np.abs(expected.u_gap).max()
+    true = np.abs(solution.q_source - expected.q).max()
+    assert true <= rtol * np.abs(expected.q).max()
+    assert true <= solution.error.q_source
+
+
+@every_law
+@pytest.mark.parametrize("shape", CHARGED)
+@pytest.mark.parametrize(("r_coat", "r_gap"), [(1e3, 2e3), (3.0, 2e4), (1e6, 2e6), (3e7, 4e9)])
+@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
+def test_the_charge_is_as_exact_as_its_error_says(
+    rtol: float, r_coat: float, r_gap: float, shape: str, law: str
+) -> None:
+    # Layers that leak fast and slowly, in every order: what is off may stay, or decay.
+    expected = charged(shape, r_coat, r_gap, law)
+    solution = fs.simulate(
+        table1(coat={"r": r_coat}, gap={"r": r_gap}), sources={"Vdrive": CHARGED[shape][0]}, t_eval=CHARGED_T,
+        t_stop=1 / 150.0, charge_law=law, rtol=rtol,
+    )  # fmt: skip
+    true = np.abs(solution.q_source - expected.q).max()
+    assert true <= solution.error.q_source <= 10.0 * rtol * np.abs(expected.q).max()
+
+
+def test_only_a_charge_that_was_followed_step_by_step_has_an_error_stated() -> None:
+    circuit = table1()
+    given = {"t_stop": 0.01, "rtol": 1e-6}
+    assert fs.simulate(circuit, **given).error.q_source > 0.0
+    assert fs.simulate(circuit, charge=False, **given).error.q_source is None
+    assert fs.simulate(circuit, method="dop853", **given).error.q_source is None
+    assert fs.simulate(circuit, start="periodic", **given).error.q_source is None
 
 
 @pytest.mark.parametrize("shape", ["sine", "square"])

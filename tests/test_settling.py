@@ -44,6 +44,7 @@ def test_a_repeated_period_is_the_one_that_would_have_been_stepped(source: fs.Wa
         # A current is a slope, and a charge adds up what every period is off.
         assert np.abs(a - b).max() <= (1.0 if name in ("u_gap", "f_el") else 10.0) * rtol * np.abs(b).max(), name
     assert np.abs(run.u_gap - stepped.u_gap).max() <= run.error.u_gap + stepped.error.u_gap
+    assert np.abs(run.q_source - stepped.q_source).max() <= run.error.q_source + stepped.error.q_source
 
 
 @every_law

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -145,6 +146,51 @@ def test_the_error_stated_holds_though_a_disturbance_would_outlast_many_periods(
     true = np.abs(state.solution.u_gap[:-1] - want.u_gap).max()
     assert true <= state.solution.error.u_gap
     assert true <= 1e-9 * np.abs(want.u_gap).max()
+
+
+LITTLE = [(25e6, 1.7e3), (2e5, 1e3), (5e6, 1e4)]
+
+
+@lru_cache(None)
+def little(r_coat: float, r_gap: float, law: str) -> tuple[np.ndarray, ref.Transient]:
+    """Times over the period and the reference's state there, of a gap that nearly shorts itself."""
+    plain = ref.table1_layers(100.0)
+    layers = (ref.Layer(plain[0].c, r_total=r_coat), ref.Layer(plain[1].c, r_total=r_gap), plain[2])
+    t = np.linspace(0.0, 1.0 / 139.0, 60)[:-1]
+    segments = ref.sine_segments(150.0, 139.0, 1.0 / 139.0, offset=20.0)
+    return t, ref.periodic_state(segments, law=law, layers=layers, t_out=t)
+
+
+@every_law
+@pytest.mark.parametrize(("r_coat", "r_gap"), LITTLE)
+@pytest.mark.parametrize("rtol", [1e-5, 1e-8, 1e-10])
+@pytest.mark.parametrize("way", ["steady_state", "simulate", "simulate by radau9"])
+def test_a_gap_that_takes_little_of_the_voltage_has_its_own_error_met(
+    way: str, rtol: float, r_coat: float, r_gap: float, law: str
+) -> None:
+    # Of 150 V a few tenths of a volt are left, or one: what is asked is relative to that.
+    circuit = table1("SIN(20 150 139)", coat={"r": r_coat}, gap={"r": r_gap})
+    t, want = little(r_coat, r_gap, law)
+    if way == "steady_state":
+        run = fs.steady_state(circuit, charge_law=law, rtol=rtol, points=59).solution
+    else:
+        method = "radau9" if way.endswith("radau9") else "auto"
+        options = {"start": "periodic", "charge_law": law, "rtol": rtol, "method": method}
+        run = fs.simulate(circuit, t_eval=t, t_stop=1.0 / 139.0, **options)
+    true_u = np.abs(run.u_gap[: t.size] - want.u_gap).max()
+    true_f = np.abs(run.f_el[: t.size] - want.force).max()
+    assert true_u <= rtol * np.abs(want.u_gap).max()
+    assert true_f <= rtol * want.force.max()
+    assert true_u <= run.error.u_gap <= rtol * np.abs(run.u_gap).max() * 1.01
+    assert true_f <= run.error.f_el <= rtol * run.f_el.max() * 1.01
+
+
+@every_law
+def test_an_error_that_rounding_of_the_source_s_voltage_forbids_is_not_claimed(law: str) -> None:
+    # A hundred-thousandth of the 150 V is left across the gap: no double holds it to 1e-13.
+    circuit = table1("SIN(20 150 139)", coat={"r": 1e9}, gap={"r": 10.0})
+    with pytest.raises(fs.SolveError, match="the error estimate stayed above the error asked for"):
+        _ = fs.steady_state(circuit, charge_law=law, rtol=1e-13).solution
 
 
 @every_law

@@ -41,12 +41,12 @@ def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run
     model, start = problem.model, problem.initial
     tables = Tables(problem, 1e-12)
     rows = np.empty((t_out.size, row_width(problem)))
-    done, u_end, table = 0, start.u_before, None
+    done, end, u_end, table = 0, problem.t_start, start.u_before, None
     for table, where in _windows(tables, t_out, left):
         u, slope = source_at(table.edges, table.terms, table.series, t_out[where], left[where])
         follow(model, u, slope, start.y, start.u_before, rows[where])
         done = where.stop
-        u_end = float(source_at(table.edges, table.terms, table.series, table.edges[-1:], np.ones(1, bool))[0][0])
+        end, u_end = _end_of(table)
     failed = tables.not_finite
     if failed is None and table is not None and done < t_out.size:
         u, slope = _after(problem, table)
@@ -60,7 +60,6 @@ def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run
     y = np.append(start.y[:-1], ended[0, -1])
     u_gap = rows[:done, 1]
     force = problem.scene.force(u_gap, rows[:done, 2])
-    end = failed if failed is not None else problem.t_stop
     return _finished(problem, t_out[:done], left[:done], live, z, current, u_gap, force, State(
         end, y, u_end, start.charge_offset, problem.scene.charge_law), 0.0, failed)  # fmt: skip
 
@@ -118,13 +117,16 @@ def solve_linear(problem: Problem, t_out: FloatArray, left: BoolArray, area: flo
     wave, failed = problem.waveform, None
     z = current = None
     z_end = float(start.y[-1])
+    end, u_end = problem.t_stop, float(wave.value(problem.t_stop, "left"))
     if _is_sample_by_sample(problem, t_out):
         live, w_end = _at_samples(problem, system, w)
         t, side = t_out, left
         u_source = wave.value(t)
     else:
         flow = _Charge(system, w, problem.t_start, start.u_before, float(start.y[-1]))
-        t, side, modes, slope, at_end, failed = _closed_form(problem, system, w, t_out, left)
+        t, side, modes, slope, at_end, reached, failed = _closed_form(problem, system, w, t_out, left)
+        if failed is not None:
+            end, u_end = reached
         w_end = at_end[:-1]
         u_source = np.array(wave.value(t))
         u_source[side] = wave.value(t[side], "left")
@@ -133,15 +135,11 @@ def solve_linear(problem: Problem, t_out: FloatArray, left: BoolArray, area: flo
         if problem.charge:
             z, current = flow.at(t, u_source, slope, modes)
             # The state is that before a jump at the end.
-            before = np.array([float(wave.value(problem.t_stop, "left"))])
-            z_end = flow.at(np.array([problem.t_stop]), before, np.zeros(1), at_end[None, :])[0][0]
+            z_end = flow.at(np.array([end]), np.array([u_end]), np.zeros(1), at_end[None, :])[0][0]
     u_gap = _probe_voltage(problem, live, u_source)
     inverse = 1.0 / areas(u_gap, problem.model.curve) if problem.model.coupled else np.full(u_gap.size, 1.0 / area)
     y = np.append(system.live[0] @ w_end, z_end)
-    end, u_end = (
-        (failed, start.u_before) if failed is not None else (problem.t_stop, wave.value(problem.t_stop, "left"))
-    )
-    ended = State(end, y, float(u_end), start.charge_offset, problem.scene.charge_law)
+    ended = State(end, y, u_end, start.charge_offset, problem.scene.charge_law)
     return _finished(
         problem, t, side, live, z, current, u_gap, problem.scene.force(u_gap, inverse), ended, bound, failed
     )
@@ -149,8 +147,11 @@ def solve_linear(problem: Problem, t_out: FloatArray, left: BoolArray, area: flo
 
 def _closed_form(
     problem: Problem, system: System, w: FloatArray, t_out: FloatArray, left: BoolArray
-) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray, FloatArray, float | None]:
-    """Outputs reached, the modes there with the source's integral last, its slope there, the modes at the end."""
+) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray, FloatArray, tuple[float, float], float | None]:
+    """Outputs reached, the modes there with the source's integral last, its slope there, the modes at the end.
+
+    Then the end itself, as time (s) and source voltage (V), and when the source stopped being finite.
+    """
     n = w.size
     # The source's integral rides along as a mode of rate zero, for the charge.
     rates, gains = np.append(system.rates[0], 0.0), np.append(system.gain[0], 1.0)
@@ -158,7 +159,7 @@ def _closed_form(
     tables = Tables(problem, 1e-13, no_chirps=True)
     modes = np.empty((t_out.size, n + 1))
     slope = np.zeros(t_out.size)
-    done = 0
+    done, end = 0, (problem.t_start, problem.initial.u_before)
     table = None
     for table, where in _windows(tables, t_out, left):
         modes[where], state = linear.respond(
@@ -166,14 +167,20 @@ def _closed_form(
         )
         if problem.charge:
             slope[where] = source_at(table.edges, table.terms, table.series, t_out[where], left[where])[1]
-        done = where.stop
+        done, end = where.stop, _end_of(table)
     failed = tables.not_finite
     if failed is None and table is not None and done < t_out.size:
         modes[done:] = state
         if problem.charge:
             slope[done:] = _after(problem, table)[1]
         done = t_out.size
-    return t_out[:done], left[:done], modes[:done], slope[:done], state, failed
+    return t_out[:done], left[:done], modes[:done], slope[:done], state, end, failed
+
+
+def _end_of(table: SourceTable) -> tuple[float, float]:
+    """Time (s) and source voltage (V, left-hand) at the end of a table: finite, where the source may no longer be."""
+    u, _ = source_at(table.edges, table.terms, table.series, table.edges[-1:], np.ones(1, bool))
+    return float(table.edges[-1]), float(u[0])
 
 
 def _after(problem: Problem, table: SourceTable) -> tuple[FloatArray, FloatArray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +14,10 @@ from fingerspice.engine import march, shooting
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.system import System
 from fingerspice.errors import InputError, SolveError
-from fingerspice.marching import LOCAL_SHARE, LONGEST_STEP, prepare_system
+from fingerspice.marching import FINEST, LOCAL_SHARE, LONGEST_STEP, SAFETY, prepare_system
 from fingerspice.numerics import linear
 from fingerspice.problem import Problem, state_from
-from fingerspice.solution import Status
+from fingerspice.solution import ErrorEstimate, Status
 
 FloatArray = NDArray[np.float64]
 
@@ -35,6 +36,8 @@ class Closed:
         Derivative of the modes after a period by those before it, to about 1e-6.
     memory : float
         Error of the periodic state over that of one period: what a slow mode collects over the periods it remembers.
+    error : ErrorEstimate
+        What the state may be off, as its effect on the gap voltage and the force of the period.
     periods : int
         Periods integrated.
     """
@@ -43,11 +46,15 @@ class Closed:
     defect: float
     map_slope: FloatArray
     memory: float
+    error: ErrorEstimate
     periods: int
 
 
 def close_period(problem: Problem, rtol: float) -> Closed:
     """Start a problem from its periodic state, keeping its length.
+
+    The error asked for is that of the state alone, relative to the peaks over the period. Where rounding does not let
+    it be met, the error stated says so.
 
     Raises
     ------
@@ -67,57 +74,74 @@ def close_period(problem: Problem, rtol: float) -> Closed:
         )
     before = float(waveform.value(begin, "left"))
     if problem.model.coupled:
-        x, defect, slope, memory, periods = _close(problem, scene.prepared[key], before, rtol)
+        x, found = _close(problem, scene.prepared[key], before, rtol)
     else:
-        x, defect, slope, memory, periods = _close_linear(problem, scene.prepared[key], rtol)
+        x, found = _close_linear(problem, scene.prepared[key], rtol)
     moved = begin - problem.t_start
     initial = state_from(problem.model, begin, x, before, scene.charge_law)
     problem = dataclasses.replace(
         problem, t_start=begin, t_stop=problem.t_stop + moved, first=problem.first + moved, initial=initial
     )
-    return Closed(problem, defect, slope, memory, periods)
+    return Closed(problem, **found)
 
 
-def _close(
-    problem: Problem, table: SourceTable, before: float, rtol: float
-) -> tuple[FloatArray, float, FloatArray, float, int]:
-    """Live voltages (V) that a period leads back to; see `Closed` for the rest."""
+def _close(problem: Problem, table: SourceTable, before: float, rtol: float) -> tuple[FloatArray, dict[str, Any]]:
+    """Live voltages (V) that a period leads back to, and the rest of `Closed`."""
     scene = problem.scene
     n = problem.model.gap.size
-    w, slope, counts = np.zeros(n), np.zeros((n, n)), np.zeros(2, np.int64)
+    w, slope, counts, figures = np.zeros(n), np.zeros((n, n)), np.zeros(2, np.int64), np.zeros(shooting.N_FIGURES)
     scale = scene.u_peak or 1.0
     longest = min(LONGEST_STEP * problem.waveform.shortest_time(), float(table.edges[-1] - table.edges[0]))
     prepared = prepare_system(scene, rtol)
-    # Largest V that the state itself is allowed to be off.
+    # A first guess: how much of the source's voltage the gap takes is known once a period has been closed.
     tol = LOCAL_SHARE * rtol * scale * problem.model.k_gap
-    share = 1.0
+    known = False
     while True:
         system = prepared.system
-        pace = Pace(max(share * tol, 1e-15 * scale), longest, True, False)
+        pace = Pace(max(tol, FINEST * scale), longest, True, False)
         code, defect = shooting.close_period(
             system, pace, prepared.tables, prepared.work, prepared.integral, table.edges, table.terms, table.series,
-            before, scale, w, slope, counts,
+            before, scale, known, w, slope, counts, figures,
         )  # fmt: skip
         if code == march.OUT_OF_RANGE:
             prepared = prepare_system(scene, rtol, 1.5 * system.u_top)
             w[:] = 0.0
+            known = False
             continue
-        memory = _memory(system, slope)
-        if code != shooting.CLOSED or share * memory <= 2.0 or pace.tol <= 1e-15 * scale:
+        if code != shooting.CLOSED:
             break
-        share = 1.0 / memory
+        memory = _memory(system, slope)
+        error, excess = _error(figures, memory, problem.model.k_gap * scale, rtol)
+        if excess <= 1.0 or pace.tol <= FINEST * scale:
+            break
+        tol = pace.tol * min(0.3, 0.5 / excess)
+        known = True
     if code == shooting.NOT_CLOSED:
         raise SolveError(f"the periodic state did not close: {defect:.3g} V are left after a period")
     if code != shooting.CLOSED:
         folding = problem.model.mobile and problem.model.coupled
         status = Status.FOLD if folding else Status.STEP_UNDERFLOW
         raise SolveError(f"no periodic state was reached: {status.value}")
-    return system.live[0] @ w, float(defect), slope, memory, int(counts[1])
+    return system.live[0] @ w, {
+        "defect": float(defect), "map_slope": slope, "memory": memory, "error": error, "periods": int(counts[1]),
+    }  # fmt: skip
 
 
-def _close_linear(
-    problem: Problem, table: SourceTable, rtol: float
-) -> tuple[FloatArray, float, FloatArray, float, int]:
+def _error(figures: FloatArray, memory: float, u_scale: float, rtol: float) -> tuple[ErrorEstimate, float]:
+    """Error of the periodic state from the figures of its period, and that error over the one asked for."""
+    peak_u, peak_f, error_u, error_f, left = map(float, figures)
+    # Rounding is an error too, and what Newton moved last was not much more than what it would move next.
+    floor = 4e-16 * (peak_u + u_scale)
+    steepest = 2.0 * peak_f / (peak_u or 1.0)
+    error = ErrorEstimate(
+        memory * (SAFETY * error_u + floor) + left, memory * (SAFETY * error_f + steepest * floor) + steepest * left
+    )
+    return error, max(
+        error.u_gap / (rtol * peak_u) if peak_u > 0.0 else 0.0, error.f_el / (rtol * peak_f) if peak_f > 0.0 else 0.0
+    )
+
+
+def _close_linear(problem: Problem, table: SourceTable, rtol: float) -> tuple[FloatArray, dict[str, Any]]:
     """As `_close`, in closed form, for an area that does not follow the voltage."""
     system = prepare_system(problem.scene, rtol).system
     rates, gains = system.rates[0], system.gain[0]
@@ -127,7 +151,11 @@ def _close_linear(
     _, end = linear.respond(rates, gains, table.edges, table.terms, table.series, w, np.empty(0))
     live = system.live[0]
     defect = float(np.abs(live @ (end - w)).max(initial=0.0))
-    return live @ w, defect, np.diag(np.exp(-rates * (table.edges[-1] - table.edges[0]))), 1.0, 1
+    slope = np.diag(np.exp(-rates * (table.edges[-1] - table.edges[0])))
+    # In closed form there is rounding only, which a run states itself.
+    return live @ w, {
+        "defect": defect, "map_slope": slope, "memory": 1.0, "error": ErrorEstimate(0.0, 0.0), "periods": 1,
+    }  # fmt: skip
 
 
 def _memory(system: System, slope: FloatArray) -> float:

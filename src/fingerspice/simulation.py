@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -102,25 +101,21 @@ def simulate(
     if sources:
         circuit = _with_sources(circuit, sources)
     times = None if t_eval is None else np.asarray(t_eval, float)
-    memory = 1.0
+    begun = None
     problem = prepare(
         circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area,
         start="uncharged" if start == "periodic" else start, charge=charge,
     )  # fmt: skip
     if start == "periodic":
-        closed = close_period(problem, rtol)
-        problem, memory = closed.problem, closed.memory
+        closed = close_period(problem, 0.5 * rtol)
+        problem, begun = closed.problem, closed.error
         if times is not None and times[0] < problem.t_start:
             raise InputError(
                 f"t_eval starts at {times[0]:g} s; allowed: from {problem.t_start:g} s on, where the source has "
                 "settled and its periodic state exists"
             )
     how = start if isinstance(start, str) else "given"
-    solution = run_problem(problem, times, max(rtol / memory, RTOL_RANGE[0]), method, progress, tier, how)
-    if memory > 1.0:
-        # What one period may be off, a slow mode has collected in the state the run starts from.
-        error = ErrorEstimate(memory * solution.error.u_gap, memory * solution.error.f_el)
-        solution = dataclasses.replace(solution, error=error, rtol=rtol)
+    solution = run_problem(problem, times, rtol, method, progress, tier, how, begun)
     if not solution.success and throw:
         raise SolveError(solution.message, solution)
     for text in solution.warnings:
@@ -161,8 +156,12 @@ def run_problem(
     progress: Progress | None = None,
     tier: str = "auto",
     start: str = "deck",
+    begun: ErrorEstimate | None = None,
 ) -> Solution:
-    """Integrate a problem made ready; arguments as in `simulate`. Never raises for a failed run."""
+    """Integrate a problem made ready; arguments as in `simulate`. Never raises for a failed run.
+
+    `begun` is the error that the start brings along, which was to be half of what is asked for; the run has the rest.
+    """
     # A method steps, and what is stepped is the coupled model.
     plan = make_plan(problem, rtol, "coupled" if tier == "auto" and method != "auto" else tier, start)
     if t_eval is None:
@@ -177,7 +176,10 @@ def run_problem(
     elif plan.tier == "linear":
         run, name = solve_linear(problem, run_at, left, plan.area, plan.error_bound), plan.tier
     else:
-        run, name = _run(problem, method, rtol, run_at, left, progress)
+        own = rtol if begun is None else max(0.5 * rtol, RTOL_RANGE[0])
+        run, name = _run(problem, method, own, run_at, left, progress)
+    if begun is not None:
+        run.error = ErrorEstimate(run.error.u_gap + begun.u_gap, run.error.f_el + begun.f_el)
     if run.status is Status.SUCCESS and run.excess(rtol) > 1.0:
         run.status = Status.ERROR_NOT_MET
     return _solution(problem, run, rtol, name, t_out, time.perf_counter() - begin, plan)

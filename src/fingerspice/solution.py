@@ -46,13 +46,16 @@ class Status(Enum):
 
 @dataclass(frozen=True)
 class ErrorEstimate:
-    """Estimated largest error over the run: of the gap voltage (V) and of the electroadhesive force (N).
+    """Estimated largest error over the run: of the gap voltage (V), the electroadhesive force (N) and the charge (C).
 
     Without a GAP, `u_gap` is that of the voltage of the layer with the smallest capacitance, and `f_el` is 0.
+    `q_source` is None where the charge was left out or has no estimate: only the coupled tier's own steps give one, and
+    not from the periodic state on.
     """
 
     u_gap: float
     f_el: float
+    q_source: float | None = None
 
 
 @dataclass(frozen=True)
@@ -311,6 +314,7 @@ class Solution:
             "rtol": repr(self.rtol),
             "error_u_gap_V": repr(self.error.u_gap),
             "error_f_el_N": repr(self.error.f_el),
+            "error_q_source_C": repr(self.error.q_source),
             "status": self.status.name,
             "message": self.message,
         }

@@ -36,6 +36,8 @@ class SteadyState:
         Derivative of the stack's modes after a period by those before it, to about 1e-6.
     memory : float
         Error of the periodic state over that of one period; large where a disturbance outlasts many periods.
+    error : ErrorEstimate
+        What the state may be off, as its effect on the gap voltage and the force of the period.
     periods : int
         Periods integrated to find it.
     """
@@ -45,6 +47,7 @@ class SteadyState:
     defect: float
     map_slope: FloatArray
     memory: float
+    error: ErrorEstimate
     periods: int
 
     @property
@@ -66,12 +69,10 @@ class SteadyState:
         SolveError
             Where that fails.
         """
-        # What one period may be off, a slow mode collects: the run is asked for that much less.
-        solution = run_problem(self.problem, rtol=max(self.rtol / self.memory, RTOL_RANGE[0]), start="periodic")
+        solution = run_problem(self.problem, rtol=self.rtol, start="periodic", begun=self.error)
         if not solution.success:
             raise SolveError(solution.message, solution)
-        error = ErrorEstimate(self.memory * solution.error.u_gap, self.memory * solution.error.f_el)
-        return dataclasses.replace(solution, error=error, rtol=self.rtol)
+        return solution
 
 
 def steady_state(
@@ -90,7 +91,7 @@ def steady_state(
     circuit : Circuit
         With a periodic source.
     charge_law, area, rtol, charge
-        As in `simulate`.
+        As in `simulate`: the error is relative to the peaks over the period.
     points : int
         Output steps in the period.
 
@@ -113,5 +114,7 @@ def steady_state(
     problem = prepare(
         circuit, t_stop=waveform.period, t_eval=None, charge_law=charge_law, area=area, start="uncharged", charge=charge
     )
-    closed = close_period(dataclasses.replace(problem, first=0.0, step=waveform.period / points), rtol)
-    return SteadyState(closed.problem, rtol, closed.defect, closed.map_slope, closed.memory, closed.periods)
+    closed = close_period(dataclasses.replace(problem, first=0.0, step=waveform.period / points), 0.5 * rtol)
+    return SteadyState(
+        closed.problem, rtol, closed.defect, closed.map_slope, closed.memory, closed.error, closed.periods
+    )

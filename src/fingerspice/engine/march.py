@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import borrow, jit
+from fingerspice.engine.charge import charge_step
 from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables
 from fingerspice.engine.model import Segment, branch_area, source
 from fingerspice.engine.pace import Pace, change_level, choose_step, enter, nearest_level, rung, take_branch
@@ -33,10 +34,8 @@ from fingerspice.engine.readout import (
     T,
     account,
     at,
-    charge_rates,
     error_at,
     first_wrong,
-    integrate,
     layers,
     series_of,
     write_outputs,
@@ -312,8 +311,9 @@ def march(
                     continue
         flips = 0
         if charge:
-            charge_rates(model, rates, gain, gap, slow_share, w, pull, r, values[n], values[n + 1])
-            integrate(integral, h, y[n], values[n], values[n])
+            charge_step(
+                model, rates, gain, gap, slow_share, w, pull, r, integral, h, y[n], places, theta, control, values
+            )  # fmt: skip
         if next_out <= t_new or kept_times.size > 0:
             layers(mobile, area0, k_layer, live, w, source_row, q_rows, values)
             for c in range(columns):

@@ -1,4 +1,4 @@
-"""What is read off a finished step: zeros of the gap voltage, state and error inside it, charge, outputs, peaks."""
+"""What is read off a finished step: zeros of the gap voltage, state and error inside it, outputs, peaks."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import jit, jit_fused, jit_rows
-from fingerspice.engine.model import Model
-from fingerspice.engine.rows import DQ, SLOPE, SOURCE, X_GAP, Q
 from fingerspice.numerics.lobatto import BARYCENTRIC, FIRST, NODES, POINTS, ROWS, SECOND, THIRD, TO_SERIES
 
 FloatArray = NDArray[np.float64]
@@ -22,7 +20,11 @@ TOO_LONG = 11
 H_AFTER_EDGE = 12
 # Largest move of the gap voltage for a move of a live one.
 MAGNIFIED = 13
-N_CONTROL = 14
+# Error of the charge, C: the largest so far, what has been collected, and the squares of what each step added, C^2.
+ERROR_Q, COLLECTED, SPREAD = 14, 15, 16
+# 1/A where the last step ended, 1/m^2.
+LAST_Q = 17
+N_CONTROL = 18
 # Entries of `counters`: rows evaluated, steps accepted and refused, zeros met, outputs written, steps kept.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT = 0, 1, 2, 3, 4, 5
 N_COUNTERS = 6
@@ -132,49 +134,6 @@ def error_at(places: FloatArray, theta: float, error: FloatArray) -> None:
     share = (theta - left) / (right - left)
     for k in range(places.shape[0]):
         error[k] = (1.0 - share) * places[k, p] + share * places[k, p + 1]
-
-
-@jit
-def charge_rates(
-    model: Model, rates: FloatArray, gain: FloatArray, gap: FloatArray, slow_share: FloatArray, w: FloatArray,
-    pull: FloatArray, r: FloatArray, rate: FloatArray, current: FloatArray,
-) -> None:  # fmt: skip
-    """z' and the current at the nodes, through the layer that leaks slowest (see `model.charge_rate`)."""
-    n = rates.size
-    slow = model.slow
-    for j in range(NODES):
-        dv = 0.0
-        v = 0.0
-        dx_gap = 0.0
-        for k in range(n):
-            dw = -rates[k] * w[k, j] + gain[k] * r[SOURCE, j] + pull[k, j]
-            dv += slow_share[k] * dw
-            v += slow_share[k] * w[k, j]
-            dx_gap += gap[k] * dw
-        q = r[Q, j]
-        scale = model.area0 * q if model.mobile else 1.0
-        voltage = slow[n] * r[SOURCE, j] + v * scale
-        lam = slow[n + 1] * dv * scale + (slow[n + 2] + q * slow[n + 3]) * voltage
-        if model.mobile:
-            rate[j] = lam / q
-            # i = Q' with Q = A U / S + z, and u' from the area equation.
-            margin = 1.0 - r[X_GAP, j] * model.area0 * r[DQ, j]
-            du = (model.k_gap * r[SLOPE, j] + dx_gap * scale) / margin
-            current[j] = rate[j] + (r[SLOPE, j] / q - r[DQ, j] * du * r[SOURCE, j] / (q * q)) / model.s
-        else:
-            rate[j] = (lam + r[SLOPE, j] / model.s) / q
-            current[j] = rate[j]
-
-
-@jit_rows
-def integrate(integral: FloatArray, h: float, z0: float, rate: FloatArray, z: FloatArray) -> None:
-    """z at the nodes from z' there; in place is allowed."""
-    total = np.zeros(NODES)
-    for m in range(NODES):
-        for j in range(NODES):
-            total[j] += integral[m, j] * rate[m]
-    for j in range(NODES):
-        z[j] = z0 + h * total[j]
 
 
 @jit_rows

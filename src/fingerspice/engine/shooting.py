@@ -9,7 +9,18 @@ from fingerspice.compiled import jit
 from fingerspice.engine.exponential import Tables
 from fingerspice.engine.march import DONE, Work, march
 from fingerspice.engine.pace import Pace
-from fingerspice.engine.readout import BRANCH_LENGTH, N_CONTROL, N_COUNTERS, NFEV, U_BEFORE, T
+from fingerspice.engine.readout import (
+    BRANCH_LENGTH,
+    ERROR_F,
+    ERROR_U,
+    N_CONTROL,
+    N_COUNTERS,
+    NFEV,
+    PEAK_F,
+    PEAK_U,
+    U_BEFORE,
+    T,
+)  # fmt: skip
 from fingerspice.engine.repeat import Kept
 from fingerspice.engine.system import System
 from fingerspice.numerics.lobatto import ROWS
@@ -20,6 +31,8 @@ IntArray = NDArray[np.int64]
 
 CLOSED, NOT_CLOSED = 100, 101
 """Codes of `close_period` beside those of `march`."""
+N_FIGURES = 5
+"""Of a period: peaks of gap voltage (V) and force (N), errors of both, the gap voltage's last move by Newton (V)."""
 # Tolerance of the map's derivative, over the voltage scale: a mode that a period hardly moves must show in it.
 _SLOPE_TOL = 1e-9
 
@@ -27,9 +40,9 @@ _SLOPE_TOL = 1e-9
 @jit
 def _map(
     system: System, pace: Pace, tables: Tables, work: Work, integral: FloatArray, edges: FloatArray, terms: FloatArray,
-    series: FloatArray, u_before: float, w: FloatArray, counters: IntArray, end: FloatArray,
+    series: FloatArray, u_before: float, w: FloatArray, counters: IntArray, end: FloatArray, figures: FloatArray,
 ) -> int:  # fmt: skip
-    """One period from modes w; `end` takes the modes at its end."""
+    """One period from modes w; `end` takes the modes at its end, `figures` its peaks and its errors."""
     n = w.size
     control = np.zeros(N_CONTROL)
     control[T] = edges[0]
@@ -49,6 +62,10 @@ def _map(
         end[k] = 0.0
         for i in range(n):
             end[k] += system.project[0, k, i] * y[i]
+    figures[0] = control[PEAK_U]
+    figures[1] = control[PEAK_F]
+    figures[2] = control[ERROR_U]
+    figures[3] = control[ERROR_F]
     counters[NFEV] += count[NFEV]
     counters[1] += 1
     return code
@@ -57,7 +74,8 @@ def _map(
 @jit
 def close_period(
     system: System, pace: Pace, tables: Tables, work: Work, integral: FloatArray, edges: FloatArray, terms: FloatArray,
-    series: FloatArray, u_before: float, scale: float, w: FloatArray, slope: FloatArray, counters: IntArray,
+    series: FloatArray, u_before: float, scale: float, known: bool, w: FloatArray, slope: FloatArray,
+    counters: IntArray, figures: FloatArray,
 ) -> tuple[int, float]:  # fmt: skip
     """Find modes that a period leads back to. A mode that does not decay keeps what it starts with.
 
@@ -69,12 +87,16 @@ def close_period(
         Source voltage just before the period, V.
     scale : float
         Voltage scale, V.
+    known : bool
+        Whether `slope` is that of an earlier call, from near the solution.
     w : ndarray, shape (n,)
         First guess of the modes of the first reference area; the solution on return.
     slope : ndarray, shape (n, n)
         Takes the derivative of the period map of the modes, to about 1e-6.
     counters : ndarray of int, shape (2,)
         Evaluations and periods, added to.
+    figures : ndarray, shape (N_FIGURES,)
+        Filled with those of the last period.
 
     Returns
     -------
@@ -90,18 +112,19 @@ def close_period(
     shifted = np.zeros(n)
     fine = Pace(_SLOPE_TOL * scale, pace.h_max, pace.controlled, False)
     plain = Pace(pace.tol, pace.h_max, pace.controlled, False)
-    solver = np.zeros((n, n))
+    solver = _solver(slope, system.rates[0])
+    unused = np.zeros(N_FIGURES)
     worst = 0.0
     for round_ in range(40):
-        code = _map(system, plain, tables, work, integral, edges, terms, series, u_before, w, counters, end)
+        code = _map(system, plain, tables, work, integral, edges, terms, series, u_before, w, counters, end, figures)
         if code != DONE:
             return code, worst
         before = worst
         for k in range(n):
             move[k] = end[k] - w[k] if system.rates[0, k] > 0.0 else 0.0
         worst = _largest_voltage(system, move)
-        if round_ == 0 or (round_ > 3 and worst > 0.3 * before):
-            code = _map(system, fine, tables, work, integral, edges, terms, series, u_before, w, counters, end)
+        if (round_ == 0 and not known) or (round_ > 3 and worst > 0.3 * before):
+            code = _map(system, fine, tables, work, integral, edges, terms, series, u_before, w, counters, end, unused)
             if code != DONE:
                 return code, worst
             for j in range(n):
@@ -114,7 +137,7 @@ def close_period(
                 move_by = 0.01 * scale / max(np.abs(system.live[0, :, j]).max(), 1e-300)
                 shifted[j] += move_by
                 code = _map(
-                    system, fine, tables, work, integral, edges, terms, series, u_before, shifted, counters, out
+                    system, fine, tables, work, integral, edges, terms, series, u_before, shifted, counters, out, unused
                 )
                 if code != DONE:
                     return code, worst
@@ -126,8 +149,12 @@ def close_period(
             for j in range(n):
                 step[k] += solver[k, j] * move[j]
             w[k] += step[k]
+        figures[4] = 0.0
+        for k in range(n):
+            figures[4] += system.gap[0, k] * step[k]
+        figures[4] = abs(figures[4])
         # What the last step moved, the next would move by the error of the slope only.
-        if round_ > 0 and (_largest_voltage(system, step) <= pace.tol or worst <= 1e-15 * scale):
+        if (round_ > 0 or known) and (_largest_voltage(system, step) <= pace.tol or worst <= 1e-15 * scale):
             return CLOSED, worst
     return NOT_CLOSED, worst
 

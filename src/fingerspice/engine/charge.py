@@ -1,0 +1,190 @@
+"""Charge through the terminals over a step, and its error: both through the layer that leaks slowest."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.compiled import jit, jit_rows
+from fingerspice.engine.exponential import N_PLACES
+from fingerspice.engine.model import Model
+from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, SPREAD, at
+from fingerspice.engine.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U
+from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, END, FIRST, NODES, POINTS
+
+FloatArray = NDArray[np.float64]
+
+# Slope at each node, per step length, of the polynomial through values at the nodes.
+DERIVATIVE = np.zeros((NODES, NODES))
+for _i in range(NODES):
+    for _j in set(range(NODES)) - {_i}:
+        DERIVATIVE[_i, _j] = BARYCENTRIC[_j] / BARYCENTRIC[_i] / (POINTS[_i] - POINTS[_j])
+    DERIVATIVE[_i, _i] = -DERIVATIVE[_i].sum()
+
+
+@jit
+def charge_step(
+    model: Model, rates: FloatArray, gain: FloatArray, gap: FloatArray, slow_share: FloatArray, w: FloatArray,
+    pull: FloatArray, r: FloatArray, integral: FloatArray, h: float, z0: float, places: FloatArray, theta: float,
+    control: FloatArray, values: FloatArray,
+) -> None:  # fmt: skip
+    """z and the current at the nodes of a step of length h that starts with z0, into the last rows of `values`.
+
+    Both go through the layer that leaks slowest (see `model.charge_rate`). What that layer stores is taken from its
+    voltages themselves: in w' a fast mode that has died away still holds its rate times the error of w, which a sum
+    over a step much longer than the mode would turn into charge. `places` holds the error of the
+    modes (see `exponential.assess`), of which the part up to fraction `theta` of the step counts.
+    """
+    n = rates.size
+    slow = model.slow
+    z, current = values[n], values[n + 1]
+    voltage = np.empty(NODES)
+    for j in range(NODES):
+        dv = 0.0
+        v = 0.0
+        dx_gap = 0.0
+        for k in range(n):
+            dw = -rates[k] * w[k, j] + gain[k] * r[SOURCE, j] + pull[k, j]
+            dv += slow_share[k] * dw
+            v += slow_share[k] * w[k, j]
+            dx_gap += gap[k] * dw
+        q = r[Q, j]
+        scale = model.area0 * q if model.mobile else 1.0
+        lam = slow[n + 1] * dv * scale + (slow[n + 2] + q * slow[n + 3]) * (slow[n] * r[SOURCE, j] + v * scale)
+        # What the layer stores, over its capacitance: A_0 x under `mobile`; under `local` its voltage moves at A.
+        voltage[j] = v if model.mobile else slow[n] * r[SOURCE, j] + v
+        # The leak alone, for the integral.
+        z[j] = (slow[n + 2] / q + slow[n + 3]) * (slow[n] * r[SOURCE, j] + v * scale)
+        if model.mobile:
+            # i = Q' with Q = A U / S + z, and u' from the area equation.
+            margin = 1.0 - r[X_GAP, j] * model.area0 * r[DQ, j]
+            du = (model.k_gap * r[SLOPE, j] + dx_gap * scale) / margin
+            current[j] = lam / q + (r[SLOPE, j] / q - r[DQ, j] * du * r[SOURCE, j] / (q * q)) / model.s
+        else:
+            current[j] = (lam + r[SLOPE, j] / model.s) / q
+    start = model.area0 if model.mobile else 1.0 / r[Q, 0]
+    if not model.mobile and model.coupled:
+        # A c du, of which A at the start of the step is taken exactly and the rest along the polynomial.
+        _add_moves(slow[n + 1] / h, voltage, r[Q], z)
+    _integrate(integral, h, z0, z)
+    for j in range(NODES):
+        z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
+    _account(model, gap, slow_share, w, r, h, places, theta, voltage, control)
+
+
+@jit_rows
+def _add_moves(factor: float, voltage: FloatArray, q: FloatArray, rate: FloatArray) -> None:
+    """Add factor (A - A at the start) times the slope of the voltage's polynomial, per step length."""
+    for j in range(NODES):
+        slope = 0.0
+        for m in range(NODES):
+            slope += DERIVATIVE[j, m] * voltage[m]
+        rate[j] += factor * (1.0 / q[j] - 1.0 / q[0]) * slope
+
+
+@jit_rows
+def _integrate(integral: FloatArray, h: float, z0: float, z: FloatArray) -> None:
+    """z at the nodes from z' there, in place."""
+    total = np.zeros(NODES)
+    for m in range(NODES):
+        for j in range(NODES):
+            total[j] += integral[m, j] * z[m]
+    for j in range(NODES):
+        z[j] = z0 + h * total[j]
+
+
+@jit
+def _account(
+    model: Model, gap: FloatArray, slow_share: FloatArray, w: FloatArray, r: FloatArray, h: float, places: FloatArray,
+    theta: float, voltages: FloatArray, control: FloatArray,
+) -> None:  # fmt: skip
+    """Largest error of the charge over the part of a step that counts, from the signed error of the modes.
+
+    With dv the error of the slow layer's voltage and dA that of the area, the charge is off by c A dv now, and by what
+    stays: the leak of dv, and under `local` the integral of c (dA v' - A' dv). Where the slow layer is the gap, whose
+    voltage decides the area, the latter is nothing.
+    """
+    n = gap.size
+    slow = model.slow
+    capacitance, g_area, g_total = slow[n + 1], slow[n + 2], slow[n + 3]
+    last_area, last_voltage, last_gap, last_error, last_gap_error = 0.0, 0.0, 0.0, 0.0, 0.0
+    last_theta = 0.0
+    added = 0.0
+    # Under `local` what the polynomial misses of the area between nodes counts with all that the voltage moves.
+    missed = 0.0 if model.mobile else capacitance * _area_missed(r[Q]) * _way(voltages)
+    spread = missed
+    for p in range(N_PLACES):
+        row = 0 if p == 0 else (END if p == N_PLACES - 1 else FIRST + p - 1)
+        q = r[Q, row]
+        area = 1.0 / q
+        v = 0.0
+        error = 0.0
+        gap_error = 0.0
+        for k in range(n):
+            v += slow_share[k] * w[k, row]
+            error += slow_share[k] * places[k, p]
+            gap_error += gap[k] * places[k, p]
+        now = capacitance * area * error
+        if model.mobile:
+            # Q = A U / S + z, and the fold magnifies the error of u, which is that of A.
+            scale = model.area0 * q
+            gap_error *= scale / max(1.0 - model.area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
+            area_error = -r[DQ, row] * area * area * gap_error
+            now = capacitance * model.area0 * error + area_error * r[SOURCE, row] / model.s
+            error = scale * error - v * scale * area_error * q
+            v *= scale
+        voltage = slow[n] * r[SOURCE, row] + v
+        if p == 0:
+            if not model.mobile and control[LAST_Q] > 0.0:
+                # The charge of a jump of the source is the integral of A over the gap's move: both ends of it are off.
+                added += (area - 1.0 / control[LAST_Q]) * gap_error / (model.k_gap * model.s)
+        else:
+            reached = min(POINTS[row], theta)
+            part = (reached - last_theta) / (POINTS[row] - last_theta)
+            mean_error = 0.5 * (error + last_error)
+            move = area - last_area
+            slope = move / (r[U, row] - last_gap) if r[U, row] != last_gap else 0.0
+            mean_area_error = 0.5 * slope * (gap_error + last_gap_error)
+            leak = (g_total + g_area * area) * mean_error + g_area * 0.5 * (voltage + last_voltage) * mean_area_error
+            stays = h * (POINTS[row] - last_theta) * leak
+            if not model.mobile:
+                stays += capacitance * (mean_area_error * (voltage - last_voltage) - move * mean_error)
+            added += part * stays
+            spread += abs(part * stays)
+            if reached < POINTS[row]:
+                break
+            last_theta = reached
+        # What has been collected may have cancelled by chance: its spread is a part of the error too.
+        control[ERROR_Q] = max(
+            control[ERROR_Q],
+            abs(now + control[COLLECTED] + added) + math.sqrt(control[SPREAD] + spread * spread) + missed,
+        )
+        last_area, last_voltage, last_gap = area, voltage, r[U, row]
+        last_error, last_gap_error = error, gap_error
+    control[COLLECTED] += added
+    control[SPREAD] += spread * spread
+    control[LAST_Q] = at(r[Q], theta)
+
+
+@jit
+def _area_missed(q: FloatArray) -> float:
+    """The most that the polynomial through the nodes misses of the area at the points between, m^2."""
+    worst = 0.0
+    for p in range(3):
+        value = q[FIRST + p]
+        for j in range(NODES):
+            value -= BETWEEN[j, p] * q[j]
+        worst = max(worst, abs(value))
+    missed: float = worst / q[0] ** 2
+    return missed
+
+
+@jit
+def _way(values: FloatArray) -> float:
+    """Length of the way that values at the nodes go, up and down."""
+    total = 0.0
+    for j in range(1, NODES):
+        total += abs(values[j] - values[j - 1])
+    return total
