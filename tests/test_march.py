@@ -372,3 +372,12 @@ def test_what_fails_returns_what_came_before_it(law: str) -> None:
     want = run(fs.Function(lambda t: 100.0 * np.sin(300.0 * np.asarray(t))), law)
     n = solution.t.size - 1
     np.testing.assert_allclose(solution.u_gap[:n], want.u_gap[:n], rtol=0, atol=2e-8 * 100.0)
+
+
+def test_a_gap_voltage_at_the_end_of_the_areas_curve_is_not_crept_up_to() -> None:
+    # The jump takes the gap to 219.4 V, the very end of the curve prepared for this source.
+    circuit = table1(coat={"r": 1.648}, gap={"r": 20016.0}).replace(
+        {"Vdrive": fs.Square(112.504, 215.957, duty=0.46255)}
+    )
+    run = fs.simulate(circuit, t_stop=5e-3, rtol=1e-11, charge_law="mobile")
+    assert run.stats["steps"] + run.stats["rejected"] < 3000

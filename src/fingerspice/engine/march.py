@@ -275,6 +275,9 @@ def march(
                 control[H] = proposed
                 break
             counters[REJECTED] += 1
+            # Near the end of the area's polynomial no step ends beyond it: the kink there would be crept up to.
+            if coupled and abs(control[U_GAP]) > 0.9 * u_top and np.abs(u_rows).max() > u_top:
+                return OUT_OF_RANGE
             # Refused at this length: a singularity, of which rounding hides the last bit.
             if h <= 1e-13 * max(abs(t), 1e-3 * (edge - start)):
                 return NO_STEP
