@@ -33,12 +33,12 @@ class Closed:
     defect : float
         Largest change of a live voltage over a further period, V.
     map_slope : ndarray, shape (n_layer - 1, n_layer - 1)
-        Derivative of the modes after a period by those before it, to about 1e-6.
+        Derivative of the modes after a period by those before it, to about 1e-5.
     memory : float
         Error of the periodic state over that of one period: what a slow mode collects over the periods it remembers.
     error : ErrorEstimate
         What the state may be off, as its effect on the gap voltage and the force of the period.
-    periods : int
+    periods : float
         Periods integrated.
     """
 
@@ -47,7 +47,7 @@ class Closed:
     map_slope: FloatArray
     memory: float
     error: ErrorEstimate
-    periods: int
+    periods: float
 
 
 def close_period(problem: Problem, rtol: float) -> Closed:
@@ -67,16 +67,17 @@ def close_period(problem: Problem, rtol: float) -> Closed:
     if waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
     begin = waveform.period * float(np.ceil(max(waveform.settled, problem.t_start) / waveform.period))
+    half = waveform.half_wave and problem.model.coupled
     key = ("period", begin)
     if key not in scene.prepared:
-        scene.prepared[key] = source_table(
-            waveform, begin, begin + waveform.period, 1e-13, problem.step, no_chirps=not problem.model.coupled
-        )
-    before = float(waveform.value(begin, "left"))
+        end = begin + (0.5 if half else 1.0) * waveform.period
+        table = source_table(waveform, begin, end, 1e-13, problem.step, no_chirps=not problem.model.coupled)
+        scene.prepared[key] = table, float(waveform.value(begin, "left"))
+    table, before = scene.prepared[key]
     if problem.model.coupled:
-        x, found = _close(problem, scene.prepared[key], before, rtol)
+        x, found = _close(problem, table, before, half, rtol)
     else:
-        x, found = _close_linear(problem, scene.prepared[key], rtol)
+        x, found = _close_linear(problem, table, rtol)
     moved = begin - problem.t_start
     initial = state_from(problem.model, begin, x, before, scene.charge_law)
     problem = dataclasses.replace(
@@ -85,11 +86,14 @@ def close_period(problem: Problem, rtol: float) -> Closed:
     return Closed(problem, **found)
 
 
-def _close(problem: Problem, table: SourceTable, before: float, rtol: float) -> tuple[FloatArray, dict[str, Any]]:
-    """Live voltages (V) that a period leads back to, and the rest of `Closed`."""
+def _close(
+    problem: Problem, table: SourceTable, before: float, half: bool, rtol: float
+) -> tuple[FloatArray, dict[str, Any]]:
+    """Live voltages (V) that a period leads back to, and the rest of `Closed`; by half a period where that will do."""
     scene = problem.scene
     n = problem.model.gap.size
     w, slope, counts, figures = np.zeros(n), np.zeros((n, n)), np.zeros(2, np.int64), np.zeros(shooting.N_FIGURES)
+    turned = -1.0 if half else 1.0
     scale = scene.u_peak or 1.0
     longest = min(LONGEST_STEP * problem.waveform.shortest_time(), float(table.edges[-1] - table.edges[0]))
     prepared = prepare_system(scene, rtol)
@@ -98,14 +102,15 @@ def _close(problem: Problem, table: SourceTable, before: float, rtol: float) -> 
     known = False
     while True:
         system = prepared.system
+        if not known:
+            w = np.zeros(n)
         pace = Pace(max(tol, FINEST * scale), longest, True, False)
         code, defect = shooting.close_period(
             system, pace, prepared.tables, prepared.work, prepared.integral, table.edges, table.terms, table.series,
-            before, scale, known, w, slope, counts, figures,
+            before, turned, scale, known, w, slope, counts, figures,
         )  # fmt: skip
         if code == march.OUT_OF_RANGE:
             prepared = prepare_system(scene, rtol, 1.5 * system.u_top)
-            w[:] = 0.0
             known = False
             continue
         if code != shooting.CLOSED:
@@ -122,14 +127,17 @@ def _close(problem: Problem, table: SourceTable, before: float, rtol: float) -> 
         folding = problem.model.mobile and problem.model.coupled
         status = Status.FOLD if folding else Status.STEP_UNDERFLOW
         raise SolveError(f"no periodic state was reached: {status.value}")
+    # Two halves: the second carries on at most what the first was off, and adds as much.
+    parts = 2 if half else 1
     return system.live[0] @ w, {
-        "defect": float(defect), "map_slope": slope, "memory": memory, "error": error, "periods": int(counts[1]),
+        "defect": parts * float(defect), "map_slope": np.linalg.matrix_power(slope, parts), "memory": memory,
+        "error": error, "periods": int(counts[1]) / parts,
     }  # fmt: skip
 
 
 def _error(figures: FloatArray, memory: float, u_scale: float, rtol: float) -> tuple[ErrorEstimate, float]:
     """Error of the periodic state from the figures of its period, and that error over the one asked for."""
-    peak_u, peak_f, error_u, error_f, left = map(float, figures)
+    peak_u, peak_f, error_u, error_f, left = map(float, figures[:5])
     # Rounding is an error too, and what Newton moved last was not much more than what it would move next.
     floor = 4e-16 * (peak_u + u_scale)
     steepest = 2.0 * peak_f / (peak_u or 1.0)

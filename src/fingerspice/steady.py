@@ -38,7 +38,7 @@ class SteadyState:
         Error of the periodic state over that of one period; large where a disturbance outlasts many periods.
     error : ErrorEstimate
         What the state may be off, as its effect on the gap voltage and the force of the period.
-    periods : int
+    periods : float
         Periods integrated to find it.
     """
 
@@ -48,7 +48,7 @@ class SteadyState:
     map_slope: FloatArray
     memory: float
     error: ErrorEstimate
-    periods: int
+    periods: float
 
     @property
     def multipliers(self) -> FloatArray:

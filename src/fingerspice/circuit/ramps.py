@@ -251,6 +251,10 @@ class Square(_Periodic):
         self.__post_init__()
         require(0.0 < duty < 1.0, "square duty", f"{duty:g}", "between 0 and 1")
 
+    @property
+    def half_wave(self) -> bool:
+        return self.offset == 0.0 and self.duty == 0.5
+
     def _knots(self) -> tuple[FloatArray, FloatArray]:
         period = 1.0 / self.frequency
         t = np.array([0.0, 0.0, self.duty, self.duty, 1.0]) * period
@@ -261,6 +265,10 @@ class Square(_Periodic):
 @dataclass(frozen=True)
 class Triangle(_Periodic):
     """Triangle in phase with the sine: 0, +amplitude at a quarter, -amplitude at three quarters of a period."""
+
+    @property
+    def half_wave(self) -> bool:
+        return self.offset == 0.0
 
     def _knots(self) -> tuple[FloatArray, FloatArray]:
         period = 1.0 / self.frequency
@@ -325,6 +333,14 @@ class Pulse(_Ramps):
     @property
     def settled(self) -> float:
         return max(0.0, self.delay)
+
+    @property
+    def half_wave(self) -> bool:
+        return (
+            self.v1 == -self.v2
+            and self.rise == self.fall
+            and abs(2.0 * (self.rise + self.width) - self.pulse_period) <= 4e-16 * self.pulse_period
+        )
 
     @property
     def _first(self) -> float:  # type: ignore[override]

@@ -90,6 +90,11 @@ class Waveform:
         return 0.0
 
     @property
+    def half_wave(self) -> bool:
+        """Whether, once settled, every half period is the one before with its sign turned."""
+        return False
+
+    @property
     def fundamental(self) -> Fundamental | None:
         """Fundamental of the periodic part, where there is one: the Fourier integral over its period."""
         frequency = self.tone()
@@ -247,6 +252,10 @@ class Sine(Waveform):
     @property
     def settled(self) -> float:
         return max(0.0, self.delay)
+
+    @property
+    def half_wave(self) -> bool:
+        return self.offset == 0.0 and self.damping == 0.0
 
     def _turns(self, t: FloatArray) -> FloatArray:
         turns = np.asarray(self.frequency * (t - self.delay))

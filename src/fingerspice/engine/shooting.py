@@ -13,6 +13,7 @@ from fingerspice.engine.readout import (
     BRANCH_LENGTH,
     ERROR_F,
     ERROR_U,
+    H_AFTER_EDGE,
     N_CONTROL,
     N_COUNTERS,
     NFEV,
@@ -31,23 +32,28 @@ IntArray = NDArray[np.int64]
 
 CLOSED, NOT_CLOSED = 100, 101
 """Codes of `close_period` beside those of `march`."""
-N_FIGURES = 5
-"""Of a period: peaks of gap voltage (V) and force (N), errors of both, the gap voltage's last move by Newton (V)."""
-# Tolerance of the map's derivative, over the voltage scale: a mode that a period hardly moves must show in it.
-_SLOPE_TOL = 1e-9
+N_FIGURES = 6
+"""Of a period: peaks of gap voltage (V) and force (N), errors of both, the gap voltage's last move by Newton (V), and
+the first step's length (s)."""
+# Tolerance of the map's derivative, over the voltage scale.
+_SLOPE_TOL, _LEAST_SLOPE_TOL = 1e-7, 1e-9
+# Of a first guess, over the voltage scale.
+_CRUDE_TOL = 1e-4
 
 
 @jit
 def _map(
     system: System, pace: Pace, tables: Tables, work: Work, integral: FloatArray, edges: FloatArray, terms: FloatArray,
-    series: FloatArray, u_before: float, w: FloatArray, counters: IntArray, end: FloatArray, figures: FloatArray,
+    series: FloatArray, u_before: float, turned: float, w: FloatArray, counters: IntArray, end: FloatArray,
+    figures: FloatArray,
 ) -> int:  # fmt: skip
-    """One period from modes w; `end` takes the modes at its end, `figures` its peaks and its errors."""
+    """From modes w through the table; `end` takes those at its end, `turned`, `figures` the peaks and errors met."""
     n = w.size
     control = np.zeros(N_CONTROL)
     control[T] = edges[0]
     control[U_BEFORE] = u_before
     control[BRANCH_LENGTH] = np.inf
+    control[H_AFTER_EDGE] = figures[5]
     y = np.zeros(n + 1)
     for i in range(n):
         for k in range(n):
@@ -61,11 +67,12 @@ def _map(
     for k in range(n):
         end[k] = 0.0
         for i in range(n):
-            end[k] += system.project[0, k, i] * y[i]
+            end[k] += turned * system.project[0, k, i] * y[i]
     figures[0] = control[PEAK_U]
     figures[1] = control[PEAK_F]
     figures[2] = control[ERROR_U]
     figures[3] = control[ERROR_F]
+    figures[5] = control[H_AFTER_EDGE]
     counters[NFEV] += count[NFEV]
     counters[1] += 1
     return code
@@ -74,7 +81,7 @@ def _map(
 @jit
 def close_period(
     system: System, pace: Pace, tables: Tables, work: Work, integral: FloatArray, edges: FloatArray, terms: FloatArray,
-    series: FloatArray, u_before: float, scale: float, known: bool, w: FloatArray, slope: FloatArray,
+    series: FloatArray, u_before: float, turned: float, scale: float, known: bool, w: FloatArray, slope: FloatArray,
     counters: IntArray, figures: FloatArray,
 ) -> tuple[int, float]:  # fmt: skip
     """Find modes that a period leads back to. A mode that does not decay keeps what it starts with.
@@ -82,17 +89,19 @@ def close_period(
     Parameters
     ----------
     system, pace, tables, work, integral, edges, terms, series
-        As `march`; the edges span one period.
+        As `march`; the edges span one period, or half of one.
     u_before : float
         Source voltage just before the period, V.
+    turned : float
+        -1 where a half period leads to the state with its sign turned, else 1.
     scale : float
         Voltage scale, V.
     known : bool
         Whether `slope` is that of an earlier call, from near the solution.
     w : ndarray, shape (n,)
-        First guess of the modes of the first reference area; the solution on return.
+        Modes of the first reference area: a first guess if `known`, else zeros; the solution on return.
     slope : ndarray, shape (n, n)
-        Takes the derivative of the period map of the modes, to about 1e-6.
+        Takes the derivative of the map of the modes, to about 1e-5.
     counters : ndarray of int, shape (2,)
         Evaluations and periods, added to.
     figures : ndarray, shape (N_FIGURES,)
@@ -110,23 +119,43 @@ def close_period(
     out = np.zeros(n)
     move = np.zeros(n)
     shifted = np.zeros(n)
-    fine = Pace(_SLOPE_TOL * scale, pace.h_max, pace.controlled, False)
+    slowest = np.inf
+    for k in range(n):
+        if system.rates[0, k] > 0.0:
+            slowest = min(slowest, system.rates[0, k])
+    # What a mode forgets must show in its slope.
+    span = edges[-1] - edges[0]
+    forgets = min(1.0, slowest * span)
+    fine = Pace(max(_SLOPE_TOL * forgets, _LEAST_SLOPE_TOL) * scale, pace.h_max, pace.controlled, False)
     plain = Pace(pace.tol, pace.h_max, pace.controlled, False)
     solver = _solver(slope, system.rates[0])
     unused = np.zeros(N_FIGURES)
     worst = 0.0
+    if not known:
+        # Near enough for the slope to be that of the solution: as if the area stood still.
+        crude = Pace(_CRUDE_TOL * scale, pace.h_max, pace.controlled, False)
+        code = _map(
+            system, crude, tables, work, integral, edges, terms, series, u_before, turned, w, counters, end, unused
+        )
+        if code != DONE:
+            return code, worst
+        for k in range(n):
+            if system.rates[0, k] > 0.0:
+                w[k] += (end[k] - w[k]) / (1.0 - turned * np.exp(-system.rates[0, k] * span))
     for round_ in range(40):
-        code = _map(system, plain, tables, work, integral, edges, terms, series, u_before, w, counters, end, figures)
+        first = round_ == 0 and not known
+        # What the slope needs is as much as the first guess is worth.
+        here = fine if first else plain
+        code = _map(
+            system, here, tables, work, integral, edges, terms, series, u_before, turned, w, counters, end, figures
+        )  # fmt: skip
         if code != DONE:
             return code, worst
         before = worst
         for k in range(n):
             move[k] = end[k] - w[k] if system.rates[0, k] > 0.0 else 0.0
         worst = _largest_voltage(system, move)
-        if (round_ == 0 and not known) or (round_ > 3 and worst > 0.3 * before):
-            code = _map(system, fine, tables, work, integral, edges, terms, series, u_before, w, counters, end, unused)
-            if code != DONE:
-                return code, worst
+        if first or (round_ > 3 and worst > 0.3 * before):
             for j in range(n):
                 for k in range(n):
                     slope[k, j] = 1.0 if k == j else 0.0
@@ -137,8 +166,9 @@ def close_period(
                 move_by = 0.01 * scale / max(np.abs(system.live[0, :, j]).max(), 1e-300)
                 shifted[j] += move_by
                 code = _map(
-                    system, fine, tables, work, integral, edges, terms, series, u_before, shifted, counters, out, unused
-                )
+                    system, here, tables, work, integral, edges, terms, series, u_before, turned, shifted, counters,
+                    out, unused,
+                )  # fmt: skip
                 if code != DONE:
                     return code, worst
                 for k in range(n):
@@ -154,7 +184,7 @@ def close_period(
             figures[4] += system.gap[0, k] * step[k]
         figures[4] = abs(figures[4])
         # What the last step moved, the next would move by the error of the slope only.
-        if (round_ > 0 or known) and (_largest_voltage(system, step) <= pace.tol or worst <= 1e-15 * scale):
+        if not first and (_largest_voltage(system, step) <= pace.tol or worst <= 1e-15 * scale):
             return CLOSED, worst
     return NOT_CLOSED, worst
 
