@@ -1,4 +1,4 @@
-"""What a user waits for: import, `fingerspice run`, and ten periods of every shipped deck inside Python.
+"""What a user waits for: import, `fingerspice run`, ten periods of every shipped deck, periodic states, dispersion.
 
 Run: python benchmarks/run_times.py [--quick]. Medians of 7, compile time apart; writes results/run_times.json.
 """
@@ -14,11 +14,16 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import fingerspice as fs
+from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 
 HERE = Path(__file__).resolve().parent
 CIRCUITS = HERE.parent / "circuits"
@@ -52,6 +57,50 @@ def ten_periods(path: Path, rtol: float, repeats: int) -> dict[str, Any]:
     }
 
 
+SCENES = (fs.Sine(200.0, 100.0), fs.Square(200.0, 100.0), fs.Sine(200.0, 5000.0), fs.Square(200.0, 5000.0))
+
+
+def steady_seconds(source: fs.Sine | fs.Square, repeats: int) -> dict[str, Any]:
+    """Time of the periodic state of Table 1 at 1e-10, without its signals."""
+    circuit = fs.read_netlist(CIRCUITS / "fingerpad.cir").replace({"Vdrive": source, "Xskin.f": source.frequency})
+    state = fs.steady_state(circuit, rtol=1e-10, charge=False)
+    seconds = median_seconds(lambda: fs.steady_state(circuit, rtol=1e-10, charge=False), 20 * repeats)
+    name = f"{type(source).__name__.lower()} {source.frequency:g} Hz"
+    return {"scene": name, "microseconds": 1e6 * seconds, "periods": state.periods, "defect_V": state.defect}
+
+
+@lru_cache(maxsize=1)
+def eight_poles() -> str:
+    """The skin's data on eight poles, as a subcircuit."""
+    f = np.geomspace(10.0, 1e5, 161)
+    rows = np.column_stack([f, skin_resistivity(f), skin_permittivity(f)])
+    return fs.fit_material(rows, poles=8).to_netlist("EIGHT")
+
+
+def dispersion_cost(source: fs.Sine | fs.Square, rtol: float, repeats: int) -> dict[str, Any]:
+    """Time per period with the skin at one frequency, as shipped, and with eight poles; every period stepped."""
+    frozen = (CIRCUITS / "fingerpad.cir").read_text(encoding="utf-8")
+    skin = f"SKIN  d=350u f={source.frequency:g}"
+    texts = {
+        "frozen": frozen.replace("SKIN  d=350u f=100", skin),
+        "shipped": frozen.replace("SKIN  d=350u f=100", "SKIN_DISPERSIVE d=350u"),
+        "eight poles": frozen.replace("SKIN  d=350u f=100", "EIGHT d=350u").replace(".end\n", eight_poles() + ".end\n"),
+    }
+    periods = 50
+    t = np.linspace(0.0, periods / source.frequency, 100 * periods + 1)
+    found: dict[str, Any] = {"scene": f"{type(source).__name__.lower()} {source.frequency:g} Hz", "rtol": rtol}
+    for name, text in texts.items():
+        circuit = fs.parse_netlist(text).replace({"Vdrive": source})
+        seconds = median_seconds(
+            lambda circuit=circuit: fs.simulate(  # type: ignore[misc]
+                circuit, t_stop=float(t[-1]), t_eval=t, rtol=rtol, charge=False, method="exponential"
+            ),
+            repeats,
+        )
+        found[f"{name}: us per period"] = 1e6 * seconds / periods
+    return found
+
+
 def command_seconds(arguments: list[str], repeats: int) -> float:
     """Median wall time of a Python command in a fresh process, s."""
     return median_seconds(
@@ -65,6 +114,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--quick", action="store_true", help="one repeat, nothing written")
     options = parser.parse_args(arguments)
     repeats = 1 if options.quick else 7
+    warnings.simplefilter("ignore", fs.FingerspiceWarning)
     decks = sorted(CIRCUITS.glob("*.cir"))
     with tempfile.TemporaryDirectory() as folder:
         run = ["-m", "fingerspice", "run", str(CIRCUITS / "fingerpad.cir"), "--out", folder]
@@ -74,6 +124,8 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
             - command_seconds(["-c", "pass"], repeats),
             "run_s": command_seconds(run, repeats),
             "run_no_plot_s": command_seconds([*run, "--no-plot"], repeats),
+            "periodic_state": [steady_seconds(source, repeats) for source in SCENES],
+            "dispersion": [dispersion_cost(s, rtol, repeats) for s in SCENES for rtol in (1e-3, 1e-6, 1e-10)],
             "ten_periods": [ten_periods(d, rtol, repeats) for d in decks for rtol in (1e-3, 1e-6, 1e-10)],
         }
     print(json.dumps(results, indent=2))

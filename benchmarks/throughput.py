@@ -46,7 +46,7 @@ def modal_gap(area: float) -> tuple[list[float], list[float], float, list[float]
     from fingerspice.problem import scene_of
 
     scene = scene_of(fs.read_netlist(DECK), "local", area, 1.0)
-    system = build_system(scene.model, 1e-13, (1.0 / area, 1.0 / area))
+    system = build_system(scene.model, 1e-13, (1.0 / area, 1.0 / area), scene.stack.grouping)
     gap = scene.stack.state_order.index(scene.probe)
     return list(system.rates[0]), list(system.gain[0]), float(scene.model.k[gap]), list(system.live[0, gap])
 

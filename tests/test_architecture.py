@@ -18,7 +18,19 @@ MAX_LINES = 450
 # From the bottom up: a part imports its own files and the parts above it in this list, nothing below.
 ORDER = (
     *("errors", "units", "files", "compiled", "numerics", "physics", "engine", "circuit"),
-    *("record", "solution", "phasors", "export", "table1", "plotting", "problem", "runs", "stepping"),
+    *(
+        "record",
+        "solution",
+        "phasors",
+        "fitting",
+        "export",
+        "table1",
+        "plotting",
+        "spectrum",
+        "problem",
+        "runs",
+        "stepping",
+    ),
     *("settling", "marching"),
     *("direct", "foreign", "periodic", "planning", "simulation", "steady", "largesignal", "comparison", "report"),
     *("figures", "options", "cli", "__main__"),

@@ -33,9 +33,9 @@ DEVICES = [
     (("fn=0.5", ""), 5, ["Xgap: GAP needs fn (N), missing here"]),
     (("f=100", ""), 6, ["Xskin: SKIN needs f (Hz), missing here"]),
     (("LAYER d=1u eps_r=3.9 r=0.2meg", "SLAB d=1u eps_r=3.9"), 4, ["SLAB needs rho (ohm m), missing here"]),
-    (("SKIN d=350u f=100", "SKIN_DISPERSIVE d=350u"), 6, ["SKIN_DISPERSIVE", "not simulated by this version"]),
+    (("SKIN d=350u f=100", "SKIN_DISPERSIVE d=350u f=100"), 6, ["SKIN_DISPERSIVE has no parameter 'f'"]),
     (("c2=5000", "c2=5000 tau=1m"), 5, ["Xgap tau (first-order area dynamics)", "not simulated by this version"]),
-    (("r=0.2meg", "e_max=3meg"), 4, ["Xcoat e_max (dielectric strength)", "not simulated by this version"]),
+    (("r=0.2meg", "e_max=0"), 4, ["Xcoat e_max is 0 V/m", "more than 0 or inf"]),
 ]
 
 VALUES = [

@@ -325,8 +325,10 @@ def test_two_kilovolt_are_stepped_through(shape: str) -> None:
     }[shape]
     t = np.linspace(1e-5, 0.0199, 101)
     expected = ref.transient(segments, t, freq=100.0)
-    with pytest.warns(fs.FingerspiceWarning, match="air breaks down"):
+    with pytest.warns(fs.FingerspiceWarning) as said:
         solution = run(source, "local", t_eval=t, rtol=1e-11)
+    # The square leaves a thirtieth of the contact, the sine a fifth and a little.
+    assert ["air breaks down" in str(w.message) for w in said] == ([True] if shape == "sine" else [True, False])
     assert np.abs(solution.u_layer - expected.u).max() <= 1e-11 * np.abs(expected.u_gap).max()
     assert np.abs(solution.f_el - expected.force).max() <= 1e-11 * expected.force.max()
 

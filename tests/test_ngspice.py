@@ -10,7 +10,7 @@ import pytest
 import fingerspice as fs
 from ngspice_tools import CIRCUITS, GAP_SIGNALS, run_ngspice, with_charge_law
 
-SHIPPED = ["fingerpad", "fingerpad_5khz", "fingerpad_square", "fingerpad_square_5khz"]
+SHIPPED = ["fingerpad", "fingerpad_5khz", "fingerpad_square", "fingerpad_square_5khz", "fingerpad_dispersive"]
 
 
 def deviation(name, law, max_step=None):
@@ -35,7 +35,7 @@ def deviation(name, law, max_step=None):
 
 
 @pytest.mark.parametrize("law", ["local", "mobile"])
-@pytest.mark.parametrize("name", ["fingerpad", "fingerpad_5khz"])
+@pytest.mark.parametrize("name", ["fingerpad", "fingerpad_5khz", "fingerpad_dispersive"])
 def test_sines_agree_to_1e_5_of_peak(name, law):
     du, _ = deviation(name, law)
     assert du <= 1e-5

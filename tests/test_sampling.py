@@ -205,3 +205,34 @@ def test_a_run_names_the_time_and_the_source_of_a_nan_and_keeps_what_came_before
     assert not partial.success
     assert 0.0029 < partial.t[-1] <= 0.003
     assert np.isfinite(partial.u_gap).all()
+
+
+def test_a_function_that_is_rough_is_followed_as_far_as_it_goes_and_says_so() -> None:
+    rng = np.random.default_rng(3)
+    table = {}
+
+    def rough(t: float) -> float:
+        # Its own rounding: a part in 1e11, anew at every time.
+        return 200.0 * math.sin(600.0 * t) * (1.0 + 1e-11 * table.setdefault(t, rng.uniform(-1.0, 1.0)))
+
+    run = fs.simulate(table1(), sources={"Vdrive": rough}, t_stop=0.02, rtol=1e-8)
+    smooth = fs.simulate(table1(), sources={"Vdrive": lambda t: 200.0 * math.sin(600.0 * t)}, t_stop=0.02, rtol=1e-8)
+    assert np.abs(run.u_gap - smooth.u_gap).max() <= run.error.u_gap
+    with pytest.raises(fs.SolveError, match="the source function itself is rough by"):
+        fs.simulate(table1(), sources={"Vdrive": rough}, t_stop=0.02, rtol=1e-12)
+
+
+def test_a_function_that_fades_below_the_smallest_numbers_is_not_followed_there() -> None:
+    def fading(t: float) -> float:
+        return 200.0 * math.sin(2e4 * t) * math.exp(-((t / 2e-3) ** 2))
+
+    calls = 0
+
+    def counted(t: float) -> float:
+        nonlocal calls
+        calls += 1
+        return fading(t)
+
+    run = fs.simulate(table1(), sources={"Vdrive": counted}, t_stop=0.2, rtol=1e-8, t_eval=np.linspace(0.0, 0.2, 100))
+    assert run.success
+    assert calls < 2_000_000

@@ -41,6 +41,9 @@ if TYPE_CHECKING:
     from fingerspice.errors import InputError as InputError
     from fingerspice.errors import SolveError as SolveError
     from fingerspice.export import export_netlist as export_netlist
+    from fingerspice.fitting import ColeCole as ColeCole
+    from fingerspice.fitting import MaterialFit as MaterialFit
+    from fingerspice.fitting import fit_material as fit_material
     from fingerspice.largesignal import large_signal as large_signal
     from fingerspice.phasors import phasor as phasor
     from fingerspice.planning import Plan as Plan
@@ -61,6 +64,7 @@ _HOMES = {
     "comparison": ("Comparison", "compare"),
     "errors": ("FingerspiceError", "FingerspiceWarning", "InputError", "SolveError"),
     "export": ("export_netlist",),
+    "fitting": ("ColeCole", "MaterialFit", "fit_material"),
     "largesignal": ("large_signal",),
     "phasors": ("phasor",),
     "planning": ("Plan",),

@@ -60,8 +60,10 @@ def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run
     y = np.append(start.y[:-1], ended[0, -1])
     u_gap = rows[:done, 1]
     force = problem.scene.force(u_gap, rows[:done, 2])
-    return _finished(problem, t_out[:done], left[:done], live, z, current, u_gap, force, State(
+    run = _finished(problem, t_out[:done], left[:done], live, z, current, u_gap, force, State(
         end, y, u_end, start.charge_offset, problem.scene.charge_law), 0.0, failed)  # fmt: skip
+    run.rough = tables.rough
+    return run
 
 
 def _finished(
@@ -110,11 +112,11 @@ def solve_linear(problem: Problem, t_out: FloatArray, left: BoolArray, area: flo
     model = linear_model(problem.model, area)
     key = ("linear", area)
     if key not in problem.scene.prepared:
-        problem.scene.prepared[key] = build_system(model, 1e-13, (1.0 / area, 1.0 / area))
+        problem.scene.prepared[key] = build_system(model, 1e-13, (1.0 / area, 1.0 / area), problem.stack.grouping)
     system: System = problem.scene.prepared[key]
     start = problem.initial
     w = system.project[0] @ start.y[:-1]
-    wave, failed = problem.waveform, None
+    wave, failed, tables = problem.waveform, None, Tables(problem, 1e-13, no_chirps=True)
     z = current = None
     z_end = float(start.y[-1])
     end, u_end = problem.t_stop, float(wave.value(problem.t_stop, "left"))
@@ -124,14 +126,14 @@ def solve_linear(problem: Problem, t_out: FloatArray, left: BoolArray, area: flo
         u_source = wave.value(t)
     else:
         flow = _Charge(system, w, problem.t_start, start.u_before, float(start.y[-1]))
-        t, side, modes, slope, at_end, reached, failed = _closed_form(problem, system, w, t_out, left)
+        t, side, modes, slope, at_end, reached, failed = _closed_form(problem, tables, system, w, t_out, left)
         if failed is not None:
             end, u_end = reached
         w_end = at_end[:-1]
         u_source = np.array(wave.value(t))
         u_source[side] = wave.value(t[side], "left")
         # Not by BLAS, whose threads cost more than the product and may round otherwise.
-        live = np.outer(model.k[:-1], u_source) + np.einsum("lk,tk->lt", system.live[0], modes[:, :-1])
+        live = np.outer(system.k_shown, u_source) + np.einsum("lk,tk->lt", system.shown[0], modes[:, :-1])
         if problem.charge:
             z, current = flow.at(t, u_source, slope, modes)
             # The state is that before a jump at the end.
@@ -140,13 +142,15 @@ def solve_linear(problem: Problem, t_out: FloatArray, left: BoolArray, area: flo
     inverse = 1.0 / areas(u_gap, problem.model.curve) if problem.model.coupled else np.full(u_gap.size, 1.0 / area)
     y = np.append(system.live[0] @ w_end, z_end)
     ended = State(end, y, u_end, start.charge_offset, problem.scene.charge_law)
-    return _finished(
+    run = _finished(
         problem, t, side, live, z, current, u_gap, problem.scene.force(u_gap, inverse), ended, bound, failed
     )
+    run.rough = tables.rough
+    return run
 
 
 def _closed_form(
-    problem: Problem, system: System, w: FloatArray, t_out: FloatArray, left: BoolArray
+    problem: Problem, tables: Tables, system: System, w: FloatArray, t_out: FloatArray, left: BoolArray
 ) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray, FloatArray, tuple[float, float], float | None]:
     """Outputs reached, the modes there with the source's integral last, its slope there, the modes at the end.
 
@@ -156,7 +160,6 @@ def _closed_form(
     # The source's integral rides along as a mode of rate zero, for the charge.
     rates, gains = np.append(system.rates[0], 0.0), np.append(system.gain[0], 1.0)
     state = np.append(w, 0.0)
-    tables = Tables(problem, 1e-13, no_chirps=True)
     modes = np.empty((t_out.size, n + 1))
     slope = np.zeros(t_out.size)
     done, end = 0, (problem.t_start, problem.initial.u_before)
@@ -209,19 +212,19 @@ def _at_samples(problem: Problem, system: System, w: FloatArray) -> tuple[FloatA
     assert isinstance(wave, Samples)
     count = round((problem.t_stop - wave.start) * wave.rate) + 1
     u = wave.values[:count]
-    live = np.empty((w.size, u.size))
+    live = np.empty((system.k_shown.size, u.size))
     end = w
-    for i in range(w.size):
+    for i in range(system.k_shown.size):
         _, end = hold.first_order_hold(
-            u, 1.0 / wave.rate, system.rates[0], system.gain[0], float(system.model.k[i]), system.live[0, i], w,
+            u, 1.0 / wave.rate, system.rates[0], system.gain[0], float(system.k_shown[i]), system.shown[0, i], w,
             out=live[i],
         )  # fmt: skip
     return live, end
 
 
 def _probe_voltage(problem: Problem, live: FloatArray, u_source: FloatArray) -> FloatArray:
-    """Voltage of the layer that errors are measured on, from the live ones."""
-    place = problem.stack.state_order.index(problem.scene.probe)
+    """Voltage of the layer that errors are measured on, from the recorded ones."""
+    place = problem.stack.layer_order.index(problem.scene.probe_layer)
     return np.asarray(live[place] if place < live.shape[0] else u_source - live.sum(axis=0))
 
 

@@ -68,9 +68,9 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     for element in circuit.elements:
         lines += _element_lines(element, circuit, ratio)
     lines += _analysis_lines(circuit)
-    if stack.contact is not None and stack.gap is not None:
+    if stack.contact is not None and stack.gap_layer is not None:
         area = stack.area_given if stack.area_given is not None else float(stack.contact.area(0.0))
-        lines.append(f".nodeset v({_name(stack.layers[stack.gap].node_names[2])})={area * 1e6!r}")
+        lines.append(f".nodeset v({_name(stack.layers[stack.gap_layer].node_names[2])})={area * 1e6!r}")
     lines += ["", library_text(law).rstrip(), ".end", ""]
     return "\n".join(lines)
 
@@ -102,7 +102,8 @@ def _element_lines(element: Element, circuit: Circuit, work_ratio: float) -> Ite
         initial = f" IC={element.initial!r}" if element.initial is not None else ""
         yield f"{name} {nodes} {element.values['value']!r}{initial}"
         return
-    values = " ".join(f"{k}={_number(v)}" for k, v in element.values.items())
+    # The strength of a dielectric is for a warning here; ngspice has no use for it.
+    values = " ".join(f"{k}={_number(v)}" for k, v in element.values.items() if k != "e_max")
     extra = f" wk={work_ratio!r}" if element.device == "GAP" and work_ratio != 1.0 else ""
     yield f"{name} {nodes} {element.device} {values}{extra}"
 

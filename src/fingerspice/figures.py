@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from fingerspice import plotting
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.ramps import Square
-from fingerspice.circuit.waveforms import Sine, require
+from fingerspice.circuit.waveforms import Sine, Waveform, require
 from fingerspice.files import write_aside
 from fingerspice.phasors import phasor
 from fingerspice.physics.materials import SKIN_BAND, skin_permittivity, skin_resistivity
@@ -210,10 +210,12 @@ def _ascii(unit: str) -> str:
     return {"µm": "um", "mm²": "mm^2", "MΩ": "Mohm"}[unit]
 
 
-def time_response(shape: type[Sine] | type[Square], frequency: float) -> Solution:
-    """One period of the periodic state of Table 1 at 200 V, its skin taken at `frequency` (Hz)."""
-    source = shape(U0_TIME, frequency)
-    return steady_state(table1_circuit().replace({"Vdrive": source, "Xskin.f": frequency}), points=1000).solution
+def time_response(shape: type[Sine] | type[Square], frequency: float, *, dispersive: bool = False) -> Solution:
+    """One period of the periodic state of Table 1 at 200 V, its skin taken at `frequency` (Hz), or dispersive."""
+    changes: dict[str, float | Waveform] = {"Vdrive": shape(U0_TIME, frequency)}
+    if not dispersive:
+        changes["Xskin.f"] = frequency
+    return steady_state(table1_circuit(dispersive=dispersive).replace(changes), points=1000).solution
 
 
 def two_periods(solution: Solution) -> dict[str, FloatArray]:
@@ -232,19 +234,28 @@ def two_periods(solution: Solution) -> dict[str, FloatArray]:
 
 
 def _time_figure(shape: type[Sine] | type[Square]) -> tuple[Figure, Table]:
-    """Gap voltage and force over two periods of the periodic state, 100 Hz left, 5000 Hz right."""
+    """Gap voltage and force over two periods of the periodic state, 100 Hz left, 5000 Hz right.
+
+    A square is broad: with it, what a dispersive skin makes of it.
+    """
+    dispersive = shape is Square
     figure, axes = plotting.new_figure(2, 2, height=4.3, sharex="col", sharey="row")
     parts = []
     for column, frequency in enumerate(FREQUENCIES):
         data = two_periods(time_response(shape, frequency))
+        if dispersive:
+            broad = two_periods(time_response(shape, frequency, dispersive=True))
+            data |= {f"{name}_dispersive": broad[name] for name in ("u_gap", "f_el")}
         parts.append((np.full(data["t"].size, frequency), *data.values()))
         _time_column((axes[column], axes[column + 2]), data, frequency)
     plotting.dress(axes[0], "Voltage [V]")
     plotting.dress(axes[2], r"Force $F_\mathrm{el}$ [N]")
     for ax in axes[2:]:
         ax.set_ylim(0.0, None)
-    header = ("frequency [Hz]", "t [s]", "u_source [V]", "u_gap [V]", "f_el [N]", "area [m^2]")
-    return figure, Table(header, tuple(np.concatenate(c) for c in zip(*parts, strict=True)))
+    header = ["frequency [Hz]", "t [s]", "u_source [V]", "u_gap [V]", "f_el [N]", "area [m^2]"]
+    if dispersive:
+        header += ["u_gap_dispersive [V]", "f_el_dispersive [N]"]
+    return figure, Table(tuple(header), tuple(np.concatenate(c) for c in zip(*parts, strict=True)))
 
 
 def _time_column(axes: Sequence[Axes], data: dict[str, FloatArray], frequency: float) -> None:
@@ -258,6 +269,11 @@ def _time_column(axes: Sequence[Axes], data: dict[str, FloatArray], frequency: f
     upper.plot(t, y["u_source"], color=plotting.GREY, linewidth=1.2, linestyle=dash, label="source $U$")
     upper.plot(t, y["u_gap"], color=plotting.BLUE, linewidth=1.6, label=r"gap $U_\mathrm{a}$")
     lower.plot(t, y["f_el"], color=plotting.VERMILION, linewidth=1.6, label=r"force $F_\mathrm{el}$")
+    for ax, name in ((upper, "u_gap_dispersive"), (lower, "f_el_dispersive")):
+        if name in y:
+            # Said once: beside the force there is room for it.
+            label = "dispersive" if ax is lower else "_"
+            ax.plot(t, y[name], color=plotting.BLACK, linewidth=0.9, linestyle=plotting.DASHES[3], label=label)
     lower.axhline(mean, color=plotting.BLACK, linewidth=1.0, linestyle=dash, label=f"mean {mean:.3f} N")
     for ax in axes:
         plotting.legend_above(ax, right=True, math=True)

@@ -257,5 +257,5 @@ def _gap(problem: Problem, run: Run) -> tuple[FloatArray, FloatArray]:
     """Voltage of the layer that errors are measured on, and the force."""
     record = run.record(problem)
     if problem.stack.contact is None:
-        return record.u_layer[:, problem.scene.probe], np.zeros(run.t.size)
+        return record.u_layer[:, problem.scene.probe_layer], np.zeros(run.t.size)
     return record.u_gap, np.asarray(problem.stack.contact.stress(record.u_gap) * record.area)

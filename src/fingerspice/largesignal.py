@@ -89,7 +89,7 @@ def _sweep(
         assert s.f_el is not None
         forces.append(mean(t, s.f_el))
     gain = np.array(gains, np.complex128)
-    gap = build_stack(circuit).gap
+    gap = build_stack(circuit).gap_layer
     assert gap is not None
     return PhasorSolution(
         frequency, gain[:, gap], gain, gain[:, gap] * amplitude, np.array(areas), np.array(forces), amplitude, s.layers

@@ -68,8 +68,9 @@ def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
         contact = scene.stack.contact
         stress = 0.0 if contact is None else float(contact.stress(1.0))
         system = build_system(
-            model, max(1e-3 * 10.0**decade, AREA_ROUNDING), area_range(model, max(scene.u_peak, u_top)), stress
-        )
+            model, max(1e-3 * 10.0**decade, AREA_ROUNDING), area_range(model, max(scene.u_peak, u_top)),
+            scene.stack.grouping, stress,
+        )  # fmt: skip
         n = model.gap.size
         scene.prepared[key] = Prepared(system, new_tables(n), march.new_work(n), integral_table())
     prepared: Prepared = scene.prepared[key]
@@ -96,7 +97,8 @@ class Track:
         self.control[readout.U_BEFORE] = start.u_before
         self.control[readout.BRANCH_LENGTH] = np.inf
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
-        self.out = np.empty((n + 2 if self.pace.charge else n, self.t_out.size))
+        self.shown = self.prepared.system.k_shown.size
+        self.out = np.empty((self.shown + 2 if self.pace.charge else self.shown, self.t_out.size))
         self.repeated = 0
         self.forget()
 
@@ -260,7 +262,9 @@ def integrate(
         track.finish(table)
     elif table is not None and table.edges.size > 1:
         last = track.last(table)
-    return _run(problem, track, status, t_failed, last)
+    run = _run(problem, track, status, t_failed, last)
+    run.rough = tables.rough
+    return run
 
 
 def _through(track: Track, table: SourceTable, settling: Settling) -> int:
@@ -288,7 +292,7 @@ def _through(track: Track, table: SourceTable, settling: Settling) -> int:
 
 def _run(problem: Problem, track: Track, status: Status, t_failed: float | None, last: FloatArray | None) -> Run:
     c, control = track.counters, track.control
-    n, n_out = problem.model.gap.size, int(c[readout.OUTPUT])
+    n, n_out = track.shown, int(c[readout.OUTPUT])
     t, side, out = track.t_out[:n_out], track.left[:n_out], track.out[:, :n_out]
     if last is not None and (n_out == 0 or track.t > t[-1]):
         # A failed run's arrays end at the time it reached.

@@ -53,7 +53,7 @@ class PhasorSolution:
 
 def mean_area(stack: Stack, frequency: float, amplitude: float) -> float:
     """Area of the coupled phasor at one frequency (Hz) and source amplitude (V), m^2."""
-    contact, gap = stack.contact, stack.gap
+    contact, gap = stack.contact, stack.gap_layer
     assert contact is not None
     assert gap is not None
     f = np.array([frequency])
@@ -87,7 +87,8 @@ def phasor(circuit: Circuit, frequency: ArrayLike | None = None, *, area: str | 
         For a circuit without GAP, a source without fundamental where one is needed, or frequencies not positive.
     """
     stack = build_stack(circuit)
-    if stack.gap is None or stack.contact is None:
+    gap = stack.gap_layer
+    if gap is None or stack.contact is None:
         raise InputError("a phasor solution needs a GAP; this circuit has none")
     fundamental = stack.waveform.fundamental
     if frequency is None:
@@ -103,13 +104,13 @@ def phasor(circuit: Circuit, frequency: ArrayLike | None = None, *, area: str | 
     )
     areas = _areas(stack, f, area, None if fundamental is None else fundamental.amplitude)
     gains = layer_gains(stack.admittance(f, areas))
-    gain = gains[:, stack.gap]
+    gain, sign = gains[:, gap], stack.sign[stack.first_cell]
     amplitude = math.nan if fundamental is None else fundamental.amplitude
     u_gap = gain * amplitude * np.exp(1j * (fundamental.phase if fundamental else 0.0))
     # Mean of sigma A over a period of a sine: half the peak.
     force = 0.5 * stack.contact.stress(np.abs(u_gap)) * areas
     return PhasorSolution(
-        f, gain * stack.sign[stack.gap], gains * stack.sign, u_gap * stack.sign[stack.gap], areas, force, amplitude,
+        f, gain * sign[gap], gains * sign, u_gap * sign[gap], areas, force, amplitude,
         tuple(e.name for e in stack.layers),
     )  # fmt: skip
 

@@ -37,7 +37,7 @@ class Plan:
     sensitivity : float
         Largest relative change of the leak rates that the area causes over the run.
     error_bound : float
-        What taking one area costs, relative to the peaks; 0 in a tier that does not.
+        What taking one area, or a dispersive skin at one frequency, costs, relative to the peaks.
     area : float
         Area of the `linear` tier, m^2.
     """
@@ -85,7 +85,7 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", start: str = "d
 
 def _choose(problem: Problem, rtol: float, tier: str, start: str) -> Plan:
     stack, model = problem.stack, problem.model
-    leaking = [e.name for e, g in zip(stack.layers, stack.g_total + stack.g_area, strict=True) if g > 0.0]
+    leaking = stack.layers_of(stack.g_total + stack.g_area > 0.0)
     sensitivity, area = _sensitivity(problem)
     best, reasons = _lightest(problem, rtol, leaking, sensitivity)
     if tier == "algebraic" and best != "algebraic":
@@ -110,6 +110,12 @@ def _choose(problem: Problem, rtol: float, tier: str, start: str) -> Plan:
     if chosen == "coupled" and period and (problem.t_stop - problem.t_start) / period >= FEWEST_PERIODS:
         reasons = (*reasons, "periodic: once a period no longer changes the state, later ones repeat it")
     needed = sensitivity if chosen == "linear" and model.coupled and np.any(model.rate0 > 0.0) else 0.0
+    skin = problem.scene.skin
+    if skin is not None:
+        reasons = (*reasons, f"skin at {skin.frequency:g} Hz: its dispersion moves the gap voltage by {skin.error:.1g}")
+        needed += skin.error
+    elif problem.circuit.by_device("SKIN_DISPERSIVE"):
+        reasons = (*reasons, f"skin dispersive: no one frequency serves to rtol = {rtol:g}")
     return Plan(chosen, reasons, start, tuple(sorted(map(float, rates))), stiff, sensitivity, needed, area)
 
 

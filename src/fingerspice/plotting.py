@@ -89,7 +89,7 @@ def dress(ax: Axes, ylabel: str = "", xlabel: str = "") -> None:
 def legend_above(ax: Axes, columns: int = 4, *, right: bool = False, math: bool = False) -> None:
     """A legend over the panel, where it covers no data; without `math` names keep their ``$``."""
     place: dict[str, Any] = {"loc": "lower right" if right else "lower left", "bbox_to_anchor": (right, 1.0)}
-    place |= {"borderaxespad": 0.1, "borderpad": 0.2}
+    place |= {"borderaxespad": 0.1, "borderpad": 0.2, "handlelength": 1.8, "columnspacing": 1.2}
     legend = ax.legend(ncols=columns, fontsize=FONT - 0.5, frameon=False, **place)
     for text in legend.get_texts():
         text.set_parse_math(math)

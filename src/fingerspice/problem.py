@@ -19,8 +19,28 @@ from fingerspice.numerics.modes import modes
 from fingerspice.phasors import mean_area
 from fingerspice.physics.contact import fixed_area_curve, inverse_area
 from fingerspice.solution import Solution, State
+from fingerspice.spectrum import freezing_error
 
 FloatArray = NDArray[np.float64]
+
+# What a dispersive skin's data taken at one frequency may cost, over the error asked for.
+FREEZING_SHARE = 0.3
+
+
+@dataclass(frozen=True)
+class Freezing:
+    """A dispersive skin's data taken at one frequency, and what that costs.
+
+    Attributes
+    ----------
+    frequency : float
+        Hz.
+    error : float
+        Of the gap voltage, relative to its peak.
+    """
+
+    frequency: float
+    error: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +56,8 @@ class Scene:
     charge_law, area_mode : str
     u_peak : float
         Largest |U|, V; 0 where it is not known.
+    skin : Freezing or None
+        At what frequency a dispersive skin's data are taken, where that is enough for the error asked for.
     prepared : dict
         What integrators made ready for this scene.
     """
@@ -46,6 +68,7 @@ class Scene:
     charge_law: str
     area_mode: str
     u_peak: float
+    skin: Freezing | None = None
     prepared: dict[Any, Any] = field(default_factory=dict)
 
     @cached_property
@@ -55,13 +78,19 @@ class Scene:
 
     @property
     def probe(self) -> int:
-        """Layer whose voltage the error is measured on: the gap, or the one with the smallest capacitance."""
-        return probe_layer(self.stack)
+        """Cell whose voltage the error is measured on: the gap, or the one with the smallest capacitance."""
+        return probe_cell(self.stack)
+
+    @property
+    def probe_layer(self) -> int:
+        """The layer that this cell is part of."""
+        return self.stack.layer_of(self.probe)
 
     def live_voltages(self, u_source: FloatArray, inverse: FloatArray, x: FloatArray) -> FloatArray:
-        """Voltages (n_layer - 1, n_t) of the live layers from U, 1/A (n_t,) and the states (n_t, n_layer - 1)."""
+        """Voltages (n_layer - 1, n_t) of the recorded layers from U, 1/A (n_t,) and the states (n_t, n_cell - 1)."""
         scale = self.model.area0 * inverse if self.model.mobile else np.ones_like(inverse)
-        return np.ascontiguousarray((np.outer(u_source, self.model.k[:-1]) + x * scale[:, None]).T)
+        cells = (np.outer(u_source, self.model.k[:-1]) + x * scale[:, None]).T
+        return np.ascontiguousarray(cells if len(self.stack.layers) > cells.shape[0] else self.stack.grouping @ cells)
 
     def force(self, u_gap: FloatArray, inverse: FloatArray) -> FloatArray:
         """Electroadhesive force (N) from the gap voltage (V) and 1/A (1/m^2); zero without a gap."""
@@ -122,8 +151,9 @@ def prepare(
     area: str | float,
     start: str | Solution,
     charge: bool = True,
+    rtol: float = 0.0,
 ) -> Problem:
-    """Make a scene ready, or refuse it.
+    """Make a scene ready, or refuse it; `rtol` decides whether a dispersive skin's data may be taken at one frequency.
 
     Raises
     ------
@@ -131,14 +161,16 @@ def prepare(
         For anything in the request that cannot be run.
     """
     t_start = start.state.t if isinstance(start, Solution) else 0.0
-    scene = scene_of(circuit, charge_law, area, t_stop)
+    scene = scene_of(circuit, charge_law, area, t_stop, rtol)
     stop, step = _times(circuit, t_start, t_stop, t_eval)
     first = t_start + (circuit.tran.start if circuit.tran else 0.0)
     initial = _initial_state(circuit, scene, start)
     return Problem(circuit, scene, t_start, stop, first, step, initial, charge)
 
 
-def scene_of(circuit: Circuit, charge_law: str | None, area: str | float, t_stop: float | None) -> Scene:
+def scene_of(
+    circuit: Circuit, charge_law: str | None, area: str | float, t_stop: float | None, rtol: float = 0.0
+) -> Scene:
     """The circuit's scene under a charge law and area mode, made on first use.
 
     Raises
@@ -150,15 +182,39 @@ def scene_of(circuit: Circuit, charge_law: str | None, area: str | float, t_stop
     require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
     stop = t_stop or (circuit.tran.stop if circuit.tran else 1.0)
 
+    skin = _freezing(circuit, stop)
+    if skin is not None and skin.error > FREEZING_SHARE * rtol:
+        skin = None
+
     def make() -> Scene:
-        stack = build_stack(circuit)
+        stack = build_stack(circuit, None if skin is None else skin.frequency)
         waveform = stack.waveform
         u_peak = _largest_voltage(waveform, stop)
         fixed, area_mode = _fixed_area(stack, area)
-        return Scene(stack, waveform, _model(stack, law, fixed, u_peak), law, area_mode, u_peak)
+        return Scene(stack, waveform, _model(stack, law, fixed, u_peak), law, area_mode, u_peak, skin)
 
-    scene: Scene = circuit.remember(("scene", law, area, stop), make)
+    scene: Scene = circuit.remember(("scene", law, area, stop, skin), make)
     return scene
+
+
+def _freezing(circuit: Circuit, stop: float) -> Freezing | None:
+    """The best single frequency of a dispersive skin, and its error; None where there is no such skin or frequency."""
+    if not circuit.by_device("SKIN_DISPERSIVE"):
+        return None
+
+    def make() -> Freezing | None:
+        stack = build_stack(circuit)
+        fundamental = stack.waveform.fundamental
+        if fundamental is None or stack.contact is None or not (math.isfinite(stop) and stop > 0.0):
+            return None
+        f = fundamental.frequency
+        areas = stack.contact.area(np.linspace(0.0, _largest_voltage(stack.waveform, stop), 65))
+        area = stack.area_given or float(np.median(areas))
+        change = 0.0 if stack.area_given else float(np.ptp(areas)) / area
+        return Freezing(f, freezing_error(circuit, f, area, change, stop))
+
+    found: Freezing | None = circuit.remember(("freezing", stop), make)
+    return found
 
 
 def _largest_voltage(waveform: Waveform, stop: float) -> float:
@@ -216,8 +272,8 @@ def _fixed_area(stack: Stack, area: str | float) -> tuple[float | None, str]:
     return mean_area(stack, fundamental.frequency, fundamental.amplitude), area
 
 
-def probe_layer(stack: Stack) -> int:
-    """The gap, or without one the layer with the smallest capacitance."""
+def probe_cell(stack: Stack) -> int:
+    """The gap, or without one the cell with the smallest capacitance."""
     return int(np.argmin(stack.c)) if stack.gap is None else stack.gap
 
 
@@ -231,7 +287,7 @@ def _model(stack: Stack, law: str, fixed: float | None, u_peak: float) -> Model:
         # Discharging layers add to the gap's share of a jump: the curve covers a little more than U itself.
         curve = stack.contact.curve(max(1.3 * u_peak, 1e-30))
     order = list(stack.state_order)
-    probe = probe_layer(stack)
+    probe = probe_cell(stack)
     k = stack.k[order]
     leaks = stack.leak_rates(area0)
     slow = int(np.argmin(leaks))
@@ -254,7 +310,7 @@ def _model(stack: Stack, law: str, fixed: float | None, u_peak: float) -> Model:
 
 
 def _row(order: list[int], layer: int) -> FloatArray:
-    """How a layer's voltage over k U follows from the states, shape (n_layer - 1,)."""
+    """How a cell's voltage over k U follows from the states, shape (n_cell - 1,)."""
     place = order.index(layer)
     n = len(order) - 1
     return np.full(n, -1.0) if place == n else np.eye(n)[place]
@@ -265,7 +321,8 @@ def _initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Sta
     stack, model, law = scene.stack, scene.model, scene.charge_law
     n = stack.c.size
     if isinstance(start, Solution):
-        if start.layers != tuple(e.name for e in stack.layers) or start.charge_law != law:
+        alike = start.layers == tuple(e.name for e in stack.layers) and start.record.stack.cells == stack.cells
+        if not alike or start.charge_law != law:
             raise InputError(
                 f"the solution to start from has layers {', '.join(start.layers)} and the {start.charge_law} law; "
                 f"allowed: those of this run, {', '.join(e.name for e in stack.layers)} and {law}"
@@ -314,25 +371,30 @@ def state_from(model: Model, t: float, x: FloatArray, u_before: float, law: str)
 
 
 def _given_voltages(circuit: Circuit, stack: Stack) -> tuple[FloatArray, float]:
-    """Layer voltages along the loop from ``.ic`` node voltages (unnamed nodes: 0), and their sum."""
+    """Cell voltages along the loop from ``.ic`` node voltages (unnamed nodes: 0), and their sum.
+
+    A dispersive layer takes its voltage as a jump would give it.
+    """
     names = {node for hop in stack.hops for node in hop.element.nodes[:2]}
     unknown = [node for node in circuit.initial if node not in names]
     if unknown:
         raise InputError(f".ic names node {unknown[0]!r}, which is not in the circuit")
     u = np.array([circuit.initial.get(e.nodes[0], 0.0) - circuit.initial.get(e.nodes[1], 0.0) for e in stack.layers])
-    u = u * stack.sign
+    inverse = 1.0 / stack.c
+    share = inverse / np.repeat(np.add.reduceat(inverse, stack.first_cell), stack.cells)
+    u = np.repeat(u, stack.cells) * share * stack.sign
     return u, float(u.sum())
 
 
 def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
-    """Layer voltages along the loop (n_layer,) at the DC operating point, the area coupled.
+    """Cell voltages along the loop (n_cell,) at the DC operating point, the area coupled.
 
     Raises
     ------
     InputError
         Where two or more layers do not leak: the node between them has no DC voltage.
     """
-    insulating = [e.name for e, g in zip(stack.layers, stack.g_total + stack.g_area, strict=True) if g == 0.0]
+    insulating = stack.layers_of(stack.g_total + stack.g_area == 0.0)
     if len(insulating) > 1:
         raise InputError(
             f"no DC operating point: {' and '.join(insulating)} do not leak, so the nodes between them are reached "

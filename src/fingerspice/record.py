@@ -38,7 +38,7 @@ class Record:
     left : ndarray of bool, shape (n_t,)
         Whether the left-hand value at a jump is meant.
     live : ndarray, shape (n_layer - 1, n_t)
-        Voltages of all layers along the loop but the last of `stack.state_order`, V.
+        Voltages of all layers along the loop but the last of `stack.layer_order`, V.
     z, current : ndarray, shape (n_t,), or None
         The charge's own state (C) and the source's regular current (A), where they were asked for.
     charge_offset : float
@@ -78,23 +78,25 @@ class Record:
     @cached_property
     def u_layer(self) -> FloatArray:
         """Layer voltages from p to n (n_t, n_layer), V."""
-        *live, last = self.stack.state_order
+        *live, last = self.stack.layer_order
         out = np.empty((self.t.size, len(live) + 1))
         out[:, live] = self.live.T
         # The layers add up to the source exactly.
         out[:, last] = self.u_source - self.live.sum(axis=0)
-        return sealed(out * self.stack.sign)
+        out *= self.stack.sign[self.stack.first_cell]
+        return sealed(out)
 
     @cached_property
     def u_gap(self) -> FloatArray:
         """Gap voltage, V, shape (n_t,)."""
-        gap = self.stack.gap
+        gap = self.stack.gap_layer
         assert gap is not None
-        *live, _ = self.stack.state_order
+        *live, _ = self.stack.layer_order
         if gap in live:
             along = self.live[live.index(gap)]
-            return sealed(along if self.stack.sign[gap] > 0.0 else -along)
-        return sealed(self.u_layer[:, gap].copy())
+            return sealed(along if self.stack.sign[self.stack.gap] > 0.0 else -along)
+        # A gap alone is all of the loop.
+        return sealed(self.u_layer[:, 0].copy())
 
     @cached_property
     def area(self) -> FloatArray:

@@ -30,7 +30,8 @@ BREAKPOINTS_PER_WINDOW = 2000.0
 class Run:
     """What one integration gives, and how it went.
 
-    `t`, `left`, `live`, `z`, `current` are as in `Record`, up to the time reached.
+    `t`, `left`, `live`, `z`, `current` are as in `Record`, up to the time reached; `rough` is the source's (see
+    `SourceTable`), V.
     """
 
     t: FloatArray
@@ -47,6 +48,7 @@ class Run:
     state: State
     t_failed: float | None = None
     detail: str = ""
+    rough: float = 0.0
 
     def record(self, problem: Problem) -> Record:
         """The outputs with what they mean."""
@@ -79,6 +81,9 @@ class Tables:
         self.edges = windows(problem)
         # Windows that end by this time (s) are done with, but for the last.
         self.done = -np.inf
+        # Largest |U| (V) of the sampled windows so far.
+        self.scale = 0.0
+        self.rough = 0.0
         self.kept: dict[Any, SourceTable] | None = {} if is_sampled(problem.waveform) else None
         if self.kept is None and len(self.edges) == 2:
             self.kept = problem.scene.prepared.setdefault("tables", {})
@@ -93,10 +98,12 @@ class Tables:
             table = self.kept.get(key) if self.kept is not None else None
             if table is None:
                 table = source_table(
-                    self.problem.waveform, w0, w1, self.tol, self.problem.step, no_chirps=self.no_chirps
-                )
+                    self.problem.waveform, w0, w1, self.tol, self.problem.step, no_chirps=self.no_chirps,
+                    scale=self.scale,
+                )  # fmt: skip
                 if self.kept is not None:
                     self.kept[key] = table
+            self.scale, self.rough = max(self.scale, table.scale), max(self.rough, table.rough)
             self.not_finite = table.not_finite
             yield table
             if table.not_finite is not None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,12 +24,15 @@ from fingerspice.problem import Problem, prepare
 from fingerspice.record import Record
 from fingerspice.runs import Progress, Run
 from fingerspice.solution import ErrorEstimate, Solution, Status
+from fingerspice.spectrum import spectrum_warning
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 RTOL_RANGE = (1e-13, 0.1)
 BREAKDOWN_VOLTAGE = 300.0
+# Contact area over that at 0 V.
+LEAST_AREA = 0.2
 
 
 def simulate(
@@ -104,7 +109,7 @@ def simulate(
     begun = None
     problem = prepare(
         circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area,
-        start="uncharged" if start == "periodic" else start, charge=charge,
+        start="uncharged" if start == "periodic" else start, charge=charge, rtol=rtol,
     )  # fmt: skip
     if start == "periodic":
         closed = close_period(problem, 0.5 * rtol)
@@ -143,7 +148,7 @@ def plan(
     if t_stop is None and circuit.tran is None:
         t_stop = 1.0
     problem = prepare(
-        circuit, t_stop=t_stop, t_eval=None, charge_law=charge_law, area=area, start="deck", charge=charge
+        circuit, t_stop=t_stop, t_eval=None, charge_law=charge_law, area=area, start="deck", charge=charge, rtol=rtol
     )  # fmt: skip
     return make_plan(problem, rtol, tier)
 
@@ -176,13 +181,27 @@ def run_problem(
     elif plan.tier == "linear":
         run, name = solve_linear(problem, run_at, left, plan.area, plan.error_bound), plan.tier
     else:
-        own = rtol if begun is None else max(0.5 * rtol, RTOL_RANGE[0])
+        # What the start and the plan give away is part of the error asked for.
+        own = max((1.0 if begun is None else 0.5) * rtol - 2.0 * plan.error_bound, RTOL_RANGE[0])
         run, name = _run(problem, method, own, run_at, left, progress)
+        _add_error(run, plan.error_bound * run.peak_u)
     if begun is not None:
-        run.error = ErrorEstimate(run.error.u_gap + begun.u_gap, run.error.f_el + begun.f_el)
+        _add_error(run, begun.u_gap, begun.f_el)
+        # What the charge collects from where it starts is not known.
+        run.error = dataclasses.replace(run.error, q_source=None)
+    if run.rough > 0.0:
+        _add_error(run, run.rough)
+        run.detail = run.detail or f"the source function itself is rough by {run.rough:.2g} V"
     if run.status is Status.SUCCESS and run.excess(rtol) > 1.0:
         run.status = Status.ERROR_NOT_MET
     return _solution(problem, run, rtol, name, t_out, time.perf_counter() - begin, plan)
+
+
+def _add_error(run: Run, u_gap: float, f_el: float | None = None) -> None:
+    """Add to a run's error what it does not know of, V and N: a force goes with the square of its voltage."""
+    if f_el is None:
+        f_el = 2.0 * u_gap / run.peak_u * run.peak_f if run.peak_u > 0.0 else 0.0
+    run.error = dataclasses.replace(run.error, u_gap=run.error.u_gap + u_gap, f_el=run.error.f_el + f_el)
 
 
 def _at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
@@ -280,7 +299,7 @@ def _solution(
         state=run.state,
         fundamental=scene.fundamental,
         period=scene.waveform.period,
-        warnings=tuple(_physics_warnings(problem, run)),
+        warnings=tuple(_physics_warnings(problem, run, record)),
     )
 
 
@@ -311,10 +330,30 @@ def _message(problem: Problem, run: Run, record: Record) -> str:
     return text
 
 
-def _physics_warnings(problem: Problem, run: Run) -> list[str]:
-    if problem.stack.gap is not None and run.peak_u > BREAKDOWN_VOLTAGE:
-        return [
-            f"the gap voltage reaches {run.peak_u:.4g} V; air breaks down above about {BREAKDOWN_VOLTAGE:g} V "
-            "(Paschen minimum 327 V), which the model does not contain"
-        ]
-    return []
+def _physics_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
+    """Where a run leaves what its model holds for."""
+    outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
+    if outside is not None:
+        yield outside
+    stack = problem.stack
+    if stack.contact is not None:
+        if run.peak_u > BREAKDOWN_VOLTAGE:
+            yield (
+                f"the gap voltage reaches {run.peak_u:.4g} V; air breaks down above about {BREAKDOWN_VOLTAGE:g} V "
+                "(Paschen minimum 327 V), which the model does not contain"
+            )
+        unloaded, least = (float(stack.contact.area(u)) for u in (0.0, run.peak_u))
+        if problem.model.coupled and least < LEAST_AREA * unloaded:
+            yield (
+                f"the contact area falls to {1e6 * least:.3g} mm^2, below {100.0 * LEAST_AREA:g} % of the "
+                f"{1e6 * unloaded:.3g} mm^2 at 0 V: the contact model was not made for so little"
+            )
+    for i, layer in enumerate(stack.layers):
+        strength = layer.values.get("e_max", math.inf)
+        if math.isfinite(strength) and record.t.size:
+            field = float(np.abs(record.u_layer[:, i]).max()) / layer.values["d"]
+            if field > strength:
+                yield (
+                    f"the field in {layer.name} reaches {field:.3g} V/m at the outputs; its dielectric strength is "
+                    f"{strength:.3g} V/m"
+                )

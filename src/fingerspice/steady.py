@@ -112,8 +112,9 @@ def steady_state(
     if waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
     problem = prepare(
-        circuit, t_stop=waveform.period, t_eval=None, charge_law=charge_law, area=area, start="uncharged", charge=charge
-    )
+        circuit, t_stop=waveform.period, t_eval=None, charge_law=charge_law, area=area, start="uncharged",
+        charge=charge,
+    )  # fmt: skip
     closed = close_period(dataclasses.replace(problem, first=0.0, step=waveform.period / points), 0.5 * rtol)
     return SteadyState(
         closed.problem, rtol, closed.defect, closed.map_slope, closed.memory, closed.error, closed.periods

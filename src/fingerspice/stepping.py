@@ -209,6 +209,7 @@ def integrate(
             problem.scene.charge_law,
         ),
         t_failed=t_failed,
+        rough=tables.rough,
     )
 
 

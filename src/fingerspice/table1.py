@@ -18,6 +18,9 @@ Xskin   skin  0    area  SKIN  d=350u f=100
 """Table 1 under a sine of 200 V and 100 Hz (Fig. 4, left), as in `circuits/fingerpad.cir`."""
 
 
-def table1_circuit() -> Circuit:
-    """The circuit of `TABLE1_DECK`."""
-    return parse_netlist(TABLE1_DECK)
+def table1_circuit(*, dispersive: bool = False) -> Circuit:
+    """The circuit of `TABLE1_DECK`; `dispersive`: with the skin's data at every frequency, not at one."""
+    text = TABLE1_DECK
+    if dispersive:
+        text = text.replace("SKIN  d=350u f=100", "SKIN_DISPERSIVE d=350u")
+    return parse_netlist(text)

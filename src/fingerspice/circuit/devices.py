@@ -58,13 +58,15 @@ _P = ParameterSpec
 _LAYER_NODES = ("p", "n", "area")
 _DIELECTRIC = (_P("d", "m"), _P("eps_r", ""))
 _LEAK = _P("r", "ohm", default=math.inf, may_be_infinite=True)
+_STRENGTH = _P("e_max", "V/m", default=math.inf, may_be_infinite=True)
 
 DEVICES: dict[str, DeviceSpec] = {
     spec.name: spec
     for spec in (
-        DeviceSpec("LAYER", _LAYER_NODES, (*_DIELECTRIC, _LEAK)),
-        DeviceSpec("SLAB", _LAYER_NODES, (*_DIELECTRIC, _P("rho", "ohm m", may_be_infinite=True))),
+        DeviceSpec("LAYER", _LAYER_NODES, (*_DIELECTRIC, _LEAK, _STRENGTH)),
+        DeviceSpec("SLAB", _LAYER_NODES, (*_DIELECTRIC, _P("rho", "ohm m", may_be_infinite=True), _STRENGTH)),
         DeviceSpec("SKIN", _LAYER_NODES, (_P("d", "m"), _P("f", "Hz"))),
+        DeviceSpec("SKIN_DISPERSIVE", _LAYER_NODES, (_P("d", "m"),)),
         DeviceSpec(
             "GAP",
             _LAYER_NODES,
@@ -91,8 +93,5 @@ DEVICES: dict[str, DeviceSpec] = {
 
 LATER = {
     ("GAP", "tau"): "first-order area dynamics",
-    ("SKIN_DISPERSIVE", ""): "the dispersive stratum corneum; SKIN takes its data at one frequency",
-    ("LAYER", "e_max"): "dielectric strength",
-    ("SLAB", "e_max"): "dielectric strength",
 }
 """Named in the file format, not simulated by this version: refused by name."""

@@ -118,6 +118,8 @@ class SourceTable:
         Largest |U| (V) seen in making a table of series; 0 where there are none.
     not_finite : float or None
         Time (s) of the first NaN or inf; the table then ends just before it.
+    rough : float
+        Largest misfit (V) that no finer series would mend: the rounding of a user's function.
     """
 
     edges: FloatArray
@@ -125,6 +127,7 @@ class SourceTable:
     series: FloatArray
     scale: float = 0.0
     not_finite: float | None = None
+    rough: float = 0.0
 
 
 def same_time(t: float) -> float:
@@ -143,7 +146,7 @@ def is_sampled(waveform: Waveform) -> bool:
 
 
 def source_table(
-    waveform: Waveform, t0: float, t1: float, tol: float, step: float, *, no_chirps: bool = False
+    waveform: Waveform, t0: float, t1: float, tol: float, step: float, *, no_chirps: bool = False, scale: float = 0.0
 ) -> SourceTable:
     """Table of a waveform over [t0, t1].
 
@@ -158,6 +161,8 @@ def source_table(
         Output step, s: a function is looked at no less finely than this.
     no_chirps : bool
         Whether a term with a changing frequency, which has no closed-form response, becomes a series too.
+    scale : float
+        |U| (V) already met in windows before: what is tiny beside it need not be followed to its own last digit.
     """
     inner = waveform.breakpoints(t0, t1)
     # A breakpoint that misses the window's edge by rounding is at the edge: no segment is shorter than that.
@@ -171,7 +176,7 @@ def source_table(
             step = min(step, 0.1 * waveform.shortest_time())
         else:
             return SourceTable(edges, np.ascontiguousarray(terms), np.zeros((edges.size - 1, 0)))
-    pieces = _Refiner(waveform, tol, step)
+    pieces = _Refiner(waveform, tol, step, scale)
     for a, b in itertools.pairwise(edges):
         if not pieces.cover(float(a), float(b)):
             break
@@ -184,6 +189,7 @@ def source_table(
         np.array(pieces.series).reshape(m, _POINTS),
         pieces.scale,
         pieces.not_finite,
+        pieces.rough,
     )
 
 
@@ -194,6 +200,12 @@ def _rephased(edges: FloatArray, period: float) -> FloatArray:
         return edges
     pieces = [np.linspace(a, b, max(1, math.ceil((b - a) / longest)) + 1)[:-1] for a, b in itertools.pairwise(edges)]
     return np.concatenate([*pieces, edges[-1:]])
+
+
+# Halvings in a row that mend nothing, and the misfit over the largest |U| that may then be called rounding.
+_IDLE, _ROUGHEST = 3, 1e-8
+# V; below, doubles lose their digits, and no function is smooth.
+_NOTHING = 1e-290
 
 
 @dataclass
@@ -211,6 +223,7 @@ class _Refiner:
     located: list[float] = field(default_factory=list)
     narrow: list[float] = field(default_factory=list)
     not_finite: float | None = None
+    rough: float = 0.0
 
     def cover(self, a: float, b: float) -> bool:
         """Add series for [a, b]; False where the waveform stops being finite inside."""
@@ -220,16 +233,23 @@ class _Refiner:
         longest = min(8.0 * self.step, 2.0 * self.waveform.shortest_time())
         count = max(1, math.ceil((b - a) / longest))
         cuts = np.linspace(a, b, count + 1)
-        stack = [(float(x), float(y), 0) for x, y in itertools.pairwise(cuts)][::-1]
+        # Intervals with how often they were halved, the misfit before the last halving, the largest before any, and how
+        # often halving was no use.
+        stack = [(float(x), float(y), 0, math.inf, 0.0, 0) for x, y in itertools.pairwise(cuts)][::-1]
         while stack:
-            lo, hi, depth = stack.pop()
-            series, values = self._try(lo, hi, depth)
+            lo, hi, depth, before, most, idle = stack.pop()
+            series, values, misfit = self._try(lo, hi, depth)
+            idle = idle + 1 if misfit > 0.7 * before else 0
+            if series is None and idle >= _IDLE and misfit <= _ROUGHEST * self.scale:
+                # A smooth function's misfit falls by 2^20, that of a kink by two: this is the rounding of its values.
+                self.rough = max(self.rough, misfit)
+                series = chebyshev.coefficients(values)
             if not np.all(np.isfinite(values)):
                 if hi - lo <= 1e-12 * max(abs(hi), self.step) or depth > 60:
                     self.not_finite = lo if lo == self.edges[0] else hi
                     return False
                 middle = 0.5 * (lo + hi)
-                stack += [(middle, hi, depth + 1), (lo, middle, depth + 1)]
+                stack += [(middle, hi, depth + 1, math.inf, most, 0), (lo, middle, depth + 1, math.inf, most, 0)]
                 continue
             floor = max(4e-15 * max(abs(lo), abs(hi)), 1e-13 * self.step)
             if series is None and hi - lo <= floor:
@@ -241,9 +261,10 @@ class _Refiner:
                 continue
             if series is None:
                 middle = 0.5 * (lo + hi)
-                stack += [(middle, hi, depth + 1), (lo, middle, depth + 1)]
+                most = max(most, misfit)
+                stack += [(middle, hi, depth + 1, misfit, most, idle), (lo, middle, depth + 1, misfit, most, idle)]
                 continue
-            if hi - lo < 0.75 * self.step:
+            if hi - lo < 0.75 * self.step and most > _ROUGHEST * self.scale:
                 self.narrow.append(0.5 * (lo + hi))
             if self.series and lo > a and not (self.jumps and self.jumps[-1][0] >= lo):
                 # A jump that happens to stand on a cut needs no refining: look across every cut.
@@ -252,12 +273,12 @@ class _Refiner:
             self.series.append(series)
         return True
 
-    def _try(self, lo: float, hi: float, depth: int) -> tuple[FloatArray | None, FloatArray]:
-        """Series of one interval if it proves itself, and the values seen."""
+    def _try(self, lo: float, hi: float, depth: int) -> tuple[FloatArray | None, FloatArray, float]:
+        """Series of one interval if it proves itself, the values at its nodes, and its misfit between them, V."""
         x = np.concatenate([chebyshev.nodes(_POINTS, -1.0, 1.0), _PROOF])
         values = self.waveform.value(0.5 * (lo + hi) + 0.5 * (hi - lo) * x)
         if not np.all(np.isfinite(values)):
-            return None, values
+            return None, values, math.inf
         self.scale = max(self.scale, float(np.abs(values).max()))
         c = chebyshev.coefficients(values[:_POINTS])
         proof = np.polynomial.chebyshev.chebval(_PROOF, c)
@@ -266,12 +287,14 @@ class _Refiner:
             self.steepest = float(np.abs(np.diff(values[:_POINTS]) / np.diff(nodes)).max())
         # A function cannot be smoother than the rounding of its own argument lets it be.
         noise = 2e-15 * max(abs(lo), abs(hi)) * self.steepest
-        good = np.abs(proof - values[_POINTS:]).max() <= max(self.tol * self.scale, noise)
-        return (c if good else None), values[:_POINTS]
+        misfit = float(np.abs(proof - values[_POINTS:]).max())
+        good = misfit <= max(self.tol * self.scale, noise, _NOTHING)
+        return (c if good else None), values[:_POINTS], misfit
 
     def warn(self) -> None:
         """One warning for the jumps, one for the narrow features, found and not declared."""
-        real = [(t, dv) for t, dv in self.jumps if abs(dv) > 1e3 * self.tol * self.scale]
+        least = max(1e3 * self.tol * self.scale, 10.0 * self.rough)
+        real = [(t, dv) for t, dv in self.jumps if abs(dv) > least]
         if real:
             t, dv = real[0]
             warnings.warn(

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,29 +22,35 @@ from fingerspice.circuit.combinations import Product, Sum
 from fingerspice.circuit.topology import Hop, find_loop
 from fingerspice.circuit.waveforms import DC, Waveform
 from fingerspice.physics.contact import Contact
+from fingerspice.physics.ladder import SKIN_LADDER
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 
 FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
 class Stack:
     """Layers in one series loop with an ideal source, sharing one area. SI throughout.
 
+    A layer is one cell, a capacitor beside a resistor, or, where its material is dispersive, several in series.
+
     Attributes
     ----------
     layers : tuple of Element
         In loop order, from the source's positive side.
-    sign : ndarray, shape (n_layer,)
+    cells : tuple of int
+        How many cells each layer has; theirs follow each other in what follows.
+    sign : ndarray, shape (n_cell,)
         +1 where a layer is written p to n along the loop, -1 where it is turned.
-    c : ndarray, shape (n_layer,)
+    c : ndarray, shape (n_cell,)
         Capacitance per area, F/m^2.
-    g_total : ndarray, shape (n_layer,)
+    g_total : ndarray, shape (n_cell,)
         Leakage conductance of fixed total, S.
-    g_area : ndarray, shape (n_layer,)
+    g_area : ndarray, shape (n_cell,)
         Leakage conductance per area, S/m^2.
     gap : int or None
-        Index of the gap among the layers.
+        Index of the gap among the cells.
     contact : Contact or None
     area_given : float or None
         Area fixed by the deck, m^2.
@@ -52,6 +59,7 @@ class Stack:
     """
 
     layers: tuple[Element, ...]
+    cells: tuple[int, ...]
     sign: FloatArray
     c: FloatArray
     g_total: FloatArray
@@ -77,14 +85,29 @@ class Stack:
             out[hop.node] = potential
         return out
 
+    @cached_property
+    def first_cell(self) -> NDArray[np.intp]:
+        """Index of the first cell of each layer."""
+        return np.concatenate([[0], np.cumsum(self.cells)[:-1]]).astype(np.intp)
+
+    @property
+    def gap_layer(self) -> int | None:
+        """Index of the gap among the layers."""
+        return None if self.gap is None else self.layer_of(self.gap)
+
+    def layers_of(self, cells: NDArray[np.bool_]) -> list[str]:
+        """Names of the layers of which some cell is marked."""
+        marked = np.logical_or.reduceat(cells, self.first_cell)
+        return [e.name for e, mark in zip(self.layers, marked, strict=True) if mark]
+
     @property
     def s(self) -> float:
-        """Sum of 1/c over the layers, m^2/F."""
+        """Sum of 1/c over the cells, m^2/F."""
         return float(np.sum(1.0 / self.c))
 
     @property
     def k(self) -> FloatArray:
-        """Share of a jump of U that each layer takes, shape (n_layer,)."""
+        """Share of a jump of U that each cell takes, shape (n_cell,)."""
         return np.asarray(1.0 / (self.c * self.s))
 
     @property
@@ -98,41 +121,64 @@ class Stack:
 
     @property
     def state_order(self) -> tuple[int, ...]:
-        """Layers in the order of the states; the last one's voltage is what the others leave of the source's.
+        """Cells in the order of the states; the last one's voltage is what the others leave of the source's.
 
-        The layer left out is never the gap, so that the gap's voltage is a state of its own.
+        The cell left out is never the gap, so that the gap's voltage is a state of its own.
         """
         left_out = next((i for i in reversed(range(self.c.size)) if i != self.gap), 0)
         return (*(i for i in range(self.c.size) if i != left_out), left_out)
 
+    @cached_property
+    def layer_order(self) -> tuple[int, ...]:
+        """Layers in the order they are recorded in, last the one whose voltage is what the others leave."""
+        left_out = self.layer_of(self.state_order[-1])
+        return (*(i for i in range(len(self.layers)) if i != left_out), left_out)
+
+    @cached_property
+    def grouping(self) -> FloatArray:
+        """Which live cells make up each recorded layer, shape (n_layer - 1, n_cell - 1)."""
+        layers = np.array([self.layer_of(cell) for cell in self.state_order[:-1]], int)
+        return np.asarray(np.array(self.layer_order[:-1], int)[:, None] == layers, float)
+
+    def layer_of(self, cell: int) -> int:
+        """Index of the layer that a cell is part of."""
+        return int(np.searchsorted(self.first_cell, cell, side="right")) - 1
+
     def leak_rates(self, area: float) -> FloatArray:
-        """Leak rate of each layer, g/c, at an area (m^2), 1/s, shape (n_layer,)."""
+        """Leak rate of each cell, g/c, at an area (m^2), 1/s, shape (n_cell,)."""
         return np.asarray((self.g_total / area + self.g_area) / self.c)
 
-    def admittance(self, frequency: FloatArray, area: FloatArray) -> FloatArray:
+    def admittance(self, frequency: FloatArray, area: FloatArray) -> ComplexArray:
         """Complex layer admittances (n_frequency, n_layer) in S, SKIN at each frequency (Eqs. 9, 16 to 19)."""
         f = np.atleast_1d(np.asarray(frequency, float))[:, None]
         a = np.broadcast_to(np.asarray(area, float), (f.shape[0],))[:, None]
-        g = np.broadcast_to(self.g_total + self.g_area * a, (f.shape[0], self.c.size)).copy()
-        c = np.broadcast_to(self.c * a, g.shape).copy()
+        y = self.g_total + self.g_area * a + 2j * math.pi * f * self.c * a
+        if len(self.layers) < self.c.size:
+            y = 1.0 / np.add.reduceat(1.0 / y, self.first_cell, axis=1)
         for i, layer in enumerate(self.layers):
             if layer.device == "SKIN":
-                d = layer.values["d"]
-                g[:, i] = (a / (skin_resistivity(f) * d))[:, 0]
-                c[:, i] = (EPS0 * skin_permittivity(f) * a / d)[:, 0]
-        return np.asarray(g + 2j * math.pi * f * c)
+                skin = 1.0 / skin_resistivity(f) + 2j * math.pi * f * EPS0 * skin_permittivity(f)
+                y[:, i] = (skin * a / layer.values["d"])[:, 0]
+        return np.asarray(y)
 
 
-def layer_constants(layer: Element) -> tuple[float, float, float]:
-    """c (F/m^2), total leakage (S) and leakage per area (S/m^2) of one layer."""
+def layer_constants(layer: Element, skin_at: float | None = None) -> FloatArray:
+    """c (F/m^2), total leakage (S) and leakage per area (S/m^2) of a layer's cells, shape (n_cell, 3).
+
+    With `skin_at` a dispersive skin's data are those at that frequency (Hz).
+    """
     v = layer.values
-    if layer.device == "SKIN":
-        f = v["f"]
-        return EPS0 * float(skin_permittivity(f)) / v["d"], 0.0, 1.0 / (float(skin_resistivity(f)) * v["d"])
-    c = EPS0 * v["eps_r"] / v["d"]
-    if layer.device == "SLAB":
-        return c, 0.0, 1.0 / (v["rho"] * v["d"])
-    return c, 1.0 / v["r"], 0.0
+    if layer.device == "LAYER" or layer.device == "GAP":
+        return np.array([[EPS0 * v["eps_r"] / v["d"], 1.0 / v["r"], 0.0]])
+    if layer.device == "SKIN_DISPERSIVE" and skin_at is not None:
+        eps_r, rho = SKIN_LADDER.permittivity([skin_at]), SKIN_LADDER.resistivity([skin_at])
+    elif layer.device == "SKIN_DISPERSIVE":
+        eps_r, rho = SKIN_LADDER.cells()
+    elif layer.device == "SKIN":
+        eps_r, rho = skin_permittivity([v["f"]]), skin_resistivity([v["f"]])
+    else:
+        eps_r, rho = np.array([v["eps_r"]]), np.array([v["rho"]])
+    return np.column_stack([EPS0 * eps_r / v["d"], np.zeros(eps_r.size), 1.0 / (rho * v["d"])])
 
 
 def contact_of(gap: Element) -> Contact:
@@ -151,8 +197,8 @@ def contact_of(gap: Element) -> Contact:
     )
 
 
-def build_stack(circuit: Circuit) -> Stack:
-    """The series stack of a circuit.
+def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
+    """The series stack of a circuit; with `skin_at`, dispersive skins have their data at that frequency (Hz).
 
     Raises
     ------
@@ -162,18 +208,21 @@ def build_stack(circuit: Circuit) -> Stack:
     """
     loop = find_loop(circuit)
     layers = [h.element for h in loop.hops if h.element.spec.is_layer]
-    constants = np.array([layer_constants(e) for e in layers])
+    parts = [layer_constants(e, skin_at) for e in layers]
+    cells = tuple(len(part) for part in parts)
+    constants = np.concatenate(parts)
     contact = None if loop.gap is None else contact_of(loop.gap)
     if contact is not None and circuit.work == "total":
-        d = np.array([e.values["d"] for e in layers])
+        d = np.repeat([e.values["d"] for e in layers], cells)
         contact = contact.with_total_voltage_held(d, constants[:, 0] * d / EPS0)
     return Stack(
         layers=tuple(layers),
-        sign=np.array([h.sign for h in loop.hops if h.element.spec.is_layer]),
+        cells=cells,
+        sign=np.repeat([h.sign for h in loop.hops if h.element.spec.is_layer], cells),
         c=constants[:, 0],
         g_total=constants[:, 1],
         g_area=constants[:, 2],
-        gap=None if loop.gap is None else layers.index(loop.gap),
+        gap=None if loop.gap is None else sum(cells[: layers.index(loop.gap)]),
         contact=contact,
         area_given=loop.area_given,
         hops=loop.hops,

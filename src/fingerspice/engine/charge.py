@@ -28,9 +28,9 @@ for _i in range(NODES):
 def charge_step(
     model: Model, rates: FloatArray, gain: FloatArray, gap: FloatArray, slow_share: FloatArray, w: FloatArray,
     pull: FloatArray, r: FloatArray, integral: FloatArray, h: float, z0: float, places: FloatArray, theta: float,
-    control: FloatArray, values: FloatArray,
+    control: FloatArray, z: FloatArray, current: FloatArray,
 ) -> None:  # fmt: skip
-    """z and the current at the nodes of a step of length h that starts with z0, into the last rows of `values`.
+    """z and the current at the nodes of a step of length h that starts with z0.
 
     Both go through the layer that leaks slowest (see `model.charge_rate`). What that layer stores is taken from its
     voltages themselves: in w' a fast mode that has died away still holds its rate times the error of w, which a sum
@@ -39,7 +39,6 @@ def charge_step(
     """
     n = rates.size
     slow = model.slow
-    z, current = values[n], values[n + 1]
     voltage = np.empty(NODES)
     for j in range(NODES):
         dv = 0.0

@@ -15,7 +15,7 @@ from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS,
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-N_SLOTS = 48
+N_SLOTS = 192
 # Places between which the error is followed: start, the points between nodes, end.
 N_PLACES = 5
 
@@ -115,22 +115,24 @@ def _linear(
 @jit_inline
 def converge(
     mobile: bool, coupled: bool, k_gap: float, area0: float, q0: float, gain: FloatArray, gap: FloatArray,
-    push: FloatArray, turn: FloatArray, powers: FloatArray, slopes: FloatArray, lo: float, scale: float,
-    curve: FloatArray, sign: float, decay: FloatArray, phi: FloatArray, w0: FloatArray, tol: float,
+    push: FloatArray, tap: FloatArray, tap_k: FloatArray, feed: FloatArray, tapped: FloatArray, powers: FloatArray,
+    slopes: FloatArray, lo: float, scale: float, curve: FloatArray, sign: float, decay: FloatArray, phi: FloatArray,
+    w0: FloatArray, tol: float,
     base: FloatArray, w: FloatArray, pull: FloatArray, used: FloatArray,
-    pull_before: FloatArray, left_before: FloatArray, r: FloatArray,
+    pull_before: FloatArray, left_before: FloatArray, weight: FloatArray, r: FloatArray,
 ) -> tuple[int, bool]:  # fmt: skip
     """Fill `w` with the collocation solution of a step, iterating on the nonlinear term.
 
     Returns the number of evaluations at all rows, and whether the iteration closed to `tol` (V). `pull` is the
-    nonlinear term at that solution, `used` the one that led to it.
+    nonlinear term at that solution, `used` the one that led to it; its modes are measured by what they move the gap.
     """
     _linear(gain, decay, phi, w0, r[SOURCE], base, w)
     for k in range(w0.size):
         for i in range(ROWS):
             used[k, i] = 0.0
     if not evaluate(
-        mobile, k_gap, area0, q0, gap, push, turn, powers, slopes, lo, scale, curve, sign, w, pull, r
+        mobile, k_gap, area0, q0, gap, push, tap, tap_k, feed, tapped, powers, slopes, lo, scale, curve, sign, w, pull,
+        r,
     ):  # fmt: skip
         return 1, False
     if not coupled:
@@ -139,15 +141,19 @@ def converge(
         r[GUESS, i] = r[U, i]
     slow = False
     for iteration in range(2, 41):
-        step = _mix(pull, used, pull_before, left_before) if slow else _plain(pull, used, pull_before, left_before)
+        if slow:
+            step = _mix(pull, used, weight, pull_before, left_before)
+        else:
+            step = _plain(pull, used, weight, pull_before, left_before)
         _respond(used, phi, base, w)
         if not evaluate(
-            mobile, k_gap, area0, q0, gap, push, turn, powers, slopes, lo, scale, curve, sign, w, pull, r
+            mobile, k_gap, area0, q0, gap, push, tap, tap_k, feed, tapped, powers, slopes, lo, scale, curve, sign, w,
+            pull, r,
         ):  # fmt: skip
             return iteration, False
         # What the gap voltage would move next, by what it moved for the last change of the nonlinear term.
         change = moved(r[U], r[GUESS])
-        left = _distance(pull, used)
+        left = _distance(pull, used, weight)
         if not left < math.inf:
             return iteration, False
         if change * left <= tol * step:
@@ -156,22 +162,36 @@ def converge(
     return 40, False
 
 
+@jit
+def weigh(rates: FloatArray, gap: FloatArray, decay: FloatArray, h: float, weight: FloatArray) -> None:
+    """Square of what a forcing of one in each mode moves the gap over a step, into `weight` (n,)."""
+    for k in range(rates.size):
+        reach = h if rates[k] * h < 1e-9 else (1.0 - decay[k, END]) / rates[k]
+        weight[k] = (gap[k] * reach) ** 2
+
+
 @jit_rows
-def _plain(pull: FloatArray, used: FloatArray, pull_before: FloatArray, left_before: FloatArray) -> float:
+def _plain(
+    pull: FloatArray, used: FloatArray, weight: FloatArray, pull_before: FloatArray, left_before: FloatArray
+) -> float:
     """Plain step of the iteration, remembered for a mixed one; returns the size of the move."""
     total = 0.0
     for k in range(pull.shape[0]):
+        size = 0.0
         for i in range(ROWS):
             left = pull[k, i] - used[k, i]
-            total += left * left
+            size += left * left
             left_before[k, i] = left
             pull_before[k, i] = pull[k, i]
             used[k, i] = pull[k, i]
+        total += weight[k] * size
     return math.sqrt(total)
 
 
 @jit_rows
-def _mix(pull: FloatArray, used: FloatArray, pull_before: FloatArray, left_before: FloatArray) -> float:
+def _mix(
+    pull: FloatArray, used: FloatArray, weight: FloatArray, pull_before: FloatArray, left_before: FloatArray
+) -> float:
     """Next nonlinear term from the last two (Anderson 1965, one step back), into `used`; returns the size of the move.
 
     What the iteration leaves decays by the area's share of the leak in a stiff stack: mixing squares that share.
@@ -179,31 +199,39 @@ def _mix(pull: FloatArray, used: FloatArray, pull_before: FloatArray, left_befor
     across = 0.0
     along = 0.0
     for k in range(pull.shape[0]):
+        mine = 0.0
+        size = 0.0
         for i in range(ROWS):
             left = pull[k, i] - used[k, i]
             difference = left - left_before[k, i]
-            across += left * difference
-            along += difference * difference
+            mine += left * difference
+            size += difference * difference
+        across += weight[k] * mine
+        along += weight[k] * size
     share = across / along if along > 0.0 else 0.0
     share = min(max(share, -1.0), 0.9)
     total = 0.0
     for k in range(pull.shape[0]):
+        size = 0.0
         for i in range(ROWS):
             left_before[k, i] = pull[k, i] - used[k, i]
             new = pull[k, i] - share * (pull[k, i] - pull_before[k, i])
             pull_before[k, i] = pull[k, i]
             move = new - used[k, i]
-            total += move * move
+            size += move * move
             used[k, i] = new
+        total += weight[k] * size
     return math.sqrt(total)
 
 
 @jit_rows
-def _distance(a: FloatArray, b: FloatArray) -> float:
+def _distance(a: FloatArray, b: FloatArray, weight: FloatArray) -> float:
     total = 0.0
     for k in range(a.shape[0]):
+        size = 0.0
         for i in range(ROWS):
-            total += (a[k, i] - b[k, i]) ** 2
+            size += (a[k, i] - b[k, i]) ** 2
+        total += weight[k] * size
     return math.sqrt(total)
 
 

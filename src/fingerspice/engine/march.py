@@ -10,15 +10,17 @@ from numpy.typing import NDArray
 
 from fingerspice.compiled import borrow, jit
 from fingerspice.engine.charge import charge_step
-from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables
+from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, weigh
 from fingerspice.engine.model import Segment, branch_area, source
 from fingerspice.engine.pace import Pace, change_level, choose_step, enter, nearest_level, rung, take_branch
 from fingerspice.engine.readout import (
     ACCEPTED,
+    ALLOWED,
     BLOCK,
     BRANCH_LENGTH,
     BRANCH_START,
     H_AFTER_EDGE,
+    H_AFTER_ZERO,
     KEPT,
     MAGNIFIED,
     NFEV,
@@ -51,6 +53,8 @@ IntArray = NDArray[np.int64]
 
 # Codes returned by `march`.
 DONE, NO_STEP, OUT_OF_RANGE = 0, 1, 2
+# Step over the one before, at most; and what of it may be foreseen growth.
+_MOST_GROWTH, _MOST_TREND = 8.0, 2.5
 
 
 class Work(NamedTuple):
@@ -70,6 +74,8 @@ class Work(NamedTuple):
     x_out: FloatArray
     at_out: FloatArray
     sums: FloatArray
+    weight: FloatArray
+    tapped: FloatArray
 
 
 def new_work(n: int) -> Work:
@@ -89,6 +95,8 @@ def new_work(n: int) -> Work:
         np.zeros(BLOCK),
         np.zeros(BLOCK),
         np.zeros((4, 4)),
+        np.zeros(n),
+        np.zeros((n + 1, ROWS)),
     )
 
 
@@ -129,8 +137,8 @@ def march(
     control, counters : ndarray
         Bookkeeping, updated in place.
     t_out, left, out : ndarray
-        Output times (ascending), whether the left-hand value is meant, and the columns to fill: live layer voltages
-        (n), then charge and current if wanted.
+        Output times (ascending), whether the left-hand value is meant, and the columns to fill: recorded voltages
+        (see `System.shown`), then charge and current if wanted.
     kept : Kept
         Takes the steps, as long as there is room (none: nothing is kept); `counters` holds how many there were.
 
@@ -143,13 +151,15 @@ def march(
     # Arrays are taken out of their tuples once: doing it where they are used costs more than the use.
     model = system.model
     mobile, coupled, k_gap, area0, tau = model.mobile, model.coupled, model.k_gap, model.area0, model.tau
-    curve, k_layer, gap_share = borrow(model.curve), borrow(model.k), borrow(model.gap)
+    curve, k_shown, gap_share = borrow(model.curve), borrow(system.k_shown), borrow(model.gap)
+    all_shown = borrow(system.shown)
     q0, powers, slopes = borrow(system.q0), borrow(system.powers), borrow(system.slopes)
     all_rates, all_gain, all_push, all_gap = (
         borrow(system.rates), borrow(system.gain), borrow(system.push), borrow(system.gap)
     )  # fmt: skip
-    all_slow, all_turn, all_live, all_project = (
-        borrow(system.slow), borrow(system.turn), borrow(system.live), borrow(system.project)
+    all_slow, all_live, all_project = borrow(system.slow), borrow(system.live), borrow(system.project)
+    all_tap, tap_k, all_feed, tapped = (
+        borrow(system.tap), borrow(system.tap_k), borrow(system.feed), borrow(work.tapped)
     )  # fmt: skip
     lo, scale, stress, u_top = system.lo, system.scale, system.stress, system.u_top
     keys_h, keys_level, count = borrow(tables.h), borrow(tables.level), borrow(tables.used)
@@ -159,21 +169,23 @@ def march(
     counters = borrow(counters)
     r, base, w, pull, used = borrow(work.r), borrow(work.base), borrow(work.w), borrow(work.pull), borrow(work.used)
     pull_before, left_before = borrow(work.pull_before), borrow(work.left_before)
-    w0, places, sums = borrow(work.w0), borrow(work.places), borrow(work.sums)
+    w0, places, sums, weight = borrow(work.w0), borrow(work.places), borrow(work.sums), borrow(work.weight)
     x_out, at_out = borrow(work.x_out), borrow(work.at_out)
     t_out, left, out = borrow(t_out), borrow(left), borrow(out)
     values, coefficients = borrow(work.values), borrow(work.coefficients)
     kept_times, kept_series = borrow(kept.times), borrow(kept.series)
     u_rows, q_rows, source_row = r[U], r[Q], r[SOURCE]
     n = model.gap.size
-    columns = out.shape[0]
+    columns, n_shown = out.shape[0], all_shown.shape[1]
     level, slot = -1, -1
     rates, gain, push, gap = all_rates[0], all_gain[0], all_push[0], all_gap[0]
-    slow_share, turn, live, project = all_slow[0], all_turn[0], all_live[0], all_project[0]
+    slow_share, live, project, shown = all_slow[0], all_live[0], all_project[0], all_shown[0]
+    tap, feed = all_tap[0], all_feed[0]
     decay, phi, miss = all_decay[0], all_phi[0], all_miss[0]
     h_slot = 0.0
     flips = 0
-    fresh = False
+    # Where the length of a step is kept that is the first after an edge or a zero; -1 for others.
+    fresh = -1
     first_out = int(counters[OUTPUT])
     next_out = t_out[first_out] if first_out < t_out.size else math.inf
     index = -1
@@ -202,7 +214,8 @@ def march(
             # The steps after a jump are often those after the one before.
             control[H] = control[H_AFTER_EDGE]
             control[TOO_LONG] = 0.0
-            fresh = True
+            control[ALLOWED] = 0.0
+            fresh = H_AFTER_EDGE
             if control[U_GAP] != control[U_GAP]:
                 return NO_STEP
         t0 = t - start
@@ -219,8 +232,8 @@ def march(
                 level = now
                 h_slot = 0.0
                 rates, gain, push, gap = all_rates[level], all_gain[level], all_push[level], all_gap[level]
-                slow_share, turn = all_slow[level], all_turn[level]
-                live, project = all_live[level], all_project[level]
+                slow_share, tap, feed = all_slow[level], all_tap[level], all_feed[level]
+                live, project, shown = all_live[level], all_project[level], all_shown[level]
         for k in range(n):
             w0[k] = 0.0
             for i in range(n):
@@ -238,14 +251,15 @@ def march(
                 )  # fmt: skip
                 h_slot = h
                 decay, phi, miss = all_decay[slot], all_phi[slot], all_miss[slot]
+                weigh(rates, gap, decay, h, weight)
             source_rows(segment_terms, segment_series, edge - start, t0, h, charge, r)
             sign = control[SIGN]
             if mobile:
                 for i in range(ROWS):
                     r[GUESS, i] = control[U_GAP]
             passes, closed = converge(
-                mobile, coupled, k_gap, area0, q0[level], gain, gap, push, turn, powers, slopes, lo, scale, curve, sign,
-                decay, phi, w0, 0.3 * tol, base, w, pull, used, pull_before, left_before, r,
+                mobile, coupled, k_gap, area0, q0[level], gain, gap, push, tap, tap_k, feed, tapped, powers, slopes, lo,
+                scale, curve, sign, decay, phi, w0, 0.3 * tol, base, w, pull, used, pull_before, left_before, weight, r,
             )  # fmt: skip
             counters[NFEV] += passes * NODES
             wrong = first_wrong(u_rows, sign) if coupled else 0
@@ -265,13 +279,17 @@ def march(
                 factor = 0.9 * (tol / step_error) ** (1.0 / NODES) if step_error < math.inf else 0.5
             if step_error <= tol:
                 # A step cut short by a boundary says little about the next one.
-                proposed = max(h * min(6.0, max(0.5, factor)), wanted if h < wanted else 0.0)
+                # After a jump the decays die away one by one, and the length allowed grows from step to step as it did.
+                growth = h * factor / control[ALLOWED] if control[ALLOWED] > 0.0 else 1.0
+                control[ALLOWED] = h * factor
+                proposed = h * min(_MOST_GROWTH, max(0.5, factor * min(max(growth, 1.0), _MOST_TREND)))
+                proposed = max(proposed, wanted if h < wanted else 0.0)
                 if control[TOO_LONG] > 0.0:
                     proposed = min(proposed, 0.93 * control[TOO_LONG])
-                    control[TOO_LONG] *= 1.03
-                if fresh and h >= wanted:
-                    control[H_AFTER_EDGE] = h * min(1.0, factor)
-                fresh = False
+                    control[TOO_LONG] *= growth if growth > 1.5 else 1.03
+                if fresh >= 0 and h >= wanted:
+                    control[fresh] = h * min(2.0, factor)
+                fresh = -1
                 control[H] = proposed
                 break
             counters[REJECTED] += 1
@@ -290,6 +308,7 @@ def march(
                 h = rung(h * min(0.9, 1.1 * POINTS[wrong]))
             else:
                 control[TOO_LONG] = h
+                control[ALLOWED] = 0.0
                 h = rung(h * min(0.9, max(0.25, factor)))
                 wanted = h
         if flip:
@@ -315,10 +334,11 @@ def march(
         flips = 0
         if charge:
             charge_step(
-                model, rates, gain, gap, slow_share, w, pull, r, integral, h, y[n], places, theta, control, values
+                model, rates, gain, gap, slow_share, w, pull, r, integral, h, y[n], places, theta, control,
+                values[n_shown], values[n_shown + 1],
             )  # fmt: skip
         if next_out <= t_new or kept_times.size > 0:
-            layers(mobile, area0, k_layer, live, w, source_row, q_rows, values)
+            layers(mobile, area0, k_shown, shown, w, source_row, q_rows, values)
             for c in range(columns):
                 series_of(values[c], coefficients[c])
             place = counters[KEPT]
@@ -341,14 +361,14 @@ def march(
                 w0[k] = at(w[k], theta)
             error_at(places, theta, error)
             if charge:
-                y[n] = at(values[n], theta)
+                y[n] = at(values[n_shown], theta)
             control[U_GAP] = 0.0 if crossed else at(u_rows, theta)
         else:
             for k in range(n):
                 w0[k] = w[k, END]
                 error[k] = places[k, N_PLACES - 1]
             if charge:
-                y[n] = values[n, END]
+                y[n] = values[n_shown, END]
             control[U_GAP] = u_rows[END]
         for i in range(n):
             y[i] = 0.0
@@ -359,6 +379,11 @@ def march(
             control[BRANCH_LENGTH] = t_new - control[BRANCH_START]
             control[BRANCH_START] = t_new
             counters[ZEROS] += 1
+            # The area has a kink here: fast modes start anew.
+            if control[H_AFTER_ZERO] > 0.0:
+                control[H] = control[H_AFTER_ZERO]
+                control[ALLOWED] = 0.0
+            fresh = H_AFTER_ZERO
         control[T] = t_new
         if t_new >= stop:
             control[U_BEFORE], _ = source(Segment(start, edge - start, segment_terms, segment_series), t_new - start)

@@ -24,7 +24,11 @@ MAGNIFIED = 13
 ERROR_Q, COLLECTED, SPREAD = 14, 15, 16
 # 1/A where the last step ended, 1/m^2.
 LAST_Q = 17
-N_CONTROL = 18
+# Length that the last step's error would have allowed, s; 0 where it says nothing about the next.
+ALLOWED = 18
+# The first step taken after a zero of the gap voltage, s; 0 before the first.
+H_AFTER_ZERO = 19
+N_CONTROL = 20
 # Entries of `counters`: rows evaluated, steps accepted and refused, zeros met, outputs written, steps kept.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT = 0, 1, 2, 3, 4, 5
 N_COUNTERS = 6
@@ -138,21 +142,21 @@ def error_at(places: FloatArray, theta: float, error: FloatArray) -> None:
 
 @jit_rows
 def layers(
-    mobile: bool, area0: float, k_layer: FloatArray, live: FloatArray, w: FloatArray, source: FloatArray, q: FloatArray,
-    values: FloatArray,
+    mobile: bool, area0: float, k_shown: FloatArray, shown: FloatArray, w: FloatArray, source: FloatArray,
+    q: FloatArray, values: FloatArray,
 ) -> None:  # fmt: skip
-    """Live layer voltages at all rows."""
-    for i in range(w.shape[0]):
+    """Recorded voltages at all rows."""
+    for i in range(shown.shape[0]):
         for j in range(ROWS):
             values[i, j] = 0.0
         for k in range(w.shape[0]):
-            share = live[i, k]
+            share = shown[i, k]
             for j in range(ROWS):
                 values[i, j] += share * w[k, j]
         if mobile:
             for j in range(ROWS):
                 values[i, j] *= area0 * q[j]
-        share = k_layer[i]
+        share = k_shown[i]
         for j in range(ROWS):
             values[i, j] += share * source[j]
 

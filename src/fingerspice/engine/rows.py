@@ -160,38 +160,43 @@ def _gap_voltage(
 
 
 @jit_rows
-def _turned(turn: FloatArray, w: FloatArray, pull: FloatArray) -> None:
-    """pull = turn w."""
-    for k in range(w.shape[0]):
+def _pull(
+    tap: FloatArray, tap_k: FloatArray, feed: FloatArray, q0: float, source: FloatArray, q: FloatArray, w: FloatArray,
+    tapped: FloatArray, pull: FloatArray,
+) -> None:  # fmt: skip
+    """pull = feed (q - q0) (tap w + tap_k U)."""
+    for t in range(tap.shape[0]):
+        share = tap_k[t]
+        for i in range(ROWS):
+            tapped[t, i] = share * source[i]
+        for k in range(w.shape[0]):
+            factor = tap[t, k]
+            for i in range(ROWS):
+                tapped[t, i] += factor * w[k, i]
+        for i in range(ROWS):
+            tapped[t, i] *= q[i] - q0
+    for k in range(pull.shape[0]):
         for i in range(ROWS):
             pull[k, i] = 0.0
-        for j in range(w.shape[0]):
-            factor = turn[k, j]
+        for t in range(tap.shape[0]):
+            factor = feed[k, t]
             for i in range(ROWS):
-                pull[k, i] += factor * w[j, i]
+                pull[k, i] += factor * tapped[t, i]
 
 
 @jit_rows
-def _pull_local(push: FloatArray, q0: float, source: FloatArray, q: FloatArray, pull: FloatArray) -> None:
-    for k in range(pull.shape[0]):
-        factor = push[k]
-        for i in range(ROWS):
-            pull[k, i] = (q[i] - q0) * (pull[k, i] + factor * source[i])
-
-
-@jit_rows
-def _pull_mobile(
-    push: FloatArray, q0: float, area0: float, source: FloatArray, q: FloatArray, pull: FloatArray
-) -> None:
+def _push(push: FloatArray, q0: float, area0: float, source: FloatArray, q: FloatArray, pull: FloatArray) -> None:
+    """pull += (1/q - 1/q0) push U / A0."""
     for k in range(pull.shape[0]):
         factor = push[k] / area0
         for i in range(ROWS):
-            pull[k, i] = (q[i] - q0) * pull[k, i] + (1.0 / q[i] - 1.0 / q0) * factor * source[i]
+            pull[k, i] += (1.0 / q[i] - 1.0 / q0) * factor * source[i]
 
 
 @jit_inline
 def evaluate(
-    mobile: bool, k_gap: float, area0: float, q0: float, gap: FloatArray, push: FloatArray, turn: FloatArray,
+    mobile: bool, k_gap: float, area0: float, q0: float, gap: FloatArray, push: FloatArray, tap: FloatArray,
+    tap_k: FloatArray, feed: FloatArray, tapped: FloatArray,
     powers: FloatArray, slopes: FloatArray, lo: float, scale: float, curve: FloatArray, sign: float,
     w: FloatArray, pull: FloatArray, r: FloatArray,
 ) -> bool:  # fmt: skip
@@ -201,17 +206,17 @@ def evaluate(
     gap voltage; False where the area equation was not solved on the branch connected to it.
     """
     _gap_voltage(k_gap, gap, w, r[SOURCE], r[X_GAP], r[U])
-    _turned(turn, w, pull)
     if mobile:
         if not _solve_mobile(area0, powers, slopes, lo, scale, curve, sign, r):
             return False
-        _pull_mobile(push, q0, area0, r[SOURCE], r[Q], pull)
+        _pull(tap, tap_k, feed, q0, r[SOURCE], r[Q], w, tapped, pull)
+        _push(push, q0, area0, r[SOURCE], r[Q], pull)
         return True
     if scale > 0.0:
         _polynomial(powers, lo, scale, r[U], sign, r[Q])
     else:
         _long_area(curve, sign, r)
-    _pull_local(push, q0, r[SOURCE], r[Q], pull)
+    _pull(tap, tap_k, feed, q0, r[SOURCE], r[Q], w, tapped, pull)
     return True
 
 

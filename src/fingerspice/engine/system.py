@@ -2,8 +2,10 @@
 
 With q = 1/A near a reference q0, every stack is a linear system with one nonlinear term:
 
-    w' = -rates w + gain U + (q - q0) (push U + turn w)                          local
-    w' = -rates w + gain U / (A0 q0) + (1/q - 1/q0) push U / A0 + (q - q0) turn w   mobile
+    w' = -rates w + gain U + (q - q0) feed (tap w + tap_k U)                          local
+    w' = -rates w + gain U / (A0 q0) + (1/q - 1/q0) push U / A0 + (q - q0) feed tap w   mobile
+
+where tap w + tap_k U are the voltages of the cells whose leak does not scale with the area: few, however many modes.
 
 u_gap = k_gap U + gap w under `local`, and k_gap U + A0 q gap w under `mobile`. The linear part is solved exactly;
 only what the area moves is left to iterate on.
@@ -40,8 +42,15 @@ class System(NamedTuple):
         Reference values of 1/A, 1/m^2, ascending.
     rates, gain, push, gap, slow : ndarray, shape (n_level, n)
         `slow` holds the slowest layer's share of each mode (see `Model.slow`).
-    turn, live, project : ndarray, shape (n_level, n, n)
+    tap : ndarray, shape (n_level, n_tap, n)
+    tap_k : ndarray, shape (n_tap,)
+        Zero under `mobile`.
+    feed : ndarray, shape (n_level, n, n_tap)
+    live, project : ndarray, shape (n_level, n, n)
         x = live @ w for the live voltages, w = project @ x.
+    shown : ndarray, shape (n_level, n_column, n)
+        Recorded voltages over k_shown U, as `live` gives the live ones.
+    k_shown : ndarray, shape (n_column,)
     powers, slopes : ndarray, shape (DEGREE + 1,)
         1/A as a polynomial in (u - lo) * scale - 1, and its derivative.
     lo, scale : float
@@ -59,9 +68,13 @@ class System(NamedTuple):
     push: FloatArray
     gap: FloatArray
     slow: FloatArray
-    turn: FloatArray
+    tap: FloatArray
+    tap_k: FloatArray
+    feed: FloatArray
     live: FloatArray
     project: FloatArray
+    shown: FloatArray
+    k_shown: FloatArray
     powers: FloatArray
     slopes: FloatArray
     lo: float
@@ -70,7 +83,9 @@ class System(NamedTuple):
     stress: float
 
 
-def build_system(model: Model, tol: float, q_range: tuple[float, float], stress: float = 0.0) -> System:
+def build_system(
+    model: Model, tol: float, q_range: tuple[float, float], grouping: FloatArray, stress: float = 0.0
+) -> System:
     """Modal form of a model.
 
     Parameters
@@ -80,6 +95,8 @@ def build_system(model: Model, tol: float, q_range: tuple[float, float], stress:
         Relative error allowed of 1/A.
     q_range : tuple of float
         Smallest and largest 1/A (1/m^2) to expect.
+    grouping : ndarray, shape (n_column, n)
+        Which live voltages add up to each recorded one.
     stress : float
         Force per area and squared gap voltage, Pa/V^2.
     """
@@ -93,19 +110,23 @@ def build_system(model: Model, tol: float, q_range: tuple[float, float], stress:
     live = np.ascontiguousarray(shape[:, :n])
     # `feed` takes -p + k sum(p) to modes; x is that of p = -x, as it sums to zero.
     project = np.ascontiguousarray(np.swapaxes(feed[:, n:] - feed[:, :n], 1, 2))
-    push_rate = model.rate if model.mobile else model.rate0
+    leaking = np.flatnonzero(model.rate0 > 0.0)
     powers, slopes, lo, scale = _polynomial(model, tol)
     return System(
         model,
         q0,
         rates,
         gain * share[:, None],
-        np.einsum("lik,i->lk", feed, push_rate * model.k),
+        np.einsum("lik,i->lk", feed, model.rate * model.k),
         np.einsum("lik,i->lk", live, model.gap),
         np.einsum("lik,i->lk", live, model.slow[:n]),
-        np.ascontiguousarray(np.einsum("lik,i,lij->lkj", feed, model.rate0, shape)),
+        np.ascontiguousarray(shape[:, leaking]),
+        np.zeros(leaking.size) if model.mobile else model.k[leaking],
+        np.ascontiguousarray(np.swapaxes(feed[:, leaking] * model.rate0[leaking, None], 1, 2)),
         live,
         project,
+        np.ascontiguousarray(grouping @ live),
+        grouping @ model.k[:n],
         powers,
         slopes,
         lo,
