@@ -14,6 +14,8 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "work_precision.json"
+# The library that needs a compiler to install, where it was measured apart.
+NUMBALSODA = HERE / "results" / "work_precision_numbalsoda.json"
 README = HERE.parent / "README.md"
 BEGIN, END = "<!-- speed:begin -->", "<!-- speed:end -->"
 TARGETS = (1e-3, 1e-6, 1e-10)
@@ -63,15 +65,44 @@ def libraries(results: Report) -> list[str]:
     return list(dict.fromkeys(p["library"] for p in results["points"]))
 
 
-def lead(results: Report, problem: str, library: str) -> str:
-    """How many times the time of one of our libraries the best of all peers takes, at each error."""
-    ours = good(results, problem, library=library)
+def lead(results: Report, problem: str) -> str:
+    """How many times our time the best of all peers takes, at each error."""
+    ours = good(results, problem, library=OURS)
     theirs = [p for p in good(results, problem) if not p["library"].startswith(OURS)]
     ratios = []
     for target in TARGETS:
         a, b = cheapest(ours, target), cheapest(theirs, target)
         ratios.append("-" if a is None or b is None else f"{b['us_per_period'] / a['us_per_period']:.2g}")
     return " / ".join(ratios)
+
+
+def worst(results: Report, ours: str, targets: tuple[float, ...], **wanted: str) -> str:
+    """How many times our time a peer takes, the least of the four scenes of Table 1, at each error."""
+    scenes = [n for n, p in results["problems"].items() if p["charge_law"] == "local"][:4]
+    least = []
+    for target in targets:
+        pairs = [
+            (cheapest(good(results, n, library=ours), target), cheapest(good(results, n, **wanted), target))
+            for n in scenes
+        ]
+        ratios = [b["us_per_period"] / a["us_per_period"] for a, b in pairs if a is not None and b is not None]
+        least.append(number(min(ratios)) if len(ratios) == len(scenes) else "-")
+    return " / ".join(least)
+
+
+def ratios(results: Report, ours: str) -> str:
+    """The same for every peer, in words."""
+    parts = []
+    for library in libraries(results):
+        if library.startswith(OURS):
+            continue
+        if library == "ngspice":
+            parts.append(f"ngspice {worst(results, ours, (NGSPICE_TARGET,), library=library)} (1e-4)")
+            continue
+        parts.append(f"{library} {worst(results, ours, TARGETS, library=library)}")
+        if library == "scipy":
+            parts.append(f"its LSODA by `solve_ivp` {worst(results, ours, TARGETS, contestant='scipy LSODA')}")
+    return ", ".join(parts)
 
 
 def short_table(results: Report, law: str) -> list[str]:
@@ -86,8 +117,7 @@ def short_table(results: Report, law: str) -> list[str]:
         if any(good(results, n, library=library) for n in names):
             label = "**fingerspice**" if library == OURS else library + (" (1e-4)" if library == "ngspice" else "")
             rows.append([label, *cells])
-    rows.append(["best peer over ours, times", *(lead(results, n, OURS) for n in names)])
-    rows.append(["best peer over every period", *(lead(results, n, STEPPED) for n in names)])
+    rows.append(["best peer over ours, times", *(lead(results, n) for n in names)])
     return markdown(rows)
 
 
@@ -139,11 +169,23 @@ def readme_text(results: Report) -> str:
         f"`python benchmarks/work_precision.py` on {conditions(results)}. Every method, what failed, and the law "
         "`mobile`: [`work_precision.md`](benchmarks/results/work_precision.md)."
     )
+    other = json.loads(NUMBALSODA.read_text(encoding="utf-8")) if NUMBALSODA.is_file() else None
+    ratio = (
+        f"Times our time, the worst of the four scenes of Table 1, at {aims}: {ratios(results, OURS)}; with every "
+        f"period stepped {ratios(results, STEPPED)}."
+    )
+    if other is not None:
+        ratio += (
+            f" In a run of its own (`{NUMBALSODA.name}`), {ratios(other, OURS)}; with every period stepped "
+            f"{ratios(other, STEPPED)}."
+        )
     return "\n".join(
         [
             *textwrap.wrap(text, 118, break_long_words=False, break_on_hyphens=False),
             "",
             *short_table(results, "local"),
+            "",
+            *textwrap.wrap(ratio, 118, break_long_words=False, break_on_hyphens=False),
             "",
             "![Error against time and against evaluations](benchmarks/results/work_precision.png)",
         ]
