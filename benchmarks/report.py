@@ -159,15 +159,14 @@ def readme_text(results: Report) -> str:
     aims = " / ".join(f"{t:.0e}".replace("e-0", "e-") for t in TARGETS)
     spread = max(p["reference_agreement"] for p in results["problems"].values())
     text = (
-        f"Wall time per simulated period (of the chirp: per ms), µs, for an error of {aims} of the peak in gap voltage "
-        "and force, 100 outputs a period included. Of each library the best method and setting, found by comparing "
-        "with the reference, on a compiled right-hand side, split at the source's jumps, and told the gap voltage's "
-        "zeros where that helps; fingerspice finds these itself, estimates its error and meets the one asked for. It "
-        "steps until a period no longer changes the state and repeats that one, at the outputs asked for, to the end "
-        "(200 periods at 100 Hz, 500 at 5 kHz); *every period* steps them all, as its peers do. Two "
-        f"independent references agree to {spread:.0e}. Medians of {results['repeats']} (slow peers: fewer) by "
-        f"`python benchmarks/work_precision.py` on {conditions(results)}. Every method, what failed, and the law "
-        "`mobile`: [`work_precision.md`](benchmarks/results/work_precision.md)."
+        f"Wall time per simulated period (chirp: per ms), µs, for an error of {aims} of the peak in gap voltage and "
+        "force, 100 outputs a period included. Of each library the best method and setting, found by comparing with the "
+        "reference, on a compiled right-hand side, split at the source's jumps, and told the gap voltage's zeros where "
+        "that helps; fingerspice finds these itself, estimates its error and meets the one asked for. It repeats a period "
+        "that no longer changes the state (200 periods at 100 Hz, 500 at 5 kHz); *every period* steps them all, as its "
+        f"peers do. Two independent references agree to {spread:.0e}. Medians of {results['repeats']} (slow peers: fewer) "
+        f"by `python benchmarks/work_precision.py` on {results['machine']}; versions, every method, what failed, and the "
+        "law `mobile`: [`work_precision.md`](benchmarks/results/work_precision.md)."
     )
     other = json.loads(NUMBALSODA.read_text(encoding="utf-8")) if NUMBALSODA.is_file() else None
     ratio = (
