@@ -160,13 +160,13 @@ def readme_text(results: Report) -> str:
     spread = max(p["reference_agreement"] for p in results["problems"].values())
     text = (
         f"Wall time per simulated period (chirp: per ms), µs, for an error of {aims} of the peak in gap voltage and "
-        "force, 100 outputs a period included. Of each library the best method and setting, found by comparing with the "
-        "reference, on a compiled right-hand side, split at the source's jumps, and told the gap voltage's zeros where "
-        "that helps; fingerspice finds these itself, estimates its error and meets the one asked for. It repeats a period "
-        "that no longer changes the state (200 periods at 100 Hz, 500 at 5 kHz); *every period* steps them all, as its "
-        f"peers do. Two independent references agree to {spread:.0e}. Medians of {results['repeats']} (slow peers: fewer) "
-        f"by `python benchmarks/work_precision.py` on {results['machine']}; versions, every method, what failed, and the "
-        "law `mobile`: [`work_precision.md`](benchmarks/results/work_precision.md)."
+        "force, 100 outputs a period included. Of each library the best method and setting, found by comparing with "
+        "the reference, on a compiled right-hand side, split at the source's jumps, and told the gap voltage's zeros "
+        "where that helps; fingerspice finds these itself, estimates its error and meets the one asked for. It repeats "
+        "a period that no longer changes the state (200 periods at 100 Hz, 500 at 5 kHz); *every period* steps them "
+        f"all, as its peers do. Two independent references agree to {spread:.0e}. Medians of {results['repeats']} "
+        f"(slow peers: fewer) by `python benchmarks/work_precision.py` on {results['machine']}; versions, every method, "
+        "what failed, and the law `mobile`: [`work_precision.md`](benchmarks/results/work_precision.md)."
     )
     other = json.loads(NUMBALSODA.read_text(encoding="utf-8")) if NUMBALSODA.is_file() else None
     ratio = (
