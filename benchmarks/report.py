@@ -165,8 +165,8 @@ def readme_text(results: Report) -> str:
         "where that helps; fingerspice finds these itself, estimates its error and meets the one asked for. It repeats "
         "a period that no longer changes the state (200 periods at 100 Hz, 500 at 5 kHz); *every period* steps them "
         f"all, as its peers do. Two independent references agree to {spread:.0e}. Medians of {results['repeats']} "
-        f"(slow peers: fewer) by `python benchmarks/work_precision.py` on {results['machine']}; versions, every method, "
-        "what failed, and the law `mobile`: [`work_precision.md`](benchmarks/results/work_precision.md)."
+        f"(slow peers: fewer) by `python benchmarks/work_precision.py` on {results['machine']}; versions, every "
+        "method, what failed, and the law `mobile`: [`work_precision.md`](benchmarks/results/work_precision.md)."
     )
     other = json.loads(NUMBALSODA.read_text(encoding="utf-8")) if NUMBALSODA.is_file() else None
     ratio = (
