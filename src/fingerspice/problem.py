@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
+from fingerspice.circuit.sampling import is_sampled
 from fingerspice.circuit.statespace import Stack, build_stack
 from fingerspice.circuit.waveforms import Fundamental, Waveform, require
 from fingerspice.engine.model import Model, choose_branch, gap_voltage
@@ -75,6 +76,11 @@ class Scene:
     def fundamental(self) -> Fundamental | None:
         """The source's."""
         return self.waveform.fundamental
+
+    @cached_property
+    def is_sampled(self) -> bool:
+        """Whether the source is a function that has to be looked at, not a waveform with a formula."""
+        return is_sampled(self.waveform)
 
     @property
     def probe(self) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.circuit.sampling import SourceTable, breakpoints_at, is_sampled, source_table
+from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
 from fingerspice.engine.model import Segment
 from fingerspice.problem import Problem
 from fingerspice.record import Record
@@ -24,6 +24,7 @@ Progress = Callable[[float], None]
 ROUNDING = 2e-14
 PERIODS_PER_WINDOW = 4096.0
 BREAKPOINTS_PER_WINDOW = 2000.0
+KEPT_WINDOWS = 4
 
 
 @dataclass
@@ -69,7 +70,7 @@ class Tables:
     """Tables of a problem's source, window by window.
 
     A user's function is expensive to look at, so its tables are kept for the run. Those of library waveforms are made
-    anew, which keeps a long run's memory constant, but for a run of one window: its table stays with the scene.
+    anew, which keeps a long run's memory constant, but for a run of few windows: its tables stay with the scene.
     """
 
     def __init__(self, problem: Problem, tol: float, *, no_chirps: bool = False) -> None:
@@ -84,8 +85,8 @@ class Tables:
         # Largest |U| (V) of the sampled windows so far.
         self.scale = 0.0
         self.rough = 0.0
-        self.kept: dict[Any, SourceTable] | None = {} if is_sampled(problem.waveform) else None
-        if self.kept is None and len(self.edges) == 2:
+        self.kept: dict[Any, SourceTable] | None = {} if problem.scene.is_sampled else None
+        if self.kept is None and len(self.edges) <= 1 + KEPT_WINDOWS:
             self.kept = problem.scene.prepared.setdefault("tables", {})
             if len(self.kept) > 16:
                 self.kept.clear()
@@ -123,7 +124,7 @@ def windows(problem: Problem) -> list[float]:
         problem.waveform.breakpoint_rate() / BREAKPOINTS_PER_WINDOW,
         1.0 / (PERIODS_PER_WINDOW * problem.waveform.shortest_time()),
         # A function is sampled at the output step.
-        1.0 / (4096.0 * problem.step) if is_sampled(problem.waveform) else 0.0,
+        1.0 / (4096.0 * problem.step) if problem.scene.is_sampled else 0.0,
     )
     count = max(1, int(np.ceil(span * rate)))
     return [problem.t_start + span * i / count for i in range(count)] + [problem.t_stop]

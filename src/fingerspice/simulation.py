@@ -19,6 +19,7 @@ from fingerspice.errors import FingerspiceWarning, InputError, SolveError
 from fingerspice.marching import solve as solve_marching
 from fingerspice.numerics.tableaus import TABLEAUS
 from fingerspice.periodic import close_period
+from fingerspice.physics.contact import inverse_area
 from fingerspice.planning import Plan, make_plan
 from fingerspice.problem import Problem, prepare
 from fingerspice.record import Record
@@ -342,7 +343,7 @@ def _physics_warnings(problem: Problem, run: Run, record: Record) -> Iterator[st
                 f"the gap voltage reaches {run.peak_u:.4g} V; air breaks down above about {BREAKDOWN_VOLTAGE:g} V "
                 "(Paschen minimum 327 V), which the model does not contain"
             )
-        unloaded, least = (float(stack.contact.area(u)) for u in (0.0, run.peak_u))
+        unloaded, least = problem.model.area0, 1.0 / inverse_area(run.peak_u, problem.model.curve)[0]
         if problem.model.coupled and least < LEAST_AREA * unloaded:
             yield (
                 f"the contact area falls to {1e6 * least:.3g} mm^2, below {100.0 * LEAST_AREA:g} % of the "

@@ -61,7 +61,8 @@ def fit(
         c = coefficients(function(nodes(size, lo, hi)))
         magnitude = np.abs(c)
         if np.all(np.isfinite(c)) and magnitude[-2:].max() <= tol * magnitude.max():
-            keep = np.flatnonzero(magnitude > tol * magnitude.max())
+            # Below twice that the function's own rounding stands, not the series.
+            keep = np.flatnonzero(magnitude > 2.0 * tol * magnitude.max())
             return np.ascontiguousarray(c[: (keep[-1] + 1 if keep.size else 1)])
     return None
 
