@@ -72,7 +72,7 @@ def lead(results: Report, problem: str) -> str:
     ratios = []
     for target in TARGETS:
         a, b = cheapest(ours, target), cheapest(theirs, target)
-        ratios.append("-" if a is None or b is None else f"{b['us_per_period'] / a['us_per_period']:.2g}")
+        ratios.append("-" if a is None or b is None else number(b["us_per_period"] / a["us_per_period"]))
     return " / ".join(ratios)
 
 

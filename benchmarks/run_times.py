@@ -9,13 +9,10 @@ import argparse
 import json
 import os
 import platform
-import statistics
 import subprocess
 import sys
 import tempfile
-import time
 import warnings
-from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -24,20 +21,10 @@ import numpy as np
 
 import fingerspice as fs
 from fingerspice.physics.materials import skin_permittivity, skin_resistivity
+from timing import median_seconds
 
 HERE = Path(__file__).resolve().parent
 CIRCUITS = HERE.parent / "circuits"
-
-
-def median_seconds(action: Callable[[], object], repeats: int) -> float:
-    """Median wall time of `action`, s, after one run that is not counted."""
-    action()
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        action()
-        times.append(time.perf_counter() - begin)
-    return statistics.median(times)
 
 
 def ten_periods(path: Path, rtol: float, repeats: int) -> dict[str, Any]:

@@ -11,9 +11,6 @@ import argparse
 import json
 import os
 import platform
-import statistics
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,22 +19,12 @@ from scipy import signal
 
 import fingerspice as fs
 from fingerspice.numerics.hold import first_order_hold, hold_weights
+from timing import median_seconds
 
 HERE = Path(__file__).resolve().parent
 DECK = HERE.parent / "circuits" / "fingerpad.cir"
 DT = 1e-5
 Report = dict[str, Any]
-
-
-def median_seconds(action: Callable[[], object], repeats: int) -> float:
-    """Median wall time of `action`, s, after one run that is not counted."""
-    action()
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        action()
-        times.append(time.perf_counter() - begin)
-    return statistics.median(times)
 
 
 def modal_gap(area: float) -> tuple[list[float], list[float], float, list[float]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import json
 from pathlib import Path
 
@@ -15,13 +14,11 @@ from fingerspice.circuit.statespace import build_stack
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 
 
-def test_run_times_runs_and_writes_nothing_when_quick(capsys):
+def test_run_times_runs_and_writes_nothing_when_quick(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(FOLDER))
     written = FOLDER / "results" / "run_times.json"
     before = written.stat().st_mtime_ns
-    spec = importlib.util.spec_from_file_location("run_times", FOLDER / "run_times.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    results = module.main(["--quick"])
+    results = importlib.import_module("run_times").main(["--quick"])
     assert {row["deck"] for row in results["ten_periods"]} == {p.stem for p in FOLDER.parent.glob("circuits/*.cir")}
     assert all(row["error_over_peak"] <= row["rtol"] for row in results["ten_periods"])
     assert written.stat().st_mtime_ns == before

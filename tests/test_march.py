@@ -272,6 +272,13 @@ def charged(shape: str, r_coat: float, r_gap: float, law: str) -> ref.Transient:
     return ref.transient(CHARGED[shape][1], CHARGED_T, law=law, layers=layers, stages=16, tol=1e-13)
 
 
+def charged_run(shape: str, r_coat: float, r_gap: float, law: str, rtol: float) -> fs.Solution:
+    """Our run of the same scene."""
+    circuit = table1(coat={"r": r_coat}, gap={"r": r_gap})
+    source = {"Vdrive": CHARGED[shape][0]}
+    return fs.simulate(circuit, sources=source, t_eval=CHARGED_T, t_stop=1 / 150.0, charge_law=law, rtol=rtol)
+
+
 @every_law
 @pytest.mark.parametrize("shape", CHARGED)
 @pytest.mark.parametrize("r_gap", [1e6, 1e10])
@@ -281,10 +288,7 @@ def test_the_charge_is_as_exact_as_the_voltages_whatever_the_leaks(
     rtol: float, r_coat: float, r_gap: float, shape: str, law: str
 ) -> None:
     expected = charged(shape, r_coat, r_gap, law)
-    solution = fs.simulate(
-        table1(coat={"r": r_coat}, gap={"r": r_gap}), sources={"Vdrive": CHARGED[shape][0]}, t_eval=CHARGED_T,
-        t_stop=1 / 150.0, charge_law=law, rtol=rtol,
-    )  # fmt: skip
+    solution = charged_run(shape, r_coat, r_gap, law, rtol)
     assert np.abs(solution.u_gap - expected.u_gap).max() <= rtol * np.abs(expected.u_gap).max()
     true = np.abs(solution.q_source - expected.q).max()
     assert true <= rtol * np.abs(expected.q).max()
@@ -300,10 +304,7 @@ def test_the_charge_is_as_exact_as_its_error_says(
 ) -> None:
     # Layers that leak fast and slowly, in every order: what is off may stay, or decay.
     expected = charged(shape, r_coat, r_gap, law)
-    solution = fs.simulate(
-        table1(coat={"r": r_coat}, gap={"r": r_gap}), sources={"Vdrive": CHARGED[shape][0]}, t_eval=CHARGED_T,
-        t_stop=1 / 150.0, charge_law=law, rtol=rtol,
-    )  # fmt: skip
+    solution = charged_run(shape, r_coat, r_gap, law, rtol)
     true = np.abs(solution.q_source - expected.q).max()
     assert true <= solution.error.q_source <= 10.0 * rtol * np.abs(expected.q).max()
 

@@ -32,7 +32,7 @@ class Closed:
         From the first whole period after the source has settled, or from where it started if that is later.
     defect : float
         Largest change of a live voltage over a further period, V.
-    map_slope : ndarray, shape (n_layer - 1, n_layer - 1)
+    map_slope : ndarray, shape (n_cell - 1, n_cell - 1)
         Derivative of the modes after a period by those before it, to about 1e-5.
     memory : float
         Error of the periodic state over that of one period: what a slow mode collects over the periods it remembers.

@@ -32,8 +32,8 @@ class SteadyState:
     rtol : float
     defect : float
         Largest change of a layer voltage over a further period, V.
-    map_slope : ndarray, shape (n_layer - 1, n_layer - 1)
-        Derivative of the stack's modes after a period by those before it, to about 1e-6.
+    map_slope : ndarray, shape (n_cell - 1, n_cell - 1)
+        Derivative of the stack's modes after a period by those before it, to about 1e-5.
     memory : float
         Error of the periodic state over that of one period; large where a disturbance outlasts many periods.
     error : ErrorEstimate
@@ -52,7 +52,7 @@ class SteadyState:
 
     @property
     def multipliers(self) -> FloatArray:
-        """Sizes of the Floquet multipliers: what a period leaves of a small disturbance, shape (n_layer - 1,)."""
+        """Sizes of the Floquet multipliers: what a period leaves of a small disturbance, shape (n_cell - 1,)."""
         return np.abs(np.linalg.eigvals(self.map_slope)) if self.map_slope.size else np.zeros(0)
 
     @property

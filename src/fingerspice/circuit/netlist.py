@@ -108,11 +108,6 @@ def _element(statement: Statement, timing: Timing, notes: list[str]) -> Element:
     waveform, initial = None, None
     if statement.letter == "X":
         device = statement.device or ""
-        if (device, "") in LATER:
-            raise InputError(
-                f"{statement.name}: {device} ({LATER[device, '']}) is not simulated by this version",
-                statement.where,
-            )
         values = _device_values(statement, device, notes)
     elif statement.letter in "VI":
         device = statement.letter
