@@ -26,6 +26,8 @@ FloatArray = NDArray[np.float64]
 
 # What a dispersive skin's data taken at one frequency may cost, over the error asked for.
 FREEZING_SHARE = 0.3
+# Breakpoints (64 kB) that a scene keeps.
+KEPT_BREAKPOINTS = 8192
 
 
 @dataclass(frozen=True)
@@ -141,6 +143,19 @@ class Problem:
     def model(self) -> Model:
         return self.scene.model
 
+    def breakpoints(self) -> FloatArray:
+        """The source's breakpoints in the run, s; those of a short run stay with the scene."""
+        kept = self.scene.prepared.setdefault("breakpoints", {})
+        key = self.t_start, self.t_stop
+        if key not in kept:
+            kept.clear()
+            edges = self.waveform.breakpoints(*key)
+            if edges.size > KEPT_BREAKPOINTS:
+                return edges
+            kept[key] = edges
+        found: FloatArray = kept[key]
+        return found
+
     @property
     def max_step(self) -> float:
         """Longest step (s) that the deck's .tran line allows."""
@@ -245,7 +260,7 @@ def _times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: Float
     require(math.isfinite(t_stop) and t_stop > t_start, "t_stop", f"{t_stop:g} s", f"more than {t_start:g} s")
     if t_eval is not None:
         require(t_eval.ndim == 1 and t_eval.size > 0, "t_eval", f"of shape {t_eval.shape}", "one row of times")
-        require(bool(np.all(np.diff(t_eval) >= 0.0)), "t_eval", "not in order", "ascending times")
+        require(bool(np.all(t_eval[1:] >= t_eval[:-1])), "t_eval", "not in order", "ascending times")
         require(
             bool(t_eval[0] >= t_start and t_eval[-1] <= t_stop),
             "t_eval",

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fingerspice.circuit.statespace import Stack
 from fingerspice.circuit.waveforms import Waveform
 from fingerspice.engine.model import Model
-from fingerspice.physics.contact import areas, inverse_area_array, inverse_areas
+from fingerspice.physics.contact import areas, forces, inverse_area_array
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -110,15 +110,11 @@ class Record:
         """Electroadhesive force (Eq. 2 times A_R), N, shape (n_t,)."""
         assert self.stack.contact is not None
         u = self.u_gap
+        stress = float(self.stack.contact.stress(1.0))
         if self.model.coupled:
-            # In place, and the same whether the area was asked for or not: fresh memory costs more than arithmetic.
-            out = inverse_areas(u, self.model.curve)
-            np.divide(u, out, out=out)
-        else:
-            out = u * self.area
-        out *= u
-        out *= self.stack.contact.stress(1.0)
-        return sealed(out)
+            # The same whether the area was asked for or not.
+            return sealed(forces(u, self.model.curve, stress))
+        return sealed(stress * u * self.area * u)
 
     @cached_property
     def charge(self) -> FloatArray | None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.sampling import breakpoints_at, same_time
+from fingerspice.circuit.sampling import breakpoints_at, misses, same_time
 from fingerspice.circuit.waveforms import Waveform, as_waveform, require
 from fingerspice.direct import solve_algebraic, solve_linear
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError
@@ -207,20 +207,11 @@ def _add_error(run: Run, u_gap: float, f_el: float | None = None) -> None:
 
 def _at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
     """Times moved onto the breakpoint they miss by rounding, so that 5 ms means the jump at 5 ms."""
-    edges = problem.waveform.breakpoints(problem.t_start, problem.t_stop)
-    if not edges.size:
-        return t
-    # Only the neighbours of an edge can be that close to it.
-    place = np.searchsorted(t, edges)
-    moved = t
-    for near in (place - 1, place):
-        near = np.clip(near, 0, t.size - 1)
-        close = (np.abs(t[near] - edges) <= same_time(1.0) * np.abs(edges)) & (t[near] != edges)
-        if close.any():
-            moved = t.copy() if moved is t else moved
-            # Several outputs may stand at the same time.
-            for edge, old in zip(edges[close], t[near[close]], strict=True):
-                moved[t == old] = edge
+    edges = problem.breakpoints()
+    near = edges[misses(t, edges, same_time(1.0))] if edges.size else edges
+    moved = t.copy() if near.size else t
+    for edge in near:
+        moved[np.abs(t - edge) <= same_time(1.0) * abs(edge)] = edge
     return moved
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.circuit.waveforms import Waveform, blank_terms, require
+from fingerspice.compiled import jit
 from fingerspice.errors import FingerspiceWarning, InputError
 from fingerspice.numerics import chebyshev
 
@@ -133,6 +134,32 @@ class SourceTable:
 def same_time(t: float) -> float:
     """Distance (s) within which a time near `t` is that time: a few roundings of t."""
     return 8e-16 * abs(t)
+
+
+@jit
+def misses(t: FloatArray, marks: FloatArray, slack: float) -> NDArray[np.bool_]:
+    """Whether a time comes within `slack` (relative) of each mark without being it; times and marks ascending."""
+    out = np.zeros(marks.size, np.bool_)
+    first = 0
+    for k in range(marks.size):
+        low = marks[k] - slack * abs(marks[k])
+        # Doubled strides, then halved ones, to the first time that is not below.
+        stride = 1
+        while first + stride < t.size and t[first + stride] < low:
+            stride *= 2
+        last = min(first + stride, t.size)
+        first += stride // 2
+        while first < last and t[first] < low:
+            middle = (first + last) // 2
+            if t[middle] < low:
+                first = middle + 1
+            else:
+                last = middle
+        i = first
+        while i < t.size and t[i] <= marks[k] + slack * abs(marks[k]):
+            out[k] |= t[i] != marks[k]
+            i += 1
+    return out
 
 
 def breakpoints_at(waveform: Waveform, t: float) -> FloatArray:

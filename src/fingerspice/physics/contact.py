@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.compiled import jit, jit_rows
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.materials import EPS0
 
@@ -214,6 +214,20 @@ def inverse_areas(u: FloatArray, curve: FloatArray) -> FloatArray:
         chebyshev.evaluate_array(series, u, lo, 2.0 / (hi - lo), out)
         return out
     return np.asarray(inverse_area_array(np.abs(u), curve)[0])
+
+
+def forces(u: FloatArray, curve: FloatArray, stress: float) -> FloatArray:
+    """Force (N) at gap voltages u (V), shape (n,), from a `Contact.curve` and the stress at 1 V, Pa."""
+    out = inverse_areas(u, curve)
+    _force_from_inverse(u, stress, out)
+    return out
+
+
+@jit_rows
+def _force_from_inverse(u: FloatArray, stress: float, out: FloatArray) -> None:
+    # In place and in one pass: fresh memory costs more than arithmetic.
+    for i in range(u.size):
+        out[i] = stress * (u[i] * u[i]) / out[i]
 
 
 def areas(u: FloatArray, curve: FloatArray) -> FloatArray:
