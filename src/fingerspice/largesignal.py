@@ -85,8 +85,9 @@ def _sweep(
         # The start of the period is a multiple of it: phases are those of the source.
         t = s.t - s.t[0]
         gains.append([fundamental(t, s.u_layer[:, i], float(f)) * sign / amplitude for i in range(len(s.layers))])
-        areas.append(mean(t, s.area))
+        assert s.area is not None
         assert s.f_el is not None
+        areas.append(mean(t, s.area))
         forces.append(mean(t, s.f_el))
     gain = np.array(gains, np.complex128)
     gap = build_stack(circuit).gap_layer

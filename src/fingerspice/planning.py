@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from fingerspice.errors import InputError
+from fingerspice.networks import NetworkProblem
 from fingerspice.numerics.modes import modes
 from fingerspice.physics.contact import areas
 from fingerspice.problem import Problem
@@ -81,6 +83,35 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", start: str = "d
         problem.scene.prepared[key] = _choose(problem, rtol, tier, start)
     plan: Plan = problem.scene.prepared[key]
     return plan
+
+
+def plan_network(problem: NetworkProblem, tier: str = "auto", start: str = "deck") -> Plan:
+    """The model for a network: closed form where its areas are fixed, else stepped.
+
+    Raises
+    ------
+    InputError
+        For an unknown tier, or one that cannot describe the circuit.
+    """
+    if tier not in ("auto", *TIERS):
+        raise InputError(f"unknown tier {tier!r}; allowed: auto, {', '.join(TIERS)}")
+    scene = problem.scene
+    best = "coupled" if scene.coupled else "linear"
+    if tier == "algebraic" or (tier == "linear" and scene.coupled):
+        raise InputError(f"the {tier} tier is not for this network; allowed: auto, {best} or coupled")
+    reason = f"the areas are {scene.area_mode}, so the circuit is linear"
+    if scene.coupled:
+        reason = f"a network whose area{'s follow' if len(problem.network.fingers) > 1 else ' follows'} the gap voltage"
+    elif not problem.network.areas:
+        reason = "no element has an area, so the circuit is linear"
+    rates = scene.modes.rates
+    shortest = min(problem.waveform.shortest_time(), problem.t_stop - problem.t_start)
+    stiff = float(rates.max(initial=0.0)) * shortest > STIFF
+    chosen = best if tier == "auto" else tier
+    if chosen != best:
+        reason = f"asked for; the lightest that is right would be {best}: {reason}"
+    area = float(scene.area0[0]) if scene.area0.size else math.nan
+    return Plan(chosen, (reason,), start, tuple(sorted(map(float, rates))), stiff, 0.0, 0.0, area)
 
 
 def _choose(problem: Problem, rtol: float, tier: str, start: str) -> Plan:

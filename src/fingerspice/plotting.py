@@ -181,6 +181,15 @@ def _curve(ax: Axes, solution: Solution, values: FloatArray, **style: Any) -> No
     ax.plot(_time_unit(solution)[0] * t, x, **{"linewidth": 1.3, "solid_joinstyle": "round", **style})
 
 
+def _curves(ax: Axes, solution: Solution, key: str, factor: float, label: str, **style: Any) -> None:
+    """A signal, or one line for each gap or source that has it."""
+    found = solution.by_name(key)
+    for i, (name, x) in enumerate(found.items()):
+        own = {"linestyle": DASHES[i % 4], "color": _CYCLE[(_CYCLE.index(style["color"]) + 2 * i) % 6]} if i else {}
+        text = f"{label} {name.partition(':')[2]}" if len(found) > 1 else label
+        _curve(ax, solution, factor * x, **{**style, **own, "label": text})
+
+
 def _peak(values: FloatArray) -> float:
     return float(np.abs(values).max(initial=0.0))
 
@@ -196,14 +205,14 @@ def _end(solution: Solution) -> float:
 
 def _voltages(ax: Axes, solution: Solution) -> None:
     factor, unit = engineering(_peak(solution.u_source), "V", 2.0)
-    source = {"color": GREY, "linewidth": 1.0, "linestyle": DASHES[1], "label": "source"}
-    _curve(ax, solution, factor * solution.u_source, **source)
+    _curves(ax, solution, "u_source", factor, color=GREY, linewidth=1.0, linestyle=DASHES[1], label="source")
     if solution.u_gap is not None:
-        _curve(ax, solution, factor * solution.u_gap, color=BLUE, label="gap")
+        _curves(ax, solution, "u_gap", factor, color=BLUE, label="gap")
     else:
-        for i, name in enumerate(solution.layers):
-            style = {"color": _CYCLE[i % 6], "linestyle": DASHES[i % 4], "label": f"layer {name}"}
-            _curve(ax, solution, factor * solution.u_layer[:, i], **style)
+        inside = {f"layer {name}": solution.u_layer[:, i] for i, name in enumerate(solution.layers)}
+        # Without layers, what there is to see are the nodes.
+        for i, (name, x) in enumerate((inside or solution.node_voltages).items()):
+            _curve(ax, solution, factor * x, color=_CYCLE[i % 6], linestyle=DASHES[i % 4], label=name)
     dress(ax, f"Voltage [{unit}]")
     legend_above(ax, 5)
 
@@ -211,7 +220,7 @@ def _voltages(ax: Axes, solution: Solution) -> None:
 def _force(ax: Axes, solution: Solution) -> None:
     assert solution.f_el is not None
     factor, unit = engineering(_peak(solution.f_el), "N", 0.05)
-    _curve(ax, solution, factor * solution.f_el, color=VERMILION, label="electroadhesive force")
+    _curves(ax, solution, "f_el", factor, color=VERMILION, label="electroadhesive force")
     summary = solution.summary()
     periodic = summary.get("f_el_mean_periodic")
     mean = periodic if periodic is not None else summary.get("f_el_mean")
@@ -225,7 +234,8 @@ def _force(ax: Axes, solution: Solution) -> None:
 
 
 def _area(ax: Axes, solution: Solution) -> None:
-    _curve(ax, solution, 1e6 * solution.area, color=GREEN)
+    assert solution.area is not None
+    _curves(ax, solution, "area", 1e6, color=GREEN, label="area")
     dress(ax, "Ridge area [mm²]")
     ax.ticklabel_format(useOffset=False)
     _flat(ax, 1e6 * solution.area)
@@ -234,9 +244,12 @@ def _area(ax: Axes, solution: Solution) -> None:
 def _friction(ax: Axes, solution: Solution) -> None:
     assert solution.f_t is not None
     factor, unit = engineering(_peak(solution.f_t), "N", 0.05)
-    _curve(ax, solution, factor * solution.f_t, color=PURPLE)
+    _curves(ax, solution, "f_t", factor, color=PURPLE, label="friction")
     dress(ax, f"Friction [{unit}]")
     _from_zero(ax)
+    if len(solution.gaps) > 1:
+        # Each has its own load.
+        return
     load = factor * solution.circuit.by_device("GAP")[0].values["fn"]
     right = ax.secondary_yaxis("right", functions=(partial(np.multiply, 1.0 / load), partial(np.multiply, load)))
     right.set_ylabel("coefficient", fontsize=FONT, color=GREY)

@@ -19,6 +19,7 @@ from fingerspice.errors import InputError
 from fingerspice.numerics.modes import modes
 from fingerspice.phasors import mean_area
 from fingerspice.physics.contact import fixed_area_curve, inverse_area
+from fingerspice.record import Record
 from fingerspice.solution import Solution, State
 from fingerspice.spectrum import freezing_error
 
@@ -183,7 +184,7 @@ def prepare(
     """
     t_start = start.state.t if isinstance(start, Solution) else 0.0
     scene = scene_of(circuit, charge_law, area, t_stop, rtol)
-    stop, step = _times(circuit, t_start, t_stop, t_eval)
+    stop, step = run_times(circuit, t_start, t_stop, t_eval)
     first = t_start + (circuit.tran.start if circuit.tran else 0.0)
     initial = _initial_state(circuit, scene, start)
     return Problem(circuit, scene, t_start, stop, first, step, initial, charge)
@@ -247,7 +248,7 @@ def _largest_voltage(waveform: Waveform, stop: float) -> float:
     return peak if math.isfinite(peak) else 0.0
 
 
-def _times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: FloatArray | None) -> tuple[float, float]:
+def run_times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: FloatArray | None) -> tuple[float, float]:
     """End of the run and output spacing, s."""
     tran = circuit.tran
     if t_stop is None:
@@ -342,12 +343,16 @@ def _initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Sta
     stack, model, law = scene.stack, scene.model, scene.charge_law
     n = stack.c.size
     if isinstance(start, Solution):
-        alike = start.layers == tuple(e.name for e in stack.layers) and start.record.stack.cells == stack.cells
+        before = start.record
+        alike = isinstance(before, Record) and (before.layers, before.stack.cells) == (
+            tuple(e.name for e in stack.layers), stack.cells
+        )  # fmt: skip
         if not alike or start.charge_law != law:
             raise InputError(
                 f"the solution to start from has layers {', '.join(start.layers)} and the {start.charge_law} law; "
                 f"allowed: those of this run, {', '.join(e.name for e in stack.layers)} and {law}"
             )
+        assert isinstance(start.state, State)
         return start.state
     require(start in ("deck", "uncharged", "dc"), "start", repr(start), "'deck', 'uncharged', 'dc' or a Solution")
     if start == "deck":

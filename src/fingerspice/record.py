@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fingerspice.circuit.statespace import Stack
 from fingerspice.circuit.waveforms import Waveform
 from fingerspice.engine.model import Model
-from fingerspice.physics.contact import areas, forces, inverse_area_array
+from fingerspice.physics.contact import Contact, areas, forces, inverse_area_array
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -21,6 +21,18 @@ def sealed(x: FloatArray) -> FloatArray:
     """The same array, read-only."""
     x.flags.writeable = False
     return x
+
+
+def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
+    """Values of a waveform at times t (s), from the left where that is meant, shape (n_t,)."""
+    out = np.array(waveform.value(t), float)
+    if left.any():
+        out[left] = waveform.value(t[left], "left")
+    lost = ~np.isfinite(out)
+    if lost.any():
+        # A run ends where the source stops being finite, found to 1e-12 of the time: just before, it was.
+        out[lost] = waveform.value(t[lost] * (1.0 - 4e-12))
+    return sealed(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,20 +72,26 @@ class Record:
             if array is not None:
                 array.flags.writeable = False
 
-    def _sided(self, waveform: Waveform) -> FloatArray:
-        out = np.array(waveform.value(self.t), float)
-        if self.left.any():
-            out[self.left] = waveform.value(self.t[self.left], "left")
-        lost = ~np.isfinite(out)
-        if lost.any():
-            # A run ends where the source stops being finite, found to 1e-12 of the time: just before, it was.
-            out[lost] = waveform.value(self.t[lost] * (1.0 - 4e-12))
-        return sealed(out)
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the layers, in the order of `u_layer`."""
+        return tuple(e.name for e in self.stack.layers)
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """What signals of the source belong to: the loop as a whole."""
+        return ("loop",)
+
+    @property
+    def fingers(self) -> tuple[tuple[str, Contact], ...]:
+        """The GAP's name and contact."""
+        gap, contact = self.stack.gap_layer, self.stack.contact
+        return () if gap is None or contact is None else ((self.stack.layers[gap].name, contact),)
 
     @cached_property
     def u_source(self) -> FloatArray:
         """Voltage around the loop, V, shape (n_t,)."""
-        return self._sided(self.waveform)
+        return sided(self.waveform, self.t, self.left)
 
     @cached_property
     def u_layer(self) -> FloatArray:
@@ -140,5 +158,5 @@ class Record:
         for element, sign in self.stack.sources:
             assert element.waveform is not None
             single = len(self.stack.sources) == 1
-            sources[element.name] = sign * self.u_source if single else self._sided(element.waveform)
+            sources[element.name] = sign * self.u_source if single else sided(element.waveform, self.t, self.left)
         return {k: sealed(v) for k, v in self.stack.node_voltages(self.u_layer, sources).items()}

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
 from fingerspice.engine.model import Segment
+from fingerspice.networks import NetworkProblem
 from fingerspice.problem import Problem
 from fingerspice.record import Record
 from fingerspice.solution import ErrorEstimate, State, Status
@@ -117,7 +118,7 @@ class Tables:
         return max(table.scale for table in self)
 
 
-def windows(problem: Problem) -> list[float]:
+def windows(problem: Problem | NetworkProblem) -> list[float]:
     """Edges of the windows the source is tabulated on: constant memory, and phases that stay exact."""
     span = problem.t_stop - problem.t_start
     rate = max(

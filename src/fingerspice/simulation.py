@@ -11,21 +11,26 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.sampling import breakpoints_at, misses, same_time
+from fingerspice.circuit.statespace import is_stack
 from fingerspice.circuit.waveforms import Waveform, as_waveform, require
 from fingerspice.direct import solve_algebraic, solve_linear
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError
 from fingerspice.marching import solve as solve_marching
+from fingerspice.network_record import NetworkRecord
+from fingerspice.networks import NetworkProblem, prepare_network
+from fingerspice.nodal import NetworkRun, solve_coupled
 from fingerspice.numerics.tableaus import TABLEAUS
 from fingerspice.periodic import close_period
 from fingerspice.physics.contact import inverse_area
-from fingerspice.planning import Plan, make_plan
+from fingerspice.planning import Plan, make_plan, plan_network
 from fingerspice.problem import Problem, prepare
 from fingerspice.record import Record
 from fingerspice.runs import Progress, Run
 from fingerspice.solution import ErrorEstimate, Solution, Status
 from fingerspice.spectrum import spectrum_warning
+from fingerspice.superposition import solve_fixed
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -107,6 +112,14 @@ def simulate(
     if sources:
         circuit = _with_sources(circuit, sources)
     times = None if t_eval is None else np.asarray(t_eval, float)
+    if not is_stack(circuit):
+        if start == "periodic":
+            raise InputError("start='periodic' needs a series stack; allowed for a network: 'deck', 'uncharged', 'dc'")
+        network = prepare_network(
+            circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=start, charge=charge
+        )
+        how = start if isinstance(start, str) else "given"
+        return _given_back(run_network(network, times, rtol, method, progress, tier, how), throw)
     begun = None
     problem = prepare(
         circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area,
@@ -121,11 +134,15 @@ def simulate(
                 "settled and its periodic state exists"
             )
     how = start if isinstance(start, str) else "given"
-    solution = run_problem(problem, times, rtol, method, progress, tier, how, begun)
+    return _given_back(run_problem(problem, times, rtol, method, progress, tier, how, begun), throw)
+
+
+def _given_back(solution: Solution, throw: bool) -> Solution:
+    """A solution with its warnings said, or the error of a failed run."""
     if not solution.success and throw:
         raise SolveError(solution.message, solution)
     for text in solution.warnings:
-        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+        warnings.warn(text, FingerspiceWarning, stacklevel=3)
     return solution
 
 
@@ -148,6 +165,11 @@ def plan(
     """
     if t_stop is None and circuit.tran is None:
         t_stop = 1.0
+    if not is_stack(circuit):
+        network = prepare_network(
+            circuit, t_stop=t_stop, t_eval=None, charge_law=charge_law, area=area, start="deck", charge=charge
+        )
+        return plan_network(network, tier)
     problem = prepare(
         circuit, t_stop=t_stop, t_eval=None, charge_law=charge_law, area=area, start="deck", charge=charge, rtol=rtol
     )  # fmt: skip
@@ -198,6 +220,54 @@ def run_problem(
     return _solution(problem, run, rtol, name, t_out, time.perf_counter() - begin, plan)
 
 
+def run_network(
+    problem: NetworkProblem,
+    t_eval: FloatArray | None = None,
+    rtol: float = 1e-8,
+    method: str = "auto",
+    progress: Progress | None = None,
+    tier: str = "auto",
+    start: str = "deck",
+) -> Solution:
+    """As `run_problem`, for a network."""
+    if method not in ("auto", "radau"):
+        raise InputError(f"method {method!r} is for series stacks; allowed for this network: 'auto' or 'radau'")
+    plan = plan_network(problem, "coupled" if tier == "auto" and method != "auto" else tier, start)
+    t_out, left = output_times(problem) if t_eval is None else (t_eval, np.zeros(t_eval.size, bool))
+    run_at = t_out if t_eval is None else _at_breakpoints(problem, t_eval)
+    begin = time.perf_counter()
+    if plan.tier == "linear":
+        run, name = solve_fixed(problem, run_at, left), plan.tier
+    else:
+        run, name = solve_coupled(problem, rtol, run_at, left, progress), "radau"
+    wall = time.perf_counter() - begin
+    scene, record = problem.scene, problem.record(run)
+    text = run.status.value
+    if run.t_failed is not None:
+        text = f"stopped at t = {run.t_failed:.10g} s: {text}"
+    if run.detail:
+        text += f" ({run.detail})"
+    return Solution(
+        t=t_out[: run.t.size].copy(),
+        record=record,
+        status=run.status,
+        message=text,
+        nfev=run.nfev,
+        stats={**run.stats, "wall_s": wall},
+        error=run.error,
+        rtol=rtol,
+        charge_law=scene.charge_law,
+        area_mode=scene.area_mode,
+        method=name,
+        plan=plan,
+        circuit=problem.circuit,
+        state=run.state,
+        fundamental=scene.fundamental,
+        period=scene.waveform.period,
+        warnings=tuple(_network_warnings(problem, run, record)),
+    )
+
+
 def _add_error(run: Run, u_gap: float, f_el: float | None = None) -> None:
     """Add to a run's error what it does not know of, V and N: a force goes with the square of its voltage."""
     if f_el is None:
@@ -205,7 +275,7 @@ def _add_error(run: Run, u_gap: float, f_el: float | None = None) -> None:
     run.error = dataclasses.replace(run.error, u_gap=run.error.u_gap + u_gap, f_el=run.error.f_el + f_el)
 
 
-def _at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
+def _at_breakpoints(problem: Problem | NetworkProblem, t: FloatArray) -> FloatArray:
     """Times moved onto the breakpoint they miss by rounding, so that 5 ms means the jump at 5 ms."""
     edges = problem.breakpoints()
     near = edges[misses(t, edges, same_time(1.0))] if edges.size else edges
@@ -244,7 +314,7 @@ def _run(
     return solve(problem, rtol, TABLEAUS[method], t_out, left, progress), method
 
 
-def output_times(problem: Problem) -> tuple[FloatArray, BoolArray]:
+def output_times(problem: Problem | NetworkProblem) -> tuple[FloatArray, BoolArray]:
     """TSTART:TSTEP:TSTOP with two entries (left, right) at each jump; t = 0 once, right-hand."""
     step, first = problem.step, problem.first
     count = int(np.floor((problem.t_stop - first) / step * (1.0 + 1e-12) + 1e-9))
@@ -329,18 +399,42 @@ def _physics_warnings(problem: Problem, run: Run, record: Record) -> Iterator[st
         yield outside
     stack = problem.stack
     if stack.contact is not None:
-        if run.peak_u > BREAKDOWN_VOLTAGE:
-            yield (
-                f"the gap voltage reaches {run.peak_u:.4g} V; air breaks down above about {BREAKDOWN_VOLTAGE:g} V "
-                "(Paschen minimum 327 V), which the model does not contain"
-            )
-        unloaded, least = problem.model.area0, 1.0 / inverse_area(run.peak_u, problem.model.curve)[0]
-        if problem.model.coupled and least < LEAST_AREA * unloaded:
-            yield (
-                f"the contact area falls to {1e6 * least:.3g} mm^2, below {100.0 * LEAST_AREA:g} % of the "
-                f"{1e6 * unloaded:.3g} mm^2 at 0 V: the contact model was not made for so little"
-            )
-    for i, layer in enumerate(stack.layers):
+        least = 1.0 / inverse_area(run.peak_u, problem.model.curve)[0]
+        yield from _gap_warnings("", run.peak_u, problem.model.area0, least if problem.model.coupled else math.inf)
+    yield from _strength_warnings(stack.layers, record)
+
+
+def _network_warnings(problem: NetworkProblem, run: NetworkRun, record: NetworkRecord) -> Iterator[str]:
+    outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
+    if outside is not None:
+        yield outside
+    several = len(record.fingers) > 1
+    for finger, i in enumerate(problem.network.fingers):
+        least = float(record.finger_area(finger).min(initial=math.inf))
+        where = f" of {record.fingers[finger][0]}" if several else ""
+        follows = problem.scene.fixed[i] is None
+        yield from _gap_warnings(
+            where, float(run.peaks[i]), float(problem.scene.area0[i]), least if follows else math.inf
+        )
+    yield from _strength_warnings(problem.network.layers, record)
+
+
+def _gap_warnings(where: str, peak: float, unloaded: float, least: float) -> Iterator[str]:
+    """Of a gap with its largest voltage (V), its area at 0 V and its smallest one (m^2)."""
+    if peak > BREAKDOWN_VOLTAGE:
+        yield (
+            f"the gap voltage{where} reaches {peak:.4g} V; air breaks down above about {BREAKDOWN_VOLTAGE:g} V "
+            "(Paschen minimum 327 V), which the model does not contain"
+        )
+    if least < LEAST_AREA * unloaded:
+        yield (
+            f"the contact area{where} falls to {1e6 * least:.3g} mm^2, below {100.0 * LEAST_AREA:g} % of the "
+            f"{1e6 * unloaded:.3g} mm^2 at 0 V: the contact model was not made for so little"
+        )
+
+
+def _strength_warnings(layers: tuple[Element, ...], record: Record | NetworkRecord) -> Iterator[str]:
+    for i, layer in enumerate(layers):
         strength = layer.values.get("e_max", math.inf)
         if math.isfinite(strength) and record.t.size:
             field = float(np.abs(record.u_layer[:, i]).max()) / layer.values["d"]

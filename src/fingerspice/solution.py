@@ -14,15 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.files import write_aside
+from fingerspice.network_record import NetworkRecord
 from fingerspice.numerics.cubics import fundamental, mean
 from fingerspice.record import Record, sealed
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import xarray
     from matplotlib.figure import Figure
 
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.circuit.waveforms import Fundamental
+    from fingerspice.physics.contact import Contact
     from fingerspice.planning import Plan
 
 FloatArray = NDArray[np.float64]
@@ -70,17 +74,29 @@ class State:
 
 
 @dataclass(frozen=True)
+class NetworkState:
+    """Where the run of a network stopped: `y` as in `engine.network`, sources before a jump, branches of the areas."""
+
+    t: float
+    y: FloatArray
+    s_before: FloatArray
+    sign: FloatArray
+
+
+@dataclass(frozen=True)
 class Solution:
     """Time response of a circuit.
 
     Signals are read-only arrays in SI units, computed when first asked for; at a jump of the source two rows share a
-    time.
+    time. Where a circuit has several GAPs, what belongs to them (`u_gap`, `area`, `sigma_el`, `f_el`, `f_t`,
+    `friction`) has the shape (n_t, n_gap), in the order of `gaps`; likewise `u_source`, `q_source` and `i_source` with
+    several sources of a network, in the order of `sources`.
 
     Attributes
     ----------
     t : ndarray, shape (n_t,)
         s.
-    record : Record
+    record : Record or NetworkRecord
         What the run wrote down.
     status : Status
     message : str
@@ -99,7 +115,7 @@ class Solution:
     """
 
     t: FloatArray
-    record: Record
+    record: Record | NetworkRecord
     status: Status
     message: str
     nfev: int
@@ -111,7 +127,7 @@ class Solution:
     method: str
     plan: Plan
     circuit: Circuit
-    state: State
+    state: State | NetworkState
     fundamental: Fundamental | None = None
     period: float | None = None
     warnings: tuple[str, ...] = field(default=())
@@ -122,7 +138,17 @@ class Solution:
     @property
     def layers(self) -> tuple[str, ...]:
         """Names of the columns of `u_layer`."""
-        return tuple(e.name for e in self.record.stack.layers)
+        return self.record.layers
+
+    @property
+    def gaps(self) -> tuple[str, ...]:
+        """Names of the GAPs."""
+        return tuple(name for name, _ in self.record.fingers)
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the sources of a network; a series stack has one loop."""
+        return self.record.sources
 
     @property
     def u_source(self) -> FloatArray:
@@ -140,8 +166,8 @@ class Solution:
         return self.record.node_voltages
 
     @property
-    def area(self) -> FloatArray:
-        """Ridge contact area, m^2, shape (n_t,)."""
+    def area(self) -> FloatArray | None:
+        """Ridge contact area, m^2, shape (n_t,); None for a circuit without any."""
         return self.record.area
 
     @property
@@ -165,30 +191,46 @@ class Solution:
     @property
     def u_gap(self) -> FloatArray | None:
         """Gap voltage, V, shape (n_t,); None for a circuit without GAP."""
-        return None if self.record.stack.gap is None else self.record.u_gap
+        return self.record.u_gap if self.gaps else None
 
     @cached_property
     def sigma_el(self) -> FloatArray | None:
         """Electroadhesive stress (Eq. 2), Pa, shape (n_t,); None for a circuit without GAP."""
-        contact = self.record.stack.contact
-        return None if contact is None else sealed(contact.stress(self.record.u_gap))
+        return self._per_gap(self.u_gap, lambda contact, u: contact.stress(u))
 
     @property
     def f_el(self) -> FloatArray | None:
         """Electroadhesive force, N, shape (n_t,); None for a circuit without GAP."""
-        return None if self.record.stack.contact is None else self.record.force
+        return self.record.force if self.gaps else None
 
     @cached_property
     def f_t(self) -> FloatArray | None:
         """Friction force (Eq. 1), N, shape (n_t,); None for a circuit without GAP."""
-        contact = self.record.stack.contact
-        return None if contact is None or self.f_el is None else sealed(contact.mu * (contact.f_n + self.f_el))
+        return self._per_gap(self.f_el, lambda contact, f: contact.mu * (contact.f_n + f))
 
     @cached_property
     def friction(self) -> FloatArray | None:
         """Friction coefficient f_t / f_n, shape (n_t,); None for a circuit without GAP."""
-        contact = self.record.stack.contact
-        return None if contact is None or self.f_t is None else sealed(self.f_t / contact.f_n)
+        return self._per_gap(self.f_t, lambda contact, f: f / contact.f_n)
+
+    def _per_gap(self, x: FloatArray | None, make: Callable[[Contact, FloatArray], FloatArray]) -> FloatArray | None:
+        """Another signal of every gap from one of them."""
+        if x is None:
+            return None
+        contacts = [contact for _, contact in self.record.fingers]
+        if len(contacts) == 1:
+            return sealed(make(contacts[0], x))
+        return sealed(np.column_stack([make(contact, x[:, i]) for i, contact in enumerate(contacts)]))
+
+    def by_name(self, key: str) -> dict[str, FloatArray]:
+        """A signal under its name, or the columns of several gaps or sources under ``name:element``."""
+        value = getattr(self, key)
+        if value is None:
+            return {}
+        if value.ndim == 1:
+            return {key: value}
+        names = self.sources if key.endswith("_source") else self.gaps
+        return {f"{key}:{name}": value[:, i] for i, name in enumerate(names)}
 
     @property
     def success(self) -> bool:
@@ -209,7 +251,7 @@ class Solution:
     def signals(self) -> dict[str, tuple[FloatArray, str, str]]:
         """Every time series by name: values (n_t,), unit, long name."""
         out: dict[str, tuple[FloatArray, str, str]] = {
-            "u_source": (self.u_source, "V", "source voltage"),
+            name: (value, "V", "source voltage") for name, value in self.by_name("u_source").items()
         }
         for i, name in enumerate(self.layers):
             out[f"u_layer:{name}"] = (self.u_layer[:, i], "V", f"voltage of {name}")
@@ -224,9 +266,7 @@ class Solution:
             ("i_source", "A", "source current, regular part"),
             ("fold_margin", "1", "distance to the fold of the mobile law"),
         ):
-            value = getattr(self, key)
-            if value is not None:
-                out[key] = (value, unit, text)
+            out.update({name: (value, unit, text) for name, value in self.by_name(key).items()})
         for name, value in self.node_voltages.items():
             out[f"v:{name}"] = (value, "V", f"voltage of node {name}")
         return out
@@ -256,7 +296,7 @@ class Solution:
             if last is not None:
                 periodic = mean(last[0], last[1][key])
                 out[f"{key}_mean_periodic"] = periodic
-                if key in ("area", "f_el", "f_t", "friction"):
+                if key.partition(":")[0] in ("area", "f_el", "f_t", "friction"):
                     out[f"{key}_ripple"] = float(np.ptp(last[1][key]))
                 else:
                     out[f"{key}_rms_periodic"] = float(np.sqrt(mean(last[0], last[1][key] ** 2)))
@@ -274,11 +314,14 @@ class Solution:
 
     def _summarised(self) -> dict[str, FloatArray]:
         """What the summary gives figures of; without a gap, every layer."""
-        if self.u_gap is None:
-            layers = {f"u_layer:{name}": self.u_layer[:, i] for i, name in enumerate(self.layers)}
-            return {"u_source": self.u_source, **layers, "area": self.area}
-        keys = ("u_source", "u_gap", "area", "f_el", "f_t", "friction")
-        return {key: getattr(self, key) for key in keys}
+        if self.u_gap is not None:
+            shown = ("u_source", "u_gap", "area", "f_el", "f_t", "friction")
+            return {name: x for key in shown for name, x in self.by_name(key).items()}
+        # Without layers either, what there is to see are the nodes.
+        inside = {f"u_layer:{name}": self.u_layer[:, i] for i, name in enumerate(self.layers)} or {
+            f"v:{name}": v for name, v in self.node_voltages.items()
+        }
+        return {**self.by_name("u_source"), **inside, **self.by_name("area")}
 
     def _last_period(self) -> tuple[FloatArray, dict[str, FloatArray]] | None:
         """Times and signals of the last period, with an interpolated first point; None where there is none."""

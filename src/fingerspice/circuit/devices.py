@@ -81,6 +81,7 @@ DEVICES: dict[str, DeviceSpec] = {
                 _P("n_exp", ""),
                 _P("c2", "mm^4/N^2", may_be_zero=True),
                 _P("a_fix", "mm^2", default=0.0, may_be_zero=True),
+                _P("tau", "s", default=0.0, may_be_zero=True),
             ),
         ),
         DeviceSpec("R", ("p", "n"), (_P("value", "ohm"),)),
@@ -90,8 +91,3 @@ DEVICES: dict[str, DeviceSpec] = {
     )
 }
 """Every device the reader knows."""
-
-LATER = {
-    ("GAP", "tau"): "first-order area dynamics",
-}
-"""Named in the file format, not simulated by this version: refused by name."""

@@ -10,11 +10,12 @@ from types import MappingProxyType
 
 from fingerspice.circuit.circuit import Circuit, Element, check
 from fingerspice.circuit.deck import Call, Deck, Number, Statement, Token, parse_deck, read_deck
-from fingerspice.circuit.devices import DEVICES, LATER, ParameterSpec
+from fingerspice.circuit.devices import DEVICES, ParameterSpec
 from fingerspice.circuit.directives import read_ac, read_initial, read_options, read_tran
 from fingerspice.circuit.expressions import nearest
+from fingerspice.circuit.network import build_network
 from fingerspice.circuit.sources import Timing, read_source
-from fingerspice.circuit.statespace import build_stack
+from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.circuit.waveforms import Waveform
 from fingerspice.errors import FingerspiceWarning, InputError
 from fingerspice.physics.materials import SKIN_BAND
@@ -92,7 +93,10 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
         path=deck.path,
     )
     check(circuit)
-    build_stack(circuit)
+    if is_stack(circuit):
+        build_stack(circuit)
+    else:
+        build_network(circuit)
     return circuit
 
 
@@ -148,10 +152,6 @@ def _device_values(statement: Statement, device: str, notes: list[str]) -> dict[
     for key in statement.params:
         if key not in known:
             place = statement.param_where[key]
-            if (device, key) in LATER:
-                raise InputError(
-                    f"{statement.name} {key} ({LATER[device, key]}) is not simulated by this version", place
-                )
             # ngspice reads m=... on an X line as so many copies.
             hint = "; the exponent is m_exp" if key == "m" and "m_exp" in known else nearest(key, known)
             raise InputError(

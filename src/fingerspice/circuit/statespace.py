@@ -21,6 +21,7 @@ from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.combinations import Product, Sum
 from fingerspice.circuit.topology import Hop, find_loop
 from fingerspice.circuit.waveforms import DC, Waveform
+from fingerspice.errors import InputError
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.ladder import SKIN_LADDER
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
@@ -197,16 +198,31 @@ def contact_of(gap: Element) -> Contact:
     )
 
 
+def is_stack(circuit: Circuit) -> bool:
+    """Whether a circuit is one series loop of sources and layers with one area that follows at once.
+
+    Raises
+    ------
+    InputError
+        As `topology.find_branches`.
+    """
+    return bool(circuit.remember("is stack", lambda: find_loop(circuit) is not None))
+
+
 def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
     """The series stack of a circuit; with `skin_at`, dispersive skins have their data at that frequency (Hz).
 
     Raises
     ------
     InputError
-        For no source, no layer, a floating or dangling node, parallel sources, a loop of sources alone, two gaps
-        or areas, and for topologies this version does not solve, naming the elements.
+        As `topology.find_branches`, and for a network that is no such stack.
     """
     loop = find_loop(circuit)
+    if loop is None:
+        raise InputError(
+            "this needs a series chain of LAYER, SLAB, SKIN and GAP driven by V sources, and the circuit is another "
+            "network; allowed for any network: simulate (run), plan, phasor (ac) and export"
+        )
     layers = [h.element for h in loop.hops if h.element.spec.is_layer]
     parts = [layer_constants(e, skin_at) for e in layers]
     cells = tuple(len(part) for part in parts)

@@ -1,4 +1,4 @@
-"""The series loop of a circuit, found by node incidence, and the refusals of what is not one."""
+"""What a circuit is: its areas, its series loop if it is one, and the refusals of what no network is."""
 
 from __future__ import annotations
 
@@ -21,6 +21,28 @@ class Hop:
 
 
 @dataclass(frozen=True)
+class Area:
+    """A contact area of a circuit, and what gives it.
+
+    Attributes
+    ----------
+    node : str
+        Canonical name of the area node.
+    gap : Element or None
+        The GAP that drives it.
+    given : float or None
+        m^2, from a DC source on the node or the gap's a_fix.
+    source : Element or None
+        That source.
+    """
+
+    node: str
+    gap: Element | None
+    given: float | None
+    source: Element | None = None
+
+
+@dataclass(frozen=True)
 class Loop:
     """A series loop of sources and layers from ground back to ground, and what gives its area."""
 
@@ -30,34 +52,51 @@ class Loop:
     """m^2, from a DC source on the area node or the gap's a_fix."""
 
 
-def find_loop(circuit: Circuit) -> Loop:
-    """The loop of a circuit.
+def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
+    """Areas of a circuit, and the elements that carry current.
 
     Raises
     ------
     InputError
-        Naming the elements or nodes at fault.
+        Naming the elements or nodes at fault: no source, a floating node, a loop of voltage sources, a current source
+        without a path, an area that nothing or too much drives.
     """
-    if not circuit.by_device("V", "I"):
+    areas = _areas(circuit)
+    on_areas = [area.source for area in areas]
+    branches = [e for e in circuit.elements if all(e is not source for source in on_areas)]
+    if not any(e.device in "VI" for e in branches):
         raise InputError(
             "the circuit has no source; allowed: a V element that drives the stack, such as V1 drive 0 SIN(0 200 100)"
         )
-    gap, area_given, area_source = _area(circuit)
-    branches = [e for e in circuit.elements if e is not area_source]
     _refuse_floating(branches)
     _refuse_source_conflicts(branches)
-    _refuse_unsupported(branches)
-    return Loop(_walk(branches), gap, area_given)
+    _refuse_current_without_path(branches)
+    return areas, branches
 
 
-def _area(circuit: Circuit) -> tuple[Element | None, float | None, Element | None]:
-    """The gap, the area its deck fixes (m^2), and the source on the area node where there is no gap."""
+def find_loop(circuit: Circuit) -> Loop | None:
+    """The loop of a circuit that is one series loop with one area following at once; None for any other network.
+
+    Raises
+    ------
+    InputError
+        As `find_branches`.
+    """
+    areas, branches = find_branches(circuit)
+    if len(areas) != 1 or any(e.device != "V" and not e.spec.is_layer for e in branches):
+        return None
+    if any(len(elements) > 2 for elements in _incidence(branches).values()):
+        return None
+    gap = areas[0].gap
+    if gap is not None and gap.values["tau"] > 0.0 and areas[0].given is None:
+        return None
+    return Loop(_walk(branches), gap, areas[0].given)
+
+
+def _areas(circuit: Circuit) -> tuple[Area, ...]:
     layers = [e for e in circuit.elements if e.spec.is_layer]
-    if not layers:
-        raise InputError("the circuit has no layer; allowed: LAYER, SLAB, SKIN and GAP between two nodes")
-    gaps = [e for e in layers if e.device == "GAP"]
     owners: dict[str, Element] = {}
-    for gap in gaps:
+    for gap in circuit.by_device("GAP"):
         node = gap.nodes[2]
         if node in owners:
             raise InputError(
@@ -66,40 +105,30 @@ def _area(circuit: Circuit) -> tuple[Element | None, float | None, Element | Non
                 gap.where,
             )
         owners[node] = gap
-    if len(gaps) > 1:
-        names = " and ".join(g.name for g in gaps)
-        raise InputError(f"{names}: circuits with several gaps are not solved by this version", gaps[1].where)
-    nodes = {e.nodes[2]: e for e in layers}
-    stray = [e for e in layers if e.nodes[2] not in owners] if gaps else []
-    if stray:
-        e = stray[0]
-        raise InputError(
-            f"{e.name} takes its area from node {e.node_names[2]!r}, which no GAP drives; {gaps[0].name} drives "
-            f"{gaps[0].node_names[2]!r}",
-            e.where,
-        )
-    on_area = [e for e in circuit.by_device("V") if set(e.nodes) & set(nodes)]
-    if gaps:
-        if on_area:
+    out = []
+    for node, layer in {e.nodes[2]: e for e in reversed(layers)}.items():
+        on_node = [e for e in circuit.by_device("V", "I", "R", "C") if node in e.nodes]
+        owner = owners.get(node)
+        if owner is None:
+            out.append(Area(node, None, *_given_by_source(layer, on_node)))
+            continue
+        if on_node:
             raise InputError(
-                f"{on_area[0].name} and {gaps[0].name} both drive the area node {gaps[0].node_names[2]!r}",
-                on_area[0].where,
+                f"{on_node[0].name} and {owner.name} both drive the area node {owner.node_names[2]!r}",
+                on_node[0].where,
             )
-        a_fix = gaps[0].values["a_fix"]
-        return gaps[0], (a_fix * 1e-6 if a_fix > 0.0 else None), None
-    return None, *_area_from_source(layers, on_area)
+        a_fix = owner.values["a_fix"]
+        out.append(Area(node, owner, a_fix * 1e-6 if a_fix > 0.0 else None))
+    return tuple(reversed(out))
 
 
-def _area_from_source(layers: list[Element], sources: list[Element]) -> tuple[float, Element]:
-    first = layers[0]
-    if len({e.nodes[2] for e in layers}) > 1:
-        raise InputError("the layers of a loop must share one area node", layers[1].where)
+def _given_by_source(layer: Element, sources: list[Element]) -> tuple[float, Element]:
     if len(sources) != 1:
         raise InputError(
-            f"node {first.node_names[2]!r} gives {first.name} its area, but "
+            f"node {layer.node_names[2]!r} gives {layer.name} its area, but "
             + ("no GAP and no DC source drives it" if not sources else "more than one source drives it")
-            + f"; allowed: one GAP, or one V element such as 'Varea {first.node_names[2]} 0 35' (mm^2)",
-            first.where,
+            + f"; allowed: one GAP, or one V element such as 'Varea {layer.node_names[2]} 0 35' (mm^2)",
+            layer.where,
         )
     source = sources[0]
     if not isinstance(source.waveform, DC) or source.nodes[1] != "0" or not source.waveform.level > 0.0:
@@ -122,6 +151,17 @@ def _as_written(node: str, element: Element) -> str:
     return element.node_names[element.nodes.index(node)]
 
 
+def _reached(at: dict[str, list[Element]]) -> set[str]:
+    """Nodes that elements connect to ground."""
+    reached, todo = {"0"}, ["0"]
+    while todo:
+        for element in at.get(todo.pop(), ()):
+            new = set(element.nodes[:2]) - reached
+            reached |= new
+            todo += new
+    return reached
+
+
 def _refuse_floating(branches: list[Element]) -> None:
     at = _incidence(branches)
     for element in branches:
@@ -138,13 +178,7 @@ def _refuse_floating(branches: list[Element]) -> None:
             )
     if "0" not in at:
         raise InputError("no element touches ground; allowed: one node must be 0 (or gnd)")
-    reached, todo = {"0"}, ["0"]
-    while todo:
-        for element in at[todo.pop()]:
-            for node in element.nodes[:2]:
-                if node not in reached:
-                    reached.add(node)
-                    todo.append(node)
+    reached = _reached(at)
     for node, elements in at.items():
         if node not in reached:
             e = elements[0]
@@ -176,21 +210,17 @@ def _refuse_source_conflicts(branches: list[Element]) -> None:
         parent[a] = b
 
 
-def _refuse_unsupported(branches: list[Element]) -> None:
-    shape = "solved here is a series chain of LAYER, SLAB, SKIN and GAP driven by V sources"
+def _refuse_current_without_path(branches: list[Element]) -> None:
+    """Every node must be reached from ground without going through a current source."""
+    reached = _reached(_incidence([e for e in branches if e.device != "I"]))
     for element in branches:
-        if element.device in ("R", "C", "I"):
-            raise InputError(
-                f"{element.name}: {element.device} elements are read, but not solved by this version; {shape}",
-                element.where,
-            )
-    for node, elements in _incidence(branches).items():
-        if len(elements) > 2:
-            names = ", ".join(e.name for e in elements)
-            raise InputError(
-                f"node {_as_written(node, elements[0])!r} joins {len(elements)} elements ({names}); {shape}",
-                elements[2].where,
-            )
+        for node in element.nodes[:2]:
+            if element.device == "I" and node not in reached:
+                raise InputError(
+                    f"{element.name} is a current source without a path: node {_as_written(node, element)!r} is "
+                    "reached through current sources only; allowed: an R, C or layer that takes the current to ground",
+                    element.where,
+                )
 
 
 def _walk(branches: list[Element]) -> tuple[Hop, ...]:

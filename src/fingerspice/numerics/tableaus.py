@@ -368,7 +368,7 @@ def _dp5() -> Tableau:
     return Tableau("dp5", 5, 4, 5, False, a, c, e, np.array(_DP5_DENSE), 6)
 
 
-def _radau(stages: int) -> Tableau:
+def radau(stages: int) -> Tableau:
     """Radau IIA collocation with `stages` nodes: order 2 s - 1, stiffly accurate, L-stable."""
     s = stages
     # Nodes: roots of P_s - P_{s-1} mapped to (0, 1]; the last is 1.
@@ -403,5 +403,5 @@ def _on_symmetric_interval(coefficients: FloatArray) -> FloatArray:
     return full
 
 
-TABLEAUS: dict[str, Tableau] = {t.name: t for t in (_dp5(), _dop853(), _radau(5))}
+TABLEAUS: dict[str, Tableau] = {t.name: t for t in (_dp5(), _dop853(), radau(5))}
 """Own steppers by name: add a tableau here, and the tests and benchmarks pick it up."""

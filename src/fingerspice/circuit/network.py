@@ -1,0 +1,329 @@
+"""From any connected netlist to its reduced state space: modified nodal analysis on a normal tree.
+
+The tree takes voltage sources first, then capacitors, then resistors. The voltages x of its capacitors are the live
+states; with the sources' voltages s every capacitor has u = P x + Q s, and the voltages of the tree's resistors, which
+follow at once, are taken out. What is left is Kirchhoff's current law on the cuts of the tree's capacitors,
+
+    P^T i + K x + B s = 0,    i the currents of all capacitors with their leaks, s with the current sources' currents,
+
+and the same on those of the voltage sources, which gives the currents that these deliver.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.statespace import contact_of, layer_constants
+from fingerspice.circuit.topology import Area, find_branches
+from fingerspice.errors import InputError
+from fingerspice.physics.contact import Contact
+from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A capacitor with the leak beside it: a C, a layer, or one of the slabs of a dispersive layer.
+
+    Capacitance and leak are `c` and `g_area` times the area, plus `g_total`; without an area, `c` alone.
+    """
+
+    element: Element
+    nodes: tuple[str, str]
+    c: float
+    g_total: float
+    g_area: float
+    area: int | None
+
+
+@dataclass(frozen=True)
+class Network:
+    """A connected network of capacitors, resistors, sources and layers. SI throughout.
+
+    n live states, one for each capacitor of the tree; n_s sources, voltage sources first.
+
+    Attributes
+    ----------
+    sources : tuple of Element
+    n_voltage : int
+        How many of them are voltage sources.
+    cells : tuple of Cell
+    live : tuple of int
+        The cell whose voltage each live state is.
+    areas : tuple of Area
+    contacts : tuple of Contact or None
+        Of each area; None where no GAP drives it.
+    gaps : tuple of int or None
+        The cell of each area's GAP.
+    p, q : ndarray, shape (n_cell, n) and (n_cell, n_s)
+        u = p x + q s.
+    k, b : ndarray, shape (n, n) and (n, n_s)
+        Currents of the resistors and the current sources into the cuts of the live capacitors, S.
+    delivered : ndarray, shape (n_s, n + n_s)
+        Their part in the current that each source delivers out of its p node, from x and s. The capacitors' part is
+        q^T i.
+    resistor_factor : ndarray, shape (n_r, n)
+        k = f^T f.
+    node_names : tuple of str
+    nodes : ndarray, shape (n_node, n + n_s)
+        Node voltages from x and s.
+    """
+
+    sources: tuple[Element, ...]
+    n_voltage: int
+    cells: tuple[Cell, ...]
+    live: tuple[int, ...]
+    areas: tuple[Area, ...]
+    contacts: tuple[Contact | None, ...]
+    gaps: tuple[int | None, ...]
+    p: FloatArray
+    q: FloatArray
+    k: FloatArray
+    b: FloatArray
+    delivered: FloatArray
+    resistor_factor: FloatArray
+    node_names: tuple[str, ...]
+    nodes: FloatArray
+
+    @cached_property
+    def layers(self) -> tuple[Element, ...]:
+        """Elements whose capacitance scales with an area, in deck order."""
+        return tuple({c.element.name: c.element for c in self.cells if c.area is not None}.values())
+
+    @cached_property
+    def grouping(self) -> FloatArray:
+        """Which cells make up each layer, shape (n_layer, n_cell)."""
+        rows = [[float(cell.element is layer) for cell in self.cells] for layer in self.layers]
+        return np.array(rows).reshape(len(self.layers), len(self.cells))
+
+    @property
+    def fingers(self) -> tuple[int, ...]:
+        """Areas that a GAP drives."""
+        return tuple(i for i, gap in enumerate(self.gaps) if gap is not None)
+
+    def capacitance(self, area: FloatArray) -> FloatArray:
+        """Capacitance of every cell at areas (n_area,) in m^2, F, shape (n_cell,)."""
+        return np.array([c.c if c.area is None else c.c * area[c.area] for c in self.cells])
+
+    def leak(self, area: FloatArray) -> FloatArray:
+        """Conductance beside every cell at areas (n_area,) in m^2, S, shape (n_cell,)."""
+        return np.array([c.g_total + (0.0 if c.area is None else c.g_area * area[c.area]) for c in self.cells])
+
+    def mass(self, area: FloatArray) -> FloatArray:
+        """p^T C p, F, shape (n, n): positive definite."""
+        return np.asarray(self.p.T @ (self.capacitance(area)[:, None] * self.p))
+
+    def stiffness(self, area: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Currents into the cuts from x (n, n) and from s (n, n_s), leaks included, S."""
+        leak = self.leak(area)[:, None]
+        return self.k + self.p.T @ (leak * self.p), self.b + self.p.T @ (leak * self.q)
+
+    def admittances(self, frequency: float, area: FloatArray) -> ComplexArray:
+        """Complex admittance of every cell at a frequency (Hz), SKIN's data taken there, S, shape (n_cell,)."""
+        y = self.leak(area) + 2j * np.pi * frequency * self.capacitance(area)
+        for i, cell in enumerate(self.cells):
+            if cell.element.device == "SKIN" and cell.area is not None:
+                f = np.array([frequency])
+                per_area = 1.0 / skin_resistivity(f) + 2j * np.pi * f * EPS0 * skin_permittivity(f)
+                y[i] = per_area[0] * area[cell.area] / cell.element.values["d"]
+        return np.asarray(y)
+
+    def phasors(self, frequency: float, area: FloatArray, s: ComplexArray) -> ComplexArray:
+        """Cell voltages (n_cell,) at a frequency (Hz) and areas (n_area,) in m^2 for source phasors s (n_s,)."""
+        y = self.admittances(frequency, area)[:, None]
+        x = np.linalg.solve(self.k + self.p.T @ (y * self.p), -(self.b + self.p.T @ (y * self.q)) @ s)
+        return np.asarray(self.p @ x + self.q @ s)
+
+
+def build_network(circuit: Circuit) -> Network:
+    """The network of a circuit.
+
+    Raises
+    ------
+    InputError
+        As `topology.find_branches`; for the reading of Eq. 7 with the total voltage held, which a series stack alone
+        has.
+    """
+    areas, branches = find_branches(circuit)
+    if circuit.work == "total" and any(area.gap for area in areas):
+        raise InputError(
+            ".options work=total holds the voltage across a series stack, and this circuit is none; allowed: work=gap"
+        )
+    place = {area.node: i for i, area in enumerate(areas)}
+    cells = [cell for e in branches for cell in _cells(e, place)]
+    # The gaps first: their voltages are then states of their own.
+    cells.sort(key=lambda cell: cell.element.device != "GAP")
+    voltages = [e for e in branches if e.device == "V"]
+    currents = [e for e in branches if e.device == "I"]
+    resistors = [e for e in branches if e.device == "R"]
+
+    tree = _Tree()
+    in_tree = [tree.add(e.nodes[0], e.nodes[1]) for e in voltages]
+    assert all(in_tree)
+    live = [tree.add(*cell.nodes) for cell in cells]
+    passive = [tree.add(e.nodes[0], e.nodes[1]) for e in resistors]
+    n_v, n, n_r = len(voltages), sum(live), sum(passive)
+    potential = tree.potentials()
+
+    def rows(pairs: list[tuple[str, ...]]) -> FloatArray:
+        """Voltages between pairs of nodes from those of the tree's branches, in the order they were added."""
+        out = [potential[a] - potential[b] for a, b, *_ in pairs]
+        return np.array(out).reshape(len(pairs), n_v + n + n_r)
+
+    across = rows([cell.nodes for cell in cells])
+    over_resistors, over_currents = rows([e.nodes for e in resistors]), rows([e.nodes for e in currents])
+    conductance = np.array([1.0 / e.values["value"] for e in resistors])
+    # Voltages e = (s, x) of the tree are given; those of its resistors make the power least.
+    e, r = slice(0, n_v + n), slice(n_v + n, None)
+    weight = np.sqrt(conductance)[:, None]
+    orthogonal, upper = np.linalg.qr(weight * over_resistors[:, r])
+    from_e = -np.linalg.solve(upper, orthogonal.T @ (weight * over_resistors[:, e])) if n_r else np.zeros((0, n_v + n))
+    back = np.linalg.solve(upper.T, over_currents[:, r].T) if n_r else np.zeros((0, len(currents)))
+    from_i = -np.linalg.solve(upper, back) if n_r else back
+    by_e = over_resistors[:, e] + over_resistors[:, r] @ from_e
+    by_i = over_resistors[:, r] @ from_i
+    # Currents out of the p nodes of the tree's branches: e^T-power, with the current sources' own.
+    into_e = by_e.T @ (conductance[:, None] * by_e)
+    into_i = over_resistors[:, e].T @ (conductance[:, None] * by_i) + over_currents[:, e].T
+    s, x = slice(0, n_v), slice(n_v, n_v + n)
+    n_i = len(currents)
+    delivered = np.zeros((n_v + n_i, n + n_v + n_i))
+    delivered[:n_v] = np.hstack([into_e[s, x], into_e[s, s], into_i[s]])
+    # A current source drives its current from p through itself to n.
+    delivered[n_v:, n + n_v :] = -np.eye(n_i)
+    names = tree.names
+    at_node = np.array([potential[name] for name in names]).reshape(len(names), n_v + n + n_r)
+    whole = at_node[:, e] + at_node[:, r] @ from_e
+    written = {node: name for el in branches for node, name in zip(el.nodes, el.node_names, strict=True)}
+    shown = [i for i, name in enumerate(names) if name in written and name != "0"]
+    return Network(
+        sources=(*voltages, *currents),
+        n_voltage=n_v,
+        cells=tuple(cells),
+        live=tuple(i for i, taken in enumerate(live) if taken),
+        areas=areas,
+        contacts=tuple(None if area.gap is None else contact_of(area.gap) for area in areas),
+        gaps=tuple(next((i for i, c in enumerate(cells) if c.element is a.gap), None) for a in areas),
+        p=np.ascontiguousarray(across[:, x]),
+        q=np.hstack([across[:, s], np.zeros((len(cells), n_i))]),
+        k=into_e[x, x],
+        b=np.hstack([into_e[x, s], into_i[x]]),
+        delivered=delivered,
+        resistor_factor=weight * by_e[:, x],
+        node_names=tuple(written[names[i]] for i in shown),
+        nodes=np.hstack([whole[shown][:, x], whole[shown][:, s], (at_node[:, r] @ from_i)[shown]]),
+    )
+
+
+def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
+    a, b = element.nodes[:2]
+    if element.device == "C":
+        return [Cell(element, (a, b), element.values["value"], 0.0, 0.0, None)]
+    if not element.spec.is_layer:
+        return []
+    constants = layer_constants(element)
+    # The nodes between the slabs of a dispersive layer have names that no netlist can write.
+    inner = [f"{element.name.lower()} {i}" for i in range(1, len(constants))]
+    path = [a, *inner, b]
+    area = place[element.nodes[2]]
+    return [
+        Cell(element, (path[i], path[i + 1]), float(c), float(g), float(g_area), area)
+        for i, (c, g, g_area) in enumerate(constants)
+    ]
+
+
+class _Tree:
+    """A spanning tree that grows branch by branch."""
+
+    def __init__(self) -> None:
+        self._parent: dict[str, str] = {}
+        self._branches: dict[str, list[tuple[str, int, float]]] = defaultdict(list)
+        self._count = 0
+
+    @property
+    def names(self) -> list[str]:
+        return list(self._branches)
+
+    def _root(self, node: str) -> str:
+        while self._parent.setdefault(node, node) != node:
+            self._parent[node] = self._parent[self._parent[node]]
+            node = self._parent[node]
+        return node
+
+    def add(self, p: str, n: str) -> bool:
+        """Take a branch in where it closes no loop; whether it did."""
+        a, b = self._root(p), self._root(n)
+        if a == b:
+            return False
+        self._parent[a] = b
+        self._branches[p].append((n, self._count, -1.0))
+        self._branches[n].append((p, self._count, 1.0))
+        self._count += 1
+        return True
+
+    def potentials(self) -> dict[str, FloatArray]:
+        """Voltage of every node against ground as a row over the branches."""
+        out = {"0": np.zeros(self._count)}
+        todo = ["0"]
+        while todo:
+            node = todo.pop()
+            for other, branch, sign in self._branches[node]:
+                if other not in out:
+                    out[other] = out[node].copy()
+                    out[other][branch] = sign
+                    todo.append(other)
+        return out
+
+
+@dataclass(frozen=True)
+class Modes:
+    """A network with fixed areas, x = shape v - follow s with v_k' = -rates_k v_k + gains_k s.
+
+    Attributes
+    ----------
+    rates : ndarray, shape (n,)
+        1/s; zero for a charge that nothing drains.
+    gains : ndarray, shape (n, n_s)
+    shape, inverse : ndarray, shape (n, n)
+        v = inverse (x + follow s).
+    follow : ndarray, shape (n, n_s)
+        What a jump of the sources moves at once.
+    """
+
+    rates: FloatArray
+    gains: FloatArray
+    shape: FloatArray
+    inverse: FloatArray
+    follow: FloatArray
+
+
+def network_modes(network: Network, area: FloatArray) -> Modes:
+    """Modes at areas (n_area,) in m^2.
+
+    From the singular values of the conductances' factor rather than the eigenvalues of their matrix: a slow rate beside
+    a fast one keeps twice the digits.
+    """
+    capacitance, leak = network.capacitance(area), network.leak(area)
+    lower = np.linalg.cholesky(network.mass(area)) if network.k.size else np.zeros((0, 0))
+    factor = np.vstack([network.resistor_factor, np.sqrt(leak)[:, None] * network.p])
+    _, sigma, turned = np.linalg.svd(np.linalg.solve(lower, factor.T).T) if factor.size else (None, np.zeros(0), lower)
+    rates = np.zeros(network.k.shape[0])
+    rates[: sigma.size] = sigma**2
+    # What is left of a charge that nothing drains is rounding.
+    rates[rates < 1e-28 * rates.max(initial=0.0)] = 0.0
+    inverse = turned @ lower.T
+    back = np.linalg.solve(lower, network.p.T) if network.k.size else network.p.T
+    moved = turned @ back @ (capacitance[:, None] * network.q)
+    _, b = network.stiffness(area)
+    pushed = turned @ (np.linalg.solve(lower, b) if network.k.size else b)
+    shape = np.linalg.solve(lower.T, turned.T) if network.k.size else turned.T
+    gains = np.asarray(rates[:, None] * moved - pushed, float)
+    return Modes(rates, gains, np.asarray(shape, float), np.asarray(inverse, float), np.asarray(shape @ moved, float))

@@ -1,0 +1,471 @@
+"""Radau collocation on a network: steps, zeros of the gap voltages, jumps of the sources, outputs."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.compiled import jit
+from fingerspice.engine.network import Net, Room, Sources, at_sources, choose_signs, gap_voltage, new_room, rates
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+IntArray = NDArray[np.int64]
+
+# Codes returned by `advance`.
+DONE, JUMP, STEP_UNDERFLOW = 0, 1, 2
+# Entries of `control`: time, next step (0: choose one), first step after the last jump, that which is looked for.
+T, H, H_AFTER_JUMP, JUMPED = 0, 1, 2, 3
+N_CONTROL = 4
+# Entries of `counters`.
+NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT = 0, 1, 2, 3, 4
+N_COUNTERS = 5
+# A source's change at an edge, relative, that is its rounding and no jump.
+ROUNDING = 1e-14
+
+
+class Scheme(NamedTuple):
+    """Radau IIA as numbers (see `fingerspice.numerics.tableaus.Tableau`), with its matrix diagonalised.
+
+    Attributes
+    ----------
+    a, c, e, dense : ndarray
+        The tableau's; `e` (s,) gives the highest Legendre coefficient of the increment.
+    eigenvalues : ndarray of complex, shape (m,)
+        Of `a`: one of each conjugate pair, and the real one.
+    to, back : ndarray of complex, shape (m, s) and (s, m)
+        a = Re(back diag(eigenvalues) to).
+    h_max : float
+        s.
+    """
+
+    a: FloatArray
+    c: FloatArray
+    e: FloatArray
+    dense: FloatArray
+    eigenvalues: ComplexArray
+    to: ComplexArray
+    back: ComplexArray
+    h_max: float
+
+
+class Work(NamedTuple):
+    """Arrays of one integration."""
+
+    k: FloatArray
+    poly: FloatArray
+    slope: FloatArray
+    newton: ComplexArray
+    rate: FloatArray
+    stage: FloatArray
+    y1: FloatArray
+    residual: FloatArray
+    place: IntArray
+
+
+@jit
+def new_work(net: Net, stages: int, n_eigen: int, size: int) -> Work:
+    """Room for steps of a state of `size`."""
+    n_s = net.b.shape[1]
+    m = size - n_s
+    return Work(
+        np.zeros((stages, size)), np.zeros((size, stages)), np.zeros((m, m)), np.zeros((n_eigen, m, m), np.complex128),
+        np.zeros(size), np.zeros(size), np.zeros(size), np.zeros((stages, m)), np.zeros(n_s, np.int64),
+    )  # fmt: skip
+
+
+@jit
+def _invert(matrix: ComplexArray) -> bool:
+    """Inverse in place by Gauss-Jordan elimination with row pivoting; False where it is singular."""
+    n = matrix.shape[0]
+    order = np.arange(n)
+    for column in range(n):
+        pivot = column
+        for row in range(column + 1, n):
+            if abs(matrix[row, column]) > abs(matrix[pivot, column]):
+                pivot = row
+        size = abs(matrix[pivot, column])
+        if not 0.0 < size < np.inf:
+            return False
+        order[column], order[pivot] = order[pivot], order[column]
+        for j in range(n):
+            matrix[column, j], matrix[pivot, j] = matrix[pivot, j], matrix[column, j]
+        scale = 1.0 / matrix[column, column]
+        matrix[column, column] = 1.0
+        for j in range(n):
+            matrix[column, j] *= scale
+        for row in range(n):
+            factor = matrix[row, column]
+            if row != column and factor != 0.0:
+                matrix[row, column] = 0.0
+                for j in range(n):
+                    matrix[row, j] -= factor * matrix[column, j]
+    swapped = np.empty(n, matrix.dtype)
+    for row in range(n):
+        for j in range(n):
+            swapped[order[j]] = matrix[row, j]
+        for j in range(n):
+            matrix[row, j] = swapped[j]
+    return True
+
+
+@jit
+def _jacobian(
+    net: Net, room: Room, work: Work, jump: bool, y: FloatArray, sign: FloatArray, scale: FloatArray, out: FloatArray
+) -> None:
+    """d y'/d y of the part of the state that feeds back, by differences; the sources are those in `room`."""
+    m = out.shape[0]
+    work.stage[:] = y
+    rates(net, room, jump, y, sign, work.y1)
+    for j in range(m):
+        change = 1e-7 * (abs(y[j]) + scale[j])
+        work.stage[j] = y[j] + change
+        rates(net, room, jump, work.stage, sign, work.rate)
+        work.stage[j] = y[j]
+        for i in range(m):
+            out[i, j] = (work.rate[i] - work.y1[i]) / change
+
+
+@jit
+def _prepare_newton(scheme: Scheme, work: Work, h: float) -> bool:
+    """Inverses of I - h lambda J for every eigenvalue of the scheme."""
+    m = work.slope.shape[0]
+    for e in range(scheme.eigenvalues.size):
+        for i in range(m):
+            for j in range(m):
+                work.newton[e, i, j] = -h * scheme.eigenvalues[e] * work.slope[i, j]
+            work.newton[e, i, i] += 1.0
+        if not _invert(work.newton[e]):
+            return False
+    return True
+
+
+@jit
+def _solve_newton(scheme: Scheme, work: Work) -> None:
+    """(I - h a (x) J)^-1 residual into `work.residual`."""
+    stages, m = work.residual.shape
+    left = np.zeros(m, np.complex128)
+    turned = np.zeros((scheme.eigenvalues.size, m), np.complex128)
+    for e in range(scheme.eigenvalues.size):
+        for j in range(m):
+            left[j] = 0.0
+            for i in range(stages):
+                left[j] += scheme.to[e, i] * work.residual[i, j]
+        for i in range(m):
+            for j in range(m):
+                turned[e, i] += work.newton[e, i, j] * left[j]
+    for i in range(stages):
+        for j in range(m):
+            total = 0.0
+            for e in range(scheme.eigenvalues.size):
+                total += (scheme.back[i, e] * turned[e, j]).real
+            work.residual[i, j] = total
+
+
+@jit
+def _step(
+    net: Net, room: Room, scheme: Scheme, work: Work, sources: Sources, jump: bool, t: float, h: float, y: FloatArray,
+    sign: FloatArray, scale: FloatArray, tol: float, counters: IntArray,
+) -> float:  # fmt: skip
+    """Collocation over [t, t + h] with `work.slope` as Newton's matrix: stages in `work.k`, the end in `work.y1`.
+
+    `work.k` holds a guess of the stages. Returns the error over `tol` times `scale`; inf where it does not converge.
+    """
+    stages, m = work.residual.shape
+    if not _prepare_newton(scheme, work, h):
+        return math.inf
+    k = work.k
+    before = math.inf
+    for iteration in range(12):
+        for i in range(stages):
+            for j in range(y.size):
+                value = 0.0
+                for r in range(stages):
+                    value += scheme.a[i, r] * k[r, j]
+                work.stage[j] = y[j] + h * value
+            at_sources(sources, work.place, t + scheme.c[i] * h, room.s, room.ds)
+            if not rates(net, room, jump, work.stage, sign, work.rate):
+                return math.inf
+            for j in range(m):
+                work.residual[i, j] = work.rate[j] - k[i, j]
+            # Nothing depends on the charges: they are only collected.
+            for j in range(m, y.size):
+                k[i, j] = work.rate[j]
+        counters[NFEV] += stages
+        _solve_newton(scheme, work)
+        change = 0.0
+        for i in range(stages):
+            for j in range(m):
+                k[i, j] += work.residual[i, j]
+                value = abs(h * work.residual[i, j]) / scale[j]
+                if not value <= change:
+                    change = value
+        if not change < math.inf or (iteration > 1 and change > before and change > tol):
+            return math.inf
+        # Converged: what is left falls as far again. Or at rounding, where nothing falls any more.
+        if change <= 1e-3 * tol or (iteration > 2 and change > 0.3 * before and change <= 1e-13):
+            break
+        if iteration > 0 and change < 0.1 * before and change * change / before <= 1e-3 * tol:
+            break
+        before = change
+    else:
+        return math.inf
+    norm = 0.0
+    for j in range(y.size):
+        top = 0.0
+        end = 0.0
+        for r in range(stages):
+            top += scheme.e[r] * k[r, j]
+            end += scheme.a[stages - 1, r] * k[r, j]
+        work.y1[j] = y[j] + h * end
+        value = abs(h * top) / (tol * scale[j])
+        if not value <= norm:
+            norm = value
+    return norm if norm == norm else math.inf
+
+
+@jit
+def _to_polynomial(scheme: Scheme, work: Work, h: float) -> None:
+    for j in range(work.poly.shape[0]):
+        for d in range(work.poly.shape[1]):
+            value = 0.0
+            for r in range(scheme.dense.shape[0]):
+                value += scheme.dense[r, d] * work.k[r, j]
+            work.poly[j, d] = h * value
+
+
+@jit
+def _inside(theta: float, y: FloatArray, poly: FloatArray, out: FloatArray) -> None:
+    """State at fraction `theta` of the step that starts at `y`."""
+    for j in range(y.size):
+        value = 0.0
+        for d in range(poly.shape[1] - 1, -1, -1):
+            value = (value + poly[j, d]) * theta
+        out[j] = y[j] + value
+
+
+@jit
+def _signed(
+    net: Net, room: Room, work: Work, sources: Sources, i: int, sign: float, t: float, h: float, theta: float,
+    y: FloatArray,
+) -> float:  # fmt: skip
+    _inside(theta, y, work.poly, work.stage)
+    at_sources(sources, work.place, t + theta * h, room.s, room.ds)
+    return sign * gap_voltage(net, room, i, work.stage)
+
+
+@jit
+def _first_zero(
+    net: Net, room: Room, work: Work, sources: Sources, t: float, h: float, y: FloatArray, sign: FloatArray
+) -> tuple[float, int]:
+    """First fraction of the step at which a gap voltage leaves its branch, and whose; 2 where none does."""
+    first = 2.0
+    which = -1
+    for i in range(sign.size):
+        if net.gap[i] < 0:
+            continue
+        lo = 0.0
+        f_lo = _signed(net, room, work, sources, i, sign[i], t, h, 0.0, y)
+        hi = 0.0
+        f_hi = 0.0
+        for part in range(1, 9):
+            hi = 0.125 * part
+            f_hi = _signed(net, room, work, sources, i, sign[i], t, h, hi, y)
+            if f_hi < 0.0:
+                break
+            lo = hi
+            f_lo = f_hi
+        if not f_hi < 0.0 or lo >= first:
+            continue
+        if f_lo > 0.0:
+            for _ in range(100):
+                mid = (lo * f_hi - hi * f_lo) / (f_hi - f_lo)
+                if not lo < mid < hi:
+                    mid = 0.5 * (lo + hi)
+                if not lo < mid < hi:
+                    break
+                f_mid = _signed(net, room, work, sources, i, sign[i], t, h, mid, y)
+                # Illinois: the end that stays counts half.
+                if f_mid < 0.0:
+                    hi = mid
+                    f_hi = f_mid
+                    f_lo *= 0.5
+                else:
+                    lo = mid
+                    f_lo = f_mid
+                    f_hi *= 0.5
+                if hi - lo <= 4e-16 or f_mid == 0.0:
+                    break
+        if hi < first:
+            first = hi if f_lo > 0.0 else lo
+            which = i
+    return first, which
+
+
+@jit
+def _write_outputs(
+    net: Net, room: Room, work: Work, sources: Sources, charge: bool, t: float, h: float, t_new: float, y: FloatArray,
+    sign: FloatArray, counters: IntArray, t_out: FloatArray, left: NDArray[np.bool_], rows: FloatArray,
+) -> None:  # fmt: skip
+    """Outputs of one step: right-hand ones in [t, t_new), left-hand ones in (t, t_new]."""
+    n_s = net.b.shape[1]
+    while counters[OUTPUT] < t_out.size:
+        i = counters[OUTPUT]
+        if t_out[i] > t_new or (t_out[i] == t_new and not left[i]):
+            return
+        theta = max(0.0, min((t_out[i] - t) / h, 1.0))
+        _inside(theta, y, work.poly, work.stage)
+        for j in range(y.size):
+            rows[i, j] = work.stage[j]
+        if charge:
+            at_sources(sources, work.place, t + theta * h, room.s, room.ds)
+            rates(net, room, False, work.stage, sign, work.rate)
+            for j in range(n_s):
+                rows[i, y.size + j] = work.rate[y.size - n_s + j]
+        counters[OUTPUT] += 1
+
+
+@jit
+def _account(
+    net: Net, room: Room, work: Work, sources: Sources, t: float, h: float, y: FloatArray, peaks: FloatArray
+) -> None:
+    """Largest |gap voltage| of every area (V), met at the ends and the quarters of steps."""
+    for part in range(5):
+        _inside(0.25 * part, y, work.poly, work.stage)
+        at_sources(sources, work.place, t + 0.25 * part * h, room.s, room.ds)
+        for i in range(peaks.size):
+            if net.gap[i] >= 0:
+                peaks[i] = max(peaks[i], abs(gap_voltage(net, room, i, work.stage)))
+
+
+@jit
+def advance(
+    net: Net, scheme: Scheme, sources: Sources, jump: bool, charge: bool, t_end: float, y: FloatArray, sign: FloatArray,
+    s_before: FloatArray, scale: FloatArray, tol: float, control: FloatArray, counters: IntArray, peaks: FloatArray,
+    t_out: FloatArray, left: NDArray[np.bool_], rows: FloatArray,
+) -> int:  # fmt: skip
+    """Step a network to `t_end` through the segments of its sources, writing outputs on the way.
+
+    Parameters
+    ----------
+    net, scheme, sources
+        What to step, how, and what drives it.
+    jump : bool
+        Whether the sources' "time" is the fraction of a jump.
+    charge : bool
+        Whether rows get the sources' currents.
+    t_end : float
+        s, not past the last edge.
+    y, sign, s_before : ndarray
+        State, branch of each area (0: choose) and the sources' values just before the time reached; updated.
+    scale : ndarray, shape (size,)
+        Of each entry of the state.
+    tol : float
+        Error allowed in a step, over `scale`.
+    control, counters, peaks : ndarray
+        Bookkeeping, updated; peaks (n_area,) in V.
+    t_out, left, rows : ndarray
+        Output times (ascending), whether the left-hand value is meant, and the rows to fill: the state, then the
+        currents.
+
+    Returns
+    -------
+    int
+        DONE; JUMP: a source jumps at the time reached, take that first; or STEP_UNDERFLOW.
+    """
+    room = new_room(net)
+    n_s = s_before.size
+    work = new_work(net, scheme.c.size, scheme.eigenvalues.size, y.size)
+    now = np.zeros(n_s)
+    slopes = np.zeros(n_s)
+    work.place[:] = 0
+    extrapolated = False
+    flips = 0
+    while control[T] < t_end:
+        t = control[T]
+        stop = t_end
+        for i in range(n_s):
+            while sources.edges[sources.first[i] + work.place[i] + 1] <= t:
+                work.place[i] += 1
+            stop = min(stop, sources.edges[sources.first[i] + work.place[i] + 1])
+        at_sources(sources, work.place, t, now, slopes)
+        if not jump:
+            for i in range(n_s):
+                if abs(now[i] - s_before[i]) > ROUNDING * max(abs(now[i]), abs(s_before[i])):
+                    return JUMP
+        room.s[:] = now
+        room.ds[:] = slopes
+        for i in range(sign.size):
+            if sign[i] == 0.0:
+                choose_signs(net, room, jump, y, sign)
+                break
+        if not rates(net, room, jump, y, sign, work.rate):
+            return STEP_UNDERFLOW
+        if not extrapolated:
+            for i in range(scheme.c.size):
+                work.k[i] = work.rate
+        start = work.rate.copy()
+        _jacobian(net, room, work, jump, y, sign, scale, work.slope)
+        counters[NFEV] += 2 + work.slope.shape[0]
+        h = control[H]
+        if h == 0.0:
+            fastest = 0.0
+            for j in range(work.slope.shape[0]):
+                fastest = max(fastest, abs(start[j]) / scale[j])
+            h = min(scheme.h_max, 0.1 / fastest if fastest > 0.0 else math.inf, stop - t)
+        h = min(h, scheme.h_max)
+        last = h >= (stop - t) * (1.0 - 1e-10)
+        if last:
+            h = stop - t
+        elif 2.0 * h > stop - t:
+            h = 0.5 * (stop - t)
+        while True:
+            norm = _step(net, room, scheme, work, sources, jump, t, h, y, sign, scale, tol, counters)
+            if norm <= 1.0:
+                break
+            counters[REJECTED] += 1
+            h *= 0.25 if norm == math.inf else max(0.2, 0.9 * norm ** (-1.0 / scheme.c.size))
+            last = False
+            if h <= 1e-15 * max(abs(t), 1e-3 * (stop - t)):
+                return STEP_UNDERFLOW
+            for i in range(scheme.c.size):
+                work.k[i] = start
+        proposed = h * min(6.0, 0.9 * norm ** (-1.0 / scheme.c.size) if norm > 0.0 else 6.0)
+        _to_polynomial(scheme, work, h)
+        theta, which = (2.0, -1) if flips > 1 else _first_zero(net, room, work, sources, t, h, y, sign)
+        if theta < 1.0:
+            t_new = t + theta * h
+            if t_new <= t:
+                # The zero is here: change branch without advancing.
+                sign[which] = -sign[which]
+                flips += 1
+                continue
+            # A step that ends on the zero has it where collocation is most exact.
+            h = t_new - t
+            if not _step(net, room, scheme, work, sources, jump, t, h, y, sign, scale, tol, counters) <= 2.0:
+                control[H] = 0.5 * h
+                extrapolated = False
+                continue
+            _to_polynomial(scheme, work, h)
+            last = False
+        flips = 0
+        t_new = stop if last else t + h
+        if not jump:
+            _write_outputs(net, room, work, sources, charge, t, h, t_new, y, sign, counters, t_out, left, rows)
+        _account(net, room, work, sources, t, h, y, peaks)
+        if which >= 0 and theta <= 1.0:
+            sign[which] = -sign[which]
+            counters[ZEROS] += 1
+        y[:] = work.y1
+        if control[JUMPED] > 0.0:
+            control[H_AFTER_JUMP] = h
+            control[JUMPED] = 0.0
+        control[H] = max(proposed, control[H]) if last and h < control[H] else proposed
+        control[T] = t_new
+        at_sources(sources, work.place, t_new, s_before, slopes)
+        extrapolated = False
+        counters[ACCEPTED] += 1
+    return DONE

@@ -1,0 +1,309 @@
+"""A network of capacitors, resistors, sources and contacts as one compiled right-hand side.
+
+State y = [x (n,) in volt, a (n_slow,), z (n_s,) in coulomb]: live capacitor voltages, areas with dynamics of their own
+over their value at 0 V, and the charge that each source has delivered. Cells have u = P x + Q s. With capacitances
+C = c A and leaks G = g + g_A A, Kirchhoff's current law on the cuts of the live capacitors is
+
+    P^T (C u' + [mobile: c u A'] + G u) + K x + B s = 0,     A = g(|u_gap|)  or  tau A' = g(|u_gap|) - A.
+
+Under `mobile` A' = dg/du u_gap' stands on both sides: where its matrix turns singular is the fold. An ideal jump is the
+limit of a fast ramp: the same equation in the fraction of the jump, with nothing leaking meanwhile.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.compiled import jit
+from fingerspice.engine.model import Segment, source
+from fingerspice.physics.contact import inverse_area
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+class Net(NamedTuple):
+    """A reduced network with its area curves, as numbers; see `fingerspice.circuit.network.Network`.
+
+    Attributes
+    ----------
+    mobile : bool
+        Charge law.
+    p, q : ndarray, shape (n_cell, n) and (n_cell, n_s)
+    c, g_total, g_area : ndarray, shape (n_cell,)
+    place : ndarray of int, shape (n_cell,)
+        The area of each cell, -1 for none.
+    k, b, delivered : ndarray, shape (n, n), (n, n_s) and (n_s, n + n_s)
+    gap : ndarray of int, shape (n_area,)
+        The cell whose voltage the area follows, -1 where it is fixed.
+    area0 : ndarray, shape (n_area,)
+        The fixed area, or the one at 0 V, m^2.
+    tau : ndarray, shape (n_area,)
+        Time constant of the area, s; 0 where it follows at once.
+    slow : ndarray of int, shape (n_area,)
+        Place of the area among the state's own, -1 where it follows at once or is fixed.
+    curves : ndarray, shape (n_area, l)
+        See `fingerspice.physics.contact.inverse_area`; series padded with zeros.
+    """
+
+    mobile: bool
+    p: FloatArray
+    q: FloatArray
+    c: FloatArray
+    g_total: FloatArray
+    g_area: FloatArray
+    place: IntArray
+    k: FloatArray
+    b: FloatArray
+    delivered: FloatArray
+    gap: IntArray
+    area0: FloatArray
+    tau: FloatArray
+    slow: IntArray
+    curves: FloatArray
+
+
+class Sources(NamedTuple):
+    """Every source on one window of time: tables of `Segment`s one behind the other.
+
+    Attributes
+    ----------
+    first : ndarray of int, shape (n_s + 1,)
+        Where each source's edges begin; its segments begin there less the number of sources before.
+    edges : ndarray, shape (sum of m + 1,)
+        s.
+    terms, series : ndarray, shape (sum of m, k, 6) and (sum of m, l)
+    """
+
+    first: IntArray
+    edges: FloatArray
+    terms: FloatArray
+    series: FloatArray
+
+
+class Room(NamedTuple):
+    """Arrays to work in."""
+
+    s: FloatArray
+    ds: FloatArray
+    u: FloatArray
+    along: FloatArray
+    current: FloatArray
+    area: FloatArray
+    slope: FloatArray
+    rate: FloatArray
+    matrix: FloatArray
+    x: FloatArray
+
+
+@jit
+def new_room(net: Net) -> Room:
+    """Room for one network."""
+    n_cell, n_s = net.q.shape
+    n, n_area = net.k.shape[0], net.gap.size
+    return Room(
+        np.zeros(n_s), np.zeros(n_s), np.zeros(n_cell), np.zeros(n_cell), np.zeros(n_cell), np.zeros(n_area),
+        np.zeros(n_area), np.zeros(n_area), np.zeros((n, n)), np.zeros(n),
+    )  # fmt: skip
+
+
+@jit
+def at_sources(sources: Sources, index: IntArray, t: float, s: FloatArray, ds: FloatArray) -> None:
+    """Value and slope of every source at t (s), on the segments `index` (n_s,) of their tables."""
+    for i in range(s.size):
+        row = sources.first[i] + index[i]
+        start = sources.edges[row]
+        length = sources.edges[row + 1] - start
+        # Each source has one edge more than it has segments.
+        segment = Segment(start, length, sources.terms[row - i], sources.series[row - i])
+        s[i], ds[i] = source(segment, t - start)
+
+
+@jit
+def followed(net: Net, i: int, sign: float, u: float) -> tuple[float, float]:
+    """Area (m^2) that gap voltage u asks for on the branch g(|u|) = g(sign u), and its slope dg/du (m^2/V).
+
+    Under `mobile`, well on the wrong side of 0 V it is the true area: a walk towards the branch stays on solid ground.
+    """
+    if net.mobile and sign * u < net.curves[i, 0]:
+        sign = -sign
+    inverse, slope = inverse_area(sign * u, net.curves[i])
+    return 1.0 / inverse, -sign * slope / (inverse * inverse)
+
+
+@jit
+def solve_in_place(matrix: FloatArray, x: FloatArray) -> bool:
+    """matrix^-1 x into x by elimination with row pivoting; False where the determinant is not positive."""
+    n = x.size
+    positive = True
+    for column in range(n):
+        pivot = column
+        for row in range(column + 1, n):
+            if abs(matrix[row, column]) > abs(matrix[pivot, column]):
+                pivot = row
+        if pivot != column:
+            positive = not positive
+            x[column], x[pivot] = x[pivot], x[column]
+            for j in range(column, n):
+                matrix[column, j], matrix[pivot, j] = matrix[pivot, j], matrix[column, j]
+        if not abs(matrix[column, column]) > 0.0:
+            return False
+        if matrix[column, column] < 0.0:
+            positive = not positive
+        for row in range(column + 1, n):
+            factor = matrix[row, column] / matrix[column, column]
+            if factor != 0.0:
+                for j in range(column + 1, n):
+                    matrix[row, j] -= factor * matrix[column, j]
+                x[row] -= factor * x[column]
+    for row in range(n - 1, -1, -1):
+        for j in range(row + 1, n):
+            x[row] -= matrix[row, j] * x[j]
+        x[row] /= matrix[row, row]
+    return positive
+
+
+@jit
+def _voltages(net: Net, room: Room, y: FloatArray) -> None:
+    """Cell voltages from the state and the sources in `room`."""
+    for cell in range(room.u.size):
+        total = 0.0
+        for j in range(net.p.shape[1]):
+            total += net.p[cell, j] * y[j]
+        along = 0.0
+        for j in range(net.q.shape[1]):
+            total += net.q[cell, j] * room.s[j]
+            along += net.q[cell, j] * room.ds[j]
+        room.u[cell] = total
+        room.along[cell] = along
+
+
+@jit
+def _areas(net: Net, room: Room, y: FloatArray, sign: FloatArray, leak: float) -> None:
+    """Areas, what of their change the gap voltage makes (per volt), and what time makes (per second)."""
+    n = net.k.shape[0]
+    for i in range(net.gap.size):
+        room.area[i] = net.area0[i]
+        room.slope[i] = 0.0
+        room.rate[i] = 0.0
+        if net.gap[i] >= 0:
+            wanted, slope = followed(net, i, sign[i], room.u[net.gap[i]])
+            if net.slow[i] >= 0:
+                room.area[i] = y[n + net.slow[i]] * net.area0[i]
+                room.rate[i] = leak * (wanted - room.area[i]) / net.tau[i]
+            else:
+                room.area[i] = wanted
+                room.slope[i] = slope
+
+
+@jit
+def rates(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray, out: FloatArray) -> bool:
+    """Write y' into `out` for the sources in `room`; False past a fold.
+
+    `sign` (n_area,) chooses the branch of each area, continued analytically through 0 V. In a `jump` time stands still
+    and the derivative is by the fraction of the jump, of which `room.ds` is the whole.
+    """
+    n, n_s = net.b.shape
+    slow = y.size - n - n_s
+    leak = 0.0 if jump else 1.0
+    _voltages(net, room, y)
+    _areas(net, room, y, sign, leak)
+    for i in range(net.gap.size):
+        if net.slow[i] >= 0:
+            out[n + net.slow[i]] = room.rate[i] / net.area0[i]
+    for j in range(n):
+        room.x[j] = 0.0
+        for k in range(n):
+            room.matrix[j, k] = 0.0
+            room.x[j] -= leak * net.k[j, k] * y[k]
+        for k in range(n_s):
+            room.x[j] -= leak * net.b[j, k] * room.s[k]
+    for cell in range(room.u.size):
+        i = net.place[cell]
+        area = 1.0 if i < 0 else room.area[i]
+        # dq/du of the cell itself, and dq/du_gap.
+        own = net.c[cell] * area
+        cross = 0.0
+        current = leak * (net.g_total[cell] + (0.0 if i < 0 else net.g_area[cell] * area)) * room.u[cell]
+        current += own * room.along[cell]
+        if net.mobile and i >= 0 and net.gap[i] >= 0:
+            cross = net.c[cell] * room.u[cell] * room.slope[i]
+            current += net.c[cell] * room.u[cell] * room.rate[i] + cross * room.along[net.gap[i]]
+        room.current[cell] = current
+        for j in range(n):
+            share = net.p[cell, j]
+            if share != 0.0:
+                room.x[j] -= share * current
+                for k in range(n):
+                    room.matrix[j, k] += share * own * net.p[cell, k]
+                    if cross != 0.0:
+                        room.matrix[j, k] += share * cross * net.p[net.gap[i], k]
+    if not solve_in_place(room.matrix, room.x):
+        return False
+    for j in range(n):
+        out[j] = room.x[j]
+    for k in range(n_s):
+        total = 0.0
+        for j in range(n):
+            total += net.delivered[k, j] * y[j]
+        for j in range(n_s):
+            total += net.delivered[k, n + j] * room.s[j]
+        if jump:
+            total = 0.0
+        for cell in range(room.u.size):
+            if net.q[cell, k] != 0.0:
+                total += net.q[cell, k] * (room.current[cell] + _displaced(net, room, cell))
+        out[n + slow + k] = total
+    return True
+
+
+@jit
+def _displaced(net: Net, room: Room, cell: int) -> float:
+    """Current (A) into a cell's capacitor that the change `room.x` of the live voltages makes."""
+    i = net.place[cell]
+    own = 0.0
+    across = 0.0
+    for j in range(room.x.size):
+        own += net.p[cell, j] * room.x[j]
+        if i >= 0 and net.gap[i] >= 0:
+            across += net.p[net.gap[i], j] * room.x[j]
+    total: float = net.c[cell] * (1.0 if i < 0 else room.area[i]) * own
+    if net.mobile and i >= 0:
+        total += net.c[cell] * room.u[cell] * room.slope[i] * across
+    return total
+
+
+@jit
+def gap_voltage(net: Net, room: Room, i: int, y: FloatArray) -> float:
+    """Voltage (V) that area i follows, for the sources in `room`."""
+    cell = net.gap[i]
+    total = 0.0
+    for j in range(net.p.shape[1]):
+        total += net.p[cell, j] * y[j]
+    for j in range(net.q.shape[1]):
+        total += net.q[cell, j] * room.s[j]
+    return total
+
+
+@jit
+def choose_signs(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray) -> None:
+    """Branch of each area: the sign of its gap voltage, or at 0 V of where that goes."""
+    rate = np.zeros(y.size)
+    for i in range(sign.size):
+        sign[i] = 1.0
+    undecided = False
+    for i in range(sign.size):
+        if net.gap[i] >= 0:
+            u = gap_voltage(net, room, i, y)
+            sign[i] = -1.0 if u < 0.0 else 1.0
+            undecided |= u == 0.0
+    if undecided and rates(net, room, jump, y, sign, rate):
+        for i in range(sign.size):
+            if net.gap[i] >= 0 and gap_voltage(net, room, i, y) == 0.0:
+                slope = room.along[net.gap[i]]
+                for j in range(room.x.size):
+                    slope += net.p[net.gap[i], j] * room.x[j]
+                sign[i] = -1.0 if slope < 0.0 else 1.0

@@ -1,0 +1,365 @@
+"""Runs of a network by Radau collocation, with a coarser run beside each for the error."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
+from fingerspice.engine import collocation
+from fingerspice.engine.collocation import Scheme, advance
+from fingerspice.engine.network import Sources, at_sources, new_room, rates
+from fingerspice.networks import NetworkProblem
+from fingerspice.numerics.tableaus import radau
+from fingerspice.physics.contact import inverse_areas
+from fingerspice.runs import Progress, windows
+from fingerspice.solution import ErrorEstimate, NetworkState, Status
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+STAGES = 7
+# Tolerance of the run beside the one given back, over its own; and the share of their difference that is stated: the
+# error of the finer is a small part of it.
+BESIDE, STATED = 30.0, 0.3
+# The error allowed in a step, over the one asked for.
+LOCAL_SHARE = 0.2
+FINEST = 1e-14
+# Steps per shortest time scale of the sources: the stages of a step must not alias it.
+LONGEST_STEP = 0.5
+# Outputs that errors are looked for at, at least.
+PROBES = 256
+ATTEMPTS = 6
+
+
+@dataclass
+class NetworkRun:
+    """What one run gives: rows of the state, then of the sources' currents where they were asked for."""
+
+    t: FloatArray
+    left: BoolArray
+    rows: FloatArray
+    status: Status
+    error: ErrorEstimate
+    peaks: FloatArray
+    nfev: int
+    stats: dict[str, int]
+    state: NetworkState
+    t_failed: float | None = None
+    detail: str = ""
+
+
+def network_scheme(h_max: float) -> Scheme:
+    """Radau IIA with its matrix diagonalised."""
+    tableau = radau(STAGES)
+    values, vectors = np.linalg.eig(tableau.a)
+    back = np.linalg.inv(vectors)
+    upper = np.flatnonzero(values.imag > -1e-12)
+    # A conjugate pair gives twice the real part of one.
+    twice = np.where(values.imag[upper] > 1e-12, 2.0, 1.0)
+    return Scheme(
+        tableau.a, tableau.c, np.ascontiguousarray(tableau.e[0]), tableau.dense, values[upper].astype(complex),
+        np.ascontiguousarray(back[upper].astype(complex)),
+        np.ascontiguousarray((vectors[:, upper] * twice).astype(complex)), h_max,
+    )  # fmt: skip
+
+
+def source_tables(problem: NetworkProblem, tol: float, *, no_chirps: bool = False) -> Iterator[list[SourceTable]]:
+    """Tables of all sources, window by window, until one of them stops being finite."""
+    waves = problem.scene.waveforms
+    scales = [0.0] * len(waves)
+    for w0, w1 in itertools.pairwise(windows(problem)):
+        found = [
+            source_table(wave, w0, w1, tol, problem.step, no_chirps=no_chirps, scale=scale)
+            for wave, scale in zip(waves, scales, strict=True)
+        ]
+        scales = [max(scale, table.scale) for scale, table in zip(scales, found, strict=True)]
+        yield found
+        if any(table.not_finite is not None for table in found):
+            return
+
+
+def _joined(tables: list[SourceTable]) -> Sources:
+    width = max(t.terms.shape[1] for t in tables), max(t.series.shape[1] for t in tables)
+    first = np.concatenate([[0], np.cumsum([t.edges.size for t in tables])]).astype(np.int64)
+    terms = [np.pad(t.terms, ((0, 0), (0, width[0] - t.terms.shape[1]), (0, 0))) for t in tables]
+    series = [np.pad(t.series, ((0, 0), (0, width[1] - t.series.shape[1]))) for t in tables]
+    return Sources(first, np.concatenate([t.edges for t in tables]), np.concatenate(terms), np.concatenate(series))
+
+
+def _ramp(before: FloatArray, after: FloatArray) -> Sources:
+    """A jump of every source as a ramp over [0, 1]."""
+    terms = np.zeros((before.size, 2, 6))
+    terms[:, 0, 0], terms[:, 1, 0], terms[:, 1, 1] = before, after - before, 1.0
+    edges = np.tile([0.0, 1.0], before.size)
+    return Sources(2 * np.arange(before.size + 1, dtype=np.int64), edges, terms, np.zeros((before.size, 0)))
+
+
+class _Integration:
+    """One integration in progress."""
+
+    def __init__(self, problem: NetworkProblem, scheme: Scheme, tol: float, u_scale: float) -> None:
+        net = problem.scene.net
+        self.problem, self.net, self.scheme, self.tol = problem, net, scheme, tol
+        n, n_s = net.b.shape
+        self.n, self.n_slow = n, problem.initial.y.size - n - n_s
+        stored = u_scale * float(np.abs(problem.network.capacitance(problem.scene.area0)).sum()) or u_scale
+        # A charge's own error is not looked at where nobody asked for it.
+        charge = stored if problem.charge else np.inf
+        self.scale = np.concatenate([np.full(n, u_scale), np.ones(self.n_slow), np.full(n_s, charge)])
+        self.y, self.sign = problem.initial.y.copy(), problem.initial.sign.copy()
+        self.s_before = problem.initial.s_before.copy()
+        self.control = np.zeros(collocation.N_CONTROL)
+        self.control[collocation.T] = problem.t_start
+        self.counters = np.zeros(collocation.N_COUNTERS, np.int64)
+        self.peaks = np.zeros(net.gap.size)
+
+    @property
+    def t(self) -> float:
+        return float(self.control[collocation.T])
+
+    def through(self, sources: Sources, t_end: float, t_out: FloatArray, left: BoolArray, rows: FloatArray) -> int:
+        """To `t_end` (s), the jumps on the way taken."""
+        while True:
+            code = advance(
+                self.net, self.scheme, sources, False, self.problem.charge, t_end, self.y, self.sign, self.s_before,
+                self.scale, self.tol, self.control, self.counters, self.peaks, t_out, left, rows,
+            )  # fmt: skip
+            if code != collocation.JUMP:
+                return int(code)
+            if not self.jump(_values(sources, self.t)):
+                return collocation.STEP_UNDERFLOW
+
+    def jump(self, after: FloatArray) -> bool:
+        """Take a jump of the sources to their values `after`; False where that goes past a fold."""
+        control = np.zeros(collocation.N_CONTROL)
+        code = advance(
+            self.net, self.scheme._replace(h_max=1.0), _ramp(self.s_before, after), True, False, 1.0, self.y, self.sign,
+            self.s_before.copy(), self.scale, self.tol, control, self.counters, self.peaks, np.empty(0),
+            np.empty(0, bool), np.empty((0, self.y.size)),
+        )  # fmt: skip
+        self.s_before[:] = after
+        self.control[collocation.H] = self.control[collocation.H_AFTER_JUMP]
+        self.control[collocation.JUMPED] = 1.0
+        return code == collocation.DONE
+
+    def settle_areas(self, after: FloatArray) -> None:
+        """Let the areas with dynamics of their own start at g(u(0+))."""
+        place = slice(self.n, self.n + self.n_slow)
+        if not np.any(np.isnan(self.y[place])):
+            return
+        slow = [i for i in range(self.net.gap.size) if self.net.slow[i] >= 0]
+        y, s_before = self.y.copy(), self.s_before.copy()
+        area = np.ones(self.n_slow)
+        for _ in range(60):
+            self.y[:], self.s_before[:] = y, s_before
+            self.y[place] = area
+            self.sign[:] = 0.0
+            self.jump(after)
+            u = np.abs(self.net.p @ self.y[: self.n] + self.net.q @ after)
+            new = area.copy()
+            for i in slow:
+                inverse = inverse_areas(u[[self.net.gap[i]]], self.net.curves[i])[0]
+                new[self.net.slow[i]] = 1.0 / (inverse * self.net.area0[i])
+            done = bool(np.all(np.abs(new - area) <= 1e-15))
+            area = new
+            if done:
+                break
+        self.y[:], self.s_before[:] = y, s_before
+        self.y[place] = area
+        self.sign[:] = 0.0
+        self.peaks[:] = 0.0
+        self.counters[:] = 0
+
+    def state(self) -> NetworkState:
+        return NetworkState(self.t, self.y.copy(), self.s_before.copy(), self.sign.copy())
+
+
+def _values(sources: Sources, t: float) -> FloatArray:
+    """Right-hand values of the sources at t (s)."""
+    n_s = sources.first.size - 1
+    out, slope, index = np.empty(n_s), np.empty(n_s), np.empty(n_s, np.int64)
+    for i in range(n_s):
+        edges = sources.edges[sources.first[i] : sources.first[i + 1]]
+        index[i] = min(max(int(np.searchsorted(edges, t, side="right")) - 1, 0), edges.size - 2)
+    at_sources(sources, index, t, out, slope)
+    return out
+
+
+def _integrate(
+    problem: NetworkProblem, scheme: Scheme, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray,
+    progress: Progress | None,
+) -> NetworkRun:  # fmt: skip
+    one = _Integration(problem, scheme, tol, u_scale)
+    n_s = problem.initial.s_before.size
+    width = one.y.size + (n_s if problem.charge else 0)
+    rows = np.full((t_out.size, width), np.nan)
+    status, t_failed = Status.SUCCESS, None
+    rough = 0.0
+    sources = None
+    for tables in source_tables(problem, min(1e-3, max(0.05 * tol, 1e-14))):
+        rough = max(rough, *(table.rough for table in tables))
+        broken = [table.not_finite for table in tables if table.not_finite is not None]
+        if all(table.edges.size > 1 for table in tables):
+            sources = _joined(tables)
+            if one.t == problem.t_start:
+                one.settle_areas(_values(sources, one.t))
+            code = one.through(sources, min(float(t.edges[-1]) for t in tables), t_out, left, rows)
+            if code == collocation.STEP_UNDERFLOW:
+                folding = problem.scene.net.mobile and problem.scene.coupled
+                status, t_failed = (Status.FOLD if folding else Status.STEP_UNDERFLOW), one.t
+                break
+        if progress is not None:
+            progress((one.t - problem.t_start) / (problem.t_stop - problem.t_start))
+        if broken:
+            status, t_failed = Status.SOURCE_NOT_FINITE, min(broken)
+            break
+    state = one.state()
+    done = int(one.counters[collocation.OUTPUT])
+    if status is Status.SUCCESS and done < t_out.size and sources is not None:
+        done += _at_the_end(one, sources, t_out[done:], left[done:], rows[done:])
+    return NetworkRun(
+        t_out[:done], left[:done], rows[:done], status, ErrorEstimate(rough, 0.0), one.peaks,
+        int(one.counters[collocation.NFEV]),
+        {name: int(one.counters[i]) for name, i in (
+            ("steps", collocation.ACCEPTED), ("rejected", collocation.REJECTED), ("zeros", collocation.ZEROS))},
+        state, t_failed,
+    )  # fmt: skip
+
+
+def _at_the_end(one: _Integration, sources: Sources, t_out: FloatArray, left: BoolArray, rows: FloatArray) -> int:
+    """Right-hand outputs at the very end, after the jump that may stand there; how many were written."""
+    problem = one.problem
+    stop = problem.t_stop
+    if any(breakpoints_at(wave, stop).size for wave in problem.scene.waveforms):
+        after = [source_table(w, stop, stop + problem.step, 1e-10, problem.step) for w in problem.scene.waveforms]
+        sources = _joined(after)
+        values = _values(sources, stop)
+        if np.any(values != one.s_before) and not one.jump(values):
+            return 0
+    rows[:, : one.y.size] = one.y
+    if problem.charge:
+        room = new_room(one.net)
+        index = np.array([
+            min(max(int(np.searchsorted(sources.edges[a:b], stop, side="right")) - 1, 0), b - a - 2)
+            for a, b in itertools.pairwise(sources.first)
+        ])  # fmt: skip
+        at_sources(sources, index, stop, room.s, room.ds)
+        rate = np.empty(one.y.size)
+        rates(one.net, room, False, one.y, one.sign, rate)
+        rows[:, one.y.size :] = rate[one.y.size - one.s_before.size :]
+    return int(t_out.size)
+
+
+def solve_coupled(
+    problem: NetworkProblem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None = None
+) -> NetworkRun:
+    """Integrate until the stated error is within `rtol` of the peaks of every gap's voltage and force.
+
+    The error is stated from a second run with a larger tolerance.
+    """
+    scheme = network_scheme(min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step))
+    at, side, mine = _with_probes(problem, t_out, left)
+    u_scale = max(problem.scene.u_peak, float(np.abs(problem.initial.y[: problem.network.k.shape[0]]).max(initial=0.0)))
+    if problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
+        u_scale = _voltage_scale(problem, scheme, u_scale or 1.0)
+    tol, nfev = LOCAL_SHARE * rtol, 0
+    beside = None
+    for attempt in range(ATTEMPTS):
+        if beside is None:
+            beside = _integrate(problem, scheme, BESIDE * tol, u_scale, at, side, None)
+            nfev += beside.nfev
+        run = _integrate(problem, scheme, tol, u_scale, at, side, progress)
+        nfev += run.nfev
+        _state_error(problem, run, beside, u_scale)
+        run.nfev = nfev
+        worst = _excess(problem, run, rtol)
+        if run.status is not Status.SUCCESS or worst <= 1.0:
+            break
+        if tol <= FINEST or attempt == ATTEMPTS - 1:
+            run.status = Status.ERROR_NOT_MET
+            break
+        tighter = max(tol * min(0.3, 0.5 / worst), FINEST)
+        beside = run if tighter <= tol / BESIDE else None
+        tol = tighter
+    keep = mine[: run.t.size]
+    run.t, run.left, run.rows = run.t[keep], run.left[keep], run.rows[keep]
+    return run
+
+
+def _voltage_scale(problem: NetworkProblem, scheme: Scheme, guess: float) -> float:
+    """Largest voltage of a cell, V, from a rough run: that of a current drive is not known beforehand."""
+    at = np.linspace(problem.t_start, problem.t_stop, PROBES)
+    for _ in range(20):
+        rough = _integrate(problem, scheme, 1e-2, guess, at, np.ones(at.size, bool), None)
+        n = problem.network.k.shape[0]
+        largest = float(np.abs(rough.rows[:, :n]).max(initial=0.0))
+        if not 0.0 < largest < math.inf or 0.1 * guess <= largest <= guess:
+            break
+        guess = 1.5 * largest
+    return guess
+
+
+def _with_probes(problem: NetworkProblem, t: FloatArray, left: BoolArray) -> tuple[FloatArray, BoolArray, BoolArray]:
+    """Times with those that errors are looked for at besides, and which of them were asked for."""
+    if t.size >= PROBES:
+        return t, left, np.ones(t.size, bool)
+    probes = np.linspace(problem.t_start, problem.t_stop, PROBES + 2)[1:-1]
+    every = np.concatenate([t, probes])
+    side = np.concatenate([left, np.ones(probes.size, bool)])
+    order = np.lexsort((~side, every))
+    return every[order], side[order], (np.arange(every.size) < t.size)[order]
+
+
+def gap_signals(problem: NetworkProblem, run: NetworkRun) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Voltage (V) and force (N) of every gap; without one, the voltage of the smallest capacitor and no force."""
+    record = problem.record(run)
+    if record.fingers:
+        for i in range(len(record.fingers)):
+            yield record.finger_voltage(i), record.finger_force(i)
+    elif problem.network.cells:
+        smallest = int(np.argmin(problem.network.capacitance(problem.scene.area0)))
+        u = record.cell_voltage(smallest)
+        yield u, np.zeros(u.size)
+
+
+def _state_error(problem: NetworkProblem, run: NetworkRun, beside: NetworkRun, u_scale: float) -> None:
+    """Write the stated error into a run: a share of the largest difference, and rounding."""
+    count = min(run.t.size, beside.t.size)
+    u_error = f_error = 0.0
+    for (u, f), (v, g) in zip(gap_signals(problem, run), gap_signals(problem, beside), strict=True):
+        off = float(np.abs(u[:count] - v[:count]).max(initial=0.0))
+        rounding = 4e-15 * u_scale
+        u_error = max(u_error, STATED * off + rounding)
+        peak = float(np.abs(u).max(initial=0.0))
+        relative = 2.0 * rounding / peak if peak > 0.0 else 0.0
+        f_error = max(
+            f_error,
+            STATED * float(np.abs(f[:count] - g[:count]).max(initial=0.0)) + relative * float(f.max(initial=0.0)),
+        )
+    charge = None
+    if problem.charge:
+        n_s = problem.initial.s_before.size
+        at = slice(problem.initial.y.size - n_s, problem.initial.y.size)
+        charge = STATED * float(np.abs(run.rows[:count, at] - beside.rows[:count, at]).max(initial=0.0))
+    rough = run.error.u_gap
+    run.error = ErrorEstimate(u_error + rough, f_error, charge)
+
+
+def _excess(problem: NetworkProblem, run: NetworkRun, rtol: float) -> float:
+    """Stated error over the one asked for, the larger of voltage and force."""
+    worst = 0.0
+    u_peak = f_peak = 0.0
+    for u, f in gap_signals(problem, run):
+        u_peak = max(u_peak, float(np.abs(u).max(initial=0.0)))
+        f_peak = max(f_peak, float(f.max(initial=0.0)))
+    if u_peak > 0.0:
+        worst = run.error.u_gap / (rtol * u_peak)
+    if f_peak > 0.0:
+        worst = max(worst, run.error.f_el / (rtol * f_peak))
+    return worst

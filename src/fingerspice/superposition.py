@@ -1,0 +1,154 @@
+"""Runs of a network whose areas are fixed: its modes answered in closed form, source by source, and added up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.circuit.network import Modes, Network
+from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
+from fingerspice.engine.algebraic import source_at
+from fingerspice.networks import NetworkProblem
+from fingerspice.nodal import NetworkRun, gap_signals, source_tables
+from fingerspice.numerics import linear
+from fingerspice.record import sided
+from fingerspice.solution import ErrorEstimate, NetworkState, Status
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# Of the closed forms, over the largest voltage of the run.
+ROUNDING = 1e-12
+
+
+def solve_fixed(problem: NetworkProblem, t_out: FloatArray, left: BoolArray) -> NetworkRun:
+    """Outputs of a network whose areas are fixed, in closed form."""
+    scene, network, start = problem.scene, problem.network, problem.initial
+    modes = scene.modes
+    n, n_s = modes.gains.shape
+    v0 = modes.inverse @ (start.y[:n] + modes.follow @ start.s_before)
+    v = np.zeros((t_out.size, n))
+    v_end = np.zeros(n)
+    integral, integral_end, slope = np.zeros((t_out.size, n_s)), np.zeros(n_s), np.zeros((t_out.size, n_s))
+    done, end, broken, rough = t_out.size, problem.t_stop, None, 0.0
+    for j in range(n_s):
+        # The source's integral rides along as a mode of rate zero, for the charge.
+        rates, gains = np.append(modes.rates, 0.0), np.append(modes.gains[:, j], 1.0)
+        state = np.append(v0 if j == 0 else np.zeros(n), 0.0)
+        first, table = 0, None
+        for tables in source_tables(problem, 1e-13, no_chirps=True):
+            table = tables[j]
+            if table.edges.size < 2:
+                break
+            rough = max(rough, table.rough)
+            last = _upto(t_out, left, float(table.edges[-1]))
+            at = slice(first, last)
+            rows, state = linear.respond(
+                rates, gains, table.edges, table.terms, table.series, state, t_out[at], left[at]
+            )
+            v[at] += rows[:, :n]
+            integral[at, j] = rows[:, n]
+            slope[at, j] = source_at(table.edges, table.terms, table.series, t_out[at], left[at])[1]
+            first = last
+        stopped = None if table is None else table.not_finite
+        if stopped is not None:
+            broken = stopped if broken is None else min(broken, stopped)
+            done = min(done, first)
+        elif table is not None and first < t_out.size:
+            v[first:] += state[:n]
+            integral[first:, j] = state[n]
+            slope[first:, j] = _slope_after(problem, j, table)
+        v_end += state[:n]
+        integral_end[j] = state[n]
+    t, side = t_out[:done], left[:done]
+    if broken is not None:
+        end = broken
+        v_end, integral_end = (v[done - 1], integral[done - 1]) if done else (v0, np.zeros(n_s))
+        end = float(t[-1]) if done else problem.t_start
+    s = np.column_stack([sided(wave, t, side) for wave in scene.waveforms])
+    s_end = np.array([float(wave.value(end, "left")) for wave in scene.waveforms])
+    x = np.einsum("jk,tk->tj", modes.shape, v[:done]) - np.einsum("jk,tk->tj", modes.follow, s)
+    x_end = modes.shape @ v_end - modes.follow @ s_end
+    parts = [x]
+    z_end = start.y[n:]
+    if problem.charge:
+        flow = _Charge(network, scene.area0, modes, v0, start, problem.t_start)
+        parts += flow.at(t, x, v[:done], s, integral[:done], slope[:done])
+        z_end = flow.at(np.array([end]), x_end[None], v_end[None], s_end[None], integral_end[None], np.zeros((1, n_s)))[
+            0
+        ][0]
+    else:
+        parts.append(np.zeros((done, n_s)))
+    run = NetworkRun(
+        t, side, np.hstack(parts), Status.SUCCESS if broken is None else Status.SOURCE_NOT_FINITE,
+        ErrorEstimate(0.0, 0.0), np.zeros(len(network.areas)), 0, {},
+        NetworkState(end, np.concatenate([x_end, z_end]), s_end, np.ones(len(network.areas))), broken,
+    )  # fmt: skip
+    rounding = ROUNDING * max(scene.u_peak, float(np.abs(x).max(initial=0.0))) + rough
+    f_error = 0.0
+    for i, (u, f) in enumerate(gap_signals(problem, run)):
+        peak = float(np.abs(u).max(initial=0.0))
+        if i < len(network.fingers):
+            run.peaks[network.fingers[i]] = peak
+        f_error = max(f_error, 2.0 * rounding / peak * float(f.max(initial=0.0)) if peak > 0.0 else 0.0)
+    run.error = ErrorEstimate(rounding, f_error)
+    return run
+
+
+def _upto(t_out: FloatArray, left: BoolArray, end: float) -> int:
+    """Number of outputs up to the end of a window, left-hand ones on it included."""
+    last = int(np.searchsorted(t_out, end, side="left"))
+    while last < t_out.size and t_out[last] == end and left[last]:
+        last += 1
+    return last
+
+
+def _slope_after(problem: NetworkProblem, j: int, table: SourceTable) -> float:
+    """Right-hand slope of a source at the very end of a run, 1/s of its unit."""
+    stop, wave = problem.t_stop, problem.scene.waveforms[j]
+    if breakpoints_at(wave, stop).size:
+        table = source_table(wave, stop, stop + problem.step, 1e-10, problem.step)
+    at = np.array([min(stop, float(table.edges[-1]))])
+    _, slope = source_at(table.edges, table.terms, table.series, at, np.array([at[0] == table.edges[-1]]))
+    return float(slope[0])
+
+
+@dataclass(frozen=True)
+class _Charge:
+    """Charge that each source delivers, and its regular current, of a network with fixed areas."""
+
+    network: Network
+    area: FloatArray
+    modes: Modes
+    v_start: FloatArray
+    start: NetworkState
+    t_start: float
+
+    def at(
+        self, t: FloatArray, x: FloatArray, v: FloatArray, s: FloatArray, integral: FloatArray, slope: FloatArray
+    ) -> list[FloatArray]:
+        """Charges and currents (n_t, n_s) at times t, from the state, the sources, their integrals and slopes."""
+        net, modes = self.network, self.modes
+        n = modes.rates.size
+        capacitance, leak = net.capacitance(self.area)[:, None], net.leak(self.area)[:, None]
+        stored_x, stored_s = net.q.T @ (capacitance * net.p), net.q.T @ (capacitance * net.q)
+        lost_x = net.q.T @ (leak * net.p) + net.delivered[:, :n]
+        lost_s = net.q.T @ (leak * net.q) + net.delivered[:, n:]
+        draining = modes.rates > 0.0
+        passed = np.einsum("kj,tj->tk", modes.gains, integral) - (v - self.v_start)
+        held = np.outer(t - self.t_start, self.v_start)
+        # What nothing drains loses nothing either, so that its integral does not count.
+        v_integral = np.where(draining, passed / np.where(draining, modes.rates, 1.0), held)
+        x_integral = np.einsum("jk,tk->tj", modes.shape, v_integral) - np.einsum("jk,tk->tj", modes.follow, integral)
+        dx = np.einsum("jk,tk->tj", modes.shape, np.einsum("kj,tj->tk", modes.gains, s) - modes.rates * v)
+        dx -= np.einsum("jk,tk->tj", modes.follow, slope)
+
+        def along(matrix: FloatArray, values: FloatArray) -> FloatArray:
+            return np.asarray(np.einsum("kj,tj->tk", matrix, values))
+
+        moved = along(stored_x, x - self.start.y[:n]) + along(stored_s, s - self.start.s_before)
+        charge = self.start.y[n:] + moved + along(lost_x, x_integral) + along(lost_s, integral)
+        current = along(stored_x, dx) + along(stored_s, slope) + along(lost_x, x) + along(lost_s, s)
+        return [charge, current]
