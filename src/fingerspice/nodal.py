@@ -23,12 +23,13 @@ from fingerspice.solution import ErrorEstimate, NetworkState, Status
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-STAGES = 7
-# Tolerance of the run beside the one given back, over its own; and the share of their difference that is stated: the
-# error of the finer is a small part of it.
-BESIDE, STATED = 30.0, 0.3
+# Of a run, and of the coarser one beside it, with its tolerance over the run's. Their difference is the error stated:
+# where a step is cut short by an edge or a zero, the order alone keeps them apart.
+STAGES, STAGES_BESIDE, BESIDE = 7, 5, 10.0
+# What Newton's method may leave in both alike, over the error allowed in a step.
+ALIKE = 0.05
 # The error allowed in a step, over the one asked for.
-LOCAL_SHARE = 0.2
+LOCAL_SHARE = 0.5
 FINEST = 1e-14
 # Steps per shortest time scale of the sources: the stages of a step must not alias it.
 LONGEST_STEP = 0.5
@@ -54,9 +55,9 @@ class NetworkRun:
     detail: str = ""
 
 
-def network_scheme(h_max: float) -> Scheme:
+def network_scheme(h_max: float, stages: int = STAGES) -> Scheme:
     """Radau IIA with its matrix diagonalised."""
-    tableau = radau(STAGES)
+    tableau = radau(stages)
     values, vectors = np.linalg.eig(tableau.a)
     back = np.linalg.inv(vectors)
     upper = np.flatnonzero(values.imag > -1e-12)
@@ -118,6 +119,8 @@ class _Integration:
         self.control[collocation.T] = problem.t_start
         self.counters = np.zeros(collocation.N_COUNTERS, np.int64)
         self.peaks = np.zeros(net.gap.size)
+        self.room = new_room(net)
+        self.work = collocation.new_work(net, scheme.c.size, scheme.eigenvalues.size, self.y.size)
 
     @property
     def t(self) -> float:
@@ -127,8 +130,8 @@ class _Integration:
         """To `t_end` (s), the jumps on the way taken."""
         while True:
             code = advance(
-                self.net, self.scheme, sources, False, self.problem.charge, t_end, self.y, self.sign, self.s_before,
-                self.scale, self.tol, self.control, self.counters, self.peaks, t_out, left, rows,
+                self.net, self.room, self.scheme, self.work, sources, False, self.problem.charge, t_end, self.y,
+                self.sign, self.s_before, self.scale, self.tol, self.control, self.counters, self.peaks, t_out, left, rows,
             )  # fmt: skip
             if code != collocation.JUMP:
                 return int(code)
@@ -139,8 +142,8 @@ class _Integration:
         """Take a jump of the sources to their values `after`; False where that goes past a fold."""
         control = np.zeros(collocation.N_CONTROL)
         code = advance(
-            self.net, self.scheme._replace(h_max=1.0), _ramp(self.s_before, after), True, False, 1.0, self.y, self.sign,
-            self.s_before.copy(), self.scale, self.tol, control, self.counters, self.peaks, np.empty(0),
+            self.net, self.room, self.scheme._replace(h_max=1.0), self.work, _ramp(self.s_before, after), True, False,
+            1.0, self.y, self.sign, self.s_before.copy(), self.scale, self.tol, control, self.counters, self.peaks, np.empty(0),
             np.empty(0, bool), np.empty((0, self.y.size)),
         )  # fmt: skip
         self.s_before[:] = after
@@ -263,20 +266,19 @@ def solve_coupled(
 
     The error is stated from a second run with a larger tolerance.
     """
-    scheme = network_scheme(min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step))
+    longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
+    fine, coarse = network_scheme(longest, STAGES), network_scheme(longest, STAGES_BESIDE)
     at, side, mine = _with_probes(problem, t_out, left)
-    u_scale = max(problem.scene.u_peak, float(np.abs(problem.initial.y[: problem.network.k.shape[0]]).max(initial=0.0)))
+    n = problem.network.k.shape[0]
+    u_scale = max(problem.scene.u_peak, float(np.abs(problem.initial.y[:n]).max(initial=0.0)))
     if problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
-        u_scale = _voltage_scale(problem, scheme, u_scale or 1.0)
+        u_scale = _voltage_scale(problem, coarse, u_scale or 1.0)
     tol, nfev = LOCAL_SHARE * rtol, 0
-    beside = None
     for attempt in range(ATTEMPTS):
-        if beside is None:
-            beside = _integrate(problem, scheme, BESIDE * tol, u_scale, at, side, None)
-            nfev += beside.nfev
-        run = _integrate(problem, scheme, tol, u_scale, at, side, progress)
-        nfev += run.nfev
-        _state_error(problem, run, beside, u_scale)
+        beside = _integrate(problem, coarse, BESIDE * tol, u_scale, at, side, None)
+        run = _integrate(problem, fine, tol, u_scale, at, side, progress)
+        nfev += beside.nfev + run.nfev
+        _state_error(problem, run, beside, u_scale, ALIKE * tol)
         run.nfev = nfev
         worst = _excess(problem, run, rtol)
         if run.status is not Status.SUCCESS or worst <= 1.0:
@@ -284,9 +286,7 @@ def solve_coupled(
         if tol <= FINEST or attempt == ATTEMPTS - 1:
             run.status = Status.ERROR_NOT_MET
             break
-        tighter = max(tol * min(0.3, 0.5 / worst), FINEST)
-        beside = run if tighter <= tol / BESIDE else None
-        tol = tighter
+        tol = max(tol * min(0.3, 0.5 / worst), FINEST)
     keep = mine[: run.t.size]
     run.t, run.left, run.rows = run.t[keep], run.left[keep], run.rows[keep]
     return run
@@ -328,27 +328,23 @@ def gap_signals(problem: NetworkProblem, run: NetworkRun) -> Iterator[tuple[Floa
         yield u, np.zeros(u.size)
 
 
-def _state_error(problem: NetworkProblem, run: NetworkRun, beside: NetworkRun, u_scale: float) -> None:
-    """Write the stated error into a run: a share of the largest difference, and rounding."""
+def _state_error(problem: NetworkProblem, run: NetworkRun, beside: NetworkRun, u_scale: float, alike: float) -> None:
+    """Write the stated error into a run: the largest difference, what both have alike, and rounding."""
     count = min(run.t.size, beside.t.size)
     u_error = f_error = 0.0
+    both = (alike + 4e-15) * u_scale
     for (u, f), (v, g) in zip(gap_signals(problem, run), gap_signals(problem, beside), strict=True):
-        off = float(np.abs(u[:count] - v[:count]).max(initial=0.0))
-        rounding = 4e-15 * u_scale
-        u_error = max(u_error, STATED * off + rounding)
+        u_error = max(u_error, float(np.abs(u[:count] - v[:count]).max(initial=0.0)) + both)
         peak = float(np.abs(u).max(initial=0.0))
-        relative = 2.0 * rounding / peak if peak > 0.0 else 0.0
-        f_error = max(
-            f_error,
-            STATED * float(np.abs(f[:count] - g[:count]).max(initial=0.0)) + relative * float(f.max(initial=0.0)),
-        )
+        # F ~ u^2: what moves u by du moves F by 2 F du / u.
+        moved = 2.0 * both / peak * float(f.max(initial=0.0)) if peak > 0.0 else 0.0
+        f_error = max(f_error, float(np.abs(f[:count] - g[:count]).max(initial=0.0)) + moved)
     charge = None
     if problem.charge:
         n_s = problem.initial.s_before.size
         at = slice(problem.initial.y.size - n_s, problem.initial.y.size)
-        charge = STATED * float(np.abs(run.rows[:count, at] - beside.rows[:count, at]).max(initial=0.0))
-    rough = run.error.u_gap
-    run.error = ErrorEstimate(u_error + rough, f_error, charge)
+        charge = float(np.abs(run.rows[:count, at] - beside.rows[:count, at]).max(initial=0.0))
+    run.error = ErrorEstimate(u_error + run.error.u_gap, f_error, charge)
 
 
 def _excess(problem: NetworkProblem, run: NetworkRun, rtol: float) -> float:

@@ -8,8 +8,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit
-from fingerspice.engine.network import Net, Room, Sources, at_sources, choose_signs, gap_voltage, new_room, rates
+from fingerspice.compiled import borrow, jit, jit_inline
+from fingerspice.engine.network import (
+    Net,
+    Room,
+    Sources,
+    at_sources,
+    choose_signs,
+    gap_voltage,
+    lend,
+    lend_room,
+    rates,
+)
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -25,6 +35,10 @@ NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT = 0, 1, 2, 3, 4
 N_COUNTERS = 5
 # A source's change at an edge, relative, that is its rounding and no jump.
 ROUNDING = 1e-14
+# What Newton's method leaves, over the error allowed in a step.
+CONVERGED = 0.01
+# How far a step's polynomial is followed past its end for a guess of the next one, in its own length.
+FARTHEST = 2.0
 
 
 class Scheme(NamedTuple):
@@ -64,6 +78,8 @@ class Work(NamedTuple):
     y1: FloatArray
     residual: FloatArray
     place: IntArray
+    s: FloatArray
+    ds: FloatArray
 
 
 @jit
@@ -74,6 +90,15 @@ def new_work(net: Net, stages: int, n_eigen: int, size: int) -> Work:
     return Work(
         np.zeros((stages, size)), np.zeros((size, stages)), np.zeros((m, m)), np.zeros((n_eigen, m, m), np.complex128),
         np.zeros(size), np.zeros(size), np.zeros(size), np.zeros((stages, m)), np.zeros(n_s, np.int64),
+        np.zeros((stages, n_s)), np.zeros((stages, n_s)),
+    )  # fmt: skip
+
+
+@jit_inline
+def _lend_work(work: Work) -> Work:
+    return Work(
+        borrow(work.k), borrow(work.poly), borrow(work.slope), borrow(work.newton), borrow(work.rate),
+        borrow(work.stage), borrow(work.y1), borrow(work.residual), borrow(work.place), borrow(work.s), borrow(work.ds),
     )  # fmt: skip
 
 
@@ -178,6 +203,8 @@ def _step(
     if not _prepare_newton(scheme, work, h):
         return math.inf
     k = work.k
+    for i in range(stages):
+        at_sources(sources, work.place, t + scheme.c[i] * h, work.s[i], work.ds[i])
     before = math.inf
     for iteration in range(12):
         for i in range(stages):
@@ -186,7 +213,8 @@ def _step(
                 for r in range(stages):
                     value += scheme.a[i, r] * k[r, j]
                 work.stage[j] = y[j] + h * value
-            at_sources(sources, work.place, t + scheme.c[i] * h, room.s, room.ds)
+            room.s[:] = work.s[i]
+            room.ds[:] = work.ds[i]
             if not rates(net, room, jump, work.stage, sign, work.rate):
                 return math.inf
             for j in range(m):
@@ -205,10 +233,10 @@ def _step(
                     change = value
         if not change < math.inf or (iteration > 1 and change > before and change > tol):
             return math.inf
-        # Converged: what is left falls as far again. Or at rounding, where nothing falls any more.
-        if change <= 1e-3 * tol or (iteration > 2 and change > 0.3 * before and change <= 1e-13):
-            break
-        if iteration > 0 and change < 0.1 * before and change * change / before <= 1e-3 * tol:
+        # What is left, as each iteration takes the same share off; or at rounding, where nothing falls any more.
+        falls = change / before if iteration > 0 else 0.5
+        left = change * falls / (1.0 - falls) if falls < 1.0 else math.inf
+        if left <= CONVERGED * tol or (iteration > 2 and falls > 0.3 and change <= 1e-13):
             break
         before = change
     else:
@@ -235,6 +263,22 @@ def _to_polynomial(scheme: Scheme, work: Work, h: float) -> None:
             for r in range(scheme.dense.shape[0]):
                 value += scheme.dense[r, d] * work.k[r, j]
             work.poly[j, d] = h * value
+
+
+@jit
+def _guess(scheme: Scheme, work: Work, start: FloatArray, h: float, h_before: float) -> None:
+    """Stages of the next step from the polynomial of the one before, or where there is none from the rate now."""
+    follows = h_before > 0.0 and h <= FARTHEST * h_before
+    for i in range(scheme.c.size):
+        theta = 1.0 + scheme.c[i] * h / h_before if follows else 0.0
+        for j in range(start.size):
+            if follows:
+                value = 0.0
+                for d in range(work.poly.shape[1] - 1, -1, -1):
+                    value = value * theta + (d + 1.0) * work.poly[j, d]
+                work.k[i, j] = value / h_before
+            else:
+                work.k[i, j] = start[j]
 
 
 @jit
@@ -343,8 +387,8 @@ def _account(
 
 @jit
 def advance(
-    net: Net, scheme: Scheme, sources: Sources, jump: bool, charge: bool, t_end: float, y: FloatArray, sign: FloatArray,
-    s_before: FloatArray, scale: FloatArray, tol: float, control: FloatArray, counters: IntArray, peaks: FloatArray,
+    net: Net, room: Room, scheme: Scheme, work: Work, sources: Sources, jump: bool, charge: bool, t_end: float,
+    y: FloatArray, sign: FloatArray, s_before: FloatArray, scale: FloatArray, tol: float, control: FloatArray, counters: IntArray, peaks: FloatArray,
     t_out: FloatArray, left: NDArray[np.bool_], rows: FloatArray,
 ) -> int:  # fmt: skip
     """Step a network to `t_end` through the segments of its sources, writing outputs on the way.
@@ -352,7 +396,7 @@ def advance(
     Parameters
     ----------
     net, scheme, sources
-        What to step, how, and what drives it.
+        What to step, how, and what drives it; `room` and `work` to do it in.
     jump : bool
         Whether the sources' "time" is the fraction of a jump.
     charge : bool
@@ -376,13 +420,20 @@ def advance(
     int
         DONE; JUMP: a source jumps at the time reached, take that first; or STEP_UNDERFLOW.
     """
-    room = new_room(net)
+    net, room, work = lend(net), lend_room(room), _lend_work(work)
+    scheme = Scheme(
+        borrow(scheme.a), borrow(scheme.c), borrow(scheme.e), borrow(scheme.dense), borrow(scheme.eigenvalues),
+        borrow(scheme.to), borrow(scheme.back), scheme.h_max,
+    )  # fmt: skip
+    sources = Sources(borrow(sources.first), borrow(sources.edges), borrow(sources.terms), borrow(sources.series))
+    y, sign, s_before, scale = borrow(y), borrow(sign), borrow(s_before), borrow(scale)
+    control, counters, peaks = borrow(control), borrow(counters), borrow(peaks)
+    t_out, left, rows = borrow(t_out), borrow(left), borrow(rows)
     n_s = s_before.size
-    work = new_work(net, scheme.c.size, scheme.eigenvalues.size, y.size)
     now = np.zeros(n_s)
     slopes = np.zeros(n_s)
     work.place[:] = 0
-    extrapolated = False
+    h_before = 0.0
     flips = 0
     while control[T] < t_end:
         t = control[T]
@@ -404,9 +455,6 @@ def advance(
                 break
         if not rates(net, room, jump, y, sign, work.rate):
             return STEP_UNDERFLOW
-        if not extrapolated:
-            for i in range(scheme.c.size):
-                work.k[i] = work.rate
         start = work.rate.copy()
         _jacobian(net, room, work, jump, y, sign, scale, work.slope)
         counters[NFEV] += 2 + work.slope.shape[0]
@@ -423,6 +471,7 @@ def advance(
         elif 2.0 * h > stop - t:
             h = 0.5 * (stop - t)
         while True:
+            _guess(scheme, work, start, h, h_before)
             norm = _step(net, room, scheme, work, sources, jump, t, h, y, sign, scale, tol, counters)
             if norm <= 1.0:
                 break
@@ -431,8 +480,6 @@ def advance(
             last = False
             if h <= 1e-15 * max(abs(t), 1e-3 * (stop - t)):
                 return STEP_UNDERFLOW
-            for i in range(scheme.c.size):
-                work.k[i] = start
         proposed = h * min(6.0, 0.9 * norm ** (-1.0 / scheme.c.size) if norm > 0.0 else 6.0)
         _to_polynomial(scheme, work, h)
         theta, which = (2.0, -1) if flips > 1 else _first_zero(net, room, work, sources, t, h, y, sign)
@@ -442,12 +489,13 @@ def advance(
                 # The zero is here: change branch without advancing.
                 sign[which] = -sign[which]
                 flips += 1
+                h_before = 0.0
                 continue
             # A step that ends on the zero has it where collocation is most exact.
             h = t_new - t
             if not _step(net, room, scheme, work, sources, jump, t, h, y, sign, scale, tol, counters) <= 2.0:
                 control[H] = 0.5 * h
-                extrapolated = False
+                h_before = 0.0
                 continue
             _to_polynomial(scheme, work, h)
             last = False
@@ -466,6 +514,6 @@ def advance(
         control[H] = max(proposed, control[H]) if last and h < control[H] else proposed
         control[T] = t_new
         at_sources(sources, work.place, t_new, s_before, slopes)
-        extrapolated = False
+        h_before = h
         counters[ACCEPTED] += 1
     return DONE
