@@ -220,6 +220,7 @@ def _net(network: Network, law: str, fixed: tuple[float | None, ...], u_top: flo
         place=np.array([-1 if c.area is None else c.area for c in cells], np.int64),
         k=np.ascontiguousarray(network.k),
         b=np.ascontiguousarray(network.b),
+        through=np.ascontiguousarray(network.through),
         delivered=np.ascontiguousarray(network.delivered),
         gap=np.array(gaps, np.int64),
         area0=np.array(area0, float),

@@ -119,7 +119,7 @@ class _Integration:
         self.control[collocation.T] = problem.t_start
         self.counters = np.zeros(collocation.N_COUNTERS, np.int64)
         self.peaks = np.zeros(net.gap.size)
-        self.room = new_room(net)
+        self.room = new_room(net, self.y.size)
         self.work = collocation.new_work(net, scheme.c.size, scheme.eigenvalues.size, self.y.size)
 
     @property
@@ -131,7 +131,8 @@ class _Integration:
         while True:
             code = advance(
                 self.net, self.room, self.scheme, self.work, sources, False, self.problem.charge, t_end, self.y,
-                self.sign, self.s_before, self.scale, self.tol, self.control, self.counters, self.peaks, t_out, left, rows,
+                self.sign, self.s_before, self.scale, self.tol, self.control, self.counters, self.peaks, t_out, left,
+                rows,
             )  # fmt: skip
             if code != collocation.JUMP:
                 return int(code)
@@ -143,8 +144,8 @@ class _Integration:
         control = np.zeros(collocation.N_CONTROL)
         code = advance(
             self.net, self.room, self.scheme._replace(h_max=1.0), self.work, _ramp(self.s_before, after), True, False,
-            1.0, self.y, self.sign, self.s_before.copy(), self.scale, self.tol, control, self.counters, self.peaks, np.empty(0),
-            np.empty(0, bool), np.empty((0, self.y.size)),
+            1.0, self.y, self.sign, self.s_before.copy(), self.scale, self.tol, control, self.counters, self.peaks,
+            np.empty(0), np.empty(0, bool), np.empty((0, self.y.size)),
         )  # fmt: skip
         self.s_before[:] = after
         self.control[collocation.H] = self.control[collocation.H_AFTER_JUMP]
@@ -213,6 +214,9 @@ def _integrate(
             if one.t == problem.t_start:
                 one.settle_areas(_values(sources, one.t))
             code = one.through(sources, min(float(t.edges[-1]) for t in tables), t_out, left, rows)
+            if code == collocation.TOO_MANY:
+                status, t_failed = Status.TOO_MANY_STEPS, one.t
+                break
             if code == collocation.STEP_UNDERFLOW:
                 folding = problem.scene.net.mobile and problem.scene.coupled
                 status, t_failed = (Status.FOLD if folding else Status.STEP_UNDERFLOW), one.t
@@ -247,7 +251,7 @@ def _at_the_end(one: _Integration, sources: Sources, t_out: FloatArray, left: Bo
             return 0
     rows[:, : one.y.size] = one.y
     if problem.charge:
-        room = new_room(one.net)
+        room = new_room(one.net, one.y.size)
         index = np.array([
             min(max(int(np.searchsorted(sources.edges[a:b], stop, side="right")) - 1, 0), b - a - 2)
             for a, b in itertools.pairwise(sources.first)

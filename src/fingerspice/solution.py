@@ -44,6 +44,7 @@ class Status(Enum):
     )
     SOURCE_NOT_FINITE = "a source gave NaN or inf; nothing after this time is a result"
     STEP_UNDERFLOW = "no step is small enough for the error asked for; ask for a larger rtol, or check the source"
+    TOO_MANY_STEPS = "the run took two million steps without coming to its end; ask for a larger rtol, or a shorter run"
     ERROR_NOT_MET = "the error estimate stayed above the error asked for; ask for a larger rtol"
     METHOD_FAILED = "the chosen method gave up; use method='auto'"
 

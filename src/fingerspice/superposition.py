@@ -133,9 +133,9 @@ class _Charge:
         net, modes = self.network, self.modes
         n = modes.rates.size
         capacitance, leak = net.capacitance(self.area)[:, None], net.leak(self.area)[:, None]
-        stored_x, stored_s = net.q.T @ (capacitance * net.p), net.q.T @ (capacitance * net.q)
-        lost_x = net.q.T @ (leak * net.p) + net.delivered[:, :n]
-        lost_s = net.q.T @ (leak * net.q) + net.delivered[:, n:]
+        stored_x, stored_s = net.through @ (capacitance * net.p), net.through @ (capacitance * net.q)
+        lost_x = net.through @ (leak * net.p) + net.delivered[:, :n]
+        lost_s = net.through @ (leak * net.q) + net.delivered[:, n:]
         draining = modes.rates > 0.0
         passed = np.einsum("kj,tj->tk", modes.gains, integral) - (v - self.v_start)
         held = np.outer(t - self.t_start, self.v_start)

@@ -67,9 +67,9 @@ class Network:
         u = p x + q s.
     k, b : ndarray, shape (n, n) and (n, n_s)
         Currents of the resistors and the current sources into the cuts of the live capacitors, S.
+    through : ndarray, shape (n_s, n_cell)
     delivered : ndarray, shape (n_s, n + n_s)
-        Their part in the current that each source delivers out of its p node, from x and s. The capacitors' part is
-        q^T i.
+        Current that each source delivers out of its p node: through @ i, i the cells' currents, and this of (x, s).
     resistor_factor : ndarray, shape (n_r, n)
         k = f^T f.
     node_names : tuple of str
@@ -88,6 +88,7 @@ class Network:
     q: FloatArray
     k: FloatArray
     b: FloatArray
+    through: FloatArray
     delivered: FloatArray
     resistor_factor: FloatArray
     node_names: tuple[str, ...]
@@ -195,8 +196,20 @@ def build_network(circuit: Circuit) -> Network:
     into_i = over_resistors[:, e].T @ (conductance[:, None] * by_i) + over_currents[:, e].T
     s, x = slice(0, n_v), slice(n_v, n_v + n)
     n_i = len(currents)
+    # The current of a small resistor is a small difference of large voltages. Taking the sources' cuts together with
+    # those of the capacitors so that as little of it as possible counts leaves what flows through the cells.
+    factor = weight * by_e
+    together = -np.linalg.lstsq(factor[:, x], factor[:, s], rcond=None)[0].T if factor.size else np.zeros((n_v, n))
     delivered = np.zeros((n_v + n_i, n + n_v + n_i))
     delivered[:n_v] = np.hstack([into_e[s, x], into_e[s, s], into_i[s]])
+    delivered[:n_v] += together @ np.hstack([into_e[x, x], into_e[x, s], into_i[x]])
+    largest = np.linalg.norm(factor[:, s], axis=0)[:, None] * np.linalg.norm(factor, axis=0)
+    rounding = np.abs(np.hstack([delivered[:n_v, :n], delivered[:n_v, n : n + n_v]])) <= 1e-13 * np.hstack(
+        [largest[:, x], largest[:, s]]
+    )
+    delivered[:n_v, : n + n_v][rounding] = 0.0
+    through = np.zeros((n_v + n_i, len(cells)))
+    through[:n_v] = across[:, s].T + together @ across[:, x].T
     # A current source drives its current from p through itself to n.
     delivered[n_v:, n + n_v :] = -np.eye(n_i)
     names = tree.names
@@ -216,6 +229,7 @@ def build_network(circuit: Circuit) -> Network:
         q=np.hstack([across[:, s], np.zeros((len(cells), n_i))]),
         k=into_e[x, x],
         b=np.hstack([into_e[x, s], into_i[x]]),
+        through=through,
         delivered=delivered,
         resistor_factor=weight * by_e[:, x],
         node_names=tuple(written[names[i]] for i in shown),

@@ -14,11 +14,13 @@ from fingerspice.engine.network import (
     Room,
     Sources,
     at_sources,
+    capacitances,
     choose_signs,
     gap_voltage,
     lend,
     lend_room,
     rates,
+    residual,
 )
 
 FloatArray = NDArray[np.float64]
@@ -26,13 +28,15 @@ ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
 
 # Codes returned by `advance`.
-DONE, JUMP, STEP_UNDERFLOW = 0, 1, 2
+DONE, JUMP, STEP_UNDERFLOW, TOO_MANY = 0, 1, 2, 3
 # Entries of `control`: time, next step (0: choose one), first step after the last jump, that which is looked for.
 T, H, H_AFTER_JUMP, JUMPED = 0, 1, 2, 3
 N_CONTROL = 4
 # Entries of `counters`.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT = 0, 1, 2, 3, 4
 N_COUNTERS = 5
+# Steps taken and refused, in a run: what needs more has a cause that smaller steps do not mend.
+MOST_STEPS = 2_000_000
 # A source's change at an edge, relative, that is its rounding and no jump.
 ROUNDING = 1e-14
 # What Newton's method leaves, over the error allowed in a step.
@@ -72,6 +76,8 @@ class Work(NamedTuple):
     k: FloatArray
     poly: FloatArray
     slope: FloatArray
+    mass: FloatArray
+    weight: FloatArray
     newton: ComplexArray
     rate: FloatArray
     stage: FloatArray
@@ -88,17 +94,18 @@ def new_work(net: Net, stages: int, n_eigen: int, size: int) -> Work:
     n_s = net.b.shape[1]
     m = size - n_s
     return Work(
-        np.zeros((stages, size)), np.zeros((size, stages)), np.zeros((m, m)), np.zeros((n_eigen, m, m), np.complex128),
-        np.zeros(size), np.zeros(size), np.zeros(size), np.zeros((stages, m)), np.zeros(n_s, np.int64),
-        np.zeros((stages, n_s)), np.zeros((stages, n_s)),
+        np.zeros((stages, size)), np.zeros((size, stages)), np.zeros((m, m)), np.zeros((m, m)), np.zeros(m),
+        np.zeros((n_eigen, m, m), np.complex128), np.zeros(size), np.zeros(size), np.zeros(size),
+        np.zeros((stages, m)), np.zeros(n_s, np.int64), np.zeros((stages, n_s)), np.zeros((stages, n_s)),
     )  # fmt: skip
 
 
 @jit_inline
 def _lend_work(work: Work) -> Work:
     return Work(
-        borrow(work.k), borrow(work.poly), borrow(work.slope), borrow(work.newton), borrow(work.rate),
-        borrow(work.stage), borrow(work.y1), borrow(work.residual), borrow(work.place), borrow(work.s), borrow(work.ds),
+        borrow(work.k), borrow(work.poly), borrow(work.slope), borrow(work.mass), borrow(work.weight),
+        borrow(work.newton), borrow(work.rate), borrow(work.stage), borrow(work.y1), borrow(work.residual),
+        borrow(work.place), borrow(work.s), borrow(work.ds),
     )  # fmt: skip
 
 
@@ -138,31 +145,47 @@ def _invert(matrix: ComplexArray) -> bool:
 
 
 @jit
-def _jacobian(
-    net: Net, room: Room, work: Work, jump: bool, y: FloatArray, sign: FloatArray, scale: FloatArray, out: FloatArray
+def _linearise(
+    net: Net, room: Room, work: Work, jump: bool, y: FloatArray, sign: FloatArray, scale: FloatArray
 ) -> None:
-    """d y'/d y of the part of the state that feeds back, by differences; the sources are those in `room`."""
-    m = out.shape[0]
+    """Derivatives of the residual by the state, by differences, and by its rate, at the rate in `work.rate`.
+
+    Only the part of the state that feeds back; rows over their largest capacitance, as currents are tiny beside rates
+    of areas. The sources are those in `room`.
+    """
+    n = net.k.shape[0]
+    m = work.slope.shape[0]
+    capacitances(net, room, y, sign)
+    work.mass[:] = 0.0
+    for i in range(m):
+        largest = 1.0 if i >= n else 0.0
+        for j in range(n):
+            if i < n:
+                work.mass[i, j] = room.matrix[i, j]
+                largest = max(largest, abs(room.matrix[i, j]))
+        if i >= n:
+            work.mass[i, i] = 1.0
+        work.weight[i] = 1.0 / largest
     work.stage[:] = y
-    rates(net, room, jump, y, sign, work.y1)
+    residual(net, room, jump, y, sign, work.rate, room.base)
     for j in range(m):
         change = 1e-7 * (abs(y[j]) + scale[j])
         work.stage[j] = y[j] + change
-        rates(net, room, jump, work.stage, sign, work.rate)
+        residual(net, room, jump, work.stage, sign, work.rate, room.probe)
         work.stage[j] = y[j]
         for i in range(m):
-            out[i, j] = (work.rate[i] - work.y1[i]) / change
+            work.slope[i, j] = work.weight[i] * (room.probe[i] - room.base[i]) / change
+            work.mass[i, j] *= work.weight[i]
 
 
 @jit
 def _prepare_newton(scheme: Scheme, work: Work, h: float) -> bool:
-    """Inverses of I - h lambda J for every eigenvalue of the scheme."""
+    """Inverses of M - h lambda J for every eigenvalue of the scheme."""
     m = work.slope.shape[0]
     for e in range(scheme.eigenvalues.size):
         for i in range(m):
             for j in range(m):
-                work.newton[e, i, j] = -h * scheme.eigenvalues[e] * work.slope[i, j]
-            work.newton[e, i, i] += 1.0
+                work.newton[e, i, j] = work.mass[i, j] - h * scheme.eigenvalues[e] * work.slope[i, j]
         if not _invert(work.newton[e]):
             return False
     return True
@@ -170,7 +193,7 @@ def _prepare_newton(scheme: Scheme, work: Work, h: float) -> bool:
 
 @jit
 def _solve_newton(scheme: Scheme, work: Work) -> None:
-    """(I - h a (x) J)^-1 residual into `work.residual`."""
+    """(1 (x) M - h a (x) J)^-1 residual into `work.residual`."""
     stages, m = work.residual.shape
     left = np.zeros(m, np.complex128)
     turned = np.zeros((scheme.eigenvalues.size, m), np.complex128)
@@ -215,13 +238,12 @@ def _step(
                 work.stage[j] = y[j] + h * value
             room.s[:] = work.s[i]
             room.ds[:] = work.ds[i]
-            if not rates(net, room, jump, work.stage, sign, work.rate):
-                return math.inf
+            residual(net, room, jump, work.stage, sign, k[i], room.base)
             for j in range(m):
-                work.residual[i, j] = work.rate[j] - k[i, j]
+                work.residual[i, j] = work.weight[j] * room.base[j]
             # Nothing depends on the charges: they are only collected.
             for j in range(m, y.size):
-                k[i, j] = work.rate[j]
+                k[i, j] = room.base[j]
         counters[NFEV] += stages
         _solve_newton(scheme, work)
         change = 0.0
@@ -252,6 +274,12 @@ def _step(
         value = abs(h * top) / (tol * scale[j])
         if not value <= norm:
             norm = value
+    if net.mobile and norm <= 1.0:
+        # Past a fold there may be a solution that does not continue this one.
+        room.s[:] = work.s[stages - 1]
+        room.ds[:] = work.ds[stages - 1]
+        if not rates(net, room, jump, work.y1, sign, work.rate):
+            return math.inf
     return norm if norm == norm else math.inf
 
 
@@ -388,8 +416,8 @@ def _account(
 @jit
 def advance(
     net: Net, room: Room, scheme: Scheme, work: Work, sources: Sources, jump: bool, charge: bool, t_end: float,
-    y: FloatArray, sign: FloatArray, s_before: FloatArray, scale: FloatArray, tol: float, control: FloatArray, counters: IntArray, peaks: FloatArray,
-    t_out: FloatArray, left: NDArray[np.bool_], rows: FloatArray,
+    y: FloatArray, sign: FloatArray, s_before: FloatArray, scale: FloatArray, tol: float, control: FloatArray,
+    counters: IntArray, peaks: FloatArray, t_out: FloatArray, left: NDArray[np.bool_], rows: FloatArray,
 ) -> int:  # fmt: skip
     """Step a network to `t_end` through the segments of its sources, writing outputs on the way.
 
@@ -418,7 +446,7 @@ def advance(
     Returns
     -------
     int
-        DONE; JUMP: a source jumps at the time reached, take that first; or STEP_UNDERFLOW.
+        DONE; JUMP: a source jumps at the time reached, take that first; STEP_UNDERFLOW; or TOO_MANY steps.
     """
     net, room, work = lend(net), lend_room(room), _lend_work(work)
     scheme = Scheme(
@@ -437,6 +465,8 @@ def advance(
     flips = 0
     while control[T] < t_end:
         t = control[T]
+        if counters[ACCEPTED] + counters[REJECTED] > MOST_STEPS:
+            return TOO_MANY
         stop = t_end
         for i in range(n_s):
             while sources.edges[sources.first[i] + work.place[i] + 1] <= t:
@@ -456,7 +486,7 @@ def advance(
         if not rates(net, room, jump, y, sign, work.rate):
             return STEP_UNDERFLOW
         start = work.rate.copy()
-        _jacobian(net, room, work, jump, y, sign, scale, work.slope)
+        _linearise(net, room, work, jump, y, sign, scale)
         counters[NFEV] += 2 + work.slope.shape[0]
         h = control[H]
         if h == 0.0:

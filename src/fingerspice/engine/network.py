@@ -6,6 +6,8 @@ C = c A and leaks G = g + g_A A, Kirchhoff's current law on the cuts of the live
 
     P^T (C u' + [mobile: c u A'] + G u) + K x + B s = 0,     A = g(|u_gap|)  or  tau A' = g(|u_gap|) - A.
 
+It is kept in that form, linear in x', and never solved for x' but at the start of a step and for outputs.
+
 Under `mobile` A' = dg/du u_gap' stands on both sides: where its matrix turns singular is the fold. An ideal jump is the
 limit of a fast ramp: the same equation in the fraction of the jump, with nothing leaking meanwhile.
 """
@@ -36,7 +38,8 @@ class Net(NamedTuple):
     c, g_total, g_area : ndarray, shape (n_cell,)
     place : ndarray of int, shape (n_cell,)
         The area of each cell, -1 for none.
-    k, b, delivered : ndarray, shape (n, n), (n, n_s) and (n_s, n + n_s)
+    k, b : ndarray, shape (n, n) and (n, n_s)
+    through, delivered : ndarray, shape (n_s, n_cell) and (n_s, n + n_s)
     gap : ndarray of int, shape (n_area,)
         The cell whose voltage the area follows, -1 where it is fixed.
     area0 : ndarray, shape (n_area,)
@@ -58,6 +61,7 @@ class Net(NamedTuple):
     place: IntArray
     k: FloatArray
     b: FloatArray
+    through: FloatArray
     delivered: FloatArray
     gap: IntArray
     area0: FloatArray
@@ -85,18 +89,19 @@ class Sources(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Arrays to work in."""
+    """Arrays to work in: of the sources, the cells, the areas and the state."""
 
     s: FloatArray
     ds: FloatArray
     u: FloatArray
     along: FloatArray
-    current: FloatArray
     area: FloatArray
     slope: FloatArray
     rate: FloatArray
     matrix: FloatArray
-    x: FloatArray
+    k: FloatArray
+    base: FloatArray
+    probe: FloatArray
 
 
 @jit_inline
@@ -104,7 +109,8 @@ def lend(net: Net) -> Net:
     """The same network without a count of its arrays' users; see `compiled.borrow`."""
     return Net(
         net.mobile, borrow(net.p), borrow(net.q), borrow(net.c), borrow(net.g_total), borrow(net.g_area),
-        borrow(net.place), borrow(net.k), borrow(net.b), borrow(net.delivered), borrow(net.gap), borrow(net.area0),
+        borrow(net.place), borrow(net.k), borrow(net.b), borrow(net.through),
+        borrow(net.delivered), borrow(net.gap), borrow(net.area0),
         borrow(net.tau), borrow(net.slow), borrow(net.curves),
     )  # fmt: skip
 
@@ -113,19 +119,19 @@ def lend(net: Net) -> Net:
 def lend_room(room: Room) -> Room:
     """As `lend`."""
     return Room(
-        borrow(room.s), borrow(room.ds), borrow(room.u), borrow(room.along), borrow(room.current), borrow(room.area),
-        borrow(room.slope), borrow(room.rate), borrow(room.matrix), borrow(room.x),
+        borrow(room.s), borrow(room.ds), borrow(room.u), borrow(room.along), borrow(room.area), borrow(room.slope),
+        borrow(room.rate), borrow(room.matrix), borrow(room.k), borrow(room.base), borrow(room.probe),
     )  # fmt: skip
 
 
 @jit
-def new_room(net: Net) -> Room:
-    """Room for one network."""
+def new_room(net: Net, size: int) -> Room:
+    """Room for one network with a state of `size`."""
     n_cell, n_s = net.q.shape
     n, n_area = net.k.shape[0], net.gap.size
     return Room(
-        np.zeros(n_s), np.zeros(n_s), np.zeros(n_cell), np.zeros(n_cell), np.zeros(n_cell), np.zeros(n_area),
-        np.zeros(n_area), np.zeros(n_area), np.zeros((n, n)), np.zeros(n),
+        np.zeros(n_s), np.zeros(n_s), np.zeros(n_cell), np.zeros(n_cell), np.zeros(n_area), np.zeros(n_area),
+        np.zeros(n_area), np.zeros((n, n)), np.zeros(size), np.zeros(size), np.zeros(size),
     )  # fmt: skip
 
 
@@ -186,13 +192,14 @@ def solve_in_place(matrix: FloatArray, x: FloatArray) -> bool:
 
 
 @jit
-def _voltages(net: Net, room: Room, y: FloatArray) -> None:
-    """Cell voltages from the state and the sources in `room`."""
+def _voltages(net: Net, room: Room, y: FloatArray, k: FloatArray) -> None:
+    """Cell voltages from the state and the sources in `room`, and their rates."""
     for cell in range(room.u.size):
         total = 0.0
+        along = 0.0
         for j in range(net.p.shape[1]):
             total += net.p[cell, j] * y[j]
-        along = 0.0
+            along += net.p[cell, j] * k[j]
         for j in range(net.q.shape[1]):
             total += net.q[cell, j] * room.s[j]
             along += net.q[cell, j] * room.ds[j]
@@ -219,80 +226,79 @@ def _areas(net: Net, room: Room, y: FloatArray, sign: FloatArray, leak: float) -
 
 
 @jit
-def rates(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray, out: FloatArray) -> bool:
-    """Write y' into `out` for the sources in `room`; False past a fold.
+def residual(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray, k: FloatArray, out: FloatArray) -> None:
+    """What is missing for `k` to be y', for the sources in `room`: currents into the cuts of the live capacitors (A).
 
+    For areas with dynamics of their own it is their rate less that in `k`; for the charges z' itself, given x' = k.
     `sign` (n_area,) chooses the branch of each area, continued analytically through 0 V. In a `jump` time stands still
-    and the derivative is by the fraction of the jump, of which `room.ds` is the whole.
+    and derivatives are by the fraction of the jump, of which `room.ds` is the whole.
+
+    Linear in k. Nothing is divided by a capacitance: where a small resistance makes a current large, its rounding stays
+    on the one cut that it flows through.
     """
     n, n_s = net.b.shape
     slow = y.size - n - n_s
     leak = 0.0 if jump else 1.0
-    _voltages(net, room, y)
+    _voltages(net, room, y, k)
     _areas(net, room, y, sign, leak)
     for i in range(net.gap.size):
         if net.slow[i] >= 0:
-            out[n + net.slow[i]] = room.rate[i] / net.area0[i]
+            out[n + net.slow[i]] = room.rate[i] / net.area0[i] - k[n + net.slow[i]]
     for j in range(n):
-        room.x[j] = 0.0
-        for k in range(n):
-            room.matrix[j, k] = 0.0
-            room.x[j] -= leak * net.k[j, k] * y[k]
-        for k in range(n_s):
-            room.x[j] -= leak * net.b[j, k] * room.s[k]
+        total = 0.0
+        for i in range(n):
+            total += net.k[j, i] * y[i]
+        for i in range(n_s):
+            total += net.b[j, i] * room.s[i]
+        out[j] = -leak * total
+    for j in range(n_s):
+        total = 0.0
+        for i in range(n):
+            total += net.delivered[j, i] * y[i]
+        for i in range(n_s):
+            total += net.delivered[j, n + i] * room.s[i]
+        out[n + slow + j] = leak * total
     for cell in range(room.u.size):
         i = net.place[cell]
         area = 1.0 if i < 0 else room.area[i]
-        # dq/du of the cell itself, and dq/du_gap.
-        own = net.c[cell] * area
-        cross = 0.0
         current = leak * (net.g_total[cell] + (0.0 if i < 0 else net.g_area[cell] * area)) * room.u[cell]
-        current += own * room.along[cell]
+        current += net.c[cell] * area * room.along[cell]
         if net.mobile and i >= 0 and net.gap[i] >= 0:
-            cross = net.c[cell] * room.u[cell] * room.slope[i]
-            current += net.c[cell] * room.u[cell] * room.rate[i] + cross * room.along[net.gap[i]]
-        room.current[cell] = current
+            current += net.c[cell] * room.u[cell] * (room.rate[i] + room.slope[i] * room.along[net.gap[i]])
         for j in range(n):
-            share = net.p[cell, j]
-            if share != 0.0:
-                room.x[j] -= share * current
-                for k in range(n):
-                    room.matrix[j, k] += share * own * net.p[cell, k]
-                    if cross != 0.0:
-                        room.matrix[j, k] += share * cross * net.p[net.gap[i], k]
-    if not solve_in_place(room.matrix, room.x):
-        return False
-    for j in range(n):
-        out[j] = room.x[j]
-    for k in range(n_s):
-        total = 0.0
-        for j in range(n):
-            total += net.delivered[k, j] * y[j]
+            out[j] -= net.p[cell, j] * current
         for j in range(n_s):
-            total += net.delivered[k, n + j] * room.s[j]
-        if jump:
-            total = 0.0
-        for cell in range(room.u.size):
-            if net.q[cell, k] != 0.0:
-                total += net.q[cell, k] * (room.current[cell] + _displaced(net, room, cell))
-        out[n + slow + k] = total
-    return True
+            out[n + slow + j] += net.through[j, cell] * current
 
 
 @jit
-def _displaced(net: Net, room: Room, cell: int) -> float:
-    """Current (A) into a cell's capacitor that the change `room.x` of the live voltages makes."""
-    i = net.place[cell]
-    own = 0.0
-    across = 0.0
-    for j in range(room.x.size):
-        own += net.p[cell, j] * room.x[j]
-        if i >= 0 and net.gap[i] >= 0:
-            across += net.p[net.gap[i], j] * room.x[j]
-    total: float = net.c[cell] * (1.0 if i < 0 else room.area[i]) * own
-    if net.mobile and i >= 0:
-        total += net.c[cell] * room.u[cell] * room.slope[i] * across
-    return total
+def capacitances(net: Net, room: Room, y: FloatArray, sign: FloatArray) -> None:
+    """The matrix (n, n) in F that small changes of the live voltages meet, into `room.matrix`."""
+    n = net.k.shape[0]
+    room.k[:] = 0.0
+    # As in a jump: beside the current of a small resistance that of a capacitor would be lost in rounding.
+    residual(net, room, True, y, sign, room.k, room.base)
+    for j in range(n):
+        room.k[j] = 1.0
+        residual(net, room, True, y, sign, room.k, room.probe)
+        room.k[j] = 0.0
+        for i in range(n):
+            room.matrix[i, j] = room.base[i] - room.probe[i]
+
+
+@jit
+def rates(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray, out: FloatArray) -> bool:
+    """Write y' into `out` for the sources in `room`; False past a fold, where no y' continues the solution."""
+    n, n_s = net.b.shape
+    capacitances(net, room, y, sign)
+    room.k[:] = 0.0
+    residual(net, room, jump, y, sign, room.k, out)
+    if not solve_in_place(room.matrix, out[:n]):
+        return False
+    # The charges' rates need the voltages' own.
+    residual(net, room, jump, y, sign, out, room.probe)
+    out[y.size - n_s :] = room.probe[y.size - n_s :]
+    return True
 
 
 @jit
@@ -322,7 +328,5 @@ def choose_signs(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArr
     if undecided and rates(net, room, jump, y, sign, rate):
         for i in range(sign.size):
             if net.gap[i] >= 0 and gap_voltage(net, room, i, y) == 0.0:
-                slope = room.along[net.gap[i]]
-                for j in range(room.x.size):
-                    slope += net.p[net.gap[i], j] * room.x[j]
-                sign[i] = -1.0 if slope < 0.0 else 1.0
+                # `rates` has left the cells' rates there.
+                sign[i] = -1.0 if room.along[net.gap[i]] < 0.0 else 1.0

@@ -1,0 +1,181 @@
+"""Networks solved another way: nodal equations by dense matrix exponentials, fingers by an ODE written out by hand.
+
+Never imports the package.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.optimize import brentq
+
+import analytic
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Tone:
+    """offset + amplitude sin(2 pi frequency t), from t = 0 on; 0 before."""
+
+    offset: float
+    amplitude: float
+    frequency: float
+
+    def __call__(self, t: float) -> float:
+        return self.offset + self.amplitude * np.sin(2.0 * np.pi * self.frequency * t)
+
+
+@dataclass(frozen=True)
+class Nodal:
+    """A network of R and C with grounded voltage sources and current sources into nodes. Node 0 is ground.
+
+    Elements are (node, node, value); `voltages` and `currents` map a node to its source.
+    """
+
+    nodes: int
+    resistors: Sequence[tuple[int, int, float]]
+    capacitors: Sequence[tuple[int, int, float]]
+    voltages: dict[int, Tone]
+    currents: dict[int, Tone]
+
+    def _matrix(self, branches: Sequence[tuple[int, int, float]]) -> FloatArray:
+        m = np.zeros((self.nodes, self.nodes))
+        for a, b, value in branches:
+            for i, j in ((a, b), (b, a)):
+                if i:
+                    m[i - 1, i - 1] += value
+                    if j:
+                        m[i - 1, j - 1] -= value
+        return m
+
+    def response(self, times: Sequence[float]) -> FloatArray:
+        """Node voltages (n_t, nodes) at t > 0 from the uncharged state, by one dense exponential per time."""
+        c = self._matrix(self.capacitors)
+        g = self._matrix([(a, b, 1.0 / r) for a, b, r in self.resistors])
+        known = [n - 1 for n in sorted(self.voltages)]
+        unknown = [i for i in range(self.nodes) if i not in known]
+        # An exosystem: for every source the states 1, sin, cos.
+        sources = [(n - 1, self.voltages[n]) for n in sorted(self.voltages)] + [
+            (n - 1, self.currents[n]) for n in sorted(self.currents)
+        ]
+        size = 3 * len(sources)
+        turn = np.zeros((size, size))
+        value = np.zeros((len(sources), size))
+        start = np.zeros(size)
+        for j, (_, tone) in enumerate(sources):
+            omega = 2.0 * np.pi * tone.frequency
+            turn[3 * j + 1, 3 * j + 2], turn[3 * j + 2, 3 * j + 1] = omega, -omega
+            value[j, 3 * j], value[j, 3 * j + 1] = tone.offset, tone.amplitude
+            start[3 * j], start[3 * j + 2] = 1.0, 1.0
+        held = value[: len(known)]
+        push = np.zeros((self.nodes, size))
+        for j, (node, _) in enumerate(sources[len(known) :]):
+            push[node] += value[len(known) + j]
+
+        def part(m: FloatArray, rows: list[int], columns: list[int]) -> FloatArray:
+            return m[np.ix_(rows, columns)]
+
+        # Of the unknown voltages some combinations charge no capacitor: those follow at once.
+        every_c, every_g = part(c, unknown, unknown), part(g, unknown, unknown)
+        values, vectors = np.linalg.eigh(every_c)
+        stored = values > 1e-9 * values.max(initial=0.0)
+        live, free = vectors[:, stored], vectors[:, ~stored]
+        force = push[unknown] - part(g, unknown, known) @ held
+        inverse = np.linalg.inv(free.T @ every_g @ free)
+        from_live = live - free @ inverse @ (free.T @ every_g @ live)
+        from_sources = free @ inverse @ (free.T @ force)
+        inverse_c = np.linalg.inv(live.T @ every_c @ live)
+        into = live.T @ (force - every_g @ from_sources - part(c, unknown, known) @ held @ turn)
+        n = live.shape[1]
+        whole = np.zeros((n + size, n + size))
+        whole[:n, :n], whole[:n, n:] = -inverse_c @ (live.T @ every_g @ from_live), inverse_c @ into
+        whole[n:, n:] = turn
+        # The step of the voltage sources at t = 0 splits over the capacitors at once.
+        first = -inverse_c @ (live.T @ (part(c, unknown, known) @ (held @ start)))
+        out = np.zeros((len(times), self.nodes))
+        for i, t in enumerate(times):
+            z = expm(whole * t) @ np.concatenate([first, start])
+            out[i, unknown] = from_live @ z[:n] + from_sources @ z[n:]
+            out[i, known] = held @ z[n:]
+        return out
+
+
+@dataclass(frozen=True)
+class Floating:
+    """Table 1's layers in series with a resistor and a capacitor to ground: amplifier, finger, body.
+
+    `tau` (s) is the contact's; 0 where the area follows at once.
+    """
+
+    frequency: float
+    resistance: float
+    body: float
+    mobile: bool
+    tau: float = 0.0
+
+    def response(
+        self, u: Callable[[float], float], times: Sequence[float], rtol: float = 1e-12
+    ) -> dict[str, FloatArray]:
+        """Gap voltage (V), area (m^2) and delivered charge (C) at times from 0 on, uncharged; gap voltage >= 0."""
+        layers = analytic.table1_layers(self.frequency)
+        a0 = float(analytic.area(0.0))
+        c = np.array([layer.c for layer in layers])
+        g_total = np.array([1.0 / layer.r_total for layer in layers])
+        g_area = np.array([1.0 / layer.r_area for layer in layers])
+        gap = 1
+
+        def unpack(y: FloatArray) -> tuple[FloatArray, float]:
+            if not self.mobile:
+                area = y[5] if self.tau > 0.0 else float(analytic.area(abs(y[gap])))
+                return y[:3], area
+            if self.tau > 0.0:
+                return y[:3] / (c * y[5]), y[5]
+            q = y[gap]
+            if q == 0.0:
+                return y[:3] / (c * a0), a0
+
+            def missing(v: float) -> float:
+                return c[gap] * float(analytic.area(abs(v))) * v - q
+
+            top = 0.9 * q / (c[gap] * a0)
+            while missing(top) * q < 0.0:
+                top *= 1.1
+            v = brentq(missing, 0.8 * q / (c[gap] * a0), top, xtol=1e-13, rtol=1e-15)
+            area = float(analytic.area(abs(v)))
+            return y[:3] / (c * area), area
+
+        def rates(t: float, y: FloatArray) -> FloatArray:
+            v, area = unpack(y)
+            i = (u(t) - v.sum() - y[3]) / self.resistance
+            net = i - (g_total + g_area * area) * v
+            out = np.zeros(y.size)
+            out[:3] = net if self.mobile else net / (c * area)
+            out[3] = i / self.body
+            out[4] = i
+            if self.tau > 0.0:
+                out[5] = (float(analytic.area(abs(v[gap]))) - area) / self.tau
+            return out
+
+        y0 = np.zeros(6 if self.tau > 0.0 else 5)
+        if self.tau > 0.0:
+            y0[5] = a0
+        scale = np.full(y0.size, 1e-12)
+        if self.mobile:
+            scale[:3] *= 1e-10
+        scale[4] *= 1e-10
+        if self.tau > 0.0:
+            scale[5] *= 1e-5
+        run = solve_ivp(rates, (0.0, times[-1]), y0, "DOP853", times, rtol=rtol, atol=scale)
+        assert run.success, run.message
+        states = [unpack(y) for y in run.y.T]
+        return {
+            "u_gap": np.array([v[gap] for v, _ in states]),
+            "area": np.array([a for _, a in states]),
+            "charge": run.y[4],
+        }

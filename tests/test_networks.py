@@ -1,0 +1,504 @@
+"""Any circuit: networks of R, C, V, I and layers against dense exponentials, hand-written ODEs, laws and phasors."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import analytic
+import fingerspice as fs
+from network_reference import Floating, Nodal, Tone
+from scenes import COAT, GAP, assignments, deck
+
+CIRCUITS = Path(__file__).resolve().parent.parent / "circuits"
+LAWS = ("local", "mobile")
+
+
+def finger(p: str, n: str, area: str = "area", name: str = "", f: float = 5000.0, **gap: object) -> list[str]:
+    """Table 1's three layers between two nodes."""
+    return [
+        f"Xcoat{name} {p} top{name} {area} LAYER {assignments(COAT)}",
+        f"Xgap{name} top{name} skin{name} {area} GAP {assignments(GAP | gap)}",
+        f"Xskin{name} skin{name} {n} {area} SKIN d=350u f={f!r}",
+    ]
+
+
+def floating(
+    source: str, resistance: float = 47e3, body: float = 150e-12, tran: str = "1u 1m uic", **gap: object
+) -> fs.Circuit:
+    """Amplifier with output resistance, finger, body capacitance to ground."""
+    return deck(f"Vdrive amp 0 {source}", f"Rout amp drive {resistance!r}", *finger("drive", "body", **gap),
+                f"Cbody body 0 {body!r}", f".tran {tran}")  # fmt: skip
+
+
+# Linear networks ---------------------------------------------------------------------------------------------
+
+
+@st.composite
+def networks(draw: st.DrawFn) -> Nodal:
+    """Connected networks of 2 to 6 nodes: every node has a path of R or C to ground, some have no capacitor."""
+    count = draw(st.integers(2, 6))
+    decade = st.floats(0.0, 3.0)
+    capacitors, resistors = [], []
+    for node in range(1, count + 1):
+        to = draw(st.integers(0, node - 1))
+        if node == 1 or draw(st.booleans()):
+            capacitors.append((node, to, 1e-11 * 10.0 ** draw(decade)))
+        else:
+            resistors.append((node, to, 1e3 * 10.0 ** draw(decade)))
+    for _ in range(draw(st.integers(1, 5))):
+        a, b = draw(st.integers(0, count)), draw(st.integers(0, count))
+        if a != b:
+            resistors.append((a, b, 1e3 * 10.0 ** draw(decade)))
+    for _ in range(draw(st.integers(0, 2))):
+        a, b = draw(st.integers(0, count)), draw(st.integers(0, count))
+        if a != b:
+            capacitors.append((a, b, 1e-11 * 10.0 ** draw(decade)))
+    tone = st.builds(Tone, st.floats(-5.0, 5.0), st.floats(-5.0, 5.0), st.sampled_from((1e3, 7e4)))
+    driven = draw(st.integers(1, count))
+    pushed = draw(st.integers(1, count))
+    current = draw(tone)
+    scaled = Tone(1e-4 * current.offset, 1e-4 * current.amplitude, current.frequency)
+    return Nodal(count, resistors, capacitors, {driven: draw(tone)}, {pushed: scaled} if draw(st.booleans()) else {})
+
+
+def circuit_of(network: Nodal) -> fs.Circuit:
+    lines = [f"R{i} n{a} n{b} {r!r}" for i, (a, b, r) in enumerate(network.resistors)]
+    lines += [f"C{i} n{a} n{b} {c!r}" for i, (a, b, c) in enumerate(network.capacitors)]
+    for node, t in network.voltages.items():
+        lines.append(f"Vs{node} n{node} 0 SIN({t.offset!r} {t.amplitude!r} {t.frequency!r})")
+    for node, t in network.currents.items():
+        lines.append(f"Is{node} 0 n{node} SIN({t.offset!r} {t.amplitude!r} {t.frequency!r})")
+    # A node that one element alone touches dangles: a large resistor changes nothing there.
+    touched = [n for line in lines for n in line.split()[1:3]]
+    lines += [f"Rx{n} n{n} 0 1e9" for n in range(1, network.nodes + 1) if touched.count(f"n{n}") == 1]
+    return deck(*(line.replace(" n0", " 0") for line in lines))
+
+
+def with_loose_ends(network: Nodal) -> Nodal:
+    ends = [n for branch in (*network.resistors, *network.capacitors) for n in branch[:2]]
+    ends += [*network.voltages, *network.currents]
+    extra = [(n, 0, 1e9) for n in range(1, network.nodes + 1) if ends.count(n) == 1]
+    return Nodal(network.nodes, [*network.resistors, *extra], network.capacitors, network.voltages, network.currents)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(networks())
+def test_random_networks_equal_a_dense_exponential_of_the_nodal_equations(network: Nodal) -> None:
+    times = np.array([1e-8, 3e-7, 1e-5, 1.3e-4, 2e-3])
+    expected = with_loose_ends(network).response(times)
+    s = fs.simulate(circuit_of(network), t_stop=2e-3, t_eval=times)
+    assert s.plan.tier == "linear"
+    got = np.column_stack([s.node_voltages[f"n{i}"] for i in range(1, network.nodes + 1)])
+    assert np.abs(got - expected).max() <= 1e-10 * max(1.0, np.abs(expected).max())
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(networks())
+def test_the_stepped_tier_agrees_with_the_closed_form(network: Nodal) -> None:
+    circuit = circuit_of(network)
+    exact = fs.simulate(circuit, t_stop=1e-3)
+    stepped = fs.simulate(circuit, t_stop=1e-3, tier="coupled", rtol=1e-8, throw=False)
+    if not stepped.success:
+        # Nothing to scale the error by: the capacitors hold nothing.
+        assert stepped.status is fs.Status.ERROR_NOT_MET
+        return
+    for name, v in exact.node_voltages.items():
+        largest = max(float(np.abs(x).max()) for x in exact.node_voltages.values())
+        assert np.abs(stepped.node_voltages[name] - v).max() <= 1e-6 * largest
+    scale = np.abs(exact.q_source).max()
+    assert np.abs(stepped.q_source - exact.q_source).max() <= 1e-6 * scale
+
+
+def test_a_divider_of_resistors_follows_at_once() -> None:
+    s = fs.simulate(deck("V1 a 0 SIN(0 10 1k)", "R1 a b 1k", "R2 b 0 3k", ".tran 1u 1m"))
+    assert np.abs(s.node_voltages["b"] - 0.75 * s.node_voltages["a"]).max() <= 1e-13
+    assert np.abs(s.i_source - s.u_source / 4e3).max() <= 1e-16
+    assert s.u_gap is None
+    assert s.area is None
+
+
+def test_a_divider_of_capacitors_follows_at_once_and_gives_back_its_charge() -> None:
+    s = fs.simulate(deck("V1 a 0 SIN(0 10 1k)", "C1 a b 1n", "C2 b 0 3n", ".tran 1u 2m uic"))
+    assert np.abs(s.node_voltages["b"] - 0.25 * s.node_voltages["a"]).max() <= 1e-12
+    assert np.abs(s.q_source - 0.75e-9 * s.u_source).max() <= 1e-20
+
+
+def test_initial_conditions_are_kept_through_a_floating_capacitor() -> None:
+    circuit = deck("V1 a 0 0", "R1 a b 1k", "C1 b c 1n IC=5", "R2 c 0 1k", ".tran 1u 10u uic")
+    s = fs.simulate(circuit)
+    expected = 5.0 * np.exp(-s.t / 2e-6)
+    assert np.abs(s.node_voltages["b"] - s.node_voltages["c"] - expected).max() <= 1e-12
+
+
+def test_the_operating_point_is_where_a_run_without_uic_starts() -> None:
+    s = fs.simulate(deck("V1 a 0 SIN(4 0 1k)", "R1 a b 1k", "R2 b 0 3k", "C1 b 0 1n", ".tran 1u 10u"))
+    assert np.abs(s.node_voltages["b"] - 3.0).max() <= 1e-14
+
+
+def test_two_sources_in_two_branches_superpose() -> None:
+    lines = ["R1 a c 1k", "R2 b c 2k", "C1 c 0 1n", "R3 c 0 5k", ".tran 1u 2m uic"]
+    both = fs.simulate(deck("V1 a 0 SIN(0 3 1k)", "V2 b 0 PULSE(0 2 0.3m 0 0 0.5m 1m)", *lines))
+    one = fs.simulate(deck("V1 a 0 SIN(0 3 1k)", "V2 b 0 0", *lines), t_eval=both.t)
+    other = fs.simulate(deck("V1 a 0 0", "V2 b 0 PULSE(0 2 0.3m 0 0 0.5m 1m)", *lines), t_eval=both.t)
+    total = one.node_voltages["c"] + other.node_voltages["c"]
+    assert np.abs(both.node_voltages["c"] - total).max() <= 1e-12
+    assert both.sources == ("V1", "V2")
+    assert both.q_source is not None
+    assert both.q_source.shape == (both.t.size, 2)
+
+
+# The same stack as a network ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("source", ["SIN(0 200 100)", "PULSE(150 -150 5m 0 0 5m 10m)", "SIN(60 120 5k)"])
+def test_a_stack_behind_a_tiny_resistor_is_the_stack(source: str, law: str) -> None:
+    f = 5000.0 if "5k" in source else 100.0
+    stop = 2.5 / f
+    plain = deck(f"Vdrive drive 0 {source}", *finger("drive", "0", f=f), f".tran {stop / 500} {stop} uic")
+    behind = deck(
+        f"Vdrive amp 0 {source}", "Rout amp drive 1u", *finger("drive", "0", f=f), f".tran {stop / 500} {stop} uic"
+    )
+    # 1 uohm times 70 pF: nothing of it is left after 1 ps.
+    t = np.linspace(0.0, stop, 400)[1:-1] + 1e-9
+    a = fs.simulate(plain, t_eval=t, charge_law=law, rtol=1e-10)
+    b = fs.simulate(behind, t_eval=t, charge_law=law, rtol=1e-8)
+    peak = np.abs(a.u_gap).max()
+    assert np.abs(a.u_gap - b.u_gap).max() <= 2e-8 * peak
+    assert np.abs(a.f_el - b.f_el).max() <= 4e-8 * a.f_el.max()
+    assert np.abs(a.q_source - b.q_source).max() <= 1e-7 * np.abs(a.q_source).max()
+    assert np.abs(a.fold_margin - b.fold_margin).max() <= 1e-6
+    assert b.error.u_gap >= np.abs(a.u_gap - b.u_gap).max() - 2e-10 * peak
+
+
+def test_a_dispersive_skin_in_a_network_is_the_same_ladder() -> None:
+    lines = [line.replace("SKIN d=350u f=5000.0", "SKIN_DISPERSIVE d=350u") for line in finger("drive", "0")]
+    plain = deck("Vdrive drive 0 SIN(0 200 5k)", *lines, ".tran 1u 0.5m uic")
+    behind = deck("Vdrive amp 0 SIN(0 200 5k)", "Rout amp drive 1m", *lines, ".tran 1u 0.5m uic")
+    a, b = fs.simulate(plain, rtol=1e-9), fs.simulate(behind, rtol=1e-8)
+    assert np.abs(a.u_gap - b.u_gap).max() <= 3e-8 * np.abs(a.u_gap).max()
+    assert np.abs(a.u_layer - b.u_layer).max() <= 1e-7 * np.abs(a.u_layer).max()
+    assert a.layers == b.layers or set(a.layers) == set(b.layers)
+
+
+# Mixed networks against an ODE written out by hand --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("tau", [0.0, 50e-6])
+def test_amplifier_finger_and_body_follow_the_hand_written_equations(law: str, tau: float) -> None:
+    circuit = floating("SIN(120 60 5k)", tau=tau)
+    times = np.linspace(0.0, 4e-4, 41)[1:]
+    reference = Floating(5000.0, 47e3, 150e-12, law == "mobile", tau)
+    expected = reference.response(Tone(120.0, 60.0, 5000.0), list(times))
+    s = fs.simulate(circuit, t_stop=4e-4, t_eval=times, charge_law=law, rtol=1e-9)
+    assert np.abs(s.u_gap - expected["u_gap"]).max() <= 2e-9 * np.abs(expected["u_gap"]).max()
+    assert np.abs(s.area - expected["area"]).max() <= 2e-9 * analytic.area(0.0)
+    assert np.abs(s.q_source - expected["charge"]).max() <= 1e-8 * np.abs(expected["charge"]).max()
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_an_ideal_jump_is_the_limit_of_a_fast_ramp(law: str) -> None:
+    # No resistor in the way: the jump splits over capacitors of which some have a fixed value.
+    def run(edge: str) -> tuple[float, float]:
+        circuit = deck(
+            f"Vdrive drive 0 PULSE(0 250 0.1m {edge} 0.1m 1m)", *finger("drive", "body"), "Cbody body 0 150p",
+            "Cside top 0 20p", ".tran 1u 0.2m uic",
+        )  # fmt: skip
+        s = fs.simulate(circuit, charge_law=law, rtol=1e-10, t_eval=[0.15e-3])
+        return float(s.u_gap[0]), float(s.q_source[0])
+
+    ideal = np.array(run("0"))
+    off = [np.abs(np.array(run(edge)) / ideal - 1.0).max() for edge in ("1u", "0.1u", "10n")]
+    # First order in the length of the ramp: what leaks meanwhile.
+    assert off[2] <= 2e-5
+    assert 8.0 < off[0] / off[1] < 12.0
+    assert 8.0 < off[1] / off[2] < 12.0
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_errors_are_stated_honestly_on_a_mixed_network(law: str) -> None:
+    circuit = floating("SIN(0 200 5k)")
+    t = np.linspace(0.0, 1e-3, 301)
+    exact = fs.simulate(circuit, t_eval=t, charge_law=law, rtol=1e-12)
+    for rtol in (1e-3, 1e-5, 1e-7, 1e-9):
+        s = fs.simulate(circuit, t_eval=t, charge_law=law, rtol=rtol)
+        u, f = np.abs(s.u_gap - exact.u_gap).max(), np.abs(s.f_el - exact.f_el).max()
+        assert u <= s.error.u_gap <= rtol * np.abs(exact.u_gap).max() * 1.01
+        assert f <= s.error.f_el <= rtol * exact.f_el.max() * 1.01
+        assert np.abs(s.q_source - exact.q_source).max() <= s.error.q_source + 1e-12 * np.abs(exact.q_source).max()
+
+
+# Energy ------------------------------------------------------------------------------------------------------
+
+
+def quadrature(start: float, stop: float, pieces: int) -> tuple[np.ndarray, np.ndarray]:
+    x, w = np.polynomial.legendre.leggauss(8)
+    edges = np.linspace(start, stop, pieces + 1)
+    half, middle = 0.5 * np.diff(edges), 0.5 * (edges[1:] + edges[:-1])
+    return (middle[:, None] + half[:, None] * x).ravel(), (half[:, None] * w).ravel()
+
+
+@pytest.mark.parametrize("area", ["frozen", "coupled"])
+@pytest.mark.parametrize("law", LAWS)
+def test_energy_of_source_resistors_and_capacitors_balances(law: str, area: str) -> None:
+    # The gap voltage keeps its sign, so that nothing has a kink.
+    circuit = floating("SIN(140 40 5k)", tran="1u 0.4m")
+    stop = 4e-4
+    t, w = quadrature(0.0, stop, 100)
+    every = np.concatenate([[0.0], t, [stop]])
+    s = fs.simulate(circuit, t_eval=every, charge_law=law, area=area, rtol=1e-12)
+    a, u = s.area, s.u_layer
+    layers = {layer: (analytic.table1_layers(5000.0)[i]) for i, layer in enumerate(("Xcoat", "Xgap", "Xskin"))}
+    column = {name: i for i, name in enumerate(s.layers)}
+    stored = 0.5 * 150e-12 * s.node_voltages["body"] ** 2
+    lost = (s.node_voltages["amp"] - s.node_voltages["drive"]) ** 2 / 47e3
+    work = np.zeros(every.size)
+    slope = np.zeros(every.size)
+    if area == "coupled":
+        # dA/dt by the chain rule: dA/du from the law, du/dt from the outputs' own series.
+        h = 1e-9
+        near = fs.simulate(circuit, t_eval=np.sort(np.concatenate([np.maximum(every - h, 0.0), every + h])),
+                           t_stop=stop + 1e-6, charge_law=law, rtol=1e-12)  # fmt: skip
+        order = np.argsort(np.concatenate([np.maximum(every - h, 0.0), every + h]), kind="stable")
+        values = np.empty(order.size)
+        values[order] = near.area
+        step = every + h - np.maximum(every - h, 0.0)
+        slope = (values[every.size :] - values[: every.size]) / step
+    for name, layer in layers.items():
+        v = u[:, column[name]]
+        stored = stored + 0.5 * layer.c * a * v**2
+        lost = lost + v**2 * (1.0 / layer.r_total + a / layer.r_area)
+        # Area that leaves takes its energy along (`local`), or gives it up as work against the field (`mobile`).
+        work = work + 0.5 * layer.c * v**2 * slope * (1.0 if law == "mobile" else -1.0)
+    given_by_source = (s.u_source * s.i_source)[1:-1] @ w
+    balance = given_by_source - (lost[1:-1] @ w) - (work[1:-1] @ w) - (stored[-1] - stored[0])
+    assert abs(balance) <= (1e-9 if area == "frozen" else 1e-7) * abs(given_by_source)
+    if area == "coupled":
+        assert abs(work[1:-1] @ w) > 1e-5 * abs(given_by_source)
+
+
+# What physics.md says ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("body", "share"), [("100p", 0.31), ("200p", 0.51), ("300p", 0.63)])
+def test_a_user_who_is_not_grounded_feels_a_part_of_the_force(body: str, share: float) -> None:
+    circuit = fs.read_netlist(CIRCUITS / "ungrounded_user.cir").replace({"Cbody.value": float(body[:-1]) * 1e-12})
+    grounded = fs.read_netlist(CIRCUITS / "fingerpad_5khz.cir")
+    area = 34.8e-6
+    phasor = fs.phasor(circuit, area=area).f_el_mean[0] / fs.phasor(grounded, area=area).f_el_mean[0]
+    assert phasor == pytest.approx(share, abs=0.005)
+    runs = [fs.simulate(c, t_stop=8e-3, area=area, charge=False) for c in (circuit, grounded)]
+    means = [run.f_el_mean_periodic for run in runs]
+    assert means[0] / means[1] == pytest.approx(phasor, rel=1e-5)
+
+
+def test_under_a_current_the_force_is_free_of_the_height_of_the_gap() -> None:
+    def force(d: str) -> tuple[np.ndarray, np.ndarray]:
+        # Nothing leaks, and the area is held.
+        circuit = deck(
+            "Idrive 0 drive SIN(0 500u 5k 0 0 90)", f"Xcoat drive top area LAYER {assignments(COAT | {'r': 'inf'})}",
+            f"Xgap top 0 area GAP {assignments(GAP | {'r': 'inf', 'd': d, 'a_fix': 35})}", ".tran 1u 0.4m uic",
+        )  # fmt: skip
+        s = fs.simulate(circuit)
+        return s.t, s.f_el
+
+    t, f = force("3.5u")
+    charge = 500e-6 / (2.0 * math.pi * 5e3) * np.sin(2.0 * math.pi * 5e3 * t)
+    assert np.abs(f - charge**2 / (2.0 * 8.854e-12 * 35e-6)).max() <= 1e-12 * f.max()
+    assert np.abs(f - force("7u")[1]).max() <= 1e-12 * f.max()
+
+
+def test_two_equal_fingers_each_feel_what_one_feels() -> None:
+    source = "Vdrive drive 0 SIN(0 200 5k)"
+    one = fs.simulate(deck(source, "Rs drive screen 1k", *finger("screen", "0"), ".tran 1u 0.6m uic"))
+    two = fs.simulate(
+        deck(
+            source,
+            "Rs drive screen 0.5k",
+            *finger("screen", "0", "left", "1"),
+            *finger("screen", "0", "right", "2"),
+            ".tran 1u 0.6m uic",
+        )
+    )
+    assert two.gaps == ("Xgap1", "Xgap2")
+    assert two.u_gap is not None
+    assert two.u_gap.shape == (two.t.size, 2)
+    for i in range(2):
+        assert np.abs(two.u_gap[:, i] - one.u_gap).max() <= 2e-8 * np.abs(one.u_gap).max()
+        assert np.abs(two.f_el[:, i] - one.f_el).max() <= 4e-8 * one.f_el.max()
+    assert np.abs(two.q_source - 2.0 * one.q_source).max() <= 1e-7 * np.abs(two.q_source).max()
+    assert {"u_gap:Xgap1", "u_gap:Xgap2", "f_el:Xgap1", "area:Xgap2"} <= set(two.signals)
+    assert two.summary()["f_el:Xgap1_mean"] == pytest.approx(one.summary()["f_el_mean"], rel=1e-7)
+
+
+# Kinetics ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_fast_area_returns_the_algebraic_law(law: str) -> None:
+    def run(tau: float) -> np.ndarray:
+        circuit = deck("Vdrive drive 0 SIN(100 80 100)", *finger("drive", "0", f=100.0, tau=tau), ".tran 0.1m 20m uic")
+        return fs.simulate(circuit, charge_law=law, rtol=1e-9).u_gap
+
+    at_once = run(0.0)
+    off = [np.abs(run(tau) - at_once).max() for tau in (1e-4, 1e-5, 1e-6)]
+    assert off[2] <= 1e-4 * np.abs(at_once).max()
+    assert 8.0 < off[1] / off[2] < 12.0
+
+
+def test_a_slow_area_stays_where_it_began() -> None:
+    circuit = deck(
+        "Vdrive drive 0 PULSE(150 -150 5m 0 0 5m 10m)", *finger("drive", "0", f=100.0, tau=1e6), ".tran 0.1m 20m uic"
+    )
+    s = fs.simulate(circuit, rtol=1e-9)
+    # It began at g(u(0+)), the source's first jump taken.
+    began = float(analytic.area(float(s.u_gap[0])))
+    assert s.area[0] == pytest.approx(began, rel=1e-12)
+    assert abs(began / analytic.area(0.0) - 1.0) > 1e-3
+    assert np.abs(s.area / began - 1.0).max() <= 1e-6
+    fixed = fs.simulate(circuit, area=began, t_eval=s.t[1:-1], rtol=1e-9)
+    assert np.abs(fixed.u_gap[::7] - s.u_gap[1:-1][::7]).max() <= 1e-3 * np.abs(s.u_gap).max()
+
+
+def test_with_kinetics_the_mobile_law_has_no_fold() -> None:
+    gap = {"fn": 1e-4}
+    algebraic = deck("Vdrive drive 0 SIN(0 200 100)", *finger("drive", "0", f=100.0, **gap), ".tran 20u 10m uic")
+    stopped = fs.simulate(algebraic, charge_law="mobile", throw=False)
+    assert stopped.status is fs.Status.FOLD
+    slow = deck("Vdrive drive 0 SIN(0 200 100)", *finger("drive", "0", f=100.0, tau=2e-3, **gap), ".tran 20u 10m uic")
+    with pytest.warns(fs.FingerspiceWarning):
+        s = fs.simulate(slow, charge_law="mobile", rtol=1e-6)
+    assert s.success
+    assert np.all(s.fold_margin == 1.0)
+
+
+@pytest.mark.parametrize("law", ["mobile"])
+def test_a_network_stops_at_its_fold_and_keeps_what_came_before(law: str) -> None:
+    lines = finger("drive", "0", f=100.0, fn=1e-4)
+    plain = deck("Vdrive drive 0 SIN(0 200 100)", *lines, ".tran 20u 10m uic")
+    behind = deck("Vdrive amp 0 SIN(0 200 100)", "Rout amp drive 1", *lines, ".tran 20u 10m uic")
+    a, b = (fs.simulate(c, charge_law=law, throw=False, rtol=1e-9) for c in (plain, behind))
+    assert a.status is b.status is fs.Status.FOLD
+    assert b.state.t == pytest.approx(a.state.t, rel=1e-6)
+    assert b.t.size > 10
+    assert b.t[-1] <= b.state.t
+
+
+# Starting, going on, refusing ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("tau", [0.0, 1e-4])
+def test_a_run_goes_on_from_another(law: str, tau: float) -> None:
+    circuit = floating("SIN(0 200 5k)", tau=tau)
+    whole = fs.simulate(circuit, t_stop=6e-4, charge_law=law, rtol=1e-9, t_eval=np.linspace(3.1e-4, 6e-4, 50))
+    first = fs.simulate(circuit, t_stop=3e-4, charge_law=law, rtol=1e-9)
+    second = fs.simulate(circuit, t_stop=6e-4, charge_law=law, rtol=1e-9, start=first, t_eval=whole.t)
+    assert np.abs(second.u_gap - whole.u_gap).max() <= 3e-9 * np.abs(whole.u_gap).max()
+    assert np.abs(second.q_source - whole.q_source).max() <= 1e-8 * np.abs(whole.q_source).max()
+
+
+def test_the_operating_point_of_a_network_with_a_finger_is_at_rest() -> None:
+    circuit = deck("Vdrive amp 0 DC 150", "Rout amp drive 47k", *finger("drive", "0"), ".tran 10u 1m")
+    s = fs.simulate(circuit, rtol=1e-9)
+    assert np.ptp(s.u_gap) <= 1e-9 * s.u_gap[0]
+    plain = fs.simulate(deck("Vdrive drive 0 DC 150", *finger("drive", "0", f=5000.0), ".tran 10u 1m"))
+    # The resistor takes its share of the resistances in series.
+    assert s.u_gap[0] < plain.u_gap[0]
+
+
+def test_results_are_the_same_bits_whichever_outputs_are_asked_for() -> None:
+    circuit = floating("SIN(0 200 5k)")
+    t = np.linspace(0.0, 1e-3, 601)
+    a, b = (fs.simulate(circuit, t_eval=t, rtol=1e-6) for _ in range(2))
+    assert np.array_equal(a.u_gap, b.u_gap)
+    half = fs.simulate(circuit, t_eval=t[::2], t_stop=1e-3, rtol=1e-6)
+    assert np.array_equal(half.u_gap, a.u_gap[::2])
+
+
+@pytest.mark.parametrize("name", ["ungrounded_user", "amplifier", "current_drive"])
+def test_phasors_of_a_network_are_its_periodic_state(name: str) -> None:
+    circuit = fs.read_netlist(CIRCUITS / f"{name}.cir")
+    p = fs.phasor(circuit, area=35e-6)
+    stop = 0.2 if name == "current_drive" else 0.02
+    t = np.linspace(stop - 2e-4, stop, 201)
+    s = fs.simulate(circuit, t_stop=stop, t_eval=t, area=35e-6, charge=False)
+    w = 2.0 * math.pi * 5000.0
+    got = 2.0 * np.mean(s.u_gap[:-1] * np.exp(-1j * (w * t[:-1] - math.pi / 2.0)))
+    assert abs(got - p.u_gap[0]) <= 1e-6 * abs(p.u_gap[0])
+
+
+REFUSALS = {
+    "current source into nothing": (
+        ["Idrive 0 drive 1m", "Ia drive 0 2m"],
+        "Idrive is a current source without a path: node 'drive' is reached through current sources only",
+    ),
+    "source loop": (["V1 a 0 1", "V2 b 0 1", "V3 a b 1", "R1 a b 1k"], "V3 closes a loop of voltage sources"),
+    "parallel sources": (["V1 a 0 1", "V2 a 0 1", "R1 a 0 1k"], "V1 and V2 are voltage sources in parallel"),
+    "dangling resistor": (["V1 a 0 1", "R1 a 0 1k", "R2 a Loose 1k"], "node 'Loose' is floating: only R2 touches it"),
+    "island": (["V1 a 0 1", "R1 a 0 1k", "R2 x y 1k", "C1 x y 1n"], "is floating: nothing connects it to ground"),
+    "area node as a conductor": (
+        ["V1 a 0 1", *finger("a", "0"), "Rx area 0 1k"],
+        "Rx and Xgap both drive the area node 'area'",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_what_no_network_is_gets_one_sentence(case: str) -> None:
+    lines, message = REFUSALS[case]
+    with pytest.raises(fs.InputError) as caught:
+        deck(*lines)
+    assert message in str(caught.value)
+
+
+def test_nodes_that_only_capacitors_reach_have_no_operating_point_but_start_with_uic() -> None:
+    lines = ["V1 a 0 SIN(0 1 1k)", "C1 a b 1n", "C2 b 0 1n"]
+    with pytest.raises(
+        fs.InputError, match="no DC operating point: C1 and C2 leave nodes that are reached by capacitors"
+    ):
+        fs.simulate(deck(*lines, ".tran 1u 1m"))
+    assert fs.simulate(deck(*lines, ".tran 1u 1m uic")).success
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        ({"method": "dop853"}, "method 'dop853' is for series stacks"),
+        ({"tier": "algebraic"}, "the algebraic tier is not for this network"),
+        ({"tier": "linear"}, "the linear tier is not for this network"),
+        ({"start": "periodic"}, "start='periodic' needs a series stack"),
+        ({"area": -1.0}, "area is -1 m^2"),
+        ({"area": "often"}, "area is 'often'"),
+        ({"charge_law": "both"}, "charge_law is 'both'"),
+        ({"t_stop": -1.0}, "t_stop is -1 s"),
+    ],
+)
+def test_requests_that_cannot_be_run_are_refused(request_: dict[str, object], message: str) -> None:
+    with pytest.raises(fs.InputError) as caught:
+        fs.simulate(floating("SIN(0 200 5k)"), **request_)  # type: ignore[arg-type]
+    assert message in str(caught.value)
+
+
+def test_what_needs_a_stack_says_so() -> None:
+    circuit = floating("SIN(0 200 5k)")
+    for call in (fs.compare, fs.steady_state):
+        with pytest.raises(fs.InputError, match="needs a series chain of LAYER, SLAB, SKIN and GAP"):
+            call(circuit)
+
+
+def test_a_source_that_stops_being_finite_ends_the_run_there() -> None:
+    def source(t: float) -> float:
+        return math.nan if t > 3e-4 else 100.0 * math.sin(2.0 * math.pi * 5e3 * t)
+
+    s = fs.simulate(floating("SIN(0 200 5k)"), sources={"Vdrive": source}, t_stop=1e-3, throw=False)
+    assert s.status is fs.Status.SOURCE_NOT_FINITE
+    assert s.t[-1] <= 3e-4 * (1.0 + 1e-9)
+    assert np.all(np.isfinite(s.u_gap))
