@@ -5,6 +5,7 @@ Never imports the package.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -143,10 +144,11 @@ class Floating:
             def missing(v: float) -> float:
                 return c[gap] * float(analytic.area(abs(v))) * v - q
 
-            top = 0.9 * q / (c[gap] * a0)
-            while missing(top) * q < 0.0:
-                top *= 1.1
-            v = brentq(missing, 0.8 * q / (c[gap] * a0), top, xtol=1e-13, rtol=1e-15)
+            # The area grows by 1 % at first, then falls; these stay where it is not less than half.
+            held = q / (c[gap] * a0)
+            if not abs(held) <= 200.0:
+                return np.full(3, np.nan), math.nan
+            v = brentq(missing, 0.9 * held, 2.0 * held, xtol=1e-13, rtol=1e-15)
             area = float(analytic.area(abs(v)))
             return y[:3] / (c * area), area
 
@@ -171,7 +173,9 @@ class Floating:
         scale[4] *= 1e-10
         if self.tau > 0.0:
             scale[5] *= 1e-5
-        run = solve_ivp(rates, (0.0, times[-1]), y0, "DOP853", times, rtol=rtol, atol=scale)
+        # A stage that is refused may have been far out.
+        with np.errstate(all="ignore"):
+            run = solve_ivp(rates, (0.0, times[-1]), y0, "DOP853", times, rtol=rtol, atol=scale)
         assert run.success, run.message
         states = [unpack(y) for y in run.y.T]
         return {

@@ -158,33 +158,50 @@ def test_two_sources_in_two_branches_superpose() -> None:
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("source", ["SIN(0 200 100)", "PULSE(150 -150 5m 0 0 5m 10m)", "SIN(60 120 5k)"])
-def test_a_stack_behind_a_tiny_resistor_is_the_stack(source: str, law: str) -> None:
+def test_a_stack_beside_a_load_is_the_stack(source: str, law: str) -> None:
     f = 5000.0 if "5k" in source else 100.0
-    stop = 2.5 / f
-    plain = deck(f"Vdrive drive 0 {source}", *finger("drive", "0", f=f), f".tran {stop / 500} {stop} uic")
-    behind = deck(
-        f"Vdrive amp 0 {source}", "Rout amp drive 1u", *finger("drive", "0", f=f), f".tran {stop / 500} {stop} uic"
+    tran = f".tran {0.005 / f} {2.5 / f} uic"
+    plain = deck(f"Vdrive drive 0 {source}", *finger("drive", "0", f=f), tran)
+    beside = deck(
+        f"Vdrive drive 0 {source}", *finger("drive", "0", f=f), "Rload drive far 1meg", "Cload far 0 1n", tran
     )
-    # 1 uohm times 70 pF: nothing of it is left after 1 ps.
-    t = np.linspace(0.0, stop, 400)[1:-1] + 1e-9
-    a = fs.simulate(plain, t_eval=t, charge_law=law, rtol=1e-10)
-    b = fs.simulate(behind, t_eval=t, charge_law=law, rtol=1e-8)
+    a = fs.simulate(plain, charge_law=law, rtol=1e-10)
+    b = fs.simulate(beside, t_eval=a.t[1:], charge_law=law, rtol=1e-8)
+    keep = np.diff(a.t, append=np.inf) > 0.0
+    keep[0] = False
+    off = np.abs(a.u_gap[keep] - b.u_gap[keep[1:]]).max()
     peak = np.abs(a.u_gap).max()
-    assert np.abs(a.u_gap - b.u_gap).max() <= 2e-8 * peak
-    assert np.abs(a.f_el - b.f_el).max() <= 4e-8 * a.f_el.max()
-    assert np.abs(a.q_source - b.q_source).max() <= 1e-7 * np.abs(a.q_source).max()
-    assert np.abs(a.fold_margin - b.fold_margin).max() <= 1e-6
-    assert b.error.u_gap >= np.abs(a.u_gap - b.u_gap).max() - 2e-10 * peak
+    assert off <= b.error.u_gap <= 1e-8 * peak
+    assert np.abs(a.f_el[keep] - b.f_el[keep[1:]]).max() <= 1e-8 * a.f_el.max()
+    assert np.abs(a.fold_margin[keep] - b.fold_margin[keep[1:]]).max() <= 1e-7
+    assert np.abs(a.u_layer[keep] - b.u_layer[keep[1:]]).max() <= 3e-8 * peak
+    assert a.layers == b.layers
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("source", ["SIN(0 200 100)", "PULSE(150 -150 5m 0 0 5m 10m)"])
+@pytest.mark.parametrize("resistance", ["10m", "1u"])
+def test_a_small_resistor_in_the_way_changes_nothing_and_costs_little(source: str, law: str, resistance: str) -> None:
+    tran = ".tran 50u 25m uic"
+    plain = deck(f"Vdrive drive 0 {source}", *finger("drive", "0", f=100.0), tran)
+    behind = deck(f"Vdrive amp 0 {source}", f"Rout amp drive {resistance}", *finger("drive", "0", f=100.0), tran)
+    t = np.linspace(0.0, 25e-3, 400)[1:-1] + 1e-9
+    a = fs.simulate(plain, t_eval=t, charge_law=law, rtol=1e-9)
+    b = fs.simulate(behind, t_eval=t, charge_law=law, rtol=1e-8)
+    # The resistor against those of the layers, a megohm: 1e-8 at most.
+    assert np.abs(a.u_gap - b.u_gap).max() <= 3e-8 * np.abs(a.u_gap).max()
+    # Its current is not lost in the rounding of its voltage.
+    assert np.abs(a.q_source - b.q_source).max() <= 3e-8 * np.abs(a.q_source).max()
+    assert b.stats["steps"] + b.stats["rejected"] <= 600
 
 
 def test_a_dispersive_skin_in_a_network_is_the_same_ladder() -> None:
     lines = [line.replace("SKIN d=350u f=5000.0", "SKIN_DISPERSIVE d=350u") for line in finger("drive", "0")]
     plain = deck("Vdrive drive 0 SIN(0 200 5k)", *lines, ".tran 1u 0.5m uic")
-    behind = deck("Vdrive amp 0 SIN(0 200 5k)", "Rout amp drive 1m", *lines, ".tran 1u 0.5m uic")
-    a, b = fs.simulate(plain, rtol=1e-9), fs.simulate(behind, rtol=1e-8)
-    assert np.abs(a.u_gap - b.u_gap).max() <= 3e-8 * np.abs(a.u_gap).max()
-    assert np.abs(a.u_layer - b.u_layer).max() <= 1e-7 * np.abs(a.u_layer).max()
-    assert a.layers == b.layers or set(a.layers) == set(b.layers)
+    beside = deck("Vdrive drive 0 SIN(0 200 5k)", *lines, "Rload drive 0 1meg", ".tran 1u 0.5m uic")
+    a, b = fs.simulate(plain, rtol=1e-9), fs.simulate(beside, rtol=1e-8)
+    assert np.abs(a.u_gap - b.u_gap).max() <= 1e-8 * np.abs(a.u_gap).max()
+    assert np.abs(a.u_layer - b.u_layer).max() <= 3e-8 * np.abs(a.u_layer).max()
 
 
 # Mixed networks against an ODE written out by hand --------------------------------------------------------------
@@ -217,7 +234,7 @@ def test_an_ideal_jump_is_the_limit_of_a_fast_ramp(law: str) -> None:
     ideal = np.array(run("0"))
     off = [np.abs(np.array(run(edge)) / ideal - 1.0).max() for edge in ("1u", "0.1u", "10n")]
     # First order in the length of the ramp: what leaks meanwhile.
-    assert off[2] <= 2e-5
+    assert off[2] <= 3e-5
     assert 8.0 < off[0] / off[1] < 12.0
     assert 8.0 < off[1] / off[2] < 12.0
 
@@ -239,7 +256,7 @@ def test_errors_are_stated_honestly_on_a_mixed_network(law: str) -> None:
 
 
 def quadrature(start: float, stop: float, pieces: int) -> tuple[np.ndarray, np.ndarray]:
-    x, w = np.polynomial.legendre.leggauss(8)
+    x, w = np.polynomial.legendre.leggauss(6)
     edges = np.linspace(start, stop, pieces + 1)
     half, middle = 0.5 * np.diff(edges), 0.5 * (edges[1:] + edges[:-1])
     return (middle[:, None] + half[:, None] * x).ravel(), (half[:, None] * w).ravel()
@@ -248,29 +265,28 @@ def quadrature(start: float, stop: float, pieces: int) -> tuple[np.ndarray, np.n
 @pytest.mark.parametrize("area", ["frozen", "coupled"])
 @pytest.mark.parametrize("law", LAWS)
 def test_energy_of_source_resistors_and_capacitors_balances(law: str, area: str) -> None:
-    # The gap voltage keeps its sign, so that nothing has a kink.
-    circuit = floating("SIN(140 40 5k)", tran="1u 0.4m")
+    # The gap voltage keeps its sign, so that nothing has a kink: the body leaks.
+    circuit = deck("Vdrive amp 0 SIN(140 40 5k)", "Rout amp drive 47k", *finger("drive", "body"), "Cbody body 0 150p",
+                   "Rbody body 0 100k", ".tran 1u 0.4m")  # fmt: skip
     stop = 4e-4
-    t, w = quadrature(0.0, stop, 100)
-    every = np.concatenate([[0.0], t, [stop]])
+    t, w = quadrature(1e-6, stop, 100)
+    every = np.concatenate([[1e-6], t, [stop]])
     s = fs.simulate(circuit, t_eval=every, charge_law=law, area=area, rtol=1e-12)
     a, u = s.area, s.u_layer
     layers = {layer: (analytic.table1_layers(5000.0)[i]) for i, layer in enumerate(("Xcoat", "Xgap", "Xskin"))}
     column = {name: i for i, name in enumerate(s.layers)}
     stored = 0.5 * 150e-12 * s.node_voltages["body"] ** 2
     lost = (s.node_voltages["amp"] - s.node_voltages["drive"]) ** 2 / 47e3
+    lost += s.node_voltages["body"] ** 2 / 100e3
+    assert s.u_gap.min() > 1.0
     work = np.zeros(every.size)
     slope = np.zeros(every.size)
     if area == "coupled":
-        # dA/dt by the chain rule: dA/du from the law, du/dt from the outputs' own series.
-        h = 1e-9
-        near = fs.simulate(circuit, t_eval=np.sort(np.concatenate([np.maximum(every - h, 0.0), every + h])),
-                           t_stop=stop + 1e-6, charge_law=law, rtol=1e-12)  # fmt: skip
-        order = np.argsort(np.concatenate([np.maximum(every - h, 0.0), every + h]), kind="stable")
-        values = np.empty(order.size)
-        values[order] = near.area
-        step = every + h - np.maximum(every - h, 0.0)
-        slope = (values[every.size :] - values[: every.size]) / step
+        # dA/dt by differences of fourth order.
+        h, weights = 1e-7, {-2: 1.0 / 12.0, -1: -2.0 / 3.0, 1: 2.0 / 3.0, 2: -1.0 / 12.0}
+        for shift, weight in weights.items():
+            near = fs.simulate(circuit, t_eval=t + shift * h, t_stop=stop + 1e-6, charge_law=law, rtol=1e-12)
+            slope[1:-1] += weight * near.area / h
     for name, layer in layers.items():
         v = u[:, column[name]]
         stored = stored + 0.5 * layer.c * a * v**2
@@ -279,7 +295,7 @@ def test_energy_of_source_resistors_and_capacitors_balances(law: str, area: str)
         work = work + 0.5 * layer.c * v**2 * slope * (1.0 if law == "mobile" else -1.0)
     given_by_source = (s.u_source * s.i_source)[1:-1] @ w
     balance = given_by_source - (lost[1:-1] @ w) - (work[1:-1] @ w) - (stored[-1] - stored[0])
-    assert abs(balance) <= (1e-9 if area == "frozen" else 1e-7) * abs(given_by_source)
+    assert abs(balance) <= (1e-9 if area == "frozen" else 2e-9) * abs(given_by_source)
     if area == "coupled":
         assert abs(work[1:-1] @ w) > 1e-5 * abs(given_by_source)
 
@@ -303,14 +319,14 @@ def test_under_a_current_the_force_is_free_of_the_height_of_the_gap() -> None:
     def force(d: str) -> tuple[np.ndarray, np.ndarray]:
         # Nothing leaks, and the area is held.
         circuit = deck(
-            "Idrive 0 drive SIN(0 500u 5k 0 0 90)", f"Xcoat drive top area LAYER {assignments(COAT | {'r': 'inf'})}",
+            "Idrive 0 drive SIN(0 200u 5k 0 0 90)", f"Xcoat drive top area LAYER {assignments(COAT | {'r': 'inf'})}",
             f"Xgap top 0 area GAP {assignments(GAP | {'r': 'inf', 'd': d, 'a_fix': 35})}", ".tran 1u 0.4m uic",
         )  # fmt: skip
         s = fs.simulate(circuit)
         return s.t, s.f_el
 
     t, f = force("3.5u")
-    charge = 500e-6 / (2.0 * math.pi * 5e3) * np.sin(2.0 * math.pi * 5e3 * t)
+    charge = 200e-6 / (2.0 * math.pi * 5e3) * np.sin(2.0 * math.pi * 5e3 * t)
     assert np.abs(f - charge**2 / (2.0 * 8.854e-12 * 35e-6)).max() <= 1e-12 * f.max()
     assert np.abs(f - force("7u")[1]).max() <= 1e-12 * f.max()
 
@@ -357,14 +373,15 @@ def test_a_slow_area_stays_where_it_began() -> None:
     circuit = deck(
         "Vdrive drive 0 PULSE(150 -150 5m 0 0 5m 10m)", *finger("drive", "0", f=100.0, tau=1e6), ".tran 0.1m 20m uic"
     )
-    s = fs.simulate(circuit, rtol=1e-9)
+    t = np.linspace(0.0, 20e-3, 401)[1:-1] + 1e-8
+    s = fs.simulate(circuit, rtol=1e-9, t_eval=[0.0, *t], t_stop=20e-3)
     # It began at g(u(0+)), the source's first jump taken.
     began = float(analytic.area(float(s.u_gap[0])))
     assert s.area[0] == pytest.approx(began, rel=1e-12)
     assert abs(began / analytic.area(0.0) - 1.0) > 1e-3
     assert np.abs(s.area / began - 1.0).max() <= 1e-6
-    fixed = fs.simulate(circuit, area=began, t_eval=s.t[1:-1], rtol=1e-9)
-    assert np.abs(fixed.u_gap[::7] - s.u_gap[1:-1][::7]).max() <= 1e-3 * np.abs(s.u_gap).max()
+    fixed = fs.simulate(circuit, area=began, t_eval=[0.0, *t], t_stop=20e-3)
+    assert np.abs(fixed.u_gap - s.u_gap).max() <= 1e-6 * np.abs(s.u_gap).max()
 
 
 def test_with_kinetics_the_mobile_law_has_no_fold() -> None:
@@ -373,22 +390,31 @@ def test_with_kinetics_the_mobile_law_has_no_fold() -> None:
     stopped = fs.simulate(algebraic, charge_law="mobile", throw=False)
     assert stopped.status is fs.Status.FOLD
     slow = deck("Vdrive drive 0 SIN(0 200 100)", *finger("drive", "0", f=100.0, tau=2e-3, **gap), ".tran 20u 10m uic")
-    with pytest.warns(fs.FingerspiceWarning):
-        s = fs.simulate(slow, charge_law="mobile", rtol=1e-6)
+    s = fs.simulate(slow, charge_law="mobile", rtol=1e-6)
     assert s.success
     assert np.all(s.fold_margin == 1.0)
 
 
-@pytest.mark.parametrize("law", ["mobile"])
-def test_a_network_stops_at_its_fold_and_keeps_what_came_before(law: str) -> None:
+def test_a_network_stops_at_its_fold_and_keeps_what_came_before() -> None:
     lines = finger("drive", "0", f=100.0, fn=1e-4)
     plain = deck("Vdrive drive 0 SIN(0 200 100)", *lines, ".tran 20u 10m uic")
-    behind = deck("Vdrive amp 0 SIN(0 200 100)", "Rout amp drive 1", *lines, ".tran 20u 10m uic")
-    a, b = (fs.simulate(c, charge_law=law, throw=False, rtol=1e-9) for c in (plain, behind))
+    beside = deck("Vdrive drive 0 SIN(0 200 100)", "Rload drive 0 1meg", *lines, ".tran 20u 10m uic")
+    a, b = (fs.simulate(c, charge_law="mobile", throw=False, rtol=1e-9) for c in (plain, beside))
     assert a.status is b.status is fs.Status.FOLD
-    assert b.state.t == pytest.approx(a.state.t, rel=1e-6)
-    assert b.t.size > 10
+    assert b.state.t == pytest.approx(a.state.t, rel=1e-7)
+    assert b.t.size > 30
     assert b.t[-1] <= b.state.t
+    assert np.abs(a.u_gap[: b.t.size] - b.u_gap).max() <= 1e-7 * np.abs(b.u_gap).max()
+
+
+def test_a_resistor_in_the_way_takes_the_fold_away() -> None:
+    # The voltage of the stack then gives way; the fold's time passes like any other.
+    lines = finger("drive", "0", f=100.0, fn=1e-4)
+    behind = deck("Vdrive amp 0 SIN(0 200 100)", "Rout amp drive 47k", *lines, ".tran 20u 0.9m uic")
+    s = fs.simulate(behind, charge_law="mobile", rtol=1e-8)
+    assert s.success
+    assert s.t[-1] > 0.83e-3
+    assert s.fold_margin.min() > 0.9
 
 
 # Starting, going on, refusing ----------------------------------------------------------------------------------
@@ -402,7 +428,8 @@ def test_a_run_goes_on_from_another(law: str, tau: float) -> None:
     first = fs.simulate(circuit, t_stop=3e-4, charge_law=law, rtol=1e-9)
     second = fs.simulate(circuit, t_stop=6e-4, charge_law=law, rtol=1e-9, start=first, t_eval=whole.t)
     assert np.abs(second.u_gap - whole.u_gap).max() <= 3e-9 * np.abs(whole.u_gap).max()
-    assert np.abs(second.q_source - whole.q_source).max() <= 1e-8 * np.abs(whole.q_source).max()
+    stated = whole.error.q_source + first.error.q_source + second.error.q_source
+    assert np.abs(second.q_source - whole.q_source).max() <= stated <= 1e-6 * np.abs(whole.q_source).max()
 
 
 def test_the_operating_point_of_a_network_with_a_finger_is_at_rest() -> None:

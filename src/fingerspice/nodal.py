@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Iterator
@@ -33,8 +34,8 @@ LOCAL_SHARE = 0.5
 FINEST = 1e-14
 # Steps per shortest time scale of the sources: the stages of a step must not alias it.
 LONGEST_STEP = 0.5
-# Outputs that errors are looked for at, at least.
-PROBES = 256
+# Times that errors are looked for at.
+PROBES, PROBES_PER_PERIOD, MOST_PROBES = 512, 32, 20_000
 ATTEMPTS = 6
 
 
@@ -116,7 +117,7 @@ class _Integration:
         self.y, self.sign = problem.initial.y.copy(), problem.initial.sign.copy()
         self.s_before = problem.initial.s_before.copy()
         self.control = np.zeros(collocation.N_CONTROL)
-        self.control[collocation.T] = problem.t_start
+        self.control[collocation.BASE] = problem.t_start
         self.counters = np.zeros(collocation.N_COUNTERS, np.int64)
         self.peaks = np.zeros(net.gap.size)
         self.room = new_room(net, self.y.size)
@@ -124,7 +125,7 @@ class _Integration:
 
     @property
     def t(self) -> float:
-        return float(self.control[collocation.T])
+        return float(self.control[collocation.BASE] + self.control[collocation.T])
 
     def through(self, sources: Sources, t_end: float, t_out: FloatArray, left: BoolArray, rows: FloatArray) -> int:
         """To `t_end` (s), the jumps on the way taken."""
@@ -191,7 +192,7 @@ def _values(sources: Sources, t: float) -> FloatArray:
     for i in range(n_s):
         edges = sources.edges[sources.first[i] : sources.first[i + 1]]
         index[i] = min(max(int(np.searchsorted(edges, t, side="right")) - 1, 0), edges.size - 2)
-    at_sources(sources, index, t, out, slope)
+    at_sources(sources, index, t, 0.0, out, slope)
     return out
 
 
@@ -256,7 +257,7 @@ def _at_the_end(one: _Integration, sources: Sources, t_out: FloatArray, left: Bo
             min(max(int(np.searchsorted(sources.edges[a:b], stop, side="right")) - 1, 0), b - a - 2)
             for a, b in itertools.pairwise(sources.first)
         ])  # fmt: skip
-        at_sources(sources, index, stop, room.s, room.ds)
+        at_sources(sources, index, stop, 0.0, room.s, room.ds)
         rate = np.empty(one.y.size)
         rates(one.net, room, False, one.y, one.sign, rate)
         rows[:, one.y.size :] = rate[one.y.size - one.s_before.size :]
@@ -272,28 +273,25 @@ def solve_coupled(
     """
     longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
     fine, coarse = network_scheme(longest, STAGES), network_scheme(longest, STAGES_BESIDE)
-    at, side, mine = _with_probes(problem, t_out, left)
+    at, side, probed = _with_probes(problem, t_out, left)
     n = problem.network.k.shape[0]
     u_scale = max(problem.scene.u_peak, float(np.abs(problem.initial.y[:n]).max(initial=0.0)))
     if problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
         u_scale = _voltage_scale(problem, coarse, u_scale or 1.0)
     tol, nfev = LOCAL_SHARE * rtol, 0
     for attempt in range(ATTEMPTS):
-        beside = _integrate(problem, coarse, BESIDE * tol, u_scale, at, side, None)
+        beside = _integrate(problem, coarse, BESIDE * tol, u_scale, at[probed], side[probed], None)
         run = _integrate(problem, fine, tol, u_scale, at, side, progress)
         nfev += beside.nfev + run.nfev
-        _state_error(problem, run, beside, u_scale, ALIKE * tol)
         run.nfev = nfev
-        worst = _excess(problem, run, rtol)
+        worst = _state_error(problem, run, _only(run, probed), beside, u_scale, ALIKE * tol) / rtol
         if run.status is not Status.SUCCESS or worst <= 1.0:
             break
         if tol <= FINEST or attempt == ATTEMPTS - 1:
             run.status = Status.ERROR_NOT_MET
             break
         tol = max(tol * min(0.3, 0.5 / worst), FINEST)
-    keep = mine[: run.t.size]
-    run.t, run.left, run.rows = run.t[keep], run.left[keep], run.rows[keep]
-    return run
+    return _only(run, ~probed)
 
 
 def _voltage_scale(problem: NetworkProblem, scheme: Scheme, guess: float) -> float:
@@ -310,14 +308,17 @@ def _voltage_scale(problem: NetworkProblem, scheme: Scheme, guess: float) -> flo
 
 
 def _with_probes(problem: NetworkProblem, t: FloatArray, left: BoolArray) -> tuple[FloatArray, BoolArray, BoolArray]:
-    """Times with those that errors are looked for at besides, and which of them were asked for."""
-    if t.size >= PROBES:
-        return t, left, np.ones(t.size, bool)
-    probes = np.linspace(problem.t_start, problem.t_stop, PROBES + 2)[1:-1]
+    """Times asked for together with those that errors are looked for at, and which are the latter.
+
+    These are the same whichever outputs are asked for, so that no result depends on that.
+    """
+    span = problem.t_stop - problem.t_start
+    count = int(min(max(PROBES, PROBES_PER_PERIOD * span / problem.waveform.shortest_time()), MOST_PROBES))
+    probes = np.linspace(problem.t_start, problem.t_stop, count + 2)[1:-1]
     every = np.concatenate([t, probes])
-    side = np.concatenate([left, np.ones(probes.size, bool)])
+    side = np.concatenate([left, np.ones(count, bool)])
     order = np.lexsort((~side, every))
-    return every[order], side[order], (np.arange(every.size) < t.size)[order]
+    return every[order], side[order], (np.arange(every.size) >= t.size)[order]
 
 
 def gap_signals(problem: NetworkProblem, run: NetworkRun) -> Iterator[tuple[FloatArray, FloatArray]]:
@@ -332,34 +333,34 @@ def gap_signals(problem: NetworkProblem, run: NetworkRun) -> Iterator[tuple[Floa
         yield u, np.zeros(u.size)
 
 
-def _state_error(problem: NetworkProblem, run: NetworkRun, beside: NetworkRun, u_scale: float, alike: float) -> None:
-    """Write the stated error into a run: the largest difference, what both have alike, and rounding."""
-    count = min(run.t.size, beside.t.size)
-    u_error = f_error = 0.0
+def _only(run: NetworkRun, keep: BoolArray) -> NetworkRun:
+    """A run with only some of its outputs."""
+    keep = keep[: run.t.size]
+    return dataclasses.replace(run, t=run.t[keep], left=run.left[keep], rows=run.rows[keep])
+
+
+def _state_error(
+    problem: NetworkProblem, run: NetworkRun, probed: NetworkRun, beside: NetworkRun, u_scale: float, alike: float
+) -> float:
+    """Write the stated error into a run: the largest difference, what both have alike, and rounding.
+
+    Returns it over the peaks, the larger of voltage and force.
+    """
+    count = min(probed.t.size, beside.t.size)
+    u_error = f_error = u_peak = f_peak = 0.0
     both = (alike + 4e-15) * u_scale
-    for (u, f), (v, g) in zip(gap_signals(problem, run), gap_signals(problem, beside), strict=True):
+    for (u, f), (v, g) in zip(gap_signals(problem, probed), gap_signals(problem, beside), strict=True):
+        peak, force = float(np.abs(u).max(initial=0.0)), float(f.max(initial=0.0))
         u_error = max(u_error, float(np.abs(u[:count] - v[:count]).max(initial=0.0)) + both)
-        peak = float(np.abs(u).max(initial=0.0))
         # F ~ u^2: what moves u by du moves F by 2 F du / u.
-        moved = 2.0 * both / peak * float(f.max(initial=0.0)) if peak > 0.0 else 0.0
+        moved = 2.0 * both / peak * force if peak > 0.0 else 0.0
         f_error = max(f_error, float(np.abs(f[:count] - g[:count]).max(initial=0.0)) + moved)
+        u_peak, f_peak = max(u_peak, peak), max(f_peak, force)
     charge = None
     if problem.charge:
         n_s = problem.initial.s_before.size
         at = slice(problem.initial.y.size - n_s, problem.initial.y.size)
-        charge = float(np.abs(run.rows[:count, at] - beside.rows[:count, at]).max(initial=0.0))
-    run.error = ErrorEstimate(u_error + run.error.u_gap, f_error, charge)
-
-
-def _excess(problem: NetworkProblem, run: NetworkRun, rtol: float) -> float:
-    """Stated error over the one asked for, the larger of voltage and force."""
-    worst = 0.0
-    u_peak = f_peak = 0.0
-    for u, f in gap_signals(problem, run):
-        u_peak = max(u_peak, float(np.abs(u).max(initial=0.0)))
-        f_peak = max(f_peak, float(f.max(initial=0.0)))
-    if u_peak > 0.0:
-        worst = run.error.u_gap / (rtol * u_peak)
-    if f_peak > 0.0:
-        worst = max(worst, run.error.f_el / (rtol * f_peak))
-    return worst
+        charge = float(np.abs(probed.rows[:count, at] - beside.rows[:count, at]).max(initial=0.0))
+    rough = run.error.u_gap
+    run.error = ErrorEstimate(u_error + rough, f_error, charge)
+    return max(u_error / u_peak if u_peak > 0.0 else 0.0, f_error / f_peak if f_peak > 0.0 else 0.0)

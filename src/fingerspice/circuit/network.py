@@ -56,6 +56,8 @@ class Network:
     n_voltage : int
         How many of them are voltage sources.
     cells : tuple of Cell
+    layers : tuple of Element
+        Those whose capacitance scales with an area, in deck order.
     live : tuple of int
         The cell whose voltage each live state is.
     areas : tuple of Area
@@ -80,6 +82,7 @@ class Network:
     sources: tuple[Element, ...]
     n_voltage: int
     cells: tuple[Cell, ...]
+    layers: tuple[Element, ...]
     live: tuple[int, ...]
     areas: tuple[Area, ...]
     contacts: tuple[Contact | None, ...]
@@ -93,11 +96,6 @@ class Network:
     resistor_factor: FloatArray
     node_names: tuple[str, ...]
     nodes: FloatArray
-
-    @cached_property
-    def layers(self) -> tuple[Element, ...]:
-        """Elements whose capacitance scales with an area, in deck order."""
-        return tuple({c.element.name: c.element for c in self.cells if c.area is not None}.values())
 
     @cached_property
     def grouping(self) -> FloatArray:
@@ -221,6 +219,7 @@ def build_network(circuit: Circuit) -> Network:
         sources=(*voltages, *currents),
         n_voltage=n_v,
         cells=tuple(cells),
+        layers=tuple(e for e in branches if e.spec.is_layer),
         live=tuple(i for i, taken in enumerate(live) if taken),
         areas=areas,
         contacts=tuple(None if area.gap is None else contact_of(area.gap) for area in areas),

@@ -29,9 +29,10 @@ IntArray = NDArray[np.int64]
 
 # Codes returned by `advance`.
 DONE, JUMP, STEP_UNDERFLOW, TOO_MANY = 0, 1, 2, 3
-# Entries of `control`: time, next step (0: choose one), first step after the last jump, that which is looked for.
-T, H, H_AFTER_JUMP, JUMPED = 0, 1, 2, 3
-N_CONTROL = 4
+# Entries of `control`: an edge, the time since (steps after a jump may be shorter than the rounding of the time
+# itself), the next step (0: choose one), the first step after the last jump, and whether that is looked for.
+BASE, T, H, H_AFTER_JUMP, JUMPED = 0, 1, 2, 3, 4
+N_CONTROL = 5
 # Entries of `counters`.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT = 0, 1, 2, 3, 4
 N_COUNTERS = 5
@@ -84,6 +85,7 @@ class Work(NamedTuple):
     y1: FloatArray
     residual: FloatArray
     place: IntArray
+    base: FloatArray
     s: FloatArray
     ds: FloatArray
 
@@ -96,7 +98,7 @@ def new_work(net: Net, stages: int, n_eigen: int, size: int) -> Work:
     return Work(
         np.zeros((stages, size)), np.zeros((size, stages)), np.zeros((m, m)), np.zeros((m, m)), np.zeros(m),
         np.zeros((n_eigen, m, m), np.complex128), np.zeros(size), np.zeros(size), np.zeros(size),
-        np.zeros((stages, m)), np.zeros(n_s, np.int64), np.zeros((stages, n_s)), np.zeros((stages, n_s)),
+        np.zeros((stages, m)), np.zeros(n_s, np.int64), np.zeros(1), np.zeros((stages, n_s)), np.zeros((stages, n_s)),
     )  # fmt: skip
 
 
@@ -105,7 +107,7 @@ def _lend_work(work: Work) -> Work:
     return Work(
         borrow(work.k), borrow(work.poly), borrow(work.slope), borrow(work.mass), borrow(work.weight),
         borrow(work.newton), borrow(work.rate), borrow(work.stage), borrow(work.y1), borrow(work.residual),
-        borrow(work.place), borrow(work.s), borrow(work.ds),
+        borrow(work.place), borrow(work.base), borrow(work.s), borrow(work.ds),
     )  # fmt: skip
 
 
@@ -227,7 +229,7 @@ def _step(
         return math.inf
     k = work.k
     for i in range(stages):
-        at_sources(sources, work.place, t + scheme.c[i] * h, work.s[i], work.ds[i])
+        at_sources(sources, work.place, work.base[0], t + scheme.c[i] * h, work.s[i], work.ds[i])
     before = math.inf
     for iteration in range(12):
         for i in range(stages):
@@ -325,7 +327,7 @@ def _signed(
     y: FloatArray,
 ) -> float:  # fmt: skip
     _inside(theta, y, work.poly, work.stage)
-    at_sources(sources, work.place, t + theta * h, room.s, room.ds)
+    at_sources(sources, work.place, work.base[0], t + theta * h, room.s, room.ds)
     return sign * gap_voltage(net, room, i, work.stage)
 
 
@@ -386,14 +388,15 @@ def _write_outputs(
     n_s = net.b.shape[1]
     while counters[OUTPUT] < t_out.size:
         i = counters[OUTPUT]
-        if t_out[i] > t_new or (t_out[i] == t_new and not left[i]):
+        since = t_out[i] - work.base[0]
+        if since > t_new or (since == t_new and not left[i]):
             return
-        theta = max(0.0, min((t_out[i] - t) / h, 1.0))
+        theta = max(0.0, min((since - t) / h, 1.0))
         _inside(theta, y, work.poly, work.stage)
         for j in range(y.size):
             rows[i, j] = work.stage[j]
         if charge:
-            at_sources(sources, work.place, t + theta * h, room.s, room.ds)
+            at_sources(sources, work.place, work.base[0], t + theta * h, room.s, room.ds)
             rates(net, room, False, work.stage, sign, work.rate)
             for j in range(n_s):
                 rows[i, y.size + j] = work.rate[y.size - n_s + j]
@@ -407,7 +410,7 @@ def _account(
     """Largest |gap voltage| of every area (V), met at the ends and the quarters of steps."""
     for part in range(5):
         _inside(0.25 * part, y, work.poly, work.stage)
-        at_sources(sources, work.place, t + 0.25 * part * h, room.s, room.ds)
+        at_sources(sources, work.place, work.base[0], t + 0.25 * part * h, room.s, room.ds)
         for i in range(peaks.size):
             if net.gap[i] >= 0:
                 peaks[i] = max(peaks[i], abs(gap_voltage(net, room, i, work.stage)))
@@ -463,16 +466,19 @@ def advance(
     work.place[:] = 0
     h_before = 0.0
     flips = 0
-    while control[T] < t_end:
+    while control[BASE] + control[T] < t_end:
+        base = control[BASE]
         t = control[T]
+        work.base[0] = base
         if counters[ACCEPTED] + counters[REJECTED] > MOST_STEPS:
             return TOO_MANY
         stop = t_end
         for i in range(n_s):
-            while sources.edges[sources.first[i] + work.place[i] + 1] <= t:
+            while sources.edges[sources.first[i] + work.place[i] + 1] <= base + t:
                 work.place[i] += 1
             stop = min(stop, sources.edges[sources.first[i] + work.place[i] + 1])
-        at_sources(sources, work.place, t, now, slopes)
+        room_left = (stop - base) - t
+        at_sources(sources, work.place, base, t, now, slopes)
         if not jump:
             for i in range(n_s):
                 if abs(now[i] - s_before[i]) > ROUNDING * max(abs(now[i]), abs(s_before[i])):
@@ -493,13 +499,13 @@ def advance(
             fastest = 0.0
             for j in range(work.slope.shape[0]):
                 fastest = max(fastest, abs(start[j]) / scale[j])
-            h = min(scheme.h_max, 0.1 / fastest if fastest > 0.0 else math.inf, stop - t)
+            h = min(scheme.h_max, 0.1 / fastest if fastest > 0.0 else math.inf, room_left)
         h = min(h, scheme.h_max)
-        last = h >= (stop - t) * (1.0 - 1e-10)
+        last = h >= room_left * (1.0 - 1e-10)
         if last:
-            h = stop - t
-        elif 2.0 * h > stop - t:
-            h = 0.5 * (stop - t)
+            h = room_left
+        elif 2.0 * h > room_left:
+            h = 0.5 * room_left
         while True:
             _guess(scheme, work, start, h, h_before)
             norm = _step(net, room, scheme, work, sources, jump, t, h, y, sign, scale, tol, counters)
@@ -508,7 +514,7 @@ def advance(
             counters[REJECTED] += 1
             h *= 0.25 if norm == math.inf else max(0.2, 0.9 * norm ** (-1.0 / scheme.c.size))
             last = False
-            if h <= 1e-15 * max(abs(t), 1e-3 * (stop - t)):
+            if h <= 1e-15 * max(t, 1e-3 * room_left):
                 return STEP_UNDERFLOW
         proposed = h * min(6.0, 0.9 * norm ** (-1.0 / scheme.c.size) if norm > 0.0 else 6.0)
         _to_polynomial(scheme, work, h)
@@ -530,7 +536,7 @@ def advance(
             _to_polynomial(scheme, work, h)
             last = False
         flips = 0
-        t_new = stop if last else t + h
+        t_new = stop - base if last else t + h
         if not jump:
             _write_outputs(net, room, work, sources, charge, t, h, t_new, y, sign, counters, t_out, left, rows)
         _account(net, room, work, sources, t, h, y, peaks)
@@ -542,8 +548,8 @@ def advance(
             control[H_AFTER_JUMP] = h
             control[JUMPED] = 0.0
         control[H] = max(proposed, control[H]) if last and h < control[H] else proposed
-        control[T] = t_new
-        at_sources(sources, work.place, t_new, s_before, slopes)
+        at_sources(sources, work.place, base, t_new, s_before, slopes)
+        control[BASE], control[T] = (stop, 0.0) if last else (base, t_new)
         h_before = h
         counters[ACCEPTED] += 1
     return DONE

@@ -136,15 +136,15 @@ def new_room(net: Net, size: int) -> Room:
 
 
 @jit
-def at_sources(sources: Sources, index: IntArray, t: float, s: FloatArray, ds: FloatArray) -> None:
-    """Value and slope of every source at t (s), on the segments `index` (n_s,) of their tables."""
+def at_sources(sources: Sources, index: IntArray, base: float, t: float, s: FloatArray, ds: FloatArray) -> None:
+    """Value and slope of every source at t (s) after `base`, on the segments `index` (n_s,) of their tables."""
     for i in range(s.size):
         row = sources.first[i] + index[i]
         start = sources.edges[row]
         length = sources.edges[row + 1] - start
         # Each source has one edge more than it has segments.
         segment = Segment(start, length, sources.terms[row - i], sources.series[row - i])
-        s[i], ds[i] = source(segment, t - start)
+        s[i], ds[i] = source(segment, (base - start) + t)
 
 
 @jit
