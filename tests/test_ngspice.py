@@ -10,18 +10,21 @@ import pytest
 import fingerspice as fs
 from ngspice_tools import CIRCUITS, GAP_SIGNALS, run_ngspice, with_charge_law
 
-SHIPPED = ["fingerpad", "fingerpad_5khz", "fingerpad_square", "fingerpad_square_5khz", "fingerpad_dispersive"]
+STACKS = ["fingerpad", "fingerpad_5khz", "fingerpad_square", "fingerpad_square_5khz", "fingerpad_dispersive"]
+ONE_GAP = ["ungrounded_user", "amplifier", "screen_protector", "current_drive", "am_carrier"]
+SHIPPED = [*STACKS, *ONE_GAP, "two_fingers"]
 
 
-def deviation(name, law, max_step=None):
+def deviation(name, law, max_step=None, edit=lambda text: text):
     """Largest difference of the gap voltage over its peak, at ngspice's own times, and of the area in mm^2."""
-    text = with_charge_law((CIRCUITS / f"{name}.cir").read_text(), law)
+    text = edit(with_charge_law((CIRCUITS / f"{name}.cir").read_text(), law))
     theirs = run_ngspice(text, signals=list(GAP_SIGNALS), max_step=max_step)
     circuit = fs.parse_netlist(text)
     t = np.unique(theirs["time"])
     keep = np.searchsorted(theirs["time"], t, side="right") - 1
     # Inside a 1 ns edge the last digit of the time is a visible voltage.
-    edges = circuit["Vdrive"].waveform.breakpoints(0.0, circuit.tran.stop)
+    sources = [e.waveform for e in circuit.by_device("V", "I")]
+    edges = np.concatenate([wave.breakpoints(1e-12, circuit.tran.stop) for wave in sources])
     near = np.zeros(t.size, bool)
     for edge in edges:
         near |= np.abs(t - edge) < 2e-9
@@ -56,6 +59,40 @@ def test_agreement_improves_as_the_square_of_the_step(law):
     assert coarse > 1e-5
     assert fine <= 1e-7
     assert area <= 2e-3
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+@pytest.mark.parametrize("name", ONE_GAP)
+def test_other_circuits_agree_with_their_error_falling_as_the_square_of_the_step(name, law):
+    step = fs.read_netlist(CIRCUITS / f"{name}.cir").tran.step
+    coarse, _ = deviation(name, law)
+    fine, area = deviation(name, law, max_step=step / 4.0)
+    assert coarse <= 1e-4
+    assert fine <= max(coarse / 10.0, 3e-6)
+    assert area <= 2e-2
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_two_fingers_agree(law):
+    text = with_charge_law((CIRCUITS / "two_fingers.cir").read_text(), law)
+    nodes = ["v(xfirm.top)-v(xfirm.skin)", "v(xlight.top)-v(xlight.skin)", "v(firm)", "v(light)"]
+    theirs = run_ngspice(text, signals=nodes, max_step=1e-7)
+    circuit = fs.parse_netlist(text)
+    t, keep = np.unique(np.minimum(theirs["time"], circuit.tran.stop), return_index=True)
+    ours = fs.simulate(circuit, t_eval=t, rtol=1e-8)
+    for i in range(2):
+        assert np.abs(ours.u_gap[:, i] - theirs[nodes[i]][keep]).max() <= 3e-6 * np.abs(ours.u_gap[:, i]).max()
+        assert np.abs(1e6 * ours.area[:, i] - theirs[nodes[2 + i]][keep]).max() <= 5e-3
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_contact_kinetics_agree(law):
+    def slow(text):
+        return text.replace("c2=5000", "c2=5000 tau=2m").replace(".nodeset", ".ic")
+
+    du, area = deviation("fingerpad", law, edit=slow)
+    assert du <= 1e-5
+    assert area <= 5e-3
 
 
 def test_every_shipped_deck_is_read_without_a_warning():

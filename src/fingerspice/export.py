@@ -10,7 +10,7 @@ import numpy as np
 
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.ramps import PWL, Pulse
-from fingerspice.circuit.statespace import build_stack
+from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
 from fingerspice.circuit.waveforms import DC, Exp, Sine, Waveform
 from fingerspice.errors import InputError
 
@@ -55,9 +55,11 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     law = charge_law or circuit.charge_law or "local"
     if law not in LIBRARIES:
         raise InputError(f"charge_law is {law!r}; allowed: {' or '.join(map(repr, LIBRARIES))}")
-    stack = build_stack(circuit)
     _refuse_merged_names(circuit)
-    ratio = stack.contact.work_ratio if stack.contact is not None else 1.0
+    ratio = 1.0
+    if is_stack(circuit):
+        contact = build_stack(circuit).contact
+        ratio = contact.work_ratio if contact is not None else 1.0
     lines = [
         circuit.title or "fingerspice export",
         f"* Written by fingerspice; charge law {law}. Run: ngspice -b -r out.raw FILE",
@@ -68,9 +70,11 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     for element in circuit.elements:
         lines += _element_lines(element, circuit, ratio)
     lines += _analysis_lines(circuit)
-    if stack.contact is not None and stack.gap_layer is not None:
-        area = stack.area_given if stack.area_given is not None else float(stack.contact.area(0.0))
-        lines.append(f".nodeset v({_name(stack.layers[stack.gap_layer].node_names[2])})={area * 1e6!r}")
+    for gap in circuit.by_device("GAP"):
+        area = gap.values["a_fix"] or 1e6 * float(contact_of(gap).area(0.0))
+        # An area with dynamics of its own has to start somewhere; a guess is enough for one that follows at once.
+        word = ".ic" if gap.values["tau"] > 0.0 else ".nodeset"
+        lines.append(f"{word} v({_name(gap.node_names[2])})={area!r}")
     lines += ["", library_text(law).rstrip(), ".end", ""]
     return "\n".join(lines)
 

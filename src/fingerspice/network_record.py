@@ -111,13 +111,13 @@ class NetworkRecord:
 
     @cached_property
     def u_source(self) -> FloatArray:
-        """Voltage of each source from p to n, V."""
+        """Voltage of each source, V: of a V from p to n, of an I from n to p, as it drives."""
         n_v = self.network.n_voltage
         out = self._s.copy()
         if n_v < out.shape[1]:
             for j, element in enumerate(self.network.sources[n_v:]):
                 ends = [self._at_node(node) for node in element.nodes[:2]]
-                out[:, n_v + j] = ends[0] - ends[1]
+                out[:, n_v + j] = ends[1] - ends[0]
         return _columns(out)
 
     def _at_node(self, node: str) -> FloatArray:
@@ -153,14 +153,14 @@ class NetworkRecord:
 
     @cached_property
     def charge(self) -> FloatArray | None:
-        """Charge that each source has delivered out of its p node, C."""
+        """Charge that each source has delivered out of its p node, or an I out of its n node, C."""
         n_s = len(self.network.sources)
         end = self.rows.shape[1] - n_s
         return _columns(self.rows[:, end - n_s : end].copy()) if self.has_charge else None
 
     @cached_property
     def current(self) -> FloatArray | None:
-        """Regular part of each source's current out of its p node, A."""
+        """Regular part of each source's current out of that node, A."""
         return _columns(self.rows[:, -len(self.network.sources) :].copy()) if self.has_charge else None
 
     @cached_property

@@ -59,23 +59,31 @@ def _with_changes(circuit: Circuit, changes: list[str]) -> Circuit:
 
 def _with_source(circuit: Circuit, text: str) -> Circuit:
     from fingerspice.circuit.netlist import source_from_text
-    from fingerspice.circuit.statespace import build_stack
+    from fingerspice.circuit.topology import find_branches
 
-    sources = build_stack(circuit).sources
+    sources = [e for e in find_branches(circuit)[1] if e.device in "VI"]
     if len(sources) != 1:
-        names = ", ".join(e.name for e, _ in sources)
-        raise InputError(f"--source needs a circuit with one voltage source; this one has {names}")
+        names = ", ".join(e.name for e in sources)
+        raise InputError(f"--source needs a circuit with one source; this one has {names}")
     try:
-        return circuit.replace({sources[0][0].name: source_from_text(text, circuit)})
+        return circuit.replace({sources[0].name: source_from_text(text, circuit)})
     except InputError as error:
         raise InputError(f"--source {error.message}") from None
 
 
 def note_skin_frequency(circuit: Circuit) -> None:
     """Warn where a SKIN's data are not taken at the source's fundamental."""
-    from fingerspice.circuit.statespace import build_stack
+    from fingerspice.circuit.statespace import build_stack, is_stack
+    from fingerspice.circuit.topology import find_branches
 
-    fundamental = build_stack(circuit).waveform.fundamental
+    if is_stack(circuit):
+        fundamental = build_stack(circuit).waveform.fundamental
+    else:
+        waves = [e.waveform for e in find_branches(circuit)[1] if e.waveform is not None]
+        fundamental = waves[0].fundamental if len(waves) == 1 else None
+        if len(waves) > 1:
+            # Which of several sources the skin's data should match is the user's to know.
+            return
     for skin in circuit.by_device("SKIN"):
         f = skin.values["f"]
         if fundamental is None:

@@ -37,7 +37,8 @@ class Plan:
     stiff : bool
         Whether an explicit method would be held back by stability.
     sensitivity : float
-        Largest relative change of the leak rates that the area causes over the run.
+        Largest relative change of the leak rates that the area causes over the run; NaN for a network, where it is not
+        what decides.
     error_bound : float
         What taking one area, or a dispersive skin at one frequency, costs, relative to the peaks.
     area : float
@@ -111,7 +112,7 @@ def plan_network(problem: NetworkProblem, tier: str = "auto", start: str = "deck
     if chosen != best:
         reason = f"asked for; the lightest that is right would be {best}: {reason}"
     area = float(scene.area0[0]) if scene.area0.size else math.nan
-    return Plan(chosen, (reason,), start, tuple(sorted(map(float, rates))), stiff, 0.0, 0.0, area)
+    return Plan(chosen, (reason,), start, tuple(sorted(map(float, rates))), stiff, math.nan, 0.0, area)
 
 
 def _choose(problem: Problem, rtol: float, tier: str, start: str) -> Plan:

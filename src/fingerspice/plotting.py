@@ -97,7 +97,8 @@ def legend_above(ax: Axes, columns: int = 4, *, right: bool = False, math: bool 
 
 def caption(figure: Figure, text: str, color: str = GREY) -> None:
     """Small print under the figure, wrapped to its width."""
-    small = figure.supxlabel(textwrap.fill(text, 140), x=0.012, ha="left", fontsize=SMALL, color=color)
+    lines = textwrap.fill(text, 132, break_on_hyphens=False)
+    small = figure.supxlabel(lines, x=0.012, ha="left", fontsize=SMALL, color=color)
     small.set_parse_math(False)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,19 +53,21 @@ def summary_table(solution: Solution) -> str:
             ("u_source", "source voltage", "V", 1.0),
             ("u_gap", "gap voltage", "V", 1.0),
             *((f"u_layer:{name}", f"{name} voltage", "V", 1.0) for name in solution.layers),
+            *((f"v:{name}", f"node {name}", "V", 1.0) for name in solution.node_voltages),
             ("f_el", "electroadhesive force", "N", 1.0),
             ("f_t", "friction force", "N", 1.0),
             ("friction", "friction coefficient", "", 1.0),
             ("area", "ridge contact area", "mm^2", 1e6),
         ):
-            if f"{key}_max" in s:
+            # Several gaps or sources have a row each.
+            for name in [
+                n for n in (key, *(f"{key}:{e}" for e in (*solution.gaps, *solution.sources))) if f"{n}_max" in s
+            ]:
                 rows.append(
                     (
-                        label,
+                        label if name == key else f"{label} {name.partition(':')[2]}",
                         *(
-                            _value(
-                                s.get(f"{key}_{part}"), unit, factor, max(abs(s[f"{key}_max"]), abs(s[f"{key}_min"]))
-                            )
+                            _value(s.get(f"{name}_{part}"), unit, factor, s[f"{name}_peak"])
                             for part in ("min", "max", "mean", "mean_periodic", "rms_periodic", "ripple")
                         ),
                     )
@@ -81,7 +84,8 @@ def summary_table(solution: Solution) -> str:
             )
     out.append("")
     if solution.u_gap is None:
-        out.append(f"no GAP, no forces; estimated error: layer voltage {solution.error.u_gap:.2g} V")
+        inside = "layer" if solution.layers else "capacitor"
+        out.append(f"no GAP, no forces; estimated error: {inside} voltage {solution.error.u_gap:.2g} V")
     else:
         out.append(f"estimated error: gap voltage {solution.error.u_gap:.2g} V, force {solution.error.f_el:.2g} N")
     out.append(f"status: {solution.message}")
@@ -100,8 +104,9 @@ def plan_text(plan: Plan, circuit: Circuit) -> str:
     """A plan in words."""
     rates = ", ".join(f"{r:.4g}" for r in plan.rates) or "none"
     lines = [circuit.title, "", f"model: {plan.tier}", *(f"  because {r}" for r in plan.reasons)]
-    lines.append(f"rates of the stack, area frozen: {rates} 1/s ({'' if plan.stiff else 'not '}stiff for this source)")
-    lines.append(f"the area moves the leaks by at most {100.0 * plan.sensitivity:.3g} %")
+    lines.append(f"rates, area frozen: {rates} 1/s ({'' if plan.stiff else 'not '}stiff for this source)")
+    if not math.isnan(plan.sensitivity):
+        lines.append(f"the area moves the leaks by at most {100.0 * plan.sensitivity:.3g} %")
     return "\n".join(lines)
 
 

@@ -71,7 +71,8 @@ class Network:
         Currents of the resistors and the current sources into the cuts of the live capacitors, S.
     through : ndarray, shape (n_s, n_cell)
     delivered : ndarray, shape (n_s, n + n_s)
-        Current that each source delivers out of its p node: through @ i, i the cells' currents, and this of (x, s).
+        Current that each source delivers, a V out of its p node and an I out of its n node: through @ i, i the cells'
+        currents, and this of (x, s).
     resistor_factor : ndarray, shape (n_r, n)
         k = f^T f.
     node_names : tuple of str
@@ -208,8 +209,7 @@ def build_network(circuit: Circuit) -> Network:
     delivered[:n_v, : n + n_v][rounding] = 0.0
     through = np.zeros((n_v + n_i, len(cells)))
     through[:n_v] = across[:, s].T + together @ across[:, x].T
-    # A current source drives its current from p through itself to n.
-    delivered[n_v:, n + n_v :] = -np.eye(n_i)
+    delivered[n_v:, n + n_v :] = np.eye(n_i)
     names = tree.names
     at_node = np.array([potential[name] for name in names]).reshape(len(names), n_v + n + n_r)
     whole = at_node[:, e] + at_node[:, r] @ from_e

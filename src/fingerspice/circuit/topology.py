@@ -239,6 +239,4 @@ def _walk(branches: list[Element]) -> tuple[Hop, ...]:
         first = next((h for h in hops if h.element.device == "V"), None)
         if first is not None and first.sign < 0.0:
             return tuple(hops)
-    if first is None:
-        raise InputError("the loop has no voltage source")
-    return tuple(hops)
+    raise AssertionError("a loop with a source meets it n first in one of its directions")
