@@ -45,12 +45,12 @@ if TYPE_CHECKING:
     from fingerspice.fitting import MaterialFit as MaterialFit
     from fingerspice.fitting import fit_material as fit_material
     from fingerspice.largesignal import large_signal as large_signal
+    from fingerspice.outcome import Status as Status
     from fingerspice.phasors import phasor as phasor
     from fingerspice.planning import Plan as Plan
     from fingerspice.simulation import plan as plan
     from fingerspice.simulation import simulate as simulate
     from fingerspice.solution import Solution as Solution
-    from fingerspice.solution import Status as Status
     from fingerspice.steady import SteadyState as SteadyState
     from fingerspice.steady import steady_state as steady_state
 
@@ -69,7 +69,8 @@ _HOMES = {
     "phasors": ("phasor",),
     "planning": ("Plan",),
     "simulation": ("plan", "simulate"),
-    "solution": ("Solution", "Status"),
+    "outcome": ("Status",),
+    "solution": ("Solution",),
     "steady": ("SteadyState", "steady_state"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}

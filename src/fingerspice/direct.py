@@ -13,10 +13,10 @@ from fingerspice.engine.algebraic import follow, source_at
 from fingerspice.engine.model import Model
 from fingerspice.engine.system import System, build_system
 from fingerspice.numerics import hold, linear
+from fingerspice.outcome import ErrorEstimate, State, Status
 from fingerspice.physics.contact import areas, fixed_area_curve
 from fingerspice.problem import Problem
 from fingerspice.runs import BoolArray, FloatArray, Run, Tables, after_the_end, from_rows, row_width
-from fingerspice.solution import ErrorEstimate, State, Status
 
 # Of the closed forms, over the source's peak.
 ROUNDING = 1e-13

@@ -18,9 +18,9 @@ from fingerspice.engine import advance as loop
 from fingerspice.engine.model import Model, Segment, choose_branch, dot, right_hand_side, source, write_row
 from fingerspice.errors import InputError
 from fingerspice.marching import solve as solve_marching
+from fingerspice.outcome import ErrorEstimate, State, Status
 from fingerspice.problem import Problem
 from fingerspice.runs import Run, Tables, after_the_end, from_rows, row_width
-from fingerspice.solution import ErrorEstimate, State, Status
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

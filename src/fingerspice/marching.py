@@ -16,6 +16,7 @@ from fingerspice.engine.model import Segment, choose_branch, source, write_row
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.system import System, area_range, build_system
 from fingerspice.numerics.lobatto import integral_table
+from fingerspice.outcome import ErrorEstimate, State, Status
 from fingerspice.problem import Problem, Scene
 from fingerspice.runs import (
     ROUNDING,
@@ -29,7 +30,6 @@ from fingerspice.runs import (
     row_width,
 )  # fmt: skip
 from fingerspice.settling import Settling
-from fingerspice.solution import ErrorEstimate, State, Status
 
 # The largest error between nodes may stand beside the two points where it is looked for, and signs may cancel there.
 SAFETY = 2.5

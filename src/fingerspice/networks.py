@@ -18,9 +18,10 @@ from fingerspice.circuit.waveforms import Fundamental, Waveform, require
 from fingerspice.engine.network import Net
 from fingerspice.errors import InputError
 from fingerspice.network_record import NetworkRecord
+from fingerspice.outcome import NetworkState
 from fingerspice.phasors import mean_network_areas
-from fingerspice.problem import run_times
-from fingerspice.solution import NetworkState, Solution
+from fingerspice.solution import Solution
+from fingerspice.times import run_times
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

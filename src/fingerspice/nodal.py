@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
 from fingerspice.engine import collocation
-from fingerspice.engine.collocation import Scheme, advance
+from fingerspice.engine.collocation import advance
 from fingerspice.engine.network import Sources, at_sources, new_room, rates
+from fingerspice.engine.radau import NFEV, Scheme, new_work
 from fingerspice.networks import NetworkProblem
 from fingerspice.numerics.tableaus import radau
+from fingerspice.outcome import ErrorEstimate, NetworkState, Status
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.runs import Progress, windows
-from fingerspice.solution import ErrorEstimate, NetworkState, Status
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -121,7 +122,7 @@ class _Integration:
         self.counters = np.zeros(collocation.N_COUNTERS, np.int64)
         self.peaks = np.zeros(net.gap.size)
         self.room = new_room(net, self.y.size)
-        self.work = collocation.new_work(net, scheme.c.size, scheme.eigenvalues.size, self.y.size)
+        self.work = new_work(net, scheme.c.size, scheme.eigenvalues.size, self.y.size)
 
     @property
     def t(self) -> float:
@@ -233,7 +234,7 @@ def _integrate(
         done += _at_the_end(one, sources, t_out[done:], left[done:], rows[done:])
     return NetworkRun(
         t_out[:done], left[:done], rows[:done], status, ErrorEstimate(rough, 0.0), one.peaks,
-        int(one.counters[collocation.NFEV]),
+        int(one.counters[NFEV]),
         {name: int(one.counters[i]) for name, i in (
             ("steps", collocation.ACCEPTED), ("rejected", collocation.REJECTED), ("zeros", collocation.ZEROS))},
         state, t_failed,
@@ -277,7 +278,7 @@ def solve_coupled(
     n = problem.network.k.shape[0]
     u_scale = max(problem.scene.u_peak, float(np.abs(problem.initial.y[:n]).max(initial=0.0)))
     if problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
-        u_scale = _voltage_scale(problem, coarse, u_scale or 1.0)
+        u_scale = _voltage_scale(problem, coarse, max(u_scale, 1.0))
     tol, nfev = LOCAL_SHARE * rtol, 0
     for attempt in range(ATTEMPTS):
         beside = _integrate(problem, coarse, BESIDE * tol, u_scale, at[probed], side[probed], None)
@@ -295,13 +296,16 @@ def solve_coupled(
 
 
 def _voltage_scale(problem: NetworkProblem, scheme: Scheme, guess: float) -> float:
-    """Largest voltage of a cell, V, from a rough run: that of a current drive is not known beforehand."""
+    """Largest live voltage, V, from rough runs: that of a current drive is not known beforehand.
+
+    From above: what is small beside the guess costs nothing, what is large beside it would be followed far too closely.
+    """
     at = np.linspace(problem.t_start, problem.t_stop, PROBES)
     for _ in range(20):
         rough = _integrate(problem, scheme, 1e-2, guess, at, np.ones(at.size, bool), None)
         n = problem.network.k.shape[0]
         largest = float(np.abs(rough.rows[:, :n]).max(initial=0.0))
-        if not 0.0 < largest < math.inf or 0.1 * guess <= largest <= guess:
+        if not 0.0 < largest < math.inf or 0.05 * guess <= largest <= guess:
             break
         guess = 1.5 * largest
     return guess

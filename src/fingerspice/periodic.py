@@ -16,8 +16,8 @@ from fingerspice.engine.system import System
 from fingerspice.errors import InputError, SolveError
 from fingerspice.marching import FINEST, LOCAL_SHARE, LONGEST_STEP, SAFETY, prepare_system
 from fingerspice.numerics import linear
+from fingerspice.outcome import ErrorEstimate, Status
 from fingerspice.problem import Problem, state_from
-from fingerspice.solution import ErrorEstimate, Status
 
 FloatArray = NDArray[np.float64]
 

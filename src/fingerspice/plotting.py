@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.files import write_aside
+from fingerspice.outcome import Status
 from fingerspice.physics.materials import SKIN_BAND
-from fingerspice.solution import Status
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,11 +17,13 @@ from fingerspice.circuit.waveforms import Fundamental, Waveform, require
 from fingerspice.engine.model import Model, choose_branch, gap_voltage
 from fingerspice.errors import InputError
 from fingerspice.numerics.modes import modes
+from fingerspice.outcome import State
 from fingerspice.phasors import mean_area
 from fingerspice.physics.contact import fixed_area_curve, inverse_area
 from fingerspice.record import Record
-from fingerspice.solution import Solution, State
+from fingerspice.solution import Solution
 from fingerspice.spectrum import freezing_error
+from fingerspice.times import run_times
 
 FloatArray = NDArray[np.float64]
 
@@ -246,30 +248,6 @@ def _largest_voltage(waveform: Waveform, stop: float) -> float:
         stop = waveform.settled + waveform.period
     peak = waveform.peak(0.0, stop)
     return peak if math.isfinite(peak) else 0.0
-
-
-def run_times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: FloatArray | None) -> tuple[float, float]:
-    """End of the run and output spacing, s."""
-    tran = circuit.tran
-    if t_stop is None:
-        if tran is not None:
-            t_stop = t_start + tran.stop
-        elif t_eval is not None and t_eval.size:
-            t_stop = float(t_eval[-1])
-        else:
-            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
-    require(math.isfinite(t_stop) and t_stop > t_start, "t_stop", f"{t_stop:g} s", f"more than {t_start:g} s")
-    if t_eval is not None:
-        require(t_eval.ndim == 1 and t_eval.size > 0, "t_eval", f"of shape {t_eval.shape}", "one row of times")
-        require(bool(np.all(t_eval[1:] >= t_eval[:-1])), "t_eval", "not in order", "ascending times")
-        require(
-            bool(t_eval[0] >= t_start and t_eval[-1] <= t_stop),
-            "t_eval",
-            f"{t_eval[0]:g} s to {t_eval[-1]:g} s",
-            f"times from {t_start:g} s to t_stop = {t_stop:g} s",
-        )
-    step = tran.step if tran is not None else (t_stop - t_start) / 1000.0
-    return t_stop, step
 
 
 def _fixed_area(stack: Stack, area: str | float) -> tuple[float | None, str]:

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
 from fingerspice.engine.model import Segment
 from fingerspice.networks import NetworkProblem
+from fingerspice.outcome import ErrorEstimate, State, Status
 from fingerspice.problem import Problem
 from fingerspice.record import Record
-from fingerspice.solution import ErrorEstimate, State, Status
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -67,7 +67,8 @@ class Settling:
         if self._looked is not None:
             before, y = self._looked
             passed = self._count - before
-            moved = magnified * float(np.abs(x - y).max(initial=0.0))
+            # For a few numbers numpy's calls would cost more than the rest of the look.
+            moved = magnified * max(map(abs, (x - y).tolist()), default=0.0)
             decay = min(self.rate * self.period * passed, 700.0)
             # What is left decays as a geometric series, or moves on no faster than up to now.
             self.remaining = moved * min(left / passed, max(1.0 / math.expm1(decay), 1e-3))
@@ -93,6 +94,10 @@ class Settling:
 
     def snapped(self, table: SourceTable) -> float:
         """Time of the next look, on the edge of the source that it misses by rounding."""
-        i = int(np.searchsorted(table.edges, self.next))
-        near = [float(e) for e in table.edges[max(i - 1, 0) : i + 1] if abs(e - self.next) <= same_time(float(e))]
-        return near[0] if near else self.next
+        if self.next == math.inf:
+            return self.next
+        i = int(table.edges.searchsorted(self.next))
+        for edge in table.edges[max(i - 1, 0) : i + 1].tolist():
+            if abs(edge - self.next) <= same_time(edge):
+                return float(edge)
+        return self.next

@@ -22,13 +22,14 @@ from fingerspice.network_record import NetworkRecord
 from fingerspice.networks import NetworkProblem, prepare_network
 from fingerspice.nodal import NetworkRun, solve_coupled
 from fingerspice.numerics.tableaus import TABLEAUS
+from fingerspice.outcome import ErrorEstimate, Status
 from fingerspice.periodic import close_period
 from fingerspice.physics.contact import inverse_area
 from fingerspice.planning import Plan, make_plan, plan_network
 from fingerspice.problem import Problem, prepare
 from fingerspice.record import Record
 from fingerspice.runs import Progress, Run
-from fingerspice.solution import ErrorEstimate, Solution, Status
+from fingerspice.solution import Solution
 from fingerspice.spectrum import spectrum_warning
 from fingerspice.superposition import solve_fixed
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import dataclass, field
-from enum import Enum
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from fingerspice.files import write_aside
 from fingerspice.network_record import NetworkRecord
 from fingerspice.numerics.cubics import fundamental, mean
+from fingerspice.outcome import ErrorEstimate, NetworkState, State, Status
 from fingerspice.record import Record, sealed
 
 if TYPE_CHECKING:
@@ -32,56 +32,6 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 # Dimensions, values, attributes: what both xarray and NetCDF take.
 _Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]
-
-
-class Status(Enum):
-    """How a run ended; the text says what happened and what to do."""
-
-    SUCCESS = "success"
-    FOLD = (
-        "the mobile charge law has no solution past this time: with the charge stored on the interfaces, less area "
-        "means more voltage means less area; use less voltage, more load, or the local law"
-    )
-    SOURCE_NOT_FINITE = "a source gave NaN or inf; nothing after this time is a result"
-    STEP_UNDERFLOW = "no step is small enough for the error asked for; ask for a larger rtol, or check the source"
-    TOO_MANY_STEPS = "the run took two million steps without coming to its end; ask for a larger rtol, or a shorter run"
-    ERROR_NOT_MET = "the error estimate stayed above the error asked for; ask for a larger rtol"
-    METHOD_FAILED = "the chosen method gave up; use method='auto'"
-
-
-@dataclass(frozen=True)
-class ErrorEstimate:
-    """Estimated largest error over the run: of the gap voltage (V), the electroadhesive force (N) and the charge (C).
-
-    Without a GAP, `u_gap` is that of the voltage of the layer with the smallest capacitance, and `f_el` is 0.
-    `q_source` is None where the charge was left out or has no estimate: only the coupled tier's own steps give one, and
-    not from the periodic state on.
-    """
-
-    u_gap: float
-    f_el: float
-    q_source: float | None = None
-
-
-@dataclass(frozen=True)
-class State:
-    """Where a run stopped, for another one to go on from."""
-
-    t: float
-    y: FloatArray
-    u_before: float
-    charge_offset: float
-    charge_law: str
-
-
-@dataclass(frozen=True)
-class NetworkState:
-    """Where the run of a network stopped: `y` as in `engine.network`, sources before a jump, branches of the areas."""
-
-    t: float
-    y: FloatArray
-    s_before: FloatArray
-    sign: FloatArray
 
 
 @dataclass(frozen=True)

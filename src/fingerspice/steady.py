@@ -13,10 +13,11 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.circuit.waveforms import require
 from fingerspice.errors import InputError, SolveError
+from fingerspice.outcome import ErrorEstimate
 from fingerspice.periodic import close_period
 from fingerspice.problem import Problem, prepare
 from fingerspice.simulation import RTOL_RANGE, run_problem
-from fingerspice.solution import ErrorEstimate, Solution
+from fingerspice.solution import Solution
 
 FloatArray = NDArray[np.float64]
 

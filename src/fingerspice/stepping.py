@@ -12,9 +12,9 @@ from fingerspice.engine import advance as loop
 from fingerspice.engine.model import Segment, choose_branch, source, write_row
 from fingerspice.engine.steps import Method
 from fingerspice.numerics.tableaus import Tableau
+from fingerspice.outcome import ErrorEstimate, State, Status
 from fingerspice.problem import Problem
 from fingerspice.runs import ROUNDING, BoolArray, FloatArray, Progress, Run, Tables, after_the_end, from_rows, row_width
-from fingerspice.solution import ErrorEstimate, State, Status
 
 LOG_ROWS = 4096
 # The shadow run's tolerance over the main run's: far enough that their difference is the main run's error.

@@ -13,8 +13,8 @@ from fingerspice.engine.algebraic import source_at
 from fingerspice.networks import NetworkProblem
 from fingerspice.nodal import NetworkRun, gap_signals, source_tables
 from fingerspice.numerics import linear
+from fingerspice.outcome import ErrorEstimate, NetworkState, Status
 from fingerspice.record import sided
-from fingerspice.solution import ErrorEstimate, NetworkState, Status
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -350,7 +350,7 @@ def march(
                         kept_series[place, c, d] = coefficients[c, d]
         if next_out <= t_new:
             first_out = write_outputs(
-                t, h, theta, t_new, 0.0, coefficients, x_out, at_out, first_out, t_out, left, out
+                t, h, theta, t_new, 0.0, False, coefficients, x_out, at_out, first_out, t_out, left, out
             )  # fmt: skip
             counters[OUTPUT] = first_out
             next_out = t_out[first_out] if first_out < t_out.size else math.inf

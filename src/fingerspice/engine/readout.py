@@ -176,6 +176,16 @@ def _clenshaw_groups(series: FloatArray, x: FloatArray, groups: int, out: FloatA
 
 
 @jit_rows
+def _horner_groups(powers: FloatArray, x: FloatArray, groups: int, out: FloatArray) -> None:
+    """As `_clenshaw_groups`, from the coefficients of 1, x, x^2, ...: half the work."""
+    for i in range(_GROUP * groups):
+        value = powers[NODES - 1]
+        for d in range(NODES - 2, -1, -1):
+            value = value * x[i] + powers[d]
+        out[i] = value
+
+
+@jit_rows
 def _place(t: float, scale: float, top: float, groups: int, x: FloatArray) -> None:
     """Output times in place as places in [-1, top] of a step."""
     for i in range(_GROUP * groups):
@@ -184,12 +194,13 @@ def _place(t: float, scale: float, top: float, groups: int, x: FloatArray) -> No
 
 @jit
 def write_outputs(
-    t: float, h: float, reached: float, t_new: float, slack: float, series: FloatArray, x: FloatArray,
+    t: float, h: float, reached: float, t_new: float, slack: float, powers: bool, series: FloatArray, x: FloatArray,
     values: FloatArray, first: int, t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray,
 ) -> int:  # fmt: skip
     """Outputs of one step from number `first` on: right-hand ones in [t, t_new), left-hand ones in (t, t_new].
 
-    Times within `slack` of t_new are t_new. Returns the number of the first output that is left.
+    With `powers` the series holds the coefficients of 1, x, x^2, ... instead. Times within `slack` of t_new are t_new.
+    Returns the number of the first output that is left.
     """
     low = t_new - slack
     high = t_new + slack
@@ -210,7 +221,10 @@ def write_outputs(
         groups = (count + _GROUP - 1) // _GROUP
         _place(t, 2.0 / h, 2.0 * reached - 1.0, groups, x)
         for column in range(out.shape[0]):
-            _clenshaw_groups(series[column], x, groups, values)
+            if powers:
+                _horner_groups(series[column], x, groups, values)
+            else:
+                _clenshaw_groups(series[column], x, groups, values)
             for i in range(count):
                 out[column, first + i] = values[i]
         first += count

@@ -85,11 +85,79 @@ def evaluate(c: FloatArray, x: float) -> tuple[float, float]:
 
 
 _BLOCK = 64
+# Largest sum of the powers' coefficients over that of the series' own: their rounding is so much larger.
+_LARGEST_GROWTH = 16.0
+
+
+@jit
+def to_powers(c: FloatArray, powers: FloatArray) -> bool:
+    """Coefficients of 1, x, x^2, ... of a series into `powers` (c.size,); False where too many digits would cancel.
+
+    A series that falls faster than by 1 + sqrt 2 from term to term loses none, and its powers take half the work.
+    """
+    n = c.size
+    # T_k from T_(k-1) and T_(k-2), as rows of powers.
+    before = np.zeros(n)
+    now = np.zeros(n)
+    now[0] = 1.0
+    powers[:] = 0.0
+    size = 0.0
+    for k in range(n):
+        for j in range(k + 1):
+            powers[j] += c[k] * now[j]
+        size += abs(c[k])
+        twice = 1.0 if k == 0 else 2.0
+        for j in range(min(k + 1, n - 1), -1, -1):
+            above = -before[j]
+            before[j] = now[j]
+            now[j] = above + (twice * now[j - 1] if j > 0 else 0.0)
+    # The shift above went from the top down, so that `now[j - 1]` was still the row before.
+    total = 0.0
+    for j in range(n):
+        total += abs(powers[j])
+    return total <= _LARGEST_GROWTH * size
 
 
 @jit_rows
 def evaluate_array(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatArray) -> None:
     """The series at (|x| - lo) scale - 1 into `out`, both of shape (n,); several at once in a processor's vector."""
+    powers = np.empty(c.size)
+    if to_powers(c, powers):
+        _horner(powers, x, lo, scale, out)
+    else:
+        _clenshaw(c, x, lo, scale, out)
+
+
+@jit_rows
+def _horner(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatArray) -> None:
+    at = np.zeros(_BLOCK)
+    value = np.zeros(_BLOCK)
+    for first in range(0, x.size, _BLOCK):
+        count = min(_BLOCK, x.size - first)
+        for i in range(count):
+            at[i] = (abs(x[first + i]) - lo) * scale - 1.0
+        k = c.size - 1
+        top = c[k]
+        for i in range(_BLOCK):
+            value[i] = top
+        # Four steps for each pass through memory.
+        while k >= 4:
+            c0, c1, c2, c3 = c[k - 1], c[k - 2], c[k - 3], c[k - 4]
+            for i in range(_BLOCK):
+                step = at[i]
+                value[i] = (((value[i] * step + c0) * step + c1) * step + c2) * step + c3
+            k -= 4
+        while k > 0:
+            k -= 1
+            c0 = c[k]
+            for i in range(_BLOCK):
+                value[i] = value[i] * at[i] + c0
+        for i in range(count):
+            out[first + i] = value[i]
+
+
+@jit_rows
+def _clenshaw(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatArray) -> None:
     twice = np.empty(_BLOCK)
     b1 = np.empty(_BLOCK)
     b2 = np.empty(_BLOCK)

@@ -1,0 +1,296 @@
+"""One step of Radau collocation on a network: simplified Newton in the eigenvectors of the tableau, dense output."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.compiled import borrow, jit, jit_inline
+from fingerspice.engine.network import Net, Room, Sources, at_sources, capacitances, rates, residual
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+IntArray = NDArray[np.int64]
+
+# Entry of `counters`: evaluations of the right-hand side.
+NFEV = 0
+# What Newton's method leaves, over the error allowed in a step.
+CONVERGED = 0.01
+# How far a step's polynomial is followed past its end for a guess of the next one, in its own length.
+FARTHEST = 2.0
+
+
+class Scheme(NamedTuple):
+    """Radau IIA as numbers (see `fingerspice.numerics.tableaus.Tableau`), with its matrix diagonalised.
+
+    Attributes
+    ----------
+    a, c, e, dense : ndarray
+        The tableau's; `e` (s,) gives the highest Legendre coefficient of the increment.
+    eigenvalues : ndarray of complex, shape (m,)
+        Of `a`: one of each conjugate pair, and the real one.
+    to, back : ndarray of complex, shape (m, s) and (s, m)
+        a = Re(back diag(eigenvalues) to).
+    h_max : float
+        s.
+    """
+
+    a: FloatArray
+    c: FloatArray
+    e: FloatArray
+    dense: FloatArray
+    eigenvalues: ComplexArray
+    to: ComplexArray
+    back: ComplexArray
+    h_max: float
+
+
+class Work(NamedTuple):
+    """Arrays of one integration."""
+
+    k: FloatArray
+    poly: FloatArray
+    slope: FloatArray
+    mass: FloatArray
+    weight: FloatArray
+    newton: ComplexArray
+    rate: FloatArray
+    stage: FloatArray
+    y1: FloatArray
+    residual: FloatArray
+    place: IntArray
+    base: FloatArray
+    s: FloatArray
+    ds: FloatArray
+
+
+@jit
+def new_work(net: Net, stages: int, n_eigen: int, size: int) -> Work:
+    """Room for steps of a state of `size`."""
+    n_s = net.b.shape[1]
+    m = size - n_s
+    return Work(
+        np.zeros((stages, size)), np.zeros((size, stages)), np.zeros((m, m)), np.zeros((m, m)), np.zeros(m),
+        np.zeros((n_eigen, m, m), np.complex128), np.zeros(size), np.zeros(size), np.zeros(size),
+        np.zeros((stages, m)), np.zeros(n_s, np.int64), np.zeros(1), np.zeros((stages, n_s)), np.zeros((stages, n_s)),
+    )  # fmt: skip
+
+
+@jit_inline
+def lend_work(work: Work) -> Work:
+    return Work(
+        borrow(work.k), borrow(work.poly), borrow(work.slope), borrow(work.mass), borrow(work.weight),
+        borrow(work.newton), borrow(work.rate), borrow(work.stage), borrow(work.y1), borrow(work.residual),
+        borrow(work.place), borrow(work.base), borrow(work.s), borrow(work.ds),
+    )  # fmt: skip
+
+
+@jit
+def _invert(matrix: ComplexArray) -> bool:
+    """Inverse in place by Gauss-Jordan elimination with row pivoting; False where it is singular."""
+    n = matrix.shape[0]
+    order = np.arange(n)
+    for column in range(n):
+        pivot = column
+        for row in range(column + 1, n):
+            if abs(matrix[row, column]) > abs(matrix[pivot, column]):
+                pivot = row
+        size = abs(matrix[pivot, column])
+        if not 0.0 < size < np.inf:
+            return False
+        order[column], order[pivot] = order[pivot], order[column]
+        for j in range(n):
+            matrix[column, j], matrix[pivot, j] = matrix[pivot, j], matrix[column, j]
+        scale = 1.0 / matrix[column, column]
+        matrix[column, column] = 1.0
+        for j in range(n):
+            matrix[column, j] *= scale
+        for row in range(n):
+            factor = matrix[row, column]
+            if row != column and factor != 0.0:
+                matrix[row, column] = 0.0
+                for j in range(n):
+                    matrix[row, j] -= factor * matrix[column, j]
+    swapped = np.empty(n, matrix.dtype)
+    for row in range(n):
+        for j in range(n):
+            swapped[order[j]] = matrix[row, j]
+        for j in range(n):
+            matrix[row, j] = swapped[j]
+    return True
+
+
+@jit
+def linearise(net: Net, room: Room, work: Work, jump: bool, y: FloatArray, sign: FloatArray, scale: FloatArray) -> None:
+    """Derivatives of the residual by the state, by differences, and by its rate, at the rate in `work.rate`.
+
+    Only the part of the state that feeds back; rows over their largest capacitance, as currents are tiny beside rates
+    of areas. The sources are those in `room`.
+    """
+    n = net.k.shape[0]
+    m = work.slope.shape[0]
+    capacitances(net, room, y, sign)
+    work.mass[:] = 0.0
+    for i in range(m):
+        largest = 1.0 if i >= n else 0.0
+        for j in range(n):
+            if i < n:
+                work.mass[i, j] = room.matrix[i, j]
+                largest = max(largest, abs(room.matrix[i, j]))
+        if i >= n:
+            work.mass[i, i] = 1.0
+        work.weight[i] = 1.0 / largest
+    work.stage[:] = y
+    residual(net, room, jump, y, sign, work.rate, room.base)
+    for j in range(m):
+        change = 1e-7 * (abs(y[j]) + scale[j])
+        work.stage[j] = y[j] + change
+        residual(net, room, jump, work.stage, sign, work.rate, room.probe)
+        work.stage[j] = y[j]
+        for i in range(m):
+            work.slope[i, j] = work.weight[i] * (room.probe[i] - room.base[i]) / change
+            work.mass[i, j] *= work.weight[i]
+
+
+@jit
+def _prepare_newton(scheme: Scheme, work: Work, h: float) -> bool:
+    """Inverses of M - h lambda J for every eigenvalue of the scheme."""
+    m = work.slope.shape[0]
+    for e in range(scheme.eigenvalues.size):
+        for i in range(m):
+            for j in range(m):
+                work.newton[e, i, j] = work.mass[i, j] - h * scheme.eigenvalues[e] * work.slope[i, j]
+        if not _invert(work.newton[e]):
+            return False
+    return True
+
+
+@jit
+def _solve_newton(scheme: Scheme, work: Work) -> None:
+    """(1 (x) M - h a (x) J)^-1 residual into `work.residual`."""
+    stages, m = work.residual.shape
+    left = np.zeros(m, np.complex128)
+    turned = np.zeros((scheme.eigenvalues.size, m), np.complex128)
+    for e in range(scheme.eigenvalues.size):
+        for j in range(m):
+            left[j] = 0.0
+            for i in range(stages):
+                left[j] += scheme.to[e, i] * work.residual[i, j]
+        for i in range(m):
+            for j in range(m):
+                turned[e, i] += work.newton[e, i, j] * left[j]
+    for i in range(stages):
+        for j in range(m):
+            total = 0.0
+            for e in range(scheme.eigenvalues.size):
+                total += (scheme.back[i, e] * turned[e, j]).real
+            work.residual[i, j] = total
+
+
+@jit
+def step(
+    net: Net, room: Room, scheme: Scheme, work: Work, sources: Sources, jump: bool, t: float, h: float, y: FloatArray,
+    sign: FloatArray, scale: FloatArray, tol: float, counters: IntArray,
+) -> float:  # fmt: skip
+    """Collocation over [t, t + h] with `work.slope` as Newton's matrix: stages in `work.k`, the end in `work.y1`.
+
+    `work.k` holds a guess of the stages. Returns the error over `tol` times `scale`; inf where it does not converge.
+    """
+    stages, m = work.residual.shape
+    if not _prepare_newton(scheme, work, h):
+        return math.inf
+    k = work.k
+    for i in range(stages):
+        at_sources(sources, work.place, work.base[0], t + scheme.c[i] * h, work.s[i], work.ds[i])
+    before = math.inf
+    for iteration in range(12):
+        for i in range(stages):
+            for j in range(y.size):
+                value = 0.0
+                for r in range(stages):
+                    value += scheme.a[i, r] * k[r, j]
+                work.stage[j] = y[j] + h * value
+            room.s[:] = work.s[i]
+            room.ds[:] = work.ds[i]
+            residual(net, room, jump, work.stage, sign, k[i], room.base)
+            for j in range(m):
+                work.residual[i, j] = work.weight[j] * room.base[j]
+            # Nothing depends on the charges: they are only collected.
+            for j in range(m, y.size):
+                k[i, j] = room.base[j]
+        counters[NFEV] += stages
+        _solve_newton(scheme, work)
+        change = 0.0
+        for i in range(stages):
+            for j in range(m):
+                k[i, j] += work.residual[i, j]
+                value = abs(h * work.residual[i, j]) / scale[j]
+                if not value <= change:
+                    change = value
+        if not change < math.inf or (iteration > 1 and change > before and change > tol):
+            return math.inf
+        # What is left, as each iteration takes the same share off; or at rounding, where nothing falls any more.
+        falls = change / before if iteration > 0 else 0.5
+        left = change * falls / (1.0 - falls) if falls < 1.0 else math.inf
+        if left <= CONVERGED * tol or (iteration > 2 and falls > 0.3 and change <= 1e-13):
+            break
+        before = change
+    else:
+        return math.inf
+    norm = 0.0
+    for j in range(y.size):
+        top = 0.0
+        end = 0.0
+        for r in range(stages):
+            top += scheme.e[r] * k[r, j]
+            end += scheme.a[stages - 1, r] * k[r, j]
+        work.y1[j] = y[j] + h * end
+        value = abs(h * top) / (tol * scale[j])
+        if not value <= norm:
+            norm = value
+    if net.mobile and norm <= 1.0:
+        # Past a fold there may be a solution that does not continue this one.
+        room.s[:] = work.s[stages - 1]
+        room.ds[:] = work.ds[stages - 1]
+        if not rates(net, room, jump, work.y1, sign, work.rate):
+            return math.inf
+    return norm if norm == norm else math.inf
+
+
+@jit
+def to_polynomial(scheme: Scheme, work: Work, h: float) -> None:
+    for j in range(work.poly.shape[0]):
+        for d in range(work.poly.shape[1]):
+            value = 0.0
+            for r in range(scheme.dense.shape[0]):
+                value += scheme.dense[r, d] * work.k[r, j]
+            work.poly[j, d] = h * value
+
+
+@jit
+def guess(scheme: Scheme, work: Work, start: FloatArray, h: float, h_before: float) -> None:
+    """Stages of the next step from the polynomial of the one before, or where there is none from the rate now."""
+    follows = h_before > 0.0 and h <= FARTHEST * h_before
+    for i in range(scheme.c.size):
+        theta = 1.0 + scheme.c[i] * h / h_before if follows else 0.0
+        for j in range(start.size):
+            if follows:
+                value = 0.0
+                for d in range(work.poly.shape[1] - 1, -1, -1):
+                    value = value * theta + (d + 1.0) * work.poly[j, d]
+                work.k[i, j] = value / h_before
+            else:
+                work.k[i, j] = start[j]
+
+
+@jit
+def inside(theta: float, y: FloatArray, poly: FloatArray, out: FloatArray) -> None:
+    """State at fraction `theta` of the step that starts at `y`."""
+    for j in range(y.size):
+        value = 0.0
+        for d in range(poly.shape[1] - 1, -1, -1):
+            value = (value + poly[j, d]) * theta
+        out[j] = y[j] + value
