@@ -34,7 +34,7 @@ DEVICES = [
     (("f=100", ""), 6, ["Xskin: SKIN needs f (Hz), missing here"]),
     (("LAYER d=1u eps_r=3.9 r=0.2meg", "SLAB d=1u eps_r=3.9"), 4, ["SLAB needs rho (ohm m), missing here"]),
     (("SKIN d=350u f=100", "SKIN_DISPERSIVE d=350u f=100"), 6, ["SKIN_DISPERSIVE has no parameter 'f'"]),
-    (("c2=5000", "c2=5000 tau=1m"), 5, ["Xgap tau (first-order area dynamics)", "not simulated by this version"]),
+    (("c2=5000", "c2=5000 tau=-1m"), 5, ["Xgap tau is -1m (-0.001 s); allowed: 0 or more"]),
     (("r=0.2meg", "e_max=0"), 4, ["Xcoat e_max is 0 V/m", "more than 0 or inf"]),
 ]
 
@@ -86,11 +86,15 @@ CIRCUIT = [
     (("Xskin skin 0", "Xskin skn 0"), 5, ["node 'skin' is floating: only Xgap touches it"]),
     (("Xskin skin 0", "Xskin skin far"), 6, ["node 'far' is floating: only Xskin touches it"]),
     (("Xskin skin 0", "Xskin skin skin"), 6, ["Xskin has both ends on node 'skin'"]),
-    (("0 area SKIN", "0 aera SKIN"), 6, ["Xskin takes its area from node 'aera', which no GAP drives"]),
+    (
+        ("0 area SKIN", "0 aera SKIN"),
+        6,
+        ["node 'aera' gives Xskin its area, but no GAP and no DC source drives it", "Xgap drives 'area'"],
+    ),
     (("Xcoat", "Xgap"), 5, ["element 'Xgap' is defined twice, first at deck.cir:4:1"]),
     ((".end", "Vb drive 0 5"), 8, ["Vdrive and Vb are voltage sources in parallel"]),
     ((".end", "Va area 0 35"), 8, ["Va and Xgap both drive the area node 'area'"]),
-    ((".end", "R1 drive 0 1k"), 8, ["R1: R elements are read, but not solved by this version"]),
+    ((".end", "R1 drive loose 1k"), 8, ["node 'loose' is floating: only R1 touches it"]),
     ((".end", "D1 drive 0 diode"), 8, ["'D1' is a diode, which is not supported"]),
     ((".include fingerspice.lib", ".include ../fingers.lib"), 2, ["lies outside the netlist's folder"]),
     ((".include fingerspice.lib", ".include /etc/passwd"), 2, ["lies outside the netlist's folder"]),

@@ -110,7 +110,7 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
         on_node = [e for e in circuit.by_device("V", "I", "R", "C") if node in e.nodes]
         owner = owners.get(node)
         if owner is None:
-            out.append(Area(node, None, *_given_by_source(layer, on_node)))
+            out.append(Area(node, None, *_given_by_source(layer, on_node, list(owners.values()))))
             continue
         if on_node:
             raise InputError(
@@ -122,12 +122,13 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
     return tuple(reversed(out))
 
 
-def _given_by_source(layer: Element, sources: list[Element]) -> tuple[float, Element]:
+def _given_by_source(layer: Element, sources: list[Element], gaps: list[Element]) -> tuple[float, Element]:
     if len(sources) != 1:
+        driven = "".join(f"; {gap.name} drives {gap.node_names[2]!r}" for gap in gaps)
         raise InputError(
             f"node {layer.node_names[2]!r} gives {layer.name} its area, but "
             + ("no GAP and no DC source drives it" if not sources else "more than one source drives it")
-            + f"; allowed: one GAP, or one V element such as 'Varea {layer.node_names[2]} 0 35' (mm^2)",
+            + f"; allowed: one GAP, or one V element such as 'Varea {layer.node_names[2]} 0 35' (mm^2){driven}",
             layer.where,
         )
     source = sources[0]
