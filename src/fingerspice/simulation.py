@@ -242,31 +242,14 @@ def run_network(
     else:
         run, name = solve_coupled(problem, rtol, run_at, left, progress), "radau"
     wall = time.perf_counter() - begin
-    scene, record = problem.scene, problem.record(run)
+    record = problem.record(run)
     text = run.status.value
     if run.t_failed is not None:
         text = f"stopped at t = {run.t_failed:.10g} s: {text}"
     if run.detail:
         text += f" ({run.detail})"
-    return Solution(
-        t=t_out[: run.t.size].copy(),
-        record=record,
-        status=run.status,
-        message=text,
-        nfev=run.nfev,
-        stats={**run.stats, "wall_s": wall},
-        error=run.error,
-        rtol=rtol,
-        charge_law=scene.charge_law,
-        area_mode=scene.area_mode,
-        method=name,
-        plan=plan,
-        circuit=problem.circuit,
-        state=run.state,
-        fundamental=scene.fundamental,
-        period=scene.waveform.period,
-        warnings=tuple(_network_warnings(problem, run, record)),
-    )
+    warned = tuple(_network_warnings(problem, run, record))
+    return _packed(problem, run, record, t_out[: run.t.size].copy(), text, rtol, name, plan, wall, warned)
 
 
 def _add_error(run: Run, u_gap: float, f_el: float | None = None) -> None:
@@ -342,14 +325,23 @@ def output_times(problem: Problem | NetworkProblem) -> tuple[FloatArray, BoolArr
 def _solution(
     problem: Problem, run: Run, rtol: float, method: str, t_out: FloatArray, wall: float, plan: Plan
 ) -> Solution:
-    scene, record = problem.scene, run.record(problem)
+    record = run.record(problem)
     # The times asked for, not those that rounding moved onto a breakpoint.
     t = np.concatenate([t_out[: run.t.size], run.t[t_out.size :]]) if run.status is Status.SUCCESS else run.t.copy()
+    warned = tuple(_physics_warnings(problem, run, record))
+    return _packed(problem, run, record, t, _message(problem, run, record), rtol, method, plan, wall, warned)
+
+
+def _packed(
+    problem: Problem | NetworkProblem, run: Run | NetworkRun, record: Record | NetworkRecord, t: FloatArray,
+    message: str, rtol: float, method: str, plan: Plan, wall: float, warned: tuple[str, ...],
+) -> Solution:  # fmt: skip
+    scene = problem.scene
     return Solution(
         t=t,
         record=record,
         status=run.status,
-        message=_message(problem, run, record),
+        message=message,
         nfev=run.nfev,
         stats={**run.stats, "wall_s": wall},
         error=run.error,
@@ -362,7 +354,7 @@ def _solution(
         state=run.state,
         fundamental=scene.fundamental,
         period=scene.waveform.period,
-        warnings=tuple(_physics_warnings(problem, run, record)),
+        warnings=warned,
     )
 
 

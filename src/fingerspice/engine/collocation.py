@@ -19,7 +19,8 @@ from fingerspice.engine.network import (
     lend_room,
     rates,
 )
-from fingerspice.engine.radau import NFEV, Scheme, Work, guess, inside, lend_work, linearise, step, to_polynomial
+from fingerspice.engine.radau import NFEV, Scheme, Work, guess, lend_work, linearise, step
+from fingerspice.engine.steps import dense_polynomial, dense_state
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -44,7 +45,7 @@ def _signed(
     net: Net, room: Room, work: Work, sources: Sources, i: int, sign: float, t: float, h: float, theta: float,
     y: FloatArray,
 ) -> float:  # fmt: skip
-    inside(theta, y, work.poly, work.stage)
+    dense_state(theta, y, work.poly, work.stage)
     at_sources(sources, work.place, work.base[0], t + theta * h, room.s, room.ds)
     return sign * gap_voltage(net, room, i, work.stage)
 
@@ -110,7 +111,7 @@ def _write_outputs(
         if since > t_new or (since == t_new and not left[i]):
             return
         theta = max(0.0, min((since - t) / h, 1.0))
-        inside(theta, y, work.poly, work.stage)
+        dense_state(theta, y, work.poly, work.stage)
         for j in range(y.size):
             rows[i, j] = work.stage[j]
         if charge:
@@ -127,7 +128,7 @@ def _account(
 ) -> None:
     """Largest |gap voltage| of every area (V), met at the ends and the quarters of steps."""
     for part in range(5):
-        inside(0.25 * part, y, work.poly, work.stage)
+        dense_state(0.25 * part, y, work.poly, work.stage)
         at_sources(sources, work.place, work.base[0], t + 0.25 * part * h, room.s, room.ds)
         for i in range(peaks.size):
             if net.gap[i] >= 0:
@@ -235,7 +236,7 @@ def advance(
             if h <= 1e-15 * max(t, 1e-3 * room_left):
                 return STEP_UNDERFLOW
         proposed = h * min(6.0, 0.9 * norm ** (-1.0 / scheme.c.size) if norm > 0.0 else 6.0)
-        to_polynomial(scheme, work, h)
+        dense_polynomial(work.k, scheme.dense, h, work.poly)
         theta, which = (2.0, -1) if flips > 1 else _first_zero(net, room, work, sources, t, h, y, sign)
         if theta < 1.0:
             t_new = t + theta * h
@@ -251,7 +252,7 @@ def advance(
                 control[H] = 0.5 * h
                 h_before = 0.0
                 continue
-            to_polynomial(scheme, work, h)
+            dense_polynomial(work.k, scheme.dense, h, work.poly)
             last = False
         flips = 0
         t_new = stop - base if last else t + h

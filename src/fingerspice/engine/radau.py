@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fingerspice.compiled import borrow, jit, jit_inline
 from fingerspice.engine.network import Net, Room, Sources, at_sources, capacitances, rates, residual
+from fingerspice.numerics.small import invert
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -89,41 +90,6 @@ def lend_work(work: Work) -> Work:
 
 
 @jit
-def _invert(matrix: ComplexArray) -> bool:
-    """Inverse in place by Gauss-Jordan elimination with row pivoting; False where it is singular."""
-    n = matrix.shape[0]
-    order = np.arange(n)
-    for column in range(n):
-        pivot = column
-        for row in range(column + 1, n):
-            if abs(matrix[row, column]) > abs(matrix[pivot, column]):
-                pivot = row
-        size = abs(matrix[pivot, column])
-        if not 0.0 < size < np.inf:
-            return False
-        order[column], order[pivot] = order[pivot], order[column]
-        for j in range(n):
-            matrix[column, j], matrix[pivot, j] = matrix[pivot, j], matrix[column, j]
-        scale = 1.0 / matrix[column, column]
-        matrix[column, column] = 1.0
-        for j in range(n):
-            matrix[column, j] *= scale
-        for row in range(n):
-            factor = matrix[row, column]
-            if row != column and factor != 0.0:
-                matrix[row, column] = 0.0
-                for j in range(n):
-                    matrix[row, j] -= factor * matrix[column, j]
-    swapped = np.empty(n, matrix.dtype)
-    for row in range(n):
-        for j in range(n):
-            swapped[order[j]] = matrix[row, j]
-        for j in range(n):
-            matrix[row, j] = swapped[j]
-    return True
-
-
-@jit
 def linearise(net: Net, room: Room, work: Work, jump: bool, y: FloatArray, sign: FloatArray, scale: FloatArray) -> None:
     """Derivatives of the residual by the state, by differences, and by its rate, at the rate in `work.rate`.
 
@@ -163,7 +129,7 @@ def _prepare_newton(scheme: Scheme, work: Work, h: float) -> bool:
         for i in range(m):
             for j in range(m):
                 work.newton[e, i, j] = work.mass[i, j] - h * scheme.eigenvalues[e] * work.slope[i, j]
-        if not _invert(work.newton[e]):
+        if not invert(work.newton[e]):
             return False
     return True
 
@@ -261,16 +227,6 @@ def step(
 
 
 @jit
-def to_polynomial(scheme: Scheme, work: Work, h: float) -> None:
-    for j in range(work.poly.shape[0]):
-        for d in range(work.poly.shape[1]):
-            value = 0.0
-            for r in range(scheme.dense.shape[0]):
-                value += scheme.dense[r, d] * work.k[r, j]
-            work.poly[j, d] = h * value
-
-
-@jit
 def guess(scheme: Scheme, work: Work, start: FloatArray, h: float, h_before: float) -> None:
     """Stages of the next step from the polynomial of the one before, or where there is none from the rate now."""
     follows = h_before > 0.0 and h <= FARTHEST * h_before
@@ -284,13 +240,3 @@ def guess(scheme: Scheme, work: Work, start: FloatArray, h: float, h_before: flo
                 work.k[i, j] = value / h_before
             else:
                 work.k[i, j] = start[j]
-
-
-@jit
-def inside(theta: float, y: FloatArray, poly: FloatArray, out: FloatArray) -> None:
-    """State at fraction `theta` of the step that starts at `y`."""
-    for j in range(y.size):
-        value = 0.0
-        for d in range(poly.shape[1] - 1, -1, -1):
-            value = (value + poly[j, d]) * theta
-        out[j] = y[j] + value

@@ -11,33 +11,48 @@ from numpy.typing import NDArray
 from fingerspice.compiled import jit
 
 FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 
 @jit
 def inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of a square matrix (n, n) by Gauss-Jordan elimination with row pivoting; NaN where it is singular."""
+    """Inverse of a square matrix (n, n); NaN where it is singular."""
+    out = matrix.copy()
+    if not invert(out):
+        out[:] = np.nan
+    return out
+
+
+@jit
+def invert(matrix: FloatArray | ComplexArray) -> bool:
+    """Invert a matrix (n, n) in place by Gauss-Jordan elimination with row pivoting; False where it is singular."""
     n = matrix.shape[0]
-    a = matrix.copy()
-    out = np.eye(n)
+    order = np.arange(n)
     for column in range(n):
         pivot = column
         for row in range(column + 1, n):
-            if abs(a[row, column]) > abs(a[pivot, column]):
+            if abs(matrix[row, column]) > abs(matrix[pivot, column]):
                 pivot = row
-        size = abs(a[pivot, column])
+        size = abs(matrix[pivot, column])
         if not 0.0 < size < np.inf:
-            return np.full((n, n), np.nan)
+            return False
+        order[column], order[pivot] = order[pivot], order[column]
         for j in range(n):
-            a[column, j], a[pivot, j] = a[pivot, j], a[column, j]
-            out[column, j], out[pivot, j] = out[pivot, j], out[column, j]
-        scale = 1.0 / a[column, column]
+            matrix[column, j], matrix[pivot, j] = matrix[pivot, j], matrix[column, j]
+        scale = 1.0 / matrix[column, column]
+        matrix[column, column] = 1.0
         for j in range(n):
-            a[column, j] *= scale
-            out[column, j] *= scale
+            matrix[column, j] *= scale
         for row in range(n):
-            factor = a[row, column]
+            factor = matrix[row, column]
             if row != column and factor != 0.0:
+                matrix[row, column] = 0.0
                 for j in range(n):
-                    a[row, j] -= factor * a[column, j]
-                    out[row, j] -= factor * out[column, j]
-    return out
+                    matrix[row, j] -= factor * matrix[column, j]
+    swapped = np.empty(n, matrix.dtype)
+    for row in range(n):
+        for j in range(n):
+            swapped[order[j]] = matrix[row, j]
+        for j in range(n):
+            matrix[row, j] = swapped[j]
+    return True
