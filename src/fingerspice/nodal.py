@@ -31,7 +31,7 @@ STAGES, STAGES_BESIDE, BESIDE = 7, 5, 10.0
 # What Newton's method may leave in both alike, over the error allowed in a step.
 ALIKE = 0.05
 # The error allowed in a step, over the one asked for.
-LOCAL_SHARE = 0.5
+LOCAL_SHARE = 0.2
 FINEST = 1e-14
 # Steps per shortest time scale of the sources: the stages of a step must not alias it.
 LONGEST_STEP = 0.5
