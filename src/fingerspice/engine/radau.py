@@ -157,6 +157,28 @@ def _solve_newton(scheme: Scheme, work: Work) -> None:
 
 
 @jit
+def _residuals(
+    net: Net, room: Room, scheme: Scheme, work: Work, jump: bool, h: float, y: FloatArray, sign: FloatArray
+) -> None:
+    """Weighted residuals of all stages into `work.residual`, and the charges' rates into `work.k`."""
+    stages, m = work.residual.shape
+    for i in range(stages):
+        for j in range(y.size):
+            value = 0.0
+            for r in range(stages):
+                value += scheme.a[i, r] * work.k[r, j]
+            work.stage[j] = y[j] + h * value
+        room.s[:] = work.s[i]
+        room.ds[:] = work.ds[i]
+        residual(net, room, jump, work.stage, sign, work.k[i], room.base)
+        for j in range(m):
+            work.residual[i, j] = work.weight[j] * room.base[j]
+        # Nothing depends on the charges: they are only collected.
+        for j in range(m, y.size):
+            work.k[i, j] = room.base[j]
+
+
+@jit
 def step(
     net: Net, room: Room, scheme: Scheme, work: Work, sources: Sources, jump: bool, t: float, h: float, y: FloatArray,
     sign: FloatArray, scale: FloatArray, tol: float, counters: IntArray,
@@ -173,20 +195,7 @@ def step(
         at_sources(sources, work.place, work.base[0], t + scheme.c[i] * h, work.s[i], work.ds[i])
     before = math.inf
     for iteration in range(12):
-        for i in range(stages):
-            for j in range(y.size):
-                value = 0.0
-                for r in range(stages):
-                    value += scheme.a[i, r] * k[r, j]
-                work.stage[j] = y[j] + h * value
-            room.s[:] = work.s[i]
-            room.ds[:] = work.ds[i]
-            residual(net, room, jump, work.stage, sign, k[i], room.base)
-            for j in range(m):
-                work.residual[i, j] = work.weight[j] * room.base[j]
-            # Nothing depends on the charges: they are only collected.
-            for j in range(m, y.size):
-                k[i, j] = room.base[j]
+        _residuals(net, room, scheme, work, jump, h, y, sign)
         counters[NFEV] += stages
         _solve_newton(scheme, work)
         change = 0.0
@@ -206,6 +215,10 @@ def step(
         before = change
     else:
         return math.inf
+    if y.size > m and scale[m] < math.inf:
+        # The charges' rates are those of the last but one iteration: once more, where charges are wanted.
+        _residuals(net, room, scheme, work, jump, h, y, sign)
+        counters[NFEV] += stages
     norm = 0.0
     for j in range(y.size):
         top = 0.0
