@@ -54,7 +54,6 @@ class NetworkRun:
     stats: dict[str, int]
     state: NetworkState
     t_failed: float | None = None
-    detail: str = ""
 
 
 def network_scheme(h_max: float, stages: int = STAGES) -> Scheme:

@@ -246,8 +246,6 @@ def run_network(
     text = run.status.value
     if run.t_failed is not None:
         text = f"stopped at t = {run.t_failed:.10g} s: {text}"
-    if run.detail:
-        text += f" ({run.detail})"
     warned = tuple(_network_warnings(problem, run, record))
     return _packed(problem, run, record, t_out[: run.t.size].copy(), text, rtol, name, plan, wall, warned)
 

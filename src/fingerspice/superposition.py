@@ -29,44 +29,42 @@ def solve_fixed(problem: NetworkProblem, t_out: FloatArray, left: BoolArray) -> 
     modes = scene.modes
     n, n_s = modes.gains.shape
     v0 = modes.inverse @ (start.y[:n] + modes.follow @ start.s_before)
-    v = np.zeros((t_out.size, n))
-    v_end = np.zeros(n)
-    integral, integral_end, slope = np.zeros((t_out.size, n_s)), np.zeros(n_s), np.zeros((t_out.size, n_s))
-    done, end, broken, rough = t_out.size, problem.t_stop, None, 0.0
-    for j in range(n_s):
-        # The source's integral rides along as a mode of rate zero, for the charge.
-        rates, gains = np.append(modes.rates, 0.0), np.append(modes.gains[:, j], 1.0)
-        state = np.append(v0 if j == 0 else np.zeros(n), 0.0)
-        first, table = 0, None
-        for tables in source_tables(problem, 1e-13, no_chirps=True):
-            table = tables[j]
-            if table.edges.size < 2:
-                break
-            rough = max(rough, table.rough)
-            last = _upto(t_out, left, float(table.edges[-1]))
-            at = slice(first, last)
-            rows, state = linear.respond(
-                rates, gains, table.edges, table.terms, table.series, state, t_out[at], left[at]
+    v, v_end = np.zeros((t_out.size, n)), np.zeros(n)
+    integral, slope = np.zeros((t_out.size, n_s)), np.zeros((t_out.size, n_s))
+    # The sources' integrals ride along as modes of rate zero, for the charge.
+    rates, gains = np.append(modes.rates, 0.0), np.vstack([modes.gains, np.ones(n_s)])
+    states = [np.append(v0 if j == 0 else np.zeros(n), 0.0) for j in range(n_s)]
+    first, last_tables, rough = 0, None, 0.0
+    for tables in source_tables(problem, 1e-13, no_chirps=True):
+        last_tables = tables
+        end = min(float(table.edges[-1]) for table in tables)
+        if any(table.edges.size < 2 for table in tables):
+            break
+        at = slice(first, _upto(t_out, left, end))
+        for j, table in enumerate(tables):
+            rows, states[j] = linear.respond(
+                rates, gains[:, j], table.edges, table.terms, table.series, states[j], t_out[at], left[at]
             )
             v[at] += rows[:, :n]
             integral[at, j] = rows[:, n]
             slope[at, j] = source_at(table.edges, table.terms, table.series, t_out[at], left[at])[1]
-            first = last
-        stopped = None if table is None else table.not_finite
-        if stopped is not None:
-            broken = stopped if broken is None else min(broken, stopped)
-            done = min(done, first)
-        elif table is not None and first < t_out.size:
-            v[first:] += state[:n]
-            integral[first:, j] = state[n]
+            rough = max(rough, table.rough)
+        first = at.stop
+    stopped = [table.not_finite for table in last_tables or () if table.not_finite is not None]
+    broken = min(stopped) if stopped else None
+    done, end = (t_out.size, problem.t_stop) if broken is None else (first, problem.t_start)
+    for j, table in enumerate(last_tables or ()):
+        v_end += states[j][:n]
+        if broken is None and first < t_out.size:
+            v[first:] += states[j][:n]
+            integral[first:, j] = states[j][n]
             slope[first:, j] = _slope_after(problem, j, table)
-        v_end += state[:n]
-        integral_end[j] = state[n]
+    integral_end = np.array([state[n] for state in states])
     t, side = t_out[:done], left[:done]
     if broken is not None:
-        end = broken
+        # What the sources that go on have moved after the last output is no result.
         v_end, integral_end = (v[done - 1], integral[done - 1]) if done else (v0, np.zeros(n_s))
-        end = float(t[-1]) if done else problem.t_start
+        end = float(t[-1]) if done else end
     s = np.column_stack([sided(wave, t, side) for wave in scene.waveforms])
     s_end = np.array([float(wave.value(end, "left")) for wave in scene.waveforms])
     x = np.einsum("jk,tk->tj", modes.shape, v[:done]) - np.einsum("jk,tk->tj", modes.follow, s)
