@@ -14,8 +14,6 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "work_precision.json"
-# The library that needs a compiler to install, where it was measured apart.
-NUMBALSODA = HERE / "results" / "work_precision_numbalsoda.json"
 README = HERE.parent / "README.md"
 BEGIN, END = "<!-- speed:begin -->", "<!-- speed:end -->"
 TARGETS = (1e-3, 1e-6, 1e-10)
@@ -168,16 +166,10 @@ def readme_text(results: Report) -> str:
         f"(slow peers: fewer) by `python benchmarks/work_precision.py` on {results['machine']}; versions, every "
         "method, what failed, and the law `mobile`: [`work_precision.md`](benchmarks/results/work_precision.md)."
     )
-    other = json.loads(NUMBALSODA.read_text(encoding="utf-8")) if NUMBALSODA.is_file() else None
     ratio = (
         f"Times our time, the worst of the four scenes of Table 1, at {aims}: {ratios(results, OURS)}; with every "
         f"period stepped {ratios(results, STEPPED)}."
     )
-    if other is not None:
-        ratio += (
-            f" In a run of its own (`{NUMBALSODA.name}`), {ratios(other, OURS)}; with every period stepped "
-            f"{ratios(other, STEPPED)}."
-        )
     return "\n".join(
         [
             *textwrap.wrap(text, 118, break_long_words=False, break_on_hyphens=False),
@@ -264,7 +256,7 @@ def picture(results: Report, path: Path) -> None:
                 ax.set_xlabel(label)
         handles, labels = axes[0][0].get_legend_handles_labels()
         figure.legend(
-            handles[::-1], labels[::-1], loc="outside upper center", ncols=len(labels), frameon=False,
+            handles[::-1], labels[::-1], loc="outside upper center", ncols=(len(labels) + 1) // 2, frameon=False,
             columnspacing=1.2, handlelength=1.6,
         )  # fmt: skip
         figure.savefig(path, dpi=200)
