@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from fingerspice.circuit.sampling import SourceTable, source_table
 from fingerspice.engine import march, shooting
 from fingerspice.engine.pace import Pace
-from fingerspice.engine.system import System
 from fingerspice.errors import InputError, SolveError
 from fingerspice.marching import FINEST, LOCAL_SHARE, LONGEST_STEP, SAFETY, prepare_system
 from fingerspice.numerics import linear
@@ -115,8 +114,7 @@ def _close(
             continue
         if code != shooting.CLOSED:
             break
-        memory = _memory(system, slope)
-        error, excess = _error(figures, memory, problem.model.k_gap * scale, rtol)
+        error, excess = _error(figures, problem.model.k_gap * scale, rtol)
         if excess <= 1.0 or pace.tol <= FINEST * scale:
             break
         tol = pace.tol * min(0.3, 0.5 / excess)
@@ -130,14 +128,14 @@ def _close(
     # Two halves: the second carries on at most what the first was off, and adds as much.
     parts = 2 if half else 1
     return system.live[0] @ w, {
-        "defect": parts * float(defect), "map_slope": np.linalg.matrix_power(slope, parts), "memory": memory,
-        "error": error, "periods": int(counts[1]) / parts,
+        "defect": parts * float(defect), "map_slope": slope @ slope if half else slope,
+        "memory": float(figures[6]), "error": error, "periods": int(counts[1]) / parts,
     }  # fmt: skip
 
 
-def _error(figures: FloatArray, memory: float, u_scale: float, rtol: float) -> tuple[ErrorEstimate, float]:
+def _error(figures: FloatArray, u_scale: float, rtol: float) -> tuple[ErrorEstimate, float]:
     """Error of the periodic state from the figures of its period, and that error over the one asked for."""
-    peak_u, peak_f, error_u, error_f, left = map(float, figures[:5])
+    peak_u, peak_f, error_u, error_f, left, _, memory = map(float, figures)
     # Rounding is an error too, and what Newton moved last was not much more than what it would move next.
     floor = 4e-16 * (peak_u + u_scale)
     steepest = 2.0 * peak_f / (peak_u or 1.0)
@@ -164,16 +162,3 @@ def _close_linear(problem: Problem, table: SourceTable, rtol: float) -> tuple[Fl
     return live @ w, {
         "defect": defect, "map_slope": slope, "memory": 1.0, "error": ErrorEstimate(0.0, 0.0), "periods": 1,
     }  # fmt: skip
-
-
-def _memory(system: System, slope: FloatArray) -> float:
-    """Largest factor by which an error of the live voltages made in every period grows until it is periodic.
-
-    Modes that do not decay keep what they start with: nothing is collected there.
-    """
-    decaying = system.rates[0] > 0.0
-    if not decaying.any():
-        return 1.0
-    solver = np.linalg.inv(np.eye(int(decaying.sum())) - slope[np.ix_(decaying, decaying)])
-    in_volts = system.live[0][:, decaying] @ solver @ system.project[0][decaying]
-    return max(1.0, float(np.abs(in_volts).sum(axis=1).max()))

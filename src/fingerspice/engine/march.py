@@ -16,7 +16,6 @@ from fingerspice.engine.pace import Pace, change_level, choose_step, enter, near
 from fingerspice.engine.readout import (
     ACCEPTED,
     ALLOWED,
-    BLOCK,
     BRANCH_LENGTH,
     BRANCH_START,
     H_AFTER_EDGE,
@@ -31,6 +30,7 @@ from fingerspice.engine.readout import (
     TOO_LONG,
     U_BEFORE,
     U_GAP,
+    WRITTEN_AT_ONCE,
     ZEROS,
     H,
     T,
@@ -71,8 +71,7 @@ class Work(NamedTuple):
     places: FloatArray
     values: FloatArray
     coefficients: FloatArray
-    x_out: FloatArray
-    at_out: FloatArray
+    outputs: FloatArray
     sums: FloatArray
     weight: FloatArray
     tapped: FloatArray
@@ -92,8 +91,7 @@ def new_work(n: int) -> Work:
         np.zeros((n, N_PLACES)),
         np.zeros((n + 2, ROWS)),
         np.zeros((n + 2, ROWS)),
-        np.zeros(BLOCK),
-        np.zeros(BLOCK),
+        np.zeros((2, WRITTEN_AT_ONCE)),
         np.zeros((4, 4)),
         np.zeros(n),
         np.zeros((n + 1, ROWS)),
@@ -170,7 +168,7 @@ def march(
     r, base, w, pull, used = borrow(work.r), borrow(work.base), borrow(work.w), borrow(work.pull), borrow(work.used)
     pull_before, left_before = borrow(work.pull_before), borrow(work.left_before)
     w0, places, sums, weight = borrow(work.w0), borrow(work.places), borrow(work.sums), borrow(work.weight)
-    x_out, at_out = borrow(work.x_out), borrow(work.at_out)
+    outputs = borrow(work.outputs)
     t_out, left, out = borrow(t_out), borrow(left), borrow(out)
     values, coefficients = borrow(work.values), borrow(work.coefficients)
     kept_times, kept_series = borrow(kept.times), borrow(kept.series)
@@ -349,8 +347,8 @@ def march(
                     for d in range(ROWS):
                         kept_series[place, c, d] = coefficients[c, d]
         if next_out <= t_new:
-            first_out = write_outputs(
-                t, h, theta, t_new, 0.0, False, coefficients, x_out, at_out, first_out, t_out, left, out
+            first_out += write_outputs(
+                t, h, theta, t_new, 0.0, False, coefficients, outputs, first_out, 0, t_out, left, out
             )  # fmt: skip
             counters[OUTPUT] = first_out
             next_out = t_out[first_out] if first_out < t_out.size else math.inf

@@ -32,9 +32,9 @@ N_CONTROL = 20
 # Entries of `counters`: rows evaluated, steps accepted and refused, zeros met, outputs written, steps kept.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT = 0, 1, 2, 3, 4, 5
 N_COUNTERS = 6
-# Outputs read at once, in groups of a processor's vectors: a step may hold few.
-BLOCK = 32
-_GROUP = 8
+# Outputs are read in groups of a processor's vectors, and looked for in strides.
+WRITTEN_AT_ONCE = _GROUP = 8
+_STRIDE = 32
 
 
 @jit_rows
@@ -162,73 +162,82 @@ def layers(
 
 
 @jit_rows
-def _clenshaw_groups(series: FloatArray, x: FloatArray, groups: int, out: FloatArray) -> None:
-    """The series at whole groups of places, so that all round alike: the inner loop is unrolled, the outer a vector."""
+def _series_at(
+    series: FloatArray, t_out: FloatArray, t: float, scale: float, top: float, groups: int, out: FloatArray
+) -> None:
+    """The series at whole groups of times, so that all round alike: the inner loop is unrolled, the outer a vector."""
     for i in range(_GROUP * groups):
-        twice = 2.0 * x[i]
+        x = min(max((t_out[i] - t) * scale - 1.0, -1.0), top)
+        twice = 2.0 * x
         b1 = 0.0
         b2 = 0.0
         for d in range(NODES - 1, 0, -1):
             b0 = twice * b1 + (series[d] - b2)
             b2 = b1
             b1 = b0
-        out[i] = series[0] + x[i] * b1 - b2
+        out[i] = series[0] + x * b1 - b2
 
 
 @jit_rows
-def _horner_groups(powers: FloatArray, x: FloatArray, groups: int, out: FloatArray) -> None:
-    """As `_clenshaw_groups`, from the coefficients of 1, x, x^2, ...: half the work."""
+def _powers_at(
+    powers: FloatArray, t_out: FloatArray, t: float, scale: float, top: float, groups: int, out: FloatArray
+) -> None:
+    """As `_series_at`, from the coefficients of 1, x, x^2, ...: half the work."""
     for i in range(_GROUP * groups):
+        x = min(max((t_out[i] - t) * scale - 1.0, -1.0), top)
         value = powers[NODES - 1]
         for d in range(NODES - 2, -1, -1):
-            value = value * x[i] + powers[d]
+            value = value * x + powers[d]
         out[i] = value
 
 
-@jit_rows
-def _place(t: float, scale: float, top: float, groups: int, x: FloatArray) -> None:
-    """Output times in place as places in [-1, top] of a step."""
-    for i in range(_GROUP * groups):
-        x[i] = min(max((x[i] - t) * scale - 1.0, -1.0), top)
+@jit
+def _outputs_within(first: int, guess: int, low: float, high: float, t_out: FloatArray, left: NDArray[np.bool_]) -> int:
+    """How many outputs from number `first` on lie in a step, its end known to lie between `low` and `high`."""
+    after = first + guess
+    if guess > 0 and after <= t_out.size and t_out[after - 1] < low and (after == t_out.size or t_out[after] > high):
+        return guess
+    at = first
+    while at + _STRIDE <= t_out.size and t_out[at + _STRIDE - 1] < low:
+        at += _STRIDE
+    while at < t_out.size and (t_out[at] < low or (t_out[at] <= high and left[at])):
+        at += 1
+    return at - first
 
 
 @jit
 def write_outputs(
-    t: float, h: float, reached: float, t_new: float, slack: float, powers: bool, series: FloatArray, x: FloatArray,
-    values: FloatArray, first: int, t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray,
+    t: float, h: float, reached: float, t_new: float, slack: float, powers: bool, series: FloatArray, work: FloatArray,
+    first: int, guess: int, t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray,
 ) -> int:  # fmt: skip
     """Outputs of one step from number `first` on: right-hand ones in [t, t_new), left-hand ones in (t, t_new].
 
-    With `powers` the series holds the coefficients of 1, x, x^2, ... instead. Times within `slack` of t_new are t_new.
-    Returns the number of the first output that is left.
+    With `powers` the series holds the coefficients of 1, x, x^2, ... instead. Times within `slack` of t_new are t_new;
+    `guess` says how many there may be. Places after the last one are written over: they belong to later steps.
+    `work` has shape (2, WRITTEN_AT_ONCE). Returns how many there were.
     """
-    low = t_new - slack
-    high = t_new + slack
-    while first < t_out.size:
-        count = 0
-        if first + BLOCK <= t_out.size and t_out[first + BLOCK - 1] < low:
-            count = BLOCK
+    count = _outputs_within(first, guess, t_new - slack, t_new + slack, t_out, left)
+    groups = (count + _GROUP - 1) // _GROUP
+    scale = 2.0 / h
+    top = 2.0 * reached - 1.0
+    # The last group of all may not fit: it is written by way of `work`.
+    whole = groups if first + _GROUP * groups <= t_out.size else groups - 1
+    rest = first + _GROUP * whole
+    for column in range(out.shape[0]):
+        if powers:
+            _powers_at(series[column], t_out[first:], t, scale, top, whole, out[column, first:])
         else:
-            while count < BLOCK and first + count < t_out.size:
-                time = t_out[first + count]
-                if time >= low and (time > high or not left[first + count]):
-                    break
-                count += 1
-        if count == 0:
-            break
-        for i in range(count):
-            x[i] = t_out[first + i]
-        groups = (count + _GROUP - 1) // _GROUP
-        _place(t, 2.0 / h, 2.0 * reached - 1.0, groups, x)
-        for column in range(out.shape[0]):
+            _series_at(series[column], t_out[first:], t, scale, top, whole, out[column, first:])
+        if whole < groups:
+            for i in range(_GROUP):
+                work[0, i] = t_out[min(rest + i, t_out.size - 1)]
             if powers:
-                _horner_groups(series[column], x, groups, values)
+                _powers_at(series[column], work[0], t, scale, top, 1, work[1])
             else:
-                _clenshaw_groups(series[column], x, groups, values)
-            for i in range(count):
-                out[column, first + i] = values[i]
-        first += count
-    return first
+                _series_at(series[column], work[0], t, scale, top, 1, work[1])
+            for i in range(t_out.size - rest):
+                out[column, rest + i] = work[1, i]
+    return count
 
 
 @jit_rows

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import borrow, jit
-from fingerspice.engine.readout import BLOCK, write_outputs
+from fingerspice.engine.readout import WRITTEN_AT_ONCE, write_outputs
 from fingerspice.numerics.chebyshev import to_powers
 from fingerspice.numerics.lobatto import NODES, ROWS
 
@@ -65,8 +65,9 @@ def repeat(
     """
     times, series = borrow(kept.times), borrow(kept.series)
     t_out, left, out = borrow(t_out), borrow(left), borrow(out)
-    x = np.zeros(BLOCK)
-    values = np.zeros(BLOCK)
+    work = np.zeros((2, WRITTEN_AT_ONCE))
+    # Outputs of each step in the period before: mostly as many as now.
+    held = np.zeros(count, np.int64)
     row = out.shape[0] - 2
     # Powers take half the work, and are as exact where their coefficients stay small.
     as_powers = np.zeros(count, np.bool_)
@@ -91,10 +92,11 @@ def repeat(
                 continue
             h = times[i, 1]
             reached = (times[i, 2] - times[i, 0]) / h
-            first = write_outputs(
-                times[i, 0] + shift, h, min(reached, 1.0), end, slack, as_powers[i], series[i], x, values, first, t_out,
-                left, out,
+            held[i] = write_outputs(
+                times[i, 0] + shift, h, min(reached, 1.0), end, slack, as_powers[i], series[i], work, first, held[i],
+                t_out, left, out,
             )  # fmt: skip
+            first += held[i]
         if drift != 0.0:
             for i in range(before, first):
                 out[row, i] += k * drift

@@ -24,7 +24,7 @@ from fingerspice.engine.readout import (
 )  # fmt: skip
 from fingerspice.engine.repeat import Kept
 from fingerspice.engine.system import System
-from fingerspice.numerics.lobatto import ROWS
+from fingerspice.numerics.lobatto import NODES, ROWS
 from fingerspice.numerics.small import inverse
 
 FloatArray = NDArray[np.float64]
@@ -32,9 +32,10 @@ IntArray = NDArray[np.int64]
 
 CLOSED, NOT_CLOSED = 100, 101
 """Codes of `close_period` beside those of `march`."""
-N_FIGURES = 6
-"""Of a period: peaks of gap voltage (V) and force (N), errors of both, the gap voltage's last move by Newton (V), and
-the first step's length (s)."""
+N_FIGURES = 7
+"""Of a period: peaks of gap voltage (V) and force (N), errors of both, the gap voltage's last move by Newton (V), the
+first step's length (s), and the largest factor by which an error of the live voltages made in every period grows until
+it is periodic."""
 # Tolerance of the map's derivative, over the voltage scale.
 _SLOPE_TOL, _LEAST_SLOPE_TOL = 1e-7, 1e-9
 # Of a first guess, over the voltage scale.
@@ -139,6 +140,7 @@ def close_period(
         )
         if code != DONE:
             return code, worst
+        figures[5] = unused[5] * (fine.tol / crude.tol) ** (1.0 / NODES)
         for k in range(n):
             if system.rates[0, k] > 0.0:
                 w[k] += (end[k] - w[k]) / (1.0 - turned * np.exp(-system.rates[0, k] * span))
@@ -151,6 +153,9 @@ def close_period(
         )  # fmt: skip
         if code != DONE:
             return code, worst
+        unused[5] = figures[5]
+        if first:
+            figures[5] *= (plain.tol / fine.tol) ** (1.0 / NODES)
         before = worst
         for k in range(n):
             move[k] = end[k] - w[k] if system.rates[0, k] > 0.0 else 0.0
@@ -185,6 +190,7 @@ def close_period(
         figures[4] = abs(figures[4])
         # What the last step moved, the next would move by the error of the slope only.
         if not first and (_largest_voltage(system, step) <= pace.tol or worst <= 1e-15 * scale):
+            figures[6] = _memory(system, solver)
             return CLOSED, worst
     return NOT_CLOSED, worst
 
@@ -198,6 +204,24 @@ def _largest_voltage(system: System, w: FloatArray) -> float:
         for k in range(w.size):
             x += system.live[0, i, k] * w[k]
         worst = max(worst, abs(x))
+    return worst
+
+
+@jit
+def _memory(system: System, solver: FloatArray) -> float:
+    """Largest factor by which an error made in every period grows; modes that do not decay collect nothing."""
+    n = solver.shape[0]
+    worst = 1.0
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            moved = 0.0
+            for k in range(n):
+                for m in range(n):
+                    if system.rates[0, k] > 0.0 and system.rates[0, m] > 0.0:
+                        moved += system.live[0, i, k] * solver[k, m] * system.project[0, m, j]
+            total += abs(moved)
+        worst = max(worst, total)
     return worst
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit, jit_rows
+from fingerspice.compiled import borrow, jit, jit_rows
 
 FloatArray = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ def evaluate(c: FloatArray, x: float) -> tuple[float, float]:
     return c[0] + x * b1 - b2, b1 + x * d1 - d2
 
 
-_BLOCK = 64
+_BLOCK = 256
 # Largest sum of the powers' coefficients over that of the series' own: their rounding is so much larger.
 _LARGEST_GROWTH = 16.0
 
@@ -130,12 +130,15 @@ def evaluate_array(c: FloatArray, x: FloatArray, lo: float, scale: float, out: F
 
 @jit_rows
 def _horner(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatArray) -> None:
+    x, out = borrow(x), borrow(out)
     at = np.zeros(_BLOCK)
     value = np.zeros(_BLOCK)
     for first in range(0, x.size, _BLOCK):
         count = min(_BLOCK, x.size - first)
+        # Views: an index with a sum in it keeps a loop from becoming vectors.
+        here, there = x[first : first + count], out[first : first + count]
         for i in range(count):
-            at[i] = (abs(x[first + i]) - lo) * scale - 1.0
+            at[i] = (abs(here[i]) - lo) * scale - 1.0
         k = c.size - 1
         top = c[k]
         for i in range(_BLOCK):
@@ -153,11 +156,12 @@ def _horner(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatArr
             for i in range(_BLOCK):
                 value[i] = value[i] * at[i] + c0
         for i in range(count):
-            out[first + i] = value[i]
+            there[i] = value[i]
 
 
 @jit_rows
 def _clenshaw(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatArray) -> None:
+    x, out = borrow(x), borrow(out)
     twice = np.empty(_BLOCK)
     b1 = np.empty(_BLOCK)
     b2 = np.empty(_BLOCK)
@@ -166,8 +170,9 @@ def _clenshaw(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatA
         if count < _BLOCK:
             for i in range(_BLOCK):
                 twice[i] = 0.0
+        here, there = x[first : first + count], out[first : first + count]
         for i in range(count):
-            twice[i] = 2.0 * ((abs(x[first + i]) - lo) * scale - 1.0)
+            twice[i] = 2.0 * ((abs(here[i]) - lo) * scale - 1.0)
         for i in range(_BLOCK):
             b1[i] = 0.0
             b2[i] = 0.0
@@ -190,4 +195,4 @@ def _clenshaw(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatA
                 b2[i] = b1[i]
                 b1[i] = newer
         for i in range(count):
-            out[first + i] = c[0] + 0.5 * twice[i] * b1[i] - b2[i]
+            there[i] = c[0] + 0.5 * twice[i] * b1[i] - b2[i]
