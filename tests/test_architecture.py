@@ -35,11 +35,12 @@ ORDER = (
         "runs",
         "stepping",
     ),
-    *("settling", "marching"),
+    *("settling", "marching", "folding"),
     *(
         "direct",
         "nodal",
         "superposition",
+        "diagnosis",
         "foreign",
         "periodic",
         "planning",

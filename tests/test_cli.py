@@ -109,7 +109,7 @@ def test_a_solve_that_fails_keeps_what_it_has_and_says_when_and_how_close(comman
     (line,) = result.lines
     said = re.fullmatch(
         r"fingerspice: stopped at t = (\S+) s: the mobile charge law .* use less voltage, more load, or the local law "
-        r"\(just before: (\S+) V across the gap, area \S+ mm\^2, distance to the fold \S+\)",
+        r"\(at Xgap, just before: (\S+) V across the gap, area \S+ mm\^2, distance to the fold \S+\)",
         line,
     )
     assert said

@@ -86,6 +86,17 @@ def _warnings_as_lines() -> Iterator[None]:
 
 
 @contextmanager
+def _failure_as_json(wanted: bool) -> Iterator[None]:
+    """A failed solve as JSON too, where that is the language spoken."""
+    try:
+        yield
+    except SolveError as error:
+        if wanted:
+            print(json_text({"success": False, "message": error.message, "failure": error.failure.to_dict()}))
+        raise
+
+
+@contextmanager
 def _progress() -> Iterator[Callable[[float], None] | None]:
     """A bar on a terminal, shown only once a run takes more than a second."""
     if not sys.stderr.isatty():
@@ -160,14 +171,15 @@ def run(
     picture = None if no_plot else out / f"{deck.stem}.png"
     files = _write_run(solution, data, picture) if solution.t.size else []
     if as_json:
-        report = {**solution.summary(), "success": solution.success, "message": solution.message}
+        failure = None if solution.failure is None else solution.failure.to_dict()
+        report = {**solution.summary(), "success": solution.success, "message": solution.message, "failure": failure}
         print(json_text({**report, "files": [str(f) for f in files]}))
     else:
         print(summary_table(solution))
         for file in files:
             print(f"wrote {file}")
-    if not solution.success:
-        raise SolveError(solution.message, solution)
+    if solution.failure is not None:
+        raise SolveError(solution.failure, solution)
 
 
 def _announce_compilation() -> None:
@@ -233,7 +245,8 @@ def ac(
             from fingerspice.largesignal import large_signal
 
             _announce_compilation()
-            results = large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol)
+            with _failure_as_json(as_json):
+                results = large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol)
         elif amplitude:
             raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
         else:
@@ -311,7 +324,8 @@ def compare(
         if not no_plot:
             check_output(picture, deck)
         _announce_compilation()
-        result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
+        with _failure_as_json(as_json):
+            result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
     if not no_plot:
         from fingerspice.plotting import plot_comparison, save
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from fingerspice.outcome import Failure
     from fingerspice.solution import Solution
 
 
@@ -43,12 +44,13 @@ class InputError(FingerspiceError, ValueError):
 
 
 class SolveError(FingerspiceError, RuntimeError):
-    """The solve did not reach its end; `solution` holds what came before."""
+    """The solve did not reach its end: `failure` says why, when and where, `solution` holds what came before."""
 
-    def __init__(self, message: str, solution: Solution | None = None) -> None:
-        self.message = message
+    def __init__(self, failure: Failure, solution: Solution | None = None) -> None:
+        self.failure = failure
+        self.message = str(failure)
         self.solution = solution
-        super().__init__(message)
+        super().__init__(self.message)
 
 
 class FingerspiceWarning(UserWarning):

@@ -234,7 +234,7 @@ def solve_foreign(problem: Problem, library: str, name: str, rtol: float, t_out:
     for _attempt in range(6):
         run = _integrate(problem, run_piece, name, tol, scale, t_out, left)
         nfev += run.nfev
-        run.nfev, run.peak_u, run.peak_f = nfev, reference.peak_u, reference.peak_f
+        run.nfev, run.peak_u, run.peak_f, run.margin = nfev, reference.peak_u, reference.peak_f, reference.margin
         theirs_u, theirs_f = _gap(problem, run)
         n = min(ours_u.size, theirs_u.size)
         run.error = ErrorEstimate(

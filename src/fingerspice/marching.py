@@ -16,7 +16,7 @@ from fingerspice.engine.model import Segment, choose_branch, source, write_row
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.system import System, area_range, build_system
 from fingerspice.numerics.lobatto import integral_table
-from fingerspice.outcome import ErrorEstimate, State, Status
+from fingerspice.outcome import ErrorEstimate, State, Status, last_tried
 from fingerspice.problem import Problem, Scene
 from fingerspice.runs import (
     ROUNDING,
@@ -96,7 +96,9 @@ class Track:
         self.control[readout.T] = self.problem.t_start
         self.control[readout.U_BEFORE] = start.u_before
         self.control[readout.BRANCH_LENGTH] = np.inf
+        self.control[readout.MARGIN] = 1.0
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
+        self.tried = np.zeros((readout.TRIED, 4))
         self.shown = self.prepared.system.k_shown.size
         self.out = np.empty((self.shown + 2 if self.pace.charge else self.shown, self.t_out.size))
         self.repeated = 0
@@ -113,7 +115,7 @@ class Track:
         return int(
             march.march(
                 p.system, self.pace, p.tables, p.work, p.integral, table.edges, table.terms, table.series, t_end,
-                *mine, self.t_out, self.left, self.out, self.kept,
+                *mine, self.t_out, self.left, self.out, self.kept, self.tried,
             )
         )  # fmt: skip
 
@@ -331,6 +333,8 @@ def _run(problem: Problem, track: Track, status: Status, t_failed: float | None,
             problem.scene.charge_law,
         ),
         t_failed=t_failed,
+        margin=float(control[readout.MARGIN]),
+        tried=last_tried(track.tried),
     )
 
 

@@ -7,6 +7,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,10 @@ from fingerspice.engine import collocation
 from fingerspice.engine.collocation import advance
 from fingerspice.engine.network import Sources, at_sources, new_room, rates
 from fingerspice.engine.radau import NFEV, Scheme, new_work
+from fingerspice.engine.readout import TRIED
 from fingerspice.networks import NetworkProblem
 from fingerspice.numerics.tableaus import radau
-from fingerspice.outcome import ErrorEstimate, NetworkState, Status
+from fingerspice.outcome import Attempt, ErrorEstimate, NetworkState, Status, last_tried
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.runs import Progress, windows
 
@@ -38,6 +40,8 @@ LONGEST_STEP = 0.5
 # Times that errors are looked for at.
 PROBES, PROBES_PER_PERIOD, MOST_PROBES = 512, 32, 20_000
 ATTEMPTS = 6
+# Two runs that meet a fold agree on its time to this, relative.
+FOLD_TIME = 1e-10
 
 
 @dataclass
@@ -54,6 +58,10 @@ class NetworkRun:
     stats: dict[str, int]
     state: NetworkState
     t_failed: float | None = None
+    margin: float = 1.0
+    tried: tuple[Attempt, ...] = ()
+    # The row at the time a failed run reached.
+    here: FloatArray | None = None
 
 
 def network_scheme(h_max: float, stages: int = STAGES) -> Scheme:
@@ -120,6 +128,7 @@ class _Integration:
         self.control[collocation.BASE] = problem.t_start
         self.counters = np.zeros(collocation.N_COUNTERS, np.int64)
         self.peaks = np.zeros(net.gap.size)
+        self.tried = np.zeros((TRIED, 4))
         self.room = new_room(net, self.y.size)
         self.work = new_work(net, scheme.c.size, scheme.eigenvalues.size, self.y.size)
 
@@ -133,7 +142,7 @@ class _Integration:
             code = advance(
                 self.net, self.room, self.scheme, self.work, sources, False, self.problem.charge, t_end, self.y,
                 self.sign, self.s_before, self.scale, self.tol, self.control, self.counters, self.peaks, t_out, left,
-                rows,
+                rows, self.tried,
             )  # fmt: skip
             if code != collocation.JUMP:
                 return int(code)
@@ -146,7 +155,7 @@ class _Integration:
         code = advance(
             self.net, self.room, self.scheme._replace(h_max=1.0), self.work, _ramp(self.s_before, after), True, False,
             1.0, self.y, self.sign, self.s_before.copy(), self.scale, self.tol, control, self.counters, self.peaks,
-            np.empty(0), np.empty(0, bool), np.empty((0, self.y.size)),
+            np.empty(0), np.empty(0, bool), np.empty((0, self.y.size)), np.zeros((TRIED, 4)),
         )  # fmt: skip
         self.s_before[:] = after
         self.control[collocation.H] = self.control[collocation.H_AFTER_JUMP]
@@ -231,12 +240,13 @@ def _integrate(
     done = int(one.counters[collocation.OUTPUT])
     if status is Status.SUCCESS and done < t_out.size and sources is not None:
         done += _at_the_end(one, sources, t_out[done:], left[done:], rows[done:])
+    here = _row(one, sources, "left") if t_failed is not None and sources and one.t > problem.t_start else None
     return NetworkRun(
         t_out[:done], left[:done], rows[:done], status, ErrorEstimate(rough, 0.0), one.peaks,
         int(one.counters[NFEV]),
         {name: int(one.counters[i]) for name, i in (
             ("steps", collocation.ACCEPTED), ("rejected", collocation.REJECTED), ("zeros", collocation.ZEROS))},
-        state, t_failed,
+        state, t_failed, tried=last_tried(one.tried), here=here,
     )  # fmt: skip
 
 
@@ -250,18 +260,24 @@ def _at_the_end(one: _Integration, sources: Sources, t_out: FloatArray, left: Bo
         values = _values(sources, stop)
         if np.any(values != one.s_before) and not one.jump(values):
             return 0
-    rows[:, : one.y.size] = one.y
-    if problem.charge:
-        room = new_room(one.net, one.y.size)
-        index = np.array([
-            min(max(int(np.searchsorted(sources.edges[a:b], stop, side="right")) - 1, 0), b - a - 2)
-            for a, b in itertools.pairwise(sources.first)
-        ])  # fmt: skip
-        at_sources(sources, index, stop, 0.0, room.s, room.ds)
-        rate = np.empty(one.y.size)
-        rates(one.net, room, False, one.y, one.sign, rate)
-        rows[:, one.y.size :] = rate[one.y.size - one.s_before.size :]
+    rows[:] = _row(one, sources, "right")
     return int(t_out.size)
+
+
+def _row(one: _Integration, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
+    """What `advance` would write at the time reached, from the segments on one side of it; NaN past a fold."""
+    if not one.problem.charge:
+        return one.y.copy()
+    room = new_room(one.net, one.y.size)
+    index = np.array([
+        min(max(int(np.searchsorted(sources.edges[a:b], one.t, side=side)) - 1, 0), b - a - 2)
+        for a, b in itertools.pairwise(sources.first)
+    ])  # fmt: skip
+    at_sources(sources, index, one.t, 0.0, room.s, room.ds)
+    rate = np.full(one.y.size, np.nan)
+    found = rates(one.net, room, False, one.y, one.sign, rate)
+    n_s = one.s_before.size
+    return np.concatenate([one.y, rate[-n_s:] if found else np.full(n_s, np.nan)])
 
 
 def solve_coupled(
@@ -279,19 +295,34 @@ def solve_coupled(
     if problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
         u_scale = _voltage_scale(problem, coarse, max(u_scale, 1.0))
     tol, nfev = LOCAL_SHARE * rtol, 0
+    folded: float | None = None
     for attempt in range(ATTEMPTS):
         beside = _integrate(problem, coarse, BESIDE * tol, u_scale, at[probed], side[probed], None)
         run = _integrate(problem, fine, tol, u_scale, at, side, progress)
         nfev += beside.nfev + run.nfev
         run.nfev = nfev
         worst = _state_error(problem, run, _only(run, probed), beside, u_scale, ALIKE * tol) / rtol
+        if run.status is Status.FOLD and run.t_failed is not None and tol > FINEST:
+            # What the state is off moves the fold: closer, until its time stays.
+            if folded is not None and abs(run.t_failed - folded) <= FOLD_TIME * run.t_failed:
+                break
+            folded, tol = run.t_failed, max(0.03 * tol, FINEST)
+            continue
         if run.status is not Status.SUCCESS or worst <= 1.0:
             break
         if tol <= FINEST or attempt == ATTEMPTS - 1:
             run.status = Status.ERROR_NOT_MET
             break
         tol = max(tol * min(0.3, 0.5 / worst), FINEST)
-    return _only(run, ~probed)
+    if problem.scene.net.mobile:
+        run.margin = float(problem.record(run).fold_margin.min(initial=1.0))
+    run = _only(run, ~probed)
+    t_end = run.state.t
+    if run.here is not None and np.all(np.isfinite(run.here)) and (run.t.size == 0 or t_end > run.t[-1]):
+        # A failed run's arrays end at the time it reached.
+        run.t, run.left = np.append(run.t, t_end), np.append(run.left, True)
+        run.rows = np.vstack([run.rows, run.here])
+    return run
 
 
 def _voltage_scale(problem: NetworkProblem, scheme: Scheme, guess: float) -> float:

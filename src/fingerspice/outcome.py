@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +13,113 @@ FloatArray = NDArray[np.float64]
 
 
 class Status(Enum):
-    """How a run ended; the text says what happened and what to do."""
+    """How a run ended: why, and what to do about it."""
 
-    SUCCESS = "success"
+    SUCCESS = ("success", "")
     FOLD = (
         "the mobile charge law has no solution past this time: with the charge stored on the interfaces, less area "
-        "means more voltage means less area; use less voltage, more load, or the local law"
+        "means more voltage means less area",
+        "use less voltage, more load, or the local law",
     )
-    SOURCE_NOT_FINITE = "a source gave NaN or inf; nothing after this time is a result"
-    STEP_UNDERFLOW = "no step is small enough for the error asked for; ask for a larger rtol, or check the source"
-    TOO_MANY_STEPS = "the run took two million steps without coming to its end; ask for a larger rtol, or a shorter run"
-    ERROR_NOT_MET = "the error estimate stayed above the error asked for; ask for a larger rtol"
-    METHOD_FAILED = "the chosen method gave up; use method='auto'"
+    SOURCE_NOT_FINITE = ("a source gave NaN or inf", "nothing after this time is a result: mend the source")
+    STEP_UNDERFLOW = (
+        "no step is small enough for the error asked for",
+        "ask for a larger rtol, or check the source",
+    )
+    TOO_MANY_STEPS = (
+        "the run took two million steps without coming to its end",
+        "ask for a larger rtol, or a shorter run",
+    )
+    ERROR_NOT_MET = ("the error estimate stayed above the error asked for", "ask for a larger rtol")
+    METHOD_FAILED = ("the chosen method gave up", "use method='auto'")
+    NOT_PERIODIC = (
+        "Newton's method did not find a state that a period leads back to",
+        "simulate more periods from rest instead, and see what they do",
+    )
+
+    @property
+    def cause(self) -> str:
+        """What happened."""
+        return self.value[0]
+
+    @property
+    def action(self) -> str:
+        """What to do."""
+        return self.value[1]
+
+
+class Attempt(NamedTuple):
+    """A step tried: its start and length (s), and its error over the one allowed; inf where it found no solution."""
+
+    t: float
+    step: float
+    error: float
+
+
+def last_tried(rows: FloatArray) -> tuple[Attempt, ...]:
+    """Steps from rows of start, length, error and number (from 1; 0: no step), oldest first."""
+    rows = rows[rows[:, 3] > 0.0]
+    return tuple(Attempt(*map(float, row[:3])) for row in rows[np.argsort(rows[:, 3])])
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why, when and where a solve failed, and what to do.
+
+    Attributes
+    ----------
+    status : Status
+    cause, action : str
+        What happened, with the figures known, and what to change.
+    t : float or None
+        Time reached, s; None where the whole run is meant.
+    step : float or None
+        Last step tried, s.
+    element : str
+        Names of the elements it happened at, with commas.
+    u_gap, area, fold_margin : float or None
+        Gap voltage (V), ridge contact area (m^2) and distance to the fold there.
+    tried : tuple of Attempt
+        The last steps tried.
+    """
+
+    status: Status
+    cause: str
+    action: str
+    t: float | None = None
+    element: str = ""
+    u_gap: float | None = None
+    area: float | None = None
+    fold_margin: float | None = None
+    tried: tuple[Attempt, ...] = ()
+
+    @property
+    def step(self) -> float | None:
+        return self.tried[-1].step if self.tried else None
+
+    def __str__(self) -> str:
+        text = f"{self.cause}; {self.action}"
+        if self.t is not None:
+            text = f"stopped at t = {self.t:.10g} s: {text}"
+        facts = [f"at {self.element}"] if self.element else []
+        if self.u_gap is not None and self.area is not None:
+            facts.append(f"just before: {self.u_gap:.4g} V across the gap, area {1e6 * self.area:.4g} mm^2")
+            if self.fold_margin is not None:
+                facts.append(f"distance to the fold {self.fold_margin:.3g}")
+        return f"{text} ({', '.join(facts)})" if facts else text
+
+    def history(self) -> str:
+        """The last steps tried, as a table."""
+        rows = [f"{a.t:<24.15g}{a.step:<14.4g}{a.error:<12.3g}" for a in self.tried]
+        return "\n".join([f"{'start [s]':<24}{'step [s]':<14}{'error / allowed':<12}", *rows])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, SI units."""
+        return {
+            "status": self.status.name, "cause": self.cause, "action": self.action, "t": self.t, "step": self.step,
+            "element": self.element, "u_gap": self.u_gap, "area": self.area, "fold_margin": self.fold_margin,
+            "tried": [a._asdict() for a in self.tried],
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)

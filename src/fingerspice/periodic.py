@@ -15,7 +15,7 @@ from fingerspice.engine.pace import Pace
 from fingerspice.errors import InputError, SolveError
 from fingerspice.marching import FINEST, LOCAL_SHARE, LONGEST_STEP, SAFETY, prepare_system
 from fingerspice.numerics import linear
-from fingerspice.outcome import ErrorEstimate, Status
+from fingerspice.outcome import ErrorEstimate, Failure, Status
 from fingerspice.problem import Problem, state_from
 
 FloatArray = NDArray[np.float64]
@@ -119,18 +119,25 @@ def _close(
             break
         tol = pace.tol * min(0.3, 0.5 / excess)
         known = True
-    if code == shooting.NOT_CLOSED:
-        raise SolveError(f"the periodic state did not close: {defect:.3g} V are left after a period")
     if code != shooting.CLOSED:
-        folding = problem.model.mobile and problem.model.coupled
-        status = Status.FOLD if folding else Status.STEP_UNDERFLOW
-        raise SolveError(f"no periodic state was reached: {status.value}")
+        raise SolveError(_failure(problem, code, float(defect)))
     # Two halves: the second carries on at most what the first was off, and adds as much.
     parts = 2 if half else 1
     return system.live[0] @ w, {
         "defect": parts * float(defect), "map_slope": slope @ slope if half else slope,
         "memory": float(figures[6]), "error": error, "periods": int(counts[1]) / parts,
     }  # fmt: skip
+
+
+def _failure(problem: Problem, code: int, defect: float) -> Failure:
+    """Why no periodic state was reached."""
+    status = Status.NOT_PERIODIC
+    cause = f"{status.cause}: {defect:.3g} V are left after a period"
+    if code != shooting.NOT_CLOSED:
+        status = Status.FOLD if problem.model.mobile and problem.model.coupled else Status.STEP_UNDERFLOW
+        cause = f"no periodic state was reached: {status.cause}"
+    layers = problem.stack.layers
+    return Failure(status, cause, status.action, element=layers[problem.scene.probe_layer].name if layers else "")
 
 
 def _error(figures: FloatArray, u_scale: float, rtol: float) -> tuple[ErrorEstimate, float]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
 from fingerspice.engine.model import Segment
 from fingerspice.networks import NetworkProblem
-from fingerspice.outcome import ErrorEstimate, State, Status
+from fingerspice.outcome import Attempt, ErrorEstimate, State, Status
 from fingerspice.problem import Problem
 from fingerspice.record import Record
 
@@ -33,7 +33,7 @@ class Run:
     """What one integration gives, and how it went.
 
     `t`, `left`, `live`, `z`, `current` are as in `Record`, up to the time reached; `rough` is the source's (see
-    `SourceTable`), V.
+    `SourceTable`), V; `margin` is the smallest distance to the fold met, and `tried` the last steps tried.
     """
 
     t: FloatArray
@@ -51,6 +51,8 @@ class Run:
     t_failed: float | None = None
     detail: str = ""
     rough: float = 0.0
+    margin: float = 1.0
+    tried: tuple[Attempt, ...] = ()
 
     def record(self, problem: Problem) -> Record:
         """The outputs with what they mean."""

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.sampling import breakpoints_at, misses, same_time
+from fingerspice.circuit.sampling import misses, same_time
 from fingerspice.circuit.statespace import is_stack
 from fingerspice.circuit.waveforms import Waveform, as_waveform, require
+from fingerspice.diagnosis import network_failure, stack_failure
 from fingerspice.direct import solve_algebraic, solve_linear
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError
 from fingerspice.marching import solve as solve_marching
@@ -22,7 +23,7 @@ from fingerspice.network_record import NetworkRecord
 from fingerspice.networks import NetworkProblem, prepare_network
 from fingerspice.nodal import NetworkRun, solve_coupled
 from fingerspice.numerics.tableaus import TABLEAUS
-from fingerspice.outcome import ErrorEstimate, Status
+from fingerspice.outcome import ErrorEstimate, Failure, Status
 from fingerspice.periodic import close_period
 from fingerspice.physics.contact import inverse_area
 from fingerspice.planning import Plan, make_plan, plan_network
@@ -40,6 +41,8 @@ RTOL_RANGE = (1e-13, 0.1)
 BREAKDOWN_VOLTAGE = 300.0
 # Contact area over that at 0 V.
 LEAST_AREA = 0.2
+# Distance to the fold of the mobile law: the voltage that would reach it is a few percent larger.
+NEAR_FOLD = 0.2
 
 
 def simulate(
@@ -140,8 +143,8 @@ def simulate(
 
 def _given_back(solution: Solution, throw: bool) -> Solution:
     """A solution with its warnings said, or the error of a failed run."""
-    if not solution.success and throw:
-        raise SolveError(solution.message, solution)
+    if solution.failure is not None and throw:
+        raise SolveError(solution.failure, solution)
     for text in solution.warnings:
         warnings.warn(text, FingerspiceWarning, stacklevel=3)
     return solution
@@ -243,11 +246,10 @@ def run_network(
         run, name = solve_coupled(problem, rtol, run_at, left, progress), "radau"
     wall = time.perf_counter() - begin
     record = problem.record(run)
-    text = run.status.value
-    if run.t_failed is not None:
-        text = f"stopped at t = {run.t_failed:.10g} s: {text}"
+    t = np.concatenate([t_out[: run.t.size], run.t[t_out.size :]]) if run.status is Status.SUCCESS else run.t.copy()
+    failure = None if run.status is Status.SUCCESS else network_failure(problem, run, record)
     warned = tuple(_network_warnings(problem, run, record))
-    return _packed(problem, run, record, t_out[: run.t.size].copy(), text, rtol, name, plan, wall, warned)
+    return _packed(problem, run, record, t, failure, rtol, name, plan, wall, warned)
 
 
 def _add_error(run: Run, u_gap: float, f_el: float | None = None) -> None:
@@ -286,7 +288,12 @@ def _run(
         run = solve_marching(problem, rtol, t_out, left, progress, repeat=method == "auto")
         if run.status is not Status.FOLD or method == "exponential":
             return run, "exponential"
-        # The time and place of a fold are for a method that solves the area equation at every evaluation.
+        from fingerspice.folding import run_to_fold
+
+        folded = run_to_fold(problem, t_out, left)
+        if folded is not None:
+            return folded, "exponential"
+        # No fold, or a jump past one: for a method that solves the area equation at every evaluation.
         method = "dop853"
     if method not in TABLEAUS:
         known = ["auto", "exponential", *TABLEAUS, "scipy:NAME", "torchdiffeq:NAME"]
@@ -327,19 +334,20 @@ def _solution(
     # The times asked for, not those that rounding moved onto a breakpoint.
     t = np.concatenate([t_out[: run.t.size], run.t[t_out.size :]]) if run.status is Status.SUCCESS else run.t.copy()
     warned = tuple(_physics_warnings(problem, run, record))
-    return _packed(problem, run, record, t, _message(problem, run, record), rtol, method, plan, wall, warned)
+    failure = None if run.status is Status.SUCCESS else stack_failure(problem, run, record)
+    return _packed(problem, run, record, t, failure, rtol, method, plan, wall, warned)
 
 
 def _packed(
     problem: Problem | NetworkProblem, run: Run | NetworkRun, record: Record | NetworkRecord, t: FloatArray,
-    message: str, rtol: float, method: str, plan: Plan, wall: float, warned: tuple[str, ...],
+    failure: Failure | None, rtol: float, method: str, plan: Plan, wall: float, warned: tuple[str, ...],
 ) -> Solution:  # fmt: skip
     scene = problem.scene
     return Solution(
         t=t,
         record=record,
         status=run.status,
-        message=message,
+        failure=failure,
         nfev=run.nfev,
         stats={**run.stats, "wall_s": wall},
         error=run.error,
@@ -350,37 +358,11 @@ def _packed(
         plan=plan,
         circuit=problem.circuit,
         state=run.state,
+        fold_margin_min=run.margin,
         fundamental=scene.fundamental,
         period=scene.waveform.period,
         warnings=warned,
     )
-
-
-def _message(problem: Problem, run: Run, record: Record) -> str:
-    text = run.status.value
-    if run.t_failed is not None:
-        text = f"stopped at t = {run.t_failed:.10g} s: {text}"
-        if run.status is Status.SOURCE_NOT_FINITE:
-            names = ", ".join(e.name for e, _ in problem.stack.sources)
-            text += f" (source {names})"
-        elif run.status is Status.FOLD and run.t.size and record.left[-1]:
-            if breakpoints_at(problem.waveform, run.t_failed).size:
-                text += "; the source jumps past the fold at this time"
-            text += (
-                f" (just before: {record.u_gap[-1]:.4g} V across the gap, area {1e6 * record.area[-1]:.4g} mm^2, "
-                f"distance to the fold {record.fold_margin[-1]:.3g})"
-            )
-    if run.detail:
-        text += f" ({run.detail})"
-    if run.status is Status.ERROR_NOT_MET:
-        text += f" (estimate {run.error.u_gap:.3g} V of {run.peak_u:.3g} V peak"
-        source = problem.scene.u_peak
-        if run.peak_u < 1e-4 * source:
-            text += (
-                f"; the gap takes almost nothing of the {source:.3g} V of the source, and rounding of these limits it"
-            )
-        text += ")"
-    return text
 
 
 def _physics_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
@@ -392,6 +374,7 @@ def _physics_warnings(problem: Problem, run: Run, record: Record) -> Iterator[st
     if stack.contact is not None:
         least = 1.0 / inverse_area(run.peak_u, problem.model.curve)[0]
         yield from _gap_warnings("", run.peak_u, problem.model.area0, least if problem.model.coupled else math.inf)
+    yield from _fold_warning(run)
     yield from _strength_warnings(stack.layers, record)
 
 
@@ -407,6 +390,7 @@ def _network_warnings(problem: NetworkProblem, run: NetworkRun, record: NetworkR
         yield from _gap_warnings(
             where, float(run.peaks[i]), float(problem.scene.area0[i]), least if follows else math.inf
         )
+    yield from _fold_warning(run)
     yield from _strength_warnings(problem.network.layers, record)
 
 
@@ -421,6 +405,14 @@ def _gap_warnings(where: str, peak: float, unloaded: float, least: float) -> Ite
         yield (
             f"the contact area{where} falls to {1e6 * least:.3g} mm^2, below {100.0 * LEAST_AREA:g} % of the "
             f"{1e6 * unloaded:.3g} mm^2 at 0 V: the contact model was not made for so little"
+        )
+
+
+def _fold_warning(run: Run | NetworkRun) -> Iterator[str]:
+    if run.margin < NEAR_FOLD and run.status is Status.SUCCESS:
+        yield (
+            f"the fold of the mobile charge law is near: the distance to it falls to {run.margin:.2g} (1 far, 0 at the "
+            "fold)"
         )
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fingerspice.files import write_aside
 from fingerspice.network_record import NetworkRecord
 from fingerspice.numerics.cubics import fundamental, mean
-from fingerspice.outcome import ErrorEstimate, NetworkState, State, Status
+from fingerspice.outcome import ErrorEstimate, Failure, NetworkState, State, Status
 from fingerspice.record import Record, sealed
 
 if TYPE_CHECKING:
@@ -50,7 +50,8 @@ class Solution:
     record : Record or NetworkRecord
         What the run wrote down.
     status : Status
-    message : str
+    failure : Failure or None
+        Why, when and where the run failed, and what to do.
     nfev : int
         Evaluations of the right-hand side.
     stats : dict
@@ -68,7 +69,7 @@ class Solution:
     t: FloatArray
     record: Record | NetworkRecord
     status: Status
-    message: str
+    failure: Failure | None
     nfev: int
     stats: dict[str, Any]
     error: ErrorEstimate
@@ -81,6 +82,7 @@ class Solution:
     state: State | NetworkState
     fundamental: Fundamental | None = None
     period: float | None = None
+    fold_margin_min: float = 1.0
     warnings: tuple[str, ...] = field(default=())
 
     def __post_init__(self) -> None:
@@ -184,6 +186,11 @@ class Solution:
         return {f"{key}:{name}": value[:, i] for i, name in enumerate(names)}
 
     @property
+    def message(self) -> str:
+        """How the run ended, in words."""
+        return self.status.cause if self.failure is None else str(self.failure)
+
+    @property
     def success(self) -> bool:
         """Whether the run reached its end with the error met."""
         return self.status is Status.SUCCESS
@@ -260,7 +267,7 @@ class Solution:
                     out[f"{key}_phase_deg"] = float(np.degrees(np.angle(p)))
             out["fundamental"] = f0.frequency
         if self.f_el is not None:
-            out["fold_margin_min"] = float(self.fold_margin.min())
+            out["fold_margin_min"] = min(self.fold_margin_min, float(self.fold_margin.min()))
         return out
 
     def _summarised(self) -> dict[str, FloatArray]:

@@ -71,8 +71,8 @@ class SteadyState:
             Where that fails.
         """
         solution = run_problem(self.problem, rtol=self.rtol, start="periodic", begun=self.error)
-        if not solution.success:
-            raise SolveError(solution.message, solution)
+        if solution.failure is not None:
+            raise SolveError(solution.failure, solution)
         return solution
 
 

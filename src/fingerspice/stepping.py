@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from fingerspice.circuit.sampling import SourceTable
 from fingerspice.engine import advance as loop
 from fingerspice.engine.model import Segment, choose_branch, source, write_row
+from fingerspice.engine.readout import TRIED
 from fingerspice.engine.steps import Method
 from fingerspice.numerics.tableaus import Tableau
-from fingerspice.outcome import ErrorEstimate, State, Status
+from fingerspice.outcome import ErrorEstimate, State, Status, last_tried
 from fingerspice.problem import Problem
 from fingerspice.runs import ROUNDING, BoolArray, FloatArray, Progress, Run, Tables, after_the_end, from_rows, row_width
 
@@ -39,6 +40,7 @@ class Track:
     y: FloatArray = field(init=False)
     control: FloatArray = field(init=False)
     counters: NDArray[np.int64] = field(init=False)
+    tried: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         start = self.problem.initial
@@ -46,7 +48,9 @@ class Track:
         self.control = np.zeros(loop.N_CONTROL)
         self.control[loop.T] = self.problem.t_start
         self.control[loop.U_BEFORE] = start.u_before
+        self.control[loop.MARGIN] = 1.0
         self.counters = np.zeros(loop.N_COUNTERS, np.int64)
+        self.tried = np.zeros((TRIED, 4))
 
     @property
     def t(self) -> float:
@@ -60,7 +64,7 @@ class Track:
         return int(
             loop.advance(
                 self.problem.model, self.method, table.edges, table.terms, table.series, t_end, self.scale,
-                self.y, self.control, self.counters, self.t_out, self.left, self.rows, self.log,
+                self.y, self.control, self.counters, self.t_out, self.left, self.rows, self.log, self.tried,
             )
         )  # fmt: skip
 
@@ -209,6 +213,8 @@ def integrate(
             problem.scene.charge_law,
         ),
         t_failed=t_failed,
+        margin=float(main.control[loop.MARGIN]),
+        tried=last_tried(main.tried),
         rough=tables.rough,
     )
 

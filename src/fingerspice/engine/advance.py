@@ -20,6 +20,7 @@ from fingerspice.engine.model import (
     source,
     write_row,
 )
+from fingerspice.engine.readout import note
 from fingerspice.engine.steps import Method, dense_polynomial, dense_state, take_step
 
 FloatArray = NDArray[np.float64]
@@ -27,9 +28,9 @@ FloatArray = NDArray[np.float64]
 # Codes returned by `advance`.
 DONE, LOG_FULL, NO_SOLUTION, STEP_UNDERFLOW = 0, 1, 2, 3
 # Entries of `control`: time, next step (0: choose one), branch of the area (0: choose one), source voltage
-# just before the time reached, last gap voltage.
-T, H, SIGN, U_BEFORE, U_GAP = 0, 1, 2, 3, 4
-N_CONTROL = 5
+# just before the time reached, last gap voltage, smallest distance to the fold met in logged places.
+T, H, SIGN, U_BEFORE, U_GAP, MARGIN = 0, 1, 2, 3, 4, 5
+N_CONTROL = 6
 # Entries of `counters`: evaluations, steps accepted and rejected, zeros met, outputs written, log rows written.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, LOGGED = 0, 1, 2, 3, 4, 5
 N_COUNTERS = 6
@@ -173,6 +174,7 @@ def _controlled_step(
     counters: NDArray[np.int64],
     k: FloatArray,
     y1: FloatArray,
+    tried: FloatArray,
 ) -> tuple[float, bool]:
     """Step until the error is met. Returns the step (0: none is small enough) and whether it ends the segment."""
     t0 = t - segment.start
@@ -180,6 +182,7 @@ def _controlled_step(
     while True:
         norm, nfev = take_step(model, method, segment, t0, h, y, control[SIGN], control[U_GAP], scale, k, y1)
         counters[NFEV] += nfev
+        note(tried, counters[ACCEPTED] + counters[REJECTED], t, h, norm)
         factor = 6.0
         if norm > 0.0:
             factor = 0.25 if norm == math.inf else 0.9 * norm ** (-1.0 / method.error_order)
@@ -221,8 +224,11 @@ def _write_log(
             continue  # a step of a few roundings has no middle
         dense_state(theta, y, poly, state)
         u_source, du_source = source(segment, t - segment.start + theta * h)
-        u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, state), control[SIGN], control[U_GAP])
-        q, _ = branch_area(model, control[SIGN], u)
+        x_gap = dot(model.gap, state)
+        u = gap_voltage(model, model.k_gap * u_source, x_gap, control[SIGN], control[U_GAP])
+        q, dq = branch_area(model, control[SIGN], u)
+        if model.mobile and model.coupled:
+            control[MARGIN] = min(control[MARGIN], 1.0 - model.area0 * x_gap * dq)
         row = log[counters[LOGGED]]
         row[0] = t + theta * h
         row[1] = u
@@ -276,6 +282,7 @@ def advance(
     left: NDArray[np.bool_],
     rows: FloatArray,
     log: FloatArray,
+    tried: FloatArray,
 ) -> int:
     """Step the model to `t_end` through the source's segments, writing outputs on the way.
 
@@ -295,6 +302,8 @@ def advance(
         Output times (ascending), whether the left-hand value is meant, and the rows to fill (`write_row`).
     log : ndarray, shape (l, 4)
         See `_write_log`; with no rows nothing is logged.
+    tried : ndarray, shape (n, 4)
+        Takes the last steps tried, in turn: start and length (s), error over the one allowed, number from 1.
 
     Returns
     -------
@@ -319,7 +328,7 @@ def advance(
             return NO_SOLUTION
         control[U_GAP] = u
         stop = min(edges[index + 1], t_end)
-        h, last = _controlled_step(model, method, segment, t, stop - t, y, scale, control, counters, k, y1)
+        h, last = _controlled_step(model, method, segment, t, stop - t, y, scale, control, counters, k, y1, tried)
         if h == 0.0:
             return STEP_UNDERFLOW
         dense_polynomial(k, method.dense, h, poly)

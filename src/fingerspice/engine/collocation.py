@@ -20,6 +20,7 @@ from fingerspice.engine.network import (
     rates,
 )
 from fingerspice.engine.radau import NFEV, Scheme, Work, guess, lend_work, linearise, step
+from fingerspice.engine.readout import note
 from fingerspice.engine.steps import dense_polynomial, dense_state
 
 FloatArray = NDArray[np.float64]
@@ -140,6 +141,7 @@ def advance(
     net: Net, room: Room, scheme: Scheme, work: Work, sources: Sources, jump: bool, charge: bool, t_end: float,
     y: FloatArray, sign: FloatArray, s_before: FloatArray, scale: FloatArray, tol: float, control: FloatArray,
     counters: IntArray, peaks: FloatArray, t_out: FloatArray, left: NDArray[np.bool_], rows: FloatArray,
+    tried: FloatArray,
 ) -> int:  # fmt: skip
     """Step a network to `t_end` through the segments of its sources, writing outputs on the way.
 
@@ -164,6 +166,8 @@ def advance(
     t_out, left, rows : ndarray
         Output times (ascending), whether the left-hand value is meant, and the rows to fill: the state, then the
         currents.
+    tried : ndarray, shape (n, 4)
+        Takes the last steps tried, in turn: start and length (s), error over the one allowed, number from 1.
 
     Returns
     -------
@@ -228,6 +232,7 @@ def advance(
         while True:
             guess(scheme, work, start, h, h_before)
             norm = step(net, room, scheme, work, sources, jump, t, h, y, sign, scale, tol, counters)
+            note(tried, counters[ACCEPTED] + counters[REJECTED], base + t, h, norm)
             if norm <= 1.0:
                 break
             counters[REJECTED] += 1

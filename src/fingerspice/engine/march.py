@@ -39,6 +39,7 @@ from fingerspice.engine.readout import (
     error_at,
     first_wrong,
     layers,
+    note,
     series_of,
     write_outputs,
     zero,
@@ -117,6 +118,7 @@ def march(
     left: NDArray[np.bool_],
     out: FloatArray,
     kept: Kept,
+    tried: FloatArray,
 ) -> int:
     """Step to `t_end` through the source's segments, writing outputs on the way.
 
@@ -139,6 +141,8 @@ def march(
         (see `System.shown`), then charge and current if wanted.
     kept : Kept
         Takes the steps, as long as there is room (none: nothing is kept); `counters` holds how many there were.
+    tried : ndarray, shape (TRIED, 4)
+        Takes the last steps tried, in turn: start and length (s), error over the one allowed, number from 1.
 
     Returns
     -------
@@ -171,7 +175,7 @@ def march(
     outputs = borrow(work.outputs)
     t_out, left, out = borrow(t_out), borrow(left), borrow(out)
     values, coefficients = borrow(work.values), borrow(work.coefficients)
-    kept_times, kept_series = borrow(kept.times), borrow(kept.series)
+    kept_times, kept_series, tried = borrow(kept.times), borrow(kept.series), borrow(tried)
     u_rows, q_rows, source_row = r[U], r[Q], r[SOURCE]
     n = model.gap.size
     columns, n_shown = out.shape[0], all_shown.shape[1]
@@ -270,6 +274,7 @@ def march(
                 step_error, run_error, magnified = assess(
                     mobile, area0, gain, gap, decay, phi, miss, error, w, pull, used, r, places, sums
                 )
+            note(tried, counters[ACCEPTED] + counters[REJECTED], t, h, step_error / tol)
             if not controlled and closed:
                 break
             factor = 6.0
@@ -353,7 +358,7 @@ def march(
             counters[OUTPUT] = first_out
             next_out = t_out[first_out] if first_out < t_out.size else math.inf
         control[MAGNIFIED] = max(control[MAGNIFIED], magnified)
-        account(stress, u_rows, q_rows, theta, run_error, control)
+        account(mobile and coupled, area0, stress, u_rows, q_rows, r[X_GAP], r[DQ], theta, run_error, control)
         if theta < 1.0:
             for k in range(n):
                 w0[k] = at(w[k], theta)

@@ -167,11 +167,11 @@ def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: floa
         return k_u + x_gap
     b = x_gap * model.area0
     u = guess
-    for _ in range(8):
+    for _ in range(12):
         q, dq = branch_area(model, sign, u)
         slope = 1.0 - b * dq
-        # Close to the fold Newton may cross to the other root: leave it to the bracket.
-        if not slope > 0.2:
+        # Past the fold Newton would go to the other root: leave it to the bracket.
+        if not slope > 1e-3:
             break
         step = (u - k_u - b * q) / slope
         u -= step
@@ -261,8 +261,17 @@ def right_hand_side(
 
     `sign` chooses the branch A(|u|) = A(sign u), continued analytically through 0 V.
     """
-    n = model.gap.size
     u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), sign, guess)
+    rates_at(model, u_source, du_source, y, sign, u, out)
+    return u
+
+
+@jit
+def rates_at(
+    model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, u: float, out: FloatArray
+) -> None:
+    """As `right_hand_side`, where the gap voltage u (V) is known."""
+    n = model.gap.size
     q, _ = branch_area(model, sign, u)
     scale = model.area0 * q if model.mobile else 1.0
     rest = 0.0
@@ -277,7 +286,20 @@ def right_hand_side(
         out[i] = (out[i] + model.k[i] * total) / scale
     lam = total / model.s
     out[n] = lam / q if model.mobile else (lam + du_source / model.s) / q
-    return u
+
+
+@jit
+def voltage_by_time(
+    model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, u: float, dy: FloatArray
+) -> tuple[float, float]:
+    """Distance to the fold, and the gap voltage's rate times it, V/s: both stay finite where the fold is met.
+
+    `dy` takes y'.
+    """
+    rates_at(model, u_source, du_source, y, sign, u, dy)
+    q, _ = branch_area(model, sign, u)
+    margin = fold_margin(model, dot(model.gap, y), u, sign)
+    return margin, model.k_gap * du_source + dot(model.gap, dy) * model.area0 * q
 
 
 @jit
@@ -335,16 +357,23 @@ def write_row(
     model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, guess: float, row: FloatArray
 ) -> None:
     """Fill one output row: U, gap voltage, 1/A, current, fold margin, then y."""
+    u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), sign, guess)
+    write_row_at(model, u_source, du_source, y, sign, u, row)
+
+
+@jit
+def write_row_at(
+    model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, u: float, row: FloatArray
+) -> None:
+    """As `write_row`, where the gap voltage u (V) is known."""
     n = model.gap.size
     dy = np.empty(n + 1)
-    u = right_hand_side(model, u_source, du_source, y, sign, guess, dy)
+    margin, speed = voltage_by_time(model, u_source, du_source, y, sign, u, dy)
     q, dq = branch_area(model, sign, u)
-    margin = fold_margin(model, dot(model.gap, y), u, sign)
     current = dy[n]
     if model.mobile:
         # i = Q' with Q = A U / S + z, and u' from the area equation.
-        du = (model.k_gap * du_source + dot(model.gap, dy) * model.area0 * q) / margin
-        current += (du_source / q - dq * du * u_source / (q * q)) / model.s
+        current += (du_source / q - dq * speed / margin * u_source / (q * q)) / model.s
     row[0] = u_source
     row[1] = u
     row[2] = q

@@ -28,13 +28,27 @@ LAST_Q = 17
 ALLOWED = 18
 # The first step taken after a zero of the gap voltage, s; 0 before the first.
 H_AFTER_ZERO = 19
-N_CONTROL = 20
+# Smallest distance to the fold met.
+MARGIN = 20
+N_CONTROL = 21
 # Entries of `counters`: rows evaluated, steps accepted and refused, zeros met, outputs written, steps kept.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT = 0, 1, 2, 3, 4, 5
 N_COUNTERS = 6
+# The last steps tried are kept, this many, as rows: start and length (s), error over the one allowed, number.
+TRIED = 8
 # Outputs are read in groups of a processor's vectors, and looked for in strides.
 WRITTEN_AT_ONCE = _GROUP = 8
 _STRIDE = 32
+
+
+@jit
+def note(tried: FloatArray, number: int, t: float, h: float, error: float) -> None:
+    """Keep a step tried, its error over the one allowed, in place of the oldest."""
+    place = number % tried.shape[0]
+    tried[place, 0] = t
+    tried[place, 1] = h
+    tried[place, 2] = error
+    tried[place, 3] = number + 1
 
 
 @jit_rows
@@ -241,8 +255,17 @@ def write_outputs(
 
 
 @jit_rows
-def account(stress: float, u: FloatArray, q: FloatArray, theta: float, run_error: float, control: FloatArray) -> None:
-    """Peaks of gap voltage and force, and the largest error of each, over the part of a step that counts."""
+def account(
+    mobile: bool, area0: float, stress: float, u: FloatArray, q: FloatArray, x_gap: FloatArray, dq: FloatArray,
+    theta: float, run_error: float, control: FloatArray,
+) -> None:  # fmt: skip
+    """Peaks of gap voltage and force, the largest error of each and the fold's distance, over what counts of a step."""
+    if mobile:
+        margin = control[MARGIN]
+        for j in range(NODES):
+            if POINTS[j] <= theta:
+                margin = min(margin, 1.0 - area0 * x_gap[j] * dq[j])
+        control[MARGIN] = margin
     peak_u = control[PEAK_U]
     peak_f = control[PEAK_F]
     steepest = 0.0

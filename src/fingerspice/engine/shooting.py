@@ -19,6 +19,7 @@ from fingerspice.engine.readout import (
     NFEV,
     PEAK_F,
     PEAK_U,
+    TRIED,
     U_BEFORE,
     T,
 )  # fmt: skip
@@ -63,7 +64,7 @@ def _map(
     code = march(
         system, pace, tables, work, integral, edges, terms, series, edges[-1], y, np.zeros(n + 1), control, count,
         np.zeros(0), np.zeros(0, np.bool_), np.zeros((n, 0)),
-        Kept(np.zeros((0, 3)), np.zeros((0, n, ROWS))),
+        Kept(np.zeros((0, 3)), np.zeros((0, n, ROWS))), np.zeros((TRIED, 4)),
     )  # fmt: skip
     for k in range(n):
         end[k] = 0.0

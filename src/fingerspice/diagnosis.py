@@ -1,0 +1,62 @@
+"""What is said of a run that failed: where it was, why, and what to change."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fingerspice.circuit.sampling import breakpoints_at
+from fingerspice.network_record import NetworkRecord
+from fingerspice.networks import NetworkProblem
+from fingerspice.nodal import NetworkRun
+from fingerspice.outcome import Failure, Status
+from fingerspice.problem import Problem
+from fingerspice.record import Record
+from fingerspice.runs import Run
+
+
+def stack_failure(problem: Problem, run: Run, record: Record) -> Failure:
+    """Of a run through a series stack that did not succeed."""
+    status, cause = run.status, run.status.cause
+    layers = problem.stack.layers
+    element = layers[problem.scene.probe_layer].name if layers else ""
+    u_gap = area = margin = None
+    if status is Status.SOURCE_NOT_FINITE:
+        element = ", ".join(e.name for e, _ in problem.stack.sources)
+    elif status is Status.FOLD and run.t.size and record.left[-1]:
+        if run.t_failed is not None and breakpoints_at(problem.waveform, run.t_failed).size:
+            cause += " (the source jumps past the fold at this time)"
+        u_gap, area, margin = float(record.u_gap[-1]), float(record.area[-1]), float(record.fold_margin[-1])
+    if run.detail:
+        cause += f" ({run.detail})"
+    if status is Status.ERROR_NOT_MET:
+        cause += f" (estimate {run.error.u_gap:.3g} V of {run.peak_u:.3g} V peak"
+        source = problem.scene.u_peak
+        if run.peak_u < 1e-4 * source:
+            cause += (
+                f"; the gap takes almost nothing of the {source:.3g} V of the source, and rounding of these limits it"
+            )
+        cause += ")"
+    return Failure(status, cause, status.action, run.t_failed, element, u_gap, area, margin, run.tried)
+
+
+def network_failure(problem: NetworkProblem, run: NetworkRun, record: NetworkRecord) -> Failure:
+    """Of a network's run: what folds is the gap with the least area left of its own."""
+    status, cause = run.status, run.status.cause
+    names = [name for name, _ in record.fingers]
+    element = ", ".join(names)
+    u_gap = area = margin = None
+    if status is Status.SOURCE_NOT_FINITE:
+        element = ", ".join(
+            e.name
+            for e, wave in zip(problem.network.sources, problem.scene.waveforms, strict=True)
+            if run.t_failed is not None and not np.isfinite(wave.value(run.t_failed))
+        )
+    elif status is Status.FOLD and run.t.size and names:
+        shrunk = [record.finger_area(i)[-1] / problem.scene.area0[j] for i, j in enumerate(problem.network.fingers)]
+        i = int(np.argmin(shrunk))
+        element = names[i]
+        u_gap, area = float(record.finger_voltage(i)[-1]), float(record.finger_area(i)[-1])
+        margin = float(record.fold_margin[-1])
+    if status is Status.ERROR_NOT_MET:
+        cause += f" (estimate {run.error.u_gap:.3g} V of {float(run.peaks.max(initial=0.0)):.3g} V peak)"
+    return Failure(status, cause, status.action, run.t_failed, element, u_gap, area, margin, run.tried)

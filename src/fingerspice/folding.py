@@ -1,0 +1,138 @@
+"""Where a run under the `mobile` law meets its fold.
+
+With m the distance to the fold, m u' = v for a gap voltage u and a v that stays finite. In time u runs into the fold
+with a square root, or creeps up to it as its own mode turns infinitely fast: no step length suits either. In the
+variable s with dt/ds = m, du/ds = v both are smooth: the path crosses m = 0, or comes to rest there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import OdeSolution, solve_ivp
+
+from fingerspice.circuit.sampling import SourceTable
+from fingerspice.engine.model import Segment, choose_branch, dot, gap_voltage, source, voltage_by_time, write_row_at
+from fingerspice.marching import solve as solve_marching
+from fingerspice.outcome import Status
+from fingerspice.problem import Problem
+from fingerspice.runs import BoolArray, Run, Tables, from_rows, row_width
+
+FloatArray = NDArray[np.float64]
+
+FINEST_RTOL = 1e-12
+# A fold is met at this distance, and looked for over so many of the shortest time constants.
+NOTHING_LEFT, LONGEST = 1e-10, 1e6
+
+
+def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | None:
+    """A run under the `mobile` law that meets a fold, up to that; None where it meets none, or a jump goes past it.
+
+    Parameters
+    ----------
+    problem : Problem
+    t_out, left : ndarray, shape (n_out,)
+        Output times (s, ascending) and whether the left-hand value is meant.
+    """
+    run = solve_marching(problem, FINEST_RTOL, t_out, left, repeat=False)
+    if run.status is not Status.FOLD:
+        return run if run.status is Status.SUCCESS else None
+    begin = run.state.t
+    table = next((table for table in Tables(problem, FINEST_RTOL) if table.edges[-1] > begin), None)
+    path = None if table is None else _ahead(problem, table, begin, run.state.y)
+    if path is None:
+        return None
+    # The row of where the steps stopped is no output.
+    done = run.t.size - int(run.t.size > t_out.size or run.t[-1] != t_out[run.t.size - 1])
+    later = t_out[done:]
+    t = np.append(later[later < path.t], path.t)
+    rows = path.rows(problem, t)
+    live, z, current = from_rows(problem, rows)
+    run.t, run.left = np.append(run.t[:done], t), np.append(left[: done + t.size - 1], True)
+    run.live = np.hstack([run.live[:, :done], live])
+    if run.z is not None and run.current is not None:
+        run.z, run.current = np.append(run.z[:done], z), np.append(run.current[:done], current)
+    run.t_failed, run.margin = path.t, 0.0
+    force = problem.scene.force(rows[:, 1], rows[:, 2])
+    run.peak_u = max(run.peak_u, float(np.abs(rows[:, 1]).max()))
+    run.peak_f = max(run.peak_f, float(force.max()))
+    n = problem.model.gap.size
+    run.state = dataclasses.replace(run.state, t=path.t, y=rows[-1, -n - 1 :].copy(), u_before=float(rows[-1, 0]))
+    return run
+
+
+@dataclasses.dataclass(frozen=True)
+class _Path:
+    """State (n + 1,), time (s) and gap voltage (V) over the variable s, up to the fold."""
+
+    segment: Segment
+    sign: float
+    scale: FloatArray
+    solution: OdeSolution
+
+    @property
+    def t(self) -> float:
+        """Time of the fold, s."""
+        return float(self.solution(self.solution.t_max)[-2] * self.scale[-2])
+
+    def rows(self, problem: Problem, t: FloatArray) -> FloatArray:
+        """Rows of `engine.model.write_row` at times (s) on the path."""
+        low, high = np.zeros(t.size), np.full(t.size, self.solution.t_max)
+        # Time rises along the path, ever slower: halving has no trouble with that.
+        for _ in range(64):
+            middle = 0.5 * (low + high)
+            early = self.solution(middle)[-2] * self.scale[-2] < t
+            low, high = np.where(early, middle, low), np.where(early, high, middle)
+        rows = np.empty((t.size, row_width(problem)))
+        for row, z, time in zip(rows, (self.solution(high).T * self.scale), t, strict=True):
+            u, du = source(self.segment, time - self.segment.start)
+            write_row_at(problem.model, u, du, z[:-2].copy(), self.sign, z[-1], row)
+        return rows
+
+
+def _ahead(problem: Problem, table: SourceTable, t: float, y: FloatArray) -> _Path | None:
+    """The path from a state (n + 1,) at t (s) to a fold in the segment of the source that it stands in."""
+    model, n = problem.model, y.size
+    i = min(max(int(np.searchsorted(table.edges, t, side="right")) - 1, 0), table.edges.size - 2)
+    start, end = float(table.edges[i]), float(table.edges[i + 1])
+    segment = Segment(start, end - start, table.terms[i], table.series[i])
+    u_source, _ = source(segment, t - start)
+    sign = float(choose_branch(model, u_source, y))
+    u = float(gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), sign, model.k_gap * u_source))
+    if not math.isfinite(u) or u == 0.0:
+        return None
+    scale = np.concatenate([
+        np.full(n - 1, max(problem.scene.u_peak, abs(u))), [model.area0 / model.s * abs(u), t, abs(u)]
+    ])  # fmt: skip
+    dy = np.empty(n)
+    pace = model.tau if math.isfinite(model.tau) else segment.length
+
+    def at(z: FloatArray) -> tuple[float, float]:
+        here = z * scale
+        u_here, du_here = source(segment, here[n] - start)
+        margin, speed = voltage_by_time(model, u_here, du_here, here[:n], sign, here[n + 1], dy)
+        return float(margin), float(speed)
+
+    def slope(_: float, z: FloatArray) -> FloatArray:
+        margin, speed = at(z)
+        along: FloatArray = np.concatenate([dy * margin, [margin, speed]]) * pace / scale
+        return along
+
+    def distance(_: float, z: FloatArray) -> float:
+        return at(z)[0] - NOTHING_LEFT
+
+    def ahead(_: float, z: FloatArray) -> float:
+        return end - float(z[n]) * t
+
+    events: list[Any] = [distance, ahead]
+    for event in events:
+        event.terminal = True
+    found = solve_ivp(
+        slope, (0.0, LONGEST), np.concatenate([y, [t, u]]) / scale, "DOP853", rtol=FINEST_RTOL, atol=FINEST_RTOL,
+        events=events, dense_output=True,
+    )  # fmt: skip
+    return _Path(segment, sign, scale, found.sol) if found.t_events[0].size else None

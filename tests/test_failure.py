@@ -1,0 +1,131 @@
+"""A run that fails says when, where, why and what to do, in one structure, with the last steps it tried."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+from conftest import Command
+from fingerspice.outcome import Attempt, Failure, last_tried
+from scenes import table1
+
+
+def test_the_last_steps_are_told_in_the_order_they_were_tried() -> None:
+    ring = np.array([[5.0, 0.1, 0.5, 6.0], [2.0, 0.1, math.inf, 3.0], [3.0, 0.1, 2.0, 4.0], [0.0, 0.0, 0.0, 0.0]])
+    assert [a.t for a in last_tried(ring)] == [2.0, 3.0, 5.0]
+    assert last_tried(np.zeros((8, 4))) == ()
+
+
+@pytest.mark.parametrize("beside", ["", "Rload drive 0 1meg\n"], ids=["stack", "network"])
+def test_a_fold_says_when_where_why_and_what_to_change(beside: str) -> None:
+    text = (
+        "a deck\nVdrive drive 0 SIN(0 200 100)\nXcoat drive top area LAYER d=1u eps_r=3.9 r=0.2meg\n"
+        "Xgap top skin area GAP d=10n eps_r=1 r=1meg fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000\n"
+        f"Xskin skin 0 area SKIN d=350u f=100\n{beside}.tran 20u 10m uic\n.end\n"
+    )
+    solution = fs.simulate(fs.parse_netlist(text), charge_law="mobile", throw=False, rtol=1e-6)
+    failure = solution.failure
+    assert failure is not None
+    assert failure.status is solution.status is fs.Status.FOLD
+    assert failure.element == "Xgap"
+    assert failure.t is not None
+    assert 0.0 < failure.t < 0.5e-3
+    assert "less area means more voltage" in failure.cause
+    assert failure.action == "use less voltage, more load, or the local law"
+    assert failure.u_gap == pytest.approx(float(solution.u_gap[-1]))
+    assert failure.area == pytest.approx(float(solution.area[-1]))
+    assert failure.fold_margin is not None
+    assert abs(failure.fold_margin) <= 0.01
+    assert 3 <= len(failure.tried) <= 8
+    assert failure.step == failure.tried[-1].step > 0.0
+    times = [a.t for a in failure.tried]
+    assert times == sorted(times)
+    assert times[-1] == pytest.approx(failure.t, rel=1e-2)
+    assert any(a.error > 1.0 for a in failure.tried)
+    with pytest.raises(fs.SolveError) as caught:
+        fs.simulate(fs.parse_netlist(text), charge_law="mobile", rtol=1e-6)
+    assert caught.value.failure.to_dict() == failure.to_dict()
+    assert str(caught.value) == solution.message == str(failure)
+
+
+def test_a_source_that_stops_being_finite_is_named() -> None:
+    circuit = table1()
+    solution = fs.simulate(
+        circuit, sources={"Vdrive": lambda t: math.nan if t >= 3e-3 else 100.0 * t}, t_stop=5e-3, throw=False
+    )
+    failure = solution.failure
+    assert failure is not None
+    assert failure.status is fs.Status.SOURCE_NOT_FINITE
+    assert failure.element == "Vdrive"
+    assert failure.t == pytest.approx(3e-3, rel=1e-9)
+    assert solution.t[-1] <= 3e-3
+
+
+def test_an_error_that_cannot_be_met_is_put_in_figures() -> None:
+    # The gap takes so little of the source that rounding of the source is more than the error asked for.
+    circuit = table1(gap={"r": "1u"})
+    solution = fs.simulate(circuit, t_stop=5e-3, rtol=1e-12, throw=False)
+    failure = solution.failure
+    assert failure is not None
+    assert failure.status is fs.Status.ERROR_NOT_MET
+    assert failure.t is None
+    assert "estimate" in failure.cause
+    assert failure.action == "ask for a larger rtol"
+
+
+def test_a_periodic_state_past_a_fold_fails_in_the_same_structure() -> None:
+    circuit = table1().replace({"Xgap.d": 10e-9})
+    with pytest.raises(fs.SolveError, match="no periodic state was reached") as caught:
+        fs.steady_state(circuit, charge_law="mobile")
+    assert caught.value.failure.status is fs.Status.FOLD
+    assert caught.value.failure.element == "Xgap"
+
+
+def test_success_has_no_failure() -> None:
+    solution = fs.simulate(table1(), t_stop=1e-3)
+    assert solution.failure is None
+    assert solution.message == "success"
+
+
+def test_the_command_line_tells_the_same_in_words_and_in_json(command: Command) -> None:
+    words = ["run", "pad.cir", "--charge-law", "mobile", "--set", "Xgap.d=10n", "--no-plot"]
+    plain = command(*words)
+    assert plain.code == 1
+    assert "last steps tried:" in plain.out
+    failure = json.loads(command(*words, "--json").out)["failure"]
+    assert failure["status"] == "FOLD"
+    assert failure["element"] == "Xgap"
+    assert set(failure) == {
+        *("status", "cause", "action", "t", "step", "element", "u_gap", "area", "fold_margin", "tried")
+    }
+    assert set(failure["tried"][0]) == {"t", "step", "error"}
+    compared = command("compare", *words[1:], "--json")
+    assert compared.code == 1
+    assert json.loads(compared.out)["failure"]["status"] == "FOLD"
+
+
+def test_a_failure_in_words_leaves_out_what_is_not_known() -> None:
+    bare = Failure(fs.Status.STEP_UNDERFLOW, "a cause", "an action")
+    assert str(bare) == "a cause; an action"
+    told = Failure(fs.Status.FOLD, "a cause", "an action", 1e-3, "Xgap", 2.0, 3e-6, 0.01, (Attempt(0.0, 1e-6, 0.5),))
+    assert str(told) == (
+        "stopped at t = 0.001 s: a cause; an action (at Xgap, just before: 2 V across the gap, area 3 mm^2, distance "
+        "to the fold 0.01)"
+    )
+    assert told.history().count("\n") == 1
+
+
+def test_a_run_near_its_fold_warns_and_says_how_near() -> None:
+    circuit = table1().replace({"Vdrive": fs.Sine(50.0, 100.0), "Xgap.d": 1e-7})
+    with pytest.warns(fs.FingerspiceWarning, match="fold of the mobile charge law is near"):
+        near = fs.simulate(circuit, charge_law="mobile", rtol=1e-6, t_stop=0.05)
+    assert near.success
+    assert 0.0 < near.fold_margin_min < 0.2
+    # Looked for between outputs too, and in a run that repeats its periods.
+    with pytest.warns(fs.FingerspiceWarning, match="fold of the mobile charge law is near"):
+        few = fs.simulate(circuit, charge_law="mobile", rtol=1e-6, t_eval=[0.0, 0.05, 0.1], t_stop=0.1)
+    assert few.fold_margin.min() > 0.9
+    assert few.summary()["fold_margin_min"] == pytest.approx(float(near.fold_margin.min()), rel=0.02)
+    assert fs.simulate(circuit, charge_law="local", rtol=1e-6).fold_margin_min == 1.0
