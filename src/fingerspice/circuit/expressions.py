@@ -122,7 +122,7 @@ class Expression:
     """A checked expression: what it reads, and its tree."""
 
     text: str
-    names: frozenset[str]  # lower case, constants included when used
+    names: tuple[str, ...]  # lower case, each once, constants included when used
     positions: Mapping[str, int]  # first use of each name
     mega: str  # its first number written with capital M, or ""
     mega_position: int
@@ -195,13 +195,13 @@ def _compile(text: str) -> Expression:
     mega = next((x for x in lexemes if x.kind == "number" and suspicious_mega(x.text)), nothing)
     if len(lexemes) == 1 and lexemes[0].kind == "number":
         value = _number(lexemes[0])
-        return Expression(text, frozenset(), {}, mega.text, mega.position, ast.Constant(value), value)
-    python = _to_python(lexemes)
+        return Expression(text, (), {}, mega.text, mega.position, ast.Constant(value), value)
+    python = _to_python(lexemes, {name: number for number, name in enumerate(positions)})
     try:
         tree = ast.parse(python, mode="eval").body
     except (SyntaxError, RecursionError, MemoryError) as error:  # the checks above should leave none
         raise _Problem(f"'{text}' is not arithmetic ({type(error).__name__})") from None
-    return Expression(text, frozenset(positions), positions, mega.text, mega.position, tree, None)
+    return Expression(text, tuple(positions), positions, mega.text, mega.position, tree, None)
 
 
 def _lex(text: str) -> list[_Lexeme]:
@@ -272,8 +272,11 @@ class _Level:
         return text
 
 
-def _to_python(lexemes: list[_Lexeme]) -> str:
-    """Python text of checked lexemes: numbers in full, names prefixed so that none is a Python word."""
+def _to_python(lexemes: list[_Lexeme], order: Mapping[str, int]) -> str:
+    """Python text of checked lexemes: numbers in full, names by their number, functions with a prefix.
+
+    So no name is a Python word, and none is changed by the parser, which normalises Unicode.
+    """
     levels = [_Level("")]
     for lexeme in lexemes:
         kind, text, position = lexeme
@@ -283,8 +286,10 @@ def _to_python(lexemes: list[_Lexeme]) -> str:
         elif kind == "call" and text.lower() not in FUNCTIONS:
             hint = nearest(text, FUNCTIONS) or f"; functions are {' '.join(FUNCTIONS)}"
             raise _Problem(f"'{text}' is not a function{hint}", position)
-        elif kind in ("name", "call"):
-            level.pieces.append((f"v_{text.lower()}", position))
+        elif kind == "call":
+            level.pieces.append((f"f_{text.lower()}", position))
+        elif kind == "name":
+            level.pieces.append((f"n{order[text.lower()]}", position))
         elif text == "(":
             levels.append(_Level("("))
         elif text == ")":
@@ -371,7 +376,7 @@ def _walk(node: ast.expr, names: Mapping[str, float], expression: Expression) ->
     if isinstance(node, ast.Constant) and type(node.value) is float:
         return node.value
     if isinstance(node, ast.Name):
-        return _look_up(node.id[2:], names, expression)
+        return _look_up(expression.names[int(node.id[1:])], names, expression)
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
         value = _walk(node.operand, names, expression)
         return -value if isinstance(node.op, ast.USub) else value
