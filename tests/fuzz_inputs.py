@@ -134,6 +134,8 @@ def table(rng: random.Random) -> bytes:
 def netlist(rng: random.Random) -> str:
     """A shipped deck with some of its lines, tokens, numbers and brackets changed."""
     text = rng.choice((*DECKS, *OWN, *OWN))
+    if rng.random() < 0.2:
+        return _extreme(text, rng)
     for _ in range(rng.choice([0, 1, 1, 1, 2, 2, 3, 5, 12])):
         lines = text.split("\n")
         text = "\n".join(rng.choice(_LINE_EDITS)(lines, rng)) if rng.random() < 0.5 else _damaged(text, rng)
@@ -183,6 +185,15 @@ def _damaged(text: str, rng: random.Random) -> str:
         numbers = [i for i, token in enumerate(tokens) if token[:1].isdigit()]
         tokens[rng.choice(numbers or [at])] = _number(rng) if kind == 7 else rng.choice(NAMES)
     return "".join(tokens)
+
+
+def _extreme(text: str, rng: random.Random) -> str:
+    """Text with one of its numbers far from what was meant."""
+    found = [match.span() for match in re.finditer(r"(?<=[= (])[\d.]+[a-z]*", text)]
+    if not found:
+        return text
+    start, stop = rng.choice(found)
+    return f"{text[:start]}{10.0 ** rng.uniform(-40, 40) if rng.random() < 0.5 else rng.choice(NUMBERS)}{text[stop:]}"
 
 
 def _line(rng: random.Random) -> str:

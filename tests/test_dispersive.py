@@ -172,7 +172,7 @@ def test_bad_requests_are_refused(tmp_path: Path) -> None:
         (lambda: fs.fit_material(rows, poles=3, error=0.1), "one of them"),
         (lambda: fs.fit_material(rows, poles=0), "poles is 0"),
         (lambda: fs.fit_material(rows, error=0.0), "error is 0"),
-        (lambda: fs.fit_material(tmp_path / "missing.csv"), "cannot be read"),
+        (lambda: fs.fit_material(tmp_path / "missing.csv"), "does not exist"),
         (lambda: fs.ColeCole(1.0, ((1.0, 1.0, 1.0),)), "alpha is 1"),
         (lambda: fs.fit_material(rows, poles=3).to_netlist("my skin"), "name is 'my skin'"),
     ):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice.circuit.reader import read_text
 from fingerspice.circuit.waveforms import require
 from fingerspice.errors import InputError
 from fingerspice.physics.ladder import Ladder
@@ -190,9 +191,9 @@ def _admittivity(data: ColeCole | ArrayLike | str | Path) -> tuple[FloatArray, C
 
 def _read_csv(path: Path) -> FloatArray:
     try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = [row for row in csv.reader(stream) if row and not row[0].lstrip().startswith("#")]
-    except (OSError, UnicodeDecodeError) as error:
+        lines = read_text(path, str(path)).splitlines(keepends=True)
+        rows = [row for row in csv.reader(lines) if row and not row[0].lstrip().startswith("#")]
+    except csv.Error as error:
         raise InputError(f"{path} cannot be read as CSV: {error}") from error
     numbers = []
     for place, row in enumerate(rows):

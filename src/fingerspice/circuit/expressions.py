@@ -13,10 +13,11 @@ from __future__ import annotations
 
 import ast
 import difflib
+import itertools
 import math
 import operator
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple, TypeAlias
@@ -27,6 +28,8 @@ from fingerspice.units import parse_number, suspicious_mega
 MAX_LENGTH = 2000
 MAX_DEPTH = 25
 MAX_SIGNS = 3
+#: Of the words among which the nearest spelling is looked for: how many, and how many characters each.
+MAX_KNOWN, MAX_COMPARED = 1000, 60
 
 CONSTANTS: Mapping[str, float] = {"pi": math.pi, "e": math.e}
 
@@ -168,9 +171,14 @@ def compile_expression(text: str, where: Place) -> Expression:
         raise InputError(problem.message, _at(where, problem.position)) from None
 
 
-def nearest(word: str, known: Mapping[str, object] | list[str] | tuple[str, ...]) -> str:
-    """The clause ``; did you mean 'x'?`` for the nearest known spelling, or an empty text."""
-    lower = {name.lower(): name for name in known}
+def nearest(word: str, known: Iterable[str]) -> str:
+    """The clause ``; did you mean 'x'?`` for the nearest known spelling, or an empty text.
+
+    Of many known words the first are looked at, and no long ones: comparing takes the product of their lengths.
+    """
+    if len(word) > MAX_COMPARED:
+        return ""
+    lower = {name.lower(): name for name in itertools.islice(known, MAX_KNOWN) if len(name) <= MAX_COMPARED}
     close = difflib.get_close_matches(word.lower(), lower, n=1)
     return f"; did you mean '{lower[close[0]]}'?" if close else ""
 
@@ -414,7 +422,7 @@ def _look_up(name: str, names: Mapping[str, float], expression: Expression) -> f
         return names[name]
     if name in CONSTANTS:
         return CONSTANTS[name]
-    hint = f": the function is written {name}(...)" if name in FUNCTIONS else nearest(name, {**names, **CONSTANTS})
+    hint = f": the function is written {name}(...)" if name in FUNCTIONS else nearest(name, [*CONSTANTS, *names])
     position = expression.positions[name]
     written = expression.text[position : position + len(name)]
     raise _Problem(f"parameter '{written}' is not defined{hint}", position)
