@@ -107,7 +107,8 @@ def test_arithmetic_with_names_conditions_and_nesting(text: str, value: float) -
         ("v(x)*2", 10, "'v' is not a function"),
         ("-" * 4 + "1", 13, "signs in a row"),
         ("(" * 500, 35, "nested deeper"),
-        ("1?" * 26 + "1" + ":1" * 26, 10, "side by side"),
+        ("1?" * 26 + "1" + ":1" * 26, 61, "more than 25 '.' in one expression"),
+        ("1?2:1?2:1?2:1?2:(" * 25 + "1" + ")" * 25, 117, "more than 25 '.' in one expression"),
     ],
 )
 def test_what_is_not_arithmetic_is_refused_at_its_column(text: str, column: int, message: str) -> None:

@@ -234,7 +234,7 @@ def _lex(text: str) -> list[_Lexeme]:
 def _check_order(lexemes: list[_Lexeme], end: int) -> None:
     """Refuse every sequence that is not an expression, and every nesting too deep to parse."""
     open_brackets: list[tuple[_Lexeme, bool]] = []  # and whether each holds a function's arguments
-    wants_value, previous, signs = True, "", 0
+    wants_value, previous, signs, questions = True, "", 0, 0
     for index, (kind, text, position) in enumerate(lexemes):
         if wants_value and kind in ("number", "name", "call"):
             wants_value, signs = kind == "call", 0
@@ -258,6 +258,9 @@ def _check_order(lexemes: list[_Lexeme], end: int) -> None:
             raise _Problem("',' outside the arguments of a function", position)
         else:
             wants_value = True
+            questions += text == "?"
+            if questions > MAX_DEPTH:
+                raise _Problem(f"more than {MAX_DEPTH} '?' in one expression", position)
         previous = kind
     if open_brackets:
         raise _Problem("'(' is never closed", open_brackets[-1][0].position)
@@ -342,8 +345,6 @@ def _conditional(pieces: list[tuple[str, int]]) -> str:
             pairs[waiting.pop()] = index
     if waiting:
         raise _Problem("'?' without its ':' (a ? b : c)", pieces[waiting[-1]][1])
-    if len(pairs) > MAX_DEPTH:
-        raise _Problem(f"more than {MAX_DEPTH} '?' side by side", pieces[0][1])
 
     def join(start: int, end: int) -> str:
         question = next((i for i in range(start, end) if i in pairs), None)

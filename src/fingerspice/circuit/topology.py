@@ -100,10 +100,10 @@ def find_loop(circuit: Circuit) -> Loop | None:
 
 def _refuse_large(circuit: Circuit) -> None:
     skins = len(circuit.by_device("SKIN_DISPERSIVE"))
-    slabs = SKIN_LADDER.cells()[0].size
-    count = len(circuit.elements) + skins * (slabs - 1)
+    more = len(SKIN_LADDER.poles)
+    count = len(circuit.elements) + skins * more
     if count > MAX_ELEMENTS:
-        counted = f", a SKIN_DISPERSIVE counted as its {slabs} slabs" if skins else ""
+        counted = f", a SKIN_DISPERSIVE counted as its {more + 1} slabs" if skins else ""
         raise InputError(f"the circuit has {count:,} elements{counted}; allowed: at most {MAX_ELEMENTS:,}")
 
 
