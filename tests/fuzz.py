@@ -147,7 +147,9 @@ def _evaluate(rng: random.Random, bench: Bench) -> object:
 
 def _read_option(rng: random.Random, bench: Bench) -> object:
     text = make.source_text(rng)
-    name = rng.choice(["Xgap.d", "Xcoat.r", "Vdrive.amplitude", "Xskin.f", "Xgap.tau", "Xgpa.d", "Xgap.fn", "Xgap.n_exp"])
+    name = rng.choice(
+        ["Xgap.d", "Xcoat.r", "Vdrive.amplitude", "Xskin.f", "Xgap.tau", "Xgpa.d", "Xgap.fn", "Xgap.n_exp"]
+    )
     with WATCH.over(bench.folder):
         kind = rng.random()
         if kind < 0.7:
@@ -192,7 +194,9 @@ class Report:
             lines.append(f"{name:12s} {taken:9,} taken {refused:9,} refused {self.counts[name, 'defect']:6,} defects")
         total = sum(self.counts.values())
         rate = total / self.seconds if self.seconds else 0.0
-        lines.append(f"{total:,} inputs in {self.seconds:.0f} s, {rate:,.0f} a second, {self.memory:.0f} MiB more memory")
+        lines.append(
+            f"{total:,} inputs in {self.seconds:.0f} s, {rate:,.0f} a second, {self.memory:.0f} MiB more memory"
+        )
         return "\n".join(lines)
 
 

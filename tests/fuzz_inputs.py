@@ -10,37 +10,212 @@ from pathlib import Path
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 
 NUMBERS = (
-    *("0", "1", "-1", "2.5", "1e-6", "3.5u", "0.2meg", "0.2M", "1MOhm", "1F", "1N", "2k7", "1x", "1a", "1mil", "µ", "1µ"),
+    *(
+        "0",
+        "1",
+        "-1",
+        "2.5",
+        "1e-6",
+        "3.5u",
+        "0.2meg",
+        "0.2M",
+        "1MOhm",
+        "1F",
+        "1N",
+        "2k7",
+        "1x",
+        "1a",
+        "1mil",
+        "µ",
+        "1µ",
+    ),
     *("1e308", "-1e308", "1e-308", "4.9e-324", "1e309", "1e-400", "1e999999999", "9" * 330, "0." + "0" * 330 + "1"),
-    *("1e150", "1e-150", "1e30", "1e-30", "nan", "inf", "-inf", "none", "infinity", "0x10", "1_000", "1e", "1e+", "--1"),
+    *(
+        "1e150",
+        "1e-150",
+        "1e30",
+        "1e-30",
+        "nan",
+        "inf",
+        "-inf",
+        "none",
+        "infinity",
+        "0x10",
+        "1_000",
+        "1e",
+        "1e+",
+        "--1",
+    ),
     *("+", ".", "1..2", "1,5", "٣", "１", "1K", "1ſ", "²", "1e3.5", "9" * 500, "1" * 20 + "u", "-0", "-0.0"),
 )
 NAMES = (
-    *("a", "drive", "top", "skin", "area", "0", "gnd", "GND", "n1", "x.y", "d", "eps_r", "r", "fn", "w", "pi", "e", "sqrt"),
+    *(
+        "a",
+        "drive",
+        "top",
+        "skin",
+        "area",
+        "0",
+        "gnd",
+        "GND",
+        "n1",
+        "x.y",
+        "d",
+        "eps_r",
+        "r",
+        "fn",
+        "w",
+        "pi",
+        "e",
+        "sqrt",
+    ),
     *("p0", "p1", "aª", "ﬁ", "dµ", "İ", "x²", "ß", "\u0301", "v_a", "if", "lambda", "__import__", "__class__", "self"),
     *("None", "True", "x" * 300, "A\u0300", "\u202e", "\x1b[31m", "\x0b", "\x85", "\u2028", "\ufeff", "\x00", "\ud800"),
 )
-MARKS = (*"(){}[]'\"=,;$+-*/^<>?:!&|.@#%~`\\_ \t\r\n", "**", "&&", "||", "==", "!=", "<=", "\r\n", "\n+", "\n*", " ;", " $ ")
+MARKS = (
+    *"(){}[]'\"=,;$+-*/^<>?:!&|.@#%~`\\_ \t\r\n",
+    "**",
+    "&&",
+    "||",
+    "==",
+    "!=",
+    "<=",
+    "\r\n",
+    "\n+",
+    "\n*",
+    " ;",
+    " $ ",
+)
 FUNCTIONS = (
     *("sqrt", "exp", "ln", "log", "log10", "sin", "tan", "acos", "atanh", "cosh", "floor", "int", "nint", "sgn", "abs"),
-    *("min", "max", "pow", "pwr", "atan2", "hypot", "ternary_fcn", "sqr", "eval", "open", "exec", "SIN", "sqrtt", "v", "i"),
+    *(
+        "min",
+        "max",
+        "pow",
+        "pwr",
+        "atan2",
+        "hypot",
+        "ternary_fcn",
+        "sqr",
+        "eval",
+        "open",
+        "exec",
+        "SIN",
+        "sqrtt",
+        "v",
+        "i",
+    ),
 )
-SOURCES = ("SIN", "PULSE", "EXP", "PWL", "SQUARE", "AM", "SFFM", "WAVEFILE", "TABLE", "DC", "AC", "SINE", "sin", "Pwl", "FOO")
+SOURCES = (
+    "SIN",
+    "PULSE",
+    "EXP",
+    "PWL",
+    "SQUARE",
+    "AM",
+    "SFFM",
+    "WAVEFILE",
+    "TABLE",
+    "DC",
+    "AC",
+    "SINE",
+    "sin",
+    "Pwl",
+    "FOO",
+)
 FILES = (
-    *("fingerspice.lib", "fingerspice_mobile.lib", "part.lib", "loop.lib", "ping.lib", "sub/inner.lib", "sub", "link.lib"),
-    *("mutated.lib", "../outside.lib", "../../etc/passwd", "/etc/passwd", "sub/../../outside.lib", "C:\\x.lib", "~/x", "."),
-    *("missing.lib", "'part.lib'", '"part.lib"', "'part.lib", "part.lib x", "sub\\inner.lib", "/dev/zero", "/dev/stdin"),
-    *("pipe.lib", "x" * 300, "a/" * 200, "file:///etc/passwd", "http://a.example/b", "part.lib/../part.lib", "deck.cir"),
+    *(
+        "fingerspice.lib",
+        "fingerspice_mobile.lib",
+        "part.lib",
+        "loop.lib",
+        "ping.lib",
+        "sub/inner.lib",
+        "sub",
+        "link.lib",
+    ),
+    *(
+        "mutated.lib",
+        "../outside.lib",
+        "../../etc/passwd",
+        "/etc/passwd",
+        "sub/../../outside.lib",
+        "C:\\x.lib",
+        "~/x",
+        ".",
+    ),
+    *(
+        "missing.lib",
+        "'part.lib'",
+        '"part.lib"',
+        "'part.lib",
+        "part.lib x",
+        "sub\\inner.lib",
+        "/dev/zero",
+        "/dev/stdin",
+    ),
+    *(
+        "pipe.lib",
+        "x" * 300,
+        "a/" * 200,
+        "file:///etc/passwd",
+        "http://a.example/b",
+        "part.lib/../part.lib",
+        "deck.cir",
+    ),
 )
 #: `{n}` is a number, `{w}` a name, `{f}` a file, `{s}` a source, `{x}` arithmetic.
 LINES = (
-    *(".include {f}", ".lib {f}", ".inc {f}", ".lib {f} {w}", ".param {w}={x}", ".param {w}={{{x}}} {w}={n}", ".param {w}='{x}'"),
-    *("R{w} {w} {w} {n}", "C{w} {w} {w} {n} ic={n}", "V{w} {w} {w} {s}", "I{w} {w} 0 {s}", "R{w} {w} {w} {{{x}}}", "Rz 0 0 {x}"),
-    *("X{w} {w} {w} area LAYER d={n} eps_r={n} r={n}", "X{w} {w} {w} {w} SLAB d={n} eps_r={n} rho={n}", "X1 a b s w={x}"),
-    *("X{w} {w} 0 area SKIN d={n} f={n}", "X{w} {w} {w} area SKIN_DISPERSIVE d={n}", "X{w} a b {w} {w}={n}", "Xq {w} {w}"),
+    *(
+        ".include {f}",
+        ".lib {f}",
+        ".inc {f}",
+        ".lib {f} {w}",
+        ".param {w}={x}",
+        ".param {w}={{{x}}} {w}={n}",
+        ".param {w}='{x}'",
+    ),
+    *(
+        "R{w} {w} {w} {n}",
+        "C{w} {w} {w} {n} ic={n}",
+        "V{w} {w} {w} {s}",
+        "I{w} {w} 0 {s}",
+        "R{w} {w} {w} {{{x}}}",
+        "Rz 0 0 {x}",
+    ),
+    *(
+        "X{w} {w} {w} area LAYER d={n} eps_r={n} r={n}",
+        "X{w} {w} {w} {w} SLAB d={n} eps_r={n} rho={n}",
+        "X1 a b s w={x}",
+    ),
+    *(
+        "X{w} {w} 0 area SKIN d={n} f={n}",
+        "X{w} {w} {w} area SKIN_DISPERSIVE d={n}",
+        "X{w} a b {w} {w}={n}",
+        "Xq {w} {w}",
+    ),
     *(".subckt s a b w={n}", ".subckt {w} {w} {w} params: {w}={x}", ".ends", ".ends s", ".end", ".control", ".endc"),
-    *(".tran {n} {n} {n} uic", ".ac dec {n} {n} {n}", ".ic v({w})={n}", ".options {w}={n}", ".options work=total", ".nodeset {w}"),
-    *(".step {w}", ".{w}", "+ {w}={n}", "+", "* {w}", "{w}", "D1 a b d", "L1 a 0 {n}", ".title {w}", ".meas {w}", ".func f(x) x"),
+    *(
+        ".tran {n} {n} {n} uic",
+        ".ac dec {n} {n} {n}",
+        ".ic v({w})={n}",
+        ".options {w}={n}",
+        ".options work=total",
+        ".nodeset {w}",
+    ),
+    *(
+        ".step {w}",
+        ".{w}",
+        "+ {w}={n}",
+        "+",
+        "* {w}",
+        "{w}",
+        "D1 a b d",
+        "L1 a 0 {n}",
+        ".title {w}",
+        ".meas {w}",
+        ".func f(x) x",
+    ),
 )
 DECKS = tuple(
     path.read_text(encoding="utf-8") for path in (*sorted(CIRCUITS.glob("*.cir")), *sorted(CIRCUITS.glob("*.lib")))
@@ -94,7 +269,9 @@ def source(rng: random.Random) -> str:
     if rng.random() < 0.1:
         values.append(rng.choice(FILES))
     inner = rng.choice([" ", ", "]).join(values)
-    call = rng.choice(["{}({})", "{}({})", "{}({})", "{} ({})", "{} {}", "{}({}", "DC 1 {}({})", "{}({}) AC 1 0", "{}({}) {}"])
+    call = rng.choice(
+        ["{}({})", "{}({})", "{}({})", "{} ({})", "{} {}", "{}({}", "DC 1 {}({})", "{}({}) AC 1 0", "{}({}) {}"]
+    )
     name = rng.choice((*SOURCES, *SOURCES[:5] * 4))
     return call.format(name, inner, name)
 
@@ -104,7 +281,9 @@ def expression(rng: random.Random) -> str:
     kind = rng.random()
     text = arithmetic(rng, rng.randint(1, 6))
     if kind < 0.05:
-        opening, closing = rng.choice([("(", ")"), ("-", ""), ("1?", ":1"), ("abs(", ")"), ("1+", ""), ("(1?2:", ")"), ("max(1,", ")")])
+        opening, closing = rng.choice(
+            [("(", ")"), ("-", ""), ("1?", ":1"), ("abs(", ")"), ("1+", ""), ("(1?2:", ")"), ("max(1,", ")")]
+        )
         count = rng.choice([5, 24, 25, 26, 100, 1000, 20_000])
         return f"{opening * count}{text}{closing * count}"
     return _damaged(text, rng) if kind < 0.6 else text

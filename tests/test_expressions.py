@@ -117,6 +117,14 @@ def test_what_is_not_arithmetic_is_refused_at_its_column(text: str, column: int,
     assert caught.value.where == Where("deck.cir", 3, column)
 
 
+@pytest.mark.parametrize("name", ["dµ", "aª", "ﬁ", "x²", "aİ"])
+def test_names_that_unicode_would_normalise_are_themselves(name: str) -> None:
+    if name[0].isascii():
+        assert evaluate(f"2*{name}", {name: 4.0}, HERE) == 8.0
+    with pytest.raises(InputError, match="is not defined|does not belong"):
+        evaluate(f"2*{name}", {"dμ": 1.0, "aa": 1.0, "fi": 1.0, "x2": 1.0}, HERE)
+
+
 @pytest.mark.parametrize("text", ["(" * 100_000, "-" * 100_000, "1+" * 100_000, "x" * 100_000, "{" * 9])
 def test_expressions_of_any_size_are_refused_and_not_parsed(text: str) -> None:
     with pytest.raises(InputError):

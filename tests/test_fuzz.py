@@ -142,7 +142,9 @@ def test_any_text_is_a_finite_number_or_refused(text: str) -> None:
     assert math.isfinite(value)
 
 
-_NAME = st.text(st.characters(categories=["Lu", "Ll", "Lo", "Lm", "Nd", "Nl", "No", "Mn", "Pc"]), max_size=4).map("a{}".format)
+_NAME = st.text(st.characters(categories=["Lu", "Ll", "Lo", "Lm", "Nd", "Nl", "No", "Mn", "Pc"]), max_size=4).map(
+    "a{}".format
+)
 
 
 @settings(max_examples=500, deadline=None)

@@ -12,7 +12,7 @@ from fingerspice.errors import InputError, Where
 
 #: Lines and characters read in all subcircuit calls together, calls inside each other, characters of a flat name.
 MAX_EXPANDED = 100_000
-MAX_EXPANDED_TEXT = 16 * 2**20
+MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
 MAX_NAME = 400
 

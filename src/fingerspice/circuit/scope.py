@@ -101,7 +101,9 @@ class Scope:
     def __init__(self, parent: Scope | None = None) -> None:
         self.parent = parent
         self.values: dict[str, float] = {}
-        self._visible: ChainMap[str, float] = parent._visible.new_child(self.values) if parent else ChainMap(self.values)
+        self._visible: ChainMap[str, float] = (
+            parent._visible.new_child(self.values) if parent else ChainMap(self.values)
+        )
         self._formulas: dict[str, Formula] = {}
         self._mega: dict[str, Token] = {}
 
