@@ -26,9 +26,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import fuzz_inputs as make
-
 import fingerspice as fs
+import fuzz_inputs as make
 from fingerspice.circuit import expressions
 from fingerspice.circuit.directives import sweep_from_text
 from fingerspice.circuit.netlist import source_from_text, value_from_text

@@ -121,7 +121,7 @@ def test_what_is_not_arithmetic_is_refused_at_its_column(text: str, column: int,
 def test_names_that_unicode_would_normalise_are_themselves(name: str) -> None:
     if name[0].isascii():
         assert evaluate(f"2*{name}", {name: 4.0}, HERE) == 8.0
-    with pytest.raises(InputError, match="is not defined|does not belong"):
+    with pytest.raises(InputError, match=r"is not defined|does not belong"):
         evaluate(f"2*{name}", {"dμ": 1.0, "aa": 1.0, "fi": 1.0, "x2": 1.0}, HERE)
 
 

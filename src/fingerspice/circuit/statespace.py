@@ -203,7 +203,7 @@ def contact_of(gap: Element) -> Contact:
             n=v["n_exp"],
             c2=v["c2"] * 1e-12,
         )
-        possible = np.all(np.isfinite(contact.pack()))
+        possible = bool(np.all(np.isfinite(contact.pack())))
     except (ArithmeticError, ValueError):  # a product overflows, or a logarithm is taken of one that underflows
         possible = False
     if not possible:

@@ -149,7 +149,8 @@ def _given_by_source(layer: Element, sources: list[Element], gaps: list[Element]
     source = sources[0]
     if not isinstance(source.waveform, DC) or source.nodes[1] != "0" or not 1e-30 <= source.waveform.level <= 1e30:
         raise InputError(
-            f"{source.name} drives an area: allowed is a DC value above 0 (mm^2, from 1e-30 to 1e30) from the area node to 0",
+            f"{source.name} drives an area: allowed is a DC value above 0 (mm^2, from 1e-30 to 1e30) from the area "
+            "node to 0",
             source.where,
         )
     return source.waveform.level * 1e-6, source
