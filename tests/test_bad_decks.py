@@ -58,6 +58,9 @@ VALUES = [
     (("fn=0.5", "fn=0"), 5, ["Xgap fn is 0 N; allowed: more than 0"]),
     (("mu=0.3", "mu=-0.3"), 5, ["Xgap mu is -0.3; allowed: 0 or more"]),
     (("c2=5000", "c2=5000 a_fix=-1"), 5, ["Xgap a_fix is -1 mm^2; allowed: 0 or more"]),
+    (("d=1u", "d=1e-40"), 4, ["Xcoat d is 1e-40 m; allowed: more than 0, from 1e-30 to 1e+30"]),
+    (("r=0.2meg", "r=1e31"), 4, ["Xcoat r is 1e31 (1e+31 ohm); allowed: more than 0 or inf, from 1e-30 to 1e+30"]),
+    (("f=100", "f=1e300"), 6, ["Xskin f is 1e300 (1e+300 Hz); allowed: more than 0, from 0.001 to 1e+09"]),
     (("eps_r=3.9", "eps_r={3/0}"), 4, ["'3/0' divides by zero"]),
     (("eps_r=3.9", "eps_r={er}"), 4, ["'er' is not defined"]),
     (("eps_r=3.9", "eps_r={__import__(1)}"), 4, ["__import__"]),
@@ -78,6 +81,11 @@ CONTACT = [
     (("m_exp=0.52", "m_exp=1.5"), 5, ["Xgap exponents are m_exp=1.5, n_exp=1.41; allowed: 0 < m_exp < n_exp"]),
     (("m_exp=0.52", "m_exp=1.41"), 5, ["allowed: 0 < m_exp < n_exp"]),
     (("m_exp=0.52", "m_exp=-1"), 5, ["Xgap m_exp is -1; allowed: more than 0"]),
+    (
+        ("n_exp=1.41", "n_exp=1000"),
+        5,
+        ["Xgap has a contact whose constants are beyond the range", "nearer to Table 1's"],
+    ),
     (("m_exp=0.52 beta=32 n_exp=1.41", "m_exp=3 beta=32 n_exp=4"), 5, ["1/m + 1/n = 0.5833; allowed: more than 1"]),
 ]
 
@@ -143,6 +151,7 @@ SOURCES = [
     (("SIN(0 200 100)", "PWL(0 0 2m 1 1m 2)"), 3, ["Vdrive: PWL times decrease: 0.001 s follows 0.002 s"]),
     (("SIN(0 200 100)", "PWL(0 0 1m nan)"), 3, ["PWL value is 'nan'; allowed: a number"]),
     (("SIN(0 200 100)", "PWL(0 0 nan 1)"), 3, ["PWL value is 'nan'; allowed: a number"]),
+    (("SIN(0 200 100)", "PWL(1e308 0 -1e308 1)"), 3, ["PWL times decrease: -1e+308 s follows 1e+308 s"]),
     (("SIN(0 200 100)", "AM(1 2 3 4)"), 3, ["Vdrive: AM changed its argument order"]),
     (("SIN(0 200 100)", "SFFM(0 1 2 3 4)"), 3, ["Vdrive: SFFM changed its argument order"]),
     (("SIN(0 200 100)", "WAVEFILE(a.wav 1)"), 3, ["Vdrive: WAVEFILE is not supported by this version"]),

@@ -56,7 +56,7 @@ OPTIONS = [
 OTHERS = [
     (["run", "missing.cir"], "'missing.cir' does not exist"),
     (["run", "pat.cir"], "'pat.cir' does not exist; did you mean 'pad.cir'?"),
-    (["run", "folder"], "'folder' is a folder, not a netlist"),
+    (["run", "folder"], "'folder' is a folder, not a file"),
     (["ac", "empty.cir"], "'empty.cir' is empty: a netlist begins with a title line"),
     (["compare", "binary.cir"], "'binary.cir' is not a text file (it holds NUL bytes): save it as UTF-8"),
     (["export", "latin.cir", "-o", "x.cir"], "'latin.cir' is not UTF-8 text (byte 0xb5 in line 2)"),

@@ -167,12 +167,16 @@ def test_files_that_are_no_material_are_refused(tmp_path: Path, text: str, says:
 
 
 def test_bad_requests_are_refused(tmp_path: Path) -> None:
+    endless = tmp_path / "endless.csv"
+    endless.write_text('"' + "1" * 140_000)
     rows = eqs_18_19(np.geomspace(*SKIN_BAND, 21))
     for call, says in (
         (lambda: fs.fit_material(rows, poles=3, error=0.1), "one of them"),
         (lambda: fs.fit_material(rows, poles=0), "poles is 0"),
         (lambda: fs.fit_material(rows, error=0.0), "error is 0"),
-        (lambda: fs.fit_material(tmp_path / "missing.csv"), "cannot be read"),
+        (lambda: fs.fit_material([[1, 1, 1], [2, 1e-300, 1], [3, 1, 1]]), "resistivity in row 2 is 1e-300"),
+        (lambda: fs.fit_material(endless), "field larger than field limit"),
+        (lambda: fs.fit_material(tmp_path / "missing.csv"), "does not exist"),
         (lambda: fs.ColeCole(1.0, ((1.0, 1.0, 1.0),)), "alpha is 1"),
         (lambda: fs.fit_material(rows, poles=3).to_netlist("my skin"), "name is 'my skin'"),
     ):

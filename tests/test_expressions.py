@@ -107,13 +107,22 @@ def test_arithmetic_with_names_conditions_and_nesting(text: str, value: float) -
         ("v(x)*2", 10, "'v' is not a function"),
         ("-" * 4 + "1", 13, "signs in a row"),
         ("(" * 500, 35, "nested deeper"),
-        ("1?" * 26 + "1" + ":1" * 26, 10, "side by side"),
+        ("1?" * 26 + "1" + ":1" * 26, 61, "more than 25 '.' in one expression"),
+        ("1?2:1?2:1?2:1?2:(" * 25 + "1" + ")" * 25, 117, "more than 25 '.' in one expression"),
     ],
 )
 def test_what_is_not_arithmetic_is_refused_at_its_column(text: str, column: int, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         evaluate(text, NAMES, HERE)
     assert caught.value.where == Where("deck.cir", 3, column)
+
+
+@pytest.mark.parametrize("name", ["dµ", "aª", "ﬁ", "x²", "aİ"])
+def test_names_that_unicode_would_normalise_are_themselves(name: str) -> None:
+    if name[0].isascii():
+        assert evaluate(f"2*{name}", {name: 4.0}, HERE) == 8.0
+    with pytest.raises(InputError, match=r"is not defined|does not belong"):
+        evaluate(f"2*{name}", {"dμ": 1.0, "aa": 1.0, "fi": 1.0, "x2": 1.0}, HERE)
 
 
 @pytest.mark.parametrize("text", ["(" * 100_000, "-" * 100_000, "1+" * 100_000, "x" * 100_000, "{" * 9])

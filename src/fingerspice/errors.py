@@ -10,6 +10,10 @@ if TYPE_CHECKING:
     from fingerspice.solution import Solution
 
 
+#: Characters of a message; of a longer one, which holds a long text of the user's, the middle is left out.
+LONGEST_MESSAGE = 1000
+
+
 @dataclass(frozen=True)
 class Where:
     """A place in a netlist: file name as shown to the user, line and column (both from 1)."""
@@ -32,15 +36,24 @@ class InputError(FingerspiceError, ValueError):
     Parameters
     ----------
     message : str
-        One clear sentence.
+        One clear sentence; whatever was given and stands in it, the error's own is short and printable.
     where : Where, optional
         The place in the netlist, where there is one.
     """
 
     def __init__(self, message: str, where: Where | None = None) -> None:
-        self.message = message
+        message = self.message = _shown(message)
         self.where = where
         super().__init__(f"{where}: {message}" if where else message)
+
+
+def _shown(message: str) -> str:
+    """A message with control characters escaped, and of bounded length."""
+    if len(message) > LONGEST_MESSAGE:
+        message = f"{message[: LONGEST_MESSAGE // 2]} ... {message[-LONGEST_MESSAGE // 4 :]}"
+    if message.isprintable():
+        return message
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in message)
 
 
 class SolveError(FingerspiceError, RuntimeError):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice.circuit.reader import read_text
 from fingerspice.circuit.waveforms import require
 from fingerspice.errors import InputError
 from fingerspice.physics.ladder import Ladder
@@ -20,6 +21,8 @@ ComplexArray = NDArray[np.complex128]
 MOST_POLES = 12
 # Poles per decade and decades beyond the band, of the fit that any causal and passive material would match.
 _DENSE, _BEYOND = 8, 2.0
+# Of data, in Hz, ohm m and 1: far from any material's, so that products and quotients stay numbers.
+_LEAST, _MOST = 1e-20, 1e20
 
 
 @dataclass(frozen=True)
@@ -179,9 +182,12 @@ def _admittivity(data: ColeCole | ArrayLike | str | Path) -> tuple[FloatArray, C
     )
     require(table.shape[0] >= 3, "material data", f"{table.shape[0]} rows", "three frequencies or more")
     for column, name in enumerate(("frequency", "resistivity", "permittivity")):
-        bad = np.flatnonzero(~(np.isfinite(table[:, column]) & (table[:, column] > 0.0)))
+        bad = np.flatnonzero(~((table[:, column] >= _LEAST) & (table[:, column] <= _MOST)))
         if bad.size:
-            raise InputError(f"{name} in row {bad[0] + 1} is {table[bad[0], column]:g}; allowed: more than 0")
+            raise InputError(
+                f"{name} in row {bad[0] + 1} is {table[bad[0], column]:g}; allowed: more than 0, from {_LEAST:g} to "
+                f"{_MOST:g}"
+            )
     table = table[np.argsort(table[:, 0])]
     f = table[:, 0].copy()
     require(bool(np.all(np.diff(f) > 0.0)), "frequencies", "repeated", "each once")
@@ -190,9 +196,9 @@ def _admittivity(data: ColeCole | ArrayLike | str | Path) -> tuple[FloatArray, C
 
 def _read_csv(path: Path) -> FloatArray:
     try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = [row for row in csv.reader(stream) if row and not row[0].lstrip().startswith("#")]
-    except (OSError, UnicodeDecodeError) as error:
+        lines = read_text(path, str(path)).splitlines(keepends=True)
+        rows = [row for row in csv.reader(lines) if row and not row[0].lstrip().startswith("#")]
+    except csv.Error as error:
         raise InputError(f"{path} cannot be read as CSV: {error}") from error
     numbers = []
     for place, row in enumerate(rows):

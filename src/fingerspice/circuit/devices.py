@@ -17,6 +17,8 @@ class ParameterSpec:
         None: required.
     may_be_zero, may_be_infinite : bool
         Besides the positive numbers.
+    least, most : float
+        Of the other numbers; far from any device's, so that products and quotients stay numbers.
     """
 
     name: str
@@ -24,16 +26,19 @@ class ParameterSpec:
     default: float | None = None
     may_be_zero: bool = False
     may_be_infinite: bool = False
+    least: float = 1e-30
+    most: float = 1e30
 
     def allowed(self) -> str:
         """What the parameter may be, in words."""
-        return ("0 or more" if self.may_be_zero else "more than 0") + (" or inf" if self.may_be_infinite else "")
+        words = ("0 or more" if self.may_be_zero else "more than 0") + (" or inf" if self.may_be_infinite else "")
+        return f"{words}, from {self.least:g} to {self.most:g}"
 
     def accepts(self, value: float) -> bool:
         """Whether a value is in range."""
-        if math.isnan(value) or value < 0.0 or (value == 0.0 and not self.may_be_zero):
-            return False
-        return self.may_be_infinite or not math.isinf(value)
+        if value == 0.0 or math.isinf(value):
+            return value >= 0.0 and (self.may_be_zero if value == 0.0 else self.may_be_infinite)
+        return self.least <= value <= self.most
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,7 @@ DEVICES: dict[str, DeviceSpec] = {
     for spec in (
         DeviceSpec("LAYER", _LAYER_NODES, (*_DIELECTRIC, _LEAK, _STRENGTH)),
         DeviceSpec("SLAB", _LAYER_NODES, (*_DIELECTRIC, _P("rho", "ohm m", may_be_infinite=True), _STRENGTH)),
-        DeviceSpec("SKIN", _LAYER_NODES, (_P("d", "m"), _P("f", "Hz"))),
+        DeviceSpec("SKIN", _LAYER_NODES, (_P("d", "m"), _P("f", "Hz", least=1e-3, most=1e9))),
         DeviceSpec("SKIN_DISPERSIVE", _LAYER_NODES, (_P("d", "m"),)),
         DeviceSpec(
             "GAP",

@@ -86,7 +86,7 @@ def read_ac(directive: Directive) -> AcSweep:
 def read_initial(directives: tuple[Directive, ...], elements: tuple[Element, ...]) -> dict[str, float]:
     """``.ic v(node)=value``: canonical node to V; the area nodes are left out."""
     usage = "allowed: .ic v(node)=value"
-    nodes = list(dict.fromkeys(node for e in elements for node in e.nodes))
+    nodes = {node: None for e in elements for node in e.nodes}  # an ordered set
     area_nodes = {e.nodes[2] for e in elements if e.spec.is_layer}
     out: dict[str, float] = {}
     for directive in directives:

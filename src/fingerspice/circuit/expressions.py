@@ -13,10 +13,11 @@ from __future__ import annotations
 
 import ast
 import difflib
+import itertools
 import math
 import operator
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple, TypeAlias
@@ -27,6 +28,8 @@ from fingerspice.units import parse_number, suspicious_mega
 MAX_LENGTH = 2000
 MAX_DEPTH = 25
 MAX_SIGNS = 3
+#: Of the words among which the nearest spelling is looked for: how many, and how many characters each.
+MAX_KNOWN, MAX_COMPARED = 1000, 60
 
 CONSTANTS: Mapping[str, float] = {"pi": math.pi, "e": math.e}
 
@@ -122,7 +125,7 @@ class Expression:
     """A checked expression: what it reads, and its tree."""
 
     text: str
-    names: frozenset[str]  # lower case, constants included when used
+    names: tuple[str, ...]  # lower case, each once, constants included when used
     positions: Mapping[str, int]  # first use of each name
     mega: str  # its first number written with capital M, or ""
     mega_position: int
@@ -168,9 +171,14 @@ def compile_expression(text: str, where: Place) -> Expression:
         raise InputError(problem.message, _at(where, problem.position)) from None
 
 
-def nearest(word: str, known: Mapping[str, object] | list[str] | tuple[str, ...]) -> str:
-    """The clause ``; did you mean 'x'?`` for the nearest known spelling, or an empty text."""
-    lower = {name.lower(): name for name in known}
+def nearest(word: str, known: Iterable[str]) -> str:
+    """The clause ``; did you mean 'x'?`` for the nearest known spelling, or an empty text.
+
+    Of many known words the first are looked at, and no long ones: comparing takes the product of their lengths.
+    """
+    if len(word) > MAX_COMPARED:
+        return ""
+    lower = {name.lower(): name for name in itertools.islice(known, MAX_KNOWN) if len(name) <= MAX_COMPARED}
     close = difflib.get_close_matches(word.lower(), lower, n=1)
     return f"; did you mean '{lower[close[0]]}'?" if close else ""
 
@@ -195,13 +203,13 @@ def _compile(text: str) -> Expression:
     mega = next((x for x in lexemes if x.kind == "number" and suspicious_mega(x.text)), nothing)
     if len(lexemes) == 1 and lexemes[0].kind == "number":
         value = _number(lexemes[0])
-        return Expression(text, frozenset(), {}, mega.text, mega.position, ast.Constant(value), value)
-    python = _to_python(lexemes)
+        return Expression(text, (), {}, mega.text, mega.position, ast.Constant(value), value)
+    python = _to_python(lexemes, {name: number for number, name in enumerate(positions)})
     try:
         tree = ast.parse(python, mode="eval").body
     except (SyntaxError, RecursionError, MemoryError) as error:  # the checks above should leave none
         raise _Problem(f"'{text}' is not arithmetic ({type(error).__name__})") from None
-    return Expression(text, frozenset(positions), positions, mega.text, mega.position, tree, None)
+    return Expression(text, tuple(positions), positions, mega.text, mega.position, tree, None)
 
 
 def _lex(text: str) -> list[_Lexeme]:
@@ -226,7 +234,7 @@ def _lex(text: str) -> list[_Lexeme]:
 def _check_order(lexemes: list[_Lexeme], end: int) -> None:
     """Refuse every sequence that is not an expression, and every nesting too deep to parse."""
     open_brackets: list[tuple[_Lexeme, bool]] = []  # and whether each holds a function's arguments
-    wants_value, previous, signs = True, "", 0
+    wants_value, previous, signs, questions = True, "", 0, 0
     for index, (kind, text, position) in enumerate(lexemes):
         if wants_value and kind in ("number", "name", "call"):
             wants_value, signs = kind == "call", 0
@@ -250,6 +258,9 @@ def _check_order(lexemes: list[_Lexeme], end: int) -> None:
             raise _Problem("',' outside the arguments of a function", position)
         else:
             wants_value = True
+            questions += text == "?"
+            if questions > MAX_DEPTH:
+                raise _Problem(f"more than {MAX_DEPTH} '?' in one expression", position)
         previous = kind
     if open_brackets:
         raise _Problem("'(' is never closed", open_brackets[-1][0].position)
@@ -272,8 +283,11 @@ class _Level:
         return text
 
 
-def _to_python(lexemes: list[_Lexeme]) -> str:
-    """Python text of checked lexemes: numbers in full, names prefixed so that none is a Python word."""
+def _to_python(lexemes: list[_Lexeme], order: Mapping[str, int]) -> str:
+    """Python text of checked lexemes: numbers in full, names by their number, functions with a prefix.
+
+    So no name is a Python word, and none is changed by the parser, which normalises Unicode.
+    """
     levels = [_Level("")]
     for lexeme in lexemes:
         kind, text, position = lexeme
@@ -283,8 +297,10 @@ def _to_python(lexemes: list[_Lexeme]) -> str:
         elif kind == "call" and text.lower() not in FUNCTIONS:
             hint = nearest(text, FUNCTIONS) or f"; functions are {' '.join(FUNCTIONS)}"
             raise _Problem(f"'{text}' is not a function{hint}", position)
-        elif kind in ("name", "call"):
-            level.pieces.append((f"v_{text.lower()}", position))
+        elif kind == "call":
+            level.pieces.append((f"f_{text.lower()}", position))
+        elif kind == "name":
+            level.pieces.append((f"n{order[text.lower()]}", position))
         elif text == "(":
             levels.append(_Level("("))
         elif text == ")":
@@ -329,8 +345,6 @@ def _conditional(pieces: list[tuple[str, int]]) -> str:
             pairs[waiting.pop()] = index
     if waiting:
         raise _Problem("'?' without its ':' (a ? b : c)", pieces[waiting[-1]][1])
-    if len(pairs) > MAX_DEPTH:
-        raise _Problem(f"more than {MAX_DEPTH} '?' side by side", pieces[0][1])
 
     def join(start: int, end: int) -> str:
         question = next((i for i in range(start, end) if i in pairs), None)
@@ -371,7 +385,7 @@ def _walk(node: ast.expr, names: Mapping[str, float], expression: Expression) ->
     if isinstance(node, ast.Constant) and type(node.value) is float:
         return node.value
     if isinstance(node, ast.Name):
-        return _look_up(node.id[2:], names, expression)
+        return _look_up(expression.names[int(node.id[1:])], names, expression)
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
         value = _walk(node.operand, names, expression)
         return -value if isinstance(node.op, ast.USub) else value
@@ -409,7 +423,7 @@ def _look_up(name: str, names: Mapping[str, float], expression: Expression) -> f
         return names[name]
     if name in CONSTANTS:
         return CONSTANTS[name]
-    hint = f": the function is written {name}(...)" if name in FUNCTIONS else nearest(name, {**names, **CONSTANTS})
+    hint = f": the function is written {name}(...)" if name in FUNCTIONS else nearest(name, [*CONSTANTS, *names])
     position = expression.positions[name]
     written = expression.text[position : position + len(name)]
     raise _Problem(f"parameter '{written}' is not defined{hint}", position)

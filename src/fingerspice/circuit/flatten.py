@@ -10,9 +10,11 @@ from fingerspice.circuit.reader import DIRECTIVES, NATIVE_DEVICES, NATIVE_NODES,
 from fingerspice.circuit.scope import Bare, Call, Number, Scope, Token, Value
 from fingerspice.errors import InputError, Where
 
-#: Lines read in all subcircuit calls together, and calls inside each other.
-MAX_EXPANDED = 1_000_000
+#: Lines and characters read in all subcircuit calls together, calls inside each other, characters of a flat name.
+MAX_EXPANDED = 100_000
+MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
+MAX_NAME = 400
 
 _VALUED = {"R": "resistor", "C": "capacitor", "V": "voltage source", "I": "current source"}
 _ELSEWHERE = {
@@ -125,6 +127,7 @@ class Flattener:
         self.statements: list[Statement] = []
         self._names: dict[str, Where] = {}
         self._expanded = 0
+        self._expanded_text = 0
 
     def run(self, root: Subcircuit, scope: Scope) -> None:
         """Flatten a deck whose parameters are known."""
@@ -145,6 +148,8 @@ class Flattener:
         if letter != "X" and letter not in _VALUED:
             raise InputError(_unknown_element(lexemes), where)
         name = f"{instance.prefix}{first.text}"
+        if len(name) > MAX_NAME:
+            raise InputError(f"an element's name of {len(name)} characters: at most {MAX_NAME} are allowed", where)
         earlier = self._names.setdefault(name.lower(), where)
         if earlier is not where:
             raise InputError(f"element '{name}' is defined twice, first at {earlier}", where)
@@ -198,6 +203,9 @@ class Flattener:
         self._expanded += 1 + len(called.elements) + len(called.params) + len(called.defaults)
         if self._expanded > MAX_EXPANDED:
             raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", where)
+        self._expanded_text += called.characters
+        if self._expanded_text > MAX_EXPANDED_TEXT:
+            raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text", where)
 
 
 def _bind(inner: _Instance, line: Line, words: Group, caller: Scope) -> None:

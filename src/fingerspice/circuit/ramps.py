@@ -129,12 +129,13 @@ class PWL(_Ramps):
             bad = np.flatnonzero(~np.isfinite(array))
             if bad.size:
                 raise InputError(f"PWL {name} number {bad[0] + 1} is {array[bad[0]]}; allowed: finite numbers")
-        step = np.diff(t)
-        if np.any(step < 0.0):
-            i = int(np.argmax(step < 0.0))
+        back = t[1:] < t[:-1]
+        if np.any(back):
+            i = int(np.argmax(back))
             raise InputError(f"PWL times decrease: {t[i + 1]:g} s follows {t[i]:g} s; allowed: not decreasing")
-        if t.size > 2 and np.any((step[1:] == 0.0) & (step[:-1] == 0.0)):
-            i = int(np.argmax((step[1:] == 0.0) & (step[:-1] == 0.0)))
+        thrice = t[2:] == t[:-2]
+        if np.any(thrice):
+            i = int(np.argmax(thrice))
             raise InputError(f"PWL time {t[i]:g} s stands three times; two equal times are a jump")
         if self.repeat is not None:
             require(

@@ -50,6 +50,7 @@ class Subcircuit:
     inner: dict[str, Subcircuit] = field(default_factory=dict)
     skipped: bool = False  # a native device's name, or inside one: its body is not read
     called: bool = False
+    characters: int = 0  # of its lines
 
 
 class Reader:
@@ -108,8 +109,10 @@ class Reader:
                 self._control = None
             return False
         if word[0] != ".":
-            if not self._open[-1].skipped:
-                self._open[-1].elements.append(line)
+            here = self._open[-1]
+            if not here.skipped:
+                here.elements.append(line)
+                here.characters += len(line.text)
             return False
         word = word.partition("(")[0].partition("=")[0]
         return self._directive(word, line, start + len(word), folder)
@@ -132,6 +135,7 @@ class Reader:
             return True
         elif word == ".param":
             here.params.extend(param_formulas(line, rest))
+            here.characters += len(line.text)
         elif word in (".include", ".inc", ".lib"):
             self._include(word, line, rest, folder)
         elif word in UNUSED:
@@ -166,6 +170,7 @@ class Reader:
                 raise InputError(problem, line.where(words.stray.position))
             defined.ports = _ports(line, names[1:])
             defined.defaults = _defaults(line, words)
+            defined.characters = len(line.text)
             _refuse_second(around, defined)
             around.inner[name.lower()] = defined
         self._open.append(defined)
@@ -207,7 +212,7 @@ class Reader:
 
 
 def read_text(path: Path, shown: str, where: Where | None = None) -> str:
-    """Text of a netlist file.
+    """Text of a netlist or table.
 
     Raises
     ------
@@ -216,7 +221,7 @@ def read_text(path: Path, shown: str, where: Where | None = None) -> str:
     """
     try:
         if path.is_dir():
-            raise InputError(f"'{shown}' is a folder, not a netlist", where)
+            raise InputError(f"'{shown}' is a folder, not a file", where)
         if not path.exists():
             raise InputError(f"'{shown}' does not exist{_similar_file(path)}", where)
         if not path.is_file():
@@ -282,14 +287,16 @@ def _file_name(word: str, line: Line, rest: int) -> tuple[str, int]:
 
 
 def _ports(line: Line, words: list[Lexeme]) -> tuple[str, ...]:
-    ports = tuple(word.text.lower() for word in words)
-    for index, word in enumerate(words):
-        if ports[index] in ("0", "gnd"):
+    ports: dict[str, None] = {}  # an ordered set
+    for word in words:
+        port = word.text.lower()
+        if port in ("0", "gnd"):
             problem = "ground is the same node everywhere and cannot be a subcircuit's node"
             raise InputError(problem, line.where(word.position))
-        if ports[index] in ports[:index]:
+        if port in ports:
             raise InputError(f"node '{word.text}' is given twice", line.where(word.position))
-    return ports
+        ports[port] = None
+    return tuple(ports)
 
 
 def _defaults(line: Line, words: Group) -> list[Formula]:

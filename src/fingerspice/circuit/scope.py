@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import ChainMap
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
@@ -100,6 +101,9 @@ class Scope:
     def __init__(self, parent: Scope | None = None) -> None:
         self.parent = parent
         self.values: dict[str, float] = {}
+        self._visible: ChainMap[str, float] = (
+            parent._visible.new_child(self.values) if parent else ChainMap(self.values)
+        )
         self._formulas: dict[str, Formula] = {}
         self._mega: dict[str, Token] = {}
 
@@ -165,25 +169,16 @@ class Scope:
             scope = scope.parent
         return scope
 
-    def _everything(self) -> dict[str, float]:
-        around = self.parent._everything() if self.parent is not None else {}
-        return {**around, **self.values}
-
     def _evaluate(self, expression: Expression, written: str, place: Callable[[int], Where]) -> Number:
         """Number of a compiled expression in this scope."""
-        known: dict[str, float] = {}
         mega = None
         if expression.mega:
             mega = Token(expression.mega, place(expression.mega_position))
-        for name in expression.positions:
-            scope = self._find(name)
+        for name in expression.names:
+            scope = None if mega else self._find(name)
             if scope is not None:
-                known[name] = scope.values[name]
-                mega = mega or scope._mega.get(name)
-            elif name not in CONSTANTS:
-                known = self._everything()  # for the nearest spelling
-                break
-        return Number(expression.evaluate(known, place), written, place(0), mega)
+                mega = scope._mega.get(name)
+        return Number(expression.evaluate(self._visible, place), written, place(0), mega)
 
     def number(self, line: Line, lexeme: Lexeme) -> Number:
         """Number of a lexeme that has to be arithmetic, with or without braces."""

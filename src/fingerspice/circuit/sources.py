@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -164,9 +165,9 @@ def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -
     """
     level: float | None = None
     waveform: Waveform | None = None
-    words = list(body)
+    words = deque(body)
     while words:
-        word = words.pop(0)
+        word = words.popleft()
         if isinstance(word, Number):
             if level is not None or waveform is not None:
                 raise InputError(
@@ -178,12 +179,9 @@ def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -
         call = word if isinstance(word, Call) else None
         if call is None and key not in ("dc", "ac"):
             # SIN 0 200 100, without brackets.
-            args = []
-            while words and isinstance(words[0], Number):
-                args.append(words.pop(0))
-            call = Call(key, tuple(a for a in args if isinstance(a, Number)), {}, {}, word.where)
+            call = Call(key, tuple(_leading_numbers(words)), {}, {}, word.where)
         if key in ("dc", "ac"):
-            numbers: list[Word] = list(call.args) if call else _leading_numbers(words)
+            numbers: Sequence[Word] = call.args if call else _leading_numbers(words)
             if key == "dc":
                 if len(numbers) != 1:
                     raise InputError(f"{name}: DC needs one value", word.where)
@@ -198,10 +196,11 @@ def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -
     return waveform if waveform is not None else DC(level or 0.0)
 
 
-def _leading_numbers(words: list[Word]) -> list[Word]:
-    out: list[Word] = []
+def _leading_numbers(words: deque[Word]) -> list[Number]:
+    out = []
     while words and isinstance(words[0], Number):
-        out.append(words.pop(0))
+        out.append(words[0])
+        words.popleft()
     return out
 
 

@@ -183,19 +183,36 @@ def layer_constants(layer: Element, skin_at: float | None = None) -> FloatArray:
 
 
 def contact_of(gap: Element) -> Contact:
-    """The contact of a GAP: the one place where the paper's mm become m."""
+    """The contact of a GAP: the one place where the paper's mm become m.
+
+    Raises
+    ------
+    InputError
+        Where its constants are beyond the range of numbers.
+    """
     v = gap.values
-    return Contact(
-        d=v["d"],
-        eps_r=v["eps_r"],
-        f_n=v["fn"],
-        mu=v["mu"],
-        alpha=v["alpha"] * 1e-6,
-        m=v["m_exp"],
-        beta=v["beta"] * 1e-6 * 1e3 ** v["n_exp"],
-        n=v["n_exp"],
-        c2=v["c2"] * 1e-12,
-    )
+    try:
+        contact = Contact(
+            d=v["d"],
+            eps_r=v["eps_r"],
+            f_n=v["fn"],
+            mu=v["mu"],
+            alpha=v["alpha"] * 1e-6,
+            m=v["m_exp"],
+            beta=v["beta"] * 1e-6 * 1e3 ** v["n_exp"],
+            n=v["n_exp"],
+            c2=v["c2"] * 1e-12,
+        )
+        possible = bool(np.all(np.isfinite(contact.pack())))
+    except (ArithmeticError, ValueError):  # a product overflows, or a logarithm is taken of one that underflows
+        possible = False
+    if not possible:
+        raise InputError(
+            f"{gap.name} has a contact whose constants are beyond the range of numbers; allowed: fn, alpha, m_exp, "
+            "beta, n_exp nearer to Table 1's",
+            gap.where,
+        )
+    return contact
 
 
 def is_stack(circuit: Circuit) -> bool:

@@ -8,6 +8,10 @@ from dataclasses import dataclass
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.waveforms import DC
 from fingerspice.errors import InputError
+from fingerspice.physics.ladder import SKIN_LADDER
+
+#: Elements of a circuit: every matrix of a network is dense.
+MAX_ELEMENTS = 2000
 
 
 @dataclass(frozen=True)
@@ -59,11 +63,12 @@ def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
     ------
     InputError
         Naming the elements or nodes at fault: no source, a floating node, a loop of voltage sources, a current source
-        without a path, an area that nothing or too much drives.
+        without a path, an area that nothing or too much drives; for a circuit of too many elements.
     """
+    _refuse_large(circuit)
     areas = _areas(circuit)
-    on_areas = [area.source for area in areas]
-    branches = [e for e in circuit.elements if all(e is not source for source in on_areas)]
+    on_areas = {id(area.source) for area in areas}
+    branches = [e for e in circuit.elements if id(e) not in on_areas]
     if not any(e.device in "VI" for e in branches):
         raise InputError(
             "the circuit has no source; allowed: a V element that drives the stack, such as V1 drive 0 SIN(0 200 100)"
@@ -93,6 +98,15 @@ def find_loop(circuit: Circuit) -> Loop | None:
     return Loop(_walk(branches), gap, areas[0].given)
 
 
+def _refuse_large(circuit: Circuit) -> None:
+    skins = len(circuit.by_device("SKIN_DISPERSIVE"))
+    more = len(SKIN_LADDER.poles)
+    count = len(circuit.elements) + skins * more
+    if count > MAX_ELEMENTS:
+        counted = f", a SKIN_DISPERSIVE counted as its {more + 1} slabs" if skins else ""
+        raise InputError(f"the circuit has {count:,} elements{counted}; allowed: at most {MAX_ELEMENTS:,}")
+
+
 def _areas(circuit: Circuit) -> tuple[Area, ...]:
     layers = [e for e in circuit.elements if e.spec.is_layer]
     owners: dict[str, Element] = {}
@@ -105,9 +119,10 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
                 gap.where,
             )
         owners[node] = gap
+    at = _incidence(list(circuit.by_device("V", "I", "R", "C")))
     out = []
     for node, layer in {e.nodes[2]: e for e in reversed(layers)}.items():
-        on_node = [e for e in circuit.by_device("V", "I", "R", "C") if node in e.nodes]
+        on_node = list({id(e): e for e in at.get(node, ())}.values())
         owner = owners.get(node)
         if owner is None:
             out.append(Area(node, None, *_given_by_source(layer, on_node, list(owners.values()))))
@@ -132,9 +147,10 @@ def _given_by_source(layer: Element, sources: list[Element], gaps: list[Element]
             layer.where,
         )
     source = sources[0]
-    if not isinstance(source.waveform, DC) or source.nodes[1] != "0" or not source.waveform.level > 0.0:
+    if not isinstance(source.waveform, DC) or source.nodes[1] != "0" or not 1e-30 <= source.waveform.level <= 1e30:
         raise InputError(
-            f"{source.name} drives an area: allowed is a DC value above 0 (mm^2) from the area node to 0",
+            f"{source.name} drives an area: allowed is a DC value above 0 (mm^2, from 1e-30 to 1e30) from the area "
+            "node to 0",
             source.where,
         )
     return source.waveform.level * 1e-6, source
@@ -195,6 +211,7 @@ def _refuse_source_conflicts(branches: list[Element]) -> None:
 
     def root(node: str) -> str:
         while parent.setdefault(node, node) != node:
+            parent[node] = parent[parent[node]]  # halves the path: a long one is walked once
             node = parent[node]
         return node
 

@@ -1,0 +1,328 @@
+"""Fuzzing of everything that reads text: every input is taken, or refused in one sentence, and touches nothing else.
+
+`python tests/fuzz.py --inputs 1000000 --seed 0`; a failure's own line says how to repeat it alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import fingerspice as fs
+import fuzz_inputs as make
+from fingerspice.circuit import expressions
+from fingerspice.circuit.directives import sweep_from_text
+from fingerspice.circuit.netlist import source_from_text, value_from_text
+from fingerspice.errors import FingerspiceWarning, InputError, Where
+from fingerspice.fitting import fit_material
+
+#: One input may take so long, s, and the whole run so much more memory than its first quarter, MiB.
+SECONDS, MEMORY = 10, 100
+LONGEST_MESSAGE = 1500
+
+
+class Defect(BaseException):
+    """What an input must not bring about; no handler for ordinary exceptions may swallow it."""
+
+
+class Watch:
+    """Says what the interpreter is asked to do while an input is read: a hook for audit events, active on demand."""
+
+    #: Parsing arithmetic into a tree is a `compile` of this and nothing else; running it would be an `exec`.
+    _TREE = re.compile(rb"(?:f_[a-z0-9_]+|n\d+|\d[\d.e+-]*|if|else|and|or|[-+*/<>=!(), .])*")
+    _HARMLESS = frozenset({"sys._getframe", "builtins.id"})
+
+    def __init__(self) -> None:
+        self.folder: str | None = None
+        self.seen: list[str] = []
+        sys.addaudithook(self._hook)
+
+    @contextmanager
+    def over(self, folder: Path) -> Iterator[None]:
+        """Watch a block, in which files may be read in a folder only.
+
+        Raises
+        ------
+        Defect
+            With the first event that is not allowed.
+        """
+        self.seen, self.folder = [], str(folder.resolve()) + os.sep
+        try:
+            yield
+        finally:
+            self.folder = None
+            if self.seen:
+                raise Defect(self.seen[0])
+
+    def _hook(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if self.folder is None or event in self._HARMLESS:
+            return
+        if event == "open" and self._may_open(*arguments):
+            return
+        if event in ("os.listdir", "os.scandir") and self._inside(arguments[0]):
+            return
+        if event == "compile" and isinstance(arguments[0], bytes | str):
+            text = arguments[0] if isinstance(arguments[0], bytes) else arguments[0].encode("utf-8", "replace")
+            if arguments[1] == "<unknown>" and self._TREE.fullmatch(text):
+                return
+        self.seen.append(f"{event} {str(arguments)[:200]}")
+
+    def _inside(self, path: Any) -> bool:
+        return (os.path.realpath(path) + os.sep).startswith(self.folder or "")
+
+    def _may_open(self, path: Any, mode: str | None, flags: int) -> bool:
+        return not flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT) and self._inside(path)
+
+
+WATCH = Watch()
+
+
+@dataclass
+class Bench:
+    """What the targets share: a folder with a deck and its files, and a circuit for the options of a command."""
+
+    folder: Path
+    circuit: fs.Circuit = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.folder = self.folder / "deck"
+        (self.folder / "sub").mkdir(parents=True)
+        files = {
+            "part.lib": "Rpart drive 0 1k\n.param part=1\n",
+            "loop.lib": ".include loop.lib\n",
+            "ping.lib": ".include pong.lib\n",
+            "pong.lib": ".include ping.lib\n",
+            "sub/inner.lib": ".include ../part.lib\n",
+            "../outside.lib": "Routside drive 0 1k\n",
+        }
+        for name, text in files.items():
+            (self.folder / name).write_text(text)
+        (self.folder / "link.lib").symlink_to(self.folder.parent / "outside.lib")
+        os.mkfifo(self.folder / "pipe.lib")
+        self.circuit = fs.read_netlist(make.CIRCUITS / "fingerpad.cir")
+
+
+def _read_text(rng: random.Random, bench: Bench) -> object:
+    text = make.netlist(rng)
+    with WATCH.over(bench.folder):
+        return fs.parse_netlist(text, bench.folder / "deck.cir")
+
+
+def _read_file(rng: random.Random, bench: Bench) -> object:
+    data = make.deck_file(rng)
+    (bench.folder / "deck.cir").write_bytes(data)
+    if b"mutated.lib" in data:
+        (bench.folder / "mutated.lib").write_bytes(make.deck_file(rng))
+    with WATCH.over(bench.folder):
+        return fs.read_netlist(bench.folder / "deck.cir")
+
+
+def _evaluate(rng: random.Random, bench: Bench) -> object:
+    text, names = make.expression(rng), {"a": 2.0, "w": -1.5, "p0": 1e-6, "Top": 1e300}
+    with WATCH.over(bench.folder):
+        value = expressions.evaluate(text, names, Where("deck.cir", 1))
+    if not abs(value) < float("inf"):
+        raise Defect(f"the value is {value}")
+    return value
+
+
+def _read_option(rng: random.Random, bench: Bench) -> object:
+    text = make.source_text(rng)
+    name = rng.choice(
+        ["Xgap.d", "Xcoat.r", "Vdrive.amplitude", "Xskin.f", "Xgap.tau", "Xgpa.d", "Xgap.fn", "Xgap.n_exp"]
+    )
+    with WATCH.over(bench.folder):
+        kind = rng.random()
+        if kind < 0.7:
+            return bench.circuit.replace({"Vdrive": source_from_text(text, bench.circuit)})
+        if kind < 0.85:
+            return sweep_from_text(text)
+        return bench.circuit.replace({name: value_from_text(bench.circuit, name, text)[0]})
+
+
+def _read_table(rng: random.Random, bench: Bench) -> object:
+    path = bench.folder / "table.csv"
+    path.write_bytes(make.table(rng))
+    with WATCH.over(bench.folder):
+        return fit_material(path, poles=1)
+
+
+Target = Callable[[random.Random, Bench], object]
+#: Target and how many of twenty inputs it gets.
+TARGETS: dict[str, tuple[Target, int]] = {
+    "netlist": (_read_text, 6),
+    "file": (_read_file, 2),
+    "expression": (_evaluate, 7),
+    "option": (_read_option, 4),
+    "table": (_read_table, 1),
+}
+
+
+@dataclass
+class Report:
+    """What came of a run: inputs by target and outcome, and the defects with the way to repeat them."""
+
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)
+    defects: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+    memory: float = 0.0
+
+    def text(self) -> str:
+        """A line for each target, and one for the whole."""
+        lines = []
+        for name in TARGETS:
+            taken, refused = self.counts[name, "taken"], self.counts[name, "refused"]
+            lines.append(f"{name:12s} {taken:9,} taken {refused:9,} refused {self.counts[name, 'defect']:6,} defects")
+        total = sum(self.counts.values())
+        rate = total / self.seconds if self.seconds else 0.0
+        lines.append(
+            f"{total:,} inputs in {self.seconds:.0f} s, {rate:,.0f} a second, {self.memory:.0f} MiB more memory"
+        )
+        return "\n".join(lines)
+
+
+def judge(error: InputError) -> None:
+    """Refuse a refusal that is not one clear sentence.
+
+    Raises
+    ------
+    Defect
+        Saying what is wrong with it.
+    """
+    said = str(error)
+    clear = error.message.strip() and said.isprintable() and len(said) <= LONGEST_MESSAGE
+    # Of the parser of Python's own only the texts it takes are asked.
+    if not clear or "Traceback" in said or re.search(r"is not arithmetic \(\w+Error\)", said):
+        raise Defect(f"no clear sentence: {said[:300]!r}")
+
+
+def once(target: Target, seed: str, bench: Bench) -> str:
+    """Read one input; `taken` or `refused`.
+
+    Raises
+    ------
+    Defect
+        For any other outcome, a warning of numpy's included, and for one that takes too long.
+    """
+
+    def late(signum: int, frame: FrameType | None) -> None:
+        raise Defect(f"no answer after {SECONDS} s")
+
+    rng = random.Random(seed)
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    try:
+        target(rng, bench)
+    except InputError as error:
+        judge(error)
+        return "refused"
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        said = f"{type(error).__name__}: {error}"
+        raise Defect(f"{said[:200]!r} in {Path(place.filename).name}:{place.lineno}") from error
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    return "taken"
+
+
+def run(
+    inputs: int,
+    seed: str = "0",
+    targets: dict[str, tuple[Target, int]] = TARGETS,
+    first: int = 0,
+    say: Callable[[str], object] = str,
+) -> Report:
+    """Read so many inputs, the target of each and what it holds made from the seed and its number alone.
+
+    Parameters
+    ----------
+    inputs : int
+    seed : str
+    targets : dict of str to (Target, int)
+    first : int
+        Number of the first input.
+    say : callable
+        Is told of every defect at once.
+    """
+    report = Report()
+    wheel = [name for name, (_, share) in targets.items() for _ in range(share)]
+    # Files in memory, where there are such, are written ten times faster.
+    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    folder = Path(tempfile.mkdtemp(prefix="fuzz-", dir=memory))
+    try:
+        bench = Bench(folder)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            warnings.simplefilter("ignore", FingerspiceWarning)
+            _warm_up(bench)
+            start, early = time.perf_counter(), _peak()
+            for number in range(first, first + inputs):
+                name = wheel[number % len(wheel)]
+                try:
+                    outcome = once(targets[name][0], f"{seed}/{number}", bench)
+                except Defect as defect:
+                    outcome = "defect"
+                    report.defects.append(f"--seed {seed} --first {number} --inputs 1: {name}: {defect}")
+                    say(report.defects[-1])
+                report.counts[name, outcome] += 1
+                if number - first == inputs // 4:
+                    early = _peak()
+            report.seconds = time.perf_counter() - start
+            report.memory = _peak() - early
+    finally:
+        shutil.rmtree(folder)
+    if report.memory > MEMORY:
+        report.defects.append(f"--seed {seed} --inputs {inputs}: {report.memory:.0f} MiB more memory than at the start")
+        say(report.defects[-1])
+    return report
+
+
+def _warm_up(bench: Bench) -> None:
+    """Load what is loaded on first use: reading a file is an event."""
+    table = bench.folder / "table.csv"
+    table.write_text("".join(f"{10.0**k:g},{1000 / k:g},{9999 / k:g}\n" for k in range(1, 6)))
+    fit_material(table, poles=1)
+    for path in sorted(make.CIRCUITS.glob("*.cir")):
+        fs.read_netlist(path)
+    gc.collect()
+
+
+def _peak() -> float:
+    """Largest memory so far, MiB."""
+    size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return size / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def main() -> int:
+    """Run from the command line; 1 where there is a defect."""
+    parser = argparse.ArgumentParser(description="Fuzz everything that reads text.")
+    parser.add_argument("--inputs", type=int, default=20_000, help="how many inputs")
+    parser.add_argument("--seed", default="0", help="what they are made from")
+    parser.add_argument("--first", type=int, default=0, help="number of the first, to repeat one")
+    given = parser.parse_args()
+    report = run(given.inputs, given.seed, first=given.first, say=lambda line: print(line, flush=True))
+    print(report.text())
+    return 1 if report.defects else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

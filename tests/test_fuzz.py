@@ -1,0 +1,180 @@
+"""Whatever is typed is taken or refused in one sentence; and the fuzzer that says so can fail."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import random
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import fuzz
+from fingerspice.circuit.expressions import FUNCTIONS, evaluate
+from fingerspice.circuit.lexer import group, lex, logical_lines, split_lines
+from fingerspice.errors import InputError, Where
+
+HERE = Where("deck.cir", 1)
+
+
+def test_twenty_thousand_inputs_are_taken_or_refused() -> None:
+    report = fuzz.run(20_000)
+    assert report.defects == []
+    for name in fuzz.TARGETS:
+        # A fuzzer whose inputs are all refused at the door reads nothing.
+        assert report.counts[name, "taken"] > 0.1 * report.counts[name, "refused"]
+
+
+def planted(target: fuzz.Target) -> list[str]:
+    return fuzz.run(1, targets={"planted": (target, 1)}).defects
+
+
+def bad_sentence(message: str) -> fuzz.Target:
+    def target(rng: random.Random, bench: fuzz.Bench) -> None:
+        error = InputError("")
+        error.args = (message,)
+        error.message = message
+        raise error
+
+    return target
+
+
+def touching(do: Callable[[Path], object]) -> fuzz.Target:
+    def target(rng: random.Random, bench: fuzz.Bench) -> None:
+        with fuzz.WATCH.over(bench.folder):
+            do(bench.folder)
+
+    return target
+
+
+def raising(error: Exception) -> fuzz.Target:
+    def target(rng: random.Random, bench: fuzz.Bench) -> None:
+        raise error
+
+    return target
+
+
+def overflowing(rng: random.Random, bench: fuzz.Bench) -> None:
+    np.array([1e308]) * 10.0
+
+
+CODE = compile("1+1", "<unknown>", "eval")
+DEFECTS: dict[str, tuple[fuzz.Target, str]] = {
+    "a traceback": (raising(KeyError("x")), "KeyError"),
+    "numpy's own warning": (overflowing, "RuntimeWarning: overflow"),
+    "an empty message": (bad_sentence(" "), "no clear sentence"),
+    "two lines": (bad_sentence("one\ntwo"), "no clear sentence"),
+    "a terminal's commands": (bad_sentence("\x1b[31m"), "no clear sentence"),
+    "an endless message": (bad_sentence("x" * 5000), "no clear sentence"),
+    "a message of Python's": (bad_sentence("'1' is not arithmetic (MemoryError)"), "no clear sentence"),
+    "a file beside the folder": (touching(lambda folder: (folder / "../outside.lib").read_text()), "open"),
+    "a link out of the folder": (touching(lambda folder: (folder / "link.lib").read_text()), "open"),
+    "a file written": (touching(lambda folder: (folder / "part.lib").write_text("x")), "open"),
+    "a folder listed": (touching(lambda folder: os.listdir("/")), "os.listdir"),
+    "code evaluated": (touching(lambda folder: eval(CODE)), "exec"),
+    "code compiled": (touching(lambda folder: compile("import os", "<unknown>", "exec")), "compile"),
+    "a command": (touching(lambda folder: subprocess.run(["true"], check=True)), "subprocess"),
+}
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+def test_a_planted_defect_is_caught(name: str) -> None:
+    target, says = DEFECTS[name]
+    (defect,) = planted(target)
+    assert defect.startswith("--seed 0 --first 0 --inputs 1: planted: ")
+    assert says in defect
+
+
+def test_an_input_without_an_end_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fuzz, "SECONDS", 0.1)
+    (defect,) = planted(lambda rng, bench: time.sleep(60))
+    assert "no answer after" in defect
+
+
+def test_memory_that_is_kept_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fuzz, "MEMORY", 5)
+    kept: list[np.ndarray] = []
+    report = fuzz.run(40, targets={"leak": (lambda rng, bench: kept.append(np.ones(2**20)), 1)})
+    assert "MiB more memory" in report.defects[-1]
+
+
+def test_reading_the_same_again_keeps_nothing() -> None:
+    def blocks_after() -> int:
+        fuzz.run(400, seed="again")
+        fuzz.expressions._compile.cache_clear()
+        fuzz.gc.collect()
+        return sys.getallocatedblocks()
+
+    blocks_after()
+    first = blocks_after()
+    assert blocks_after() < first + 400
+
+
+def test_an_input_is_the_same_every_time_and_alone() -> None:
+    seen: list[float] = []
+    targets: dict[str, tuple[fuzz.Target, int]] = {"note": (lambda rng, bench: seen.append(rng.random()), 1)}
+    fuzz.run(5, "7", targets)
+    fuzz.run(1, "7", targets, first=3)
+    assert seen[5] == seen[3]
+    assert len(set(seen)) == 5
+
+
+# Where shrinking to the smallest example is worth more than many inputs.
+
+
+@settings(max_examples=500, deadline=None)
+@given(st.text(max_size=80))
+def test_any_text_is_a_finite_number_or_refused(text: str) -> None:
+    try:
+        value = evaluate(text, {"a": 1.0}, HERE)
+    except InputError as error:
+        fuzz.judge(error)
+        return
+    assert math.isfinite(value)
+
+
+_NAME = st.text(st.characters(categories=["Lu", "Ll", "Lo", "Lm", "Nd", "Nl", "No", "Mn", "Pc"]), max_size=4).map(
+    "a{}".format
+)
+
+
+@settings(max_examples=500, deadline=None)
+@given(_NAME, _NAME, st.sampled_from([*FUNCTIONS, "("]))
+def test_names_in_any_alphabet_are_themselves(name: str, other: str, function: str) -> None:
+    text = f"{name}+1" if function == "(" else f"{name}+0*{function}({other})"
+    with contextlib.suppress(InputError):
+        assert evaluate(text, {name: 2.0, other: 1.0}, HERE) in (2.0, 3.0, 1.0)
+
+
+@settings(max_examples=500, deadline=None)
+@given(st.text(max_size=80))
+def test_the_pieces_of_any_text_have_places_in_it(text: str) -> None:
+    with contextlib.suppress(InputError):
+        for line in logical_lines(split_lines(text), "deck.cir"):
+            lexemes = lex(line)
+            group(line, lexemes, probes=True)
+            for lexeme in lexemes:
+                where = line.where(lexeme.position)
+                written = split_lines(text)[where.line - 1][where.column - 1 :]
+                assert line.written(lexeme)[:1] == written[:1]
+
+
+def test_the_fuzzer_runs_from_the_command_line() -> None:
+    command = [sys.executable, "tests/fuzz.py", "--inputs", "100", "--seed", "5"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "100 inputs in" in done.stdout
+
+
+@pytest.fixture(autouse=True)
+def _leave_warnings_alone() -> None:
+    warnings.simplefilter("ignore", fuzz.FingerspiceWarning)

@@ -1,0 +1,177 @@
+"""Decks beyond all measure are read in time that grows with their length, or refused by the limit they pass.
+
+Nothing is timed: at these sizes an algorithm that looks at every pair would not come to its end.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import fingerspice as fs
+from fingerspice.circuit import flatten, topology
+from fingerspice.circuit.deck import Number, parse_deck
+from fingerspice.circuit.expressions import evaluate, nearest
+from fingerspice.errors import LONGEST_MESSAGE, InputError, Where
+
+MANY = 20_000
+
+
+def lines(of: Callable[[int], str], count: int = MANY) -> str:
+    return "".join(f"{of(i)}\n" for i in range(count))
+
+
+def refusal(text: str) -> str:
+    with pytest.raises(InputError) as caught:
+        fs.parse_netlist(f"t\n{text}", "deck.cir")
+    return caught.value.message
+
+
+def test_a_million_comments_are_skipped() -> None:
+    assert len(parse_deck("t\n" + "* a comment\n" * 1_000_000 + "R1 a 0 1\n").statements) == 1
+
+
+def test_a_line_of_many_continuations_keeps_the_place_of_each() -> None:
+    read = parse_deck("t\nV1 a 0 PWL(0 0\n" + lines(lambda i: f"+ {i + 1} 1") + "+)\n")
+    (call,) = read.statements[0].body
+    assert len(call.args) == 2 * MANY + 2
+    assert call.args[-1].where == Where("<netlist>", MANY + 2, len(f"+ {MANY} ") + 1)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        lines(lambda i: f".param p{i}={i}"),
+        ".param " + " ".join(f"p{i}={{{i}}}" for i in range(MANY)),
+        lines(lambda i: f".param p{i}={{p{i + 1} - 1}}") + f".param p{MANY}={MANY}\n",
+        lines(lambda i: f".param p{MANY - i}={{p{MANY - i - 1} + 1}}") + ".param p0=0\n",
+        lines(lambda i: f".param p{i}={{1 ? {i} : nothing{i}}}"),
+    ],
+    ids=["lines", "one line", "chain", "chain the other way", "names never looked up"],
+)
+def test_many_parameters_are_evaluated_each_once(text: str) -> None:
+    read = parse_deck(f"t\n{text}")
+    assert len(read.params) in (MANY, MANY + 1)
+    assert abs(read.params[f"p{MANY - 1}"] - MANY) <= 1
+
+
+def test_many_ports_nodes_and_definitions_are_read() -> None:
+    ports = " ".join(f"n{i}" for i in range(MANY))
+    read = parse_deck(f"t\n.subckt s {ports}\nR1 n0 n{MANY - 1} 1\n.ends\nX1 {ports} s\n")
+    assert read.statements[0].nodes == ("n0", f"n{MANY - 1}")
+    read = parse_deck("t\n" + lines(lambda i: f".subckt s{i} a\nR1 a 0 {i + 1}\n.ends\nX{i} a s{i}", MANY // 5))
+    assert len(read.statements) == MANY // 5
+
+
+def test_a_million_words_on_one_line_are_counted() -> None:
+    assert refusal(f"V1 a 0 SIN {'1 ' * 200_000}").startswith("SIN takes at most 6 values, 200000 given")
+    assert refusal(f"R1 a 0 {'x' * 1_000_000}").startswith("R1 value is 'xxx")
+
+
+def test_brackets_of_any_depth_are_read_or_refused() -> None:
+    (value,) = parse_deck(f"t\nR1 a 0 {'(' * 100_000}5{')' * 100_000}\n").statements[0].body
+    assert isinstance(value, Number)
+    assert "at most 2000 are allowed" in refusal(f"R1 a 0 {{{'(' * 100_000}5{')' * 100_000}}}")
+    assert "at most 2000 are allowed" in refusal(f"R1 a 0 {'{' * 100_000}5{'}' * 100_000}")
+    assert refusal(f"R1 a 0 {'(' * 100_000}") == "'(' is never closed"
+    assert refusal(f".param x={'{' * 100_000}") == "{ is never closed"
+
+
+def test_subcircuits_nested_in_each_other_are_read() -> None:
+    read = parse_deck("t\n" + lines(lambda i: f".subckt s{i} a") + ".ends\n" * MANY + "R1 a 0 1\n")
+    assert len(read.statements) == 1
+
+
+def laughs(body: str, levels: int = 30) -> str:
+    calls = lines(lambda i: f".subckt s{i} a\nX1 a s{i + 1}\nX2 a s{i + 1}\n.ends", levels)
+    return f"{calls}.subckt s{levels} a\n{body}\n.ends\nX1 a s0\n"
+
+
+def test_subcircuits_that_double_at_every_level_are_refused() -> None:
+    assert refusal(laughs("R1 a 0 1")) == "the subcircuits expand to more than 100,000 lines"
+    assert refusal(laughs(f"R1 a {' ' * 300_000} 0 1")) == "the subcircuits expand to more than 4 MiB of text"
+    assert refusal(laughs(f".param {' '.join(f'p{i}=1' for i in range(1000))}")).endswith("100,000 lines")
+
+
+def test_calls_of_calls_are_refused_by_depth_and_circle() -> None:
+    chain = lines(lambda i: f".subckt s{i} a\nX1 a s{i + 1}\n.ends")
+    assert refusal(f"{chain}X1 a s0\n") == f"subcircuits call each other more than {flatten.MAX_DEPTH} deep"
+    assert refusal(".subckt s a\nX1 a s\n.ends\nX1 a s\n") == "subcircuit 's' calls itself: s -> s"
+
+
+def test_names_that_grow_with_every_call_are_refused() -> None:
+    assert refusal(f"R{'x' * 1000} a 0 1") == "an element's name of 1001 characters: at most 400 are allowed"
+    calls = lines(lambda i: f".subckt s{i} a\nX{'y' * 90} a s{i + 1}\n.ends", 10)
+    assert "an element's name of 462 characters" in refusal(f"{calls}X1 a s0\n")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        lines(lambda i: f"R{i} n{i} n{i + 1} 1\nC{i} n{i + 1} 0 1u", MANY // 2),
+        lines(lambda i: f"X{i} n{i} n{i + 1} area LAYER d=1u eps_r=1", MANY // 4),
+        lines(lambda i: f"X{i} d 0 a{i} LAYER d=1u eps_r=1\nV{i} a{i} 0 1", MANY // 4),
+    ],
+    ids=["ladder", "stack", "areas"],
+)
+def test_circuits_too_large_for_dense_matrices_are_refused(text: str) -> None:
+    said = refusal(f"Vd n0 0 1\n{text}")
+    assert re.fullmatch(r"deck.cir: the circuit has [\d,]+ elements; allowed: at most 2,000", said)
+
+
+def test_slabs_of_a_dispersive_skin_count_as_elements(monkeypatch: pytest.MonkeyPatch) -> None:
+    deck = "Va area 0 35\nV1 d 0 1\nX1 d m area SKIN_DISPERSIVE d=1u\nX2 m 0 area LAYER d=1u eps_r=1\n"
+    monkeypatch.setattr(topology, "MAX_ELEMENTS", 9)
+    assert len(fs.parse_netlist(f"t\n{deck}").elements) == 4
+    monkeypatch.setattr(topology, "MAX_ELEMENTS", 8)
+    assert "9 elements, a SKIN_DISPERSIVE counted as its 6 slabs; allowed: at most 8" in refusal(deck)
+
+
+def test_the_largest_circuits_find_conflicts_and_start_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(topology, "MAX_ELEMENTS", 10**9)
+    star = lines(lambda i: f"V{i} n0 n{i + 1} 1", 5_000)
+    assert refusal(f"{star}Vx n5000 n1 1\nR1 n5000 0 1\nR2 n1 0 1\n").startswith("node 'n2' is floating")
+    ring = lines(lambda i: f"V{i} n0 n{i + 1} 1\nR{i} n{i + 1} 0 1", 5_000)
+    assert refusal(f"{ring}Vx n5000 n1 1\n") == "Vx closes a loop of voltage sources"
+    start = lines(lambda i: f"R{i} n{i} 0 1\n.ic v(n{i})=1", 5_000)
+    assert refusal(f"{start}.ic v(n1)=2\n") == ".ic gives node 'n1' twice"
+    areas = lines(lambda i: f"X{i} d 0 a{i} LAYER d=1u eps_r=1\nV{i} a{i} 0 1", 4_000)
+    assert refusal(f"{areas}V1x d 0 1\nV2x d 0 1\n") == "V1x and V2x are voltage sources in parallel"
+
+
+def test_the_nearest_spelling_is_looked_for_in_bounded_time() -> None:
+    assert nearest("thik", ["thick", *map(str, range(10**6))]) == "; did you mean 'thick'?"
+    assert nearest("x" * 10**6, ["x" * 10**6]) == nearest("a" * 50, ["a" * 10**6] * 1000) == ""
+    with pytest.raises(InputError, match="'q' is not defined"):
+        parse_deck("t\n" + lines(lambda i: f".param p{i}=1") + "R1 a 0 {q}\n")
+
+
+def test_messages_are_short_and_printable_whatever_was_given() -> None:
+    with pytest.raises(InputError) as caught:
+        evaluate("\x1b[31m" + "x" * 10, {}, Where("deck.cir", 1))
+    assert caught.value.message.startswith("'\\x1b' does not belong")
+    said = refusal(f"R1 a 0 {'x' * 10**6}\u202e\n")
+    assert len(said) < LONGEST_MESSAGE
+    assert said.isprintable()
+    assert said.endswith("allowed: a number ohm")
+
+
+def test_included_files_are_bounded_in_number_depth_and_size(tmp_path: Path) -> None:
+    deck = tmp_path / "deck.cir"
+    (tmp_path / "part.lib").write_text("* nothing\n")
+    for i in range(40):
+        (tmp_path / f"deep{i}.lib").write_text(f".include deep{i + 1}.lib\n")
+        (tmp_path / f"wide{i}.lib").write_text(f".include wide{i + 1}.lib\n" * 2)
+    (tmp_path / "wide40.lib").write_text("\n")
+    limit = "too many included files: at most 1000, nested 32 deep"
+    for text in (".include part.lib\n" * 1001, ".include deep0.lib\n", ".include wide12.lib\n"):
+        deck.write_text(f"t\n{text}")
+        with pytest.raises(InputError, match=limit):
+            fs.read_netlist(deck)
+    (tmp_path / "large.lib").write_text(("*" * 1000 + "\n") * 10_000)
+    deck.write_text("t\n" + ".include large.lib\n" * 8)
+    with pytest.raises(InputError, match="the included files are larger than 64 MiB in all"):
+        fs.read_netlist(deck)
