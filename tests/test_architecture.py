@@ -47,6 +47,7 @@ ORDER = (
         "simulation",
         "steady",
         "largesignal",
+        "limits",
         "comparison",
         "report",
     ),

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from fingerspice.fitting import MaterialFit as MaterialFit
     from fingerspice.fitting import fit_material as fit_material
     from fingerspice.largesignal import large_signal as large_signal
+    from fingerspice.limits import FoldLimits as FoldLimits
+    from fingerspice.limits import fold_limits as fold_limits
     from fingerspice.outcome import Status as Status
     from fingerspice.phasors import phasor as phasor
     from fingerspice.planning import Plan as Plan
@@ -66,6 +68,7 @@ _HOMES = {
     "export": ("export_netlist",),
     "fitting": ("ColeCole", "MaterialFit", "fit_material"),
     "largesignal": ("large_signal",),
+    "limits": ("FoldLimits", "fold_limits"),
     "phasors": ("phasor",),
     "planning": ("Plan",),
     "simulation": ("plan", "simulate"),

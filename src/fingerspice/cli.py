@@ -1,4 +1,4 @@
-"""Command line: run, ac, compare, export, figures. Exit 0 done, 1 the solve failed, 2 bad input."""
+"""Command line: run, ac, plan, compare, limits, export, figures. Exit 0 done, 1 the solve failed, 2 bad input."""
 
 from __future__ import annotations
 
@@ -336,6 +336,47 @@ def compare(
     print(comparison_table(result))
     if not no_plot:
         print(f"wrote {picture}")
+
+
+@app.command()
+def limits(
+    deck: Deck,
+    out: Out = Path(),
+    points: Annotated[int, typer.Option(help="Values of each parameter.")] = 13,
+    span: Annotated[float, typer.Option(help="Each goes from its own value over this to this times it.")] = 10.0,
+    changes: Set = None,
+    source: Source = None,
+    as_json: AsJson = False,
+    no_plot: NoPlot = False,
+) -> None:
+    """Map where DECK folds under the mobile charge law: source voltage against load, gap and frequency.
+
+    Examples:
+
+      fingerspice limits circuits/fingerpad.cir --out out
+
+      fingerspice limits circuits/fingerpad.cir --set Xgap.d=100n --points 7 --json --no-plot
+    """
+    from fingerspice.limits import fold_limits, plot_limits
+    from fingerspice.report import limits_csv, limits_text
+
+    with _warnings_as_lines():
+        circuit = read_circuit(deck, changes, source)
+        table = out / f"{deck.stem}_limits.csv"
+        check_output(table, deck)
+        _announce_compilation()
+        result = fold_limits(circuit, points=points, span=span)
+    files = [limits_csv(result, table)]
+    if not no_plot:
+        from fingerspice.plotting import save
+
+        files.append(save(plot_limits(result), out / f"{deck.stem}_limits.png"))
+    if as_json:
+        print(json_text({**result.to_dict(), "files": [str(f) for f in files]}))
+        return
+    print(limits_text(result))
+    for file in files:
+        print(f"wrote {file}")
 
 
 @app.command()

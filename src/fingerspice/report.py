@@ -16,6 +16,7 @@ from fingerspice.units import format_si
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.comparison import Comparison
+    from fingerspice.limits import FoldLimits
     from fingerspice.phasors import PhasorSolution
     from fingerspice.planning import Plan
     from fingerspice.solution import Solution
@@ -141,6 +142,40 @@ def comparison_table(comparison: Comparison) -> str:
             f"area, {waveform:+.2f} % is the waveform's (zero for a sine)",
         ]
     )
+
+
+def limits_text(limits: FoldLimits) -> str:
+    """Where the mobile law folds, in words and a table per parameter."""
+    own = format_si(limits.peak, "V")
+    if math.isfinite(limits.voltage):
+        head = (
+            f"under the mobile law this deck folds at {format_si(limits.voltage, 'V')} peak; its source reaches {own}, "
+            f"{100.0 * limits.peak / limits.voltage:.3g} % of that"
+        )
+    else:
+        head = f"under the mobile law this deck does not fold; its source reaches {own}"
+    lines = [limits.circuit.title, head]
+    for sweep in limits.sweeps:
+        rows = [
+            (format_si(x, sweep.unit), format_si(u, "V") if math.isfinite(u) else "none")
+            for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True)
+        ]
+        lines += ["", _aligned(rows, (sweep.name, "folds at"))]
+    return "\n".join(lines)
+
+
+def limits_csv(limits: FoldLimits, path: Path) -> Path:
+    """Write a map of the fold as CSV; no voltage where there is no fold."""
+
+    def write(target: Path) -> None:
+        with target.open("w", newline="") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(["parameter", "value [SI]", "unit", "fold [V]"])
+            for sweep in limits.sweeps:
+                for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True):
+                    writer.writerow([sweep.name, repr(x), sweep.unit, repr(u) if math.isfinite(u) else ""])
+
+    return write_aside(path, write)
 
 
 def phasor_dict(result: PhasorSolution) -> dict[str, Any]:

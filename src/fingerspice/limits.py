@@ -1,0 +1,209 @@
+"""Where the `mobile` charge law folds: the source voltage it takes, against load, gap and frequency."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.combinations import Product
+from fingerspice.circuit.waveforms import Waveform, as_waveform, require
+from fingerspice.errors import FingerspiceWarning, InputError
+from fingerspice.outcome import Status
+from fingerspice.simulation import simulate
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FloatArray = NDArray[np.float64]
+
+# Voltages looked at, V, how exactly the fold's is found, relative, and the error of each run.
+LOWEST, HIGHEST = 1e-3, 1e5
+EXACT = 1e-3
+RTOL = 1e-5
+
+
+@dataclass(frozen=True)
+class FoldSweep:
+    """Voltage at which the law folds against one parameter.
+
+    Attributes
+    ----------
+    name, unit : str
+    own : float
+        The deck's value.
+    values, voltages : ndarray, shape (n,)
+        The parameter, and the source's peak voltage at the fold (V); NaN where there is none up to `HIGHEST`.
+    """
+
+    name: str
+    unit: str
+    own: float
+    values: FloatArray
+    voltages: FloatArray
+
+
+@dataclass(frozen=True)
+class FoldLimits:
+    """Where a circuit folds under the `mobile` law.
+
+    Attributes
+    ----------
+    circuit : Circuit
+    peak : float
+        The deck's own source voltage, V.
+    voltage : float
+        Peak source voltage at the fold with the deck's values, V; NaN where there is none up to `HIGHEST`.
+    sweeps : tuple of FoldSweep
+        Load, gap, and where the source has one, frequency.
+    """
+
+    circuit: Circuit
+    peak: float
+    voltage: float
+    sweeps: tuple[FoldSweep, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, SI units."""
+        return {
+            "peak": self.peak, "voltage": self.voltage,
+            "sweeps": [
+                {"name": s.name, "unit": s.unit, "own": s.own, "values": s.values.tolist(),
+                 "voltages": s.voltages.tolist()}
+                for s in self.sweeps
+            ],
+        }  # fmt: skip
+
+
+def fold_limits(circuit: Circuit, *, points: int = 13, span: float = 10.0) -> FoldLimits:
+    """Find the source voltage at which runs under the `mobile` law meet their fold, to 1e-3.
+
+    Every run starts as the deck's does and lasts as many periods. Each parameter goes from its own value over `span` to
+    `span` times it, the others as in the deck; SKIN is evaluated at each frequency.
+
+    Parameters
+    ----------
+    circuit : Circuit
+        With one GAP, a source and a .tran line.
+    points : int
+        Values of each parameter, 3 or more.
+    span : float
+        Above 1.
+
+    Raises
+    ------
+    InputError
+        For a circuit without these.
+    """
+    require(points >= 3, "points", points, "3 or more")
+    require(span > 1.0, "span", span, "more than 1")
+    gaps = circuit.by_device("GAP")
+    if len(gaps) != 1:
+        found = ", ".join(g.name for g in gaps) or "none"
+        raise InputError(f"a map of the fold needs one GAP whose area follows it; this circuit has {found}")
+    if circuit.tran is None:
+        raise InputError("a map of the fold needs a .tran line that says how long a run is")
+    sources = circuit.by_device("V")
+    t_stop = circuit.tran.stop
+    peak = max((e.waveform.peak(0.0, t_stop) for e in sources if e.waveform is not None), default=0.0)
+    if not 0.0 < peak < math.inf:
+        raise InputError("a map of the fold needs a V element with a voltage to raise; this circuit has none")
+    gap = gaps[0]
+    factors = np.geomspace(1.0 / span, span, points)
+    around = fold_voltage(circuit, peak, t_stop)
+    sweeps = []
+    for key, name, unit in (("fn", "load", "N"), ("d", "gap", "m")):
+        own = float(gap.values[key])
+        changed = [circuit.replace({f"{gap.name}.{key}": own * x}) for x in factors]
+        sweeps.append(FoldSweep(name, unit, own, own * factors, _along(changed, peak, [t_stop] * points)))
+    waves = [e.waveform for e in sources]
+    if len(waves) == 1 and isinstance(getattr(waves[0], "frequency", None), float):
+        own = float(waves[0].frequency)  # type: ignore[union-attr]
+        skins = [e.name for e in circuit.by_device("SKIN")]
+        changed = []
+        for x in factors:
+            wave: Waveform = dataclasses.replace(waves[0], frequency=own * x)  # type: ignore[type-var, assignment]
+            changes: dict[str, float | Waveform] = {f"{skin}.f": own * x for skin in skins}
+            changed.append(circuit.replace({**changes, sources[0].name: wave}))
+        voltages = _along(changed, peak, [t_stop / x for x in factors])
+        sweeps.append(FoldSweep("frequency", "Hz", own, own * factors, voltages))
+    return FoldLimits(circuit, peak, around, tuple(sweeps))
+
+
+def _along(circuits: list[Circuit], peak: float, ends: list[float]) -> FloatArray:
+    """Fold voltages of circuits, each looked for near that of the one before."""
+    out = []
+    guess = peak
+    for circuit, t_stop in zip(circuits, ends, strict=True):
+        out.append(fold_voltage(circuit, peak, t_stop, guess))
+        guess = out[-1] if math.isfinite(out[-1]) else HIGHEST
+    return np.array(out)
+
+
+def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | None = None) -> float:
+    """Peak source voltage (V) at which a run up to `t_stop` (s) meets the fold, to 1e-3; NaN for none up to `HIGHEST`.
+
+    `peak` is what the circuit's sources reach now, V; `guess` where to look first.
+    """
+
+    def folds(voltage: float) -> bool:
+        factor = as_waveform(voltage / peak)
+        raised = circuit.replace(
+            {e.name: Product((factor, e.waveform)) for e in circuit.by_device("V") if e.waveform is not None}
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FingerspiceWarning)
+            run = simulate(
+                raised, t_stop=t_stop, t_eval=[0.0, t_stop], charge_law="mobile", rtol=RTOL, charge=False,
+                method="exponential", throw=False,
+            )  # fmt: skip
+        if run.status not in (Status.SUCCESS, Status.FOLD):
+            raise InputError(f"a run at {voltage:.4g} V failed: {run.message}")
+        return run.status is Status.FOLD
+
+    low = high = min(max(guess or peak, LOWEST), HIGHEST)
+    if folds(low):
+        while True:
+            low, high = 0.7 * low, low
+            if not folds(low):
+                break
+            if low < LOWEST:
+                return low
+    else:
+        while True:
+            if high >= HIGHEST:
+                return math.nan
+            low, high = high, min(high / 0.7, HIGHEST)
+            if folds(high):
+                break
+    while high > low * (1.0 + EXACT):
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if folds(middle) else (middle, high)
+    return math.sqrt(low * high)
+
+
+def plot_limits(limits: FoldLimits) -> Figure:
+    """The fold's voltage against every parameter, the deck's own point marked."""
+    from fingerspice.plotting import BLUE, GREY, VERMILION, caption, dress, engineering, legend_above, new_figure
+
+    figure, axes = new_figure(1, len(limits.sweeps), height=3.2, sharey=True)
+    for ax, sweep in zip(axes, limits.sweeps, strict=True):
+        factor, unit = engineering(sweep.own, sweep.unit)
+        x, own = factor * sweep.values, factor * sweep.own
+        ax.plot(x, sweep.voltages, color=BLUE, marker="o", markersize=3, label="fold of the mobile law")
+        ax.fill_between(x, sweep.voltages, 1e6, color=GREY, alpha=0.2, linewidth=0, label="no solution")
+        ax.plot([own], [limits.peak], color=VERMILION, marker="D", linestyle="none", label="this deck")
+        ax.set_xscale("log")
+        ax.set_yscale("log")
+        dress(ax, "Peak source voltage [V]" if ax is axes[0] else "", f"{sweep.name.capitalize()} [{unit}]")
+    shown = np.concatenate([s.voltages[np.isfinite(s.voltages)] for s in limits.sweeps] + [[limits.peak]])
+    axes[0].set_ylim(0.5 * shown.min(), 2.0 * shown.max())
+    legend_above(axes[0], 3)
+    caption(figure, f"{limits.circuit.title} · charge law mobile; the other parameters as in the deck")
+    return figure
