@@ -1,0 +1,446 @@
+"""Killed, interrupted, no room, nobody who reads: outputs are whole or absent, the exit code is right, a rerun works.
+
+`python tests/test_faults.py --kills 200` strikes more often, at moments spread over the whole command.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fingerspice as fs
+from commands import QUICK
+from deck_edits import edited
+from fingerspice.files import write_aside
+
+COMMANDS = {
+    "run": (["run", "pad.cir", "--out", "out"], ["pad.nc", "pad.png"]),
+    "csv": (["run", "pad.cir", "--out", "out", "--csv", "--no-plot"], ["pad.csv"]),
+    "ac": (["ac", "pad.cir", "--out", "out"], ["pad_ac.csv", "pad_ac.png"]),
+    "compare": (["compare", "pad.cir", "--out", "out"], ["pad_compare.png"]),
+    "export": (["export", "pad.cir", "-o", "out/spice.cir"], ["spice.cir"]),
+    "figures": (["figures", "--out", "out", "--only", "2"], ["fig2.csv", "fig2.png"]),
+}
+ENTRY = [sys.executable, "-m", "fingerspice"]
+# The command, with what ends it just where it would hurt: PLACE is patched to strike when called for the N-th time.
+STRUCK = """
+import os, pathlib, sys
+from fingerspice.__main__ import main
+place, count, number = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+sys.argv[1:4] = []
+calls, original = [], getattr(pathlib.Path, place)
+def strike(self, *arguments):
+    calls.append(1)
+    if len(calls) == count:
+        if place == "write_bytes":
+            original(self, bytes(arguments[0])[:1000])
+        os.kill(os.getpid(), number)
+    return original(self, *arguments)
+setattr(pathlib.Path, place, strike)
+main()
+"""
+BROKEN_OFF = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated")}
+CAUGHT = "SigCgt:"
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="faults are made by Linux's means")
+
+
+def start(folder: Path, *arguments: str, entry: list[str] | None = None, **options: Any) -> subprocess.Popen[str]:
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": folder} | options
+    return subprocess.Popen([*(entry or ENTRY), *arguments], **options)
+
+
+def ended(process: subprocess.Popen[str]) -> tuple[int, list[str], str]:
+    """Exit code, lines on stderr without notes, and stdout."""
+    out, err = process.communicate(timeout=120)
+    lines = [
+        line for line in (err or "").splitlines() if not line.startswith(("fingerspice: warning", "fingerspice: note"))
+    ]
+    return process.returncode, lines, out or ""
+
+
+def written(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.iterdir()} if folder.is_dir() else {}
+
+
+def minded(process: subprocess.Popen[str]) -> None:
+    """Wait until the command minds signals: before, they are Python's, which has just begun."""
+    while process.poll() is None:
+        status = Path(f"/proc/{process.pid}/status").read_text()
+        caught = int(next(line for line in status.splitlines() if line.startswith(CAUGHT)).split()[1], 16)
+        if caught >> (signal.SIGTERM - 1) & 1:
+            return
+        time.sleep(0.002)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "pad.cir").write_text(edited(QUICK))
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, bytes]]:
+    """What every command writes, by name of the command and the file."""
+    return all_undisturbed(tmp_path_factory.mktemp("undisturbed"))
+
+
+def all_undisturbed(folder: Path) -> dict[str, dict[str, bytes]]:
+    found = {}
+    for name, (arguments, files) in COMMANDS.items():
+        (folder / name).mkdir()
+        (folder / name / "pad.cir").write_text(edited(QUICK))
+        code, lines, _ = ended(start(folder / name, *arguments))
+        assert (code, lines) == (0, [])
+        found[name] = written(folder / name / "out")
+        assert sorted(found[name]) == files
+    return found
+
+
+def check(name: str, out: Path, right: dict[str, bytes], *, killed: bool) -> None:
+    """Outputs are those of an undisturbed run or absent; only a process that was killed leaves what it was writing."""
+    for file, content in written(out).items():
+        if killed and file.startswith(".fingerspice-"):
+            continue
+        assert content == right[file], f"{name}: {file} is not whole"
+
+
+def rerun(name: str, folder: Path, right: dict[str, bytes]) -> None:
+    assert ended(start(folder, *COMMANDS[name][0]))[:2] == (0, [])
+    assert {n: c for n, c in written(folder / "out").items() if not n.startswith(".fingerspice-")} == right
+
+
+# Signals
+
+
+def strike(folder: Path, name: str, number: int, delay: float, right: dict[str, bytes]) -> int:
+    """Start a command, send it a signal `delay` s after it minds them, and look at what it leaves; its exit code."""
+    process = start(folder, *COMMANDS[name][0])
+    minded(process)
+    time.sleep(delay)
+    process.send_signal(number)
+    code, lines, _ = ended(process)
+    check(name, folder / "out", right, killed=number == signal.SIGKILL)
+    if code == 0:
+        assert set(written(folder / "out")) >= set(right)
+    elif number == signal.SIGKILL:
+        assert code == -number
+    else:
+        expected, word = BROKEN_OFF[signal.Signals(number)]
+        assert (code, lines) == (expected, [f"fingerspice: {word}; nothing half-written is left"])
+    return code
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
+def test_at_any_moment_a_signal_leaves_whole_files_or_none(
+    folder: Path, undisturbed: dict[str, dict[str, bytes]], number: int
+) -> None:
+    right = undisturbed["run"]
+    for delay in (0.05, 0.4, 0.9):
+        strike(folder, "run", number, delay, right)
+    rerun("run", folder, right)
+
+
+@pytest.mark.parametrize(
+    ("place", "count", "done"), [("write_bytes", 1, []), ("replace", 1, []), ("replace", 2, ["pad.nc"])]
+)
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
+def test_while_a_file_is_written_too(
+    folder: Path, undisturbed: dict[str, dict[str, bytes]], number: signal.Signals, place: str, count: int,
+    done: list[str],
+) -> None:  # fmt: skip
+    right = undisturbed["run"]
+    out = folder / "out"
+    out.mkdir()
+    for file in right:
+        (out / file).write_bytes(b"of a run before")
+    entry = [sys.executable, "-c", STRUCK, place, str(count), str(int(number))]
+    code, lines, _ = ended(start(folder, *COMMANDS["run"][0], entry=entry))
+    left = written(out)
+    assert {name: left[name] for name in right} == {
+        name: right[name] if name in done else b"of a run before" for name in right
+    }
+    hidden = [name for name in left if name not in right]
+    if number is signal.SIGKILL:
+        assert code == -number
+        assert len(hidden) == 1
+        rerun("run", folder, right)
+    else:
+        assert code == BROKEN_OFF[number][0]
+        assert lines == [f"fingerspice: {BROKEN_OFF[number][1]}; nothing half-written is left"]
+        assert hidden == []
+
+
+def test_ctrl_c_is_heard_in_the_middle_of_a_long_run(tmp_path: Path) -> None:
+    deck = (Path(__file__).parents[1] / "circuits" / "two_fingers.cir").read_text()
+    (tmp_path / "long.cir").write_text(deck)
+    code = "import fingerspice as fs; fs.simulate(fs.read_netlist('long.cir'), t_stop=100.0, t_eval=[1.0])"
+    entry = [sys.executable, "-c", f"import fingerspice.__main__ as m, sys\nsys.argv[1:] = []\n{SOLVING.format(code)}"]
+    process = start(tmp_path, entry=entry)
+    minded(process)
+    time.sleep(2.5)
+    begin = time.perf_counter()
+    process.send_signal(signal.SIGINT)
+    assert ended(process)[0] == 130
+    assert time.perf_counter() - begin < 2.0
+
+
+# As the command, with another thing to do than its arguments say.
+SOLVING = """
+import fingerspice.cli
+def solve():
+    {}
+fingerspice.cli.main = solve
+m.main()
+"""
+
+
+def test_a_command_started_with_ctrl_c_switched_off_leaves_it_off(
+    folder: Path, undisturbed: dict[str, dict[str, bytes]]
+) -> None:
+    ignoring: Callable[[], Any] = lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)  # noqa: E731
+    process = start(folder, *COMMANDS["run"][0], preexec_fn=ignoring)
+    minded(process)
+    process.send_signal(signal.SIGINT)
+    assert ended(process)[:2] == (0, [])
+    assert written(folder / "out") == undisturbed["run"]
+
+
+# No room
+
+
+def no_room(size: int) -> Callable[[], None]:
+    """No file may grow beyond `size` bytes; the write that would is refused, as on a full disk."""
+
+    def limit() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+    return limit
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "first"),
+    [
+        ("run", 0, "pad.nc"),
+        ("run", 5000, "pad.nc"),
+        ("run", 50_000, "pad.png"),
+        ("csv", 5000, "pad.csv"),
+        ("ac", 500, "pad_ac.csv"),
+        ("compare", 5000, "pad_compare.png"),
+        ("export", 500, "spice.cir"),
+        ("figures", 5000, "fig2.png"),
+    ],
+)
+def test_a_full_disk_is_one_sentence_and_no_half_file(
+    folder: Path, undisturbed: dict[str, dict[str, bytes]], name: str, size: int, first: str
+) -> None:
+    code, lines, out = ended(start(folder, *COMMANDS[name][0], preexec_fn=no_room(size)))
+    assert (code, lines, out) == (2, [f"fingerspice: cannot write out/{first}: File too large"], "")
+    right = undisturbed[name]
+    assert written(folder / "out") == {n: right[n] for n in COMMANDS[name][1] if n != first and n < first}
+    if name != "run" or size == 0:
+        rerun(name, folder, right)
+
+
+def test_a_report_that_finds_no_room_is_told_and_the_files_are_whole(
+    folder: Path, undisturbed: dict[str, dict[str, bytes]]
+) -> None:
+    for arguments in (COMMANDS["run"][0], ["--version"], ["--help"]):
+        with open("/dev/full", "w") as full:
+            code, lines, _ = ended(start(folder, *arguments, stdout=full))
+        assert (code, lines) == (2, ["fingerspice: cannot write to the standard output: No space left on device"])
+    assert written(folder / "out") == undisturbed["run"]
+
+
+FAILS = ["run", "pad.cir", "--no-plot", "--charge-law", "mobile", "--set", "Xgap.d=10n"]
+
+
+@pytest.mark.parametrize(("arguments", "expected"), [(COMMANDS["run"][0], 0), (FAILS, 1), (["--help"], 0)])
+def test_a_reader_that_has_gone_changes_no_exit_code(folder: Path, arguments: list[str], expected: int) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    process = start(folder, *arguments, stdout=writing)
+    os.close(writing)
+    code, lines, _ = ended(process)
+    assert code == expected
+    assert len(lines) == expected
+
+
+def test_without_a_standard_output_the_files_are_written(
+    folder: Path, undisturbed: dict[str, dict[str, bytes]]
+) -> None:
+    assert ended(start(folder, *COMMANDS["run"][0], preexec_fn=lambda: os.close(1)))[:2] == (0, [])
+    assert written(folder / "out") == undisturbed["run"]
+
+
+# What stands where an output should go
+
+
+def test_a_folder_that_takes_no_files_is_refused(folder: Path) -> None:
+    # Not even root may make a file there.
+    code, lines, _ = ended(start(folder, "run", "pad.cir", "--out", "/proc/self"))
+    assert code == 2
+    assert len(lines) == 1
+    assert lines[0].startswith("fingerspice: cannot write /proc/self/pad.nc: ")
+    assert lines[0].endswith("; allowed: a folder that can be written")
+
+
+@pytest.mark.parametrize("name", ["run", "ac", "compare", "figures"])
+def test_a_folder_in_the_place_of_a_picture_is_refused_before_the_run(folder: Path, name: str) -> None:
+    picture = COMMANDS[name][1][-1]
+    (folder / "out" / picture).mkdir(parents=True)
+    code, lines, _ = ended(start(folder, *COMMANDS[name][0]))
+    assert (code, lines) == (2, [f"fingerspice: cannot write out/{picture}: it is a folder; allowed: a file's name"])
+    assert [p.name for p in (folder / "out").iterdir()] == [picture]
+
+
+def test_a_deck_named_as_the_picture_is_not_overwritten(folder: Path) -> None:
+    (folder / "pad.cir").rename(folder / "pad.png")
+    code, lines, _ = ended(start(folder, "run", "pad.png"))
+    assert code == 2
+    assert lines == ["fingerspice: cannot write pad.png: it is the deck itself; allowed: another name or folder"]
+    assert (folder / "pad.png").read_text() == edited(QUICK)
+
+
+def test_a_link_is_followed_and_a_pipe_is_written_as_it_stands(tmp_path: Path) -> None:
+    def write(path: Path) -> Path:
+        return write_aside(path, lambda p: p.write_text("new"))
+
+    (tmp_path / "else").mkdir()
+    (tmp_path / "else" / "there").write_text("old")
+    for link, target in (("link", "else/there"), ("dangling", "else/none")):
+        (tmp_path / link).symlink_to(target)
+        write(tmp_path / link)
+        assert (tmp_path / link).is_symlink()
+        assert (tmp_path / target).read_text() == "new"
+    os.mkfifo(tmp_path / "pipe")
+    got: list[str] = []
+    reader = threading.Thread(target=lambda: got.append((tmp_path / "pipe").read_text()))
+    reader.start()
+    write(tmp_path / "pipe")
+    reader.join()
+    assert got == ["new"]
+    assert (tmp_path / "pipe").is_fifo()
+    # By a link: were it replaced as a file is, the link would go, not the device.
+    (tmp_path / "full").symlink_to("/dev/full")
+    with pytest.raises(fs.InputError, match=r"cannot write .*full: No space left on device"):
+        write(tmp_path / "full")
+    assert (tmp_path / "full").is_symlink()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["dangling", "else", "full", "link", "pipe"]
+
+
+def test_a_file_gets_the_permissions_that_files_get(tmp_path: Path) -> None:
+    before = os.umask(0o077)
+    try:
+        path = write_aside(tmp_path / "x" * 250, lambda p: p.write_text(""))
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+# The cache of compiled code
+
+AREA = """
+import fingerspice.engine.march
+from fingerspice.physics.contact import ridge_area, Contact
+c = Contact(3.5e-6, 1.0, 0.5, 0.3, 54.4e-6, 0.52, 32e-6 * 1e3**1.41, 1.41, 5e-9)
+print(repr(ridge_area(0.0, c.pack())))
+"""
+# numba ends with the N-th file of its cache ready, but for its name.
+KILLED = """
+import os, sys
+from numba.core import caching
+calls, replace = [], os.replace
+def strike(*names):
+    calls.append(names)
+    if len(calls) == int(sys.argv[1]):
+        os.kill(os.getpid(), 9)
+    replace(*names)
+caching.os.replace = strike
+"""
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Iterator[Path]:
+    """The package where nothing is compiled yet."""
+    package = tmp_path / "src" / "fingerspice"
+    shutil.copytree(Path(fs.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    yield package
+    shutil.rmtree(package)
+
+
+def area(copy: Path, *arguments: str, before: str = "", **options: Any) -> tuple[int, list[str], str]:
+    home = str(copy / "__init__.py" / "no")
+    hidden = {"PYTHONPATH": str(copy.parent), "HOME": home, "XDG_CACHE_HOME": home, "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | hidden
+    entry = [sys.executable, "-c", before + AREA]
+    return ended(start(copy, *arguments, entry=entry, env=environment, **options))
+
+
+def test_no_room_for_compiled_code_means_compiling_again(copy: Path) -> None:
+    expected = (0, [], area(copy)[2])
+    assert float(expected[2]) > 0.0
+    cached = {p: p.read_bytes() for p in copy.rglob("*.nb?")}
+    assert cached
+    for path in cached:
+        path.unlink()
+    assert area(copy, preexec_fn=no_room(0)) == expected
+    assert not list(copy.rglob("*.nb?*"))
+    # Nowhere at all, not even for root.
+    for folder in [copy, *(p for p in copy.iterdir() if p.is_dir() and p.name != "__pycache__")]:
+        shutil.rmtree(folder / "__pycache__", ignore_errors=True)
+        (folder / "__pycache__").write_text("")
+    assert area(copy) == expected
+
+
+def test_killed_while_it_keeps_compiled_code_it_works_the_next_time(copy: Path) -> None:
+    # An index without its data, data without a name, and in the middle.
+    for count in ("1", "2", "5"):
+        assert area(copy, count, before=KILLED)[0] == -signal.SIGKILL
+    code, lines, out = area(copy)
+    assert (code, lines) == (0, [])
+    assert area(copy) == (0, [], out)
+
+
+def main() -> None:
+    """Strike the commands in turn with the signals in turn, at moments spread over the time they take."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--kills", type=int, default=200)
+    count = parser.parse_args().kills
+    seen: dict[tuple[str, int], int] = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        root = Path(scratch)
+        right = all_undisturbed(root)
+        took = {}
+        for name in COMMANDS:
+            begin = time.perf_counter()
+            rerun(name, root / name, right[name])
+            took[name] = time.perf_counter() - begin
+        for i in range(count):
+            name = list(COMMANDS)[i % len(COMMANDS)]
+            number = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)[i // len(COMMANDS) % 3]
+            # By the golden ratio: every part of the time is struck.
+            code = strike(root / name, name, number, took[name] * (i * 0.6180339887 % 1.0), right[name])
+            seen[number.name, code] = seen.get((number.name, code), 0) + 1
+        for name in COMMANDS:
+            rerun(name, root / name, right[name])
+    print(f"{count} strikes, every file whole or absent, every rerun the same")
+    print("\n".join(f"{name:8} exit {code:4}: {times}" for (name, code), times in sorted(seen.items())))
+
+
+if __name__ == "__main__":
+    main()
