@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.integrate
 
 import fingerspice as fs
 from fingerspice.plotting import save
@@ -223,22 +225,32 @@ def test_threads_may_ask_for_the_periodic_state_of_one_circuit(law: str) -> None
     assert at_once(8 * [lambda: steady(circuit, law)]) == 8 * [expected]
 
 
-@pytest.mark.usefixtures("switching")
 def test_what_a_circuit_remembers_may_go_while_another_thread_asks_for_it() -> None:
     circuit = table1()
 
-    def ask(first: int) -> str:
-        for i in range(3000):
-            key = (first + 7 * i) % 40
-            assert circuit.remember(key, lambda key=key: (key, None)) == (key, None)
-            assert circuit.remember((key, "nothing"), lambda: None) is None
-        return "done"
+    class Key:
+        asked = 0
 
-    assert at_once([lambda i=i: ask(5 * i) for i in range(8)]) == 8 * ["done"]
+        def __hash__(self) -> int:
+            self.asked += 1
+            if self.asked == moment:
+                # As another thread would between two looks at it.
+                circuit._memory.clear()
+            return 7
+
+    for moment in range(2, 9):
+        key = Key()
+        assert [circuit.remember(key, lambda: None) for _ in range(3)] == 3 * [None]
 
 
-@pytest.mark.usefixtures("switching")
-def test_scipys_methods_in_threads_leave_the_warning_filters_as_they_were() -> None:
+def test_scipys_methods_in_threads_leave_the_warning_filters_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
+    solve_ivp = scipy.integrate.solve_ivp
+
+    def slow(*arguments: Any, **options: Any) -> Any:
+        time.sleep(0.01)
+        return solve_ivp(*arguments, **options)
+
+    monkeypatch.setattr(scipy.integrate, "solve_ivp", slow)
     circuit = table1(tran="100u 1m uic")
 
     def one() -> str:

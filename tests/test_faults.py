@@ -343,7 +343,6 @@ def test_a_file_gets_the_permissions_that_files_get(tmp_path: Path) -> None:
 # The cache of compiled code
 
 AREA = """
-import fingerspice.engine.march
 from fingerspice.physics.contact import ridge_area, Contact
 c = Contact(3.5e-6, 1.0, 0.5, 0.3, 54.4e-6, 0.52, 32e-6 * 1e3**1.41, 1.41, 5e-9)
 print(repr(ridge_area(0.0, c.pack())))
