@@ -229,17 +229,18 @@ def test_what_a_circuit_remembers_may_go_while_another_thread_asks_for_it() -> N
     circuit = table1()
 
     class Key:
-        asked = 0
+        def __init__(self, moment: int) -> None:
+            self.asked, self.moment = 0, moment
 
         def __hash__(self) -> int:
             self.asked += 1
-            if self.asked == moment:
+            if self.asked == self.moment:
                 # As another thread would between two looks at it.
                 circuit._memory.clear()
             return 7
 
     for moment in range(2, 9):
-        key = Key()
+        key = Key(moment)
         assert [circuit.remember(key, lambda: None) for _ in range(3)] == 3 * [None]
 
 

@@ -68,13 +68,7 @@ def _fail(message: str, code: int) -> NoReturn:
 
 
 def _say(text: str = "", end: str = "\n") -> None:
-    """Print, and know that it has arrived.
-
-    Raises
-    ------
-    InputError
-        Where it went to a full disk. That its reader (head, less) has gone is not our failure.
-    """
+    """Print, and know that it has arrived: a full disk is bad input, a reader (head, less) that has gone is nothing."""
     try:
         print(text, end=end, flush=True)
     except OSError as error:
