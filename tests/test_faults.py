@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
-import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +23,7 @@ import fingerspice as fs
 from commands import QUICK, Command
 from deck_edits import edited
 from fingerspice.files import write_aside
+from processes import ended, no_room, start
 
 COMMANDS = {
     "run": (["run", "pad.cir", "--out", "out"], ["pad.nc", "pad.png"]),
@@ -34,7 +33,6 @@ COMMANDS = {
     "export": (["export", "pad.cir", "-o", "out/spice.cir"], ["spice.cir"]),
     "figures": (["figures", "--out", "out", "--only", "2"], ["fig2.csv", "fig2.png"]),
 }
-ENTRY = [sys.executable, "-m", "fingerspice"]
 # The command, with what ends it just where it would hurt: PLACE is patched to strike when called for the N-th time.
 STRUCK = """
 import os, pathlib, sys
@@ -56,20 +54,6 @@ BROKEN_OFF = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "termin
 CAUGHT = "SigCgt:"
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="faults are made by Linux's means")
-
-
-def start(folder: Path, *arguments: str, entry: list[str] | None = None, **options: Any) -> subprocess.Popen[str]:
-    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": folder} | options
-    return subprocess.Popen([*(entry or ENTRY), *arguments], **options)
-
-
-def ended(process: subprocess.Popen[str]) -> tuple[int, list[str], str]:
-    """Exit code, lines on stderr without notes, and stdout."""
-    out, err = process.communicate(timeout=120)
-    lines = [
-        line for line in (err or "").splitlines() if not line.startswith(("fingerspice: warning", "fingerspice: note"))
-    ]
-    return process.returncode, lines, out or ""
 
 
 def written(folder: Path) -> dict[str, bytes]:
@@ -216,16 +200,6 @@ def test_a_command_started_with_ctrl_c_switched_off_leaves_it_off(folder: Path, 
 # No room
 
 
-def no_room(size: int) -> Callable[[], None]:
-    """No file may grow beyond `size` bytes; the write that would is refused, as on a full disk."""
-
-    def limit() -> None:
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
-
-    return limit
-
-
 @pytest.mark.parametrize(
     ("name", "size", "first", "before"),
     [
@@ -338,69 +312,6 @@ def test_a_file_gets_the_permissions_that_files_get(tmp_path: Path) -> None:
     finally:
         os.umask(before)
     assert path.stat().st_mode & 0o777 == 0o600
-
-
-# The cache of compiled code
-
-AREA = """
-from fingerspice.physics.contact import ridge_area, Contact
-c = Contact(3.5e-6, 1.0, 0.5, 0.3, 54.4e-6, 0.52, 32e-6 * 1e3**1.41, 1.41, 5e-9)
-print(repr(ridge_area(0.0, c.pack())))
-"""
-# numba ends with the N-th file of its cache ready, but for its name.
-KILLED = """
-import os, sys
-from numba.core import caching
-calls, replace = [], os.replace
-def strike(*names):
-    calls.append(names)
-    if len(calls) == int(sys.argv[1]):
-        os.kill(os.getpid(), 9)
-    replace(*names)
-caching.os.replace = strike
-"""
-
-
-@pytest.fixture
-def copy(tmp_path: Path) -> Iterator[Path]:
-    """The package where nothing is compiled yet."""
-    package = tmp_path / "src" / "fingerspice"
-    shutil.copytree(Path(fs.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
-    yield package
-    shutil.rmtree(package)
-
-
-def area(copy: Path, *arguments: str, before: str = "", **options: Any) -> tuple[int, list[str], str]:
-    home = str(copy / "__init__.py" / "no")
-    hidden = {"PYTHONPATH": str(copy.parent), "HOME": home, "XDG_CACHE_HOME": home, "PYTHONDONTWRITEBYTECODE": "1"}
-    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | hidden
-    entry = [sys.executable, "-c", before + AREA]
-    return ended(start(copy, *arguments, entry=entry, env=environment, **options))
-
-
-def test_no_room_for_compiled_code_means_compiling_again(copy: Path) -> None:
-    expected = (0, [], area(copy)[2])
-    assert float(expected[2]) > 0.0
-    cached = {p: p.read_bytes() for p in copy.rglob("*.nb?")}
-    assert cached
-    for path in cached:
-        path.unlink()
-    assert area(copy, preexec_fn=no_room(0)) == expected
-    assert not list(copy.rglob("*.nb?*"))
-    # Nowhere at all, not even for root.
-    for folder in [copy, *(p for p in copy.iterdir() if p.is_dir() and p.name != "__pycache__")]:
-        shutil.rmtree(folder / "__pycache__", ignore_errors=True)
-        (folder / "__pycache__").write_text("")
-    assert area(copy) == expected
-
-
-def test_killed_while_it_keeps_compiled_code_it_works_the_next_time(copy: Path) -> None:
-    # An index without its data, data without a name, and in the middle.
-    for count in ("1", "2", "3"):
-        assert area(copy, count, before=KILLED)[0] == -signal.SIGKILL
-    code, lines, out = area(copy)
-    assert (code, lines) == (0, [])
-    assert area(copy) == (0, [], out)
 
 
 def main() -> None:
