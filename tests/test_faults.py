@@ -188,6 +188,12 @@ m.main()
 """
 
 
+def test_ctrl_c_after_all_is_done_comes_too_late(tmp_path: Path) -> None:
+    late = "import atexit, os; atexit.register(os.kill, os.getpid(), 2); from fingerspice.__main__ import main; main()"
+    code, lines, out = ended(start(tmp_path, "--version", entry=[sys.executable, "-c", late]))
+    assert (code, lines, out) == (0, [], f"fingerspice {fs.__version__}\n")
+
+
 def test_a_command_started_with_ctrl_c_switched_off_leaves_it_off(folder: Path, right: dict[str, bytes]) -> None:
     ignoring: Callable[[], Any] = lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)  # noqa: E731
     process = start(folder, *COMMANDS["run"][0], preexec_fn=ignoring)

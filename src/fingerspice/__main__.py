@@ -31,7 +31,12 @@ def main() -> None:
             signal.signal(number, _stop)
     from fingerspice.cli import main as command
 
-    command()
+    try:
+        command()
+    finally:
+        # All is written: what comes while Python tidies up comes too late.
+        for number in _STOPS:
+            signal.signal(number, signal.SIG_IGN)
 
 
 if __name__ == "__main__":
