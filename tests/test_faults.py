@@ -341,6 +341,8 @@ def main() -> None:
             # By the golden ratio: every part of the time is struck.
             code = strike(root / name, name, number, took[name] * (i * 0.6180339887 % 1.0), right[name])
             seen[number.name, code] = seen.get((number.name, code), 0) + 1
+            for left in (root / name / "out").glob(".fingerspice-*"):
+                left.unlink()
         for name in COMMANDS:
             rerun(name, root / name, right[name])
     print(f"{count} strikes, every file whole or absent, every rerun the same")
