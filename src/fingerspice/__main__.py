@@ -1,6 +1,43 @@
-"""`python -m fingerspice` is the `fingerspice` command."""
+"""Entry of the `fingerspice` command and of `python -m fingerspice`: signals are minded before anything is loaded."""
 
-from fingerspice.cli import main
+from __future__ import annotations
+
+import os
+import signal
+from types import FrameType
+
+from fingerspice.files import discard_unfinished
+
+_STOPS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+
+
+def _stop(number: int, _: FrameType | None) -> None:
+    """End here and now: an exception would have to find its way through callbacks of libraries that swallow it."""
+    discard_unfinished()
+    # On a terminal a bar may stand, with the cursor hidden.
+    tidy = b"\r\x1b[K\x1b[?25h" if os.isatty(2) else b""
+    text = f"fingerspice: {_STOPS[signal.Signals(number)]}; nothing half-written is left\n"
+    try:
+        os.write(2, tidy + text.encode())
+    finally:
+        os._exit(128 + number)
+
+
+def main() -> None:
+    """Run the command."""
+    for number in _STOPS:
+        # Whoever started this in the background may have chosen to have it left alone.
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _stop)
+    from fingerspice.cli import main as command
+
+    try:
+        command()
+    finally:
+        # All is written: what comes while Python tidies up comes too late.
+        for number in _STOPS:
+            signal.signal(number, signal.SIG_IGN)
+
 
 if __name__ == "__main__":
     main()

@@ -1,8 +1,9 @@
-"""Command line: run, ac, plan, compare, limits, export, figures. Exit 0 done, 1 the solve failed, 2 bad input."""
+"""Command line: run, ac, plan, compare, limits, export, figures. Exit 0, 1: the solve failed, 2: bad input, full disk."""
 
 from __future__ import annotations
 
 import gc
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -43,7 +44,11 @@ def main() -> None:
     # Loading libraries makes a million objects and no garbage: looking for it would take a fifth of a run.
     gc.set_threshold(500_000)
     with _plain_errors():
-        app(standalone_mode=True)
+        try:
+            app(standalone_mode=True)
+        finally:
+            # What typer printed.
+            _say(end="")
 
 
 @contextmanager
@@ -55,17 +60,22 @@ def _plain_errors() -> Iterator[None]:
         _fail(str(error), 2)
     except SolveError as error:
         _fail(str(error), 1)
-    except KeyboardInterrupt:
-        _fail("interrupted; nothing half-written is left", 130)
-    except BrokenPipeError:
-        # The reader of our output (head, less) has gone: not our failure to report.
-        sys.stderr.close()
-        raise SystemExit(0) from None
 
 
 def _fail(message: str, code: int) -> NoReturn:
     print(f"fingerspice: {message}", file=sys.stderr)
     raise SystemExit(code)
+
+
+def _say(text: str = "", end: str = "\n") -> None:
+    """Print, and know that it has arrived: a full disk is bad input, a reader (head, less) that has gone is nothing."""
+    try:
+        print(text, end=end, flush=True)
+    except OSError as error:
+        # Python would try again at its end, and complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            raise InputError(f"cannot write to the standard output: {error.strerror}") from None
 
 
 @contextmanager
@@ -92,7 +102,7 @@ def _failure_as_json(wanted: bool) -> Iterator[None]:
         yield
     except SolveError as error:
         if wanted:
-            print(json_text({"success": False, "message": error.message, "failure": error.failure.to_dict()}))
+            _say(json_text({"success": False, "message": error.message, "failure": error.failure.to_dict()}))
         raise
 
 
@@ -159,7 +169,9 @@ def run(
             raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic]")
         note_skin_frequency(circuit)
         data = out / f"{deck.stem}.{'csv' if csv else 'nc'}"
-        check_output(data, deck)
+        picture = None if no_plot else out / f"{deck.stem}.png"
+        for file in (data, picture):
+            check_output(file, deck)
         _announce_compilation()
         with _progress() as progress:
             solution = simulate(
@@ -168,16 +180,15 @@ def run(
             )  # fmt: skip
         for text in solution.warnings:
             warnings.warn(text, FingerspiceWarning, stacklevel=1)
-    picture = None if no_plot else out / f"{deck.stem}.png"
     files = _write_run(solution, data, picture) if solution.t.size else []
     if as_json:
         failure = None if solution.failure is None else solution.failure.to_dict()
         report = {**solution.summary(), "success": solution.success, "message": solution.message, "failure": failure}
-        print(json_text({**report, "files": [str(f) for f in files]}))
+        _say(json_text({**report, "files": [str(f) for f in files]}))
     else:
-        print(summary_table(solution))
+        _say(summary_table(solution))
         for file in files:
-            print(f"wrote {file}")
+            _say(f"wrote {file}")
     if solution.failure is not None:
         raise SolveError(solution.failure, solution)
 
@@ -232,7 +243,9 @@ def ac(
 
     with _warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
-        check_output(out / f"{deck.stem}_ac.csv", deck)
+        data, picture = out / f"{deck.stem}_ac.csv", None if no_plot else out / f"{deck.stem}_ac.png"
+        for file in (data, picture):
+            check_output(file, deck)
         if sweep is not None:
             frequencies = sweep_frequencies(options.sweep(sweep))
         elif circuit.ac is not None:
@@ -251,19 +264,19 @@ def ac(
             raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
         else:
             results = (phasor(circuit, frequencies, area=area_from_text(area)),)
-    files = [phasor_csv(results, out / f"{deck.stem}_ac.csv")]
-    if not no_plot:
+    files = [phasor_csv(results, data)]
+    if picture is not None:
         from fingerspice.plotting import plot_phasor, save
 
-        files.append(save(plot_phasor(results, circuit), out / f"{deck.stem}_ac.png"))
+        files.append(save(plot_phasor(results, circuit), picture))
     if as_json:
         sweeps = [phasor_dict(r) for r in results]
         report = sweeps[0] if len(sweeps) == 1 else {"sweeps": sweeps}
-        print(json_text({**report, "files": [str(f) for f in files]}))
+        _say(json_text({**report, "files": [str(f) for f in files]}))
     else:
-        print(phasor_tables(results))
+        _say(phasor_tables(results))
         for file in files:
-            print(f"wrote {file}")
+            _say(f"wrote {file}")
 
 
 @app.command()
@@ -292,7 +305,7 @@ def plan(
         circuit = read_circuit(deck, changes, source)
         note_skin_frequency(circuit)
         result = make(circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge)
-    print(json_text(result.to_dict()) if as_json else plan_text(result, circuit))
+    _say(json_text(result.to_dict()) if as_json else plan_text(result, circuit))
 
 
 @app.command()
@@ -320,22 +333,22 @@ def compare(
     with _warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
         note_skin_frequency(circuit)
-        picture = out / f"{deck.stem}_compare.png"
-        if not no_plot:
-            check_output(picture, deck)
+        picture = None if no_plot else out / f"{deck.stem}_compare.png"
+        check_output(picture, deck)
         _announce_compilation()
         with _failure_as_json(as_json):
             result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
-    if not no_plot:
+    files = []
+    if picture is not None:
         from fingerspice.plotting import plot_comparison, save
 
-        save(plot_comparison(result), picture)
+        files.append(save(plot_comparison(result), picture))
     if as_json:
-        print(json_text({**result.to_dict(), "files": [] if no_plot else [str(picture)]}))
+        _say(json_text({**result.to_dict(), "files": [str(f) for f in files]}))
         return
-    print(comparison_table(result))
-    if not no_plot:
-        print(f"wrote {picture}")
+    _say(comparison_table(result))
+    for file in files:
+        _say(f"wrote {file}")
 
 
 @app.command()
@@ -362,21 +375,22 @@ def limits(
 
     with _warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
-        table = out / f"{deck.stem}_limits.csv"
+        table, picture = out / f"{deck.stem}_limits.csv", None if no_plot else out / f"{deck.stem}_limits.png"
         check_output(table, deck)
+        check_output(picture, deck)
         _announce_compilation()
         result = fold_limits(circuit, points=points, span=span)
     files = [limits_csv(result, table)]
-    if not no_plot:
+    if picture is not None:
         from fingerspice.plotting import save
 
-        files.append(save(plot_limits(result), out / f"{deck.stem}_limits.png"))
+        files.append(save(plot_limits(result), picture))
     if as_json:
-        print(json_text({**result.to_dict(), "files": [str(f) for f in files]}))
+        _say(json_text({**result.to_dict(), "files": [str(f) for f in files]}))
         return
-    print(limits_text(result))
+    _say(limits_text(result))
     for file in files:
-        print(f"wrote {file}")
+        _say(f"wrote {file}")
 
 
 @app.command()
@@ -400,7 +414,8 @@ def export(
         circuit = read_circuit(deck, changes, source)
         check_output(output, deck)
     text = export_netlist(circuit, charge_law=charge_law)
-    print(f"wrote {write_aside(output, lambda path: path.write_text(text))}")
+    write_aside(output, lambda path: path.write_text(text, encoding="utf-8"))
+    _say(f"wrote {output}")
 
 
 @app.command()
@@ -414,11 +429,14 @@ def figures(
 
       fingerspice figures --out out --only 4 --only 5
     """
-    from fingerspice.figures import make_figures
+    from fingerspice.figures import FIGURES, make_figures
 
+    for number in only or FIGURES:
+        for kind in ("png", "csv"):
+            check_output(out / f"fig{number}.{kind}")
     with _warnings_as_lines():
         for file in make_figures(out, only=only):
-            print(f"wrote {file}")
+            _say(f"wrote {file}")
 
 
 @app.callback(invoke_without_command=True)
@@ -428,5 +446,5 @@ def _root(
     if version:
         from fingerspice import __version__
 
-        print(f"fingerspice {__version__}")
+        _say(f"fingerspice {__version__}")
         raise typer.Exit

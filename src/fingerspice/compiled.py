@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
 from numba import njit
 from numba.core import cgutils
+from numba.core.caching import FunctionCache
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
 Array = TypeVar("Array", bound=np.ndarray)
+Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGE = Path(__file__).resolve().parent
 
 
@@ -38,14 +41,34 @@ def _drop_stale_cache() -> None:
         return
 
 
+class _Cache(FunctionCache):
+    """numba's, where a disk that is full means that the next process compiles again."""
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with suppress(OSError):
+            cast(Any, super()).save_overload(sig, data)
+
+
+def _cached(**options: Any) -> Callable[[Function], Function]:
+    """`njit` with a cache, or without where no folder can be written."""
+
+    def compile_when_called(function: Function) -> Function:
+        compiled = njit(error_model="numpy", **options)(function)
+        with suppress(RuntimeError):
+            compiled._cache = cast(Any, _Cache)(function)
+        return cast(Function, compiled)
+
+    return compile_when_called
+
+
 _drop_stale_cache()
 # A division by zero is an infinity that the step control refuses, not an exception out of compiled code.
-jit = njit(cache=True, error_model="numpy")
+jit = _cached()
 # For loops over the rows of a step: fused, so that they vectorise; and where sums may be reordered (always alike).
-jit_fused = njit(cache=True, error_model="numpy", fastmath={"contract"})
-jit_rows = njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+jit_fused = _cached(fastmath={"contract"})
+jit_rows = _cached(fastmath={"contract", "reassoc"})
 # Put into its caller before compilation: handing over twenty arrays would cost as much as the work.
-jit_inline = njit(cache=True, error_model="numpy", inline="always")
+jit_inline = _cached(inline="always")
 
 
 @intrinsic

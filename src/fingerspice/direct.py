@@ -250,8 +250,13 @@ class _Charge:
         held = np.outer(t - self.t_start, self.w_start)
         decaying = rates > 0.0
         w_integral = np.where(decaying, (np.outer(u_integral, gain) - moved) / np.where(decaying, rates, 1.0), held)
-        passed = capacitance * moved @ row + leak * (share * u_integral + w_integral @ row)
+        passed = capacitance * _weighed(moved, row) + leak * (share * u_integral + _weighed(w_integral, row))
         jumped = 0.0 if model.mobile else (u - self.u_before) / model.s
-        rate = (np.outer(u, gain) - rates * w) @ row
-        lam = capacitance * rate + leak * (share * u + w @ row)
+        rate = _weighed(np.outer(u, gain) - rates * w, row)
+        lam = capacitance * rate + leak * (share * u + _weighed(w, row))
         return self.z_start + (passed + jumped) / q, (lam + slope / model.s) / q
+
+
+def _weighed(rows: FloatArray, weights: FloatArray) -> FloatArray:
+    """Sum over each row with weights; not by BLAS, whose rounding of a row depends on how many there are."""
+    return np.asarray(np.einsum("tk,k->t", rows, weights))

@@ -3,34 +3,61 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 from fingerspice.errors import InputError
 
+_UNFINISHED: set[Path] = set()
+
 
 def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
     """Call `write` with a temporary path in the same folder, then move it to `path`.
 
+    Where `path` is a link, the file it names is written; a device is written as it stands.
+
     Raises
     ------
     InputError
-        Where the folder does not exist or cannot be written.
+        Where the folder does not exist or cannot be written, or the disk is full.
     """
+    if path.exists() and not path.is_file():
+        try:
+            write(path)
+        except OSError as error:
+            raise InputError(f"cannot write {path}: {error.strerror or error}") from None
+        return path
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".fingerspice-{os.urandom(6).hex()}")
+    # Known before it is there: whenever a signal comes, `discard_unfinished` finds it.
+    _UNFINISHED.add(temporary)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}; allowed: a folder that can be written") from None
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        write(temporary)
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from None
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            temporary.touch(exist_ok=False)
+        except OSError as error:
+            raise InputError(f"cannot write {path}: {error.strerror}; allowed: a folder that can be written") from None
+        try:
+            write(temporary)
+            temporary.replace(target)
+        except OSError as error:
+            raise InputError(f"cannot write {path}: {error.strerror or error}") from None
     finally:
-        temporary.unlink(missing_ok=True)
+        _discard(temporary)
     return path
+
+
+def discard_unfinished() -> None:
+    """Remove what is being written: for a process that is about to end."""
+    for temporary in list(_UNFINISHED):
+        _discard(temporary)
+
+
+def _discard(temporary: Path) -> None:
+    try:
+        temporary.unlink(missing_ok=True)
+    except OSError:
+        # Where the folder is no folder, or is gone, there is nothing to remove.
+        return
+    finally:
+        _UNFINISHED.discard(temporary)

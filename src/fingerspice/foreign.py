@@ -5,6 +5,7 @@ Their error is measured against our own stepper at a tighter tolerance, and met 
 
 from __future__ import annotations
 
+import threading
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from fingerspice.runs import Run, Tables, after_the_end, from_rows, row_width
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+_QUIET = threading.Lock()
 SCIPY_METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 TORCH_METHODS = ("dopri5", "dopri8", "bosh3", "adaptive_heun", "rk4", "midpoint", "euler")
 _TORCH_FIXED = {"rk4": 4, "midpoint": 2, "euler": 1}
@@ -84,8 +86,9 @@ def _scipy_piece(piece: _Piece, name: str) -> _Result:
 
     zero.terminal = True  # type: ignore[attr-defined]
     zero.direction = -piece.sign  # type: ignore[attr-defined]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    # Filters are of the whole process: one thread at a time changes them, and only for scipy's own.
+    with _QUIET, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module=r"scipy\.")
         result = solve_ivp(
             lambda t, y: _slope(piece.model, piece.segment, t, y, piece.sign),
             (piece.t0, piece.t1), piece.y, method=name, dense_output=True, events=zero,

@@ -47,7 +47,10 @@ KEPT_STEPS = 2000
 
 @dataclasses.dataclass(frozen=True)
 class Prepared:
-    """A scene's system with the tables it has needed so far, and arrays to work in."""
+    """A scene's system with the tables it has needed so far, and arrays to work in.
+
+    Threads may share it: compiled code holds the interpreter's lock, and leaves nothing in `work` for its next call.
+    """
 
     system: System
     tables: StepTables

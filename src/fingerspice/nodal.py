@@ -144,6 +144,8 @@ class _Integration:
                 self.sign, self.s_before, self.scale, self.tol, self.control, self.counters, self.peaks, t_out, left,
                 rows, self.tried,
             )  # fmt: skip
+            if code == collocation.PAUSED:
+                continue
             if code != collocation.JUMP:
                 return int(code)
             if not self.jump(_values(sources, self.t)):

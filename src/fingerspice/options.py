@@ -126,8 +126,10 @@ def json_text(data: dict[str, Any]) -> str:
     return json.dumps(clean(data), indent=2, allow_nan=False)
 
 
-def check_output(file: Path, deck: Path) -> None:
+def check_output(file: Path | None, deck: Path | None = None) -> None:
     """Refuse an output that cannot be written, or is the deck, before spending time on the run; writes nothing."""
+    if file is None:
+        return
     folder = file.parent
     while not folder.exists() and folder != folder.parent and not folder.is_symlink():
         folder = folder.parent
@@ -137,7 +139,7 @@ def check_output(file: Path, deck: Path) -> None:
         raise InputError(f"cannot write {file}: no permission in {folder}; allowed: a folder that can be written")
     if file.is_dir():
         raise InputError(f"cannot write {file}: it is a folder; allowed: a file's name")
-    if file.exists() and deck.exists() and file.samefile(deck):
+    if deck is not None and file.exists() and deck.exists() and file.samefile(deck):
         raise InputError(f"cannot write {file}: it is the deck itself; allowed: another name or folder")
 
 

@@ -67,7 +67,8 @@ def close_period(problem: Problem, rtol: float) -> Closed:
         raise InputError("the source has no period, so there is no periodic state to find")
     begin = waveform.period * float(np.ceil(max(waveform.settled, problem.t_start) / waveform.period))
     half = waveform.half_wave and problem.model.coupled
-    key = ("period", begin)
+    # A function's table is as fine as the outputs.
+    key = ("period", begin, problem.step if scene.is_sampled else 0.0)
     if key not in scene.prepared:
         end = begin + (0.5 if half else 1.0) * waveform.period
         table = source_table(waveform, begin, end, 1e-13, problem.step, no_chirps=not problem.model.coupled)

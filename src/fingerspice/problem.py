@@ -148,16 +148,14 @@ class Problem:
 
     def breakpoints(self) -> FloatArray:
         """The source's breakpoints in the run, s; those of a short run stay with the scene."""
-        kept = self.scene.prepared.setdefault("breakpoints", {})
-        key = self.t_start, self.t_stop
-        if key not in kept:
-            kept.clear()
-            edges = self.waveform.breakpoints(*key)
-            if edges.size > KEPT_BREAKPOINTS:
-                return edges
-            kept[key] = edges
-        found: FloatArray = kept[key]
-        return found
+        span = self.t_start, self.t_stop
+        # One entry with its key: another thread may put its own there at any time.
+        kept, edges = self.scene.prepared.get("breakpoints", (None, np.empty(0)))
+        if kept != span:
+            edges = self.waveform.breakpoints(*span)
+            if edges.size <= KEPT_BREAKPOINTS:
+                self.scene.prepared["breakpoints"] = span, edges
+        return np.asarray(edges)
 
     @property
     def max_step(self) -> float:

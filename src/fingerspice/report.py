@@ -221,7 +221,7 @@ def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:
     units = ("Hz", "1", "deg", "V", "m^2", "N")
 
     def write(target: Path) -> None:
-        with target.open("w", newline="") as stream:
+        with target.open("w", newline="", encoding="utf-8") as stream:
             writer = csv.writer(stream)
             head = [f"{c} [{u}]" for c, u in zip(columns, units, strict=True)]
             writer.writerow([*head, "amplitude [V]"])

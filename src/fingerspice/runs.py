@@ -137,11 +137,13 @@ def after_the_end(problem: Problem, table: SourceTable) -> tuple[Segment, float]
     """The segment that right-hand outputs at the very end of a run belong to, and how far into it they are, s."""
     stop = problem.t_stop
     if breakpoints_at(problem.waveform, stop).size:
-        kept = problem.scene.prepared.setdefault("after", {})
-        if kept.get("stop") != (stop, problem.step):
-            kept["stop"] = (stop, problem.step)
-            kept["table"] = source_table(problem.waveform, stop, stop + problem.step, 1e-10, problem.step)
-        table = kept["table"]
+        span = stop, problem.step
+        # One entry with its key: another thread may put its own there at any time.
+        kept, after = problem.scene.prepared.get("after", (None, None))
+        if kept != span:
+            after = source_table(problem.waveform, stop, stop + problem.step, 1e-10, problem.step)
+            problem.scene.prepared["after"] = span, after
+        table = after
         length = float(table.edges[1] - table.edges[0])
         return Segment(float(table.edges[0]), length, table.terms[0], table.series[0]), 0.0
     start = float(table.edges[-2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -333,7 +334,7 @@ class Solution:
         table = np.column_stack([self.t, *(value for value, _, _ in signals.values())])
 
         def write(target: Path) -> None:
-            with target.open("w", newline="") as stream:
+            with target.open("w", newline="", encoding="utf-8") as stream:
                 writer = csv.writer(stream)
                 writer.writerow(header)
                 writer.writerows([repr(float(x)) for x in row] for row in table)
@@ -395,7 +396,9 @@ class Solution:
         data, coords = self._dataset(jumps)
 
         def write(target: Path) -> None:
-            with h5netcdf.File(target, "w") as file:
+            # HDF5 ends the process where the disk is full, so it gets to see memory only.
+            content = io.BytesIO()
+            with h5netcdf.File(content, "w") as file:
                 for name, (_, values, _) in coords.items():
                     file.dimensions[name] = values.size
                 for name, (dimensions, values, attributes) in {**coords, **data}.items():
@@ -404,6 +407,7 @@ class Solution:
                     variable.attrs.update(attributes)
                 for key, text in self.provenance().items():
                     file.attrs[key] = text
+            target.write_bytes(content.getbuffer())
 
         return write_aside(Path(path), write)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -17,6 +18,7 @@ from fingerspice.errors import InputError, Where
 
 CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
+_REMEMBERING = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -137,12 +139,16 @@ class Circuit:
 
     def remember(self, key: Any, make: Callable[[], Any]) -> Any:
         """What `make` gives, kept for the next call with the same key: circuits do not change."""
-        if key not in self._memory:
-            # The oldest goes: a sweep over stop times must not fill the memory.
-            if len(self._memory) >= 16:
-                self._memory.pop(next(iter(self._memory)))
-            self._memory[key] = make()
-        return self._memory[key]
+        kept = self._memory.get(key)
+        if kept is None:
+            # Two threads may both make it: it is the same.
+            kept = (make(),)
+            with _REMEMBERING:
+                # The oldest goes: a sweep over stop times must not fill the memory.
+                if len(self._memory) >= 16:
+                    self._memory.pop(next(iter(self._memory)))
+                self._memory[key] = kept
+        return kept[0]
 
     def __getitem__(self, name: str) -> Element:
         """The element of that name, whatever its case.

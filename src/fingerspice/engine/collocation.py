@@ -27,16 +27,19 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 # Codes returned by `advance`.
-DONE, JUMP, STEP_UNDERFLOW, TOO_MANY = 0, 1, 2, 3
+DONE, JUMP, STEP_UNDERFLOW, TOO_MANY, PAUSED = 0, 1, 2, 3, 4
 # Entries of `control`: an edge, the time since (steps after a jump may be shorter than the rounding of the time
-# itself), the next step (0: choose one), the first step after the last jump, and whether that is looked for.
-BASE, T, H, H_AFTER_JUMP, JUMPED = 0, 1, 2, 3, 4
-N_CONTROL = 5
+# itself), the next step (0: choose one), the first step after the last jump, whether that is looked for, and the step
+# before a pause.
+BASE, T, H, H_AFTER_JUMP, JUMPED, BEFORE = 0, 1, 2, 3, 4, 5
+N_CONTROL = 6
 # Entries of `counters`, after the evaluations.
 ACCEPTED, REJECTED, ZEROS, OUTPUT = 1, 2, 3, 4
 N_COUNTERS = 5
 # Steps taken and refused, in a run: what needs more has a cause that smaller steps do not mend.
 MOST_STEPS = 2_000_000
+# Steps between pauses: a tenth of a second, after which Python may see to a Ctrl-C.
+STEPS_AT_ONCE = 250
 # A source's change at an edge, relative, that is its rounding and no jump.
 ROUNDING = 1e-14
 
@@ -172,7 +175,8 @@ def advance(
     Returns
     -------
     int
-        DONE; JUMP: a source jumps at the time reached, take that first; STEP_UNDERFLOW; or TOO_MANY steps.
+        DONE; JUMP: a source jumps at the time reached, take that first; STEP_UNDERFLOW; TOO_MANY steps; or PAUSED: call
+        again.
     """
     net, room, work = lend(net), lend_room(room), lend_work(work)
     scheme = Scheme(
@@ -187,8 +191,10 @@ def advance(
     now = np.zeros(n_s)
     slopes = np.zeros(n_s)
     work.place[:] = 0
-    h_before = 0.0
+    h_before = control[BEFORE]
+    control[BEFORE] = 0.0
     flips = 0
+    pause = counters[ACCEPTED] + STEPS_AT_ONCE
     while control[BASE] + control[T] < t_end:
         base = control[BASE]
         t = control[T]
@@ -276,4 +282,7 @@ def advance(
         control[BASE], control[T] = (stop, 0.0) if last else (base, t_new)
         h_before = h
         counters[ACCEPTED] += 1
+        if counters[ACCEPTED] >= pause and not jump:
+            control[BEFORE] = h_before
+            return PAUSED
     return DONE

@@ -1,0 +1,37 @@
+"""The command in a process of its own, and what a system may refuse it."""
+
+from __future__ import annotations
+
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+ENTRY = [sys.executable, "-m", "fingerspice"]
+
+
+def start(folder: Path, *arguments: str, entry: list[str] | None = None, **options: Any) -> subprocess.Popen[str]:
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": folder} | options
+    return subprocess.Popen([*(entry or ENTRY), *arguments], **options)
+
+
+def ended(process: subprocess.Popen[str]) -> tuple[int, list[str], str]:
+    """Exit code, lines on stderr without notes, and stdout."""
+    out, err = process.communicate(timeout=120)
+    lines = [
+        line for line in (err or "").splitlines() if not line.startswith(("fingerspice: warning", "fingerspice: note"))
+    ]
+    return process.returncode, lines, out or ""
+
+
+def no_room(size: int) -> Callable[[], None]:
+    """No file may grow beyond `size` bytes; the write that would is refused, as on a full disk."""
+
+    def limit() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+    return limit

@@ -1,0 +1,78 @@
+"""The cache of compiled code: no room for it, or killed while it is written."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fingerspice as fs
+from processes import ended, no_room, start
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="faults are made by Linux's means")
+
+AREA = """
+from fingerspice.physics.contact import ridge_area, Contact
+c = Contact(3.5e-6, 1.0, 0.5, 0.3, 54.4e-6, 0.52, 32e-6 * 1e3**1.41, 1.41, 5e-9)
+print(repr(ridge_area(0.0, c.pack())))
+"""
+# numba ends with the N-th file of its cache ready, but for its name.
+KILLED = """
+import os, sys
+from numba.core import caching
+calls, replace = [], os.replace
+def strike(*names):
+    calls.append(names)
+    if len(calls) == int(sys.argv[1]):
+        os.kill(os.getpid(), 9)
+    replace(*names)
+caching.os.replace = strike
+"""
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Iterator[Path]:
+    """The package where nothing is compiled yet."""
+    package = tmp_path / "src" / "fingerspice"
+    shutil.copytree(Path(fs.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    yield package
+    shutil.rmtree(package)
+
+
+def area(copy: Path, *arguments: str, before: str = "", **options: Any) -> tuple[int, list[str], str]:
+    home = str(copy / "__init__.py" / "no")
+    hidden = {"PYTHONPATH": str(copy.parent), "HOME": home, "XDG_CACHE_HOME": home, "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | hidden
+    entry = [sys.executable, "-c", before + AREA]
+    return ended(start(copy, *arguments, entry=entry, env=environment, **options))
+
+
+def test_no_room_for_compiled_code_means_compiling_again(copy: Path) -> None:
+    expected = (0, [], area(copy)[2])
+    assert float(expected[2]) > 0.0
+    cached = {p: p.read_bytes() for p in copy.rglob("*.nb?")}
+    assert cached
+    for path in cached:
+        path.unlink()
+    assert area(copy, preexec_fn=no_room(0)) == expected
+    assert not list(copy.rglob("*.nb?*"))
+    # Nowhere at all, not even for root.
+    for folder in [copy, *(p for p in copy.iterdir() if p.is_dir() and p.name != "__pycache__")]:
+        shutil.rmtree(folder / "__pycache__", ignore_errors=True)
+        (folder / "__pycache__").write_text("")
+    assert area(copy) == expected
+
+
+def test_killed_while_it_keeps_compiled_code_it_works_the_next_time(copy: Path) -> None:
+    # An index without its data, data without a name, and in the middle.
+    for count in ("1", "2", "3"):
+        assert area(copy, count, before=KILLED)[0] == -signal.SIGKILL
+    code, lines, out = area(copy)
+    assert (code, lines) == (0, [])
+    assert area(copy) == (0, [], out)

@@ -1,0 +1,353 @@
+"""Killed, interrupted, no room, nobody who reads: outputs are whole or absent, the exit code is right, a rerun works.
+
+`python tests/test_faults.py --kills 200` strikes more often, at moments spread over the whole command.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fingerspice as fs
+from commands import QUICK, Command
+from deck_edits import edited
+from fingerspice.files import write_aside
+from processes import ended, no_room, start
+
+COMMANDS = {
+    "run": (["run", "pad.cir", "--out", "out"], ["pad.nc", "pad.png"]),
+    "csv": (["run", "pad.cir", "--out", "out", "--csv", "--no-plot"], ["pad.csv"]),
+    "ac": (["ac", "pad.cir", "--out", "out"], ["pad_ac.csv", "pad_ac.png"]),
+    "compare": (["compare", "pad.cir", "--out", "out"], ["pad_compare.png"]),
+    "export": (["export", "pad.cir", "-o", "out/spice.cir"], ["spice.cir"]),
+    "figures": (["figures", "--out", "out", "--only", "2"], ["fig2.csv", "fig2.png"]),
+}
+# The command, with what ends it just where it would hurt: PLACE is patched to strike when called for the N-th time.
+STRUCK = """
+import os, pathlib, sys
+from fingerspice.__main__ import main
+place, count, number = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+sys.argv[1:4] = []
+calls, original = [], getattr(pathlib.Path, place)
+def strike(self, *arguments):
+    calls.append(1)
+    if len(calls) == count:
+        if place == "write_bytes":
+            original(self, bytes(arguments[0])[:1000])
+        os.kill(os.getpid(), number)
+    return original(self, *arguments)
+setattr(pathlib.Path, place, strike)
+main()
+"""
+BROKEN_OFF = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated")}
+CAUGHT = "SigCgt:"
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="faults are made by Linux's means")
+
+
+def written(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.iterdir()} if folder.is_dir() else {}
+
+
+def minded(process: subprocess.Popen[str]) -> None:
+    """Wait until the command minds signals: before, they are Python's, which has just begun."""
+    while process.poll() is None:
+        status = Path(f"/proc/{process.pid}/status").read_text()
+        caught = int(next(line for line in status.splitlines() if line.startswith(CAUGHT)).split()[1], 16)
+        if caught >> (signal.SIGTERM - 1) & 1:
+            return
+        time.sleep(0.002)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "pad.cir").write_text(edited(QUICK))
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def right(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What `run` writes when nothing disturbs it."""
+    return undisturbed("run", tmp_path_factory.mktemp("undisturbed"))
+
+
+def undisturbed(name: str, folder: Path) -> dict[str, bytes]:
+    (folder / "pad.cir").write_text(edited(QUICK))
+    arguments, files = COMMANDS[name]
+    assert ended(start(folder, *arguments))[:2] == (0, [])
+    assert sorted(written(folder / "out")) == files
+    return written(folder / "out")
+
+
+def check(name: str, out: Path, right: dict[str, bytes], *, killed: bool) -> None:
+    """Outputs are those of an undisturbed run or absent; only a process that was killed leaves what it was writing."""
+    for file, content in written(out).items():
+        if killed and file.startswith(".fingerspice-"):
+            continue
+        assert content == right[file], f"{name}: {file} is not whole"
+
+
+def rerun(name: str, folder: Path, right: dict[str, bytes]) -> None:
+    assert ended(start(folder, *COMMANDS[name][0]))[:2] == (0, [])
+    assert {n: c for n, c in written(folder / "out").items() if not n.startswith(".fingerspice-")} == right
+
+
+# Signals
+
+
+def strike(folder: Path, name: str, number: int, delay: float, right: dict[str, bytes]) -> int:
+    """Start a command, send it a signal `delay` s after it minds them, and look at what it leaves; its exit code."""
+    process = start(folder, *COMMANDS[name][0])
+    minded(process)
+    time.sleep(delay)
+    process.send_signal(number)
+    code, lines, _ = ended(process)
+    check(name, folder / "out", right, killed=number == signal.SIGKILL)
+    if code == 0:
+        assert set(written(folder / "out")) >= set(right)
+    elif number == signal.SIGKILL:
+        assert code == -number
+    else:
+        expected, word = BROKEN_OFF[signal.Signals(number)]
+        assert (code, lines) == (expected, [f"fingerspice: {word}; nothing half-written is left"])
+    return code
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
+def test_at_any_moment_a_signal_leaves_whole_files_or_none(folder: Path, right: dict[str, bytes], number: int) -> None:
+    for delay in (0.1, 0.6):
+        strike(folder, "run", number, delay, right)
+
+
+@pytest.mark.parametrize(
+    ("number", "place", "count", "done"),
+    [
+        (signal.SIGKILL, "write_bytes", 1, []),
+        (signal.SIGKILL, "replace", 2, ["pad.nc"]),
+        (signal.SIGINT, "write_bytes", 1, []),
+        (signal.SIGINT, "replace", 2, ["pad.nc"]),
+        (signal.SIGTERM, "replace", 1, []),
+    ],
+)
+def test_while_a_file_is_written_too(
+    folder: Path, right: dict[str, bytes], number: signal.Signals, place: str, count: int, done: list[str]
+) -> None:
+    out = folder / "out"
+    out.mkdir()
+    for file in right:
+        (out / file).write_bytes(b"of a run before")
+    entry = [sys.executable, "-c", STRUCK, place, str(count), str(int(number))]
+    code, lines, _ = ended(start(folder, *COMMANDS["run"][0], entry=entry))
+    left = written(out)
+    assert {name: left[name] for name in right} == {
+        name: right[name] if name in done else b"of a run before" for name in right
+    }
+    hidden = [name for name in left if name not in right]
+    if number is signal.SIGKILL:
+        assert code == -number
+        assert len(hidden) == 1
+        rerun("run", folder, right)
+    else:
+        assert code == BROKEN_OFF[number][0]
+        assert lines == [f"fingerspice: {BROKEN_OFF[number][1]}; nothing half-written is left"]
+        assert hidden == []
+
+
+def test_ctrl_c_is_heard_in_the_middle_of_a_long_run(tmp_path: Path) -> None:
+    deck = (Path(__file__).parents[1] / "circuits" / "two_fingers.cir").read_text()
+    (tmp_path / "long.cir").write_text(deck)
+    code = "import fingerspice as fs; fs.simulate(fs.read_netlist('long.cir'), t_stop=100.0, t_eval=[1.0])"
+    entry = [sys.executable, "-c", f"import fingerspice.__main__ as m, sys\nsys.argv[1:] = []\n{SOLVING.format(code)}"]
+    process = start(tmp_path, entry=entry)
+    minded(process)
+    time.sleep(2.5)
+    begin = time.perf_counter()
+    process.send_signal(signal.SIGINT)
+    assert ended(process)[0] == 130
+    assert time.perf_counter() - begin < 2.0
+
+
+# As the command, with another thing to do than its arguments say.
+SOLVING = """
+import fingerspice.cli
+def solve():
+    {}
+fingerspice.cli.main = solve
+m.main()
+"""
+
+
+def test_ctrl_c_after_all_is_done_comes_too_late(tmp_path: Path) -> None:
+    late = "import atexit, os; atexit.register(os.kill, os.getpid(), 2); from fingerspice.__main__ import main; main()"
+    code, lines, out = ended(start(tmp_path, "--version", entry=[sys.executable, "-c", late]))
+    assert (code, lines, out) == (0, [], f"fingerspice {fs.__version__}\n")
+
+
+def test_a_command_started_with_ctrl_c_switched_off_leaves_it_off(folder: Path, right: dict[str, bytes]) -> None:
+    ignoring: Callable[[], Any] = lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)  # noqa: E731
+    process = start(folder, *COMMANDS["run"][0], preexec_fn=ignoring)
+    minded(process)
+    process.send_signal(signal.SIGINT)
+    assert ended(process)[:2] == (0, [])
+    assert written(folder / "out") == right
+
+
+# No room
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "first", "before"),
+    [
+        ("run", 0, "pad.nc", []),
+        ("csv", 5000, "pad.csv", []),
+        ("ac", 20_000, "pad_ac.png", ["pad_ac.csv"]),
+        ("compare", 5000, "pad_compare.png", []),
+        ("export", 500, "spice.cir", []),
+        ("figures", 5000, "fig2.png", []),
+    ],
+)
+def test_a_full_disk_is_one_sentence_and_no_half_file(
+    folder: Path, right: dict[str, bytes], name: str, size: int, first: str, before: list[str]
+) -> None:
+    code, lines, out = ended(start(folder, *COMMANDS[name][0], preexec_fn=no_room(size)))
+    assert (code, lines, out) == (2, [f"fingerspice: cannot write out/{first}: File too large"], "")
+    assert list(written(folder / "out")) == before
+    if name == "run":
+        rerun(name, folder, right)
+
+
+def test_a_report_that_finds_no_room_is_told_and_the_files_are_whole(folder: Path, right: dict[str, bytes]) -> None:
+    for arguments in (COMMANDS["run"][0], ["--version"]):
+        with open("/dev/full", "w") as full:
+            code, lines, _ = ended(start(folder, *arguments, stdout=full))
+        assert (code, lines) == (2, ["fingerspice: cannot write to the standard output: No space left on device"])
+    assert written(folder / "out") == right
+
+
+FAILS = ["run", "pad.cir", "--no-plot", "--charge-law", "mobile", "--set", "Xgap.d=10n"]
+
+
+@pytest.mark.parametrize(("arguments", "expected"), [(["plan", "pad.cir"], 0), (FAILS, 1)])
+def test_a_reader_that_has_gone_changes_no_exit_code(folder: Path, arguments: list[str], expected: int) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    process = start(folder, *arguments, stdout=writing)
+    os.close(writing)
+    code, lines, _ = ended(process)
+    assert code == expected
+    assert len(lines) == expected
+
+
+def test_without_a_standard_output_the_files_are_written(folder: Path, right: dict[str, bytes]) -> None:
+    assert ended(start(folder, *COMMANDS["run"][0], preexec_fn=lambda: os.close(1)))[:2] == (0, [])
+    assert written(folder / "out") == right
+
+
+# What stands where an output should go
+
+
+def test_a_folder_that_takes_no_files_is_refused(folder: Path) -> None:
+    # Not even root may make a file there.
+    code, lines, _ = ended(start(folder, "run", "pad.cir", "--out", "/proc/self"))
+    assert code == 2
+    assert len(lines) == 1
+    assert lines[0].startswith("fingerspice: cannot write /proc/self/pad.nc: ")
+    assert lines[0].endswith("; allowed: a folder that can be written")
+
+
+@pytest.mark.parametrize("name", ["run", "ac", "compare", "figures"])
+def test_a_folder_in_the_place_of_a_picture_is_refused_before_the_run(command: Command, name: str) -> None:
+    picture = COMMANDS[name][1][-1]
+    Path("out", picture).mkdir(parents=True)
+    result = command(*COMMANDS[name][0])
+    assert result.code == 2
+    assert result.lines == [f"fingerspice: cannot write out/{picture}: it is a folder; allowed: a file's name"]
+    assert [p.name for p in Path("out").iterdir()] == [picture]
+
+
+def test_a_deck_named_as_the_picture_is_not_overwritten(command: Command) -> None:
+    Path("pad.cir").rename("pad.png")
+    result = command("run", "pad.png")
+    assert result.code == 2
+    assert result.lines == ["fingerspice: cannot write pad.png: it is the deck itself; allowed: another name or folder"]
+    assert Path("pad.png").read_text() == edited(QUICK)
+
+
+def test_a_link_is_followed_and_a_pipe_is_written_as_it_stands(tmp_path: Path) -> None:
+    def write(path: Path) -> Path:
+        return write_aside(path, lambda p: p.write_text("new"))
+
+    (tmp_path / "else").mkdir()
+    (tmp_path / "else" / "there").write_text("old")
+    for link, target in (("link", "else/there"), ("dangling", "else/none")):
+        (tmp_path / link).symlink_to(target)
+        write(tmp_path / link)
+        assert (tmp_path / link).is_symlink()
+        assert (tmp_path / target).read_text() == "new"
+    os.mkfifo(tmp_path / "pipe")
+    got: list[str] = []
+    reader = threading.Thread(target=lambda: got.append((tmp_path / "pipe").read_text()))
+    reader.start()
+    write(tmp_path / "pipe")
+    reader.join()
+    assert got == ["new"]
+    assert (tmp_path / "pipe").is_fifo()
+    # By a link: were it replaced as a file is, the link would go, not the device.
+    (tmp_path / "full").symlink_to("/dev/full")
+    with pytest.raises(fs.InputError, match=r"cannot write .*full: No space left on device"):
+        write(tmp_path / "full")
+    assert (tmp_path / "full").is_symlink()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["dangling", "else", "full", "link", "pipe"]
+
+
+def test_a_file_gets_the_permissions_that_files_get(tmp_path: Path) -> None:
+    before = os.umask(0o077)
+    try:
+        path = write_aside(tmp_path / (250 * "x"), lambda p: p.write_text(""))
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+def main() -> None:
+    """Strike the commands in turn with the signals in turn, at moments spread over the time they take."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--kills", type=int, default=200)
+    count = parser.parse_args().kills
+    seen: dict[tuple[str, int], int] = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        root = Path(scratch)
+        right, took = {}, {}
+        for name in COMMANDS:
+            (root / name).mkdir()
+            right[name] = undisturbed(name, root / name)
+            begin = time.perf_counter()
+            rerun(name, root / name, right[name])
+            took[name] = time.perf_counter() - begin
+        for i in range(count):
+            name = list(COMMANDS)[i % len(COMMANDS)]
+            number = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)[i // len(COMMANDS) % 3]
+            # By the golden ratio: every part of the time is struck.
+            code = strike(root / name, name, number, took[name] * (i * 0.6180339887 % 1.0), right[name])
+            seen[number.name, code] = seen.get((number.name, code), 0) + 1
+            for left in (root / name / "out").glob(".fingerspice-*"):
+                left.unlink()
+        for name in COMMANDS:
+            rerun(name, root / name, right[name])
+    print(f"{count} strikes, every file whole or absent, every rerun the same")
+    print("\n".join(f"{name:8} exit {code:4}: {times}" for (name, code), times in sorted(seen.items())))
+
+
+if __name__ == "__main__":
+    main()
