@@ -1,7 +1,7 @@
 """The hard cases through this package and everything else that could solve them: right, wrong, refused, or hung.
 
-Run: python benchmarks/hard_cases.py [--quick] [--cases NAME ...] [--tools WORD ...]. A full run writes
-results/hard_cases.json and hard_cases.md.
+Run: python benchmarks/hard_cases.py [--quick] [--cases NAME ... [--update]] [--tools WORD ...]. A full run takes about
+20 minutes and writes results/hard_cases.json and hard_cases.md; --update renews the cases named in them.
 
 1e-6 of the peak of gap voltage and force is asked. Peers control the error of a step, not of the result: they are run
 at 1e-7, split at the jumps that are declared, on the compiled right-hand side of `right_hand_side.py` (an equation
@@ -48,13 +48,20 @@ TOOLS = (
     "fingerspice", "scipy LSODA", "scipy Radau", "scipy BDF", "scipy DOP853", "CVODE BDF", "diffrax Tsit5",
     "diffrax Kvaerno5", "torchdiffeq dopri5", "ngspice",
 )  # fmt: skip
-MARKS = {"right": "✓", "wrong silently": "**wrong**", "failed with message": "message", "hung": "hung", "n/a": "–"}
+MARKS = {
+    "right": "✓",
+    "wrong silently": "**wrong**",
+    "failed with message": "message",
+    "warned": "warned",
+    "hung": "hung",
+    "n/a": "–",
+}
 Report = dict[str, Any]
 Case = HardProblem | Deck
 
 
-def solver(case: Case, tool: str) -> Callable[[], tuple[FloatArray, FloatArray] | None]:
-    """What is run: gap voltage and force at the outputs; None for a deck that was run to its end."""
+def solver(case: Case, tool: str) -> Callable[[], tuple[FloatArray, FloatArray] | str]:
+    """What is run: gap voltage and force at the outputs; of a deck that was run to its end, what was said of it."""
     if isinstance(case, Deck):
         return lambda: run_deck(case, tool)
     plan = Plan(case, case.periods)
@@ -96,11 +103,10 @@ def run_ngspice(plan: Plan) -> tuple[FloatArray, FloatArray]:
     return u_gap, plan.problem.constants.stress * u_gap**2 * 1e-6 * area
 
 
-def run_deck(case: Deck, tool: str) -> None:
-    """Run a netlist to its end, or fail with what was said of it."""
+def run_deck(case: Deck, tool: str) -> str:
+    """Run a netlist to its end, or fail; what was said of it."""
     if tool == "fingerspice":
-        fs.simulate(fs.parse_netlist(case.text))
-        return
+        return fs.simulate(fs.parse_netlist(case.text)).message
     with tempfile.TemporaryDirectory() as name:
         shutil.copy(DECK.parent / "fingerspice.lib", name)
         (Path(name) / "deck.cir").write_text(case.text, encoding="utf-8")
@@ -108,11 +114,12 @@ def run_deck(case: Deck, tool: str) -> None:
             ["ngspice", "-b", "-r", "out.raw", "deck.cir"],
             cwd=name, capture_output=True, text=True, errors="replace", check=False,
         )  # fmt: skip
-        said = [x.strip() for x in (done.stderr + done.stdout).splitlines() if re.search("(?i)error|singular|too small|"
-                "aborted|warning", x)]  # fmt: skip
+        lines = (x.strip() for x in done.stderr.splitlines())
+        said = list(dict.fromkeys(x for x in lines if x and not x.startswith(("Note", "Trying gmin"))))
         whole = (Path(name) / "out.raw").is_file() and done.returncode == 0 and "aborted" not in " ".join(said)
         if not whole:
-            raise NotSolvedError("; ".join(said[:3]) or f"exit {done.returncode}")
+            raise NotSolvedError("; ".join(said[:5]) or f"exit {done.returncode}")
+    return "; ".join(said[:5])
 
 
 def can(case: Case, tool: str) -> bool:
@@ -174,7 +181,10 @@ def judge(case: Case, tool: str, found: tuple[str, Any], truth: tuple[FloatArray
         return {"verdict": "right" if named else "failed with message", "message": what}
     answer, seconds = what
     report: Report = {"verdict": "wrong silently", "seconds": float(f"{seconds:.3g}")}
-    if answer is None or case.refusal or truth is None:
+    if isinstance(answer, str):
+        warned = re.search(case.refusal, answer)
+        return {"verdict": "warned" if warned else "wrong silently", "message": answer}
+    if case.refusal or truth is None:
         return report
     if not all(np.all(np.isfinite(x)) for x in answer):
         return report | {"error": None}
@@ -185,9 +195,9 @@ def judge(case: Case, tool: str, found: tuple[str, Any], truth: tuple[FloatArray
     return report | ({"verdict": "right"} if max(errors) <= allowed else {})
 
 
-def contest(cases: list[Case], tools: list[str], versions: dict[str, str], path: Path | None) -> Report:
+def contest(cases: list[Case], tools: list[str], versions: dict[str, str], path: Path | None, kept: Report) -> Report:
     """All tools on all cases, a line printed for each; what there is by then is written after every case."""
-    results: Report = {"machine": machine(), "versions": versions, "limit_s": LIMIT, "asked": ASKED, "cases": {}}
+    results: Report = {"machine": machine(), "versions": versions, "limit_s": LIMIT, "asked": ASKED, "cases": kept}
     for case in cases:
         truth = None
         if isinstance(case, HardProblem):
@@ -214,7 +224,7 @@ def page(results: Report) -> str:
         f"{results['asked']:g} of the peak asked, {results['limit_s']:g} s given, on {results['machine']}. ✓: within "
         "ten times what was asked, or refused for the true reason (cases marked †, which have no answer). **wrong**: "
         "returned as a success, and is none. message: failed and said so, for another reason or where there is an "
-        "answer. –: cannot be expressed.", "",
+        "answer. warned: ran on, with a warning that names the element. –: cannot be expressed.", "",
         "| case | " + " | ".join(tools) + " |",
         "|---" * (len(tools) + 1) + "|",
     ]  # fmt: skip
@@ -236,6 +246,7 @@ def main(arguments: list[str] | None = None) -> Report:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="three cases, this package and DOP853, nothing written")
     parser.add_argument("--cases", nargs="+", choices=[c.name for c in (*SCENES, *DECKS)], help="these only")
+    parser.add_argument("--update", action="store_true", help="keep the other cases of the results, and write")
     parser.add_argument("--tools", nargs="+", help="those whose names begin with one of these")
     options = parser.parse_args(arguments)
     field, versions = contestants()
@@ -250,7 +261,9 @@ def main(arguments: list[str] | None = None) -> Report:
     if named:
         tools = [t for t in tools if t.startswith(tuple(named))]
     versions["fingerspice"] = f"fingerspice {fs.__version__}"
-    return contest(cases, tools, versions, None if chosen or named else RESULTS)
+    kept = json.loads(RESULTS.read_text(encoding="utf-8"))["cases"] if options.update else {}
+    written = options.update or not (chosen or named)
+    return contest(cases, tools, versions, RESULTS if written else None, kept)
 
 
 if __name__ == "__main__":

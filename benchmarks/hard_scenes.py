@@ -288,9 +288,10 @@ class Deck:
 DECKS = (
     Deck("no_contact", "contact impossible (µ = 1.1)",
          (_DRIVE, *(x.replace("mu=0.3", "mu=1.1") for x in _FINGER), _TRAN), r"(?i)no contact"),
-    Deck("floating", "floating node", (_DRIVE, *_FINGER, "R1 top far 1k", _TRAN), r"(?i)\bfar\b|R1"),
-    Deck("parallel", "two sources in parallel", (_DRIVE, "Vb drive 0 5", *_FINGER, _TRAN), r"(?i)\bvb\b"),
-    Deck("loop", "loop of sources", (_DRIVE, "Vb drive mid 5", "Vc mid 0 5", *_FINGER, _TRAN), r"(?i)\bv[bc]\b"),
+    Deck("floating", "floating node", (_DRIVE, *(x.replace("skin 0", "skin far") for x in _FINGER), _TRAN),
+         r"(?i)\bfar\b|xskin"),
+    Deck("parallel", "two sources in parallel", (_DRIVE, "Vb drive 0 5", *_FINGER, _TRAN), r"(?i)\bv(b|drive)\b"),
+    Deck("loop", "loop of sources", (_DRIVE, "Vb drive mid 5", "Vc mid 0 5", *_FINGER, _TRAN), r"(?i)\bv(b|c|drive)\b"),
     Deck("no_operating_point", "capacitors only, DC start", ("V1 a 0 5", "C1 a b 1n", "C2 b 0 3n", ".tran 1u 1m"),
          r"(?i)\bc[12]\b|node b\b"),
     Deck("zero_r", "R = 0", (_DRIVE, *_FINGER, "R1 top 0 0", _TRAN), r"(?i)\br1\b"),
