@@ -226,7 +226,7 @@ SCENES: tuple[HardProblem, ...] = (
     _steps(
         "nanosecond_jumps", "two jumps 1 ns apart",
         fs.PWL((0.0, 3e-3, 3e-3, 3e-3 + NS, 3e-3 + NS), (0.0, 0.0, 200.0, 200.0, -50.0)),
-        "PWL(0 0 3m 0 3.0000001m 200 3.000001m 200 3.0000011m -50)",
+        "PWL(0 0 3m 0 3.000000001m 200 3.000001m 200 3.000001001m -50)",
     ),
     _steps(
         "declared", "pulse of 20 µs, edges of 1 ns declared",
