@@ -215,7 +215,7 @@ _PULSE = _trapezoid(START, WIDTH, NS)
 _PULSE_TEXT = f"PULSE(0 200 {START!r} 1n 1n {WIDTH!r} 1)"
 UNDECLARED = {"undeclared": (START, START + NS, START + NS + WIDTH, START + 2.0 * NS + WIDTH)}
 _FOLD = r"fold|no solution|no root"
-_NUMBER = r"(?i)\bnan\b|\binf\b|finite"
+_NUMBER = r"(?i)\bnan\b|\binf\b|finite|out of range for log"
 _GATE = fs.PWL((0.0, 2.6e-4, 2.6e-4, 3.6e-4, 3.6e-4), (0.0, 0.0, 1.0, 1.0, 0.0))
 
 SCENES: tuple[HardProblem, ...] = (
