@@ -222,6 +222,8 @@ def contest(cases: list[Case], tools: list[str], versions: dict[str, str], path:
             "peers_rtol": PEERS_RTOL,
             "tools": row,
         }
+        known = [c.name for c in (*SCENES, *DECKS)]
+        results["cases"] = dict(sorted(results["cases"].items(), key=lambda row: known.index(row[0])))
         if path is not None:
             path.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
             path.with_suffix(".md").write_text(page(results), encoding="utf-8")
