@@ -251,7 +251,12 @@ def page(results: Report) -> str:
         "| right, of those expressed | " + " | ".join(f"{r}/{n}" for r, n in zip(right, asked, strict=True)) + " |"
     )
     absent = [name for name, version in results["versions"].items() if version == "absent"]
-    lines += ["", "Versions: " + ", ".join(v for v in results["versions"].values() if v != "absent") + "."]
+    lines += [
+        "",
+        "Versions: "
+        + ", ".join(v if " " in v else f"{name} {v}" for name, v in results["versions"].items() if v != "absent")
+        + ".",
+    ]
     return "\n".join([*lines, *([f"Absent: {', '.join(absent)}."] if absent else []), ""])
 
 
