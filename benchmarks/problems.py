@@ -179,13 +179,13 @@ class Constants:
     stress: float
 
 
-def constants(circuit: fs.Circuit, reach: float) -> Constants:
-    """Numbers of a circuit's stack, taken from the package; the area's series reaches to `reach` (V).
+def constants(circuit: fs.Circuit, reach: float, error: float = SERIES_ERROR, degrees: int = 24) -> Constants:
+    """Numbers of a circuit's stack, taken from the package; the area's series reaches to `reach` (V) within `error`.
 
     Raises
     ------
     ValueError
-        Where no series up to degree 24 reaches `SERIES_ERROR`.
+        Where no series up to that degree does.
     """
     stack = build_stack(circuit)
     assert stack.contact is not None
@@ -193,11 +193,11 @@ def constants(circuit: fs.Circuit, reach: float) -> Constants:
     contact = stack.contact
     check = np.linspace(-1.0, 1.0, 4001)
     exact = 1.0 / contact.area(0.5 * reach * (check + 1.0))
-    for degree in range(8, 25):
+    for degree in range(8, degrees + 1):
         fit = chebyshev.chebinterpolate(lambda x: 1.0 / contact.area(0.5 * reach * (x + 1.0)), degree)
         # Powers for Horner's rule, which compilers do best: on [-1, 1], with decaying coefficients, no digit is lost.
         series = chebyshev.cheb2poly(fit)
-        if np.abs(polynomial.polyval(check, series) / exact - 1.0).max() <= SERIES_ERROR:
+        if np.abs(polynomial.polyval(check, series) / exact - 1.0).max() <= error:
             return Constants(
                 k=tuple(stack.k.tolist()),
                 fixed=tuple((stack.g_area / stack.c).tolist()),
@@ -207,7 +207,7 @@ def constants(circuit: fs.Circuit, reach: float) -> Constants:
                 area0=float(contact.area(0.0)),
                 stress=float(contact.stress(1.0)),
             )
-    raise ValueError(f"1/A_R has no series of degree 24 or less within {SERIES_ERROR:g} to {reach:g} V")
+    raise ValueError(f"1/A_R has no series of degree {degrees} or less within {error:g} to {reach:g} V")
 
 
 def _sine(frequency: float) -> Drive:

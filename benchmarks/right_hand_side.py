@@ -9,14 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from problems import Constants, Drive, Problem, by_name
+from problems import Constants, Drive, Problem
 
 FloatArray = NDArray[np.float64]
 BELOW = 1.1
@@ -68,17 +67,46 @@ def _mobile_rates(
     least: Callable[[Any, Any], Any],
     compile_part: Callable[[Any], Any],
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """The same under `mobile`: u_gap = k U + x1 A(0)/A(|u_gap|) is solved by Newton's method at every evaluation."""
+    """The same under `mobile`: u_gap = k U + x1 A(0)/A(|u_gap|) is solved by Newton's method at every evaluation.
+
+    Where that does not converge the first root is searched for from 0 V on and bisected; NaN where there is none.
+    """
     (k0, k1, k2), (f0, f1, f2), (p0, p1, p2) = constants.k, constants.fixed, constants.per_area
     series, scale, area0 = constants.series[::-1], 2.0 / constants.reach, constants.area0
-    source = compile_part(drive(sin))
+    source, reach = compile_part(drive(sin)), constants.reach
+
+    @compile_part
+    def defect(v, share, stored):  # type: ignore[no-untyped-def]
+        s = -least(-least(scale * v - 1.0, 1.0), BELOW)
+        inverse = series[0]
+        for c in series[1:]:
+            inverse = inverse * s + c
+        return v - share - stored * area0 * inverse, inverse
+
+    @compile_part
+    def search(share, stored):  # type: ignore[no-untyped-def]
+        side = 1.0 if share + stored >= 0.0 else -1.0
+        low = 0.0
+        for i in range(1, 201):
+            high = i * reach / 200.0
+            if defect(high, side * share, side * stored)[0] >= 0.0:
+                for _ in range(60):
+                    middle = 0.5 * (low + high)
+                    if defect(middle, side * share, side * stored)[0] < 0.0:
+                        low = middle
+                    else:
+                        high = middle
+                return side * high, defect(high, side * share, side * stored)[1]
+            low = high
+        return math.nan, math.nan
 
     @compile_part
     def gap(u_source, x0, x1, sign):  # type: ignore[no-untyped-def]
         share = k1 * u_source
         u = share + x1
+        step = 0.0
         inverse = 1.0 / area0
-        # From the root at A(0) Newton converges on every scene here, all of them off the fold.
+        # From the root at A(0) Newton converges on every scene of the races, all of them off the fold.
         for _ in range(30):
             side = sign if sign != 0.0 else (1.0 if u >= 0.0 else -1.0)
             s = -least(-least(scale * side * u - 1.0, 1.0), BELOW)
@@ -93,6 +121,9 @@ def _mobile_rates(
             u -= step
             if abs(step) <= 4e-16 * (abs(share) + abs(x1)):
                 break
+        # A last step above rounding, or a root of another branch, which lies beyond where the area is known.
+        if not abs(step) <= 1e-12 * (abs(share) + abs(x1)) or abs(u) > reach:
+            return search(share, x1)
         return u, inverse
 
     @compile_part
@@ -133,14 +164,17 @@ class Compiled:
     observe: Callable[..., tuple[FloatArray, FloatArray]]
 
 
+_COMPILED: dict[str, Compiled] = {}
+
+
 def compiled(problem: Problem) -> Compiled:
-    """The compiled right-hand side of a problem; compiled once in a process."""
-    return _compiled(problem.name)
+    """The compiled right-hand side of a problem; compiled once in a process for all problems of that name."""
+    if problem.name not in _COMPILED:
+        _COMPILED[problem.name] = _compile(problem)
+    return _COMPILED[problem.name]
 
 
-@lru_cache(maxsize=32)
-def _compiled(name: str) -> Compiled:
-    problem = by_name()[name]
+def _compile(problem: Problem) -> Compiled:
     constants = problem.constants
     build = _mobile_rates if problem.law == "mobile" else local_rates
     rates, gap = build(constants, problem.drive, math.sin, min, njit(error_model="numpy"))

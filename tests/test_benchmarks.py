@@ -94,3 +94,42 @@ def test_throughput_compares_the_same_response_and_writes_nothing_when_quick(mon
     assert results["samples"]["difference_over_peak"] <= 1e-12, "the filter beside ours solves the same system"
     assert all(row["stated_error"] <= row["rtol"] for row in results["tolerances"])
     assert (written.stat().st_mtime_ns if written.exists() else None) == before
+
+
+def test_hard_cases_are_judged_and_nothing_is_written_when_quick(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    written = FOLDER / "results" / "hard_cases.json"
+    before = written.stat().st_mtime_ns if written.exists() else None
+    hard_cases = importlib.import_module("hard_cases")
+    results = hard_cases.main(["--quick"])
+    assert len(results["cases"]) == 3
+    for case in results["cases"].values():
+        assert case["tools"]["fingerspice"]["verdict"] == "right", case
+    # A pulse that nobody declares falls between the steps of a solver that knows nothing of it.
+    assert results["cases"]["undeclared"]["tools"]["scipy DOP853"]["verdict"] == "wrong silently"
+    assert results["cases"]["parallel"]["tools"]["scipy DOP853"]["verdict"] == "n/a"
+    assert "| the same, undeclared | ✓ | **wrong** |" in hard_cases.page(results)
+    assert (written.stat().st_mtime_ns if written.exists() else None) == before
+
+
+def test_a_hard_case_is_right_only_with_the_right_answer_or_the_true_reason(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    judge = importlib.import_module("hard_cases").judge
+    scenes = {scene.name: scene for scene in importlib.import_module("hard_scenes").SCENES}
+    truth = (np.array([1.0, -2.0]), np.array([0.5, 1.0]))
+
+    def verdict(name, found, tool="scipy DOP853"):
+        return judge(scenes[name], tool, found, None if scenes[name].refusal else truth)["verdict"]
+
+    def answer(scale):
+        return "done", ((truth[0] * scale, truth[1] * scale), 0.1)
+
+    assert verdict("stiff_coat", answer(1.0 + 9e-6)) == "right"
+    assert verdict("stiff_coat", answer(1.0 + 2e-5)) == "wrong silently"
+    assert verdict("stiff_coat", answer(1.0 + 2e-5), "ngspice") == "right"
+    assert verdict("stiff_coat", answer(np.nan)) == "wrong silently"
+    assert verdict("stiff_coat", ("failed", "step size too small")) == "failed with message"
+    assert verdict("stiff_coat", ("hung", None)) == "hung"
+    assert verdict("nan", answer(1.0)) == "wrong silently"
+    assert verdict("nan", ("failed", "step size too small")) == "failed with message"
+    assert verdict("nan", ("failed", "the source gave NaN at 3 ms")) == "right"
