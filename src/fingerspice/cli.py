@@ -1,4 +1,4 @@
-"""Command line: run, ac, plan, compare, limits, export, figures. Exit 0, 1: the solve failed, 2: bad input, full disk."""
+"""The command line. Exits: 0, done; 1, the solve failed; 2, bad input or a full disk."""
 
 from __future__ import annotations
 
@@ -364,11 +364,9 @@ def limits(
 ) -> None:
     """Map where DECK folds under the mobile charge law: source voltage against load, gap and frequency.
 
-    Examples:
+    Example:
 
-      fingerspice limits circuits/fingerpad.cir --out out
-
-      fingerspice limits circuits/fingerpad.cir --set Xgap.d=100n --points 7 --json --no-plot
+      fingerspice limits circuits/fingerpad.cir --set Xgap.d=100n --points 7 --out out
     """
     from fingerspice.limits import fold_limits, plot_limits
     from fingerspice.report import limits_csv, limits_text

@@ -20,12 +20,14 @@ def stack_failure(problem: Problem, run: Run, record: Record) -> Failure:
     layers = problem.stack.layers
     element = layers[problem.scene.probe_layer].name if layers else ""
     u_gap = area = margin = None
-    if status is Status.SOURCE_NOT_FINITE:
+    if status in (Status.SOURCE_NOT_FINITE, Status.SOURCE_UNSEEN):
         element = ", ".join(e.name for e, _ in problem.stack.sources)
     elif status is Status.FOLD and run.t.size and record.left[-1]:
         if run.t_failed is not None and breakpoints_at(problem.waveform, run.t_failed).size:
             cause += " (the source jumps past the fold at this time)"
         u_gap, area, margin = float(record.u_gap[-1]), float(record.area[-1]), float(record.fold_margin[-1])
+    if status is Status.SOURCE_UNSEEN and run.unseen is not None:
+        cause += f" (by {run.unseen[1]:.3g} V)"
     if run.detail:
         cause += f" ({run.detail})"
     if status is Status.ERROR_NOT_MET:

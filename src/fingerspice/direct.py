@@ -39,7 +39,7 @@ def _windows(tables: Tables, t_out: FloatArray, left: BoolArray) -> Iterator[tup
 def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run:
     """Outputs of a stack without any leak: the layers keep their share of the source's voltage."""
     model, start = problem.model, problem.initial
-    tables = Tables(problem, 1e-12)
+    tables = Tables(problem, 1e-12, t_out=t_out)
     rows = np.empty((t_out.size, row_width(problem)))
     done, end, u_end, table = 0, problem.t_start, start.u_before, None
     for table, where in _windows(tables, t_out, left):
@@ -62,7 +62,7 @@ def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run
     force = problem.scene.force(u_gap, rows[:done, 2])
     run = _finished(problem, t_out[:done], left[:done], live, z, current, u_gap, force, State(
         end, y, u_end, start.charge_offset, problem.scene.charge_law), 0.0, failed)  # fmt: skip
-    run.rough = tables.rough
+    run.rough, run.unseen = tables.rough, tables.unseen
     return run
 
 
@@ -116,7 +116,7 @@ def solve_linear(problem: Problem, t_out: FloatArray, left: BoolArray, area: flo
     system: System = problem.scene.prepared[key]
     start = problem.initial
     w = system.project[0] @ start.y[:-1]
-    wave, failed, tables = problem.waveform, None, Tables(problem, 1e-13, no_chirps=True)
+    wave, failed, tables = problem.waveform, None, Tables(problem, 1e-13, no_chirps=True, t_out=t_out)
     z = current = None
     z_end = float(start.y[-1])
     end, u_end = problem.t_stop, float(wave.value(problem.t_stop, "left"))
@@ -145,7 +145,7 @@ def solve_linear(problem: Problem, t_out: FloatArray, left: BoolArray, area: flo
     run = _finished(
         problem, t, side, live, z, current, u_gap, problem.scene.force(u_gap, inverse), ended, bound, failed
     )
-    run.rough = tables.rough
+    run.rough, run.unseen = tables.rough, tables.unseen
     return run
 
 

@@ -153,8 +153,9 @@ def _integrate(
     done, nfev, pieces = 0, 0, 0
     status, detail, t_failed = Status.SUCCESS, "", None
     table: SourceTable | None = None
+    tables = Tables(problem, tol, t_out=t_out)
     try:
-        for table in Tables(problem, tol):
+        for table in tables:
             for i in range(table.edges.size - 1):
                 start, stop = float(table.edges[i]), float(table.edges[i + 1])
                 segment = Segment(start, stop - start, table.terms[i], table.series[i])
@@ -204,6 +205,7 @@ def _integrate(
         state=state,
         t_failed=t_failed,
         detail=detail,
+        unseen=tables.unseen,
     )
 
 

@@ -268,7 +268,7 @@ def integrate(
     elif table is not None and table.edges.size > 1:
         last = track.last(table)
     run = _run(problem, track, status, t_failed, last)
-    run.rough = tables.rough
+    run.rough, run.unseen = tables.rough, tables.unseen
     return run
 
 
@@ -365,7 +365,7 @@ def solve(
     The first attempt's tolerance is a guess; each further one follows from the error estimated.
     """
     scene, model = problem.scene, problem.model
-    tables = Tables(problem, LOCAL_SHARE * rtol)
+    tables = Tables(problem, LOCAL_SHARE * rtol, t_out=t_out)
     peak = scene.u_peak or tables.peak()
     start = float(np.abs(problem.initial.y[:-1]).max(initial=0.0))
     u_scale = max(peak * model.k_gap if np.isfinite(peak) else 0.0, start) or 1.0

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
+from fingerspice.circuit.sampling import SourceTable, breakpoints_at, is_sampled, source_table
 from fingerspice.engine import collocation
 from fingerspice.engine.collocation import advance
 from fingerspice.engine.network import Sources, at_sources, new_room, rates
@@ -58,10 +58,16 @@ class NetworkRun:
     stats: dict[str, int]
     state: NetworkState
     t_failed: float | None = None
+    unseen: tuple[float, float] | None = None
     margin: float = 1.0
     tried: tuple[Attempt, ...] = ()
     # The row at the time a failed run reached.
     here: FloatArray | None = None
+
+    def end_before(self, t: float) -> None:
+        """Take back the outputs from a time (s) on."""
+        kept = self.t < t
+        self.t, self.left, self.rows = self.t[kept], self.left[kept], self.rows[kept]
 
 
 def network_scheme(h_max: float, stages: int = STAGES) -> Scheme:
@@ -92,6 +98,15 @@ def source_tables(problem: NetworkProblem, tol: float, *, no_chirps: bool = Fals
         yield found
         if any(table.not_finite is not None for table in found):
             return
+
+
+def first_unseen(
+    problem: NetworkProblem, tables: list[SourceTable], t_out: FloatArray, tol: float
+) -> tuple[float, float] | None:
+    """The first output at which a user's function is not what its table says, s, and by how much, V."""
+    pairs = zip(problem.scene.waveforms, tables, strict=True)
+    found = (table.unseen(wave, t_out, max(tol, 1e-14)) for wave, table in pairs if is_sampled(wave))
+    return min((x for x in found if x is not None), default=None)
 
 
 def _joined(tables: list[SourceTable]) -> Sources:
@@ -216,10 +231,11 @@ def _integrate(
     width = one.y.size + (n_s if problem.charge else 0)
     rows = np.full((t_out.size, width), np.nan)
     status, t_failed = Status.SUCCESS, None
-    rough = 0.0
-    sources = None
+    rough, unseen = 0.0, None
+    sources: Sources | None = None
     for tables in source_tables(problem, min(1e-3, max(0.05 * tol, 1e-14))):
         rough = max(rough, *(table.rough for table in tables))
+        unseen = unseen or first_unseen(problem, tables, t_out, tol)
         broken = [table.not_finite for table in tables if table.not_finite is not None]
         if all(table.edges.size > 1 for table in tables):
             sources = _joined(tables)
@@ -242,13 +258,15 @@ def _integrate(
     done = int(one.counters[collocation.OUTPUT])
     if status is Status.SUCCESS and done < t_out.size and sources is not None:
         done += _at_the_end(one, sources, t_out[done:], left[done:], rows[done:])
-    here = _row(one, sources, "left") if t_failed is not None and sources and one.t > problem.t_start else None
+    here = None
+    if t_failed is not None and status is not Status.SOURCE_NOT_FINITE and sources and one.t > problem.t_start:
+        here = _row(one, sources, "left")
     return NetworkRun(
         t_out[:done], left[:done], rows[:done], status, ErrorEstimate(rough, 0.0), one.peaks,
         int(one.counters[NFEV]),
         {name: int(one.counters[i]) for name, i in (
             ("steps", collocation.ACCEPTED), ("rejected", collocation.REJECTED), ("zeros", collocation.ZEROS))},
-        state, t_failed, tried=last_tried(one.tried), here=here,
+        state, t_failed, tried=last_tried(one.tried), here=here, unseen=unseen,
     )  # fmt: skip
 
 

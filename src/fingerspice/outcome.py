@@ -22,6 +22,10 @@ class Status(Enum):
         "use less voltage, more load, or the local law",
     )
     SOURCE_NOT_FINITE = ("a source gave NaN or inf", "nothing after this time is a result: mend the source")
+    SOURCE_UNSEEN = (
+        "the source function has a feature at this output that its samples missed",
+        "nothing from this time on is a result: give Function(f, breaks=(...)) the times of its edges",
+    )
     STEP_UNDERFLOW = (
         "no step is small enough for the error asked for",
         "ask for a larger rtol, or check the source",

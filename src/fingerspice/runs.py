@@ -33,7 +33,8 @@ class Run:
     """What one integration gives, and how it went.
 
     `t`, `left`, `live`, `z`, `current` are as in `Record`, up to the time reached; `rough` is the source's (see
-    `SourceTable`), V; `margin` is the smallest distance to the fold met, and `tried` the last steps tried.
+    `SourceTable`), V, and `unseen` the first output (s) at which it is not what was integrated, by how much (V);
+    `margin` is the smallest distance to the fold met, and `tried` the last steps tried.
     """
 
     t: FloatArray
@@ -51,6 +52,7 @@ class Run:
     t_failed: float | None = None
     detail: str = ""
     rough: float = 0.0
+    unseen: tuple[float, float] | None = None
     margin: float = 1.0
     tried: tuple[Attempt, ...] = ()
 
@@ -60,6 +62,13 @@ class Run:
             problem.stack, problem.waveform, problem.model, self.t, self.left, self.live, self.z, self.current,
             self.state.charge_offset,
         )  # fmt: skip
+
+    def end_before(self, t: float) -> None:
+        """Take back the outputs from a time (s) on."""
+        kept = self.t < t
+        self.t, self.left, self.live = self.t[kept], self.left[kept], self.live[:, kept]
+        if self.z is not None and self.current is not None:
+            self.z, self.current = self.z[kept], self.current[kept]
 
     def excess(self, rtol: float) -> float:
         """Estimated error over the one asked for, the larger of voltage and force."""
@@ -76,8 +85,13 @@ class Tables:
     anew, which keeps a long run's memory constant, but for a run of few windows: its tables stay with the scene.
     """
 
-    def __init__(self, problem: Problem, tol: float, *, no_chirps: bool = False) -> None:
+    def __init__(
+        self, problem: Problem, tol: float, *, no_chirps: bool = False, t_out: FloatArray | None = None
+    ) -> None:
         self.no_chirps = no_chirps
+        # Times (s) at which a user's function is compared with its table, and the first that it is not like it.
+        self.t_out = t_out
+        self.unseen: tuple[float, float] | None = None
         # Time at which the source stopped being finite, once that has been met.
         self.not_finite: float | None = None
         self.problem = problem
@@ -105,6 +119,8 @@ class Tables:
                     self.problem.waveform, w0, w1, self.tol, self.problem.step, no_chirps=self.no_chirps,
                     scale=self.scale,
                 )  # fmt: skip
+                if self.unseen is None and self.t_out is not None and self.problem.scene.is_sampled:
+                    self.unseen = table.unseen(self.problem.waveform, self.t_out, self.tol)
                 if self.kept is not None:
                     self.kept[key] = table
             self.scale, self.rough = max(self.scale, table.scale), max(self.rough, table.rough)

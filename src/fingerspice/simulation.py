@@ -216,6 +216,7 @@ def run_problem(
         _add_error(run, begun.u_gap, begun.f_el)
         # What the charge collects from where it starts is not known.
         run.error = dataclasses.replace(run.error, q_source=None)
+    _mind_unseen(run)
     if run.rough > 0.0:
         _add_error(run, run.rough)
         run.detail = run.detail or f"the source function itself is rough by {run.rough:.2g} V"
@@ -245,11 +246,20 @@ def run_network(
     else:
         run, name = solve_coupled(problem, rtol, run_at, left, progress), "radau"
     wall = time.perf_counter() - begin
+    _mind_unseen(run)
     record = problem.record(run)
     t = np.concatenate([t_out[: run.t.size], run.t[t_out.size :]]) if run.status is Status.SUCCESS else run.t.copy()
     failure = None if run.status is Status.SUCCESS else network_failure(problem, run, record)
     warned = tuple(_network_warnings(problem, run, record))
     return _packed(problem, run, record, t, failure, rtol, name, plan, wall, warned)
+
+
+def _mind_unseen(run: Run | NetworkRun) -> None:
+    """A run of a source that its outputs show to be another one than was integrated fails there."""
+    if run.unseen is not None and run.status in (Status.SUCCESS, Status.ERROR_NOT_MET):
+        run.t_failed, off = run.unseen
+        run.status = Status.SOURCE_UNSEEN if math.isfinite(off) else Status.SOURCE_NOT_FINITE
+        run.end_before(run.t_failed)
 
 
 def _add_error(run: Run, u_gap: float, f_el: float | None = None) -> None:

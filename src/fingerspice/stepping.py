@@ -216,6 +216,7 @@ def integrate(
         margin=float(main.control[loop.MARGIN]),
         tried=last_tried(main.tried),
         rough=tables.rough,
+        unseen=tables.unseen,
     )
 
 
@@ -263,7 +264,7 @@ def solve(
 
     The first attempt's local tolerance is a guess; each further one follows from the error measured.
     """
-    tables = Tables(problem, LOCAL_SHARE * rtol)
+    tables = Tables(problem, LOCAL_SHARE * rtol, t_out=t_out)
     u_scale = tables.peak()
     u_scale = u_scale * problem.model.k_gap if np.isfinite(u_scale) and u_scale > 0.0 else 1.0
     u_scale = max(u_scale, float(np.abs(problem.initial.y[:-1]).max(initial=0.0)))

@@ -11,7 +11,7 @@ from fingerspice.circuit.network import Modes, Network
 from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
 from fingerspice.engine.algebraic import source_at
 from fingerspice.networks import NetworkProblem
-from fingerspice.nodal import NetworkRun, gap_signals, source_tables
+from fingerspice.nodal import NetworkRun, first_unseen, gap_signals, source_tables
 from fingerspice.numerics import linear
 from fingerspice.outcome import ErrorEstimate, NetworkState, Status
 from fingerspice.record import sided
@@ -34,7 +34,7 @@ def solve_fixed(problem: NetworkProblem, t_out: FloatArray, left: BoolArray) -> 
     # The sources' integrals ride along as modes of rate zero, for the charge.
     rates, gains = np.append(modes.rates, 0.0), np.vstack([modes.gains, np.ones(n_s)])
     states = [np.append(v0 if j == 0 else np.zeros(n), 0.0) for j in range(n_s)]
-    first, last_tables, rough = 0, None, 0.0
+    first, last_tables, rough, unseen = 0, None, 0.0, None
     for tables in source_tables(problem, 1e-13, no_chirps=True):
         last_tables = tables
         end = min(float(table.edges[-1]) for table in tables)
@@ -49,6 +49,7 @@ def solve_fixed(problem: NetworkProblem, t_out: FloatArray, left: BoolArray) -> 
             integral[at, j] = rows[:, n]
             slope[at, j] = source_at(table.edges, table.terms, table.series, t_out[at], left[at])[1]
             rough = max(rough, table.rough)
+        unseen = unseen or first_unseen(problem, tables, t_out[at], 1e-13)
         first = at.stop
     stopped = [table.not_finite for table in last_tables or () if table.not_finite is not None]
     broken = min(stopped) if stopped else None
@@ -84,6 +85,7 @@ def solve_fixed(problem: NetworkProblem, t_out: FloatArray, left: BoolArray) -> 
         ErrorEstimate(0.0, 0.0), np.zeros(len(network.areas)), 0, {},
         NetworkState(end, np.concatenate([x_end, z_end]), s_end, np.ones(len(network.areas))), broken,
     )  # fmt: skip
+    run.unseen = unseen
     rounding = ROUNDING * max(scene.u_peak, float(np.abs(x).max(initial=0.0))) + rough
     f_error = 0.0
     for i, (u, f) in enumerate(gap_signals(problem, run)):

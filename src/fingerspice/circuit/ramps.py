@@ -17,6 +17,9 @@ from fingerspice.errors import InputError
 
 FloatArray = NDArray[np.float64]
 
+# Knots that fit any window of a source.
+_FEW_KNOTS = 1000
+
 
 class _Ramps(Waveform):
     """Straight lines between knots (t, v), two knots at one time being a jump; held outside, or repeated.
@@ -97,6 +100,9 @@ class _Ramps(Waveform):
 
     def breakpoint_rate(self) -> float:
         times, _ = self._knots()
+        if self.period is None and times.size <= _FEW_KNOTS:
+            # They are all there will ever be, however close they stand.
+            return 0.0
         span = self.period or (times[-1] - times[0])
         return times.size / span if span > 0.0 else 0.0
 

@@ -130,6 +130,30 @@ class SourceTable:
     not_finite: float | None = None
     rough: float = 0.0
 
+    def values(self, t: FloatArray) -> FloatArray:
+        """A table of series at times within it (s), V."""
+        i = np.clip(np.searchsorted(self.edges, t, side="right") - 1, 0, self.edges.size - 2)
+        x = 2.0 * (t - self.edges[i]) / (self.edges[i + 1] - self.edges[i]) - 1.0
+        out = np.empty(t.size)
+        for k in np.unique(i):
+            here = i == k
+            out[here] = np.polynomial.chebyshev.chebval(x[here], self.series[k])
+        return out
+
+    def unseen(self, waveform: Waveform, t: FloatArray, tol: float) -> tuple[float, float] | None:
+        """The first of some times (s) at which a function is not what its table says, and by how much (V)."""
+        t = t[(t > self.edges[0]) & (t < self.edges[-1])]
+        if t.size == 0 or self.series.size == 0:
+            return None
+        # An edge is where the table itself found the function to jump.
+        right = np.clip(np.searchsorted(self.edges, t), 1, self.edges.size - 1)
+        near = np.minimum(np.abs(t - self.edges[right]), np.abs(t - self.edges[right - 1]))
+        t = t[near > 8e-15 * np.abs(t)]
+        off = np.abs(waveform.value(t) - self.values(t))
+        # NaN is not below anything.
+        wrong = np.flatnonzero(~(off <= max(1e3 * tol * self.scale, 30.0 * self.rough)))
+        return (float(t[wrong[0]]), float(off[wrong[0]])) if wrong.size else None
+
 
 def same_time(t: float) -> float:
     """Distance (s) within which a time near `t` is that time: a few roundings of t."""
@@ -232,6 +256,8 @@ def _rephased(edges: FloatArray, period: float) -> FloatArray:
 
 # Halvings in a row that mend nothing, and the misfit over the largest |U| that may then be called rounding.
 _IDLE, _ROUGHEST = 3, 1e-8
+# Change over the largest |U| that makes a short series an edge, and not one of those that stand around a kink.
+_STEEP = 0.05
 # V; below, doubles lose their digits, and no function is smooth.
 _NOTHING = 1e-290
 
@@ -250,6 +276,7 @@ class _Refiner:
     jumps: list[tuple[float, float]] = field(default_factory=list)
     located: list[float] = field(default_factory=list)
     narrow: list[float] = field(default_factory=list)
+    short: list[tuple[float, float]] = field(default_factory=list)
     not_finite: float | None = None
     rough: float = 0.0
 
@@ -294,9 +321,22 @@ class _Refiner:
                 continue
             if hi - lo < 0.75 * self.step and most > _ROUGHEST * self.scale:
                 self.narrow.append(0.5 * (lo + hi))
+            if hi - lo < 0.75 * self.step:
+                self.short.append((lo, float(series.sum() - series @ _AT_START)))
             if self.series and lo > a and not (self.jumps and self.jumps[-1][0] >= lo):
-                # A jump that happens to stand on a cut needs no refining: look across every cut.
-                self.jumps.append((lo, float(series @ _AT_START - self.series[-1].sum())))
+                # A jump, or a steep edge, may stand on a cut, where no point of either side sees it.
+                change = float(series @ _AT_START - self.series[-1].sum())
+                if abs(change) > self._least and hi - lo > floor:
+                    first, middle, behind = self.edges[-2], 0.5 * (lo + hi), 0.5 * (self.edges[-2] + lo)
+                    stack += [(middle, hi, depth + 1, math.inf, most, 0), (lo, middle, depth + 1, math.inf, most, 0)]
+                    if lo - first > floor:
+                        del self.edges[-1], self.series[-1]
+                        stack += [
+                            (behind, lo, depth + 1, math.inf, most, 0),
+                            (first, behind, depth + 1, math.inf, most, 0),
+                        ]
+                    continue
+                self.jumps.append((lo, change))
             self.edges.append(hi)
             self.series.append(series)
         return True
@@ -319,10 +359,14 @@ class _Refiner:
         good = misfit <= max(self.tol * self.scale, noise, _NOTHING)
         return (c if good else None), values[:_POINTS], misfit
 
+    @property
+    def _least(self) -> float:
+        """Smallest change that is a jump, V."""
+        return max(1e3 * self.tol * self.scale, 10.0 * self.rough)
+
     def warn(self) -> None:
         """One warning for the jumps, one for the narrow features, found and not declared."""
-        least = max(1e3 * self.tol * self.scale, 10.0 * self.rough)
-        real = [(t, dv) for t, dv in self.jumps if abs(dv) > least]
+        real = [(t, dv) for t, dv in self.jumps if abs(dv) > self._least]
         if real:
             t, dv = real[0]
             warnings.warn(
@@ -335,6 +379,7 @@ class _Refiner:
         # Around a jump, a kink or the end of what is finite, short series are natural.
         known = [*self.located, *(t for t, _ in real), *([] if self.not_finite is None else [self.not_finite])]
         apart = [t for t in self.narrow if all(abs(t - k) > 8.0 * self.step for k in known)]
+        apart = sorted(apart + self._edges_found())
         if apart:
             warnings.warn(
                 f"the source function has a feature narrower than the output step {self.step:.3g} s "
@@ -343,3 +388,13 @@ class _Refiner:
                 FingerspiceWarning,
                 stacklevel=2,
             )
+
+    def _edges_found(self) -> list[float]:
+        """Where short series change much within a tenth of a step: edges that were not declared, and resolved."""
+        if not self.short:
+            return []
+        t, change = np.array(self.short).T
+        total = np.concatenate([[0.0], np.cumsum(change)])
+        after = np.searchsorted(t, t + 0.1 * self.step)
+        steep = np.flatnonzero(np.abs(total[after] - total[:-1]) > _STEEP * self.scale)
+        return [float(t[i + np.argmax(np.abs(change[i : after[i]]))]) for i in steep[:1]]

@@ -224,8 +224,29 @@ def _refuse_source_conflicts(branches: list[Element]) -> None:
         pairs[pair] = element
         a, b = root(element.nodes[0]), root(element.nodes[1])
         if a == b:
-            raise InputError(f"{element.name} closes a loop of voltage sources", element.where)
+            others = ", ".join(e.name for e in _path(list(pairs.values())[:-1], *element.nodes[:2]))
+            raise InputError(f"{element.name} closes a loop of voltage sources with {others}", element.where)
         parent[a] = b
+
+
+def _path(branches: list[Element], start: str, end: str) -> list[Element]:
+    """The branches, which form no loop, that lead from one node to another."""
+    at = _incidence(branches)
+    came: dict[str, Element | None] = {start: None}
+    ahead = [start]
+    while end not in came:
+        node = ahead.pop()
+        for e in at[node]:
+            for other in e.nodes[:2]:
+                if other not in came:
+                    came[other] = e
+                    ahead.append(other)
+    found = []
+    node = end
+    while (step := came[node]) is not None:
+        found.append(step)
+        node = step.nodes[0] if step.nodes[1] == node else step.nodes[1]
+    return found
 
 
 def _refuse_current_without_path(branches: list[Element]) -> None:
