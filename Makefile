@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DECK ?= circuits/fingerpad.cir
 
-.PHONY: run test check figures fuzz clean
+.PHONY: run test check figures fuzz stress clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -33,6 +33,9 @@ figures: $(VENV)/.run
 
 test: $(VENV)/.test
 	$(BIN)/python -m pytest
+
+stress: $(VENV)/.test
+	$(BIN)/python tests/stress.py --scenes 10000
 
 fuzz: $(VENV)/.test
 	$(BIN)/python tests/fuzz.py --inputs 1000000

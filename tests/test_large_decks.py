@@ -135,7 +135,7 @@ def test_the_largest_circuits_find_conflicts_and_start_values(monkeypatch: pytes
     star = lines(lambda i: f"V{i} n0 n{i + 1} 1", 5_000)
     assert refusal(f"{star}Vx n5000 n1 1\nR1 n5000 0 1\nR2 n1 0 1\n").startswith("node 'n2' is floating")
     ring = lines(lambda i: f"V{i} n0 n{i + 1} 1\nR{i} n{i + 1} 0 1", 5_000)
-    assert refusal(f"{ring}Vx n5000 n1 1\n") == "Vx closes a loop of voltage sources"
+    assert refusal(f"{ring}Vx n5000 n1 1\n") == "Vx closes a loop of voltage sources with V0, V4999"
     start = lines(lambda i: f"R{i} n{i} 0 1\n.ic v(n{i})=1", 5_000)
     assert refusal(f"{start}.ic v(n1)=2\n") == ".ic gives node 'n1' twice"
     areas = lines(lambda i: f"X{i} d 0 a{i} LAYER d=1u eps_r=1\nV{i} a{i} 0 1", 4_000)

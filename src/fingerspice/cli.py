@@ -355,7 +355,7 @@ def compare(
 def limits(
     deck: Deck,
     out: Out = Path(),
-    points: Annotated[int, typer.Option(help="Values of each parameter.")] = 13,
+    points: Annotated[int, typer.Option(help="Values of each parameter.")] = 9,
     span: Annotated[float, typer.Option(help="Each goes from its own value over this to this times it.")] = 10.0,
     changes: Set = None,
     source: Source = None,

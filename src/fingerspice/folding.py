@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import OdeSolution, solve_ivp
 
-from fingerspice.circuit.sampling import SourceTable
+from fingerspice.circuit.sampling import breakpoints_at
 from fingerspice.engine.model import Segment, choose_branch, dot, gap_voltage, source, voltage_by_time, write_row_at
+from fingerspice.errors import SolveError
 from fingerspice.marching import solve as solve_marching
-from fingerspice.outcome import Status
+from fingerspice.outcome import Failure, State, Status
 from fingerspice.problem import Problem
 from fingerspice.runs import BoolArray, Run, Tables, from_rows, row_width
 
@@ -26,7 +27,7 @@ FloatArray = NDArray[np.float64]
 
 FINEST_RTOL = 1e-12
 # A fold is met at this distance, and looked for over so many of the shortest time constants.
-NOTHING_LEFT, LONGEST = 1e-10, 1e6
+NOTHING_LEFT, LONGEST = 1e-10, 1e4
 
 
 def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | None:
@@ -41,9 +42,7 @@ def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | N
     run = solve_marching(problem, FINEST_RTOL, t_out, left, repeat=False)
     if run.status is not Status.FOLD:
         return run if run.status is Status.SUCCESS else None
-    begin = run.state.t
-    table = next((table for table in Tables(problem, FINEST_RTOL) if table.edges[-1] > begin), None)
-    path = None if table is None else _ahead(problem, table, begin, run.state.y)
+    path = _ahead(problem, run.state, FINEST_RTOL)
     if path is None:
         return None
     # The row of where the steps stopped is no output.
@@ -63,6 +62,23 @@ def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | N
     n = problem.model.gap.size
     run.state = dataclasses.replace(run.state, t=path.t, y=rows[-1, -n - 1 :].copy(), u_before=float(rows[-1, 0]))
     return run
+
+
+def meets_fold(problem: Problem, rtol: float) -> bool:
+    """Whether a problem meets a fold, or a jump of its source goes past one; what follows a near miss is not looked at.
+
+    Raises
+    ------
+    SolveError
+        Where the run fails otherwise.
+    """
+    nothing = np.empty(0)
+    run = solve_marching(problem, rtol, nothing, nothing.astype(bool))
+    if run.status is Status.SUCCESS:
+        return False
+    if run.status is not Status.FOLD:
+        raise SolveError(Failure(run.status, run.status.cause, run.status.action, run.t_failed, tried=run.tried))
+    return bool(breakpoints_at(problem.waveform, run.state.t).size) or _ahead(problem, run.state, rtol) is not None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,9 +110,12 @@ class _Path:
         return rows
 
 
-def _ahead(problem: Problem, table: SourceTable, t: float, y: FloatArray) -> _Path | None:
-    """The path from a state (n + 1,) at t (s) to a fold in the segment of the source that it stands in."""
-    model, n = problem.model, y.size
+def _ahead(problem: Problem, state: State, rtol: float) -> _Path | None:
+    """The path from a state to a fold in the segment of the source that it stands in; None where there is no fold."""
+    t, y, model, n = state.t, state.y, problem.model, state.y.size
+    table = next((table for table in Tables(problem, rtol) if table.edges[-1] > t), None)
+    if table is None:
+        return None
     i = min(max(int(np.searchsorted(table.edges, t, side="right")) - 1, 0), table.edges.size - 2)
     start, end = float(table.edges[i]), float(table.edges[i + 1])
     segment = Segment(start, end - start, table.terms[i], table.series[i])
@@ -128,11 +147,17 @@ def _ahead(problem: Problem, table: SourceTable, t: float, y: FloatArray) -> _Pa
     def ahead(_: float, z: FloatArray) -> float:
         return end - float(z[n]) * t
 
-    events: list[Any] = [distance, ahead]
+    begin = np.concatenate([y, [t, u]]) / scale
+    far = 3.0 * at(begin)[0]
+
+    def away(_: float, z: FloatArray) -> float:
+        return far - at(z)[0]
+
+    events: list[Any] = [distance, ahead, away]
     for event in events:
         event.terminal = True
     found = solve_ivp(
-        slope, (0.0, LONGEST), np.concatenate([y, [t, u]]) / scale, "DOP853", rtol=FINEST_RTOL, atol=FINEST_RTOL,
+        slope, (0.0, LONGEST), begin, "DOP853", rtol=rtol, atol=rtol,
         events=events, dense_output=True,
     )  # fmt: skip
     return _Path(segment, sign, scale, found.sol) if found.t_events[0].size else None

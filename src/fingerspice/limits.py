@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +12,12 @@ from numpy.typing import NDArray
 
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.combinations import Product
+from fingerspice.circuit.statespace import is_stack
 from fingerspice.circuit.waveforms import Waveform, as_waveform, require
-from fingerspice.errors import FingerspiceWarning, InputError
+from fingerspice.errors import InputError, SolveError
+from fingerspice.folding import meets_fold
 from fingerspice.outcome import Status
+from fingerspice.problem import prepare
 from fingerspice.simulation import simulate
 
 if TYPE_CHECKING:
@@ -81,7 +83,7 @@ class FoldLimits:
         }  # fmt: skip
 
 
-def fold_limits(circuit: Circuit, *, points: int = 13, span: float = 10.0) -> FoldLimits:
+def fold_limits(circuit: Circuit, *, points: int = 9, span: float = 10.0) -> FoldLimits:
     """Find the source voltage at which runs under the `mobile` law meet their fold, to 1e-3.
 
     Every run starts as the deck's does and lasts as many periods. Each parameter goes from its own value over `span` to
@@ -100,6 +102,8 @@ def fold_limits(circuit: Circuit, *, points: int = 13, span: float = 10.0) -> Fo
     ------
     InputError
         For a circuit without these.
+    SolveError
+        Where a run fails for another reason than a fold.
     """
     require(points >= 3, "points", points, "3 or more")
     require(span > 1.0, "span", span, "more than 1")
@@ -157,14 +161,17 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
         raised = circuit.replace(
             {e.name: Product((factor, e.waveform)) for e in circuit.by_device("V") if e.waveform is not None}
         )
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FingerspiceWarning)
-            run = simulate(
-                raised, t_stop=t_stop, t_eval=[0.0, t_stop], charge_law="mobile", rtol=RTOL, charge=False,
-                method="exponential", throw=False,
+        if is_stack(raised):
+            problem = prepare(
+                raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="uncharged",
+                charge=False, rtol=RTOL,
             )  # fmt: skip
-        if run.status not in (Status.SUCCESS, Status.FOLD):
-            raise InputError(f"a run at {voltage:.4g} V failed: {run.message}")
+            return meets_fold(problem, RTOL)
+        run = simulate(
+            raised, t_stop=t_stop, t_eval=[0.0, t_stop], charge_law="mobile", rtol=RTOL, charge=False, throw=False
+        )  # fmt: skip
+        if run.failure is not None and run.status is not Status.FOLD:
+            raise SolveError(run.failure, run)
         return run.status is Status.FOLD
 
     low = high = min(max(guess or peak, LOWEST), HIGHEST)
@@ -190,7 +197,7 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
 
 def plot_limits(limits: FoldLimits) -> Figure:
     """The fold's voltage against every parameter, the deck's own point marked."""
-    from fingerspice.plotting import BLUE, GREY, VERMILION, caption, dress, engineering, legend_above, new_figure
+    from fingerspice.plotting import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
 
     figure, axes = new_figure(1, len(limits.sweeps), height=3.2, sharey=True)
     for ax, sweep in zip(axes, limits.sweeps, strict=True):
@@ -204,6 +211,7 @@ def plot_limits(limits: FoldLimits) -> Figure:
         dress(ax, "Peak source voltage [V]" if ax is axes[0] else "", f"{sweep.name.capitalize()} [{unit}]")
     shown = np.concatenate([s.voltages[np.isfinite(s.voltages)] for s in limits.sweeps] + [[limits.peak]])
     axes[0].set_ylim(0.5 * shown.min(), 2.0 * shown.max())
-    legend_above(axes[0], 3)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=3, fontsize=FONT - 0.5, frameon=False)
     caption(figure, f"{limits.circuit.title} · charge law mobile; the other parameters as in the deck")
     return figure

@@ -255,9 +255,10 @@ def integrate(
             progress((track.t - problem.t_start) / span)
         if code == march.OUT_OF_RANGE:
             return None
-        if code == march.NO_STEP:
+        if code in (march.NO_STEP, march.TOO_MANY):
             folding = problem.model.mobile and problem.model.coupled
             status = Status.FOLD if folding else Status.STEP_UNDERFLOW
+            status = Status.TOO_MANY_STEPS if code == march.TOO_MANY else status
             t_failed = track.t
             break
         if table.not_finite is not None:

@@ -31,7 +31,7 @@ class Status(Enum):
         "ask for a larger rtol, or check the source",
     )
     TOO_MANY_STEPS = (
-        "the run took two million steps without coming to its end",
+        "the run took more steps than any that was well posed has needed",
         "ask for a larger rtol, or a shorter run",
     )
     ERROR_NOT_MET = ("the error estimate stayed above the error asked for", "ask for a larger rtol")

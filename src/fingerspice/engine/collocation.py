@@ -36,10 +36,10 @@ N_CONTROL = 6
 # Entries of `counters`, after the evaluations.
 ACCEPTED, REJECTED, ZEROS, OUTPUT = 1, 2, 3, 4
 N_COUNTERS = 5
-# Steps taken and refused, in a run: what needs more has a cause that smaller steps do not mend.
-MOST_STEPS = 2_000_000
 # Steps between pauses: a tenth of a second, after which Python may see to a Ctrl-C.
 STEPS_AT_ONCE = 250
+# Steps taken and refused, in a run: what needs more has a cause that smaller steps do not mend.
+MOST_STEPS = 2_000_000
 # A source's change at an edge, relative, that is its rounding and no jump.
 ROUNDING = 1e-14
 

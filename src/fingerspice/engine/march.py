@@ -22,6 +22,7 @@ from fingerspice.engine.readout import (
     H_AFTER_ZERO,
     KEPT,
     MAGNIFIED,
+    MOST_STEPS,
     NFEV,
     OUTPUT,
     PEAK_U,
@@ -53,7 +54,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 # Codes returned by `march`.
-DONE, NO_STEP, OUT_OF_RANGE = 0, 1, 2
+DONE, NO_STEP, OUT_OF_RANGE, TOO_MANY = 0, 1, 2, 3
 # Step over the one before, at most; and what of it may be foreseen growth.
 _MOST_GROWTH, _MOST_TREND = 8.0, 2.5
 
@@ -147,8 +148,8 @@ def march(
     Returns
     -------
     int
-        DONE, NO_STEP (no step is short enough: a fold, or an error that cannot be met) or OUT_OF_RANGE (a gap voltage
-        beyond the range of the area's polynomial).
+        DONE, NO_STEP (no step is short enough: a fold, or an error that cannot be met), OUT_OF_RANGE (a gap voltage
+        beyond the range of the area's polynomial) or TOO_MANY steps.
     """
     # Arrays are taken out of their tuples once: doing it where they are used costs more than the use.
     model = system.model
@@ -196,8 +197,11 @@ def march(
     segment_terms, segment_series = terms[0], series[0]
     if edges[0] < control[T]:
         index = np.searchsorted(edges, control[T], side="right") - 2
+    most = counters[ACCEPTED] + counters[REJECTED] + MOST_STEPS
     while control[T] < t_end:
         t = control[T]
+        if counters[ACCEPTED] + counters[REJECTED] > most:
+            return TOO_MANY
         if t >= edge:
             index += 1
             start = edges[index]
@@ -264,7 +268,7 @@ def march(
                 scale, curve, sign, decay, phi, w0, 0.3 * tol, base, w, pull, used, pull_before, left_before, weight, r,
             )  # fmt: skip
             counters[NFEV] += passes * NODES
-            wrong = first_wrong(u_rows, sign) if coupled else 0
+            wrong = first_wrong(u_rows, sign, tol) if coupled else 0
             if wrong == 1 and flips < 2 and sign * u_rows[0] <= 1e-9 * abs(u_rows[1]):
                 # The step starts at a zero and leaves on the other side.
                 flip = True

@@ -36,6 +36,9 @@ NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT = 0, 1, 2, 3, 4, 5
 N_COUNTERS = 6
 # The last steps tried are kept, this many, as rows: start and length (s), error over the one allowed, number.
 TRIED = 8
+# Steps taken and refused in a window of the source, which holds a few thousand of its periods at most: what needs more
+# has a cause that smaller steps do not mend.
+MOST_STEPS = 200_000
 # Outputs are read in groups of a processor's vectors, and looked for in strides.
 WRITTEN_AT_ONCE = _GROUP = 8
 _STRIDE = 32
@@ -107,12 +110,18 @@ def zero(u: FloatArray, sign: float, last: int, series: FloatArray) -> float:
 
 
 @jit
-def first_wrong(u: FloatArray, sign: float) -> int:
-    """First node past the start at which the gap voltage is off its branch, or 0."""
-    for j in range(1, NODES):
+def first_wrong(u: FloatArray, sign: float, tol: float) -> int:
+    """First node past the start at which the gap voltage is off its branch, or 0.
+
+    A voltage that stays below the error allowed (V) may be all rounding: its zeros mean nothing.
+    """
+    first = 0
+    largest = 0.0
+    for j in range(NODES - 1, 0, -1):
+        largest = max(largest, abs(u[j]))
         if sign * u[j] < 0.0:
-            return j
-    return 0
+            first = j
+    return first if largest > tol else 0
 
 
 @jit
