@@ -167,7 +167,7 @@ def judge(scene: Scene) -> str:
     peak = float(np.nanmax(np.abs(expected.u_gap), initial=0.0))
     if solution.status is fs.Status.ERROR_NOT_MET:
         # The gap takes so little that rounding of the source is more than what was asked for.
-        if solution.error.u_gap <= 1e-11 * scene.amplitude:
+        if RTOL * peak <= 1e-12 * scene.amplitude:
             return "refused: rounding"
         raise WrongError(f"error not met: {solution.message}")
     if solution.status is fs.Status.FOLD:

@@ -15,6 +15,16 @@ def test_a_random_scene_is_right_or_refused_for_a_true_reason(number: int) -> No
     assert stress.judge(stress.draw(0, number))
 
 
+@pytest.mark.parametrize("number", [24, 58])
+@pytest.mark.xfail(
+    raises=stress.WrongError,
+    reason="mobile: ours passes a fold at 7e-11 s (24), or finds one where the reference goes on (58)",
+)
+def test_a_scene_that_is_not_understood_yet(number: int) -> None:
+    # Scenes 12 (shorted gap, 0.2 Hz) and 19 (a fold approached on a fast mode) take minutes, and are left out.
+    stress.judge(stress.draw(0, number))
+
+
 def test_scenes_reach_over_twelve_decades_and_repeat() -> None:
     scenes = [stress.draw(0, k) for k in range(2000)]
     assert stress.draw(0, 7) == scenes[7]

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import OdeSolution, solve_ivp
 
-from fingerspice.circuit.sampling import breakpoints_at
 from fingerspice.engine.model import Segment, choose_branch, dot, gap_voltage, source, voltage_by_time, write_row_at
 from fingerspice.errors import SolveError
 from fingerspice.marching import solve as solve_marching
@@ -31,7 +30,7 @@ NOTHING_LEFT, LONGEST = 1e-10, 1e4
 
 
 def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | None:
-    """A run under the `mobile` law that meets a fold, up to that; None where it meets none, or a jump goes past it.
+    """A run under the `mobile` law that meets a fold, or jumps past one, up to that; None where it meets none.
 
     Parameters
     ----------
@@ -42,7 +41,10 @@ def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | N
     run = solve_marching(problem, FINEST_RTOL, t_out, left, repeat=False)
     if run.status is not Status.FOLD:
         return run if run.status is Status.SUCCESS else None
-    path = _ahead(problem, run.state, FINEST_RTOL)
+    begun = _start(problem, run.state)
+    if math.isnan(begun.u):
+        return run
+    path = _ahead(problem, run.state, begun, FINEST_RTOL)
     if path is None:
         return None
     # The row of where the steps stopped is no output.
@@ -78,7 +80,8 @@ def meets_fold(problem: Problem, rtol: float) -> bool:
         return False
     if run.status is not Status.FOLD:
         raise SolveError(Failure(run.status, run.status.cause, run.status.action, run.t_failed, tried=run.tried))
-    return bool(breakpoints_at(problem.waveform, run.state.t).size) or _ahead(problem, run.state, rtol) is not None
+    begun = _start(problem, run.state)
+    return math.isnan(begun.u) or _ahead(problem, run.state, begun, rtol) is not None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,19 +113,37 @@ class _Path:
         return rows
 
 
-def _ahead(problem: Problem, state: State, rtol: float) -> _Path | None:
-    """The path from a state to a fold in the segment of the source that it stands in; None where there is no fold."""
-    t, y, model, n = state.t, state.y, problem.model, state.y.size
-    table = next((table for table in Tables(problem, rtol) if table.edges[-1] > t), None)
-    if table is None:
-        return None
+class _Start(NamedTuple):
+    """Where a path starts: the segment of the source, its end (s), the area's branch, and the gap voltage (V).
+
+    The voltage is NaN where a jump of the source has gone past the fold.
+    """
+
+    segment: Segment
+    end: float
+    sign: float
+    u: float
+
+
+def _start(problem: Problem, state: State) -> _Start:
+    t, model = state.t, problem.model
+    tables = list(Tables(problem, FINEST_RTOL))
+    table = next((table for table in tables if table.edges[-1] > t), tables[-1])
     i = min(max(int(np.searchsorted(table.edges, t, side="right")) - 1, 0), table.edges.size - 2)
     start, end = float(table.edges[i]), float(table.edges[i + 1])
     segment = Segment(start, end - start, table.terms[i], table.series[i])
     u_source, _ = source(segment, t - start)
-    sign = float(choose_branch(model, u_source, y))
-    u = float(gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), sign, model.k_gap * u_source))
-    if not math.isfinite(u) or u == 0.0:
+    sign = float(choose_branch(model, u_source, state.y))
+    u = float(gap_voltage(model, model.k_gap * u_source, dot(model.gap, state.y), sign, model.k_gap * u_source))
+    return _Start(segment, end, sign, u)
+
+
+def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path | None:
+    """The path from a state to a fold in the segment of the source that it stands in; None where there is no fold."""
+    t, y, model, n = state.t, state.y, problem.model, state.y.size
+    segment, end, sign, u = begun
+    start = segment.start
+    if u == 0.0:
         return None
     scale = np.concatenate([
         np.full(n - 1, max(problem.scene.u_peak, abs(u))), [model.area0 / model.s * abs(u), t, abs(u)]

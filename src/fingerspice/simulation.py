@@ -303,7 +303,7 @@ def _run(
         folded = run_to_fold(problem, t_out, left)
         if folded is not None:
             return folded, "exponential"
-        # No fold, or a jump past one: for a method that solves the area equation at every evaluation.
+        # Near a fold, but none: for a method that solves the area equation at every evaluation.
         method = "dop853"
     if method not in TABLEAUS:
         known = ["auto", "exponential", *TABLEAUS, "scipy:NAME", "torchdiffeq:NAME"]
