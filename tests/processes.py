@@ -2,18 +2,36 @@
 
 from __future__ import annotations
 
+import atexit
+import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 ENTRY = [sys.executable, "-m", "fingerspice"]
 
 
+@lru_cache(1)
+def fonts() -> str:
+    """A folder with matplotlib's list of fonts: made on a full disk, it would be broken for everyone after."""
+    folder = tempfile.mkdtemp(prefix="fonts-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    subprocess.run(
+        [sys.executable, "-c", "import matplotlib.font_manager"], check=True, capture_output=True,
+        env={**os.environ, "MPLCONFIGDIR": folder},
+    )  # fmt: skip
+    return folder
+
+
 def start(folder: Path, *arguments: str, entry: list[str] | None = None, **options: Any) -> subprocess.Popen[str]:
+    options["env"] = {**options.get("env", os.environ), "MPLCONFIGDIR": fonts()}
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": folder} | options
     return subprocess.Popen([*(entry or ENTRY), *arguments], **options)
 
