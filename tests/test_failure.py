@@ -129,3 +129,27 @@ def test_a_run_near_its_fold_warns_and_says_how_near() -> None:
     assert few.fold_margin.min() > 0.9
     assert few.summary()["fold_margin_min"] == pytest.approx(float(near.fold_margin.min()), rel=0.02)
     assert fs.simulate(circuit, charge_law="local", rtol=1e-6).fold_margin_min == 1.0
+
+
+@pytest.mark.parametrize("t_eval", [[1e-3], [0.0, 1e-3], None])
+def test_a_fold_before_or_between_outputs_leaves_what_there_is(t_eval: list[float] | None) -> None:
+    circuit = table1().replace({"Xgap.d": 1e-8})
+    solution = fs.simulate(circuit, charge_law="mobile", t_eval=t_eval, t_stop=2e-3, throw=False)
+    assert solution.status is fs.Status.FOLD
+    assert solution.t[-1] == pytest.approx(0.02332418286278 * 0.01, rel=1e-9)
+    assert np.all(np.isfinite(solution.u_gap))
+
+
+def test_a_fold_soon_after_a_jump_at_the_start_is_met() -> None:
+    circuit = table1().replace({"Xgap.d": 1e-8})
+    # A step takes the gap's share at once and less than the fold; the leak of the layers then brings it there.
+    runs = [
+        fs.simulate(
+            circuit, sources={"Vdrive": fs.DC(u)}, start="uncharged", charge_law="mobile", t_stop=0.02, throw=False
+        )
+        for u in (2.0, 5.0, 20.0)
+    ]
+    assert all(run.status in (fs.Status.SUCCESS, fs.Status.FOLD) for run in runs)
+    times = [run.failure.t for run in runs if run.failure is not None]
+    assert times == sorted(times, reverse=True)
+    assert times

@@ -48,7 +48,8 @@ def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | N
     if path is None:
         return None
     # The row of where the steps stopped is no output.
-    done = run.t.size - int(run.t.size > t_out.size or run.t[-1] != t_out[run.t.size - 1])
+    stopped = run.t.size > 0 and (run.t.size > t_out.size or run.t[-1] != t_out[run.t.size - 1])
+    done = run.t.size - int(stopped)
     later = t_out[done:]
     t = np.append(later[later < path.t], path.t)
     rows = path.rows(problem, t)
@@ -86,8 +87,9 @@ def meets_fold(problem: Problem, rtol: float) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class _Path:
-    """State (n + 1,), time (s) and gap voltage (V) over the variable s, up to the fold."""
+    """State (n + 1,), time since `begin` (s) and gap voltage (V) over the variable s, up to the fold."""
 
+    begin: float
     segment: Segment
     sign: float
     scale: FloatArray
@@ -96,7 +98,7 @@ class _Path:
     @property
     def t(self) -> float:
         """Time of the fold, s."""
-        return float(self.solution(self.solution.t_max)[-2] * self.scale[-2])
+        return self.begin + float(self.solution(self.solution.t_max)[-2] * self.scale[-2])
 
     def rows(self, problem: Problem, t: FloatArray) -> FloatArray:
         """Rows of `engine.model.write_row` at times (s) on the path."""
@@ -104,7 +106,7 @@ class _Path:
         # Time rises along the path, ever slower: halving has no trouble with that.
         for _ in range(64):
             middle = 0.5 * (low + high)
-            early = self.solution(middle)[-2] * self.scale[-2] < t
+            early = self.solution(middle)[-2] * self.scale[-2] < t - self.begin
             low, high = np.where(early, middle, low), np.where(early, high, middle)
         rows = np.empty((t.size, row_width(problem)))
         for row, z, time in zip(rows, (self.solution(high).T * self.scale), t, strict=True):
@@ -142,18 +144,17 @@ def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path 
     """The path from a state to a fold in the segment of the source that it stands in; None where there is no fold."""
     t, y, model, n = state.t, state.y, problem.model, state.y.size
     segment, end, sign, u = begun
-    start = segment.start
     if u == 0.0:
         return None
+    pace = model.tau if math.isfinite(model.tau) else segment.length
     scale = np.concatenate([
-        np.full(n - 1, max(problem.scene.u_peak, abs(u))), [model.area0 / model.s * abs(u), t, abs(u)]
+        np.full(n - 1, max(problem.scene.u_peak, abs(u))), [model.area0 / model.s * abs(u), pace, abs(u)]
     ])  # fmt: skip
     dy = np.empty(n)
-    pace = model.tau if math.isfinite(model.tau) else segment.length
 
     def at(z: FloatArray) -> tuple[float, float]:
         here = z * scale
-        u_here, du_here = source(segment, here[n] - start)
+        u_here, du_here = source(segment, t - segment.start + here[n])
         margin, speed = voltage_by_time(model, u_here, du_here, here[:n], sign, here[n + 1], dy)
         return float(margin), float(speed)
 
@@ -166,9 +167,9 @@ def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path 
         return at(z)[0] - NOTHING_LEFT
 
     def ahead(_: float, z: FloatArray) -> float:
-        return end - float(z[n]) * t
+        return end - t - float(z[n]) * pace
 
-    begin = np.concatenate([y, [t, u]]) / scale
+    begin = np.concatenate([y, [0.0, u]]) / scale
     far = 3.0 * at(begin)[0]
 
     def away(_: float, z: FloatArray) -> float:
@@ -181,4 +182,4 @@ def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path 
         slope, (0.0, LONGEST), begin, "DOP853", rtol=rtol, atol=rtol,
         events=events, dense_output=True,
     )  # fmt: skip
-    return _Path(segment, sign, scale, found.sol) if found.t_events[0].size else None
+    return _Path(t, segment, sign, scale, found.sol) if found.t_events[0].size else None
