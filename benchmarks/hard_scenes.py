@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import fingerspice as fs
-from problems import Constants, Drive, FloatArray, Piece, Problem, constants
+from problems import Constants, Drive, FloatArray, Piece, Problem, constants, held, tone
 from reference import _analytic
 
 SERIES = 1e-7
@@ -118,25 +118,6 @@ class HardProblem(Problem):
         return [(a, b, whole[2]) for a, b in pairwise(edges)]
 
 
-def _tone(amplitude: float, frequency: float, offset: float = 0.0) -> Drive:
-    omega = 2.0 * math.pi * frequency
-
-    def bind(sin: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
-        def u(t: Any, level: Any) -> Any:
-            return offset + amplitude * sin(omega * t)
-
-        return u
-
-    return bind
-
-
-def _held(sin: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
-    def u(t: Any, level: Any) -> Any:
-        return level
-
-    return u
-
-
 def _gated(sin: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
     def u(t: Any, level: Any) -> Any:
         return level * 200.0 * sin(2.0 * math.pi * 5000.0 * t)
@@ -193,7 +174,7 @@ def _sine(name: str, title: str, changes: Mapping[str, float] | None = None, *, 
     return HardProblem(
         **{
             "name": name, "title": title, "waveform": fs.Sine(amplitude, frequency),
-            "drive": _tone(amplitude, frequency), "ngspice": f"SIN(0 {amplitude!r} {frequency!r})",
+            "drive": tone(amplitude, frequency), "ngspice": f"SIN(0 {amplitude!r} {frequency!r})",
             "skin_frequency": frequency, "period": 1.0 / frequency, "periods": 2, "changes": changes or {},
             "peak": amplitude, "reach": amplitude,
         } | given
@@ -203,7 +184,7 @@ def _sine(name: str, title: str, changes: Mapping[str, float] | None = None, *, 
 def _steps(name: str, title: str, waveform: fs.Waveform, ngspice: str, **given: Any) -> HardProblem:
     return HardProblem(
         **{
-            "name": name, "title": title, "waveform": waveform, "drive": _held, "ngspice": ngspice,
+            "name": name, "title": title, "waveform": waveform, "drive": held, "ngspice": ngspice,
             "skin_frequency": 100.0, "period": 0.01, "periods": 1, "reach": 260.0, "outputs": 100,
         } | given
     )  # fmt: skip

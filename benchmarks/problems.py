@@ -210,19 +210,22 @@ def constants(circuit: fs.Circuit, reach: float, error: float = SERIES_ERROR, de
     raise ValueError(f"1/A_R has no series of degree {degrees} or less within {error:g} to {reach:g} V")
 
 
-def _sine(frequency: float) -> Drive:
+def tone(amplitude: float, frequency: float, offset: float = 0.0) -> Drive:
+    """A sine about an offset, V."""
     omega = 2.0 * math.pi * frequency
 
     def bind(sin: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
         def u(t: Any, level: Any) -> Any:
-            return AMPLITUDE * sin(omega * t)
+            return offset + amplitude * sin(omega * t)
 
         return u
 
     return bind
 
 
-def _held(sin: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
+def held(sin: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
+    """The level of each piece, V."""
+
     def u(t: Any, level: Any) -> Any:
         return level
 
@@ -267,7 +270,7 @@ def _scene(kind: str, frequency: float, law: str = "local") -> Problem:
         name=f"{kind}_{label.replace(' ', '')}" + ("" if law == "local" else f"_{law}"),
         title=f"{kind} {label}",
         waveform=fs.Square(AMPLITUDE, frequency) if square else fs.Sine(AMPLITUDE, frequency),
-        drive=_held if square else _sine(frequency),
+        drive=held if square else tone(AMPLITUDE, frequency),
         ngspice=_square_text(frequency) if square else f"SIN(0 {AMPLITUDE!r} {frequency!r})",
         skin_frequency=frequency,
         period=1.0 / frequency,
@@ -305,7 +308,7 @@ _STIFF = Problem(
     name="stiff",
     title="sine 100 Hz, R_i = 1 ohm",
     waveform=fs.Sine(AMPLITUDE, 100.0),
-    drive=_sine(100.0),
+    drive=tone(AMPLITUDE, 100.0),
     ngspice=f"SIN(0 {AMPLITUDE!r} 100.0)",
     skin_frequency=100.0,
     period=0.01,
