@@ -30,9 +30,15 @@ def fonts() -> str:
     return folder
 
 
+def hears_ctrl_c() -> None:
+    """Tests run in the background of a shell would hand on that Ctrl-C is to be ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def start(folder: Path, *arguments: str, entry: list[str] | None = None, **options: Any) -> subprocess.Popen[str]:
     options["env"] = {**options.get("env", os.environ), "MPLCONFIGDIR": fonts()}
-    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": folder} | options
+    standard = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "preexec_fn": hears_ctrl_c}
+    options = standard | {"cwd": folder} | options
     return subprocess.Popen([*(entry or ENTRY), *arguments], **options)
 
 
