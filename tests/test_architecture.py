@@ -35,7 +35,7 @@ ORDER = (
         "runs",
         "stepping",
     ),
-    *("settling", "marching", "folding"),
+    *("settling", "track", "approach", "marching", "folding"),
     *(
         "direct",
         "nodal",

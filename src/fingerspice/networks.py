@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.combinations import Sum
 from fingerspice.circuit.network import Modes, Network, build_network, network_modes
-from fingerspice.circuit.sampling import is_sampled
+from fingerspice.circuit.sampling import is_sampled, on_breakpoint
 from fingerspice.circuit.waveforms import Fundamental, Waveform, require
 from fingerspice.engine.network import Net
 from fingerspice.errors import InputError
@@ -159,6 +159,7 @@ def prepare_network(
         ("network scene", law, area, t_stop), lambda: _scene(circuit, law, area, t_stop)
     )
     stop, step = run_times(circuit, t_start, t_stop, t_eval)
+    stop = on_breakpoint(scene.waveform, stop)
     first = t_start + (circuit.tran.start if circuit.tran else 0.0)
     return NetworkProblem(circuit, scene, t_start, stop, first, step, _initial(circuit, scene, start), charge)
 

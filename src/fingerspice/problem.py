@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
-from fingerspice.circuit.sampling import is_sampled
+from fingerspice.circuit.sampling import is_sampled, on_breakpoint
 from fingerspice.circuit.statespace import Stack, build_stack
 from fingerspice.circuit.waveforms import Fundamental, Waveform, require
 from fingerspice.engine.model import Model, choose_branch, gap_voltage
@@ -185,6 +185,7 @@ def prepare(
     t_start = start.state.t if isinstance(start, Solution) else 0.0
     scene = scene_of(circuit, charge_law, area, t_stop, rtol)
     stop, step = run_times(circuit, t_start, t_stop, t_eval)
+    stop = on_breakpoint(scene.waveform, stop)
     first = t_start + (circuit.tran.start if circuit.tran else 0.0)
     initial = _initial_state(circuit, scene, start)
     return Problem(circuit, scene, t_start, stop, first, step, initial, charge)

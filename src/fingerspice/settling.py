@@ -8,14 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import SourceTable, same_time
+from fingerspice.engine import readout
 from fingerspice.problem import Problem
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 # Shorter runs are stepped as they are: nothing would be saved.
 FEWEST_PERIODS = 6.0
 # What all later periods may still move, over the error allowed in a step.
 _SHARE = 1.0 / 3.0
+# Distance to the periodic state, over the root of allowed error and peak, at which the map of a period may be linear
+# enough; found out by trying.
+_NEAR = 10.0
+# Steps that a leap's calls cost, in all and in each of its periods: one per live voltage and three more.
+_CALLS, _CALL = 50, 10
 # Coupling changes the rates of the stack with its area frozen; by how much they may be too large.
 _RATE_SHARE = 0.5
 
@@ -35,8 +42,10 @@ class Settling:
     ----------
     next : float
         Time of the next look, s; inf where there is nothing to wait for.
-    remaining : float
-        Bound of what all periods after the last look still move, V.
+    distance, remaining : float
+        Bound of what all periods after the last look still move, V; and of that with what it adds to the charge.
+    near : float
+        Distance at which the map of a period may pass for a linear one, V.
     """
 
     def __init__(self, problem: Problem, rates: FloatArray, tol: float) -> None:
@@ -49,7 +58,10 @@ class Settling:
         # A mode that does not leak keeps its charge: it has nothing to settle to.
         self.rate = _RATE_SHARE * float(live.min()) if live.size else math.inf
         self.next = self.start if self.periods_left(self.start) >= FEWEST_PERIODS else math.inf
-        self.remaining = math.inf
+        self.distance = self.remaining = math.inf
+        self.near = math.inf
+        self._modes = live.size
+        self._steps = 0.0
         self._count = 0
         self._looked: tuple[int, FloatArray] | None = None
 
@@ -57,12 +69,17 @@ class Settling:
         """Whole periods from t (s) to the end of the run."""
         return max(0, math.floor((self.stop - t) / self.period * (1.0 + 1e-12)))
 
-    def look(self, x: FloatArray, magnified: float) -> bool:
-        """Compare the live voltages (n,) now, at `next`, with those of the last look; whether they have settled.
+    def look(self, y: FloatArray, control: FloatArray, counters: IntArray) -> bool:
+        """Compare the live voltages now, at `next`, with those of the last look; whether they have settled.
 
-        `magnified` is the largest move of the gap voltage for a move of a live one.
+        `y` holds them and the charge, `control` and `counters` the rest of a run (see `engine.readout`).
         """
-        self.remaining = math.inf
+        x = y[:-1]
+        magnified, peak = float(control[readout.MAGNIFIED]), float(control[readout.PEAK_U])
+        self._steps = float(counters[readout.ACCEPTED]) / max(self._count, 1)
+        if peak > 0.0:
+            self.near = max(self.allowed, min(self.near, _NEAR * math.sqrt(self.allowed * peak)))
+        self.distance = self.remaining = math.inf
         left = self.periods_left(self.next)
         if self._looked is not None:
             before, y = self._looked
@@ -71,7 +88,7 @@ class Settling:
             moved = magnified * max(map(abs, (x - y).tolist()), default=0.0)
             decay = min(self.rate * self.period * passed, 700.0)
             # What is left decays as a geometric series, or moves on no faster than up to now.
-            self.remaining = moved * min(left / passed, max(1.0 / math.expm1(decay), 1e-3))
+            self.distance = self.remaining = moved * min(left / passed, max(1.0 / math.expm1(decay), 1e-3))
             if self.charge:
                 # The charge of the kept period, a little off, is added up in every later one.
                 self.remaining *= max(1.0, left * min(1.0, self.rate * self.period))
@@ -80,24 +97,60 @@ class Settling:
         self._plan(1 if settled else self._wait(), left)
         return settled
 
-    def _wait(self) -> int:
-        """Periods until it may have settled, by the frozen rates, but no more than twice those passed."""
+    def _until(self, share: float) -> float:
+        """Periods until things have decayed to a share, by the frozen rates; nan where nothing is known yet."""
         per_period = self.rate / _RATE_SHARE * self.period
-        if not (math.isfinite(self.remaining) and 0.0 < per_period < math.inf):
-            return 1
-        wait = math.ceil(0.8 * math.log(self.remaining / self.allowed) / per_period)
-        return max(1, min(wait, 2 * self._count))
+        if not (0.0 < share < math.inf and 0.0 < per_period < math.inf):
+            return math.nan
+        return -math.log(share) / per_period
+
+    @property
+    def may_leap(self) -> bool:
+        """Whether what is left after the last look is nearly periodic, and long enough."""
+        return self.allowed < self.distance <= self.near and self._is_far(self.periods_left(self._last_look))
+
+    def _is_far(self, left: float) -> bool:
+        """Whether a leap saves twice what it costs, in steps."""
+        saved = min(self._until(self.allowed / self.remaining), left) * self._steps
+        return saved > 2.0 * ((self._modes + 3) * (self._steps + _CALL) + _CALLS)
+
+    @property
+    def _last_look(self) -> float:
+        assert self._looked is not None
+        return self.start + self._looked[0] * self.period
+
+    def leapt(self, periods: int, x: FloatArray) -> None:
+        """Go on from live voltages (n,), that many periods after the last look."""
+        assert self._looked is not None
+        self._count = self._looked[0] + periods
+        self._looked = self._count, x.copy()
+        self._plan(1, self.periods_left(self._last_look))
+
+    def stumbled(self, excess: float) -> None:
+        """A leap after the last look would have been off by so many times what is allowed: wait to be nearer."""
+        assert self._looked is not None
+        # What a linear map misses goes with the square of the distance.
+        self.near = max(self.allowed, self.distance * min(0.5, 0.7 / math.sqrt(excess)))
+        self._count = self._looked[0]
+        self._plan(self._wait(), self.periods_left(self._last_look))
+
+    def _wait(self) -> int:
+        """Periods until it may have settled, or is near enough to leap, but no more than twice those passed."""
+        settled = self._until(self.allowed / self.remaining)
+        wait = self._until(self.near / self.distance) if self._is_far(math.inf) else settled
+        return 1 if wait != wait else max(1, min(math.ceil(0.8 * wait), 2 * self._count))
 
     def _plan(self, wait: int, left: int) -> None:
         self._count += wait
         self.next = self.start + self._count * self.period if wait < left else math.inf
 
-    def snapped(self, table: SourceTable) -> float:
-        """Time of the next look, on the edge of the source that it misses by rounding."""
-        if self.next == math.inf:
-            return self.next
-        i = int(table.edges.searchsorted(self.next))
+    @staticmethod
+    def snapped(table: SourceTable, t: float) -> float:
+        """Time t (s), on the edge of the source that it misses by rounding."""
+        if t == math.inf:
+            return t
+        i = int(table.edges.searchsorted(t))
         for edge in table.edges[max(i - 1, 0) : i + 1].tolist():
-            if abs(edge - self.next) <= same_time(edge):
+            if abs(edge - t) <= same_time(edge):
                 return float(edge)
-        return self.next
+        return t

@@ -191,6 +191,12 @@ def breakpoints_at(waveform: Waveform, t: float) -> FloatArray:
     return waveform.breakpoints(t - same_time(t), t + same_time(t))
 
 
+def on_breakpoint(waveform: Waveform, t: float) -> float:
+    """Time t (s), on the breakpoint that it misses by rounding: a run to "three periods" ends at the jump there."""
+    near = breakpoints_at(waveform, t)
+    return float(near[0]) if near.size else t
+
+
 def is_sampled(waveform: Waveform) -> bool:
     """Whether a waveform has no terms and is represented by series."""
     return waveform.terms(np.zeros(1), np.ones(1)) is None

@@ -45,7 +45,7 @@ from fingerspice.engine.readout import (
     write_outputs,
     zero,
 )  # fmt: skip
-from fingerspice.engine.repeat import Kept
+from fingerspice.engine.repeat import AT_EDGE, AT_ZERO, Kept
 from fingerspice.engine.rows import DQ, GUESS, N_FLAT, SOURCE, X_GAP, Q, U, source_rows
 from fingerspice.engine.system import System
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
@@ -352,6 +352,7 @@ def march(
             counters[KEPT] += 1
             if place < kept_times.shape[0]:
                 kept_times[place, 0], kept_times[place, 1], kept_times[place, 2] = t, h, t_new
+                kept_times[place, 3] = AT_ZERO if crossed else (AT_EDGE if t_new == stop else 0.0)
                 for c in range(columns):
                     for d in range(ROWS):
                         kept_series[place, c, d] = coefficients[c, d]

@@ -1,4 +1,4 @@
-"""A period kept as polynomials, and its outputs written again: what a periodic scene needs once it has settled."""
+"""Outputs of periods from the polynomials of one: the same again, or moved by what its start has moved."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ FloatArray = NDArray[np.float64]
 
 # A boundary of a step, moved by whole periods, is one of the times asked for if it is this near, relative.
 _SLACK = 8e-16
+AT_ZERO, AT_EDGE = 1.0, 2.0
 
 
 class Kept(NamedTuple):
@@ -23,8 +24,9 @@ class Kept(NamedTuple):
 
     Attributes
     ----------
-    times : ndarray, shape (n_step, 3)
-        Start, length and reached end of each step, s.
+    times : ndarray, shape (n_step, 4)
+        Start, length and reached end of each step, s; and whether it ends at a zero of the gap voltage, an edge of the
+        source, or anywhere (AT_ZERO, AT_EDGE, 0).
     series : ndarray, shape (n_step, n_column, ROWS)
         Chebyshev coefficients of the output columns over the whole length.
     """
@@ -35,7 +37,7 @@ class Kept(NamedTuple):
 
 def new_kept(steps: int, columns: int) -> Kept:
     """Room for so many steps."""
-    return Kept(np.zeros((steps, 3)), np.zeros((steps, columns, ROWS)))
+    return Kept(np.zeros((steps, 4)), np.zeros((steps, columns, ROWS)))
 
 
 @jit
@@ -101,3 +103,98 @@ def repeat(
             for i in range(before, first):
                 out[row, i] += k * drift
     return first
+
+
+@jit
+def approach(
+    marks: FloatArray, marks_by: FloatArray, series: FloatArray, by: FloatArray, slope: FloatArray, x: FloatArray,
+    end: FloatArray, state: FloatArray, shown: int, still: float, period: float, periods: int, first: int,
+    t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray,
+) -> int:  # fmt: skip
+    """Write the outputs of periods that follow one another by an affine map.
+
+    Parameters
+    ----------
+    marks : ndarray, shape (n_step + 1,)
+        Where the steps begin and end in the first period, if that starts from live voltages `x` (n,) without charge, s.
+    marks_by : ndarray, shape (n_step + 1, n)
+        Its derivative by the live voltages at the start, s/V.
+    series : ndarray, shape (n_step, n_column, ROWS)
+        Chebyshev coefficients of that period's outputs, each over its step.
+    by : ndarray, shape (n_step, n_column, n, ROWS)
+        Their derivative.
+    slope : ndarray, shape (n + 1, n)
+        That of live voltages and charge at the end.
+    end, state : ndarray, shape (n + 1,)
+        Live voltages (V) and charge (C): `end` where the period from `x` ends; `state` where the first period starts,
+        and on return where the last one ends.
+    shown : int
+        Columns that are voltages; after them come charge and current, if wanted.
+    still : float
+        What a period may start off the one before and have its outputs, V.
+    period : float
+        s.
+    periods : int
+        How many there are.
+    first, t_out, left, out
+        As `readout.write_outputs`.
+
+    Returns
+    -------
+    int
+        The first output that is left.
+    """
+    n = x.size
+    work = np.zeros((2, WRITTEN_AT_ONCE))
+    formed = np.zeros_like(series)
+    stops = np.zeros(marks.size)
+    delta = np.zeros(n)
+    formed_at = np.full(n, np.inf)
+    stale = True
+    for k in range(periods):
+        shift = k * period
+        moved = 0.0
+        for m in range(n):
+            delta[m] = state[m] - x[m]
+            moved = max(moved, abs(delta[m] - formed_at[m]))
+        # Whether outputs are asked for or not: none of them depends on the others.
+        if moved > still:
+            formed_at[:] = delta
+            stale = True
+        close = marks[-1] + shift
+        if first < t_out.size and t_out[first] <= close + _SLACK * abs(close):
+            if stale:
+                _form(marks, marks_by, series, by, formed_at, stops, formed)
+                stale = False
+            for i in range(series.shape[0]):
+                begin, stop = stops[i] + shift, stops[i + 1] + shift
+                if series.shape[1] > shown:
+                    formed[i, shown, 0] += state[n]
+                first += write_outputs(
+                    begin, stop - begin, 1.0, stop, _SLACK * abs(stop), False, formed[i], work, first, 0, t_out, left,
+                    out,
+                )  # fmt: skip
+                if series.shape[1] > shown:
+                    formed[i, shown, 0] -= state[n]
+        for j in range(n + 1):
+            state[j] = end[j] + (state[n] if j == n else 0.0)
+        for m in range(n):
+            for j in range(n + 1):
+                state[j] += slope[j, m] * delta[m]
+    return first
+
+
+@jit
+def _form(
+    marks: FloatArray, marks_by: FloatArray, series: FloatArray, by: FloatArray, delta: FloatArray, stops: FloatArray,
+    formed: FloatArray,
+) -> None:  # fmt: skip
+    """Marks and series of the period that starts `delta` (V) off, see `approach`, into `stops` and `formed`."""
+    stops[:] = marks
+    formed[:] = series
+    for m in range(delta.size):
+        stops += marks_by[:, m] * delta[m]
+        for i in range(series.shape[0]):
+            for c in range(series.shape[1]):
+                for d in range(ROWS):
+                    formed[i, c, d] += by[i, c, m, d] * delta[m]
