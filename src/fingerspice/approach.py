@@ -23,10 +23,10 @@ from fingerspice.engine import repeat as repetition
 from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
 from fingerspice.runs import FloatArray
 from fingerspice.settling import Settling
-from fingerspice.track import FINEST, Track
+from fingerspice.track import KEPT_STEPS, Track
 
-# Tolerance of a period that others are made from, over that of a step: differences and sums of it magnify its error.
-_FINER = 0.05
+# Steps of a period over those of another.
+_ROOM = 4
 # What a leap is taken to be off, over what is allowed, if a period on its way could not be integrated.
 _LOST = 10.0
 # Periods that start nearer to one another than that, over what is allowed, are the same.
@@ -76,16 +76,14 @@ class _Period:
         return np.interp(other.marks, its, mine)
 
 
-def _period(track: Track, table: SourceTable, stop: float, x: FloatArray) -> _Period:
-    """A period from live voltages x on, integrated to `stop` (s) by a copy of the track."""
+def _period(track: Track, table: SourceTable, stop: float, x: FloatArray, steps: int = KEPT_STEPS) -> _Period:
+    """A period of so many steps at most from live voltages x on, integrated to `stop` (s) by a copy of the track."""
     probe = copy.copy(track)
     probe.y = np.append(x, 0.0)
     probe.error, probe.control, probe.tried = track.error.copy(), track.control.copy(), track.tried.copy()
     probe.counters = np.zeros_like(track.counters)
-    finest = FINEST * float(track.control[readout.PEAK_U])
-    probe.pace = track.pace._replace(tol=max(_FINER * track.pace.tol, finest))
     probe.t_out, probe.left, probe.out = np.zeros(0), np.zeros(0, bool), np.empty((track.out.shape[0], 0))
-    probe.keep()
+    probe.keep(steps)
     code = probe.advance(table, stop)
     track.counters[: readout.OUTPUT] += probe.counters[: readout.OUTPUT]
     if code != march.DONE or not probe.keeps_all:
@@ -119,24 +117,25 @@ def _leap(track: Track, table: SourceTable, settling: Settling, stop: float) -> 
     series_here, end = here.series(here.marks), here.track.y
     slope = np.empty((n + 1, n))
     marks_by = np.empty((here.marks.size, n))
-    by = np.empty((*series_here.shape[:2], n, series_here.shape[2]))
+    by = np.empty((n, *series_here.shape))
+    room = _ROOM * len(series_here)
     for k in range(n):
         x = x0.copy()
         x[k] += settling.distance
-        probe = _period(track, table, stop, x)
+        probe = _period(track, table, stop, x, room)
         marks = probe.marks_like(here)
         slope[:, k] = (probe.track.y - end) / settling.distance
         marks_by[:, k] = (marks - here.marks) / settling.distance
-        by[:, :, k] = (probe.series(marks) - series_here) / settling.distance
+        by[k] = (probe.series(marks) - series_here) / settling.distance
     base_x = x0 + _moved(slope[:n], end[:n] - x0, left)
-    base = _period(track, table, stop, base_x)
+    base = _period(track, table, stop, base_x, room)
     marks = base.marks_like(here)
     series = base.series(marks)
     # What the map misses where the run stands.
     delta = x0 - base_x
     missed = end - base.track.y - slope @ delta
     marks_missed = here.marks - marks - marks_by @ delta
-    missed_series = series_here - series - np.einsum("scnr,n->scr", by, delta)
+    missed_series = series_here - series - np.tensordot(delta, by, 1)
     # A polynomial is nowhere larger than the sum of its coefficients.
     off = float(np.abs(missed_series[:, : track.shown]).sum(axis=-1).max(initial=0.0))
     steepest = np.abs(series[:, : track.shown]) @ np.arange(series.shape[-1]) * 2.0 / np.diff(marks)[:, None]

@@ -115,9 +115,9 @@ class Track:
         """Keep no steps."""
         self.kept = repetition.new_kept(0, self.out.shape[0])
 
-    def keep(self) -> None:
-        """Keep the steps that follow."""
-        self.kept = repetition.new_kept(KEPT_STEPS, self.out.shape[0])
+    def keep(self, steps: int = KEPT_STEPS) -> None:
+        """Keep so many of the steps that follow."""
+        self.kept = repetition.new_kept(steps, self.out.shape[0])
         self.counters[readout.KEPT] = 0
         self.before = float(self.y[-1]), float(self.control[readout.COLLECTED]), float(self.control[readout.SPREAD])
 

@@ -71,17 +71,11 @@ def repeat(
     # Outputs of each step in the period before: mostly as many as now.
     held = np.zeros(count, np.int64)
     row = out.shape[0] - 2
-    # Powers take half the work, and are as exact where their coefficients stay small.
     as_powers = np.zeros(count, np.bool_)
-    room = np.zeros(NODES)
     for i in range(count):
-        as_powers[i] = True
-        for c in range(out.shape[0]):
-            as_powers[i] &= to_powers(series[i, c, :NODES], room)
+        as_powers[i] = _may_be_powers(series[i])
         if as_powers[i]:
-            for c in range(out.shape[0]):
-                to_powers(series[i, c, :NODES], room)
-                series[i, c, :NODES] = room
+            _make_powers(series[i])
     for k in range(1, periods + 1):
         shift = k * period
         before = first
@@ -106,6 +100,25 @@ def repeat(
 
 
 @jit
+def _may_be_powers(series: FloatArray) -> bool:
+    """Whether columns of coefficients (n_column, ROWS) are as exact as those of 1, x, x^2, ..., half the work."""
+    room = np.zeros(NODES)
+    small = True
+    for c in range(series.shape[0]):
+        small &= to_powers(series[c, :NODES], room)
+    return small
+
+
+@jit
+def _make_powers(series: FloatArray) -> None:
+    """Turn columns (n_column, ROWS) into coefficients of 1, x, x^2, ..."""
+    room = np.zeros(NODES)
+    for c in range(series.shape[0]):
+        to_powers(series[c, :NODES], room)
+        series[c, :NODES] = room
+
+
+@jit
 def approach(
     marks: FloatArray, marks_by: FloatArray, series: FloatArray, by: FloatArray, slope: FloatArray, x: FloatArray,
     end: FloatArray, state: FloatArray, shown: int, still: float, period: float, periods: int, first: int,
@@ -120,9 +133,9 @@ def approach(
     marks_by : ndarray, shape (n_step + 1, n)
         Its derivative by the live voltages at the start, s/V.
     series : ndarray, shape (n_step, n_column, ROWS)
-        Chebyshev coefficients of that period's outputs, each over its step.
-    by : ndarray, shape (n_step, n_column, n, ROWS)
-        Their derivative.
+        Chebyshev coefficients of that period's outputs, each over its step; used up.
+    by : ndarray, shape (n, n_step, n_column, ROWS)
+        Their derivative; used up.
     slope : ndarray, shape (n + 1, n)
         That of live voltages and charge at the end.
     end, state : ndarray, shape (n + 1,)
@@ -146,6 +159,14 @@ def approach(
     """
     n = x.size
     work = np.zeros((2, WRITTEN_AT_ONCE))
+    held = np.zeros(series.shape[0], np.int64)
+    as_powers = np.zeros(series.shape[0], np.bool_)
+    for i in range(series.shape[0]):
+        as_powers[i] = _may_be_powers(series[i])
+        if as_powers[i]:
+            _make_powers(series[i])
+            for m in range(n):
+                _make_powers(by[m, i])
     formed = np.zeros_like(series)
     stops = np.zeros(marks.size)
     delta = np.zeros(n)
@@ -170,10 +191,11 @@ def approach(
                 begin, stop = stops[i] + shift, stops[i + 1] + shift
                 if series.shape[1] > shown:
                     formed[i, shown, 0] += state[n]
-                first += write_outputs(
-                    begin, stop - begin, 1.0, stop, _SLACK * abs(stop), False, formed[i], work, first, 0, t_out, left,
-                    out,
+                held[i] = write_outputs(
+                    begin, stop - begin, 1.0, stop, _SLACK * abs(stop), as_powers[i], formed[i], work, first, held[i],
+                    t_out, left, out,
                 )  # fmt: skip
+                first += held[i]
                 if series.shape[1] > shown:
                     formed[i, shown, 0] -= state[n]
         for j in range(n + 1):
@@ -197,4 +219,4 @@ def _form(
         for i in range(series.shape[0]):
             for c in range(series.shape[1]):
                 for d in range(ROWS):
-                    formed[i, c, d] += by[i, c, m, d] * delta[m]
+                    formed[i, c, d] += by[m, i, c, d] * delta[m]
