@@ -23,8 +23,10 @@ from fingerspice.engine import repeat as repetition
 from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
 from fingerspice.runs import FloatArray
 from fingerspice.settling import Settling
-from fingerspice.track import KEPT_STEPS, Track
+from fingerspice.track import FINEST, KEPT_STEPS, Track
 
+# Tolerance of its steps, over that of others, where the charge is wanted: what it is off is off in every period.
+_FINER = 0.01
 # Steps of a period over those of another.
 _ROOM = 4
 # What a leap is taken to be off, over what is allowed, if a period on its way could not be integrated.
@@ -82,6 +84,9 @@ def _period(track: Track, table: SourceTable, stop: float, x: FloatArray, steps:
     probe.y = np.append(x, 0.0)
     probe.error, probe.control, probe.tried = track.error.copy(), track.control.copy(), track.tried.copy()
     probe.counters = np.zeros_like(track.counters)
+    if probe.pace.charge:
+        finest = FINEST * float(track.control[readout.PEAK_U])
+        probe.pace = probe.pace._replace(tol=max(_FINER * probe.pace.tol, finest))
     probe.t_out, probe.left, probe.out = np.zeros(0), np.zeros(0, bool), np.empty((track.out.shape[0], 0))
     probe.keep(steps)
     code = probe.advance(table, stop)
