@@ -126,12 +126,12 @@ def _leap(track: Track, table: SourceTable, settling: Settling, stop: float) -> 
     room = _ROOM * len(series_here)
     for k in range(n):
         x = x0.copy()
-        x[k] += settling.distance
+        x[k] += settling.probe
         probe = _period(track, table, stop, x, room)
         marks = probe.marks_like(here)
-        slope[:, k] = (probe.track.y - end) / settling.distance
-        marks_by[:, k] = (marks - here.marks) / settling.distance
-        by[k] = (probe.series(marks) - series_here) / settling.distance
+        slope[:, k] = (probe.track.y - end) / settling.probe
+        marks_by[:, k] = (marks - here.marks) / settling.probe
+        by[k] = (probe.series(marks) - series_here) / settling.probe
     base_x = x0 + _moved(slope[:n], end[:n] - x0, left)
     base = _period(track, table, stop, base_x, room)
     marks = base.marks_like(here)

@@ -21,6 +21,8 @@ _SHARE = 1.0 / 3.0
 # Distance to the periodic state, over the root of allowed error and peak, at which the map of a period may be linear
 # enough; found out by trying.
 _NEAR = 10.0
+# How far it is looked around, over that distance, at least: nearer by, differences of periods are rounding.
+_PROBE = 0.1
 # Steps that a leap's calls cost, in all and in each of its periods: one per live voltage and three more.
 _CALLS, _CALL = 50, 10
 # Coupling changes the rates of the stack with its area frozen; by how much they may be too large.
@@ -107,17 +109,25 @@ class Settling:
     @property
     def may_leap(self) -> bool:
         """Whether what is left after the last look is nearly periodic, and long enough."""
-        return self.allowed < self.distance <= self.near and self._is_far(self.periods_left(self._last_look))
+        return self.distance <= self.near and self._is_far(self.periods_left(self._last_look))
 
     def _is_far(self, left: float) -> bool:
         """Whether a leap saves twice what it costs, in steps."""
-        saved = min(self._until(self.allowed / self.remaining), left) * self._steps
+        if self.distance > self.allowed:
+            left = min(self._until(self.allowed / self.remaining), left)
+        # Else only the charge has to wait, which the errors of steps may keep from ever settling.
+        saved = left * self._steps
         return saved > 2.0 * ((self._modes + 3) * (self._steps + _CALL) + _CALLS)
 
     @property
     def _last_look(self) -> float:
         assert self._looked is not None
         return self.start + self._looked[0] * self.period
+
+    @property
+    def probe(self) -> float:
+        """How far to move a live voltage to see what the end of a period owes to its start, V."""
+        return max(self.distance, _PROBE * self.near)
 
     def leapt(self, periods: int, x: FloatArray) -> None:
         """Go on from live voltages (n,), that many periods after the last look."""

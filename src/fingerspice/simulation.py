@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import time
 import warnings
@@ -269,13 +270,23 @@ def _add_error(run: Run, u_gap: float, f_el: float | None = None) -> None:
     run.error = dataclasses.replace(run.error, u_gap=run.error.u_gap + u_gap, f_el=run.error.f_el + f_el)
 
 
+# Of a long run, so that its memory does not grow with its length.
+_BREAKPOINTS_AT_ONCE = 65_536
+
+
 def _at_breakpoints(problem: Problem | NetworkProblem, t: FloatArray) -> FloatArray:
     """Times moved onto the breakpoint they miss by rounding, so that 5 ms means the jump at 5 ms."""
-    edges = problem.breakpoints()
-    near = edges[misses(t, edges, same_time(1.0))] if edges.size else edges
-    moved = t.copy() if near.size else t
-    for edge in near:
-        moved[np.abs(t - edge) <= same_time(1.0) * abs(edge)] = edge
+    windows = 1 + int((problem.t_stop - problem.t_start) * problem.waveform.breakpoint_rate() / _BREAKPOINTS_AT_ONCE)
+    moved = t
+    for w0, w1 in itertools.pairwise(np.linspace(problem.t_start, problem.t_stop, windows + 1)):
+        edges = problem.breakpoints() if windows == 1 else problem.waveform.breakpoints(w0, w1)
+        near = edges[misses(t, edges, same_time(1.0))] if edges.size else edges
+        moved = t.copy() if near.size and moved is t else moved
+        slack = same_time(1.0) * np.abs(near)
+        for edge, first, last in zip(
+            near, t.searchsorted(near - slack), t.searchsorted(near + slack, "right"), strict=True
+        ):
+            moved[first:last] = edge
     return moved
 
 
