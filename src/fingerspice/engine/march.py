@@ -57,6 +57,8 @@ IntArray = NDArray[np.int64]
 DONE, NO_STEP, OUT_OF_RANGE, TOO_MANY = 0, 1, 2, 3
 # Step over the one before, at most; and what of it may be foreseen growth.
 _MOST_GROWTH, _MOST_TREND = 8.0, 2.5
+# Over a length once found too long: if the error allows this much, what made it so has passed.
+_REFUTED = 1.5
 
 
 class Work(NamedTuple):
@@ -291,6 +293,8 @@ def march(
                 control[ALLOWED] = h * factor
                 proposed = h * min(_MOST_GROWTH, max(0.5, factor * min(max(growth, 1.0), _MOST_TREND)))
                 proposed = max(proposed, wanted if h < wanted else 0.0)
+                if h * factor > _REFUTED * control[TOO_LONG]:
+                    control[TOO_LONG] = 0.0
                 if control[TOO_LONG] > 0.0:
                     proposed = min(proposed, 0.93 * control[TOO_LONG])
                     control[TOO_LONG] *= growth if growth > 1.5 else 1.03
