@@ -78,6 +78,23 @@ def _say(text: str = "", end: str = "\n") -> None:
             raise InputError(f"cannot write to the standard output: {error.strerror}") from None
 
 
+def _report(as_json: bool, figures: Callable[[], dict[str, Any]], text: Callable[[], str], files: list[Path]) -> None:
+    """What a command found and wrote, in the language asked for."""
+    if as_json:
+        _say(json_text({**figures(), "files": [str(f) for f in files]}))
+        return
+    _say(text())
+    for file in files:
+        _say(f"wrote {file}")
+
+
+def _target(deck: Path, out: Path, end: str) -> Path:
+    """A file named after a deck, which may be written."""
+    file = out / f"{deck.stem}{end}"
+    check_output(file, deck)
+    return file
+
+
 @contextmanager
 def _warnings_as_lines() -> Iterator[None]:
     """Our own warnings as plain lines on stderr, each once."""
@@ -168,10 +185,8 @@ def run(
         if circuit.tran is None:
             raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic]")
         note_skin_frequency(circuit)
-        data = out / f"{deck.stem}.{'csv' if csv else 'nc'}"
-        picture = None if no_plot else out / f"{deck.stem}.png"
-        for file in (data, picture):
-            check_output(file, deck)
+        data = _target(deck, out, ".csv" if csv else ".nc")
+        picture = None if no_plot else _target(deck, out, ".png")
         _announce_compilation()
         with _progress() as progress:
             solution = simulate(
@@ -181,14 +196,9 @@ def run(
         for text in solution.warnings:
             warnings.warn(text, FingerspiceWarning, stacklevel=1)
     files = _write_run(solution, data, picture) if solution.t.size else []
-    if as_json:
-        failure = None if solution.failure is None else solution.failure.to_dict()
-        report = {**solution.summary(), "success": solution.success, "message": solution.message, "failure": failure}
-        _say(json_text({**report, "files": [str(f) for f in files]}))
-    else:
-        _say(summary_table(solution))
-        for file in files:
-            _say(f"wrote {file}")
+    failure = None if solution.failure is None else solution.failure.to_dict()
+    ended = {"success": solution.success, "message": solution.message, "failure": failure}
+    _report(as_json, lambda: {**solution.summary(), **ended}, lambda: summary_table(solution), files)
     if solution.failure is not None:
         raise SolveError(solution.failure, solution)
 
@@ -243,9 +253,8 @@ def ac(
 
     with _warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
-        data, picture = out / f"{deck.stem}_ac.csv", None if no_plot else out / f"{deck.stem}_ac.png"
-        for file in (data, picture):
-            check_output(file, deck)
+        data = _target(deck, out, "_ac.csv")
+        picture = None if no_plot else _target(deck, out, "_ac.png")
         if sweep is not None:
             frequencies = sweep_frequencies(options.sweep(sweep))
         elif circuit.ac is not None:
@@ -269,14 +278,10 @@ def ac(
         from fingerspice.plotting import plot_phasor, save
 
         files.append(save(plot_phasor(results, circuit), picture))
-    if as_json:
-        sweeps = [phasor_dict(r) for r in results]
-        report = sweeps[0] if len(sweeps) == 1 else {"sweeps": sweeps}
-        _say(json_text({**report, "files": [str(f) for f in files]}))
-    else:
-        _say(phasor_tables(results))
-        for file in files:
-            _say(f"wrote {file}")
+    sweeps = [phasor_dict(r) for r in results] if as_json else []
+    _report(
+        as_json, lambda: sweeps[0] if len(sweeps) == 1 else {"sweeps": sweeps}, lambda: phasor_tables(results), files
+    )
 
 
 @app.command()
@@ -333,8 +338,7 @@ def compare(
     with _warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
         note_skin_frequency(circuit)
-        picture = None if no_plot else out / f"{deck.stem}_compare.png"
-        check_output(picture, deck)
+        picture = None if no_plot else _target(deck, out, "_compare.png")
         _announce_compilation()
         with _failure_as_json(as_json):
             result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
@@ -343,12 +347,7 @@ def compare(
         from fingerspice.plotting import plot_comparison, save
 
         files.append(save(plot_comparison(result), picture))
-    if as_json:
-        _say(json_text({**result.to_dict(), "files": [str(f) for f in files]}))
-        return
-    _say(comparison_table(result))
-    for file in files:
-        _say(f"wrote {file}")
+    _report(as_json, result.to_dict, lambda: comparison_table(result), files)
 
 
 @app.command()
@@ -373,9 +372,8 @@ def limits(
 
     with _warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
-        table, picture = out / f"{deck.stem}_limits.csv", None if no_plot else out / f"{deck.stem}_limits.png"
-        check_output(table, deck)
-        check_output(picture, deck)
+        table = _target(deck, out, "_limits.csv")
+        picture = None if no_plot else _target(deck, out, "_limits.png")
         _announce_compilation()
         result = fold_limits(circuit, points=points, span=span)
     files = [limits_csv(result, table)]
@@ -383,12 +381,7 @@ def limits(
         from fingerspice.plotting import save
 
         files.append(save(plot_limits(result), picture))
-    if as_json:
-        _say(json_text({**result.to_dict(), "files": [str(f) for f in files]}))
-        return
-    _say(limits_text(result))
-    for file in files:
-        _say(f"wrote {file}")
+    _report(as_json, result.to_dict, lambda: limits_text(result), files)
 
 
 @app.command()

@@ -126,10 +126,8 @@ def json_text(data: dict[str, Any]) -> str:
     return json.dumps(clean(data), indent=2, allow_nan=False)
 
 
-def check_output(file: Path | None, deck: Path | None = None) -> None:
+def check_output(file: Path, deck: Path | None = None) -> None:
     """Refuse an output that cannot be written, or is the deck, before spending time on the run; writes nothing."""
-    if file is None:
-        return
     folder = file.parent
     while not folder.exists() and folder != folder.parent and not folder.is_symlink():
         folder = folder.parent
