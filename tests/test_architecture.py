@@ -41,6 +41,7 @@ ORDER = (
         "nodal",
         "superposition",
         "diagnosis",
+        "cautions",
         "foreign",
         "periodic",
         "planning",

@@ -194,3 +194,24 @@ def test_a_run_that_ends_at_a_jump_but_for_rounding_ends_after_it(deck, options,
         longer = fs.simulate(circuit, t_stop=stop + 1e-5, t_eval=t, rtol=1e-6, **options)
         assert short.u_source[-1] == longer.u_source[-1] == 200.0
         assert abs(short.u_gap[-1] - longer.u_gap[-1]) <= 2e-6 * np.abs(longer.u_gap).max()
+
+
+def test_a_gap_behind_an_insulating_coating_rests_at_zero_volt():
+    # At DC the coating takes it all: what is left in the gap is the rounding of 100 V.
+    circuit = table1().replace({"Vdrive": fs.DC(100.0), "Xcoat.r": math.inf})
+    with pytest.warns(fs.FingerspiceWarning, match="no more than rounding of the source's voltage"):
+        solution = fs.simulate(circuit, t_stop=0.01, start="dc")
+    assert np.abs(solution.u_gap).max() <= 1e-12
+    assert solution.error.u_gap >= np.abs(solution.u_gap).max()
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_a_run_may_start_from_a_gap_at_rest_behind_an_insulating_coating(law):
+    circuit = table1().replace({"Vdrive": fs.Sine(50.0, 100.0, offset=100.0), "Xcoat.r": math.inf})
+    solution = fs.simulate(circuit, t_stop=0.01, start="dc", charge_law=law)
+    assert abs(solution.u_gap[0]) <= 1e-12
+    # What the offset has left in the coating is no more than a shift of the start: without it, the same.
+    without = fs.simulate(circuit.replace({"Vdrive": fs.Sine(50.0, 100.0)}), t_stop=0.01, start="dc", charge_law=law)
+    assert (
+        np.abs(solution.u_gap - without.u_gap).max() <= (1e-7 if law == "local" else 0.2) * np.abs(without.u_gap).max()
+    )

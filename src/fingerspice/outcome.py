@@ -139,6 +139,10 @@ class ErrorEstimate:
     f_el: float
     q_source: float | None = None
 
+    def at_least(self, u_gap: float, f_el: float) -> ErrorEstimate:
+        """With no less than these, V and N."""
+        return ErrorEstimate(max(self.u_gap, u_gap), max(self.f_el, f_el), self.q_source)
+
 
 @dataclass(frozen=True)
 class State:

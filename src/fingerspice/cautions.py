@@ -1,0 +1,93 @@
+"""What a user should be warned of in a run that ended well: beyond what the models, or the materials, are made for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from fingerspice.circuit.circuit import Element
+from fingerspice.network_record import NetworkRecord
+from fingerspice.networks import NetworkProblem
+from fingerspice.nodal import NetworkRun
+from fingerspice.outcome import Status
+from fingerspice.physics.contact import inverse_area
+from fingerspice.problem import Problem
+from fingerspice.record import Record
+from fingerspice.runs import Run
+from fingerspice.spectrum import spectrum_warning
+
+BREAKDOWN_VOLTAGE = 300.0
+# Contact area over that at 0 V.
+LEAST_AREA = 0.2
+# Distance to the fold of the mobile law: the voltage that would reach it is a few percent larger.
+NEAR_FOLD = 0.2
+
+
+def stack_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
+    """Where a run leaves what its model holds for."""
+    outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
+    if outside is not None:
+        yield outside
+    stack = problem.stack
+    if stack.contact is not None:
+        least = 1.0 / inverse_area(run.peak_u, problem.model.curve)[0]
+        yield from _gap_warnings("", run.peak_u, problem.model.area0, least if problem.model.coupled else math.inf)
+    if run.status is Status.SUCCESS and 0.0 < run.peak_u <= run.error.u_gap:
+        yield (
+            f"the gap takes no more than rounding of the source's voltage: of its {run.peak_u:.2g} V nothing is known "
+            "but that they are as good as 0"
+        )
+    yield from _fold_warning(run)
+    yield from _strength_warnings(stack.layers, record)
+
+
+def network_warnings(problem: NetworkProblem, run: NetworkRun, record: NetworkRecord) -> Iterator[str]:
+    outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
+    if outside is not None:
+        yield outside
+    several = len(record.fingers) > 1
+    for finger, i in enumerate(problem.network.fingers):
+        least = float(record.finger_area(finger).min(initial=math.inf))
+        where = f" of {record.fingers[finger][0]}" if several else ""
+        follows = problem.scene.fixed[i] is None
+        yield from _gap_warnings(
+            where, float(run.peaks[i]), float(problem.scene.area0[i]), least if follows else math.inf
+        )
+    yield from _fold_warning(run)
+    yield from _strength_warnings(problem.network.layers, record)
+
+
+def _gap_warnings(where: str, peak: float, unloaded: float, least: float) -> Iterator[str]:
+    """Of a gap with its largest voltage (V), its area at 0 V and its smallest one (m^2)."""
+    if peak > BREAKDOWN_VOLTAGE:
+        yield (
+            f"the gap voltage{where} reaches {peak:.4g} V; air breaks down above about {BREAKDOWN_VOLTAGE:g} V "
+            "(Paschen minimum 327 V), which the model does not contain"
+        )
+    if least < LEAST_AREA * unloaded:
+        yield (
+            f"the contact area{where} falls to {1e6 * least:.3g} mm^2, below {100.0 * LEAST_AREA:g} % of the "
+            f"{1e6 * unloaded:.3g} mm^2 at 0 V: the contact model was not made for so little"
+        )
+
+
+def _fold_warning(run: Run | NetworkRun) -> Iterator[str]:
+    if run.margin < NEAR_FOLD and run.status is Status.SUCCESS:
+        yield (
+            f"the fold of the mobile charge law is near: the distance to it falls to {run.margin:.2g} (1 far, 0 at the "
+            "fold)"
+        )
+
+
+def _strength_warnings(layers: tuple[Element, ...], record: Record | NetworkRecord) -> Iterator[str]:
+    for i, layer in enumerate(layers):
+        strength = layer.values.get("e_max", math.inf)
+        if math.isfinite(strength) and record.t.size:
+            field = float(np.abs(record.u_layer[:, i]).max()) / layer.values["d"]
+            if field > strength:
+                yield (
+                    f"the field in {layer.name} reaches {field:.3g} V/m at the outputs; its dielectric strength is "
+                    f"{strength:.3g} V/m"
+                )
