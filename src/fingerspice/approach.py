@@ -23,9 +23,9 @@ from fingerspice.engine import repeat as repetition
 from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
 from fingerspice.runs import FloatArray
 from fingerspice.settling import Settling
-from fingerspice.track import FINEST, KEPT_STEPS, Track
+from fingerspice.track import FINEST, KEPT_STEPS, SAFETY, Track
 
-# Tolerance of its steps, over that of others, where the charge is wanted: what it is off is off in every period.
+# Tolerance of its steps, over that of others: what it is off is off in every period that is made of it.
 _FINER = 0.01
 # Steps of a period over those of another.
 _ROOM = 4
@@ -57,6 +57,12 @@ class _Period:
     marks: FloatArray
     fixed: FloatArray
 
+    @property
+    def off(self) -> FloatArray:
+        """Estimated error of the live voltages at its end, by its own steps, V."""
+        error = self.track.error
+        return np.asarray(self.track.prepared.system.live[int(error[-1])] @ error[:-1])
+
     def series(self, marks: FloatArray) -> FloatArray:
         """Chebyshev coefficients (n_step, n_column, ROWS) of the outputs between marks (s) of a period."""
         t = marks[:-1, None] + np.diff(marks)[:, None] * POINTS[:NODES]
@@ -82,11 +88,11 @@ def _period(track: Track, table: SourceTable, stop: float, x: FloatArray, steps:
     """A period of so many steps at most from live voltages x on, integrated to `stop` (s) by a copy of the track."""
     probe = copy.copy(track)
     probe.y = np.append(x, 0.0)
-    probe.error, probe.control, probe.tried = track.error.copy(), track.control.copy(), track.tried.copy()
+    probe.error, probe.control, probe.tried = np.zeros_like(track.error), track.control.copy(), track.tried.copy()
+    probe.error[-1] = track.error[-1]
     probe.counters = np.zeros_like(track.counters)
-    if probe.pace.charge:
-        finest = FINEST * float(track.control[readout.PEAK_U])
-        probe.pace = probe.pace._replace(tol=max(_FINER * probe.pace.tol, finest))
+    finest = FINEST * float(track.control[readout.PEAK_U])
+    probe.pace = track.pace._replace(tol=max(_FINER * track.pace.tol, finest))
     probe.t_out, probe.left, probe.out = np.zeros(0), np.zeros(0, bool), np.empty((track.out.shape[0], 0))
     probe.keep(steps)
     code = probe.advance(table, stop)
@@ -123,11 +129,13 @@ def _leap(track: Track, table: SourceTable, settling: Settling, stop: float) -> 
     slope = np.empty((n + 1, n))
     marks_by = np.empty((here.marks.size, n))
     by = np.empty((n, *series_here.shape))
+    offs = []
     room = _ROOM * len(series_here)
     for k in range(n):
         x = x0.copy()
         x[k] += settling.probe
         probe = _period(track, table, stop, x, room)
+        offs.append(probe.off)
         marks = probe.marks_like(here)
         slope[:, k] = (probe.track.y - end) / settling.probe
         marks_by[:, k] = (marks - here.marks) / settling.probe
@@ -150,13 +158,17 @@ def _leap(track: Track, table: SourceTable, settling: Settling, stop: float) -> 
     slowest = float(slowest[slowest < 1.0 - 1e-9].max(initial=0.0))
     # What the map misses of a period's charge goes with the square of the distance.
     owed = abs(float(missed[n])) * min(left, 1.0 / (1.0 - slowest**2))
-    error = max(float(track.control[readout.MAGNIFIED]) * later + off + late, owed / track.capacitance)
+    # What steps are off goes into the map, and is collected for as long as it is remembered.
+    noise = base.off + (np.array(offs) - here.off).T @ (delta / settling.probe)
+    later += SAFETY * max(float(np.abs(noise).max()), float(np.abs(_moved(slope[:n], noise, left)).max()))
+    still = _STILL * settling.allowed
+    error = max(float(track.control[readout.MAGNIFIED]) * (later + still) + off + late, owed / track.capacitance)
     if not error <= settling.allowed:
         settling.stumbled(error / settling.allowed)
         return
     state = np.append(x0, track.y[n])
     track.counters[readout.OUTPUT] = repetition.approach(
-        marks, marks_by, series, by, slope, base_x, base.track.y, state, track.shown, _STILL * settling.allowed,
+        marks, marks_by, series, by, slope, base_x, base.track.y, state, track.shown, still,
         settling.period, left, int(track.counters[readout.OUTPUT]), track.t_out, track.left, track.out,
     )  # fmt: skip
     control, before = base.track.control, here.track.control

@@ -20,10 +20,8 @@ from fingerspice.runs import (
     from_rows,
 )  # fmt: skip
 from fingerspice.settling import Settling
-from fingerspice.track import FINEST, Prepared, Track, prepare_system
+from fingerspice.track import FINEST, SAFETY, Prepared, Track, prepare_system
 
-# The largest error between nodes may stand beside the two points where it is looked for, and signs may cancel there.
-SAFETY = 2.5
 # The error allowed in a step, over the one asked for: the force doubles it, and steps add up.
 LOCAL_SHARE = 0.15
 # Steps per shortest time scale of the source: the points of a step must not alias it.

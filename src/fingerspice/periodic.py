@@ -13,11 +13,11 @@ from fingerspice.circuit.sampling import SourceTable, source_table
 from fingerspice.engine import march, shooting
 from fingerspice.engine.pace import Pace
 from fingerspice.errors import InputError, SolveError
-from fingerspice.marching import LOCAL_SHARE, LONGEST_STEP, SAFETY
+from fingerspice.marching import LOCAL_SHARE, LONGEST_STEP
 from fingerspice.numerics import linear
 from fingerspice.outcome import ErrorEstimate, Failure, Status
 from fingerspice.problem import Problem, state_from
-from fingerspice.track import FINEST, prepare_system
+from fingerspice.track import FINEST, SAFETY, prepare_system
 
 FloatArray = NDArray[np.float64]
 

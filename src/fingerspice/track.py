@@ -20,6 +20,8 @@ from fingerspice.problem import Problem, Scene
 from fingerspice.runs import BoolArray, FloatArray, after_the_end, from_rows, row_width
 from fingerspice.settling import Settling
 
+# The largest error between nodes may stand beside the two points where it is looked for, and signs may cancel there.
+SAFETY = 2.5
 # The smallest error of a step that is more than rounding, over the voltage scale.
 FINEST = 4e-15
 # Of 1/A, relative: finer, the polynomial would give way to the long series, which nobody's voltage can tell.
