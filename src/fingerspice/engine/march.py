@@ -37,6 +37,7 @@ from fingerspice.engine.readout import (
     T,
     account,
     at,
+    dip,
     error_at,
     first_wrong,
     layers,
@@ -250,6 +251,7 @@ def march(
         run_error = 0.0
         magnified = 1.0
         wrong = 0
+        below = 0.0
         flip = False
         wanted = control[H]
         while True:
@@ -275,6 +277,15 @@ def march(
                 # The step starts at a zero and leaves on the other side.
                 flip = True
                 break
+            below = dip(u_rows, sign, tol, wrong, coefficients[0]) if coupled and closed else 0.0
+            if 0.0 < below < POINTS[1] and sign * u_rows[0] <= 1e-9 * abs(u_rows[1]):
+                # The step starts at a zero and is soon back there: a shorter one will see it.
+                counters[REJECTED] += 1
+                h = rung(2.0 * below * h)
+                wanted = h
+                control[H] = h
+                flips = 0
+                continue
             step_error = math.inf
             if closed:
                 step_error, run_error, magnified = assess(
@@ -332,8 +343,8 @@ def march(
         if t_new >= stop or stop - t_new <= 1e-12 * h:
             t_new = stop
             theta = min(1.0, (stop - t) / h)
-        if wrong > 0 and flips < 2:
-            crossing = zero(u_rows, control[SIGN], wrong, coefficients[0])
+        if (wrong > 0 or below > 0.0) and flips < 2:
+            crossing = zero(u_rows, control[SIGN], wrong, below, coefficients[0])
             if t + crossing * h <= t_new and crossing <= theta:
                 theta = crossing
                 t_new = t + crossing * h
@@ -392,7 +403,11 @@ def march(
             control[BRANCH_START] = t_new
             counters[ZEROS] += 1
             # The area has a kink here: fast modes start anew.
-            if control[H_AFTER_ZERO] > 0.0:
+            if below > 0.0:
+                # It will soon be back.
+                control[H] = 2.0 * (below - theta) * h
+                control[ALLOWED] = 0.0
+            elif control[H_AFTER_ZERO] > 0.0:
                 control[H] = control[H_AFTER_ZERO]
                 control[ALLOWED] = 0.0
             fresh = H_AFTER_ZERO

@@ -82,14 +82,58 @@ def _value_and_slope(series: FloatArray, x: float) -> tuple[float, float]:
 
 
 @jit
-def zero(u: FloatArray, sign: float, last: int, series: FloatArray) -> float:
-    """Fraction of the step at which the gap voltage leaves its branch, between nodes `last` - 1 and `last`."""
+def dip(u: FloatArray, sign: float, tol: float, wrong: int, series: FloatArray) -> float:
+    """Fraction of the step at which the gap voltage is farthest off its branch between two nodes that are on it, or 0.
+
+    Looked for before node `wrong`, if that is not 0; what is off by no more than `tol` (V) is no matter.
+    """
+    last = wrong if wrong > 0 else NODES
+    for j in range(last):
+        here = sign * u[j]
+        before = sign * u[j - 1] - here if j > 0 else 0.0
+        after = sign * u[j + 1] - here if j + 1 < last else 0.0
+        # A parabola through three nodes goes below the lowest by less than that.
+        if before < 0.0 or after < 0.0 or here > before + after or (j + 1 == last and wrong > 0):
+            continue
+        lo = POINTS[max(j - 1, 0)]
+        hi = POINTS[min(j + 1, NODES - 1)]
+        series_of(u, series)
+        _, slope_lo = _value_and_slope(series, 2.0 * lo - 1.0)
+        _, slope_hi = _value_and_slope(series, 2.0 * hi - 1.0)
+        if not (sign * slope_lo < 0.0 < sign * slope_hi):
+            continue
+        for _ in range(40):
+            mid = 0.5 * (lo + hi)
+            _, slope = _value_and_slope(series, 2.0 * mid - 1.0)
+            if sign * slope < 0.0:
+                lo = mid
+            else:
+                hi = mid
+        lowest, _ = _value_and_slope(series, lo + hi - 1.0)
+        if sign * lowest < -tol:
+            return float(0.5 * (lo + hi))
+    return 0.0
+
+
+@jit
+def zero(u: FloatArray, sign: float, last: int, below: float, series: FloatArray) -> float:
+    """Fraction of the step at which the gap voltage leaves its branch.
+
+    Between nodes `last` - 1 and `last`, or, where `below` is not 0, before that fraction of the step and after the last
+    node before it.
+    """
+    if below > 0.0:
+        last = 1
+        while POINTS[last] < below:
+            last += 1
     lo: float = POINTS[last - 1]
-    hi: float = POINTS[last]
+    hi: float = POINTS[last] if below == 0.0 else below
     if not sign * u[last - 1] > 0.0:
         return lo
     series_of(u, series)
-    theta: float = lo + (hi - lo) * u[last - 1] / (u[last - 1] - u[last])
+    theta: float = 0.5 * (lo + hi)
+    if below == 0.0:
+        theta = lo + (hi - lo) * u[last - 1] / (u[last - 1] - u[last])
     # Newton, in a bracket that only closes; after a move of 1e-9 its next one is below rounding.
     for _ in range(60):
         value, slope = _value_and_slope(series, 2.0 * theta - 1.0)
