@@ -166,3 +166,33 @@ def test_a_carrier_of_20_khz_under_an_envelope_of_1_hz() -> None:
     assert np.abs(solution.u_layer - expected).max() <= 1e-8 * peak + rounded
     assert solution.error.u_gap <= 1.001e-8 * peak
     assert solution.stats["steps"] <= 5 * 20_000
+
+
+# A fast mode behind the kink: a decay of a hundredth of a step, or a zero that is soon taken back ---------------
+
+HIDDEN = {
+    "decay": (851.0, fs.Sine(25.27, 851.0, offset=7.7), {"Xcoat.r": 1817.0, "Xgap.r": 4.6e8, "Xgap.d": 1.3865e-5}),
+    "zeros": (
+        1406.0,
+        fs.Sine(36.55, 1406.0) + fs.Sine(21.93, 2812.0),
+        {"Xcoat.r": 36973.62608915747, "Xgap.r": 697266.7456424526, "Xgap.d": 6.889344375310366e-06},
+    ),
+}
+
+
+@pytest.mark.parametrize("rtol", [1e-5, 1e-7, 1e-9])
+@pytest.mark.parametrize("law", ["local", "mobile"])
+@pytest.mark.parametrize("case", HIDDEN)
+def test_nothing_hides_between_the_nodes_of_a_step(case: str, law: str, rtol: float) -> None:
+    f, source, changes = HIDDEN[case]
+    circuit = table1().replace({"Vdrive": source, **changes})
+    t = np.linspace(78.0 / f, 81.0 / f, 20_001)[1:-1]
+    options = {"t_stop": 81.0 / f, "t_eval": t, "charge_law": law, "charge": False}
+    solution = fs.simulate(circuit, rtol=rtol, **options)
+    # Runge-Kutta steps see every zero by other means.
+    other = fs.simulate(circuit, rtol=1e-11, method="dop853", **options)
+    peak = np.abs(other.u_gap).max()
+    off = np.abs(solution.u_gap - other.u_gap).max()
+    assert off <= solution.error.u_gap + other.error.u_gap
+    assert off <= rtol * peak
+    assert np.abs(solution.area / other.area - 1.0).max() <= 10.0 * rtol
