@@ -296,15 +296,20 @@ def _run(
         return solve_foreign(problem, library, name, rtol, t_out, left), method
     if method in ("auto", "exponential"):
         run = solve_marching(problem, rtol, t_out, left, progress, repeat=method == "auto")
-        if run.status is not Status.FOLD or method == "exponential":
+        stopped = problem.model.mobile and run.status in (Status.FOLD, Status.TOO_MANY_STEPS)
+        if not stopped or method == "exponential":
             return run, "exponential"
-        from fingerspice.folding import run_to_fold
+        from fingerspice.folding import lead_to_fold, run_to_fold
+        from fingerspice.stepping import solve
 
         folded = run_to_fold(problem, t_out, left)
         if folded is not None:
             return folded, "exponential"
-        # Near a fold, but none: for a method that solves the area equation at every evaluation.
-        method = "dop853"
+        # A fold that is not near, or none: for an implicit method, which no fast mode holds up.
+        run = solve(problem, rtol, TABLEAUS["radau9"], t_out, left, progress)
+        if run.status is Status.FOLD:
+            run = lead_to_fold(problem, run, t_out, left) or run
+        return run, "radau9"
     if method not in TABLEAUS:
         known = ["auto", "exponential", *TABLEAUS, "scipy:NAME", "torchdiffeq:NAME"]
         raise InputError(f"unknown method {method!r}; allowed: {', '.join(known)}")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import SourceTable
 from fingerspice.engine import advance as loop
-from fingerspice.engine.model import Segment, choose_branch, source, write_row
+from fingerspice.engine.model import Segment, source, write_row
 from fingerspice.engine.readout import TRIED
 from fingerspice.engine.steps import Method
 from fingerspice.numerics.tableaus import Tableau
@@ -18,6 +18,10 @@ from fingerspice.problem import Problem
 from fingerspice.runs import ROUNDING, BoolArray, FloatArray, Progress, Run, Tables, after_the_end, from_rows, row_width
 
 LOG_ROWS = 4096
+# Steps taken and refused, to begin with and over the run; one that needs more would take hours, for no good reason.
+FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
+# Beside the codes of `advance`.
+TOO_MANY = -1
 # The shadow run's tolerance over the main run's: far enough that their difference is the main run's error.
 SHADOW = 0.03
 # The estimate is the largest difference met in the middle and at the end of steps; between them it may be larger.
@@ -49,12 +53,19 @@ class Track:
         self.control[loop.T] = self.problem.t_start
         self.control[loop.U_BEFORE] = start.u_before
         self.control[loop.MARGIN] = 1.0
+        if self.problem.model.mobile and abs(start.u_gap) > 0.0:
+            self.control[loop.U_GAP], self.control[loop.SIGN] = start.u_gap, np.sign(start.u_gap)
         self.counters = np.zeros(loop.N_COUNTERS, np.int64)
         self.tried = np.zeros((TRIED, 4))
 
     @property
     def t(self) -> float:
         return float(self.control[loop.T])
+
+    @property
+    def steps(self) -> int:
+        """Steps taken and refused."""
+        return int(self.counters[loop.ACCEPTED] + self.counters[loop.REJECTED])
 
     @property
     def log_rows(self) -> FloatArray:
@@ -85,9 +96,7 @@ class Track:
         segment = Segment(start, float(table.edges[i + 1]) - start, table.terms[i], table.series[i])
         row = np.empty(row_width(self.problem))
         u, du = source(segment, self.t - start)
-        # A jump that failed has left its own branch in `control`.
-        sign = choose_branch(self.problem.model, u, self.y)
-        write_row(self.problem.model, u, du, self.y, sign, self.problem.model.k_gap * u, row)
+        write_row(self.problem.model, u, du, self.y, self.control[loop.SIGN], self.control[loop.U_GAP], row)
         return row if np.all(np.isfinite(row)) else None
 
     def finish(self, table: SourceTable) -> None:
@@ -170,11 +179,15 @@ def integrate(
             if shadow:
                 other.follow(table, main)
             meter.compare(main.log_rows, other.rows if shadow else None)
+            done = (main.t - problem.t_start) / (problem.t_stop - problem.t_start)
             if progress is not None:
-                progress((main.t - problem.t_start) / (problem.t_stop - problem.t_start))
-        if code in (loop.NO_SOLUTION, loop.STEP_UNDERFLOW):
+                progress(done)
+            if code == loop.LOG_FULL and main.steps > FIRST_STEPS + done * MOST_STEPS:
+                code = TOO_MANY
+        if code in (loop.NO_SOLUTION, loop.STEP_UNDERFLOW, TOO_MANY):
             folding = problem.model.mobile and problem.model.coupled
             status = Status.FOLD if folding else Status.STEP_UNDERFLOW
+            status = Status.TOO_MANY_STEPS if code == TOO_MANY else status
             t_failed = main.t
             break
         if table.not_finite is not None:
@@ -211,6 +224,7 @@ def integrate(
             float(main.control[loop.U_BEFORE]),
             problem.initial.charge_offset,
             problem.scene.charge_law,
+            float(main.control[loop.U_GAP]),
         ),
         t_failed=t_failed,
         margin=float(main.control[loop.MARGIN]),

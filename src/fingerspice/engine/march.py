@@ -11,17 +11,20 @@ from numpy.typing import NDArray
 from fingerspice.compiled import borrow, jit
 from fingerspice.engine.charge import charge_step
 from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, weigh
-from fingerspice.engine.model import Segment, branch_area, source
+from fingerspice.engine.model import Segment, branch_area, dot, source, turns_at_zero
 from fingerspice.engine.pace import Pace, change_level, choose_step, enter, nearest_level, rung, take_branch
 from fingerspice.engine.readout import (
     ACCEPTED,
     ALLOWED,
     BRANCH_LENGTH,
     BRANCH_START,
+    FIRST_PASSES,
     H_AFTER_EDGE,
     H_AFTER_ZERO,
     KEPT,
     MAGNIFIED,
+    MARGIN,
+    MOST_PASSES,
     MOST_STEPS,
     NFEV,
     OUTPUT,
@@ -198,10 +201,15 @@ def march(
     if edges[0] < control[T]:
         index = np.searchsorted(edges, control[T], side="right") - 2
     most = counters[ACCEPTED] + counters[REJECTED] + MOST_STEPS
+    begun, evaluated = control[T], counters[NFEV]
     while control[T] < t_end:
         t = control[T]
         if counters[ACCEPTED] + counters[REJECTED] > most:
             return TOO_MANY
+        if mobile and counters[NFEV] - evaluated > NODES * FIRST_PASSES:
+            done = (t - begun) / (t_end - begun)
+            if counters[NFEV] - evaluated > NODES * (FIRST_PASSES + done * MOST_PASSES):
+                return TOO_MANY
         if t >= edge:
             index += 1
             start = edges[index]
@@ -211,7 +219,8 @@ def march(
             segment_terms, segment_series = terms[index], series[index]
             u_source, _ = source(Segment(start, edge - start, segment_terms, segment_series), t - start)
             if mobile or charge:
-                enter(model, charge, u_source, y, control)
+                if not enter(model, charge, u_source, y, control):
+                    return NO_STEP
             else:
                 control[U_GAP] = k_gap * u_source
                 for i in range(n):
@@ -222,8 +231,6 @@ def march(
             control[TOO_LONG] = 0.0
             control[ALLOWED] = 0.0
             fresh = H_AFTER_EDGE
-            if control[U_GAP] != control[U_GAP]:
-                return NO_STEP
         t0 = t - start
         stop = min(edge, t_end)
         if q0.size > 1 or level < 0:
@@ -319,6 +326,9 @@ def march(
                 h = rung(h * min(0.9, max(0.25, factor)))
                 wanted = h
         if flip:
+            if turns_at_zero(model, r[X_GAP, 0], -control[SIGN]):
+                control[MARGIN] = 0.0
+                return NO_STEP
             control[SIGN] = -control[SIGN]
             flips += 1
             continue
@@ -386,6 +396,11 @@ def march(
             control[BRANCH_LENGTH] = t_new - control[BRANCH_START]
             control[BRANCH_START] = t_new
             counters[ZEROS] += 1
+            if turns_at_zero(model, dot(gap_share, y), control[SIGN]):
+                control[T] = t_new
+                control[SIGN] = -control[SIGN]
+                control[MARGIN] = 0.0
+                return NO_STEP
             # The area has a kink here: fast modes start anew.
             if control[H_AFTER_ZERO] > 0.0:
                 control[H] = control[H_AFTER_ZERO]
