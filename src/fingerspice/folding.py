@@ -27,6 +27,13 @@ FloatArray = NDArray[np.float64]
 FINEST_RTOL = 1e-12
 # A fold is met at this distance, and looked for over so many of the shortest time constants.
 NOTHING_LEFT, LONGEST = 1e-10, 1e12
+# A path to a fold takes a few thousand evaluations.
+MOST_EVALUATIONS = 20_000
+
+
+class _LostError(Exception):
+    """A path took too many evaluations."""
+
 
 
 def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | None:
@@ -164,7 +171,13 @@ def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path 
         margin, speed = voltage_by_time(model, u_here, du_here, here[:n], sign, here[n + 1], dy)
         return float(margin), float(speed)
 
+    left = MOST_EVALUATIONS
+
     def slope(_: float, z: FloatArray) -> FloatArray:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise _LostError
         margin, speed = at(z)
         along: FloatArray = np.concatenate([dy * margin, [margin, speed]]) * pace / scale
         return along
@@ -185,7 +198,10 @@ def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path 
     for event in events:
         event.terminal = True
     # The mode that is to fold may be faster than all else and follow it: an explicit method would not get there.
-    found = solve_ivp(
-        slope, (0.0, LONGEST), begin, "Radau", rtol=rtol, atol=rtol, events=events, dense_output=True
-    )  # fmt: skip
+    try:
+        found = solve_ivp(
+            slope, (0.0, LONGEST), begin, "Radau", rtol=rtol, atol=rtol, events=events, dense_output=True
+        )  # fmt: skip
+    except _LostError:
+        return None
     return _Path(t, segment, sign, scale, found.sol) if found.t_events[0].size else None

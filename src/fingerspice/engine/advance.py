@@ -28,7 +28,7 @@ from fingerspice.engine.steps import Method, dense_polynomial, dense_state, take
 FloatArray = NDArray[np.float64]
 
 # Codes returned by `advance`.
-DONE, LOG_FULL, NO_SOLUTION, STEP_UNDERFLOW = 0, 1, 2, 3
+DONE, LOG_FULL, NO_SOLUTION, STEP_UNDERFLOW, TOO_MANY = 0, 1, 2, 3, 4
 # Entries of `control`: time, next step (0: choose one), branch of the area (0: choose one), source voltage
 # just before the time reached, last gap voltage, smallest distance to the fold met in logged places.
 T, H, SIGN, U_BEFORE, U_GAP, MARGIN = 0, 1, 2, 3, 4, 5
@@ -36,6 +36,8 @@ N_CONTROL = 6
 # Entries of `counters`: evaluations, steps accepted and rejected, zeros met, outputs written, log rows written.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, LOGGED = 0, 1, 2, 3, 4, 5
 N_COUNTERS = 6
+# Steps taken and refused in one call, at most.
+MOST_STEPS = 20_000
 # Distance at which a fold counts as met.
 _AT_FOLD = 1e-6
 
@@ -325,7 +327,7 @@ def advance(
     Returns
     -------
     int
-        DONE, LOG_FULL (call again), NO_SOLUTION (past a fold at the time reached) or STEP_UNDERFLOW.
+        DONE, LOG_FULL (call again), NO_SOLUTION (past a fold at the time reached), STEP_UNDERFLOW or TOO_MANY steps.
     """
     k = np.zeros((method.a.shape[0], y.size))
     poly = np.zeros((y.size, method.dense.shape[1]))
@@ -334,7 +336,10 @@ def advance(
     counters[LOGGED] = 0
     flips = 0
     index = np.searchsorted(edges, control[T], side="right") - 1
+    most = counters[ACCEPTED] + counters[REJECTED] + MOST_STEPS
     while control[T] < t_end:
+        if counters[ACCEPTED] + counters[REJECTED] > most:
+            return TOO_MANY
         t = control[T]
         while edges[index + 1] <= t:
             index += 1
