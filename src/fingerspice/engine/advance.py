@@ -38,8 +38,8 @@ NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, LOGGED = 0, 1, 2, 3, 4, 5
 N_COUNTERS = 6
 # Steps taken and refused in one call, at most.
 MOST_STEPS = 20_000
-# Distance at which a fold counts as met.
-_AT_FOLD = 1e-6
+# Distance at which a fold counts as met, and at which it is near.
+_AT_FOLD, _NEAR_FOLD = 1e-6, 1e-3
 
 
 @jit
@@ -187,6 +187,7 @@ def _controlled_step(
     segment: Segment,
     t: float,
     remaining: float,
+    least: float,
     y: FloatArray,
     scale: FloatArray,
     control: FloatArray,
@@ -195,7 +196,7 @@ def _controlled_step(
     y1: FloatArray,
     tried: FloatArray,
 ) -> tuple[float, bool]:
-    """Step until the error is met. Returns the step (0: none is small enough) and whether it ends the segment."""
+    """Step until the error is met. Returns the step (0: none above `least` is small enough) and if it ends the segment."""
     t0 = t - segment.start
     h, last = _choose_step(model, method, remaining, control, k[0], scale)
     while True:
@@ -214,7 +215,7 @@ def _controlled_step(
         h *= min(0.9, max(0.2, factor))
         control[H] = h
         last = False
-        if h <= 1e-15 * max(abs(t), 1e-3 * segment.length):
+        if h <= least:
             return 0.0, False
 
 
@@ -353,14 +354,20 @@ def advance(
             return NO_SOLUTION
         control[U_GAP] = u
         stop = min(edges[index + 1], t_end)
+        least = 1e-15 * max(abs(t), 1e-3 * segment.length)
         if model.mobile:
             q, dq = branch_area(model, control[SIGN], u)
-            # So close to a fold steps are rounding of the time.
-            if 1.0 - dot(model.gap, y) * model.area0 * dq < _AT_FOLD:
+            margin = 1.0 - dot(model.gap, y) * model.area0 * dq
+            if margin < _AT_FOLD:
                 return NO_SOLUTION
+            if margin < _NEAR_FOLD:
+                # What rounding leaves of the way is not worth its many steps.
+                least = max(least, 1e-10 * (t - segment.start))
             # The state is a voltage at the area of 0 V.
             allowed[:] = scale / (model.area0 * q)
-        h, last = _controlled_step(model, method, segment, t, stop - t, y, allowed, control, counters, k, y1, tried)
+        h, last = _controlled_step(
+            model, method, segment, t, stop - t, least, y, allowed, control, counters, k, y1, tried
+        )
         if h == 0.0:
             return STEP_UNDERFLOW
         dense_polynomial(k, method.dense, h, poly)

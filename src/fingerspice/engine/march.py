@@ -310,8 +310,8 @@ def march(
             # Near the end of the area's polynomial no step ends beyond it: the kink there would be crept up to.
             if coupled and abs(control[U_GAP]) > 0.9 * u_top and np.abs(u_rows).max() > u_top:
                 return OUT_OF_RANGE
-            # Refused at this length: a singularity, of which rounding hides the last bit.
-            if h <= 1e-13 * max(abs(t), 1e-3 * (edge - start)):
+            # Refused at this length, which is rounding of the time: a singularity.
+            if h <= 1e-15 * abs(t) + 1e-25 * (edge - start):
                 return NO_STEP
             # Close to a fold the iteration closes on short steps only: methods that solve the area equation at
             # every evaluation get there sooner.
