@@ -296,13 +296,12 @@ def _run(
         return solve_foreign(problem, library, name, rtol, t_out, left), method
     if method in ("auto", "exponential"):
         run = solve_marching(problem, rtol, t_out, left, progress, repeat=method == "auto")
-        stopped = problem.model.mobile and run.status in (Status.FOLD, Status.TOO_MANY_STEPS)
-        if not stopped or method == "exponential":
+        if run.status not in (Status.FOLD, Status.TOO_MANY_STEPS) or method == "exponential":
             return run, "exponential"
         from fingerspice.folding import lead_to_fold, run_to_fold
         from fingerspice.stepping import solve
 
-        folded = run_to_fold(problem, t_out, left)
+        folded = run_to_fold(problem, t_out, left) if run.status is Status.FOLD else None
         if folded is not None:
             return folded, "exponential"
         # A fold that is not near, or none: for an implicit method, which no fast mode holds up.

@@ -197,6 +197,7 @@ def march(
     index = -1
     start = 0.0
     edge = control[T]
+    since = 0.0
     segment_terms, segment_series = terms[0], series[0]
     if edges[0] < control[T]:
         index = np.searchsorted(edges, control[T], side="right") - 2
@@ -206,7 +207,7 @@ def march(
         t = control[T]
         if counters[ACCEPTED] + counters[REJECTED] > most:
             return TOO_MANY
-        if mobile and counters[NFEV] - evaluated > NODES * FIRST_PASSES:
+        if counters[NFEV] - evaluated > NODES * FIRST_PASSES:
             done = (t - begun) / (t_end - begun)
             if counters[NFEV] - evaluated > NODES * (FIRST_PASSES + done * MOST_PASSES):
                 return TOO_MANY
@@ -216,6 +217,8 @@ def march(
             edge = edges[index + 1]
             if edge <= t:
                 continue
+            # Time is counted from the edge: what decays after it may be faster than the rounding of t.
+            since = t - start
             segment_terms, segment_series = terms[index], series[index]
             u_source, _ = source(Segment(start, edge - start, segment_terms, segment_series), t - start)
             if mobile or charge:
@@ -231,8 +234,8 @@ def march(
             control[TOO_LONG] = 0.0
             control[ALLOWED] = 0.0
             fresh = H_AFTER_EDGE
-        t0 = t - start
         stop = min(edge, t_end)
+        length = stop - start
         if q0.size > 1 or level < 0:
             now = 0
             if q0.size > 1:
@@ -251,7 +254,7 @@ def march(
             w0[k] = 0.0
             for i in range(n):
                 w0[k] += project[k, i] * y[i]
-        h = choose_step(pace, tau, coupled, segment_series.size > 0, t, stop - t, control)
+        h = choose_step(pace, tau, coupled, segment_series.size > 0, t, length - since, control)
         run_error = 0.0
         magnified = 1.0
         wrong = 0
@@ -265,7 +268,7 @@ def march(
                 h_slot = h
                 decay, phi, miss = all_decay[slot], all_phi[slot], all_miss[slot]
                 weigh(rates, gap, decay, h, weight)
-            source_rows(segment_terms, segment_series, edge - start, t0, h, charge, r)
+            source_rows(segment_terms, segment_series, edge - start, since, h, charge, r)
             sign = control[SIGN]
             if mobile:
                 for i in range(ROWS):
@@ -311,7 +314,7 @@ def march(
             if coupled and abs(control[U_GAP]) > 0.9 * u_top and np.abs(u_rows).max() > u_top:
                 return OUT_OF_RANGE
             # Refused at this length, which is rounding of the time: a singularity.
-            if h <= 1e-15 * abs(t) + 1e-25 * (edge - start):
+            if h <= 1e-15 * since + 1e-25 * (edge - start):
                 return NO_STEP
             # Close to a fold the iteration closes on short steps only: methods that solve the area equation at
             # every evaluation get there sooner.
@@ -332,23 +335,24 @@ def march(
             control[SIGN] = -control[SIGN]
             flips += 1
             continue
-        t_new = t + h
+        reached = since + h
         theta = 1.0
         crossed = False
-        if t_new >= stop or stop - t_new <= 1e-12 * h:
-            t_new = stop
-            theta = min(1.0, (stop - t) / h)
+        if reached >= length or length - reached <= 1e-12 * h:
+            reached = length
+            theta = min(1.0, (length - since) / h)
         if wrong > 0 and flips < 2:
             crossing = zero(u_rows, control[SIGN], wrong, coefficients[0])
-            if t + crossing * h <= t_new and crossing <= theta:
+            if since + crossing * h <= reached and crossing <= theta:
                 theta = crossing
-                t_new = t + crossing * h
+                reached = since + crossing * h
                 crossed = True
-                if t_new <= t:
+                if reached <= since:
                     control[SIGN] = -control[SIGN]
                     flips += 1
                     continue
         flips = 0
+        t_new = stop if reached == length else start + reached
         if charge:
             charge_step(
                 model, rates, gain, gap, slow_share, w, pull, r, integral, h, y[n], places, theta, control,
@@ -406,7 +410,7 @@ def march(
                 control[H] = control[H_AFTER_ZERO]
                 control[ALLOWED] = 0.0
             fresh = H_AFTER_ZERO
-        control[T] = t_new
+        control[T], since = t_new, reached
         if t_new >= stop:
             control[U_BEFORE], _ = source(Segment(start, edge - start, segment_terms, segment_series), t_new - start)
         counters[ACCEPTED] += 1

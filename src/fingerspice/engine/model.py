@@ -247,7 +247,7 @@ def ramp(model: Model, k_u: float, x_gap: float, u: float) -> float:
         u = _walk(model, k_u, b, before, u, True)
         if u != 0.0:
             return u
-    return _walk(model, k_u, b, after, u, False)
+    return _walk(model, k_u, b, after, u, True)
 
 
 @jit
