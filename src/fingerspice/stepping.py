@@ -18,6 +18,8 @@ from fingerspice.problem import Problem
 from fingerspice.runs import ROUNDING, BoolArray, FloatArray, Progress, Run, Tables, after_the_end, from_rows, row_width
 
 LOG_ROWS = 1024
+# Error over the peak above which the time of a fold is not believed.
+FOLD_ERROR = 0.01
 # Steps taken and refused, the shadow's too, to begin with and over the run: what needs more has a cause that smaller
 # steps do not mend.
 FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
@@ -169,7 +171,9 @@ def integrate(
     rows = np.full((t_out.size, width), np.nan)
     log = np.empty((LOG_ROWS, 4))
     main = Track(problem, method, scale, t_out, left, rows, log)
-    other = Track(problem, method, SHADOW * scale, t_out[:0], left[:0], rows[:0], log[:0])
+    # Only voltages are compared.
+    finer = np.append(SHADOW * scale[:-1], np.inf)
+    other = Track(problem, method, finer, t_out[:0], left[:0], rows[:0], log[:0])
     meter = _Meter(problem)
     status, t_failed, last = Status.SUCCESS, None, None
     table = None
@@ -294,13 +298,18 @@ def solve(
             # Steps that small are held up by rounding: the attempt before is as good as it gets.
             run = before
             break
-        worst, before = run.excess(rtol), run
-        # A fold magnifies errors, but one that is met by a run that is all error means nothing.
-        met = 1.0 if run.status is Status.SUCCESS else 0.01 / rtol
-        if run.status not in (Status.SUCCESS, Status.FOLD) or worst <= met:
+        if run.status is Status.FOLD:
+            # A fold magnifies errors, but one that is met by a run that is half error may stand anywhere.
+            enough, less = run.error.u_gap <= FOLD_ERROR * run.peak_u, 0.01
+        elif run.status is Status.SUCCESS:
+            worst = run.excess(rtol)
+            enough, less = worst <= 1.0, min(0.3, 0.5 / worst) if worst > 0.0 else 0.3
+        else:
+            return run
+        if enough:
             return run
         if rtol * run.peak_u < ROUNDING * u_scale or tol <= finest:
             break
-        tol = max(tol * min(0.3, 0.5 / worst), finest)
+        tol, before = max(less * tol, finest), run
     run.status = Status.ERROR_NOT_MET
     return run

@@ -39,7 +39,7 @@ N_COUNTERS = 6
 # Steps taken and refused in one call, at most.
 MOST_STEPS = 20_000
 # Distance at which a fold counts as met, and at which it is near.
-_AT_FOLD, _NEAR_FOLD = 1e-6, 1e-3
+_AT_FOLD, _NEAR_FOLD = 1e-6, 1e-2
 
 
 @jit
@@ -362,7 +362,7 @@ def advance(
                 return NO_SOLUTION
             if margin < _NEAR_FOLD:
                 # What rounding leaves of the way is not worth its many steps.
-                least = max(least, 1e-10 * (t - segment.start))
+                least = max(least, 1e-8 * (t - segment.start))
             # The state is a voltage at the area of 0 V.
             allowed[:] = scale / (model.area0 * q)
         h, last = _controlled_step(
