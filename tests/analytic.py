@@ -1232,7 +1232,13 @@ def _sample(run: Transient, t: np.ndarray, side: str) -> Transient:
     for j, index in groups.items():
         step = run.steps[j]
         ti = t[index]
-        u[index], a[index] = _on_step(stack, nodes, step, ti)
+        try:
+            u[index], a[index] = _on_step(stack, nodes, step, ti)
+        except _NoStep:
+            # The last step before a fold may pass it by rounding.
+            if run.fold is None:
+                raise
+            continue
         x = np.clip(2.0 * (ti - step.t) / step.h - 1.0, -1.0, 1.0)
         leaked = step.q_leak + step.h * (nodes.antiderivative(x) @ step.leak)
         q[index] = leaked + np.array([stack.stored(v) - stored0 for v in u[index, stack.gap]])
@@ -1269,7 +1275,12 @@ def _collocate(
             system[m * n :, : m * n] = (np.eye(m)[:, :, None] * (by_w * unit)[:, None, :]).reshape(m, m * n)
             system[m * n :, m * n :] = np.diag(slope)
             left.append(-miss)
-        delta = np.linalg.solve(system, np.concatenate(left))
+        if not np.all(np.isfinite(system)):
+            raise _NoStep("newton")
+        try:
+            delta = np.linalg.solve(system, np.concatenate(left))
+        except np.linalg.LinAlgError:
+            raise _NoStep("newton") from None
         if not np.all(np.isfinite(delta)):
             raise _NoStep("newton")
         damping = 1.0
