@@ -998,7 +998,8 @@ class _Stack:
             if self.rise(u, kk, d) <= 0.0:
                 raise FoldError(d * miss(u), u)
             if self.rise(ahead, kk, -d) <= 0.0:
-                ahead = float(brentq(lambda v: self.rise(v, kk, math.copysign(1.0, u or d)), u or d * 1e-300, ahead))
+                side = math.copysign(1.0, u or d)
+                ahead = float(brentq(self.rise, u or d * 1e-300, ahead, args=(kk, side)))
                 if d * miss(ahead) < 0.0:
                     raise FoldError(d * miss(ahead), ahead)
             if d * miss(ahead) >= 0.0:
@@ -1271,7 +1272,8 @@ def _collocate(
         left, slope = [((h * nodes.integrate @ f - z) / unit).ravel()], 1.0
         if stack.mobile:
             miss, by_w, slope = stack.equation(drive, w0 + z, s, v, a, da)
-            system[: m * n, m * n :] = -h * (nodes.integrate[:, None, :] * jac[None, :, :, n].transpose(0, 2, 1)).reshape(m * n, m)
+            by_v = nodes.integrate[:, None, :] * jac[None, :, :, n].transpose(0, 2, 1)
+            system[: m * n, m * n :] = -h * by_v.reshape(m * n, m)
             system[m * n :, : m * n] = (np.eye(m)[:, :, None] * (by_w * unit)[:, None, :]).reshape(m, m * n)
             system[m * n :, m * n :] = np.diag(slope)
             left.append(-miss)
@@ -1381,7 +1383,8 @@ class _Run:
             least = 1e-12 * tau + 1e-25 * length
             try:
                 step, us = self.attempt(t, h, u, source, s)
-                error = float(np.max(np.abs(nodes.tail @ (step.w - step.w[0])) / stack.w_scale(u))) / (self.tol * self.scale)
+                tail = np.abs(nodes.tail @ (step.w - step.w[0])) / stack.w_scale(u)
+                error = float(np.max(tail)) / (self.tol * self.scale)
                 cut = _first_zero(stack, nodes, step, self.scale, us) if error <= 1.0 else None
             except _NoStep as reason:
                 if h < least:

@@ -35,7 +35,6 @@ class _LostError(Exception):
     """A path took too many evaluations."""
 
 
-
 def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | None:
     """A run under the `mobile` law that meets a fold, or jumps past one, up to that; None where it meets none.
 
@@ -197,9 +196,9 @@ def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path 
     events: list[Any] = [distance, ahead, away]
     for event in events:
         event.terminal = True
-    # The mode that is to fold may be faster than all else and follow it: an explicit method would not get there.
+
     def jacobian(s: float, z: FloatArray) -> FloatArray:
-        # By plain differences: scipy's own double their width for ever where nothing depends on an entry, as the charge.
+        # By plain differences: scipy's widen theirs for ever where nothing depends on an entry, as on the charge.
         here, columns = slope(s, z), []
         for i in range(z.size):
             moved = z.copy()
@@ -207,6 +206,7 @@ def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path 
             columns.append((slope(s, moved) - here) / (moved[i] - z[i]))
         return np.array(columns).T
 
+    # The mode that is to fold may be faster than all else and follow it: an explicit method would not get there.
     try:
         found = solve_ivp(
             slope, (0.0, LONGEST), begin, "Radau",

@@ -83,7 +83,8 @@ def simulate(
     method : str
         ``"auto"``, an own stepper (``"exponential"``, ``"dp5"``, ``"dop853"``, ``"radau9"``), ``"scipy:NAME"`` or
         ``"torchdiffeq:NAME"``. ``"auto"`` steps as ``"exponential"`` does, and once a period of the source no longer
-        changes the state it lets that period stand for those that follow; the others step every period.
+        changes the state it lets that period stand for those that follow; the others step every period. Where a fast
+        mode that the area moves lets only short steps converge, ``"auto"`` goes on as ``"radau9"``.
     tier : str
         ``"auto"``, or the model to take: ``"algebraic"``, ``"linear"`` or ``"coupled"`` (see `Plan`).
     start : str or Solution
@@ -304,7 +305,7 @@ def _run(
         folded = run_to_fold(problem, t_out, left) if run.status is Status.FOLD else None
         if folded is not None:
             return folded, "exponential"
-        # A fold that is not near, or none: for an implicit method, which no fast mode holds up.
+        # No fold is near, or none at all: for an implicit method, which no fast mode holds up.
         run = solve(problem, rtol, TABLEAUS["radau9"], t_out, left, progress)
         if run.status is Status.FOLD:
             run = lead_to_fold(problem, run, t_out, left) or run

@@ -196,7 +196,10 @@ def _controlled_step(
     y1: FloatArray,
     tried: FloatArray,
 ) -> tuple[float, bool]:
-    """Step until the error is met. Returns the step (0: none above `least` is small enough) and if it ends the segment."""
+    """Step until the error is met.
+
+    Returns the step (0: none above `least`, s, is small enough) and whether it ends the segment.
+    """
     t0 = t - segment.start
     h, last = _choose_step(model, method, remaining, control, k[0], scale)
     while True:

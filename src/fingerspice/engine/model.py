@@ -159,8 +159,8 @@ def branch_area(model: Model, sign: float, u: float) -> tuple[float, float]:
 def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: float) -> float:
     """Gap voltage (V): k U + x under `local`; under `mobile` the root of u = k U + x A_0 / A(|u|).
 
-    The root meant is the one connected to `guess`, a gap voltage not long before; with k U for a guess, to the uncharged
-    state. NaN where the branch holds no such root: past the fold.
+    The root meant is the one connected to `guess`, a gap voltage not long before; with k U for a guess, to the
+    uncharged state. NaN where the branch holds no such root: past the fold.
     """
     if not model.mobile or x_gap == 0.0:
         return k_u + x_gap
