@@ -208,8 +208,8 @@ def march(
         if counters[ACCEPTED] + counters[REJECTED] > most:
             return TOO_MANY
         if counters[NFEV] - evaluated > NODES * FIRST_PASSES:
-            done = (t - begun) / (t_end - begun)
-            if counters[NFEV] - evaluated > NODES * (FIRST_PASSES + done * MOST_PASSES):
+            longest = (t - begun) / pace.h_max
+            if counters[NFEV] - evaluated > NODES * (FIRST_PASSES + MOST_PASSES * longest):
                 return TOO_MANY
         if t >= edge:
             index += 1
