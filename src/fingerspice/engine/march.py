@@ -219,6 +219,7 @@ def march(
                 continue
             # Time is counted from the edge: what decays after it may be faster than the rounding of t.
             since = t - start
+            begun, evaluated = t, counters[NFEV]
             segment_terms, segment_series = terms[index], series[index]
             u_source, _ = source(Segment(start, edge - start, segment_terms, segment_series), t - start)
             if mobile or charge:
