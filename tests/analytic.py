@@ -860,29 +860,43 @@ class _Stack:
         _, a, da, _ = contact(v, self.params, self.k)
         return a, da
 
-    def _mobile_v(self, sp: np.ndarray, skk: np.ndarray) -> np.ndarray:
-        """v = s u_a on the stable branch of the mobile equation (see `fold_margin`), by monotone Newton.
+    def _mobile_v(self, sp: np.ndarray, skk: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """v = s u_a, the root of the mobile equation connected to a v at hand, by Newton.
 
-        s kk > 0: the residual is concave up to its maximum and negative at 0: from v = 0 upwards to the
-        first root. s kk < 0: convex, and positive at v = s p: from there downwards to the last root.
+        The residual is neither convex nor concave all the way: a step is shortened until the area changes by a third
+        at most and the residual still rises, so no fold is stepped over.
         """
-        v, last = np.where(skk < 0.0, np.maximum(sp, 0.0), 0.0), np.inf
-        for _ in range(80):
-            a, da = self.area(v)
-            slope = 1.0 + skk * self.a_zero * da / a**2
+        last = np.inf
+        a, da = self.area(v)
+        slope = 1.0 + skk * self.a_zero * da / a**2
+        for _ in range(100):
             if not np.all(slope > 0.0):
-                raise _NoStep("fold")
-            step = (v - sp - skk * self.a_zero / a) / slope
-            v = v - step
+                break
+            step = -(v - sp - skk * self.a_zero / a) / slope
             size = float(np.max(np.abs(step)))
             scale = float(np.max(np.abs(v)) + np.max(np.abs(sp)) + np.max(np.abs(skk)))
-            if size <= 1e-16 * scale or (size < 1e-12 * scale and size >= last):
+            # Close to a fold v is as uncertain as rounding over the slope.
+            left = size * float(np.min(slope))
+            if left <= 1e-16 * scale or (left < 1e-12 * scale and size >= last):
                 return v
             last = size
+            for _ in range(60):
+                a_new, da_new = self.area(v + step)
+                slope_new = 1.0 + skk * self.a_zero * da_new / a_new**2
+                fair = (slope_new > 0.0) & (np.abs(np.log(a_new / a)) < 0.3)
+                if np.all(fair):
+                    break
+                step = np.where(fair, step, 0.5 * step)
+            v, a, da, slope = v + step, a_new, da_new, slope_new
         raise _NoStep("fold")
 
-    def fields(self, source: np.ndarray, w: np.ndarray, s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """u (m, n), A (m,), dA/dv (m,) for source (m,), w (m, n) and the sign s of u_a on this piece."""
+    def fields(
+        self, source: np.ndarray, w: np.ndarray, s: float, v: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """u (m, n), A (m,), dA/dv (m,) for source (m,), w (m, n) and the sign s of u_a on this piece.
+
+        `mobile` takes v = s u_a (m,) as it is given, whether it solves the area equation or not (see `closed`).
+        """
         b = w @ self.b_of_w.T
         free = source[:, None] * self.share
         if not self.mobile:
@@ -890,9 +904,30 @@ class _Stack:
             a, da = self.area(s * u[:, self.gap])
             return u, a, da
         j = self.gap
-        v = self._mobile_v(s * free[:, j], s * b[:, j] / (self.c[j] * self.a_zero))
         a, da = self.area(v)
-        return free + b / (self.c * a[:, None]), a, da
+        u = free + b / (self.c * a[:, None])
+        u[:, j] = s * v
+        return u, a, da
+
+    def closed(
+        self, source: np.ndarray, w: np.ndarray, s: float, v: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`fields` with the area equation solved from a v nearby."""
+        if self.mobile:
+            j = self.gap
+            kk = w @ self.b_of_w[j] / (self.c[j] * self.a_zero)
+            v = self._mobile_v(s * source * self.share[j], s * kk, v)
+        return self.fields(source, w, s, v)
+
+    def equation(
+        self, source: np.ndarray, w: np.ndarray, s: float, v: np.ndarray, a: np.ndarray, da: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What the area equation of `mobile` misses, V, and its slopes by w (m, n) and by v (m,), 0 at a fold."""
+        j = self.gap
+        b = w @ self.b_of_w[j]
+        miss = v - s * source * self.share[j] - s * b / (self.c[j] * a)
+        by_w = -s * self.b_of_w[j] / (self.c[j] * a[:, None])
+        return miss, by_w, 1.0 + s * b * da / (self.c[j] * a**2)
 
     def rates(self, u: np.ndarray, a: np.ndarray) -> np.ndarray:
         """w' (m, n)."""
@@ -901,17 +936,17 @@ class _Stack:
         return u * (self.g_total / a[:, None] + self.g_area)
 
     def rates_jacobian(self, w: np.ndarray, u: np.ndarray, a: np.ndarray, da: np.ndarray, s: float) -> np.ndarray:
-        """d w' / d w, (m, n, n)."""
+        """d w' / d w, (m, n, n); under `mobile` at a v held, with d w' / d v after it, (m, n, n + 1)."""
         j = self.gap
         if self.mobile:
             b = w @ self.b_of_w.T
-            du = self.b_of_w[None] / (self.c * a[:, None])[:, :, None]
-            fold = 1.0 + s * b[:, j] * da / (self.c[j] * a**2)
-            dua = du[:, j, :] / fold[:, None]
-            dadw = (s * da)[:, None] * dua
-            du = du - (b / (self.c * a[:, None] ** 2))[:, :, None] * dadw[:, None, :]
-            g = self.g_total + a[:, None] * self.g_area
-            return g[:, :, None] * du + (u * self.g_area)[:, :, None] * dadw[:, None, :]
+            du = np.empty((len(a), self.n, self.n + 1))
+            du[:, :, :-1] = self.b_of_w[None] / (self.c * a[:, None])[:, :, None]
+            du[:, :, -1] = -b / self.c * (da / a**2)[:, None]
+            du[:, j, :-1], du[:, j, -1] = 0.0, s
+            du *= (self.g_total + a[:, None] * self.g_area)[:, :, None]
+            du[:, :, -1] += u * self.g_area * da[:, None]
+            return du
         du = np.broadcast_to(self.b_of_w / self.c[:, None], (len(a), self.n, self.n))
         dadw = (s * da)[:, None] * du[:, j, :]
         g = self.g_total / a[:, None] + self.g_area
@@ -919,13 +954,13 @@ class _Stack:
 
     def gauge(self, u: np.ndarray) -> np.ndarray:
         """Leaked charges that stand for the layer voltages u in the gauge D = 0 (Q = 0)."""
-        if not self.mobile:
-            return -self.c * u
-        return -self.c * u * float(self.area(np.abs(u[self.gap : self.gap + 1]))[0][0])
+        return -self.w_scale(u) * u
 
-    def w_scale(self) -> np.ndarray:
-        """w per volt, for tolerances."""
-        return self.c * (self.a_zero if self.mobile else 1.0)
+    def w_scale(self, u: np.ndarray) -> np.ndarray:
+        """w per volt, for tolerances, at layer voltages u."""
+        if not self.mobile:
+            return self.c
+        return self.c * float(self.area(np.abs(u[self.gap : self.gap + 1]))[0][0])
 
     def jump(self, u: np.ndarray, source: float) -> np.ndarray:
         """Layer voltages after the source has jumped to `source` from layer voltages u."""
@@ -933,17 +968,44 @@ class _Stack:
             return u + self.share * (source - float(np.sum(u)))
         b = self.b_of_w @ self.gauge(u)
         j = self.gap
-        ua = mobile_gap_voltage(
-            source * self.share[j], b[j] / (self.c[j] * self.a_zero), self.params, self.k, u[j] or None
-        )
+        ua = self._ramped(source * self.share[j], float(b[j]) / (self.c[j] * self.a_zero), float(u[j]))
         a = float(self.area(np.array([abs(ua)]))[0][0])
-        return source * self.share + b / (self.c * a)
+        after = source * self.share + b / (self.c * a)
+        after[j] = ua
+        return after
 
-    def margin(self, source: float, w: np.ndarray, branch: float) -> tuple[float, float]:
-        """`fold_margin` of a state (mobile law)."""
-        j = self.gap
-        kk = float((self.b_of_w @ w)[j]) / (self.c[j] * self.a_zero)
-        return fold_margin(source * self.share[j], kk, self.params, self.k, branch)
+    def rise(self, u: float, kk: float, side: float) -> float:
+        """d p / d u of the mobile equation p = u - kk A(0)/A(|u|), on the given side of 0: 0 at a fold."""
+        a, da = (float(x[0]) for x in self.area(np.array([abs(u)])))
+        return 1.0 + math.copysign(1.0, u or side) * kk * self.a_zero * da / a**2
+
+    def _ramped(self, p: float, kk: float, u: float) -> float:
+        """Gap voltage where the source's share has gone to p along a ramp too fast for any leak.
+
+        With kk held, u moves along p(u) = u - kk A(0)/A(|u|) as long as that rises. Raises FoldError where it ends.
+        """
+
+        def miss(v: float) -> float:
+            return v - kk * self.a_zero / float(self.area(np.array([abs(v)]))[0][0]) - p
+
+        d = -math.copysign(1.0, miss(u))
+        _, _, x_per_u, sigma_per_u2, c = _contact_constants(self.params, self.k)
+        knee = min(0.5 / x_per_u, 0.5 / math.sqrt(sigma_per_u2 * math.sqrt(c)))
+        while d * miss(u) < 0.0:
+            ahead = u + d * max(0.02 * abs(u), 0.01 * knee)
+            if ahead * u < 0.0:
+                ahead = 0.0
+            if self.rise(u, kk, d) <= 0.0:
+                raise FoldError(d * miss(u), u)
+            if self.rise(ahead, kk, -d) <= 0.0:
+                side = math.copysign(1.0, u or d)
+                ahead = float(brentq(self.rise, u or d * 1e-300, ahead, args=(kk, side)))
+                if d * miss(ahead) < 0.0:
+                    raise FoldError(d * miss(ahead), ahead)
+            if d * miss(ahead) >= 0.0:
+                return float(brentq(miss, u, ahead, xtol=1e-300, rtol=1e-15))
+            u = ahead
+        return u
 
     def stored(self, u: float) -> float:
         """Charge taken up by the gap capacitor between 0 and u, C: c_a int A du (local), c_a A u (mobile)."""
@@ -1015,6 +1077,7 @@ class _Step:
     s: float
     source: Waveform
     w: np.ndarray  # (stages + 1, n): start value and stages
+    v: np.ndarray  # (stages + 1,): s u_a there
     leak: np.ndarray  # (stages,): current through the gap resistance, A
     force: np.ndarray  # (stages,): F_el, N
     q_leak: float  # integrals up to t
@@ -1024,7 +1087,10 @@ class _Step:
 
 @dataclass(frozen=True)
 class Fold:
-    """Where the `mobile` law lost its solution: time s, gap voltage V, source V, margin V just before."""
+    """Where the `mobile` law lost its solution: time s, gap voltage V, source V just before, and what was left.
+
+    `margin`: of the rise of p(u) (see `_Stack.rise`), 0 at the fold; past it, after a jump, how far p is off, V.
+    """
 
     t: float
     u_gap: float
@@ -1131,9 +1197,16 @@ def _find(steps: Sequence[_Step], t: float, side: str) -> _Step:
 
 def _fields_on_step(stack: _Stack, nodes: _Nodes, step: _Step, t: np.ndarray) -> tuple[np.ndarray, ...]:
     """Layer voltages (m, n), area (m,) and dA/d(s u_a) (m,) at times t inside one step."""
-    x = np.clip(2.0 * (t - step.t) / step.h - 1.0, -1.0, 1.0)
+    return _fields_at(stack, nodes, step, np.clip((t - step.t) / step.h, 0.0, 1.0))
+
+
+def _fields_at(stack: _Stack, nodes: _Nodes, step: _Step, theta: np.ndarray) -> tuple[np.ndarray, ...]:
+    """As `_fields_on_step`, at fractions of the step: its length may be a rounding of its time."""
+    x = 2.0 * theta - 1.0
     w = nodes.interpolation(x) @ step.w
-    return stack.fields(np.asarray(step.source(t), dtype=float) + np.zeros_like(t), w, step.s)
+    nearby = step.v[np.argmin(np.abs(x[:, None] - nodes.full), axis=1)]
+    drive = np.asarray(step.source(step.t + theta * step.h), dtype=float) + np.zeros_like(theta)
+    return stack.closed(drive, w, step.s, nearby)
 
 
 def _on_step(stack: _Stack, nodes: _Nodes, step: _Step, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -1160,7 +1233,13 @@ def _sample(run: Transient, t: np.ndarray, side: str) -> Transient:
     for j, index in groups.items():
         step = run.steps[j]
         ti = t[index]
-        u[index], a[index] = _on_step(stack, nodes, step, ti)
+        try:
+            u[index], a[index] = _on_step(stack, nodes, step, ti)
+        except _NoStep:
+            # The last step before a fold may pass it by rounding.
+            if run.fold is None:
+                raise
+            continue
         x = np.clip(2.0 * (ti - step.t) / step.h - 1.0, -1.0, 1.0)
         leaked = step.q_leak + step.h * (nodes.antiderivative(x) @ step.leak)
         q[index] = leaked + np.array([stack.stored(v) - stored0 for v in u[index, stack.gap]])
@@ -1177,28 +1256,46 @@ def _collocate(
     drive = np.asarray(source(t + h * nodes.tau), dtype=float) + np.zeros(m)
     if not np.all(np.isfinite(drive)):
         raise ValueError(f"source is not finite in [{t}, {t + h}] s")
-    z, unit = np.zeros((m, n)), stack.w_scale()
-    us, a, da = stack.fields(drive, w0 + z, s)
-    for _ in range(40):
+    z, unit, v = np.zeros((m, n)), stack.w_scale(u), np.full(m, s * u[stack.gap])
+    # The gap voltage is an unknown of its own under `mobile`: at a fold it does not follow from w any more.
+    extra = m if stack.mobile else 0
+    for _ in range(60):
+        us, a, da = stack.fields(drive, w0 + z, s, v)
         f = stack.rates(us, a)
         f = f - f[:, stack.gap, None]  # gauge: the gap's w stands still, so w is constant at DC
         jac = stack.rates_jacobian(w0 + z, us, a, da, s)
-        jac = jac - jac[:, stack.gap, None, :]
-        blocks = nodes.integrate[:, None, :, None] * jac.transpose(1, 0, 2)[None]
-        system = np.eye(m * n) - h * blocks.reshape(m * n, m * n)
-        delta = np.linalg.solve(system, (h * nodes.integrate @ f - z).ravel()).reshape(m, n)
+        jac = (jac - jac[:, stack.gap, None, :]) / unit[:, None]
+        jac[:, :, :n] *= unit
+        blocks = nodes.integrate[:, None, :, None] * jac[:, :, :n].transpose(1, 0, 2)[None]
+        system = np.eye(m * n + extra)
+        system[: m * n, : m * n] -= h * blocks.reshape(m * n, m * n)
+        left, slope = [((h * nodes.integrate @ f - z) / unit).ravel()], 1.0
+        if stack.mobile:
+            miss, by_w, slope = stack.equation(drive, w0 + z, s, v, a, da)
+            by_v = nodes.integrate[:, None, :] * jac[None, :, :, n].transpose(0, 2, 1)
+            system[: m * n, m * n :] = -h * by_v.reshape(m * n, m)
+            system[m * n :, : m * n] = (np.eye(m)[:, :, None] * (by_w * unit)[:, None, :]).reshape(m, m * n)
+            system[m * n :, m * n :] = np.diag(slope)
+            left.append(-miss)
+        if not np.all(np.isfinite(system)):
+            raise _NoStep("newton")
+        try:
+            delta = np.linalg.solve(system, np.concatenate(left))
+        except np.linalg.LinAlgError:
+            raise _NoStep("newton") from None
         if not np.all(np.isfinite(delta)):
             raise _NoStep("newton")
-        for damping in (1.0, 0.5, 0.25, 0.1, 0.01, 0.0):
-            if damping == 0.0:
+        damping = 1.0
+        if stack.mobile:
+            # No farther at once than the area changes by a third.
+            while damping > 1e-6 and not np.all(np.abs(np.log(stack.area(v + damping * delta[m * n :])[0] / a)) < 0.3):
+                damping *= 0.5
+            v = v + damping * delta[m * n :]
+        z = z + damping * delta[: m * n].reshape(m, n) * unit
+        if damping == 1.0 and np.max(np.abs(delta)) <= 1e-9 * scale:
+            if not np.all(slope > 0.0):
                 raise _NoStep("fold")
-            try:  # an iterate beyond the fold of the mobile law: go less far
-                us, a, da = stack.fields(drive, w0 + z + damping * delta, s)
-                break
-            except _NoStep:
-                continue
-        z = z + damping * delta
-        if damping == 1.0 and np.max(np.abs(delta) / unit) <= 1e-9 * scale:
+            us, a, _ = stack.fields(drive, w0 + z, s, v)
             return np.vstack([w0, w0 + z]), us, a
     raise _NoStep("newton")
 
@@ -1212,10 +1309,10 @@ def _first_zero(stack: _Stack, nodes: _Nodes, step: _Step, scale: float, us: np.
         return None
 
     def value(x: float) -> float:
-        return float(step.s * _on_step(stack, nodes, step, np.array([step.t + x * step.h]))[0][0, j])
+        return float(step.s * _fields_at(stack, nodes, step, np.array([x]))[0][0, j])
 
     grid = np.union1d(np.append(nodes.tau, 1.0), tau)
-    values = step.s * _on_step(stack, nodes, step, step.t + grid * step.h)[0][:, j]
+    values = step.s * _fields_at(stack, nodes, step, grid)[0][:, j]
     bad = int(np.argmax(values < -noise))
     if values[bad] >= -noise:
         return None
@@ -1247,13 +1344,14 @@ class _Run:
             s,
             source,
             w,
+            s * np.append(u[stack.gap], ua),
             g * ua,
             stack.sigma_per_u2 * ua**2 * a,
             self.q_leak,
             self.force_integral,
             us[-1],
         )
-        end = _on_step(stack, self.nodes, step, np.array([t + h]))[0][0]
+        end = _fields_at(stack, self.nodes, step, np.array([1.0]))[0][0]
         return replace(step, u_end=end), us
 
     def sign(self, t: float, h: float, u: np.ndarray, source: Waveform) -> float:
@@ -1269,30 +1367,37 @@ class _Run:
                 h *= 0.25
         return 1.0
 
-    def segment(self, t: float, t1: float, u: np.ndarray, source: Waveform) -> np.ndarray:
-        """Integrate over one smooth segment; returns the voltages at its end (left-hand)."""
+    def segment(self, start: float, t1: float, u: np.ndarray, source: Waveform) -> np.ndarray:
+        """Integrate over one smooth segment; returns the voltages at its end (left-hand).
+
+        Time is counted from the start of the segment: what decays there may be faster than the rounding of t1.
+        """
         stack, nodes = self.stack, self.nodes
-        h, scales = t1 - t, stack.w_scale()
-        s = self.sign(t, min(h, 1e-3 * h), u, source)
-        while t < t1:
-            last = h >= (t1 - t) * (1.0 - 1e-12)
-            h = t1 - t if last else h
+        length = t1 - start
+        tau, h = 0.0, length
+        s = self.sign(start, 1e-3 * h, u, source)
+        while tau < length:
+            last = h >= (length - tau) * (1.0 - 1e-12)
+            h = length - tau if last else h
+            t = start + tau
+            least = 1e-12 * tau + 1e-25 * length
             try:
                 step, us = self.attempt(t, h, u, source, s)
-                error = float(np.max(np.abs(nodes.tail @ step.w) / scales)) / (self.tol * self.scale)
+                tail = np.abs(nodes.tail @ (step.w - step.w[0])) / stack.w_scale(u)
+                error = float(np.max(tail)) / (self.tol * self.scale)
+                cut = _first_zero(stack, nodes, step, self.scale, us) if error <= 1.0 else None
             except _NoStep as reason:
-                if h < 1e-9 * (t1 - t) + 1e-12 * abs(t1):
+                if h < least:
                     self.fold_at(t, u, source, s, str(reason))
                     return u
                 h *= 0.4
                 continue
             if error > 1.0:
                 h *= max(0.2, 0.8 * error ** (-1.0 / len(nodes.tau)))
-                if h < 1e-14 * abs(t1):
+                if h < least:
                     raise RuntimeError(f"step underflow at t = {t} s")
                 continue
             h_next = h * min(3.0, 0.85 * max(error, 1e-12) ** (-1.0 / len(nodes.tau)))
-            cut = _first_zero(stack, nodes, step, self.scale, us)
             if cut is not None:
                 h_cut = h * cut
                 for _ in range(2):  # once more: the cut step is not the same polynomial
@@ -1304,65 +1409,41 @@ class _Run:
             self.steps.append(step)
             self.q_leak += step.h * float(nodes.weights @ step.leak)
             self.force_integral += step.h * float(nodes.weights @ step.force)
-            t = t1 if last else t + step.h
+            tau = length if last else tau + step.h
             h = max(h_next - step.h, 0.2 * h_next) if cut is not None else h_next
             if cut is not None:
-                self.zeros.append(t)
+                self.zeros.append(start + tau)
                 s = -s
-            elif abs(u[stack.gap]) <= 1e-12 * self.scale and t < t1:
-                s = self.sign(t, 1e-3 * min(h, t1 - t), u, source)
+                if stack.mobile and stack.rise(0.0, self.stored(u), s) <= 0.0:
+                    # The area turns at 0 V, and with it the equation: no voltage leads on.
+                    now = start + tau
+                    self.fold = Fold(now, 0.0, float(source(np.float64(now))), 0.0)
+                    return u
+            elif abs(u[stack.gap]) <= 1e-12 * self.scale and tau < length:
+                s = self.sign(start + tau, 1e-3 * min(h, length - tau), u, source)
         return u
 
     def polish(self, step: _Step) -> float:
         """Step length after one Newton correction onto u_a = 0 at its end."""
-        j, d = self.stack.gap, 1e-3 * step.h
-        t = step.t + step.h
-        ends = _on_step(self.stack, self.nodes, step, np.array([t - d, t]))[0][:, j]
+        j, d = self.stack.gap, 1e-3
+        ends = _fields_at(self.stack, self.nodes, step, np.array([1.0 - d, 1.0]))[0][:, j]
         slope = (ends[1] - ends[0]) / d
         if slope == 0.0:
             return step.h
-        return step.h - float(np.clip(ends[1] / slope, -d, d))
+        return step.h * (1.0 - float(np.clip(ends[1] / slope, -d, d)))
+
+    def stored(self, u: np.ndarray) -> float:
+        """kk of `fold_margin` for layer voltages u."""
+        j = self.stack.gap
+        return float((self.stack.b_of_w @ self.stack.gauge(u))[j]) / (self.stack.c[j] * self.stack.a_zero)
 
     def fold_at(self, t: float, u: np.ndarray, source: Waveform, s: float, reason: str) -> None:
-        """Record the fold: extrapolate the margin to zero as M = const (t_fold - t)^p through the last
-        states.
-
-        p is 1 where u_a runs into the fold with a square-root singularity, 2 where it is slaved to a slow
-        drift (gap time constant far below the drift, as at a tiny load).
-        """
+        """Record the fold, which steps have come up to until they were rounding of the time."""
         stack = self.stack
-        if not stack.mobile:
-            raise RuntimeError(f"collocation failed at t = {t} s ({reason}), u = {u} V")
-
-        def margin(time: float, state: np.ndarray) -> tuple[float, float]:
-            return stack.margin(float(source(np.float64(time))), stack.gauge(state), s)
-
-        m3, u_fold = margin(t, u)
-        if not math.isfinite(m3):
-            raise RuntimeError(f"collocation failed at t = {t} s ({reason}) far from a fold, u = {u} V")
-        history = [(t, max(m3, 1e-300))]
-        for before, step in zip(self.steps[-2::-1], self.steps[:0:-1], strict=True):
-            now = margin(step.t, before.u_end)[0]
-            if step.s != s or step.source is not source or not math.isfinite(now) or len(history) == 3:
-                break
-            if now > 1.5 * history[-1][1]:
-                history.append((step.t, now))
-        t_fold = t
-        if len(history) > 1:  # p = 1, the answer where the states are too close to tell more
-            (t3, m3), (t2, m2) = history[:2]
-            t_fold = t3 + m3 * (t3 - t2) / (m2 - m3)
-        if len(history) == 3 and history[0][0] - history[1][0] > 1e-9 * abs(t):
-            (t3, m3), (t2, m2), (t1, m1) = history
-
-            def power(tf: float) -> float:
-                return math.log(m1 / m2) * math.log((tf - t2) / (tf - t3)) - math.log(m2 / m3) * math.log(
-                    (tf - t1) / (tf - t2)
-                )
-
-            low, high = t3 + 1e-4 * (t3 - t2), t3 + 10.0 * (t3 - t1)
-            if power(low) * power(high) < 0.0:
-                t_fold = float(brentq(power, low, high, xtol=1e-18, rtol=1e-15))
-        self.fold = Fold(t_fold, u_fold, float(source(np.float64(t_fold))), float(m3))
+        rise = stack.rise(float(u[stack.gap]), self.stored(u), s) if stack.mobile else math.inf
+        if not rise < 1e-3:
+            raise RuntimeError(f"collocation failed at t = {t} s ({reason}), u = {u} V, {rise} from a fold")
+        self.fold = Fold(t, float(u[stack.gap]), float(source(np.float64(t))), rise)
 
 
 def dc_operating_point(

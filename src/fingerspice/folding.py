@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import OdeSolution, solve_ivp
 
-from fingerspice.engine.model import Segment, choose_branch, dot, gap_voltage, source, voltage_by_time, write_row_at
+from fingerspice.engine.model import Segment, dot, ramp, source, voltage_by_time, write_row_at
 from fingerspice.errors import SolveError
 from fingerspice.marching import solve as solve_marching
 from fingerspice.outcome import Failure, State, Status
@@ -26,7 +26,13 @@ FloatArray = NDArray[np.float64]
 
 FINEST_RTOL = 1e-12
 # A fold is met at this distance, and looked for over so many of the shortest time constants.
-NOTHING_LEFT, LONGEST = 1e-10, 1e4
+NOTHING_LEFT, LONGEST = 1e-10, 1e12
+# A path to a fold takes a few thousand evaluations.
+MOST_EVALUATIONS = 10_000
+
+
+class _LostError(Exception):
+    """A path took too many evaluations."""
 
 
 def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | None:
@@ -39,10 +45,15 @@ def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | N
         Output times (s, ascending) and whether the left-hand value is meant.
     """
     run = solve_marching(problem, FINEST_RTOL, t_out, left, repeat=False)
-    if run.status is not Status.FOLD:
-        return run if run.status is Status.SUCCESS else None
+    if run.status is Status.FOLD:
+        return lead_to_fold(problem, run, t_out, left)
+    return run if run.status is Status.SUCCESS else None
+
+
+def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray) -> Run | None:
+    """A run that stopped for a fold, led on until it meets it; None where it meets none."""
     begun = _start(problem, run.state)
-    if math.isnan(begun.u):
+    if run.margin <= 0.0 or math.isnan(begun.u):
         return run
     path = _ahead(problem, run.state, begun, FINEST_RTOL)
     if path is None:
@@ -63,7 +74,9 @@ def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | N
     run.peak_u = max(run.peak_u, float(np.abs(rows[:, 1]).max()))
     run.peak_f = max(run.peak_f, float(force.max()))
     n = problem.model.gap.size
-    run.state = dataclasses.replace(run.state, t=path.t, y=rows[-1, -n - 1 :].copy(), u_before=float(rows[-1, 0]))
+    run.state = dataclasses.replace(
+        run.state, t=path.t, y=rows[-1, -n - 1 :].copy(), u_before=float(rows[-1, 0]), u_gap=float(rows[-1, 1])
+    )
     return run
 
 
@@ -82,7 +95,7 @@ def meets_fold(problem: Problem, rtol: float) -> bool:
     if run.status is not Status.FOLD:
         raise SolveError(Failure(run.status, run.status.cause, run.status.action, run.t_failed, tried=run.tried))
     begun = _start(problem, run.state)
-    return math.isnan(begun.u) or _ahead(problem, run.state, begun, rtol) is not None
+    return run.margin <= 0.0 or math.isnan(begun.u) or _ahead(problem, run.state, begun, rtol) is not None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,9 +148,8 @@ def _start(problem: Problem, state: State) -> _Start:
     start, end = float(table.edges[i]), float(table.edges[i + 1])
     segment = Segment(start, end - start, table.terms[i], table.series[i])
     u_source, _ = source(segment, t - start)
-    sign = float(choose_branch(model, u_source, state.y))
-    u = float(gap_voltage(model, model.k_gap * u_source, dot(model.gap, state.y), sign, model.k_gap * u_source))
-    return _Start(segment, end, sign, u)
+    u = float(ramp(model, model.k_gap * u_source, dot(model.gap, state.y), state.u_gap))
+    return _Start(segment, end, math.copysign(1.0, u), u)
 
 
 def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path | None:
@@ -158,7 +170,13 @@ def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path 
         margin, speed = voltage_by_time(model, u_here, du_here, here[:n], sign, here[n + 1], dy)
         return float(margin), float(speed)
 
+    left = MOST_EVALUATIONS
+
     def slope(_: float, z: FloatArray) -> FloatArray:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise _LostError
         margin, speed = at(z)
         along: FloatArray = np.concatenate([dy * margin, [margin, speed]]) * pace / scale
         return along
@@ -178,8 +196,22 @@ def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path 
     events: list[Any] = [distance, ahead, away]
     for event in events:
         event.terminal = True
-    found = solve_ivp(
-        slope, (0.0, LONGEST), begin, "DOP853", rtol=rtol, atol=rtol,
-        events=events, dense_output=True,
-    )  # fmt: skip
+
+    def jacobian(s: float, z: FloatArray) -> FloatArray:
+        # By plain differences: scipy's widen theirs for ever where nothing depends on an entry, as on the charge.
+        here, columns = slope(s, z), []
+        for i in range(z.size):
+            moved = z.copy()
+            moved[i] += 1e-7 * abs(z[i]) + 1e-13
+            columns.append((slope(s, moved) - here) / (moved[i] - z[i]))
+        return np.array(columns).T
+
+    # The mode that is to fold may be faster than all else and follow it: an explicit method would not get there.
+    try:
+        found = solve_ivp(
+            slope, (0.0, LONGEST), begin, "Radau",
+            rtol=rtol, atol=rtol, jac=jacobian, events=events, dense_output=True,
+        )  # fmt: skip
+    except _LostError:
+        return None
     return _Path(t, segment, sign, scale, found.sol) if found.t_events[0].size else None

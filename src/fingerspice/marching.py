@@ -23,7 +23,7 @@ from fingerspice.settling import Settling
 from fingerspice.track import FINEST, SAFETY, Prepared, Track, prepare_system
 
 # The error allowed in a step, over the one asked for: the force doubles it, and steps add up.
-LOCAL_SHARE = 0.15
+LOCAL_SHARE = 0.13
 # Steps per shortest time scale of the source: the points of a step must not alias it.
 LONGEST_STEP = 0.6
 
@@ -162,6 +162,7 @@ def _run(problem: Problem, track: Track, status: Status, t_failed: float | None,
             float(control[readout.U_BEFORE]),
             problem.initial.charge_offset,
             problem.scene.charge_law,
+            float(control[readout.U_GAP]),
         ),
         t_failed=t_failed,
         margin=float(control[readout.MARGIN]),

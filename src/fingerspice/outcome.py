@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, NamedTuple
@@ -146,13 +147,17 @@ class ErrorEstimate:
 
 @dataclass(frozen=True)
 class State:
-    """Where a run stopped, for another one to go on from."""
+    """Where a run stopped, for another one to go on from.
+
+    `u_gap` (V) tells which of several gap voltages that the mobile law allows it is; NaN: the one connected to rest.
+    """
 
     t: float
     y: FloatArray
     u_before: float
     charge_offset: float
     charge_law: str
+    u_gap: float = math.nan
 
 
 @dataclass(frozen=True)

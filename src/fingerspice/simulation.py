@@ -78,7 +78,8 @@ def simulate(
     method : str
         ``"auto"``, an own stepper (``"exponential"``, ``"dp5"``, ``"dop853"``, ``"radau9"``), ``"scipy:NAME"`` or
         ``"torchdiffeq:NAME"``. ``"auto"`` steps as ``"exponential"`` does, and once a period of the source no longer
-        changes the state it lets that period stand for those that follow; the others step every period.
+        changes the state it lets that period stand for those that follow; the others step every period. Where a fast
+        mode that the area moves lets only short steps converge, ``"auto"`` goes on as ``"radau9"``.
     tier : str
         ``"auto"``, or the model to take: ``"algebraic"``, ``"linear"`` or ``"coupled"`` (see `Plan`).
     start : str or Solution
@@ -306,15 +307,19 @@ def _run(
         return solve_foreign(problem, library, name, rtol, t_out, left), method
     if method in ("auto", "exponential"):
         run = solve_marching(problem, rtol, t_out, left, progress, repeat=method == "auto")
-        if run.status is not Status.FOLD or method == "exponential":
+        if run.status not in (Status.FOLD, Status.TOO_MANY_STEPS) or method == "exponential":
             return run, "exponential"
-        from fingerspice.folding import run_to_fold
+        from fingerspice.folding import lead_to_fold, run_to_fold
+        from fingerspice.stepping import solve
 
-        folded = run_to_fold(problem, t_out, left)
+        folded = run_to_fold(problem, t_out, left) if run.status is Status.FOLD else None
         if folded is not None:
             return folded, "exponential"
-        # Near a fold, but none: for a method that solves the area equation at every evaluation.
-        method = "dop853"
+        # No fold is near, or none at all: for an implicit method, which no fast mode holds up.
+        run = solve(problem, rtol, TABLEAUS["radau9"], t_out, left, progress)
+        if run.status is Status.FOLD:
+            run = lead_to_fold(problem, run, t_out, left) or run
+        return run, "radau9"
     if method not in TABLEAUS:
         known = ["auto", "exponential", *TABLEAUS, "scipy:NAME", "torchdiffeq:NAME"]
         raise InputError(f"unknown method {method!r}; allowed: {', '.join(known)}")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import SourceTable
 from fingerspice.engine import advance as loop
-from fingerspice.engine.model import Segment, choose_branch, source, write_row
+from fingerspice.engine.model import Segment, source, write_row
 from fingerspice.engine.readout import TRIED
 from fingerspice.engine.steps import Method
 from fingerspice.numerics.tableaus import Tableau
@@ -17,7 +17,14 @@ from fingerspice.outcome import ErrorEstimate, State, Status, last_tried
 from fingerspice.problem import Problem
 from fingerspice.runs import ROUNDING, BoolArray, FloatArray, Progress, Run, Tables, after_the_end, from_rows, row_width
 
-LOG_ROWS = 4096
+LOG_ROWS = 1024
+# Error over the peak above which the time of a fold is not believed.
+FOLD_ERROR = 0.01
+# Steps taken and refused, the shadow's too, to begin with and over the run: what needs more has a cause that smaller
+# steps do not mend.
+FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
+# The smallest local error, over the voltage scale, that another attempt is worth: the shadow's is near rounding.
+FINEST = 3e-13
 # The shadow run's tolerance over the main run's: far enough that their difference is the main run's error.
 SHADOW = 0.03
 # The estimate is the largest difference met in the middle and at the end of steps; between them it may be larger.
@@ -49,12 +56,19 @@ class Track:
         self.control[loop.T] = self.problem.t_start
         self.control[loop.U_BEFORE] = start.u_before
         self.control[loop.MARGIN] = 1.0
+        if self.problem.model.mobile and abs(start.u_gap) > 0.0:
+            self.control[loop.U_GAP], self.control[loop.SIGN] = start.u_gap, np.sign(start.u_gap)
         self.counters = np.zeros(loop.N_COUNTERS, np.int64)
         self.tried = np.zeros((TRIED, 4))
 
     @property
     def t(self) -> float:
         return float(self.control[loop.T])
+
+    @property
+    def steps(self) -> int:
+        """Steps taken and refused."""
+        return int(self.counters[loop.ACCEPTED] + self.counters[loop.REJECTED])
 
     @property
     def log_rows(self) -> FloatArray:
@@ -85,9 +99,7 @@ class Track:
         segment = Segment(start, float(table.edges[i + 1]) - start, table.terms[i], table.series[i])
         row = np.empty(row_width(self.problem))
         u, du = source(segment, self.t - start)
-        # A jump that failed has left its own branch in `control`.
-        sign = choose_branch(self.problem.model, u, self.y)
-        write_row(self.problem.model, u, du, self.y, sign, self.problem.model.k_gap * u, row)
+        write_row(self.problem.model, u, du, self.y, self.control[loop.SIGN], self.control[loop.U_GAP], row)
         return row if np.all(np.isfinite(row)) else None
 
     def finish(self, table: SourceTable) -> None:
@@ -159,7 +171,9 @@ def integrate(
     rows = np.full((t_out.size, width), np.nan)
     log = np.empty((LOG_ROWS, 4))
     main = Track(problem, method, scale, t_out, left, rows, log)
-    other = Track(problem, method, SHADOW * scale, t_out[:0], left[:0], rows[:0], log[:0])
+    # Only voltages are compared.
+    finer = np.append(SHADOW * scale[:-1], np.inf)
+    other = Track(problem, method, finer, t_out[:0], left[:0], rows[:0], log[:0])
     meter = _Meter(problem)
     status, t_failed, last = Status.SUCCESS, None, None
     table = None
@@ -167,14 +181,18 @@ def integrate(
         code = loop.LOG_FULL
         while code == loop.LOG_FULL:
             code = main.advance(table, float(table.edges[-1])) if table.edges.size > 1 else loop.DONE
-            if shadow:
-                other.follow(table, main)
+            if shadow and other.follow(table, main) == loop.TOO_MANY:
+                code = loop.TOO_MANY
             meter.compare(main.log_rows, other.rows if shadow else None)
+            done = (main.t - problem.t_start) / (problem.t_stop - problem.t_start)
             if progress is not None:
-                progress((main.t - problem.t_start) / (problem.t_stop - problem.t_start))
-        if code in (loop.NO_SOLUTION, loop.STEP_UNDERFLOW):
+                progress(done)
+            if code == loop.LOG_FULL and main.steps + other.steps > FIRST_STEPS + done * MOST_STEPS:
+                code = loop.TOO_MANY
+        if code in (loop.NO_SOLUTION, loop.STEP_UNDERFLOW, loop.TOO_MANY):
             folding = problem.model.mobile and problem.model.coupled
             status = Status.FOLD if folding else Status.STEP_UNDERFLOW
+            status = Status.TOO_MANY_STEPS if code == loop.TOO_MANY else status
             t_failed = main.t
             break
         if table.not_finite is not None:
@@ -211,6 +229,7 @@ def integrate(
             float(main.control[loop.U_BEFORE]),
             problem.initial.charge_offset,
             problem.scene.charge_law,
+            float(main.control[loop.U_GAP]),
         ),
         t_failed=t_failed,
         margin=float(main.control[loop.MARGIN]),
@@ -269,18 +288,28 @@ def solve(
     u_scale = u_scale * problem.model.k_gap if np.isfinite(u_scale) and u_scale > 0.0 else 1.0
     u_scale = max(u_scale, float(np.abs(problem.initial.y[:-1]).max(initial=0.0)))
     tol = LOCAL_SHARE * rtol
-    nfev = 0
+    finest = min(FINEST, 0.05 * tol)
+    nfev, before = 0, None
     for _attempt in range(6):
         run = integrate(problem, tableau, tol, u_scale, t_out, left, tables=tables, progress=progress)
         nfev += run.nfev
         run.nfev = nfev
-        if run.status is not Status.SUCCESS:
-            return run
-        worst = run.excess(rtol)
-        if worst <= 1.0:
-            return run
-        if rtol * run.peak_u < ROUNDING * u_scale:
+        if run.status is Status.TOO_MANY_STEPS and before is not None:
+            # Steps that small are held up by rounding: the attempt before is as good as it gets.
+            run = before
             break
-        tol = max(tol * min(0.3, 0.5 / worst), 1e-16)
+        if run.status is Status.FOLD:
+            # A fold magnifies errors, but one that is met by a run that is half error may stand anywhere.
+            enough, less = run.error.u_gap <= FOLD_ERROR * run.peak_u, 0.01
+        elif run.status is Status.SUCCESS:
+            worst = run.excess(rtol)
+            enough, less = worst <= 1.0, min(0.3, 0.5 / worst) if worst > 0.0 else 0.3
+        else:
+            return run
+        if enough:
+            return run
+        if rtol * run.peak_u < ROUNDING * u_scale or tol <= finest:
+            break
+        tol, before = max(less * tol, finest), run
     run.status = Status.ERROR_NOT_MET
     return run

@@ -12,7 +12,7 @@ from fingerspice.engine import repeat as repetition
 from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
 from fingerspice.engine.march import Work
-from fingerspice.engine.model import Segment, choose_branch, source, write_row
+from fingerspice.engine.model import Segment, source, write_row
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.system import System, area_range, build_system
 from fingerspice.numerics.lobatto import integral_table
@@ -85,6 +85,8 @@ class Track:
         self.control[readout.U_BEFORE] = start.u_before
         self.control[readout.BRANCH_LENGTH] = np.inf
         self.control[readout.MARGIN] = 1.0
+        if self.problem.model.mobile and abs(start.u_gap) > 0.0:
+            self.control[readout.U_GAP], self.control[readout.SIGN] = start.u_gap, np.sign(start.u_gap)
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
         self.tried = np.zeros((readout.TRIED, 4))
         self.shown = self.prepared.system.k_shown.size
@@ -178,14 +180,6 @@ class Track:
             )  # fmt: skip
         self.repeated += periods
 
-    def row(self, segment: Segment, tau: float, y: FloatArray) -> FloatArray:
-        """A row of `write_row` from a state, `tau` s into a segment."""
-        model = self.prepared.system.model
-        row = np.empty(row_width(self.problem))
-        u, du = source(segment, tau)
-        write_row(model, u, du, y, choose_branch(model, u, y), model.k_gap * u, row)
-        return row
-
     def finish(self, table: SourceTable) -> None:
         """Write the right-hand outputs at the very end of the run."""
         first = int(self.counters[readout.OUTPUT])
@@ -194,10 +188,14 @@ class Track:
         segment, tau = after_the_end(self.problem, table)
         control = np.zeros(advance.N_CONTROL)
         control[advance.U_BEFORE] = self.control[readout.U_BEFORE]
+        control[advance.U_GAP], control[advance.SIGN] = self.control[readout.U_GAP], self.control[readout.SIGN]
         # Takes the charge of a jump that stands at the end; the state itself stays before it.
         y = self.y.copy()
-        advance.enter(self.prepared.system.model, segment, tau, y, control)
-        live, z, current = from_rows(self.problem, self.row(segment, tau, y)[None, :])
+        model = self.prepared.system.model
+        u, du = advance.enter(model, segment, tau, y, control)
+        row = np.empty(row_width(self.problem))
+        write_row(model, u, du, y, control[advance.SIGN], control[advance.U_GAP], row)
+        live, z, current = from_rows(self.problem, row[None, :])
         n = live.shape[0]
         self.out[:n, first:] = live
         if self.pace.charge:
@@ -212,5 +210,8 @@ class Track:
         i = max(int(np.searchsorted(table.edges, self.t, side="left")) - 1, 0)
         start = float(table.edges[i])
         segment = Segment(start, float(table.edges[i + 1]) - start, table.terms[i], table.series[i])
-        row = self.row(segment, self.t - start, self.y)
+        row = np.empty(row_width(self.problem))
+        u, du = source(segment, self.t - start)
+        sign, u_gap = self.control[readout.SIGN], self.control[readout.U_GAP]
+        write_row(self.prepared.system.model, u, du, self.y, sign, u_gap, row)
         return row if np.all(np.isfinite(row)) else None

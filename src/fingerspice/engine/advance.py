@@ -16,8 +16,10 @@ from fingerspice.engine.model import (
     dot,
     gap_voltage,
     jump_charge,
+    ramp,
     right_hand_side,
     source,
+    turns_at_zero,
     write_row,
 )
 from fingerspice.engine.readout import note
@@ -26,7 +28,7 @@ from fingerspice.engine.steps import Method, dense_polynomial, dense_state, take
 FloatArray = NDArray[np.float64]
 
 # Codes returned by `advance`.
-DONE, LOG_FULL, NO_SOLUTION, STEP_UNDERFLOW = 0, 1, 2, 3
+DONE, LOG_FULL, NO_SOLUTION, STEP_UNDERFLOW, TOO_MANY = 0, 1, 2, 3, 4
 # Entries of `control`: time, next step (0: choose one), branch of the area (0: choose one), source voltage
 # just before the time reached, last gap voltage, smallest distance to the fold met in logged places.
 T, H, SIGN, U_BEFORE, U_GAP, MARGIN = 0, 1, 2, 3, 4, 5
@@ -34,11 +36,18 @@ N_CONTROL = 6
 # Entries of `counters`: evaluations, steps accepted and rejected, zeros met, outputs written, log rows written.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, LOGGED = 0, 1, 2, 3, 4, 5
 N_COUNTERS = 6
+# Steps taken and refused in one call, at most.
+MOST_STEPS = 20_000
+# Distance at which a fold counts as met, and at which it is near.
+_AT_FOLD, _NEAR_FOLD = 1e-6, 1e-2
 
 
 @jit
 def enter(model: Model, segment: Segment, t0: float, y: FloatArray, control: FloatArray) -> tuple[float, float]:
-    """Source voltage and slope, `t0` s into a segment, after taking the jump that may stand there."""
+    """Source voltage and slope, `t0` s into a segment, after taking the jump that may stand there.
+
+    The voltage is NaN where the jump goes past a fold; then nothing is taken.
+    """
     u_source, du_source = source(segment, t0)
     x_gap = dot(model.gap, y)
     jump = u_source - control[U_BEFORE]
@@ -47,9 +56,19 @@ def enter(model: Model, segment: Segment, t0: float, y: FloatArray, control: Flo
             y[-1] += jump_charge(model, x_gap, control[U_BEFORE], u_source)
         if not abs(jump) <= 1e-3 * (abs(u_source) + abs(control[U_BEFORE])):
             control[H] = 0.0
-        control[U_BEFORE] = u_source
         zero = model.k_gap * u_source + x_gap
-        control[SIGN] = choose_branch(model, u_source, y)
+        if model.mobile and control[SIGN] != 0.0:
+            before = model.k_gap * control[U_BEFORE]
+            u = gap_voltage(model, before, x_gap, control[SIGN], control[U_GAP])
+            u = ramp(model, model.k_gap * u_source, x_gap, u)
+            if u != u:
+                return math.nan, du_source
+            control[U_GAP] = u
+            control[SIGN] = math.copysign(1.0, u)
+        else:
+            control[SIGN] = choose_branch(model, u_source, y)
+            control[U_GAP] = model.k_gap * u_source
+        control[U_BEFORE] = u_source
         if model.coupled and abs(zero) <= 1e-13 * (abs(model.k_gap * u_source) + abs(x_gap)):
             # At a zero the branch is the one the voltage is about to take.
             dy = np.empty(y.size)
@@ -168,6 +187,7 @@ def _controlled_step(
     segment: Segment,
     t: float,
     remaining: float,
+    least: float,
     y: FloatArray,
     scale: FloatArray,
     control: FloatArray,
@@ -176,7 +196,10 @@ def _controlled_step(
     y1: FloatArray,
     tried: FloatArray,
 ) -> tuple[float, bool]:
-    """Step until the error is met. Returns the step (0: none is small enough) and whether it ends the segment."""
+    """Step until the error is met.
+
+    Returns the step (0: none above `least`, s, is small enough) and whether it ends the segment.
+    """
     t0 = t - segment.start
     h, last = _choose_step(model, method, remaining, control, k[0], scale)
     while True:
@@ -195,7 +218,7 @@ def _controlled_step(
         h *= min(0.9, max(0.2, factor))
         control[H] = h
         last = False
-        if h <= 1e-15 * max(abs(t), 1e-3 * segment.length):
+        if h <= least:
             return 0.0, False
 
 
@@ -295,7 +318,7 @@ def advance(
     t_end : float
         Where to stop, s; not past the last edge.
     scale : ndarray, shape (n + 1,)
-        Local error allowed in a step, in V and C.
+        Local error allowed in a step, in V and C; under `mobile` at the area of 0 V.
     y, control, counters : ndarray
         State and bookkeeping, updated in place.
     t_out, left, rows : ndarray
@@ -308,27 +331,46 @@ def advance(
     Returns
     -------
     int
-        DONE, LOG_FULL (call again), NO_SOLUTION (past a fold at the time reached) or STEP_UNDERFLOW.
+        DONE, LOG_FULL (call again), NO_SOLUTION (past a fold at the time reached), STEP_UNDERFLOW or TOO_MANY steps.
     """
     k = np.zeros((method.a.shape[0], y.size))
     poly = np.zeros((y.size, method.dense.shape[1]))
     y1 = np.empty(y.size)
+    allowed = scale.copy()
     counters[LOGGED] = 0
     flips = 0
     index = np.searchsorted(edges, control[T], side="right") - 1
+    most = counters[ACCEPTED] + counters[REJECTED] + MOST_STEPS
     while control[T] < t_end:
+        if counters[ACCEPTED] + counters[REJECTED] > most:
+            return TOO_MANY
         t = control[T]
         while edges[index + 1] <= t:
             index += 1
         segment = Segment(edges[index], edges[index + 1] - edges[index], terms[index], series[index])
         u_source, du_source = enter(model, segment, t - segment.start, y, control)
+        if u_source != u_source:
+            return NO_SOLUTION
         u = right_hand_side(model, u_source, du_source, y, control[SIGN], control[U_GAP], k[0])
         counters[NFEV] += 1
         if u != u:
             return NO_SOLUTION
         control[U_GAP] = u
         stop = min(edges[index + 1], t_end)
-        h, last = _controlled_step(model, method, segment, t, stop - t, y, scale, control, counters, k, y1, tried)
+        least = 1e-15 * max(abs(t), 1e-3 * segment.length)
+        if model.mobile:
+            q, dq = branch_area(model, control[SIGN], u)
+            margin = 1.0 - dot(model.gap, y) * model.area0 * dq
+            if margin < _AT_FOLD:
+                return NO_SOLUTION
+            if margin < _NEAR_FOLD:
+                # What rounding leaves of the way is not worth its many steps.
+                least = max(least, 1e-8 * (t - segment.start))
+            # The state is a voltage at the area of 0 V.
+            allowed[:] = scale / (model.area0 * q)
+        h, last = _controlled_step(
+            model, method, segment, t, stop - t, least, y, allowed, control, counters, k, y1, tried
+        )
         if h == 0.0:
             return STEP_UNDERFLOW
         dense_polynomial(k, method.dense, h, poly)
@@ -363,11 +405,16 @@ def advance(
             dense_state(reached, y, poly, y1)
         if theta <= 1.0:
             control[SIGN] = -control[SIGN]
+            control[U_GAP] = 0.0
             counters[ZEROS] += 1
         y[:] = y1
         control[T] = t_new
         control[U_BEFORE], _ = source(segment, t_new - segment.start)
         counters[ACCEPTED] += 1
+        if theta <= 1.0 and turns_at_zero(model, dot(model.gap, y), control[SIGN]):
+            control[SIGN] = -control[SIGN]
+            control[MARGIN] = 0.0
+            return NO_SOLUTION
         if log.shape[0] > 0 and counters[LOGGED] + 2 > log.shape[0]:
             return LOG_FULL
     return DONE

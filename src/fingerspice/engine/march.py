@@ -11,17 +11,20 @@ from numpy.typing import NDArray
 from fingerspice.compiled import borrow, jit
 from fingerspice.engine.charge import charge_step
 from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, weigh
-from fingerspice.engine.model import Segment, branch_area, source
+from fingerspice.engine.model import Segment, branch_area, dot, source, turns_at_zero
 from fingerspice.engine.pace import Pace, change_level, choose_step, enter, nearest_level, rung, take_branch
 from fingerspice.engine.readout import (
     ACCEPTED,
     ALLOWED,
     BRANCH_LENGTH,
     BRANCH_START,
+    FIRST_PASSES,
     H_AFTER_EDGE,
     H_AFTER_ZERO,
     KEPT,
     MAGNIFIED,
+    MARGIN,
+    MOST_PASSES,
     MOST_STEPS,
     NFEV,
     OUTPUT,
@@ -197,24 +200,34 @@ def march(
     index = -1
     start = 0.0
     edge = control[T]
+    since = 0.0
     segment_terms, segment_series = terms[0], series[0]
     if edges[0] < control[T]:
         index = np.searchsorted(edges, control[T], side="right") - 2
     most = counters[ACCEPTED] + counters[REJECTED] + MOST_STEPS
+    begun, evaluated = control[T], counters[NFEV]
     while control[T] < t_end:
         t = control[T]
         if counters[ACCEPTED] + counters[REJECTED] > most:
             return TOO_MANY
+        if counters[NFEV] - evaluated > NODES * FIRST_PASSES:
+            longest = (t - begun) / pace.h_max
+            if counters[NFEV] - evaluated > NODES * (FIRST_PASSES + MOST_PASSES * longest):
+                return TOO_MANY
         if t >= edge:
             index += 1
             start = edges[index]
             edge = edges[index + 1]
             if edge <= t:
                 continue
+            # Time is counted from the edge: what decays after it may be faster than the rounding of t.
+            since = t - start
+            begun, evaluated = t, counters[NFEV]
             segment_terms, segment_series = terms[index], series[index]
             u_source, _ = source(Segment(start, edge - start, segment_terms, segment_series), t - start)
             if mobile or charge:
-                enter(model, charge, u_source, y, control)
+                if not enter(model, charge, u_source, y, control):
+                    return NO_STEP
             else:
                 control[U_GAP] = k_gap * u_source
                 for i in range(n):
@@ -225,10 +238,8 @@ def march(
             control[TOO_LONG] = 0.0
             control[ALLOWED] = 0.0
             fresh = H_AFTER_EDGE
-            if control[U_GAP] != control[U_GAP]:
-                return NO_STEP
-        t0 = t - start
         stop = min(edge, t_end)
+        length = stop - start
         if q0.size > 1 or level < 0:
             now = 0
             if q0.size > 1:
@@ -247,7 +258,7 @@ def march(
             w0[k] = 0.0
             for i in range(n):
                 w0[k] += project[k, i] * y[i]
-        h = choose_step(pace, tau, coupled, segment_series.size > 0, t, stop - t, control)
+        h = choose_step(pace, tau, coupled, segment_series.size > 0, t, length - since, control)
         run_error = 0.0
         magnified = 1.0
         wrong = 0
@@ -262,7 +273,7 @@ def march(
                 h_slot = h
                 decay, phi, miss = all_decay[slot], all_phi[slot], all_miss[slot]
                 weigh(rates, gap, decay, h, weight)
-            source_rows(segment_terms, segment_series, edge - start, t0, h, charge, r)
+            source_rows(segment_terms, segment_series, edge - start, since, h, charge, r)
             sign = control[SIGN]
             if mobile:
                 for i in range(ROWS):
@@ -318,8 +329,8 @@ def march(
             # Near the end of the area's polynomial no step ends beyond it: the kink there would be crept up to.
             if coupled and abs(control[U_GAP]) > 0.9 * u_top and np.abs(u_rows).max() > u_top:
                 return OUT_OF_RANGE
-            # Refused at this length: a singularity, of which rounding hides the last bit.
-            if h <= 1e-13 * max(abs(t), 1e-3 * (edge - start)):
+            # Refused at this length, which is rounding of the time: a singularity.
+            if h <= 1e-15 * since + 1e-25 * (edge - start):
                 return NO_STEP
             # Close to a fold the iteration closes on short steps only: methods that solve the area equation at
             # every evaluation get there sooner.
@@ -334,26 +345,30 @@ def march(
                 h = rung(h * min(0.9, max(0.25, factor)))
                 wanted = h
         if flip:
+            if turns_at_zero(model, r[X_GAP, 0], -control[SIGN]):
+                control[MARGIN] = 0.0
+                return NO_STEP
             control[SIGN] = -control[SIGN]
             flips += 1
             continue
-        t_new = t + h
+        reached = since + h
         theta = 1.0
         crossed = False
-        if t_new >= stop or stop - t_new <= 1e-12 * h:
-            t_new = stop
-            theta = min(1.0, (stop - t) / h)
+        if reached >= length or length - reached <= 1e-12 * h:
+            reached = length
+            theta = min(1.0, (length - since) / h)
         if (wrong > 0 or below > 0.0) and flips < 2:
             crossing = zero(u_rows, control[SIGN], wrong, below, coefficients[0])
-            if t + crossing * h <= t_new and crossing <= theta:
+            if since + crossing * h <= reached and crossing <= theta:
                 theta = crossing
-                t_new = t + crossing * h
+                reached = since + crossing * h
                 crossed = True
-                if t_new <= t:
+                if reached <= since:
                     control[SIGN] = -control[SIGN]
                     flips += 1
                     continue
         flips = 0
+        t_new = stop if reached == length else start + reached
         if charge:
             charge_step(
                 model, rates, gain, gap, slow_share, w, pull, r, integral, h, y[n], places, theta, control,
@@ -402,6 +417,11 @@ def march(
             control[BRANCH_LENGTH] = t_new - control[BRANCH_START]
             control[BRANCH_START] = t_new
             counters[ZEROS] += 1
+            if turns_at_zero(model, dot(gap_share, y), control[SIGN]):
+                control[T] = t_new
+                control[SIGN] = -control[SIGN]
+                control[MARGIN] = 0.0
+                return NO_STEP
             # The area has a kink here: fast modes start anew.
             if below > 0.0:
                 # It will soon be back.
@@ -411,7 +431,7 @@ def march(
                 control[H] = control[H_AFTER_ZERO]
                 control[ALLOWED] = 0.0
             fresh = H_AFTER_ZERO
-        control[T] = t_new
+        control[T], since = t_new, reached
         if t_new >= stop:
             control[U_BEFORE], _ = source(Segment(start, edge - start, segment_terms, segment_series), t_new - start)
         counters[ACCEPTED] += 1

@@ -159,73 +159,102 @@ def branch_area(model: Model, sign: float, u: float) -> tuple[float, float]:
 def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: float) -> float:
     """Gap voltage (V): k U + x under `local`; under `mobile` the root of u = k U + x A_0 / A(|u|).
 
-    The root meant is the first one met from k U in the direction of x: the one connected to the uncharged
-    state. `guess` starts Newton; where that does not settle, the root is bracketed. NaN where the branch holds no
-    such root: past the fold.
+    The root meant is the one connected to `guess`, a gap voltage not long before; with k U for a guess, to the
+    uncharged state. NaN where the branch holds no such root: past the fold.
     """
     if not model.mobile or x_gap == 0.0:
         return k_u + x_gap
     b = x_gap * model.area0
     u = guess
+    last = math.inf
     for _ in range(12):
         q, dq = branch_area(model, sign, u)
         slope = 1.0 - b * dq
-        # Past the fold Newton would go to the other root: leave it to the bracket.
+        # Past the fold Newton would go to another root: leave it to the walk.
         if not slope > 1e-3:
             break
         step = (u - k_u - b * q) / slope
         u -= step
-        if abs(step) <= 4e-16 * (abs(u) + abs(k_u)):
-            if (u - k_u) * x_gap >= 0.0 and sign * u >= model.curve[0]:
+        if _settled(step, last, slope, abs(u) + abs(k_u)):
+            if sign * u >= model.curve[0]:
                 return u
             break
-    return _bracketed_root(model, k_u, b, sign)
-
-
-@jit
-def _residual(model: Model, k_u: float, b: float, sign: float, r: float) -> tuple[float, float]:
-    """Residual of the mobile area equation at r = |u - k U|, and its slope, walking from k U towards the root."""
-    direction = 1.0 if b > 0.0 else -1.0
-    q, dq = branch_area(model, sign, k_u + direction * r)
-    return r - abs(b) * q, 1.0 - b * dq
-
-
-@jit
-def _bracketed_root(model: Model, k_u: float, b: float, sign: float) -> float:
-    lo = 0.0
-    width = 0.02 * abs(b) / model.area0
-    hi = width
-    value, slope = _residual(model, k_u, b, sign, hi)
-    while value < 0.0 and slope > 0.0:
-        lo = hi
-        width *= 1.1
-        hi += width
-        value, slope = _residual(model, k_u, b, sign, hi)
-    if not value >= 0.0:
-        # The residual turns between lo and hi: a root exists only if its peak reaches zero.
-        for _ in range(60):
-            mid = 0.5 * (lo + hi)
-            value, slope = _residual(model, k_u, b, sign, mid)
-            if value >= 0.0:
-                hi = mid
-                break
-            if slope > 0.0:
-                lo = mid
-            else:
-                hi = mid
-        if not value >= 0.0:
-            return math.nan
-    for _ in range(100):
-        mid = 0.5 * (lo + hi)
-        if not lo < mid < hi:
-            break
-        value, slope = _residual(model, k_u, b, sign, mid)
-        if value >= 0.0:
-            hi = mid
-        else:
-            lo = mid
-    u = k_u + (hi if b > 0.0 else -hi)
+        last = abs(step)
+    u = _walk(model, k_u, b, sign, guess, False)
     return u if sign * u >= model.curve[0] else math.nan
+
+
+@jit
+def _settled(step: float, last: float, slope: float, size: float) -> bool:
+    """Whether Newton's step is down to rounding of `size`, or no longer falls close to that.
+
+    A small slope, close to a fold, magnifies what rounding leaves.
+    """
+    return abs(step) <= 4e-16 * size or (abs(step) * min(slope, 1.0) <= 1e-13 * size and abs(step) >= last)
+
+
+@jit
+def _walk(model: Model, k_u: float, b: float, sign: float, u: float, stops: bool) -> float:
+    """From gap voltage u to the root of u = k_u + b / A on the same branch, or to 0 V if that comes first and `stops`.
+
+    k_u(u) = u - b / A must rise all the way: no step crosses a fold, as none takes off more than three quarters of the
+    slope. NaN where a fold comes first.
+    """
+    q, dq = branch_area(model, sign, u)
+    slope = 1.0 - b * dq
+    last = math.inf
+    for _ in range(200):
+        if not slope > 0.0:
+            return math.nan
+        whole = (k_u - u + b * q) / slope
+        if _settled(whole, last, slope, abs(u) + abs(k_u)):
+            return u
+        last = abs(whole)
+        step = whole
+        new = u
+        q_new, dq_new, slope_new = q, dq, slope
+        for _ in range(50):
+            new = u + step
+            if stops and sign * new < 0.0:
+                new = 0.0
+            q_new, dq_new = branch_area(model, sign, new)
+            slope_new = 1.0 - b * dq_new
+            if slope_new > 0.25 * slope and abs(q_new - q) < 0.3 * min(q, q_new):
+                break
+            step *= 0.5
+        if abs(step) <= 1e-10 * abs(u) and abs(step) < abs(whole):
+            return math.nan
+        if stops and new == 0.0 and u == 0.0:
+            return 0.0
+        u, q, dq, slope = new, q_new, dq_new, slope_new
+    return math.nan
+
+
+@jit
+def ramp(model: Model, k_u: float, x_gap: float, u: float) -> float:
+    """Gap voltage after a jump of the source to k_u from gap voltage u: the limit of a ramp too fast for any leak.
+
+    NaN where the ramp meets a fold.
+    """
+    if not model.mobile or not model.coupled or x_gap == 0.0:
+        return k_u + x_gap
+    b = x_gap * model.area0
+    q, _ = branch_area(model, 1.0, 0.0)
+    # The side of 0 V that k_u leads to from there.
+    after = 1.0 if k_u + b * q >= 0.0 else -1.0
+    before = after if u == 0.0 else math.copysign(1.0, u)
+    if before != after:
+        u = _walk(model, k_u, b, before, u, True)
+        if u != 0.0:
+            return u
+    return _walk(model, k_u, b, after, u, True)
+
+
+@jit
+def turns_at_zero(model: Model, x_gap: float, sign: float) -> bool:
+    """Whether the mobile law folds at 0 V towards a sign: the area has its kink there, and the root may end in it."""
+    _, dq = branch_area(model, sign, 0.0)
+    return model.mobile and not 1.0 - x_gap * model.area0 * dq > 0.0
 
 
 @jit

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import jit
-from fingerspice.engine.model import Model, choose_branch, dot, gap_voltage, jump_charge
+from fingerspice.engine.model import Model, choose_branch, dot, gap_voltage, jump_charge, ramp
 from fingerspice.engine.readout import BRANCH_LENGTH, BRANCH_START, SIGN, U_BEFORE, U_GAP, H, T
 
 FloatArray = NDArray[np.float64]
@@ -55,13 +55,23 @@ def nearest_level(q0: FloatArray, q: float) -> int:
 
 
 @jit
-def enter(model: Model, charge: bool, u_source: float, y: FloatArray, control: FloatArray) -> None:
-    """Take the jump of the source that may stand here, and choose the branch after it."""
+def enter(model: Model, charge: bool, u_source: float, y: FloatArray, control: FloatArray) -> bool:
+    """Take the jump of the source that may stand here, and the branch after it; False where a fold lies in between."""
     x_gap = dot(model.gap, y)
     if not model.mobile and u_source != control[U_BEFORE] and charge:
         y[-1] += jump_charge(model, x_gap, control[U_BEFORE], u_source)
-    take_branch(choose_branch(model, u_source, y), control)
-    control[U_GAP] = gap_voltage(model, model.k_gap * u_source, x_gap, control[SIGN], model.k_gap * u_source)
+    k_u = model.k_gap * u_source
+    if model.mobile and control[SIGN] != 0.0:
+        u = ramp(model, k_u, x_gap, control[U_GAP])
+        sign = control[SIGN] if u == 0.0 else math.copysign(1.0, u)
+    else:
+        sign = choose_branch(model, u_source, y)
+        u = gap_voltage(model, k_u, x_gap, sign, k_u)
+    if u != u:
+        return False
+    take_branch(sign if model.coupled else 1.0, control)
+    control[U_GAP] = u
+    return True
 
 
 @jit

@@ -39,6 +39,9 @@ TRIED = 8
 # Steps taken and refused in a window of the source, which holds a few thousand of its periods at most: what needs more
 # has a cause that smaller steps do not mend.
 MOST_STEPS = 200_000
+# Evaluations at all rows, to begin with after each edge of the source and over the longest step that it allows: a fast
+# mode that the area moves may let only short steps converge, and another method is soon done there.
+FIRST_PASSES, MOST_PASSES = 20_000, 2_000
 # Outputs are read in groups of a processor's vectors, and looked for in strides.
 WRITTEN_AT_ONCE = _GROUP = 8
 _STRIDE = 32

@@ -47,7 +47,7 @@ BARYCENTRIC = 1.0 / np.array([np.prod(4.0 * (x - np.delete(_X, i))) for i, x in 
 """Barycentric weights of the nodes (times a constant), shape (NODES,)."""
 # Midway between neighbours: first of all, where a fast mode's decay after an edge or zero would hide, and at two more
 # distances from the middle, so that no error of the next few orders is small at all.
-_BETWEEN = np.array([0.5 * (_X[i] + _X[i + 1]) for i in (0, 6, 9)])
+_BETWEEN = np.array([0.5 * (_X[i] + _X[i + 1]) for i in (0, 5, 9)])
 POINTS = np.concatenate([_X, _BETWEEN])
 """Fractions of the step, shape (ROWS,)."""
 BETWEEN = np.ascontiguousarray(_lagrange(_BETWEEN, _X, BARYCENTRIC).T)
