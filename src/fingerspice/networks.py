@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,8 @@ class NetworkScene:
         Each area where it is fixed, m^2.
     u_peak : float
         Sum of the largest |U| of the voltage sources, V.
+    prepared : dict
+        What integrators made ready for this scene.
     """
 
     network: Network
@@ -50,6 +52,7 @@ class NetworkScene:
     area_mode: str
     fixed: tuple[float | None, ...]
     u_peak: float
+    prepared: dict[Any, Any] = field(default_factory=dict)
 
     @cached_property
     def waveforms(self) -> tuple[Waveform, ...]:

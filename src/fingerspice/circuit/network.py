@@ -309,6 +309,8 @@ class Modes:
         v = inverse (x + follow s).
     follow : ndarray, shape (n, n_s)
         What a jump of the sources moves at once.
+    take : ndarray, shape (n, n_cell)
+        v_k' = -take j for currents j (A) that cells take beside their own.
     """
 
     rates: FloatArray
@@ -316,6 +318,7 @@ class Modes:
     shape: FloatArray
     inverse: FloatArray
     follow: FloatArray
+    take: FloatArray
 
 
 def network_modes(network: Network, area: FloatArray) -> Modes:
@@ -334,9 +337,12 @@ def network_modes(network: Network, area: FloatArray) -> Modes:
     rates[rates < 1e-28 * rates.max(initial=0.0)] = 0.0
     inverse = turned @ lower.T
     back = np.linalg.solve(lower, network.p.T) if network.k.size else network.p.T
-    moved = turned @ back @ (capacitance[:, None] * network.q)
+    take = np.asarray(turned @ back, float)
+    moved = take @ (capacitance[:, None] * network.q)
     _, b = network.stiffness(area)
     pushed = turned @ (np.linalg.solve(lower, b) if network.k.size else b)
     shape = np.linalg.solve(lower.T, turned.T) if network.k.size else turned.T
     gains = np.asarray(rates[:, None] * moved - pushed, float)
-    return Modes(rates, gains, np.asarray(shape, float), np.asarray(inverse, float), np.asarray(shape @ moved, float))
+    return Modes(
+        rates, gains, np.asarray(shape, float), np.asarray(inverse, float), np.asarray(shape @ moved, float), take
+    )

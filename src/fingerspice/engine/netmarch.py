@@ -1,0 +1,605 @@
+"""The loop of exponential steps of a network; `march` is the same for a stack, whose ways of pacing it shares."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.compiled import borrow, jit, jit_rows
+from fingerspice.engine.exponential import (
+    N_PLACES,
+    Tables,
+    between,
+    distance,
+    largest,
+    left_over,
+    make_tables,
+    mix,
+    plain,
+    respond,
+    weigh,
+)
+from fingerspice.engine.netcharge import charge_error, charge_rows
+from fingerspice.engine.netrows import (
+    AREA,
+    CELL_U,
+    FREE,
+    FREE_RATE,
+    GUESS,
+    MORE,
+    RATE,
+    SLOPE,
+    Form,
+    J,
+    U,
+    combine,
+    evaluate,
+    lowest_pivot,
+)
+from fingerspice.engine.network import Sources, at_sources
+from fingerspice.engine.pace import Pace, choose_step, rung
+from fingerspice.engine.readout import (
+    ACCEPTED,
+    ALLOWED,
+    BRANCH_LENGTH,
+    BRANCH_START,
+    H_AFTER_EDGE,
+    H_AFTER_ZERO,
+    MAGNIFIED,
+    N_CONTROL,
+    NFEV,
+    OUTPUT,
+    REJECTED,
+    TOO_LONG,
+    WRITTEN_AT_ONCE,
+    ZEROS,
+    H,
+    T,
+    at,
+    error_at,
+    first_wrong,
+    note,
+    series_of,
+    write_outputs,
+    zero,
+)
+from fingerspice.engine import rows
+from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS
+from fingerspice.physics.contact import inverse_area
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# Codes returned by `march`.
+DONE, JUMP, NO_STEP, TOO_MANY, REFERENCE, PAUSED = 0, 1, 2, 3, 4, 5
+# One entry of `control` more than `readout` has: steps taken and refused, at most.
+MOST = N_CONTROL
+# Columns of `peaks`: of each gap the largest voltage (V) and force (N), and the errors of both.
+PEAK_U, PEAK_F, ERROR_U, ERROR_F = 0, 1, 2, 3
+# Step over the one before, at most; and what of it may be foreseen growth.
+_MOST_GROWTH, _MOST_TREND = 8.0, 2.5
+# An area this many times another reference's, or a part of it, wants a reference of its own.
+FARTHEST = 1.2
+# A source's change at an edge, relative, that is its rounding and no jump.
+ROUNDING = 1e-14
+# Closer to the fold, other methods get there sooner.
+NEAR_FOLD = 0.02
+# Modes times steps between pauses, after which Python may see to a Ctrl-C.
+AT_ONCE = 40_000
+
+
+class Work(NamedTuple):
+    """Arrays that steps work in; those with ROWS behind hold one value for each row of a step."""
+
+    r: FloatArray
+    s: FloatArray
+    ds: FloatArray
+    modes: FloatArray
+    cells: FloatArray
+    areas: FloatArray
+    matrix: FloatArray
+    w0: FloatArray
+    places: FloatArray
+    weight: FloatArray
+    values: FloatArray
+    coefficients: FloatArray
+    outputs: FloatArray
+    room: FloatArray
+    x: FloatArray
+
+
+# Blocks of `Work.modes`.
+_W, _BASE, _LIN, _D, _PULL, _USED, _PULL_BEFORE, _LEFT_BEFORE = range(8)
+
+
+def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: int) -> Work:
+    """Work arrays for so many live voltages, modes, cells whose area moves, areas, sources and output columns."""
+    return Work(
+        np.zeros((sources, rows.N_FLAT, ROWS)),
+        np.zeros((sources, ROWS)),
+        np.zeros((sources, ROWS)),
+        np.zeros((8, modes, ROWS)),
+        np.zeros((5, cells, ROWS)),
+        np.zeros((6, areas, ROWS)),
+        np.zeros((cells, cells + 1, ROWS)),
+        np.zeros(modes),
+        np.zeros((modes, N_PLACES)),
+        np.zeros(modes),
+        np.zeros((columns, ROWS)),
+        np.zeros((columns, ROWS)),
+        np.zeros((2, WRITTEN_AT_ONCE)),
+        np.zeros((4, ROWS)),
+        np.zeros((n, 4)),
+    )
+
+
+@jit
+def _clear(block: FloatArray) -> None:
+    for a in range(block.shape[0]):
+        for i in range(ROWS):
+            block[a, i] = 0.0
+
+
+@jit_rows
+def _moved(u: FloatArray, before: FloatArray) -> float:
+    """Root of the summed squares of u - before; `before` becomes u."""
+    total = 0.0
+    for a in range(u.shape[0]):
+        for i in range(ROWS):
+            change = u[a, i] - before[a, i]
+            total += change * change
+            before[a, i] = u[a, i]
+    return math.sqrt(total)
+
+
+@jit
+def _assess(
+    shape: FloatArray, follow: FloatArray, gap: FloatArray, gap_s: FloatArray, size: FloatArray, decay: FloatArray,
+    phi: FloatArray, miss: FloatArray, error: FloatArray, w: FloatArray, lin: FloatArray, pull: FloatArray,
+    used: FloatArray, s: FloatArray, magnified: float, x: FloatArray, places: FloatArray, run: FloatArray,
+) -> float:  # fmt: skip
+    """Error of a converged step, V, from what its polynomials miss between nodes; see `exponential.assess`.
+
+    `places` (m, N_PLACES) takes the error of the modes, `run` (n_area,) the largest of each gap's voltage with what
+    the iteration left and what came before, `x` (n, 4) is for passing use.
+    """
+    n = shape.shape[0]
+    left = np.zeros(4)
+    step = 0.0
+    for i in range(n):
+        for p in range(4):
+            x[i, p] = 0.0
+    for a in range(run.size):
+        run[a] = 0.0
+    for j in range(s.shape[0]):
+        first, second, third = between(s[j])
+        for i in range(n):
+            x[i, 0] -= follow[i, j] * first
+            x[i, 1] -= follow[i, j] * second
+            x[i, 2] -= follow[i, j] * third
+    for k in range(w.shape[0]):
+        lin_first, lin_second, lin_third = between(lin[k])
+        pull_first, pull_second, pull_third = between(pull[k])
+        missed = largest(
+            (lin_first + pull_first) / MISS[0], (lin_second + pull_second) / MISS[1], (lin_third + pull_third) / MISS[2]
+        )
+        left_over(phi[k], pull[k], used[k], left)
+        places[k, 0] = error[k]
+        mode_first, mode_second, mode_third = between(w[k])
+        for p in range(4):
+            row = FIRST + p if p < 3 else END
+            fresh = magnified * miss[k, row] * missed
+            places[k, p + 1] = decay[k, row] * error[k] + magnified * left[p] + fresh
+            off = fresh
+            if p < 3:
+                off += mode_first if p == 0 else (mode_second if p == 1 else mode_third)
+            if k < n:
+                for i in range(n):
+                    x[i, p] += shape[i, k] * off
+            else:
+                step = max(step, size[k] * abs(off))
+        places[k, 1] += mode_first
+        places[k, 2] += mode_second
+        places[k, 3] += mode_third
+    for i in range(n):
+        for p in range(4):
+            if not abs(x[i, p]) <= step:
+                step = abs(x[i, p])
+    for a in range(run.size):
+        for p in range(4):
+            total = 0.0
+            for k in range(n):
+                total += gap[a, k] * places[k, p + 1]
+            run[a] = max(run[a], abs(total))
+    return step
+
+
+@jit_rows
+def _account(
+    u: FloatArray, area: FloatArray, stress: float, theta: float, run: float, area_off: float, peaks: FloatArray
+) -> None:
+    """Peaks of a gap's voltage and force over what counts of a step, and the errors of both."""
+    steepest = 0.0
+    force = 0.0
+    for i in range(NODES):
+        if POINTS[i] <= theta:
+            size = abs(u[i])
+            pressure = stress * size * area[i]
+            peaks[PEAK_U] = max(peaks[PEAK_U], size)
+            force = max(force, pressure * size)
+            # F ~ u^2 A: what moves u by du moves F by at most 2 F du / u, as the area falls with u.
+            steepest = max(steepest, 2.0 * pressure)
+    peaks[PEAK_F] = max(peaks[PEAK_F], force)
+    peaks[ERROR_U] = max(peaks[ERROR_U], run)
+    peaks[ERROR_F] = max(peaks[ERROR_F], run * steepest + area_off * force)
+
+
+@jit
+def march(
+    form: Form, pace: Pace, tables: Tables, work: Work, integral: FloatArray, size: FloatArray, sources: Sources,
+    jump: bool, tau: float, t_end: float, y: FloatArray, error: FloatArray, sign: FloatArray, s_before: FloatArray,
+    branch: FloatArray, control: FloatArray, counters: IntArray, peaks: FloatArray, collected: FloatArray,
+    t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray, tried: FloatArray,
+) -> int:  # fmt: skip
+    """Step to `t_end` through the sources' segments, writing outputs on the way.
+
+    Parameters
+    ----------
+    form, pace, tables, work, integral
+        What to step, how and where; `integral` is `lobatto.integral_table()`.
+    size : ndarray, shape (m,)
+        Voltage (V) that each mode moves.
+    sources : Sources
+    jump : bool
+        Whether this is the inside of a jump, with time its fraction.
+    tau : float
+        Shortest time constant, s.
+    t_end : float
+        s, not past the last edge.
+    y : ndarray
+        State as in `engine.network`; updated, as all that follow.
+    error : ndarray, shape (m,)
+        Estimated error of the modes, signed.
+    sign, s_before : ndarray
+        Branch of each area (0: choose), and the sources' values just before the time reached.
+    branch : ndarray, shape (n_area, 2)
+        When each area's branch began, and how long the one before was, s.
+    control, counters, peaks, collected : ndarray
+        Bookkeeping: `readout`, the columns above, and `charge_error`.
+    t_out, left, out : ndarray
+        Output times (ascending), whether the left-hand value is meant, and the columns to fill: the state, then the
+        currents.
+    tried : ndarray, shape (TRIED, 4)
+        Takes the last steps tried, in turn: start and length (s), error over the one allowed, number from 1.
+
+    Returns
+    -------
+    int
+        DONE; JUMP: a source jumps at the time reached, take that first; NO_STEP is short enough; TOO_MANY steps;
+        REFERENCE: an area is far from its reference; or PAUSED: call again.
+    """
+    mobile = form.mobile
+    rates, gain, shape, inverse, follow = (
+        borrow(form.rates), borrow(form.gain), borrow(form.shape), borrow(form.inverse), borrow(form.follow)
+    )  # fmt: skip
+    feed, tap, tap_s, met = borrow(form.feed), borrow(form.tap), borrow(form.tap_s), borrow(form.met)
+    c, g, home, cell = borrow(form.c), borrow(form.g), borrow(form.home), borrow(form.cell)
+    area0, unit, slow, speed = borrow(form.area0), borrow(form.unit), borrow(form.slow), borrow(form.pace)
+    gap, gap_s, stress = borrow(form.gap), borrow(form.gap_s), borrow(form.stress)
+    powers, slopes, lo, scale = borrow(form.powers), borrow(form.slopes), borrow(form.lo), borrow(form.scale)
+    curves = borrow(form.curves)
+    stored, stored_s, lost, lost_s = (
+        borrow(form.stored), borrow(form.stored_s), borrow(form.lost), borrow(form.lost_s)
+    )  # fmt: skip
+    through = borrow(form.through)
+    keys_h, keys_level, count = borrow(tables.h), borrow(tables.level), borrow(tables.used)
+    all_decay, all_phi, all_miss = borrow(tables.decay), borrow(tables.phi), borrow(tables.miss)
+    sources = Sources(borrow(sources.first), borrow(sources.edges), borrow(sources.terms), borrow(sources.series))
+    r, s, ds, matrix = borrow(work.r), borrow(work.s), borrow(work.ds), borrow(work.matrix)
+    modes, cells, areas = borrow(work.modes), borrow(work.cells), borrow(work.areas)
+    w, base, lin, d, pull, used = modes[_W], modes[_BASE], modes[_LIN], modes[_D], modes[_PULL], modes[_USED]
+    pull_before, left_before = modes[_PULL_BEFORE], modes[_LEFT_BEFORE]
+    free, free_rate, cell_u, j = cells[FREE], cells[FREE_RATE], cells[CELL_U], cells[J]
+    area, slope, more = areas[AREA], areas[SLOPE], areas[MORE]
+    u, guess = areas[U], areas[GUESS]
+    w0, places, weight, room, x_off = (
+        borrow(work.w0), borrow(work.places), borrow(work.weight), borrow(work.room), borrow(work.x)
+    )  # fmt: skip
+    values, coefficients, outputs = borrow(work.values), borrow(work.coefficients), borrow(work.outputs)
+    y, error, sign, s_before = borrow(y), borrow(error), borrow(sign), borrow(s_before)
+    control, counters, peaks, branch = borrow(control), borrow(counters), borrow(peaks), borrow(branch)
+    t_out, left, out, tried = borrow(t_out), borrow(left), borrow(out), borrow(tried)
+    integral, size = borrow(integral), borrow(size)
+    n, n_s, m, n_area = shape.shape[0], s_before.size, rates.size, sign.size
+    first_z = y.size - n_s
+    tol, charge = pace.tol, pace.charge
+    is_series = sources.series.shape[1] > 0
+    index = np.zeros(n_s, np.int64)
+    now, slopes_now = np.zeros(n_s), np.zeros(n_s)
+    run, gained = np.zeros(n_area), np.zeros(n_s)
+    unfollow = -follow
+    for a in range(n_area):
+        for i in range(ROWS):
+            area[a, i] = area0[a]
+            slope[a, i] = 0.0
+            areas[RATE, a, i] = 0.0
+            more[a, i] = 0.0
+    slot, h_slot, flips, fresh = -1, 0.0, 0, -1
+    first_out = counters[OUTPUT]
+    next_out = t_out[first_out] if first_out < t_out.size else math.inf
+    pause = counters[ACCEPTED] + 1 + AT_ONCE // m
+    while control[T] < t_end:
+        t = control[T]
+        if counters[ACCEPTED] + counters[REJECTED] > control[MOST]:
+            return TOO_MANY
+        if counters[ACCEPTED] >= pause:
+            return PAUSED
+        stop = t_end
+        at_edge = False
+        for i in range(n_s):
+            while sources.edges[sources.first[i] + index[i] + 1] <= t:
+                index[i] += 1
+            at_edge |= sources.edges[sources.first[i] + index[i]] == t
+            stop = min(stop, sources.edges[sources.first[i] + index[i] + 1])
+        at_sources(sources, index, t, 0.0, now, slopes_now)
+        if at_edge:
+            if not jump:
+                for i in range(n_s):
+                    if abs(now[i] - s_before[i]) > ROUNDING * max(abs(now[i]), abs(s_before[i])):
+                        return JUMP
+            # The steps after a jump are often those after the one before.
+            control[H] = control[H_AFTER_EDGE]
+            control[TOO_LONG] = 0.0
+            control[ALLOWED] = 0.0
+            fresh = H_AFTER_EDGE
+        for k in range(n):
+            w0[k] = 0.0
+        for i in range(n):
+            x = y[i]
+            for e in range(n_s):
+                x += follow[i, e] * now[e]
+            for k in range(n):
+                w0[k] += inverse[k, i] * x
+        for k in range(n, m):
+            w0[k] = y[k]
+        ahead = math.inf
+        control[BRANCH_START], control[BRANCH_LENGTH] = t, math.inf
+        for a in range(n_area):
+            if cell[a] < 0:
+                sign[a] = 1.0
+                continue
+            voltage = 0.0
+            for k in range(n):
+                voltage += gap[a, k] * w0[k]
+            for e in range(n_s):
+                voltage += gap_s[a, e] * now[e]
+            if sign[a] == 0.0:
+                sign[a] = 1.0 if voltage >= 0.0 else -1.0
+                branch[a, 0], branch[a, 1] = t, math.inf
+            here = unit[a] * y[slow[a]] if slow[a] >= 0 else 1.0 / inverse_area(abs(voltage), curves[a])[0]
+            if not jump and max(here / area0[a], area0[a] / here) > FARTHEST:
+                return REFERENCE
+            end = branch[a, 0] + 1.02 * branch[a, 1] - t
+            if 0.0 < end < ahead:
+                ahead = end
+                control[BRANCH_START], control[BRANCH_LENGTH] = branch[a, 0], branch[a, 1]
+        h = choose_step(pace, tau, True, is_series, t, stop - t, control)
+        wanted = control[H]
+        which, wrong, magnified = -1, 0, 1.0
+        while True:
+            if h != h_slot:
+                slot = make_tables(rates, 0, h, keys_h, keys_level, count, all_decay, all_phi, all_miss)
+                h_slot = h
+                weigh(rates, size, all_decay[slot], h, weight)
+            decay, phi, miss = all_decay[slot], all_phi[slot], all_miss[slot]
+            for e in range(n_s):
+                row = sources.first[e] + index[e]
+                start = sources.edges[row]
+                rows.source_rows(
+                    sources.terms[row - e], sources.series[row - e], sources.edges[row + 1] - start, t - start, h, True,
+                    r[e],
+                )  # fmt: skip
+                for i in range(ROWS):
+                    s[e, i] = r[e, rows.SOURCE, i]
+                    ds[e, i] = r[e, rows.SLOPE, i]
+            _clear(lin)
+            combine(gain, s, lin)
+            _clear(free)
+            combine(tap_s, s, free)
+            _clear(free_rate)
+            combine(tap_s, ds, free_rate)
+            _clear(used)
+            _clear(guess)
+            for k in range(m):
+                for i in range(ROWS):
+                    base[k, i] = decay[k, i] * w0[k]
+            respond(lin, phi, base, base)
+            closed = False
+            slowly = False
+            step = 0.0
+            for iteration in range(1, 41):
+                if iteration > 1:
+                    if slowly:
+                        step = mix(pull, used, weight, pull_before, left_before)
+                    else:
+                        step = plain(pull, used, weight, pull_before, left_before)
+                respond(used, phi, base, w)
+                counters[NFEV] += NODES
+                if not evaluate(
+                    mobile, rates, feed, tap, met, c, g, home, cell, area0, unit, slow, speed, powers, slopes, lo,
+                    scale, curves, sign, w, lin, d, pull, cells, areas, matrix, room[3],
+                ):  # fmt: skip
+                    break
+                _clear(u)
+                combine(gap, w[:n], u)
+                combine(gap_s, s, u)
+                change = _moved(u, guess)
+                if iteration == 1:
+                    continue
+                # What the gap voltages would move next, by what they moved for the last change of the currents.
+                off = distance(pull, used, weight)
+                if not off < math.inf:
+                    break
+                if change * off <= 0.3 * tol * step:
+                    closed = True
+                    break
+                slowly = off > 0.15 * step
+            step_error = math.inf
+            flip = False
+            which, wrong = -1, 0
+            for a in range(n_area):
+                if cell[a] >= 0:
+                    found = first_wrong(u[a], sign[a], tol)
+                    if found == 1 and flips <= n_area and sign[a] * u[a, 0] <= 1e-9 * abs(u[a, 1]):
+                        # The step starts at a zero and leaves on the other side.
+                        sign[a] = -sign[a]
+                        branch[a, 0], branch[a, 1] = t, math.inf
+                        flip = True
+            if flip:
+                flips += 1
+                continue
+            lowest = 1.0
+            if closed:
+                lowest = lowest_pivot(matrix)
+                magnified = 1.0 / lowest if mobile else 1.0
+                step_error = _assess(
+                    shape, follow, gap, gap_s, size, decay, phi, miss, error, w, lin, pull, used, s, magnified, x_off,
+                    places, run,
+                )  # fmt: skip
+                if charge:
+                    # A charge is the integral of A du among others.
+                    for a in range(n_area):
+                        if cell[a] >= 0:
+                            one, two, three = between(area[a])
+                            swing = 0.3 * abs(u[a, END] - u[a, 0]) / area0[a]
+                            step_error = max(step_error, swing * abs(largest(one, two, three)))
+            note(tried, counters[ACCEPTED] + counters[REJECTED], t, h, step_error / tol)
+            factor = 6.0
+            if step_error > 0.0:
+                factor = 0.9 * (tol / step_error) ** (1.0 / NODES) if step_error < math.inf else 0.5
+            if step_error <= tol:
+                # A step cut short by a boundary says little about the next one; after a jump the decays die away one
+                # by one, and the length allowed grows from step to step as it did.
+                growth = h * factor / control[ALLOWED] if control[ALLOWED] > 0.0 else 1.0
+                control[ALLOWED] = h * factor
+                proposed = h * min(_MOST_GROWTH, max(0.5, factor * min(max(growth, 1.0), _MOST_TREND)))
+                proposed = max(proposed, wanted if h < wanted else 0.0)
+                if control[TOO_LONG] > 0.0:
+                    proposed = min(proposed, 0.93 * control[TOO_LONG])
+                    control[TOO_LONG] *= growth if growth > 1.5 else 1.03
+                if fresh >= 0 and h >= wanted:
+                    control[fresh] = h * min(2.0, factor)
+                fresh = -1
+                control[H] = proposed
+                break
+            counters[REJECTED] += 1
+            # Refused at this length: a singularity, of which rounding hides the last bit.
+            if h <= 1e-13 * max(abs(t), 1e-3 * (stop - t)) or (mobile and lowest < NEAR_FOLD):
+                return NO_STEP
+            shorter = 1.0
+            for a in range(n_area):
+                if cell[a] >= 0 and sign[a] * u[a, END] < lo[a]:
+                    # It went far over a zero, where the branch has no meaning: end soon after the zero.
+                    found = first_wrong(u[a], sign[a], tol)
+                    if found > 1:
+                        shorter = min(shorter, 1.1 * POINTS[found])
+            if shorter < 1.0:
+                h = rung(h * min(0.9, shorter))
+            else:
+                control[TOO_LONG] = h
+                control[ALLOWED] = 0.0
+                h = rung(h * min(0.9, max(0.25, factor)))
+                wanted = h
+        t_new = t + h
+        theta = 1.0
+        if t_new >= stop or stop - t_new <= 1e-12 * h:
+            t_new = stop
+            theta = min(1.0, (stop - t) / h)
+        if flips <= n_area:
+            for a in range(n_area):
+                wrong = first_wrong(u[a], sign[a], tol) if cell[a] >= 0 else 0
+                if wrong > 0:
+                    crossing = zero(u[a], sign[a], wrong, coefficients[0])
+                    if t + crossing * h <= t_new and crossing <= theta:
+                        theta = crossing
+                        t_new = t + crossing * h
+                        which = a
+        if which >= 0 and t_new <= t:
+            sign[which] = -sign[which]
+            branch[which, 0], branch[which, 1] = t, math.inf
+            flips += 1
+            continue
+        flips = 0
+        if charge:
+            for k in range(m):
+                for i in range(ROWS):
+                    d[k, i] += pull[k, i]
+            charge_rows(
+                mobile, h, stored, stored_s, lost, lost_s, through, c, g, home, integral, w, d, s, ds, cell_u, more, j,
+                room, values[first_z:], values[y.size :],
+            )  # fmt: skip
+            charge_error(
+                mobile, h, stored, lost, through, tap, c, g, home, cell, unit, slow, places, theta, cell_u, area,
+                slope, more, collected, control,
+            )  # fmt: skip
+        for e in range(n_s):
+            gained[e] = at(values[first_z + e], theta) if charge else 0.0
+        if next_out <= t_new:
+            _clear(values[:first_z])
+            combine(shape, w[:n], values[:n])
+            combine(unfollow, s, values[:n])
+            for k in range(n, m):
+                for i in range(ROWS):
+                    values[k, i] = w[k, i]
+            for e in range(n_s):
+                for i in range(ROWS):
+                    values[first_z + e, i] = y[first_z + e] + (values[first_z + e, i] if charge else 0.0)
+            for i in range(out.shape[0]):
+                series_of(values[i], coefficients[i])
+            first_out += write_outputs(
+                t, h, theta, t_new, 0.0, False, coefficients, outputs, first_out, 0, t_out, left, out
+            )  # fmt: skip
+            counters[OUTPUT] = first_out
+            next_out = t_out[first_out] if first_out < t_out.size else math.inf
+        control[MAGNIFIED] = max(control[MAGNIFIED], magnified)
+        for a in range(n_area):
+            if stress[a] > 0.0:
+                area_off = 0.0
+                if slow[a] >= 0:
+                    for p in range(N_PLACES):
+                        area_off = max(area_off, abs(places[slow[a], p]))
+                _account(u[a], area[a], stress[a], theta, run[a], area_off, peaks[a])
+        for k in range(m):
+            w0[k] = at(w[k], theta) if theta < 1.0 else w[k, END]
+        if theta < 1.0:
+            error_at(places, theta, error)
+        else:
+            for k in range(m):
+                error[k] = places[k, N_PLACES - 1]
+        at_sources(sources, index, t_new, 0.0, s_before, slopes_now)
+        for i in range(n):
+            y[i] = 0.0
+            for k in range(n):
+                y[i] += shape[i, k] * w0[k]
+            for e in range(n_s):
+                y[i] -= follow[i, e] * s_before[e]
+        for k in range(n, m):
+            y[k] = w0[k]
+        for e in range(n_s):
+            y[first_z + e] += gained[e]
+        if which >= 0:
+            sign[which] = -sign[which]
+            branch[which, 1] = t_new - branch[which, 0]
+            branch[which, 0] = t_new
+            counters[ZEROS] += 1
+            # The area has a kink here: fast modes start anew.
+            if control[H_AFTER_ZERO] > 0.0:
+                control[H] = control[H_AFTER_ZERO]
+                control[ALLOWED] = 0.0
+            fresh = H_AFTER_ZERO
+        control[T] = t_new
+        counters[ACCEPTED] += 1
+    return DONE
