@@ -93,7 +93,7 @@ def charge_rows(
 def charge_error(
     mobile: bool, h: float, stored: FloatArray, lost: FloatArray, through: FloatArray, tap: FloatArray, c: FloatArray,
     g: FloatArray, home: IntArray, cell: IntArray, unit: FloatArray, slow: IntArray, places: FloatArray,
-    theta: float, u: FloatArray, area: FloatArray, slope: FloatArray, more: FloatArray,
+    early: FloatArray, theta: float, u: FloatArray, area: FloatArray, slope: FloatArray, more: FloatArray,
     collected: FloatArray, control: FloatArray,
 ) -> None:  # fmt: skip
     """Largest error of the charges over the part of a step that counts, from the signed error of the modes.
@@ -133,7 +133,7 @@ def charge_error(
             leak = 0.0
             turned = 0.0
             for k in range(n):
-                now += stored[source, k] * places[k, p]
+                now += stored[source, k] * (places[k, p] + (early[k] if p == 0 else 0.0))
                 leak += lost[source, k] * places[k, p]
             for b in range(n_f):
                 a = home[b]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import borrow, jit, jit_rows
+from fingerspice.engine.charge import DERIVATIVE
 from fingerspice.engine.exponential import (
     N_PLACES,
     Tables,
@@ -83,6 +84,8 @@ PEAK_U, PEAK_F, ERROR_U, ERROR_F = 0, 1, 2, 3
 _MOST_GROWTH, _MOST_TREND = 8.0, 2.5
 # An area this many times another reference's, or a part of it, wants a reference of its own.
 FARTHEST = 1.2
+# Share of a step in which its polynomials may miss a decay: a third of the way to the first node.
+_EARLY = POINTS[1] / 3.0
 # A source's change at an edge, relative, that is its rounding and no jump.
 ROUNDING = 1e-14
 # Closer to the fold, other methods get there sooner.
@@ -132,7 +135,7 @@ def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: 
         np.zeros((columns, ROWS)),
         np.zeros((2, WRITTEN_AT_ONCE)),
         np.zeros((4, ROWS)),
-        np.zeros((n, 4)),
+        np.zeros((n, 5)),
     )
 
 
@@ -157,23 +160,23 @@ def _moved(u: FloatArray, before: FloatArray) -> float:
 
 @jit
 def _assess(
-    shape: FloatArray, follow: FloatArray, gap: FloatArray, gap_s: FloatArray, size: FloatArray, decay: FloatArray,
-    phi: FloatArray, miss: FloatArray, error: FloatArray, w: FloatArray, lin: FloatArray, pull: FloatArray,
-    used: FloatArray, s: FloatArray, magnified: float, x: FloatArray, places: FloatArray, run: FloatArray,
+    rates: FloatArray, h: float, shape: FloatArray, follow: FloatArray, gap: FloatArray, size: FloatArray,
+    decay: FloatArray, phi: FloatArray, miss: FloatArray, error: FloatArray, w: FloatArray, lin: FloatArray,
+    pull: FloatArray, used: FloatArray, s: FloatArray, magnified: float, x: FloatArray, places: FloatArray,
+    early: FloatArray, run: FloatArray,
 ) -> float:  # fmt: skip
     """Error of a converged step, V, from what its polynomials miss between nodes; see `exponential.assess`.
 
-    `places` (m, N_PLACES) takes the error of the modes, `run` (n_area,) the largest of each gap's voltage with what
-    the iteration left and what came before, `x` (n, 4) is for passing use.
+    `places` (m, N_PLACES) takes the error of the modes, `early` (m,) what their polynomials miss of a decay that is over
+    before the first node, `run` (n_area,) the largest error of each gap's voltage with what the iteration left and what
+    came before; `x` (n, 5) is for passing use.
     """
     n = shape.shape[0]
     left = np.zeros(4)
     step = 0.0
     for i in range(n):
-        for p in range(4):
+        for p in range(5):
             x[i, p] = 0.0
-    for a in range(run.size):
-        run[a] = 0.0
     for j in range(s.shape[0]):
         first, second, third = between(s[j])
         for i in range(n):
@@ -189,6 +192,15 @@ def _assess(
         left_over(phi[k], pull[k], used[k], left)
         places[k, 0] = error[k]
         mode_first, mode_second, mode_third = between(w[k])
+        # Its slope at the start tells: it is off by the size of the decay times its rate.
+        fall = 0.0
+        for j in range(NODES):
+            fall += DERIVATIVE[0, j] * w[k, j]
+        fall = lin[k, 0] + pull[k, 0] - rates[k] * w[k, 0] - fall / h
+        early[k] = fall / (rates[k] + 1.0 / (_EARLY * h))
+        if k < n:
+            for i in range(n):
+                x[i, 4] += shape[i, k] * early[k]
         for p in range(4):
             row = FIRST + p if p < 3 else END
             fresh = magnified * miss[k, row] * missed
@@ -205,10 +217,14 @@ def _assess(
         places[k, 2] += mode_second
         places[k, 3] += mode_third
     for i in range(n):
-        for p in range(4):
+        for p in range(5):
             if not abs(x[i, p]) <= step:
                 step = abs(x[i, p])
     for a in range(run.size):
+        total = 0.0
+        for k in range(n):
+            total += gap[a, k] * (places[k, 0] + early[k])
+        run[a] = abs(total)
         for p in range(4):
             total = 0.0
             for k in range(n):
@@ -319,7 +335,7 @@ def march(
     is_series = sources.series.shape[1] > 0
     index = np.zeros(n_s, np.int64)
     now, slopes_now = np.zeros(n_s), np.zeros(n_s)
-    run, gained = np.zeros(n_area), np.zeros(n_s)
+    run, gained, early = np.zeros(n_area), np.zeros(n_s), np.zeros(m)
     unfollow = -follow
     for a in range(n_area):
         for i in range(ROWS):
@@ -466,8 +482,8 @@ def march(
                 lowest = lowest_pivot(matrix)
                 magnified = 1.0 / lowest if mobile else 1.0
                 step_error = _assess(
-                    shape, follow, gap, gap_s, size, decay, phi, miss, error, w, lin, pull, used, s, magnified, x_off,
-                    places, run,
+                    rates, h, shape, follow, gap, size, decay, phi, miss, error, w, lin, pull, used, s, magnified,
+                    x_off, places, early, run,
                 )  # fmt: skip
                 if charge:
                     # A charge is the integral of A du among others.
@@ -542,7 +558,7 @@ def march(
                 room, values[first_z:], values[y.size :],
             )  # fmt: skip
             charge_error(
-                mobile, h, stored, lost, through, tap, c, g, home, cell, unit, slow, places, theta, cell_u, area,
+                mobile, h, stored, lost, through, tap, c, g, home, cell, unit, slow, places, early, theta, cell_u, area,
                 slope, more, collected, control,
             )  # fmt: skip
         for e in range(n_s):

@@ -154,7 +154,8 @@ def area_polynomial(curve: FloatArray, tol: float) -> tuple[FloatArray, FloatArr
     kept = series[: DEGREE + 1]
     if series.size == 0 or np.abs(series[DEGREE + 1 :]).sum() > tol * abs(series[0]):
         return powers, slopes, lo, 0.0
-    powers[: kept.size] = chebyshev.cheb2poly(kept)
+    found = chebyshev.cheb2poly(kept)
+    powers[: found.size] = found
     slopes[:-1] = np.arange(1, DEGREE + 1) * powers[1:]
     x = np.linspace(-1.0, 1.0, 33)
     miss = np.abs(np.polynomial.polynomial.polyval(x, powers) - chebyshev.chebval(x, series)).max()
