@@ -38,6 +38,8 @@ ORDER = (
     *("settling", "marching", "folding"),
     *(
         "direct",
+        "netruns",
+        "netmarching",
         "nodal",
         "superposition",
         "diagnosis",

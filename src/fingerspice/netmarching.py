@@ -106,7 +106,6 @@ def _make_reference(scene: NetworkScene, area: FloatArray, tol: float) -> Refere
         feed=_packed(feed),
         tap=_packed(tap[fed]),
         tap_s=_packed(tap_s[fed]),
-        met=_packed(tap[fed] @ feed[:n]),
         c=net.c[fed],
         g=net.g_area[fed],
         home=net.place[fed],

@@ -33,12 +33,14 @@ from fingerspice.engine.netrows import (
     MORE,
     RATE,
     SLOPE,
+    STIFF,
     Form,
     J,
     U,
     combine,
     evaluate,
     lowest_pivot,
+    meet,
 )
 from fingerspice.engine.network import Sources, at_sources
 from fingerspice.engine.pace import Pace, choose_step, rung
@@ -104,6 +106,7 @@ class Work(NamedTuple):
     cells: FloatArray
     areas: FloatArray
     matrix: FloatArray
+    met: FloatArray
     w0: FloatArray
     places: FloatArray
     weight: FloatArray
@@ -128,6 +131,7 @@ def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: 
         np.zeros((5, cells, ROWS)),
         np.zeros((6, areas, ROWS)),
         np.zeros((cells, cells + 1, ROWS)),
+        np.zeros((cells, cells)),
         np.zeros(modes),
         np.zeros((modes, N_PLACES)),
         np.zeros(modes),
@@ -301,7 +305,7 @@ def march(
     rates, gain, shape, inverse, follow = (
         borrow(form.rates), borrow(form.gain), borrow(form.shape), borrow(form.inverse), borrow(form.follow)
     )  # fmt: skip
-    feed, tap, tap_s, met = borrow(form.feed), borrow(form.tap), borrow(form.tap_s), borrow(form.met)
+    feed, tap, tap_s, met = borrow(form.feed), borrow(form.tap), borrow(form.tap_s), borrow(work.met)
     c, g, home, cell = borrow(form.c), borrow(form.g), borrow(form.home), borrow(form.cell)
     area0, unit, slow, speed = borrow(form.area0), borrow(form.unit), borrow(form.slow), borrow(form.pace)
     gap, gap_s, stress = borrow(form.gap), borrow(form.gap_s), borrow(form.stress)
@@ -409,6 +413,7 @@ def march(
             if h != h_slot:
                 slot = make_tables(rates, 0, h, keys_h, keys_level, count, all_decay, all_phi, all_miss)
                 h_slot = h
+                meet(h, rates, feed, tap, met)
                 weigh(rates, size, all_decay[slot], h, weight)
             decay, phi, miss = all_decay[slot], all_phi[slot], all_miss[slot]
             for e in range(n_s):
@@ -445,7 +450,7 @@ def march(
                 respond(used, phi, base, w)
                 counters[NFEV] += NODES
                 if not evaluate(
-                    mobile, rates, feed, tap, met, c, g, home, cell, area0, unit, slow, speed, powers, slopes, lo,
+                    mobile, h, rates, feed, tap, met, c, g, home, cell, area0, unit, slow, speed, powers, slopes, lo,
                     scale, curves, sign, w, lin, d, pull, cells, areas, matrix, room[3],
                 ):  # fmt: skip
                     break
@@ -551,8 +556,9 @@ def march(
         flips = 0
         if charge:
             for k in range(m):
-                for i in range(ROWS):
-                    d[k, i] += pull[k, i]
+                if not rates[k] * h > STIFF:
+                    for i in range(ROWS):
+                        d[k, i] += pull[k, i]
             charge_rows(
                 mobile, h, stored, stored_s, lost, lost_s, through, c, g, home, integral, w, d, s, ds, cell_u, more, j,
                 room, values[first_z:], values[y.size :],

@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import jit, jit_inline, jit_rows
+from fingerspice.engine.charge import DERIVATIVE
 from fingerspice.engine.rows import polynomial_rows
-from fingerspice.numerics.lobatto import NODES, ROWS
+from fingerspice.numerics.lobatto import BETWEEN, NODES, ROWS
 from fingerspice.physics.contact import inverse_area
 
 FloatArray = NDArray[np.float64]
@@ -31,6 +32,12 @@ IntArray = NDArray[np.int64]
 # Blocks of the cells' rows, and of the areas'; then gap voltages and a guess of them.
 FREE, FREE_RATE, CELL_U, DU, J = range(5)
 AREA, SLOPE, RATE, MORE, U, GUESS = range(6)
+
+# Steps over the time constant of a mode from which on its rate is taken from its polynomial: -rate w + gain s + feed j
+# would be what is left of large numbers, and j hands that on to every other mode.
+STIFF = 300.0
+# From values at the nodes to slopes at all rows, per step length: slopes = values @ TO_RATES.
+TO_RATES = np.ascontiguousarray(np.vstack([DERIVATIVE, BETWEEN.T @ DERIVATIVE]).T)
 
 
 class Form(NamedTuple):
@@ -47,8 +54,6 @@ class Form(NamedTuple):
     follow : ndarray, shape (n, n_s)
     feed : ndarray, shape (m, n_f)
     tap, tap_s : ndarray, shape (n_f, n) and (n_f, n_s)
-    met : ndarray, shape (n_f, n_f)
-        tap @ feed.
     c, g : ndarray, shape (n_f,)
         Capacitance and leak of the cells per area.
     home : ndarray of int, shape (n_f,)
@@ -80,7 +85,6 @@ class Form(NamedTuple):
     feed: FloatArray
     tap: FloatArray
     tap_s: FloatArray
-    met: FloatArray
     c: FloatArray
     g: FloatArray
     home: IntArray
@@ -115,12 +119,31 @@ def combine(matrix: FloatArray, rows: FloatArray, out: FloatArray) -> None:
 
 
 @jit_rows
-def _straight(rates: FloatArray, w: FloatArray, lin: FloatArray, out: FloatArray) -> None:
-    """What the modes' rates are without j."""
+def _straight(h: float, rates: FloatArray, w: FloatArray, lin: FloatArray, out: FloatArray) -> None:
+    """What the modes' rates are without j; of stiff ones, with it."""
     for k in range(w.shape[0]):
         rate = rates[k]
-        for i in range(ROWS):
-            out[k, i] = lin[k, i] - rate * w[k, i]
+        if rate * h > STIFF:
+            for i in range(ROWS):
+                out[k, i] = 0.0
+            for m in range(NODES):
+                share = w[k, m] / h
+                for i in range(ROWS):
+                    out[k, i] += TO_RATES[m, i] * share
+        else:
+            for i in range(ROWS):
+                out[k, i] = lin[k, i] - rate * w[k, i]
+
+
+@jit
+def meet(h: float, rates: FloatArray, feed: FloatArray, tap: FloatArray, met: FloatArray) -> None:
+    """Rates of the cells' voltages for each j, into `met` (n_f, n_f): tap @ feed but for the stiff modes."""
+    for a in range(met.shape[0]):
+        for b in range(met.shape[1]):
+            met[a, b] = 0.0
+            for k in range(tap.shape[1]):
+                if not rates[k] * h > STIFF:
+                    met[a, b] += tap[a, k] * feed[k, b]
 
 
 @jit_rows
@@ -208,8 +231,8 @@ def _times(factor: float, a: FloatArray, b: FloatArray, out: FloatArray) -> None
 
 @jit_inline
 def evaluate(
-    mobile: bool, rates: FloatArray, feed: FloatArray, tap: FloatArray, met: FloatArray, c: FloatArray, g: FloatArray,
-    home: IntArray, cell: IntArray, area0: FloatArray, unit: FloatArray, slow: IntArray, pace: FloatArray,
+    mobile: bool, h: float, rates: FloatArray, feed: FloatArray, tap: FloatArray, met: FloatArray, c: FloatArray,
+    g: FloatArray, home: IntArray, cell: IntArray, area0: FloatArray, unit: FloatArray, slow: IntArray, pace: FloatArray,
     powers: FloatArray, slopes: FloatArray, lo: FloatArray, scale: FloatArray, curves: FloatArray, sign: FloatArray,
     w: FloatArray, lin: FloatArray, d: FloatArray, pull: FloatArray, cells: FloatArray, areas: FloatArray,
     matrix: FloatArray, least: FloatArray,
@@ -223,7 +246,7 @@ def evaluate(
     n = tap.shape[1]
     free, free_rate, u, du, j = cells[FREE], cells[FREE_RATE], cells[CELL_U], cells[DU], cells[J]
     area, slope, rate, more = areas[AREA], areas[SLOPE], areas[RATE], areas[MORE]
-    _straight(rates, w, lin, d)
+    _straight(h, rates, w, lin, d)
     _copy(free, u)
     combine(tap, w[:n], u)
     _copy(free_rate, du)
@@ -240,7 +263,7 @@ def evaluate(
                     pull[k, i] = pace[a] / unit[a] * area[a, i]
                     area[a, i] = unit[a] * w[k, i]
                     slope[a, i] = 0.0
-                    rate[a, i] = unit[a] * (d[k, i] + pull[k, i])
+                    rate[a, i] = unit[a] * (d[k, i] if rates[k] * h > STIFF else d[k, i] + pull[k, i])
             for i in range(ROWS):
                 more[a, i] = area[a, i] - area0[a]
     n_f = c.size
