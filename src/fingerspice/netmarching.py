@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.network import network_modes
-from fingerspice.engine import netmarch, readout
+from fingerspice.engine import netassess, netmarch, readout
 from fingerspice.engine.exponential import Tables, new_tables
 from fingerspice.engine.network import Sources
 from fingerspice.engine.netrows import Form
@@ -136,8 +136,14 @@ def _make_reference(scene: NetworkScene, area: FloatArray, tol: float) -> Refere
     return Reference(
         form, jump, new_tables(n + n_slow), new_tables(n + n_slow), np.linalg.norm(modes.shape, axis=0),
         1.0 / fastest if fastest > 0.0 else math.inf,
-        float((np.abs(modes.shape) @ np.abs(modes.inverse)).sum(axis=1).max(initial=1.0)),
+        float((np.abs(modes.shape) @ np.abs(modes.inverse)).sum(axis=1).max(initial=1.0)) + _spread(modes.rates),
     )  # fmt: skip
+
+
+def _spread(rates: FloatArray) -> float:
+    """What the rounding of the fastest mode leaves in the slowest."""
+    live = rates[rates > 0.0]
+    return math.sqrt(float(live.max() / live.min())) if live.size else 0.0
 
 
 def _packed(x: FloatArray) -> FloatArray:
@@ -177,7 +183,7 @@ class March(Integration):
         n_s, n_area = self.s_before.size, self.net.gap.size
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
         self.met = np.zeros((n_area, 4))
-        self.peaks = self.met[:, netmarch.PEAK_U]
+        self.peaks = self.met[:, netassess.PEAK_U]
         self.collected = np.zeros((2, n_s))
         self.error[:] = 0.0
         self.control[readout.ERROR_Q] = 0.0
@@ -280,4 +286,7 @@ def _state_error(run: NetworkRun, one: March, u_scale: float) -> float:
         charge = 2.0 * SAFETY * float(one.control[readout.ERROR_Q]) + 4e-16 * held * steps
     run.error = ErrorEstimate(u_error + run.error.u_gap, f_error, charge)
     run.margin = 1.0 / float(one.control[readout.MAGNIFIED])
+    if one.net.mobile:
+        # Where a mode follows at once, its part of the determinant is known at the outputs only.
+        run.margin = min(run.margin, float(one.problem.record(run).fold_margin.min(initial=1.0)))
     return max(u_error / u_peak if u_peak > 0.0 else 0.0, f_error / f_peak if f_peak > 0.0 else 0.0)

@@ -8,21 +8,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import borrow, jit, jit_rows
-from fingerspice.engine.charge import DERIVATIVE
+from fingerspice.compiled import borrow, jit
 from fingerspice.engine.exponential import (
     N_PLACES,
     Tables,
     between,
     distance,
     largest,
-    left_over,
     make_tables,
     mix,
     plain,
     respond,
     weigh,
 )
+from fingerspice.engine.netassess import account, assess, clear, moved
 from fingerspice.engine.netcharge import charge_error, charge_rows
 from fingerspice.engine.netrows import (
     AREA,
@@ -39,7 +38,6 @@ from fingerspice.engine.netrows import (
     U,
     combine,
     evaluate,
-    lowest_pivot,
     meet,
 )
 from fingerspice.engine.network import Sources, at_sources
@@ -70,7 +68,7 @@ from fingerspice.engine.readout import (
     zero,
 )
 from fingerspice.engine import rows
-from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
 from fingerspice.physics.contact import inverse_area
 
 FloatArray = NDArray[np.float64]
@@ -80,14 +78,10 @@ IntArray = NDArray[np.int64]
 DONE, JUMP, NO_STEP, TOO_MANY, REFERENCE, PAUSED = 0, 1, 2, 3, 4, 5
 # One entry of `control` more than `readout` has: steps taken and refused, at most.
 MOST = N_CONTROL
-# Columns of `peaks`: of each gap the largest voltage (V) and force (N), and the errors of both.
-PEAK_U, PEAK_F, ERROR_U, ERROR_F = 0, 1, 2, 3
 # Step over the one before, at most; and what of it may be foreseen growth.
 _MOST_GROWTH, _MOST_TREND = 8.0, 2.5
 # An area this many times another reference's, or a part of it, wants a reference of its own.
 FARTHEST = 1.2
-# Share of a step in which its polynomials may miss a decay: a third of the way to the first node.
-_EARLY = POINTS[1] / 3.0
 # A source's change at an edge, relative, that is its rounding and no jump.
 ROUNDING = 1e-14
 # Closer to the fold, other methods get there sooner.
@@ -106,6 +100,7 @@ class Work(NamedTuple):
     cells: FloatArray
     areas: FloatArray
     matrix: FloatArray
+    small: FloatArray
     met: FloatArray
     w0: FloatArray
     places: FloatArray
@@ -130,7 +125,8 @@ def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: 
         np.zeros((8, modes, ROWS)),
         np.zeros((5, cells, ROWS)),
         np.zeros((6, areas, ROWS)),
-        np.zeros((cells, cells + 1, ROWS)),
+        np.zeros((cells, cells + 1 + areas, ROWS)),
+        np.zeros((areas, areas + 1, ROWS)),
         np.zeros((cells, cells)),
         np.zeros(modes),
         np.zeros((modes, N_PLACES)),
@@ -141,120 +137,6 @@ def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: 
         np.zeros((4, ROWS)),
         np.zeros((n, 5)),
     )
-
-
-@jit
-def _clear(block: FloatArray) -> None:
-    for a in range(block.shape[0]):
-        for i in range(ROWS):
-            block[a, i] = 0.0
-
-
-@jit_rows
-def _moved(u: FloatArray, before: FloatArray) -> float:
-    """Root of the summed squares of u - before; `before` becomes u."""
-    total = 0.0
-    for a in range(u.shape[0]):
-        for i in range(ROWS):
-            change = u[a, i] - before[a, i]
-            total += change * change
-            before[a, i] = u[a, i]
-    return math.sqrt(total)
-
-
-@jit
-def _assess(
-    rates: FloatArray, h: float, shape: FloatArray, follow: FloatArray, gap: FloatArray, size: FloatArray,
-    decay: FloatArray, phi: FloatArray, miss: FloatArray, error: FloatArray, w: FloatArray, lin: FloatArray,
-    pull: FloatArray, used: FloatArray, s: FloatArray, magnified: float, x: FloatArray, places: FloatArray,
-    early: FloatArray, run: FloatArray,
-) -> float:  # fmt: skip
-    """Error of a converged step, V, from what its polynomials miss between nodes; see `exponential.assess`.
-
-    `places` (m, N_PLACES) takes the error of the modes, `early` (m,) what their polynomials miss of a decay that is over
-    before the first node, `run` (n_area,) the largest error of each gap's voltage with what the iteration left and what
-    came before; `x` (n, 5) is for passing use.
-    """
-    n = shape.shape[0]
-    left = np.zeros(4)
-    step = 0.0
-    for i in range(n):
-        for p in range(5):
-            x[i, p] = 0.0
-    for j in range(s.shape[0]):
-        first, second, third = between(s[j])
-        for i in range(n):
-            x[i, 0] -= follow[i, j] * first
-            x[i, 1] -= follow[i, j] * second
-            x[i, 2] -= follow[i, j] * third
-    for k in range(w.shape[0]):
-        lin_first, lin_second, lin_third = between(lin[k])
-        pull_first, pull_second, pull_third = between(pull[k])
-        missed = largest(
-            (lin_first + pull_first) / MISS[0], (lin_second + pull_second) / MISS[1], (lin_third + pull_third) / MISS[2]
-        )
-        left_over(phi[k], pull[k], used[k], left)
-        places[k, 0] = error[k]
-        mode_first, mode_second, mode_third = between(w[k])
-        # Its slope at the start tells: it is off by the size of the decay times its rate.
-        fall = 0.0
-        for j in range(NODES):
-            fall += DERIVATIVE[0, j] * w[k, j]
-        fall = lin[k, 0] + pull[k, 0] - rates[k] * w[k, 0] - fall / h
-        early[k] = fall / (rates[k] + 1.0 / (_EARLY * h))
-        if k < n:
-            for i in range(n):
-                x[i, 4] += shape[i, k] * early[k]
-        for p in range(4):
-            row = FIRST + p if p < 3 else END
-            fresh = magnified * miss[k, row] * missed
-            places[k, p + 1] = decay[k, row] * error[k] + magnified * left[p] + fresh
-            off = fresh
-            if p < 3:
-                off += mode_first if p == 0 else (mode_second if p == 1 else mode_third)
-            if k < n:
-                for i in range(n):
-                    x[i, p] += shape[i, k] * off
-            else:
-                step = max(step, size[k] * abs(off))
-        places[k, 1] += mode_first
-        places[k, 2] += mode_second
-        places[k, 3] += mode_third
-    for i in range(n):
-        for p in range(5):
-            if not abs(x[i, p]) <= step:
-                step = abs(x[i, p])
-    for a in range(run.size):
-        total = 0.0
-        for k in range(n):
-            total += gap[a, k] * (places[k, 0] + early[k])
-        run[a] = abs(total)
-        for p in range(4):
-            total = 0.0
-            for k in range(n):
-                total += gap[a, k] * places[k, p + 1]
-            run[a] = max(run[a], abs(total))
-    return step
-
-
-@jit_rows
-def _account(
-    u: FloatArray, area: FloatArray, stress: float, theta: float, run: float, area_off: float, peaks: FloatArray
-) -> None:
-    """Peaks of a gap's voltage and force over what counts of a step, and the errors of both."""
-    steepest = 0.0
-    force = 0.0
-    for i in range(NODES):
-        if POINTS[i] <= theta:
-            size = abs(u[i])
-            pressure = stress * size * area[i]
-            peaks[PEAK_U] = max(peaks[PEAK_U], size)
-            force = max(force, pressure * size)
-            # F ~ u^2 A: what moves u by du moves F by at most 2 F du / u, as the area falls with u.
-            steepest = max(steepest, 2.0 * pressure)
-    peaks[PEAK_F] = max(peaks[PEAK_F], force)
-    peaks[ERROR_U] = max(peaks[ERROR_U], run)
-    peaks[ERROR_F] = max(peaks[ERROR_F], run * steepest + area_off * force)
 
 
 @jit
@@ -318,7 +200,9 @@ def march(
     keys_h, keys_level, count = borrow(tables.h), borrow(tables.level), borrow(tables.used)
     all_decay, all_phi, all_miss = borrow(tables.decay), borrow(tables.phi), borrow(tables.miss)
     sources = Sources(borrow(sources.first), borrow(sources.edges), borrow(sources.terms), borrow(sources.series))
-    r, s, ds, matrix = borrow(work.r), borrow(work.s), borrow(work.ds), borrow(work.matrix)
+    r, s, ds, matrix, small = (
+        borrow(work.r), borrow(work.s), borrow(work.ds), borrow(work.matrix), borrow(work.small)
+    )  # fmt: skip
     modes, cells, areas = borrow(work.modes), borrow(work.cells), borrow(work.areas)
     w, base, lin, d, pull, used = modes[_W], modes[_BASE], modes[_LIN], modes[_D], modes[_PULL], modes[_USED]
     pull_before, left_before = modes[_PULL_BEFORE], modes[_LEFT_BEFORE]
@@ -347,7 +231,7 @@ def march(
             slope[a, i] = 0.0
             areas[RATE, a, i] = 0.0
             more[a, i] = 0.0
-    slot, h_slot, flips, fresh = -1, 0.0, 0, -1
+    slot, h_slot, flips, fresh, whole = -1, 0.0, 0, -1, True
     first_out = counters[OUTPUT]
     next_out = t_out[first_out] if first_out < t_out.size else math.inf
     pause = counters[ACCEPTED] + 1 + AT_ONCE // m
@@ -413,7 +297,7 @@ def march(
             if h != h_slot:
                 slot = make_tables(rates, 0, h, keys_h, keys_level, count, all_decay, all_phi, all_miss)
                 h_slot = h
-                meet(h, rates, feed, tap, met)
+                whole = meet(h, rates, feed, tap, met)
                 weigh(rates, size, all_decay[slot], h, weight)
             decay, phi, miss = all_decay[slot], all_phi[slot], all_miss[slot]
             for e in range(n_s):
@@ -426,14 +310,14 @@ def march(
                 for i in range(ROWS):
                     s[e, i] = r[e, rows.SOURCE, i]
                     ds[e, i] = r[e, rows.SLOPE, i]
-            _clear(lin)
+            clear(lin)
             combine(gain, s, lin)
-            _clear(free)
+            clear(free)
             combine(tap_s, s, free)
-            _clear(free_rate)
+            clear(free_rate)
             combine(tap_s, ds, free_rate)
-            _clear(used)
-            _clear(guess)
+            clear(used)
+            clear(guess)
             for k in range(m):
                 for i in range(ROWS):
                     base[k, i] = decay[k, i] * w0[k]
@@ -451,13 +335,14 @@ def march(
                 counters[NFEV] += NODES
                 if not evaluate(
                     mobile, h, rates, feed, tap, met, c, g, home, cell, area0, unit, slow, speed, powers, slopes, lo,
-                    scale, curves, sign, w, lin, d, pull, cells, areas, matrix, room[3],
+                    scale, curves, sign, w, lin, d, pull, cells, areas, matrix, small,
+                    room[3],
                 ):  # fmt: skip
                     break
-                _clear(u)
+                clear(u)
                 combine(gap, w[:n], u)
                 combine(gap_s, s, u)
-                change = _moved(u, guess)
+                change = moved(u, guess)
                 if iteration == 1:
                     continue
                 # What the gap voltages would move next, by what they moved for the last change of the currents.
@@ -484,9 +369,10 @@ def march(
                 continue
             lowest = 1.0
             if closed:
-                lowest = lowest_pivot(matrix)
-                magnified = 1.0 / lowest if mobile else 1.0
-                step_error = _assess(
+                if mobile:
+                    lowest = room[3].min()
+                magnified = 1.0 / lowest
+                step_error = assess(
                     rates, h, shape, follow, gap, size, decay, phi, miss, error, w, lin, pull, used, s, magnified,
                     x_off, places, early, run,
                 )  # fmt: skip
@@ -510,7 +396,7 @@ def march(
                 proposed = max(proposed, wanted if h < wanted else 0.0)
                 if control[TOO_LONG] > 0.0:
                     proposed = min(proposed, 0.93 * control[TOO_LONG])
-                    control[TOO_LONG] *= growth if growth > 1.5 else 1.03
+                    control[TOO_LONG] *= max(growth, factor) if max(growth, factor) > 1.5 else 1.03
                 if fresh >= 0 and h >= wanted:
                     control[fresh] = h * min(2.0, factor)
                 fresh = -1
@@ -518,7 +404,7 @@ def march(
                 break
             counters[REJECTED] += 1
             # Refused at this length: a singularity, of which rounding hides the last bit.
-            if h <= 1e-13 * max(abs(t), 1e-3 * (stop - t)) or (mobile and lowest < NEAR_FOLD):
+            if h <= 1e-13 * max(abs(t), 1e-3 * (stop - t)) or (whole and lowest < NEAR_FOLD):
                 return NO_STEP
             shorter = 1.0
             for a in range(n_area):
@@ -570,7 +456,7 @@ def march(
         for e in range(n_s):
             gained[e] = at(values[first_z + e], theta) if charge else 0.0
         if next_out <= t_new:
-            _clear(values[:first_z])
+            clear(values[:first_z])
             combine(shape, w[:n], values[:n])
             combine(unfollow, s, values[:n])
             for k in range(n, m):
@@ -586,14 +472,15 @@ def march(
             )  # fmt: skip
             counters[OUTPUT] = first_out
             next_out = t_out[first_out] if first_out < t_out.size else math.inf
-        control[MAGNIFIED] = max(control[MAGNIFIED], magnified)
+        if whole:
+            control[MAGNIFIED] = max(control[MAGNIFIED], magnified)
         for a in range(n_area):
             if stress[a] > 0.0:
                 area_off = 0.0
                 if slow[a] >= 0:
                     for p in range(N_PLACES):
                         area_off = max(area_off, abs(places[slow[a], p]))
-                _account(u[a], area[a], stress[a], theta, run[a], area_off, peaks[a])
+                account(u[a], area[a], stress[a], theta, run[a], area_off, peaks[a])
         for k in range(m):
             w0[k] = at(w[k], theta) if theta < 1.0 else w[k, END]
         if theta < 1.0:

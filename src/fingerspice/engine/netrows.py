@@ -14,7 +14,6 @@ These functions take plain arrays, as those of `fingerspice.engine.rows`.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -136,14 +135,21 @@ def _straight(h: float, rates: FloatArray, w: FloatArray, lin: FloatArray, out: 
 
 
 @jit
-def meet(h: float, rates: FloatArray, feed: FloatArray, tap: FloatArray, met: FloatArray) -> None:
-    """Rates of the cells' voltages for each j, into `met` (n_f, n_f): tap @ feed but for the stiff modes."""
+def meet(h: float, rates: FloatArray, feed: FloatArray, tap: FloatArray, met: FloatArray) -> bool:
+    """Rates of the cells' voltages for each j, into `met` (n_f, n_f): tap @ feed but for the stiff modes.
+
+    Whether that was all of them.
+    """
+    whole = True
     for a in range(met.shape[0]):
         for b in range(met.shape[1]):
             met[a, b] = 0.0
             for k in range(tap.shape[1]):
-                if not rates[k] * h > STIFF:
+                if rates[k] * h > STIFF:
+                    whole = False
+                else:
                     met[a, b] += tap[a, k] * feed[k, b]
+    return whole
 
 
 @jit_rows
@@ -198,29 +204,53 @@ def _add_column(
 
 
 @jit_rows
-def _eliminate(matrix: FloatArray, out: FloatArray, least: FloatArray) -> None:
-    """Solve the systems (n_f, n_f + 1, ROWS) of all rows at once; `least` takes the smallest pivot of each.
+def _eliminate(matrix: FloatArray, columns: int) -> None:
+    """Solve the systems (n, n + columns, ROWS) of all rows at once; the solutions take the last columns' place.
 
-    Without pivoting: they are a unit matrix and as much again as the areas move.
+    Without pivoting: they are a unit matrix and as much again as the areas move. Pivots stay on the diagonal.
     """
     n = matrix.shape[0]
-    for i in range(ROWS):
-        least[i] = 1.0
     for p in range(n):
-        for i in range(ROWS):
-            least[i] = min(least[i], matrix[p, p, i])
         for a in range(p + 1, n):
-            for b in range(p + 1, n + 1):
+            for b in range(p + 1, n + columns):
                 for i in range(ROWS):
                     matrix[a, b, i] -= matrix[a, p, i] / matrix[p, p, i] * matrix[p, b, i]
     for p in range(n - 1, -1, -1):
-        for i in range(ROWS):
-            out[p, i] = matrix[p, n, i]
-        for b in range(p + 1, n):
+        for c in range(n, n + columns):
+            for b in range(p + 1, n):
+                for i in range(ROWS):
+                    matrix[p, c, i] -= matrix[p, b, i] * matrix[b, c, i]
             for i in range(ROWS):
-                out[p, i] -= matrix[p, b, i] * out[b, i]
+                matrix[p, c, i] /= matrix[p, p, i]
+
+
+@jit
+def _fold(matrix: FloatArray, small: FloatArray, cell: IntArray, least: FloatArray) -> None:
+    """Finish what `matrix` has solved with the rates of the gaps' voltages as given, one more column each.
+
+    `least` takes the distance to the fold: the determinant of the capacitances that small changes meet, over that with
+    every area held.
+    """
+    n, n_area = matrix.shape[0], cell.size
+    for a in range(n_area):
+        for b in range(n_area + 1):
+            for i in range(ROWS):
+                small[a, b, i] = 1.0 if a == b else 0.0
+        if cell[a] >= 0:
+            for i in range(ROWS):
+                small[a, n_area, i] = matrix[cell[a], n, i]
+            for b in range(n_area):
+                for i in range(ROWS):
+                    small[a, b, i] -= matrix[cell[a], n + 1 + b, i]
+    _eliminate(small, 1)
+    for i in range(ROWS):
+        least[i] = 1.0
+    for a in range(n_area):
         for i in range(ROWS):
-            out[p, i] /= matrix[p, p, i]
+            least[i] *= small[a, a, i]
+        for c in range(n):
+            for i in range(ROWS):
+                matrix[c, n, i] += matrix[c, n + 1 + a, i] * small[a, n_area, i]
 
 
 @jit_rows
@@ -235,13 +265,13 @@ def evaluate(
     g: FloatArray, home: IntArray, cell: IntArray, area0: FloatArray, unit: FloatArray, slow: IntArray, pace: FloatArray,
     powers: FloatArray, slopes: FloatArray, lo: FloatArray, scale: FloatArray, curves: FloatArray, sign: FloatArray,
     w: FloatArray, lin: FloatArray, d: FloatArray, pull: FloatArray, cells: FloatArray, areas: FloatArray,
-    matrix: FloatArray, least: FloatArray,
+    matrix: FloatArray, small: FloatArray, least: FloatArray,
 ) -> bool:  # fmt: skip
     """Voltages and currents of the cells from the modes w (m, ROWS), and what the areas add to the modes' rates.
 
     `lin` is gain s, and `d` takes the modes' rates without j. `cells` and `areas` are blocks of rows: of the cells what
     of the voltages and their rates follows the sources, then voltages, rates and j; of the areas A, dA/du, A' of what
-    time moves, and A - A0. False past a fold.
+    time moves, and A - A0. False past a fold; under `mobile`, `least` (ROWS,) takes the distance to it.
     """
     n = tap.shape[1]
     free, free_rate, u, du, j = cells[FREE], cells[FREE_RATE], cells[CELL_U], cells[DU], cells[J]
@@ -266,10 +296,12 @@ def evaluate(
                     rate[a, i] = unit[a] * (d[k, i] if rates[k] * h > STIFF else d[k, i] + pull[k, i])
             for i in range(ROWS):
                 more[a, i] = area[a, i] - area0[a]
-    n_f = c.size
+    n_f, n_area = c.size, cell.size
+    # Under `mobile` c u A' holds the rate of the gap's own voltage: one more unknown for each area.
+    columns = 1 + n_area if mobile else 1
     for a in range(n_f):
         _known(mobile, c[a], g[a], u[a], more[home[a]], rate[home[a]], j[a])
-        for b in range(n_f):
+        for b in range(n_f + columns):
             for i in range(ROWS):
                 matrix[a, b, i] = 1.0 if a == b else 0.0
         for i in range(ROWS):
@@ -277,34 +309,25 @@ def evaluate(
     for b in range(n_f):
         _add_column(met, b, b, c[b], more[home[b]], matrix)
         _add_column(met, b, n_f, -1.0, j[b], matrix)
-        if mobile and slow[home[b]] < 0:
-            # c u A' holds the rate of the gap's own voltage.
+        if mobile:
             for i in range(ROWS):
                 least[i] = u[b, i] * slope[home[b], i]
-            _add_column(met, b, cell[home[b]], c[b], least, matrix)
-    _eliminate(matrix, du, least)
-    lowest = math.inf
-    for i in range(ROWS):
-        # NaN is no fold, but no solution either.
-        if not least[i] >= lowest:
-            lowest = least[i]
-    if not lowest > 0.0:
-        return False
+            _add_column(met, b, n_f + 1 + home[b], -c[b], least, matrix)
+    _eliminate(matrix, columns)
+    if mobile:
+        _fold(matrix, small, cell, least)
+        for i in range(ROWS):
+            # NaN is no solution either.
+            if not least[i] > 0.0:
+                return False
+    for b in range(n_f):
+        for i in range(ROWS):
+            du[b, i] = matrix[b, n_f, i]
     for b in range(n_f):
         _times(c[b], more[home[b]], du[b], j[b])
-        if mobile and slow[home[b]] < 0:
+        if mobile:
             for i in range(ROWS):
-                least[i] = u[b, i] * slope[home[b], i]
-            _times(c[b], least, du[cell[home[b]]], j[b])
+                matrix[b, n_f, i] = u[b, i] * slope[home[b], i]
+            _times(c[b], matrix[b, n_f], du[cell[home[b]]], j[b])
     combine(feed, j, pull)
     return True
-
-
-@jit
-def lowest_pivot(matrix: FloatArray) -> float:
-    """The smallest pivot of the rows' systems at the nodes: near the fold it is the distance to it."""
-    lowest = 1.0
-    for i in range(NODES):
-        for p in range(matrix.shape[0]):
-            lowest = min(lowest, matrix[p, p, i])
-    return lowest
