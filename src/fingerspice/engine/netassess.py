@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from fingerspice.compiled import jit, jit_rows
 from fingerspice.engine.charge import DERIVATIVE
 from fingerspice.engine.exponential import N_PLACES, between, largest, left_over
+from fingerspice.engine.readout import first_wrong, zero
 from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 # Columns of `peaks`: of each gap the largest voltage (V) and force (N), and the errors of both.
 PEAK_U, PEAK_F, ERROR_U, ERROR_F = 0, 1, 2, 3
@@ -114,11 +116,47 @@ def assess(
     return step
 
 
+@jit
+def charged(cell: IntArray, u: FloatArray, area: FloatArray) -> float:
+    """What the polynomials of the areas miss between nodes, V: a charge is the integral of A du among others."""
+    worst = 0.0
+    for a in range(cell.size):
+        if cell[a] >= 0:
+            first, second, third = between(area[a])
+            swing = 0.3 * abs(u[a, END] - u[a, 0])
+            worst = max(worst, swing * abs(largest(first, second, third)) / area[a, 0])
+    return worst
+
+
+@jit
+def first_zero(
+    cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t: float, h: float, theta: float, t_new: float,
+    series: FloatArray,
+) -> tuple[int, float, float]:  # fmt: skip
+    """The area whose gap voltage is first to leave its branch before t_new, or -1, at what fraction, and when."""
+    which = -1
+    for a in range(cell.size):
+        wrong = first_wrong(u[a], sign[a], tol) if cell[a] >= 0 else 0
+        if wrong > 0:
+            crossing = zero(u[a], sign[a], wrong, series)
+            if t + crossing * h <= t_new and crossing <= theta:
+                which, theta, t_new = a, crossing, t + crossing * h
+    return which, theta, t_new
+
+
 @jit_rows
 def account(
-    u: FloatArray, area: FloatArray, stress: float, theta: float, run: float, area_off: float, peaks: FloatArray
-) -> None:
-    """Peaks of a gap's voltage and force over what counts of a step, and the errors of both."""
+    u: FloatArray, area: FloatArray, stress: float, theta: float, run: float, places: FloatArray, slow: int,
+    peaks: FloatArray,
+) -> None:  # fmt: skip
+    """Peaks of a gap's voltage and force over what counts of a step, and the errors of both.
+
+    `places` holds the error of the modes (see `assess`), of which `slow` is the area's, if it is not negative.
+    """
+    area_off = 0.0
+    if slow >= 0:
+        for p in range(N_PLACES):
+            area_off = max(area_off, abs(places[slow, p]))
     steepest = 0.0
     force = 0.0
     for i in range(NODES):
@@ -132,3 +170,26 @@ def account(
     peaks[PEAK_F] = max(peaks[PEAK_F], force)
     peaks[ERROR_U] = max(peaks[ERROR_U], run)
     peaks[ERROR_F] = max(peaks[ERROR_F], run * steepest + area_off * force)
+
+
+@jit_rows
+def write_columns(
+    n: int, first_z: int, charge: bool, shape: FloatArray, follow: FloatArray, w: FloatArray, s: FloatArray,
+    y: FloatArray, values: FloatArray,
+) -> None:  # fmt: skip
+    """The state at all rows, into the first of `values`; charges hold what they have gained, where they are wanted."""
+    for j in range(n):
+        for i in range(ROWS):
+            values[j, i] = 0.0
+        for k in range(n):
+            for i in range(ROWS):
+                values[j, i] += shape[j, k] * w[k, i]
+        for e in range(s.shape[0]):
+            for i in range(ROWS):
+                values[j, i] -= follow[j, e] * s[e, i]
+    for k in range(n, first_z):
+        for i in range(ROWS):
+            values[k, i] = w[k, i]
+    for e in range(first_z, y.size):
+        for i in range(ROWS):
+            values[e, i] = y[e] + (values[e, i] if charge else 0.0)

@@ -94,13 +94,13 @@ def charge_error(
     mobile: bool, h: float, stored: FloatArray, lost: FloatArray, through: FloatArray, tap: FloatArray, c: FloatArray,
     g: FloatArray, home: IntArray, cell: IntArray, unit: FloatArray, slow: IntArray, places: FloatArray,
     early: FloatArray, theta: float, u: FloatArray, area: FloatArray, slope: FloatArray, more: FloatArray,
-    collected: FloatArray, control: FloatArray,
+    z: FloatArray, collected: FloatArray, control: FloatArray,
 ) -> None:  # fmt: skip
     """Largest error of the charges over the part of a step that counts, from the signed error of the modes.
 
     With du the error of a cell's voltage and dA that of its area, a charge is off by what is stored of them now, and by
     what stays: their leak, and under `local` the integral of c (dA u' - A' du). `collected` (2, n_s) holds what stayed
-    so far, and the squares of what each step added: it may have cancelled by chance.
+    so far, and the squares of what each step added: it may have cancelled by chance. `z` is that of `charge_rows`.
     """
     n, n_f, n_area = tap.shape[1], c.size, cell.size
     off = np.zeros((N_PLACES, n_f))
@@ -117,7 +117,8 @@ def charge_error(
                     area_off[p, a] = unit[a] * places[slow[a], p]
     for source in range(stored.shape[0]):
         # Under `local` what the polynomial misses of an area between nodes counts with all that the voltage moves.
-        missed = 0.0
+        first, second, third = between(z[source])
+        missed = max(abs(first), abs(second), abs(third))
         if not mobile:
             for b in range(n_f):
                 first, second, third = between(area[home[b]])

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,31 +10,40 @@ from fingerspice.compiled import borrow, jit
 from fingerspice.engine.exponential import (
     N_PLACES,
     Tables,
-    between,
     distance,
-    largest,
     make_tables,
     mix,
     plain,
     respond,
     weigh,
 )
-from fingerspice.engine.netassess import account, assess, clear, moved
+from fingerspice.engine.netassess import account, assess, charged, clear, first_zero, moved, write_columns
 from fingerspice.engine.netcharge import charge_error, charge_rows
 from fingerspice.engine.netrows import (
     AREA,
+    BASE,
     CELL_U,
+    DU,
     FREE,
     FREE_RATE,
     GUESS,
+    LEFT_BEFORE,
+    LIN,
     MORE,
+    PULL,
+    PULL_BEFORE,
     RATE,
     SLOPE,
     STIFF,
+    USED,
+    D,
     Form,
     J,
     U,
+    W,
+    Work,
     combine,
+    couple,
     evaluate,
     meet,
 )
@@ -55,7 +62,6 @@ from fingerspice.engine.readout import (
     OUTPUT,
     REJECTED,
     TOO_LONG,
-    WRITTEN_AT_ONCE,
     ZEROS,
     H,
     T,
@@ -65,7 +71,6 @@ from fingerspice.engine.readout import (
     note,
     series_of,
     write_outputs,
-    zero,
 )
 from fingerspice.engine import rows
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
@@ -88,55 +93,6 @@ ROUNDING = 1e-14
 NEAR_FOLD = 0.02
 # Modes times steps between pauses, after which Python may see to a Ctrl-C.
 AT_ONCE = 40_000
-
-
-class Work(NamedTuple):
-    """Arrays that steps work in; those with ROWS behind hold one value for each row of a step."""
-
-    r: FloatArray
-    s: FloatArray
-    ds: FloatArray
-    modes: FloatArray
-    cells: FloatArray
-    areas: FloatArray
-    matrix: FloatArray
-    small: FloatArray
-    met: FloatArray
-    w0: FloatArray
-    places: FloatArray
-    weight: FloatArray
-    values: FloatArray
-    coefficients: FloatArray
-    outputs: FloatArray
-    room: FloatArray
-    x: FloatArray
-
-
-# Blocks of `Work.modes`.
-_W, _BASE, _LIN, _D, _PULL, _USED, _PULL_BEFORE, _LEFT_BEFORE = range(8)
-
-
-def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: int) -> Work:
-    """Work arrays for so many live voltages, modes, cells whose area moves, areas, sources and output columns."""
-    return Work(
-        np.zeros((sources, rows.N_FLAT, ROWS)),
-        np.zeros((sources, ROWS)),
-        np.zeros((sources, ROWS)),
-        np.zeros((8, modes, ROWS)),
-        np.zeros((5, cells, ROWS)),
-        np.zeros((6, areas, ROWS)),
-        np.zeros((cells, cells + 1 + areas, ROWS)),
-        np.zeros((areas, areas + 1, ROWS)),
-        np.zeros((cells, cells)),
-        np.zeros(modes),
-        np.zeros((modes, N_PLACES)),
-        np.zeros(modes),
-        np.zeros((columns, ROWS)),
-        np.zeros((columns, ROWS)),
-        np.zeros((2, WRITTEN_AT_ONCE)),
-        np.zeros((4, ROWS)),
-        np.zeros((n, 5)),
-    )
 
 
 @jit
@@ -204,9 +160,9 @@ def march(
         borrow(work.r), borrow(work.s), borrow(work.ds), borrow(work.matrix), borrow(work.small)
     )  # fmt: skip
     modes, cells, areas = borrow(work.modes), borrow(work.cells), borrow(work.areas)
-    w, base, lin, d, pull, used = modes[_W], modes[_BASE], modes[_LIN], modes[_D], modes[_PULL], modes[_USED]
-    pull_before, left_before = modes[_PULL_BEFORE], modes[_LEFT_BEFORE]
-    free, free_rate, cell_u, j = cells[FREE], cells[FREE_RATE], cells[CELL_U], cells[J]
+    w, base, lin, d, pull, used = modes[W], modes[BASE], modes[LIN], modes[D], modes[PULL], modes[USED]
+    pull_before, left_before = modes[PULL_BEFORE], modes[LEFT_BEFORE]
+    free, free_rate, cell_u, du, j = cells[FREE], cells[FREE_RATE], cells[CELL_U], cells[DU], cells[J]
     area, slope, more = areas[AREA], areas[SLOPE], areas[MORE]
     u, guess = areas[U], areas[GUESS]
     w0, places, weight, room, x_off = (
@@ -224,7 +180,6 @@ def march(
     index = np.zeros(n_s, np.int64)
     now, slopes_now = np.zeros(n_s), np.zeros(n_s)
     run, gained, early = np.zeros(n_area), np.zeros(n_s), np.zeros(m)
-    unfollow = -follow
     for a in range(n_area):
         for i in range(ROWS):
             area[a, i] = area0[a]
@@ -292,7 +247,7 @@ def march(
                 control[BRANCH_START], control[BRANCH_LENGTH] = branch[a, 0], branch[a, 1]
         h = choose_step(pace, tau, True, is_series, t, stop - t, control)
         wanted = control[H]
-        which, wrong, magnified = -1, 0, 1.0
+        which, magnified = -1, 1.0
         while True:
             if h != h_slot:
                 slot = make_tables(rates, 0, h, keys_h, keys_level, count, all_decay, all_phi, all_miss)
@@ -355,7 +310,6 @@ def march(
                 slowly = off > 0.15 * step
             step_error = math.inf
             flip = False
-            which, wrong = -1, 0
             for a in range(n_area):
                 if cell[a] >= 0:
                     found = first_wrong(u[a], sign[a], tol)
@@ -377,12 +331,7 @@ def march(
                     x_off, places, early, run,
                 )  # fmt: skip
                 if charge:
-                    # A charge is the integral of A du among others.
-                    for a in range(n_area):
-                        if cell[a] >= 0:
-                            one, two, three = between(area[a])
-                            swing = 0.3 * abs(u[a, END] - u[a, 0]) / area0[a]
-                            step_error = max(step_error, swing * abs(largest(one, two, three)))
+                    step_error = max(step_error, charged(cell, u, area))
             note(tried, counters[ACCEPTED] + counters[REJECTED], t, h, step_error / tol)
             factor = 6.0
             if step_error > 0.0:
@@ -426,19 +375,19 @@ def march(
             t_new = stop
             theta = min(1.0, (stop - t) / h)
         if flips <= n_area:
-            for a in range(n_area):
-                wrong = first_wrong(u[a], sign[a], tol) if cell[a] >= 0 else 0
-                if wrong > 0:
-                    crossing = zero(u[a], sign[a], wrong, coefficients[0])
-                    if t + crossing * h <= t_new and crossing <= theta:
-                        theta = crossing
-                        t_new = t + crossing * h
-                        which = a
+            which, theta, t_new = first_zero(cell, u, sign, tol, t, h, theta, t_new, room[0])
         if which >= 0 and t_new <= t:
             sign[which] = -sign[which]
             branch[which, 0], branch[which, 1] = t, math.inf
             flips += 1
             continue
+        if mobile and not whole:
+            # A mode that follows at once takes no part in the fold of the others, but it does in that of all.
+            couple(mobile, form.met, c, home, cell, cell_u, slope, more, du, j, matrix, small, room[3])
+            magnified = 1.0 / room[3, :NODES].min()
+        if not 0.0 < magnified < math.inf:
+            return NO_STEP
+        control[MAGNIFIED] = max(control[MAGNIFIED], magnified)
         flips = 0
         if charge:
             for k in range(m):
@@ -451,20 +400,12 @@ def march(
             )  # fmt: skip
             charge_error(
                 mobile, h, stored, lost, through, tap, c, g, home, cell, unit, slow, places, early, theta, cell_u, area,
-                slope, more, collected, control,
+                slope, more, values[first_z:], collected, control,
             )  # fmt: skip
         for e in range(n_s):
             gained[e] = at(values[first_z + e], theta) if charge else 0.0
         if next_out <= t_new:
-            clear(values[:first_z])
-            combine(shape, w[:n], values[:n])
-            combine(unfollow, s, values[:n])
-            for k in range(n, m):
-                for i in range(ROWS):
-                    values[k, i] = w[k, i]
-            for e in range(n_s):
-                for i in range(ROWS):
-                    values[first_z + e, i] = y[first_z + e] + (values[first_z + e, i] if charge else 0.0)
+            write_columns(n, first_z, charge, shape, follow, w, s, y, values)
             for i in range(out.shape[0]):
                 series_of(values[i], coefficients[i])
             first_out += write_outputs(
@@ -472,15 +413,9 @@ def march(
             )  # fmt: skip
             counters[OUTPUT] = first_out
             next_out = t_out[first_out] if first_out < t_out.size else math.inf
-        if whole:
-            control[MAGNIFIED] = max(control[MAGNIFIED], magnified)
         for a in range(n_area):
             if stress[a] > 0.0:
-                area_off = 0.0
-                if slow[a] >= 0:
-                    for p in range(N_PLACES):
-                        area_off = max(area_off, abs(places[slow[a], p]))
-                account(u[a], area[a], stress[a], theta, run[a], area_off, peaks[a])
+                account(u[a], area[a], stress[a], theta, run[a], places, slow[a], peaks[a])
         for k in range(m):
             w0[k] = at(w[k], theta) if theta < 1.0 else w[k, END]
         if theta < 1.0:

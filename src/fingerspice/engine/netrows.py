@@ -21,14 +21,17 @@ from numpy.typing import NDArray
 
 from fingerspice.compiled import jit, jit_inline, jit_rows
 from fingerspice.engine.charge import DERIVATIVE
-from fingerspice.engine.rows import polynomial_rows
+from fingerspice.engine.exponential import N_PLACES
+from fingerspice.engine.readout import WRITTEN_AT_ONCE
+from fingerspice.engine.rows import N_FLAT, polynomial_rows
 from fingerspice.numerics.lobatto import BETWEEN, NODES, ROWS
 from fingerspice.physics.contact import inverse_area
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Blocks of the cells' rows, and of the areas'; then gap voltages and a guess of them.
+# Blocks of the modes' rows, of the cells', and of the areas'; then gap voltages and a guess of them.
+W, BASE, LIN, D, PULL, USED, PULL_BEFORE, LEFT_BEFORE = range(8)
 FREE, FREE_RATE, CELL_U, DU, J = range(5)
 AREA, SLOPE, RATE, MORE, U, GUESS = range(6)
 
@@ -52,6 +55,8 @@ class Form(NamedTuple):
         v = inverse (x + follow s).
     follow : ndarray, shape (n, n_s)
     feed : ndarray, shape (m, n_f)
+    met : ndarray, shape (n_f, n_f)
+        tap @ feed.
     tap, tap_s : ndarray, shape (n_f, n) and (n_f, n_s)
     c, g : ndarray, shape (n_f,)
         Capacitance and leak of the cells per area.
@@ -82,6 +87,7 @@ class Form(NamedTuple):
     inverse: FloatArray
     follow: FloatArray
     feed: FloatArray
+    met: FloatArray
     tap: FloatArray
     tap_s: FloatArray
     c: FloatArray
@@ -105,6 +111,51 @@ class Form(NamedTuple):
     lost: FloatArray
     lost_s: FloatArray
     through: FloatArray
+
+
+class Work(NamedTuple):
+    """Arrays that steps work in; those with ROWS behind hold one value for each row of a step."""
+
+    r: FloatArray
+    s: FloatArray
+    ds: FloatArray
+    modes: FloatArray
+    cells: FloatArray
+    areas: FloatArray
+    matrix: FloatArray
+    small: FloatArray
+    met: FloatArray
+    w0: FloatArray
+    places: FloatArray
+    weight: FloatArray
+    values: FloatArray
+    coefficients: FloatArray
+    outputs: FloatArray
+    room: FloatArray
+    x: FloatArray
+
+
+def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: int) -> Work:
+    """Work arrays for so many live voltages, modes, cells whose area moves, areas, sources and output columns."""
+    return Work(
+        np.zeros((sources, N_FLAT, ROWS)),
+        np.zeros((sources, ROWS)),
+        np.zeros((sources, ROWS)),
+        np.zeros((8, modes, ROWS)),
+        np.zeros((5, cells, ROWS)),
+        np.zeros((6, areas, ROWS)),
+        np.zeros((cells, cells + 1 + areas, ROWS)),
+        np.zeros((areas, areas + 1, ROWS)),
+        np.zeros((cells, cells)),
+        np.zeros(modes),
+        np.zeros((modes, N_PLACES)),
+        np.zeros(modes),
+        np.zeros((columns, ROWS)),
+        np.zeros((columns, ROWS)),
+        np.zeros((2, WRITTEN_AT_ONCE)),
+        np.zeros((4, ROWS)),
+        np.zeros((n, 5)),
+    )
 
 
 @jit_rows
@@ -253,6 +304,35 @@ def _fold(matrix: FloatArray, small: FloatArray, cell: IntArray, least: FloatArr
                 matrix[c, n, i] += matrix[c, n + 1 + a, i] * small[a, n_area, i]
 
 
+@jit
+def couple(
+    mobile: bool, met: FloatArray, c: FloatArray, home: IntArray, cell: IntArray, u: FloatArray, slope: FloatArray,
+    more: FloatArray, du: FloatArray, known: FloatArray, matrix: FloatArray, small: FloatArray, least: FloatArray,
+) -> None:  # fmt: skip
+    """Rates of the cells' voltages into column n_f of `matrix`, from those without j and what of j is known.
+
+    Under `mobile`, c u A' holds the rate of the gap's own voltage: one more unknown for each area.
+    """
+    n_f = c.size
+    columns = 1 + cell.size if mobile else 1
+    for a in range(n_f):
+        for b in range(n_f + columns):
+            for i in range(ROWS):
+                matrix[a, b, i] = 1.0 if a == b else 0.0
+        for i in range(ROWS):
+            matrix[a, n_f, i] = du[a, i]
+    for b in range(n_f):
+        _add_column(met, b, b, c[b], more[home[b]], matrix)
+        _add_column(met, b, n_f, -1.0, known[b], matrix)
+        if mobile:
+            for i in range(ROWS):
+                least[i] = u[b, i] * slope[home[b], i]
+            _add_column(met, b, n_f + 1 + home[b], -c[b], least, matrix)
+    _eliminate(matrix, columns)
+    if mobile:
+        _fold(matrix, small, cell, least)
+
+
 @jit_rows
 def _times(factor: float, a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     for i in range(ROWS):
@@ -296,26 +376,11 @@ def evaluate(
                     rate[a, i] = unit[a] * (d[k, i] if rates[k] * h > STIFF else d[k, i] + pull[k, i])
             for i in range(ROWS):
                 more[a, i] = area[a, i] - area0[a]
-    n_f, n_area = c.size, cell.size
-    # Under `mobile` c u A' holds the rate of the gap's own voltage: one more unknown for each area.
-    columns = 1 + n_area if mobile else 1
+    n_f = c.size
     for a in range(n_f):
         _known(mobile, c[a], g[a], u[a], more[home[a]], rate[home[a]], j[a])
-        for b in range(n_f + columns):
-            for i in range(ROWS):
-                matrix[a, b, i] = 1.0 if a == b else 0.0
-        for i in range(ROWS):
-            matrix[a, n_f, i] = du[a, i]
-    for b in range(n_f):
-        _add_column(met, b, b, c[b], more[home[b]], matrix)
-        _add_column(met, b, n_f, -1.0, j[b], matrix)
-        if mobile:
-            for i in range(ROWS):
-                least[i] = u[b, i] * slope[home[b], i]
-            _add_column(met, b, n_f + 1 + home[b], -c[b], least, matrix)
-    _eliminate(matrix, columns)
+    couple(mobile, met, c, home, cell, u, slope, more, du, j, matrix, small, least)
     if mobile:
-        _fold(matrix, small, cell, least)
         for i in range(ROWS):
             # NaN is no solution either.
             if not least[i] > 0.0:
