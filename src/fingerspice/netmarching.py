@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from fingerspice.circuit.network import network_modes
 from fingerspice.engine import netassess, netmarch, readout
 from fingerspice.engine.exponential import Tables, new_tables
-from fingerspice.engine.network import Sources
 from fingerspice.engine.netrows import Form, new_work
+from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.system import area_polynomial
 from fingerspice.netruns import Integration, NetworkRun, integrate, ramp, values_at
@@ -169,7 +169,7 @@ class March(Integration):
         longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.t_stop - problem.t_start)
         self.pace = Pace(tol * u_scale, min(longest, problem.max_step), True, problem.charge)
         self.error = np.zeros(self.n + self.n_slow)
-        self.control = np.zeros(netmarch.N_CONTROL + 1)
+        self.control = np.zeros(netmarch.MOST + 1)
         self.control[readout.T] = problem.t_start
         self.branch = np.tile([problem.t_start, math.inf], (n_area, 1))
         self.shortest = problem.waveform.shortest_time()

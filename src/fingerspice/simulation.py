@@ -19,10 +19,10 @@ from fingerspice.diagnosis import network_failure, stack_failure
 from fingerspice.direct import solve_algebraic, solve_linear
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError
 from fingerspice.marching import solve as solve_marching
-from fingerspice.network_record import NetworkRecord
-from fingerspice.networks import NetworkProblem, prepare_network
 from fingerspice.netmarching import solve_network
 from fingerspice.netruns import NetworkRun
+from fingerspice.network_record import NetworkRecord
+from fingerspice.networks import NetworkProblem, prepare_network
 from fingerspice.nodal import solve_coupled
 from fingerspice.numerics.tableaus import TABLEAUS
 from fingerspice.outcome import ErrorEstimate, Failure, Status

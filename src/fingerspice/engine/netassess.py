@@ -50,9 +50,9 @@ def assess(
 ) -> float:  # fmt: skip
     """Error of a converged step, V, from what its polynomials miss between nodes; see `exponential.assess`.
 
-    `places` (m, N_PLACES) takes the error of the modes, `early` (m,) what their polynomials miss of a decay that is over
-    before the first node, `run` (n_area,) the largest error of each gap's voltage with what the iteration left and what
-    came before; `x` (n, 5) is for passing use.
+    `places` (m, N_PLACES) takes the error of the modes, `early` (m,) what their polynomials miss of a decay that is
+    over before the first node, `run` (n_area,) the largest error of each gap's voltage with what the iteration left and
+    what came before; `x` (n, 5) is for passing use.
     """
     n = shape.shape[0]
     left = np.zeros(4)
@@ -126,6 +126,18 @@ def charged(cell: IntArray, u: FloatArray, area: FloatArray) -> float:
             swing = 0.3 * abs(u[a, END] - u[a, 0])
             worst = max(worst, swing * abs(largest(first, second, third)) / area[a, 0])
     return worst
+
+
+@jit
+def turn_at_start(cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t: float, branch: FloatArray) -> bool:
+    """Change the branch of every area whose gap voltage starts at a zero and leaves on the other side; whether one did."""
+    turned = False
+    for a in range(cell.size):
+        if cell[a] >= 0 and sign[a] * u[a, 0] <= 1e-9 * abs(u[a, 1]) and first_wrong(u[a], sign[a], tol) == 1:
+            sign[a] = -sign[a]
+            branch[a, 0], branch[a, 1] = t, math.inf
+            turned = True
+    return turned
 
 
 @jit

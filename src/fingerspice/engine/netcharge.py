@@ -144,9 +144,14 @@ def charge_error(
                 now += share * c[b] * (both if mobile else more[a, row] * off[p, b])
                 if p > 0 and not mobile:
                     last = _row(p - 1)
-                    turned += 0.5 * share * c[b] * (
-                        (area_off[p, a] + area_off[p - 1, a]) * (u[b, row] - u[b, last])
-                        - (area[a, row] - area[a, last]) * (off[p, b] + off[p - 1, b])
+                    turned += (
+                        0.5
+                        * share
+                        * c[b]
+                        * (
+                            (area_off[p, a] + area_off[p - 1, a]) * (u[b, row] - u[b, last])
+                            - (area[a, row] - area[a, last]) * (off[p, b] + off[p - 1, b])
+                        )
                     )
             if p > 0:
                 reached = min(POINTS[row], theta)

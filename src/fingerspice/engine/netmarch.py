@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import borrow, jit
+from fingerspice.engine import rows
 from fingerspice.engine.exponential import (
     N_PLACES,
     Tables,
@@ -17,7 +19,16 @@ from fingerspice.engine.exponential import (
     respond,
     weigh,
 )
-from fingerspice.engine.netassess import account, assess, charged, clear, first_zero, moved, write_columns
+from fingerspice.engine.netassess import (
+    account,
+    assess,
+    charged,
+    clear,
+    first_zero,
+    moved,
+    turn_at_start,
+    write_columns,
+)
 from fingerspice.engine.netcharge import charge_error, charge_rows
 from fingerspice.engine.netrows import (
     AREA,
@@ -32,7 +43,6 @@ from fingerspice.engine.netrows import (
     MORE,
     PULL,
     PULL_BEFORE,
-    RATE,
     SLOPE,
     STIFF,
     USED,
@@ -72,7 +82,6 @@ from fingerspice.engine.readout import (
     series_of,
     write_outputs,
 )
-from fingerspice.engine import rows
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
 from fingerspice.physics.contact import inverse_area
 
@@ -136,8 +145,8 @@ def march(
     Returns
     -------
     int
-        DONE; JUMP: a source jumps at the time reached, take that first; NO_STEP is short enough; TOO_MANY steps;
-        REFERENCE: an area is far from its reference; or PAUSED: call again.
+        DONE; JUMP: a source jumps here, take that first; NO_STEP is short enough; TOO_MANY steps; REFERENCE: an area is
+        far from its own; or PAUSED: call again.
     """
     mobile = form.mobile
     rates, gain, shape, inverse, follow = (
@@ -180,13 +189,10 @@ def march(
     index = np.zeros(n_s, np.int64)
     now, slopes_now = np.zeros(n_s), np.zeros(n_s)
     run, gained, early = np.zeros(n_area), np.zeros(n_s), np.zeros(m)
+    areas[:] = 0.0
     for a in range(n_area):
-        for i in range(ROWS):
-            area[a, i] = area0[a]
-            slope[a, i] = 0.0
-            areas[RATE, a, i] = 0.0
-            more[a, i] = 0.0
-    slot, h_slot, flips, fresh, whole = -1, 0.0, 0, -1, True
+        area[a] = area0[a]
+    slot, h_slot, flips, fresh, whole, closing = -1, 0.0, 0, -1, True, False
     first_out = counters[OUTPUT]
     next_out = t_out[first_out] if first_out < t_out.size else math.inf
     pause = counters[ACCEPTED] + 1 + AT_ONCE // m
@@ -309,16 +315,8 @@ def march(
                     break
                 slowly = off > 0.15 * step
             step_error = math.inf
-            flip = False
-            for a in range(n_area):
-                if cell[a] >= 0:
-                    found = first_wrong(u[a], sign[a], tol)
-                    if found == 1 and flips <= n_area and sign[a] * u[a, 0] <= 1e-9 * abs(u[a, 1]):
-                        # The step starts at a zero and leaves on the other side.
-                        sign[a] = -sign[a]
-                        branch[a, 0], branch[a, 1] = t, math.inf
-                        flip = True
-            if flip:
+            # What did not close says nothing about where it goes.
+            if closed and flips <= n_area and turn_at_start(cell, u, sign, tol, t, branch):
                 flips += 1
                 continue
             lowest = 1.0
@@ -345,7 +343,8 @@ def march(
                 proposed = max(proposed, wanted if h < wanted else 0.0)
                 if control[TOO_LONG] > 0.0:
                     proposed = min(proposed, 0.93 * control[TOO_LONG])
-                    control[TOO_LONG] *= max(growth, factor) if max(growth, factor) > 1.5 else 1.03
+                    grows = growth if closing else max(growth, factor)
+                    control[TOO_LONG] *= grows if grows > 1.5 else 1.03
                 if fresh >= 0 and h >= wanted:
                     control[fresh] = h * min(2.0, factor)
                 fresh = -1
@@ -366,6 +365,7 @@ def march(
                 h = rung(h * min(0.9, shorter))
             else:
                 control[TOO_LONG] = h
+                closing = not closed
                 control[ALLOWED] = 0.0
                 h = rung(h * min(0.9, max(0.25, factor)))
                 wanted = h

@@ -244,9 +244,7 @@ def _known(
 
 
 @jit_rows
-def _add_column(
-    met: FloatArray, b: int, at: int, factor: float, size: FloatArray, matrix: FloatArray
-) -> None:
+def _add_column(met: FloatArray, b: int, at: int, factor: float, size: FloatArray, matrix: FloatArray) -> None:
     """Take met[:, b] factor size from column `at` of the matrices (n_f, n_f + 1, ROWS)."""
     for a in range(met.shape[0]):
         share = factor * met[a, b]
@@ -342,10 +340,10 @@ def _times(factor: float, a: FloatArray, b: FloatArray, out: FloatArray) -> None
 @jit_inline
 def evaluate(
     mobile: bool, h: float, rates: FloatArray, feed: FloatArray, tap: FloatArray, met: FloatArray, c: FloatArray,
-    g: FloatArray, home: IntArray, cell: IntArray, area0: FloatArray, unit: FloatArray, slow: IntArray, pace: FloatArray,
-    powers: FloatArray, slopes: FloatArray, lo: FloatArray, scale: FloatArray, curves: FloatArray, sign: FloatArray,
-    w: FloatArray, lin: FloatArray, d: FloatArray, pull: FloatArray, cells: FloatArray, areas: FloatArray,
-    matrix: FloatArray, small: FloatArray, least: FloatArray,
+    g: FloatArray, home: IntArray, cell: IntArray, area0: FloatArray, unit: FloatArray, slow: IntArray,
+    pace: FloatArray, powers: FloatArray, slopes: FloatArray, lo: FloatArray, scale: FloatArray, curves: FloatArray,
+    sign: FloatArray, w: FloatArray, lin: FloatArray, d: FloatArray, pull: FloatArray, cells: FloatArray,
+    areas: FloatArray, matrix: FloatArray, small: FloatArray, least: FloatArray,
 ) -> bool:  # fmt: skip
     """Voltages and currents of the cells from the modes w (m, ROWS), and what the areas add to the modes' rates.
 
