@@ -130,7 +130,7 @@ def charged(cell: IntArray, u: FloatArray, area: FloatArray) -> float:
 
 @jit
 def turn_at_start(cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t: float, branch: FloatArray) -> bool:
-    """Change the branch of every area whose gap voltage starts at a zero and leaves on the other side; whether one did."""
+    """Change the branch of every area whose gap voltage starts at 0 and leaves on the other side; whether one did."""
     turned = False
     for a in range(cell.size):
         if cell[a] >= 0 and sign[a] * u[a, 0] <= 1e-9 * abs(u[a, 1]) and first_wrong(u[a], sign[a], tol) == 1:
