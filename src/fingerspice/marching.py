@@ -142,9 +142,12 @@ class Track:
         periods, period = settling.periods_left(self.t), settling.period
         charge, collected, spread = self.before
         drift = float(self.y[-1]) - charge
+        drifts = np.zeros(self.out.shape[0])
+        if self.pace.charge:
+            drifts[-2] = drift
         first, kept = int(self.counters[readout.OUTPUT]), int(self.counters[readout.KEPT])
         self.counters[readout.OUTPUT] = repetition.repeat(
-            self.kept, kept, period, periods, drift, first, self.t_out, self.left, self.out
+            self.kept, kept, period, periods, drifts, first, self.t_out, self.left, self.out
         )
         self.y[-1] += periods * drift
         self.control[readout.T] += periods * period
@@ -277,7 +280,7 @@ def _through(track: Track, table: SourceTable, settling: Settling) -> int:
     """To the end of a table, or past it where a settled run repeats its last period."""
     end = float(table.edges[-1])
     while True:
-        stop = min(settling.snapped(table), end)
+        stop = min(settling.snapped(table.edges), end)
         code = track.advance(table, stop)
         if code != march.DONE or stop < settling.next - same_time(stop):
             return code

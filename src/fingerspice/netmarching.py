@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.network import network_modes
+from fingerspice.circuit.sampling import same_time
 from fingerspice.engine import netassess, netmarch, readout
+from fingerspice.engine import repeat as repetition
 from fingerspice.engine.exponential import Tables, new_tables
 from fingerspice.engine.netrows import Form, new_work
 from fingerspice.engine.network import Sources
@@ -21,6 +23,7 @@ from fingerspice.numerics.lobatto import integral_table
 from fingerspice.outcome import ErrorEstimate, Status
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.runs import Progress
+from fingerspice.settling import Settling
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -34,6 +37,8 @@ LEVEL_RATIO = 1.28
 MOST_STEPS = 100
 # References that stay with a scene.
 MOST_REFERENCES = 64
+# Steps of a period that is kept, at most.
+KEPT_STEPS = 2000
 # A gap's voltage over the largest one of its sources' before it is known, V.
 GUESS = 1.0
 
@@ -68,13 +73,15 @@ def reference_at(scene: NetworkScene, levels: tuple[int, ...], decade: int) -> R
     """The reference whose areas are the fixed ones, or LEVEL_RATIO to these powers over those at 0 V."""
     key = ("reference", levels, decade)
     if key not in scene.prepared:
-        if sum(name[0] == "reference" for name in scene.prepared) >= MOST_REFERENCES:
-            for name in [name for name in scene.prepared if name[0] == "reference"]:
-                del scene.prepared[name]
+        kept = [name for name in list(scene.prepared) if name[0] == "reference"]
+        for name in kept if len(kept) >= MOST_REFERENCES else ():
+            scene.prepared.pop(name, None)
         area = scene.area0 * LEVEL_RATIO ** np.array(levels, float)
-        scene.prepared[key] = _make_reference(scene, area, max(1e-3 * 10.0**decade, AREA_ROUNDING))
-    found: Reference = scene.prepared[key]
-    return found
+        found = _make_reference(scene, area, max(1e-3 * 10.0**decade, AREA_ROUNDING))
+        scene.prepared[key] = found
+        return found
+    made: Reference = scene.prepared[key]
+    return made
 
 
 def _make_reference(scene: NetworkScene, area: FloatArray, tol: float) -> Reference:
@@ -158,8 +165,9 @@ class March(Integration):
     """One integration in progress; see `engine.netmarch.march`."""
 
     def __init__(
-        self, problem: NetworkProblem, tol: float, rtol: float, u_scale: float, t_out: FloatArray, left: BoolArray
-    ) -> None:
+        self, problem: NetworkProblem, tol: float, rtol: float, u_scale: float, t_out: FloatArray, left: BoolArray,
+        repeat: bool,
+    ) -> None:  # fmt: skip
         super().__init__(problem, tol, t_out, left)
         n_s, n_area = self.s_before.size, self.net.gap.size
         self.decade = int(np.floor(np.log10(rtol)))
@@ -169,6 +177,10 @@ class March(Integration):
         longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.t_stop - problem.t_start)
         self.pace = Pace(tol * u_scale, min(longest, problem.max_step), True, problem.charge)
         self.error = np.zeros(self.n + self.n_slow)
+        self.counters = np.zeros(readout.N_COUNTERS, np.int64)
+        self.met = np.zeros((n_area, 4))
+        self.peaks = self.met[:, netassess.PEAK_U]
+        self.collected = np.zeros((2, n_s))
         self.control = np.zeros(netmarch.MOST + 1)
         self.control[readout.T] = problem.t_start
         self.branch = np.tile([problem.t_start, math.inf], (n_area, 1))
@@ -178,6 +190,11 @@ class March(Integration):
         self.reference = reference_at(problem.scene, self.levels, self.decade)
         cells = self.reference.form.c.size
         self.work = new_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
+        self.settling = Settling(problem, self.reference.form.rates, self.pace.tol)
+        if not repeat:
+            self.settling.next = math.inf
+        self.repeated = 0
+        self.keep(0)
         self.forget()
 
     @property
@@ -185,12 +202,8 @@ class March(Integration):
         return float(self.control[readout.T])
 
     def forget(self) -> None:
-        n_s, n_area = self.s_before.size, self.net.gap.size
-        self.counters = np.zeros(readout.N_COUNTERS, np.int64)
-        self.met = np.zeros((n_area, 4))
-        self.peaks = self.met[:, netassess.PEAK_U]
-        self.collected = np.zeros((2, n_s))
-        self.error[:] = 0.0
+        for array in (self.counters, self.met, self.collected, self.error):
+            array[:] = 0
         self.control[readout.ERROR_Q] = 0.0
         self.control[readout.MAGNIFIED] = 1.0
 
@@ -200,6 +213,7 @@ class March(Integration):
         pace = self.pace._replace(h_max=1.0) if jump else self.pace
         outputs = (self.t_out[:0], self.left[:0], self.out[:, :0].copy()) if jump else (self.t_out, self.left, self.out)
         size = np.append(reference.size, np.full(self.n_slow, self.u_scale))
+        kept = repetition.new_kept(0, self.width) if jump else self.kept
         # In a jump time stands still: its own are fractions.
         before = self.s_before.copy() if jump else self.s_before
         taken = int(self.counters[readout.ACCEPTED] + self.counters[readout.REJECTED])
@@ -208,12 +222,67 @@ class March(Integration):
             code = netmarch.march(
                 form, pace, tables, self.work, self.integral, size, sources, jump,
                 math.inf if jump else reference.tau, t_end, self.y, self.error, self.sign, before, branch, control,
-                self.counters, self.met, self.collected, *outputs, self.tried,
+                self.counters, self.met, self.collected, *outputs, kept, self.tried,
             )  # fmt: skip
             if code != netmarch.PAUSED:
                 return int(code)
 
     def through(self, sources: Sources, t_end: float) -> Status:
+        edges, settling = np.sort(sources.edges), self.settling
+        while True:
+            stop = min(settling.snapped(edges), t_end)
+            status = self._to(sources, stop)
+            if status is not Status.SUCCESS or stop < settling.next - same_time(stop):
+                return status
+            kept, room = int(self.counters[readout.KEPT]), len(self.kept.times)
+            state = np.append(self.y[: self.n], self.u_scale * self.y[self.n : self.n + self.n_slow])
+            if not settling.look(state, float(self.control[readout.MAGNIFIED])):
+                self.keep(0)
+            elif room == 0:
+                self.keep(KEPT_STEPS)
+            else:
+                if 0 < kept <= room:
+                    self._repeat(kept)
+                self.keep(0)
+                settling.next = math.inf
+            if self.t >= t_end:
+                return status
+
+    def keep(self, steps: int) -> None:
+        """Keep so many of the steps that follow."""
+        self.kept = repetition.new_kept(steps, self.width)
+        self.counters[readout.KEPT] = 0
+        self.before = self.y.copy(), self.collected.copy()
+
+    def _repeat(self, kept: int) -> None:
+        """Let the period that is kept stand for the whole ones that follow."""
+        settling, n_s = self.settling, self.s_before.size
+        periods, span = settling.periods_left(self.t), settling.periods_left(self.t) * settling.period
+        y, collected = self.before
+        drifts = np.zeros(self.width)
+        if self.problem.charge:
+            drifts[self.y.size - n_s : self.y.size] = (self.y - y)[-n_s:]
+        self.counters[readout.OUTPUT] = repetition.repeat(
+            self.kept, kept, settling.period, periods, drifts, int(self.counters[readout.OUTPUT]), self.t_out,
+            self.left, self.out,
+        )  # fmt: skip
+        self.y[-n_s:] += periods * (self.y - y)[-n_s:]
+        self.control[readout.T] += span
+        self.branch[:, 0] += span
+        peaks = self.met
+        peaks[:, netassess.ERROR_U] += settling.remaining
+        steepest = 2.0 * peaks[:, netassess.PEAK_F] / np.maximum(peaks[:, netassess.PEAK_U], 1e-300)
+        peaks[:, netassess.ERROR_F] += settling.remaining * steepest
+        # What the kept period is off is off in every one that it stands for.
+        missed, spread = self.collected - collected
+        self.collected[0] += periods * missed
+        held = float(self.problem.network.capacitance(self.problem.scene.area0).sum())
+        self.control[readout.ERROR_Q] += (
+            periods * float((np.abs(missed) + np.sqrt(spread)).max()) + held * settling.remaining
+        )
+        self.repeated = periods
+
+    def _to(self, sources: Sources, t_end: float) -> Status:
         while True:
             code = self._march(sources, False, t_end, self.control, self.branch)
             if code == netmarch.DONE:
@@ -253,7 +322,13 @@ class March(Integration):
 
 
 def solve_network(
-    problem: NetworkProblem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None = None
+    problem: NetworkProblem,
+    rtol: float,
+    t_out: FloatArray,
+    left: BoolArray,
+    progress: Progress | None = None,
+    *,
+    repeat: bool = True,
 ) -> NetworkRun | None:
     """Integrate until the stated error is within `rtol` of the peaks of every gap's voltage and force.
 
@@ -263,10 +338,11 @@ def solve_network(
     u_scale = max(problem.scene.u_peak, float(np.abs(problem.initial.y[:n]).max(initial=0.0))) or GUESS
     tol, nfev = LOCAL_SHARE * rtol, 0
     for _ in range(ATTEMPTS):
-        one = March(problem, tol, rtol, u_scale, t_out, left)
+        one = March(problem, tol, rtol, u_scale, t_out, left, repeat)
         run = integrate(one, progress)
         nfev += run.nfev
         run.nfev = nfev
+        run.stats["repeated"] = one.repeated
         if run.status in (Status.FOLD, Status.STEP_UNDERFLOW, Status.TOO_MANY_STEPS):
             return None
         worst = _state_error(run, one, u_scale) / rtol

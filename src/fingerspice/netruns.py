@@ -63,22 +63,23 @@ def source_tables(problem: NetworkProblem, tol: float, *, no_chirps: bool = Fals
     keeps = len(edges) <= 1 + KEPT_WINDOWS and not problem.scene.is_sampled
     kept = problem.scene.prepared.setdefault("tables", {})
     key = (problem.t_start, problem.t_stop, problem.step, tol, no_chirps)
-    if keeps and key in kept:
-        yield from kept[key]
+    found = kept.get(key) if keeps else None
+    if found is not None:
+        yield from found
         return
     waves = problem.scene.waveforms
     scales = [0.0] * len(waves)
     made = []
     for w0, w1 in itertools.pairwise(edges):
-        found = [
+        tables = [
             source_table(wave, w0, w1, tol, problem.step, no_chirps=no_chirps, scale=scale)
             for wave, scale in zip(waves, scales, strict=True)
         ]
-        scales = [max(scale, table.scale) for scale, table in zip(scales, found, strict=True)]
+        scales = [max(scale, table.scale) for scale, table in zip(scales, tables, strict=True)]
         if keeps:
-            made.append(found)
-        yield found
-        if any(table.not_finite is not None for table in found):
+            made.append(tables)
+        yield tables
+        if any(table.not_finite is not None for table in tables):
             return
     if keeps:
         if len(kept) >= MOST_KEPT:

@@ -20,6 +20,7 @@ from fingerspice.errors import InputError
 from fingerspice.network_record import NetworkRecord
 from fingerspice.outcome import NetworkState
 from fingerspice.phasors import mean_network_areas
+from fingerspice.physics.contact import N_PACKED
 from fingerspice.solution import Solution
 from fingerspice.times import run_times
 
@@ -230,8 +231,16 @@ def _net(network: Network, law: str, fixed: tuple[float | None, ...], u_top: flo
         area0=np.array(area0, float),
         tau=np.array(tau, float),
         slow=np.array(slow, np.int64),
-        curves=np.array([np.pad(c, (0, width - c.size)) for c in curves]).reshape(len(curves), width),
+        curves=np.array([_padded(c, width) for c in curves]).reshape(len(curves), width),
     )
+
+
+def _padded(curve: FloatArray, width: int) -> FloatArray:
+    """A curve as long as the others'; of one without a series no voltage is in reach."""
+    out = np.pad(curve, (0, width - curve.size))
+    if curve.size == 2 + N_PACKED:
+        out[1] = -math.inf
+    return out
 
 
 def _initial(circuit: Circuit, scene: NetworkScene, start: str | Solution) -> NetworkState:

@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.circuit.sampling import SourceTable, same_time
+from fingerspice.circuit.sampling import same_time
+from fingerspice.networks import NetworkProblem
 from fingerspice.problem import Problem
 
 FloatArray = NDArray[np.float64]
@@ -25,7 +26,7 @@ class Settling:
 
     Parameters
     ----------
-    problem : Problem
+    problem : Problem or NetworkProblem
     rates : ndarray
         Rates of the stack with its area frozen, 1/s.
     tol : float
@@ -39,7 +40,7 @@ class Settling:
         Bound of what all periods after the last look still move, V.
     """
 
-    def __init__(self, problem: Problem, rates: FloatArray, tol: float) -> None:
+    def __init__(self, problem: Problem | NetworkProblem, rates: FloatArray, tol: float) -> None:
         self.period = problem.waveform.period or math.inf
         self.start = max(problem.t_start, problem.waveform.settled)
         self.stop = problem.t_stop
@@ -92,12 +93,12 @@ class Settling:
         self._count += wait
         self.next = self.start + self._count * self.period if wait < left else math.inf
 
-    def snapped(self, table: SourceTable) -> float:
-        """Time of the next look, on the edge of the source that it misses by rounding."""
+    def snapped(self, edges: FloatArray) -> float:
+        """Time of the next look, on the edge (ascending, s) of the source that it misses by rounding."""
         if self.next == math.inf:
             return self.next
-        i = int(table.edges.searchsorted(self.next))
-        for edge in table.edges[max(i - 1, 0) : i + 1].tolist():
+        i = int(edges.searchsorted(self.next))
+        for edge in edges[max(i - 1, 0) : i + 1].tolist():
             if abs(edge - self.next) <= same_time(edge):
                 return float(edge)
         return self.next

@@ -250,7 +250,7 @@ def run_network(
     else:
         found = None
         if method != "radau" and problem.scene.coupled:
-            found = solve_network(problem, rtol, run_at, left, progress)
+            found = solve_network(problem, rtol, run_at, left, progress, repeat=method == "auto")
         name = "radau" if found is None else "exponential"
         run = solve_coupled(problem, rtol, run_at, left, progress) if found is None else found
     wall = time.perf_counter() - begin

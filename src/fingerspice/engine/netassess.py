@@ -29,6 +29,40 @@ def clear(block: FloatArray) -> None:
             block[a, i] = 0.0
 
 
+@jit
+def load(inverse: FloatArray, follow: FloatArray, y: FloatArray, s: FloatArray, w: FloatArray) -> None:
+    """Modes from the state and the sources' values."""
+    n = inverse.shape[0]
+    for k in range(n):
+        w[k] = 0.0
+    for i in range(n):
+        x = y[i]
+        for e in range(s.size):
+            x += follow[i, e] * s[e]
+        for k in range(n):
+            w[k] += inverse[k, i] * x
+    for k in range(n, w.size):
+        w[k] = y[k]
+
+
+@jit
+def store(
+    shape: FloatArray, follow: FloatArray, w: FloatArray, s: FloatArray, gained: FloatArray, y: FloatArray
+) -> None:
+    """State from the modes, the sources' values and what the charges have gained."""
+    n = shape.shape[0]
+    for i in range(n):
+        y[i] = 0.0
+        for k in range(n):
+            y[i] += shape[i, k] * w[k]
+        for e in range(s.size):
+            y[i] -= follow[i, e] * s[e]
+    for k in range(n, w.size):
+        y[k] = w[k]
+    for e in range(s.size):
+        y[w.size + e] += gained[e]
+
+
 @jit_rows
 def moved(u: FloatArray, before: FloatArray) -> float:
     """Root of the summed squares of u - before; `before` becomes u."""

@@ -25,7 +25,9 @@ from fingerspice.engine.netassess import (
     charged,
     clear,
     first_zero,
+    load,
     moved,
+    store,
     turn_at_start,
     write_columns,
 )
@@ -66,6 +68,7 @@ from fingerspice.engine.readout import (
     BRANCH_START,
     H_AFTER_EDGE,
     H_AFTER_ZERO,
+    KEPT,
     MAGNIFIED,
     N_CONTROL,
     NFEV,
@@ -82,6 +85,7 @@ from fingerspice.engine.readout import (
     series_of,
     write_outputs,
 )
+from fingerspice.engine.repeat import Kept
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
 from fingerspice.physics.contact import inverse_area
 
@@ -97,7 +101,7 @@ _MOST_GROWTH, _MOST_TREND = 8.0, 2.5
 # An area this many times another reference's, or a part of it, wants a reference of its own.
 FARTHEST = 1.2
 # A source's change at an edge, relative, that is its rounding and no jump.
-ROUNDING = 1e-14
+ROUNDING, UNNOTICED = 1e-14, 1e-9
 # Closer to the fold, other methods get there sooner.
 NEAR_FOLD = 0.02
 # Modes times steps between pauses, after which Python may see to a Ctrl-C.
@@ -109,7 +113,7 @@ def march(
     form: Form, pace: Pace, tables: Tables, work: Work, integral: FloatArray, size: FloatArray, sources: Sources,
     jump: bool, tau: float, t_end: float, y: FloatArray, error: FloatArray, sign: FloatArray, s_before: FloatArray,
     branch: FloatArray, control: FloatArray, counters: IntArray, peaks: FloatArray, collected: FloatArray,
-    t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray, tried: FloatArray,
+    t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray, kept: Kept, tried: FloatArray,
 ) -> int:  # fmt: skip
     """Step to `t_end` through the sources' segments, writing outputs on the way.
 
@@ -139,6 +143,8 @@ def march(
     t_out, left, out : ndarray
         Output times (ascending), whether the left-hand value is meant, and the columns to fill: the state, then the
         currents.
+    kept : Kept
+        Takes the steps, as long as there is room.
     tried : ndarray, shape (TRIED, 4)
         Takes the last steps tried, in turn: start and length (s), error over the one allowed, number from 1.
 
@@ -182,6 +188,7 @@ def march(
     control, counters, peaks, branch = borrow(control), borrow(counters), borrow(peaks), borrow(branch)
     t_out, left, out, tried = borrow(t_out), borrow(left), borrow(out), borrow(tried)
     integral, size = borrow(integral), borrow(size)
+    kept_times, kept_series = borrow(kept.times), borrow(kept.series)
     n, n_s, m, n_area = shape.shape[0], s_before.size, rates.size, sign.size
     first_z = y.size - n_s
     tol, charge = pace.tol, pace.charge
@@ -210,26 +217,18 @@ def march(
             at_edge |= sources.edges[sources.first[i] + index[i]] == t
             stop = min(stop, sources.edges[sources.first[i] + index[i] + 1])
         at_sources(sources, index, t, 0.0, now, slopes_now)
+        # The time of a call may miss an edge by rounding.
+        least = ROUNDING if at_edge else (UNNOTICED if h_slot == 0.0 else math.inf)
+        for i in range(n_s):
+            if not jump and abs(now[i] - s_before[i]) > least * max(abs(now[i]), abs(s_before[i])):
+                return JUMP
         if at_edge:
-            if not jump:
-                for i in range(n_s):
-                    if abs(now[i] - s_before[i]) > ROUNDING * max(abs(now[i]), abs(s_before[i])):
-                        return JUMP
             # The steps after a jump are often those after the one before.
             control[H] = control[H_AFTER_EDGE]
             control[TOO_LONG] = 0.0
             control[ALLOWED] = 0.0
             fresh = H_AFTER_EDGE
-        for k in range(n):
-            w0[k] = 0.0
-        for i in range(n):
-            x = y[i]
-            for e in range(n_s):
-                x += follow[i, e] * now[e]
-            for k in range(n):
-                w0[k] += inverse[k, i] * x
-        for k in range(n, m):
-            w0[k] = y[k]
+        load(inverse, follow, y, now, w0)
         ahead = math.inf
         control[BRANCH_START], control[BRANCH_LENGTH] = t, math.inf
         for a in range(n_area):
@@ -404,10 +403,16 @@ def march(
             )  # fmt: skip
         for e in range(n_s):
             gained[e] = at(values[first_z + e], theta) if charge else 0.0
-        if next_out <= t_new:
+        if next_out <= t_new or kept_times.size > 0:
             write_columns(n, first_z, charge, shape, follow, w, s, y, values)
             for i in range(out.shape[0]):
                 series_of(values[i], coefficients[i])
+            place = counters[KEPT]
+            counters[KEPT] += 1
+            if place < kept_times.shape[0]:
+                kept_times[place, 0], kept_times[place, 1], kept_times[place, 2] = t, h, t_new
+                kept_series[place] = coefficients[: out.shape[0]]
+        if next_out <= t_new:
             first_out += write_outputs(
                 t, h, theta, t_new, 0.0, False, coefficients, outputs, first_out, 0, t_out, left, out
             )  # fmt: skip
@@ -424,16 +429,7 @@ def march(
             for k in range(m):
                 error[k] = places[k, N_PLACES - 1]
         at_sources(sources, index, t_new, 0.0, s_before, slopes_now)
-        for i in range(n):
-            y[i] = 0.0
-            for k in range(n):
-                y[i] += shape[i, k] * w0[k]
-            for e in range(n_s):
-                y[i] -= follow[i, e] * s_before[e]
-        for k in range(n, m):
-            y[k] = w0[k]
-        for e in range(n_s):
-            y[first_z + e] += gained[e]
+        store(shape, follow, w0, s_before, gained, y)
         if which >= 0:
             sign[which] = -sign[which]
             branch[which, 1] = t_new - branch[which, 0]

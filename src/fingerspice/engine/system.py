@@ -152,7 +152,7 @@ def area_polynomial(curve: FloatArray, tol: float) -> tuple[FloatArray, FloatArr
     lo, hi = float(curve[0]), float(curve[1])
     series = curve[2 + N_PACKED :]
     kept = series[: DEGREE + 1]
-    if series.size == 0 or np.abs(series[DEGREE + 1 :]).sum() > tol * abs(series[0]):
+    if series.size == 0 or not lo < hi or np.abs(series[DEGREE + 1 :]).sum() > tol * abs(series[0]):
         return powers, slopes, lo, 0.0
     found = chebyshev.cheb2poly(kept)
     powers[: found.size] = found
