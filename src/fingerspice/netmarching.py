@@ -217,7 +217,8 @@ class March(Integration):
         # In a jump time stands still: its own are fractions.
         before = self.s_before.copy() if jump else self.s_before
         taken = int(self.counters[readout.ACCEPTED] + self.counters[readout.REJECTED])
-        control[netmarch.MOST] = taken + MOST_STEPS * (4.0 + sources.edges.size + (t_end - self.t) / self.shortest)
+        times = 0.0 if jump else (t_end - self.t) / self.shortest
+        control[netmarch.MOST] = taken + MOST_STEPS * (4.0 + sources.edges.size + times)
         while True:
             code = netmarch.march(
                 form, pace, tables, self.work, self.integral, size, sources, jump,
