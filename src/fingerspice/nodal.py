@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,8 @@ ATTEMPTS = 6
 FOLD_TIME = 1e-10
 
 
-def network_scheme(h_max: float, stages: int = STAGES) -> Scheme:
+@cache
+def _scheme(stages: int) -> Scheme:
     """Radau IIA with its matrix diagonalised."""
     tableau = radau(stages)
     values, vectors = np.linalg.eig(tableau.a)
@@ -50,7 +52,7 @@ def network_scheme(h_max: float, stages: int = STAGES) -> Scheme:
     return Scheme(
         tableau.a, tableau.c, np.ascontiguousarray(tableau.e[0]), tableau.dense, values[upper].astype(complex),
         np.ascontiguousarray(back[upper].astype(complex)),
-        np.ascontiguousarray((vectors[:, upper] * twice).astype(complex)), h_max,
+        np.ascontiguousarray((vectors[:, upper] * twice).astype(complex)), np.inf,
     )  # fmt: skip
 
 
@@ -126,7 +128,7 @@ def solve_coupled(
     The error is stated from a second run with a larger tolerance.
     """
     longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
-    fine, coarse = network_scheme(longest, STAGES), network_scheme(longest, STAGES_BESIDE)
+    fine, coarse = (_scheme(stages)._replace(h_max=longest) for stages in (STAGES, STAGES_BESIDE))
     at, side, probed = _with_probes(problem, t_out, left)
     n = problem.network.k.shape[0]
     u_scale = max(problem.scene.u_peak, float(np.abs(problem.initial.y[:n]).max(initial=0.0)))
