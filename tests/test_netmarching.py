@@ -91,3 +91,14 @@ def test_windows_of_a_long_run_join() -> None:
     near = fs.simulate(circuit, t_stop=0.0503, t_eval=late - 1.15, rtol=1e-6)
     assert run.method == "exponential"
     assert np.abs(run.u_gap - near.u_gap).max() <= run.error.u_gap + near.error.u_gap
+
+
+@pytest.mark.parametrize("lines", [["Vfast m 0 SIN(0 60 2k)"], ["Vfast m n SIN(0 60 2k)", "Rout n 0 10k"]])
+def test_a_gap_voltage_that_turns_back_between_nodes_has_crossed_zero(lines: list[str]) -> None:
+    circuit = deck("Vdrive a m SIN(0 80 100)", *lines, *finger("a", "0", f=100.0), ".tran 30u 15m uic")
+    t = np.linspace(0.0, 15e-3, 3001)
+    exact = fs.simulate(circuit, t_eval=t, rtol=1e-10)
+    for rtol in (1e-5, 1e-6, 1e-7, 1e-8, 1e-9):
+        s = fs.simulate(circuit, t_eval=t, rtol=rtol)
+        assert s.stats["zeros"] == exact.stats["zeros"]
+        assert np.abs(s.u_gap - exact.u_gap).max() <= s.error.u_gap + exact.error.u_gap

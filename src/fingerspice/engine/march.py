@@ -40,10 +40,10 @@ from fingerspice.engine.readout import (
     error_at,
     first_wrong,
     layers,
+    leaves,
     note,
     series_of,
     write_outputs,
-    zero,
 )  # fmt: skip
 from fingerspice.engine.repeat import Kept
 from fingerspice.engine.rows import DQ, GUESS, N_FLAT, SOURCE, X_GAP, Q, U, source_rows
@@ -328,8 +328,8 @@ def march(
         if t_new >= stop or stop - t_new <= 1e-12 * h:
             t_new = stop
             theta = min(1.0, (stop - t) / h)
-        if wrong > 0 and flips < 2:
-            crossing = zero(u_rows, control[SIGN], wrong, coefficients[0])
+        if coupled and flips < 2:
+            crossing = leaves(u_rows, control[SIGN], wrong, tol, coefficients[0])
             if t + crossing * h <= t_new and crossing <= theta:
                 theta = crossing
                 t_new = t + crossing * h

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fingerspice.compiled import jit, jit_rows
 from fingerspice.engine.charge import DERIVATIVE
 from fingerspice.engine.exponential import N_PLACES, between, largest, left_over
-from fingerspice.engine.readout import at, first_wrong, zero
+from fingerspice.engine.readout import first_wrong, leaves
 from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS
 
 FloatArray = NDArray[np.float64]
@@ -175,50 +175,17 @@ def turn_at_start(cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t
 
 
 @jit
-def _dip(u: FloatArray, du: FloatArray, sign: float, j: int, least: float) -> float:
-    """Fraction of the step at which a gap voltage leaves its branch between nodes j - 1 and j, on it at both; or 2.
-
-    It comes back where its slope turns. What goes less than `least` (V) beyond does not matter.
-    """
-    if not (sign * du[j - 1] < 0.0 < sign * du[j]):
-        return 2.0
-    lo: float = POINTS[j - 1]
-    hi: float = lo + (POINTS[j] - lo) * du[j - 1] / (du[j - 1] - du[j])
-    if not sign * at(u, hi) < -least:
-        return 2.0
-    for _ in range(60):
-        middle = 0.5 * (lo + hi)
-        if not lo < middle < hi:
-            break
-        if sign * at(u, middle) > 0.0:
-            lo = middle
-        else:
-            hi = middle
-    return hi
-
-
-@jit
 def first_zero(
-    cell: IntArray, u: FloatArray, du: FloatArray, sign: FloatArray, tol: float, t: float, h: float, theta: float,
-    t_new: float, series: FloatArray,
+    cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t: float, h: float, theta: float, t_new: float,
+    series: FloatArray,
 ) -> tuple[int, float, float]:  # fmt: skip
-    """The area whose gap voltage is first to leave its branch before t_new, or -1, at what fraction, and when.
-
-    `du` (n_f, ROWS) holds the rates of the cells' voltages.
-    """
+    """The area whose gap voltage is first to leave its branch before t_new, or -1, at what fraction, and when."""
     which = -1
     for a in range(cell.size):
-        if cell[a] < 0:
-            continue
-        wrong = first_wrong(u[a], sign[a], tol)
-        crossing = zero(u[a], sign[a], wrong, series) if wrong > 0 else 2.0
-        for j in range(1, wrong if wrong > 0 else NODES):
-            dip = _dip(u[a], du[cell[a]], sign[a], j, 0.01 * tol)
-            if dip < crossing:
-                crossing = dip
-                break
-        if crossing <= theta and t + crossing * h <= t_new:
-            which, theta, t_new = a, crossing, t + crossing * h
+        if cell[a] >= 0:
+            crossing = leaves(u[a], sign[a], first_wrong(u[a], sign[a], tol), tol, series)
+            if crossing <= theta and t + crossing * h <= t_new:
+                which, theta, t_new = a, crossing, t + crossing * h
     return which, theta, t_new
 
 

@@ -374,7 +374,7 @@ def march(
             t_new = stop
             theta = min(1.0, (stop - t) / h)
         if flips <= n_area:
-            which, theta, t_new = first_zero(cell, u, du, sign, tol, t, h, theta, t_new, room[0])
+            which, theta, t_new = first_zero(cell, u, sign, tol, t, h, theta, t_new, room[0])
         if which >= 0 and t_new <= t:
             sign[which] = -sign[which]
             branch[which, 0], branch[which, 1] = t, math.inf

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import jit, jit_fused, jit_rows
-from fingerspice.numerics.lobatto import BARYCENTRIC, FIRST, NODES, POINTS, ROWS, SECOND, THIRD, TO_SERIES
+from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, SECOND, THIRD, TO_SERIES
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -138,6 +138,46 @@ def at(values: FloatArray, theta: float) -> float:
         top += weight * values[j]
         bottom += weight
     return top / bottom
+
+
+@jit
+def _dip(u: FloatArray, sign: float, last: int, least: float) -> float:
+    """Fraction of the step at which the gap voltage leaves its branch to come back before the next node, or 2.
+
+    Looked for about nodes before `last` that lie lower than their neighbours; what goes less than `least` (V) beyond
+    does not matter.
+    """
+    for j in range(1, last):
+        before, here, after = sign * u[j - 1], sign * u[j], sign * u[j + 1]
+        if not (here <= before and here <= after):
+            continue
+        # Where the parabola through the three is lowest.
+        left, right = (before - here) / (POINTS[j] - POINTS[j - 1]), (after - here) / (POINTS[j + 1] - POINTS[j])
+        lo: float = POINTS[j - 1]
+        hi: float = POINTS[j + 1]
+        if left + right > 0.0:
+            hi = 0.5 * (lo + POINTS[j]) + 0.5 * (hi - lo) * left / (left + right)
+        if not sign * at(u, hi) < -least:
+            continue
+        for _ in range(60):
+            middle = 0.5 * (lo + hi)
+            if not lo < middle < hi:
+                break
+            if sign * at(u, middle) > 0.0:
+                lo = middle
+            else:
+                hi = middle
+        return hi
+    return 2.0
+
+
+@jit
+def leaves(u: FloatArray, sign: float, wrong: int, tol: float, series: FloatArray) -> float:
+    """Fraction of the step at which the gap voltage leaves its branch, or 2; `wrong` is that of `first_wrong`."""
+    dip = _dip(u, sign, wrong - 1 if wrong > 0 else END, 0.01 * tol)
+    if dip < 2.0 or wrong == 0:
+        return dip
+    return zero(u, sign, wrong, series)
 
 
 @jit
