@@ -38,6 +38,8 @@ ORDER = (
     *("settling", "track", "approach", "marching", "folding"),
     *(
         "direct",
+        "netruns",
+        "netmarching",
         "nodal",
         "superposition",
         "diagnosis",

@@ -72,7 +72,7 @@ class _Period:
         out = np.empty((self.track.out.shape[0], t.size))
         kept, count = self.track.kept, self.marks.size - 1
         # Its steps' series are used up by that.
-        if repetition.repeat(kept, count, 0.0, 1, 0.0, 0, t.ravel(), left.ravel(), out) < t.size:
+        if repetition.repeat(kept, count, 0.0, 1, np.zeros(len(out)), 0, t.ravel(), left.ravel(), out) < t.size:
             raise _LostError
         return np.ascontiguousarray(out.reshape(-1, *t.shape).swapaxes(0, 1) @ TO_SERIES)
 
@@ -111,7 +111,7 @@ def _moved(slope: FloatArray, shift: FloatArray, periods: int) -> FloatArray:
 
 def leap(track: Track, table: SourceTable, settling: Settling) -> None:
     """Let the periods that follow come from one map, if its error allows it; see `Settling.may_leap`."""
-    stop = settling.snapped(table, track.t + settling.period)
+    stop = settling.snapped(table.edges, track.t + settling.period)
     if stop > table.edges[-1]:
         return
     try:

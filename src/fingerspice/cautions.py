@@ -10,7 +10,7 @@ import numpy as np
 from fingerspice.circuit.circuit import Element
 from fingerspice.network_record import NetworkRecord
 from fingerspice.networks import NetworkProblem
-from fingerspice.nodal import NetworkRun
+from fingerspice.netruns import NetworkRun
 from fingerspice.outcome import Status
 from fingerspice.physics.contact import inverse_area
 from fingerspice.problem import Problem

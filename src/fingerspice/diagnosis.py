@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from fingerspice.circuit.sampling import breakpoints_at
+from fingerspice.netruns import NetworkRun
 from fingerspice.network_record import NetworkRecord
 from fingerspice.networks import NetworkProblem
-from fingerspice.nodal import NetworkRun
 from fingerspice.outcome import Failure, Status
 from fingerspice.problem import Problem
 from fingerspice.record import Record

@@ -23,7 +23,7 @@ from fingerspice.settling import Settling
 from fingerspice.track import FINEST, SAFETY, Prepared, Track, prepare_system
 
 # The error allowed in a step, over the one asked for: the force doubles it, and steps add up.
-LOCAL_SHARE = 0.13
+LOCAL_SHARE = 0.15
 # Steps per shortest time scale of the source: the points of a step must not alias it.
 LONGEST_STEP = 0.6
 
@@ -102,11 +102,14 @@ def _through(track: Track, table: SourceTable, settling: Settling) -> int:
     """To the end of a table, or past it where a settled run repeats its last period."""
     end = float(table.edges[-1])
     while True:
-        stop = min(settling.snapped(table, settling.next), end)
+        stop = min(settling.snapped(table.edges, settling.next), end)
         code = track.advance(table, stop)
         if code != march.DONE or stop < settling.next - same_time(stop):
             return code
-        if not settling.look(track.y, track.control, track.counters):
+        c = track.control
+        if not settling.look(
+            track.y[:-1], float(c[readout.MAGNIFIED]), float(c[readout.PEAK_U]), int(track.counters[readout.ACCEPTED])
+        ):
             track.forget()
             if settling.may_leap:
                 leap(track, table, settling)

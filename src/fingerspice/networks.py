@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from fingerspice.errors import InputError
 from fingerspice.network_record import NetworkRecord
 from fingerspice.outcome import NetworkState
 from fingerspice.phasors import mean_network_areas
+from fingerspice.physics.contact import N_PACKED
 from fingerspice.solution import Solution
 from fingerspice.times import run_times
 
@@ -42,6 +43,8 @@ class NetworkScene:
         Each area where it is fixed, m^2.
     u_peak : float
         Sum of the largest |U| of the voltage sources, V.
+    prepared : dict
+        What integrators made ready for this scene.
     """
 
     network: Network
@@ -50,6 +53,7 @@ class NetworkScene:
     area_mode: str
     fixed: tuple[float | None, ...]
     u_peak: float
+    prepared: dict[Any, Any] = field(default_factory=dict)
 
     @cached_property
     def waveforms(self) -> tuple[Waveform, ...]:
@@ -228,8 +232,16 @@ def _net(network: Network, law: str, fixed: tuple[float | None, ...], u_top: flo
         area0=np.array(area0, float),
         tau=np.array(tau, float),
         slow=np.array(slow, np.int64),
-        curves=np.array([np.pad(c, (0, width - c.size)) for c in curves]).reshape(len(curves), width),
+        curves=np.array([_padded(c, width) for c in curves]).reshape(len(curves), width),
     )
+
+
+def _padded(curve: FloatArray, width: int) -> FloatArray:
+    """A curve as long as the others'; of one without a series no voltage is in reach."""
+    out = np.pad(curve, (0, width - curve.size))
+    if curve.size == 2 + N_PACKED:
+        out[1] = -math.inf
+    return out
 
 
 def _initial(circuit: Circuit, scene: NetworkScene, start: str | Solution) -> NetworkState:

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.circuit.sampling import SourceTable, breakpoints_at, is_sampled, source_table
 from fingerspice.engine import collocation
 from fingerspice.engine.collocation import advance
-from fingerspice.engine.network import Sources, at_sources, new_room, rates
-from fingerspice.engine.radau import NFEV, Scheme, new_work
+from fingerspice.engine.network import Sources, new_room
+from fingerspice.engine.radau import Scheme, new_work
 from fingerspice.engine.readout import TRIED
+from fingerspice.netruns import Integration, NetworkRun, gap_signals, integrate, ramp, values_at
 from fingerspice.networks import NetworkProblem
 from fingerspice.numerics.tableaus import radau
-from fingerspice.outcome import Attempt, ErrorEstimate, NetworkState, Status, last_tried
-from fingerspice.physics.contact import inverse_areas
-from fingerspice.runs import Progress, windows
+from fingerspice.outcome import ErrorEstimate, Status
+from fingerspice.runs import Progress
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -44,33 +40,8 @@ ATTEMPTS = 6
 FOLD_TIME = 1e-10
 
 
-@dataclass
-class NetworkRun:
-    """What one run gives: rows of the state, then of the sources' currents where they were asked for."""
-
-    t: FloatArray
-    left: BoolArray
-    rows: FloatArray
-    status: Status
-    error: ErrorEstimate
-    peaks: FloatArray
-    nfev: int
-    stats: dict[str, int]
-    state: NetworkState
-    t_failed: float | None = None
-    unseen: tuple[float, float] | None = None
-    margin: float = 1.0
-    tried: tuple[Attempt, ...] = ()
-    # The row at the time a failed run reached.
-    here: FloatArray | None = None
-
-    def end_before(self, t: float) -> None:
-        """Take back the outputs from a time (s) on."""
-        kept = self.t < t
-        self.t, self.left, self.rows = self.t[kept], self.left[kept], self.rows[kept]
-
-
-def network_scheme(h_max: float, stages: int = STAGES) -> Scheme:
+@cache
+def _scheme(stages: int) -> Scheme:
     """Radau IIA with its matrix diagonalised."""
     tableau = radau(stages)
     values, vectors = np.linalg.eig(tableau.a)
@@ -81,96 +52,54 @@ def network_scheme(h_max: float, stages: int = STAGES) -> Scheme:
     return Scheme(
         tableau.a, tableau.c, np.ascontiguousarray(tableau.e[0]), tableau.dense, values[upper].astype(complex),
         np.ascontiguousarray(back[upper].astype(complex)),
-        np.ascontiguousarray((vectors[:, upper] * twice).astype(complex)), h_max,
+        np.ascontiguousarray((vectors[:, upper] * twice).astype(complex)), np.inf,
     )  # fmt: skip
 
 
-def source_tables(problem: NetworkProblem, tol: float, *, no_chirps: bool = False) -> Iterator[list[SourceTable]]:
-    """Tables of all sources, window by window, until one of them stops being finite."""
-    waves = problem.scene.waveforms
-    scales = [0.0] * len(waves)
-    for w0, w1 in itertools.pairwise(windows(problem)):
-        found = [
-            source_table(wave, w0, w1, tol, problem.step, no_chirps=no_chirps, scale=scale)
-            for wave, scale in zip(waves, scales, strict=True)
-        ]
-        scales = [max(scale, table.scale) for scale, table in zip(scales, found, strict=True)]
-        yield found
-        if any(table.not_finite is not None for table in found):
-            return
+class Collocation(Integration):
+    """One integration in progress; see `engine.collocation.advance`."""
 
-
-def first_unseen(
-    problem: NetworkProblem, tables: list[SourceTable], t_out: FloatArray, tol: float
-) -> tuple[float, float] | None:
-    """The first output at which a user's function is not what its table says, s, and by how much, V."""
-    pairs = zip(problem.scene.waveforms, tables, strict=True)
-    found = (table.unseen(wave, t_out, max(tol, 1e-14)) for wave, table in pairs if is_sampled(wave))
-    return min((x for x in found if x is not None), default=None)
-
-
-def _joined(tables: list[SourceTable]) -> Sources:
-    width = max(t.terms.shape[1] for t in tables), max(t.series.shape[1] for t in tables)
-    first = np.concatenate([[0], np.cumsum([t.edges.size for t in tables])]).astype(np.int64)
-    terms = [np.pad(t.terms, ((0, 0), (0, width[0] - t.terms.shape[1]), (0, 0))) for t in tables]
-    series = [np.pad(t.series, ((0, 0), (0, width[1] - t.series.shape[1]))) for t in tables]
-    return Sources(first, np.concatenate([t.edges for t in tables]), np.concatenate(terms), np.concatenate(series))
-
-
-def _ramp(before: FloatArray, after: FloatArray) -> Sources:
-    """A jump of every source as a ramp over [0, 1]."""
-    terms = np.zeros((before.size, 2, 6))
-    terms[:, 0, 0], terms[:, 1, 0], terms[:, 1, 1] = before, after - before, 1.0
-    edges = np.tile([0.0, 1.0], before.size)
-    return Sources(2 * np.arange(before.size + 1, dtype=np.int64), edges, terms, np.zeros((before.size, 0)))
-
-
-class _Integration:
-    """One integration in progress."""
-
-    def __init__(self, problem: NetworkProblem, scheme: Scheme, tol: float, u_scale: float) -> None:
-        net = problem.scene.net
-        self.problem, self.net, self.scheme, self.tol = problem, net, scheme, tol
-        n, n_s = net.b.shape
-        self.n, self.n_slow = n, problem.initial.y.size - n - n_s
+    def __init__(
+        self, problem: NetworkProblem, scheme: Scheme, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray
+    ) -> None:
+        super().__init__(problem, tol, t_out, left)
+        self.scheme = scheme
+        n_s = self.s_before.size
         stored = u_scale * float(np.abs(problem.network.capacitance(problem.scene.area0)).sum()) or u_scale
         # A charge's own error is not looked at where nobody asked for it.
         charge = stored if problem.charge else np.inf
-        self.scale = np.concatenate([np.full(n, u_scale), np.ones(self.n_slow), np.full(n_s, charge)])
-        self.y, self.sign = problem.initial.y.copy(), problem.initial.sign.copy()
-        self.s_before = problem.initial.s_before.copy()
+        self.scale = np.concatenate([np.full(self.n, u_scale), np.ones(self.n_slow), np.full(n_s, charge)])
         self.control = np.zeros(collocation.N_CONTROL)
         self.control[collocation.BASE] = problem.t_start
         self.counters = np.zeros(collocation.N_COUNTERS, np.int64)
-        self.peaks = np.zeros(net.gap.size)
-        self.tried = np.zeros((TRIED, 4))
-        self.room = new_room(net, self.y.size)
-        self.work = new_work(net, scheme.c.size, scheme.eigenvalues.size, self.y.size)
+        self.peaks = np.zeros(self.net.gap.size)
+        self.room = new_room(self.net, self.y.size)
+        self.work = new_work(self.net, scheme.c.size, scheme.eigenvalues.size, self.y.size)
 
     @property
     def t(self) -> float:
         return float(self.control[collocation.BASE] + self.control[collocation.T])
 
-    def through(self, sources: Sources, t_end: float, t_out: FloatArray, left: BoolArray, rows: FloatArray) -> int:
-        """To `t_end` (s), the jumps on the way taken."""
+    def through(self, sources: Sources, t_end: float) -> Status:
         while True:
             code = advance(
                 self.net, self.room, self.scheme, self.work, sources, False, self.problem.charge, t_end, self.y,
-                self.sign, self.s_before, self.scale, self.tol, self.control, self.counters, self.peaks, t_out, left,
-                rows, self.tried,
+                self.sign, self.s_before, self.scale, self.tol, self.control, self.counters, self.peaks, self.t_out,
+                self.left, self.rows, self.tried,
             )  # fmt: skip
-            if code == collocation.PAUSED:
-                continue
-            if code != collocation.JUMP:
-                return int(code)
-            if not self.jump(_values(sources, self.t)):
-                return collocation.STEP_UNDERFLOW
+            if code == collocation.DONE:
+                return Status.SUCCESS
+            if code == collocation.TOO_MANY:
+                return Status.TOO_MANY_STEPS
+            if code == collocation.STEP_UNDERFLOW or (
+                code == collocation.JUMP and not self.jump(values_at(sources, self.t))
+            ):
+                return self.stuck()
 
     def jump(self, after: FloatArray) -> bool:
-        """Take a jump of the sources to their values `after`; False where that goes past a fold."""
         control = np.zeros(collocation.N_CONTROL)
         code = advance(
-            self.net, self.room, self.scheme._replace(h_max=1.0), self.work, _ramp(self.s_before, after), True, False,
+            self.net, self.room, self.scheme._replace(h_max=1.0), self.work, ramp(self.s_before, after), True, False,
             1.0, self.y, self.sign, self.s_before.copy(), self.scale, self.tol, control, self.counters, self.peaks,
             np.empty(0), np.empty(0, bool), np.empty((0, self.y.size)), np.zeros((TRIED, 4)),
         )  # fmt: skip
@@ -179,125 +108,16 @@ class _Integration:
         self.control[collocation.JUMPED] = 1.0
         return code == collocation.DONE
 
-    def settle_areas(self, after: FloatArray) -> None:
-        """Let the areas with dynamics of their own start at g(u(0+))."""
-        place = slice(self.n, self.n + self.n_slow)
-        if not np.any(np.isnan(self.y[place])):
-            return
-        slow = [i for i in range(self.net.gap.size) if self.net.slow[i] >= 0]
-        y, s_before = self.y.copy(), self.s_before.copy()
-        area = np.ones(self.n_slow)
-        for _ in range(60):
-            self.y[:], self.s_before[:] = y, s_before
-            self.y[place] = area
-            self.sign[:] = 0.0
-            self.jump(after)
-            u = np.abs(self.net.p @ self.y[: self.n] + self.net.q @ after)
-            new = area.copy()
-            for i in slow:
-                inverse = inverse_areas(u[[self.net.gap[i]]], self.net.curves[i])[0]
-                new[self.net.slow[i]] = 1.0 / (inverse * self.net.area0[i])
-            done = bool(np.all(np.abs(new - area) <= 1e-15))
-            area = new
-            if done:
-                break
-        self.y[:], self.s_before[:] = y, s_before
-        self.y[place] = area
-        self.sign[:] = 0.0
+    def forget(self) -> None:
         self.peaks[:] = 0.0
         self.counters[:] = 0
-
-    def state(self) -> NetworkState:
-        return NetworkState(self.t, self.y.copy(), self.s_before.copy(), self.sign.copy())
-
-
-def _values(sources: Sources, t: float) -> FloatArray:
-    """Right-hand values of the sources at t (s)."""
-    n_s = sources.first.size - 1
-    out, slope, index = np.empty(n_s), np.empty(n_s), np.empty(n_s, np.int64)
-    for i in range(n_s):
-        edges = sources.edges[sources.first[i] : sources.first[i + 1]]
-        index[i] = min(max(int(np.searchsorted(edges, t, side="right")) - 1, 0), edges.size - 2)
-    at_sources(sources, index, t, 0.0, out, slope)
-    return out
 
 
 def _integrate(
     problem: NetworkProblem, scheme: Scheme, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray,
     progress: Progress | None,
 ) -> NetworkRun:  # fmt: skip
-    one = _Integration(problem, scheme, tol, u_scale)
-    n_s = problem.initial.s_before.size
-    width = one.y.size + (n_s if problem.charge else 0)
-    rows = np.full((t_out.size, width), np.nan)
-    status, t_failed = Status.SUCCESS, None
-    rough, unseen = 0.0, None
-    sources: Sources | None = None
-    for tables in source_tables(problem, min(1e-3, max(0.05 * tol, 1e-14))):
-        rough = max(rough, *(table.rough for table in tables))
-        unseen = unseen or first_unseen(problem, tables, t_out, tol)
-        broken = [table.not_finite for table in tables if table.not_finite is not None]
-        if all(table.edges.size > 1 for table in tables):
-            sources = _joined(tables)
-            if one.t == problem.t_start:
-                one.settle_areas(_values(sources, one.t))
-            code = one.through(sources, min(float(t.edges[-1]) for t in tables), t_out, left, rows)
-            if code == collocation.TOO_MANY:
-                status, t_failed = Status.TOO_MANY_STEPS, one.t
-                break
-            if code == collocation.STEP_UNDERFLOW:
-                folding = problem.scene.net.mobile and problem.scene.coupled
-                status, t_failed = (Status.FOLD if folding else Status.STEP_UNDERFLOW), one.t
-                break
-        if progress is not None:
-            progress((one.t - problem.t_start) / (problem.t_stop - problem.t_start))
-        if broken:
-            status, t_failed = Status.SOURCE_NOT_FINITE, min(broken)
-            break
-    state = one.state()
-    done = int(one.counters[collocation.OUTPUT])
-    if status is Status.SUCCESS and done < t_out.size and sources is not None:
-        done += _at_the_end(one, sources, t_out[done:], left[done:], rows[done:])
-    here = None
-    if t_failed is not None and status is not Status.SOURCE_NOT_FINITE and sources and one.t > problem.t_start:
-        here = _row(one, sources, "left")
-    return NetworkRun(
-        t_out[:done], left[:done], rows[:done], status, ErrorEstimate(rough, 0.0), one.peaks,
-        int(one.counters[NFEV]),
-        {name: int(one.counters[i]) for name, i in (
-            ("steps", collocation.ACCEPTED), ("rejected", collocation.REJECTED), ("zeros", collocation.ZEROS))},
-        state, t_failed, tried=last_tried(one.tried), here=here, unseen=unseen,
-    )  # fmt: skip
-
-
-def _at_the_end(one: _Integration, sources: Sources, t_out: FloatArray, left: BoolArray, rows: FloatArray) -> int:
-    """Right-hand outputs at the very end, after the jump that may stand there; how many were written."""
-    problem = one.problem
-    stop = problem.t_stop
-    if any(breakpoints_at(wave, stop).size for wave in problem.scene.waveforms):
-        after = [source_table(w, stop, stop + problem.step, 1e-10, problem.step) for w in problem.scene.waveforms]
-        sources = _joined(after)
-        values = _values(sources, stop)
-        if np.any(values != one.s_before) and not one.jump(values):
-            return 0
-    rows[:] = _row(one, sources, "right")
-    return int(t_out.size)
-
-
-def _row(one: _Integration, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
-    """What `advance` would write at the time reached, from the segments on one side of it; NaN past a fold."""
-    if not one.problem.charge:
-        return one.y.copy()
-    room = new_room(one.net, one.y.size)
-    index = np.array([
-        min(max(int(np.searchsorted(sources.edges[a:b], one.t, side=side)) - 1, 0), b - a - 2)
-        for a, b in itertools.pairwise(sources.first)
-    ])  # fmt: skip
-    at_sources(sources, index, one.t, 0.0, room.s, room.ds)
-    rate = np.full(one.y.size, np.nan)
-    found = rates(one.net, room, False, one.y, one.sign, rate)
-    n_s = one.s_before.size
-    return np.concatenate([one.y, rate[-n_s:] if found else np.full(n_s, np.nan)])
+    return integrate(Collocation(problem, scheme, tol, u_scale, t_out, left), progress)
 
 
 def solve_coupled(
@@ -308,7 +128,7 @@ def solve_coupled(
     The error is stated from a second run with a larger tolerance.
     """
     longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
-    fine, coarse = network_scheme(longest, STAGES), network_scheme(longest, STAGES_BESIDE)
+    fine, coarse = (_scheme(stages)._replace(h_max=longest) for stages in (STAGES, STAGES_BESIDE))
     at, side, probed = _with_probes(problem, t_out, left)
     n = problem.network.k.shape[0]
     u_scale = max(problem.scene.u_peak, float(np.abs(problem.initial.y[:n]).max(initial=0.0)))
@@ -373,18 +193,6 @@ def _with_probes(problem: NetworkProblem, t: FloatArray, left: BoolArray) -> tup
     side = np.concatenate([left, np.ones(count, bool)])
     order = np.lexsort((~side, every))
     return every[order], side[order], (np.arange(every.size) >= t.size)[order]
-
-
-def gap_signals(problem: NetworkProblem, run: NetworkRun) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Voltage (V) and force (N) of every gap; without one, the voltage of the smallest capacitor and no force."""
-    record = problem.record(run)
-    if record.fingers:
-        for i in range(len(record.fingers)):
-            yield record.finger_voltage(i), record.finger_force(i)
-    elif problem.network.cells:
-        smallest = int(np.argmin(problem.network.capacitance(problem.scene.area0)))
-        u = record.cell_voltage(smallest)
-        yield u, np.zeros(u.size)
 
 
 def _only(run: NetworkRun, keep: BoolArray) -> NetworkRun:

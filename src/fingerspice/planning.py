@@ -17,6 +17,7 @@ from fingerspice.settling import FEWEST_PERIODS
 TIERS = ("algebraic", "linear", "coupled")
 # A frozen stack this many times faster than its source would hold an explicit method back by stability alone.
 STIFF = 300.0
+REPEATS = "periodic: once a period no longer changes the state, later ones repeat it"
 
 
 @dataclass(frozen=True)
@@ -111,8 +112,12 @@ def plan_network(problem: NetworkProblem, tier: str = "auto", start: str = "deck
     chosen = best if tier == "auto" else tier
     if chosen != best:
         reason = f"asked for; the lightest that is right would be {best}: {reason}"
+    reasons: tuple[str, ...] = (reason,)
+    period = problem.waveform.period
+    if scene.coupled and period and (problem.t_stop - problem.t_start) / period >= FEWEST_PERIODS:
+        reasons = (reason, REPEATS)
     area = float(scene.area0[0]) if scene.area0.size else math.nan
-    return Plan(chosen, (reason,), start, tuple(sorted(map(float, rates))), stiff, math.nan, 0.0, area)
+    return Plan(chosen, reasons, start, tuple(sorted(map(float, rates))), stiff, math.nan, 0.0, area)
 
 
 def _choose(problem: Problem, rtol: float, tier: str, start: str) -> Plan:
@@ -140,7 +145,7 @@ def _choose(problem: Problem, rtol: float, tier: str, start: str) -> Plan:
         )
     period = problem.waveform.period
     if chosen == "coupled" and period and (problem.t_stop - problem.t_start) / period >= FEWEST_PERIODS:
-        reasons = (*reasons, "periodic: once a period no longer changes the state, later ones repeat it")
+        reasons = (*reasons, REPEATS)
     needed = sensitivity if chosen == "linear" and model.coupled and np.any(model.rate0 > 0.0) else 0.0
     skin = problem.scene.skin
     if skin is not None:

@@ -7,12 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.circuit.sampling import SourceTable, same_time
-from fingerspice.engine import readout
+from fingerspice.circuit.sampling import same_time
+from fingerspice.networks import NetworkProblem
 from fingerspice.problem import Problem
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Shorter runs are stepped as they are: nothing would be saved.
 FEWEST_PERIODS = 6.0
@@ -34,7 +33,7 @@ class Settling:
 
     Parameters
     ----------
-    problem : Problem
+    problem : Problem or NetworkProblem
     rates : ndarray
         Rates of the stack with its area frozen, 1/s.
     tol : float
@@ -50,7 +49,7 @@ class Settling:
         Distance at which the map of a period may pass for a linear one, V.
     """
 
-    def __init__(self, problem: Problem, rates: FloatArray, tol: float) -> None:
+    def __init__(self, problem: Problem | NetworkProblem, rates: FloatArray, tol: float) -> None:
         self.period = problem.waveform.period or math.inf
         self.start = max(problem.t_start, problem.waveform.settled)
         self.stop = problem.t_stop
@@ -71,14 +70,13 @@ class Settling:
         """Whole periods from t (s) to the end of the run."""
         return max(0, math.floor((self.stop - t) / self.period * (1.0 + 1e-12)))
 
-    def look(self, y: FloatArray, control: FloatArray, counters: IntArray) -> bool:
-        """Compare the live voltages now, at `next`, with those of the last look; whether they have settled.
+    def look(self, x: FloatArray, magnified: float, peak: float = 0.0, steps: int = 0) -> bool:
+        """Compare the live voltages (n,) now, at `next`, with those of the last look; whether they have settled.
 
-        `y` holds them and the charge, `control` and `counters` the rest of a run (see `engine.readout`).
+        `magnified` is the largest move of the gap voltage for a move of a live one. Where a leap may come of it: the
+        gap voltage's peak (V), and the steps taken so far.
         """
-        x = y[:-1]
-        magnified, peak = float(control[readout.MAGNIFIED]), float(control[readout.PEAK_U])
-        self._steps = float(counters[readout.ACCEPTED]) / max(self._count, 1)
+        self._steps = steps / max(self._count, 1)
         if peak > 0.0:
             self.near = max(self.allowed, min(self.near, _NEAR * math.sqrt(self.allowed * peak)))
         self.distance = self.remaining = math.inf
@@ -155,12 +153,12 @@ class Settling:
         self.next = self.start + self._count * self.period if wait < left else math.inf
 
     @staticmethod
-    def snapped(table: SourceTable, t: float) -> float:
-        """Time t (s), on the edge of the source that it misses by rounding."""
+    def snapped(edges: FloatArray, t: float) -> float:
+        """Time t (s), on the edge (ascending, s) of the source that it misses by rounding."""
         if t == math.inf:
             return t
-        i = int(table.edges.searchsorted(t))
-        for edge in table.edges[max(i - 1, 0) : i + 1].tolist():
+        i = int(edges.searchsorted(t))
+        for edge in edges[max(i - 1, 0) : i + 1].tolist():
             if abs(edge - t) <= same_time(edge):
                 return float(edge)
         return t

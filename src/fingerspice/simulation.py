@@ -21,9 +21,11 @@ from fingerspice.diagnosis import network_failure, stack_failure
 from fingerspice.direct import solve_algebraic, solve_linear
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError
 from fingerspice.marching import solve as solve_marching
+from fingerspice.netmarching import solve_network
+from fingerspice.netruns import NetworkRun
 from fingerspice.network_record import NetworkRecord
 from fingerspice.networks import NetworkProblem, prepare_network
-from fingerspice.nodal import NetworkRun, solve_coupled
+from fingerspice.nodal import solve_coupled
 from fingerspice.numerics.tableaus import TABLEAUS
 from fingerspice.outcome import ErrorEstimate, Failure, Status
 from fingerspice.periodic import close_period
@@ -236,8 +238,10 @@ def run_network(
     start: str = "deck",
 ) -> Solution:
     """As `run_problem`, for a network."""
-    if method not in ("auto", "radau"):
-        raise InputError(f"method {method!r} is for series stacks; allowed for this network: 'auto' or 'radau'")
+    if method not in ("auto", "exponential", "radau"):
+        raise InputError(
+            f"method {method!r} is for series stacks; allowed for this network: 'auto', 'exponential' or 'radau'"
+        )
     plan = plan_network(problem, "coupled" if tier == "auto" and method != "auto" else tier, start)
     t_out, left = output_times(problem) if t_eval is None else (t_eval, np.zeros(t_eval.size, bool))
     run_at = t_out if t_eval is None else _at_breakpoints(problem, t_eval)
@@ -245,7 +249,11 @@ def run_network(
     if plan.tier == "linear":
         run, name = solve_fixed(problem, run_at, left), plan.tier
     else:
-        run, name = solve_coupled(problem, rtol, run_at, left, progress), "radau"
+        found = None
+        if method != "radau" and problem.scene.coupled:
+            found = solve_network(problem, rtol, run_at, left, progress, repeat=method == "auto")
+        name = "radau" if found is None else "exponential"
+        run = solve_coupled(problem, rtol, run_at, left, progress) if found is None else found
     wall = time.perf_counter() - begin
     _mind_unseen(run)
     record = problem.record(run)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from fingerspice.circuit.network import Modes, Network
 from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
 from fingerspice.engine.algebraic import source_at
+from fingerspice.netruns import NetworkRun, first_unseen, gap_signals, source_tables
 from fingerspice.networks import NetworkProblem
-from fingerspice.nodal import NetworkRun, first_unseen, gap_signals, source_tables
 from fingerspice.numerics import linear
 from fingerspice.outcome import ErrorEstimate, NetworkState, Status
 from fingerspice.record import sided

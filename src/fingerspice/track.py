@@ -135,9 +135,12 @@ class Track:
         periods, period = settling.periods_left(self.t), settling.period
         charge, collected, spread = self.before
         drift = float(self.y[-1]) - charge
+        drifts = np.zeros(self.out.shape[0])
+        if self.pace.charge:
+            drifts[-2] = drift
         first, kept = int(self.counters[readout.OUTPUT]), int(self.counters[readout.KEPT])
         self.counters[readout.OUTPUT] = repetition.repeat(
-            self.kept, kept, period, periods, drift, first, self.t_out, self.left, self.out
+            self.kept, kept, period, periods, drifts, first, self.t_out, self.left, self.out
         )
         self.y[-1] += periods * drift
         self._pass(periods, periods, settling, settling.remaining, collected, spread)

@@ -73,8 +73,8 @@ class Network:
     delivered : ndarray, shape (n_s, n + n_s)
         Current that each source delivers, a V out of its p node and an I out of its n node: through @ i, i the cells'
         currents, and this of (x, s).
-    resistor_factor : ndarray, shape (n_r, n)
-        k = f^T f.
+    resistor_factor, resistor_factor_s : ndarray, shape (n_r, n) and (n_r, n_s)
+        k = f^T f, and b = f^T f_s but for the current sources, whose f_s is zero.
     node_names : tuple of str
     nodes : ndarray, shape (n_node, n + n_s)
         Node voltages from x and s.
@@ -95,6 +95,7 @@ class Network:
     through: FloatArray
     delivered: FloatArray
     resistor_factor: FloatArray
+    resistor_factor_s: FloatArray
     node_names: tuple[str, ...]
     nodes: FloatArray
 
@@ -231,6 +232,7 @@ def build_network(circuit: Circuit) -> Network:
         through=through,
         delivered=delivered,
         resistor_factor=weight * by_e[:, x],
+        resistor_factor_s=np.hstack([weight * by_e[:, s], np.zeros((len(resistors), n_i))]),
         node_names=tuple(written[names[i]] for i in shown),
         nodes=np.hstack([whole[shown][:, x], whole[shown][:, s], (at_node[:, r] @ from_i)[shown]]),
     )
@@ -309,6 +311,8 @@ class Modes:
         v = inverse (x + follow s).
     follow : ndarray, shape (n, n_s)
         What a jump of the sources moves at once.
+    take : ndarray, shape (n, n_cell)
+        v_k' = -take j for currents j (A) that cells take beside their own.
     """
 
     rates: FloatArray
@@ -316,27 +320,34 @@ class Modes:
     shape: FloatArray
     inverse: FloatArray
     follow: FloatArray
+    take: FloatArray
 
 
 def network_modes(network: Network, area: FloatArray) -> Modes:
     """Modes at areas (n_area,) in m^2.
 
     From the singular values of the conductances' factor rather than the eigenvalues of their matrix: a slow rate beside
-    a fast one keeps twice the digits.
+    a fast one keeps twice the digits, and so does what the sources push it.
     """
     capacitance, leak = network.capacitance(area), network.leak(area)
-    lower = np.linalg.cholesky(network.mass(area)) if network.k.size else np.zeros((0, 0))
-    factor = np.vstack([network.resistor_factor, np.sqrt(leak)[:, None] * network.p])
-    _, sigma, turned = np.linalg.svd(np.linalg.solve(lower, factor.T).T) if factor.size else (None, np.zeros(0), lower)
-    rates = np.zeros(network.k.shape[0])
+    n, n_v = network.k.shape[0], network.n_voltage
+    lower = np.linalg.cholesky(network.mass(area)) if n else np.zeros((0, 0))
+    weight = np.sqrt(leak)[:, None]
+    factor = np.vstack([network.resistor_factor, weight * network.p])
+    factor_s = np.vstack([network.resistor_factor_s, weight * network.q])
+    left, sigma, turned = np.zeros((factor.shape[0], 0)), np.zeros(0), lower
+    if factor.size:
+        left, sigma, turned = np.linalg.svd(np.linalg.solve(lower, factor.T).T)
+    rates = np.zeros(n)
     rates[: sigma.size] = sigma**2
     # What is left of a charge that nothing drains is rounding.
     rates[rates < 1e-28 * rates.max(initial=0.0)] = 0.0
     inverse = turned @ lower.T
-    back = np.linalg.solve(lower, network.p.T) if network.k.size else network.p.T
-    moved = turned @ back @ (capacitance[:, None] * network.q)
-    _, b = network.stiffness(area)
-    pushed = turned @ (np.linalg.solve(lower, b) if network.k.size else b)
-    shape = np.linalg.solve(lower.T, turned.T) if network.k.size else turned.T
-    gains = np.asarray(rates[:, None] * moved - pushed, float)
-    return Modes(rates, gains, np.asarray(shape, float), np.asarray(inverse, float), np.asarray(shape @ moved, float))
+    take = turned @ (np.linalg.solve(lower, network.p.T) if n else network.p.T)
+    moved = take @ (capacitance[:, None] * network.q)
+    pushed = np.zeros((n, network.b.shape[1]))
+    pushed[: sigma.size] = sigma[:, None] * (left[:, : sigma.size].T @ factor_s)
+    pushed[:, n_v:] += turned @ (np.linalg.solve(lower, network.b[:, n_v:]) if n else network.b[:, n_v:])
+    shape = np.linalg.solve(lower.T, turned.T) if n else turned.T
+    gains = rates[:, None] * moved - pushed
+    return Modes(*(np.asarray(x, float) for x in (rates, gains, shape, inverse, shape @ moved, take)))

@@ -15,7 +15,8 @@ from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS,
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-N_SLOTS = 192
+# Step lengths with tables of their own; fewer where there are many modes, each of which takes 2 kB a slot.
+N_SLOTS, FEWEST_SLOTS, MOST_ENTRIES = 192, 8, 8_192
 # Places between which the error is followed: start, the points between nodes, end.
 N_PLACES = 5
 
@@ -25,11 +26,11 @@ class Tables(NamedTuple):
 
     Attributes
     ----------
-    h : ndarray, shape (N_SLOTS,)
+    h : ndarray, shape (n_slots,)
         Step length of each slot, s.
     level, used : ndarray of int
         Reference area of each slot, and [slots in use, slot used last].
-    decay, phi, miss : ndarray, shape (N_SLOTS, n, ...)
+    decay, phi, miss : ndarray, shape (n_slots, n, ...)
         See `fill_table`; `phi` and `miss` times h.
     """
 
@@ -43,13 +44,14 @@ class Tables(NamedTuple):
 
 def new_tables(n: int) -> Tables:
     """No tables yet, for n modes."""
+    slots = max(FEWEST_SLOTS, min(N_SLOTS, MOST_ENTRIES // max(n, 1)))
     return Tables(
-        np.zeros(N_SLOTS),
-        np.full(N_SLOTS, -1),
+        np.zeros(slots),
+        np.full(slots, -1),
         np.zeros(2, np.int64),
-        np.zeros((N_SLOTS, n, ROWS)),
-        np.zeros((N_SLOTS, n, NODES, ROWS)),
-        np.zeros((N_SLOTS, n, ROWS)),
+        np.zeros((slots, n, ROWS)),
+        np.zeros((slots, n, NODES, ROWS)),
+        np.zeros((slots, n, ROWS)),
     )
 
 
@@ -59,15 +61,16 @@ def make_tables(
     decay: FloatArray, phi: FloatArray, miss: FloatArray,
 ) -> int:  # fmt: skip
     """The slot with the tables of a step, filled now if need be; when all are in use the oldest give way."""
-    for slot in range(min(count[0], N_SLOTS)):
+    slots = keys_h.size
+    for slot in range(min(count[0], slots)):
         if keys_h[slot] == h and keys_level[slot] == level:
             count[1] = slot
             return slot
-    slot = int(count[0] % N_SLOTS)
+    slot = int(count[0] % slots)
     count[0] += 1
     # Beyond twice the slots the count means only "all in use" and where to go on.
-    if count[0] >= 2 * N_SLOTS:
-        count[0] -= N_SLOTS
+    if count[0] >= 2 * slots:
+        count[0] -= slots
     count[1] = slot
     keys_h[slot] = h
     keys_level[slot] = level
@@ -81,7 +84,7 @@ def make_tables(
 
 
 @jit_rows
-def _respond(forcing: FloatArray, phi: FloatArray, base: FloatArray, w: FloatArray) -> None:
+def respond(forcing: FloatArray, phi: FloatArray, base: FloatArray, w: FloatArray) -> None:
     """w = base + response to `forcing` (n, ROWS), of which the nodes count."""
     for k in range(w.shape[0]):
         for i in range(ROWS):
@@ -142,10 +145,10 @@ def converge(
     slow = False
     for iteration in range(2, 41):
         if slow:
-            step = _mix(pull, used, weight, pull_before, left_before)
+            step = mix(pull, used, weight, pull_before, left_before)
         else:
-            step = _plain(pull, used, weight, pull_before, left_before)
-        _respond(used, phi, base, w)
+            step = plain(pull, used, weight, pull_before, left_before)
+        respond(used, phi, base, w)
         if not evaluate(
             mobile, k_gap, area0, q0, gap, push, tap, tap_k, feed, tapped, powers, slopes, lo, scale, curve, sign, w,
             pull, r,
@@ -153,7 +156,7 @@ def converge(
             return iteration, False
         # What the gap voltage would move next, by what it moved for the last change of the nonlinear term.
         change = moved(r[U], r[GUESS])
-        left = _distance(pull, used, weight)
+        left = distance(pull, used, weight)
         if not left < math.inf:
             return iteration, False
         if change * left <= tol * step:
@@ -171,7 +174,7 @@ def weigh(rates: FloatArray, gap: FloatArray, decay: FloatArray, h: float, weigh
 
 
 @jit_rows
-def _plain(
+def plain(
     pull: FloatArray, used: FloatArray, weight: FloatArray, pull_before: FloatArray, left_before: FloatArray
 ) -> float:
     """Plain step of the iteration, remembered for a mixed one; returns the size of the move."""
@@ -189,7 +192,7 @@ def _plain(
 
 
 @jit_rows
-def _mix(
+def mix(
     pull: FloatArray, used: FloatArray, weight: FloatArray, pull_before: FloatArray, left_before: FloatArray
 ) -> float:
     """Next nonlinear term from the last two (Anderson 1965, one step back), into `used`; returns the size of the move.
@@ -225,7 +228,7 @@ def _mix(
 
 
 @jit_rows
-def _distance(a: FloatArray, b: FloatArray, weight: FloatArray) -> float:
+def distance(a: FloatArray, b: FloatArray, weight: FloatArray) -> float:
     total = 0.0
     for k in range(a.shape[0]):
         size = 0.0
@@ -236,7 +239,7 @@ def _distance(a: FloatArray, b: FloatArray, weight: FloatArray) -> float:
 
 
 @jit_rows
-def _between(values: FloatArray) -> tuple[float, float, float]:
+def between(values: FloatArray) -> tuple[float, float, float]:
     """What the polynomial through values at the nodes misses at the points between."""
     first = 0.0
     second = 0.0
@@ -249,7 +252,7 @@ def _between(values: FloatArray) -> tuple[float, float, float]:
 
 
 @jit_rows
-def _left_over(phi: FloatArray, pull: FloatArray, used: FloatArray, at: FloatArray) -> None:
+def left_over(phi: FloatArray, pull: FloatArray, used: FloatArray, at: FloatArray) -> None:
     """Response to what the iteration left, at the points between and the end."""
     first = 0.0
     second = 0.0
@@ -268,7 +271,7 @@ def _left_over(phi: FloatArray, pull: FloatArray, used: FloatArray, at: FloatArr
 
 
 @jit
-def _largest(first: float, second: float, third: float) -> float:
+def largest(first: float, second: float, third: float) -> float:
     """The entry of largest size."""
     out = first if abs(first) > abs(second) else second
     return out if abs(out) > abs(third) else third
@@ -298,23 +301,23 @@ def assess(
         one misses more or less), and all of it with what the iteration left and what came before. Largest move of the
         gap voltage for a move of a live one.
     """
-    source_first, source_second, source_third = _between(r[SOURCE])
+    source_first, source_second, source_third = between(r[SOURCE])
     # The outputs are read off the polynomial through the nodes' gap voltages.
-    sums[0, 0], sums[0, 1], sums[0, 2] = _between(r[U])
+    sums[0, 0], sums[0, 1], sums[0, 2] = between(r[U])
     sums[0, 3] = 0.0
     for p in range(4):
         sums[1, p] = 0.0
         sums[2, p] = 0.0
     for k in range(gain.size):
-        pull_first, pull_second, pull_third = _between(pull[k])
-        mode_first, mode_second, mode_third = _between(w[k])
-        missed = _largest(
+        pull_first, pull_second, pull_third = between(pull[k])
+        mode_first, mode_second, mode_third = between(w[k])
+        missed = largest(
             (gain[k] * source_first + pull_first) / MISS[0],
             (gain[k] * source_second + pull_second) / MISS[1],
             (gain[k] * source_third + pull_third) / MISS[2],
         )
         left = sums[3]
-        _left_over(phi[k], pull[k], used[k], left)
+        left_over(phi[k], pull[k], used[k], left)
         places[k, 0] = error[k]
         for p in range(4):
             row = FIRST + p if p < 3 else END
@@ -338,7 +341,8 @@ def assess(
         step = max(step, abs(factor * sums[1, p] + sums[0, p]))
         run = max(run, abs(factor * sums[2, p] + sums[0, p]))
     # The charge is the integral of A dU among others: what the polynomial misses of 1/A counts with the source's move.
-    area_first, area_second, area_third = _between(r[Q])
+    area_first, area_second, area_third = between(r[Q])
     swing = 0.3 * abs(r[SOURCE, END] - r[SOURCE, 0])
-    charged = swing * abs(_largest(area_first, area_second, area_third)) / r[Q, 0]
+    missed = abs(largest(area_first / MISS[0], area_second / MISS[1], area_third / MISS[2]))
+    charged = swing * missed / r[Q, 0]
     return max(step, charged), run, magnified

@@ -157,6 +157,14 @@ def zero(u: FloatArray, sign: float, last: int, below: float, series: FloatArray
 
 
 @jit
+def leaves(u: FloatArray, sign: float, tol: float, series: FloatArray) -> float:
+    """Fraction of the step at which the gap voltage leaves its branch, or 2; `tol` (V) as in `first_wrong`."""
+    wrong = first_wrong(u, sign, tol)
+    below = dip(u, sign, 0.01 * tol, wrong, series)
+    return zero(u, sign, wrong, below, series) if wrong > 0 or below > 0.0 else 2.0
+
+
+@jit
 def first_wrong(u: FloatArray, sign: float, tol: float) -> int:
     """First node past the start at which the gap voltage is off its branch, or 0.
 

@@ -42,7 +42,7 @@ def new_kept(steps: int, columns: int) -> Kept:
 
 @jit
 def repeat(
-    kept: Kept, count: int, period: float, periods: int, drift: float, first: int, t_out: FloatArray,
+    kept: Kept, count: int, period: float, periods: int, drifts: FloatArray, first: int, t_out: FloatArray,
     left: NDArray[np.bool_], out: FloatArray,
 ) -> int:  # fmt: skip
     """Write the outputs of the periods that follow the kept one.
@@ -55,8 +55,8 @@ def repeat(
         s.
     periods : int
         How often to repeat it.
-    drift : float
-        What the charge, the last but one column of `out` where there is one, gains in a period, C.
+    drifts : ndarray, shape (n_column,)
+        What each column gains in a period: a charge does, C.
     first, t_out, left, out
         As `readout.write_outputs`.
 
@@ -66,11 +66,10 @@ def repeat(
         The first output that is left.
     """
     times, series = borrow(kept.times), borrow(kept.series)
-    t_out, left, out = borrow(t_out), borrow(left), borrow(out)
+    t_out, left, out, drifts = borrow(t_out), borrow(left), borrow(out), borrow(drifts)
     work = np.zeros((2, WRITTEN_AT_ONCE))
     # Outputs of each step in the period before: mostly as many as now.
     held = np.zeros(count, np.int64)
-    row = out.shape[0] - 2
     as_powers = np.zeros(count, np.bool_)
     for i in range(count):
         as_powers[i] = _may_be_powers(series[i])
@@ -93,9 +92,10 @@ def repeat(
                 t_out, left, out,
             )  # fmt: skip
             first += held[i]
-        if drift != 0.0:
-            for i in range(before, first):
-                out[row, i] += k * drift
+        for c in range(out.shape[0]):
+            if drifts[c] != 0.0:
+                for i in range(before, first):
+                    out[c, i] += k * drifts[c]
     return first
 
 

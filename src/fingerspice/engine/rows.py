@@ -123,7 +123,7 @@ def _add_general(term: FloatArray, waves: bool, t0: float, h: float, out: FloatA
 
 
 @jit_rows
-def _polynomial(powers: FloatArray, lo: float, scale: float, u: FloatArray, sign: float, out: FloatArray) -> None:
+def polynomial_rows(powers: FloatArray, lo: float, scale: float, u: FloatArray, sign: float, out: FloatArray) -> None:
     """The polynomial in (sign u - lo) scale - 1 at every row."""
     for i in range(ROWS):
         x = (sign * u[i] - lo) * scale - 1.0
@@ -213,7 +213,7 @@ def evaluate(
         _push(push, q0, area0, r[SOURCE], r[Q], pull)
         return True
     if scale > 0.0:
-        _polynomial(powers, lo, scale, r[U], sign, r[Q])
+        polynomial_rows(powers, lo, scale, r[U], sign, r[Q])
     else:
         _long_area(curve, sign, r)
     _pull(tap, tap_k, feed, q0, r[SOURCE], r[Q], w, tapped, pull)
@@ -233,8 +233,8 @@ def _solve_mobile(
         size = max(size, abs(r[FREE, i]) + abs(r[X_GAP, i]))
     for _ in range(30):
         if scale > 0.0:
-            _polynomial(powers, lo, scale, r[U], sign, r[Q])
-            _polynomial(slopes, lo, scale, r[U], sign, r[DQ])
+            polynomial_rows(powers, lo, scale, r[U], sign, r[Q])
+            polynomial_rows(slopes, lo, scale, r[U], sign, r[DQ])
             for i in range(ROWS):
                 r[DQ, i] *= scale * sign
         else:

@@ -138,17 +138,24 @@ def build_system(
 
 def _polynomial(model: Model, tol: float) -> tuple[FloatArray, FloatArray, float, float]:
     """1/A as a polynomial of `DEGREE` over the model's own range, where it is good enough."""
+    if model.coupled:
+        return area_polynomial(model.curve, tol)
+    powers = np.zeros(DEGREE + 1)
+    powers[0] = 1.0 / model.area0
+    return powers, np.zeros(DEGREE + 1), 0.0, 1.0
+
+
+def area_polynomial(curve: FloatArray, tol: float) -> tuple[FloatArray, FloatArray, float, float]:
+    """1/A as a polynomial of `DEGREE`, its slopes, `lo` and `scale` (see `System`) from a `Contact.curve`."""
     powers = np.zeros(DEGREE + 1)
     slopes = np.zeros(DEGREE + 1)
-    if not model.coupled:
-        powers[0] = 1.0 / model.area0
-        return powers, slopes, 0.0, 1.0
-    lo, hi = float(model.curve[0]), float(model.curve[1])
-    series = model.curve[2 + N_PACKED :]
+    lo, hi = float(curve[0]), float(curve[1])
+    series = curve[2 + N_PACKED :]
     kept = series[: DEGREE + 1]
-    if series.size == 0 or np.abs(series[DEGREE + 1 :]).sum() > tol * abs(series[0]):
+    if series.size == 0 or not lo < hi or np.abs(series[DEGREE + 1 :]).sum() > tol * abs(series[0]):
         return powers, slopes, lo, 0.0
-    powers[: kept.size] = chebyshev.cheb2poly(kept)
+    found = chebyshev.cheb2poly(kept)
+    powers[: found.size] = found
     slopes[:-1] = np.arange(1, DEGREE + 1) * powers[1:]
     x = np.linspace(-1.0, 1.0, 33)
     miss = np.abs(np.polynomial.polynomial.polyval(x, powers) - chebyshev.chebval(x, series)).max()

@@ -1,0 +1,240 @@
+"""What a finished step of a network is off, and its peaks; see `exponential.assess` and `readout` for a stack."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.compiled import jit, jit_rows
+from fingerspice.engine.charge import DERIVATIVE
+from fingerspice.engine.exponential import N_PLACES, between, largest, left_over
+from fingerspice.engine.readout import first_wrong, leaves
+from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# Columns of `peaks`: of each gap the largest voltage (V) and force (N), and the errors of both.
+PEAK_U, PEAK_F, ERROR_U, ERROR_F = 0, 1, 2, 3
+# Share of a step in which its polynomials may miss a decay: a third of the way to the first node.
+_EARLY = POINTS[1] / 3.0
+
+
+@jit
+def clear(block: FloatArray) -> None:
+    for a in range(block.shape[0]):
+        for i in range(ROWS):
+            block[a, i] = 0.0
+
+
+@jit
+def load(inverse: FloatArray, follow: FloatArray, y: FloatArray, s: FloatArray, w: FloatArray) -> None:
+    """Modes from the state and the sources' values."""
+    n = inverse.shape[0]
+    for k in range(n):
+        w[k] = 0.0
+    for i in range(n):
+        x = y[i]
+        for e in range(s.size):
+            x += follow[i, e] * s[e]
+        for k in range(n):
+            w[k] += inverse[k, i] * x
+    for k in range(n, w.size):
+        w[k] = y[k]
+
+
+@jit
+def store(
+    shape: FloatArray, follow: FloatArray, w: FloatArray, s: FloatArray, gained: FloatArray, y: FloatArray
+) -> None:
+    """State from the modes, the sources' values and what the charges have gained."""
+    n = shape.shape[0]
+    for i in range(n):
+        y[i] = 0.0
+        for k in range(n):
+            y[i] += shape[i, k] * w[k]
+        for e in range(s.size):
+            y[i] -= follow[i, e] * s[e]
+    for k in range(n, w.size):
+        y[k] = w[k]
+    for e in range(s.size):
+        y[w.size + e] += gained[e]
+
+
+@jit_rows
+def moved(u: FloatArray, before: FloatArray) -> float:
+    """Root of the summed squares of u - before; `before` becomes u."""
+    total = 0.0
+    for a in range(u.shape[0]):
+        for i in range(ROWS):
+            change = u[a, i] - before[a, i]
+            total += change * change
+            before[a, i] = u[a, i]
+    return math.sqrt(total)
+
+
+@jit
+def assess(
+    rates: FloatArray, h: float, shape: FloatArray, follow: FloatArray, gap: FloatArray, size: FloatArray,
+    decay: FloatArray, phi: FloatArray, miss: FloatArray, error: FloatArray, w: FloatArray, lin: FloatArray,
+    pull: FloatArray, used: FloatArray, s: FloatArray, magnified: float, x: FloatArray, places: FloatArray,
+    early: FloatArray, run: FloatArray,
+) -> float:  # fmt: skip
+    """Error of a converged step, V, from what its polynomials miss between nodes; see `exponential.assess`.
+
+    `places` (m, N_PLACES) takes the error of the modes, `early` (m,) what their polynomials miss of a decay that is
+    over before the first node, `run` (n_area,) the largest error of each gap's voltage with what the iteration left and
+    what came before; `x` (n, 5) is for passing use.
+    """
+    n = shape.shape[0]
+    left = np.zeros(4)
+    step = 0.0
+    for i in range(n):
+        for p in range(5):
+            x[i, p] = 0.0
+    for j in range(s.shape[0]):
+        first, second, third = between(s[j])
+        for i in range(n):
+            x[i, 0] -= follow[i, j] * first
+            x[i, 1] -= follow[i, j] * second
+            x[i, 2] -= follow[i, j] * third
+    for k in range(w.shape[0]):
+        lin_first, lin_second, lin_third = between(lin[k])
+        pull_first, pull_second, pull_third = between(pull[k])
+        missed = largest(
+            (lin_first + pull_first) / MISS[0], (lin_second + pull_second) / MISS[1], (lin_third + pull_third) / MISS[2]
+        )
+        left_over(phi[k], pull[k], used[k], left)
+        places[k, 0] = error[k]
+        mode_first, mode_second, mode_third = between(w[k])
+        # Its slope at the start tells: it is off by the size of the decay times its rate.
+        fall = 0.0
+        for j in range(NODES):
+            fall += DERIVATIVE[0, j] * w[k, j]
+        fall = lin[k, 0] + pull[k, 0] - rates[k] * w[k, 0] - fall / h
+        early[k] = fall / (rates[k] + 1.0 / (_EARLY * h))
+        if k < n:
+            for i in range(n):
+                x[i, 4] += shape[i, k] * early[k]
+        for p in range(4):
+            row = FIRST + p if p < 3 else END
+            fresh = magnified * miss[k, row] * missed
+            places[k, p + 1] = decay[k, row] * error[k] + magnified * left[p] + fresh
+            off = fresh
+            if p < 3:
+                off += mode_first if p == 0 else (mode_second if p == 1 else mode_third)
+            if k < n:
+                for i in range(n):
+                    x[i, p] += shape[i, k] * off
+            else:
+                step = max(step, size[k] * abs(off))
+        places[k, 1] += mode_first
+        places[k, 2] += mode_second
+        places[k, 3] += mode_third
+    for i in range(n):
+        for p in range(5):
+            if not abs(x[i, p]) <= step:
+                step = abs(x[i, p])
+    for a in range(run.size):
+        total = 0.0
+        for k in range(n):
+            total += gap[a, k] * (places[k, 0] + early[k])
+        run[a] = abs(total)
+        for p in range(4):
+            total = 0.0
+            for k in range(n):
+                total += gap[a, k] * places[k, p + 1]
+            run[a] = max(run[a], abs(total))
+    return step
+
+
+@jit
+def charged(cell: IntArray, u: FloatArray, area: FloatArray) -> float:
+    """What the polynomials of the areas miss between nodes, V: a charge is the integral of A du among others."""
+    worst = 0.0
+    for a in range(cell.size):
+        if cell[a] >= 0:
+            first, second, third = between(area[a])
+            swing = 0.3 * abs(u[a, END] - u[a, 0])
+            worst = max(worst, swing * abs(largest(first, second, third)) / area[a, 0])
+    return worst
+
+
+@jit
+def turn_at_start(cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t: float, branch: FloatArray) -> bool:
+    """Change the branch of every area whose gap voltage starts at 0 and leaves on the other side; whether one did."""
+    turned = False
+    for a in range(cell.size):
+        if cell[a] >= 0 and sign[a] * u[a, 0] <= 1e-9 * abs(u[a, 1]) and first_wrong(u[a], sign[a], tol) == 1:
+            sign[a] = -sign[a]
+            branch[a, 0], branch[a, 1] = t, math.inf
+            turned = True
+    return turned
+
+
+@jit
+def first_zero(
+    cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t: float, h: float, theta: float, t_new: float,
+    series: FloatArray,
+) -> tuple[int, float, float]:  # fmt: skip
+    """The area whose gap voltage is first to leave its branch before t_new, or -1, at what fraction, and when."""
+    which = -1
+    for a in range(cell.size):
+        if cell[a] >= 0:
+            crossing = leaves(u[a], sign[a], tol, series)
+            if crossing <= theta and t + crossing * h <= t_new:
+                which, theta, t_new = a, crossing, t + crossing * h
+    return which, theta, t_new
+
+
+@jit_rows
+def account(
+    u: FloatArray, area: FloatArray, stress: float, theta: float, run: float, places: FloatArray, slow: int,
+    peaks: FloatArray,
+) -> None:  # fmt: skip
+    """Peaks of a gap's voltage and force over what counts of a step, and the errors of both.
+
+    `places` holds the error of the modes (see `assess`), of which `slow` is the area's, if it is not negative.
+    """
+    area_off = 0.0
+    if slow >= 0:
+        for p in range(N_PLACES):
+            area_off = max(area_off, abs(places[slow, p]))
+    steepest = 0.0
+    force = 0.0
+    for i in range(NODES):
+        if POINTS[i] <= theta:
+            size = abs(u[i])
+            pressure = stress * size * area[i]
+            peaks[PEAK_U] = max(peaks[PEAK_U], size)
+            force = max(force, pressure * size)
+            # F ~ u^2 A: what moves u by du moves F by at most 2 F du / u, as the area falls with u.
+            steepest = max(steepest, 2.0 * pressure)
+    peaks[PEAK_F] = max(peaks[PEAK_F], force)
+    peaks[ERROR_U] = max(peaks[ERROR_U], run)
+    peaks[ERROR_F] = max(peaks[ERROR_F], run * steepest + area_off * force)
+
+
+@jit_rows
+def write_columns(
+    n: int, first_z: int, charge: bool, shape: FloatArray, follow: FloatArray, w: FloatArray, s: FloatArray,
+    y: FloatArray, values: FloatArray,
+) -> None:  # fmt: skip
+    """The state at all rows, into the first of `values`; charges hold what they have gained, where they are wanted."""
+    for j in range(n):
+        for i in range(ROWS):
+            values[j, i] = 0.0
+        for k in range(n):
+            for i in range(ROWS):
+                values[j, i] += shape[j, k] * w[k, i]
+        for e in range(s.shape[0]):
+            for i in range(ROWS):
+                values[j, i] -= follow[j, e] * s[e, i]
+    for k in range(n, first_z):
+        for i in range(ROWS):
+            values[k, i] = w[k, i]
+    for e in range(first_z, y.size):
+        for i in range(ROWS):
+            values[e, i] = y[e] + (values[e, i] if charge else 0.0)

@@ -1,0 +1,445 @@
+"""The loop of exponential steps of a network; `march` is the same for a stack, whose ways of pacing it shares."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.compiled import borrow, jit
+from fingerspice.engine import rows
+from fingerspice.engine.exponential import (
+    N_PLACES,
+    Tables,
+    distance,
+    make_tables,
+    mix,
+    plain,
+    respond,
+    weigh,
+)
+from fingerspice.engine.netassess import (
+    account,
+    assess,
+    charged,
+    clear,
+    first_zero,
+    load,
+    moved,
+    store,
+    turn_at_start,
+    write_columns,
+)
+from fingerspice.engine.netcharge import charge_error, charge_rows
+from fingerspice.engine.netrows import (
+    AREA,
+    BASE,
+    CELL_U,
+    DU,
+    FREE,
+    FREE_RATE,
+    GUESS,
+    LEFT_BEFORE,
+    LIN,
+    MORE,
+    PULL,
+    PULL_BEFORE,
+    SLOPE,
+    STIFF,
+    USED,
+    D,
+    Form,
+    J,
+    U,
+    W,
+    Work,
+    combine,
+    couple,
+    evaluate,
+    meet,
+)
+from fingerspice.engine.network import Sources, at_sources
+from fingerspice.engine.pace import Pace, choose_step, rung
+from fingerspice.engine.readout import (
+    ACCEPTED,
+    ALLOWED,
+    BRANCH_LENGTH,
+    BRANCH_START,
+    H_AFTER_EDGE,
+    H_AFTER_ZERO,
+    KEPT,
+    MAGNIFIED,
+    N_CONTROL,
+    NFEV,
+    OUTPUT,
+    REJECTED,
+    TOO_LONG,
+    ZEROS,
+    H,
+    T,
+    at,
+    error_at,
+    first_wrong,
+    note,
+    series_of,
+    write_outputs,
+)
+from fingerspice.engine.repeat import Kept
+from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
+from fingerspice.physics.contact import inverse_area
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# Codes returned by `march`.
+DONE, JUMP, NO_STEP, TOO_MANY, REFERENCE, PAUSED = 0, 1, 2, 3, 4, 5
+# One entry of `control` more than `readout` has: steps taken and refused, at most.
+MOST = N_CONTROL
+# Step over the one before, at most; and what of it may be foreseen growth.
+_MOST_GROWTH, _MOST_TREND = 8.0, 2.5
+# An area this many times another reference's, or a part of it, wants a reference of its own.
+FARTHEST = 1.2
+# A source's change at an edge, relative, that is its rounding and no jump.
+ROUNDING, UNNOTICED = 1e-14, 1e-9
+# Closer to the fold, other methods get there sooner.
+NEAR_FOLD = 0.02
+# Modes times steps between pauses, after which Python may see to a Ctrl-C.
+AT_ONCE = 40_000
+
+
+@jit
+def march(
+    form: Form, pace: Pace, tables: Tables, work: Work, integral: FloatArray, size: FloatArray, sources: Sources,
+    jump: bool, tau: float, t_end: float, y: FloatArray, error: FloatArray, sign: FloatArray, s_before: FloatArray,
+    branch: FloatArray, control: FloatArray, counters: IntArray, peaks: FloatArray, collected: FloatArray,
+    t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray, kept: Kept, tried: FloatArray,
+) -> int:  # fmt: skip
+    """Step to `t_end` through the sources' segments, writing outputs on the way.
+
+    Parameters
+    ----------
+    form, pace, tables, work, integral
+        What to step, how and where; `integral` is `lobatto.integral_table()`.
+    size : ndarray, shape (m,)
+        Voltage (V) that each mode moves.
+    sources : Sources
+    jump : bool
+        Whether this is the inside of a jump, with time its fraction.
+    tau : float
+        Shortest time constant, s.
+    t_end : float
+        s, not past the last edge.
+    y : ndarray
+        State as in `engine.network`; updated, as all that follow.
+    error : ndarray, shape (m,)
+        Estimated error of the modes, signed.
+    sign, s_before : ndarray
+        Branch of each area (0: choose), and the sources' values just before the time reached.
+    branch : ndarray, shape (n_area, 2)
+        When each area's branch began, and how long the one before was, s.
+    control, counters, peaks, collected : ndarray
+        Bookkeeping: `readout`, the columns above, and `charge_error`.
+    t_out, left, out : ndarray
+        Output times (ascending), whether the left-hand value is meant, and the columns to fill: the state, then the
+        currents.
+    kept : Kept
+        Takes the steps, as long as there is room.
+    tried : ndarray, shape (TRIED, 4)
+        Takes the last steps tried, in turn: start and length (s), error over the one allowed, number from 1.
+
+    Returns
+    -------
+    int
+        DONE; JUMP: a source jumps here, take that first; NO_STEP is short enough; TOO_MANY steps; REFERENCE: an area is
+        far from its own; or PAUSED: call again.
+    """
+    mobile = form.mobile
+    rates, gain, shape, inverse, follow = (
+        borrow(form.rates), borrow(form.gain), borrow(form.shape), borrow(form.inverse), borrow(form.follow)
+    )  # fmt: skip
+    feed, tap, tap_s, met = borrow(form.feed), borrow(form.tap), borrow(form.tap_s), borrow(work.met)
+    c, g, home, cell = borrow(form.c), borrow(form.g), borrow(form.home), borrow(form.cell)
+    area0, unit, slow, speed = borrow(form.area0), borrow(form.unit), borrow(form.slow), borrow(form.pace)
+    gap, gap_s, stress = borrow(form.gap), borrow(form.gap_s), borrow(form.stress)
+    powers, slopes, lo, scale = borrow(form.powers), borrow(form.slopes), borrow(form.lo), borrow(form.scale)
+    curves = borrow(form.curves)
+    stored, stored_s, lost, lost_s = (
+        borrow(form.stored), borrow(form.stored_s), borrow(form.lost), borrow(form.lost_s)
+    )  # fmt: skip
+    through = borrow(form.through)
+    keys_h, keys_level, count = borrow(tables.h), borrow(tables.level), borrow(tables.used)
+    all_decay, all_phi, all_miss = borrow(tables.decay), borrow(tables.phi), borrow(tables.miss)
+    sources = Sources(borrow(sources.first), borrow(sources.edges), borrow(sources.terms), borrow(sources.series))
+    r, s, ds, matrix, small = (
+        borrow(work.r), borrow(work.s), borrow(work.ds), borrow(work.matrix), borrow(work.small)
+    )  # fmt: skip
+    modes, cells, areas = borrow(work.modes), borrow(work.cells), borrow(work.areas)
+    w, base, lin, d, pull, used = modes[W], modes[BASE], modes[LIN], modes[D], modes[PULL], modes[USED]
+    pull_before, left_before = modes[PULL_BEFORE], modes[LEFT_BEFORE]
+    free, free_rate, cell_u, du, j = cells[FREE], cells[FREE_RATE], cells[CELL_U], cells[DU], cells[J]
+    area, slope, more = areas[AREA], areas[SLOPE], areas[MORE]
+    u, guess = areas[U], areas[GUESS]
+    w0, places, weight, room, x_off = (
+        borrow(work.w0), borrow(work.places), borrow(work.weight), borrow(work.room), borrow(work.x)
+    )  # fmt: skip
+    values, coefficients, outputs = borrow(work.values), borrow(work.coefficients), borrow(work.outputs)
+    y, error, sign, s_before = borrow(y), borrow(error), borrow(sign), borrow(s_before)
+    control, counters, peaks, branch = borrow(control), borrow(counters), borrow(peaks), borrow(branch)
+    t_out, left, out, tried = borrow(t_out), borrow(left), borrow(out), borrow(tried)
+    integral, size = borrow(integral), borrow(size)
+    kept_times, kept_series = borrow(kept.times), borrow(kept.series)
+    n, n_s, m, n_area = shape.shape[0], s_before.size, rates.size, sign.size
+    first_z = y.size - n_s
+    tol, charge = pace.tol, pace.charge
+    is_series = sources.series.shape[1] > 0
+    index = np.zeros(n_s, np.int64)
+    now, slopes_now = np.zeros(n_s), np.zeros(n_s)
+    run, gained, early = np.zeros(n_area), np.zeros(n_s), np.zeros(m)
+    areas[:] = 0.0
+    for a in range(n_area):
+        area[a] = area0[a]
+    slot, h_slot, flips, fresh, whole, closing = -1, 0.0, 0, -1, True, False
+    first_out = counters[OUTPUT]
+    next_out = t_out[first_out] if first_out < t_out.size else math.inf
+    pause = counters[ACCEPTED] + 1 + AT_ONCE // m
+    while control[T] < t_end:
+        t = control[T]
+        if counters[ACCEPTED] + counters[REJECTED] > control[MOST]:
+            return TOO_MANY
+        if counters[ACCEPTED] >= pause:
+            return PAUSED
+        stop = t_end
+        at_edge = False
+        for i in range(n_s):
+            while sources.edges[sources.first[i] + index[i] + 1] <= t:
+                index[i] += 1
+            at_edge |= sources.edges[sources.first[i] + index[i]] == t
+            stop = min(stop, sources.edges[sources.first[i] + index[i] + 1])
+        at_sources(sources, index, t, 0.0, now, slopes_now)
+        # The time of a call may miss an edge by rounding.
+        least = ROUNDING if at_edge else (UNNOTICED if h_slot == 0.0 else math.inf)
+        for i in range(n_s):
+            if not jump and abs(now[i] - s_before[i]) > least * max(abs(now[i]), abs(s_before[i])):
+                return JUMP
+        if at_edge:
+            # The steps after a jump are often those after the one before.
+            control[H] = control[H_AFTER_EDGE]
+            control[TOO_LONG] = 0.0
+            control[ALLOWED] = 0.0
+            fresh = H_AFTER_EDGE
+        load(inverse, follow, y, now, w0)
+        ahead = math.inf
+        control[BRANCH_START], control[BRANCH_LENGTH] = t, math.inf
+        for a in range(n_area):
+            if cell[a] < 0:
+                sign[a] = 1.0
+                continue
+            voltage = 0.0
+            for k in range(n):
+                voltage += gap[a, k] * w0[k]
+            for e in range(n_s):
+                voltage += gap_s[a, e] * now[e]
+            if sign[a] == 0.0:
+                sign[a] = 1.0 if voltage >= 0.0 else -1.0
+                branch[a, 0], branch[a, 1] = t, math.inf
+            here = unit[a] * y[slow[a]] if slow[a] >= 0 else 1.0 / inverse_area(abs(voltage), curves[a])[0]
+            if not jump and max(here / area0[a], area0[a] / here) > FARTHEST:
+                return REFERENCE
+            end = branch[a, 0] + 1.02 * branch[a, 1] - t
+            if 0.0 < end < ahead:
+                ahead = end
+                control[BRANCH_START], control[BRANCH_LENGTH] = branch[a, 0], branch[a, 1]
+        h = choose_step(pace, tau, True, is_series, t, stop - t, control)
+        wanted = control[H]
+        which, magnified = -1, 1.0
+        while True:
+            if h != h_slot:
+                slot = make_tables(rates, 0, h, keys_h, keys_level, count, all_decay, all_phi, all_miss)
+                h_slot = h
+                whole = meet(h, rates, feed, tap, met)
+                weigh(rates, size, all_decay[slot], h, weight)
+            decay, phi, miss = all_decay[slot], all_phi[slot], all_miss[slot]
+            for e in range(n_s):
+                row = sources.first[e] + index[e]
+                start = sources.edges[row]
+                rows.source_rows(
+                    sources.terms[row - e], sources.series[row - e], sources.edges[row + 1] - start, t - start, h, True,
+                    r[e],
+                )  # fmt: skip
+                for i in range(ROWS):
+                    s[e, i] = r[e, rows.SOURCE, i]
+                    ds[e, i] = r[e, rows.SLOPE, i]
+            clear(lin)
+            combine(gain, s, lin)
+            clear(free)
+            combine(tap_s, s, free)
+            clear(free_rate)
+            combine(tap_s, ds, free_rate)
+            clear(used)
+            clear(guess)
+            for k in range(m):
+                for i in range(ROWS):
+                    base[k, i] = decay[k, i] * w0[k]
+            respond(lin, phi, base, base)
+            closed = False
+            slowly = False
+            step = 0.0
+            for iteration in range(1, 41):
+                if iteration > 1:
+                    if slowly:
+                        step = mix(pull, used, weight, pull_before, left_before)
+                    else:
+                        step = plain(pull, used, weight, pull_before, left_before)
+                respond(used, phi, base, w)
+                counters[NFEV] += NODES
+                if not evaluate(
+                    mobile, h, rates, feed, tap, met, c, g, home, cell, area0, unit, slow, speed, powers, slopes, lo,
+                    scale, curves, sign, w, lin, d, pull, cells, areas, matrix, small,
+                    room[3],
+                ):  # fmt: skip
+                    break
+                clear(u)
+                combine(gap, w[:n], u)
+                combine(gap_s, s, u)
+                change = moved(u, guess)
+                if iteration == 1:
+                    continue
+                # What the gap voltages would move next, by what they moved for the last change of the currents.
+                off = distance(pull, used, weight)
+                if not off < math.inf:
+                    break
+                if change * off <= 0.3 * tol * step:
+                    closed = True
+                    break
+                slowly = off > 0.15 * step
+            step_error = math.inf
+            # What did not close says nothing about where it goes.
+            if closed and flips <= n_area and turn_at_start(cell, u, sign, tol, t, branch):
+                flips += 1
+                continue
+            lowest = 1.0
+            if closed:
+                if mobile:
+                    lowest = room[3].min()
+                magnified = 1.0 / lowest
+                step_error = assess(
+                    rates, h, shape, follow, gap, size, decay, phi, miss, error, w, lin, pull, used, s, magnified,
+                    x_off, places, early, run,
+                )  # fmt: skip
+                if charge:
+                    step_error = max(step_error, charged(cell, u, area))
+            note(tried, counters[ACCEPTED] + counters[REJECTED], t, h, step_error / tol)
+            factor = 6.0
+            if step_error > 0.0:
+                factor = 0.9 * (tol / step_error) ** (1.0 / NODES) if step_error < math.inf else 0.5
+            if step_error <= tol:
+                # A step cut short by a boundary says little about the next one; after a jump the decays die away one
+                # by one, and the length allowed grows from step to step as it did.
+                growth = h * factor / control[ALLOWED] if control[ALLOWED] > 0.0 else 1.0
+                control[ALLOWED] = h * factor
+                proposed = h * min(_MOST_GROWTH, max(0.5, factor * min(max(growth, 1.0), _MOST_TREND)))
+                proposed = max(proposed, wanted if h < wanted else 0.0)
+                if control[TOO_LONG] > 0.0:
+                    proposed = min(proposed, 0.93 * control[TOO_LONG])
+                    grows = growth if closing else max(growth, factor)
+                    control[TOO_LONG] *= grows if grows > 1.5 else 1.03
+                if fresh >= 0 and h >= wanted:
+                    control[fresh] = h * min(2.0, factor)
+                fresh = -1
+                control[H] = proposed
+                break
+            counters[REJECTED] += 1
+            # Refused at this length: a singularity, of which rounding hides the last bit.
+            if h <= 1e-13 * max(abs(t), 1e-3 * (stop - t)) or (whole and lowest < NEAR_FOLD):
+                return NO_STEP
+            shorter = 1.0
+            for a in range(n_area):
+                if cell[a] >= 0 and sign[a] * u[a, END] < lo[a]:
+                    # It went far over a zero, where the branch has no meaning: end soon after the zero.
+                    found = first_wrong(u[a], sign[a], tol)
+                    if found > 1:
+                        shorter = min(shorter, 1.1 * POINTS[found])
+            if shorter < 1.0:
+                h = rung(h * min(0.9, shorter))
+            else:
+                control[TOO_LONG] = h
+                closing = not closed
+                control[ALLOWED] = 0.0
+                h = rung(h * min(0.9, max(0.25, factor)))
+                wanted = h
+        t_new = t + h
+        theta = 1.0
+        if t_new >= stop or stop - t_new <= 1e-12 * h:
+            t_new = stop
+            theta = min(1.0, (stop - t) / h)
+        if flips <= n_area:
+            which, theta, t_new = first_zero(cell, u, sign, tol, t, h, theta, t_new, room[0])
+        if which >= 0 and t_new <= t:
+            sign[which] = -sign[which]
+            branch[which, 0], branch[which, 1] = t, math.inf
+            flips += 1
+            continue
+        if mobile and not whole:
+            # A mode that follows at once takes no part in the fold of the others, but it does in that of all.
+            couple(mobile, form.met, c, home, cell, cell_u, slope, more, du, j, matrix, small, room[3])
+            magnified = 1.0 / room[3, :NODES].min()
+        if not 0.0 < magnified < math.inf:
+            return NO_STEP
+        control[MAGNIFIED] = max(control[MAGNIFIED], magnified)
+        flips = 0
+        if charge:
+            for k in range(m):
+                if not rates[k] * h > STIFF:
+                    for i in range(ROWS):
+                        d[k, i] += pull[k, i]
+            charge_rows(
+                mobile, h, stored, stored_s, lost, lost_s, through, c, g, home, integral, w, d, s, ds, cell_u, more, j,
+                room, values[first_z:], values[y.size :],
+            )  # fmt: skip
+            charge_error(
+                mobile, h, stored, lost, through, tap, c, g, home, cell, unit, slow, places, early, theta, cell_u, area,
+                slope, more, values[first_z:], collected, control,
+            )  # fmt: skip
+        for e in range(n_s):
+            gained[e] = at(values[first_z + e], theta) if charge else 0.0
+        if next_out <= t_new or kept_times.size > 0:
+            write_columns(n, first_z, charge, shape, follow, w, s, y, values)
+            for i in range(out.shape[0]):
+                series_of(values[i], coefficients[i])
+            place = counters[KEPT]
+            counters[KEPT] += 1
+            if place < kept_times.shape[0]:
+                kept_times[place, 0], kept_times[place, 1], kept_times[place, 2] = t, h, t_new
+                kept_series[place] = coefficients[: out.shape[0]]
+        if next_out <= t_new:
+            first_out += write_outputs(
+                t, h, theta, t_new, 0.0, False, coefficients, outputs, first_out, 0, t_out, left, out
+            )  # fmt: skip
+            counters[OUTPUT] = first_out
+            next_out = t_out[first_out] if first_out < t_out.size else math.inf
+        for a in range(n_area):
+            if stress[a] > 0.0:
+                account(u[a], area[a], stress[a], theta, run[a], places, slow[a], peaks[a])
+        for k in range(m):
+            w0[k] = at(w[k], theta) if theta < 1.0 else w[k, END]
+        if theta < 1.0:
+            error_at(places, theta, error)
+        else:
+            for k in range(m):
+                error[k] = places[k, N_PLACES - 1]
+        at_sources(sources, index, t_new, 0.0, s_before, slopes_now)
+        store(shape, follow, w0, s_before, gained, y)
+        if which >= 0:
+            sign[which] = -sign[which]
+            branch[which, 1] = t_new - branch[which, 0]
+            branch[which, 0] = t_new
+            counters[ZEROS] += 1
+            # The area has a kink here: fast modes start anew.
+            if control[H_AFTER_ZERO] > 0.0:
+                control[H] = control[H_AFTER_ZERO]
+                control[ALLOWED] = 0.0
+            fresh = H_AFTER_ZERO
+        control[T] = t_new
+        counters[ACCEPTED] += 1
+    return DONE
