@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from fingerspice.circuit.circuit import Element
+from fingerspice.netruns import NetworkRun
 from fingerspice.network_record import NetworkRecord
 from fingerspice.networks import NetworkProblem
-from fingerspice.netruns import NetworkRun
 from fingerspice.outcome import Status
 from fingerspice.physics.contact import inverse_area
 from fingerspice.problem import Problem
