@@ -284,9 +284,10 @@ _BREAKPOINTS_AT_ONCE = 65_536
 
 def _at_breakpoints(problem: Problem | NetworkProblem, t: FloatArray) -> FloatArray:
     """Times moved onto the breakpoint they miss by rounding, so that 5 ms means the jump at 5 ms."""
-    windows = 1 + int((problem.t_stop - problem.t_start) * problem.waveform.breakpoint_rate() / _BREAKPOINTS_AT_ONCE)
+    span = problem.t_start, problem.t_stop
+    windows = 1 + int((span[1] - span[0]) * problem.waveform.breakpoint_rate() / _BREAKPOINTS_AT_ONCE)
     moved = t
-    for w0, w1 in itertools.pairwise(np.linspace(problem.t_start, problem.t_stop, windows + 1)):
+    for w0, w1 in itertools.pairwise(span if windows == 1 else np.linspace(*span, windows + 1)):
         edges = problem.breakpoints() if windows == 1 else problem.waveform.breakpoints(w0, w1)
         near = edges[misses(t, edges, same_time(1.0))] if edges.size else edges
         moved = t.copy() if near.size and moved is t else moved
