@@ -32,7 +32,7 @@ def test_a_fold_says_when_where_why_and_what_to_change(beside: str) -> None:
     assert failure.element == "Xgap"
     assert failure.t is not None
     assert 0.0 < failure.t < 0.5e-3
-    assert "less area means more voltage" in failure.cause
+    assert "area and gap voltage drive each other on" in failure.cause
     assert failure.action == "use less voltage, more load, or the local law"
     assert failure.u_gap == pytest.approx(float(solution.u_gap[-1]))
     assert failure.area == pytest.approx(float(solution.area[-1]))

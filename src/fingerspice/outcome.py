@@ -18,8 +18,8 @@ class Status(Enum):
 
     SUCCESS = ("success", "")
     FOLD = (
-        "the mobile charge law has no solution past this time: with the charge stored on the interfaces, less area "
-        "means more voltage means less area",
+        "the mobile charge law has no solution past this time: with the charge stored on the interfaces, area and gap "
+        "voltage drive each other on",
         "use less voltage, more load, or the local law",
     )
     SOURCE_NOT_FINITE = ("a source gave NaN or inf", "nothing after this time is a result: mend the source")
