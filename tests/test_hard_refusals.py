@@ -62,7 +62,11 @@ def test_a_run_past_the_fold_stops_there_and_says_where_how_near_why_and_what_to
         fs.simulate(table1().replace(changes), charge_law="mobile")
     said, kept = str(caught.value), caught.value.solution
     assert said.startswith(f"stopped at t = {fold.t:.6g}"[:-1])
-    for part in ("no solution past this time", "area and gap voltage drive each other on", "use less voltage, more load, or"):
+    for part in (
+        "no solution past this time",
+        "area and gap voltage drive each other on",
+        "use less voltage, more load, or",
+    ):
         assert part in said
     assert f"{fold.u_gap:.3f} V across the gap, area {1e6 * fold.area:.4g} mm^2, distance to the fold" in said
     assert kept is not None
