@@ -65,3 +65,9 @@ def test_a_scene_judged_by_another_one_s_reference_is_wrong() -> None:
 
     with pytest.raises(stress.WrongError, match="of the peak"):
         stress.judge(Another(**dataclasses.asdict(scene)))
+
+
+@pytest.mark.parametrize("number", [12, 68, 214])
+def test_a_run_that_stopped_early_is_no_result_however_little_the_gap_takes(number: int) -> None:
+    # Their gap voltage is rounding of the source's, and a fold ends them.
+    assert stress.judge(stress.draw(3, number)) == "refused: rounding"

@@ -219,7 +219,8 @@ def run_problem(
         _add_error(run, run.rough)
         run.detail = run.detail or f"the source function itself is rough by {run.rough:.2g} V"
     rounding = ROUNDING * problem.scene.u_peak
-    if run.status in (Status.SUCCESS, Status.ERROR_NOT_MET) and run.peak_u <= rounding:
+    ended = run.status in (Status.SUCCESS, Status.ERROR_NOT_MET) and run.t_failed is None
+    if ended and run.state.t == problem.t_stop and run.peak_u <= rounding:
         # Zero, as far as numbers can tell; the force goes with the square.
         share = rounding / run.peak_u if run.peak_u > 0.0 else 0.0
         run.status, run.error = Status.SUCCESS, run.error.at_least(share * run.peak_u, share**2 * run.peak_f)
