@@ -25,6 +25,8 @@ MENDED = {
     186: "refused: fold",  # A fold on a mode five million times faster than what leads to it.
     196: "refused: fold",  # As 186, on a gap that takes a ten-millionth of the source's voltage.
     205: "refused: fold",  # As 24, slower.
+    231: "right",  # The gap takes so little that every step is longer than its error asks for.
+    436: "right",  # As 231.
     454: "refused: fold",
     650: "right",
     761: "refused: fold",

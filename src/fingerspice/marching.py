@@ -218,4 +218,5 @@ def solve(
         if rtol * run.peak_u < ROUNDING * u_scale or tol <= FINEST or attempts == 6:
             run.status = Status.ERROR_NOT_MET
             return run
-        tol = tol * min(0.3, 0.5 / worst)
+        # Steps that something else than their error kept short are shortened by a tolerance below what they made only.
+        tol = min(tol * min(0.3, 0.5 / worst), 0.5 / worst * run.error.u_gap / u_scale)
