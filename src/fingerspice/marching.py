@@ -18,6 +18,7 @@ from fingerspice.runs import (
     Run,
     Tables,
     from_rows,
+    last_row,
 )  # fmt: skip
 from fingerspice.settling import Settling
 from fingerspice.track import FINEST, SAFETY, Prepared, Track, prepare_system
@@ -92,7 +93,8 @@ def integrate(
     if status is Status.SUCCESS and table is not None:
         track.finish(table)
     elif table is not None and table.edges.size > 1:
-        last = track.last(table)
+        model, control = prepared.system.model, track.control
+        last = last_row(problem, model, table, track.t, track.y, control[readout.SIGN], control[readout.U_GAP])
     run = _run(problem, track, status, t_failed, last)
     run.rough, run.unseen = tables.rough, tables.unseen
     return run

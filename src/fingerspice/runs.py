@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
-from fingerspice.engine.model import Segment
+from fingerspice.engine.model import Model, Segment, source, write_row
 from fingerspice.networks import NetworkProblem
 from fingerspice.outcome import Attempt, ErrorEstimate, State, Status
 from fingerspice.problem import Problem
@@ -165,6 +165,25 @@ def after_the_end(problem: Problem, table: SourceTable) -> tuple[Segment, float]
     start = float(table.edges[-2])
     segment = Segment(start, float(table.edges[-1]) - start, table.terms[-1], table.series[-1])
     return segment, stop - start
+
+
+def last_row(
+    problem: Problem, model: Model, table: SourceTable, t: float, y: FloatArray, sign: float, u_gap: float
+) -> FloatArray | None:  # fmt: skip
+    """Row at the time t (s) that a failed run reached, left-hand; None before the first step, or if it is not finite.
+
+    `model` may cover more of the area's curve than the problem's; `y`, `sign` and `u_gap` (V) are the state there, its
+    branch and its gap voltage.
+    """
+    if t <= problem.t_start:
+        return None
+    i = max(int(np.searchsorted(table.edges, t, side="left")) - 1, 0)
+    start = float(table.edges[i])
+    segment = Segment(start, float(table.edges[i + 1]) - start, table.terms[i], table.series[i])
+    row = np.empty(row_width(problem))
+    u, du = source(segment, t - start)
+    write_row(model, u, du, y, sign, u_gap, row)
+    return row if np.all(np.isfinite(row)) else None
 
 
 def from_rows(problem: Problem, rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

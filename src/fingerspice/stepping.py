@@ -9,13 +9,24 @@ from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import SourceTable
 from fingerspice.engine import advance as loop
-from fingerspice.engine.model import Segment, source, write_row
+from fingerspice.engine.model import write_row
 from fingerspice.engine.readout import TRIED
 from fingerspice.engine.steps import Method
 from fingerspice.numerics.tableaus import Tableau
 from fingerspice.outcome import ErrorEstimate, State, Status, last_tried
 from fingerspice.problem import Problem
-from fingerspice.runs import ROUNDING, BoolArray, FloatArray, Progress, Run, Tables, after_the_end, from_rows, row_width
+from fingerspice.runs import (
+    ROUNDING,
+    BoolArray,
+    FloatArray,
+    Progress,
+    Run,
+    Tables,
+    after_the_end,
+    from_rows,
+    last_row,
+    row_width,
+)
 
 LOG_ROWS = 1024
 # Error over the peak above which the time of a fold is not believed.
@@ -89,18 +100,6 @@ class Track:
         self.rows = np.full((self.t_out.size, self.rows.shape[1]), np.nan)
         self.counters[loop.OUTPUT] = 0
         return self.advance(table, main.t)
-
-    def here(self, table: SourceTable) -> FloatArray | None:
-        """Row at the time reached, left-hand; None before the first step."""
-        if self.t <= self.problem.t_start:
-            return None
-        i = max(int(np.searchsorted(table.edges, self.t, side="left")) - 1, 0)
-        start = float(table.edges[i])
-        segment = Segment(start, float(table.edges[i + 1]) - start, table.terms[i], table.series[i])
-        row = np.empty(row_width(self.problem))
-        u, du = source(segment, self.t - start)
-        write_row(self.problem.model, u, du, self.y, self.control[loop.SIGN], self.control[loop.U_GAP], row)
-        return row if np.all(np.isfinite(row)) else None
 
     def finish(self, table: SourceTable) -> None:
         """Write the right-hand outputs at the very end of the run."""
@@ -201,7 +200,8 @@ def integrate(
     if status is Status.SUCCESS and table is not None:
         main.finish(table)
     elif table is not None and table.edges.size > 1:
-        last = main.here(table)
+        sign, u_gap = main.control[loop.SIGN], main.control[loop.U_GAP]
+        last = last_row(problem, problem.model, table, main.t, main.y, sign, u_gap)
     c = main.counters
     n_out = int(c[loop.OUTPUT])
     t, side, rows = t_out[:n_out], left[:n_out], main.rows[:n_out]

@@ -12,7 +12,7 @@ from fingerspice.engine import repeat as repetition
 from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
 from fingerspice.engine.march import Work
-from fingerspice.engine.model import Segment, source, write_row
+from fingerspice.engine.model import write_row
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.system import System, area_range, build_system
 from fingerspice.numerics.lobatto import integral_table
@@ -205,16 +205,3 @@ class Track:
             self.out[n, first:] = z
             self.out[n + 1, first:] = current
         self.counters[readout.OUTPUT] = self.t_out.size
-
-    def last(self, table: SourceTable) -> FloatArray | None:
-        """Row at the time a failed run reached, left-hand; None before the first step."""
-        if self.t <= self.problem.t_start:
-            return None
-        i = max(int(np.searchsorted(table.edges, self.t, side="left")) - 1, 0)
-        start = float(table.edges[i])
-        segment = Segment(start, float(table.edges[i + 1]) - start, table.terms[i], table.series[i])
-        row = np.empty(row_width(self.problem))
-        u, du = source(segment, self.t - start)
-        sign, u_gap = self.control[readout.SIGN], self.control[readout.U_GAP]
-        write_row(self.prepared.system.model, u, du, self.y, sign, u_gap, row)
-        return row if np.all(np.isfinite(row)) else None
