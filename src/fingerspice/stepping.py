@@ -65,6 +65,7 @@ class Track:
         self.y = start.y.copy()
         self.control = np.zeros(loop.N_CONTROL)
         self.control[loop.T] = self.problem.t_start
+        self.control[loop.START] = np.nan
         self.control[loop.U_BEFORE] = start.u_before
         self.control[loop.MARGIN] = 1.0
         if self.problem.model.mobile and abs(start.u_gap) > 0.0:
@@ -168,7 +169,7 @@ def integrate(
     z_scale = u_scale * problem.model.area0 / problem.model.s
     scale = tol * np.append(np.full(problem.stack.c.size - 1, u_scale), z_scale)
     rows = np.full((t_out.size, width), np.nan)
-    log = np.empty((LOG_ROWS, 4))
+    log = np.empty((LOG_ROWS, 3))
     main = Track(problem, method, scale, t_out, left, rows, log)
     # Only voltages are compared.
     finer = np.append(SHADOW * scale[:-1], np.inf)
@@ -261,10 +262,8 @@ class _Meter:
         n = int(np.count_nonzero(np.isfinite(shadow_rows[:, 1])))
         if n:
             other = self.problem.scene.force(shadow_rows[:n, 1], shadow_rows[:n, 2])
-            # F ~ u^2: what moves u by du moves F by 2 F du / u.
-            rounding = 2.0 * force[:n] * log[:n, 3] / np.maximum(np.abs(log[:n, 1]), 1e-300)
-            self.diff_u = max(self.diff_u, float((np.abs(shadow_rows[:n, 1] - log[:n, 1]) - log[:n, 3]).max()))
-            self.diff_f = max(self.diff_f, float((np.abs(other - force[:n]) - rounding).max()))
+            self.diff_u = max(self.diff_u, float(np.abs(shadow_rows[:n, 1] - log[:n, 1]).max()))
+            self.diff_f = max(self.diff_f, float(np.abs(other - force[:n]).max()))
 
     def error(self) -> ErrorEstimate:
         # Rounding is an error too, and two runs may share it.

@@ -30,9 +30,10 @@ FloatArray = NDArray[np.float64]
 # Codes returned by `advance`.
 DONE, LOG_FULL, NO_SOLUTION, STEP_UNDERFLOW, TOO_MANY = 0, 1, 2, 3, 4
 # Entries of `control`: time, next step (0: choose one), branch of the area (0: choose one), source voltage
-# just before the time reached, last gap voltage, smallest distance to the fold met in logged places.
-T, H, SIGN, U_BEFORE, U_GAP, MARGIN = 0, 1, 2, 3, 4, 5
-N_CONTROL = 6
+# just before the time reached, last gap voltage, smallest distance to the fold met in logged places, the
+# segment's start, and the time since: what decays there may be faster than the rounding of the time itself.
+T, H, SIGN, U_BEFORE, U_GAP, MARGIN, START, SINCE = 0, 1, 2, 3, 4, 5, 6, 7
+N_CONTROL = 8
 # Entries of `counters`: evaluations, steps accepted and rejected, zeros met, outputs written, log rows written.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, LOGGED = 0, 1, 2, 3, 4, 5
 N_COUNTERS = 6
@@ -185,7 +186,7 @@ def _controlled_step(
     model: Model,
     method: Method,
     segment: Segment,
-    t: float,
+    since: float,
     remaining: float,
     least: float,
     y: FloatArray,
@@ -200,12 +201,11 @@ def _controlled_step(
 
     Returns the step (0: none above `least`, s, is small enough) and whether it ends the segment.
     """
-    t0 = t - segment.start
     h, last = _choose_step(model, method, remaining, control, k[0], scale)
     while True:
-        norm, nfev = take_step(model, method, segment, t0, h, y, control[SIGN], control[U_GAP], scale, k, y1)
+        norm, nfev = take_step(model, method, segment, since, h, y, control[SIGN], control[U_GAP], scale, k, y1)
         counters[NFEV] += nfev
-        note(tried, counters[ACCEPTED] + counters[REJECTED], t, h, norm)
+        note(tried, counters[ACCEPTED] + counters[REJECTED], segment.start + since, h, norm)
         factor = 6.0
         if norm > 0.0:
             factor = 0.25 if norm == math.inf else 0.9 * norm ** (-1.0 / method.error_order)
@@ -226,7 +226,7 @@ def _controlled_step(
 def _write_log(
     model: Model,
     segment: Segment,
-    t: float,
+    since: float,
     h: float,
     reached: float,
     y: FloatArray,
@@ -235,28 +235,27 @@ def _write_log(
     counters: NDArray[np.int64],
     log: FloatArray,
 ) -> None:
-    """What the error estimate compares, in the middle and at the end of a step.
-
-    Columns: time, gap voltage, 1/A, and how far the rounding of the time itself moves the gap voltage (it matters
-    on an edge of 1 ns late in a run).
-    """
+    """What the error estimate compares, in the middle and at the end of a step: time, gap voltage, 1/A."""
     state = np.empty(y.size)
+    before = segment.start + since
     for i in range(1, 3):
-        theta = 0.5 * i * reached
-        if i == 1 and t + theta * h in (t, t + reached * h):
-            continue  # a step of a few roundings has no middle
+        # A time that another run of the same segment reads as the same one; a step below its rounding has none.
+        t = segment.start + (since + 0.5 * i * reached * h)
+        theta = (t - segment.start - since) / h
+        if t <= before or not 0.0 < theta <= reached:
+            continue
+        before = t
         dense_state(theta, y, poly, state)
-        u_source, du_source = source(segment, t - segment.start + theta * h)
+        u_source, _ = source(segment, t - segment.start)
         x_gap = dot(model.gap, state)
         u = gap_voltage(model, model.k_gap * u_source, x_gap, control[SIGN], control[U_GAP])
         q, dq = branch_area(model, control[SIGN], u)
         if model.mobile and model.coupled:
             control[MARGIN] = min(control[MARGIN], 1.0 - model.area0 * x_gap * dq)
         row = log[counters[LOGGED]]
-        row[0] = t + theta * h
+        row[0] = t
         row[1] = u
         row[2] = q
-        row[3] = 4.5e-16 * (abs(t) + h) * abs(model.k_gap * du_source)
         counters[LOGGED] += 1
 
 
@@ -264,10 +263,10 @@ def _write_log(
 def _write_outputs(
     model: Model,
     segment: Segment,
-    t: float,
+    since: float,
     h: float,
     reached: float,
-    t_new: float,
+    ended: float,
     y: FloatArray,
     poly: FloatArray,
     control: FloatArray,
@@ -276,15 +275,16 @@ def _write_outputs(
     left: NDArray[np.bool_],
     rows: FloatArray,
 ) -> None:
-    """Outputs of one step: right-hand ones in [t, t_new), left-hand ones in (t, t_new]."""
+    """Outputs of one step: right-hand ones from `since` to before `ended`, left-hand ones after it to `ended`."""
     state = np.empty(y.size)
     while counters[OUTPUT] < t_out.size:
         i = counters[OUTPUT]
-        if t_out[i] > t_new or (t_out[i] == t_new and not left[i]):
+        wanted = t_out[i] - segment.start
+        if wanted > ended or (wanted == ended and not left[i]):
             return
-        theta = max(0.0, min((t_out[i] - t) / h, reached))
+        theta = max(0.0, min((wanted - since) / h, reached))
         dense_state(theta, y, poly, state)
-        u_source, du_source = source(segment, t - segment.start + theta * h)
+        u_source, du_source = source(segment, since + theta * h)
         write_row(model, u_source, du_source, state, control[SIGN], control[U_GAP], rows[i])
         counters[OUTPUT] += 1
 
@@ -323,7 +323,7 @@ def advance(
         State and bookkeeping, updated in place.
     t_out, left, rows : ndarray
         Output times (ascending), whether the left-hand value is meant, and the rows to fill (`write_row`).
-    log : ndarray, shape (l, 4)
+    log : ndarray, shape (l, 3)
         See `_write_log`; with no rows nothing is logged.
     tried : ndarray, shape (n, 4)
         Takes the last steps tried, in turn: start and length (s), error over the one allowed, number from 1.
@@ -344,11 +344,21 @@ def advance(
     while control[T] < t_end:
         if counters[ACCEPTED] + counters[REJECTED] > most:
             return TOO_MANY
-        t = control[T]
-        while edges[index + 1] <= t:
+        while edges[index + 1] <= control[T]:
             index += 1
-        segment = Segment(edges[index], edges[index + 1] - edges[index], terms[index], series[index])
-        u_source, du_source = enter(model, segment, t - segment.start, y, control)
+        start = edges[index]
+        if control[START] != start:
+            control[START] = start
+            control[SINCE] = control[T] - start
+        since = control[SINCE]
+        stop = min(edges[index + 1], t_end)
+        remaining = stop - start - since
+        if remaining <= 0.0:
+            # Nothing but rounding is left.
+            control[T] = stop
+            continue
+        segment = Segment(start, edges[index + 1] - start, terms[index], series[index])
+        u_source, du_source = enter(model, segment, since, y, control)
         if u_source != u_source:
             return NO_SOLUTION
         u = right_hand_side(model, u_source, du_source, y, control[SIGN], control[U_GAP], k[0])
@@ -356,8 +366,7 @@ def advance(
         if u != u:
             return NO_SOLUTION
         control[U_GAP] = u
-        stop = min(edges[index + 1], t_end)
-        least = 1e-15 * max(abs(t), 1e-3 * segment.length)
+        least = 1e-15 * since + 1e-25 * segment.length
         if model.mobile:
             q, dq = branch_area(model, control[SIGN], u)
             margin = 1.0 - dot(model.gap, y) * model.area0 * dq
@@ -365,22 +374,23 @@ def advance(
                 return NO_SOLUTION
             if margin < _NEAR_FOLD:
                 # What rounding leaves of the way is not worth its many steps.
-                least = max(least, 1e-8 * (t - segment.start))
+                least = max(least, 1e-8 * since)
             # The state is a voltage at the area of 0 V.
             allowed[:] = scale / (model.area0 * q)
         h, last = _controlled_step(
-            model, method, segment, t, stop - t, least, y, allowed, control, counters, k, y1, tried
+            model, method, segment, since, remaining, least, y, allowed, control, counters, k, y1, tried
         )
         if h == 0.0:
             return STEP_UNDERFLOW
         dense_polynomial(k, method.dense, h, poly)
         theta = 2.0
         if model.coupled and flips < 2:
-            theta = _first_zero(model, segment, t - segment.start, h, control[SIGN], y, poly)
-        t_new = stop if last else t + h
+            theta = _first_zero(model, segment, since, h, control[SIGN], y, poly)
+        ended = stop - start if last else since + h
         if theta < 1.0:
-            t_new = t + theta * h
-        if t_new <= t:
+            ended = since + theta * h
+            last = False
+        if ended <= since:
             # The zero is here: change branch without advancing.
             control[SIGN] = -control[SIGN]
             flips += 1
@@ -389,7 +399,7 @@ def advance(
         if theta < 1.0 and method.implicit:
             # Collocation is more exact at the end of a step than inside: step again to end on the zero.
             norm, nfev = take_step(
-                model, method, segment, t - segment.start, theta * h, y, control[SIGN], control[U_GAP], scale, k, y1
+                model, method, segment, since, theta * h, y, control[SIGN], control[U_GAP], scale, k, y1
             )
             counters[NFEV] += nfev
             if norm < math.inf:
@@ -397,10 +407,9 @@ def advance(
                 theta = 1.0
                 dense_polynomial(k, method.dense, h, poly)
         reached = min(theta, 1.0)
-        _write_outputs(model, segment, t, h, reached, t_new, y, poly, control, counters, t_out, left, rows)
+        _write_outputs(model, segment, since, h, reached, ended, y, poly, control, counters, t_out, left, rows)
         if log.shape[0] > 0:
-            _write_log(model, segment, t, h, reached, y, poly, control, counters, log)
-            log[counters[LOGGED] - 1, 0] = t_new
+            _write_log(model, segment, since, h, reached, y, poly, control, counters, log)
         if reached < 1.0:
             dense_state(reached, y, poly, y1)
         if theta <= 1.0:
@@ -408,8 +417,9 @@ def advance(
             control[U_GAP] = 0.0
             counters[ZEROS] += 1
         y[:] = y1
-        control[T] = t_new
-        control[U_BEFORE], _ = source(segment, t_new - segment.start)
+        control[SINCE] = ended
+        control[T] = stop if last else min(start + ended, np.nextafter(stop, start))
+        control[U_BEFORE], _ = source(segment, ended)
         counters[ACCEPTED] += 1
         if theta <= 1.0 and turns_at_zero(model, dot(model.gap, y), control[SIGN]):
             control[SIGN] = -control[SIGN]

@@ -166,15 +166,19 @@ def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: floa
         return k_u + x_gap
     b = x_gap * model.area0
     u = guess
+    q, dq = branch_area(model, sign, u)
     last = math.inf
     for _ in range(12):
-        q, dq = branch_area(model, sign, u)
         slope = 1.0 - b * dq
         # Past the fold Newton would go to another root: leave it to the walk.
         if not slope > 1e-3:
             break
-        step = (u - k_u - b * q) / slope
-        u -= step
+        step = (k_u - u + b * q) / slope
+        new = u + step
+        q_new, dq_new = branch_area(model, sign, new)
+        if not _rises(b, q, dq, q_new, dq_new, step):
+            break
+        u, q, dq = new, q_new, dq_new
         if _settled(step, last, slope, abs(u) + abs(k_u)):
             if sign * u >= model.curve[0]:
                 return u
@@ -182,6 +186,22 @@ def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: floa
         last = abs(step)
     u = _walk(model, k_u, b, sign, guess, False)
     return u if sign * u >= model.curve[0] else math.nan
+
+
+@jit
+def _rises(b: float, q: float, dq: float, q_new: float, dq_new: float, step: float) -> bool:
+    """Whether k_u(u) = u - b / A rises all along a step from (q, dq) to (q_new, dq_new), so that no fold is crossed.
+
+    No step takes off more than three quarters of the slope, at its end or in between, as far as the slopes at both ends
+    miss the mean one; nor does the area change by a third.
+    """
+    slope, slope_new = 1.0 - b * dq, 1.0 - b * dq_new
+    if not (slope_new > 0.25 * slope and abs(q_new - q) < 0.3 * min(q, q_new)):
+        return False
+    # A change as small as rounding tells no mean slope; but nothing can lie in between.
+    if abs(q_new - q) < 1e-6 * q and abs(b * (dq_new - dq)) < 0.5 * slope:
+        return True
+    return abs(b * ((q_new - q) / step - 0.5 * (dq + dq_new))) < 0.5 * min(slope, slope_new)
 
 
 @jit
@@ -197,8 +217,7 @@ def _settled(step: float, last: float, slope: float, size: float) -> bool:
 def _walk(model: Model, k_u: float, b: float, sign: float, u: float, stops: bool) -> float:
     """From gap voltage u to the root of u = k_u + b / A on the same branch, or to 0 V if that comes first and `stops`.
 
-    k_u(u) = u - b / A must rise all the way: no step crosses a fold, as none takes off more than three quarters of the
-    slope. NaN where a fold comes first.
+    k_u(u) = u - b / A must rise all the way. NaN where a fold comes first.
     """
     q, dq = branch_area(model, sign, u)
     slope = 1.0 - b * dq
@@ -212,21 +231,20 @@ def _walk(model: Model, k_u: float, b: float, sign: float, u: float, stops: bool
         last = abs(whole)
         step = whole
         new = u
-        q_new, dq_new, slope_new = q, dq, slope
+        q_new, dq_new = q, dq
         for _ in range(50):
             new = u + step
             if stops and sign * new < 0.0:
                 new = 0.0
             q_new, dq_new = branch_area(model, sign, new)
-            slope_new = 1.0 - b * dq_new
-            if slope_new > 0.25 * slope and abs(q_new - q) < 0.3 * min(q, q_new):
+            if _rises(b, q, dq, q_new, dq_new, new - u):
                 break
             step *= 0.5
         if abs(step) <= 1e-10 * abs(u) and abs(step) < abs(whole):
             return math.nan
         if stops and new == 0.0 and u == 0.0:
             return 0.0
-        u, q, dq, slope = new, q_new, dq_new, slope_new
+        u, q, dq, slope = new, q_new, dq_new, 1.0 - b * dq_new
     return math.nan
 
 
