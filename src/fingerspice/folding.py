@@ -25,14 +25,16 @@ from fingerspice.runs import BoolArray, Run, Tables, from_rows, row_width
 FloatArray = NDArray[np.float64]
 
 FINEST_RTOL = 1e-12
+# Tries at a path to a fold: by how much looser, but no looser than this, and the evaluations they may take. Where leaks
+# are fast beside the path, their rounding leaves no tight tolerance to be met, or only in many steps.
+TRIES = ((1.0, 10_000), (1e3, 10_000), (1e6, 10_000), (1e3, 100_000), (1e6, 100_000))
+LOOSEST_RTOL = 1e-6
 # A fold is met at this distance, and looked for over so many of the shortest time constants.
 NOTHING_LEFT, LONGEST = 1e-10, 1e12
-# A path to a fold takes a few thousand evaluations.
-MOST_EVALUATIONS = 10_000
 
 
 class _LostError(Exception):
-    """A path took too many evaluations."""
+    """A path took too many evaluations, or no step was small enough."""
 
 
 def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | None:
@@ -153,7 +155,16 @@ def _start(problem: Problem, state: State) -> _Start:
 
 
 def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path | None:
-    """The path from a state to a fold in the segment of the source that it stands in; None where there is no fold."""
+    """The path from a state to a fold in the segment of the source that it stands in; None where none is found."""
+    for tried, evaluations in dict.fromkeys((max(rtol, min(x * rtol, LOOSEST_RTOL)), n) for x, n in TRIES):
+        try:
+            return _path(problem, state, begun, tried, evaluations)
+        except _LostError:
+            continue
+    return None
+
+
+def _path(problem: Problem, state: State, begun: _Start, rtol: float, evaluations: int) -> _Path | None:
     t, y, model, n = state.t, state.y, problem.model, state.y.size
     segment, end, sign, u = begun
     if u == 0.0:
@@ -170,7 +181,7 @@ def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path 
         margin, speed = voltage_by_time(model, u_here, du_here, here[:n], sign, here[n + 1], dy)
         return float(margin), float(speed)
 
-    left = MOST_EVALUATIONS
+    left = evaluations
 
     def slope(_: float, z: FloatArray) -> FloatArray:
         nonlocal left
@@ -207,11 +218,10 @@ def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path 
         return np.array(columns).T
 
     # The mode that is to fold may be faster than all else and follow it: an explicit method would not get there.
-    try:
-        found = solve_ivp(
-            slope, (0.0, LONGEST), begin, "Radau",
-            rtol=rtol, atol=rtol, jac=jacobian, events=events, dense_output=True,
-        )  # fmt: skip
-    except _LostError:
-        return None
+    found = solve_ivp(
+        slope, (0.0, LONGEST), begin, "Radau",
+        rtol=rtol, atol=rtol, jac=jacobian, events=events, dense_output=True,
+    )  # fmt: skip
+    if found.status < 1:
+        raise _LostError
     return _Path(t, segment, sign, scale, found.sol) if found.t_events[0].size else None

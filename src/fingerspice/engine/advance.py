@@ -20,6 +20,7 @@ from fingerspice.engine.model import (
     right_hand_side,
     source,
     turns_at_zero,
+    walk,
     write_row,
 )
 from fingerspice.engine.readout import note
@@ -86,10 +87,14 @@ def _zero_function(
     h: float,
     theta: float,
     sign: float,
+    u_start: float,
     y: FloatArray,
     poly: FloatArray,
 ) -> float:
-    """A function with the sign of the gap voltage on its branch, and its zeros: k U + x_gap."""
+    """A function with the sign of the gap voltage on its branch, and its zeros: k U + x_gap.
+
+    `u_start` is the gap voltage (V) at the start of the step.
+    """
     u_source, _ = source(segment, t0 + theta * h)
     x_gap = 0.0
     for j in range(model.gap.size):
@@ -98,26 +103,27 @@ def _zero_function(
             x = (x + poly[j, d]) * theta
         x_gap += model.gap[j] * (y[j] + x)
     zero = model.k_gap * u_source + x_gap
-    if model.mobile and sign * zero < 0.0 and sign * model.k_gap * u_source > 0.0:
-        # Under `mobile` the voltage may keep its sign where this sum does not (see `choose_branch`).
-        u = gap_voltage(model, model.k_gap * u_source, x_gap, sign, model.k_gap * u_source)
+    if model.mobile and sign * zero < 0.0 and x_gap != 0.0:
+        # The sum is of the area at 0 V; at another area the voltage may keep its sign.
+        u = walk(model, model.k_gap * u_source, x_gap * model.area0, sign, u_start, True)
         # No root is a fold, not a zero: the next step will say so.
-        return u if u == u else sign
+        if u != 0.0:
+            return u if u == u else sign
     return zero
 
 
 @jit
 def _first_zero(
-    model: Model, segment: Segment, t0: float, h: float, sign: float, y: FloatArray, poly: FloatArray
+    model: Model, segment: Segment, t0: float, h: float, sign: float, u_start: float, y: FloatArray, poly: FloatArray
 ) -> float:
     """First fraction of the step at which the gap voltage leaves its branch, or 2 where it does not."""
     lo = 0.0
-    f_lo = sign * _zero_function(model, segment, t0, h, 0.0, sign, y, poly)
+    f_lo = sign * _zero_function(model, segment, t0, h, 0.0, sign, u_start, y, poly)
     hi = 0.0
     f_hi = 0.0
     for i in range(1, 5):
         hi = 0.25 * i
-        f_hi = sign * _zero_function(model, segment, t0, h, hi, sign, y, poly)
+        f_hi = sign * _zero_function(model, segment, t0, h, hi, sign, u_start, y, poly)
         if f_hi < 0.0:
             break
         lo = hi
@@ -133,7 +139,7 @@ def _first_zero(
             mid = 0.5 * (lo + hi)
         if not lo < mid < hi:
             break
-        f_mid = sign * _zero_function(model, segment, t0, h, mid, sign, y, poly)
+        f_mid = sign * _zero_function(model, segment, t0, h, mid, sign, u_start, y, poly)
         if f_mid < 0.0:
             hi = mid
             f_hi = f_mid
@@ -385,7 +391,7 @@ def advance(
         dense_polynomial(k, method.dense, h, poly)
         theta = 2.0
         if model.coupled and flips < 2:
-            theta = _first_zero(model, segment, since, h, control[SIGN], y, poly)
+            theta = _first_zero(model, segment, since, h, control[SIGN], u, y, poly)
         ended = stop - start if last else since + h
         if theta < 1.0:
             ended = since + theta * h

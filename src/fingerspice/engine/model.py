@@ -184,7 +184,7 @@ def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: floa
                 return u
             break
         last = abs(step)
-    u = _walk(model, k_u, b, sign, guess, False)
+    u = walk(model, k_u, b, sign, guess, False)
     return u if sign * u >= model.curve[0] else math.nan
 
 
@@ -214,7 +214,7 @@ def _settled(step: float, last: float, slope: float, size: float) -> bool:
 
 
 @jit
-def _walk(model: Model, k_u: float, b: float, sign: float, u: float, stops: bool) -> float:
+def walk(model: Model, k_u: float, b: float, sign: float, u: float, stops: bool) -> float:
     """From gap voltage u to the root of u = k_u + b / A on the same branch, or to 0 V if that comes first and `stops`.
 
     k_u(u) = u - b / A must rise all the way. NaN where a fold comes first.
@@ -262,10 +262,10 @@ def ramp(model: Model, k_u: float, x_gap: float, u: float) -> float:
     after = 1.0 if k_u + b * q >= 0.0 else -1.0
     before = after if u == 0.0 else math.copysign(1.0, u)
     if before != after:
-        u = _walk(model, k_u, b, before, u, True)
+        u = walk(model, k_u, b, before, u, True)
         if u != 0.0:
             return u
-    return _walk(model, k_u, b, after, u, True)
+    return walk(model, k_u, b, after, u, True)
 
 
 @jit
