@@ -235,20 +235,28 @@ def _write_log(
     since: float,
     h: float,
     reached: float,
+    stop: float,
+    last: bool,
     y: FloatArray,
     poly: FloatArray,
     control: FloatArray,
     counters: NDArray[np.int64],
     log: FloatArray,
 ) -> None:
-    """What the error estimate compares, in the middle and at the end of a step: time, gap voltage, 1/A."""
+    """What the error estimate compares, in the middle and at the end of a step: time, gap voltage, 1/A.
+
+    The `last` step ends at `stop`.
+    """
     state = np.empty(y.size)
     before = segment.start + since
     for i in range(1, 3):
         # A time that another run of the same segment reads as the same one; a step below its rounding has none.
         t = segment.start + (since + 0.5 * i * reached * h)
         theta = (t - segment.start - since) / h
-        if t <= before or not 0.0 < theta <= reached:
+        if last and i == 2:
+            t = stop
+            theta = reached
+        if not before < t <= stop or not 0.0 < theta <= reached:
             continue
         before = t
         dense_state(theta, y, poly, state)
@@ -415,7 +423,7 @@ def advance(
         reached = min(theta, 1.0)
         _write_outputs(model, segment, since, h, reached, ended, y, poly, control, counters, t_out, left, rows)
         if log.shape[0] > 0:
-            _write_log(model, segment, since, h, reached, y, poly, control, counters, log)
+            _write_log(model, segment, since, h, reached, stop, last, y, poly, control, counters, log)
         if reached < 1.0:
             dense_state(reached, y, poly, y1)
         if theta <= 1.0:

@@ -279,8 +279,8 @@ def largest(first: float, second: float, third: float) -> float:
 
 @jit_inline
 def assess(
-    mobile: bool, area0: float, gain: FloatArray, gap: FloatArray, decay: FloatArray, phi: FloatArray,
-    miss: FloatArray, error: FloatArray, w: FloatArray, pull: FloatArray, used: FloatArray, r: FloatArray,
+    mobile: bool, area0: float, gain: FloatArray, gap: FloatArray, phi: FloatArray, miss: FloatArray,
+    error: FloatArray, carried: FloatArray, w: FloatArray, pull: FloatArray, used: FloatArray, r: FloatArray,
     places: FloatArray, sums: FloatArray,
 ) -> tuple[float, float, float]:  # fmt: skip
     """Error of a converged step, from what its polynomial misses between nodes and what its iteration left.
@@ -289,6 +289,8 @@ def assess(
     ----------
     error : ndarray, shape (n,)
         Error of the modes at the start of the step, signed.
+    carried : ndarray, shape (n, 4)
+        What has become of it at the points between and the end (see `engine.growth`).
     places : ndarray, shape (n, N_PLACES)
         Filled with the error of the modes at the start, the points between and the end; dense output included.
     sums : ndarray, shape (4, 4)
@@ -322,7 +324,7 @@ def assess(
         for p in range(4):
             row = FIRST + p if p < 3 else END
             fresh = miss[k, row] * missed
-            places[k, p + 1] = decay[k, row] * error[k] + left[p] + fresh
+            places[k, p + 1] = carried[k, p] + left[p] + fresh
             sums[1, p] += gap[k] * fresh
             sums[2, p] += gap[k] * places[k, p + 1]
         places[k, 1] += mode_first

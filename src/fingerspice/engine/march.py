@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fingerspice.compiled import borrow, jit
 from fingerspice.engine.charge import charge_step
 from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, weigh
+from fingerspice.engine.growth import carry
 from fingerspice.engine.model import Segment, branch_area, dot, source, turns_at_zero
 from fingerspice.engine.pace import Pace, change_level, choose_step, enter, nearest_level, rung, take_branch
 from fingerspice.engine.readout import (
@@ -77,6 +78,7 @@ class Work(NamedTuple):
     left_before: FloatArray
     w0: FloatArray
     places: FloatArray
+    carried: FloatArray
     values: FloatArray
     coefficients: FloatArray
     outputs: FloatArray
@@ -97,6 +99,7 @@ def new_work(n: int) -> Work:
         np.zeros((n, ROWS)),
         np.zeros(n),
         np.zeros((n, N_PLACES)),
+        np.zeros((n, N_PLACES - 1)),
         np.zeros((n + 2, ROWS)),
         np.zeros((n + 2, ROWS)),
         np.zeros((2, WRITTEN_AT_ONCE)),
@@ -179,7 +182,7 @@ def march(
     r, base, w, pull, used = borrow(work.r), borrow(work.base), borrow(work.w), borrow(work.pull), borrow(work.used)
     pull_before, left_before = borrow(work.pull_before), borrow(work.left_before)
     w0, places, sums, weight = borrow(work.w0), borrow(work.places), borrow(work.sums), borrow(work.weight)
-    outputs = borrow(work.outputs)
+    outputs, carried = borrow(work.outputs), borrow(work.carried)
     t_out, left, out = borrow(t_out), borrow(left), borrow(out)
     values, coefficients = borrow(work.values), borrow(work.coefficients)
     kept_times, kept_series, tried = borrow(kept.times), borrow(kept.series), borrow(tried)
@@ -299,8 +302,9 @@ def march(
                 continue
             step_error = math.inf
             if closed:
+                carry(model, rates, gap, push, tap, tap_k, feed, decay, h, sign, w, r, error, carried)
                 step_error, run_error, magnified = assess(
-                    mobile, area0, gain, gap, decay, phi, miss, error, w, pull, used, r, places, sums
+                    mobile, area0, gain, gap, phi, miss, error, carried, w, pull, used, r, places, sums
                 )
             note(tried, counters[ACCEPTED] + counters[REJECTED], t, h, step_error / tol)
             if not controlled and closed:

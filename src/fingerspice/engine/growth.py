@@ -1,0 +1,108 @@
+"""How the error of a run is carried through a step where the area's answer to it makes it grow.
+
+The modes' own decay carries an error e while the area stands still. The area answers with dq = q' du for an error du of
+the gap voltage, which forces the modes by G du: where that supports du, errors grow, and near an instability of the
+circuit (a layer's leak that rises with the area, or an area that the stored charge drives on) they grow thousandfold
+within a few steps.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.compiled import jit
+from fingerspice.engine.model import Model, branch_area
+from fingerspice.engine.rows import DQ, SOURCE, X_GAP, Q, U
+from fingerspice.numerics.lobatto import END, NODES, POINTS
+
+FloatArray = NDArray[np.float64]
+
+# Loop gain of the area, over a step, up to which the modes' own decay is taken for all.
+_SLIGHT = 0.05
+# Growth within the interval between two nodes, at most.
+_MOST = 10.0
+# The node after each of the points between, and the end.
+_PLACES = np.append(np.searchsorted(POINTS[:NODES], POINTS[NODES:]), END)
+
+
+@jit
+def _answer(
+    model: Model, push: FloatArray, tap: FloatArray, tap_k: FloatArray, feed: FloatArray, sign: float, w: FloatArray,
+    r: FloatArray, j: int, forced: FloatArray,
+) -> float:  # fmt: skip
+    """G at a node, into `forced` (n,): forcing of the modes for an error of the gap voltage; du for one of gap @ w."""
+    q = r[Q, j]
+    if model.mobile:
+        slope = r[DQ, j]
+    else:
+        _, slope = branch_area(model, sign, r[U, j])
+    for k in range(push.size):
+        forced[k] = -push[k] * r[SOURCE, j] / (model.area0 * q * q) if model.mobile else 0.0
+    for t in range(tap_k.size):
+        tapped = tap_k[t] * r[SOURCE, j]
+        for k in range(push.size):
+            tapped += tap[t, k] * w[k, j]
+        for k in range(push.size):
+            forced[k] += feed[k, t] * tapped
+    for k in range(push.size):
+        forced[k] *= slope
+    if not model.mobile:
+        return 1.0
+    return model.area0 * q / max(1.0 - model.area0 * r[X_GAP, j] * r[DQ, j], 1e-12)
+
+
+@jit
+def carry(
+    model: Model, rates: FloatArray, gap: FloatArray, push: FloatArray, tap: FloatArray, tap_k: FloatArray,
+    feed: FloatArray, decay: FloatArray, h: float, sign: float, w: FloatArray, r: FloatArray, error: FloatArray,
+    carried: FloatArray,
+) -> None:  # fmt: skip
+    """The error of the modes (n,) at the start of a step as it is at the points between and the end, into `carried`.
+
+    `carried` (n, 4); see `exponential.converge` for the rest.
+    """
+    n = gap.size
+    forced = np.empty(n)
+    gain = 0.0
+    for j in (NODES // 2, END):
+        factor = _answer(model, push, tap, tap_k, feed, sign, w, r, j, forced)
+        loop = 0.0
+        for k in range(n):
+            loop += gap[k] * forced[k] * (h if rates[k] * h < 1e-9 else (1.0 - decay[k, END]) / rates[k])
+        gain = max(gain, factor * loop)
+    if not gain > _SLIGHT:
+        for k in range(n):
+            for p in range(4):
+                carried[k, p] = decay[k, NODES + p if p < 3 else END] * error[k]
+        return
+    # By the exponential trapezoidal rule between nodes: only the gap voltage is implicit.
+    now = error[:n].copy()
+    moved = 0.0
+    factor = _answer(model, push, tap, tap_k, feed, sign, w, r, 0, forced)
+    for k in range(n):
+        moved += factor * gap[k] * now[k]
+    for j in range(1, NODES):
+        dt = h * (POINTS[j] - POINTS[j - 1])
+        for k in range(n):
+            now[k] = now[k] * math.exp(-rates[k] * dt) + 0.5 * _reach(rates[k], dt) * forced[k] * moved
+        factor = _answer(model, push, tap, tap_k, feed, sign, w, r, j, forced)
+        known = 0.0
+        loop = 0.0
+        for k in range(n):
+            known += factor * gap[k] * now[k]
+            loop += 0.5 * factor * gap[k] * _reach(rates[k], dt) * forced[k]
+        moved = known / max(1.0 - loop, 1.0 / _MOST)
+        for k in range(n):
+            now[k] += 0.5 * _reach(rates[k], dt) * forced[k] * moved
+        for p in range(4):
+            if _PLACES[p] == j:
+                carried[:, p] = now
+
+
+@jit
+def _reach(rate: float, dt: float) -> float:
+    """Response of a mode to a forcing of one for so long, s."""
+    return dt if rate * dt < 1e-9 else -math.expm1(-rate * dt) / rate
