@@ -24,21 +24,21 @@ FloatArray = NDArray[np.float64]
 _SLIGHT = 0.05
 # Growth within the interval between two nodes, at most.
 _MOST = 10.0
+_MIDDLE = NODES // 2
 # The node after each of the points between, and the end.
 _PLACES = np.append(np.searchsorted(POINTS[:NODES], POINTS[NODES:]), END)
 
 
 @jit
 def _answer(
-    model: Model, push: FloatArray, tap: FloatArray, tap_k: FloatArray, feed: FloatArray, sign: float, w: FloatArray,
-    r: FloatArray, j: int, forced: FloatArray,
+    model: Model, push: FloatArray, tap: FloatArray, tap_k: FloatArray, feed: FloatArray, w: FloatArray,
+    r: FloatArray, j: int, slope: float, forced: FloatArray,
 ) -> float:  # fmt: skip
-    """G at a node, into `forced` (n,): forcing of the modes for an error of the gap voltage; du for one of gap @ w."""
+    """G at a node, into `forced` (n,): forcing of the modes for an error of the gap voltage; du for one of gap @ w.
+
+    `slope` is that of 1/A there, 1/(m^2 V).
+    """
     q = r[Q, j]
-    if model.mobile:
-        slope = r[DQ, j]
-    else:
-        _, slope = branch_area(model, sign, r[U, j])
     for k in range(push.size):
         forced[k] = -push[k] * r[SOURCE, j] / (model.area0 * q * q) if model.mobile else 0.0
     for t in range(tap_k.size):
@@ -51,24 +51,35 @@ def _answer(
         forced[k] *= slope
     if not model.mobile:
         return 1.0
-    return model.area0 * q / max(1.0 - model.area0 * r[X_GAP, j] * r[DQ, j], 1e-12)
+    return model.area0 * q / max(1.0 - model.area0 * r[X_GAP, j] * slope, 1e-12)
+
+
+@jit
+def _slope(model: Model, sign: float, r: FloatArray, j: int) -> float:
+    """Slope of 1/A at a node, 1/(m^2 V)."""
+    if model.mobile:
+        return r[DQ, j]
+    _, slope = branch_area(model, sign, r[U, j])
+    return slope
 
 
 @jit
 def carry(
     model: Model, rates: FloatArray, gap: FloatArray, push: FloatArray, tap: FloatArray, tap_k: FloatArray,
     feed: FloatArray, decay: FloatArray, h: float, sign: float, w: FloatArray, r: FloatArray, error: FloatArray,
-    carried: FloatArray,
+    carried: FloatArray, forced: FloatArray,
 ) -> None:  # fmt: skip
     """The error of the modes (n,) at the start of a step as it is at the points between and the end, into `carried`.
 
-    `carried` (n, 4); see `exponential.converge` for the rest.
+    `carried` (n, 4); `forced` (n,) is for passing use; see `exponential.converge` for the rest.
     """
     n = gap.size
-    forced = np.empty(n)
     gain = 0.0
-    for j in (NODES // 2, END):
-        factor = _answer(model, push, tap, tap_k, feed, sign, w, r, j, forced)
+    for j in (_MIDDLE, END):
+        # The mean slope will do to see whether it matters.
+        way = r[U, j] - r[U, j - _MIDDLE]
+        slope = r[DQ, j] if model.mobile else ((r[Q, j] - r[Q, j - _MIDDLE]) / way if way != 0.0 else 0.0)
+        factor = _answer(model, push, tap, tap_k, feed, w, r, j, slope, forced)
         loop = 0.0
         for k in range(n):
             loop += gap[k] * forced[k] * (h if rates[k] * h < 1e-9 else (1.0 - decay[k, END]) / rates[k])
@@ -81,14 +92,14 @@ def carry(
     # By the exponential trapezoidal rule between nodes: only the gap voltage is implicit.
     now = error[:n].copy()
     moved = 0.0
-    factor = _answer(model, push, tap, tap_k, feed, sign, w, r, 0, forced)
+    factor = _answer(model, push, tap, tap_k, feed, w, r, 0, _slope(model, sign, r, 0), forced)
     for k in range(n):
         moved += factor * gap[k] * now[k]
     for j in range(1, NODES):
         dt = h * (POINTS[j] - POINTS[j - 1])
         for k in range(n):
             now[k] = now[k] * math.exp(-rates[k] * dt) + 0.5 * _reach(rates[k], dt) * forced[k] * moved
-        factor = _answer(model, push, tap, tap_k, feed, sign, w, r, j, forced)
+        factor = _answer(model, push, tap, tap_k, feed, w, r, j, _slope(model, sign, r, j), forced)
         known = 0.0
         loop = 0.0
         for k in range(n):

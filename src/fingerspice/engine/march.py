@@ -79,6 +79,7 @@ class Work(NamedTuple):
     w0: FloatArray
     places: FloatArray
     carried: FloatArray
+    forced: FloatArray
     values: FloatArray
     coefficients: FloatArray
     outputs: FloatArray
@@ -100,6 +101,7 @@ def new_work(n: int) -> Work:
         np.zeros(n),
         np.zeros((n, N_PLACES)),
         np.zeros((n, N_PLACES - 1)),
+        np.zeros(n),
         np.zeros((n + 2, ROWS)),
         np.zeros((n + 2, ROWS)),
         np.zeros((2, WRITTEN_AT_ONCE)),
@@ -182,7 +184,7 @@ def march(
     r, base, w, pull, used = borrow(work.r), borrow(work.base), borrow(work.w), borrow(work.pull), borrow(work.used)
     pull_before, left_before = borrow(work.pull_before), borrow(work.left_before)
     w0, places, sums, weight = borrow(work.w0), borrow(work.places), borrow(work.sums), borrow(work.weight)
-    outputs, carried = borrow(work.outputs), borrow(work.carried)
+    outputs, carried, forced = borrow(work.outputs), borrow(work.carried), borrow(work.forced)
     t_out, left, out = borrow(t_out), borrow(left), borrow(out)
     values, coefficients = borrow(work.values), borrow(work.coefficients)
     kept_times, kept_series, tried = borrow(kept.times), borrow(kept.series), borrow(tried)
@@ -302,7 +304,7 @@ def march(
                 continue
             step_error = math.inf
             if closed:
-                carry(model, rates, gap, push, tap, tap_k, feed, decay, h, sign, w, r, error, carried)
+                carry(model, rates, gap, push, tap, tap_k, feed, decay, h, sign, w, r, error, carried, forced)
                 step_error, run_error, magnified = assess(
                     mobile, area0, gain, gap, phi, miss, error, carried, w, pull, used, r, places, sums
                 )
