@@ -289,12 +289,14 @@ def march(
             )  # fmt: skip
             counters[NFEV] += passes * NODES
             wrong = first_wrong(u_rows, sign, tol) if coupled else 0
-            if wrong == 1 and flips < 2 and sign * u_rows[0] <= 1e-9 * abs(u_rows[1]):
+            # An iteration that has not closed may lead anywhere.
+            at_zero = sign * u_rows[0] <= 1e-9 * min(abs(u_rows[1]), u_top)
+            if wrong == 1 and flips < 2 and at_zero:
                 # The step starts at a zero and leaves on the other side.
                 flip = True
                 break
             below = dip(u_rows, sign, tol, wrong, coefficients[0]) if coupled and closed else 0.0
-            if 0.0 < below < POINTS[1] and sign * u_rows[0] <= 1e-9 * abs(u_rows[1]):
+            if 0.0 < below < POINTS[1] and at_zero:
                 # The step starts at a zero and is soon back there: a shorter one will see it.
                 counters[REJECTED] += 1
                 h = rung(2.0 * below * h)
