@@ -176,7 +176,7 @@ def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: floa
         step = (k_u - u + b * q) / slope
         new = u + step
         q_new, dq_new = branch_area(model, sign, new)
-        if not _rises(b, q, dq, q_new, dq_new, step):
+        if not _rises(b, u, q, dq, q_new, dq_new, step, model.curve[0]):
             break
         u, q, dq = new, q_new, dq_new
         if _settled(step, last, slope, abs(u) + abs(k_u)):
@@ -189,12 +189,17 @@ def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: floa
 
 
 @jit
-def _rises(b: float, q: float, dq: float, q_new: float, dq_new: float, step: float) -> bool:
-    """Whether k_u(u) = u - b / A rises all along a step from (q, dq) to (q_new, dq_new), so that no fold is crossed.
+def _rises(
+    b: float, u: float, q: float, dq: float, q_new: float, dq_new: float, step: float, lowest: float
+) -> bool:  # fmt: skip
+    """Whether k_u(u) = u - b / A rises all along a step from (u, q, dq) to (q_new, dq_new), so that no fold is crossed.
 
     No step takes off more than three quarters of the slope, at its end or in between, as far as the slopes at both ends
-    miss the mean one; nor does the area change by a third.
+    miss the mean one; nor does the area change by a third, nor the voltage by more than a half or by its own scale, as
+    far as which (`lowest`, V) the area may be continued past 0 V.
     """
+    if abs(step) > max(0.5 * abs(u), abs(lowest)):
+        return False
     slope, slope_new = 1.0 - b * dq, 1.0 - b * dq_new
     if not (slope_new > 0.25 * slope and abs(q_new - q) < 0.3 * min(q, q_new)):
         return False
@@ -237,7 +242,7 @@ def walk(model: Model, k_u: float, b: float, sign: float, u: float, stops: bool)
             if stops and sign * new < 0.0:
                 new = 0.0
             q_new, dq_new = branch_area(model, sign, new)
-            if _rises(b, q, dq, q_new, dq_new, new - u):
+            if _rises(b, u, q, dq, q_new, dq_new, new - u, model.curve[0]):
                 break
             step *= 0.5
         if abs(step) <= 1e-10 * abs(u) and abs(step) < abs(whole):
