@@ -13,6 +13,12 @@ import fingerspice
 PACKAGE = Path(fingerspice.__file__).parent
 
 
+def printed(code, folder, **more):
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {"PYTHONPATH": str(folder)} | more
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    return float(done.stdout)
+
+
 def area_at_zero_volt(folder):
     # numba would look in the user's own cache where the package's cannot be written; here it can.
     code = (
@@ -20,9 +26,7 @@ def area_at_zero_volt(folder):
         "c = Contact(3.5e-6, 1.0, 0.5, 0.3, 54.4e-6, 0.52, 32e-6 * 1e3**1.41, 1.41, 5e-9)\n"
         "print(repr(ridge_area(0.0, c.pack())))"
     )
-    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {"PYTHONPATH": str(folder)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
-    return float(done.stdout)
+    return printed(code, folder)
 
 
 def test_a_change_of_one_source_reaches_the_compiled_code_of_another(tmp_path):
@@ -41,3 +45,20 @@ def test_a_change_of_one_source_reaches_the_compiled_code_of_another(tmp_path):
     oldest = min(p.stat().st_mtime_ns for p in copy.rglob("*.nbc"))
     assert oldest > written, "a cache file from before the change is still there"
     assert newest >= oldest
+
+
+def test_a_change_reaches_code_that_is_cached_elsewhere(tmp_path):
+    copy = tmp_path / "fingerspice"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    # `source` calls `chebyshev.evaluate`, which stands in another file.
+    code = (
+        "import numpy as np\n"
+        "from fingerspice.engine.model import Segment, source\n"
+        "print(repr(source(Segment(0.0, 1.0, np.zeros((1, 6)), np.array([3.0, 0.0])), 0.5)[0]))"
+    )
+    cache = tmp_path / "cache"
+    assert printed(code, tmp_path, NUMBA_CACHE_DIR=str(cache)) == 3.0
+    assert list(cache.rglob("*.nbc")), "nothing was cached there, so this test would prove nothing"
+    with (copy / "numerics" / "chebyshev.py").open("a") as module:
+        module.write("\n\n@jit\ndef evaluate(series, x):\n    return 7.0, 0.0\n")
+    assert printed(code, tmp_path, NUMBA_CACHE_DIR=str(cache)) == 7.0

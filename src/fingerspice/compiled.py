@@ -1,7 +1,7 @@
 """The compiler's decorator, with a cache on disk that no change of the sources outlives.
 
 numba keys its cache by the one file a function stands in, while the compiled code holds every function it calls: after
-a change of one file it would go on running the old code of the others.
+a change of one file it would go on running the old code of the others. So the key holds a stamp of all files.
 """
 
 from __future__ import annotations
@@ -24,25 +24,30 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGE = Path(__file__).resolve().parent
 
 
+_STAMP = "\n".join(f"{p.name} {p.stat().st_mtime_ns} {p.stat().st_size}" for p in sorted(_PACKAGE.rglob("*.py")))
+
+
 def _drop_stale_cache() -> None:
-    sources = sorted(_PACKAGE.rglob("*.py"))
-    stamp = "\n".join(f"{p.name} {p.stat().st_mtime_ns} {p.stat().st_size}" for p in sources)
+    """Delete what no key leads to any more, where it stands in the package."""
     record = _PACKAGE / "__pycache__" / "compiled.stamp"
     try:
-        if record.is_file() and record.read_text() == stamp:
+        if record.is_file() and record.read_text() == _STAMP:
             return
         for kind in ("*.nbi", "*.nbc"):
             for file in _PACKAGE.rglob(kind):
                 file.unlink(missing_ok=True)
         record.parent.mkdir(exist_ok=True)
-        record.write_text(stamp)
+        record.write_text(_STAMP)
     except OSError:
         # A package that cannot be written has its cache elsewhere, and is replaced as a whole.
         return
 
 
 class _Cache(FunctionCache):
-    """numba's, where a disk that is full means that the next process compiles again."""
+    """numba's, for this state of the package; a disk that is full means that the next process compiles again."""
+
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        return (*cast(Any, super())._index_key(sig, codegen), _STAMP)
 
     def save_overload(self, sig: Any, data: Any) -> None:
         with suppress(OSError):

@@ -389,8 +389,8 @@ def advance(
             if margin < _NEAR_FOLD:
                 # What rounding leaves of the way is not worth its many steps.
                 least = max(least, 1e-8 * since)
-            # The state is a voltage at the area of 0 V.
-            allowed[:] = scale / (model.area0 * q)
+            # The state is a voltage at the area of 0 V, and the gap's moves the farther, the nearer the fold is.
+            allowed[:] = scale * min(margin, 1.0) / (model.area0 * q)
         h, last = _controlled_step(
             model, method, segment, since, remaining, least, y, allowed, control, counters, k, y1, tried
         )

@@ -51,14 +51,13 @@ def _answer(
         forced[k] *= slope
     if not model.mobile:
         return 1.0
-    return model.area0 * q / max(1.0 - model.area0 * r[X_GAP, j] * slope, 1e-12)
+    magnified: float = model.area0 * q / max(1.0 - model.area0 * r[X_GAP, j] * slope, 1e-12)
+    return magnified
 
 
 @jit
 def _slope(model: Model, sign: float, r: FloatArray, j: int) -> float:
     """Slope of 1/A at a node, 1/(m^2 V)."""
-    if model.mobile:
-        return r[DQ, j]
     _, slope = branch_area(model, sign, r[U, j])
     return slope
 
