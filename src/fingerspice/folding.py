@@ -26,9 +26,10 @@ FloatArray = NDArray[np.float64]
 
 FINEST_RTOL = 1e-12
 # Tries at a path to a fold: by how much looser, but no looser than this, and the evaluations they may take. Where leaks
-# are fast beside the path, their rounding leaves no tight tolerance to be met, or only in many steps.
+# are fast beside the path, their rounding leaves no tight tolerance to be met, or only in many steps: these are worth it
+# where the fold is not at hand.
 TRIES = ((1.0, 10_000), (1e3, 10_000), (1e6, 10_000), (1e3, 100_000), (1e6, 100_000))
-LOOSEST_RTOL = 1e-6
+LOOSEST_RTOL, AT_HAND = 1e-6, 1e-4
 # A fold is met at this distance, and looked for over so many of the shortest time constants.
 NOTHING_LEFT, LONGEST = 1e-10, 1e12
 
@@ -57,7 +58,7 @@ def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray)
     begun = _start(problem, run.state)
     if run.margin <= 0.0 or math.isnan(begun.u):
         return run
-    path = _ahead(problem, run.state, begun, FINEST_RTOL)
+    path = _ahead(problem, run.state, begun, run.margin, FINEST_RTOL)
     if path is None:
         return None
     # The row of where the steps stopped is no output.
@@ -97,7 +98,7 @@ def meets_fold(problem: Problem, rtol: float) -> bool:
     if run.status is not Status.FOLD:
         raise SolveError(Failure(run.status, run.status.cause, run.status.action, run.t_failed, tried=run.tried))
     begun = _start(problem, run.state)
-    return run.margin <= 0.0 or math.isnan(begun.u) or _ahead(problem, run.state, begun, rtol) is not None
+    return run.margin <= 0.0 or math.isnan(begun.u) or _ahead(problem, run.state, begun, run.margin, rtol) is not None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,9 +155,10 @@ def _start(problem: Problem, state: State) -> _Start:
     return _Start(segment, end, math.copysign(1.0, u), u)
 
 
-def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path | None:
-    """The path from a state to a fold in the segment of the source that it stands in; None where none is found."""
-    for tried, evaluations in dict.fromkeys((max(rtol, min(x * rtol, LOOSEST_RTOL)), n) for x, n in TRIES):
+def _ahead(problem: Problem, state: State, begun: _Start, margin: float, rtol: float) -> _Path | None:
+    """The path from a state, so far from a fold, to that in its segment of the source; None where none is found."""
+    tries = TRIES if margin > AT_HAND else TRIES[:3]
+    for tried, evaluations in dict.fromkeys((max(rtol, min(x * rtol, LOOSEST_RTOL)), n) for x, n in tries):
         try:
             return _path(problem, state, begun, tried, evaluations)
         except _LostError:

@@ -34,7 +34,8 @@ class Run:
 
     `t`, `left`, `live`, `z`, `current` are as in `Record`, up to the time reached; `rough` is the source's (see
     `SourceTable`), V, and `unseen` the first output (s) at which it is not what was integrated, by how much (V);
-    `margin` is the smallest distance to the fold met, and `tried` the last steps tried.
+    `margin` is the smallest distance to the fold met, `fold_spread` how far (s) the shadow run's fold is from its own,
+    and `tried` the last steps tried.
     """
 
     t: FloatArray
@@ -54,6 +55,7 @@ class Run:
     rough: float = 0.0
     unseen: tuple[float, float] | None = None
     margin: float = 1.0
+    fold_spread: float = np.inf
     tried: tuple[Attempt, ...] = ()
 
     def record(self, problem: Problem) -> Record:

@@ -29,8 +29,8 @@ from fingerspice.runs import (
 )
 
 LOG_ROWS = 1024
-# Error over the peak above which the time of a fold is not believed.
-FOLD_ERROR = 0.01
+# A fold is believed where the error over the peak is below this, or where the shadow meets it as soon, relative.
+FOLD_ERROR, FOLD_SPREAD = 0.01, 1e-6
 # Steps taken and refused, the shadow's too, to begin with and over the run: what needs more has a cause that smaller
 # steps do not mend.
 FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
@@ -175,7 +175,7 @@ def integrate(
     finer = np.append(SHADOW * scale[:-1], np.inf)
     other = Track(problem, method, finer, t_out[:0], left[:0], rows[:0], log[:0])
     meter = _Meter(problem)
-    status, t_failed, last = Status.SUCCESS, None, None
+    status, t_failed, last, spread = Status.SUCCESS, None, None, np.inf
     table = None
     for table in tables:
         code = loop.LOG_FULL
@@ -194,6 +194,8 @@ def integrate(
             status = Status.FOLD if folding else Status.STEP_UNDERFLOW
             status = Status.TOO_MANY_STEPS if code == loop.TOO_MANY else status
             t_failed = main.t
+            if status is Status.FOLD and shadow and other.advance(table, float(table.edges[-1])) != loop.TOO_MANY:
+                spread = abs(other.t - main.t)
             break
         if table.not_finite is not None:
             status, t_failed = Status.SOURCE_NOT_FINITE, table.not_finite
@@ -234,6 +236,7 @@ def integrate(
         ),
         t_failed=t_failed,
         margin=float(main.control[loop.MARGIN]),
+        fold_spread=spread,
         tried=last_tried(main.tried),
         rough=tables.rough,
         unseen=tables.unseen,
@@ -300,6 +303,7 @@ def solve(
         if run.status is Status.FOLD:
             # A fold magnifies errors, but one that is met by a run that is half error may stand anywhere.
             enough, less = run.error.u_gap <= FOLD_ERROR * run.peak_u, 0.01
+            enough = enough or run.fold_spread <= FOLD_SPREAD * (run.state.t - problem.t_start)
         elif run.status is Status.SUCCESS:
             worst = run.excess(rtol)
             enough, less = worst <= 1.0, min(0.3, 0.5 / worst) if worst > 0.0 else 0.3

@@ -200,6 +200,7 @@ def _controlled_step(
     control: FloatArray,
     counters: NDArray[np.int64],
     k: FloatArray,
+    us: FloatArray,
     y1: FloatArray,
     tried: FloatArray,
 ) -> tuple[float, bool]:
@@ -209,7 +210,7 @@ def _controlled_step(
     """
     h, last = _choose_step(model, method, remaining, control, k[0], scale)
     while True:
-        norm, nfev = take_step(model, method, segment, since, h, y, control[SIGN], control[U_GAP], scale, k, y1)
+        norm, nfev = take_step(model, method, segment, since, h, y, control[SIGN], control[U_GAP], scale, k, us, y1)
         counters[NFEV] += nfev
         note(tried, counters[ACCEPTED] + counters[REJECTED], segment.start + since, h, norm)
         factor = 6.0
@@ -229,6 +230,18 @@ def _controlled_step(
 
 
 @jit
+def _nearest(c: FloatArray, us: FloatArray, u_start: float, theta: float) -> float:
+    """Gap voltage (V) of the stage nearest to fraction `theta` of a step, or of its start."""
+    u = u_start
+    distance = theta
+    for i in range(c.size):
+        if abs(c[i] - theta) < distance:
+            distance = abs(c[i] - theta)
+            u = us[i]
+    return u
+
+
+@jit
 def _write_log(
     model: Model,
     segment: Segment,
@@ -237,6 +250,8 @@ def _write_log(
     reached: float,
     stop: float,
     last: bool,
+    c: FloatArray,
+    us: FloatArray,
     y: FloatArray,
     poly: FloatArray,
     control: FloatArray,
@@ -262,7 +277,8 @@ def _write_log(
         dense_state(theta, y, poly, state)
         u_source, _ = source(segment, t - segment.start)
         x_gap = dot(model.gap, state)
-        u = gap_voltage(model, model.k_gap * u_source, x_gap, control[SIGN], control[U_GAP])
+        guess = _nearest(c, us, control[U_GAP], theta)
+        u = gap_voltage(model, model.k_gap * u_source, x_gap, control[SIGN], guess)
         q, dq = branch_area(model, control[SIGN], u)
         if model.mobile and model.coupled:
             control[MARGIN] = min(control[MARGIN], 1.0 - model.area0 * x_gap * dq)
@@ -281,6 +297,8 @@ def _write_outputs(
     h: float,
     reached: float,
     ended: float,
+    c: FloatArray,
+    us: FloatArray,
     y: FloatArray,
     poly: FloatArray,
     control: FloatArray,
@@ -299,7 +317,8 @@ def _write_outputs(
         theta = max(0.0, min((wanted - since) / h, reached))
         dense_state(theta, y, poly, state)
         u_source, du_source = source(segment, since + theta * h)
-        write_row(model, u_source, du_source, state, control[SIGN], control[U_GAP], rows[i])
+        guess = _nearest(c, us, control[U_GAP], theta)
+        write_row(model, u_source, du_source, state, control[SIGN], guess, rows[i])
         counters[OUTPUT] += 1
 
 
@@ -348,6 +367,7 @@ def advance(
         DONE, LOG_FULL (call again), NO_SOLUTION (past a fold at the time reached), STEP_UNDERFLOW or TOO_MANY steps.
     """
     k = np.zeros((method.a.shape[0], y.size))
+    us = np.zeros(method.a.shape[0])
     poly = np.zeros((y.size, method.dense.shape[1]))
     y1 = np.empty(y.size)
     allowed = scale.copy()
@@ -389,10 +409,10 @@ def advance(
             if margin < _NEAR_FOLD:
                 # What rounding leaves of the way is not worth its many steps.
                 least = max(least, 1e-8 * since)
-            # The state is a voltage at the area of 0 V, and the gap's moves the farther, the nearer the fold is.
-            allowed[:] = scale * min(margin, 1.0) / (model.area0 * q)
+            # The state is a voltage at the area of 0 V.
+            allowed[:] = scale / (model.area0 * q)
         h, last = _controlled_step(
-            model, method, segment, since, remaining, least, y, allowed, control, counters, k, y1, tried
+            model, method, segment, since, remaining, least, y, allowed, control, counters, k, us, y1, tried
         )
         if h == 0.0:
             return STEP_UNDERFLOW
@@ -413,7 +433,7 @@ def advance(
         if theta < 1.0 and method.implicit:
             # Collocation is more exact at the end of a step than inside: step again to end on the zero.
             norm, nfev = take_step(
-                model, method, segment, since, theta * h, y, control[SIGN], control[U_GAP], scale, k, y1
+                model, method, segment, since, theta * h, y, control[SIGN], control[U_GAP], scale, k, us, y1
             )
             counters[NFEV] += nfev
             if norm < math.inf:
@@ -421,15 +441,19 @@ def advance(
                 theta = 1.0
                 dense_polynomial(k, method.dense, h, poly)
         reached = min(theta, 1.0)
-        _write_outputs(model, segment, since, h, reached, ended, y, poly, control, counters, t_out, left, rows)
+        _write_outputs(
+            model, segment, since, h, reached, ended, method.c, us, y, poly, control, counters, t_out, left, rows
+        )
         if log.shape[0] > 0:
-            _write_log(model, segment, since, h, reached, stop, last, y, poly, control, counters, log)
+            _write_log(model, segment, since, h, reached, stop, last, method.c, us, y, poly, control, counters, log)
         if reached < 1.0:
             dense_state(reached, y, poly, y1)
         if theta <= 1.0:
             control[SIGN] = -control[SIGN]
             control[U_GAP] = 0.0
             counters[ZEROS] += 1
+        if reached == 1.0 and theta > 1.0:
+            control[U_GAP] = _nearest(method.c, us, control[U_GAP], 1.0)
         y[:] = y1
         control[SINCE] = ended
         control[T] = stop if last else min(start + ended, np.nextafter(stop, start))

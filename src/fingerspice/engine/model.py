@@ -375,11 +375,15 @@ def charge_rate(
 
 
 @jit
-def jacobian(model: Model, u_source: float, y: FloatArray, sign: float, guess: float, out: FloatArray) -> None:
-    """Write d x'/d x (n, n) into `out`."""
+def jacobian(
+    model: Model, u_source: float, y: FloatArray, sign: float, u: float, out: FloatArray, by_u: FloatArray
+) -> None:
+    """Write d x'/d x (n, n) along the area equation into `out`, and d x'/d u (n,) at fixed x into `by_u`.
+
+    `u` is the gap voltage (V), whether it solves the area equation or is on its way there.
+    """
     n = model.gap.size
     x_gap = dot(model.gap, y)
-    u = gap_voltage(model, model.k_gap * u_source, x_gap, sign, guess)
     q, dq = branch_area(model, sign, u)
     scale = model.area0 * q if model.mobile else 1.0
     # dq/dx_j = slope gap_j, through the area equation under `mobile`.
@@ -398,6 +402,7 @@ def jacobian(model: Model, u_source: float, y: FloatArray, sign: float, guess: f
         total += by_q[i]
     last = model.rate[n] + q * model.rate0[n]
     for i in range(n):
+        by_u[i] = (model.k[i] * total - by_q[i]) * dq
         sensitivity = (model.k[i] * total - by_q[i]) * slope
         for j in range(n):
             out[i, j] = model.k[i] * (model.rate[j] + q * model.rate0[j] - last) + sensitivity * model.gap[j]

@@ -9,10 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import jit
-from fingerspice.engine.model import Model, Segment, charge_rate, jacobian, right_hand_side, source
+from fingerspice.engine.model import (
+    Model,
+    Segment,
+    branch_area,
+    charge_rate,
+    dot,
+    jacobian,
+    rates_at,
+    right_hand_side,
+    source,
+)
 from fingerspice.numerics.small import inverse
 
 FloatArray = NDArray[np.float64]
+
+
+# What rounding may leave of Newton's last move, over the local error allowed.
+_FLOOR = 0.02
 
 
 class Method(NamedTuple):
@@ -41,18 +55,20 @@ def take_step(
     h: float,
     y: FloatArray,
     sign: float,
-    guess: float,
+    u: float,
     scale: FloatArray,
     k: FloatArray,
+    us: FloatArray,
     y1: FloatArray,
 ) -> tuple[float, int]:
     """Step from `t0` (s into the segment) by `h`; fill the stages `k` (s, n + 1) and the end `y1`.
 
-    For an explicit method k[0] is given. Returns the local error over `scale`, and the evaluations spent.
+    `u` is the gap voltage (V) at the start, `us` (s,) takes that of every stage. For an explicit method k[0] is given.
+    Returns the local error over `scale`, and the evaluations spent.
     """
     if method.implicit:
-        return _collocation_step(model, method, segment, t0, h, y, sign, guess, scale, k, y1)
-    return _explicit_step(model, method, segment, t0, h, y, sign, guess, scale, k, y1)
+        return _collocation_step(model, method, segment, t0, h, y, sign, u, scale, k, us, y1)
+    return _explicit_step(model, method, segment, t0, h, y, sign, u, scale, k, us, y1)
 
 
 @jit
@@ -64,18 +80,20 @@ def _explicit_step(
     h: float,
     y: FloatArray,
     sign: float,
-    guess: float,
+    u: float,
     scale: FloatArray,
     k: FloatArray,
+    us: FloatArray,
     y1: FloatArray,
 ) -> tuple[float, int]:
     stages = method.a.shape[0]
     stage = np.empty(y.size)
     norm = math.inf
+    us[0] = u
     for i in range(1, stages):
         _stage_state(method.a, i, i, h, y, k, stage)
         u_source, du_source = source(segment, t0 + method.c[i] * h)
-        guess = right_hand_side(model, u_source, du_source, stage, sign, guess, k[i])
+        us[i] = right_hand_side(model, u_source, du_source, stage, sign, us[i - 1], k[i])
         if i == method.n_end:
             y1[:] = stage
             norm = _error_norm(h, method.e, k, i + 1, scale)
@@ -114,30 +132,15 @@ def _error_norm(h: float, e: FloatArray, k: FloatArray, stages: int, scale: Floa
 
 
 @jit
-def _newton_inverse(
-    model: Model,
-    method: Method,
-    segment: Segment,
-    t0: float,
-    h: float,
-    y: FloatArray,
-    sign: float,
-    guess: float,
-    base: FloatArray,
-) -> FloatArray:
-    """Inverse of I - h A (x) J with J at the start of the step; `base` takes y' there."""
-    n = y.size - 1
-    stages = method.a.shape[0]
-    u_source, du_source = source(segment, t0)
-    guess = right_hand_side(model, u_source, du_source, y, sign, guess, base)
-    slope = np.empty((n, n))
-    jacobian(model, u_source, y, sign, guess, slope)
+def _newton_inverse(method: Method, h: float, slopes: FloatArray) -> FloatArray:
+    """Inverse of I - h A (x) J, with J of every stage in `slopes` (s, n, n)."""
+    stages, n, _ = slopes.shape
     matrix = np.eye(stages * n)
     for i in range(stages):
         for r in range(stages):
             for p in range(n):
                 for j in range(n):
-                    matrix[i * n + p, r * n + j] -= h * method.a[i, r] * slope[p, j]
+                    matrix[i * n + p, r * n + j] -= h * method.a[i, r] * slopes[r, p, j]
     return inverse(matrix)
 
 
@@ -150,49 +153,122 @@ def _collocation_step(
     h: float,
     y: FloatArray,
     sign: float,
-    guess: float,
+    u: float,
     scale: FloatArray,
     k: FloatArray,
+    us: FloatArray,
     y1: FloatArray,
 ) -> tuple[float, int]:
+    """By Newton on the rates and, under `mobile`, the gap voltages of all stages at once.
+
+    Near a fold no gap voltage is found from a state alone: the one at hand may be past the fold of the new state.
+    """
     n = y.size - 1
     stages = method.a.shape[0]
-    base = np.empty(n + 1)
-    newton = _newton_inverse(model, method, segment, t0, h, y, sign, guess, base)
+    slopes = np.empty((stages, n, n))
+    by_u = np.empty((stages, n))
+    u_source, du_source = source(segment, t0)
+    rates_at(model, u_source, du_source, y, sign, u, k[0])
+    jacobian(model, u_source, y, sign, u, slopes[0], by_u[0])
+    us[:] = u
+    for i in range(1, stages):
+        slopes[i] = slopes[0]
+        by_u[i] = by_u[0]
+        k[i] = k[0]
+    if model.mobile:
+        # What rounding leaves of a fast leak leads far from where the voltages are.
+        k[:] = 0.0
+    newton = _newton_inverse(method, h, slopes)
     nfev = 1
     if newton[0, 0] != newton[0, 0]:
         return math.inf, nfev
-    for i in range(stages):
-        k[i] = base
     stage = np.empty(n + 1)
     moved = np.empty(n + 1)
     residual = np.empty(stages * n)
+    move = np.empty((stages, n))
+    # Of the area equation, at every stage: what is left of it, its slope, and how its voltage follows gap @ x.
+    off = np.zeros(stages)
+    margin = np.ones(stages)
+    follows = np.ones(stages)
     before = math.inf
+    slow = False
     for iteration in range(40):
         for i in range(stages):
             _stage_state(method.a, i, stages, h, y, k, stage)
             u_source, du_source = source(segment, t0 + method.c[i] * h)
-            guess = right_hand_side(model, u_source, du_source, stage, sign, guess, moved)
-            residual[i * n : (i + 1) * n] = moved[:n] - k[i, :n]
-            k[i, n] = charge_rate(model, u_source, du_source, stage, k[i], sign, guess)
+            x_gap = dot(model.gap, stage)
+            if model.mobile:
+                q, dq = branch_area(model, sign, us[i])
+                follows[i] = model.area0 * q
+                off[i] = us[i] - model.k_gap * u_source - follows[i] * x_gap
+                margin[i] = 1.0 - x_gap * model.area0 * dq
+                if not margin[i] > 0.0:
+                    return math.inf, nfev
+            else:
+                us[i] = model.k_gap * u_source + x_gap
+            if slow:
+                # Near a fold the stiff mode's rate changes within a step: one slope would not do for all stages.
+                jacobian(model, u_source, stage, sign, us[i], slopes[i], by_u[i])
+            rates_at(model, u_source, du_source, stage, sign, us[i], moved)
+            for p in range(n):
+                residual[i * n + p] = moved[p] - k[i, p] - by_u[i, p] * off[i] / margin[i]
+            k[i, n] = charge_rate(model, u_source, du_source, stage, k[i], sign, us[i])
         nfev += stages
-        change = 0.0
+        if slow:
+            newton = _newton_inverse(method, h, slopes)
         for i in range(stages * n):
             value = 0.0
             for j in range(stages * n):
                 value += newton[i, j] * residual[j]
-            k[i // n, i % n] += value
-            value = abs(h * value) / scale[i % n]
+            move[i // n, i % n] = value
+        share = _take(model, method, h, sign, move, off, margin, follows, us, k)
+        change = 0.0
+        for i in range(stages * n):
+            value = abs(h * move[i // n, i % n]) / scale[i % n]
             if not value <= change:
                 change = value
-        if not change < math.inf or (iteration > 3 and change > 0.95 * before and change > 0.1):
+        if not change < math.inf or (iteration > 5 and change > 0.95 * before and change > _FLOOR and share == 1.0):
             return math.inf, nfev
         # Converged, or at the floor of rounding where it no longer contracts.
-        if change <= 1e-4 or (iteration > 3 and change > 0.5 * before):
+        if share == 1.0 and (change <= 1e-4 or (iteration > 5 and change > 0.5 * before and change <= _FLOOR)):
             break
+        slow = iteration > 0 and change > 0.1 * before
         before = change
+    else:
+        return math.inf, nfev
     _stage_state(method.a, stages - 1, stages, h, y, k, y1)
     return _error_norm(h, method.e, k, stages, scale), nfev
+
+
+@jit
+def _take(
+    model: Model, method: Method, h: float, sign: float, move: FloatArray, off: FloatArray, margin: FloatArray,
+    follows: FloatArray, us: FloatArray, k: FloatArray,
+) -> float:  # fmt: skip
+    """Take Newton's move of the rates and gap voltages, or a share of it; returns that."""
+    stages, n = move.shape
+    share = 1.0
+    if model.mobile:
+        moves = np.empty(stages)
+        for i in range(stages):
+            x_gap = 0.0
+            for r in range(stages):
+                x_gap += h * method.a[i, r] * dot(model.gap, move[r])
+            moves[i] = (follows[i] * x_gap - off[i]) / margin[i]
+        for i in range(stages):
+            # No farther at once than the area changes by a third.
+            q, _ = branch_area(model, sign, us[i])
+            while share > 1e-6:
+                new, _ = branch_area(model, sign, us[i] + share * moves[i])
+                if abs(new - q) < 0.3 * min(new, q):
+                    break
+                share *= 0.5
+        for i in range(stages):
+            us[i] += share * moves[i]
+    for i in range(stages):
+        for p in range(n):
+            k[i, p] += share * move[i, p]
+    return share
 
 
 @jit
