@@ -1238,7 +1238,7 @@ def _sample(run: Transient, t: np.ndarray, side: str) -> Transient:
         except _NoStep:
             # The last step before a fold may pass it by rounding.
             if run.fold is None:
-                raise
+                raise RuntimeError(f"no voltages at t = {ti[0]} s, in a step that has them at its nodes") from None
             continue
         x = np.clip(2.0 * (ti - step.t) / step.h - 1.0, -1.0, 1.0)
         leaked = step.q_leak + step.h * (nodes.antiderivative(x) @ step.leak)
@@ -1400,10 +1400,13 @@ class _Run:
             h_next = h * min(3.0, 0.85 * max(error, 1e-12) ** (-1.0 / len(nodes.tau)))
             if cut is not None:
                 h_cut = h * cut
-                for _ in range(2):  # once more: the cut step is not the same polynomial
+                try:
+                    for _ in range(2):  # once more: the cut step is not the same polynomial
+                        step, _ = self.attempt(t, h_cut, u, source, s)
+                        h_cut = self.polish(step)
                     step, _ = self.attempt(t, h_cut, u, source, s)
-                    h_cut = self.polish(step)
-                step, _ = self.attempt(t, h_cut, u, source, s)
+                except _NoStep as reason:
+                    raise RuntimeError(f"no step to the zero at t = {t + h_cut} s: {reason}") from None
                 last = False
             u = step.u_end
             self.steps.append(step)

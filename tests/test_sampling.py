@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import fingerspice as fs
 from fingerspice.circuit.sampling import SourceTable, source_table
-from fingerspice.engine.model import Segment, source
+from fingerspice.engine.segment import Segment, source
 from scenes import table1
 
 STEP = 1e-5

@@ -15,7 +15,7 @@ import fingerspice as fs
 from fingerspice.circuit import ramps, sampling, waveforms
 from fingerspice.circuit.sampling import source_table
 from fingerspice.circuit.waveforms import as_waveform
-from fingerspice.engine.model import Segment, source
+from fingerspice.engine.segment import Segment, source
 from scenes import table1
 from waveform_cases import CASES, Case, turns
 

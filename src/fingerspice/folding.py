@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import OdeSolution, solve_ivp
 
-from fingerspice.engine.model import Segment, dot, ramp, source, voltage_by_time, write_row_at
+from fingerspice.engine.model import dot, ramp, voltage_by_time, write_row_at
+from fingerspice.engine.segment import Segment, source
 from fingerspice.errors import SolveError
 from fingerspice.marching import solve as solve_marching
 from fingerspice.outcome import Failure, State, Status
@@ -26,10 +27,10 @@ FloatArray = NDArray[np.float64]
 
 FINEST_RTOL = 1e-12
 # Tries at a path to a fold: by how much looser, but no looser than this, and the evaluations they may take. Where leaks
-# are fast beside the path, their rounding leaves no tight tolerance to be met, or only in many steps: these are worth it
-# where the fold is not at hand.
+# are fast beside the path, their rounding leaves no tight tolerance to be met, or only in many steps, which are worth
+# it where the fold is near but not at hand.
 TRIES = ((1.0, 10_000), (1e3, 10_000), (1e6, 10_000), (1e3, 100_000), (1e6, 100_000))
-LOOSEST_RTOL, AT_HAND = 1e-6, 1e-4
+LOOSEST_RTOL, AT_HAND, NEAR = 1e-6, 1e-4, 0.03
 # A fold is met at this distance, and looked for over so many of the shortest time constants.
 NOTHING_LEFT, LONGEST = 1e-10, 1e12
 
@@ -157,7 +158,7 @@ def _start(problem: Problem, state: State) -> _Start:
 
 def _ahead(problem: Problem, state: State, begun: _Start, margin: float, rtol: float) -> _Path | None:
     """The path from a state, so far from a fold, to that in its segment of the source; None where none is found."""
-    tries = TRIES if margin > AT_HAND else TRIES[:3]
+    tries = TRIES if AT_HAND < margin < NEAR else TRIES[:3]
     for tried, evaluations in dict.fromkeys((max(rtol, min(x * rtol, LOOSEST_RTOL)), n) for x, n in tries):
         try:
             return _path(problem, state, begun, tried, evaluations)

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from fingerspice.circuit.sampling import SourceTable
 from fingerspice.compiled import jit
 from fingerspice.engine import advance as loop
-from fingerspice.engine.model import Model, Segment, choose_branch, dot, right_hand_side, source, write_row
+from fingerspice.engine.model import Model, choose_branch, dot, right_hand_side, write_row
+from fingerspice.engine.segment import Segment, source
 from fingerspice.errors import InputError
 from fingerspice.marching import solve as solve_marching
 from fingerspice.outcome import ErrorEstimate, State, Status

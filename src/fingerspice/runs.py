@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
-from fingerspice.engine.model import Model, Segment, source, write_row
+from fingerspice.engine.model import Model, write_row
+from fingerspice.engine.segment import Segment, source
 from fingerspice.networks import NetworkProblem
 from fingerspice.outcome import Attempt, ErrorEstimate, State, Status
 from fingerspice.problem import Problem

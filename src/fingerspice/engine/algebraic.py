@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import jit
-from fingerspice.engine.model import Model, Segment, choose_branch, dot, jump_charge, source, write_row
+from fingerspice.engine.model import Model, choose_branch, dot, jump_charge, write_row
+from fingerspice.engine.segment import Segment, source
 
 FloatArray = NDArray[np.float64]
 

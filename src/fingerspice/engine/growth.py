@@ -1,8 +1,8 @@
-"""How the error of a run is carried through a step where the area's answer to it makes it grow.
+"""How the error of a run is carried through a step, with what the area answers to it.
 
 The modes' own decay carries an error e while the area stands still. The area answers with dq = q' du for an error du of
-the gap voltage, which forces the modes by G du: where that supports du, errors grow, and near an instability of the
-circuit (a layer's leak that rises with the area, or an area that the stored charge drives on) they grow thousandfold
+the gap voltage, which forces the modes by G du: that may oppose du or support it, and near an instability of the
+circuit (a layer's leak that rises with the area, or an area that the stored charge drives on) errors grow thousandfold
 within a few steps.
 """
 
@@ -20,13 +20,12 @@ from fingerspice.numerics.lobatto import END, NODES, POINTS
 
 FloatArray = NDArray[np.float64]
 
-# Loop gain of the area, over a step, up to which the modes' own decay is taken for all.
-_SLIGHT = 0.05
-# Growth within the interval between two nodes, at most.
+# Loop gain of the area, over a step, up to which the modes' own decay is taken for all; and up to which two halves of
+# the step are short enough.
+_SLIGHT, _MODERATE = 0.05, 1.0
+# Growth within an interval, at most.
 _MOST = 10.0
 _MIDDLE = NODES // 2
-# The node after each of the points between, and the end.
-_PLACES = np.append(np.searchsorted(POINTS[:NODES], POINTS[NODES:]), END)
 
 
 @jit
@@ -82,37 +81,44 @@ def carry(
         loop = 0.0
         for k in range(n):
             loop += gap[k] * forced[k] * (h if rates[k] * h < 1e-9 else (1.0 - decay[k, END]) / rates[k])
-        gain = max(gain, factor * loop)
+        gain = max(gain, abs(factor * loop))
+    for k in range(n):
+        for p in range(4):
+            carried[k, p] = decay[k, NODES + p if p < 3 else END] * error[k]
     if not gain > _SLIGHT:
-        for k in range(n):
-            for p in range(4):
-                carried[k, p] = decay[k, NODES + p if p < 3 else END] * error[k]
         return
-    # By the exponential trapezoidal rule between nodes: only the gap voltage is implicit.
-    now = error[:n].copy()
+    # By the exponential trapezoidal rule: only the gap voltage is implicit.
+    stride = _MIDDLE if gain <= _MODERATE else 1
     moved = 0.0
     factor = _answer(model, push, tap, tap_k, feed, w, r, 0, _slope(model, sign, r, 0), forced)
     for k in range(n):
-        moved += factor * gap[k] * now[k]
-    for j in range(1, NODES):
-        dt = h * (POINTS[j] - POINTS[j - 1])
+        carried[k, 3] = error[k]
+        moved += factor * gap[k] * error[k]
+    place = 0
+    for j in range(stride, NODES, stride):
+        dt = h * (POINTS[j] - POINTS[j - stride])
         for k in range(n):
-            now[k] = now[k] * math.exp(-rates[k] * dt) + 0.5 * _reach(rates[k], dt) * forced[k] * moved
+            fade = decay[k, _MIDDLE] if stride == _MIDDLE else math.exp(-rates[k] * dt)
+            carried[k, 3] = carried[k, 3] * fade + 0.5 * _reach(rates[k], dt, fade) * forced[k] * moved
         factor = _answer(model, push, tap, tap_k, feed, w, r, j, _slope(model, sign, r, j), forced)
         known = 0.0
         loop = 0.0
         for k in range(n):
-            known += factor * gap[k] * now[k]
-            loop += 0.5 * factor * gap[k] * _reach(rates[k], dt) * forced[k]
+            fade = decay[k, _MIDDLE] if stride == _MIDDLE else math.exp(-rates[k] * dt)
+            known += factor * gap[k] * carried[k, 3]
+            loop += 0.5 * factor * gap[k] * _reach(rates[k], dt, fade) * forced[k]
         moved = known / max(1.0 - loop, 1.0 / _MOST)
         for k in range(n):
-            now[k] += 0.5 * _reach(rates[k], dt) * forced[k] * moved
-        for p in range(4):
-            if _PLACES[p] == j:
-                carried[:, p] = now
+            fade = decay[k, _MIDDLE] if stride == _MIDDLE else math.exp(-rates[k] * dt)
+            carried[k, 3] += 0.5 * _reach(rates[k], dt, fade) * forced[k] * moved
+        # The points between that have been passed.
+        while place < 3 and POINTS[NODES + place] < POINTS[j]:
+            for k in range(n):
+                carried[k, place] = carried[k, 3]
+            place += 1
 
 
 @jit
-def _reach(rate: float, dt: float) -> float:
-    """Response of a mode to a forcing of one for so long, s."""
-    return dt if rate * dt < 1e-9 else -math.expm1(-rate * dt) / rate
+def _reach(rate: float, dt: float, fade: float) -> float:
+    """Response of a mode to a forcing of one for so long (s), in which it falls to `fade`."""
+    return dt if rate * dt < 1e-6 else (1.0 - fade) / rate

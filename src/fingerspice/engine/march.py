@@ -12,7 +12,7 @@ from fingerspice.compiled import borrow, jit
 from fingerspice.engine.charge import charge_step
 from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, weigh
 from fingerspice.engine.growth import carry
-from fingerspice.engine.model import Segment, branch_area, dot, source, turns_at_zero
+from fingerspice.engine.model import branch_area, dot, turns_at_zero
 from fingerspice.engine.pace import Pace, change_level, choose_step, enter, nearest_level, rung, take_branch
 from fingerspice.engine.readout import (
     ACCEPTED,
@@ -52,6 +52,7 @@ from fingerspice.engine.readout import (
 )  # fmt: skip
 from fingerspice.engine.repeat import AT_EDGE, AT_ZERO, Kept
 from fingerspice.engine.rows import DQ, GUESS, N_FLAT, SOURCE, X_GAP, Q, U, source_rows
+from fingerspice.engine.segment import Segment, source
 from fingerspice.engine.system import System
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
 

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import jit
-from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area
 
 FloatArray = NDArray[np.float64]
@@ -70,67 +69,8 @@ class Model(NamedTuple):
     curve: FloatArray
 
 
-class Segment(NamedTuple):
-    """The source between two breakpoints.
-
-    Attributes
-    ----------
-    start, length : float
-        Seconds.
-    terms : ndarray, shape (k, 6)
-        c, n, a, omega, phi, beta of c tau^n exp(a tau) cos(phi + omega tau + beta tau^2 / 2), tau from the start.
-    series : ndarray, shape (l,)
-        Chebyshev coefficients over the segment, or empty.
-    """
-
-    start: float
-    length: float
-    terms: FloatArray
-    series: FloatArray
-
-
 # Gauss-Legendre rule for the charge of a jump under the local law: A is analytic on either side of 0 V.
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(24)
-
-
-@jit
-def source(segment: Segment, tau: float) -> tuple[float, float]:
-    """Source voltage (V) and its slope (V/s), tau seconds into a segment."""
-    u = 0.0
-    du = 0.0
-    terms = segment.terms
-    for i in range(terms.shape[0]):
-        value = terms[i, 0]
-        if value == 0.0:
-            continue
-        slope = 0.0
-        n = terms[i, 1]
-        if n == 1.0:
-            slope = value
-            value *= tau
-        elif n > 1.0:
-            slope = value * n * tau ** (n - 1.0)
-            value *= tau**n
-        a = terms[i, 2]
-        if a != 0.0:
-            e = math.exp(a * tau)
-            slope = (slope + a * value) * e
-            value *= e
-        omega = terms[i, 3]
-        phi = terms[i, 4]
-        beta = terms[i, 5]
-        if omega != 0.0 or phi != 0.0 or beta != 0.0:
-            phase = phi + (omega + 0.5 * beta * tau) * tau
-            c = math.cos(phase)
-            slope = slope * c - value * (omega + beta * tau) * math.sin(phase)
-            value *= c
-        u += value
-        du += slope
-    if segment.series.size > 0:
-        value, slope = chebyshev.evaluate(segment.series, 2.0 * tau / segment.length - 1.0)
-        u += value
-        du += slope * 2.0 / segment.length
-    return u, du
 
 
 @jit

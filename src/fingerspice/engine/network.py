@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import borrow, jit, jit_inline
-from fingerspice.engine.model import Segment, source
+from fingerspice.engine.segment import Segment, source
 from fingerspice.physics.contact import inverse_area
 
 FloatArray = NDArray[np.float64]
