@@ -230,3 +230,12 @@ def test_the_inside_of_a_step_converges_with_the_local_order_of_the_dense_output
     tableau: Tableau, wave: str, law: str
 ) -> None:
     assert orders(tableau.name, wave, law)[1] == pytest.approx(tableau.dense_order + 1, abs=0.15)
+
+
+def test_a_stepper_s_tolerance_is_relative_to_the_source() -> None:
+    # So small a voltage moves no area: the circuit is linear, and a thousandth of the source gives a thousandth of all.
+    evaluations = {
+        fs.simulate(table1(), sources={"Vdrive": fs.Sine(u, 100)}, t_stop=0.02, rtol=1e-6, method="dop853").nfev
+        for u in (1e-3, 1e-6, 1e-9)
+    }
+    assert max(evaluations) <= 1.02 * min(evaluations)

@@ -15,29 +15,52 @@ def test_a_random_scene_is_right_or_refused_for_a_true_reason(number: int) -> No
     assert stress.judge(stress.draw(0, number))
 
 
-# Scenes that were once wrong, or took minutes; seed 0.
+# Scenes that were once wrong, or took minutes: seed and number.
 MENDED = {
-    24: "refused: fold",  # Charge opposes the source: the voltage falls from 44 kV to 19 V before its branch ends.
-    37: "refused: fold",  # A jump past the kink at 0 V, where charge holds the area's branch no longer.
-    51: "right",  # What decays after a jump is faster than the rounding of the time.
-    58: "refused: fold",  # The kink itself: the voltage comes down to 0 V, and no voltage leads on.
-    185: "right",  # Stiff, and the area moves the fast mode: short steps only converge.
-    186: "refused: fold",  # A fold on a mode five million times faster than what leads to it.
-    196: "refused: fold",  # As 186, on a gap that takes a ten-millionth of the source's voltage.
-    205: "refused: fold",  # As 24, slower.
-    231: "right",  # The gap takes so little that every step is longer than its error asks for.
-    436: "right",  # As 231.
-    454: "refused: fold",
-    650: "right",
-    761: "refused: fold",
-    807: "right",  # As 185, under `local`.
-    857: "right",  # As 51.
+    (0, 24): "refused: fold",  # Charge opposes the source: the voltage falls from 44 kV to 19 V before its branch ends.
+    (0, 37): "refused: fold",  # A jump past the kink at 0 V, where charge holds the area's branch no longer.
+    (0, 51): "right",  # What decays after a jump is faster than the rounding of the time.
+    (0, 58): "refused: fold",  # The kink itself: the voltage comes down to 0 V, and no voltage leads on.
+    (0, 185): "right",  # Stiff, and the area moves the fast mode: short steps only converge.
+    (0, 186): "refused: fold",  # A fold on a mode five million times faster than what leads to it.
+    (0, 196): "refused: fold",  # As 186, on a gap that takes a ten-millionth of the source's voltage.
+    (0, 205): "refused: fold",  # As 24, slower.
+    (0, 231): "right",  # The gap takes so little that every step is longer than its error asks for.
+    (0, 436): "right",  # As 231.
+    (0, 454): "refused: fold",
+    (0, 650): "right",
+    (0, 761): "refused: fold",
+    (0, 807): "right",  # As 185, under `local`.
+    (0, 857): "right",  # As 51.
+    # Newton, or a walk, went over a fold to another root: a result where there is none.
+    (0, 661): "refused: fold",
+    (0, 1730): "refused: fold",
+    (0, 4371): "refused: fold",  # As 661, and a sum of voltages that turned was taken for a zero of the gap's.
+    # Errors grew thousandfold by what the area answers, and the estimate knew only the modes' decay.
+    (0, 5568): "right",
+    (0, 3956): "right",  # As 5568, but what grows had been damped as much before.
+    (0, 8277): "right",  # An iteration that had not closed turned the branch round, and a zero was stepped over.
+    # Decays after a jump below the rounding of the time, by Radau.
+    (1, 299): "right",
+    (1, 539): "right",
+    (4, 394): "right",
+    # Radau's Newton met no slope of the area equation from the start of a step that served at its end.
+    (0, 2608): "right",
+    (0, 3773): "refused: fold",
+    (3, 178): "refused: fold",
+    (0, 354): "right",  # Radau's tolerance was one of 1 V, however large the source.
+    (0, 5490): "right",
+    (1, 920): "refused: fold",
+    # The path to a fold is followed only at a loose tolerance, for the rounding of a fast leak.
+    (0, 1204): "refused: fold",
+    (1, 45): "refused: fold",
+    (4, 124): "right",  # A jump to an area of 4.5e-13 m^2 past no fold.
 }
 
 
-@pytest.mark.parametrize("number", MENDED)
-def test_a_scene_that_was_wrong_or_endless_is_mended(number: int) -> None:
-    assert stress.judge(stress.draw(0, number)) == MENDED[number]
+@pytest.mark.parametrize(("seed", "number"), MENDED)
+def test_a_scene_that_was_wrong_or_endless_is_mended(seed: int, number: int) -> None:
+    assert stress.judge(stress.draw(seed, number)) == MENDED[seed, number]
 
 
 def test_scenes_reach_over_twelve_decades_and_repeat() -> None:
@@ -70,6 +93,6 @@ def test_a_scene_judged_by_another_one_s_reference_is_wrong() -> None:
 
 
 @pytest.mark.parametrize("number", [12, 68, 214])
-def test_a_run_that_stopped_early_is_no_result_however_little_the_gap_takes(number: int) -> None:
-    # Their gap voltage is rounding of the source's, and a fold ends them.
-    assert stress.judge(stress.draw(3, number)) == "refused: rounding"
+def test_a_fold_is_no_result_however_little_the_gap_takes(number: int) -> None:
+    # Their gap voltage is near rounding of the source's, and a fold ends them.
+    assert stress.judge(stress.draw(3, number)) == "refused: fold"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import OdeSolution, solve_ivp
 
-from fingerspice.engine.model import dot, ramp, voltage_by_time, write_row_at
+from fingerspice.engine.model import branch_area, dot, ramp, voltage_by_time, write_row_at
 from fingerspice.engine.segment import Segment, source
 from fingerspice.errors import SolveError
 from fingerspice.marching import solve as solve_marching
@@ -26,17 +26,18 @@ from fingerspice.runs import BoolArray, Run, Tables, from_rows, row_width
 FloatArray = NDArray[np.float64]
 
 FINEST_RTOL = 1e-12
-# Tries at a path to a fold: by how much looser, but no looser than this, and the evaluations they may take. Where leaks
-# are fast beside the path, their rounding leaves no tight tolerance to be met, or only in many steps, which are worth
-# it where the fold is near but not at hand.
-TRIES = ((1.0, 10_000), (1e3, 10_000), (1e6, 10_000), (1e3, 100_000), (1e6, 100_000))
-LOOSEST_RTOL, AT_HAND, NEAR = 1e-6, 1e-4, 0.03
+# Where leaks are fast beside a path to a fold, their rounding leaves no tight tolerance to be met: the second try's.
+LOOSER_RTOL = 1e-9
+# What a path may leave of the area equation, over the gap voltage.
+STRAYED = 1e-3
 # A fold is met at this distance, and looked for over so many of the shortest time constants.
 NOTHING_LEFT, LONGEST = 1e-10, 1e12
+# A path to a fold takes a few thousand evaluations.
+MOST_EVALUATIONS = 10_000
 
 
 class _LostError(Exception):
-    """A path took too many evaluations, or no step was small enough."""
+    """A path took too many evaluations, found no step small enough, or strayed."""
 
 
 def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | None:
@@ -59,7 +60,7 @@ def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray)
     begun = _start(problem, run.state)
     if run.margin <= 0.0 or math.isnan(begun.u):
         return run
-    path = _ahead(problem, run.state, begun, run.margin, FINEST_RTOL)
+    path = _ahead(problem, run.state, begun, FINEST_RTOL)
     if path is None:
         return None
     # The row of where the steps stopped is no output.
@@ -99,7 +100,7 @@ def meets_fold(problem: Problem, rtol: float) -> bool:
     if run.status is not Status.FOLD:
         raise SolveError(Failure(run.status, run.status.cause, run.status.action, run.t_failed, tried=run.tried))
     begun = _start(problem, run.state)
-    return run.margin <= 0.0 or math.isnan(begun.u) or _ahead(problem, run.state, begun, run.margin, rtol) is not None
+    return run.margin <= 0.0 or math.isnan(begun.u) or _ahead(problem, run.state, begun, rtol) is not None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,25 +157,24 @@ def _start(problem: Problem, state: State) -> _Start:
     return _Start(segment, end, math.copysign(1.0, u), u)
 
 
-def _ahead(problem: Problem, state: State, begun: _Start, margin: float, rtol: float) -> _Path | None:
-    """The path from a state, so far from a fold, to that in its segment of the source; None where none is found."""
-    tries = TRIES if AT_HAND < margin < NEAR else TRIES[:3]
-    for tried, evaluations in dict.fromkeys((max(rtol, min(x * rtol, LOOSEST_RTOL)), n) for x, n in tries):
+def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path | None:
+    """The path from a state to a fold in the segment of the source that it stands in; None where none is found."""
+    for tried in sorted({rtol, max(rtol, LOOSER_RTOL)}):
         try:
-            return _path(problem, state, begun, tried, evaluations)
+            return _path(problem, state, begun, tried)
         except _LostError:
             continue
     return None
 
 
-def _path(problem: Problem, state: State, begun: _Start, rtol: float, evaluations: int) -> _Path | None:
+def _path(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path | None:
     t, y, model, n = state.t, state.y, problem.model, state.y.size
     segment, end, sign, u = begun
     if u == 0.0:
         return None
     pace = model.tau if math.isfinite(model.tau) else segment.length
     scale = np.concatenate([
-        np.full(n - 1, max(problem.scene.u_peak, abs(u))), [model.area0 / model.s * abs(u), pace, abs(u)]
+        np.full(n - 1, max(np.abs(y[:-1]).max(), abs(u))), [model.area0 / model.s * abs(u), pace, abs(u)]
     ])  # fmt: skip
     dy = np.empty(n)
 
@@ -184,7 +184,7 @@ def _path(problem: Problem, state: State, begun: _Start, rtol: float, evaluation
         margin, speed = voltage_by_time(model, u_here, du_here, here[:n], sign, here[n + 1], dy)
         return float(margin), float(speed)
 
-    left = evaluations
+    left = MOST_EVALUATIONS
 
     def slope(_: float, z: FloatArray) -> FloatArray:
         nonlocal left
@@ -227,4 +227,12 @@ def _path(problem: Problem, state: State, begun: _Start, rtol: float, evaluation
     )  # fmt: skip
     if found.status < 1:
         raise _LostError
-    return _Path(t, segment, sign, scale, found.sol) if found.t_events[0].size else None
+    if not found.t_events[0].size:
+        return None
+    # The voltage is carried along by its rate: it has to be a solution still.
+    last = found.y[:, -1] * scale
+    q, _ = branch_area(model, sign, last[n + 1])
+    k_u = model.k_gap * source(segment, t - segment.start + last[n])[0]
+    if abs(last[n + 1] - k_u - model.area0 * q * dot(model.gap, last[:n])) > STRAYED * abs(last[n + 1]):
+        raise _LostError
+    return _Path(t, segment, sign, scale, found.sol)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
-from fingerspice.engine.model import Model, write_row
+from fingerspice.engine.model import Model, dot, gap_voltage, write_row_at
 from fingerspice.engine.segment import Segment, source
 from fingerspice.networks import NetworkProblem
 from fingerspice.outcome import Attempt, ErrorEstimate, State, Status
@@ -185,7 +185,9 @@ def last_row(
     segment = Segment(start, float(table.edges[i + 1]) - start, table.terms[i], table.series[i])
     row = np.empty(row_width(problem))
     u, du = source(segment, t - start)
-    write_row(model, u, du, y, sign, u_gap, row)
+    found = gap_voltage(model, model.k_gap * u, dot(model.gap, y), sign, u_gap)
+    # By rounding of the time alone a state at a fold may have none.
+    write_row_at(model, u, du, y, sign, found if found == found else u_gap, row)
     return row if np.all(np.isfinite(row)) else None
 
 
