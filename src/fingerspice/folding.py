@@ -26,8 +26,9 @@ from fingerspice.runs import BoolArray, Run, Tables, from_rows, row_width
 FloatArray = NDArray[np.float64]
 
 FINEST_RTOL = 1e-12
-# Where leaks are fast beside a path to a fold, their rounding leaves no tight tolerance to be met: the second try's.
-LOOSER_RTOL = 1e-9
+# Where leaks are fast beside a path to a fold, their rounding leaves no tight tolerance to be met: a second try's, and
+# a third one's that starts as near as this to the fold, so that it has no way to stray.
+LOOSER_RTOL, LOOSEST_RTOL, NEAR = 1e-9, 1e-6, 3e-3
 # What a path may leave of the area equation, over the gap voltage.
 STRAYED = 1e-3
 # A fold is met at this distance, and looked for over so many of the shortest time constants.
@@ -60,7 +61,7 @@ def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray)
     begun = _start(problem, run.state)
     if run.margin <= 0.0 or math.isnan(begun.u):
         return run
-    path = _ahead(problem, run.state, begun, FINEST_RTOL)
+    path = _ahead(problem, run.state, begun, run.margin, FINEST_RTOL)
     if path is None:
         return None
     # The row of where the steps stopped is no output.
@@ -100,7 +101,7 @@ def meets_fold(problem: Problem, rtol: float) -> bool:
     if run.status is not Status.FOLD:
         raise SolveError(Failure(run.status, run.status.cause, run.status.action, run.t_failed, tried=run.tried))
     begun = _start(problem, run.state)
-    return run.margin <= 0.0 or math.isnan(begun.u) or _ahead(problem, run.state, begun, rtol) is not None
+    return run.margin <= 0.0 or math.isnan(begun.u) or _ahead(problem, run.state, begun, run.margin, rtol) is not None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,14 +153,17 @@ def _start(problem: Problem, state: State) -> _Start:
     i = min(max(int(np.searchsorted(table.edges, t, side="right")) - 1, 0), table.edges.size - 2)
     start, end = float(table.edges[i]), float(table.edges[i + 1])
     segment = Segment(start, end - start, table.terms[i], table.series[i])
-    u_source, _ = source(segment, t - start)
-    u = float(ramp(model, model.k_gap * u_source, dot(model.gap, state.y), state.u_gap))
+    u = state.u_gap
+    if t == start:
+        u_source, _ = source(segment, 0.0)
+        u = float(ramp(model, model.k_gap * u_source, dot(model.gap, state.y), u))
     return _Start(segment, end, math.copysign(1.0, u), u)
 
 
-def _ahead(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path | None:
-    """The path from a state to a fold in the segment of the source that it stands in; None where none is found."""
-    for tried in sorted({rtol, max(rtol, LOOSER_RTOL)}):
+def _ahead(problem: Problem, state: State, begun: _Start, margin: float, rtol: float) -> _Path | None:
+    """The path from a state, so far from a fold, to that in its segment of the source; None where none is found."""
+    tries = (rtol, LOOSER_RTOL, LOOSEST_RTOL) if margin < NEAR else (rtol, LOOSER_RTOL)
+    for tried in sorted({max(rtol, x) for x in tries}):
         try:
             return _path(problem, state, begun, tried)
         except _LostError:

@@ -36,7 +36,7 @@ FOLD_SPREAD, FOLD_ERROR = 1e-5, 0.01
 # steps do not mend.
 FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
 # The smallest local error, over the voltage scale, that another attempt is worth: the shadow's is near rounding.
-FINEST = 3e-13
+FINEST = 1e-14
 # The shadow run's tolerance over the main run's: far enough that their difference is the main run's error.
 SHADOW = 0.03
 # The estimate is the largest difference met in the middle and at the end of steps; between them it may be larger.
