@@ -78,7 +78,7 @@ def moved(u: FloatArray, before: FloatArray) -> float:
 @jit
 def assess(
     rates: FloatArray, h: float, shape: FloatArray, follow: FloatArray, gap: FloatArray, size: FloatArray,
-    decay: FloatArray, phi: FloatArray, miss: FloatArray, error: FloatArray, w: FloatArray, lin: FloatArray,
+    phi: FloatArray, miss: FloatArray, error: FloatArray, carried: FloatArray, w: FloatArray, lin: FloatArray,
     pull: FloatArray, used: FloatArray, s: FloatArray, magnified: float, x: FloatArray, places: FloatArray,
     early: FloatArray, run: FloatArray,
 ) -> float:  # fmt: skip
@@ -121,7 +121,7 @@ def assess(
         for p in range(4):
             row = FIRST + p if p < 3 else END
             fresh = magnified * miss[k, row] * missed
-            places[k, p + 1] = decay[k, row] * error[k] + magnified * left[p] + fresh
+            places[k, p + 1] = carried[k, p] + magnified * left[p] + fresh
             off = fresh
             if p < 3:
                 off += mode_first if p == 0 else (mode_second if p == 1 else mode_third)

@@ -32,6 +32,7 @@ from fingerspice.engine.netassess import (
     write_columns,
 )
 from fingerspice.engine.netcharge import charge_error, charge_rows
+from fingerspice.engine.netgrowth import carry
 from fingerspice.engine.netrows import (
     AREA,
     BASE,
@@ -180,9 +181,8 @@ def march(
     free, free_rate, cell_u, du, j = cells[FREE], cells[FREE_RATE], cells[CELL_U], cells[DU], cells[J]
     area, slope, more = areas[AREA], areas[SLOPE], areas[MORE]
     u, guess = areas[U], areas[GUESS]
-    w0, places, weight, room, x_off = (
-        borrow(work.w0), borrow(work.places), borrow(work.weight), borrow(work.room), borrow(work.x)
-    )  # fmt: skip
+    w0, places, carried, weight = borrow(work.w0), borrow(work.places), borrow(work.carried), borrow(work.weight)
+    room, x_off = borrow(work.room), borrow(work.x)
     values, coefficients, outputs = borrow(work.values), borrow(work.coefficients), borrow(work.outputs)
     y, error, sign, s_before = borrow(y), borrow(error), borrow(sign), borrow(s_before)
     control, counters, peaks, branch = borrow(control), borrow(counters), borrow(peaks), borrow(branch)
@@ -323,8 +323,9 @@ def march(
                 if mobile:
                     lowest = room[3].min()
                 magnified = 1.0 / lowest
+                carry(form, work, h, decay, phi, error, sign)
                 step_error = assess(
-                    rates, h, shape, follow, gap, size, decay, phi, miss, error, w, lin, pull, used, s, magnified,
+                    rates, h, shape, follow, gap, size, phi, miss, error, carried, w, lin, pull, used, s, magnified,
                     x_off, places, early, run,
                 )  # fmt: skip
                 if charge:

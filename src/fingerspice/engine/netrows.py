@@ -133,6 +133,10 @@ class Work(NamedTuple):
     outputs: FloatArray
     room: FloatArray
     x: FloatArray
+    carried: FloatArray
+    spare: FloatArray
+    spare_cells: FloatArray
+    spare_areas: FloatArray
 
 
 def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: int) -> Work:
@@ -155,6 +159,10 @@ def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: 
         np.zeros((2, WRITTEN_AT_ONCE)),
         np.zeros((4, ROWS)),
         np.zeros((n, 5)),
+        np.zeros((modes, N_PLACES - 1)),
+        np.zeros((6, modes, ROWS)),
+        np.zeros((5, cells, ROWS)),
+        np.zeros((6, areas, ROWS)),
     )
 
 
