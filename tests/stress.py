@@ -46,10 +46,15 @@ class Scene:
 
     @property
     def circuit(self) -> fs.Circuit:
+        """As a circuit."""
+        return fs.parse_netlist(self.netlist)
+
+    @property
+    def netlist(self) -> str:
         """As a netlist."""
         r = [f" r={x!r}" if math.isfinite(x) else "" for x in self.r]
         gap = f"eps_r=1{r[1]} fn={self.f_n!r} mu={self.mu!r} alpha=54.4 m_exp={self.m!r} beta=32 n_exp={self.n!r}"
-        return fs.parse_netlist(
+        return (
             f"a random scene\nVdrive drive 0 {self.source}({self._arguments})\n"
             f"Xcoat drive top area LAYER d={self.d[0]!r} eps_r={self.eps_r[0]!r}{r[0]}\n"
             f"Xgap top skin area GAP d={self.d[1]!r} {gap} c2=5000\n"

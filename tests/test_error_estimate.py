@@ -11,6 +11,7 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
+import stress
 from scenes import table1
 
 N = 100
@@ -119,3 +120,23 @@ def test_the_estimate_is_at_most_ten_times_the_true_error_on_95_percent_of_scene
 @pytest.mark.filterwarnings("ignore:the gap voltage reaches")
 def test_the_error_asked_for_is_met(ratios: np.ndarray) -> None:
     assert ratios[:, 2:].max() <= 1.0
+
+
+# Scenes of `stress.py`: an instability that magnifies errors a thousandfold; and one whose area damps them as much
+# before it magnifies them again, so that magnifying alone would state 1e10 V.
+@pytest.mark.parametrize("number", [5568, 3956])
+@pytest.mark.parametrize("network", [False, True], ids=["stack", "network"])
+@pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
+def test_the_error_is_carried_with_what_the_area_answers(number: int, network: bool) -> None:
+    scene = stress.draw(0, number)
+    # A resistor beside the source draws a current of its own, and makes a network of the stack.
+    netlist = scene.netlist.replace("\n", "\nRbeside drive 0 1meg\n", 1) if network else scene.netlist
+    solution = fs.simulate(fs.parse_netlist(netlist), charge_law=scene.law, rtol=1e-6, method="exponential")
+    with np.errstate(all="ignore"):
+        expected = scene.expected(solution.t)
+    turns = 2.0 * scene.frequency * solution.t
+    between = np.abs(turns - np.rint(turns)) > 1e-6
+    u_gap = np.asarray(solution.u_gap).reshape(solution.t.size)
+    off = np.abs(u_gap - expected.u_gap)[between].max()
+    assert off <= solution.error.u_gap
+    assert solution.error.u_gap <= 1e-6 * np.abs(u_gap).max() * 4.0
