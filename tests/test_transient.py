@@ -196,11 +196,12 @@ def test_a_run_that_ends_at_a_jump_but_for_rounding_ends_after_it(deck, options,
         assert abs(short.u_gap[-1] - longer.u_gap[-1]) <= 2e-6 * np.abs(longer.u_gap).max()
 
 
-def test_a_gap_behind_an_insulating_coating_rests_at_zero_volt():
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_a_gap_behind_an_insulating_coating_rests_at_zero_volt(law):
     # At DC the coating takes it all: what is left in the gap is the rounding of 100 V.
     circuit = table1().replace({"Vdrive": fs.DC(100.0), "Xcoat.r": math.inf})
     with pytest.warns(fs.FingerspiceWarning, match="no more than rounding of the source's voltage"):
-        solution = fs.simulate(circuit, t_stop=0.01, start="dc")
+        solution = fs.simulate(circuit, t_stop=0.01, start="dc", charge_law=law)
     assert np.abs(solution.u_gap).max() <= 1e-12
     assert solution.error.u_gap >= np.abs(solution.u_gap).max()
 

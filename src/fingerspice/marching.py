@@ -217,7 +217,9 @@ def solve(
         worst = run.excess(rtol)
         if run.status is not Status.SUCCESS or worst <= 1.0:
             return run
-        if rtol * run.peak_u < ROUNDING * u_scale or tol <= FINEST or attempts == 6:
+        # A peak that is no more than the error may yet turn out to be none.
+        hopeless = rtol * run.peak_u < ROUNDING * u_scale and run.error.u_gap < run.peak_u
+        if hopeless or tol <= FINEST or attempts == 6:
             run.status = Status.ERROR_NOT_MET
             return run
         # Steps that something else than their error kept short are shortened by a tolerance below what they made only.
