@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from fingerspice.compiled import SHARED_FOLDERS
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "fingerspice"
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -177,6 +179,27 @@ def test_nothing_evaluates_text_or_unpickles(path: Path) -> None:
             assert node.id not in ("eval", "exec"), f"line {node.lineno}"
     forbidden = {"pickle", "marshal", "shelve", "dill", "joblib"}
     assert not forbidden & {x.partition(".")[0] for x in imports(path)}
+
+
+@each_file
+def test_compiled_code_calls_other_files_in_the_shared_folders_only(path: Path) -> None:
+    # The key of the compiled code's cache holds the state of these folders: see compiled.py.
+    if name_of(path).partition(".")[0] in SHARED_FOLDERS:
+        return
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    origin = {
+        alias.name: node.module
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("fingerspice")
+        for alias in node.names
+    }
+    shared = tuple(f"fingerspice.{part}" for part in (*SHARED_FOLDERS, "compiled"))
+    for function in ast.walk(tree):
+        if not isinstance(function, ast.FunctionDef):
+            continue
+        if any(isinstance(d, ast.Name) and d.id.startswith("jit") for d in function.decorator_list):
+            called = {node.id for node in ast.walk(function) if isinstance(node, ast.Name)}
+            assert all(origin[name].startswith(shared) for name in called & set(origin)), function.name
 
 
 @each_file

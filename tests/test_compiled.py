@@ -47,6 +47,19 @@ def test_a_change_of_one_source_reaches_the_compiled_code_of_another(tmp_path):
     assert newest >= oldest
 
 
+def test_a_change_of_a_file_that_nothing_compiled_depends_on_compiles_nothing(tmp_path):
+    copy = tmp_path / "fingerspice"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    area_at_zero_volt(tmp_path)
+    before = {p: p.stat().st_mtime_ns for p in copy.rglob("*.nb[ic]")}
+    assert before
+    for name in ("cli.py", "circuit/reader.py"):
+        with (copy / name).open("a") as source:
+            source.write("\n# changed\n")
+    area_at_zero_volt(tmp_path)
+    assert {p: p.stat().st_mtime_ns for p in copy.rglob("*.nb[ic]")} == before
+
+
 def test_a_change_reaches_code_that_is_cached_elsewhere(tmp_path):
     copy = tmp_path / "fingerspice"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))

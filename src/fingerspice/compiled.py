@@ -1,7 +1,8 @@
 """The compiler's decorator, with a cache on disk that no change of the sources outlives.
 
 numba keys its cache by the one file a function stands in, while the compiled code holds every function it calls: after
-a change of one file it would go on running the old code of the others. So the key holds a stamp of all files.
+a change of one file it would go on running the old code of the others. So the key holds a stamp of all files that
+compiled code may call: those of the folders below, as compiled functions elsewhere are private to their own file.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from numba.np.arrayobj import make_array
 Array = TypeVar("Array", bound=np.ndarray)
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGE = Path(__file__).resolve().parent
-
-
-_STAMP = "\n".join(f"{p.name} {p.stat().st_mtime_ns} {p.stat().st_size}" for p in sorted(_PACKAGE.rglob("*.py")))
+#: Where functions stand that compiled code of other files may call.
+SHARED_FOLDERS = ("engine", "numerics", "physics")
+_SOURCES = [Path(__file__).resolve(), *sorted(p for name in SHARED_FOLDERS for p in (_PACKAGE / name).rglob("*.py"))]
+_STAMP = "\n".join(f"{p.name} {p.stat().st_mtime_ns} {p.stat().st_size}" for p in _SOURCES)
 
 
 def _drop_stale_cache() -> None:
@@ -44,7 +46,7 @@ def _drop_stale_cache() -> None:
 
 
 class _Cache(FunctionCache):
-    """numba's, for this state of the package; a disk that is full means that the next process compiles again."""
+    """numba's, for this state of the shared folders; a disk that is full means that the next process compiles again."""
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
         return (*cast(Any, super())._index_key(sig, codegen), _STAMP)
