@@ -23,6 +23,7 @@ from fingerspice.engine import repeat as repetition
 from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
 from fingerspice.runs import FloatArray
 from fingerspice.settling import Settling
+from fingerspice.steps import Leap, Recorder
 from fingerspice.track import FINEST, KEPT_STEPS, SAFETY, Track
 
 # Tolerance of its steps, over that of others: what it is off is off in every period that is made of it.
@@ -93,6 +94,7 @@ def _period(track: Track, table: SourceTable, stop: float, x: FloatArray, steps:
     probe.counters = np.zeros_like(track.counters)
     finest = FINEST * float(track.control[readout.PEAK_U])
     probe.pace = track.pace._replace(tol=max(_FINER * track.pace.tol, finest))
+    probe.recorder = Recorder(track.shown, 0)
     probe.t_out, probe.left, probe.out = np.zeros(0), np.zeros(0, bool), np.empty((track.out.shape[0], 0))
     probe.keep(steps)
     code = probe.advance(table, stop)
@@ -167,6 +169,12 @@ def _leap(track: Track, table: SourceTable, settling: Settling, stop: float) -> 
         settling.stumbled(error / settling.allowed)
         return
     state = np.append(x0, track.y[n])
+    shown = slice(0, track.shown)
+    track.recorder.drain(track.counters)
+    track.recorder.parts.append(Leap(
+        marks, marks_by, series[:, shown].copy(), by[:, :, shown].copy(), slope, base_x, base.track.y.copy(),
+        x0.copy(), still, settling.period, left,
+    ))  # fmt: skip
     track.counters[readout.OUTPUT] = repetition.approach(
         marks, marks_by, series, by, slope, base_x, base.track.y, state, track.shown, still,
         settling.period, left, int(track.counters[readout.OUTPUT]), track.t_out, track.left, track.out,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -16,6 +18,8 @@ from fingerspice.numerics import hold, linear
 from fingerspice.outcome import ErrorEstimate, State, Status
 from fingerspice.physics.contact import areas, fixed_area_curve
 from fingerspice.problem import Problem
+from fingerspice.record import Record
+from fingerspice.refined import ClosedForm
 from fingerspice.runs import BoolArray, FloatArray, Run, Tables, after_the_end, from_rows, row_width
 
 # Of the closed forms, over the source's peak.
@@ -42,16 +46,18 @@ def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run
     tables = Tables(problem, 1e-12, t_out=t_out)
     rows = np.empty((t_out.size, row_width(problem)))
     done, end, u_end, table = 0, problem.t_start, start.u_before, None
+    charge_error = 0.0
     for table, where in _windows(tables, t_out, left):
         u, slope = source_at(table.edges, table.terms, table.series, t_out[where], left[where])
-        follow(model, u, slope, start.y, start.u_before, rows[where])
+        charge_error = max(charge_error, follow(model, u, slope, start.y, start.u_before, rows[where]))
         done = where.stop
         end, u_end = _end_of(table)
     failed = tables.not_finite
     if failed is None and table is not None and done < t_out.size:
         u, slope = _after(problem, table)
         count = t_out.size - done
-        follow(model, np.repeat(u, count), np.repeat(slope, count), start.y, start.u_before, rows[done:])
+        last_error = follow(model, np.repeat(u, count), np.repeat(slope, count), start.y, start.u_before, rows[done:])
+        charge_error = max(charge_error, last_error)
         done = t_out.size
     live, z, current = from_rows(problem, rows[:done])
     # The state is that before a jump at the end.
@@ -63,7 +69,29 @@ def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run
     run = _finished(problem, t_out[:done], left[:done], live, z, current, u_gap, force, State(
         end, y, u_end, start.charge_offset, problem.scene.charge_law), 0.0, failed)  # fmt: skip
     run.rough, run.unseen = tables.rough, tables.unseen
+    if problem.charge:
+        held = (
+            float(np.abs(z).max(initial=0.0))
+            + float(np.abs(rows[:done, 0] / rows[:done, 2]).max(initial=0.0)) / model.s
+        )
+        run.error = dataclasses.replace(run.error, q_source=charge_error + ROUNDING * held)
+    run.continuous = _in_closed_form(problem, solve_algebraic)
     return run
+
+
+def _in_closed_form(problem: Problem, solve: Callable[..., Run], *more: float) -> ClosedForm | None:
+    """The run between its outputs; None where the source is a function, which costs too much to look at."""
+    if problem.scene.is_sampled:
+        return None
+    bare = dataclasses.replace(problem, charge=False)
+    look = partial(_look, bare, solve, more)
+    return ClosedForm(look, problem.waveform, problem.t_start, problem.first, problem.t_stop)
+
+
+def _look(
+    problem: Problem, solve: Callable[..., Run], more: tuple[float, ...], t: FloatArray, left: BoolArray
+) -> Record:  # fmt: skip
+    return solve(problem, t, left, *more).record(problem)
 
 
 def _finished(
@@ -146,6 +174,7 @@ def solve_linear(problem: Problem, t_out: FloatArray, left: BoolArray, area: flo
         problem, t, side, live, z, current, u_gap, problem.scene.force(u_gap, inverse), ended, bound, failed
     )
     run.rough, run.unseen = tables.rough, tables.unseen
+    run.continuous = _in_closed_form(problem, solve_linear, area, bound)
     return run
 
 

@@ -172,6 +172,7 @@ def _run(problem: Problem, track: Track, status: Status, t_failed: float | None,
         t_failed=t_failed,
         margin=float(control[readout.MARGIN]),
         tried=last_tried(track.tried),
+        continuous=track.recorded(),
     )
 
 

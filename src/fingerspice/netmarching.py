@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +18,15 @@ from fingerspice.engine.netrows import Form, new_work
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.system import area_polynomial
-from fingerspice.netruns import Integration, NetworkRun, integrate, ramp, values_at
+from fingerspice.netruns import Integration, NetworkRun, integrate, ramp, state_error, values_at
+from fingerspice.network_record import bare_record
 from fingerspice.networks import NetworkProblem, NetworkScene
 from fingerspice.numerics.lobatto import integral_table
-from fingerspice.outcome import ErrorEstimate, Status
+from fingerspice.outcome import Status
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.runs import Progress
 from fingerspice.settling import Settling
+from fingerspice.steps import Recorded, Recorder
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -194,6 +197,7 @@ class March(Integration):
         if not repeat:
             self.settling.next = math.inf
         self.repeated = 0
+        self.recorder = Recorder(self.n + self.n_slow)
         self.keep(0)
         self.forget()
 
@@ -214,6 +218,7 @@ class March(Integration):
         outputs = (self.t_out[:0], self.left[:0], self.out[:, :0].copy()) if jump else (self.t_out, self.left, self.out)
         size = np.append(reference.size, np.full(self.n_slow, self.u_scale))
         kept = repetition.new_kept(0, self.width) if jump else self.kept
+        room = readout.new_steps(0, self.recorder.columns) if jump else self.recorder.room
         # In a jump time stands still: its own are fractions.
         before = self.s_before.copy() if jump else self.s_before
         taken = int(self.counters[readout.ACCEPTED] + self.counters[readout.REJECTED])
@@ -223,8 +228,10 @@ class March(Integration):
             code = netmarch.march(
                 form, pace, tables, self.work, self.integral, size, sources, jump,
                 math.inf if jump else reference.tau, t_end, self.y, self.error, self.sign, before, branch, control,
-                self.counters, self.met, self.collected, *outputs, kept, self.tried,
+                self.counters, self.met, self.collected, *outputs, kept, room, self.tried,
             )  # fmt: skip
+            if not jump and self.counters[readout.RECORDED] >= len(room.times):
+                self.recorder.drain(self.counters)
             if code != netmarch.PAUSED:
                 return int(code)
 
@@ -253,6 +260,8 @@ class March(Integration):
         """Keep so many of the steps that follow."""
         self.kept = repetition.new_kept(steps, self.width)
         self.counters[readout.KEPT] = 0
+        self.recorder.drain(self.counters)
+        self.kept_from = len(self.recorder.parts)
         self.before = self.y.copy(), self.collected.copy()
 
     def _repeat(self, kept: int) -> None:
@@ -281,7 +290,17 @@ class March(Integration):
         self.control[readout.ERROR_Q] += (
             periods * float((np.abs(missed) + np.sqrt(spread)).max()) + held * settling.remaining
         )
+        self.recorder.drain(self.counters)
+        self.recorder.repeat(self.kept_from, periods, settling.period)
         self.repeated = periods
+
+    def recorded(self) -> Recorded | None:
+        """The steps taken so far."""
+        self.recorder.drain(self.counters)
+        problem = self.problem
+        return self.recorder.finish(
+            problem.first, problem.t_stop, partial(bare_record, problem.network, self.net, problem.scene.waveforms)
+        )
 
     def _to(self, sources: Sources, t_end: float) -> Status:
         while True:
@@ -344,9 +363,10 @@ def solve_network(
         nfev += run.nfev
         run.nfev = nfev
         run.stats["repeated"] = one.repeated
+        run.continuous = one.recorded()
         if run.status in (Status.FOLD, Status.STEP_UNDERFLOW, Status.TOO_MANY_STEPS):
             return None
-        worst = _state_error(run, one, u_scale) / rtol
+        worst = _stated(run, one, u_scale) / rtol
         if run.status is not Status.SUCCESS or worst <= 1.0:
             return run
         if tol <= FINEST:
@@ -355,18 +375,20 @@ def solve_network(
     return None
 
 
-def _state_error(run: NetworkRun, one: March, u_scale: float) -> float:
-    """Write the stated error into a run; returns it over the peaks, the larger of voltage and force."""
-    u_peak, f_peak, u_error, f_error = (float(x) for x in one.met.max(axis=0))
+def _stated(run: NetworkRun, one: March, u_scale: float) -> float:
+    """Write the stated error into a run; returns it over the peaks of each gap, the larger of voltage and force."""
+    gaps = one.met.copy()
+    u_peak = gaps[:, netassess.PEAK_U]
+    largest = float(u_peak.max(initial=0.0))
     # Rounding is an error too.
-    floor = 4e-16 * one.reference.magnified * (u_peak + u_scale)
-    u_error = SAFETY * u_error + floor
-    f_error = SAFETY * f_error + (2.0 * floor / u_peak * f_peak if u_peak > 0.0 else 0.0)
+    floor = 4e-16 * one.reference.magnified * (largest + u_scale)
+    steepest = 2.0 * gaps[:, netassess.PEAK_F] / np.where(u_peak > 0.0, u_peak, np.inf)
+    gaps[:, netassess.ERROR_U] = SAFETY * gaps[:, netassess.ERROR_U] + floor
+    gaps[:, netassess.ERROR_F] = SAFETY * gaps[:, netassess.ERROR_F] + floor * steepest
     charge = None
     if one.problem.charge:
         steps = 1.0 + float(one.counters[readout.ACCEPTED])
-        held = float(one.problem.network.capacitance(one.problem.scene.area0).sum()) * (u_scale + u_peak)
+        held = float(one.problem.network.capacitance(one.problem.scene.area0).sum()) * (u_scale + largest)
         charge = 2.0 * SAFETY * float(one.control[readout.ERROR_Q]) + 4e-16 * held * steps
-    run.error = ErrorEstimate(u_error + run.error.u_gap, f_error, charge)
     run.margin = 1.0 / float(one.control[readout.MAGNIFIED])
-    return max(u_error / u_peak if u_peak > 0.0 else 0.0, f_error / f_peak if f_peak > 0.0 else 0.0)
+    return state_error(run, gaps[one.net.gap >= 0], u_scale, charge)

@@ -17,7 +17,7 @@ from fingerspice.engine.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, 
 from fingerspice.networks import NetworkProblem
 from fingerspice.outcome import Attempt, ErrorEstimate, NetworkState, Status, last_tried
 from fingerspice.physics.contact import inverse_areas
-from fingerspice.runs import Progress, windows
+from fingerspice.runs import ROUNDING, Continuous, Progress, windows
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -47,6 +47,8 @@ class NetworkRun:
     tried: tuple[Attempt, ...] = ()
     # The row at the time a failed run reached.
     here: FloatArray | None = None
+    # The run between its outputs, where that is known.
+    continuous: Continuous | None = None
 
     def end_before(self, t: float) -> None:
         """Take back the outputs from a time (s) on."""
@@ -271,6 +273,31 @@ def _row(one: Integration, sources: Sources, side: Literal["left", "right"]) -> 
     found = rates(one.net, room, False, one.y, one.sign, rate)
     n_s = one.s_before.size
     return np.concatenate([one.y, rate[-n_s:] if found else np.full(n_s, np.nan)])
+
+
+def state_error(run: NetworkRun, gaps: FloatArray, u_scale: float, charge: float | None) -> float:
+    """Write the stated error of a run; returns the largest over the peak it belongs to, in any gap's voltage or force.
+
+    Parameters
+    ----------
+    run : NetworkRun
+        Its error is so far how rough its sources are, V: they move a gap by no more than that.
+    gaps : ndarray, shape (n_gap, 4)
+        Peaks of voltage (V) and force (N) and the errors of both, of every gap.
+    u_scale : float
+        Largest voltage of the circuit, V: a gap that takes no more than rounding of it is at 0 V.
+    charge : float or None
+        Error of the charge, C.
+    """
+    rough = run.error.u_gap
+    u_peak, f_peak = gaps[:, 0], gaps[:, 1]
+    live = u_peak > ROUNDING * u_scale
+    safe = np.where(u_peak > 0.0, u_peak, 1.0)
+    u_error = gaps[:, 2] + rough
+    f_error = gaps[:, 3] + 2.0 * rough / safe * f_peak
+    run.error = ErrorEstimate(float(u_error.max(initial=rough)), float(f_error.max(initial=0.0)), charge)
+    over = np.append(u_error[live] / u_peak[live], (f_error / np.where(f_peak > 0.0, f_peak, np.inf))[live])
+    return float(over.max(initial=0.0))
 
 
 def gap_signals(problem: NetworkProblem, run: NetworkRun) -> Iterator[tuple[FloatArray, FloatArray]]:

@@ -195,3 +195,10 @@ class NetworkRecord:
 def _columns(x: FloatArray) -> FloatArray:
     """A single column as one row of numbers."""
     return sealed(np.ascontiguousarray(x[:, 0]) if x.shape[1] == 1 else x)
+
+
+def bare_record(
+    network: Network, net: Net, waveforms: tuple[Waveform, ...], t: FloatArray, left: BoolArray, rows: FloatArray
+) -> NetworkRecord:  # fmt: skip
+    """A record without charge, of rows of voltages and slow areas as columns (size, n_t)."""
+    return NetworkRecord(network, net, waveforms, t, left, np.ascontiguousarray(rows.T), False)

@@ -121,6 +121,10 @@ class NetworkProblem:
     def waveform(self) -> Waveform:
         return self.scene.waveform
 
+    @property
+    def waveforms(self) -> tuple[Waveform, ...]:
+        return self.scene.waveforms
+
     def record(self, run: Outputs) -> NetworkRecord:
         """The outputs of a run with what they mean."""
         scene = self.scene

@@ -14,10 +14,10 @@ from fingerspice.engine.collocation import advance
 from fingerspice.engine.network import Sources, new_room
 from fingerspice.engine.radau import Scheme, new_work
 from fingerspice.engine.readout import TRIED
-from fingerspice.netruns import Integration, NetworkRun, gap_signals, integrate, ramp, values_at
+from fingerspice.netruns import Integration, NetworkRun, gap_signals, integrate, ramp, state_error, values_at
 from fingerspice.networks import NetworkProblem
 from fingerspice.numerics.tableaus import radau
-from fingerspice.outcome import ErrorEstimate, Status
+from fingerspice.outcome import Status
 from fingerspice.runs import Progress
 
 FloatArray = NDArray[np.float64]
@@ -141,7 +141,7 @@ def solve_coupled(
         run = _integrate(problem, fine, tol, u_scale, at, side, progress)
         nfev += beside.nfev + run.nfev
         run.nfev = nfev
-        worst = _state_error(problem, run, _only(run, probed), beside, u_scale, ALIKE * tol) / rtol
+        worst = _stated(problem, run, _only(run, probed), beside, u_scale, ALIKE * tol) / rtol
         if run.status is Status.FOLD and run.t_failed is not None and tol > FINEST:
             # What the state is off moves the fold: closer, until its time stays.
             if folded is not None and abs(run.t_failed - folded) <= FOLD_TIME * run.t_failed:
@@ -201,28 +201,25 @@ def _only(run: NetworkRun, keep: BoolArray) -> NetworkRun:
     return dataclasses.replace(run, t=run.t[keep], left=run.left[keep], rows=run.rows[keep])
 
 
-def _state_error(
+def _stated(
     problem: NetworkProblem, run: NetworkRun, probed: NetworkRun, beside: NetworkRun, u_scale: float, alike: float
 ) -> float:
     """Write the stated error into a run: the largest difference, what both have alike, and rounding.
 
-    Returns it over the peaks, the larger of voltage and force.
+    Returns it over the peaks of each gap, the larger of voltage and force.
     """
     count = min(probed.t.size, beside.t.size)
-    u_error = f_error = u_peak = f_peak = 0.0
     both = (alike + 4e-15) * u_scale
+    gaps = []
     for (u, f), (v, g) in zip(gap_signals(problem, probed), gap_signals(problem, beside), strict=True):
         peak, force = float(np.abs(u).max(initial=0.0)), float(f.max(initial=0.0))
-        u_error = max(u_error, float(np.abs(u[:count] - v[:count]).max(initial=0.0)) + both)
+        u_error = float(np.abs(u[:count] - v[:count]).max(initial=0.0)) + both
         # F ~ u^2: what moves u by du moves F by 2 F du / u.
         moved = 2.0 * both / peak * force if peak > 0.0 else 0.0
-        f_error = max(f_error, float(np.abs(f[:count] - g[:count]).max(initial=0.0)) + moved)
-        u_peak, f_peak = max(u_peak, peak), max(f_peak, force)
+        gaps.append((peak, force, u_error, float(np.abs(f[:count] - g[:count]).max(initial=0.0)) + moved))
     charge = None
     if problem.charge:
         n_s = problem.initial.s_before.size
         at = slice(problem.initial.y.size - n_s, problem.initial.y.size)
         charge = float(np.abs(probed.rows[:count, at] - beside.rows[:count, at]).max(initial=0.0))
-    rough = run.error.u_gap
-    run.error = ErrorEstimate(u_error + rough, f_error, charge)
-    return max(u_error / u_peak if u_peak > 0.0 else 0.0, f_error / f_peak if f_peak > 0.0 else 0.0)
+    return state_error(run, np.array(gaps).reshape(-1, 4), u_scale, charge)

@@ -132,8 +132,8 @@ class ErrorEstimate:
     """Estimated largest error over the run: of the gap voltage (V), the electroadhesive force (N) and the charge (C).
 
     Without a GAP, `u_gap` is that of the voltage of the layer with the smallest capacitance, and `f_el` is 0.
-    `q_source` is None where the charge was left out or has no estimate: only the coupled tier's own steps give one, and
-    not from the periodic state on.
+    `q_source` is None where the charge was left out or has no estimate: only the coupled tier's own steps and the
+    algebraic tier give one, and not from the periodic state on.
     """
 
     u_gap: float

@@ -143,6 +143,11 @@ class Problem:
         return self.scene.waveform
 
     @property
+    def waveforms(self) -> tuple[Waveform, ...]:
+        """The loop's voltage, as the one source of a network."""
+        return (self.scene.waveform,)
+
+    @property
     def model(self) -> Model:
         return self.scene.model
 

@@ -160,3 +160,10 @@ class Record:
             single = len(self.stack.sources) == 1
             sources[element.name] = sign * self.u_source if single else sided(element.waveform, self.t, self.left)
         return {k: sealed(v) for k, v in self.stack.node_voltages(self.u_layer, sources).items()}
+
+
+def stack_record(
+    stack: Stack, waveform: Waveform, model: Model, t: FloatArray, left: BoolArray, live: FloatArray
+) -> Record:  # fmt: skip
+    """A record without charge."""
+    return Record(stack, waveform, model, t, left, live, None, None)

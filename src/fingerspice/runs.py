@@ -17,10 +17,13 @@ from fingerspice.networks import NetworkProblem
 from fingerspice.outcome import Attempt, ErrorEstimate, State, Status
 from fingerspice.problem import Problem
 from fingerspice.record import Record
+from fingerspice.refined import ClosedForm
+from fingerspice.steps import Recorded
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Progress = Callable[[float], None]
+Continuous = Recorded | ClosedForm
 
 # An error below this share of the voltages that cancel in the gap's is rounding: finer steps would not reach it.
 ROUNDING = 2e-14
@@ -36,7 +39,7 @@ class Run:
     `t`, `left`, `live`, `z`, `current` are as in `Record`, up to the time reached; `rough` is the source's (see
     `SourceTable`), V, and `unseen` the first output (s) at which it is not what was integrated, by how much (V);
     `margin` is the smallest distance to the fold met, `fold_spread` how far (s) the shadow run's fold is from its own,
-    and `tried` the last steps tried.
+    `tried` the last steps tried, and `continuous` the run between its outputs, where that is known.
     """
 
     t: FloatArray
@@ -58,6 +61,7 @@ class Run:
     margin: float = 1.0
     fold_spread: float = np.inf
     tried: tuple[Attempt, ...] = ()
+    continuous: Continuous | None = None
 
     def record(self, problem: Problem) -> Record:
         """The outputs with what they mean."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import time
 import warnings
@@ -14,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.cautions import network_warnings, stack_warnings
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.sampling import misses, same_time
 from fingerspice.circuit.statespace import is_stack
 from fingerspice.circuit.waveforms import Waveform, as_waveform, require
 from fingerspice.diagnosis import network_failure, stack_failure
@@ -28,6 +26,7 @@ from fingerspice.networks import NetworkProblem, prepare_network
 from fingerspice.nodal import solve_coupled
 from fingerspice.numerics.tableaus import TABLEAUS
 from fingerspice.outcome import ErrorEstimate, Failure, Status
+from fingerspice.outputs import at_breakpoints, output_times
 from fingerspice.periodic import close_period
 from fingerspice.planning import Plan, make_plan, plan_network
 from fingerspice.problem import Problem, prepare
@@ -55,6 +54,7 @@ def simulate(
     tier: str = "auto",
     start: str | Solution = "deck",
     charge: bool = True,
+    jumps: str = "both",
     throw: bool = True,
     progress: Progress | None = None,
 ) -> Solution:
@@ -89,6 +89,9 @@ def simulate(
         directly), or a Solution to go on from.
     charge : bool
         Whether `q_source` and `i_source` are wanted; leaving them out saves a fifth of the time.
+    jumps : str
+        ``"both"``: without `t_eval`, both one-sided values at each jump of a source; ``"none"``: no rows but those at
+        TSTART:TSTEP:TSTOP, right-hand values, so that `Solution.t` rises strictly.
     throw : bool
         Raise where the run fails; otherwise return what came before, with its status.
     progress : callable, optional
@@ -111,6 +114,7 @@ def simulate(
         rtol,
         "1e-13 to 0.1",
     )
+    require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
     if sources:
         circuit = _with_sources(circuit, sources)
     times = None if t_eval is None else np.asarray(t_eval, float)
@@ -121,7 +125,7 @@ def simulate(
             circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=start, charge=charge
         )
         how = start if isinstance(start, str) else "given"
-        return _given_back(run_network(network, times, rtol, method, progress, tier, how), throw)
+        return _given_back(run_network(network, times, rtol, method, progress, tier, how, jumps), throw)
     begun = None
     problem = prepare(
         circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area,
@@ -136,7 +140,7 @@ def simulate(
                 "settled and its periodic state exists"
             )
     how = start if isinstance(start, str) else "given"
-    return _given_back(run_problem(problem, times, rtol, method, progress, tier, how, begun), throw)
+    return _given_back(run_problem(problem, times, rtol, method, progress, tier, how, begun, jumps), throw)
 
 
 def _given_back(solution: Solution, throw: bool) -> Solution:
@@ -187,6 +191,7 @@ def run_problem(
     tier: str = "auto",
     start: str = "deck",
     begun: ErrorEstimate | None = None,
+    jumps: str = "both",
 ) -> Solution:
     """Integrate a problem made ready; arguments as in `simulate`. Never raises for a failed run.
 
@@ -195,11 +200,11 @@ def run_problem(
     # A method steps, and what is stepped is the coupled model.
     plan = make_plan(problem, rtol, "coupled" if tier == "auto" and method != "auto" else tier, start)
     if t_eval is None:
-        t_out, left = output_times(problem)
+        t_out, left = output_times(problem, jumps)
         run_at = t_out
     else:
         t_out, left = t_eval, np.zeros(t_eval.size, bool)
-        run_at = _at_breakpoints(problem, t_eval)
+        run_at = at_breakpoints(problem, t_eval)
     begin = time.perf_counter()
     if plan.tier == "algebraic":
         run, name = solve_algebraic(problem, run_at, left), plan.tier
@@ -237,6 +242,7 @@ def run_network(
     progress: Progress | None = None,
     tier: str = "auto",
     start: str = "deck",
+    jumps: str = "both",
 ) -> Solution:
     """As `run_problem`, for a network."""
     if method not in ("auto", "exponential", "radau"):
@@ -244,8 +250,8 @@ def run_network(
             f"method {method!r} is for series stacks; allowed for this network: 'auto', 'exponential' or 'radau'"
         )
     plan = plan_network(problem, "coupled" if tier == "auto" and method != "auto" else tier, start)
-    t_out, left = output_times(problem) if t_eval is None else (t_eval, np.zeros(t_eval.size, bool))
-    run_at = t_out if t_eval is None else _at_breakpoints(problem, t_eval)
+    t_out, left = output_times(problem, jumps) if t_eval is None else (t_eval, np.zeros(t_eval.size, bool))
+    run_at = t_out if t_eval is None else at_breakpoints(problem, t_eval)
     begin = time.perf_counter()
     if plan.tier == "linear":
         run, name = solve_fixed(problem, run_at, left), plan.tier
@@ -277,27 +283,6 @@ def _add_error(run: Run, u_gap: float, f_el: float | None = None) -> None:
     if f_el is None:
         f_el = 2.0 * u_gap / run.peak_u * run.peak_f if run.peak_u > 0.0 else 0.0
     run.error = dataclasses.replace(run.error, u_gap=run.error.u_gap + u_gap, f_el=run.error.f_el + f_el)
-
-
-# Of a long run, so that its memory does not grow with its length.
-_BREAKPOINTS_AT_ONCE = 65_536
-
-
-def _at_breakpoints(problem: Problem | NetworkProblem, t: FloatArray) -> FloatArray:
-    """Times moved onto the breakpoint they miss by rounding, so that 5 ms means the jump at 5 ms."""
-    span = problem.t_start, problem.t_stop
-    windows = 1 + int((span[1] - span[0]) * problem.waveform.breakpoint_rate() / _BREAKPOINTS_AT_ONCE)
-    moved = t
-    for w0, w1 in itertools.pairwise(span if windows == 1 else np.linspace(*span, windows + 1)):
-        edges = problem.breakpoints() if windows == 1 else problem.waveform.breakpoints(w0, w1)
-        near = edges[misses(t, edges, same_time(1.0))] if edges.size else edges
-        moved = t.copy() if near.size and moved is t else moved
-        slack = same_time(1.0) * np.abs(near)
-        for edge, first, last in zip(
-            near, t.searchsorted(near - slack), t.searchsorted(near + slack, "right"), strict=True
-        ):
-            moved[first:last] = edge
-    return moved
 
 
 def _with_sources(circuit: Circuit, sources: Mapping[str, Waveform | float | Callable[[float], float]]) -> Circuit:
@@ -338,30 +323,6 @@ def _run(
     return solve(problem, rtol, TABLEAUS[method], t_out, left, progress), method
 
 
-def output_times(problem: Problem | NetworkProblem) -> tuple[FloatArray, BoolArray]:
-    """TSTART:TSTEP:TSTOP with two entries (left, right) at each jump; t = 0 once, right-hand."""
-    step, first = problem.step, problem.first
-    count = int(np.floor((problem.t_stop - first) / step * (1.0 + 1e-12) + 1e-9))
-    grid = first + step * np.arange(count + 1)
-    if grid.size and abs(grid[-1] - problem.t_stop) <= 1e-9 * step:
-        grid[-1] = problem.t_stop
-    rounding = same_time(problem.t_stop)
-    edges = problem.waveform.breakpoints(problem.t_start, problem.t_stop + rounding)
-    edges = edges[(edges > problem.t_start + same_time(problem.t_start)) & (edges >= first)]
-    size = np.abs(problem.waveform.value(edges) - problem.waveform.value(edges, "left"))
-    level = np.maximum(np.abs(problem.waveform.value(edges)), np.abs(problem.waveform.value(edges, "left")))
-    jumps = edges[size > 1e-12 * level]
-    jumps = np.where(jumps > problem.t_stop - rounding, problem.t_stop, jumps)
-    if jumps.size:
-        near = np.clip(np.searchsorted(jumps, grid), 1, max(jumps.size - 1, 1))
-        distance = np.minimum(np.abs(grid - jumps[near - 1]), np.abs(grid - jumps[np.minimum(near, jumps.size - 1)]))
-        grid = grid[distance > 1e-9 * step]
-    t = np.concatenate([grid, jumps, jumps])
-    left = np.concatenate([np.zeros(grid.size, bool), np.ones(jumps.size, bool), np.zeros(jumps.size, bool)])
-    order = np.lexsort((~left, t))
-    return np.ascontiguousarray(t[order]), np.ascontiguousarray(left[order])
-
-
 def _solution(
     problem: Problem, run: Run, rtol: float, method: str, t_out: FloatArray, wall: float, plan: Plan
 ) -> Solution:
@@ -397,4 +358,7 @@ def _packed(
         fundamental=scene.fundamental,
         period=scene.waveform.period,
         warnings=warned,
+        first=max(problem.first, problem.t_start),
+        t_stop=problem.t_stop,
+        continuous=run.continuous if run.t_failed is None else None,
     )

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
+import cmath
+import dataclasses
 import json
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.files import write_aside
+from fingerspice.datafiles import variables, write_csv, write_netcdf
+from fingerspice.measures import Weighed, weigh_outputs, weigh_run
 from fingerspice.network_record import NetworkRecord
-from fingerspice.numerics.cubics import fundamental, mean
 from fingerspice.outcome import ErrorEstimate, Failure, NetworkState, State, Status
 from fingerspice.record import Record, sealed
 
@@ -29,10 +30,12 @@ if TYPE_CHECKING:
     from fingerspice.circuit.waveforms import Fundamental
     from fingerspice.physics.contact import Contact
     from fingerspice.planning import Plan
+    from fingerspice.refined import ClosedForm
+    from fingerspice.steps import Recorded
 
 FloatArray = NDArray[np.float64]
-# Dimensions, values, attributes: what both xarray and NetCDF take.
-_Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]
+# Signals with what their values weigh, and the range of each.
+_Figures = tuple[Weighed, dict[str, tuple[float, float]]]
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,10 @@ class Solution:
         Which model was run, and why.
     circuit : Circuit
     state : State
+    first, t_stop : float
+        TSTART and the end of the run, s.
+    continuous : Recorded or ClosedForm or None
+        The run between its outputs, where that is known.
     """
 
     t: FloatArray
@@ -85,6 +92,9 @@ class Solution:
     period: float | None = None
     fold_margin_min: float = 1.0
     warnings: tuple[str, ...] = field(default=())
+    first: float = 0.0
+    t_stop: float = 0.0
+    continuous: Recorded | ClosedForm | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         sealed(self.t)
@@ -197,7 +207,7 @@ class Solution:
         return self.status is Status.SUCCESS
 
     @property
-    def f_elmean(self) -> float | None:
+    def f_el_mean(self) -> float | None:
         """Mean electroadhesive force over the run, N; None without a GAP."""
         return self.summary().get("f_el_mean")
 
@@ -233,43 +243,60 @@ class Solution:
     def summary(self) -> dict[str, Any]:
         """Figures of the run: peak, rms, mean, ripple, amplitude and phase at the fundamental; SI units.
 
-        Means are integrals of cubics through the outputs. `f_el_mean` is over the whole run, `f_el_mean_periodic` over
-        the last period of the source; the entries of a period are None where the run holds none. A circuit without
-        GAP has its layer voltages (``u_layer:Xcoat_max``) in place of gap voltage and forces.
+        They are those of the run itself, from TSTART to its end, whatever outputs were asked for: ``figures_from`` is
+        ``"steps"``. Where the run between its outputs is not known, because another method or a failed run made them or
+        because it is too long, it is ``"outputs"``: means are integrals of cubics through the outputs then, and
+        extremes those of the outputs. `f_el_mean` is over the whole run, `f_el_mean_periodic` over the last period of
+        the source; the entries of a period are None where the run holds none. A circuit without GAP has its layer
+        voltages (``u_layer:Xcoat_max``) in place of gap voltage and forces.
         """
+        return dict(self._summary)
+
+    @cached_property
+    def _summary(self) -> dict[str, Any]:
         out: dict[str, Any] = {
             "t_stop": float(self.t[-1]) if self.t.size else None,
             "status": self.status.name,
         }
         out.update({f"error_{k}": v for k, v in vars(self.error).items()})
-        if self.t.size < 2:
+        whole = self._measured(self.first, self.t_stop)
+        if whole is None and self.t.size < 2:
             return out
+        out["figures_from"] = "outputs" if whole is None else "steps"
+        values, ranges = whole or self._of_outputs(0)
         last = self._last_period()
-        for key, x in self._summarised().items():
-            out[f"{key}_max"] = float(x.max())
-            out[f"{key}_min"] = float(x.min())
-            out[f"{key}_peak"] = float(np.abs(x).max())
-            out[f"{key}_mean"] = mean(self.t, x)
-            out[f"{key}_rms"] = float(np.sqrt(mean(self.t, x**2)))
-            out[f"{key}_mean_periodic"] = None
-            if last is not None:
-                periodic = mean(last[0], last[1][key])
-                out[f"{key}_mean_periodic"] = periodic
-                if key.partition(":")[0] in ("area", "f_el", "f_t", "friction"):
-                    out[f"{key}_ripple"] = float(np.ptp(last[1][key]))
-                else:
-                    out[f"{key}_rms_periodic"] = float(np.sqrt(mean(last[0], last[1][key] ** 2)))
+        for key, (low, high) in ranges.items():
+            out[f"{key}_max"], out[f"{key}_min"], out[f"{key}_peak"] = high, low, max(high, -low)
+            out[f"{key}_mean"], out[f"{key}_rms"] = values.mean(key), math.sqrt(values.mean(key, 2))
+            out[f"{key}_mean_periodic"] = None if last is None else last[0].mean(key)
+            if last is not None and key.partition(":")[0] in ("area", "f_el", "f_t", "friction"):
+                out[f"{key}_ripple"] = last[1][key][1] - last[1][key][0]
+            elif last is not None:
+                out[f"{key}_rms_periodic"] = math.sqrt(last[0].mean(key, 2))
         if last is not None and self.fundamental is not None:
-            f0 = self.fundamental
             for key in ("u_source", "u_gap"):
                 if key in last[1]:
-                    p = fundamental(last[0], last[1][key], f0.frequency)
-                    out[f"{key}_amplitude"] = abs(p)
-                    out[f"{key}_phase_deg"] = float(np.degrees(np.angle(p)))
-            out["fundamental"] = f0.frequency
+                    p = last[0].phasor(key, self.fundamental.frequency)
+                    out[f"{key}_amplitude"], out[f"{key}_phase_deg"] = abs(p), math.degrees(cmath.phase(p))
+            out["fundamental"] = self.fundamental.frequency
         if self.f_el is not None:
-            out["fold_margin_min"] = min(self.fold_margin_min, float(self.fold_margin.min()))
+            out["fold_margin_min"] = min(self.fold_margin_min, float(self.fold_margin.min(initial=1.0)))
         return out
+
+    def _measured(self, since: float, until: float) -> _Figures | None:
+        """Figures between two times (s) from the run between its outputs; None where that is not known."""
+        run = None if self.continuous is None else self.continuous.run(self._read, since, until)
+        return None if run is None else weigh_run(run, self._read, since, until)
+
+    def _read(self, record: Record | NetworkRecord) -> dict[str, FloatArray]:
+        """The signals that figures are taken of, from other outputs of this run."""
+        return dataclasses.replace(self, t=record.t, record=record)._summarised()
+
+    def _of_outputs(self, first: int) -> _Figures:
+        """Figures of the outputs from number `first` on."""
+        t, signals = self.t[first:], {name: x[first:] for name, x in self._summarised().items()}
+        ranges = {name: (float(x.min()), float(x.max())) for name, x in signals.items()}
+        return weigh_outputs(t, signals), ranges
 
     def _summarised(self) -> dict[str, FloatArray]:
         """What the summary gives figures of; without a gap, every layer."""
@@ -282,24 +309,26 @@ class Solution:
         }
         return {**self.by_name("u_source"), **inside, **self.by_name("area")}
 
-    def _last_period(self) -> tuple[FloatArray, dict[str, FloatArray]] | None:
-        """Times and signals of the last period, with an interpolated first point; None where there is none."""
-        if self.period is None:
+    def _last_period(self) -> _Figures | None:
+        """Figures of the last period of the source; None where the run holds none."""
+        if self.period is None or not self.t.size:
             return None
-        start = self.t[-1] - self.period
         tolerance = 1e-9 * self.period
+        if self.continuous is not None and self.t_stop - self.period >= self.first - tolerance:
+            found = self._measured(max(self.t_stop - self.period, self.first), self.t_stop)
+            if found is not None:
+                return found
+        start = self.t[-1] - self.period
         if start < self.t[0] - tolerance or np.count_nonzero(self.t >= start) < 8:
             return None
         first = int(np.searchsorted(self.t, start - tolerance, side="right"))
-        exact = abs(self.t[first] - start) <= tolerance
-        if exact:
+        if abs(self.t[first] - start) <= tolerance:
             # At a jump the period starts with the right-hand value.
-            first = int(np.searchsorted(self.t, start + tolerance, side="right")) - 1
-        signals = {}
-        for key, x in self._summarised().items():
-            head = [] if exact else [np.interp(start, self.t, x)]
-            signals[key] = np.concatenate([head, x[first:]])
-        return np.concatenate([[] if exact else [start], self.t[first:]]), signals
+            return self._of_outputs(int(np.searchsorted(self.t, start + tolerance, side="right")) - 1)
+        t, signals = self.t[first:], self._summarised()
+        cut = {name: np.append(np.interp(start, self.t, x), x[first:]) for name, x in signals.items()}
+        ranges = {name: (float(x.min()), float(x.max())) for name, x in cut.items()}
+        return weigh_outputs(np.append(start, t), cut), ranges
 
     def provenance(self) -> dict[str, str]:
         """What it takes to repeat the run, as text."""
@@ -329,40 +358,7 @@ class Solution:
         InputError
             Where the folder cannot be written.
         """
-        signals = self.signals
-        header = ["t [s]", *(f"{name} [{unit}]" for name, (_, unit, _) in signals.items())]
-        table = np.column_stack([self.t, *(value for value, _, _ in signals.values())])
-
-        def write(target: Path) -> None:
-            with target.open("w", newline="", encoding="utf-8") as stream:
-                writer = csv.writer(stream)
-                writer.writerow(header)
-                writer.writerows([repr(float(x)) for x in row] for row in table)
-
-        return write_aside(Path(path), write)
-
-    def _dataset(self, jumps: str) -> tuple[dict[str, _Variable], dict[str, _Variable]]:
-        """Variables and coordinates of the data files, as (dimensions, values, attributes)."""
-        from fingerspice.circuit.waveforms import require
-
-        require(jumps in ("right", "both"), "jumps", repr(jumps), "'right' or 'both'")
-        keep = np.ones(self.t.size, bool)
-        if jumps == "right" and self.t.size:
-            keep[:-1] = np.diff(self.t) > 0.0
-        data: dict[str, _Variable] = {
-            name: (("time",), value[keep], {"units": unit, "long_name": text})
-            for name, (value, unit, text) in self.signals.items()
-            if not name.startswith(("u_layer:", "v:"))
-        }
-        data["u_layer"] = (("time", "layer"), self.u_layer[keep], {"units": "V", "long_name": "layer voltage"})
-        nodes = np.column_stack(list(self.node_voltages.values()))[keep]
-        data["v"] = (("time", "node"), nodes, {"units": "V", "long_name": "node voltage"})
-        coords: dict[str, _Variable] = {
-            "time": (("time",), self.t[keep], {"units": "s", "long_name": "time"}),
-            "layer": (("layer",), np.array(self.layers, dtype=object), {}),
-            "node": (("node",), np.array(list(self.node_voltages), dtype=object), {}),
-        }
-        return data, coords
+        return write_csv(self, Path(path))
 
     def to_xarray(self, *, jumps: str = "right") -> xarray.Dataset:
         """The run as an xarray Dataset with units and provenance.
@@ -379,7 +375,7 @@ class Solution:
         """
         import xarray
 
-        data, coords = self._dataset(jumps)
+        data, coords = variables(self, jumps)
         return xarray.Dataset(data, coords=coords, attrs=self.provenance())
 
     def to_netcdf(self, path: str | Path, *, jumps: str = "right") -> Path:
@@ -390,26 +386,7 @@ class Solution:
         InputError
             Where the folder cannot be written, or for another value of `jumps`.
         """
-        import h5netcdf
-        import h5py
-
-        data, coords = self._dataset(jumps)
-
-        def write(target: Path) -> None:
-            # HDF5 ends the process where the disk is full, so it gets to see memory only.
-            content = io.BytesIO()
-            with h5netcdf.File(content, "w") as file:
-                for name, (_, values, _) in coords.items():
-                    file.dimensions[name] = values.size
-                for name, (dimensions, values, attributes) in {**coords, **data}.items():
-                    kind = h5py.string_dtype() if values.dtype == object else values.dtype
-                    variable = file.create_variable(name, dimensions, dtype=kind, data=values)
-                    variable.attrs.update(attributes)
-                for key, text in self.provenance().items():
-                    file.attrs[key] = text
-            target.write_bytes(content.getbuffer())
-
-        return write_aside(Path(path), write)
+        return write_netcdf(self, Path(path), jumps)
 
     def plot(self) -> Figure:
         """Source and gap voltage, force and area against time."""

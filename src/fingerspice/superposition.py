@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +13,12 @@ from fingerspice.circuit.network import Modes, Network
 from fingerspice.circuit.sampling import SourceTable, breakpoints_at, source_table
 from fingerspice.engine.algebraic import source_at
 from fingerspice.netruns import NetworkRun, first_unseen, gap_signals, source_tables
+from fingerspice.network_record import NetworkRecord
 from fingerspice.networks import NetworkProblem
 from fingerspice.numerics import linear
 from fingerspice.outcome import ErrorEstimate, NetworkState, Status
 from fingerspice.record import sided
+from fingerspice.refined import ClosedForm
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -94,7 +98,14 @@ def solve_fixed(problem: NetworkProblem, t_out: FloatArray, left: BoolArray) -> 
             run.peaks[network.fingers[i]] = peak
         f_error = max(f_error, 2.0 * rounding / peak * float(f.max(initial=0.0)) if peak > 0.0 else 0.0)
     run.error = ErrorEstimate(rounding, f_error)
+    if not scene.is_sampled:
+        look = partial(_look, dataclasses.replace(problem, charge=False))
+        run.continuous = ClosedForm(look, problem.waveform, problem.t_start, problem.first, problem.t_stop)
     return run
+
+
+def _look(problem: NetworkProblem, t: FloatArray, left: BoolArray) -> NetworkRecord:
+    return problem.record(solve_fixed(problem, t, left))
 
 
 def _upto(t_out: FloatArray, left: BoolArray, end: float) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 
@@ -11,14 +12,16 @@ from fingerspice.engine import advance, march, readout
 from fingerspice.engine import repeat as repetition
 from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
-from fingerspice.engine.march import Work
 from fingerspice.engine.model import write_row
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.system import System, area_range, build_system
+from fingerspice.engine.work import Work, new_work
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.problem import Problem, Scene
+from fingerspice.record import stack_record
 from fingerspice.runs import BoolArray, FloatArray, after_the_end, from_rows, row_width
 from fingerspice.settling import Settling
+from fingerspice.steps import Recorded, Recorder
 
 # The largest error between nodes may stand beside the two points where it is looked for, and signs may cancel there.
 SAFETY = 2.5
@@ -60,7 +63,7 @@ def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
             scene.stack.grouping, stress,
         )  # fmt: skip
         n = model.gap.size
-        scene.prepared[key] = Prepared(system, new_tables(n), march.new_work(n), integral_table())
+        scene.prepared[key] = Prepared(system, new_tables(n), new_work(n), integral_table())
     prepared: Prepared = scene.prepared[key]
     return prepared
 
@@ -92,6 +95,7 @@ class Track:
         self.shown = self.prepared.system.k_shown.size
         self.out = np.empty((self.shown + 2 if self.pace.charge else self.shown, self.t_out.size))
         self.repeated = 0
+        self.recorder = Recorder(self.shown)
         self.forget()
 
     @property
@@ -108,12 +112,14 @@ class Track:
         """March to `t_end` (s) through a table."""
         p = self.prepared
         mine = (self.y, self.error, self.control, self.counters)
-        return int(
-            march.march(
+        while True:
+            code = march.march(
                 p.system, self.pace, p.tables, p.work, p.integral, table.edges, table.terms, table.series, t_end,
-                *mine, self.t_out, self.left, self.out, self.kept, self.tried,
-            )
-        )  # fmt: skip
+                *mine, self.t_out, self.left, self.out, self.kept, self.recorder.room, self.tried,
+            )  # fmt: skip
+            if code != march.PAUSED:
+                return int(code)
+            self.recorder.drain(self.counters)
 
     def forget(self) -> None:
         """Keep no steps."""
@@ -123,6 +129,8 @@ class Track:
         """Keep so many of the steps that follow."""
         self.kept = repetition.new_kept(steps, self.out.shape[0])
         self.counters[readout.KEPT] = 0
+        self.recorder.drain(self.counters)
+        self.kept_from = len(self.recorder.parts)
         self.before = float(self.y[-1]), float(self.control[readout.COLLECTED]), float(self.control[readout.SPREAD])
 
     @property
@@ -143,6 +151,8 @@ class Track:
             self.kept, kept, period, periods, drifts, first, self.t_out, self.left, self.out
         )
         self.y[-1] += periods * drift
+        self.recorder.drain(self.counters)
+        self.recorder.repeat(self.kept_from, periods, period)
         self._pass(periods, periods, settling, settling.remaining, collected, spread)
         self.forget()
 
@@ -182,6 +192,14 @@ class Track:
                 + self.capacitance * off
             )  # fmt: skip
         self.repeated += periods
+
+    def recorded(self) -> Recorded | None:
+        """The steps taken so far."""
+        self.recorder.drain(self.counters)
+        problem = self.problem
+        return self.recorder.finish(
+            problem.first, problem.t_stop, partial(stack_record, problem.stack, problem.waveform, problem.model)
+        )
 
     def finish(self, table: SourceTable) -> None:
         """Write the right-hand outputs at the very end of the run."""

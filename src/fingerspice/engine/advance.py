@@ -54,7 +54,7 @@ def enter(model: Model, segment: Segment, t0: float, y: FloatArray, control: Flo
     jump = u_source - control[U_BEFORE]
     if t0 == 0.0 or control[SIGN] == 0.0:
         if not model.mobile and jump != 0.0:
-            y[-1] += jump_charge(model, x_gap, control[U_BEFORE], u_source)
+            y[-1] += jump_charge(model, x_gap, control[U_BEFORE], u_source)[0]
         if not abs(jump) <= 1e-3 * (abs(u_source) + abs(control[U_BEFORE])):
             control[H] = 0.0
         zero = model.k_gap * u_source + x_gap

@@ -29,14 +29,18 @@ def source_at(
 
 
 @jit
-def follow(model: Model, u: FloatArray, slope: FloatArray, y: FloatArray, u_before: float, rows: FloatArray) -> None:
+def follow(model: Model, u: FloatArray, slope: FloatArray, y: FloatArray, u_before: float, rows: FloatArray) -> float:
     """Fill `rows` (see `write_row`) for source voltages u and slopes, from state y at source voltage `u_before`.
 
-    The charge of the path from one voltage to another depends on these two alone.
+    The charge of the path from one voltage to another depends on these two alone. Returns its largest error, C.
     """
     here = y.copy()
+    worst = 0.0
     for i in range(u.size):
         if not model.mobile:
-            here[-1] = y[-1] + jump_charge(model, dot(model.gap, y), u_before, u[i])
+            moved, error = jump_charge(model, dot(model.gap, y), u_before, u[i])
+            here[-1] = y[-1] + moved
+            worst = max(worst, error)
         sign = choose_branch(model, u[i], here)
         write_row(model, u[i], slope[i], here, sign, model.k_gap * u[i], rows[i])
+    return worst

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +29,15 @@ from fingerspice.engine.readout import (
     NFEV,
     OUTPUT,
     PEAK_U,
+    RECORDED,
     REJECTED,
     SIGN,
     TOO_LONG,
     U_BEFORE,
     U_GAP,
-    WRITTEN_AT_ONCE,
     ZEROS,
     H,
+    Steps,
     T,
     account,
     at,
@@ -46,70 +46,27 @@ from fingerspice.engine.readout import (
     first_wrong,
     layers,
     note,
+    record,
     series_of,
     write_outputs,
     zero,
 )  # fmt: skip
 from fingerspice.engine.repeat import AT_EDGE, AT_ZERO, Kept
-from fingerspice.engine.rows import DQ, GUESS, N_FLAT, SOURCE, X_GAP, Q, U, source_rows
+from fingerspice.engine.rows import DQ, GUESS, SOURCE, X_GAP, Q, U, source_rows
 from fingerspice.engine.segment import Segment, source
 from fingerspice.engine.system import System
+from fingerspice.engine.work import Work
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 # Codes returned by `march`.
-DONE, NO_STEP, OUT_OF_RANGE, TOO_MANY = 0, 1, 2, 3
+DONE, NO_STEP, OUT_OF_RANGE, TOO_MANY, PAUSED = 0, 1, 2, 3, 4
 # Step over the one before, at most; and what of it may be foreseen growth.
 _MOST_GROWTH, _MOST_TREND = 8.0, 2.5
 # Over a length once found too long: if the error allows this much, what made it so has passed.
 _REFUTED = 1.5
-
-
-class Work(NamedTuple):
-    """Arrays that steps work in: those of `fingerspice.engine.rows`, and the loop's own."""
-
-    r: FloatArray
-    base: FloatArray
-    w: FloatArray
-    pull: FloatArray
-    used: FloatArray
-    pull_before: FloatArray
-    left_before: FloatArray
-    w0: FloatArray
-    places: FloatArray
-    carried: FloatArray
-    forced: FloatArray
-    values: FloatArray
-    coefficients: FloatArray
-    outputs: FloatArray
-    sums: FloatArray
-    weight: FloatArray
-    tapped: FloatArray
-
-
-def new_work(n: int) -> Work:
-    """Work arrays for n modes."""
-    return Work(
-        np.zeros((N_FLAT, ROWS)),
-        np.zeros((n, ROWS)),
-        np.zeros((n, ROWS)),
-        np.zeros((n, ROWS)),
-        np.zeros((n, ROWS)),
-        np.zeros((n, ROWS)),
-        np.zeros((n, ROWS)),
-        np.zeros(n),
-        np.zeros((n, N_PLACES)),
-        np.zeros((n, N_PLACES - 1)),
-        np.zeros(n),
-        np.zeros((n + 2, ROWS)),
-        np.zeros((n + 2, ROWS)),
-        np.zeros((2, WRITTEN_AT_ONCE)),
-        np.zeros((4, 4)),
-        np.zeros(n),
-        np.zeros((n + 1, ROWS)),
-    )
 
 
 @jit
@@ -131,6 +88,7 @@ def march(
     left: NDArray[np.bool_],
     out: FloatArray,
     kept: Kept,
+    steps: Steps,
     tried: FloatArray,
 ) -> int:
     """Step to `t_end` through the source's segments, writing outputs on the way.
@@ -154,6 +112,8 @@ def march(
         (see `System.shown`), then charge and current if wanted.
     kept : Kept
         Takes the steps, as long as there is room (none: nothing is kept); `counters` holds how many there were.
+    steps : Steps
+        Takes the steps too.
     tried : ndarray, shape (TRIED, 4)
         Takes the last steps tried, in turn: start and length (s), error over the one allowed, number from 1.
 
@@ -161,7 +121,7 @@ def march(
     -------
     int
         DONE, NO_STEP (no step is short enough: a fold, or an error that cannot be met), OUT_OF_RANGE (a gap voltage
-        beyond the range of the area's polynomial) or TOO_MANY steps.
+        beyond the range of the area's polynomial), TOO_MANY steps, or PAUSED: make room in `steps`, and call again.
     """
     # Arrays are taken out of their tuples once: doing it where they are used costs more than the use.
     model = system.model
@@ -189,6 +149,8 @@ def march(
     t_out, left, out = borrow(t_out), borrow(left), borrow(out)
     values, coefficients = borrow(work.values), borrow(work.coefficients)
     kept_times, kept_series, tried = borrow(kept.times), borrow(kept.series), borrow(tried)
+    step_times, step_values, paused = borrow(steps.times), borrow(steps.values), borrow(steps.paused)
+    room = step_times.shape[0]
     u_rows, q_rows, source_row = r[U], r[Q], r[SOURCE]
     n = model.gap.size
     columns, n_shown = out.shape[0], all_shown.shape[1]
@@ -212,8 +174,18 @@ def march(
         index = np.searchsorted(edges, control[T], side="right") - 2
     most = counters[ACCEPTED] + counters[REJECTED] + MOST_STEPS
     begun, evaluated = control[T], counters[NFEV]
+    if paused[0] > 0.0:
+        # In the middle of a segment: go on as if there had been no pause.
+        index = np.searchsorted(edges, control[T], side="left") - 1
+        start, edge = edges[index], edges[index + 1]
+        segment_terms, segment_series = terms[index], series[index]
+        paused[0], since, begun = 0.0, paused[1], paused[2]
+        fresh, evaluated, most = int(paused[3]), int(paused[4]), int(paused[5])
     while control[T] < t_end:
         t = control[T]
+        if counters[RECORDED] >= room > 0:
+            paused[0], paused[1], paused[2], paused[3], paused[4], paused[5] = 1.0, since, begun, fresh, evaluated, most
+            return PAUSED
         if counters[ACCEPTED] + counters[REJECTED] > most:
             return TOO_MANY
         if counters[NFEV] - evaluated > NODES * FIRST_PASSES:
@@ -383,8 +355,12 @@ def march(
                 model, rates, gain, gap, slow_share, w, pull, r, integral, h, y[n], places, theta, control,
                 values[n_shown], values[n_shown + 1],
             )  # fmt: skip
-        if next_out <= t_new or kept_times.size > 0:
+        if room > 0 or next_out <= t_new or kept_times.size > 0:
             layers(mobile, area0, k_shown, shown, w, source_row, q_rows, values)
+        if room > 0:
+            record(step_times, step_values, counters[RECORDED], t, h, t_new, values)
+            counters[RECORDED] += 1
+        if next_out <= t_new or kept_times.size > 0:
             for c in range(columns):
                 series_of(values[c], coefficients[c])
             place = counters[KEPT]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.compiled import borrow, jit
-from fingerspice.engine import rows
+from fingerspice.engine import netrows, rows
 from fingerspice.engine.exponential import (
     N_PLACES,
     Tables,
@@ -33,33 +33,7 @@ from fingerspice.engine.netassess import (
 )
 from fingerspice.engine.netcharge import charge_error, charge_rows
 from fingerspice.engine.netgrowth import carry
-from fingerspice.engine.netrows import (
-    AREA,
-    BASE,
-    CELL_U,
-    DU,
-    FREE,
-    FREE_RATE,
-    GUESS,
-    LEFT_BEFORE,
-    LIN,
-    MORE,
-    PULL,
-    PULL_BEFORE,
-    SLOPE,
-    STIFF,
-    USED,
-    D,
-    Form,
-    J,
-    U,
-    W,
-    Work,
-    combine,
-    couple,
-    evaluate,
-    meet,
-)
+from fingerspice.engine.netrows import STIFF, Form, Work, combine, couple, evaluate, meet
 from fingerspice.engine.network import Sources, at_sources
 from fingerspice.engine.pace import Pace, choose_step, rung
 from fingerspice.engine.readout import (
@@ -74,15 +48,18 @@ from fingerspice.engine.readout import (
     N_CONTROL,
     NFEV,
     OUTPUT,
+    RECORDED,
     REJECTED,
     TOO_LONG,
     ZEROS,
     H,
+    Steps,
     T,
     at,
     error_at,
     first_wrong,
     note,
+    record,
     series_of,
     write_outputs,
 )
@@ -114,7 +91,8 @@ def march(
     form: Form, pace: Pace, tables: Tables, work: Work, integral: FloatArray, size: FloatArray, sources: Sources,
     jump: bool, tau: float, t_end: float, y: FloatArray, error: FloatArray, sign: FloatArray, s_before: FloatArray,
     branch: FloatArray, control: FloatArray, counters: IntArray, peaks: FloatArray, collected: FloatArray,
-    t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray, kept: Kept, tried: FloatArray,
+    t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray, kept: Kept, steps: Steps,
+    tried: FloatArray,
 ) -> int:  # fmt: skip
     """Step to `t_end` through the sources' segments, writing outputs on the way.
 
@@ -146,6 +124,8 @@ def march(
         currents.
     kept : Kept
         Takes the steps, as long as there is room.
+    steps : Steps
+        Takes the steps too: the voltages and slow areas of the state.
     tried : ndarray, shape (TRIED, 4)
         Takes the last steps tried, in turn: start and length (s), error over the one allowed, number from 1.
 
@@ -176,11 +156,24 @@ def march(
         borrow(work.r), borrow(work.s), borrow(work.ds), borrow(work.matrix), borrow(work.small)
     )  # fmt: skip
     modes, cells, areas = borrow(work.modes), borrow(work.cells), borrow(work.areas)
-    w, base, lin, d, pull, used = modes[W], modes[BASE], modes[LIN], modes[D], modes[PULL], modes[USED]
-    pull_before, left_before = modes[PULL_BEFORE], modes[LEFT_BEFORE]
-    free, free_rate, cell_u, du, j = cells[FREE], cells[FREE_RATE], cells[CELL_U], cells[DU], cells[J]
-    area, slope, more = areas[AREA], areas[SLOPE], areas[MORE]
-    u, guess = areas[U], areas[GUESS]
+    w, base, lin, d, pull, used = (
+        modes[netrows.W],
+        modes[netrows.BASE],
+        modes[netrows.LIN],
+        modes[netrows.D],
+        modes[netrows.PULL],
+        modes[netrows.USED],
+    )
+    pull_before, left_before = modes[netrows.PULL_BEFORE], modes[netrows.LEFT_BEFORE]
+    free, free_rate, cell_u, du, j = (
+        cells[netrows.FREE],
+        cells[netrows.FREE_RATE],
+        cells[netrows.CELL_U],
+        cells[netrows.DU],
+        cells[netrows.J],
+    )
+    area, slope, more = areas[netrows.AREA], areas[netrows.SLOPE], areas[netrows.MORE]
+    u, guess = areas[netrows.U], areas[netrows.GUESS]
     w0, places, carried, weight = borrow(work.w0), borrow(work.places), borrow(work.carried), borrow(work.weight)
     room, x_off = borrow(work.room), borrow(work.x)
     values, coefficients, outputs = borrow(work.values), borrow(work.coefficients), borrow(work.outputs)
@@ -189,6 +182,8 @@ def march(
     t_out, left, out, tried = borrow(t_out), borrow(left), borrow(out), borrow(tried)
     integral, size = borrow(integral), borrow(size)
     kept_times, kept_series = borrow(kept.times), borrow(kept.series)
+    step_times, step_values = borrow(steps.times), borrow(steps.values)
+    step_room = step_times.shape[0]
     n, n_s, m, n_area = shape.shape[0], s_before.size, rates.size, sign.size
     first_z = y.size - n_s
     tol, charge = pace.tol, pace.charge
@@ -207,7 +202,7 @@ def march(
         t = control[T]
         if counters[ACCEPTED] + counters[REJECTED] > control[MOST]:
             return TOO_MANY
-        if counters[ACCEPTED] >= pause:
+        if counters[ACCEPTED] >= pause or counters[RECORDED] >= step_room > 0:
             return PAUSED
         stop = t_end
         at_edge = False
@@ -404,8 +399,12 @@ def march(
             )  # fmt: skip
         for e in range(n_s):
             gained[e] = at(values[first_z + e], theta) if charge else 0.0
-        if next_out <= t_new or kept_times.size > 0:
+        if step_room > 0 or next_out <= t_new or kept_times.size > 0:
             write_columns(n, first_z, charge, shape, follow, w, s, y, values)
+        if step_room > 0:
+            record(step_times, step_values, counters[RECORDED], t, h, t_new, values)
+            counters[RECORDED] += 1
+        if next_out <= t_new or kept_times.size > 0:
             for i in range(out.shape[0]):
                 series_of(values[i], coefficients[i])
             place = counters[KEPT]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fingerspice.compiled import jit
 from fingerspice.engine.model import Model, choose_branch, dot, gap_voltage, jump_charge, ramp
-from fingerspice.engine.readout import BRANCH_LENGTH, BRANCH_START, SIGN, U_BEFORE, U_GAP, H, T
+from fingerspice.engine.readout import BRANCH_LENGTH, BRANCH_START, ERROR_Q, SIGN, U_BEFORE, U_GAP, H, T
 
 FloatArray = NDArray[np.float64]
 
@@ -59,7 +59,9 @@ def enter(model: Model, charge: bool, u_source: float, y: FloatArray, control: F
     """Take the jump of the source that may stand here, and the branch after it; False where a fold lies in between."""
     x_gap = dot(model.gap, y)
     if not model.mobile and u_source != control[U_BEFORE] and charge:
-        y[-1] += jump_charge(model, x_gap, control[U_BEFORE], u_source)
+        moved, error = jump_charge(model, x_gap, control[U_BEFORE], u_source)
+        y[-1] += moved
+        control[ERROR_Q] += error
     k_u = model.k_gap * u_source
     if model.mobile and control[SIGN] != 0.0:
         u = ramp(model, k_u, x_gap, control[U_GAP])

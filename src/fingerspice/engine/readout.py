@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,9 +33,9 @@ H_AFTER_ZERO = 19
 # Smallest distance to the fold met.
 MARGIN = 20
 N_CONTROL = 21
-# Entries of `counters`: rows evaluated, steps accepted and refused, zeros met, outputs written, steps kept.
-NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT = 0, 1, 2, 3, 4, 5
-N_COUNTERS = 6
+# Entries of `counters`: rows evaluated, steps accepted and refused, zeros met, outputs written, steps kept, recorded.
+NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT, RECORDED = 0, 1, 2, 3, 4, 5, 6
+N_COUNTERS = 7
 # The last steps tried are kept, this many, as rows: start and length (s), error over the one allowed, number.
 TRIED = 8
 # Steps taken and refused in a window of the source, which holds a few thousand of its periods at most: what needs more
@@ -45,6 +47,40 @@ FIRST_PASSES, MOST_PASSES = 20_000, 2_000
 # Outputs are read in groups of a processor's vectors, and looked for in strides.
 WRITTEN_AT_ONCE = _GROUP = 8
 _STRIDE = 32
+
+
+class Steps(NamedTuple):
+    """Takes every step, for figures of the run that no outputs are needed for.
+
+    Attributes
+    ----------
+    times : ndarray, shape (capacity, 3)
+        Start and length (s), and the end reached; no capacity: nothing is recorded.
+    values : ndarray, shape (capacity, n_column, NODES)
+        Recorded voltages, or the state of a network, at the nodes of the whole length.
+    paused : ndarray, shape (6,)
+        Where a loop stopped because all places are taken; the first entry is 1 then, else 0.
+    """
+
+    times: FloatArray
+    values: FloatArray
+    paused: FloatArray
+
+
+def new_steps(capacity: int, columns: int) -> Steps:
+    """Room for so many steps."""
+    return Steps(np.empty((capacity, 3)), np.empty((capacity, columns, NODES)), np.zeros(6))
+
+
+@jit
+def record(
+    times: FloatArray, recorded: FloatArray, place: int, t: float, h: float, t_new: float, values: FloatArray
+) -> None:
+    """Put a step in its place."""
+    times[place, 0], times[place, 1], times[place, 2] = t, h, t_new
+    for c in range(recorded.shape[1]):
+        for j in range(NODES):
+            recorded[place, c, j] = values[c, j]
 
 
 @jit

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fingerspice.compiled import jit
 from fingerspice.engine.exponential import Tables
-from fingerspice.engine.march import DONE, Work, march
+from fingerspice.engine.march import DONE, march
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.readout import (
     BRANCH_LENGTH,
@@ -21,10 +21,12 @@ from fingerspice.engine.readout import (
     PEAK_U,
     TRIED,
     U_BEFORE,
+    Steps,
     T,
 )  # fmt: skip
 from fingerspice.engine.repeat import Kept
 from fingerspice.engine.system import System
+from fingerspice.engine.work import Work
 from fingerspice.numerics.lobatto import NODES, ROWS
 from fingerspice.numerics.small import inverse
 
@@ -64,7 +66,8 @@ def _map(
     code = march(
         system, pace, tables, work, integral, edges, terms, series, edges[-1], y, np.zeros(n + 1), control, count,
         np.zeros(0), np.zeros(0, np.bool_), np.zeros((n, 0)),
-        Kept(np.zeros((0, 4)), np.zeros((0, n, ROWS))), np.zeros((TRIED, 4)),
+        Kept(np.zeros((0, 4)), np.zeros((0, n, ROWS))),
+        Steps(np.zeros((0, 3)), np.zeros((0, n, NODES)), np.zeros(6)), np.zeros((TRIED, 4)),
     )  # fmt: skip
     for k in range(n):
         end[k] = 0.0

@@ -1,0 +1,219 @@
+"""A run between its outputs: the steps that were taken, and how many periods each of them stands for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from fingerspice.circuit.sampling import same_time
+from fingerspice.engine.readout import RECORDED, Steps, new_steps
+from fingerspice.measures import Panels, Read, Signals
+from fingerspice.network_record import NetworkRecord
+from fingerspice.numerics.lobatto import BARYCENTRIC, NODES, POINTS
+from fingerspice.record import Record
+
+AnyRecord = Record | NetworkRecord
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+#: Steps recorded between two looks from Python, and numbers at the nodes of all of them, at most.
+CAPACITY, _AT_ONCE = 512, 16_384
+#: Numbers kept of a run's steps (64 MB): of a longer run figures rest on its outputs.
+MOST_NUMBERS = 8_000_000
+#: Periods of a leap that differ, at most.
+_MOST_PERIODS = 20_000
+_NODES = POINTS[:NODES]
+#: From Chebyshev coefficients to values at the nodes.
+_FROM_SERIES = chebyshev.chebvander(2.0 * _NODES - 1.0, NODES - 1).T
+
+
+@dataclass(frozen=True)
+class Block:
+    """Steps that follow one another, and the periods they stand for.
+
+    Attributes
+    ----------
+    times : ndarray, shape (k, 3)
+        Start and length of each step, and the end reached, s.
+    values : ndarray, shape (k, n_column, NODES)
+        At the nodes of the whole length.
+    count : int
+        Periods that are alike, these steps' own included or not (see `shift`).
+    shift, period : float
+        The first of them comes `shift` after the steps' own times, each further one `period` later, s.
+    """
+
+    times: FloatArray
+    values: FloatArray
+    count: int = 1
+    shift: float = 0.0
+    period: float = 0.0
+
+
+@dataclass(frozen=True)
+class Leap:
+    """Periods that follow one another by an affine map: arguments as those of `engine.repeat.approach`."""
+
+    marks: FloatArray
+    marks_by: FloatArray
+    series: FloatArray
+    by: FloatArray
+    slope: FloatArray
+    x: FloatArray
+    end: FloatArray
+    start: FloatArray
+    still: float
+    period: float
+    periods: int
+
+    def blocks(self) -> list[Block] | None:
+        """The periods one by one until they no longer change; None where they do so for too long."""
+        n = self.x.size
+        out: list[Block] = []
+        delta = self.start[:n] - self.x
+        last = None
+        for k in range(self.periods):
+            if last is not None and float(np.abs(delta - last).max(initial=0.0)) <= self.still:
+                moved = self._block(last, k * self.period)
+                out.append(Block(moved.times, moved.values, self.periods - k, moved.shift, self.period))
+                return out
+            if k >= _MOST_PERIODS:
+                return None
+            out.append(self._block(delta, k * self.period))
+            last, delta = delta, self.end[:n] - self.x + self.slope[:n] @ delta
+        return out
+
+    def _block(self, delta: FloatArray, shift: float) -> Block:
+        marks = self.marks + self.marks_by @ delta
+        series = self.series + np.tensordot(delta, self.by, 1)
+        times = np.column_stack([marks[:-1], np.diff(marks), marks[1:]])
+        return Block(times, series[:, :, :NODES] @ _FROM_SERIES, 1, shift, self.period)
+
+
+@dataclass
+class Recorder:
+    """Takes the steps of one integration, call by call of its loop."""
+
+    columns: int
+    capacity: int = CAPACITY
+    room: Steps = field(init=False)
+    parts: list[Block | Leap] = field(default_factory=list)
+    numbers: int = 0
+    full: bool = False
+
+    def __post_init__(self) -> None:
+        self.room = new_steps(min(self.capacity, 1 + _AT_ONCE // max(self.columns, 1)), self.columns)
+
+    def drain(self, counters: IntArray) -> Block | None:
+        """Take what the loop has recorded; the steps as a block, None where there are none or too many."""
+        count = int(counters[RECORDED])
+        counters[RECORDED] = 0
+        self.numbers += count * self.columns * NODES
+        self.full = self.full or self.numbers > MOST_NUMBERS
+        if self.full:
+            self.parts.clear()
+            return None
+        if count == 0:
+            return None
+        block = Block(self.room.times[:count].copy(), self.room.values[:count].copy())
+        self.parts.append(block)
+        return block
+
+    def repeat(self, since: int, periods: int, period: float) -> None:
+        """Let the blocks from number `since` on stand for whole periods that follow."""
+        for part in self.parts[since:]:
+            if isinstance(part, Block) and periods > 0:
+                self.parts.append(Block(part.times, part.values, periods, period, period))
+
+    def finish(self, first: float, stop: float, make: Callable[..., AnyRecord]) -> Recorded | None:
+        """What was recorded, from `first` to `stop` (s)."""
+        return None if self.full or not self.parts else Recorded(tuple(self.parts), first, stop, make)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Recorded steps; `make` turns times, sides and columns into a record."""
+
+    parts: tuple[Block | Leap, ...]
+    first: float
+    stop: float
+    make: Callable[[FloatArray, BoolArray, FloatArray], AnyRecord]
+
+    def run(self, read: Read, since: float, until: float) -> Stretches | None:
+        """The steps as one array; None where they are too many."""
+        return self._stretches
+
+    @cached_property
+    def _stretches(self) -> Stretches | None:
+        blocks: list[Block] = []
+        for part in self.parts:
+            made = part.blocks() if isinstance(part, Leap) else [part]
+            if made is None:
+                return None
+            blocks += made
+        return Stretches(blocks, self.make)
+
+
+class Stretches:
+    """Steps of a run, and their signals at any fraction of each."""
+
+    def __init__(self, blocks: list[Block], make: Callable[[FloatArray, BoolArray, FloatArray], AnyRecord]) -> None:
+        sizes = [len(b.times) for b in blocks]
+        self._make = make
+        self.start, self.length, self.reached = np.concatenate([b.times for b in blocks]).T
+        self.values = np.concatenate([b.values for b in blocks])
+        self.count = np.repeat([b.count for b in blocks], sizes)
+        self.shift = np.repeat([b.shift for b in blocks], sizes)
+        self.period = np.repeat([b.period for b in blocks], sizes)
+
+    def panels(self, since: float, until: float) -> Panels:
+        """The parts of the steps between two times (s); those of periods that are alike and inside only once."""
+        begin, end = self.start + self.shift, self.reached + self.shift
+        slack = same_time(1.0) * np.abs(end)
+        period = np.where(self.count > 1, self.period, 1.0)
+        # Of the periods that a step stands for, those from number `first` to `last` lie inside as a whole.
+        first = np.clip(np.ceil((since - slack - begin) / period), 0, self.count)
+        last = np.clip(np.floor((until + slack - end) / period), -1, self.count - 1)
+        reach = (self.reached - self.start) / self.length
+        inside = np.maximum(last - first + 1.0, 0.0)
+        found = [(np.zeros_like(reach), reach, inside)]
+        for k, once in ((first - 1.0, True), (last + 1.0, last + 1.0 != first - 1.0)):
+            cut = once & (k >= 0) & (k < self.count)
+            low = np.maximum((since - begin - k * period) / self.length, 0.0)
+            high = np.minimum((until - begin - k * period) / self.length, reach)
+            found.append((low, high, np.where(cut & (high > low), 1.0, 0.0)))
+        index = np.tile(np.arange(self.start.size), 3)
+        low, high, weight = (np.concatenate(x) for x in zip(*found, strict=True))
+        some = weight > 0.0
+        return Panels(index[some], low[some], high[some], (weight * (high - low))[some] * self.length[index[some]])
+
+    def signals(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, Signals]:
+        """As `measures.Run` says, from the polynomials of the steps."""
+        columns = np.empty((self.values.shape[1], *fraction.shape))
+        cut = np.ones(index.size, bool)
+        if fraction.shape[1] == NODES:
+            # Whole steps at their nodes need no polynomial.
+            cut = (fraction != _NODES).any(axis=1)
+            columns[:, ~cut] = self.values[index[~cut]].swapaxes(0, 1)
+        columns[:, cut] = np.einsum("pcn,pqn->cpq", self.values[index[cut]], _basis(fraction[cut]))
+        t = self.start[index, None] + fraction * self.length[index, None]
+        reached = self.reached[index, None]
+        left = t >= reached - same_time(1.0) * np.abs(reached)
+        t = np.where(left, reached, t)
+        record = self._make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], -1))
+        return t, {name: x.reshape(t.shape) for name, x in read(record).items()}
+
+
+def _basis(fraction: FloatArray) -> FloatArray:
+    """Weights (p, q, NODES) of the values at the nodes in those at fractions (p, q) of a step."""
+    distance = fraction[:, :, None] - _NODES
+    hit = distance == 0.0
+    weight = np.where(hit.any(axis=2, keepdims=True), hit, BARYCENTRIC / np.where(hit, 1.0, distance))
+    weight /= weight.sum(axis=2, keepdims=True)
+    return np.asarray(weight)
