@@ -123,16 +123,17 @@ def test_figures_of_a_sine_equal_plain_numpy(sine: fs.Solution) -> None:
     t, u, f = sine.t, sine.u_gap, sine.f_el
     assert u is not None
     assert f is not None
-    assert s["u_gap_max"] == u.max()
-    assert s["u_gap_min"] == u.min()
-    assert s["u_gap_peak"] == np.abs(u).max()
+    # 1000 outputs a period miss an extreme by (pi / 1000)^2 / 2 of it at most.
+    assert u.max() <= s["u_gap_max"] <= u.max() * (1.0 + 5e-6)
+    assert u.min() >= s["u_gap_min"] >= u.min() * (1.0 + 5e-6)
+    assert s["u_gap_peak"] == max(s["u_gap_max"], -s["u_gap_min"])
     assert s["f_el_mean"] == pytest.approx(simpson(f, x=t) / t[-1], rel=1e-8)
     # The last of the five periods holds 1000 steps: without its last point, sums over it are exact means.
     last = slice(t.size - 1001, t.size - 1)
     assert t[last][0] == pytest.approx(0.04, rel=1e-12)
     assert s["f_el_mean_periodic"] == pytest.approx(f[last].mean(), rel=1e-6)
     assert s["u_gap_rms_periodic"] == pytest.approx(np.sqrt(np.mean(u[last] ** 2)), rel=1e-6)
-    assert s["area_ripple"] == pytest.approx(np.ptp(sine.area[last]), rel=1e-9)
+    assert s["area_ripple"] == pytest.approx(np.ptp(sine.area[last]), rel=2e-5)
     spectrum = np.fft.rfft(u[last]) / 500.0
     assert s["u_gap_amplitude"] == pytest.approx(abs(spectrum[1]), rel=1e-6)
     phase = np.degrees(np.angle(1j * spectrum[1]))
@@ -180,7 +181,8 @@ def test_a_circuit_without_gap_has_figures_of_its_layers(tmp_path: Path) -> None
         )
     )
     s = solution.summary()
-    assert s["u_layer:X1_max"] == solution.u_layer[:, 0].max()
+    top = solution.u_layer[:, 0].max()
+    assert top <= s["u_layer:X1_max"] <= top * (1.0 + 5e-4)
     assert not [key for key in s if key.startswith(("f_el", "u_gap", "friction"))]
     assert load(solution.to_netcdf(tmp_path / "a.nc")).identical(solution.to_xarray())
     assert "f_el" not in solution.to_xarray()
@@ -292,7 +294,7 @@ def test_a_file_is_whole_or_as_it_was_when_the_disk_is_full(
 
         return write_aside(path, half)
 
-    monkeypatch.setattr("fingerspice.solution.write_aside", full)
+    monkeypatch.setattr("fingerspice.datafiles.write_aside", full)
     with pytest.raises(fs.InputError, match=r"cannot write .*run\.dat: No space left on device"):
         getattr(square, write)(path)
     assert [p.name for p in tmp_path.iterdir()] == (["run.dat"] if there else [])

@@ -32,13 +32,15 @@ def stack_failure(problem: Problem, run: Run, record: Record) -> Failure:
         cause += f" ({run.detail})"
     if status is Status.ERROR_NOT_MET:
         cause += f" (estimate {run.error.u_gap:.3g} V of {run.peak_u:.3g} V peak"
-        source = problem.scene.u_peak
-        if run.peak_u < 1e-4 * source:
-            cause += (
-                f"; the gap takes almost nothing of the {source:.3g} V of the source, and rounding of these limits it"
-            )
-        cause += ")"
+        cause += _little(run.peak_u, problem.scene.u_peak) + ")"
     return Failure(status, cause, status.action, run.t_failed, element, u_gap, area, margin, run.tried)
+
+
+def _little(peak: float, largest: float) -> str:
+    """Why the error of a gap at so little of the circuit's largest voltage (V) cannot be met."""
+    if not peak < 1e-4 * largest:
+        return ""
+    return f"; the gap takes almost nothing of the {largest:.3g} V of the source, and rounding of these limits it"
 
 
 def network_failure(problem: NetworkProblem, run: NetworkRun, record: NetworkRecord) -> Failure:
@@ -59,6 +61,10 @@ def network_failure(problem: NetworkProblem, run: NetworkRun, record: NetworkRec
         element = names[i]
         u_gap, area = float(record.finger_voltage(i)[-1]), float(record.finger_area(i)[-1])
         margin = float(record.fold_margin[-1])
-    if status is Status.ERROR_NOT_MET:
-        cause += f" (estimate {run.error.u_gap:.3g} V of {float(run.peaks.max(initial=0.0)):.3g} V peak)"
+    if status is Status.ERROR_NOT_MET and len(run.gaps):
+        peaks = run.gaps[:, 0]
+        worst = int(np.argmax(run.gaps[:, 2] / np.where(peaks > 0.0, peaks, np.inf)))
+        element = names[worst] if names else element
+        cause += f" (estimate {run.gaps[worst, 2]:.3g} V of {peaks[worst]:.3g} V peak"
+        cause += _little(peaks[worst], max(problem.scene.u_peak, float(peaks.max()))) + ")"
     return Failure(status, cause, status.action, run.t_failed, element, u_gap, area, margin, run.tried)

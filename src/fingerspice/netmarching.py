@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.circuit.network import network_modes
+from fingerspice.circuit.network import Modes, network_modes
 from fingerspice.circuit.sampling import same_time
 from fingerspice.engine import netassess, netmarch, readout
 from fingerspice.engine import repeat as repetition
@@ -59,8 +59,8 @@ class Reference:
         Voltage that each mode of the live voltages moves, V.
     tau : float
         Shortest time constant, s.
-    magnified : float
-        Rounding of the modes over that of the voltages.
+    magnified : ndarray, shape (n_area,)
+        Rounding of each gap's voltage over that of the largest voltage.
     """
 
     form: Form
@@ -69,7 +69,7 @@ class Reference:
     jump_tables: Tables
     size: FloatArray
     tau: float
-    magnified: float
+    magnified: FloatArray
 
 
 def reference_at(scene: NetworkScene, levels: tuple[int, ...], decade: int) -> Reference:
@@ -150,14 +150,18 @@ def _make_reference(scene: NetworkScene, area: FloatArray, tol: float) -> Refere
     return Reference(
         form, jump, new_tables(n + n_slow), new_tables(n + n_slow), np.linalg.norm(modes.shape, axis=0),
         1.0 / fastest if fastest > 0.0 else math.inf,
-        float((np.abs(modes.shape) @ np.abs(modes.inverse)).sum(axis=1).max(initial=1.0)) + _spread(modes.rates),
+        _magnified(modes, gap, gap_s),
     )  # fmt: skip
 
 
-def _spread(rates: FloatArray) -> float:
-    """What the rounding of the fastest mode leaves in the slowest."""
-    live = rates[rates > 0.0]
-    return math.sqrt(float(live.max() / live.min())) if live.size else 0.0
+def _magnified(modes: Modes, gap: FloatArray, gap_s: FloatArray) -> FloatArray:
+    """Rounding of each gap's voltage, a sum over modes and sources, over that of the largest voltage."""
+    live = modes.rates[modes.rates > 0.0]
+    # What the rounding of the fastest mode leaves in the slowest.
+    spread = math.sqrt(float(live.max() / live.min())) if live.size else 0.0
+    every = (np.abs(modes.shape) @ np.abs(modes.inverse)).sum(axis=1).max(initial=1.0)
+    own = (np.abs(gap) @ np.abs(modes.inverse)).sum(axis=1) + np.abs(gap_s).sum(axis=1)
+    return np.asarray((every + spread) * np.minimum(own / every, 1.0))
 
 
 def _packed(x: FloatArray) -> FloatArray:
@@ -381,7 +385,7 @@ def _stated(run: NetworkRun, one: March, u_scale: float) -> float:
     u_peak = gaps[:, netassess.PEAK_U]
     largest = float(u_peak.max(initial=0.0))
     # Rounding is an error too.
-    floor = 4e-16 * one.reference.magnified * (largest + u_scale)
+    floor = 4e-16 * (one.reference.magnified * (largest + u_scale) + u_peak)
     steepest = 2.0 * gaps[:, netassess.PEAK_F] / np.where(u_peak > 0.0, u_peak, np.inf)
     gaps[:, netassess.ERROR_U] = SAFETY * gaps[:, netassess.ERROR_U] + floor
     gaps[:, netassess.ERROR_F] = SAFETY * gaps[:, netassess.ERROR_F] + floor * steepest

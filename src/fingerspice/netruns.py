@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -49,6 +49,8 @@ class NetworkRun:
     here: FloatArray | None = None
     # The run between its outputs, where that is known.
     continuous: Continuous | None = None
+    # Of each gap: peaks of voltage (V) and force (N), and the stated errors of both.
+    gaps: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
 
     def end_before(self, t: float) -> None:
         """Take back the outputs from a time (s) on."""
@@ -296,6 +298,7 @@ def state_error(run: NetworkRun, gaps: FloatArray, u_scale: float, charge: float
     u_error = gaps[:, 2] + rough
     f_error = gaps[:, 3] + 2.0 * rough / safe * f_peak
     run.error = ErrorEstimate(float(u_error.max(initial=rough)), float(f_error.max(initial=0.0)), charge)
+    run.gaps = np.column_stack([u_peak, f_peak, u_error, f_error])
     over = np.append(u_error[live] / u_peak[live], (f_error / np.where(f_peak > 0.0, f_peak, np.inf))[live])
     return float(over.max(initial=0.0))
 
