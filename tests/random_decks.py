@@ -1,4 +1,4 @@
-"""Random decks over every device, source and directive, and both charge laws, for the exports' comparison with ngspice."""
+"""Random decks over every device, source and directive, and both charge laws: what is exported and run in ngspice."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _source(rng: random.Random, kind: str, scale: float) -> str:
 
 
 def _layers(rng: random.Random, slow: bool, top: str, low: str, area: str, number: str = "") -> list[str]:
-    """A coating, a gap and a skin between two nodes, each of them of a random kind; all leak, for the operating point."""
+    """A coating, a gap and a skin between two nodes, each of a random kind; all leak, for the operating point."""
     coat = rng.choice(
         (f"LAYER d={rng.uniform(0.5, 3.0):.3f}u eps_r=3.9 r=0.2meg", "SLAB d=2u eps_r=3 rho=1e9 e_max=inf")
     )
@@ -56,20 +56,24 @@ def _network(rng: random.Random, kind: str, slow: bool, drive: str, second: str,
     """Elements of a network: volts in `drive` and `second`, milliamperes in `current`."""
     # Time constants of many steps, to which ngspice's error is relative.
     r, c = f"{rng.uniform(0.2, 1.0):.3f}meg", f"{rng.uniform(80.0, 300.0):.1f}p"
+    state = rng.getstate()
+    finger = _layers(rng, slow, "drive", "0", "area")
+    rng.setstate(state)
+    floating = _layers(rng, slow, "drive", "body", "area")
     return {
-        "stack": [f"Vdrive drive 0 {drive}", *_layers(rng, slow, "drive", "0", "area")],
-        "two sources": [f"Vdrive drive m {drive}", f"Vlow 0 m {second}", *_layers(rng, slow, "drive", "0", "area")],
+        "stack": [f"Vdrive drive 0 {drive}", *finger],
+        "two sources": [f"Vdrive drive m {drive}", f"Vlow 0 m {second}", *finger],
         "amplifier": [
-            f"Vdrive amp 0 {drive}", f"Rout amp drive {r}", f"Ccable drive 0 {c}", *_layers(rng, slow, "drive", "0", "area"),
+            f"Vdrive amp 0 {drive}", f"Rout amp drive {r}", f"Ccable drive 0 {c}", *finger,
         ],
         "ungrounded": [
-            f"Vdrive drive 0 {drive}", *_layers(rng, slow, "drive", "body", "area"), "Rbody body far 0.2meg", f"Cbody far 0 {c}",
+            f"Vdrive drive 0 {drive}", *floating, "Rbody body far 0.2meg", f"Cbody far 0 {c}",
         ],
-        "shunt": [f"Vdrive amp 0 {drive}", f"Cs amp drive {c}", f"Rs drive 0 {r}", *_layers(rng, slow, "drive", "0", "area")],
-        "current": [f"Idrive 0 drive {current}", f"Rp drive 0 {r}", *_layers(rng, slow, "drive", "0", "area")],
+        "shunt": [f"Vdrive amp 0 {drive}", f"Cs amp drive {c}", f"Rs drive 0 {r}", *finger],
+        "current": [f"Idrive 0 drive {current}", f"Rp drive 0 {r}", *finger],
         "divider": [
             f"Vdrive amp 0 {drive}", f"R1 amp drive {r}", f"C1 drive 0 {c}", f"Iin 0 drive {current}",
-            *_layers(rng, slow, "drive", "0", "area"),
+            *finger,
         ],
         "two fingers": [
             f"Vdrive drive 0 {drive}", *_layers(rng, slow, "drive", "body", "left", "1"),

@@ -73,7 +73,7 @@ def test_the_random_decks_hold_every_device_source_and_directive() -> None:
     assert {e.device for e in elements} == {"LAYER", "SLAB", "SKIN", "SKIN_DISPERSIVE", "GAP", "R", "C", "V", "I"}
     waves = {type(e.waveform).__name__ for e in elements if e.waveform is not None}
     assert waves >= {"DC", "Sine", "Pulse", "Exp", "PWL", "Square"}
-    assert len(waves) >= 8
+    assert waves & {"Chirp", "Product", "Sawtooth"}
     for key in ("a_fix", "tau"):
         assert {e.values[key] > 0.0 for e in elements if e.device == "GAP"} == {True, False}
     assert {c.charge_law for c in circuits} == {"local", "mobile"}

@@ -23,8 +23,8 @@ NOW = 1e-30
 
 # Measured on ngspice 39, over edges, constant stretches and sines, both laws. Its step control cuts the step to nothing
 # at an edge: trtol turns it off, so that TMAX (TSTEP by default) sets the accuracy. Inside a capacitor C='...' flows
-# du/dt in A, which at a constant voltage is rounding over the step, 1e-6 or so in the first ones, above the usual abstol
-# of 1e-12. The last of several lines counts, so it follows the library.
+# du/dt in A, which at a constant voltage is rounding over the step, 1e-6 or so in the first ones, above the usual
+# abstol of 1e-12. The last of several lines counts, so it follows the library.
 _OPTIONS = ".options reltol=1e-4 trtol=1e4 abstol=1e-4"
 
 # Straight lines between them miss a sine by 5e-6 of its amplitude.

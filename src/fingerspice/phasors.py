@@ -420,12 +420,8 @@ def sweep_frequencies(sweep: AcSweep) -> FloatArray:
     InputError
         For more than `MAX_FREQUENCIES` of them.
     """
-    if sweep.scale == "lin":
-        count = float(sweep.points - 1)
-    else:
-        # Not of the quotient, which may be beyond the range of numbers.
-        base = 10.0 if sweep.scale == "dec" else 2.0
-        count = (math.log(sweep.stop) - math.log(sweep.start)) / math.log(base) * sweep.points
+    base, ratio = (10.0 if sweep.scale == "dec" else 2.0), sweep.stop / sweep.start
+    count = sweep.points - 1.0 if sweep.scale == "lin" else math.log(ratio) / math.log(base) * sweep.points
     if not count < MAX_FREQUENCIES:
         raise InputError(f"the sweep has {count + 1.0:.3g} frequencies; allowed: at most {MAX_FREQUENCIES}")
     if sweep.scale == "lin":

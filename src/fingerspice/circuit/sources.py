@@ -232,8 +232,8 @@ def _differences(name: str, key: str, waveform: Waveform, call: Call) -> tuple[s
     if isinstance(waveform, Exp) and 0.0 in (waveform.td1, waveform.td2):
         which = " and ".join(n for n, x in (("TD1", waveform.td1), ("TD2", waveform.td2)) if x == 0.0)
         return (
-            f"{call.where}: {name}: {key.upper()} has {which} = 0, which is 0 s here and not in ngspice 39, which takes "
-            "TSTEP for TD1 = 0 and TD1 + TSTEP for TD2 = 0; write 1f for both to start at once",
+            f"{call.where}: {name}: {key.upper()} has {which} = 0, which is 0 s here and not in ngspice 39, which "
+            "takes TSTEP for TD1 = 0 and TD1 + TSTEP for TD2 = 0; write 1f for both to start at once",
         )
     return ()
 
