@@ -231,6 +231,7 @@ def ac(
     amplitude: Annotated[
         list[float] | None, typer.Option(help="With --area coupled: source amplitude in V; may be repeated.")
     ] = None,
+    skin: Annotated[str, typer.Option(help="SKIN's data: swept, at each frequency; own, at its f.")] = "swept",
     charge_law: ChargeLaw = None,
     rtol: Rtol = 1e-8,
     changes: Set = None,
@@ -239,6 +240,8 @@ def ac(
     no_plot: NoPlot = False,
 ) -> None:
     """Phasor sweep of DECK: gap voltage, phase, area and mean force against frequency.
+
+    The source's AC magnitude and phase drive it; without AC its fundamental does.
 
     Examples:
 
@@ -255,16 +258,12 @@ def ac(
         circuit = read_circuit(deck, changes, source)
         data = _target(deck, out, "_ac.csv")
         picture = None if no_plot else _target(deck, out, "_ac.png")
-        if sweep is not None:
-            frequencies = sweep_frequencies(options.sweep(sweep))
-        elif circuit.ac is not None:
-            frequencies = sweep_frequencies(circuit.ac)
-        else:
-            from fingerspice.circuit.circuit import AcSweep
-
-            frequencies = sweep_frequencies(AcSweep("dec", 20, 10.0, 1e5))
+        frequencies = sweep_frequencies(options.sweep(sweep, circuit))
         if area == "coupled":
             from fingerspice.largesignal import large_signal
+
+            if skin != "swept":
+                raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
 
             _announce_compilation()
             with _failure_as_json(as_json):
@@ -272,7 +271,9 @@ def ac(
         elif amplitude:
             raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
         else:
-            results = (phasor(circuit, frequencies, area=area_from_text(area)),)
+            results = (phasor(circuit, frequencies, area=area_from_text(area), skin=skin),)
+        for text in results[0].warnings:
+            warnings.warn(text, FingerspiceWarning, stacklevel=1)
     files = [phasor_csv(results, data)]
     if picture is not None:
         from fingerspice.plotting import plot_phasor, save

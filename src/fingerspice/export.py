@@ -16,11 +16,21 @@ from fingerspice.errors import InputError
 
 LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
 EDGE = 1e-9
-"""Rise time (s) of an ideal jump in the export: ngspice has no ideal edge."""
+"""Longest rise time (s) of an ideal jump in the export, a thousandth of TSTEP if that is shorter: ngspice has no
+ideal edge."""
+NOW = 1e-30
+"""What stands for a time of 0 (s) that ngspice takes for "not given"."""
+
+# Measured on ngspice 39, over edges, constant stretches and sines, both laws. Its step control cuts the step to nothing
+# at an edge: trtol turns it off, so that TMAX (TSTEP by default) sets the accuracy. Inside a capacitor C='...' flows
+# du/dt in A, which at a constant voltage is rounding over the step, 1e-6 or so in the first ones, above the usual
+# abstol of 1e-12. The last of several lines counts, so it follows the library.
+_OPTIONS = ".options reltol=1e-4 trtol=1e4 abstol=1e-4"
 
 # Straight lines between them miss a sine by 5e-6 of its amplitude.
 _POINTS_PER_TIME_SCALE = 1000
 _MAX_POINTS = 2_000_000
+_FEW_POINTS = 1000
 
 
 def library_text(law: str) -> str:
@@ -50,7 +60,8 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     Raises
     ------
     InputError
-        For a circuit without .tran line where a source has to be written as points.
+        For a circuit without .tran line where a source has to be written as points, and for names that would become
+        one.
     """
     law = charge_law or circuit.charge_law or "local"
     if law not in LIBRARIES:
@@ -75,32 +86,38 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
         # An area with dynamics of its own has to start somewhere; a guess is enough for one that follows at once.
         word = ".ic" if gap.values["tau"] > 0.0 else ".nodeset"
         lines.append(f"{word} v({_name(gap.node_names[2])})={area!r}")
-    lines += ["", library_text(law).rstrip(), ".end", ""]
+    lines += ["", library_text(law).rstrip(), "", _OPTIONS, ".end", ""]
     return "\n".join(lines)
 
 
 def _name(name: str) -> str:
-    # ngspice uses the dot for what is inside a subcircuit; here the circuit is flat.
-    return name.replace(".", "_")
+    # ngspice uses the dot for what is inside a subcircuit; here the circuit is flat. A node called temper ends it.
+    return "temper_" if name.lower() == "temper" else name.replace(".", "_")
+
+
+def _element_name(element: Element) -> str:
+    name = _name(element.name)
+    letter = element.device if len(element.device) == 1 else "X"
+    # ngspice tells elements by their first letter, which inside a subcircuit call is the call's.
+    return name if name[0].upper() == letter else f"{letter}{name}"
 
 
 def _refuse_merged_names(circuit: Circuit) -> None:
-    for names in ({n for e in circuit.elements for n in e.node_names}, {e.name for e in circuit.elements}):
+    nodes = {n: _name(n) for e in circuit.elements for n in e.node_names}
+    for names in (nodes, {e.name: _element_name(e) for e in circuit.elements}):
         seen: dict[str, str] = {}
         for name in sorted(names):
-            other = seen.setdefault(_name(name).lower(), name)
+            other = seen.setdefault(names[name].lower(), name)
             if other.lower() != name.lower():
                 raise InputError(f"{other} and {name} would be one name in the export; allowed: rename one of them")
 
 
 def _element_lines(element: Element, circuit: Circuit, work_ratio: float) -> Iterator[str]:
     nodes = " ".join(_name(n) for n in element.node_names)
-    name = _name(element.name)
-    letter = element.device if len(element.device) == 1 else "X"
-    # ngspice tells elements by their first letter, which inside a subcircuit call is the call's.
-    name = name if name[0].upper() == letter else f"{letter}{name}"
+    name = _element_name(element)
     if element.waveform is not None:
-        yield from _wrapped(f"{name} {nodes} {_source_text(element.waveform, element, circuit)}")
+        ac = "" if element.ac is None else f" AC {float(element.ac.magnitude)!r} {float(element.ac.phase_deg)!r}"
+        yield from _wrapped(f"{name} {nodes} {_source_text(element.waveform, element, circuit)}{ac}")
         return
     if not element.spec.is_layer:
         initial = f" IC={element.initial!r}" if element.initial is not None else ""
@@ -135,20 +152,49 @@ def _source_text(waveform: Waveform, element: Element, circuit: Circuit) -> str:
         w = waveform
         numbers = (w.offset, w.amplitude, w.frequency, w.delay, w.damping, w.phase_deg)
         return f"SIN({' '.join(repr(float(x)) for x in numbers)})"
-    if isinstance(waveform, Pulse):
-        p = waveform
-        stop = circuit.tran.stop if circuit.tran else 1.0
-        # ngspice turns a rise or fall of 0 into TSTEP, and an infinite width into TSTOP.
-        width = p.width if math.isfinite(p.width) else 10.0 * stop
-        period = p.pulse_period if math.isfinite(p.pulse_period) else 20.0 * stop + width
-        pulse = (p.v1, p.v2, p.delay, p.rise or EDGE, p.fall or EDGE, width, period)
-        return f"PULSE({' '.join(repr(float(x)) for x in pulse)})"
+    pulse = _pulse_text(waveform, circuit) if isinstance(waveform, Pulse) else None
+    if pulse is not None:
+        return pulse
     if isinstance(waveform, Exp):
         e = waveform
-        return f"EXP({' '.join(repr(float(x)) for x in (e.v1, e.v2, e.td1, e.tau1, e.td2, e.tau2))})"
+        return f"EXP({' '.join(repr(float(x)) for x in (e.v1, e.v2, e.td1 or NOW, e.tau1, e.td2 or NOW, e.tau2))})"
     if isinstance(waveform, PWL) and waveform.repeat is None:
-        return _pwl_text(np.asarray(waveform.times), np.asarray(waveform.values))
-    return _pwl_text(*_sampled(waveform, element, circuit))
+        t, v = np.asarray(waveform.times), np.asarray(waveform.values)
+    else:
+        t, v = _sampled(waveform, element, circuit)
+    if _starts_uncharged(circuit):
+        # Everything is at 0 V before, and the source jumps from there: a first step without one is hard for ngspice.
+        t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append([0.0, waveform.value(0.0)], v[t > 0.0])
+    return _pwl_text(t, v, _edge(circuit))
+
+
+def _starts_uncharged(circuit: Circuit) -> bool:
+    given = circuit.initial or any(e.initial is not None for e in circuit.elements)
+    return circuit.tran is not None and circuit.tran.uic and not given
+
+
+def _stop(circuit: Circuit) -> float:
+    return circuit.tran.stop if circuit.tran else 1.0
+
+
+def _edge(circuit: Circuit) -> float:
+    """Rise time of an ideal jump, s."""
+    return min(EDGE, 1e-3 * circuit.tran.step) if circuit.tran else EDGE
+
+
+def _pulse_text(p: Pulse, circuit: Circuit) -> str | None:
+    """A pulse, where ngspice has it: its width and period are not 0, its edges have room, its start is at rest."""
+    if _starts_uncharged(circuit) and p.value(0.0) != 0.0 and p.breakpoint_rate() * _stop(circuit) < _FEW_POINTS:
+        return None
+    edge, span = _edge(circuit), _stop(circuit) + abs(p.delay)
+    # A jump takes its edge from the time after it: what follows keeps its own time.
+    width = p.width - (0.0 if p.rise else edge) if math.isfinite(p.width) else 10.0 * span
+    rise, fall = p.rise or edge, p.fall or edge
+    period = p.pulse_period if math.isfinite(p.pulse_period) else 20.0 * span + rise + width + fall
+    if width <= 0.0 or rise + width + fall > period:
+        return None
+    numbers = (p.v1, p.v2, p.delay, rise, fall, width, period)
+    return f"PULSE({' '.join(repr(float(x)) for x in numbers)})"
 
 
 def _sampled(waveform: Waveform, element: Element, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
@@ -183,25 +229,22 @@ def _sampled(waveform: Waveform, element: Element, circuit: Circuit) -> tuple[np
     return t[order], v[order]
 
 
-def _pwl_text(t: np.ndarray, v: np.ndarray) -> str:
-    """PWL text; a jump becomes an edge of `EDGE` seconds, and repeated points are left out."""
+def _pwl_text(t: np.ndarray, v: np.ndarray, edge: float) -> str:
+    """PWL text; a jump becomes an edge of `edge` seconds, and repeated points are left out."""
     times: list[float] = []
     values: list[float] = []
     for time, value in zip(t.tolist(), v.tolist(), strict=True):
         if times and time <= times[-1]:
             if value == values[-1]:
                 continue
-            time = times[-1] + EDGE
+            # Late in a long run an edge may be less than the rounding of the time.
+            time = max(times[-1] + edge, np.nextafter(times[-1], math.inf).item())
         times.append(time)
         values.append(value)
     return "PWL(" + " ".join(f"{a!r} {b!r}" for a, b in zip(times, values, strict=True)) + ")"
 
 
 def _analysis_lines(circuit: Circuit) -> Iterator[str]:
-    # Measured on ngspice 39, over edges, constant stretches and sines, both laws. Its step control cuts the step to
-    # nothing at an edge: trtol turns it off, so that TMAX (TSTEP by default) sets the accuracy. Inside a capacitor
-    # C='...' flows du/dt in A, which at a constant voltage is rounding, 1e-9 or so, above the usual abstol of 1e-12.
-    yield ".options reltol=1e-4 trtol=1e4 abstol=1e-6"
     if circuit.tran is not None:
         tran = circuit.tran
         words = [f"{tran.step!r}", f"{tran.stop!r}"]

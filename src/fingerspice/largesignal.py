@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -10,7 +12,7 @@ from fingerspice.circuit.statespace import build_stack
 from fingerspice.circuit.waveforms import Sine, Waveform, require
 from fingerspice.errors import InputError
 from fingerspice.numerics.cubics import fundamental, mean
-from fingerspice.phasors import PhasorSolution
+from fingerspice.phasors import Drive, PhasorSolution, sweep_drive, sweep_notes
 from fingerspice.steady import steady_state
 
 FloatArray = NDArray[np.float64]
@@ -35,7 +37,7 @@ def large_signal(
     frequency : array_like
         Hz, positive.
     amplitude : array_like, optional
-        V, positive; the fundamental's of the circuit's own source by default.
+        V, positive; by default that of the source's own ``AC``, or without it of its fundamental.
     charge_law, rtol
         As in `simulate`.
 
@@ -57,24 +59,24 @@ def large_signal(
     if len(stack.sources) != 1:
         names = ", ".join(e.name for e, _ in stack.sources)
         raise InputError(f"a large-signal sweep drives one source, and this circuit has {names}")
-    own = stack.waveform.fundamental
-    if amplitude is None:
-        if own is None:
-            raise InputError("the source has no fundamental to take the amplitude of: give the amplitudes in V")
-        amplitude = own.amplitude
+    own = sweep_drive(stack.sources, stack.waveform.fundamental, swept=True)
+    if amplitude is None and math.isnan(own.amplitude):
+        raise InputError("the source has no fundamental to take the amplitude of: give the amplitudes in V")
+    given = np.atleast_1d(own.amplitude if amplitude is None else amplitude)
     f = np.atleast_1d(np.asarray(frequency, float))
-    for what, values, unit in (("frequency", f, "Hz"), ("amplitude", np.atleast_1d(amplitude), "V")):
+    for what, values, unit in (("frequency", f, "Hz"), ("amplitude", given, "V")):
         good = bool(np.all(np.isfinite(values) & (np.asarray(values) > 0.0)))
         require(good, what, f"{values} {unit}", "positive numbers")
-    return tuple(_sweep(circuit, f, float(a), charge_law, rtol) for a in np.atleast_1d(amplitude))
+    drives = [own] if amplitude is None else [Drive(float(a), 0.0, "the amplitude given") for a in given]
+    return tuple(_sweep(circuit, f, drive, charge_law, rtol) for drive in drives)
 
 
 def _sweep(
-    circuit: Circuit, frequency: FloatArray, amplitude: float, charge_law: str | None, rtol: float
+    circuit: Circuit, frequency: FloatArray, drive: Drive, charge_law: str | None, rtol: float
 ) -> PhasorSolution:
     (source, sign), *_ = build_stack(circuit).sources
     skins = [e.name for e in circuit.by_device("SKIN")]
-    gains, areas, forces = [], [], []
+    gains, areas, forces, amplitude = [], [], [], drive.amplitude
     for f in frequency:
         changes: dict[str, float | Waveform] = {f"{name}.f": float(f) for name in skins}
         changes[source.name] = Sine(amplitude, float(f))
@@ -93,5 +95,6 @@ def _sweep(
     gap = build_stack(circuit).gap_layer
     assert gap is not None
     return PhasorSolution(
-        frequency, gain[:, gap], gain, gain[:, gap] * amplitude, np.array(areas), np.array(forces), amplitude, s.layers
-    )
+        frequency, gain[:, gap], gain, gain[:, gap] * amplitude * np.exp(1j * drive.phase), np.array(areas),
+        np.array(forces), amplitude, s.layers, drive.phase, drive.text, *sweep_notes(circuit, frequency),
+    )  # fmt: skip

@@ -141,10 +141,13 @@ def check_output(file: Path, deck: Path | None = None) -> None:
         raise InputError(f"cannot write {file}: it is the deck itself; allowed: another name or folder")
 
 
-def sweep(text: str) -> AcSweep:
-    """The sweep of ``--sweep``."""
+def sweep(text: str | None, circuit: Circuit) -> AcSweep:
+    """The sweep of ``--sweep``, or without it the deck's; else the band of the skin's data."""
+    from fingerspice.circuit.circuit import AcSweep
     from fingerspice.circuit.directives import sweep_from_text
 
+    if text is None:
+        return circuit.ac or AcSweep("dec", 20, 10.0, 1e5)
     try:
         return sweep_from_text(text)
     except InputError as error:

@@ -3,20 +3,44 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.circuit.circuit import AcSweep, Circuit
+from fingerspice.circuit.circuit import AcSweep, Circuit, Element
 from fingerspice.circuit.network import Network, build_network
 from fingerspice.circuit.statespace import Stack, build_stack, is_stack
 from fingerspice.circuit.waveforms import Fundamental, require
 from fingerspice.errors import InputError
+from fingerspice.physics.contact import Contact
+from fingerspice.physics.materials import SKIN_BAND, skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+MAX_FREQUENCIES = 1_000_000
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What drives a sweep.
+
+    Attributes
+    ----------
+    amplitude : float
+        V (A of a current source); NaN where there is nothing to take it from.
+    phase : float
+        rad.
+    text : str
+        Where it comes from.
+    """
+
+    amplitude: float
+    phase: float
+    text: str
 
 
 @dataclass(frozen=True)
@@ -32,14 +56,22 @@ class PhasorSolution:
     layer_gain : ndarray of complex, shape (n_frequency, n_layer)
         The same for every layer.
     u_gap : ndarray of complex
-        Gap voltage amplitude, V (NaN for a source without fundamental).
+        Gap voltage amplitude with the source's phase, V (NaN for a source without fundamental or AC).
     area : ndarray
         Ridge contact area, m^2.
     f_el_mean : ndarray
         Mean electroadhesive force, N.
     amplitude : float
-        Source amplitude, V.
+        Source amplitude, V (A of a current source).
     layers : tuple of str
+    phase : float
+        Of the source, rad.
+    drive : str
+        What the amplitude and the phase are those of.
+    notes : tuple of str
+        How the sweep was made where a deck may mean it otherwise.
+    warnings : tuple of str
+        Where it leaves what is known.
     """
 
     frequency: FloatArray
@@ -50,6 +82,141 @@ class PhasorSolution:
     f_el_mean: FloatArray
     amplitude: float
     layers: tuple[str, ...]
+    phase: float = 0.0
+    drive: str = ""
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+class _Scene(Protocol):
+    """A circuit with one contact as its phasors see it."""
+
+    @property
+    def contact(self) -> Contact: ...
+    @property
+    def fundamental(self) -> Fundamental | None: ...
+    @property
+    def sources(self) -> tuple[tuple[Element, float], ...]:
+        """Each source with the sign it drives with."""
+        ...
+
+    @property
+    def layers(self) -> tuple[str, ...]: ...
+    @property
+    def gap(self) -> int:
+        """Index of the GAP among the layers."""
+        ...
+
+    @property
+    def finger(self) -> int:
+        """Index of the GAP's area."""
+        ...
+
+    @property
+    def fixed(self) -> bool:
+        """Whether the deck gives that area."""
+        ...
+
+    def areas(self, f: float, area: str | float, amplitude: float) -> FloatArray:
+        """Areas at one frequency (Hz), m^2, shape (n_area,)."""
+        ...
+
+    def layer_gain(self, f: float, areas: FloatArray) -> ComplexArray:
+        """Voltage of each layer from p to n over the source's, shape (n_layer,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class _StackScene:
+    """A series stack."""
+
+    stack: Stack
+    contact: Contact
+    gap: int
+    finger: int = 0
+
+    @property
+    def fixed(self) -> bool:
+        return self.stack.area_given is not None
+
+    @property
+    def fundamental(self) -> Fundamental | None:
+        return self.stack.waveform.fundamental
+
+    @property
+    def sources(self) -> tuple[tuple[Element, float], ...]:
+        return self.stack.sources
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.stack.layers)
+
+    def areas(self, f: float, area: str | float, amplitude: float) -> FloatArray:
+        if not isinstance(area, str):
+            return np.array([area])
+        if self.stack.area_given is not None:
+            return np.array([self.stack.area_given])
+        frozen = area == "frozen"
+        return np.array([float(self.contact.area(0.0)) if frozen else mean_area(self.stack, f, amplitude)])
+
+    def layer_gain(self, f: float, areas: FloatArray) -> ComplexArray:
+        sign = self.stack.sign[self.stack.first_cell]
+        return np.asarray(layer_gains(self.stack.admittance(np.array([f]), areas))[0] * sign)
+
+
+@dataclass(frozen=True)
+class _NetworkScene:
+    """Any other circuit."""
+
+    network: Network
+    contact: Contact
+    gap: int
+    finger: int
+
+    @property
+    def fixed(self) -> bool:
+        return self.network.areas[self.finger].given is not None
+
+    @property
+    def fundamental(self) -> Fundamental | None:
+        waveform = self.network.sources[0].waveform
+        return None if waveform is None else waveform.fundamental
+
+    @property
+    def sources(self) -> tuple[tuple[Element, float], ...]:
+        return tuple((e, 1.0) for e in self.network.sources)
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.network.layers)
+
+    def areas(self, f: float, area: str | float, amplitude: float) -> FloatArray:
+        if not isinstance(area, str):
+            return np.full(len(self.network.areas), area)
+        return _areas_at_rest(self.network) if area == "frozen" else _coupled_areas(self.network, f, amplitude)
+
+    def layer_gain(self, f: float, areas: FloatArray) -> ComplexArray:
+        return np.asarray(self.network.grouping @ self.network.phasors(f, areas, np.ones(1, complex)))
+
+
+def _scene(circuit: Circuit) -> _Scene:
+    """The circuit's contact and what drives it."""
+    if is_stack(circuit):
+        stack = build_stack(circuit)
+        if stack.gap_layer is None or stack.contact is None:
+            raise InputError("a phasor solution needs a GAP; this circuit has none")
+        return _StackScene(stack, stack.contact, stack.gap_layer)
+    network = build_network(circuit)
+    if len(network.fingers) != 1 or len(network.sources) != 1:
+        raise InputError(
+            f"a phasor solution needs one GAP and one source; this circuit has {len(network.fingers)} and "
+            f"{len(network.sources)}"
+        )
+    place = network.fingers[0]
+    contact, gap = network.contacts[place], network.areas[place].gap
+    assert contact is not None
+    assert gap is not None
+    return _NetworkScene(network, contact, network.layers.index(gap), place)
 
 
 def mean_area(stack: Stack, frequency: float, amplitude: float) -> float:
@@ -82,11 +249,19 @@ def mean_network_areas(circuit: Circuit, network: Network, frequency: float | No
             "allowed: 'coupled', 'frozen' or an area in m^2"
         )
     f = fundamental.frequency if frequency is None else frequency
-    s = np.array([complex(fundamental.amplitude)])
-    area = np.array([
-        float(c.area(0.0)) if c is not None and a.given is None else a.given
-        for a, c in zip(network.areas, network.contacts, strict=True)
-    ])  # fmt: skip
+    return _coupled_areas(network, f, fundamental.amplitude)
+
+
+def _areas_at_rest(network: Network) -> FloatArray:
+    """Areas at 0 V, or as the deck gives them, m^2, shape (n_area,)."""
+    pairs = zip(network.areas, network.contacts, strict=True)
+    return np.array([float(c.area(0.0)) if c is not None and a.given is None else a.given for a, c in pairs])
+
+
+def _coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
+    """Areas under one source's amplitude (V or A) at one frequency (Hz), each at its gap's rms voltage."""
+    s = np.array([complex(amplitude)])
+    area = _areas_at_rest(network)
     for attempt in range(500):
         u = np.abs(network.phasors(f, area, s))
         new = area.copy()
@@ -94,48 +269,12 @@ def mean_network_areas(circuit: Circuit, network: Network, frequency: float | No
             contact, gap = network.contacts[i], network.gaps[i]
             if network.areas[i].given is None and contact is not None and gap is not None:
                 new[i] = float(contact.area(float(u[gap]) / math.sqrt(2.0)))
-        if np.all(np.abs(new - area) <= 4e-16 * area):
+        # What is no number never settles, and is refused where it is used.
+        if np.all(np.abs(new - area) <= 4e-16 * area) or not np.all(np.isfinite(new)):
             return new
         # Two areas may swing against each other.
         area = new if attempt < 50 else 0.5 * (area + new)
     raise InputError("the phasor's areas do not settle; allowed: area='frozen' or an area in m^2")
-
-
-def _network_phasor(circuit: Circuit, frequency: ArrayLike | None, area: str | float) -> PhasorSolution:
-    network = build_network(circuit)
-    if len(network.fingers) != 1 or len(network.sources) != 1:
-        raise InputError(
-            f"a phasor solution needs one GAP and one source; this circuit has {len(network.fingers)} and "
-            f"{len(network.sources)}"
-        )
-    place = network.fingers[0]
-    contact, gap = network.contacts[place], network.gaps[place]
-    assert contact is not None
-    assert gap is not None
-    waveform = network.sources[0].waveform
-    fundamental = None if waveform is None else waveform.fundamental
-    f = _frequencies(frequency, fundamental)
-    if isinstance(area, str):
-        require(area in ("mean", "frozen"), "area", repr(area), "'mean', 'frozen' or a number in m^2")
-    given = [a.given for a in network.areas]
-    areas = np.empty((f.size, len(given)))
-    for i, x in enumerate(f):
-        if not isinstance(area, str):
-            areas[i] = area
-        elif area == "mean":
-            areas[i] = mean_network_areas(circuit, network, float(x))
-        else:
-            areas[i] = [
-                float(c.area(0.0)) if c and g is None else g for c, g in zip(network.contacts, given, strict=True)
-            ]
-    u = np.array([network.phasors(float(x), a, np.ones(1, complex)) for x, a in zip(f, areas, strict=True)])
-    layers = np.einsum("fc,lc->fl", u, network.grouping)
-    amplitude = math.nan if fundamental is None else fundamental.amplitude
-    u_gap = u[:, gap] * amplitude * np.exp(1j * (fundamental.phase if fundamental else 0.0))
-    force = 0.5 * contact.stress(np.abs(u_gap)) * areas[:, place]
-    return PhasorSolution(
-        f, u[:, gap], layers, u_gap, areas[:, place].copy(), force, amplitude, tuple(e.name for e in network.layers)
-    )
 
 
 def _frequencies(frequency: ArrayLike | None, fundamental: Fundamental | None) -> FloatArray:
@@ -153,18 +292,96 @@ def _frequencies(frequency: ArrayLike | None, fundamental: Fundamental | None) -
     return f
 
 
-def phasor(circuit: Circuit, frequency: ArrayLike | None = None, *, area: str | float = "mean") -> PhasorSolution:
-    """Phasor solution of a circuit, SKIN evaluated at each frequency.
+def sweep_drive(sources: tuple[tuple[Element, float], ...], fundamental: Fundamental | None, swept: bool) -> Drive:
+    """What drives a circuit: ``AC`` of its sources in a sweep, where the deck has it, else the fundamental."""
+    given = [(e, sign) for e, sign in sources if e.ac is not None]
+    if swept and given:
+        # As in ngspice, a source without AC is silent.
+        total = sum(sign * e.ac.phasor for e, sign in given if e.ac is not None)
+        words = [f"AC {e.ac.magnitude:g} {e.ac.phase_deg:g} of {e.name}" for e, _ in given if e.ac is not None]
+        return Drive(abs(total), math.atan2(total.imag, total.real), " and ".join(words))
+    names = " and ".join(e.name for e, _ in sources)
+    if fundamental is None:
+        return Drive(math.nan, 0.0, f"no fundamental of {names}")
+    return Drive(fundamental.amplitude, fundamental.phase, f"the fundamental of {names}")
+
+
+def _check_area(area: str | float, amplitude: float, fixed: bool) -> None:
+    """Refuse what is no area or mode, and a coupled one without an amplitude to couple it to."""
+    if not isinstance(area, str):
+        require(math.isfinite(area) and area > 0.0, "area", f"{area:g} m^2", "a positive area in m^2")
+        return
+    require(area in ("mean", "frozen"), "area", repr(area), "'mean', 'frozen' or a number in m^2")
+    if area == "mean" and math.isnan(amplitude) and not fixed:
+        raise InputError(
+            "area='mean' needs the amplitude of the source's fundamental, and this source has none; allowed: "
+            "'frozen' or an area in m^2"
+        )
+
+
+def _with_skin_held(circuit: Circuit) -> Circuit:
+    """A circuit whose SKINs are slabs of their data at their own frequency."""
+
+    def held(skin: Element) -> Element:
+        d, f = skin.values["d"], skin.values["f"]
+        eps_r, rho = float(skin_permittivity(f)), float(skin_resistivity(f))
+        values = MappingProxyType({"d": d, "eps_r": eps_r, "rho": rho, "e_max": math.inf})
+        return replace(skin, device="SLAB", values=values)
+
+    return replace(circuit, elements=tuple(held(e) if e.device == "SKIN" else e for e in circuit.elements))
+
+
+def sweep_notes(circuit: Circuit, f: FloatArray, skin: str = "swept") -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Notes and warnings of a sweep over frequencies (Hz): where a skin's data are taken, and how far outside them."""
+    skins = {e.name: e.values["f"] for e in circuit.by_device("SKIN")}
+    own = ", ".join(f"{name} f = {x:g} Hz" for name, x in skins.items())
+    notes: tuple[str, ...] = ()
+    if skins and skin == "own":
+        notes = (f"the skin's data are held at the deck's own frequency ({own}) over the whole sweep",)
+    elif any(np.any(np.abs(f / x - 1.0) > 1e-9) for x in skins.values()):
+        notes = (f"the skin's data are taken at each frequency of the sweep, not at the deck's own ({own})",)
+    swept = bool(circuit.by_device("SKIN_DISPERSIVE")) or (bool(skins) and skin != "own")
+    low, high = float(f.min()), float(f.max())
+    beyond = []
+    if low < SKIN_BAND[0]:
+        beyond.append(f"down to {low:g} Hz, {math.log10(SKIN_BAND[0] / low):.2g} decades below")
+    if high > SKIN_BAND[1]:
+        beyond.append(f"up to {high:g} Hz, {math.log10(high / SKIN_BAND[1]):.2g} decades above")
+    if not swept or not beyond:
+        return notes, ()
+    return notes, (
+        f"the sweep goes {' and '.join(beyond)} the 10 Hz to 100 kHz of the skin's data (Eqs. 18, 19): what it shows "
+        "there is extrapolated",
+    )
+
+
+def _refuse_no_number(f: FloatArray, *results: NDArray[np.inexact]) -> None:
+    """Refuse a sweep whose figures are beyond the range of numbers."""
+    bad = ~np.logical_and.reduce([np.isfinite(x).reshape(f.size, -1).all(axis=1) for x in results])
+    if np.any(bad):
+        raise InputError(
+            f"the phasor at {f[np.argmax(bad)]:g} Hz is beyond the range of numbers; allowed: frequencies nearer to "
+            "the 10 Hz to 100 kHz of the skin's data, and values nearer to Table 1's"
+        )
+
+
+def phasor(
+    circuit: Circuit, frequency: ArrayLike | None = None, *, area: str | float = "mean", skin: str = "swept"
+) -> PhasorSolution:
+    """Phasor solution of a circuit.
 
     Parameters
     ----------
     circuit : Circuit
     frequency : array_like, optional
-        Hz, positive; the source's fundamental by default.
+        Hz, positive; the source's fundamental by default. Over given frequencies a deck's ``AC magnitude [phase]`` is
+        what drives, as in ngspice; without it, and at the fundamental, the source's fundamental.
     area : str or float
         ``"mean"``: coupled through the mean stress at the source's own amplitude (its fundamental's, if it is
         not a sine); ``"frozen"``: the area at 0 V; or an area in m^2. An area fixed by the deck comes before
         ``"mean"`` and ``"frozen"``.
+    skin : str
+        ``"swept"``: SKIN's data at each frequency; ``"own"``: at SKIN's own f, as in ngspice.
 
     Returns
     -------
@@ -174,53 +391,41 @@ def phasor(circuit: Circuit, frequency: ArrayLike | None = None, *, area: str | 
     ------
     InputError
         For a circuit without GAP, a network with several GAPs or sources, a source without fundamental where one is
-        needed, or frequencies not positive.
+        needed, frequencies or an area not positive, or a result beyond the range of numbers.
     """
-    if not is_stack(circuit):
-        return _network_phasor(circuit, frequency, area)
-    stack = build_stack(circuit)
-    gap = stack.gap_layer
-    if gap is None or stack.contact is None:
-        raise InputError("a phasor solution needs a GAP; this circuit has none")
-    fundamental = stack.waveform.fundamental
-    f = _frequencies(frequency, fundamental)
-    areas = _areas(stack, f, area, None if fundamental is None else fundamental.amplitude)
-    gains = layer_gains(stack.admittance(f, areas))
-    gain, sign = gains[:, gap], stack.sign[stack.first_cell]
-    amplitude = math.nan if fundamental is None else fundamental.amplitude
-    u_gap = gain * amplitude * np.exp(1j * (fundamental.phase if fundamental else 0.0))
-    # Mean of sigma A over a period of a sine: half the peak.
-    force = 0.5 * stack.contact.stress(np.abs(u_gap)) * areas
+    require(skin in ("swept", "own"), "skin", repr(skin), "'swept' or 'own'")
+    scene = _scene(circuit if skin == "swept" else _with_skin_held(circuit))
+    f = _frequencies(frequency, scene.fundamental)
+    drive = sweep_drive(scene.sources, scene.fundamental, frequency is not None)
+    _check_area(area, drive.amplitude, scene.fixed)
+    with np.errstate(all="ignore"):
+        areas = np.array([scene.areas(float(x), area, drive.amplitude) for x in f])
+        layers = np.array([scene.layer_gain(float(x), a) for x, a in zip(f, areas, strict=True)])
+        gain, own = layers[:, scene.gap], areas[:, scene.finger].copy()
+        u_gap = gain * drive.amplitude * np.exp(1j * drive.phase)
+        # Mean of sigma A over a period of a sine: half the peak.
+        force = 0.5 * scene.contact.stress(np.abs(u_gap)) * own
+    _refuse_no_number(f, layers, own, *((u_gap, force) if math.isfinite(drive.amplitude) else ()))
+    notes, warnings = sweep_notes(circuit, f, skin)
     return PhasorSolution(
-        f, gain * sign[gap], gains * sign, u_gap * sign[gap], areas, force, amplitude,
-        tuple(e.name for e in stack.layers),
-    )  # fmt: skip
-
-
-def _areas(stack: Stack, f: FloatArray, area: str | float, amplitude: float | None) -> FloatArray:
-    if not isinstance(area, str):
-        require(math.isfinite(area) and area > 0.0, "area", f"{area:g} m^2", "a positive area in m^2")
-        return np.full(f.size, float(area))
-    require(area in ("mean", "frozen"), "area", repr(area), "'mean', 'frozen' or a number in m^2")
-    assert stack.contact is not None
-    if stack.area_given is not None:
-        return np.full(f.size, stack.area_given)
-    if area == "frozen":
-        return np.full(f.size, float(stack.contact.area(0.0)))
-    if amplitude is None:
-        raise InputError(
-            "area='mean' needs the amplitude of the source's fundamental, and this source has none; allowed: "
-            "'frozen' or an area in m^2"
-        )
-    return np.array([mean_area(stack, float(x), amplitude) for x in f])
+        f, gain, layers, u_gap, own, force, drive.amplitude, scene.layers, drive.phase, drive.text, notes, warnings
+    )
 
 
 def sweep_frequencies(sweep: AcSweep) -> FloatArray:
-    """Frequencies (Hz) of an ``.ac`` line."""
+    """Frequencies (Hz) of an ``.ac`` line.
+
+    Raises
+    ------
+    InputError
+        For more than `MAX_FREQUENCIES` of them.
+    """
+    base, ratio = (10.0 if sweep.scale == "dec" else 2.0), sweep.stop / sweep.start
+    count = sweep.points - 1.0 if sweep.scale == "lin" else math.log(ratio) / math.log(base) * sweep.points
+    if not count < MAX_FREQUENCIES:
+        raise InputError(f"the sweep has {count + 1.0:.3g} frequencies; allowed: at most {MAX_FREQUENCIES}")
     if sweep.scale == "lin":
         return np.linspace(sweep.start, sweep.stop, sweep.points)
-    base = 10.0 if sweep.scale == "dec" else 2.0
-    count = math.log(sweep.stop / sweep.start, base) * sweep.points
     n = math.floor(count + 1e-9)
     out = sweep.start * base ** (np.arange(n + 1) / sweep.points)
     return np.asarray(np.append(out, sweep.stop) if count - n > 1e-9 else out)

@@ -188,6 +188,10 @@ def phasor_dict(result: PhasorSolution) -> dict[str, Any]:
         "area": result.area.tolist(),
         "f_el_mean": result.f_el_mean.tolist(),
         "amplitude": result.amplitude,
+        "source_phase_deg": math.degrees(result.phase),
+        "drive": result.drive,
+        "notes": list(result.notes),
+        "warnings": list(result.warnings),
     }
 
 
@@ -212,7 +216,9 @@ def phasor_table(result: PhasorSolution, most: int = 40) -> str:
         for i in keep
     ]
     head = ("frequency [Hz]", "|u_gap/U|", "phase [deg]", "u_gap [V]", "area [mm^2]", "mean force [N]")
-    return f"source amplitude {format_si(result.amplitude, 'V')}\n" + _aligned(rows, head)
+    drive = f"source amplitude {format_si(result.amplitude, 'V')}, phase {math.degrees(result.phase):.4g} deg"
+    said = [f"{drive}: {result.drive}", *result.notes]
+    return "\n".join([*said, _aligned(rows, head)])
 
 
 def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:

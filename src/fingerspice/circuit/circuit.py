@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import dataclasses
 import math
 import threading
@@ -22,6 +23,24 @@ _REMEMBERING = threading.Lock()
 
 
 @dataclass(frozen=True)
+class SmallSignal:
+    """``AC magnitude [phase]`` of a source: what drives it in an ``.ac`` sweep, V or A, and degrees."""
+
+    magnitude: float = 1.0
+    phase_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        for what, value in (("magnitude", self.magnitude), ("phase", self.phase_deg)):
+            if not math.isfinite(value):
+                raise InputError(f"AC {what} is {value:g}; allowed: a finite number")
+
+    @property
+    def phasor(self) -> complex:
+        """Complex amplitude; a negative magnitude turns it round."""
+        return cmath.rect(self.magnitude, math.radians(self.phase_deg))
+
+
+@dataclass(frozen=True)
 class Element:
     """One device of a circuit.
 
@@ -37,6 +56,8 @@ class Element:
         Every parameter of the device, in the netlist's units.
     waveform : Waveform or None
         Of a source.
+    ac : SmallSignal or None
+        Of a source that has one.
     initial : float or None
         ``IC=`` of a capacitor, V.
     where : Where or None
@@ -51,6 +72,7 @@ class Element:
     waveform: Waveform | None = None
     initial: float | None = None
     where: Where | None = None
+    ac: SmallSignal | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "values": dict(self.values)}
@@ -200,7 +222,8 @@ class Circuit:
             name, _, parameter = path.rpartition(".")
             if path.lower() in elements and elements[path.lower()].device in "VI":
                 element = elements[path.lower()]
-                elements[path.lower()] = dataclasses.replace(element, waveform=as_waveform(value))
+                # What an .ac sweep took from the old source goes with it.
+                elements[path.lower()] = dataclasses.replace(element, waveform=as_waveform(value), ac=None)
             elif name.lower() in elements and not isinstance(value, Waveform) and not callable(value):
                 elements[name.lower()] = _changed(elements[name.lower()], parameter.lower(), float(value), path)
             else:

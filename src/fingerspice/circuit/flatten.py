@@ -177,6 +177,8 @@ class Flattener:
             _check_nodes(name, native, len(nodes), NATIVE_NODES, where)
             canonical, written = _nodes(line, nodes, instance)
             params = instance.scope.pairs(line, words, bare="arithmetic")
+            given = {key: value.value for key, value in params[0].items() if isinstance(value, Number)}
+            _refuse_captured(native, given, line, words, instance.scope)
             start = line.where(lexemes[0].position)
             self.statements.append(Statement(name, "X", canonical, written, native, (), *params, start))
             return
@@ -187,7 +189,7 @@ class Flattener:
         _check_nodes(name, called.name, len(nodes), called.ports, where)
         self._check_depth(called, instance, len(instance.calls), where)
         ports = zip(called.ports, zip(*_nodes(line, nodes, instance), strict=True), strict=True)
-        inner = _Instance(called, Scope(outside.scope), outside, f"{name}.", dict(ports))
+        inner = _Instance(called, Scope(instance.scope), outside, f"{name}.", dict(ports))
         inner.calls = (*instance.calls, called)
         _bind(inner, line, words, instance.scope)
         called.called = True
@@ -221,6 +223,19 @@ def _bind(inner: _Instance, line: Line, words: Group, caller: Scope) -> None:
             raise InputError(problem, line.where(pair.key.position))
         inner.scope.preset(key, caller.number(line, pair.value))
     inner.scope.solve()
+    _refuse_captured(definition.name, inner.scope.values, line, words, caller)
+
+
+def _refuse_captured(device: str, own: dict[str, float], line: Line, words: Group, caller: Scope) -> None:
+    """Refuse a value on an X line whose name is the caller's here, and another parameter of the device in ngspice."""
+    for key, pair in words.params.items():
+        for name, value in caller.references(line, pair.value).items():
+            if name != key and own.get(name, value) != value:
+                problem = (
+                    f"{pair.key.text}={line.written(pair.value)} means {name} = {value:g} of the calling netlist here, "
+                    f"and in ngspice {device}'s own {name} = {own[name]:g}; allowed: another name for one of them"
+                )
+                raise InputError(problem, line.where(pair.value.position))
 
 
 def _valued(line: Line, lexemes: list[Lexeme], name: str, instance: _Instance) -> Statement:

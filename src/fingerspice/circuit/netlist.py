@@ -14,7 +14,7 @@ from fingerspice.circuit.devices import DEVICES, ParameterSpec
 from fingerspice.circuit.directives import read_ac, read_initial, read_options, read_tran
 from fingerspice.circuit.expressions import nearest
 from fingerspice.circuit.network import build_network
-from fingerspice.circuit.sources import Timing, read_source
+from fingerspice.circuit.sources import Source, Timing, read_source
 from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.circuit.waveforms import Waveform
 from fingerspice.errors import FingerspiceWarning, InputError
@@ -109,13 +109,14 @@ def _charge_law(includes: tuple[str, ...]) -> str | None:
 
 def _element(statement: Statement, timing: Timing, notes: list[str]) -> Element:
     values: dict[str, float] = {}
-    waveform, initial = None, None
+    source, initial = None, None
     if statement.letter == "X":
         device = statement.device or ""
         values = _device_values(statement, device, notes)
     elif statement.letter in "VI":
         device = statement.letter
-        waveform = _source(statement, timing)
+        source = _source(statement, timing)
+        notes.extend(source.notes)
     else:
         device = statement.letter
         values, initial = _passive_value(statement, notes)
@@ -125,13 +126,14 @@ def _element(statement: Statement, timing: Timing, notes: list[str]) -> Element:
         statement.nodes,
         statement.node_names,
         MappingProxyType(values),
-        waveform,
+        None if source is None else source.waveform,
         initial,
         statement.where,
+        None if source is None else source.ac,
     )
 
 
-def _source(statement: Statement, timing: Timing) -> Waveform:
+def _source(statement: Statement, timing: Timing) -> Source:
     body = list(statement.body)
     if statement.params:
         last = body[-1] if body else None
@@ -277,6 +279,9 @@ def source_from_text(text: str, circuit: Circuit) -> Waveform:
         deck = parse_deck(f"source\nVsource a 0 {text}\n{line}")
         if len(deck.statements) != 1 or deck.statements[0].params:
             raise InputError("not one source; allowed: such as SQUARE(200 100)")
-        return read_source("source", deck.statements[0].body, timing, deck.statements[0].where)
+        source = read_source("source", deck.statements[0].body, timing, deck.statements[0].where)
+        if source.ac is not None:
+            raise InputError("AC belongs into the deck; allowed: the source function alone, whose fundamental drives")
+        return source.waveform
     except InputError as error:
         raise InputError(f"{text!r}: {error.message}") from None

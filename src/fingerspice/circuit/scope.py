@@ -90,12 +90,15 @@ class Formula:
 
 
 class Scope:
-    """The parameters of the deck or of one subcircuit instance, which also sees those around it.
+    """The parameters of the deck or of one subcircuit call, which also sees those of its callers.
+
+    As in ngspice, which looks a name up along the calls: a name that a subcircuit does not define is its caller's, then
+    that one's caller's, and the deck's last, wherever the definition stands.
 
     Parameters
     ----------
     parent : Scope, optional
-        The scope in which the subcircuit was defined.
+        The scope of the call.
     """
 
     def __init__(self, parent: Scope | None = None) -> None:
@@ -192,6 +195,14 @@ class Scope:
 
         number = self._evaluate(compile_expression(lexeme.text, place), line.written(lexeme), place)
         return Number(number.value, number.text, line.where(lexeme.position), number.mega)
+
+    def references(self, line: Line, lexeme: Lexeme) -> dict[str, float]:
+        """Parameters that a value refers to, with their values here; none for what is no arithmetic."""
+        try:
+            names = compile_expression(lexeme.text, lambda _: line.where(lexeme.position)).names
+        except InputError:
+            return {}
+        return {name: self._visible[name] for name in names if name in self._visible}
 
     def value(self, line: Line, lexeme: Lexeme, bare: Bare = "nothing") -> Value:
         """Number or token of a lexeme.

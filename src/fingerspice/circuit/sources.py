@@ -1,4 +1,4 @@
-"""Source functions of a netlist, as waveforms: SPICE's portable set, and SQUARE."""
+"""Source functions of a netlist, as waveforms: SPICE's portable set, and SQUARE; and ``AC`` beside them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from fingerspice.circuit.circuit import SmallSignal
 from fingerspice.circuit.deck import Call, Number, Token
 from fingerspice.circuit.expressions import nearest
 from fingerspice.circuit.ramps import PWL, Pulse, Square
@@ -145,8 +146,25 @@ _REFUSED = {
 }
 
 
-def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -> Waveform:
-    """Waveform of a V or I element from the words after its nodes.
+@dataclass(frozen=True)
+class Source:
+    """What the words after the nodes of a V or I element say.
+
+    Attributes
+    ----------
+    waveform : Waveform
+    ac : SmallSignal or None
+    notes : tuple of str
+        Where ngspice takes something else.
+    """
+
+    waveform: Waveform
+    ac: SmallSignal | None = None
+    notes: tuple[str, ...] = ()
+
+
+def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -> Source:
+    """The words after the nodes of a V or I element.
 
     Parameters
     ----------
@@ -164,7 +182,9 @@ def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -
         One sentence with the place.
     """
     level: float | None = None
+    ac: SmallSignal | None = None
     waveform: Waveform | None = None
+    notes: tuple[str, ...] = ()
     words = deque(body)
     while words:
         word = words.popleft()
@@ -177,23 +197,45 @@ def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -
             continue
         key = (word.text if isinstance(word, Token) else word.name).lower()
         call = word if isinstance(word, Call) else None
-        if call is None and key not in ("dc", "ac"):
+        if call is None:
             # SIN 0 200 100, without brackets.
             call = Call(key, tuple(_leading_numbers(words)), {}, {}, word.where)
-        if key in ("dc", "ac"):
-            numbers: Sequence[Word] = call.args if call else _leading_numbers(words)
-            if key == "dc":
-                if len(numbers) != 1:
-                    raise InputError(f"{name}: DC needs one value", word.where)
-                level = _number(numbers[0], f"{name} DC")
-            continue
-        assert call is not None
-        if waveform is not None:
+        if key == "dc":
+            if len(call.args) != 1:
+                raise InputError(f"{name}: DC needs one value", word.where)
+            level = _number(call.args[0], f"{name} DC")
+        elif key == "ac":
+            if ac is not None:
+                raise InputError(f"{name} has AC twice; allowed: AC [magnitude [phase]] once", word.where)
+            ac = _small_signal(name, call)
+        elif waveform is not None:
             raise InputError(f"{name} has two source functions, the second is {key.upper()}", word.where)
-        waveform = _read_call(name, key, call, timing)
-    if waveform is None and level is None:
+        else:
+            waveform = _read_call(name, key, call, timing)
+            notes = _differences(name, key, waveform, call)
+    if waveform is None and level is None and ac is None:
         raise InputError(f"{name} has no value; allowed: a number or one of {_known()}", where)
-    return waveform if waveform is not None else DC(level or 0.0)
+    return Source(waveform if waveform is not None else DC(level or 0.0), ac, notes)
+
+
+def _small_signal(name: str, call: Call) -> SmallSignal:
+    """``AC [magnitude [phase]]``: 1 and 0 degrees where left out."""
+    numbers = [_number(arg, f"{name} AC") for arg in call.args]
+    if len(numbers) > 2:
+        raise InputError(f"{name}: AC takes at most 2 values, {len(numbers)} given; allowed: AC [magnitude [phase]]",
+                         call.where)  # fmt: skip
+    return SmallSignal(*numbers)
+
+
+def _differences(name: str, key: str, waveform: Waveform, call: Call) -> tuple[str, ...]:
+    """Where ngspice 39 takes another number than the one written, and this reader does not."""
+    if isinstance(waveform, Exp) and 0.0 in (waveform.td1, waveform.td2):
+        which = " and ".join(n for n, x in (("TD1", waveform.td1), ("TD2", waveform.td2)) if x == 0.0)
+        return (
+            f"{call.where}: {name}: {key.upper()} has {which} = 0, which is 0 s here and not in ngspice 39, which "
+            "takes TSTEP for TD1 = 0 and TD1 + TSTEP for TD2 = 0; write 1f for both to start at once",
+        )
+    return ()
 
 
 def _leading_numbers(words: deque[Word]) -> list[Number]:

@@ -265,17 +265,23 @@ def _refuse_current_without_path(branches: list[Element]) -> None:
 def _walk(branches: list[Element]) -> tuple[Hop, ...]:
     """Walk the loop from ground, in the direction that meets the first source n first."""
     at = _incidence(branches)
-    for start in at["0"]:
-        hops: list[Hop] = []
-        node, element = "0", start
-        while True:
-            forward = element.nodes[0] == node
-            node = element.nodes[1] if forward else element.nodes[0]
-            hops.append(Hop(element, 1.0 if forward else -1.0, element.node_names[1 if forward else 0]))
-            if node == "0":
-                break
-            element = next(e for e in at[node] if e is not element)
-        first = next((h for h in hops if h.element.device == "V"), None)
-        if first is not None and first.sign < 0.0:
+    walks = [_walk_from(start, at) for start in at["0"]]
+    for hops in walks:
+        if next(h for h in hops if h.element.device == "V").sign < 0.0:
+            return hops
+    # Sources against each other, met p first either way: the deck's first one decides.
+    deciding = next(e for e in branches if e.device == "V")
+    return next(hops for hops in walks if any(h.element is deciding and h.sign < 0.0 for h in hops))
+
+
+def _walk_from(start: Element, at: dict[str, list[Element]]) -> tuple[Hop, ...]:
+    """The loop from ground, beginning with one of the two elements there."""
+    hops: list[Hop] = []
+    node, element = "0", start
+    while True:
+        forward = element.nodes[0] == node
+        node = element.nodes[1] if forward else element.nodes[0]
+        hops.append(Hop(element, 1.0 if forward else -1.0, element.node_names[1 if forward else 0]))
+        if node == "0":
             return tuple(hops)
-    raise AssertionError("a loop with a source meets it n first in one of its directions")
+        element = next(e for e in at[node] if e is not element)
