@@ -10,6 +10,8 @@ from fingerspice.circuit.deck import Directive, Number, Token, parse_deck
 from fingerspice.circuit.expressions import nearest
 from fingerspice.errors import InputError, Where
 
+MOST_VOLTS = 1e30
+"""Start values of voltages, V: far from any circuit's, so that products stay numbers."""
 _NGSPICE_OPTIONS = frozenset(
     """abstol acct bypass chgtol defad defas defl defw gmin gminsteps interp itl1 itl2 itl3 itl4 itl5 itl6 keepopinfo
     klu list maxevtiter maxopalter maxord method minbreak noacct noinit nomod nopage node noopalter numdgt opts
@@ -109,6 +111,8 @@ def read_initial(directives: tuple[Directive, ...], elements: tuple[Element, ...
                 raise InputError(f".ic {key} is {value.text} V; allowed: 0, it is ground", place)
             if node in area_nodes and not 1e-30 <= value.value <= 1e30:
                 raise InputError(f".ic {key} is {value.text} mm^2; allowed: more than 0, from 1e-30 to 1e30", place)
+            if not abs(value.value) <= MOST_VOLTS:
+                raise InputError(f".ic {key} is {value.text} V; allowed: from -{MOST_VOLTS:g} to {MOST_VOLTS:g}", place)
             out[node] = value.value
     return out
 
