@@ -137,9 +137,10 @@ def test_ac_asks_for_a_sweep() -> None:
     assert read().ac is None
 
 
-def test_start_values_are_kept_by_node_and_those_of_the_area_are_not_used() -> None:
+def test_start_values_are_kept_by_node() -> None:
     circuit = read((".end", ".ic V(Top)=3 v(skin)={1+1} v(area)=34.97\n.ic v(drive)=5 v(gnd)=0"))
-    assert circuit.initial == {"top": 3.0, "skin": 2.0, "drive": 5.0, "0": 0.0}
+    assert circuit.initial == {"top": 3.0, "skin": 2.0, "drive": 5.0, "0": 0.0, "area": 34.97}
+    assert circuit.unused == (".ic v(area)",)
 
 
 def test_the_included_library_says_which_charge_law() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +11,12 @@ import numpy as np
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.ramps import PWL, Pulse
 from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
+from fingerspice.circuit.topology import find_branches
 from fingerspice.circuit.waveforms import DC, Exp, Sine, Waveform
 from fingerspice.errors import InputError
+from fingerspice.networks import prepare_network
+from fingerspice.physics.contact import Contact
+from fingerspice.starting import start_voltage, starts_uncharged
 
 LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
 EDGE = 1e-9
@@ -67,10 +71,7 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     if law not in LIBRARIES:
         raise InputError(f"charge_law is {law!r}; allowed: {' or '.join(map(repr, LIBRARIES))}")
     _refuse_merged_names(circuit)
-    ratio = 1.0
-    if is_stack(circuit):
-        contact = build_stack(circuit).contact
-        ratio = contact.work_ratio if contact is not None else 1.0
+    ratio = max((contact.work_ratio for contact in _contacts(circuit).values()), default=1.0)
     lines = [
         circuit.title or "fingerspice export",
         f"* Written by fingerspice; charge law {law}. Run: ngspice -b -r out.raw FILE",
@@ -78,14 +79,11 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     if circuit.overrides:
         changed = ", ".join(f"{k} = {v}" for k, v in circuit.overrides.items())
         lines.append(f"* Changed from the deck: {' '.join(changed.split())}"[:1000])
+    areas = _start_areas(circuit, law)
     for element in circuit.elements:
-        lines += _element_lines(element, circuit, ratio)
+        lines += _element_lines(element, circuit, ratio, areas)
     lines += _analysis_lines(circuit)
-    for gap in circuit.by_device("GAP"):
-        area = gap.values["a_fix"] or 1e6 * float(contact_of(gap).area(0.0))
-        # An area with dynamics of its own has to start somewhere; a guess is enough for one that follows at once.
-        word = ".ic" if gap.values["tau"] > 0.0 else ".nodeset"
-        lines.append(f"{word} v({_name(gap.node_names[2])})={area!r}")
+    lines += _start_lines(circuit, areas)
     lines += ["", library_text(law).rstrip(), "", _OPTIONS, ".end", ""]
     return "\n".join(lines)
 
@@ -112,7 +110,84 @@ def _refuse_merged_names(circuit: Circuit) -> None:
                 raise InputError(f"{other} and {name} would be one name in the export; allowed: rename one of them")
 
 
-def _element_lines(element: Element, circuit: Circuit, work_ratio: float) -> Iterator[str]:
+def _contacts(circuit: Circuit) -> dict[str, Contact]:
+    """The contact of each GAP by its area node."""
+    if is_stack(circuit):
+        stack = build_stack(circuit)
+        return {e.nodes[2]: stack.contact for e in stack.layers if stack.contact is not None}
+    return {gap.nodes[2]: contact_of(gap) for gap in circuit.by_device("GAP")}
+
+
+def _start_areas(circuit: Circuit, law: str) -> dict[str, float]:
+    """Area (mm^2) of each area node just as a ``uic`` run starts; none where a run starts otherwise."""
+    if circuit.tran is None or not starts_uncharged(circuit):
+        return {}
+    areas, _ = find_branches(circuit)
+    contacts = _contacts(circuit)
+    out = {}
+    for area in areas:
+        value = area.given
+        if value is None and area.gap is not None:
+            value = float(contacts[area.node].area(abs(start_voltage(area.gap, circuit.initial))))
+        assert value is not None
+        out[area.node] = 1e6 * value
+    if any(area.gap and area.gap.values["tau"] > 0.0 for area in areas):
+        out |= _slow_areas(circuit, law)
+    return out
+
+
+def _slow_areas(circuit: Circuit, law: str) -> dict[str, float]:
+    """Where areas with dynamics of their own start, mm^2."""
+    problem = prepare_network(
+        circuit, t_stop=None, t_eval=None, charge_law=law, area="coupled", start="deck", charge=False
+    )
+    net, n = problem.scene.net, problem.scene.net.k.shape[0]
+    slow = problem.initial.y[n:]
+    return {
+        area.node: 1e6 * float(slow[place] * area0)
+        for area, place, area0 in zip(problem.network.areas, net.slow, net.area0, strict=True)
+        if place >= 0
+    }
+
+
+def _start_lines(circuit: Circuit, areas: Mapping[str, float]) -> Iterator[str]:
+    """Start values and guesses of nodes; what layers hold with ``uic`` stands with the layers."""
+    written = {node: name for e in circuit.elements for node, name in zip(e.nodes, e.node_names, strict=True)}
+    gaps = {gap.nodes[2]: gap for gap in circuit.by_device("GAP")}
+    contacts = _contacts(circuit)
+    for node, value in circuit.initial.items():
+        if node != "0" and node not in gaps:
+            yield f".ic v({_name(written[node])})={value!r}"
+    for node, gap in gaps.items():
+        guess = gap.values["a_fix"] or 1e6 * float(contacts[node].area(0.0))
+        held = circuit.initial.get(node)
+        if areas:
+            # An area with dynamics of its own has to start somewhere; a guess is enough for one that follows at once.
+            held = areas[node] if gap.values["tau"] > 0.0 else None
+            guess = areas[node]
+        word, value = (".nodeset", guess) if held is None else (".ic", held)
+        yield f"{word} v({_name(written[node])})={value!r}"
+        if areas and circuit.initial and not gap.values["a_fix"]:
+            yield from _guesses_inside(gap, contacts[node], start_voltage(gap, circuit.initial))
+
+
+def _guesses_inside(gap: Element, contact: Contact, u: float) -> Iterator[str]:
+    """Guesses for the nodes inside a GAP at `u` V: with charge to hold ngspice finds no first point without them."""
+    at_rest, adhesive = (float(contact.area_adhesive(v)) for v in (0.0, u))
+    y = adhesive / at_rest
+    guesses = {
+        "x": math.log(y),
+        "y": y,
+        "v": float(contact.stress(u)) * at_rest / contact.f_n,
+        "follow": 1e6 * float(contact.area(u)),
+    }
+    name = _element_name(gap)
+    yield ".nodeset " + " ".join(f"v({name}.{node})={value!r}" for node, value in guesses.items())
+
+
+def _element_lines(
+    element: Element, circuit: Circuit, work_ratio: float, start_areas: Mapping[str, float]
+) -> Iterator[str]:
     nodes = " ".join(_name(n) for n in element.node_names)
     name = _element_name(element)
     if element.waveform is not None:
@@ -126,7 +201,10 @@ def _element_lines(element: Element, circuit: Circuit, work_ratio: float) -> Ite
     # The strength of a dielectric is for a warning here; ngspice has no use for it.
     values = " ".join(f"{k}={_number(v)}" for k, v in element.values.items() if k != "e_max")
     extra = f" wk={work_ratio!r}" if element.device == "GAP" and work_ratio != 1.0 else ""
-    yield f"{name} {nodes} {element.device} {values}{extra}"
+    area = start_areas.get(element.nodes[2])
+    held = 0.0 if area is None else start_voltage(element, circuit.initial)
+    extra += f" ic={held!r} a_ic={area!r}" if held else ""
+    yield from _wrapped(f"{name} {nodes} {element.device} {values}{extra}")
 
 
 def _number(value: float) -> str:
@@ -256,5 +334,3 @@ def _analysis_lines(circuit: Circuit) -> Iterator[str]:
     if circuit.ac is not None:
         ac = circuit.ac
         yield f".ac {ac.scale} {ac.points} {ac.start!r} {ac.stop!r}"
-    for node, value in circuit.initial.items():
-        yield f".ic v({_name(node)})={value!r}"

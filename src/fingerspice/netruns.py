@@ -16,7 +16,6 @@ from fingerspice.engine.network import Sources, at_sources, new_room, rates
 from fingerspice.engine.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, ZEROS
 from fingerspice.networks import NetworkProblem
 from fingerspice.outcome import Attempt, ErrorEstimate, NetworkState, Status, last_tried
-from fingerspice.physics.contact import inverse_areas
 from fingerspice.runs import ROUNDING, Continuous, Progress, windows
 
 FloatArray = NDArray[np.float64]
@@ -159,37 +158,6 @@ class Integration(ABC):
     def jump(self, after: FloatArray) -> bool:
         """Take a jump of the sources to their values `after`; False where that goes past a fold."""
 
-    @abstractmethod
-    def forget(self) -> None:
-        """Forget what was counted: it was a trial."""
-
-    def settle_areas(self, after: FloatArray) -> None:
-        """Let the areas with dynamics of their own start at g(u(0+))."""
-        place = slice(self.n, self.n + self.n_slow)
-        if not np.any(np.isnan(self.y[place])):
-            return
-        slow = [i for i in range(self.net.gap.size) if self.net.slow[i] >= 0]
-        y, s_before = self.y.copy(), self.s_before.copy()
-        area = np.ones(self.n_slow)
-        for _ in range(60):
-            self.y[:], self.s_before[:] = y, s_before
-            self.y[place] = area
-            self.sign[:] = 0.0
-            self.jump(after)
-            u = np.abs(self.net.p @ self.y[: self.n] + self.net.q @ after)
-            new = area.copy()
-            for i in slow:
-                inverse = inverse_areas(u[[self.net.gap[i]]], self.net.curves[i])[0]
-                new[self.net.slow[i]] = 1.0 / (inverse * self.net.area0[i])
-            done = bool(np.all(np.abs(new - area) <= 1e-15))
-            area = new
-            if done:
-                break
-        self.y[:], self.s_before[:] = y, s_before
-        self.y[place] = area
-        self.sign[:] = 0.0
-        self.forget()
-
     def state(self) -> NetworkState:
         return NetworkState(self.t, self.y.copy(), self.s_before.copy(), self.sign.copy())
 
@@ -221,8 +189,6 @@ def integrate(one: Integration, progress: Progress | None) -> NetworkRun:
         broken = [table.not_finite for table in tables if table.not_finite is not None]
         if all(table.edges.size > 1 for table in tables):
             sources = joined(tables)
-            if one.t == problem.t_start:
-                one.settle_areas(values_at(sources, one.t))
             status = one.through(sources, min(float(t.edges[-1]) for t in tables))
             if status is not Status.SUCCESS:
                 t_failed = one.t

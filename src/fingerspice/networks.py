@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
@@ -20,8 +21,16 @@ from fingerspice.errors import InputError
 from fingerspice.network_record import NetworkRecord
 from fingerspice.outcome import NetworkState
 from fingerspice.phasors import mean_network_areas
-from fingerspice.physics.contact import N_PACKED
+from fingerspice.physics.contact import N_PACKED, inverse_area
 from fingerspice.solution import Solution
+from fingerspice.starting import (
+    ROUNDING,
+    at_own_area,
+    operating_point,
+    settle,
+    start_voltages,
+    starts_uncharged,
+)
 from fingerspice.times import run_times
 
 FloatArray = NDArray[np.float64]
@@ -249,13 +258,12 @@ def _padded(curve: FloatArray, width: int) -> FloatArray:
 
 
 def _initial(circuit: Circuit, scene: NetworkScene, start: str | Solution) -> NetworkState:
-    """State just before the start; areas with dynamics of their own are NaN where they start at g(u(0+))."""
+    """State just before the start."""
     network = scene.network
-    n, n_s = network.b.shape
-    n_slow = int(np.count_nonzero(scene.net.slow >= 0))
+    size = sum(network.b.shape) + int(np.count_nonzero(scene.net.slow >= 0))
     if isinstance(start, Solution):
         state = start.state
-        alike = isinstance(state, NetworkState) and state.y.size == n + n_slow + n_s and start.layers == tuple(
+        alike = isinstance(state, NetworkState) and state.y.size == size and start.layers == tuple(
             e.name for e in network.layers
         )  # fmt: skip
         if not alike or start.charge_law != scene.charge_law:
@@ -266,86 +274,70 @@ def _initial(circuit: Circuit, scene: NetworkScene, start: str | Solution) -> Ne
         assert isinstance(state, NetworkState)
         return state
     require(start in ("deck", "uncharged", "dc"), "start", repr(start), "'deck', 'uncharged', 'dc' or a Solution")
-    given = {c.element.name: c.element.initial for c in network.cells if c.element.initial is not None}
-    if start == "deck":
-        uic = circuit.tran is None or circuit.tran.uic
-        named = bool(circuit.initial) or (uic and bool(given))
-        start = "given" if named else ("uncharged" if uic else "dc")
-    y = np.concatenate([np.zeros(n), np.full(n_slow, np.nan), np.zeros(n_s)])
-    s = np.zeros(n_s)
-    if start == "given":
-        y[:n], s = _given(circuit, network)
-    elif start == "dc":
-        s = np.array([float(w.value(0.0, "left")) for w in scene.waveforms])
-        y[:n] = _operating_point(scene, s)
-    return NetworkState(0.0, y, s, np.zeros(len(network.areas)))
+    if start == "uncharged" or (start == "deck" and starts_uncharged(circuit)):
+        u, area, s = _given(circuit, scene, start == "deck")
+    else:
+        u, area, s = _at_rest(circuit, scene, circuit.initial if start == "deck" else {})
+    return _state(scene, u, area, s)
 
 
-def _given(circuit: Circuit, network: Network) -> tuple[FloatArray, FloatArray]:
-    """Live voltages from ``.ic`` and ``IC=`` (nodes without: 0 V), and the sources' values that go with them."""
-    known = {node for cell in network.cells for node in cell.element.nodes[:2]}
-    u = np.zeros(len(network.cells))
-    total: dict[str, float] = {}
-    for cell in network.cells:
-        total[cell.element.name] = total.get(cell.element.name, 0.0) + 1.0 / cell.c
-    for node in circuit.initial:
-        if node not in known:
-            raise InputError(
-                f".ic names node {node!r}, where no capacitor or layer ends: its voltage follows from others"
-            )
-    for i, cell in enumerate(network.cells):
-        e = cell.element
-        across = circuit.initial.get(e.nodes[0], 0.0) - circuit.initial.get(e.nodes[1], 0.0)
-        if e.initial is not None and not circuit.initial:
-            across = e.initial
-        # The slabs of a dispersive layer share its voltage as in a jump.
-        u[i] = across / cell.c / total[e.name]
-    x = u[list(network.live)]
-    s = np.linalg.lstsq(network.q, u - network.p @ x, rcond=None)[0] if network.q.size else np.zeros(network.q.shape[1])
-    return np.asarray(x, float), np.asarray(s, float)
+def _given(circuit: Circuit, scene: NetworkScene, asked: bool) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Cell voltages (V) and areas (m^2) that a start with ``uic`` gives; None for the sources: their own at 0+.
 
-
-def _operating_point(scene: NetworkScene, s: FloatArray) -> FloatArray:
-    """Live voltages of the DC operating point, the areas coupled.
-
-    Raises
-    ------
-    InputError
-        Where a node has no path for direct current, or the areas find no rest.
+    Areas are NaN where they follow, or start at rest.
     """
     network = scene.network
-    area = scene.area0.copy()
-    for _ in range(200):
-        k, b = network.stiffness(area)
-        _refuse_floating_at_dc(network, area)
-        x = np.linalg.solve(k, -b @ s) if k.size else np.zeros(0)
-        u = network.p @ x + network.q @ s
-        new = area.copy()
-        for i in range(area.size):
-            contact, gap = network.contacts[i], network.gaps[i]
-            if scene.fixed[i] is None and contact is not None and gap is not None:
-                new[i] = float(contact.area(abs(float(u[gap]))))
-        if np.all(np.abs(new - area) <= 4e-16 * area):
-            return np.asarray(x)
-        # Halfway: a leak that scales with the area may make it swing.
-        area = new if np.all(np.abs(new - area) <= 1e-3 * area) else 0.5 * (area + new)
-    raise InputError("the areas find no DC operating point; allowed: uic in .tran, to start uncharged")
+    area = np.full(len(network.areas), np.nan)
+    if not asked:
+        return np.zeros(len(network.cells)), area, None
+    for i, one in enumerate(network.areas):
+        if scene.net.slow[i] >= 0:
+            area[i] = 1e-6 * circuit.initial.get(one.node, math.nan)
+    cells = network.cells
+    return start_voltages([c.element for c in cells], scene.net.c, circuit.initial), area, None
 
 
-def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
-    """Voltages that only capacitors hold have no DC value."""
-    factor = np.vstack([network.resistor_factor, np.sqrt(network.leak(area))[:, None] * network.p])
-    if not factor.shape[1]:
-        return
-    # Columns of like size: conductances range over many decades.
-    size = np.linalg.norm(factor, axis=0)
-    _, sigma, turned = np.linalg.svd(factor / np.where(size > 0.0, size, 1.0))
-    rank = int(np.count_nonzero(sigma > 1e-12 * max(1.0, sigma.max(initial=0.0))))
-    if rank == factor.shape[1]:
-        return
-    held = np.abs(network.p @ turned[rank:].T).max(axis=1) > 1e-9
-    names = dict.fromkeys(c.element.name for c, mark in zip(network.cells, held, strict=True) if mark)
-    raise InputError(
-        f"no DC operating point: {' and '.join(names)} leave nodes that are reached by capacitors only; allowed: a "
-        "leakage (r=... or an R), or uic in .tran to start uncharged"
-    )
+def _at_rest(
+    circuit: Circuit, scene: NetworkScene, initial: Mapping[str, float]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Cell voltages (V), areas (m^2) and sources of the operating point, the nodes in `initial` held."""
+    network, net = scene.network, scene.net
+    contacts = [c if gap >= 0 else None for c, gap in zip(network.contacts, net.gap, strict=True)]
+    point = operating_point(circuit, network, scene.area0, contacts, initial)
+    u = point.u.copy()
+    if net.mobile:
+        for i in np.flatnonzero(point.held & (net.slow < 0)):
+            # Let go, the area goes its own way, and the charge stays.
+            gap = net.gap[i]
+            own = at_own_area(float(u[gap]), point.area[i], net.curves[i])
+            rest = 1.0 / inverse_area(abs(own), net.curves[i])[0]
+            u[net.place == i] *= point.area[i] / rest
+            u[gap] = own
+    return u, point.area, np.array([float(w.value(0.0, "left")) for w in scene.waveforms])
+
+
+def _state(scene: NetworkScene, u: FloatArray, area: FloatArray, s: FloatArray | None) -> NetworkState:
+    """State just before the start of cells that hold `u` (n_cell,) V, with the sources at `s` or else at what fits."""
+    network, net = scene.network, scene.net
+    slow = (area / net.area0)[net.slow >= 0]
+    after = np.array([float(w.value(0.0)) for w in scene.waveforms])
+    # A run of a source that is not finite says so itself.
+    after[~np.isfinite(after)] = 0.0
+    x, charge = u[list(network.live)], np.zeros(after.size)
+    before = _fitting(network, u - network.p @ x) if s is None else s
+    off = float(np.abs(u - network.p @ x - network.q @ before).max(initial=0.0))
+    if off > ROUNDING * float(np.abs(u).max(initial=0.0)):
+        before = after if s is None else s
+        settled = settle(net, u, slow, before)
+        x, slow, charge = settled.x, settled.slow, settled.charge
+    elif np.any(np.isnan(slow)):
+        # Areas with dynamics of their own start where they rest after the sources' first jump.
+        slow = settle(net, u, slow, after).slow
+    return NetworkState(0.0, np.concatenate([x, slow, charge]), before, np.zeros(len(network.areas)))
+
+
+def _fitting(network: Network, u: FloatArray) -> FloatArray:
+    """Values of the sources that leave the cells `u` (n_cell,) V, as nearly as they can."""
+    if not network.q.size:
+        return np.zeros(network.q.shape[1])
+    return np.asarray(np.linalg.lstsq(network.q, u, rcond=None)[0], float)

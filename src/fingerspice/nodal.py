@@ -108,10 +108,6 @@ class Collocation(Integration):
         self.control[collocation.JUMPED] = 1.0
         return code == collocation.DONE
 
-    def forget(self) -> None:
-        self.peaks[:] = 0.0
-        self.counters[:] = 0
-
 
 def _integrate(
     problem: NetworkProblem, scheme: Scheme, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
+from fingerspice.circuit.network import build_network
 from fingerspice.circuit.sampling import is_sampled, on_breakpoint
 from fingerspice.circuit.statespace import Stack, build_stack
 from fingerspice.circuit.waveforms import Fundamental, Waveform, require
@@ -23,6 +24,7 @@ from fingerspice.physics.contact import fixed_area_curve, inverse_area
 from fingerspice.record import Record
 from fingerspice.solution import Solution
 from fingerspice.spectrum import freezing_error
+from fingerspice.starting import PAST_FOLD, operating_point, start_voltages, starts_uncharged
 from fingerspice.times import run_times
 
 FloatArray = NDArray[np.float64]
@@ -341,31 +343,35 @@ def _initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Sta
         assert isinstance(start.state, State)
         return start.state
     require(start in ("deck", "uncharged", "dc"), "start", repr(start), "'deck', 'uncharged', 'dc' or a Solution")
+    initial = circuit.initial if start == "deck" else {}
     if start == "deck":
-        uic = circuit.tran is None or circuit.tran.uic
-        start = "uncharged" if uic and not circuit.initial else ("given" if circuit.initial else "dc")
+        start = "dc" if not starts_uncharged(circuit) else ("given" if initial else "uncharged")
     if start == "uncharged":
         return State(0.0, np.zeros(n), 0.0, 0.0, law)
+    inverse, let_go = 0.0, False
     if start == "given":
-        u, u_before = _given_voltages(circuit, stack)
+        of = [e for e, count in zip(stack.layers, stack.cells, strict=True) for _ in range(count)]
+        u = stack.sign * start_voltages(of, stack.c, initial)
+        u_before = float(u.sum())
     else:
         u_before = float(scene.waveform.value(0.0, "left"))
-        u = dc_voltages(stack, u_before, model)
+        u = dc_voltages(stack, u_before, model) if not initial else np.zeros(n)
+        if initial:
+            u, inverse, let_go = _held_voltages(circuit, scene)
     v = u - stack.k * u_before
-    inverse = 1.0 / model.area0
-    if stack.gap is not None:
-        inverse, _ = inverse_area(abs(float(u[stack.gap])), model.curve)
+    if not let_go:
+        inverse = 1.0 / model.area0
+        if stack.gap is not None:
+            inverse, _ = inverse_area(abs(float(u[stack.gap])), model.curve)
     x = v[list(stack.state_order[:-1])] / (model.area0 * inverse if model.mobile else 1.0)
     state = state_from(model, 0.0, x, u_before, law)
     if stack.gap is not None:
         found = _gap_voltage(model, x, u_before)
         # Behind an insulating coating the gap's 0 V are the difference of others.
         slack = 1e-9 * abs(u[stack.gap]) + 1e-13 * float(np.abs(u).max())
-        if not abs(found - u[stack.gap]) <= slack:
-            raise InputError(
-                f"the start has {u[stack.gap]:.4g} V across the gap, past the fold of the mobile law; allowed: less "
-                "voltage, more load, or the local law"
-            )
+        # An area that .ic held springs back, and the voltage with it.
+        if not (math.isfinite(found) if let_go else abs(found - u[stack.gap]) <= slack):
+            raise InputError(f"the start has {u[stack.gap]:.4g} V across the gap, {PAST_FOLD}")
     return state
 
 
@@ -384,20 +390,18 @@ def state_from(model: Model, t: float, x: FloatArray, u_before: float, law: str)
     return State(t, np.append(x, 0.0), u_before, offset, law)
 
 
-def _given_voltages(circuit: Circuit, stack: Stack) -> tuple[FloatArray, float]:
-    """Cell voltages along the loop from ``.ic`` node voltages (unnamed nodes: 0), and their sum.
-
-    A dispersive layer takes its voltage as a jump would give it.
-    """
-    names = {node for hop in stack.hops for node in hop.element.nodes[:2]}
-    unknown = [node for node in circuit.initial if node not in names]
-    if unknown:
-        raise InputError(f".ic names node {unknown[0]!r}, which is not in the circuit")
-    u = np.array([circuit.initial.get(e.nodes[0], 0.0) - circuit.initial.get(e.nodes[1], 0.0) for e in stack.layers])
-    inverse = 1.0 / stack.c
-    share = inverse / np.repeat(np.add.reduceat(inverse, stack.first_cell), stack.cells)
-    u = np.repeat(u, stack.cells) * share * stack.sign
-    return u, float(u.sum())
+def _held_voltages(circuit: Circuit, scene: Scene) -> tuple[FloatArray, float, bool]:
+    """Cell voltages (n_cell,) and 1/A (1/m^2) at rest with ``.ic`` held, and whether that holds the area."""
+    stack, model = scene.stack, scene.model
+    network = build_network(replace(circuit, work="gap"))
+    contact = stack.contact if model.coupled else None
+    point = operating_point(circuit, network, np.array([model.area0]), [contact], circuit.initial)
+    u = []
+    for layer, count in zip(stack.layers, stack.cells, strict=True):
+        own = point.u[[i for i, cell in enumerate(network.cells) if cell.element is layer]]
+        # A dispersive skin whose data are taken at one frequency is one cell.
+        u += list(own) if own.size == count else [own.sum()]
+    return stack.sign * np.array(u), float(1.0 / point.area[0]), bool(point.held[0])
 
 
 def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:

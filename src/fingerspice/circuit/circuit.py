@@ -126,7 +126,7 @@ class Circuit:
     tran : Tran or None
     ac : AcSweep or None
     initial : mapping of str to float
-        ``.ic``: canonical node to V.
+        ``.ic``: canonical node to V, or to mm^2 where it is an area's.
     charge_law : str or None
         Of the included library: ``local``, ``mobile`` or None.
     work : str

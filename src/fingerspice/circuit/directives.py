@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Element, Tran
@@ -9,6 +10,8 @@ from fingerspice.circuit.deck import Directive, Number, Token, parse_deck
 from fingerspice.circuit.expressions import nearest
 from fingerspice.errors import InputError, Where
 
+MOST_VOLTS = 1e30
+"""Start values of voltages, V: far from any circuit's, so that products stay numbers."""
 _NGSPICE_OPTIONS = frozenset(
     """abstol acct bypass chgtol defad defas defl defw gmin gminsteps interp itl1 itl2 itl3 itl4 itl5 itl6 keepopinfo
     klu list maxevtiter maxopalter maxord method minbreak noacct noinit nomod nopage node noopalter numdgt opts
@@ -84,7 +87,7 @@ def read_ac(directive: Directive) -> AcSweep:
 
 
 def read_initial(directives: tuple[Directive, ...], elements: tuple[Element, ...]) -> dict[str, float]:
-    """``.ic v(node)=value``: canonical node to V; the area nodes are left out."""
+    """``.ic v(node)=value``: canonical node to V, or to mm^2 where it is an area's."""
     usage = "allowed: .ic v(node)=value"
     nodes = {node: None for e in elements for node in e.nodes}  # an ordered set
     area_nodes = {e.nodes[2] for e in elements if e.spec.is_layer}
@@ -106,10 +109,28 @@ def read_initial(directives: tuple[Directive, ...], elements: tuple[Element, ...
                 raise InputError(f".ic gives node {node!r} twice", place)
             if node == "0" and value.value != 0.0:
                 raise InputError(f".ic {key} is {value.text} V; allowed: 0, it is ground", place)
-            # ngspice needs a start value for the area; here the area follows from the state.
-            if node not in area_nodes:
-                out[node] = value.value
+            if node in area_nodes and not 1e-30 <= value.value <= 1e30:
+                raise InputError(f".ic {key} is {value.text} mm^2; allowed: more than 0, from 1e-30 to 1e30", place)
+            if not abs(value.value) <= MOST_VOLTS:
+                raise InputError(f".ic {key} is {value.text} V; allowed: from -{MOST_VOLTS:g} to {MOST_VOLTS:g}", place)
+            out[node] = value.value
     return out
+
+
+def unused_starts(initial: Mapping[str, float], elements: tuple[Element, ...], uic: bool) -> tuple[str, ...]:
+    """Start values that have no effect: of other nodes than capacitors' with ``uic``, ``IC=`` without."""
+    layers = [e for e in elements if e.spec.is_layer]
+    gaps = {e.nodes[2]: e.values for e in layers if e.device == "GAP" and e.values["a_fix"] == 0.0}
+    taken = {node for e in elements if e.device == "C" or e.spec.is_layer for node in e.nodes[:2]}
+    out = []
+    for node in initial:
+        if any(e.nodes[2] == node for e in layers):
+            used = node in gaps and (gaps[node]["tau"] > 0.0 or not uic)
+        else:
+            used = node in taken or not uic
+        if not used:
+            out.append(f".ic v({node})")
+    return (*out, *(f"IC= of {e.name}" for e in elements if e.initial is not None and not uic))
 
 
 def read_options(directives: tuple[Directive, ...]) -> tuple[str, tuple[str, ...]]:

@@ -11,7 +11,14 @@ from types import MappingProxyType
 from fingerspice.circuit.circuit import Circuit, Element, check
 from fingerspice.circuit.deck import Call, Deck, Number, Statement, Token, parse_deck, read_deck
 from fingerspice.circuit.devices import DEVICES, ParameterSpec
-from fingerspice.circuit.directives import read_ac, read_initial, read_options, read_tran
+from fingerspice.circuit.directives import (
+    MOST_VOLTS,
+    read_ac,
+    read_initial,
+    read_options,
+    read_tran,
+    unused_starts,
+)
 from fingerspice.circuit.expressions import nearest
 from fingerspice.circuit.network import build_network
 from fingerspice.circuit.sources import Source, Timing, read_source
@@ -79,16 +86,17 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
     timing = Timing(tran.step if tran else None, tran.stop if tran else None)
     elements = tuple(_element(statement, timing, notes) for statement in deck.statements)
     work, unused = read_options(deck.options)
+    initial = read_initial(deck.ic, elements)
     circuit = Circuit(
         title=deck.title,
         elements=elements,
         tran=tran,
         ac=read_ac(deck.ac) if deck.ac else None,
-        initial=read_initial(deck.ic, elements),
+        initial=initial,
         charge_law=_charge_law(deck.includes),
         work=work,
         warnings=tuple(notes),
-        unused=(*deck.unused, *unused),
+        unused=(*deck.unused, *unused, *unused_starts(initial, elements, tran is None or tran.uic)),
         text=deck.text,
         path=deck.path,
     )
@@ -261,6 +269,9 @@ def _passive_value(statement: Statement, notes: list[str]) -> tuple[dict[str, fl
     initial = statement.params.get("ic")
     if isinstance(initial, Token):
         raise InputError(f"{name} IC is {initial.text!r}; allowed: a number V", initial.where)
+    if initial is not None and not abs(initial.value) <= MOST_VOLTS:
+        allowed_volts = f"from -{MOST_VOLTS:g} to {MOST_VOLTS:g}"
+        raise InputError(f"{name} IC is {initial.text} V; allowed: {allowed_volts}", initial.where)
     return {"value": _value(name, spec, word, notes)}, None if initial is None else initial.value
 
 

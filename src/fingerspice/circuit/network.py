@@ -144,8 +144,8 @@ class Network:
         return np.asarray(self.p @ x + self.q @ s)
 
 
-def build_network(circuit: Circuit) -> Network:
-    """The network of a circuit.
+def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
+    """The network of a circuit; voltage sources in `held` hold nodes of it, no two of which other sources tie together.
 
     Raises
     ------
@@ -154,6 +154,7 @@ def build_network(circuit: Circuit) -> Network:
         has.
     """
     areas, branches = find_branches(circuit)
+    branches = [*branches, *held]
     if circuit.work == "total" and any(area.gap for area in areas):
         raise InputError(
             ".options work=total holds the voltage across a series stack, and this circuit is none; allowed: work=gap"

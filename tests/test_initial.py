@@ -1,0 +1,346 @@
+"""Where a run starts: IC=, .ic and the operating point, against ngspice 39, closed forms and the charge conserved."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import analytic
+import fingerspice as fs
+from ngspice_tools import CIRCUITS, run_ngspice
+from scenes import deck, table1
+from start_reference import deck_of, random_network
+from test_networks import finger
+
+LAWS = ("local", "mobile")
+DC_AMPLIFIER = (("1m uic", "1m"), ("SIN(0 200 5k)", "SIN(26 100 5k)"))
+STEP, STOP = 2e-9, 2e-6
+
+
+def shipped(name: str, *changes: tuple[str, str], extra: str = "") -> fs.Circuit:
+    """A deck of `circuits/`, changed."""
+    text = (CIRCUITS / f"{name}.cir").read_text()
+    for old, new in (*changes, ("\n.end\n", f"\n{extra}\n.end\n")):
+        assert old in text
+        text = text.replace(old, new)
+    return fs.parse_netlist(text)
+
+
+def start(circuit: fs.Circuit, law: str | None = None) -> dict[str, float]:
+    """Node voltages at 0+."""
+    tran = circuit.tran
+    assert tran is not None
+    s = fs.simulate(circuit, charge_law=law, t_stop=min(tran.stop, 100 * tran.step), t_eval=np.zeros(1))
+    return {node: float(v[0]) for node, v in s.node_voltages.items()}
+
+
+def apart(circuit: fs.Circuit, law: str | None = None, text: str | None = None, max_step: float | None = None) -> float:
+    """Largest difference of a node's voltage or an area from ngspice's, over the largest of a run, from 0+ on."""
+    text = text or fs.export_netlist(circuit, charge_law=law)
+    tran = circuit.tran
+    assert tran is not None
+    areas = [gap.node_names[2] for gap in circuit.by_device("GAP")]
+    nodes = {n for e in circuit.elements for n in e.node_names[:2]} - {"0"} - {e.node_names[2] for e in circuit.elements
+                                                                                if e.spec.is_layer}  # fmt: skip
+    signals = {f"v({n.replace('.', '_')})": n for n in (*nodes, *areas)}
+    theirs = run_ngspice(text, signals=list(signals), max_step=max_step, timeout=20.0)
+    t, first = np.unique(np.minimum(theirs["time"], tran.stop), return_index=True)
+    # Their first point is that of 0 s without uic, with it a step away.
+    t, first = t[t > 0.0], first[t > 0.0]
+    assert t.size > 400
+    ours = fs.simulate(circuit, charge_law=law, t_eval=t, rtol=1e-8)
+    assert ours.success
+    scale = max(1.0, *(float(np.abs(ours.node_voltages[n]).max()) for n in nodes))
+    worst = 0.0
+    for signal, name in signals.items():
+        if name in areas:
+            area = np.reshape(ours.area, (t.size, -1))[:, areas.index(name)]
+            worst = max(worst, float(np.abs(1e6 * area / theirs[signal][first] - 1.0).max()))
+        else:
+            worst = max(worst, float(np.abs(ours.node_voltages[name] - theirs[signal][first]).max()) / scale)
+    return worst
+
+
+# Random networks ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(140))
+def test_random_networks_start_and_go_on_as_their_charge_says(seed: int) -> None:
+    network = random_network(seed)
+    times = np.array([0.0, 1e-8, 1e-7, 1e-6, 1e-5, 1e-3])
+    expected = network.response(times)
+    s = fs.simulate(fs.parse_netlist(deck_of(network, 1e-8, 1e-3)), t_eval=times)
+    got = np.column_stack([s.node_voltages[f"n{i}"] for i in range(1, network.nodes + 1)])
+    assert np.abs(got - expected).max() <= 1e-9 * max(1.0, np.abs(expected).max())
+
+
+@pytest.mark.parametrize("seed", range(1000, 1040))
+def test_random_networks_start_as_in_ngspice(seed: int) -> None:
+    text = deck_of(random_network(seed), STEP, STOP, (".options reltol=1e-6",))
+    circuit = fs.parse_netlist(text)
+    # Every other one as exported.
+    assert apart(circuit, text=None if seed % 2 else text, max_step=STEP) <= 3e-4
+
+
+# In 2008 next to nothing moves, and ngspice's step runs out.
+@pytest.mark.parametrize("seed", [seed for seed in range(2000, 2025) if seed != 2008])
+@pytest.mark.filterwarnings("ignore:the gap voltage reaches")
+def test_random_networks_with_a_finger_start_as_in_ngspice(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    gap = {"tau": "1u"} if rng.random() < 0.4 else {}
+    initial = [
+        f".ic v({n})={round(float(rng.uniform(-30.0, 30.0)), 2)!r}" for n in ("top", "skin") if rng.random() < 0.6
+    ]
+    if gap and rng.random() < 0.6:
+        initial.append(f".ic v(area)={round(float(rng.uniform(20.0, 40.0)), 2)!r}")
+    text = deck_of(random_network(seed), STEP, STOP, (*finger("n1", "n2", **gap), *initial))
+    assert apart(fs.parse_netlist(text), LAWS[seed % 2], max_step=STEP) <= 1.01e-3
+
+
+# IC= of several capacitors ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_order_of_capacitors_does_not_matter_and_charge_is_conserved(turned: bool) -> None:
+    capacitors = ["C2 b 0 100p", "C1 b 0 1n IC=50"]
+    circuit = deck("V1 a 0 0", "R1 a b 10k", *capacitors[:: -1 if turned else 1], ".tran 1n 100n uic")
+    s = fs.simulate(circuit)
+    expected = 50.0 / 1.1 * np.exp(-s.t / 11e-6)
+    assert np.abs(s.node_voltages["b"] - expected).max() <= 1e-12 * 50.0
+
+
+def test_a_capacitor_with_ic_beside_others_that_ic_lines_give() -> None:
+    circuit = deck("V1 a 0 10", "R1 a b 10k", "C2 b 0 100p", "C1 b c 1n IC=50", "C3 c 0 1n", "R3 c 0 1meg",
+                   ".ic v(b)=20 v(c)=5", ".tran 1n 100n uic")  # fmt: skip
+    v = start(circuit)
+    # Charge of nodes b and c: 100 pF at 20 V, 1 nF at IC=, 1 nF at 5 V.
+    b, c = np.linalg.solve([[1.1, -1.0], [-1.0, 2.0]], [0.1 * 20.0 + 50.0, 5.0 - 50.0])
+    assert [v["b"], v["c"]] == pytest.approx([b, c], rel=1e-13)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("top", [0.0, 40.0, -100.0])
+def test_a_charged_cable_shares_its_charge_with_the_finger(law: str, top: float) -> None:
+    cable = 250.0
+    v = start(shipped("amplifier", ("150p", f"1n IC={cable}"), extra=f".ic v(top)={top}"), law)
+    c = np.array([layer.c for layer in analytic.table1_layers(5000.0)])
+    before = np.array([-top, top, 0.0])
+    after = np.array([v["drive"] - v["top"], v["top"] - v["skin"], v["skin"]])
+    if law == "local":
+        # All layers have one area: what flows through each is c times the integral of A(u_gap) du.
+        moved = c * (after - before) * (analytic.area_primitive(after[1]) - analytic.area_primitive(before[1]))
+        moved /= after[1] - before[1]
+    else:
+        moved = c * (float(analytic.area(after[1])) * after - float(analytic.area(before[1])) * before)
+    assert moved == pytest.approx(np.full(3, 1e-9 * (cable - v["drive"])), rel=1e-10)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_charged_cable_is_as_in_ngspice(law: str) -> None:
+    # Its first step takes the area at the end of what settles, not on the way: 1.2e-4.
+    assert apart(shipped("amplifier", ("150p", "150p IC=100")), law) <= 2e-4
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("initial", [(), (".ic v(skin)=3",)])
+def test_a_capacitor_across_an_ideal_source_moves_nothing(law: str, initial: tuple[str, ...]) -> None:
+    lines = ("V1 a 0 SIN(20 50 5k)", *finger("a", "0"), *initial, ".tran 1u 100u uic")
+    with_it, without = (
+        fs.simulate(circuit, charge_law=law, rtol=1e-9) for circuit in (deck(*lines, "C1 a 0 1u IC=-500"), deck(*lines))
+    )
+    assert with_it.u_gap is not None
+    assert np.abs(with_it.u_gap - without.u_gap).max() <= 1e-7
+
+
+def test_a_source_delivers_what_the_start_takes() -> None:
+    s = fs.simulate(deck("V1 a 0 10", "C1 a 0 1n IC=4", "C2 a b 1n", "C3 b 0 1n IC=2", "R1 b 0 1g", ".tran 1n 10n uic"))
+    # C1 by 6 V; C2 and C3 share what 10 V are above 2 V.
+    assert s.node_voltages["b"][0] == pytest.approx(6.0, rel=1e-13)
+    assert s.q_source[0] == pytest.approx(6e-9 + 4e-9, rel=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore:the gap voltage reaches")
+def test_a_start_past_the_fold_is_refused() -> None:
+    circuit = shipped("amplifier", ("150p", "1n IC=600"), extra=".ic v(top)=100")
+    assert start(circuit, "local")["drive"] > 500.0
+    with pytest.raises(fs.InputError, match=r"start voltages settle past the fold of the mobile law; allowed: less"):
+        fs.simulate(circuit, charge_law="mobile")
+
+
+def test_ic_of_capacitors_counts_with_uic_only() -> None:
+    lines = ("V1 a 0 10", "R1 a b 1k", "R2 b 0 1k", "C1 b 0 1n IC=3")
+    assert start(deck(*lines, ".tran 1n 10n uic"))["b"] == pytest.approx(3.0, rel=1e-13)
+    circuit = deck(*lines, ".tran 1n 10n")
+    assert start(circuit)["b"] == pytest.approx(5.0, rel=1e-13)
+    assert circuit.unused == ("IC= of C1",)
+
+
+# The operating point with .ic held ---------------------------------------------------------------------------
+
+
+def test_nodes_that_ic_does_not_name_are_at_rest() -> None:
+    circuit = deck("V1 a 0 10", "R1 a b 1k", "R2 b 0 1k", "C1 b 0 1n", "R3 a c 1k", "C2 c 0 1n", "R4 c d 1k",
+                   "R5 d 0 2k", "C3 d 0 1n", ".ic v(c)=3", ".tran 1n 10n")  # fmt: skip
+    assert start(circuit) == pytest.approx({"a": 10.0, "b": 5.0, "c": 3.0, "d": 2.0}, rel=1e-13)
+
+
+def test_a_voltage_source_is_stronger_than_ic_and_tied_nodes_take_the_mean() -> None:
+    circuit = deck("V1 a 0 10", "V2 a b 4", "C1 b 0 1n", "R3 b 0 1meg", "Vf c d 4", "Cc c 0 1n", "Rd d 0 1k",
+                   ".ic v(b)=3 v(c)=7 v(d)=5", ".tran 1n 10n")  # fmt: skip
+    assert start(circuit) == pytest.approx({"a": 10.0, "b": 6.0, "c": 8.0, "d": 4.0}, rel=1e-13)
+
+
+def test_a_node_that_only_capacitors_reach_starts_where_ic_says() -> None:
+    lines = ("V1 a 0 10", "C1 a b 1n", "C2 b 0 2n")
+    with pytest.raises(fs.InputError, match="C1 and C2 leave nodes that are reached by capacitors only"):
+        fs.simulate(deck(*lines, ".tran 1n 10n"))
+    assert start(deck(*lines, ".ic v(b)=7", ".tran 1n 10n"))["b"] == pytest.approx(7.0, rel=1e-13)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_held_node_of_the_amplifier_is_met_and_the_others_follow(law: str) -> None:
+    v = start(shipped("amplifier", *DC_AMPLIFIER, extra=".ic v(top)=30"), law)
+    assert v["top"] == pytest.approx(30.0, rel=1e-12)
+    assert v["amp"] == pytest.approx(26.0, rel=1e-12)
+    # Through the coating into 47 k; through gap and skin to ground.
+    assert v["drive"] == pytest.approx(26.0 + 4.0 * 47.0 / 247.0, rel=1e-12)
+    skin = analytic.table1_layers(5000.0)[2]
+    r = skin.r_area / float(analytic.area(v["top"] - v["skin"]))
+    assert v["skin"] == pytest.approx(30.0 * r / (1e6 + r), rel=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore:the gap voltage reaches")
+@pytest.mark.parametrize("top", [500.0, 1000.0, 5000.0])
+def test_an_area_that_swings_far_finds_its_rest(top: float) -> None:
+    # At 100 Hz the skin's leak falls with the area, and the gap's voltage with it.
+    v = start(table1("SIN(26 100 100)", tran="1u 100u", extra=f".ic v(top)={top}"))
+    r = analytic.table1_layers(100.0)[2].r_area / float(analytic.area(v["top"] - v["skin"]))
+    assert v["skin"] == pytest.approx(top * r / (1e6 + r), rel=1e-12)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_held_node_of_a_stack_is_met_and_the_others_follow(law: str) -> None:
+    v = start(table1("SIN(26 100 100)", tran="10u 50m", extra=".ic v(top)=30"), law)
+    assert v["drive"] == pytest.approx(26.0, rel=1e-12)
+    assert v["top"] == pytest.approx(30.0, rel=1e-12)
+    skin = analytic.table1_layers(100.0)[2]
+    r = skin.r_area / float(analytic.area(v["top"] - v["skin"]))
+    assert v["skin"] == pytest.approx(30.0 * r / (1e6 + r), rel=1e-12)
+
+
+def test_the_difference_of_two_nodes_is_node_p_minus_node_n() -> None:
+    v = start(table1(tran="10u 50m uic", extra=".ic v(drive)=50 v(top)=30 v(skin)=10"))
+    # The source takes its 50 V back at once, shared as 1/C.
+    coat, gap, skin = (1.0 / layer.c for layer in analytic.table1_layers(100.0))
+    whole = coat + gap + skin
+    assert v["skin"] == pytest.approx(10.0 - 50.0 * skin / whole, rel=1e-10)
+    assert v["top"] == pytest.approx(30.0 - 50.0 * (skin + gap) / whole, rel=1e-10)
+
+
+# Areas with dynamics of their own ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("changes", [(), DC_AMPLIFIER], ids=["uic", "operating point"])
+def test_ic_of_the_area_starts_one_with_dynamics_of_its_own(law: str, changes: tuple[tuple[str, str], ...]) -> None:
+    circuit = shipped("amplifier", ("c2=5000", "c2=5000 tau=50u"), *changes, extra=".ic v(area)=20")
+    s = fs.simulate(circuit, charge_law=law, t_eval=np.zeros(1))
+    assert s.area is not None
+    assert s.area[0] == pytest.approx(20e-6, rel=1e-13)
+    assert circuit.unused == (".nodeset",)
+    assert apart(circuit, law) <= 5e-5
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_start_from_rest_has_the_area_at_rest_though_the_source_jumps(law: str) -> None:
+    lines = ["V1 a 0 PWL(0 60 0 160)", *finger("a", "0", tau="1m"), ".tran 1u 100u"]
+    s = fs.simulate(deck(*lines), charge_law=law, t_eval=np.array([0.0, 1e-9]))
+    resistances = [200e3, 1e6]
+    for _ in range(50):
+        at_rest = float(analytic.area(60.0 * 1e6 / (sum(resistances[:2]) + (resistances[2:] or [0.0])[0])))
+        resistances[2:] = [analytic.table1_layers(5000.0)[2].r_area / at_rest]
+    assert s.area is not None
+    assert s.area[-1] == pytest.approx(at_rest, rel=1e-5)
+
+
+@pytest.mark.parametrize("value", ["0", "-3", "1e31"])
+def test_an_area_that_cannot_be_is_refused(value: str) -> None:
+    with pytest.raises(fs.InputError, match=r"\.ic v\(area\) is .* mm\^2; allowed: more than 0"):
+        table1(extra=f".ic v(area)={value}")
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("C1 skin 0 1n IC=1e200", r"C1 IC is 1e200 V; allowed: from -1e\+30 to 1e\+30"),
+        (".ic v(top)=-1e31", r"\.ic v\(top\) is -1e31 V; allowed: from -1e\+30 to 1e\+30"),
+    ],
+)
+def test_a_voltage_that_cannot_be_is_refused(line: str, said: str) -> None:
+    with pytest.raises(fs.InputError, match=said):
+        table1(extra=line)
+
+
+def test_start_values_without_effect_are_listed() -> None:
+    lines = ["V1 a 0 1", "R1 a b 1k", "R2 b c 1k", "C1 c 0 1n", ".ic v(b)=3 v(c)=1"]
+    assert deck(*lines, ".tran 1n 10n uic").unused == (".ic v(b)",)
+    assert deck(*lines, ".tran 1n 10n").unused == ()
+    assert table1(extra=".ic v(area)=34").unused == (".ic v(area)",)
+    assert table1(extra=".ic v(area)=34", tran="10u 10m").unused == ()
+
+
+# Exports ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(
+    ("name", "changes", "initial"),
+    [
+        ("amplifier", (), "v(top)=30 v(skin)=-5 v(drive)=40"),
+        ("amplifier", (("c2=5000", "c2=5000 tau=50u"),), "v(top)=30"),
+        ("amplifier", DC_AMPLIFIER, "v(top)=30"),
+        ("amplifier", DC_AMPLIFIER, "v(area)=20 v(top)=10"),
+        ("amplifier", (*DC_AMPLIFIER, ("c2=5000", "c2=5000 tau=50u")), "v(amp)=3"),
+        ("fingerpad_5khz", (), "v(top)=30 v(skin)=10"),
+        ("fingerpad_5khz", (), "v(drive)=50 v(top)=-130 v(skin)=10"),
+        ("fingerpad_5khz", (("SIN(0 200 5k)", "DC 150"),), "v(drive)=50 v(top)=30 v(skin)=-60"),
+        ("fingerpad_5khz", (("SIN(0 200 5k)", "SIN(26 100 5k)"), ("1m uic", "1m")), "v(area)=20 v(top)=30"),
+        ("fingerpad_dispersive", (("30m uic", "3m uic"),), "v(top)=30 v(skin)=10"),
+        ("fingerpad_dispersive", (("30m uic", "3m"), ("SIN(0 120 100)", "SIN(50 120 100)")), "v(top)=30"),
+        (
+            "two_fingers",
+            (("c2=5000", "c2=5000 tau=50u"), ("0.5u 1m", "20n 40u")),
+            "v(xlight.top)=30 v(xlight.skin)=5 v(body)=-10 v(firm)=20",
+        ),
+    ],
+)  # fmt: skip
+@pytest.mark.filterwarnings("ignore:of the source's energy")
+def test_an_export_starts_where_the_deck_does(
+    name: str, changes: tuple[tuple[str, str], ...], initial: str, law: str
+) -> None:
+    assert apart(shipped(name, *changes, extra=f".ic {initial}"), law) <= 1.2e-4
+
+
+def test_ic_of_capacitors_goes_along() -> None:
+    text = fs.export_netlist(shipped("amplifier", ("150p", "150p IC=100")))
+    assert re.search(r"^Ccable drive 0 1\.5e-10 IC=100\.0$", text, re.MULTILINE)
+
+
+def test_the_other_reading_of_eq_7_starts_the_same_there() -> None:
+    circuit = table1(extra=".options work=total\n.ic v(top)=30 v(skin)=10", tran="10u 10m uic")
+    for law in LAWS:
+        assert apart(circuit, law) <= 1e-4
+
+
+def test_a_run_that_goes_on_from_a_settled_start_is_the_run() -> None:
+    circuit = shipped("amplifier", ("150p", "150p IC=100"))
+    times: NDArray[np.float64] = np.linspace(0.0, 4e-4, 41)
+    whole = fs.simulate(circuit, t_stop=4e-4, t_eval=times, rtol=1e-9)
+    first = fs.simulate(circuit, t_stop=2e-4, rtol=1e-9)
+    rest = fs.simulate(circuit, start=first, t_stop=4e-4, t_eval=times[21:], rtol=1e-9)
+    assert whole.u_gap is not None
+    assert np.abs(rest.u_gap - whole.u_gap[21:]).max() <= 1e-6
+    assert np.abs(rest.q_source - whole.q_source[21:]).max() <= 1e-7 * np.abs(whole.q_source).max()
