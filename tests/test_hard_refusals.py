@@ -116,6 +116,19 @@ def test_the_local_law_has_no_fold_in_the_same_scene(case: str) -> None:
     assert np.abs(solution.u_gap - expected.u_gap).max() <= 1e-8 * np.abs(expected.u_gap).max()
 
 
+@pytest.mark.filterwarnings("ignore:the contact area falls")
+@pytest.mark.parametrize(("gap", "rtol"), [(5e-8, 3e-3), (1e-7, 1e-2), (2e-7, 3e-3)])
+def test_a_fold_is_not_believed_while_a_finer_run_meets_it_elsewhere(gap: float, rtol: float) -> None:
+    # Steps as coarse as these errors ask for end a hundred-thousandth to a ten-thousandth of the time too late.
+    params = dataclasses.replace(ref.TABLE1, d_a=gap)
+    fold = ref.transient(SINE, [], law="mobile", freq=100.0, params=params, tol=1e-12).fold
+    assert fold is not None
+    circuit = table1().replace({"Xgap.d": gap})
+    kept = fs.simulate(circuit, charge_law="mobile", method="dp5", rtol=rtol, throw=False)
+    assert kept.status is fs.Status.FOLD
+    assert kept.state.t == pytest.approx(fold.t, rel=1e-5)
+
+
 def test_a_square_of_two_kilovolt_jumps_past_the_fold_at_its_first_reversal() -> None:
     expected = ref.transient(ref.square_segments(2000.0, 100.0, 1), [], law="mobile", freq=100.0).fold
     assert expected is not None
