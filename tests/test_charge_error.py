@@ -228,7 +228,7 @@ class Net:
     def held(self, x: float) -> float:
         """What the error is worth that is stored at a fraction of the step, C."""
         at = np.array([x])
-        _, u, a = self.at(at, 0.0)
+        _, _, a = self.at(at, 0.0)
         value = float((self.stored @ slope_of(lambda e: self.at(at, e)[0]))[0])
         for b, share in enumerate(self.through):
             if self.mobile:

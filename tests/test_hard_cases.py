@@ -43,7 +43,8 @@ def check(solution: fs.Solution, expected: ref.Transient, steps: int, rounded: f
     assert force <= solution.rtol * strongest
     assert force <= solution.error.f_el + 2.0 * rounded / peak * strongest
     assert solution.error.u_gap <= 1.001 * solution.rtol * peak
-    assert np.abs(solution.u_layer.sum(axis=1) - solution.u_source).max() <= 1e-13 * np.abs(solution.u_layer).max()
+    # What the gap misses is in the other layers too, which share the same states.
+    assert np.abs(solution.u_layer - expected.u).max() <= 3.0 * solution.rtol * peak + rounded
     assert solution.stats["steps"] <= steps
     # A step is some iterations of 13 nodes; none gets stuck.
     assert solution.nfev <= 30 * 13 * (solution.stats["steps"] + solution.stats["rejected"])
