@@ -48,19 +48,6 @@ def test_a_later_source_gives_the_same_response_later(law):
     assert np.abs(now.u_gap - later.u_gap).max() <= 2e-9 * np.abs(now.u_gap).max()
 
 
-@pytest.mark.parametrize("law", ["local", "mobile"])
-def test_a_run_in_two_halves_equals_the_whole(law):
-    whole = run(SOURCES["square"], law)
-    first = run(SOURCES["square"], law, t_stop=0.0123)
-    second = fs.simulate(
-        table1(), sources={"Vdrive": SOURCES["square"]}, charge_law=law, start=first, t_stop=0.02,
-        t_eval=whole.t[whole.t > 0.0123][1:], rtol=1e-9,
-    )  # fmt: skip
-    keep = np.searchsorted(whole.t, second.t, side="right") - 1
-    assert np.abs(whole.u_gap[keep] - second.u_gap).max() <= 3e-9 * np.abs(whole.u_gap).max()
-    assert np.abs(whole.q_source[keep] - second.q_source).max() <= 3e-9 * np.abs(whole.q_source).max()
-
-
 def permuted(order):
     layers = {
         "c": "Xcoat {} {} area LAYER d=1u eps_r=3.9 r=0.2meg",
@@ -134,13 +121,6 @@ def test_force_vanishes_with_the_voltage_as_its_square():
     forces = [run(fs.Sine(u, 100.0)).f_el.max() for u in (1e-3, 1e-6, 1e-9)]
     assert_allclose(forces[1] / forces[0], 1e-6, rtol=1e-6)
     assert_allclose(forces[2] / forces[1], 1e-6, rtol=1e-7)
-
-
-def test_nothing_happens_at_zero_volt():
-    solution = run(fs.DC(0.0))
-    for value in (solution.u_layer, solution.f_el, solution.q_source, solution.i_source):
-        assert np.all(value == 0.0)
-    assert_allclose(solution.f_t, 0.3 * 0.5, rtol=1e-15)
 
 
 @pytest.mark.filterwarnings("ignore:the gap voltage reaches")

@@ -450,15 +450,6 @@ def test_the_operating_point_of_a_network_with_a_finger_is_at_rest() -> None:
     assert s.u_gap[0] < plain.u_gap[0]
 
 
-def test_results_are_the_same_bits_whichever_outputs_are_asked_for() -> None:
-    circuit = floating("SIN(0 200 5k)")
-    t = np.linspace(0.0, 1e-3, 601)
-    a, b = (fs.simulate(circuit, t_eval=t, rtol=1e-6) for _ in range(2))
-    assert np.array_equal(a.u_gap, b.u_gap)
-    half = fs.simulate(circuit, t_eval=t[::2], t_stop=1e-3, rtol=1e-6)
-    assert np.array_equal(half.u_gap, a.u_gap[::2])
-
-
 @pytest.mark.parametrize("name", ["ungrounded_user", "amplifier", "current_drive"])
 def test_phasors_of_a_network_are_its_periodic_state(name: str) -> None:
     circuit = fs.read_netlist(CIRCUITS / f"{name}.cir")
@@ -476,8 +467,6 @@ REFUSALS = {
         ["Idrive 0 drive 1m", "Ia drive 0 2m"],
         "Idrive is a current source without a path: node 'drive' is reached through current sources only",
     ),
-    "source loop": (["V1 a 0 1", "V2 b 0 1", "V3 a b 1", "R1 a b 1k"], "V3 closes a loop of voltage sources"),
-    "parallel sources": (["V1 a 0 1", "V2 a 0 1", "R1 a 0 1k"], "V1 and V2 are voltage sources in parallel"),
     "dangling resistor": (["V1 a 0 1", "R1 a 0 1k", "R2 a Loose 1k"], "node 'Loose' is floating: only R2 touches it"),
     "island": (["V1 a 0 1", "R1 a 0 1k", "R2 x y 1k", "C1 x y 1n"], "is floating: nothing connects it to ground"),
     "area node as a conductor": (
@@ -493,17 +482,6 @@ def test_what_no_network_is_gets_one_sentence(case: str) -> None:
     with pytest.raises(fs.InputError) as caught:
         deck(*lines)
     assert message in str(caught.value)
-
-
-def test_nodes_that_only_capacitors_reach_have_no_operating_point_but_start_with_uic() -> None:
-    lines = ["V1 a 0 SIN(0 1 1k)", "C1 a b 1n", "C2 b 0 1n"]
-    with pytest.raises(
-        fs.InputError, match="no DC operating point: C1 and C2 leave nodes that are reached by capacitors"
-    ):
-        fs.simulate(deck(*lines, ".tran 1u 1m"))
-    s = fs.simulate(deck(*lines, ".tran 1u 1m uic"))
-    # Equal capacitors halve the voltage.
-    assert np.abs(s.node_voltages["b"] - 0.5 * np.sin(2e3 * math.pi * s.t)).max() <= 1e-13
 
 
 @pytest.mark.parametrize(
@@ -530,13 +508,3 @@ def test_what_needs_a_stack_says_so() -> None:
     for call in (fs.compare, fs.steady_state):
         with pytest.raises(fs.InputError, match="needs a series chain of LAYER, SLAB, SKIN and GAP"):
             call(circuit)
-
-
-def test_a_source_that_stops_being_finite_ends_the_run_there() -> None:
-    def source(t: float) -> float:
-        return math.nan if t > 3e-4 else 100.0 * math.sin(2.0 * math.pi * 5e3 * t)
-
-    s = fs.simulate(floating("SIN(0 200 5k)"), sources={"Vdrive": source}, t_stop=1e-3, throw=False)
-    assert s.status is fs.Status.SOURCE_NOT_FINITE
-    assert s.t[-1] <= 3e-4 * (1.0 + 1e-9)
-    assert np.all(np.isfinite(s.u_gap))
