@@ -35,7 +35,7 @@ test: $(VENV)/.test
 	$(BIN)/python -m pytest
 
 stress: $(VENV)/.test
-	$(BIN)/python tests/stress.py --scenes 10000
+	$(BIN)/python tests/stress.py --scenes 10000 --json benchmarks/results/stress.json
 
 fuzz: $(VENV)/.test
 	$(BIN)/python tests/fuzz.py --inputs 1000000

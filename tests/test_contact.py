@@ -22,7 +22,8 @@ from analytic import (
 )
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.physics.contact import Contact, fixed_area_curve, inverse_area, ridge_area, universal_curve
-from scenes import table1
+from fingerspice.physics.ladder import SKIN_LADDER
+from scenes import table1, table1_deck
 
 SEARCH = settings(max_examples=60, derandomize=True, deadline=None)
 MM2 = 1e6
@@ -288,6 +289,16 @@ def test_with_the_total_voltage_held_the_area_is_larger_by_less_than_a_percent(f
         assert abs(held.area(u) / area_mp(u, k=k)[1] - 1) < 1e-13
         assert low < float(held.area(u) / PAPER.area(u)) - 1.0 < high
     assert float(held.area(0.0)) == pytest.approx(float(PAPER.area(0.0)), rel=1e-15)
+
+
+def test_with_the_total_voltage_held_a_dispersive_skin_counts_with_its_permittivity_above_all_poles() -> None:
+    text = table1_deck(extra=".options work=total").replace("SKIN d=350u f=100.0", "SKIN_DISPERSIVE d=350u")
+    circuit = fs.parse_netlist(text)
+    # The sum of d / eps_r over coating, gap and skin, over the gap's.
+    for skin_at, eps in ((None, 1004.82), (100.0, float(SKIN_LADDER.permittivity([100.0])[0]))):
+        held = build_stack(circuit, skin_at).contact
+        assert held is not None
+        assert held.work_ratio == pytest.approx((1e-6 / 3.9 + 3.5e-6 + 350e-6 / eps) / 3.5e-6, rel=1e-13)
 
 
 def test_the_gap_voltage_is_held_unless_the_deck_says_otherwise() -> None:

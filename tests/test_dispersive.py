@@ -282,7 +282,6 @@ def test_the_coupled_run_is_the_independent_references(shape: str, law: str) -> 
     # The skin is one layer for its user.
     assert run.layers == ("Xcoat", "Xgap", "Xskin")
     assert np.abs(run.u_layer[:, 2] - exact.u[:, 2:].sum(axis=1)).max() <= rtol * 200.0
-    np.testing.assert_allclose(run.u_layer.sum(axis=1), run.u_source, rtol=0, atol=1e-12 * 200.0)
 
 
 @every_law
@@ -389,13 +388,3 @@ def test_a_dielectric_beyond_its_strength_is_warned_about(layer: str) -> None:
     assert field > 1e6
     strong = fs.parse_netlist(text.replace("e_max=1meg", f"e_max={field * 1.001}"))
     assert fs.simulate(strong, t_stop=1e-3, rtol=1e-6).warnings == ()
-
-
-def test_a_contact_that_nearly_vanishes_is_warned_about() -> None:
-    circuit = fs.parse_netlist(table1_deck("SIN(0 2k 100)"))
-    with pytest.warns(fs.FingerspiceWarning) as caught:
-        run = fs.simulate(circuit, t_stop=0.01, rtol=1e-6)
-    least = run.area.min()
-    text = " ".join(str(w.message) for w in caught)
-    assert ("contact area falls to" in text) == (least < 0.2 * run.area[0])
-    assert "air breaks down" in text

@@ -101,25 +101,32 @@ def ratios() -> np.ndarray:
         true_f = np.abs(solution.f_el - exact.force).max()
         asked_u, asked_f = scene.rtol * np.abs(exact.u_gap).max(), scene.rtol * exact.force.max()
         stated = solution.error
-        out.append((stated.u_gap / true_u, stated.f_el / true_f, true_u / asked_u, true_f / asked_f))
+        true_q = np.abs(solution.q_source - exact.q).max()
+        asked_q = scene.rtol * np.abs(exact.q).max()
+        out.append(
+            (stated.u_gap / true_u, stated.f_el / true_f, stated.q_source / true_q, true_u / asked_u, true_f / asked_f,
+             true_q / asked_q)
+        )  # fmt: skip
     return np.array(out)
 
 
 @pytest.mark.filterwarnings("ignore:the gap voltage reaches")
 def test_the_estimate_covers_the_true_error_on_95_percent_of_scenes(ratios: np.ndarray) -> None:
-    assert np.mean(ratios[:, 0] >= 1.0) >= 0.95
-    assert np.mean(ratios[:, 1] >= 1.0) >= 0.95
+    assert np.all(np.mean(ratios[:, :3] >= 1.0, axis=0) >= 0.95)
 
 
 @pytest.mark.filterwarnings("ignore:the gap voltage reaches")
 def test_the_estimate_is_at_most_ten_times_the_true_error_on_95_percent_of_scenes(ratios: np.ndarray) -> None:
-    assert np.mean(ratios[:, 0] <= 10.0) >= 0.95
-    assert np.mean(ratios[:, 1] <= 10.0) >= 0.95
+    assert np.all(np.mean(ratios[:, :2] <= 10.0, axis=0) >= 0.95)
+    # What a charge collects may cancel by chance: its error is stated more safely.
+    assert np.mean(ratios[:, 2] <= 30.0) >= 0.95
 
 
 @pytest.mark.filterwarnings("ignore:the gap voltage reaches")
 def test_the_error_asked_for_is_met(ratios: np.ndarray) -> None:
-    assert ratios[:, 2:].max() <= 1.0
+    assert ratios[:, 3:5].max() <= 1.0
+    # None is asked for of the charge.
+    assert np.mean(ratios[:, 5] <= 1.0) >= 0.95
 
 
 # Scenes of `stress.py`: an instability that magnifies errors a thousandfold; and one whose area damps them as much

@@ -51,18 +51,11 @@ def test_periodic_square_equals_the_matrix_exponential(f, duty, law):
     assert np.abs(solution.u_layer[inside] - expected).max() <= 1e-10 * 200.0
 
 
-def test_transient_from_rest_equals_the_closed_form():
-    t = np.linspace(0.0, 0.02, 83)
-    expected = ref.sine_frozen_from_rest(100.0, 200.0, AREA, t, ref.table1_layers(100.0))
-    solution = fs.simulate(table1(), t_eval=t, area=AREA, rtol=1e-11)
-    assert np.abs(solution.u_layer - expected).max() <= 1e-11 * np.abs(expected[:, 1]).max()
-
-
 def test_mean_and_frozen_areas_are_what_their_names_say():
     frozen = fs.simulate(table1(), area="frozen")
-    assert frozen.area == pytest.approx(34.9715871843e-6, rel=1e-11)
+    assert frozen.area == pytest.approx(34.9715871843e-6, rel=1e-11, abs=0.0)
     mean = fs.simulate(table1(), area="mean")
-    assert mean.area == pytest.approx(ref.coupled_phasor(100.0, 200.0).area, rel=1e-12)
+    assert mean.area == pytest.approx(ref.coupled_phasor(100.0, 200.0).area, rel=1e-12, abs=0.0)
     with pytest.raises(fs.InputError, match="this source has none"):
         fs.simulate(table1(), sources={"Vdrive": fs.DC(10.0)}, area="mean")
 

@@ -14,7 +14,7 @@ import pytest
 import analytic as ref
 import fingerspice as fs
 from hard_cases_reference import StackFold, stack_fold
-from scenes import deck, table1, table1_deck
+from scenes import deck, table1
 
 every_law = pytest.mark.parametrize("law", ["local", "mobile"])
 SINE = ref.sine_segments(200.0, 100.0, 0.02)
@@ -114,6 +114,19 @@ def test_the_local_law_has_no_fold_in_the_same_scene(case: str) -> None:
         warnings.filterwarnings("ignore", "the contact area falls")
         solution = fs.simulate(table1().replace(changes), t_eval=t, t_stop=0.02)
     assert np.abs(solution.u_gap - expected.u_gap).max() <= 1e-8 * np.abs(expected.u_gap).max()
+
+
+@pytest.mark.filterwarnings("ignore:the contact area falls")
+@pytest.mark.parametrize(("gap", "rtol"), [(5e-8, 3e-3), (1e-7, 1e-2), (2e-7, 3e-3)])
+def test_a_fold_is_not_believed_while_a_finer_run_meets_it_elsewhere(gap: float, rtol: float) -> None:
+    # Steps as coarse as these errors ask for end a hundred-thousandth to a ten-thousandth of the time too late.
+    params = dataclasses.replace(ref.TABLE1, d_a=gap)
+    fold = ref.transient(SINE, [], law="mobile", freq=100.0, params=params, tol=1e-12).fold
+    assert fold is not None
+    circuit = table1().replace({"Xgap.d": gap})
+    kept = fs.simulate(circuit, charge_law="mobile", method="dp5", rtol=rtol, throw=False)
+    assert kept.status is fs.Status.FOLD
+    assert kept.state.t == pytest.approx(fold.t, rel=1e-5)
 
 
 def test_a_square_of_two_kilovolt_jumps_past_the_fold_at_its_first_reversal() -> None:
@@ -219,34 +232,10 @@ def test_nan_at_one_instant_that_is_an_output_is_not_passed_over() -> None:
 
 # Circuits that are none -----------------------------------------------------------------------------------------
 
-TOPOLOGY = {
-    "floating node": ([V, COAT, GAP, SKIN.replace(" 0 ", " far ")], ["node 'far' is floating", "Xskin"]),
-    "floating end of a resistor": ([V, COAT, GAP, SKIN, "R1 top far 1k"], ["node 'far' is floating", "R1"]),
-    "floating island": (
-        [V, COAT, GAP, SKIN, "C1 p q 1n", "R1 p q 1k"],
-        ["node 'p' (C1) is floating", "nothing connects it to ground"],
-    ),
-    "two sources in parallel": ([V, "Vb drive 0 5", COAT, GAP, SKIN], ["Vdrive and Vb", "in parallel"]),
-    "the same, head to tail": ([V, "Vb 0 drive 5", COAT, GAP, SKIN], ["Vdrive and Vb", "in parallel"]),
-    "loop of three sources": (
-        [V, "Vb drive mid 5", "Vc mid 0 5", COAT, GAP, SKIN],
-        ["Vc closes a loop of voltage sources"],
-    ),
-}
-
-
-@pytest.mark.parametrize("case", TOPOLOGY)
-def test_a_circuit_that_is_none_is_refused_with_the_names_of_its_elements(case: str) -> None:
-    lines, parts = TOPOLOGY[case]
-    with pytest.raises(fs.InputError) as caught:
-        deck(*lines, ".tran 10u 10m uic")
-    for part in parts:
-        assert part in str(caught.value)
-
 
 def test_a_loop_of_sources_is_refused_with_the_names_of_all_of_them() -> None:
     with pytest.raises(fs.InputError, match=r"Vdrive.*Vb|Vb.*Vdrive"):
-        deck(*TOPOLOGY["loop of three sources"][0], ".tran 10u 10m uic")
+        deck(V, "Vb drive mid 5", "Vc mid 0 5", COAT, GAP, SKIN, ".tran 10u 10m uic")
 
 
 def test_a_node_reached_by_capacitors_only_has_no_operating_point_in_a_stack() -> None:
@@ -271,37 +260,6 @@ def test_a_node_reached_by_capacitors_only_has_no_operating_point_in_a_network()
         assert part in str(caught.value)
     solution = fs.simulate(deck(*lines, ".tran 1u 1m uic"))
     np.testing.assert_allclose(solution.node_voltages["b"], 1.25, rtol=1e-14)
-
-
-VALUES = {
-    "zero R": ("r1", "R1 top 0 0", ["R1", "0 ohm", "more than 0"]),
-    "negative R": ("r1", "R1 top 0 -1k", ["R1", "-1000 ohm", "more than 0"]),
-    "zero C": ("c1", "C1 top 0 0", ["C1", "0 F", "more than 0"]),
-    "negative C": ("c1", "C1 top 0 -1p", ["C1", "-1e-12 F", "more than 0"]),
-    "zero leak": ("coat", {"r": "0"}, ["Xcoat r", "0 ohm", "more than 0"]),
-    "negative leak": ("gap", {"r": "-1meg"}, ["Xgap r", "-1e+06 ohm", "more than 0"]),
-    "zero d": ("gap", {"d": "0"}, ["Xgap d", "0 m", "more than 0"]),
-    "negative d": ("skin", {"d": "-350u"}, ["Xskin d", "-0.00035 m", "more than 0"]),
-    "negative fixed A": ("gap", {"a_fix": "-35"}, ["Xgap a_fix", "-35 mm^2", "0 or more"]),
-}
-
-
-@pytest.mark.parametrize("case", VALUES)
-def test_zero_and_negative_values_are_refused_with_the_elements_name(case: str) -> None:
-    where, change, parts = VALUES[case]
-    given = {"extra": change} if isinstance(change, str) else {where: change}
-    with pytest.raises(fs.InputError) as caught:
-        fs.parse_netlist(table1_deck(**given))
-    for part in parts:
-        assert part in str(caught.value)
-    assert caught.value.where is not None
-
-
-@pytest.mark.parametrize("level", ["0", "-35"])
-def test_an_area_that_is_driven_to_nothing_or_less_is_refused(level: str) -> None:
-    lines = [V, COAT, "Xslab top 0 area SLAB d=350u eps_r=1000 rho=1e4", f"Varea area 0 {level}"]
-    with pytest.raises(fs.InputError, match="Varea drives an area: allowed is a DC value above 0"):
-        deck(*lines, ".tran 10u 10m uic")
 
 
 @pytest.mark.parametrize("area", [0.0, -1e-6, math.nan, math.inf])

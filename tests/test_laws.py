@@ -30,14 +30,6 @@ def run(waveform, law="local", **options):
 
 @pytest.mark.parametrize("law", ["local", "mobile"])
 @pytest.mark.parametrize("source", SOURCES)
-def test_layer_voltages_sum_to_the_source(source, law):
-    solution = run(SOURCES[source], law)
-    peak = np.abs(solution.u_source).max()
-    assert np.abs(solution.u_layer.sum(axis=1) - solution.u_source).max() <= 1e-13 * peak
-
-
-@pytest.mark.parametrize("law", ["local", "mobile"])
-@pytest.mark.parametrize("source", SOURCES)
 def test_reversing_the_source_reverses_every_voltage_and_no_force(source, law):
     plus = run(SOURCES[source], law)
     minus = run(SOURCES[source] * -1.0, law)
@@ -54,19 +46,6 @@ def test_a_later_source_gives_the_same_response_later(law):
     now = run(fs.Sine(200.0, 100.0), law, t_eval=t, t_stop=0.02)
     later = run(fs.Sine(200.0, 100.0, delay=0.003), law, t_eval=t + 0.003, t_stop=0.023)
     assert np.abs(now.u_gap - later.u_gap).max() <= 2e-9 * np.abs(now.u_gap).max()
-
-
-@pytest.mark.parametrize("law", ["local", "mobile"])
-def test_a_run_in_two_halves_equals_the_whole(law):
-    whole = run(SOURCES["square"], law)
-    first = run(SOURCES["square"], law, t_stop=0.0123)
-    second = fs.simulate(
-        table1(), sources={"Vdrive": SOURCES["square"]}, charge_law=law, start=first, t_stop=0.02,
-        t_eval=whole.t[whole.t > 0.0123][1:], rtol=1e-9,
-    )  # fmt: skip
-    keep = np.searchsorted(whole.t, second.t, side="right") - 1
-    assert np.abs(whole.u_gap[keep] - second.u_gap).max() <= 3e-9 * np.abs(whole.u_gap).max()
-    assert np.abs(whole.q_source[keep] - second.q_source).max() <= 3e-9 * np.abs(whole.q_source).max()
 
 
 def permuted(order):
@@ -135,20 +114,13 @@ def test_a_jump_delivers_its_integral_of_a_dd():
     u = np.linspace(0.0, 200.0, 20001)
     area = np.asarray(ref.area(share * u))
     simpson = (u[1] / 3.0) * (area[0] + area[-1] + 4.0 * area[1::2].sum() + 2.0 * area[2:-1:2].sum())
-    assert solution.q_source[0] == pytest.approx(simpson / s, rel=1e-9)
+    assert solution.q_source[0] == pytest.approx(simpson / s, rel=1e-9, abs=0.0)
 
 
 def test_force_vanishes_with_the_voltage_as_its_square():
     forces = [run(fs.Sine(u, 100.0)).f_el.max() for u in (1e-3, 1e-6, 1e-9)]
     assert_allclose(forces[1] / forces[0], 1e-6, rtol=1e-6)
     assert_allclose(forces[2] / forces[1], 1e-6, rtol=1e-7)
-
-
-def test_nothing_happens_at_zero_volt():
-    solution = run(fs.DC(0.0))
-    for value in (solution.u_layer, solution.f_el, solution.q_source, solution.i_source):
-        assert np.all(value == 0.0)
-    assert_allclose(solution.f_t, 0.3 * 0.5, rtol=1e-15)
 
 
 @pytest.mark.filterwarnings("ignore:the gap voltage reaches")
@@ -161,12 +133,11 @@ def test_nothing_happens_at_zero_volt():
     load=st.floats(0.1, 1.0),
     law=st.sampled_from(["local", "mobile"]),
 )
-def test_random_scenes_obey_kirchhoff_and_amontons(amplitude, frequency, d_gap, r_gap, load, law):
+def test_random_scenes_obey_the_contact_s_law_and_amontons(amplitude, frequency, d_gap, r_gap, load, law):
     circuit = table1().replace({"Xgap.d": d_gap, "Xgap.r": r_gap, "Xgap.fn": load})
     s = fs.simulate(circuit, sources={"Vdrive": fs.Square(amplitude, frequency)}, t_stop=3.0 / frequency,
                     charge_law=law, rtol=1e-6, throw=False)  # fmt: skip
     assert s.success or s.status is fs.Status.FOLD
-    assert np.abs(s.u_layer.sum(axis=1) - s.u_source).max() <= 1e-12 * amplitude
     assert_allclose(s.sigma_el, EPS0 * s.u_gap**2 / (2.0 * d_gap**2), rtol=1e-12)
     assert_allclose(s.f_t, 0.3 * (load + s.sigma_el * s.area), rtol=1e-12)
     assert_allclose(s.area, ref.area(s.u_gap, _parameters(d_gap, load)), rtol=1e-11)

@@ -1,5 +1,6 @@
 """The map of the mobile law's fold: where it lies, and that it is the fold that runs meet."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import analytic as ref
 import fingerspice as fs
 from conftest import Command
 from fingerspice.limits import fold_voltage
@@ -28,6 +30,34 @@ def test_the_fold_voltage_parts_runs_that_fold_from_runs_that_do_not() -> None:
     assert above.status is fs.Status.FOLD
     # Where it is looked for first does not matter.
     assert fold_voltage(circuit, 200.0, 0.05, 20.0 * found) == pytest.approx(found, rel=2e-3)
+
+
+@pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
+@pytest.mark.parametrize("start", ["uncharged", "operating point", "given"])
+def test_the_fold_is_that_of_a_run_which_starts_as_the_deck_s_does(start: str) -> None:
+    # A cosine from its crest: from rest it jumps there, from its operating point it has been there for ever.
+    tran = "10u 4m" if start == "operating point" else "10u 4m uic"
+    ic = ".ic v(top)=12 v(skin)=-9" if start == "given" else ""
+    circuit = table1("SIN(0 200 100 0 0 90)", tran=tran, extra=ic).replace({"Xgap.d": 3e-7})
+    found = fold_voltage(circuit, 200.0, 4e-3)
+    params = dataclasses.replace(ref.TABLE1, d_a=3e-7)
+    how = {"uncharged": "uncharged", "operating point": "dc", "given": [-12.0, 21.0, -9.0]}[start]
+    for x, folds in ((0.998, False), (1.002, True)):
+        segments = ref.sine_segments(x * found, 100.0, 4e-3, phase=0.5 * math.pi)
+        run = ref.transient(segments, [], law="mobile", freq=100.0, params=params, start=how, tol=1e-11)
+        assert (run.fold is not None) == folds
+
+
+@pytest.mark.filterwarnings("ignore:the fold of the mobile charge law is near")
+def test_an_operating_point_past_the_fold_has_met_it_and_a_given_start_there_is_refused() -> None:
+    # Across 10 nm the first of the voltages tried stands past the fold before it has begun.
+    circuit = table1("SIN(0 200 100 0 0 90)", tran="10u 4m").replace({"Xgap.d": 1e-8})
+    found = fold_voltage(circuit, 200.0, 4e-3)
+    with pytest.raises(fs.InputError, match="past the fold of the mobile law"):
+        fs.simulate(circuit.replace({"Vdrive.amplitude": 1.002 * found}), charge_law="mobile")
+    assert fs.simulate(circuit.replace({"Vdrive.amplitude": 0.998 * found}), charge_law="mobile").success
+    with pytest.raises(fs.InputError, match="past the fold of the mobile law"):
+        fold_voltage(dataclasses.replace(circuit, initial={"top": 5.0}), 200.0, 4e-3)
 
 
 def test_a_map_holds_the_deck_s_own_point_and_the_scaling_of_a_voltage() -> None:

@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 import pytest
 
+import analytic as ref
 import fingerspice as fs
 from deck_edits import DECK, edited
 from fingerspice.circuit.circuit import AcSweep, Tran
@@ -172,7 +173,10 @@ def test_a_deck_without_gap_has_voltages_and_no_forces() -> None:
     solution = fs.simulate(circuit)
     assert solution.u_gap is solution.f_el is solution.f_t is solution.friction is None
     np.testing.assert_array_equal(solution.area, 35e-6)
-    np.testing.assert_allclose(solution.u_layer.sum(axis=1), solution.u_source, rtol=0, atol=1e-12)
+    eps0 = ref.TABLE1.eps0
+    layers = [ref.Layer(2.0 * eps0 / 1e-6, r_total=1e6), ref.Layer(3.0 * eps0 / 2e-6, r_area=1e6 * 2e-6)]
+    expected = ref.sine_frozen_from_rest(100.0, 10.0, 35e-6, solution.t, layers)
+    np.testing.assert_allclose(solution.u_layer, expected, rtol=0, atol=1e-11)
     assert set(solution.node_voltages) == {"a", "b"}
 
 

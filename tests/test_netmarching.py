@@ -102,3 +102,15 @@ def test_a_gap_voltage_that_turns_back_between_nodes_has_crossed_zero(lines: lis
         s = fs.simulate(circuit, t_eval=t, rtol=rtol)
         assert s.stats["zeros"] == exact.stats["zeros"]
         assert np.abs(s.u_gap - exact.u_gap).max() <= s.error.u_gap + exact.error.u_gap
+
+
+@pytest.mark.parametrize("method", ["auto", "radau"])
+@pytest.mark.parametrize("longest", [1e-3, 2.3e-4])
+def test_no_step_of_a_network_is_longer_than_the_decks_tmax(method: str, longest: float) -> None:
+    # A resistor and a capacitor: 50 V come with exp(-t / 0.1 ms), of which most steps see nothing.
+    lines = ["Vdrive a 0 50", "Rout a b 1k", *finger("b", "0"), "Ccable b 0 100n"]
+    free = fs.simulate(deck(*lines, ".tran 1m 20m uic"), rtol=1e-6, method=method)
+    bound = fs.simulate(deck(*lines, f".tran 1m 20m 0 {longest!r} uic"), rtol=1e-6, method=method)
+    assert free.stats["steps"] < 0.8 * 0.02 / longest
+    assert 0.02 / longest <= bound.stats["steps"] <= 1.2 * 0.02 / longest + free.stats["steps"]
+    assert np.abs(bound.u_gap - free.u_gap).max() <= bound.error.u_gap + free.error.u_gap

@@ -354,6 +354,16 @@ def test_two_equal_fingers_each_feel_what_one_feels() -> None:
     assert two.summary()["f_el:Xgap1_mean"] == pytest.approx(one.summary()["f_el_mean"], rel=1e-7)
 
 
+def agreeing(circuit: fs.Circuit, **options: object) -> tuple[fs.Solution, fs.Solution]:
+    """A run, and a finer one by Radau's method, from which it differs by no more than both state."""
+    s = fs.simulate(circuit, rtol=1e-6, **options)  # type: ignore[arg-type]
+    exact = fs.simulate(circuit, rtol=1e-9, method="radau", **options)  # type: ignore[arg-type]
+    assert exact.method == "radau"
+    assert np.abs(s.u_gap - exact.u_gap).max() <= s.error.u_gap + exact.error.u_gap
+    assert np.abs(s.f_el - exact.f_el).max() <= s.error.f_el + exact.error.f_el
+    return s, exact
+
+
 # Kinetics ----------------------------------------------------------------------------------------------------
 
 
@@ -377,7 +387,7 @@ def test_a_slow_area_stays_where_it_began() -> None:
     s = fs.simulate(circuit, rtol=1e-9, t_eval=[0.0, *t], t_stop=20e-3)
     # It began at g(u(0+)), the source's first jump taken.
     began = float(analytic.area(float(s.u_gap[0])))
-    assert s.area[0] == pytest.approx(began, rel=1e-12)
+    assert s.area[0] == pytest.approx(began, rel=1e-12, abs=0.0)
     assert abs(began / analytic.area(0.0) - 1.0) > 1e-3
     assert np.abs(s.area / began - 1.0).max() <= 1e-6
     fixed = fs.simulate(circuit, area=began, t_eval=[0.0, *t], t_stop=20e-3)
@@ -390,8 +400,8 @@ def test_with_kinetics_the_mobile_law_has_no_fold() -> None:
     stopped = fs.simulate(algebraic, charge_law="mobile", throw=False)
     assert stopped.status is fs.Status.FOLD
     slow = deck("Vdrive drive 0 SIN(0 200 100)", *finger("drive", "0", f=100.0, tau=2e-3, **gap), ".tran 20u 10m uic")
-    s = fs.simulate(slow, charge_law="mobile", rtol=1e-6)
-    assert s.success
+    s, exact = agreeing(slow, charge_law="mobile")
+    assert s.t[-1] == exact.t[-1] == 0.01
     assert np.all(s.fold_margin == 1.0)
 
 
@@ -411,9 +421,8 @@ def test_a_resistor_in_the_way_takes_the_fold_away() -> None:
     # The voltage of the stack then gives way; the fold's time passes like any other.
     lines = finger("drive", "0", f=100.0, fn=1e-4)
     behind = deck("Vdrive amp 0 SIN(0 200 100)", "Rout amp drive 47k", *lines, ".tran 20u 0.9m uic")
-    s = fs.simulate(behind, charge_law="mobile", rtol=1e-8)
-    assert s.success
-    assert s.t[-1] > 0.83e-3
+    s, _ = agreeing(behind, charge_law="mobile")
+    assert s.t[-1] == 0.9e-3
     assert s.fold_margin.min() > 0.9
 
 
@@ -441,15 +450,6 @@ def test_the_operating_point_of_a_network_with_a_finger_is_at_rest() -> None:
     assert s.u_gap[0] < plain.u_gap[0]
 
 
-def test_results_are_the_same_bits_whichever_outputs_are_asked_for() -> None:
-    circuit = floating("SIN(0 200 5k)")
-    t = np.linspace(0.0, 1e-3, 601)
-    a, b = (fs.simulate(circuit, t_eval=t, rtol=1e-6) for _ in range(2))
-    assert np.array_equal(a.u_gap, b.u_gap)
-    half = fs.simulate(circuit, t_eval=t[::2], t_stop=1e-3, rtol=1e-6)
-    assert np.array_equal(half.u_gap, a.u_gap[::2])
-
-
 @pytest.mark.parametrize("name", ["ungrounded_user", "amplifier", "current_drive"])
 def test_phasors_of_a_network_are_its_periodic_state(name: str) -> None:
     circuit = fs.read_netlist(CIRCUITS / f"{name}.cir")
@@ -467,8 +467,6 @@ REFUSALS = {
         ["Idrive 0 drive 1m", "Ia drive 0 2m"],
         "Idrive is a current source without a path: node 'drive' is reached through current sources only",
     ),
-    "source loop": (["V1 a 0 1", "V2 b 0 1", "V3 a b 1", "R1 a b 1k"], "V3 closes a loop of voltage sources"),
-    "parallel sources": (["V1 a 0 1", "V2 a 0 1", "R1 a 0 1k"], "V1 and V2 are voltage sources in parallel"),
     "dangling resistor": (["V1 a 0 1", "R1 a 0 1k", "R2 a Loose 1k"], "node 'Loose' is floating: only R2 touches it"),
     "island": (["V1 a 0 1", "R1 a 0 1k", "R2 x y 1k", "C1 x y 1n"], "is floating: nothing connects it to ground"),
     "area node as a conductor": (
@@ -484,15 +482,6 @@ def test_what_no_network_is_gets_one_sentence(case: str) -> None:
     with pytest.raises(fs.InputError) as caught:
         deck(*lines)
     assert message in str(caught.value)
-
-
-def test_nodes_that_only_capacitors_reach_have_no_operating_point_but_start_with_uic() -> None:
-    lines = ["V1 a 0 SIN(0 1 1k)", "C1 a b 1n", "C2 b 0 1n"]
-    with pytest.raises(
-        fs.InputError, match="no DC operating point: C1 and C2 leave nodes that are reached by capacitors"
-    ):
-        fs.simulate(deck(*lines, ".tran 1u 1m"))
-    assert fs.simulate(deck(*lines, ".tran 1u 1m uic")).success
 
 
 @pytest.mark.parametrize(
@@ -519,13 +508,3 @@ def test_what_needs_a_stack_says_so() -> None:
     for call in (fs.compare, fs.steady_state):
         with pytest.raises(fs.InputError, match="needs a series chain of LAYER, SLAB, SKIN and GAP"):
             call(circuit)
-
-
-def test_a_source_that_stops_being_finite_ends_the_run_there() -> None:
-    def source(t: float) -> float:
-        return math.nan if t > 3e-4 else 100.0 * math.sin(2.0 * math.pi * 5e3 * t)
-
-    s = fs.simulate(floating("SIN(0 200 5k)"), sources={"Vdrive": source}, t_stop=1e-3, throw=False)
-    assert s.status is fs.Status.SOURCE_NOT_FINITE
-    assert s.t[-1] <= 3e-4 * (1.0 + 1e-9)
-    assert np.all(np.isfinite(s.u_gap))

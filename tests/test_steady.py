@@ -168,7 +168,7 @@ def little(r_coat: float, r_gap: float, law: str) -> tuple[np.ndarray, ref.Trans
 
 @every_law
 @pytest.mark.parametrize(("r_coat", "r_gap"), LITTLE)
-@pytest.mark.parametrize("rtol", [1e-5, 1e-8, 1e-10])
+@pytest.mark.parametrize("rtol", [1e-5, 1e-10])
 @pytest.mark.parametrize("way", ["steady_state", "simulate", "simulate by radau9"])
 def test_a_gap_that_takes_little_of_the_voltage_has_its_own_error_met(
     way: str, rtol: float, r_coat: float, r_gap: float, law: str

@@ -112,7 +112,13 @@ def test_what_is_not_a_stack_is_a_network(case: str) -> None:
     circuit = deck(*NETWORKS[case])
     with pytest.raises(fs.InputError, match="needs a series chain of LAYER, SLAB, SKIN and GAP"):
         fs.steady_state(circuit)
-    assert fs.simulate(circuit, t_stop=1e-4, rtol=1e-4).success
+    options = {"t_stop": 1e-4, "t_eval": np.linspace(1e-5, 1e-4, 10)}
+    solution = fs.simulate(circuit, rtol=1e-6, **options)
+    exact = fs.simulate(circuit, rtol=1e-9, method="radau", **options)
+    largest = max(float(np.abs(v).max()) for v in exact.node_voltages.values())
+    assert largest > 1e-3
+    for node, v in exact.node_voltages.items():
+        assert np.abs(solution.node_voltages[node] - v).max() <= 3e-6 * largest
 
 
 # Circuits as data -------------------------------------------------------------------------------------------

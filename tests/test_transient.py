@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -114,59 +113,8 @@ def test_work_of_adhesion_at_total_voltage_held(law):
     assert np.abs(solution.u_gap - plain.u_gap).max() > 1e-5 * np.abs(expected.u_gap).max()
 
 
-@pytest.mark.parametrize("shape", ["sine", "square"])
-def test_two_kilovolt_local_is_solved(shape):
-    segments = {"sine": ref.sine_segments(2000.0, 100.0, 0.02), "square": ref.square_segments(2000.0, 100.0, 2)}[shape]
-    waveform = {"sine": fs.Sine(2000.0, 100.0), "square": fs.Square(2000.0, 100.0)}[shape]
-    t = output_times(segments)
-    expected = ref.transient(segments, t, law="local", freq=100.0)
-    with pytest.warns(fs.FingerspiceWarning) as said:
-        solution = fs.simulate(table1(), sources={"Vdrive": waveform}, t_eval=t, t_stop=0.02, rtol=1e-10)
-    assert "air breaks down" in str(said[0].message)
-    # The square leaves a twenty-seventh of the contact.
-    assert any("contact area falls to 1.31 mm^2" in str(w.message) for w in said) == (shape == "square")
-    assert np.abs(solution.u_gap - expected.u_gap).max() <= 1e-9 * np.abs(expected.u_gap).max()
-
-
-@pytest.mark.parametrize(("changes", "share"), [({"Xgap.fn": 1e-4}, 0.0822404), ({"Xgap.d": 10e-9}, 0.02332418286)])
-def test_mobile_law_stops_at_its_fold_and_says_where(changes, share):
-    circuit = table1().replace(changes)
-    solution = fs.simulate(circuit, charge_law="mobile", throw=False)
-    assert solution.status is fs.Status.FOLD
-    assert not solution.success
-    assert "success" not in solution.message
-    assert solution.state.t == pytest.approx(share * 0.01, rel=1e-6)
-    assert solution.t[-1] <= solution.state.t
-    assert solution.t.size > 10
-    assert np.all(np.isfinite(solution.u_gap))
-    with pytest.raises(fs.SolveError, match="no solution past this time") as caught:
-        fs.simulate(circuit, charge_law="mobile")
-    assert caught.value.solution.t.size == solution.t.size
-
-
-def test_mobile_square_of_two_kilovolt_folds_at_its_first_reversal():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", fs.FingerspiceWarning)
-        solution = fs.simulate(table1(), sources={"Vdrive": fs.Square(2000.0, 100.0)}, charge_law="mobile", throw=False)
-    assert solution.status is fs.Status.FOLD
-    assert solution.state.t == pytest.approx(0.005, rel=1e-12)
-
-
-@pytest.mark.parametrize("r_coat", ["1", "1e15", "inf"])
-@pytest.mark.parametrize("law", ["local", "mobile"])
-def test_extreme_coatings_equal_the_reference(r_coat, law):
-    t = np.linspace(0.0, 0.0199, 57)
-    plain = ref.table1_layers(100.0)
-    layers = (ref.Layer(plain[0].c, r_total=float(r_coat)), *plain[1:])
-    expected = ref.transient(ref.sine_segments(200.0, 100.0, 0.02), t, law=law, layers=layers)
-    circuit = table1(coat={"r": r_coat})
-    solution = fs.simulate(circuit, t_eval=t, t_stop=0.02, charge_law=law, rtol=1e-8)
-    assert np.abs(solution.u_gap - expected.u_gap).max() <= 1e-8 * np.abs(expected.u_gap).max()
-    assert solution.stats["steps"] < 5000
-
-
 @pytest.mark.parametrize("method", ["dp5", "dop853", "radau9"])
-@pytest.mark.parametrize("rtol", [1e-3, 1e-5, 1e-7, 1e-9])
+@pytest.mark.parametrize("rtol", [1e-3, 1e-9])
 def test_the_error_asked_for_is_met_by_every_own_stepper(method, rtol):
     if method == "dp5" and rtol < 1e-8:
         rtol = 1e-8
@@ -181,12 +129,12 @@ def test_the_error_asked_for_is_met_by_every_own_stepper(method, rtol):
 
 
 @pytest.mark.parametrize("deck", ["fingerpad.cir", "amplifier.cir"])
-@pytest.mark.parametrize("options", [{}, {"area": "frozen"}, {"method": "dop853"}, {"charge_law": "mobile"}], ids=str)
-@pytest.mark.parametrize("periods", [3, 7, 10])
+@pytest.mark.parametrize("options", [{}, {"area": "frozen"}, {"method": "other"}, {"charge_law": "mobile"}], ids=str)
+@pytest.mark.parametrize("periods", [3, 7])
 def test_a_run_that_ends_at_a_jump_but_for_rounding_ends_after_it(deck, options, periods):
     # Three periods of 0.2 ms are 0.6000000000000001 ms: the source is past its jump there, and so is the gap.
-    if deck == "amplifier.cir" and "method" in options:
-        pytest.skip("networks have one method")
+    if "method" in options:
+        options = {"method": {"fingerpad.cir": "dop853", "amplifier.cir": "radau"}[deck]}
     circuit = fs.read_netlist(CIRCUITS / deck).replace({"Vdrive": fs.Square(200.0, 5000.0)})
     stop = periods * 2e-4
     for t in (np.linspace(0.0, stop, 31), np.array([0.0, periods * 0.2 / 1000.0])):
@@ -209,10 +157,12 @@ def test_a_gap_behind_an_insulating_coating_rests_at_zero_volt(law):
 @pytest.mark.parametrize("law", ["local", "mobile"])
 def test_a_run_may_start_from_a_gap_at_rest_behind_an_insulating_coating(law):
     circuit = table1().replace({"Vdrive": fs.Sine(50.0, 100.0, offset=100.0), "Xcoat.r": math.inf})
-    solution = fs.simulate(circuit, t_stop=0.01, start="dc", charge_law=law)
+    t = np.linspace(0.0, 0.01, 101)[:-1]
+    solution = fs.simulate(circuit, t_eval=t, t_stop=0.01, start="dc", charge_law=law)
     assert abs(solution.u_gap[0]) <= 1e-12
-    # What the offset has left in the coating is no more than a shift of the start: without it, the same.
-    without = fs.simulate(circuit.replace({"Vdrive": fs.Sine(50.0, 100.0)}), t_stop=0.01, start="dc", charge_law=law)
-    assert (
-        np.abs(solution.u_gap - without.u_gap).max() <= (1e-7 if law == "local" else 0.2) * np.abs(without.u_gap).max()
-    )
+    # The offset stands on the coating alone.
+    coat, *others = ref.table1_layers(100.0)
+    segments = ref.sine_segments(50.0, 100.0, 0.01, offset=100.0)
+    expected = ref.transient(segments, t, law=law, layers=(ref.Layer(coat.c), *others), start=[100.0, 0.0, 0.0])
+    assert np.abs(solution.u_layer - expected.u).max() <= 1e-8 * np.abs(expected.u_gap).max()
+    assert np.abs(solution.f_el - expected.force).max() <= 1e-8 * expected.force.max()

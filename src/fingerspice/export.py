@@ -240,15 +240,15 @@ def _source_text(waveform: Waveform, element: Element, circuit: Circuit) -> str:
         t, v = np.asarray(waveform.times), np.asarray(waveform.values)
     else:
         t, v = _sampled(waveform, element, circuit)
-    if _starts_uncharged(circuit):
+    if _starts_empty(circuit):
         # Everything is at 0 V before, and the source jumps from there: a first step without one is hard for ngspice.
         t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append([0.0, waveform.value(0.0)], v[t > 0.0])
     return _pwl_text(t, v, _edge(circuit))
 
 
-def _starts_uncharged(circuit: Circuit) -> bool:
+def _starts_empty(circuit: Circuit) -> bool:
     given = circuit.initial or any(e.initial is not None for e in circuit.elements)
-    return circuit.tran is not None and circuit.tran.uic and not given
+    return circuit.tran is not None and starts_uncharged(circuit) and not given
 
 
 def _stop(circuit: Circuit) -> float:
@@ -262,7 +262,7 @@ def _edge(circuit: Circuit) -> float:
 
 def _pulse_text(p: Pulse, circuit: Circuit) -> str | None:
     """A pulse, where ngspice has it: its width and period are not 0, its edges have room, its start is at rest."""
-    if _starts_uncharged(circuit) and p.value(0.0) != 0.0 and p.breakpoint_rate() * _stop(circuit) < _FEW_POINTS:
+    if _starts_empty(circuit) and p.value(0.0) != 0.0 and p.breakpoint_rate() * _stop(circuit) < _FEW_POINTS:
         return None
     edge, span = _edge(circuit), _stop(circuit) + abs(p.delay)
     # A jump takes its edge from the time after it: what follows keeps its own time.

@@ -86,8 +86,9 @@ class FoldLimits:
 def fold_limits(circuit: Circuit, *, points: int = 9, span: float = 10.0) -> FoldLimits:
     """Find the source voltage at which runs under the `mobile` law meet their fold, to 1e-3.
 
-    Every run starts as the deck's does and lasts as many periods. Each parameter goes from its own value over `span` to
-    `span` times it, the others as in the deck; SKIN is evaluated at each frequency.
+    Every run starts as the deck's does (uncharged, from the operating point of the source so raised, or from .ic as it
+    is) and lasts as many periods. Each parameter goes from its own value over `span` to `span` times it, the others as
+    in the deck; SKIN is evaluated at each frequency.
 
     Parameters
     ----------
@@ -101,7 +102,7 @@ def fold_limits(circuit: Circuit, *, points: int = 9, span: float = 10.0) -> Fol
     Raises
     ------
     InputError
-        For a circuit without these.
+        For a circuit without these, and where .ic stands past the fold itself.
     SolveError
         Where a run fails for another reason than a fold.
     """
@@ -153,7 +154,7 @@ def _along(circuits: list[Circuit], peak: float, ends: list[float]) -> FloatArra
 def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | None = None) -> float:
     """Peak source voltage (V) at which a run up to `t_stop` (s) meets the fold, to 1e-3; NaN for none up to `HIGHEST`.
 
-    `peak` is what the circuit's sources reach now, V; `guess` where to look first.
+    It starts as the deck's run does. `peak` is what the circuit's sources reach now, V; `guess` where to look first.
     """
 
     def folds(voltage: float) -> bool:
@@ -162,10 +163,16 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
             {e.name: Product((factor, e.waveform)) for e in circuit.by_device("V") if e.waveform is not None}
         )
         if is_stack(raised):
-            problem = prepare(
-                raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="uncharged",
-                charge=False, rtol=RTOL,
-            )  # fmt: skip
+            try:
+                problem = prepare(
+                    raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="deck",
+                    charge=False, rtol=RTOL,
+                )  # fmt: skip
+            except InputError as error:
+                # An operating point goes with the source, and may itself stand past the fold; a given start does not.
+                if circuit.initial or "past the fold" not in str(error):
+                    raise
+                return True
             return meets_fold(problem, RTOL)
         run = simulate(
             raised, t_stop=t_stop, t_eval=[0.0, t_stop], charge_law="mobile", rtol=RTOL, charge=False, throw=False

@@ -130,7 +130,8 @@ class Circuit:
     charge_law : str or None
         Of the included library: ``local``, ``mobile`` or None.
     work : str
-        Reading of Eq. 7: ``gap`` (gap voltage held) or ``total`` (total voltage held).
+        Reading of Eq. 7: ``gap`` (gap voltage held) or ``total`` (total voltage held, of a dispersive skin with its
+        permittivity above all poles).
     warnings : tuple of str
         What the reader noticed.
     unused : tuple of str

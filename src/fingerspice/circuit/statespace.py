@@ -229,6 +229,9 @@ def is_stack(circuit: Circuit) -> bool:
 def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
     """The series stack of a circuit; with `skin_at`, dispersive skins have their data at that frequency (Hz).
 
+    Where the deck holds the total voltage in Eq. 7, the stack is the capacitive one: a dispersive skin counts with its
+    permittivity above all poles, eps_inf, and with the one at `skin_at` where that is given.
+
     Raises
     ------
     InputError

@@ -1,0 +1,291 @@
+"""The error that a step adds to the charge, against the derivative of the charge by the voltages, written out here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.polynomial import Polynomial
+from scipy.optimize import brentq
+
+from fingerspice.engine import charge, netcharge, readout, rows
+from fingerspice.engine.exponential import N_PLACES
+from fingerspice.engine.model import Model
+from fingerspice.numerics.lobatto import END, FIRST, NODES, POINTS, ROWS
+
+PLACES = np.array([0, FIRST, FIRST + 1, FIRST + 2, END])
+A0, H = 35e-6, 1e-3
+every_law = pytest.mark.parametrize("law", ["local", "mobile"])
+# What a step leaves to trapezoids through five places.
+ROUGH = 0.04
+X, W = np.polynomial.legendre.leggauss(12)
+
+
+def area_at(u: np.ndarray | float) -> np.ndarray:
+    """An area that falls with the gap voltage, m^2."""
+    return A0 * (1.05 - 4e-4 * np.asarray(u) - 3e-7 * np.asarray(u) ** 2)
+
+
+def slope_at(u: np.ndarray) -> np.ndarray:
+    """Its slope, m^2/V."""
+    return A0 * (-4e-4 - 6e-7 * np.asarray(u))
+
+
+def integral(f: Callable[[np.ndarray], np.ndarray], stop: float) -> float:
+    """Over [0, stop] fractions of the step, of a function of the fraction; s times its unit."""
+    return float(0.5 * H * stop * np.sum(W * f(0.5 * stop * (1.0 + X))))
+
+
+def gentle(rng: np.random.Generator, size: float) -> Polynomial:
+    """A voltage that goes by a tenth of itself in the step, nearly straight."""
+    return Polynomial(
+        size * np.array([1.0, rng.choice([-1.0, 1.0]) * rng.uniform(0.05, 0.1), rng.uniform(-0.01, 0.01)])
+    )
+
+
+def slope_of(charge_by: Callable[[float], np.ndarray]) -> np.ndarray:
+    """Derivative by a perturbation at nothing."""
+    return (charge_by(0.5) - charge_by(-0.5)) / 1.0
+
+
+# A stack ----------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Stack:
+    """Two modes of a stack over one step, their errors, and what of the slow layer's charge counts."""
+
+    mobile: bool
+    c: float
+    g_area: float
+    g_total: float
+    modes: list[Polynomial]
+    errors: list[Polynomial]
+    gap: np.ndarray
+    slow: np.ndarray
+    source: Polynomial
+    k_gap: float = 0.6
+
+    @property
+    def s(self) -> float:
+        """Sum of 1/c such that the slow layer takes 0.3 of a jump."""
+        return 1.0 / (0.3 * self.c) if self.c > 0.0 else 1e6
+
+    @property
+    def model(self) -> Model:
+        """As the engine takes it."""
+        return Model(
+            mobile=self.mobile, coupled=True, k=np.zeros(3), rate=np.zeros(3), rate0=np.zeros(3), k_gap=self.k_gap,
+            gap=self.gap, s=self.s, slow=np.array([*self.slow, 0.3, self.c, self.g_area, self.g_total]), area0=A0,
+            tau=1e-3, curve=np.zeros(4),
+        )  # fmt: skip
+
+    def at(self, x: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gap voltage and slow layer's voltage (V), and area (m^2), with so much of the errors on the modes."""
+        w = np.array([m(x) + error * e(x) for m, e in zip(self.modes, self.errors, strict=True)])
+        free, along = self.k_gap * self.source(x), self.gap @ w
+        if not self.mobile:
+            u = free + along
+            return u, 0.3 * self.source(x) + self.slow @ w, area_at(u)
+        u = np.array([
+            brentq(lambda v, f=f, b=b: v - f - b * A0 / float(area_at(v)), 0.0, 500.0, xtol=1e-12)
+            for f, b in zip(np.atleast_1d(free), np.atleast_1d(along), strict=True)
+        ]).reshape(np.shape(free))  # fmt: skip
+        area = area_at(u)
+        return u, 0.3 * self.source(x) + self.slow @ w * A0 / area, area
+
+    def charge(self, stop: float, error: float) -> tuple[float, float]:
+        """Charge through the slow layer from the start to a fraction of the step, and the part that has leaked, C.
+
+        i = C u' + u/R under `local`, (C u)' + u/R under `mobile`.
+        """
+        leaked = integral(lambda x: (self.g_total + self.g_area * self.at(x, error)[2]) * self.at(x, error)[1], stop)
+        if self.mobile:
+            ends = [self.c * a * v for _, v, a in (self.at(np.array([x]), error) for x in (0.0, stop))]
+            return float(ends[1][0] - ends[0][0]) + leaked, leaked
+        d = 1e-4
+
+        def current(x: np.ndarray) -> np.ndarray:
+            rate = (self.at(x + d, error)[1] - self.at(x - d, error)[1]) / (2.0 * d * H)
+            return self.c * self.at(x, error)[2] * rate
+
+        return integral(current, stop) + leaked, leaked
+
+    def held(self, x: float) -> float:
+        """What the error is worth that is stored at a fraction of the step, C."""
+        at = np.array([x])
+        if self.mobile:
+            return float(self.c * slope_of(lambda e: self.at(at, e)[2] * self.at(at, e)[1])[0])
+        return float(self.c * self.at(at, 0.0)[2][0] * slope_of(lambda e: self.at(at, e)[1])[0])
+
+
+def stack(rng: np.random.Generator, law: str, parts: str) -> Stack:
+    """A random step of which the slow layer stores, leaks or both, and one of the modes or both are off."""
+    shares = rng.uniform(0.3, 1.0, 4) * rng.choice([-1.0, 1.0], 4)
+    errors = [Polynomial([1e-3 * rng.uniform(0.5, 1.0) * rng.choice([-1.0, 1.0]), 1e-4 * rng.normal()]) for _ in "ab"]
+    return Stack(
+        law == "mobile", 1e-5 * ("stores" in parts), 1e-2 * ("area" in parts), 3e-7 * ("leaks" in parts),
+        [gentle(rng, 20.0), gentle(rng, -15.0)], errors, shares[:2], shares[2:], gentle(rng, 150.0),
+    )  # fmt: skip
+
+
+def engine_account(step: Stack, collected: float = 0.0, last_area: float | None = None) -> np.ndarray:
+    """`control` after the engine's account of the step, with a jump before it from an area (m^2) if that is given."""
+    u, slow_voltage, area = step.at(POINTS, 0.0)
+    w = np.array([m(POINTS) for m in step.modes])
+    places = np.array([e(POINTS[PLACES]) for e in step.errors])
+    r = np.zeros((rows.N_FLAT, ROWS))
+    r[rows.SOURCE], r[rows.U], r[rows.Q] = step.source(POINTS), u, 1.0 / area
+    r[rows.DQ], r[rows.X_GAP] = -slope_at(u) / area**2, step.gap @ w
+    control = np.zeros(readout.N_CONTROL)
+    control[readout.COLLECTED] = collected
+    control[readout.LAST_Q] = 0.0 if last_area is None else 1.0 / last_area
+    voltage = slow_voltage[:NODES] if not step.mobile else (step.slow @ w)[:NODES].copy()
+    charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, voltage.copy(), control)
+    return control
+
+
+@every_law
+@pytest.mark.parametrize("parts", ["stores", "leaks", "leaks by its area", "stores and leaks, also by its area"])
+@pytest.mark.parametrize("seed", range(4))
+def test_what_a_step_of_a_stack_leaves_in_the_charge_is_its_derivative_by_the_voltages(
+    seed: int, parts: str, law: str
+) -> None:
+    step = stack(np.random.default_rng([seed, 3]), law, parts)
+    control = engine_account(step)
+    fractions = POINTS[PLACES]
+    total = np.array([slope_of(lambda e, x=x: np.array([step.charge(x, e)[0]]))[0] for x in fractions])
+    held = np.array([step.held(x) for x in fractions])
+    stays = total - (held - held[0])
+    spread = np.cumsum(np.abs(np.diff(stays, prepend=0.0)))
+    scale = max(np.abs(stays).max(), np.abs(held).max())
+    assert control[readout.COLLECTED] == pytest.approx(stays[-1], abs=ROUGH * spread[-1] + 1e-9 * scale)
+    # Since the start of the run, where nothing was off; and what was collected may have cancelled by chance.
+    want = np.max(np.abs(held + stays) + spread)
+    assert control[readout.ERROR_Q] == pytest.approx(want, rel=2.0 * ROUGH, abs=0.0)
+    # What was collected before adds to it with its sign.
+    for before in (3.0 * scale, -3.0 * scale):
+        want = np.max(np.abs(held + stays + before) + spread)
+        assert engine_account(step, before)[readout.ERROR_Q] == pytest.approx(want, rel=2.0 * ROUGH, abs=0.0)
+
+
+def test_both_ends_of_a_jump_s_move_are_off_in_its_charge() -> None:
+    # A jump's charge is the integral of A dU / S: an error of the gap voltage moves both of its ends.
+    step = stack(np.random.default_rng(8), "local", "stores")
+    area = float(step.at(np.array([0.0]), 0.0)[2][0])
+    before = 1.1 * area
+    added = engine_account(step, last_area=before)[readout.COLLECTED] - engine_account(step)[readout.COLLECTED]
+    # From u1 to u2 the charge is the integral of A du / (k S): moved by d, (A(u2) - A(u1)) d / (k S).
+    moved = float(step.gap @ [e(0.0) for e in step.errors])
+    assert added == pytest.approx((area - before) * moved / (step.k_gap * step.s), rel=1e-9, abs=0.0)
+
+
+# A network --------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Net:
+    """Two modes of a network over one step, their errors, and two cells on one area, of which the first is the gap."""
+
+    mobile: bool
+    slow: bool
+    stored: np.ndarray
+    lost: np.ndarray
+    through: np.ndarray
+    tap: np.ndarray
+    c: np.ndarray
+    g: np.ndarray
+    modes: list[Polynomial]
+    errors: list[Polynomial]
+
+    def at(self, x: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Modes, cells' voltages (V) and area (m^2)."""
+        w = np.array([m(x) + error * e(x) for m, e in zip(self.modes, self.errors, strict=True)])
+        u = self.tap @ w[:2]
+        return w[:2], u, A0 * w[2] if self.slow else area_at(u[0])
+
+    def charge(self, stop: float, error: float) -> float:
+        """Of the source since the start of the step, to a fraction of it, C."""
+        (w0, u0, a0), (w1, u1, a1) = (self.at(np.array([x]), error) for x in (0.0, stop))
+        total = float((self.stored @ (w1 - w0))[0])
+        total += integral(lambda x: self.lost @ self.at(x, error)[0], stop)
+        d = 1e-4
+        for b, share in enumerate(self.through):
+            total += share * integral(
+                lambda x, b=b: self.g[b] * (self.at(x, error)[2] - A0) * self.at(x, error)[1][b], stop
+            )
+            if self.mobile:
+                total += share * self.c[b] * float(((a1 - A0) * u1[b] - (a0 - A0) * u0[b])[0])
+            else:
+                total += share * integral(
+                    lambda x, b=b: self.c[b] * (self.at(x, error)[2] - A0)
+                    * (self.at(x + d, error)[1][b] - self.at(x - d, error)[1][b]) / (2.0 * d * H), stop
+                )  # fmt: skip
+        return total
+
+    def held(self, x: float) -> float:
+        """What the error is worth that is stored at a fraction of the step, C."""
+        at = np.array([x])
+        _, _, a = self.at(at, 0.0)
+        value = float((self.stored @ slope_of(lambda e: self.at(at, e)[0]))[0])
+        for b, share in enumerate(self.through):
+            if self.mobile:
+                change = slope_of(lambda e, b=b: (self.at(at, e)[2] - A0) * self.at(at, e)[1][b])
+            else:
+                change = (a - A0) * slope_of(lambda e, b=b: self.at(at, e)[1][b])
+            value += share * self.c[b] * float(change[0])
+        return value
+
+
+def network(rng: np.random.Generator, law: str, parts: str, slow: bool) -> Net:
+    def some(size: float, name: str) -> np.ndarray:
+        return size * rng.uniform(0.3, 1.0, 2) * rng.choice([-1.0, 1.0], 2) * (name in parts)
+
+    errors = [Polynomial([1e-3 * rng.uniform(0.5, 1.0) * rng.choice([-1.0, 1.0]), 1e-4 * rng.normal()]) for _ in "ab"]
+    modes = [gentle(rng, 120.0), gentle(rng, -90.0)]
+    if slow:
+        modes.append(Polynomial([0.9, rng.choice([-0.05, 0.05])]))
+        errors.append(Polynomial([2e-5, 1e-6]))
+    return Net(
+        law == "mobile", slow, some(3e-10, "reference"), some(1e-7, "reference"), rng.uniform(0.4, 1.0, 2),
+        rng.uniform(0.2, 1.0, (2, 2)), np.abs(some(1e-5, "stores")), np.abs(some(1e-2, "leaks")), modes, errors,
+    )  # fmt: skip
+
+
+@every_law
+@pytest.mark.parametrize("slow", [False, True], ids=["area at once", "slow area"])
+@pytest.mark.parametrize("parts", ["reference", "stores", "leaks", "reference, stores, leaks"])
+@pytest.mark.parametrize("seed", range(3))
+def test_what_a_step_of_a_network_leaves_in_the_charge_is_its_derivative_by_the_voltages(
+    seed: int, parts: str, slow: bool, law: str
+) -> None:
+    step = network(np.random.default_rng([seed, 4]), law, parts, slow)
+    _, u, area = step.at(POINTS, 0.0)
+    places = np.array([e(POINTS[PLACES]) for e in step.errors])
+    slope = np.zeros(ROWS) if slow else slope_at(u[0])
+    fractions = POINTS[PLACES]
+    total = np.array([(step.charge(x, 0.5) - step.charge(x, -0.5)) for x in fractions])
+    held = np.array([step.held(x) for x in fractions])
+    stays = total - (held - held[0])
+    scale = max(np.abs(stays).max(), np.abs(held).max())
+    spread = np.cumsum(np.abs(np.diff(stays, prepend=0.0)))
+    z = np.array([[step.charge(x, 0.0) for x in POINTS]])
+    for before in (0.0, 3.0 * scale, -3.0 * scale):
+        control, collected = np.zeros(readout.N_CONTROL), np.array([[before], [0.0]])
+        netcharge.charge_error(
+            step.mobile, H, step.stored[None, :], step.lost[None, :], step.through[None, :], step.tap, step.c, step.g,
+            np.zeros(2, np.int64), np.zeros(1, np.int64), np.array([A0]), np.array([2 if slow else -1]),
+            places, np.zeros(3), 1.0, np.ascontiguousarray(u), area[None, :].copy(), slope[None, :].copy(),
+            area[None, :] - A0, z, collected, control,
+        )  # fmt: skip
+        assert collected[0, 0] - before == pytest.approx(stays[-1], abs=ROUGH * spread[-1] + 1e-9 * scale)
+        want = np.max(np.abs(held + stays + before) + spread)
+        assert control[readout.ERROR_Q] == pytest.approx(want, rel=2.0 * ROUGH, abs=0.0)
+
+
+def test_the_places_of_the_error_are_where_this_file_says() -> None:
+    assert PLACES.size == N_PLACES
+    assert np.all(np.diff(POINTS[PLACES]) > 0.0)
+    assert POINTS[PLACES[[0, -1]]].tolist() == [0.0, 1.0]
