@@ -35,6 +35,7 @@ from fingerspice.record import Record
 from fingerspice.runs import ROUNDING, Progress, Run
 from fingerspice.solution import Solution
 from fingerspice.superposition import solve_fixed
+from fingerspice.times import check_length, check_outputs
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -105,12 +106,7 @@ def simulate(
     SolveError
         Where the run failed and `throw` is set; its `solution` holds what came before.
     """
-    require(
-        isinstance(rtol, (int, float)) and RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1],
-        "rtol",
-        rtol,
-        "1e-13 to 0.1",
-    )
+    _check_rtol(rtol)
     if sources:
         circuit = _with_sources(circuit, sources)
     times = None if t_eval is None else np.asarray(t_eval, float)
@@ -139,6 +135,11 @@ def simulate(
     return _given_back(run_problem(problem, times, rtol, method, progress, tier, how, begun), throw)
 
 
+def _check_rtol(rtol: float) -> None:
+    good = isinstance(rtol, (int, float)) and RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1]
+    require(good, "rtol", rtol, "1e-13 to 0.1")
+
+
 def _given_back(solution: Solution, throw: bool) -> Solution:
     """A solution with its warnings said, or the error of a failed run."""
     if solution.failure is not None and throw:
@@ -165,6 +166,7 @@ def plan(
     InputError
         For a request that cannot be run.
     """
+    _check_rtol(rtol)
     if t_stop is None and circuit.tran is None:
         t_stop = 1.0
     if not is_stack(circuit):
@@ -194,12 +196,8 @@ def run_problem(
     """
     # A method steps, and what is stepped is the coupled model.
     plan = make_plan(problem, rtol, "coupled" if tier == "auto" and method != "auto" else tier, start)
-    if t_eval is None:
-        t_out, left = output_times(problem)
-        run_at = t_out
-    else:
-        t_out, left = t_eval, np.zeros(t_eval.size, bool)
-        run_at = _at_breakpoints(problem, t_eval)
+    t_out, left = _asked_for(problem, t_eval)
+    run_at = t_out if t_eval is None else _at_breakpoints(problem, t_eval)
     begin = time.perf_counter()
     if plan.tier == "algebraic":
         run, name = solve_algebraic(problem, run_at, left), plan.tier
@@ -244,7 +242,7 @@ def run_network(
             f"method {method!r} is for series stacks; allowed for this network: 'auto', 'exponential' or 'radau'"
         )
     plan = plan_network(problem, "coupled" if tier == "auto" and method != "auto" else tier, start)
-    t_out, left = output_times(problem) if t_eval is None else (t_eval, np.zeros(t_eval.size, bool))
+    t_out, left = _asked_for(problem, t_eval)
     run_at = t_out if t_eval is None else _at_breakpoints(problem, t_eval)
     begin = time.perf_counter()
     if plan.tier == "linear":
@@ -336,6 +334,18 @@ def _run(
     from fingerspice.stepping import solve
 
     return solve(problem, rtol, TABLEAUS[method], t_out, left, progress), method
+
+
+def _asked_for(problem: Problem | NetworkProblem, t_eval: FloatArray | None) -> tuple[FloatArray, BoolArray]:
+    """Output times and sides: those given, or the deck's; a run that is too long, or has too many, is refused."""
+    check_length(problem.waveform, problem.t_start, problem.t_stop)
+    if t_eval is not None:
+        return t_eval, np.zeros(t_eval.size, bool)
+    check_outputs(problem.circuit, (problem.t_stop - problem.first) / problem.step)
+    t_out, left = output_times(problem)
+    # Jumps have two each.
+    check_outputs(problem.circuit, t_out.size)
+    return t_out, left
 
 
 def output_times(problem: Problem | NetworkProblem) -> tuple[FloatArray, BoolArray]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
+from fingerspice.circuit.bounds import check_range
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Element, Tran
 from fingerspice.circuit.deck import Directive, Number, Token, parse_deck
 from fingerspice.circuit.expressions import nearest
@@ -45,6 +47,8 @@ def read_tran(directive: Directive) -> Tran:
     longest = numbers[3] if len(numbers) > 3 else None
     _require(step.value > 0.0, "TSTEP", step, "more than 0 s")
     _require(stop.value > 0.0, "TSTOP", stop, "more than 0 s")
+    for what, number in (("TSTEP", step), ("TSTOP", stop), ("TMAX", longest)):
+        _require(number is None or 1e-30 <= number.value <= 1e30, what, number, "1e-30 to 1e30 s")
     _require(step.value <= stop.value, "TSTEP", step, f"at most TSTOP = {stop.text} (the output step comes first)")
     _require(start is None or 0.0 <= start.value < stop.value, "TSTART", start, f"0 to TSTOP = {stop.text}")
     _require(longest is None or longest.value > 0.0, "TMAX", longest, "more than 0 s")
@@ -79,7 +83,11 @@ def read_ac(directive: Directive) -> AcSweep:
     _require(n.value >= 1 and n.value == int(n.value) and n.value <= 1e6, "N", n, "a whole number, 1 to 1e6")
     _require(low.value > 0.0, "FSTART", low, "more than 0 Hz")
     _require(high.value >= low.value, "FSTOP", high, f"at least FSTART = {low.text}")
+    for what, number in (("FSTART", low), ("FSTOP", high)):
+        _require(1e-30 <= number.value <= 1e30, what, number, "1e-30 to 1e30 Hz")
     scale: Literal["dec", "oct", "lin"] = words[0]  # type: ignore[assignment]
+    spans = 1.0 if scale == "lin" else math.log(high.value / low.value, 10.0 if scale == "dec" else 2.0)
+    _require(n.value * spans <= 1e6, "N", n, f"at most 1e6 frequencies in a sweep, here {n.value * spans:.3g}")
     return AcSweep(scale, int(n.value), low.value, high.value)
 
 
@@ -104,12 +112,22 @@ def read_initial(directives: tuple[Directive, ...], elements: tuple[Element, ...
                 raise InputError(f".ic names node {node!r}, which is not in the circuit{nearest(node, nodes)}", place)
             if node in out:
                 raise InputError(f".ic gives node {node!r} twice", place)
-            if node == "0" and value.value != 0.0:
+            start = start_voltage(f".ic {key}", value)
+            if node == "0" and start != 0.0:
                 raise InputError(f".ic {key} is {value.text} V; allowed: 0, it is ground", place)
             # ngspice needs a start value for the area; here the area follows from the state.
             if node not in area_nodes:
-                out[node] = value.value
+                out[node] = start
     return out
+
+
+def start_voltage(what: str, number: Number) -> float:
+    """A voltage to start from, V, within the range of a source's."""
+    try:
+        check_range(what, number.value, "V")
+    except InputError as error:
+        raise InputError(error.message, number.where) from None
+    return number.value
 
 
 def read_options(directives: tuple[Directive, ...]) -> tuple[str, tuple[str, ...]]:

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from fingerspice.circuit.circuit import Circuit, Element, check
 from fingerspice.circuit.deck import Call, Deck, Number, Statement, Token, parse_deck, read_deck
 from fingerspice.circuit.devices import DEVICES, ParameterSpec
-from fingerspice.circuit.directives import read_ac, read_initial, read_options, read_tran
+from fingerspice.circuit.directives import read_ac, read_initial, read_options, read_tran, start_voltage
 from fingerspice.circuit.expressions import nearest
 from fingerspice.circuit.network import build_network
 from fingerspice.circuit.sources import Timing, read_source
@@ -259,7 +259,8 @@ def _passive_value(statement: Statement, notes: list[str]) -> tuple[dict[str, fl
     initial = statement.params.get("ic")
     if isinstance(initial, Token):
         raise InputError(f"{name} IC is {initial.text!r}; allowed: a number V", initial.where)
-    return {"value": _value(name, spec, word, notes)}, None if initial is None else initial.value
+    start = None if initial is None else start_voltage(f"{name} IC", initial)
+    return {"value": _value(name, spec, word, notes)}, start
 
 
 def source_from_text(text: str, circuit: Circuit) -> Waveform:

@@ -12,7 +12,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.circuit.waveforms import Waveform, blank_terms, check_finite, require
+from fingerspice.circuit.bounds import check_finite, check_range, runs_through
+from fingerspice.circuit.waveforms import Waveform, blank_terms, require
 from fingerspice.errors import InputError
 
 FloatArray = NDArray[np.float64]
@@ -45,9 +46,9 @@ class _Ramps(Waveform):
         times, _ = self._knots()
         if self.period is None:
             return times
-        low = max(0.0, math.floor((t0 - self._first) / self.period) - 1.0)
-        high = max(low, math.ceil((t1 - self._first) / self.period) + 1.0)
-        starts = self._first + np.arange(low, high + 1.0) * self.period
+        low = max(0.0, np.floor((t0 - self._first) / self.period) - 1.0)
+        high = max(low, np.ceil((t1 - self._first) / self.period) + 1.0)
+        starts = self._first + runs_through(low, high, times.size, t0, t1) * self.period
         return np.asarray((starts[:, None] + times[None, :]).ravel())
 
     def _edges(self, t0: float, t1: float) -> FloatArray:
@@ -135,6 +136,8 @@ class PWL(_Ramps):
             bad = np.flatnonzero(~np.isfinite(array))
             if bad.size:
                 raise InputError(f"PWL {name} number {bad[0] + 1} is {array[bad[0]]}; allowed: finite numbers")
+        check_range("PWL time", t, "s")
+        check_range("PWL value", v, "V")
         back = t[1:] < t[:-1]
         if np.any(back):
             i = int(np.argmax(back))
@@ -176,9 +179,9 @@ class PWL(_Ramps):
             return times
         period = self.times[-1] - self.repeat
         body = times[times >= self.repeat]
-        low = max(1.0, math.floor((t0 - self.repeat) / period) - 1.0)
-        high = max(low, math.ceil((t1 - self.repeat) / period) + 1.0)
-        runs = (np.arange(low, high + 1.0) * period)[:, None] + body[None, :]
+        low = max(1.0, np.floor((t0 - self.repeat) / period) - 1.0)
+        high = max(low, np.ceil((t1 - self.repeat) / period) + 1.0)
+        runs = (runs_through(low, high, body.size, t0, t1) * period)[:, None] + body[None, :]
         return np.concatenate([times, runs.ravel()])
 
 
@@ -213,9 +216,10 @@ class _Periodic(_Ramps):
         # (k + x) / f rounds to the time a user writes; k (1 / f) + x (1 / f) often misses it.
         x = self._knots()[0] * self.frequency
         shift = self.delay - self.phase_deg / 360.0 / self.frequency
-        low = math.floor((t0 - shift) * self.frequency) - 1.0
-        high = math.ceil((t1 - shift) * self.frequency) + 1.0
-        return np.asarray(((np.arange(low, high + 1.0)[:, None] + x) / self.frequency + shift).ravel())
+        low = np.floor((t0 - shift) * self.frequency) - 1.0
+        high = np.ceil((t1 - shift) * self.frequency) + 1.0
+        runs = runs_through(low, high, x.size, t0, t1)
+        return np.asarray(((runs[:, None] + x) / self.frequency + shift).ravel())
 
     @property
     def _first(self) -> float:  # type: ignore[override]
@@ -323,6 +327,8 @@ class Pulse(_Ramps):
         for name in ("rise", "fall", "width"):
             require(getattr(self, name) >= 0.0, f"pulse {name}", f"{getattr(self, name):g} s", ">= 0")
         require(self.pulse_period > 0.0, "pulse period", f"{self.pulse_period:g} s", "> 0")
+        for name, unit in self.units.items():
+            check_range(f"pulse {name.replace('_', ' ')}", getattr(self, name), unit)
         require(math.isfinite(self.rise + self.fall), "pulse rise + fall", "infinite", "finite times")
         busy = self.rise + self.width + self.fall
         if math.isfinite(self.pulse_period):
@@ -400,6 +406,7 @@ class Samples(_Ramps):
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
             raise InputError(f"sample number {bad[0]} is {values[bad[0]]}; allowed: finite numbers")
+        check_range("a sample", values, "V")
         check_finite(self)
         require(self.rate > 0.0, "sample rate", f"{self.rate:g} Hz", "> 0")
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice.circuit.bounds import runs_through
 from fingerspice.circuit.waveforms import Waveform, blank_terms, require
 from fingerspice.compiled import jit
 from fingerspice.errors import FingerspiceWarning, InputError
@@ -96,7 +97,7 @@ class Function(Waveform):
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
         times = np.asarray(self.breaks, float)
         if self.repeat is not None and times.size:
-            runs = np.arange(math.floor(t0 / self.repeat) - 1.0, math.ceil(t1 / self.repeat) + 1.0)
+            runs = runs_through(np.floor(t0 / self.repeat) - 1.0, np.ceil(t1 / self.repeat), times.size, t0, t1)
             times = np.unique((runs[:, None] * self.repeat + times).ravel())
         return times[(times >= t0) & (times <= t1)]
 
