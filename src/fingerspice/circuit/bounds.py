@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import fields
 from typing import TYPE_CHECKING
 
@@ -19,8 +20,10 @@ FloatArray = NDArray[np.float64]
 #: Largest and smallest size of a number that is not 0, by unit: of voltages and currents, of angles, of all others.
 RANGES = {"V": (1e12, 1e-300), "deg": (1e9, 0.0)}
 ANY_RANGE = (1e30, 1e-30)
-#: Breakpoints that are listed at once; they and what is made of them take 100 bytes each.
-MOST_LISTED = 10_000_000
+#: Breakpoints that are listed at once; they and what is made of them take 40 bytes each.
+MOST_LISTED = 20_000_000
+#: Breakpoints among which values are looked up at once.
+_WINDOW = 1_000_000
 
 
 def check_finite(waveform: Waveform) -> None:
@@ -60,3 +63,16 @@ def runs_through(first: float, last: float, count: int, t0: float, t1: float) ->
             "once: a shorter run, or a longer period"
         )
     return np.arange(first, last + 1.0)
+
+
+def in_windows(t: FloatArray, rate: float) -> Iterator[slice | NDArray[np.intp]]:
+    """Times (s) in groups that no more than `_WINDOW` breakpoints lie between, of which there are `rate` a second.
+
+    Ten times in a year of square waves are ten windows, and the breakpoints between them are never listed.
+    """
+    window = np.floor(t * (rate / _WINDOW))
+    if t.size and window.min() == window.max():
+        yield slice(None)
+        return
+    order = np.argsort(window, kind="stable")
+    yield from np.split(order, np.flatnonzero(np.diff(window[order])) + 1)

@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.circuit.bounds import check_finite, check_range, runs_through
+from fingerspice.circuit.bounds import check_finite, check_range, in_windows, runs_through
 from fingerspice.circuit.waveforms import Waveform, blank_terms, require
 from fingerspice.errors import InputError
 
@@ -65,15 +65,20 @@ class _Ramps(Waveform):
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         t = np.asarray(t, float)
         flat = t.ravel()
-        if flat.size == 0:
-            return np.empty(t.shape)
+        out = np.empty(flat.size)
+        for window in in_windows(flat, self.breakpoint_rate() if self.period else 0.0):
+            out[window] = self._values(flat[window], side)
+        return out.reshape(t.shape)
+
+    def _values(self, flat: FloatArray, side: str) -> FloatArray:
+        """As `value`, at times (n_t,) that are not far apart."""
         edges = self._edges(flat.min(), flat.max())
         index = np.searchsorted(edges, flat, side="right" if side == "right" else "left")
         bounds = np.concatenate([[-math.inf], edges, [math.inf]])
         start, stop = bounds[index], bounds[index + 1]
         v0, slope = self._line(start, stop)
         tau = np.where(np.isfinite(start), flat - np.where(np.isfinite(start), start, 0.0), 0.0)
-        return np.asarray((v0 + slope * tau).reshape(t.shape))
+        return np.asarray(v0 + slope * tau)
 
     def _line(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Value at the start and slope of the pieces from `start` to `stop`, told apart by their midpoints."""

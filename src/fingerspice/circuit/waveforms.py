@@ -114,6 +114,9 @@ class Waveform:
 
     def peak(self, t0: float, t1: float) -> float:
         """Largest |U| (V) over [t0, t1], to a few parts in a thousand where it is not at a breakpoint."""
+        if self.period is not None:
+            # Later periods are alike.
+            t1 = min(t1, max(t0, self.settled) + self.period)
         knots = np.unique(np.concatenate([self.breakpoints(t0, t1), np.linspace(t0, t1, 513)]))
         return float(max(np.abs(self.value(knots)).max(), np.abs(self.value(knots, "left")).max()))
 
