@@ -17,7 +17,7 @@ from fingerspice.files import write_aside
 from fingerspice.network_record import NetworkRecord
 from fingerspice.numerics.cubics import fundamental, mean
 from fingerspice.outcome import ErrorEstimate, Failure, NetworkState, State, Status
-from fingerspice.record import Record, sealed
+from fingerspice.record import Record, Sealed, sealed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,7 +36,7 @@ _Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]
 
 
 @dataclass(frozen=True)
-class Solution:
+class Solution(Sealed):
     """Time response of a circuit.
 
     Signals are read-only arrays in SI units, computed when first asked for; at a jump of the source two rows share a

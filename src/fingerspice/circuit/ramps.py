@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -414,6 +414,11 @@ class Samples(_Ramps):
         check_range("a sample", values, "V")
         check_finite(self)
         require(self.rate > 0.0, "sample rate", f"{self.rate:g} Hz", "> 0")
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        # numpy's own copies can be written.
+        self.values.flags.writeable = False
 
     def _knots(self) -> tuple[FloatArray, FloatArray]:
         return self.start + np.arange(self.values.size) / self.rate, self.values
