@@ -7,6 +7,7 @@ import signal
 from types import FrameType
 
 from fingerspice.files import discard_unfinished
+from fingerspice.streams import mend_streams
 
 _STOPS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
@@ -29,6 +30,7 @@ def main() -> None:
         # Whoever started this in the background may have chosen to have it left alone.
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _stop)
+    mend_streams()
     from fingerspice.cli import main as command
 
     try:

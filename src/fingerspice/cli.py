@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import gc
-import os
-import sys
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fingerspice import options
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError
-from fingerspice.options import area_from_text, check_output, json_text, note_skin_frequency, read_circuit
+from fingerspice.options import area_from_text, check_output, note_skin_frequency, read_circuit
+from fingerspice.terminal import (
+    failure_as_json,
+    listen,
+    plain_errors,
+    progress,
+    report,
+    say,
+    say_json,
+    warnings_as_lines,
+)
 
 if TYPE_CHECKING:
     from fingerspice.solution import Solution
@@ -43,49 +51,13 @@ def main() -> None:
     """Entry point of the `fingerspice` command."""
     # Loading libraries makes a million objects and no garbage: looking for it would take a fifth of a run.
     gc.set_threshold(500_000)
-    with _plain_errors():
+    listen()
+    with plain_errors():
         try:
             app(standalone_mode=True)
         finally:
             # What typer printed.
-            _say(end="")
-
-
-@contextmanager
-def _plain_errors() -> Iterator[None]:
-    """One sentence instead of a traceback, and the exit code that says which kind."""
-    try:
-        yield
-    except InputError as error:
-        _fail(str(error), 2)
-    except SolveError as error:
-        _fail(str(error), 1)
-
-
-def _fail(message: str, code: int) -> NoReturn:
-    print(f"fingerspice: {message}", file=sys.stderr)
-    raise SystemExit(code)
-
-
-def _say(text: str = "", end: str = "\n") -> None:
-    """Print, and know that it has arrived: a full disk is bad input, a reader (head, less) that has gone is nothing."""
-    try:
-        print(text, end=end, flush=True)
-    except OSError as error:
-        # Python would try again at its end, and complain.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(error, BrokenPipeError):
-            raise InputError(f"cannot write to the standard output: {error.strerror}") from None
-
-
-def _report(as_json: bool, figures: Callable[[], dict[str, Any]], text: Callable[[], str], files: list[Path]) -> None:
-    """What a command found and wrote, in the language asked for."""
-    if as_json:
-        _say(json_text({**figures(), "files": [str(f) for f in files]}))
-        return
-    _say(text())
-    for file in files:
-        _say(f"wrote {file}")
+            say(end="")
 
 
 def _target(deck: Path, out: Path, end: str) -> Path:
@@ -93,62 +65,6 @@ def _target(deck: Path, out: Path, end: str) -> Path:
     file = out / f"{deck.stem}{end}"
     check_output(file, deck)
     return file
-
-
-@contextmanager
-def _warnings_as_lines() -> Iterator[None]:
-    """Our own warnings as plain lines on stderr, each once."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", FingerspiceWarning)
-        seen: set[str] = set()
-
-        def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-            text = str(message)
-            if text not in seen:
-                seen.add(text)
-                print(f"fingerspice: warning: {text}", file=sys.stderr)
-
-        warnings.showwarning = show
-        yield
-
-
-@contextmanager
-def _failure_as_json(wanted: bool) -> Iterator[None]:
-    """A failed solve as JSON too, where that is the language spoken."""
-    try:
-        yield
-    except SolveError as error:
-        if wanted:
-            _say(json_text({"success": False, "message": error.message, "failure": error.failure.to_dict()}))
-        raise
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[float], None] | None]:
-    """A bar on a terminal, shown only once a run takes more than a second."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    import time
-
-    from rich.console import Console
-    from rich.progress import Progress
-
-    bar = Progress(console=Console(stderr=True), transient=True)
-    begin = time.perf_counter()
-    task = bar.add_task("simulating", total=1.0)
-
-    def update(done: float) -> None:
-        if time.perf_counter() - begin > 1.0:
-            if not bar.live.is_started:
-                bar.start()
-            bar.update(task, completed=done)
-
-    try:
-        yield update
-    finally:
-        if bar.live.is_started:
-            bar.stop()
 
 
 @app.command()
@@ -180,44 +96,40 @@ def run(
     from fingerspice.report import summary_table
     from fingerspice.simulation import simulate
 
-    with _warnings_as_lines():
+    with warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
         if circuit.tran is None:
             raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic]")
         note_skin_frequency(circuit)
         data = _target(deck, out, ".csv" if csv else ".nc")
         picture = None if no_plot else _target(deck, out, ".png")
-        _announce_compilation()
-        with _progress() as progress:
+        with progress() as update:
             solution = simulate(
                 circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method, throw=False,
-                progress=progress,
+                progress=update,
             )  # fmt: skip
         for text in solution.warnings:
             warnings.warn(text, FingerspiceWarning, stacklevel=1)
-    files = _write_run(solution, data, picture) if solution.t.size else []
     failure = None if solution.failure is None else solution.failure.to_dict()
     ended = {"success": solution.success, "message": solution.message, "failure": failure}
-    _report(as_json, lambda: {**solution.summary(), **ended}, lambda: summary_table(solution), files)
+    report(
+        as_json, lambda: {**solution.summary(), **ended}, lambda: summary_table(solution),
+        _written(solution, data, picture),
+    )  # fmt: skip
     if solution.failure is not None:
         raise SolveError(solution.failure, solution)
 
 
-def _announce_compilation() -> None:
-    """Say why the first run takes long."""
-    from fingerspice.compiled import is_first_use
+def _written(solution: Solution, data: Path, picture: Path | None) -> list[Callable[[], Path]]:
+    """How the files of a run are written: the data, then the picture where one is wanted."""
+    from fingerspice.plotting import save
 
-    if is_first_use():
-        print("fingerspice: first use here: compiling, about 20 s; later runs take 2 s", file=sys.stderr)
-
-
-def _write_run(solution: Solution, data: Path, picture: Path | None) -> list[Path]:
-    files = [solution.to_csv(data) if data.suffix == ".csv" else solution.to_netcdf(data)]
+    if not solution.t.size:
+        return []
+    writes: list[Callable[[], Path]] = [partial(solution.to_csv if data.suffix == ".csv" else solution.to_netcdf, data)]
     if picture is not None:
-        from fingerspice.plotting import save
-
-        files.append(save(solution.plot(), picture))
-    return files
+        writes.append(lambda: save(solution.plot(), picture))
+    return writes
 
 
 @app.command()
@@ -254,7 +166,7 @@ def ac(
     from fingerspice.phasors import phasor, sweep_frequencies
     from fingerspice.report import phasor_csv, phasor_dict, phasor_tables
 
-    with _warnings_as_lines():
+    with warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
         data = _target(deck, out, "_ac.csv")
         picture = None if no_plot else _target(deck, out, "_ac.png")
@@ -265,8 +177,7 @@ def ac(
             if skin != "swept":
                 raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
 
-            _announce_compilation()
-            with _failure_as_json(as_json):
+            with failure_as_json(as_json):
                 results = large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol)
         elif amplitude:
             raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
@@ -274,14 +185,14 @@ def ac(
             results = (phasor(circuit, frequencies, area=area_from_text(area), skin=skin),)
         for text in results[0].warnings:
             warnings.warn(text, FingerspiceWarning, stacklevel=1)
-    files = [phasor_csv(results, data)]
+    writes = [lambda: phasor_csv(results, data)]
     if picture is not None:
         from fingerspice.plotting import plot_phasor, save
 
-        files.append(save(plot_phasor(results, circuit), picture))
+        writes.append(lambda: save(plot_phasor(results, circuit), picture))
     sweeps = [phasor_dict(r) for r in results] if as_json else []
-    _report(
-        as_json, lambda: sweeps[0] if len(sweeps) == 1 else {"sweeps": sweeps}, lambda: phasor_tables(results), files
+    report(
+        as_json, lambda: sweeps[0] if len(sweeps) == 1 else {"sweeps": sweeps}, lambda: phasor_tables(results), writes
     )
 
 
@@ -307,11 +218,14 @@ def plan(
     from fingerspice.report import plan_text
     from fingerspice.simulation import plan as make
 
-    with _warnings_as_lines():
+    with warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
         note_skin_frequency(circuit)
         result = make(circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge)
-    _say(json_text(result.to_dict()) if as_json else plan_text(result, circuit))
+    if as_json:
+        say_json(result.to_dict())
+    else:
+        say(plan_text(result, circuit))
 
 
 @app.command()
@@ -336,19 +250,18 @@ def compare(
     from fingerspice.comparison import compare as run_comparison
     from fingerspice.report import comparison_table
 
-    with _warnings_as_lines():
+    with warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
         note_skin_frequency(circuit)
         picture = None if no_plot else _target(deck, out, "_compare.png")
-        _announce_compilation()
-        with _failure_as_json(as_json):
+        with failure_as_json(as_json):
             result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
-    files = []
+    writes: list[Callable[[], Path]] = []
     if picture is not None:
         from fingerspice.plotting import plot_comparison, save
 
-        files.append(save(plot_comparison(result), picture))
-    _report(as_json, result.to_dict, lambda: comparison_table(result), files)
+        writes.append(lambda: save(plot_comparison(result), picture))
+    report(as_json, result.to_dict, lambda: comparison_table(result), writes)
 
 
 @app.command()
@@ -371,18 +284,17 @@ def limits(
     from fingerspice.limits import fold_limits, plot_limits
     from fingerspice.report import limits_csv, limits_text
 
-    with _warnings_as_lines():
+    with warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
         table = _target(deck, out, "_limits.csv")
         picture = None if no_plot else _target(deck, out, "_limits.png")
-        _announce_compilation()
         result = fold_limits(circuit, points=points, span=span)
-    files = [limits_csv(result, table)]
+    writes = [lambda: limits_csv(result, table)]
     if picture is not None:
         from fingerspice.plotting import save
 
-        files.append(save(plot_limits(result), picture))
-    _report(as_json, result.to_dict, lambda: limits_text(result), files)
+        writes.append(lambda: save(plot_limits(result), picture))
+    report(as_json, result.to_dict, lambda: limits_text(result), writes)
 
 
 @app.command()
@@ -402,12 +314,12 @@ def export(
     from fingerspice.export import export_netlist
     from fingerspice.files import write_aside
 
-    with _warnings_as_lines():
+    with warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
         check_output(output, deck)
     text = export_netlist(circuit, charge_law=charge_law)
     write_aside(output, lambda path: path.write_text(text, encoding="utf-8"))
-    _say(f"wrote {output}")
+    say(f"wrote {output}")
 
 
 @app.command()
@@ -426,9 +338,9 @@ def figures(
     for number in only or FIGURES:
         for kind in ("png", "csv"):
             check_output(out / f"fig{number}.{kind}")
-    with _warnings_as_lines():
+    with warnings_as_lines():
         for file in make_figures(out, only=only):
-            _say(f"wrote {file}")
+            say(f"wrote {file}")
 
 
 @app.callback(invoke_without_command=True)
@@ -438,5 +350,5 @@ def _root(
     if version:
         from fingerspice import __version__
 
-        _say(f"fingerspice {__version__}")
+        say(f"fingerspice {__version__}")
         raise typer.Exit

@@ -7,7 +7,8 @@ compiled code may call: those of the folders below, as compiled functions elsewh
 
 from __future__ import annotations
 
-import os
+import hashlib
+import logging
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -15,10 +16,12 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 from numba import njit
-from numba.core import cgutils
-from numba.core.caching import FunctionCache
+from numba.core import cgutils, config
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
+
+from fingerspice.errors import InputError
 
 Array = TypeVar("Array", bound=np.ndarray)
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -26,7 +29,9 @@ _PACKAGE = Path(__file__).resolve().parent
 #: Where functions stand that compiled code of other files may call.
 SHARED_FOLDERS = ("engine", "numerics", "physics")
 _SOURCES = [Path(__file__).resolve(), *sorted(p for name in SHARED_FOLDERS for p in (_PACKAGE / name).rglob("*.py"))]
-_STAMP = "\n".join(f"{p.name} {p.stat().st_mtime_ns} {p.stat().st_size}" for p in _SOURCES)
+# By content: a package that is copied, or packed into an image, brings along what was compiled for it.
+_STAMP = hashlib.sha256(b"".join(p.name.encode() + p.read_bytes() for p in _SOURCES)).hexdigest()
+_LOG = logging.getLogger("fingerspice")
 
 
 def _drop_stale_cache() -> None:
@@ -45,29 +50,75 @@ def _drop_stale_cache() -> None:
         return
 
 
+_InPackage: Any = next(c for c in CompileResultCacheImpl._locator_classes if c.__name__.endswith("InTreeCacheLocator"))
+
+
+class _ReadOnly(_InPackage):  # type: ignore[misc]
+    """The package's own folder, where neither that nor any other can be written."""
+
+    def ensure_cache_path(self) -> None:
+        return
+
+
+class _Place(CompileResultCacheImpl):
+    _locator_classes = [*CompileResultCacheImpl._locator_classes, _ReadOnly]  # noqa: RUF012
+
+
 class _Cache(FunctionCache):
-    """numba's, for this state of the shared folders; a disk that is full means that the next process compiles again."""
+    """numba's, for this state of the shared folders.
+
+    What came with the package is read even where nothing can be written; a disk that is full means that the next
+    process compiles again. The first function that is found nowhere is logged: compiling takes its time.
+    """
+
+    _impl_class = _Place
+    told = False
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        cast(Any, super()).__init__(function)
+        place: Any = self._impl
+        came = _InPackage(function, function.__code__.co_filename).get_cache_path()
+        self._came = cast(Any, IndexDataCacheFile)(came, place.filename_base, place.locator.get_source_stamp())
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
         return (*cast(Any, super())._index_key(sig, codegen), _STAMP)
+
+    def _load_overload(self, sig: Any, target_context: Any) -> Any:
+        found = cast(Any, super())._load_overload(sig, target_context)
+        if found is None:
+            with suppress(OSError):
+                data = self._came.load(self._index_key(sig, target_context.codegen()))
+                found = None if data is None else cast(Any, self._impl).rebuild(target_context, data)
+        if found is None and not _Cache.told:
+            _Cache.told = True
+            _LOG.info(_COMPILING if not isinstance(self._impl.locator, _ReadOnly) else _EVERY_TIME)
+        return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
         with suppress(OSError):
             cast(Any, super()).save_overload(sig, data)
 
 
+_COMPILING = "compiling what this needs, about 20 s; later runs take 2 s"
+_EVERY_TIME = (
+    "compiling, about 20 s, as at every run: no folder for compiled code can be written, neither the package's nor "
+    "the user's; set NUMBA_CACHE_DIR to one that can"
+)
+
+
 def _cached(**options: Any) -> Callable[[Function], Function]:
-    """`njit` with a cache, or without where no folder can be written."""
+    """`njit` with a cache."""
 
     def compile_when_called(function: Function) -> Function:
         compiled = njit(error_model="numpy", **options)(function)
-        with suppress(RuntimeError):
-            compiled._cache = cast(Any, _Cache)(function)
+        compiled._cache = cast(Any, _Cache)(function)
         return cast(Function, compiled)
 
     return compile_when_called
 
 
+if cast(Any, config).DISABLE_JIT:
+    raise InputError("NUMBA_DISABLE_JIT is set: uncompiled, a run of seconds would take a day; allowed: unset, or 0")
 _drop_stale_cache()
 # A division by zero is an infinity that the step control refuses, not an exception out of compiled code.
 jit = _cached()
@@ -98,8 +149,3 @@ def _borrow(typing: Any, array: Any) -> Any:
 
 
 borrow: Callable[[Array], Array] = cast(Any, _borrow)
-
-
-def is_first_use() -> bool:
-    """Whether nothing has been compiled here yet: the first run then takes about 20 s longer."""
-    return os.access(_PACKAGE, os.W_OK) and not any((_PACKAGE / "engine").rglob("*.nbc"))

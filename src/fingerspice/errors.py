@@ -42,18 +42,22 @@ class InputError(FingerspiceError, ValueError):
     """
 
     def __init__(self, message: str, where: Where | None = None) -> None:
-        message = self.message = _shown(message)
+        message = self.message = printable(message)
         self.where = where
-        super().__init__(f"{where}: {message}" if where else message)
+        super().__init__(printable(f"{where}: {message}") if where else message)
 
 
-def _shown(message: str) -> str:
-    """A message with control characters escaped, and of bounded length."""
-    if len(message) > LONGEST_MESSAGE:
-        message = f"{message[: LONGEST_MESSAGE // 2]} ... {message[-LONGEST_MESSAGE // 4 :]}"
-    if message.isprintable():
-        return message
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in message)
+def printable(text: str, longest: int = LONGEST_MESSAGE) -> str:
+    """One line that may be shown whoever wrote it: control characters escaped, the middle of a long text left out."""
+    # Cut first, so that little is escaped, and again, as what is escaped is longer.
+    text = _shortened(text, longest)
+    if text.isprintable():
+        return text
+    return _shortened("".join(c if c.isprintable() else repr(c)[1:-1] for c in text), longest)
+
+
+def _shortened(text: str, longest: int) -> str:
+    return text if len(text) <= longest else f"{text[: longest // 2]} ... {text[-(longest // 4) :]}"
 
 
 class SolveError(FingerspiceError, RuntimeError):
@@ -61,10 +65,13 @@ class SolveError(FingerspiceError, RuntimeError):
 
     def __init__(self, failure: Failure, solution: Solution | None = None) -> None:
         self.failure = failure
-        self.message = str(failure)
+        self.message = printable(str(failure))
         self.solution = solution
         super().__init__(self.message)
 
 
 class FingerspiceWarning(UserWarning):
     """Something in the input is legal but probably not what was meant."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))

@@ -106,8 +106,8 @@ def fold_limits(circuit: Circuit, *, points: int = 9, span: float = 10.0) -> Fol
     SolveError
         Where a run fails for another reason than a fold.
     """
-    require(points >= 3, "points", points, "3 or more")
-    require(span > 1.0, "span", span, "more than 1")
+    require(3 <= points <= 1000, "points", points, "3 to 1000")
+    require(1.0 < span <= 1e6, "span", span, "more than 1, at most 1e6")
     gaps = circuit.by_device("GAP")
     if len(gaps) != 1:
         found = ", ".join(g.name for g in gaps) or "none"

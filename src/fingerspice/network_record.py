@@ -12,14 +12,14 @@ from fingerspice.circuit.network import Network
 from fingerspice.circuit.waveforms import Waveform
 from fingerspice.engine.network import Net
 from fingerspice.physics.contact import Contact, areas, inverse_area_array
-from fingerspice.record import sealed, sided
+from fingerspice.record import Sealed, sealed, sided
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class NetworkRecord:
+class NetworkRecord(Sealed):
     """Outputs of a network's run as they were computed, and what they mean.
 
     Signals of fingers and sources have the shape (n_t,) where there is one of them, else (n_t, n).

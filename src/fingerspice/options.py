@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import math
 import os
-import sys
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from fingerspice.errors import FingerspiceWarning, InputError
+from fingerspice.terminal import complain
 from fingerspice.units import parse_number
 
 if TYPE_CHECKING:
@@ -29,7 +27,7 @@ def read_circuit(deck: Path, changes: list[str] | None, source: str | None) -> C
     if source is not None:
         circuit = _with_source(circuit, source)
     for directive in circuit.unused:
-        print(f"fingerspice: note: {directive} has no effect here", file=sys.stderr)
+        complain(f"note: {directive} has no effect here")
     return circuit
 
 
@@ -113,21 +111,17 @@ def area_from_text(text: str) -> str | float:
     return area
 
 
-def json_text(data: dict[str, Any]) -> str:
-    """JSON with null for what is not a number: NaN is no JSON."""
-
-    def clean(x: Any) -> Any:
-        if isinstance(x, dict):
-            return {k: clean(v) for k, v in x.items()}
-        if isinstance(x, list | tuple):
-            return [clean(v) for v in x]
-        return None if isinstance(x, float) and not math.isfinite(x) else x
-
-    return json.dumps(clean(data), indent=2, allow_nan=False)
-
-
 def check_output(file: Path, deck: Path | None = None) -> None:
     """Refuse an output that cannot be written, or is the deck, before spending time on the run; writes nothing."""
+    try:
+        _check_output(file, deck)
+    except OSError as error:
+        raise InputError(f"cannot write {file}: {error.strerror}; allowed: a folder that can be written") from None
+
+
+def _check_output(file: Path, deck: Path | None) -> None:
+    # A name that is too long is found only by looking for the file itself.
+    file.exists()
     folder = file.parent
     while not folder.exists() and folder != folder.parent and not folder.is_symlink():
         folder = folder.parent

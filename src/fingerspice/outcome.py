@@ -144,6 +144,12 @@ class ErrorEstimate:
         """With no less than these, V and N."""
         return ErrorEstimate(max(self.u_gap, u_gap), max(self.f_el, f_el), self.q_source)
 
+    def excess(self, rtol: float, peak_u: float, peak_f: float) -> float:
+        """How many times the error asked for it is, relative to the peaks (V, N), the larger of voltage and force."""
+        pairs = ((self.u_gap, peak_u), (self.f_el, peak_f))
+        # A product that underflows asks for nothing.
+        return max(error / (rtol * peak) if rtol * peak > 0.0 else 0.0 for error, peak in pairs)
+
 
 @dataclass(frozen=True)
 class State:

@@ -11,6 +11,7 @@ from fingerspice.circuit.sampling import misses, same_time
 from fingerspice.circuit.waveforms import Waveform
 from fingerspice.networks import NetworkProblem
 from fingerspice.problem import Problem
+from fingerspice.times import check_length, check_outputs
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -36,6 +37,26 @@ def at_breakpoints(problem: Problem | NetworkProblem, t: FloatArray) -> FloatArr
         ):
             moved[first:last] = edge
     return moved
+
+
+def asked_for(
+    problem: Problem | NetworkProblem, t_eval: FloatArray | None, jumps: str
+) -> tuple[FloatArray, BoolArray]:  # fmt: skip
+    """Output times and sides: those given, or the deck's.
+
+    Raises
+    ------
+    InputError
+        For a run that is too long, or one of too many outputs.
+    """
+    check_length(problem.waveform, problem.t_start, problem.t_stop)
+    if t_eval is not None:
+        return t_eval, np.zeros(t_eval.size, bool)
+    check_outputs(problem.circuit, (problem.t_stop - problem.first) / problem.step)
+    t_out, left = output_times(problem, jumps)
+    # Jumps have two each.
+    check_outputs(problem.circuit, t_out.size)
+    return t_out, left
 
 
 def output_times(problem: Problem | NetworkProblem, jumps: str = "both") -> tuple[FloatArray, BoolArray]:

@@ -151,9 +151,7 @@ def _error(figures: FloatArray, u_scale: float, rtol: float) -> tuple[ErrorEstim
     error = ErrorEstimate(
         memory * (SAFETY * error_u + floor) + left, memory * (SAFETY * error_f + steepest * floor) + steepest * left
     )
-    return error, max(
-        error.u_gap / (rtol * peak_u) if peak_u > 0.0 else 0.0, error.f_el / (rtol * peak_f) if peak_f > 0.0 else 0.0
-    )
+    return error, error.excess(rtol, peak_u, peak_f)
 
 
 def _close_linear(problem: Problem, table: SourceTable, rtol: float) -> tuple[FloatArray, dict[str, Any]]:

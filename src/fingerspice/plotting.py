@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.errors import printable
 from fingerspice.files import write_aside
 from fingerspice.outcome import Status
 from fingerspice.physics.materials import SKIN_BAND
@@ -38,6 +39,8 @@ WIDTH = 7.0
 """Font sizes (points) and width (inches) of a figure across a page."""
 
 MAX_BINS = 4000
+#: Characters of a name in a legend.
+LONGEST_LABEL = 60
 _CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (1, 1.2)))
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
@@ -93,11 +96,23 @@ def legend_above(ax: Axes, columns: int = 4, *, right: bool = False, math: bool 
     legend = ax.legend(ncols=columns, fontsize=FONT - 0.5, frameon=False, **place)
     for text in legend.get_texts():
         text.set_parse_math(math)
+        text.set_text(drawable(text.get_text(), LONGEST_LABEL))
+
+
+def drawable(text: str, longest: int = 1000) -> str:
+    """Text of a deck as it may be drawn: printable, not long, and with a box for what the font has no picture of."""
+    text = printable(text, longest)
+    if text.isascii():
+        return text
+    from matplotlib import font_manager
+
+    known = font_manager.get_font(font_manager.findfont(font_manager.FontProperties())).get_charmap()
+    return "".join(c if ord(c) in known else "□" for c in text)
 
 
 def caption(figure: Figure, text: str, color: str = GREY) -> None:
     """Small print under the figure, wrapped to its width."""
-    lines = textwrap.fill(text, 132, break_on_hyphens=False)
+    lines = textwrap.fill(drawable(text), 132, break_on_hyphens=False)
     small = figure.supxlabel(lines, x=0.012, ha="left", fontsize=SMALL, color=color)
     small.set_parse_math(False)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,17 @@ def sealed(x: FloatArray) -> FloatArray:
     return x
 
 
+class Sealed:
+    """A result whose arrays are read-only, also where it was copied or unpickled: numpy's own copies can be written."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for value in state.values():
+            for array in value.values() if isinstance(value, dict) else (value,):
+                if isinstance(array, np.ndarray):
+                    sealed(array)
+
+
 def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
     """Values of a waveform at times t (s), from the left where that is meant, shape (n_t,)."""
     out = np.array(waveform.value(t), float)
@@ -36,7 +48,7 @@ def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class Record(Sealed):
     """Outputs of a run as they were computed, and what they mean.
 
     Attributes

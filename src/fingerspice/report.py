@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fingerspice.errors import printable
 from fingerspice.files import write_aside
 from fingerspice.units import format_si
 
@@ -22,9 +23,13 @@ if TYPE_CHECKING:
     from fingerspice.solution import Solution
 
 
+#: Characters of a row's name in a table.
+LONGEST_LABEL = 60
+
+
 def _aligned(rows: Sequence[tuple[str, ...]], head: tuple[str, ...]) -> str:
     """Rows as text columns, the first left-aligned."""
-    table = [head, *rows]
+    table = [(printable(r[0], LONGEST_LABEL), *r[1:]) for r in (head, *rows)]
     widths = [max(len(r[i]) for r in table) for i in range(len(head))]
     lines = []
     for r in table:

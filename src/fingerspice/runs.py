@@ -19,6 +19,7 @@ from fingerspice.problem import Problem
 from fingerspice.record import Record
 from fingerspice.refined import ClosedForm
 from fingerspice.steps import Recorded
+from fingerspice.times import check_length
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -79,10 +80,7 @@ class Run:
 
     def excess(self, rtol: float) -> float:
         """Estimated error over the one asked for, the larger of voltage and force."""
-        return max(
-            self.error.u_gap / (rtol * self.peak_u) if self.peak_u > 0.0 else 0.0,
-            self.error.f_el / (rtol * self.peak_f) if self.peak_f > 0.0 else 0.0,
-        )
+        return self.error.excess(rtol, self.peak_u, self.peak_f)
 
 
 class Tables:
@@ -145,6 +143,7 @@ class Tables:
 
 def windows(problem: Problem | NetworkProblem) -> list[float]:
     """Edges of the windows the source is tabulated on: constant memory, and phases that stay exact."""
+    check_length(problem.waveform, problem.t_start, problem.t_stop)
     span = problem.t_stop - problem.t_start
     rate = max(
         problem.waveform.breakpoint_rate() / BREAKPOINTS_PER_WINDOW,

@@ -26,7 +26,7 @@ from fingerspice.networks import NetworkProblem, prepare_network
 from fingerspice.nodal import solve_coupled
 from fingerspice.numerics.tableaus import TABLEAUS
 from fingerspice.outcome import ErrorEstimate, Failure, Status
-from fingerspice.outputs import at_breakpoints, output_times
+from fingerspice.outputs import asked_for, at_breakpoints
 from fingerspice.periodic import close_period
 from fingerspice.planning import Plan, make_plan, plan_network
 from fingerspice.problem import Problem, prepare
@@ -108,12 +108,7 @@ def simulate(
     SolveError
         Where the run failed and `throw` is set; its `solution` holds what came before.
     """
-    require(
-        isinstance(rtol, (int, float)) and RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1],
-        "rtol",
-        rtol,
-        "1e-13 to 0.1",
-    )
+    _check_rtol(rtol)
     require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
     if sources:
         circuit = _with_sources(circuit, sources)
@@ -143,6 +138,11 @@ def simulate(
     return _given_back(run_problem(problem, times, rtol, method, progress, tier, how, begun, jumps), throw)
 
 
+def _check_rtol(rtol: float) -> None:
+    good = isinstance(rtol, (int, float)) and RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1]
+    require(good, "rtol", rtol, "1e-13 to 0.1")
+
+
 def _given_back(solution: Solution, throw: bool) -> Solution:
     """A solution with its warnings said, or the error of a failed run."""
     if solution.failure is not None and throw:
@@ -169,6 +169,7 @@ def plan(
     InputError
         For a request that cannot be run.
     """
+    _check_rtol(rtol)
     if t_stop is None and circuit.tran is None:
         t_stop = 1.0
     if not is_stack(circuit):
@@ -199,12 +200,8 @@ def run_problem(
     """
     # A method steps, and what is stepped is the coupled model.
     plan = make_plan(problem, rtol, "coupled" if tier == "auto" and method != "auto" else tier, start)
-    if t_eval is None:
-        t_out, left = output_times(problem, jumps)
-        run_at = t_out
-    else:
-        t_out, left = t_eval, np.zeros(t_eval.size, bool)
-        run_at = at_breakpoints(problem, t_eval)
+    t_out, left = asked_for(problem, t_eval, jumps)
+    run_at = t_out if t_eval is None else at_breakpoints(problem, t_eval)
     begin = time.perf_counter()
     if plan.tier == "algebraic":
         run, name = solve_algebraic(problem, run_at, left), plan.tier
@@ -250,7 +247,7 @@ def run_network(
             f"method {method!r} is for series stacks; allowed for this network: 'auto', 'exponential' or 'radau'"
         )
     plan = plan_network(problem, "coupled" if tier == "auto" and method != "auto" else tier, start)
-    t_out, left = output_times(problem, jumps) if t_eval is None else (t_eval, np.zeros(t_eval.size, bool))
+    t_out, left = asked_for(problem, t_eval, jumps)
     run_at = t_out if t_eval is None else at_breakpoints(problem, t_eval)
     begin = time.perf_counter()
     if plan.tier == "linear":

@@ -18,7 +18,7 @@ from fingerspice.datafiles import variables, write_csv, write_netcdf
 from fingerspice.measures import Weighed, weigh_outputs, weigh_run
 from fingerspice.network_record import NetworkRecord
 from fingerspice.outcome import ErrorEstimate, Failure, NetworkState, State, Status
-from fingerspice.record import Record, sealed
+from fingerspice.record import Record, Sealed, sealed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,7 +39,7 @@ _Figures = tuple[Weighed, dict[str, tuple[float, float]]]
 
 
 @dataclass(frozen=True)
-class Solution:
+class Solution(Sealed):
     """Time response of a circuit.
 
     Signals are read-only arrays in SI units, computed when first asked for; at a jump of the source two rows share a

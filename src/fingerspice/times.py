@@ -1,4 +1,4 @@
-"""How long a run is, and how far apart its outputs are."""
+"""How long a run is, how far apart its outputs are, and how much of either is too much."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.waveforms import require
+from fingerspice.circuit.waveforms import Waveform, require
 from fingerspice.errors import InputError
 
 FloatArray = NDArray[np.float64]
+
+#: Periods (or shortest time scales) of the source in a run, and its breakpoints: hours of work, and a gigabyte.
+MOST_PERIODS, MOST_BREAKPOINTS = 1e10, 4e9
+#: Bytes of the signals at the deck's own output times; writing a file takes three times as much.
+MOST_BYTES = 2e9
 
 
 def run_times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: FloatArray | None) -> tuple[float, float]:
@@ -36,3 +41,49 @@ def run_times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: Fl
         )
     step = tran.step if tran is not None else (t_stop - t_start) / 1000.0
     return t_stop, step
+
+
+def check_length(waveform: Waveform, t_start: float, t_stop: float) -> None:
+    """Refuse a run of more periods or breakpoints than one can come to the end of.
+
+    Raises
+    ------
+    InputError
+        With how many there are.
+    """
+    span = t_stop - t_start
+    periods = span / waveform.shortest_time()
+    require(
+        periods <= MOST_PERIODS,
+        "the run",
+        f"{span:g} s long, {periods:.3g} periods or time constants of its source",
+        f"at most {MOST_PERIODS:.0e} of them",
+    )
+    breakpoints = span * waveform.breakpoint_rate()
+    require(
+        breakpoints <= MOST_BREAKPOINTS,
+        "the run",
+        f"{span:g} s long, {breakpoints:.3g} breakpoints of its source",
+        f"at most {MOST_BREAKPOINTS:.0e} of them",
+    )
+
+
+def check_outputs(circuit: Circuit, count: float) -> None:
+    """Refuse more output times than the memory holds the signals of.
+
+    Raises
+    ------
+    InputError
+        With the memory they would take.
+    """
+    devices = [element.device for element in circuit.elements]
+    layers = sum(element.spec.is_layer for element in circuit.elements)
+    nodes = len({node for element in circuit.elements for node in element.nodes})
+    columns = layers + nodes + 7 * devices.count("GAP") + 3 * (devices.count("V") + devices.count("I")) + 1
+    size = 8.0 * columns * count
+    require(
+        size <= MOST_BYTES,
+        "the run",
+        f"one of {count:.3g} outputs with {columns} signals, {size / 1e9:.3g} GB",
+        f"at most {MOST_BYTES / 1e9:g} GB: a longer TSTEP, or a TSTART that leaves out the beginning",
+    )

@@ -10,7 +10,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.circuit.waveforms import DC, Sine, Waveform, blank_terms, check_finite, require
+from fingerspice.circuit.bounds import check_finite
+from fingerspice.circuit.waveforms import DC, Sine, Waveform, blank_terms, require
 
 FloatArray = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fingerspice.circuit.flatten import Flattener, Statement
-from fingerspice.circuit.lexer import Line, group, lex, split_lines
+from fingerspice.circuit.lexer import Line, group, lex
 from fingerspice.circuit.reader import (
     DIRECTIVES,
     MAX_BYTES,
@@ -23,7 +23,7 @@ from fingerspice.circuit.reader import (
     read_text,
 )
 from fingerspice.circuit.scope import Call, Number, Scope, Token, Value
-from fingerspice.errors import InputError, Where
+from fingerspice.errors import InputError, Where, printable
 
 __all__ = [
     "NATIVE_DEVICES",
@@ -37,6 +37,9 @@ __all__ = [
     "parse_deck",
     "read_deck",
 ]
+
+#: Characters of a title that are shown; of a longer one the middle is left out.
+LONGEST_TITLE = 200
 
 _VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sin|pulse|exp|pwl|square|wavefile|table)\b)"
 _ELEMENT_TITLE = re.compile(rf"[rcvi]\w*\s+\S+\s+\S+\s+{_VALUE}", re.IGNORECASE)
@@ -78,7 +81,7 @@ class Deck:
     Attributes
     ----------
     title : str
-        The first line.
+        The first line, made fit to be shown (see `errors.printable`); as written it is in `text`.
     statements : tuple of Statement
         Elements in the order of the file, subcircuit calls expanded.
     tran, ac : Directive or None
@@ -154,11 +157,11 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
         raise InputError(f"'{file}' is larger than {MAX_BYTES >> 20} MiB")
     if "\0" in text:
         raise InputError(f"'{file}' is not text (it holds NUL characters)")
-    lines = split_lines(text.removeprefix("\ufeff"))
     reader = Reader(file, path)
-    title = lines[0].strip()
+    lines = reader.split(text.removeprefix("\ufeff"))
+    title = printable(lines[0].strip(), LONGEST_TITLE)
     if _reads_like_a_statement(title):
-        problem = f"the first line is the title, but '{title[:60]}' reads like a statement: add a title above"
+        problem = f"the first line is the title, but '{title}' reads like a statement: add a title above"
         reader.warn(problem, Where(file, 1))
     reader.read_deck(lines)
     return _assemble(reader, title, text, path)

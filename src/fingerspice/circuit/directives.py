@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Literal
 
+from fingerspice.circuit.bounds import check_range
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Element, Tran
 from fingerspice.circuit.deck import Directive, Number, Token, parse_deck
 from fingerspice.circuit.expressions import nearest
 from fingerspice.errors import InputError, Where
 
-MOST_VOLTS = 1e30
 """Start values of voltages, V: far from any circuit's, so that products stay numbers."""
 _NGSPICE_OPTIONS = frozenset(
     """abstol acct bypass chgtol defad defas defl defw gmin gminsteps interp itl1 itl2 itl3 itl4 itl5 itl6 keepopinfo
@@ -48,6 +49,8 @@ def read_tran(directive: Directive) -> Tran:
     longest = numbers[3] if len(numbers) > 3 else None
     _require(step.value > 0.0, "TSTEP", step, "more than 0 s")
     _require(stop.value > 0.0, "TSTOP", stop, "more than 0 s")
+    for what, number in (("TSTEP", step), ("TSTOP", stop), ("TMAX", longest)):
+        _require(number is None or 1e-30 <= number.value <= 1e30, what, number, "1e-30 to 1e30 s")
     _require(step.value <= stop.value, "TSTEP", step, f"at most TSTOP = {stop.text} (the output step comes first)")
     _require(start is None or 0.0 <= start.value < stop.value, "TSTART", start, f"0 to TSTOP = {stop.text}")
     _require(longest is None or longest.value > 0.0, "TMAX", longest, "more than 0 s")
@@ -82,7 +85,11 @@ def read_ac(directive: Directive) -> AcSweep:
     _require(n.value >= 1 and n.value == int(n.value) and n.value <= 1e6, "N", n, "a whole number, 1 to 1e6")
     _require(low.value > 0.0, "FSTART", low, "more than 0 Hz")
     _require(high.value >= low.value, "FSTOP", high, f"at least FSTART = {low.text}")
+    for what, number in (("FSTART", low), ("FSTOP", high)):
+        _require(1e-30 <= number.value <= 1e30, what, number, "1e-30 to 1e30 Hz")
     scale: Literal["dec", "oct", "lin"] = words[0]  # type: ignore[assignment]
+    spans = 1.0 if scale == "lin" else math.log(high.value / low.value, 10.0 if scale == "dec" else 2.0)
+    _require(n.value * spans <= 1e6, "N", n, f"at most 1e6 frequencies in a sweep, here {n.value * spans:.3g}")
     return AcSweep(scale, int(n.value), low.value, high.value)
 
 
@@ -111,10 +118,17 @@ def read_initial(directives: tuple[Directive, ...], elements: tuple[Element, ...
                 raise InputError(f".ic {key} is {value.text} V; allowed: 0, it is ground", place)
             if node in area_nodes and not 1e-30 <= value.value <= 1e30:
                 raise InputError(f".ic {key} is {value.text} mm^2; allowed: more than 0, from 1e-30 to 1e30", place)
-            if not abs(value.value) <= MOST_VOLTS:
-                raise InputError(f".ic {key} is {value.text} V; allowed: from -{MOST_VOLTS:g} to {MOST_VOLTS:g}", place)
-            out[node] = value.value
+            out[node] = value.value if node in area_nodes else start_volts(f".ic {key}", value)
     return out
+
+
+def start_volts(what: str, number: Number) -> float:
+    """A voltage to start from, V, within the range of a source's."""
+    try:
+        check_range(what, number.value, "V")
+    except InputError as error:
+        raise InputError(error.message, number.where) from None
+    return number.value
 
 
 def unused_starts(initial: Mapping[str, float], elements: tuple[Element, ...], uic: bool) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import re
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import NamedTuple
 
 from fingerspice.errors import InputError, Where
@@ -16,6 +17,8 @@ from fingerspice.errors import InputError, Where
 #: A `;` or a free-standing `$` starts a comment, unless it stands between double quotes.
 _COMMENT = re.compile(r'"[^"]*"|(;|(?<!\S)\$(?!\S))')
 _LEX = re.compile(r"""[\s,]+|([()=])|("[^"]*")|('[^']*')|([^\s,()={}'"]+)""")
+#: A word, bracket or text begins at the start of a line or after one of these, or is one of them.
+_SPLIT = re.compile(r"""[\s,]+|[()={}'"]""")
 _BRACE = re.compile(r"[{}]")
 _MARKS = ("(", ")", "=")
 _KEY = re.compile(r"[A-Za-z_]\w*")
@@ -64,6 +67,10 @@ class Line:
         """Text of a lexeme with its braces or quotes."""
         marks = 2 * (lexeme.kind in ("expression", "string"))
         return self.text[lexeme.position : lexeme.position + len(lexeme.text) + marks]
+
+    def words(self, most: int) -> int:
+        """How many lexemes there are at most, counted no further than `most`; blanks count as one."""
+        return len(self._numbers) + sum(1 for _ in islice(_SPLIT.finditer(self.text), most))
 
     @property
     def start(self) -> int:

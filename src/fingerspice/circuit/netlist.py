@@ -12,11 +12,11 @@ from fingerspice.circuit.circuit import Circuit, Element, check
 from fingerspice.circuit.deck import Call, Deck, Number, Statement, Token, parse_deck, read_deck
 from fingerspice.circuit.devices import DEVICES, ParameterSpec
 from fingerspice.circuit.directives import (
-    MOST_VOLTS,
     read_ac,
     read_initial,
     read_options,
     read_tran,
+    start_volts,
     unused_starts,
 )
 from fingerspice.circuit.expressions import nearest
@@ -269,10 +269,8 @@ def _passive_value(statement: Statement, notes: list[str]) -> tuple[dict[str, fl
     initial = statement.params.get("ic")
     if isinstance(initial, Token):
         raise InputError(f"{name} IC is {initial.text!r}; allowed: a number V", initial.where)
-    if initial is not None and not abs(initial.value) <= MOST_VOLTS:
-        allowed_volts = f"from -{MOST_VOLTS:g} to {MOST_VOLTS:g}"
-        raise InputError(f"{name} IC is {initial.text} V; allowed: {allowed_volts}", initial.where)
-    return {"value": _value(name, spec, word, notes)}, None if initial is None else initial.value
+    start = None if initial is None else start_volts(f"{name} IC", initial)
+    return {"value": _value(name, spec, word, notes)}, start
 
 
 def source_from_text(text: str, circuit: Circuit) -> Waveform:

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.circuit.waveforms import Waveform, blank_terms, check_finite, require
+from fingerspice.circuit.bounds import check_finite, check_range, in_windows, runs_through
+from fingerspice.circuit.waveforms import Waveform, blank_terms, require
 from fingerspice.errors import InputError
 
 FloatArray = NDArray[np.float64]
@@ -45,9 +46,9 @@ class _Ramps(Waveform):
         times, _ = self._knots()
         if self.period is None:
             return times
-        low = max(0.0, math.floor((t0 - self._first) / self.period) - 1.0)
-        high = max(low, math.ceil((t1 - self._first) / self.period) + 1.0)
-        starts = self._first + np.arange(low, high + 1.0) * self.period
+        low = max(0.0, np.floor((t0 - self._first) / self.period) - 1.0)
+        high = max(low, np.ceil((t1 - self._first) / self.period) + 1.0)
+        starts = self._first + runs_through(low, high, times.size, t0, t1) * self.period
         return np.asarray((starts[:, None] + times[None, :]).ravel())
 
     def _edges(self, t0: float, t1: float) -> FloatArray:
@@ -64,15 +65,20 @@ class _Ramps(Waveform):
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         t = np.asarray(t, float)
         flat = t.ravel()
-        if flat.size == 0:
-            return np.empty(t.shape)
+        out = np.empty(flat.size)
+        for window in in_windows(flat, self.breakpoint_rate() if self.period else 0.0):
+            out[window] = self._values(flat[window], side)
+        return out.reshape(t.shape)
+
+    def _values(self, flat: FloatArray, side: str) -> FloatArray:
+        """As `value`, at times (n_t,) that are not far apart."""
         edges = self._edges(flat.min(), flat.max())
         index = np.searchsorted(edges, flat, side="right" if side == "right" else "left")
         bounds = np.concatenate([[-math.inf], edges, [math.inf]])
         start, stop = bounds[index], bounds[index + 1]
         v0, slope = self._line(start, stop)
         tau = np.where(np.isfinite(start), flat - np.where(np.isfinite(start), start, 0.0), 0.0)
-        return np.asarray((v0 + slope * tau).reshape(t.shape))
+        return np.asarray(v0 + slope * tau)
 
     def _line(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Value at the start and slope of the pieces from `start` to `stop`, told apart by their midpoints."""
@@ -135,6 +141,8 @@ class PWL(_Ramps):
             bad = np.flatnonzero(~np.isfinite(array))
             if bad.size:
                 raise InputError(f"PWL {name} number {bad[0] + 1} is {array[bad[0]]}; allowed: finite numbers")
+        check_range("PWL time", t, "s")
+        check_range("PWL value", v, "V")
         back = t[1:] < t[:-1]
         if np.any(back):
             i = int(np.argmax(back))
@@ -176,9 +184,9 @@ class PWL(_Ramps):
             return times
         period = self.times[-1] - self.repeat
         body = times[times >= self.repeat]
-        low = max(1.0, math.floor((t0 - self.repeat) / period) - 1.0)
-        high = max(low, math.ceil((t1 - self.repeat) / period) + 1.0)
-        runs = (np.arange(low, high + 1.0) * period)[:, None] + body[None, :]
+        low = max(1.0, np.floor((t0 - self.repeat) / period) - 1.0)
+        high = max(low, np.ceil((t1 - self.repeat) / period) + 1.0)
+        runs = (runs_through(low, high, body.size, t0, t1) * period)[:, None] + body[None, :]
         return np.concatenate([times, runs.ravel()])
 
 
@@ -213,9 +221,10 @@ class _Periodic(_Ramps):
         # (k + x) / f rounds to the time a user writes; k (1 / f) + x (1 / f) often misses it.
         x = self._knots()[0] * self.frequency
         shift = self.delay - self.phase_deg / 360.0 / self.frequency
-        low = math.floor((t0 - shift) * self.frequency) - 1.0
-        high = math.ceil((t1 - shift) * self.frequency) + 1.0
-        return np.asarray(((np.arange(low, high + 1.0)[:, None] + x) / self.frequency + shift).ravel())
+        low = np.floor((t0 - shift) * self.frequency) - 1.0
+        high = np.ceil((t1 - shift) * self.frequency) + 1.0
+        runs = runs_through(low, high, x.size, t0, t1)
+        return np.asarray(((runs[:, None] + x) / self.frequency + shift).ravel())
 
     @property
     def _first(self) -> float:  # type: ignore[override]
@@ -323,6 +332,8 @@ class Pulse(_Ramps):
         for name in ("rise", "fall", "width"):
             require(getattr(self, name) >= 0.0, f"pulse {name}", f"{getattr(self, name):g} s", ">= 0")
         require(self.pulse_period > 0.0, "pulse period", f"{self.pulse_period:g} s", "> 0")
+        for name, unit in self.units.items():
+            check_range(f"pulse {name.replace('_', ' ')}", getattr(self, name), unit)
         require(math.isfinite(self.rise + self.fall), "pulse rise + fall", "infinite", "finite times")
         busy = self.rise + self.width + self.fall
         if math.isfinite(self.pulse_period):
@@ -400,8 +411,14 @@ class Samples(_Ramps):
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
             raise InputError(f"sample number {bad[0]} is {values[bad[0]]}; allowed: finite numbers")
+        check_range("a sample", values, "V")
         check_finite(self)
         require(self.rate > 0.0, "sample rate", f"{self.rate:g} Hz", "> 0")
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        # numpy's own copies can be written.
+        self.values.flags.writeable = False
 
     def _knots(self) -> tuple[FloatArray, FloatArray]:
         return self.start + np.arange(self.values.size) / self.rate, self.values

@@ -15,6 +15,10 @@ from fingerspice.circuit.scope import Formula, param_formulas
 from fingerspice.errors import InputError, Where
 
 MAX_BYTES = 64 * 2**20
+#: Of a netlist with what it includes: a word takes up to 500 bytes and a line 200 while it is read.
+MAX_WORDS, MAX_LINES = 1_000_000, 2_000_000
+#: More of them nobody reads.
+MAX_WARNINGS = 100
 MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 32
 
@@ -78,6 +82,16 @@ class Reader:
         self._control: Line | None = None
         self._reading: list[Path] = []
         self._size = 0
+        self._lines = 0
+        self._words = 0
+
+    def split(self, text: str, where: Where | None = None) -> list[str]:
+        """Physical lines of the deck or of a file it includes; refuses more than there may be in all."""
+        self._lines += 1 + text.count("\n") + text.count("\r")
+        if self._lines > MAX_LINES:
+            problem = f"the netlist has {self._lines:,} lines; allowed: {MAX_LINES:,}, included files counted"
+            raise InputError(problem, where or Where(self.file, 1))
+        return split_lines(text)
 
     def read_deck(self, lines: list[str]) -> None:
         """Read the deck's own lines, of which the first is the title and not read here."""
@@ -93,8 +107,11 @@ class Reader:
             raise InputError(f".subckt {left.name} without its .ends", _where(left))
 
     def warn(self, message: str, where: Where) -> None:
-        """Keep a warning with its place."""
-        self.warnings.append(f"{where}: {message}")
+        """Keep a warning with its place, unless there are many already."""
+        if len(self.warnings) < MAX_WARNINGS:
+            self.warnings.append(f"{where}: {message}")
+        elif len(self.warnings) == MAX_WARNINGS:
+            self.warnings.append(f"{where}: more warnings than {MAX_WARNINGS}: the others are not shown")
 
     def _warn_after_end(self, line: Line | None) -> None:
         if line is not None:
@@ -108,6 +125,10 @@ class Reader:
             if word == ".endc":
                 self._control = None
             return False
+        self._words += line.words(MAX_WORDS)
+        if self._words > MAX_WORDS:
+            problem = f"the netlist has more than {MAX_WORDS:,} words and brackets; allowed: samples in a file of their"
+            raise InputError(f"{problem} own, as TABLE(file.csv) or WAVEFILE(file.wav 1)", _place(line))
         if word[0] != ".":
             here = self._open[-1]
             if not here.skipped:
@@ -206,7 +227,7 @@ class Reader:
             raise InputError(f"the included files are larger than {MAX_BYTES >> 20} MiB in all", where)
         self._reading.append(path)
         shown = str(Path(self.file).parent / path.relative_to(self.folder))
-        for inner in logical_lines(split_lines(text), shown):
+        for inner in logical_lines(self.split(text, where), shown):
             self._take(inner, path.parent)
         self._reading.pop()
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice.circuit.bounds import in_windows, runs_through
 from fingerspice.circuit.waveforms import Waveform, blank_terms, require
 from fingerspice.compiled import jit
 from fingerspice.errors import FingerspiceWarning, InputError
@@ -72,7 +73,9 @@ class Function(Waveform):
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         t = np.asarray(t, float)
         if side == "left":
-            t = np.where(np.isin(t, self.breakpoints(t.min(), t.max())) if t.size else False, np.nextafter(t, -1), t)
+            windows = [t.ravel()[window] for window in in_windows(t.ravel(), self.breakpoint_rate())]
+            edges = np.concatenate([self.breakpoints(x.min(), x.max()) for x in windows if x.size] or [np.empty(0)])
+            t = np.where(np.isin(t, edges), np.nextafter(t, -1), t)
         if t.ndim == 0:
             return np.asarray(self._scalar(float(t)))
         try:
@@ -96,7 +99,7 @@ class Function(Waveform):
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
         times = np.asarray(self.breaks, float)
         if self.repeat is not None and times.size:
-            runs = np.arange(math.floor(t0 / self.repeat) - 1.0, math.ceil(t1 / self.repeat) + 1.0)
+            runs = runs_through(np.floor(t0 / self.repeat) - 1.0, np.ceil(t1 / self.repeat), times.size, t0, t1)
             times = np.unique((runs[:, None] * self.repeat + times).ravel())
         return times[(times >= t0) & (times <= t1)]
 

@@ -13,16 +13,20 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice.circuit.bounds import check_finite
 from fingerspice.errors import InputError
 
 FloatArray = NDArray[np.float64]
 TAU = 2.0 * math.pi
+
+#: Panels of an integral over a period.
+MOST_PANELS = 100_000
 
 
 @dataclass(frozen=True)
@@ -110,6 +114,9 @@ class Waveform:
 
     def peak(self, t0: float, t1: float) -> float:
         """Largest |U| (V) over [t0, t1], to a few parts in a thousand where it is not at a breakpoint."""
+        if self.period is not None:
+            # Later periods are alike.
+            t1 = min(t1, max(t0, self.settled) + self.period)
         knots = np.unique(np.concatenate([self.breakpoints(t0, t1), np.linspace(t0, t1, 513)]))
         return float(max(np.abs(self.value(knots)).max(), np.abs(self.value(knots, "left")).max()))
 
@@ -159,14 +166,6 @@ def require(condition: bool, what: str, given: Any, allowed: str) -> None:
         raise InputError(f"{what} is {given}; allowed: {allowed}")
 
 
-def check_finite(waveform: Waveform) -> None:
-    """Refuse NaN and inf in any numeric field of a waveform dataclass."""
-    for field in fields(waveform):  # type: ignore[arg-type]
-        value = getattr(waveform, field.name)
-        if isinstance(value, (float, int)):
-            require(math.isfinite(value), f"{type(waveform).__name__} {field.name}", value, "a finite number")
-
-
 def fourier_integral(waveform: Waveform, frequency: float, t0: float, t1: float) -> complex:
     """Integral of U(t) exp(-i 2 pi f t) over [t0, t1], by Gauss-Legendre panels between breakpoints."""
     inner = waveform.breakpoints(t0, t1)
@@ -175,7 +174,14 @@ def fourier_integral(waveform: Waveform, frequency: float, t0: float, t1: float)
     panel = min(0.5 / frequency, waveform.shortest_time())
     total = 0j
     for a, b in itertools.pairwise(edges):
-        cuts = np.linspace(a, b, max(1, math.ceil((b - a) / panel)) + 1)
+        panels = (b - a) / panel
+        require(
+            panels <= MOST_PANELS,
+            "the source's shortest time scale",
+            f"{panel:.3g} s in a period of {t1 - t0:.3g} s",
+            f"at least 1/{MOST_PANELS:.0e} of the period",
+        )
+        cuts = np.linspace(a, b, max(1, math.ceil(panels)) + 1)
         half = 0.5 * np.diff(cuts)[:, None]
         t = 0.5 * (cuts[1:] + cuts[:-1])[:, None] + half * x
         total += complex(np.sum(half * w * waveform.value(t) * np.exp(-1j * TAU * frequency * t)))

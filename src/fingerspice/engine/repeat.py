@@ -1,7 +1,12 @@
-"""Outputs of periods from the polynomials of one: the same again, or moved by what its start has moved."""
+"""Outputs of periods from the polynomials of one: the same again, or moved by what its start has moved.
+
+A walk over a billion periods takes half a minute: it is made in compiled calls of some milliseconds, between which
+Python sees to a Ctrl-C. What one of them knows is handed to the next, so that no result depends on where it was cut.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +22,8 @@ FloatArray = NDArray[np.float64]
 # A boundary of a step, moved by whole periods, is one of the times asked for if it is this near, relative.
 _SLACK = 8e-16
 AT_ZERO, AT_EDGE = 1.0, 2.0
+# Steps gone through in one compiled call.
+AT_ONCE = 1_000_000
 
 
 class Kept(NamedTuple):
@@ -40,7 +47,24 @@ def new_kept(steps: int, columns: int) -> Kept:
     return Kept(np.zeros((steps, 4)), np.zeros((steps, columns, ROWS)))
 
 
-@jit
+class _Walk(NamedTuple):
+    """What compiled calls hand on: of each step, its outputs in the period before, and whether it is in powers of x."""
+
+    held: NDArray[np.int64]
+    as_powers: NDArray[np.bool_]
+
+
+def _new_walk(steps: int) -> _Walk:
+    return _Walk(np.zeros(steps, np.int64), np.zeros(steps, np.bool_))
+
+
+def _calls(periods: int, steps: int) -> Iterator[tuple[int, int]]:
+    """Where a walk over periods 0, 1, ... is cut: the first period of each call, and the first that is not its own."""
+    most = max(1, AT_ONCE // max(1, steps))
+    for begin in range(0, periods, most):
+        yield begin, min(begin + most, periods)
+
+
 def repeat(
     kept: Kept, count: int, period: float, periods: int, drifts: FloatArray, first: int, t_out: FloatArray,
     left: NDArray[np.bool_], out: FloatArray,
@@ -65,30 +89,41 @@ def repeat(
     int
         The first output that is left.
     """
+    walk = _new_walk(count)
+    for i in range(count):
+        walk.as_powers[i] = _made_powers(kept.series[i])
+    for begin, end in _calls(periods, count):
+        first = _repeat(kept, walk, period, begin + 1, end + 1, drifts, first, t_out, left, out)
+        if first >= t_out.size:
+            break
+    return first
+
+
+@jit
+def _repeat(
+    kept: Kept, walk: _Walk, period: float, begin: int, end: int, drifts: FloatArray, first: int, t_out: FloatArray,
+    left: NDArray[np.bool_], out: FloatArray,
+) -> int:  # fmt: skip
+    """As `repeat`, of the periods from `begin` to before `end`."""
     times, series = borrow(kept.times), borrow(kept.series)
     t_out, left, out, drifts = borrow(t_out), borrow(left), borrow(out), borrow(drifts)
+    held, as_powers = borrow(walk.held), borrow(walk.as_powers)
     work = np.zeros((2, WRITTEN_AT_ONCE))
-    # Outputs of each step in the period before: mostly as many as now.
-    held = np.zeros(count, np.int64)
-    as_powers = np.zeros(count, np.bool_)
-    for i in range(count):
-        as_powers[i] = _may_be_powers(series[i])
-        if as_powers[i]:
-            _make_powers(series[i])
-    for k in range(1, periods + 1):
+    for k in range(begin, end):
         shift = k * period
         before = first
-        for i in range(count):
+        for i in range(held.size):
             if first >= t_out.size:
                 break
-            end = times[i, 2] + shift
-            slack = _SLACK * abs(end)
-            if t_out[first] > end + slack:
+            stop = times[i, 2] + shift
+            slack = _SLACK * abs(stop)
+            if t_out[first] > stop + slack:
                 continue
             h = times[i, 1]
             reached = (times[i, 2] - times[i, 0]) / h
+            # As many as in the period before, mostly.
             held[i] = write_outputs(
-                times[i, 0] + shift, h, min(reached, 1.0), end, slack, as_powers[i], series[i], work, first, held[i],
+                times[i, 0] + shift, h, min(reached, 1.0), stop, slack, as_powers[i], series[i], work, first, held[i],
                 t_out, left, out,
             )  # fmt: skip
             first += held[i]
@@ -97,6 +132,15 @@ def repeat(
                 for i in range(before, first):
                     out[c, i] += k * drifts[c]
     return first
+
+
+@jit
+def _made_powers(series: FloatArray) -> bool:
+    """Turn columns (n_column, ROWS) into coefficients of 1, x, x^2, ... where that is as exact; whether it was done."""
+    if _may_be_powers(series):
+        _make_powers(series)
+        return True
+    return False
 
 
 @jit
@@ -118,7 +162,6 @@ def _make_powers(series: FloatArray) -> None:
         series[c, :NODES] = room
 
 
-@jit
 def approach(
     marks: FloatArray, marks_by: FloatArray, series: FloatArray, by: FloatArray, slope: FloatArray, x: FloatArray,
     end: FloatArray, state: FloatArray, shown: int, still: float, period: float, periods: int, first: int,
@@ -157,47 +200,78 @@ def approach(
     int
         The first output that is left.
     """
+    walk = _new_walk(series.shape[0])
+    for i in range(series.shape[0]):
+        walk.as_powers[i] = _made_powers(series[i])
+        if walk.as_powers[i]:
+            for m in range(x.size):
+                _make_powers(by[m, i])
+    formed = _Formed(np.full(x.size, np.inf), np.zeros(marks.size), np.zeros_like(series), np.ones(1, np.bool_))
+    for begin, stop in _calls(periods, series.shape[0]):
+        first = _approach(
+            marks, marks_by, series, by, slope, x, end, state, shown, still, period, begin, stop, walk, formed, first,
+            t_out, left, out,
+        )  # fmt: skip
+    return first
+
+
+class _Formed(NamedTuple):
+    """The period that was formed last, and is written until its start has moved on.
+
+    Attributes
+    ----------
+    at : ndarray, shape (n,)
+        How far off its start was, V.
+    stops : ndarray, shape (n_step + 1,)
+        Its marks, s.
+    series : ndarray, shape (n_step, n_column, ROWS)
+    stale : ndarray of bool, shape (1,)
+        Whether `stops` and `series` are still those of an earlier start than `at`.
+    """
+
+    at: FloatArray
+    stops: FloatArray
+    series: FloatArray
+    stale: NDArray[np.bool_]
+
+
+@jit
+def _approach(
+    marks: FloatArray, marks_by: FloatArray, series: FloatArray, by: FloatArray, slope: FloatArray, x: FloatArray,
+    end: FloatArray, state: FloatArray, shown: int, still: float, period: float, begin: int, stop: int, walk: _Walk,
+    formed: _Formed, first: int, t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray,
+) -> int:  # fmt: skip
+    """As `approach`, of the periods from `begin` to before `stop`."""
     n = x.size
     work = np.zeros((2, WRITTEN_AT_ONCE))
-    held = np.zeros(series.shape[0], np.int64)
-    as_powers = np.zeros(series.shape[0], np.bool_)
-    for i in range(series.shape[0]):
-        as_powers[i] = _may_be_powers(series[i])
-        if as_powers[i]:
-            _make_powers(series[i])
-            for m in range(n):
-                _make_powers(by[m, i])
-    formed = np.zeros_like(series)
-    stops = np.zeros(marks.size)
+    held, stops, made = walk.held, formed.stops, formed.series
     delta = np.zeros(n)
-    formed_at = np.full(n, np.inf)
-    stale = True
-    for k in range(periods):
+    for k in range(begin, stop):
         shift = k * period
         moved = 0.0
         for m in range(n):
             delta[m] = state[m] - x[m]
-            moved = max(moved, abs(delta[m] - formed_at[m]))
+            moved = max(moved, abs(delta[m] - formed.at[m]))
         # Whether outputs are asked for or not: none of them depends on the others.
         if moved > still:
-            formed_at[:] = delta
-            stale = True
+            formed.at[:] = delta
+            formed.stale[0] = True
         close = marks[-1] + shift
         if first < t_out.size and t_out[first] <= close + _SLACK * abs(close):
-            if stale:
-                _form(marks, marks_by, series, by, formed_at, stops, formed)
-                stale = False
+            if formed.stale[0]:
+                _form(marks, marks_by, series, by, formed.at, stops, made)
+                formed.stale[0] = False
             for i in range(series.shape[0]):
-                begin, stop = stops[i] + shift, stops[i + 1] + shift
+                since, until = stops[i] + shift, stops[i + 1] + shift
                 if series.shape[1] > shown:
-                    formed[i, shown, 0] += state[n]
+                    made[i, shown, 0] += state[n]
                 held[i] = write_outputs(
-                    begin, stop - begin, 1.0, stop, _SLACK * abs(stop), as_powers[i], formed[i], work, first, held[i],
-                    t_out, left, out,
+                    since, until - since, 1.0, until, _SLACK * abs(until), walk.as_powers[i], made[i], work, first,
+                    held[i], t_out, left, out,
                 )  # fmt: skip
                 first += held[i]
                 if series.shape[1] > shown:
-                    formed[i, shown, 0] -= state[n]
+                    made[i, shown, 0] -= state[n]
         for j in range(n + 1):
             state[j] = end[j] + (state[n] if j == n else 0.0)
         for m in range(n):
