@@ -29,13 +29,15 @@ from typing import Any
 import fingerspice as fs
 import fuzz_inputs as make
 from fingerspice.circuit import expressions
+from fingerspice.circuit.deck import LONGEST_TITLE
 from fingerspice.circuit.directives import sweep_from_text
 from fingerspice.circuit.netlist import source_from_text, value_from_text
+from fingerspice.circuit.reader import MAX_WARNINGS
 from fingerspice.errors import FingerspiceWarning, InputError, Where
 from fingerspice.fitting import fit_material
 
-#: One input may take so long, s, and the whole run so much more memory than its first quarter, MiB.
-SECONDS, MEMORY = 10, 100
+#: One input may take so long, s, and so much memory, MiB; and the whole run so much more than its first quarter, MiB.
+SECONDS, ROOM, MEMORY = 10, 1024, 100
 LONGEST_MESSAGE = 1500
 
 
@@ -120,10 +122,18 @@ class Bench:
         self.circuit = fs.read_netlist(make.CIRCUITS / "fingerpad.cir")
 
 
+def _shown_well(circuit: fs.Circuit) -> fs.Circuit:
+    """The circuit, if what is shown of it drives no terminal and floods none."""
+    title = circuit.title
+    if not title.isprintable() or len(title) > LONGEST_TITLE or len(circuit.warnings) > MAX_WARNINGS + 1:
+        raise Defect(f"not fit to be shown: {title[:300]!r}, {len(circuit.warnings)} warnings")
+    return circuit
+
+
 def _read_text(rng: random.Random, bench: Bench) -> object:
     text = make.netlist(rng)
     with WATCH.over(bench.folder):
-        return fs.parse_netlist(text, bench.folder / "deck.cir")
+        return _shown_well(fs.parse_netlist(text, bench.folder / "deck.cir"))
 
 
 def _read_file(rng: random.Random, bench: Bench) -> object:
@@ -132,7 +142,7 @@ def _read_file(rng: random.Random, bench: Bench) -> object:
     if b"mutated.lib" in data:
         (bench.folder / "mutated.lib").write_bytes(make.deck_file(rng))
     with WATCH.over(bench.folder):
-        return fs.read_netlist(bench.folder / "deck.cir")
+        return _shown_well(fs.read_netlist(bench.folder / "deck.cir"))
 
 
 def _evaluate(rng: random.Random, bench: Bench) -> object:
@@ -214,6 +224,25 @@ def judge(error: InputError) -> None:
         raise Defect(f"no clear sentence: {said[:300]!r}")
 
 
+def judge_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    """Refuse a warning of ours that is not one line of text, as `judge` does."""
+    if not str(message).isprintable() or len(str(message)) > LONGEST_MESSAGE:
+        raise Defect(f"no clear warning: {str(message)[:300]!r}")
+
+
+@contextmanager
+def little_room() -> Iterator[None]:
+    """A block that may take `ROOM` MiB more memory than there is now, and is refused what goes beyond."""
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    if sys.platform == "linux":
+        taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (taken + ROOM * 2**20, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+
+
 def once(target: Target, seed: str, bench: Bench) -> str:
     """Read one input; `taken` or `refused`.
 
@@ -272,22 +301,24 @@ def run(
         bench = Bench(folder)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            warnings.simplefilter("ignore", FingerspiceWarning)
+            warnings.simplefilter("always", FingerspiceWarning)
+            warnings.showwarning = judge_warning
             _warm_up(bench)
-            start, early = time.perf_counter(), _peak()
+            start, early = time.perf_counter(), _taken()
             for number in range(first, first + inputs):
                 name = wheel[number % len(wheel)]
                 try:
-                    outcome = once(targets[name][0], f"{seed}/{number}", bench)
+                    with little_room():
+                        outcome = once(targets[name][0], f"{seed}/{number}", bench)
                 except Defect as defect:
                     outcome = "defect"
                     report.defects.append(f"--seed {seed} --first {number} --inputs 1: {name}: {defect}")
                     say(report.defects[-1])
                 report.counts[name, outcome] += 1
                 if number - first == inputs // 4:
-                    early = _peak()
+                    early = _taken()
             report.seconds = time.perf_counter() - start
-            report.memory = _peak() - early
+            report.memory = _taken() - early
     finally:
         shutil.rmtree(folder)
     if report.memory > MEMORY:
@@ -306,10 +337,12 @@ def _warm_up(bench: Bench) -> None:
     gc.collect()
 
 
-def _peak() -> float:
-    """Largest memory so far, MiB."""
-    size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return size / (2**20 if sys.platform == "darwin" else 2**10)
+def _taken() -> float:
+    """Memory in use, or where that is not known the largest so far, MiB."""
+    gc.collect()
+    if sys.platform == "linux":
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
 def main() -> int:

@@ -27,6 +27,10 @@ NAMES = (
 )
 MARKS = (*"(){}[]'\"=,;$+-*/^<>?:!&|.@#%~`\\_ \t\r\n", "**", "&&", "||", "==", "!=", "<=", "\r\n", "\n+",
       "\n*", " ;", " $ ")
+TITLES = (
+    *("\x1b[31mred\x1b[0m", "\x1b]0;owned\x07", "\x9b2J", "\r", "\x08" * 9, "\x1b[2J\x1b[H", "\u202egnp.exe"),
+    *("$\\frac{$", "$x$", "漢字", "😀", "\U000e0041", "\ud800", "e\u0301\u0301", "a" * 5000, "\t", "\x00", "<b>", "%s"),
+)
 FUNCTIONS = (
     *("sqrt", "exp", "ln", "log", "log10", "sin", "tan", "acos", "atanh", "cosh", "floor", "int", "nint", "sgn", "abs"),
     *("min", "max", "pow", "pwr", "atan2", "hypot", "ternary_fcn", "sqr", "eval", "open", "exec", "SIN",
@@ -292,6 +296,31 @@ def _splice(lines: list[str], rng: random.Random) -> list[str]:
     return lines[: rng.randint(1, len(lines))] + other[rng.randrange(len(other)) :]
 
 
+def _title(lines: list[str], rng: random.Random) -> list[str]:
+    """The deck under a title that would drive a terminal, flood it, or be drawn as a formula."""
+    pieces = [rng.choice((*TITLES, *NAMES, *MARKS)) for _ in range(rng.randint(1, 5))]
+    return ["".join(pieces).replace("\n", "") * rng.choice([1, 1, 1, 50, 20_000]), *lines[1:]]
+
+
+def _start(lines: list[str], rng: random.Random) -> list[str]:
+    """Voltages to start from, at nodes that mostly exist, and on capacitors."""
+    nodes = ("drive", "top", "skin", "area", "out", "in", "0", "gnd", "d", "m", rng.choice(NAMES))
+    pairs = [f"v({rng.choice(nodes)})={rng.choice(['', '-'])}{_number(rng)}" for _ in range(rng.choice([1, 1, 2, 4]))]
+    between = f"{rng.choice(nodes)} {rng.choice(nodes)}"
+    extra = [f".ic {' '.join(pairs)}", f"Cstart {between} 1n ic={_number(rng)}", f"Rstart {between} {_number(rng)}"]
+    return [*lines[:1], *rng.sample(extra, rng.randint(1, 3)), *lines[1:]]
+
+
+def _vast(lines: list[str], rng: random.Random) -> list[str]:
+    """One line, or one word of it, out of all measure; seldom, for it takes a second."""
+    if rng.random() > 0.01:
+        return _insert(lines, rng)
+    at = rng.randrange(len(lines))
+    piece = rng.choice((*MARKS, *NAMES, " 1", " 1u 2", "(1", "+\n", "R1 a 0 1\n", f"{lines[at]}\n", ".param a=1\n"))
+    return [*lines[:at], lines[at] + piece * (int(10.0 ** rng.uniform(3.0, 6.2)) // len(piece)), *lines[at + 1 :]]
+
+
 _LINE_EDITS: Sequence[Callable[[list[str], random.Random], list[str]]] = (
     *(_insert, _insert, _insert, _drop, _double, _swap, _continue, _chain, _nest, _wrap, _splice),
+    *(_title, _start, _start, _vast),
 )

@@ -36,6 +36,18 @@ caching.os.replace = strike
 """
 
 
+# No folder can be written, the package's neither, as for one that others installed.
+SHUT = """
+import tempfile
+def refuse(*_, **__):
+    raise PermissionError(13, "Permission denied")
+tempfile.TemporaryFile = refuse
+"""
+# What the package logs, as the command line shows it.
+LOGGED = "import logging; logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
+ONCE = "compiling what this needs, about 20 s; later runs take 2 s"
+
+
 @pytest.fixture
 def copy(tmp_path: Path) -> Iterator[Path]:
     """The package where nothing is compiled yet."""
@@ -67,6 +79,23 @@ def test_no_room_for_compiled_code_means_compiling_again(copy: Path) -> None:
         shutil.rmtree(folder / "__pycache__", ignore_errors=True)
         (folder / "__pycache__").write_text("")
     assert area(copy) == expected
+
+
+def test_compiled_code_that_came_with_the_package_is_used_where_nothing_can_be_written(copy: Path) -> None:
+    first = area(copy, before=LOGGED)
+    assert first[:2] == (0, [ONCE])
+    # Copied, or unpacked from an archive: the times of its files are others.
+    for path in copy.rglob("*.py"):
+        os.utime(path, (1e9, 1e9))
+    assert area(copy, before=SHUT + LOGGED) == (0, [], first[2])
+
+
+def test_where_compiled_code_cannot_be_kept_it_is_said_what_to_set(copy: Path) -> None:
+    code, (said,), out = area(copy, before=SHUT + LOGGED)
+    assert code == 0
+    assert float(out) > 0.0
+    assert said.startswith("compiling, about 20 s, as at every run: no folder for compiled code can be written")
+    assert said.endswith("set NUMBA_CACHE_DIR to one that can")
 
 
 def test_killed_while_it_keeps_compiled_code_it_works_the_next_time(copy: Path) -> None:

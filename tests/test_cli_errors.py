@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -48,6 +49,10 @@ OPTIONS = [
         "unknown method 'rk4'; allowed: auto, exponential, dp5, dop853, radau9, scipy:NAME, torchdiffeq:NAME",
     ),
     (["--method", "scipy:RK4"], "unknown method 'scipy:RK4'; allowed: scipy:RK23"),
+    (["--set", "Vdrive.amplitude=1e99"], "Sine amplitude is 1e+99 V; allowed: 0, or a size from 1e-300 to 1e+12"),
+    (["--source", "SIN(0 1e-320 100)"], "allowed: 0, or a size from 1e-300 to 1e+12"),
+    (["--source", "PULSE(0 1 0 1e-300 1e-300 1e-300 1e-299)"], "pulse rise is 1e-300 s; allowed: 0, or a size from"),
+    (["--source", "SIN(0 200 1e300)"], "Sine frequency is 1e+300 Hz; allowed: 0, or a size from 1e-30 to 1e+30"),
     (["--area", "frozn"], "area is 'frozn'; allowed: 'coupled', 'mean', 'frozen' or m^2"),
     (["--area", "-1u"], "area is -1e-06 m^2; allowed: a positive area in m^2"),
     (["--area", "nan"], "area is 'nan'; allowed"),
@@ -77,6 +82,16 @@ OTHERS = [
     (["ac", "pad.cir", "--area", "couple"], "area is 'couple'; allowed: 'mean', 'frozen' or a number in m^2"),
     (["ac", "pad.cir", "--amplitude", "50"], "--amplitude goes with --area coupled, not with --area mean"),
     (["ac", "pad.cir", "--area", "coupled", "--amplitude", "-5"], "allowed: positive numbers"),
+    (["ac", "pad.cir", "--sweep", "dec 1 1e-300 1e300"], "FSTART is 1e-300; allowed: 1e-30 to 1e30 Hz"),
+    (["ac", "pad.cir", "--sweep", "dec 1000000 1 100k"], "at most 1e6 frequencies in a sweep, here 5e+06"),
+    (["limits", "pad.cir", "--span", "inf"], "span is inf; allowed: more than 1, at most 1e6"),
+    (["limits", "pad.cir", "--points", "1000000000"], "points is 1000000000; allowed: 3 to 1000"),
+    (["plan", "pad.cir", "--rtol", "nan"], "rtol is nan; allowed: 1e-13 to 0.1"),
+    (["plan", "pad.cir", "--rtol", "-1"], "rtol is -1.0; allowed: 1e-13 to 0.1"),
+    (["run", "x" * 300], "cannot be read: File name too long"),
+    (["run", "pad.cir", "--out", "x" * 300], ".nc: File name too long; allowed: a folder that can be written"),
+    (["export", "pad.cir", "-o", "x" * 300], "File name too long; allowed: a folder that can be written"),
+    (["limits", f"{'y' * 248}.cir"], "_limits.csv: File name too long; allowed: a folder that can be written"),
     (["plan", "pad.cir", "--area", "frozn"], "area is 'frozn'; allowed: 'coupled', 'mean', 'frozen' or m^2"),
     (["ac", "pad.cir", "--source", "DC 5"], "area='mean' needs the amplitude of the source's fundamental"),
     (["compare", "pad.cir", "--source", "DC 5"], "compare needs a source with a fundamental"),
@@ -105,6 +120,7 @@ def folder(command: Command, tmp_path: Path) -> Path:
     (tmp_path / "wrong.cir").write_text(edited(("d=1u", "d=-1u")))
     (tmp_path / "endless.cir").write_text(edited((".tran 10u 50m uic", "*")))
     (tmp_path / "deck.csv").write_text(edited())
+    (tmp_path / f"{'y' * 248}.cir").write_text(edited())
     return tmp_path
 
 
@@ -125,6 +141,26 @@ def test_bad_input_gets_one_sentence_and_leaves_nothing(
     assert lines[0].startswith("fingerspice: ")
     assert said in lines[0]
     assert tree(folder) == before
+
+
+def test_a_fault_of_the_program_is_one_sentence_with_its_place(
+    command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise errors.pop()
+
+    monkeypatch.setattr("fingerspice.simulation.simulate", fail)
+    errors = [ZeroDivisionError("float division by zero"), MemoryError()]
+    result = command("run", "pad.cir")
+    assert (result.code, result.lines) == (2, ["fingerspice: " + SAID_OF_MEMORY])
+    result = command("run", "pad.cir")
+    assert result.code == 1
+    (line,) = result.lines
+    assert line.startswith("fingerspice: this is a fault of fingerspice, please report it with the deck (ZeroDivision")
+    assert "in test_cli_errors.py:" in line
+
+
+SAID_OF_MEMORY = "not enough memory; allowed: fewer outputs (a longer TSTEP, or TSTART), or a shorter run"
 
 
 @pytest.mark.parametrize(("arguments", "said"), USAGE, ids=lambda x: " ".join(x) if isinstance(x, list) else "")
@@ -205,3 +241,17 @@ def test_the_installed_command_exits_with_0_1_and_2(tmp_path: Path) -> None:
 def test_the_package_runs_as_a_module(tmp_path: Path) -> None:
     done = process("--version", folder=tmp_path, module=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, f"fingerspice {fs.__version__}\n", "")
+
+
+def test_an_encoding_without_the_letters_and_closed_streams_change_nothing(tmp_path: Path) -> None:
+    (tmp_path / "µ.cir").write_text(edited(("Fingerpad", "Finger µ \x1b[31m \x07 漢 " + "x" * 100_000)), "utf-8")
+    plan = [FINGERSPICE, "plan", "µ.cir"]
+    bare = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(plan, cwd=tmp_path, capture_output=True, text=True, env=bare)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert len(done.stdout) < 1000
+    assert done.stdout.startswith("Finger \\xb5 \\x1b[31m \\x07 \\u6f22 xxx")
+    for closed in ("0<&-", "1>&-", "2>&-", "0<&- 1>&- 2>&-"):
+        for words, code in ((plan, 0), ([FINGERSPICE, "plan", "none.cir"], 2), ([FINGERSPICE, "plan", "--no"], 2)):
+            command = f"{shlex.join(words)} {closed}"
+            assert subprocess.run(["sh", "-c", command], cwd=tmp_path, capture_output=True).returncode == code

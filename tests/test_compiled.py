@@ -75,3 +75,12 @@ def test_a_change_reaches_code_that_is_cached_elsewhere(tmp_path):
     with (copy / "numerics" / "chebyshev.py").open("a") as module:
         module.write("\n\n@jit\ndef evaluate(series, x):\n    return 7.0, 0.0\n")
     assert printed(code, tmp_path, NUMBA_CACHE_DIR=str(cache)) == 7.0
+
+
+def test_an_engine_that_is_not_to_be_compiled_is_refused_in_one_sentence(tmp_path):
+    deck = Path(__file__).parents[1] / "circuits" / "fingerpad.cir"
+    command = [sys.executable, "-m", "fingerspice", "run", str(deck), "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "NUMBA_DISABLE_JIT": "1"})
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("fingerspice: NUMBA_DISABLE_JIT is set: ")
+    assert done.stderr.count("\n") == 1

@@ -178,6 +178,21 @@ def test_ctrl_c_is_heard_in_the_middle_of_a_long_run(tmp_path: Path) -> None:
     assert time.perf_counter() - begin < 2.0
 
 
+def test_ctrl_c_is_heard_while_a_billion_periods_are_walked_over(tmp_path: Path) -> None:
+    source = ("SIN(0 200 100)", "SIN(0 200 100k)"), ("r=1meg", "r=10g")
+    (tmp_path / "long.cir").write_text(edited(*source))
+    code = "import fingerspice as fs; fs.simulate(fs.read_netlist('long.cir'), t_stop=1e4, t_eval=[1e4])"
+    entry = [sys.executable, "-c", f"import fingerspice.__main__ as m, sys\nsys.argv[1:] = []\n{SOLVING.format(code)}"]
+    for number in (signal.SIGINT, signal.SIGTERM):
+        process = start(tmp_path, entry=entry)
+        minded(process)
+        time.sleep(3.0)
+        begin = time.perf_counter()
+        process.send_signal(number)
+        assert ended(process)[0] == 128 + number
+        assert time.perf_counter() - begin < 1.0
+
+
 # As the command, with another thing to do than its arguments say.
 SOLVING = """
 import fingerspice.cli
@@ -207,21 +222,24 @@ def test_a_command_started_with_ctrl_c_switched_off_leaves_it_off(folder: Path, 
 
 
 @pytest.mark.parametrize(
-    ("name", "size", "first", "before"),
+    ("name", "size", "first", "before", "found"),
     [
-        ("run", 0, "pad.nc", []),
-        ("csv", 5000, "pad.csv", []),
-        ("ac", 20_000, "pad_ac.png", ["pad_ac.csv"]),
-        ("compare", 5000, "pad_compare.png", []),
-        ("export", 500, "spice.cir", []),
-        ("figures", 5000, "fig2.png", []),
+        ("run", 0, "pad.nc", [], "electroadhesive force"),
+        ("csv", 5000, "pad.csv", [], "electroadhesive force"),
+        ("ac", 20_000, "pad_ac.png", ["pad_ac.csv"], "wrote out/pad_ac.csv"),
+        ("compare", 5000, "pad_compare.png", [], "mean force"),
+        ("export", 500, "spice.cir", [], ""),
+        ("figures", 5000, "fig2.png", [], ""),
     ],
 )
-def test_a_full_disk_is_one_sentence_and_no_half_file(
-    folder: Path, right: dict[str, bytes], name: str, size: int, first: str, before: list[str]
+def test_a_full_disk_is_one_sentence_and_no_half_file_and_what_was_found_is_printed(
+    folder: Path, right: dict[str, bytes], name: str, size: int, first: str, before: list[str], found: str
 ) -> None:
     code, lines, out = ended(start(folder, *COMMANDS[name][0], preexec_fn=no_room(size)))
-    assert (code, lines, out) == (2, [f"fingerspice: cannot write out/{first}: File too large"], "")
+    assert (code, lines) == (2, [f"fingerspice: cannot write out/{first}: File too large"])
+    assert found in out
+    assert bool(out) == bool(found)
+    assert f"wrote out/{first}" not in out
     assert list(written(folder / "out")) == before
     if name == "run":
         rerun(name, folder, right)
@@ -247,6 +265,22 @@ def test_a_reader_that_has_gone_changes_no_exit_code(folder: Path, arguments: li
     code, lines, _ = ended(process)
     assert code == expected
     assert len(lines) == expected
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [(["ac", "pad.cir", "--no-plot", "--set", "Xcoat.r=0.2M"], 0), (["plan", "none.cir"], 2), (["plan", "--no"], 2)],
+    ids=["warnings", "a refusal", "bad usage"],
+)
+def test_complaints_that_nobody_reads_change_no_exit_code(folder: Path, arguments: list[str], expected: int) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open("/dev/full", "w") as full:
+        for stream in (writing, full):
+            process = start(folder, *arguments, stderr=stream, stdout=subprocess.DEVNULL)
+            assert process.wait(60) == expected
+    os.close(writing)
+    assert ended(start(folder, "--help", stdout=subprocess.DEVNULL))[0] == 0
 
 
 def test_without_a_standard_output_the_files_are_written(folder: Path, right: dict[str, bytes]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 import os
 import random
@@ -67,6 +68,28 @@ def overflowing(rng: random.Random, bench: fuzz.Bench) -> None:
     np.array([1e308]) * 10.0
 
 
+def greedy(rng: random.Random, bench: fuzz.Bench) -> None:
+    np.zeros((fuzz.ROOM + 1) * 2**20, np.uint8)
+
+
+def warning_of(message: str) -> fuzz.Target:
+    def target(rng: random.Random, bench: fuzz.Bench) -> None:
+        warnings.warn(Unclear(message), stacklevel=1)
+
+    return target
+
+
+class Unclear(fuzz.FingerspiceWarning):
+    """One that its base has not made clear."""
+
+    def __str__(self) -> str:
+        return "\x1b[2J"
+
+
+def titled(rng: random.Random, bench: fuzz.Bench) -> None:
+    fuzz._shown_well(dataclasses.replace(bench.circuit, title="\x1b[2J"))
+
+
 CODE = compile("1+1", "<unknown>", "eval")
 DEFECTS: dict[str, tuple[fuzz.Target, str]] = {
     "a traceback": (raising(KeyError("x")), "KeyError"),
@@ -82,6 +105,9 @@ DEFECTS: dict[str, tuple[fuzz.Target, str]] = {
     "a folder listed": (touching(lambda folder: os.listdir("/")), "os.listdir"),
     "code evaluated": (touching(lambda folder: eval(CODE)), "exec"),
     "code compiled": (touching(lambda folder: compile("import os", "<unknown>", "exec")), "compile"),
+    "a gigabyte": (greedy, "MemoryError"),
+    "a warning that clears the screen": (warning_of("x"), "no clear warning"),
+    "a title that clears the screen": (titled, "not fit to be shown"),
     "a command": (touching(lambda folder: subprocess.run(["true"], check=True)), "subprocess"),
 }
 

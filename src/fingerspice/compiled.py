@@ -84,15 +84,17 @@ class _Cache(FunctionCache):
         return (*cast(Any, super())._index_key(sig, codegen), _STAMP)
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        found = cast(Any, super())._load_overload(sig, target_context)
-        if found is None:
+        key = self._index_key(sig, target_context.codegen())
+        for place in (self._cache_file, self._came):
+            # What cannot be read is not there.
             with suppress(OSError):
-                data = self._came.load(self._index_key(sig, target_context.codegen()))
-                found = None if data is None else cast(Any, self._impl).rebuild(target_context, data)
-        if found is None and not _Cache.told:
+                data = place.load(key)
+                if data is not None:
+                    return cast(Any, self._impl).rebuild(target_context, data)
+        if not _Cache.told:
             _Cache.told = True
-            _LOG.info(_COMPILING if not isinstance(self._impl.locator, _ReadOnly) else _EVERY_TIME)
-        return found
+            _LOG.info(_EVERY_TIME if isinstance(self._impl.locator, _ReadOnly) else _COMPILING)
+        return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         with suppress(OSError):

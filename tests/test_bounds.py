@@ -1,0 +1,148 @@
+"""Memory and time are bounded before they are spent: a request without an end is one sentence with the figure."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+from deck_edits import edited
+from fingerspice.circuit import bounds
+from fingerspice.engine import repeat
+from fingerspice.times import MOST_BYTES
+from processes import ended, start
+from scenes import table1
+
+GIB = 2**30
+#: What the engine, compiled, and the libraries take; not a tenth of what these requests would.
+ROOM = 4 * GIB
+SOURCE = "SIN(0 200 100)"
+#: A change of the deck, the command, and what is said.
+ENDLESS = {
+    "picoseconds": ("PULSE(0 200 0 1e-13 1e-13 8e-13 2e-12)", ".tran 10u 5m uic", "1.25e+10 breakpoints of its source"),
+    "many squares": ("SQUARE(200 1e9)", ".tran 1 10 uic", "4e+10 breakpoints of its source; allowed: at most 4e+09"),
+    "listed squares": (
+        "SQUARE(200 10meg)",
+        ".tran 1m 1 uic",
+        "5e+07 breakpoints from 0 s to 1 s; allowed: at most 2e+07",
+    ),
+    "outputs": (SOURCE, ".tran 10n 1 uic", "one of 1e+08 outputs with 19 signals, 15.2 GB; allowed: at most 2 GB"),
+    "frequency": ("SIN(0 200 1e30)", ".tran 10u 5m uic", "5e+27 periods or time constants"),
+    "time": (SOURCE, ".tran 1e11 1e12 uic", "1e+14 periods or time constants of its source; allowed: at most 1e+10"),
+    "decay": ("EXP(0 200 0 1e-15 1m 1e-15)", ".tran 10u 50m uic", "5e+13 periods or time constants"),
+}
+
+
+def test_a_request_without_an_end_is_refused_in_little_memory(tmp_path: Path) -> None:
+    for name, (source, tran, _) in ENDLESS.items():
+        text = edited((SOURCE, source), (".tran 10u 50m uic", tran))
+        (tmp_path / f"{name}.cir").write_text(text)
+    code = (
+        "import sys, warnings, fingerspice as fs\nwarnings.simplefilter('ignore')\nfor name in sys.argv[1:]:\n"
+        "    try:\n        fs.simulate(fs.read_netlist(name + '.cir'))\n    except fs.InputError as error:\n"
+        "        print(error)\n    else:\n        print('it ran')\n"
+    )
+    limit = lambda: resource.setrlimit(resource.RLIMIT_AS, (ROOM, ROOM))  # noqa: E731
+    done, lines, out = ended(start(tmp_path, *ENDLESS, entry=[sys.executable, "-c", code], preexec_fn=limit))
+    assert (done, lines) == (0, [])
+    for said, (_, _, expected) in zip(out.splitlines(), ENDLESS.values(), strict=True):
+        assert expected in said
+
+
+def test_the_bound_on_outputs_is_not_met_by_times_that_are_given() -> None:
+    circuit = fs.parse_netlist(edited((".tran 10u 50m uic", ".tran 10n 1 uic")))
+    solution = fs.simulate(circuit, t_eval=[0.01, 1.0])
+    assert solution.t.size == 2
+    # What a run may hold fits a computer of today three times.
+    assert MOST_BYTES * 3 < 8e9
+
+
+def test_ten_values_in_a_year_of_squares_need_no_list_of_its_edges() -> None:
+    square = fs.Square(200.0, 5000.0)
+    t = np.array([0.0, 3e7 + 2.5e-5, 3e7 + 1.25e-4, 1.0, 1.00005])
+    np.testing.assert_array_equal(square.value(t), [200.0, 200.0, -200.0, 200.0, 200.0])
+    with pytest.raises(fs.InputError, match=r"7\.5e\+11 breakpoints from 0 s to 3e\+07 s"):
+        square.breakpoints(0.0, 3e7)
+    edges = np.array([1e-4, 3e7 + 1e-4])
+    np.testing.assert_array_equal(square.value(edges, "left") - square.value(edges), [400.0, 400.0])
+
+
+@pytest.mark.parametrize(
+    "wave",
+    [
+        fs.Square(200.0, 100.0, 0.3, delay=1e-3),
+        fs.Pulse(-1.0, 2.0, 1e-3, 1e-4, 0.0, 2e-3, 0.01),
+        fs.PWL((0.0, 1e-3, 1e-3, 4e-3), (0.0, 1.0, -1.0, 0.5), repeat=1e-3),
+    ],
+    ids=lambda w: type(w).__name__,
+)
+def test_values_do_not_depend_on_the_windows_they_are_looked_up_in(
+    wave: fs.Waveform, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(7)
+    t = np.concatenate([rng.uniform(-0.01, 0.5, 300), wave.breakpoints(0.0, 0.5)]).reshape(-1, 1)
+    whole = [wave.value(t, side) for side in ("left", "right")]
+    monkeypatch.setattr(bounds, "_WINDOW", 7)
+    assert len(list(bounds.in_windows(t.ravel(), wave.breakpoint_rate()))) > 20
+    for expected, side in zip(whole, ("left", "right"), strict=True):
+        np.testing.assert_array_equal(wave.value(t, side), expected)
+
+
+def test_the_peak_of_a_periodic_source_is_looked_for_in_one_period() -> None:
+    assert fs.Square(200.0, 1e6, delay=1e-3).peak(0.0, 1e6) == 200.0
+    assert fs.Pulse(5.0, 1.0, 1.0, 0.0, 0.0, 1e-3, 2e-3).peak(0.0, 1e9) == 5.0
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: fs.Sine(1e99, 100.0), "Sine amplitude is 1e+99 V; allowed: 0, or a size from 1e-300 to 1e+12"),
+        (lambda: fs.Sine(1e-320, 100.0), "Sine amplitude is 9.99989e-321 V"),
+        (lambda: fs.Sine(1.0, 1e-320), "Sine frequency is 9.99989e-321 Hz; allowed: 0, or a size from 1e-30 to 1e+30"),
+        (lambda: fs.Sine(1.0, 1.0, phase_deg=1e30), "Sine phase_deg is 1e+30 deg; allowed: a size up to 1e+09"),
+        (lambda: fs.Pulse(0.0, 1.0, 0.0, 1e-300), "pulse rise is 1e-300 s"),
+        (lambda: fs.PWL((0.0, 1e-300), (0.0, 1.0)), "PWL time is 1e-300 s"),
+        (lambda: fs.PWL((0.0, 1.0), (0.0, -1e13)), "PWL value is -1e+13 V"),
+        (lambda: fs.Samples(np.array([0.0, 1e300]), 1.0), "a sample is 1e+300 V"),
+        (lambda: fs.DC(1e99), "DC level is 1e+99 V"),
+    ],
+)
+def test_numbers_that_no_calculation_bears_are_refused(make: object, said: str) -> None:
+    with pytest.raises(fs.InputError) as caught:
+        make()  # type: ignore[operator]
+    assert caught.value.message.startswith(said)
+
+
+@pytest.mark.parametrize("line", [".ic v(top)=1e99", "C1 top 0 1n ic=1e99"])
+def test_voltages_to_start_from_are_bounded_as_sources_are(line: str) -> None:
+    with pytest.raises(fs.InputError, match=r"is 1e\+99 V; allowed: 0, or a size from 1e-300 to 1e\+12"):
+        fs.parse_netlist(edited((".end", f"{line}\n.end")))
+
+
+def test_an_error_asked_for_that_underflows_is_met() -> None:
+    solution = fs.simulate(table1("SIN(0 1e-300 100)"), rtol=1e-13, throw=False)
+    assert np.isfinite(solution.error.u_gap)
+
+
+@pytest.mark.parametrize("source", ["SIN(0 200 1k)", "SQUARE(200 1k)"])
+@pytest.mark.parametrize("r_gap", ["1meg", "10g"])
+def test_no_result_depends_on_where_a_walk_over_periods_is_cut(
+    source: str, r_gap: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    circuit = fs.parse_netlist(edited((SOURCE, source), ("r=1meg", f"r={r_gap}"), ("f=100", "f=1k")))
+    t = np.linspace(0.0, 3.0, 4001)
+    calls: list[int] = []
+    whole = fs.simulate(circuit, t_eval=t, t_stop=3.0, rtol=1e-6)
+    assert whole.stats["repeated"] > 1000
+    cut = repeat._calls
+    monkeypatch.setattr(repeat, "AT_ONCE", 100)
+    monkeypatch.setattr(repeat, "_calls", lambda *a: calls.append(1) or cut(*a))
+    again = fs.simulate(circuit, t_eval=t, t_stop=3.0, rtol=1e-6)
+    assert calls
+    for name, (values, _, _) in whole.signals.items():
+        np.testing.assert_array_equal(again.signals[name][0], values, err_msg=name)
+    np.testing.assert_array_equal(again.state.y, whole.state.y)
