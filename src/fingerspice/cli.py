@@ -79,6 +79,9 @@ def run(
     ] = "auto",
     changes: Set = None,
     source: Source = None,
+    jumps: Annotated[
+        str, typer.Option(help="Rows at jumps of the source: both, or none, so that time rises strictly.")
+    ] = "both",
     csv: Annotated[bool, typer.Option("--csv", help="Write CSV instead of NetCDF.")] = False,
     as_json: AsJson = False,
     no_plot: NoPlot = False,
@@ -105,8 +108,8 @@ def run(
         picture = None if no_plot else _target(deck, out, ".png")
         with progress() as update:
             solution = simulate(
-                circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method, throw=False,
-                progress=update,
+                circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method, jumps=jumps,
+                throw=False, progress=update,
             )  # fmt: skip
         for text in solution.warnings:
             warnings.warn(text, FingerspiceWarning, stacklevel=1)

@@ -11,7 +11,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.circuit.waveforms import Sine, Waveform, require
 from fingerspice.errors import InputError
-from fingerspice.numerics.cubics import fundamental, mean
+from fingerspice.measures import weigh_outputs
 from fingerspice.phasors import Drive, PhasorSolution, sweep_drive, sweep_notes
 from fingerspice.steady import steady_state
 
@@ -85,12 +85,13 @@ def _sweep(
         )  # fmt: skip
         s = state.solution
         # The start of the period is a multiple of it: phases are those of the source.
-        t = s.t - s.t[0]
-        gains.append([fundamental(t, s.u_layer[:, i], float(f)) * sign / amplitude for i in range(len(s.layers))])
         assert s.area is not None
         assert s.f_el is not None
-        areas.append(mean(t, s.area))
-        forces.append(mean(t, s.f_el))
+        layers = {name: s.u_layer[:, i] for i, name in enumerate(s.layers)}
+        period = weigh_outputs(s.t - s.t[0], {**layers, "area": s.area, "f_el": s.f_el})
+        gains.append([period.phasor(name, float(f)) * sign / amplitude for name in s.layers])
+        areas.append(period.mean("area"))
+        forces.append(period.mean("f_el"))
     gain = np.array(gains, np.complex128)
     gap = build_stack(circuit).gap_layer
     assert gap is not None

@@ -94,6 +94,8 @@ def summary_table(solution: Solution) -> str:
         out.append(f"no GAP, no forces; estimated error: {inside} voltage {solution.error.u_gap:.2g} V")
     else:
         out.append(f"estimated error: gap voltage {solution.error.u_gap:.2g} V, force {solution.error.f_el:.2g} N")
+    if s.get("figures_from") == "outputs":
+        out.append("figures are those of the outputs: what lies between them is not known")
     if solution.charge_law == "mobile" and "fold_margin_min" in s:
         out.append(f"distance to the fold: {s['fold_margin_min']:.3g} at least (1 far, 0 at the fold)")
     out.append(f"status: {solution.message}")
