@@ -17,7 +17,7 @@ from fingerspice.engine.exponential import Tables, new_tables
 from fingerspice.engine.netrows import Form, new_work
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import Pace
-from fingerspice.engine.system import area_polynomial
+from fingerspice.engine.system import area_error, area_polynomial
 from fingerspice.netruns import Integration, NetworkRun, integrate, ramp, state_error, values_at
 from fingerspice.network_record import bare_record
 from fingerspice.networks import NetworkProblem, NetworkScene
@@ -32,7 +32,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 # As in `marching`.
-SAFETY, LOCAL_SHARE, FINEST, AREA_ROUNDING, LONGEST_STEP, ATTEMPTS = 2.5, 0.15, 4e-15, 2e-14, 0.6, 6
+SAFETY, LOCAL_SHARE, FINEST, LONGEST_STEP, ATTEMPTS = 2.5, 0.15, 4e-15, 0.6, 6
 # Ratio of neighbouring reference areas.
 LEVEL_RATIO = 1.28
 # Steps for each of the sources' edges and shortest times: what needs more is for another method. Where a mode follows
@@ -80,7 +80,7 @@ def reference_at(scene: NetworkScene, levels: tuple[int, ...], decade: int) -> R
         for name in kept if len(kept) >= MOST_REFERENCES else ():
             scene.prepared.pop(name, None)
         area = scene.area0 * LEVEL_RATIO ** np.array(levels, float)
-        found = _make_reference(scene, area, max(1e-3 * 10.0**decade, AREA_ROUNDING))
+        found = _make_reference(scene, area, area_error(decade))
         scene.prepared[key] = found
         return found
     made: Reference = scene.prepared[key]
@@ -393,6 +393,9 @@ def _stated(run: NetworkRun, one: March, u_scale: float) -> float:
     if one.problem.charge:
         steps = 1.0 + float(one.counters[readout.ACCEPTED])
         held = float(one.problem.network.capacitance(one.problem.scene.area0).sum()) * (u_scale + largest)
+        # Whatever the areas' polynomials miss, all charge that is moved misses too.
+        moved = held + float(np.abs(one.y[-one.s_before.size :]).max(initial=0.0))
         charge = 2.0 * SAFETY * float(one.control[readout.ERROR_Q]) + 4e-16 * held * steps
+        charge += area_error(one.decade) * moved
     run.margin = 1.0 / float(one.control[readout.MAGNIFIED])
     return state_error(run, gaps[one.net.gap >= 0], u_scale, charge)

@@ -14,7 +14,7 @@ from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
 from fingerspice.engine.model import write_row
 from fingerspice.engine.pace import Pace
-from fingerspice.engine.system import System, area_range, build_system
+from fingerspice.engine.system import System, area_error, area_range, build_system
 from fingerspice.engine.work import Work, new_work
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.problem import Problem, Scene
@@ -27,8 +27,6 @@ from fingerspice.steps import Recorded, Recorder
 SAFETY = 2.5
 # The smallest error of a step that is more than rounding, over the voltage scale.
 FINEST = 4e-15
-# Of 1/A, relative: finer, the polynomial would give way to the long series, which nobody's voltage can tell.
-AREA_ROUNDING = 2e-14
 # Steps of a period that is kept, at most: 1 MB.
 KEPT_STEPS = 2000
 
@@ -44,6 +42,8 @@ class Prepared:
     tables: StepTables
     work: Work
     integral: FloatArray
+    # What the area's polynomial may miss, relative.
+    area_error: float
 
 
 def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
@@ -58,12 +58,13 @@ def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
             model = model._replace(curve=scene.stack.contact.curve(u_top))
         contact = scene.stack.contact
         stress = 0.0 if contact is None else float(contact.stress(1.0))
+        missed = area_error(decade)
         system = build_system(
-            model, max(1e-3 * 10.0**decade, AREA_ROUNDING), area_range(model, max(scene.u_peak, u_top)),
+            model, missed, area_range(model, max(scene.u_peak, u_top)),
             scene.stack.grouping, stress,
         )  # fmt: skip
         n = model.gap.size
-        scene.prepared[key] = Prepared(system, new_tables(n), new_work(n), integral_table())
+        scene.prepared[key] = Prepared(system, new_tables(n), new_work(n), integral_table(), missed)
     prepared: Prepared = scene.prepared[key]
     return prepared
 

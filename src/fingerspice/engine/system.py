@@ -32,6 +32,11 @@ DEGREE = 27
 _LEVEL_RATIO = 1.28
 
 
+# Over the error asked for; finer than rounding, the polynomial would give way to the long series, which nobody's
+# voltage can tell.
+_AREA_SHARE, _AREA_ROUNDING = 1e-3, 2e-14
+
+
 class System(NamedTuple):
     """See the module; arrays have one row per reference area.
 
@@ -143,6 +148,11 @@ def _polynomial(model: Model, tol: float) -> tuple[FloatArray, FloatArray, float
     powers = np.zeros(DEGREE + 1)
     powers[0] = 1.0 / model.area0
     return powers, np.zeros(DEGREE + 1), 0.0, 1.0
+
+
+def area_error(decade: int) -> float:
+    """What the area's polynomial may miss, relative, where an error of that decade is asked for."""
+    return max(_AREA_SHARE * 10.0**decade, _AREA_ROUNDING)
 
 
 def area_polynomial(curve: FloatArray, tol: float) -> tuple[FloatArray, FloatArray, float, float]:
