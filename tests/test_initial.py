@@ -213,7 +213,7 @@ def test_a_held_node_of_the_amplifier_is_met_and_the_others_follow(law: str) -> 
 
 
 @pytest.mark.filterwarnings("ignore:the gap voltage reaches")
-@pytest.mark.parametrize("top", [500.0, 1000.0, 5000.0])
+@pytest.mark.parametrize("top", [500.0, 1000.0, 2000.0])
 def test_an_area_that_swings_far_finds_its_rest(top: float) -> None:
     # At 100 Hz the skin's leak falls with the area, and the gap's voltage with it.
     v = start(table1("SIN(26 100 100)", tran="1u 100u", extra=f".ic v(top)={top}"))
