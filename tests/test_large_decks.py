@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 
 import fingerspice as fs
-from fingerspice.circuit import flatten, topology
-from fingerspice.circuit.deck import Number, parse_deck
+import fuzz
+from fingerspice.circuit import flatten, reader, topology
+from fingerspice.circuit.deck import LONGEST_TITLE, Number, parse_deck
 from fingerspice.circuit.expressions import evaluate, nearest
-from fingerspice.errors import LONGEST_MESSAGE, InputError, Where
+from fingerspice.errors import LONGEST_MESSAGE, FingerspiceWarning, InputError, Where
 
 MANY = 20_000
 
@@ -64,6 +65,57 @@ def test_many_ports_nodes_and_definitions_are_read() -> None:
     assert read.statements[0].nodes == ("n0", f"n{MANY - 1}")
     read = parse_deck("t\n" + lines(lambda i: f".subckt s{i} a\nR1 a 0 {i + 1}\n.ends\nX{i} a s{i}", MANY // 5))
     assert len(read.statements) == MANY // 5
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("V1 a 0 PWL(" + "1 " * 1_000_000 + ")", "more than 1,000,000 words and brackets; allowed: samples in a file"),
+        ("V1 a 0 " + "(" * 1_000_000, "more than 1,000,000 words and brackets"),
+        ("V1 a 0 " + "{" * 1_000_000, "more than 1,000,000 words and brackets"),
+        ("V1 a 0 " + "'" * 1_000_000, "more than 1,000,000 words and brackets"),
+        ("R1 a 0 1\n" * 260_000, "more than 1,000,000 words and brackets"),
+        ("R1 a 0 1\n" + "+\n" * 1_000_000, "more than 1,000,000 words and brackets"),
+        ("\n" * 2_000_000, "the netlist has 2,000,002 lines; allowed: 2,000,000, included files counted"),
+        ("\r" * 2_000_000, "the netlist has 2,000,002 lines"),
+    ],
+    ids=["words", "brackets", "braces", "quotes", "elements", "continuations", "lines", "lines of old"],
+)
+def test_more_words_and_lines_than_a_netlist_may_hold_are_refused_before_they_are_kept(
+    text: str, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fuzz, "ROOM", 512)
+    with fuzz.little_room():
+        assert said in refusal(text)
+
+
+def test_words_and_lines_of_included_files_count_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "part.lib").write_text("R1 a 0 1\n" * 10)
+    (tmp_path / "deck.cir").write_text("t\nR2 a 0 1\n.include part.lib\n.end\n")
+    monkeypatch.setattr(reader, "MAX_WORDS", 45)
+    with pytest.raises(InputError, match=r"part.lib:10:1: the netlist has more than 45 words"):
+        fs.read_netlist(tmp_path / "deck.cir")
+    monkeypatch.setattr(reader, "MAX_LINES", 12)
+    with pytest.raises(InputError, match=r"deck.cir:3:10: the netlist has 16 lines; allowed: 12"):
+        fs.read_netlist(tmp_path / "deck.cir")
+
+
+def test_a_title_is_shown_short_and_drives_no_terminal() -> None:
+    title = "\x1b[31mred\x1b]0;owned\x07" + "x" * 100_000 + "\u202e"
+    read = parse_deck(f"{title}\nR1 a 0 1\n")
+    assert read.title.startswith("\\x1b[31mred\\x1b]0;owned\\x07xxx")
+    assert read.title.endswith("xxx\\u202e")
+    assert len(read.title) <= LONGEST_TITLE
+    assert read.text.startswith(title)
+
+
+def test_warnings_are_short_printable_and_no_flood() -> None:
+    text = lines(lambda i: f".subckt s{i}\x1b[31m{'y' * 3000 if i == 0 else ''} a\n.ends", 1000)
+    read = parse_deck(f"t\n{text}R1 a 0 1\n")
+    assert len(read.warnings) == reader.MAX_WARNINGS + 1
+    assert read.warnings[-1].endswith("more warnings than 100: the others are not shown")
+    shown = [str(FingerspiceWarning(warning)) for warning in read.warnings]
+    assert all(text.isprintable() and len(text) <= LONGEST_MESSAGE for text in shown)
 
 
 def test_a_million_words_on_one_line_are_counted() -> None:

@@ -244,3 +244,17 @@ def test_pictures_need_no_pyplot_and_their_module_no_matplotlib() -> None:
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=60)
+
+
+def test_what_a_deck_names_is_drawn_without_formulas_floods_or_warnings(tmp_path: Path) -> None:
+    name = "n$x^$漢\x1b[31m" + "y" * 200
+    lines = (f"V1 {name} 0 SIN(0 10 100)", f"R1 {name} out$ 1k", "C1 out$ 0 1n", ".tran 100u 20m uic")
+    title = "$\\frac{$ 漢字 😀 \x1b[31m" + "x" * 100_000
+    # Warnings are errors here: matplotlib has one for each picture that the font lacks, and for what finds no room.
+    circuit = fs.parse_netlist("\n".join((title, *lines)))
+    figure = simulate(circuit).plot()
+    plotting.save(figure, tmp_path / "odd.png")
+    shown = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert any(text.startswith("n$x^$□\\x1b[31myyy") for text in shown)
+    assert max(map(len, shown)) <= plotting.LONGEST_LABEL
+    assert "$\\frac{$ □□ 😀 \\x1b[31mxxx" in small_print(figure)
