@@ -94,12 +94,10 @@ def deck(seed: int) -> tuple[str, fs.Circuit, str]:
     rng = random.Random(f"export {seed}")
     network, kind = NETWORKS[seed % len(NETWORKS)], SOURCES[seed // 2 % len(SOURCES)]
     law = ("local", "mobile")[seed % 2]
-    # An area that follows slowly starts at the one at 0 V, so its sources start there.
     slow = rng.random() < 0.25
-    kind = rng.choice(("pwl", "repeat")) if slow else kind
     volts = rng.choice((40.0, 120.0))
     drive = _source(rng, kind, volts)
-    second = _source(rng, "pwl" if slow else rng.choice(("sin", "dc", "pulse")), 0.3 * volts)
+    second = _source(rng, rng.choice(("sin", "dc", "pulse")), 0.3 * volts)
     current = _source(rng, "sin" if kind == "dc" else kind, volts * 2e-6)
     lines = _network(rng, network, slow, drive, second, current)
     if rng.random() < 0.4:
@@ -108,7 +106,7 @@ def deck(seed: int) -> tuple[str, fs.Circuit, str]:
         nodes = sorted({word for line in inside for word in line.split()[1:4]} - {"0"})
         call = [f".subckt part {' '.join(nodes)} u=1", *inside, ".ends", f"Xp {' '.join(nodes)} part u={{v}}"]
         lines = [".param v=2", *outside, *call]
-    uic = slow or rng.random() < 0.6
+    uic = rng.random() < 0.6
     step = PERIOD / STEPS
     extra = rng.choice(("", f" {0.5 * PERIOD!r} {step!r}")) if uic else ""
     text = "\n".join(

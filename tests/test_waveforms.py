@@ -350,3 +350,9 @@ def test_the_square_is_high_for_its_duty_at_any_phase() -> None:
         wave = fs.Square(1.0, 100.0, duty=0.2, phase_deg=phase)
         t = (np.arange(1000) + 0.5) / 1000 * 0.01
         np.testing.assert_array_equal(wave.value(t) > 0.0, turns(t, 100.0, 0.0, phase) < 0.2)
+
+
+@pytest.mark.parametrize("waveform", [fs.Square(1.0, 100.0), fs.Triangle(1.0, 3.0), fs.PWL((0.0, 1.0), (0.0, 1.0))])
+def test_no_times_have_no_values(waveform: fs.Waveform) -> None:
+    for side in ("right", "left"):
+        assert waveform.value(np.empty(0), side).shape == (0,)

@@ -70,8 +70,10 @@ def in_windows(t: FloatArray, rate: float) -> Iterator[slice | NDArray[np.intp]]
 
     Ten times in a year of square waves are ten windows, and the breakpoints between them are never listed.
     """
+    if t.size == 0:
+        return
     window = np.floor(t * (rate / _WINDOW))
-    if t.size and window.min() == window.max():
+    if window.min() == window.max():
         yield slice(None)
         return
     order = np.argsort(window, kind="stable")
