@@ -1,8 +1,9 @@
 """Random scenes over twelve decades: each is right against an independent reference, or refused for a true reason.
 
-Right are gap voltage, force, area and charge, and the stated errors have to cover the true ones: how often one does not
-is counted. Run: python tests/stress.py [--scenes 10000] [--seed 0] [--first 0] [--json PATH]. A scene is made from seed
-and number alone.
+Right are gap voltage, force, area, charge and the figures of the summary, and the stated errors have to cover the true
+ones: how often one does not is counted. A scene is made from seed and number alone.
+
+Run: python tests/stress.py [--scenes 10000] [--seed 0] [--first 0] [--json PATH].
 """
 
 from __future__ import annotations
@@ -160,8 +161,8 @@ class Verdict:
     end : str
         "right", or why it was refused or could not be judged.
     over : dict
-        Of a scene that is right: true error over the stated one of ``u_gap``, ``f_el`` and ``q_source``, both beyond
-        what the reference itself may be off; 0 where the reference cannot tell.
+        Of a scene that is right: true error over the stated one of each quantity that has one, both beyond what the
+        reference itself may be off; 0 where the reference cannot tell.
     unsure : bool
         Whether the scene would have been wrong, or its stated error too small, had not two references differed by
         half as much or more from each other: what is over soon after a jump leaves a charge that they know badly.
@@ -243,7 +244,47 @@ def quantities(
         ),
         beside("area", "area", steep * may + REFERENCE * largest, math.inf, None),
         beside("q_source", "q", CHARGE_SHARE * RTOL * delivered + unsure, unsure, stated.q_source),
+        *figures(solution, expected, may, push * may + REFERENCE * strongest, rounded, push * rounded),
     ]  # fmt: skip
+
+
+def figures(
+    solution: fs.Solution, expected: ref.Transient, may_u: float, may_f: float, floor_u: float, floor_f: float
+) -> list[Quantity]:
+    """Peaks and mean of the summary, which TSTEP (twenty outputs in a period) must not touch, beside the reference's.
+
+    The errors (V and N) that they may have, and what the reference itself may be off, are those of the signals.
+    """
+    found = solution.summary()
+    if found["figures_from"] != "steps":
+        return []
+    stop = float(solution.t[-1])
+    extremes = expected.extremes(0.0, stop)
+    # The reference looks for its extremes between sixty points of a step, and its mean adds up its steps' rounding.
+    floor_f += REFERENCE * extremes["force_max"]
+    stated = solution.error
+    return [
+        Quantity("u_gap_peak", abs(found["u_gap_peak"] - extremes["u_gap_max"]), may_u, floor_u, stated.u_gap),
+        Quantity("f_el_max", abs(found["f_el_max"] - extremes["force_max"]), may_f, floor_f, stated.f_el),
+        Quantity("f_el_mean", abs(found["f_el_mean"] - mean_force(expected, stop)), may_f, floor_f, stated.f_el),
+    ]
+
+
+def mean_force(expected: ref.Transient, stop: float) -> float:
+    """Mean force of the reference, N: by Gauss panels that shrink towards both ends of each of its steps.
+
+    Its steps follow the voltages, while the area may change within a small part of one, next to a zero.
+    """
+    x, w = np.polynomial.legendre.leggauss(12)
+    near = 0.5 ** np.arange(1, 45)
+    edges = np.concatenate([[0.0], near[::-1], 1.0 - near[1:], [1.0]])
+    half = 0.5 * np.diff(edges)[:, None]
+    inside = edges[:-1, None] + half * (1.0 + x)
+    total = 0.0
+    for step in expected.steps:
+        force = expected._on_step(step, step.t + step.h * inside.ravel(), "force").reshape(inside.shape)
+        total += step.h * float((half * w * force).sum())
+    return total / stop
 
 
 def judge(scene: Scene) -> Verdict:
@@ -344,7 +385,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="where to write the counts")
     options = parser.parse_args(arguments)
     counts: collections.Counter[str] = collections.Counter()
-    stated = {name: Stated() for name in ("u_gap", "f_el", "q_source")}
+    stated = {name: Stated() for name in ("u_gap", "f_el", "q_source", "u_gap_peak", "f_el_max", "f_el_mean")}
     wrong: dict[str, str] = {}
     unsure: list[int] = []
     slowest = (0.0, 0)

@@ -11,7 +11,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from fingerspice.numerics.extremes import largest
-from fingerspice.numerics.lobatto import NODES, POINTS
+from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -20,6 +20,8 @@ Signals = Mapping[str, FloatArray]
 Read = Callable[[Any], Signals]
 
 _NODES = POINTS[:NODES]
+#: Halves of panels that are looked at, beside four for each panel.
+_MOST_CUT = 4096
 #: Gauss-Lobatto weights on [0, 1]: exact for polynomials of degree 23.
 _WEIGHTS = 1.0 / (NODES * (NODES - 1) * legendre.Legendre.basis(NODES - 1)(2.0 * _NODES - 1.0) ** 2)
 
@@ -40,6 +42,16 @@ class Panels(NamedTuple):
     low: FloatArray
     high: FloatArray
     duration: FloatArray
+
+    def take(self, which: IntArray) -> Panels:
+        """Some of them, by number."""
+        return Panels(self.step[which], self.low[which], self.high[which], self.duration[which])
+
+    def halved(self) -> Panels:
+        """Both halves of each."""
+        middle, half = 0.5 * (self.low + self.high), 0.5 * self.duration
+        low, high = np.append(self.low, middle), np.append(middle, self.high)
+        return Panels(np.tile(self.step, 2), low, high, np.tile(half, 2))
 
     def fractions(self, points: FloatArray) -> FloatArray:
         """Points in [0, 1] of each panel as fractions of its step, shape (p, n)."""
@@ -83,10 +95,38 @@ class Weighed:
         return complex(2j * np.sum(turning * self.signals[name]) / self.weight.sum())
 
 
-def weigh_run(run: Run, read: Read, since: float, until: float) -> tuple[Weighed, dict[str, tuple[float, float]]]:
-    """Signals of a run between two times (s) for means, and the smallest and largest value of each."""
-    panels = run.panels(since, until)
-    t, signals = run.signals(read, panels.step, panels.fractions(_NODES))
+def weigh_run(
+    run: Run, read: Read, since: float, until: float, tol: float
+) -> tuple[Weighed, dict[str, tuple[float, float]]]:
+    """Signals of a run between two times (s) for means, and the smallest and largest value of each.
+
+    A panel on which a polynomial through the nodes misses some signal between them, by more than `tol` of its peak, is
+    cut in halves: steps follow the gap voltage, and the area may change on a small part of its range.
+    """
+    panels, parts = run.panels(since, until), []
+    most = _MOST_CUT + 4 * panels.step.size
+    peaks: dict[str, float] = {}
+    while panels.step.size:
+        t, signals = run.signals(read, panels.step, panels.fractions(POINTS))
+        wrong = np.zeros(panels.step.size, bool)
+        for name, x in signals.items():
+            peaks[name] = max(peaks.get(name, 0.0), float(np.abs(x).max()))
+            missed = np.abs(x[:, :NODES] @ BETWEEN - x[:, NODES:]).max(axis=1)
+            wrong |= missed > tol * peaks[name]
+        if most <= 0:
+            # What still is not smooth is rounding.
+            wrong[:] = False
+        kept = panels.take(np.flatnonzero(~wrong))
+        parts.append((kept, t[~wrong, :NODES], {name: x[~wrong, :NODES] for name, x in signals.items()}))
+        panels = panels.take(np.flatnonzero(wrong)).halved()
+        most -= panels.step.size
+    every = [part[0] for part in parts]
+    panels = Panels(
+        np.concatenate([p.step for p in every]), np.concatenate([p.low for p in every]),
+        np.concatenate([p.high for p in every]), np.concatenate([p.duration for p in every]),
+    )  # fmt: skip
+    signals = {name: np.concatenate([part[2][name] for part in parts]) for name in peaks}
+    t = np.concatenate([part[1] for part in parts])
     weight = panels.duration[:, None] * _WEIGHTS
     flat = {name: x.ravel() for name, x in signals.items()}
     return Weighed(t.ravel(), weight.ravel(), flat), _extremes(run, read, panels, signals)

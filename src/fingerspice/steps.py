@@ -14,7 +14,7 @@ from fingerspice.circuit.sampling import same_time
 from fingerspice.engine.readout import RECORDED, Steps, new_steps
 from fingerspice.measures import Panels, Read, Signals
 from fingerspice.network_record import NetworkRecord
-from fingerspice.numerics.lobatto import BARYCENTRIC, NODES, POINTS
+from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS, ROWS
 from fingerspice.record import Record
 
 AnyRecord = Record | NetworkRecord
@@ -197,10 +197,11 @@ class Stretches:
         """As `measures.Run` says, from the polynomials of the steps."""
         columns = np.empty((self.values.shape[1], *fraction.shape))
         cut = np.ones(index.size, bool)
-        if fraction.shape[1] == NODES:
-            # Whole steps at their nodes need no polynomial.
-            cut = (fraction != _NODES).any(axis=1)
-            columns[:, ~cut] = self.values[index[~cut]].swapaxes(0, 1)
+        if fraction.shape[1] == ROWS:
+            # Whole steps at their own points.
+            cut = (fraction != POINTS).any(axis=1)
+            whole = self.values[index[~cut]].swapaxes(0, 1)
+            columns[:, ~cut] = np.concatenate([whole, np.einsum("cpn,nb->cpb", whole, BETWEEN)], axis=2)
         columns[:, cut] = np.einsum("pcn,pqn->cpq", self.values[index[cut]], _basis(fraction[cut]))
         t = self.start[index, None] + fraction * self.length[index, None]
         reached = self.reached[index, None]
