@@ -36,18 +36,20 @@ COMMANDS = {
 # The command, with what ends it just where it would hurt: PLACE is patched to strike when called for the N-th time.
 STRUCK = """
 import os, pathlib, sys
+from fingerspice import datafiles
 from fingerspice.__main__ import main
 place, count, number = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 sys.argv[1:4] = []
-calls, original = [], getattr(pathlib.Path, place)
+owner = datafiles if place == "write_pieces" else pathlib.Path
+calls, original = [], getattr(owner, place)
 def strike(self, *arguments):
     calls.append(1)
     if len(calls) == count:
-        if place == "write_bytes":
-            original(self, bytes(arguments[0])[:1000])
+        if place == "write_pieces":
+            original(self, arguments[0][:1000])
         os.kill(os.getpid(), number)
     return original(self, *arguments)
-setattr(pathlib.Path, place, strike)
+setattr(owner, place, strike)
 main()
 """
 BROKEN_OFF = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated")}
@@ -133,9 +135,9 @@ def test_at_any_moment_a_signal_leaves_whole_files_or_none(folder: Path, right: 
 @pytest.mark.parametrize(
     ("number", "place", "count", "done"),
     [
-        (signal.SIGKILL, "write_bytes", 1, []),
+        (signal.SIGKILL, "write_pieces", 1, []),
         (signal.SIGKILL, "replace", 2, ["pad.nc"]),
-        (signal.SIGINT, "write_bytes", 1, []),
+        (signal.SIGINT, "write_pieces", 1, []),
         (signal.SIGINT, "replace", 2, ["pad.nc"]),
         (signal.SIGTERM, "replace", 1, []),
     ],

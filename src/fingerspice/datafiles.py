@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.waveforms import require
-from fingerspice.files import write_aside
+from fingerspice.files import write_aside, write_pieces
 
 if TYPE_CHECKING:
     from fingerspice.solution import Solution
@@ -77,6 +77,6 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
                 variable.attrs.update(attributes)
             for key, text in solution.provenance().items():
                 file.attrs[key] = text
-        target.write_bytes(content.getbuffer())
+        write_pieces(target, content.getbuffer())
 
     return write_aside(path, write)

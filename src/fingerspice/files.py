@@ -9,6 +9,7 @@ from pathlib import Path
 from fingerspice.errors import InputError
 
 _UNFINISHED: set[Path] = set()
+_PIECE = 64 * 2**20
 
 
 def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
@@ -45,6 +46,13 @@ def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
     finally:
         _discard(temporary)
     return path
+
+
+def write_pieces(path: Path, data: memoryview) -> None:
+    """Write bytes a piece at a time: one write of gigabytes would let a Ctrl-C wait for seconds."""
+    with path.open("wb") as stream:
+        for begin in range(0, data.nbytes, _PIECE):
+            stream.write(data[begin : begin + _PIECE])
 
 
 def discard_unfinished() -> None:
