@@ -242,7 +242,7 @@ def test_the_command_says_what_drives_where_the_data_are_taken_and_where_they_en
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--sweep", "lin 2 100 1e308"], "the phasor at 1e+308 Hz is beyond the range of numbers"),
+        (["--sweep", "lin 2 100 1e308"], "FSTOP is 1e308; allowed: 1e-30 to 1e30 Hz"),
         (["--area", "-35u"], "area is -3.5e-05 m^2; allowed: a positive area in m^2"),
         (["--area", "nan"], "area is 'nan'; allowed: 'mean', 'frozen' or a number in m^2"),
         (["--skin", "mine"], "skin is 'mine'; allowed: 'swept' or 'own'"),
