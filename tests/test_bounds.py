@@ -100,8 +100,7 @@ def test_the_peak_of_a_periodic_source_is_looked_for_in_one_period() -> None:
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: fs.Sine(1e99, 100.0), "Sine amplitude is 1e+99 V; allowed: 0, or a size from 1e-300 to 1e+12"),
-        (lambda: fs.Sine(1e-320, 100.0), "Sine amplitude is 9.99989e-321 V"),
+        (lambda: fs.Sine(1e99, 100.0), "Sine amplitude is 1e+99 V; allowed: a size up to 1e+12"),
         (lambda: fs.Sine(1.0, 1e-320), "Sine frequency is 9.99989e-321 Hz; allowed: 0, or a size from 1e-30 to 1e+30"),
         (lambda: fs.Sine(1.0, 1.0, phase_deg=1e30), "Sine phase_deg is 1e+30 deg; allowed: a size up to 1e+09"),
         (lambda: fs.Pulse(0.0, 1.0, 0.0, 1e-300), "pulse rise is 1e-300 s"),
@@ -119,7 +118,7 @@ def test_numbers_that_no_calculation_bears_are_refused(make: object, said: str) 
 
 @pytest.mark.parametrize("line", [".ic v(top)=1e99", "C1 top 0 1n ic=1e99"])
 def test_voltages_to_start_from_are_bounded_as_sources_are(line: str) -> None:
-    with pytest.raises(fs.InputError, match=r"is 1e\+99 V; allowed: 0, or a size from 1e-300 to 1e\+12"):
+    with pytest.raises(fs.InputError, match=r"is 1e\+99 V; allowed: a size up to 1e\+12"):
         fs.parse_netlist(edited((".end", f"{line}\n.end")))
 
 

@@ -69,7 +69,7 @@ def overflowing(rng: random.Random, bench: fuzz.Bench) -> None:
 
 
 def greedy(rng: random.Random, bench: fuzz.Bench) -> None:
-    np.zeros((fuzz.ROOM + 1) * 2**20, np.uint8)
+    np.zeros(8 * fuzz.ROOM * 2**20, np.uint8)
 
 
 def warning_of(message: str) -> fuzz.Target:

@@ -33,6 +33,8 @@ FloatArray = NDArray[np.float64]
 FREEZING_SHARE = 0.3
 # Breakpoints (64 kB) that a scene keeps.
 KEPT_BREAKPOINTS = 8192
+# V; below, the digits of all that a source causes are lost.
+LEAST_PEAK = 1e-300
 
 
 @dataclass(frozen=True)
@@ -257,6 +259,7 @@ def _largest_voltage(waveform: Waveform, stop: float) -> float:
     if waveform.period is not None:
         stop = waveform.settled + waveform.period
     peak = waveform.peak(0.0, stop)
+    require(not 0.0 < peak < LEAST_PEAK, "the source's peak", f"{peak:g} V", f"0, or {LEAST_PEAK:g} V or more")
     return peak if math.isfinite(peak) else 0.0
 
 

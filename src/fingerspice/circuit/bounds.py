@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 #: Largest and smallest size of a number that is not 0, by unit: of voltages and currents, of angles, of all others.
-RANGES = {"V": (1e12, 1e-300), "deg": (1e9, 0.0)}
+RANGES = {"V": (1e12, 0.0), "deg": (1e9, 0.0)}
 ANY_RANGE = (1e30, 1e-30)
 #: Breakpoints that are listed at once; they and what is made of them take 40 bytes each.
 MOST_LISTED = 20_000_000
