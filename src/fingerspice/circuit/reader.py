@@ -127,8 +127,8 @@ class Reader:
             return False
         self._words += line.words(MAX_WORDS)
         if self._words > MAX_WORDS:
-            problem = f"the netlist has more than {MAX_WORDS:,} words and brackets; allowed: samples in a file of their"
-            raise InputError(f"{problem} own, as TABLE(file.csv) or WAVEFILE(file.wav 1)", _place(line))
+            problem = f"the netlist has more than {MAX_WORDS:,} words and brackets; allowed: no more"
+            raise InputError(f"{problem}, samples go in by Python: fs.Samples(values, rate)", _place(line))
         if word[0] != ".":
             here = self._open[-1]
             if not here.skipped:
