@@ -90,9 +90,10 @@ def _jumps(problem: Problem | NetworkProblem) -> FloatArray:
     for wave in problem.waveforms:
         edges = wave.breakpoints(problem.t_start, stop + rounding)
         edges = edges[(edges > problem.t_start + same_time(problem.t_start)) & (edges >= problem.first)]
-        edges = edges[_is_jump(wave, edges)]
-        found.append(np.where(edges > stop - rounding, stop, edges))
-    return np.unique(np.concatenate(found))
+        if edges.size:
+            edges = edges[_is_jump(wave, edges)]
+            found.append(np.where(edges > stop - rounding, stop, edges))
+    return np.unique(np.concatenate(found)) if found else np.empty(0)
 
 
 def _is_jump(wave: Waveform, edges: FloatArray) -> BoolArray:

@@ -94,7 +94,7 @@ class Record(Sealed):
         """What signals of the source belong to: the loop as a whole."""
         return ("loop",)
 
-    @property
+    @cached_property
     def fingers(self) -> tuple[tuple[str, Contact], ...]:
         """The GAP's name and contact."""
         gap, contact = self.stack.gap_layer, self.stack.contact

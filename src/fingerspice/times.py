@@ -43,6 +43,10 @@ def run_times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: Fl
     return t_stop, step
 
 
+# Signals that an element brings along: at most those of a GAP, with its two nodes and its area.
+_MOST_COLUMNS = 12
+
+
 def check_length(waveform: Waveform, t_start: float, t_stop: float) -> None:
     """Refuse a run of more periods or breakpoints than one can come to the end of.
 
@@ -76,6 +80,8 @@ def check_outputs(circuit: Circuit, count: float) -> None:
     InputError
         With the memory they would take.
     """
+    if 8.0 * count * _MOST_COLUMNS * len(circuit.elements) <= MOST_BYTES:
+        return
     devices = [element.device for element in circuit.elements]
     layers = sum(element.spec.is_layer for element in circuit.elements)
     nodes = len({node for element in circuit.elements for node in element.nodes})
