@@ -180,7 +180,7 @@ def _leap(track: Track, table: SourceTable, settling: Settling, stop: float) -> 
         settling.period, left, int(track.counters[readout.OUTPUT]), track.t_out, track.left, track.out,
     )  # fmt: skip
     control, before = base.track.control, here.track.control
-    for peak in (readout.PEAK_U, readout.PEAK_F, readout.ERROR_U, readout.ERROR_F):
+    for peak in (readout.PEAK_U, readout.PEAK_F, readout.PEAK_Q, readout.ERROR_U, readout.ERROR_F):
         control[peak] = max(control[peak], before[peak])
     control[readout.MARGIN] = min(control[readout.MARGIN], before[readout.MARGIN])
     track.leap(base.track, state, left, settling, error, owed)

@@ -182,7 +182,7 @@ def _charge_error(problem: Problem, track: Track, peak_u: float) -> float:
     held = float(model.slow[-3]) * model.area0 * (problem.scene.u_peak + peak_u)
     steps = 1.0 + float(track.counters[readout.ACCEPTED])
     # Whatever the area's polynomial misses, all charge that is moved misses too.
-    missed = track.prepared.area_error * (held + abs(float(track.y[-1]))) if model.coupled else 0.0
+    missed = track.prepared.area_error * (held + float(track.control[readout.PEAK_Q])) if model.coupled else 0.0
     # Twice as safe: what leaks between nodes is looked for at a few places only, and against the reference 1.7 times as
     # much was met in a stack that leaks fast throughout.
     return 2.0 * SAFETY * float(track.control[readout.ERROR_Q]) + 4e-16 * held * steps + missed

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fingerspice.compiled import jit, jit_rows
 from fingerspice.engine.exponential import N_PLACES
 from fingerspice.engine.model import Model
-from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, SPREAD, at
+from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, PEAK_Q, SPREAD, at
 from fingerspice.engine.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U
 from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, END, FIRST, NODES, POINTS
 
@@ -70,6 +70,7 @@ def charge_step(
     _integrate(integral, h, z0, z)
     for j in range(NODES):
         z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
+        control[PEAK_Q] = max(control[PEAK_Q], abs(z[j]))
     _account(model, gap, slow_share, w, r, h, places, theta, voltage, control)
 
 
@@ -169,14 +170,18 @@ def _account(
 
 @jit
 def _area_missed(q: FloatArray) -> float:
-    """The most that the polynomial through the nodes misses of the area at the points between, m^2."""
-    worst = 0.0
-    for p in range(3):
-        value = q[FIRST + p]
-        for j in range(NODES):
-            value -= BETWEEN[j, p] * q[j]
-        worst = max(worst, abs(value))
-    missed: float = worst / q[0] ** 2
+    """The most that a polynomial through the nodes misses of the area, 1 / q, at the points between, m^2.
+
+    The charge is summed with that of the area: where the area falls by decades within a step it misses far more than
+    one of 1 / A, which the voltages need.
+    """
+    first, second, third = 1.0 / q[FIRST], 1.0 / q[FIRST + 1], 1.0 / q[FIRST + 2]
+    for j in range(NODES):
+        area = 1.0 / q[j]
+        first -= BETWEEN[j, 0] * area
+        second -= BETWEEN[j, 1] * area
+        third -= BETWEEN[j, 2] * area
+    missed: float = max(abs(first), abs(second), abs(third))
     return missed
 
 

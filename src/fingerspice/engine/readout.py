@@ -32,7 +32,9 @@ ALLOWED = 18
 H_AFTER_ZERO = 19
 # Smallest distance to the fold met.
 MARGIN = 20
-N_CONTROL = 21
+# Largest charge met, C.
+PEAK_Q = 21
+N_CONTROL = 22
 # Entries of `counters`: rows evaluated, steps accepted and refused, zeros met, outputs written, steps kept, recorded.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT, RECORDED = 0, 1, 2, 3, 4, 5, 6
 N_COUNTERS = 7
