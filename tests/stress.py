@@ -34,6 +34,8 @@ LONGEST = 10
 # What the reference itself may be off: of the source's amplitude, of area and force; and of the charge, both delivered
 # and standing on the layers.
 REFERENCE, REFERENCE_CHARGE = 1e-11, 2e-10
+# What a voltage of the reference that should be 0 may be, over the source's amplitude.
+REFERENCE_REST = 1e-17
 # A charge has no error that was asked for: over what voltage's and area's leave of its largest value, it may be off by
 # so much.
 CHARGE_SHARE = 30.0
@@ -236,14 +238,18 @@ def quantities(
     held = largest * scene.amplitude / sum(1.0 / layer.c for layer in scene.layers)
     delivered = float(np.abs(expected.q).max())
     stated = solution.error
-    unsure = REFERENCE_CHARGE * (held + delivered)
+    # A voltage that rests at 0 behind a small resistance is rounding there, and leaks all the time.
+    leak = sum(1.0 / layer.r_total for layer in scene.layers) * float(solution.t[-1])
+    unsure = REFERENCE_CHARGE * (held + delivered) + REFERENCE_REST * scene.amplitude * leak
+    # A charge of which more is stated than that is no surprise.
+    may_q = max(CHARGE_SHARE * RTOL * delivered, stated.q_source or 0.0) + unsure
     return [
         beside("u_gap", "u_gap", may, rounded, stated.u_gap),
         beside(
             "f_el", "force", RTOL * strongest + push * rounded, push * rounded + REFERENCE * strongest, stated.f_el
         ),
         beside("area", "area", steep * may + REFERENCE * largest, math.inf, None),
-        beside("q_source", "q", CHARGE_SHARE * RTOL * delivered + unsure, unsure, stated.q_source),
+        beside("q_source", "q", may_q, unsure, stated.q_source),
         *figures(solution, expected, may, push * may + REFERENCE * strongest, rounded, push * rounded),
     ]  # fmt: skip
 
