@@ -275,8 +275,8 @@ def test_an_area_that_cannot_be_is_refused(value: str) -> None:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("C1 skin 0 1n IC=1e200", r"C1 IC is 1e200 V; allowed: from -1e\+30 to 1e\+30"),
-        (".ic v(top)=-1e31", r"\.ic v\(top\) is -1e31 V; allowed: from -1e\+30 to 1e\+30"),
+        ("C1 skin 0 1n IC=1e200", r"C1 IC is 1e\+200 V; allowed: a size up to 1e\+12"),
+        (".ic v(top)=-1e31", r"\.ic v\(top\) is -1e\+31 V; allowed: a size up to 1e\+12"),
     ],
 )
 def test_a_voltage_that_cannot_be_is_refused(line: str, said: str) -> None:

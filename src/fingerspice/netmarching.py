@@ -17,7 +17,7 @@ from fingerspice.engine.exponential import Tables, new_tables
 from fingerspice.engine.netrows import Form, new_work
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import Pace
-from fingerspice.engine.system import area_error, area_polynomial
+from fingerspice.engine.system import area_error, area_missed, area_polynomial
 from fingerspice.netruns import Integration, NetworkRun, integrate, ramp, state_error, values_at
 from fingerspice.network_record import bare_record
 from fingerspice.networks import NetworkProblem, NetworkScene
@@ -396,6 +396,6 @@ def _stated(run: NetworkRun, one: March, u_scale: float) -> float:
         # Whatever the areas' polynomials miss, all charge that is moved misses too.
         moved = held + float(np.abs(one.y[-one.s_before.size :]).max(initial=0.0))
         charge = 2.0 * SAFETY * float(one.control[readout.ERROR_Q]) + 4e-16 * held * steps
-        charge += area_error(one.decade) * moved
+        charge += moved * max((area_missed(curve, one.decade) for curve in one.net.curves), default=0.0)
     run.margin = 1.0 / float(one.control[readout.MAGNIFIED])
     return state_error(run, gaps[one.net.gap >= 0], u_scale, charge)

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from fingerspice.steps import Recorded
 
 FloatArray = NDArray[np.float64]
-# What a polynomial may miss of a signal where figures are taken of it, over the error asked for.
-_SMOOTH = 1e-2
+# What a polynomial may miss of a signal where figures are taken of it, over its peak.
+_SMOOTH = 1e-12
 # Signals with what their values weigh, and the range of each.
 _Figures = tuple[Weighed, dict[str, tuple[float, float]]]
 
@@ -288,7 +288,7 @@ class Solution(Sealed):
     def _measured(self, since: float, until: float) -> _Figures | None:
         """Figures between two times (s) from the run between its outputs; None where that is not known."""
         run = None if self.continuous is None else self.continuous.run(self._read, since, until)
-        return None if run is None else weigh_run(run, self._read, since, until, _SMOOTH * self.rtol)
+        return None if run is None else weigh_run(run, self._read, since, until, _SMOOTH)
 
     def _read(self, record: Record | NetworkRecord) -> dict[str, FloatArray]:
         """The signals that figures are taken of, from other outputs of this run."""

@@ -39,8 +39,8 @@ class Block:
 
     Attributes
     ----------
-    times : ndarray, shape (k, 3)
-        Start and length of each step, and the end reached, s.
+    times : ndarray, shape (k, 4)
+        Start and length of each step, the end reached (s), and which fraction of the length that is.
     values : ndarray, shape (k, n_column, NODES)
         At the nodes of the whole length.
     count : int
@@ -92,7 +92,7 @@ class Leap:
     def _block(self, delta: FloatArray, shift: float) -> Block:
         marks = self.marks + self.marks_by @ delta
         series = self.series + np.tensordot(delta, self.by, 1)
-        times = np.column_stack([marks[:-1], np.diff(marks), marks[1:]])
+        times = np.column_stack([marks[:-1], np.diff(marks), marks[1:], np.ones(marks.size - 1)])
         return Block(times, series[:, :, :NODES] @ _FROM_SERIES, 1, shift, self.period)
 
 
@@ -166,7 +166,7 @@ class Stretches:
     def __init__(self, blocks: list[Block], make: Callable[[FloatArray, BoolArray, FloatArray], AnyRecord]) -> None:
         sizes = [len(b.times) for b in blocks]
         self._make = make
-        self.start, self.length, self.reached = np.concatenate([b.times for b in blocks]).T
+        self.start, self.length, self.reached, self.reach = np.concatenate([b.times for b in blocks]).T
         self.values = np.concatenate([b.values for b in blocks])
         self.count = np.repeat([b.count for b in blocks], sizes)
         self.shift = np.repeat([b.shift for b in blocks], sizes)
@@ -180,13 +180,12 @@ class Stretches:
         # Of the periods that a step stands for, those from number `first` to `last` lie inside as a whole.
         first = np.clip(np.ceil((since - slack - begin) / period), 0, self.count)
         last = np.clip(np.floor((until + slack - end) / period), -1, self.count - 1)
-        reach = (self.reached - self.start) / self.length
         inside = np.maximum(last - first + 1.0, 0.0)
-        found = [(np.zeros_like(reach), reach, inside)]
+        found = [(np.zeros_like(self.reach), self.reach, inside)]
         for k, once in ((first - 1.0, True), (last + 1.0, last + 1.0 != first - 1.0)):
             cut = once & (k >= 0) & (k < self.count)
             low = np.maximum((since - begin - k * period) / self.length, 0.0)
-            high = np.minimum((until - begin - k * period) / self.length, reach)
+            high = np.minimum((until - begin - k * period) / self.length, self.reach)
             found.append((low, high, np.where(cut & (high > low), 1.0, 0.0)))
         index = np.tile(np.arange(self.start.size), 3)
         low, high, weight = (np.concatenate(x) for x in zip(*found, strict=True))
@@ -205,7 +204,7 @@ class Stretches:
         columns[:, cut] = np.einsum("pcn,pqn->cpq", self.values[index[cut]], _basis(fraction[cut]))
         t = self.start[index, None] + fraction * self.length[index, None]
         reached = self.reached[index, None]
-        left = t >= reached - same_time(1.0) * np.abs(reached)
+        left = fraction >= self.reach[index, None]
         t = np.where(left, reached, t)
         record = self._make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], -1))
         return t, {name: x.reshape(t.shape) for name, x in read(record).items()}

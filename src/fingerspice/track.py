@@ -14,7 +14,7 @@ from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
 from fingerspice.engine.model import write_row
 from fingerspice.engine.pace import Pace
-from fingerspice.engine.system import System, area_error, area_range, build_system
+from fingerspice.engine.system import System, area_error, area_missed, area_range, build_system
 from fingerspice.engine.work import Work, new_work
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.problem import Problem, Scene
@@ -42,7 +42,7 @@ class Prepared:
     tables: StepTables
     work: Work
     integral: FloatArray
-    # What the area's polynomial may miss, relative.
+    # What the area's polynomial misses, relative.
     area_error: float
 
 
@@ -58,13 +58,14 @@ def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
             model = model._replace(curve=scene.stack.contact.curve(u_top))
         contact = scene.stack.contact
         stress = 0.0 if contact is None else float(contact.stress(1.0))
-        missed = area_error(decade)
         system = build_system(
-            model, missed, area_range(model, max(scene.u_peak, u_top)),
+            model, area_error(decade), area_range(model, max(scene.u_peak, u_top)),
             scene.stack.grouping, stress,
         )  # fmt: skip
         n = model.gap.size
-        scene.prepared[key] = Prepared(system, new_tables(n), new_work(n), integral_table(), missed)
+        scene.prepared[key] = Prepared(
+            system, new_tables(n), new_work(n), integral_table(), area_missed(model.curve, decade)
+        )
     prepared: Prepared = scene.prepared[key]
     return prepared
 

@@ -16,6 +16,8 @@ from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, END, FIRST, NODES
 
 FloatArray = NDArray[np.float64]
 
+# What a polynomial misses changes its sign at every node: of the integral no more than one interval's is left.
+_LOBE = 0.1
 # Slope at each node, per step length, of the polynomial through values at the nodes.
 DERIVATIVE = np.zeros((NODES, NODES))
 for _i in range(NODES):
@@ -113,7 +115,7 @@ def _account(
     last_theta = 0.0
     added = 0.0
     # Under `local` what the polynomial misses of the area between nodes counts with all that the voltage moves.
-    missed = 0.0 if model.mobile else capacitance * _area_missed(r[Q]) * _way(voltages)
+    missed = 0.0 if model.mobile else _LOBE * capacitance * _area_missed(r[Q]) * _way(voltages)
     spread = missed
     for p in range(N_PLACES):
         row = 0 if p == 0 else (END if p == N_PLACES - 1 else FIRST + p - 1)

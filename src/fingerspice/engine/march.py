@@ -358,7 +358,7 @@ def march(
         if room > 0 or next_out <= t_new or kept_times.size > 0:
             layers(mobile, area0, k_shown, shown, w, source_row, q_rows, values)
         if room > 0:
-            record(step_times, step_values, counters[RECORDED], t, h, t_new, values)
+            record(step_times, step_values, counters[RECORDED], t, h, t_new, theta, values)
             counters[RECORDED] += 1
         if next_out <= t_new or kept_times.size > 0:
             for c in range(columns):

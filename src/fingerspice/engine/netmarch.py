@@ -402,7 +402,7 @@ def march(
         if step_room > 0 or next_out <= t_new or kept_times.size > 0:
             write_columns(n, first_z, charge, shape, follow, w, s, y, values)
         if step_room > 0:
-            record(step_times, step_values, counters[RECORDED], t, h, t_new, values)
+            record(step_times, step_values, counters[RECORDED], t, h, t_new, theta, values)
             counters[RECORDED] += 1
         if next_out <= t_new or kept_times.size > 0:
             for i in range(out.shape[0]):

@@ -56,8 +56,9 @@ class Steps(NamedTuple):
 
     Attributes
     ----------
-    times : ndarray, shape (capacity, 3)
-        Start and length (s), and the end reached; no capacity: nothing is recorded.
+    times : ndarray, shape (capacity, 4)
+        Start and length (s), the end reached (s), and which fraction of the length that is: a step may be shorter than
+        the rounding of the time. No capacity: nothing is recorded.
     values : ndarray, shape (capacity, n_column, NODES)
         Recorded voltages, or the state of a network, at the nodes of the whole length.
     paused : ndarray, shape (6,)
@@ -71,15 +72,16 @@ class Steps(NamedTuple):
 
 def new_steps(capacity: int, columns: int) -> Steps:
     """Room for so many steps."""
-    return Steps(np.empty((capacity, 3)), np.empty((capacity, columns, NODES)), np.zeros(6))
+    return Steps(np.empty((capacity, 4)), np.empty((capacity, columns, NODES)), np.zeros(6))
 
 
 @jit
 def record(
-    times: FloatArray, recorded: FloatArray, place: int, t: float, h: float, t_new: float, values: FloatArray
-) -> None:
+    times: FloatArray, recorded: FloatArray, place: int, t: float, h: float, t_new: float, theta: float,
+    values: FloatArray,
+) -> None:  # fmt: skip
     """Put a step in its place."""
-    times[place, 0], times[place, 1], times[place, 2] = t, h, t_new
+    times[place, 0], times[place, 1], times[place, 2], times[place, 3] = t, h, t_new, theta
     for c in range(recorded.shape[1]):
         for j in range(NODES):
             recorded[place, c, j] = values[c, j]

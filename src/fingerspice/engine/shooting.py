@@ -67,7 +67,7 @@ def _map(
         system, pace, tables, work, integral, edges, terms, series, edges[-1], y, np.zeros(n + 1), control, count,
         np.zeros(0), np.zeros(0, np.bool_), np.zeros((n, 0)),
         Kept(np.zeros((0, 4)), np.zeros((0, n, ROWS))),
-        Steps(np.zeros((0, 3)), np.zeros((0, n, NODES)), np.zeros(6)), np.zeros((TRIED, 4)),
+        Steps(np.zeros((0, 4)), np.zeros((0, n, NODES)), np.zeros(6)), np.zeros((TRIED, 4)),
     )  # fmt: skip
     for k in range(n):
         end[k] = 0.0

@@ -155,6 +155,13 @@ def area_error(decade: int) -> float:
     return max(_AREA_SHARE * 10.0**decade, _AREA_ROUNDING)
 
 
+def area_missed(curve: FloatArray, decade: int) -> float:
+    """What the area's polynomial does miss of a `Contact.curve`, relative; 0 where the long series is taken."""
+    series = np.abs(curve[2 + N_PACKED :])
+    missed = float(series[DEGREE + 1 :].sum() / series[0]) if series.size > 1 else 0.0
+    return missed if missed <= area_error(decade) else 0.0
+
+
 def area_polynomial(curve: FloatArray, tol: float) -> tuple[FloatArray, FloatArray, float, float]:
     """1/A as a polynomial of `DEGREE`, its slopes, `lo` and `scale` (see `System`) from a `Contact.curve`."""
     powers = np.zeros(DEGREE + 1)
