@@ -70,7 +70,10 @@ def test_many_ports_nodes_and_definitions_are_read() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("V1 a 0 PWL(" + "1 " * 1_000_000 + ")", "more than 1,000,000 words and brackets; allowed: samples in a file"),
+        (
+            "V1 a 0 PWL(" + "1 " * 1_000_000 + ")",
+            "more than 1,000,000 words and brackets; allowed: no more, samples go in by Python",
+        ),
         ("V1 a 0 " + "(" * 1_000_000, "more than 1,000,000 words and brackets"),
         ("V1 a 0 " + "{" * 1_000_000, "more than 1,000,000 words and brackets"),
         ("V1 a 0 " + "'" * 1_000_000, "more than 1,000,000 words and brackets"),

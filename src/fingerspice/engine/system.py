@@ -156,9 +156,9 @@ def area_error(decade: int) -> float:
 
 
 def area_missed(curve: FloatArray, decade: int) -> float:
-    """What the area's polynomial does miss of a `Contact.curve`, relative; 0 where the long series is taken."""
+    """What the area's polynomial does miss of a `Contact.curve`, relative; 0 where another form of it is taken."""
     series = np.abs(curve[2 + N_PACKED :])
-    missed = float(series[DEGREE + 1 :].sum() / series[0]) if series.size > 1 else 0.0
+    missed = float(series[DEGREE + 1 :].sum() / series[0]) if series.size > 1 and series[0] > 0.0 else 0.0
     return missed if missed <= area_error(decade) else 0.0
 
 
