@@ -203,17 +203,11 @@ class March(Integration):
         self.repeated = 0
         self.recorder = Recorder(self.n + self.n_slow)
         self.keep(0)
-        self.forget()
+        self.control[readout.MAGNIFIED] = 1.0
 
     @property
     def t(self) -> float:
         return float(self.control[readout.T])
-
-    def forget(self) -> None:
-        for array in (self.counters, self.met, self.collected, self.error):
-            array[:] = 0
-        self.control[readout.ERROR_Q] = 0.0
-        self.control[readout.MAGNIFIED] = 1.0
 
     def _march(self, sources: Sources, jump: bool, t_end: float, control: FloatArray, branch: FloatArray) -> int:
         reference = self.reference
