@@ -75,6 +75,8 @@ _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(24)
 _TAIL = np.array([(k + 0.5) * _GAUSS_W * np.polynomial.legendre.Legendre.basis(k)(_GAUSS_X) for k in (20, 21, 22, 23)])
 # Of a panel's charge, and the most panels that a jump is split into.
 _RULE_ERROR, _MOST_PANELS = 1e-15, 200
+# Legendre coefficients below this share of the values are their rounding.
+_TAIL_ROUNDING = 1e-14
 
 
 @jit
@@ -419,7 +421,8 @@ def _panel_charge(model: Model, x_gap: float, u_from: float, u_to: float) -> tup
     """Integral of A dU between source voltages on one side of the gap's 0 V, and what the rule misses of it, m^2 V."""
     half, middle = 0.5 * (u_to - u_from), 0.5 * (u_to + u_from)
     total = 0.0
-    low, high = math.inf, 0.0
+    centre = 1.0 / inverse_area(abs(model.k_gap * middle + x_gap), model.curve)[0]
+    low, high = centre, centre
     tail = np.zeros(_TAIL.shape[0])
     for g in range(_GAUSS_X.size):
         u = abs(model.k_gap * (middle + half * _GAUSS_X[g]) + x_gap)
@@ -427,8 +430,8 @@ def _panel_charge(model: Model, x_gap: float, u_from: float, u_to: float) -> tup
         total += _GAUSS_W[g] * area
         low, high = min(low, area), max(high, area)
         for k in range(tail.size):
-            tail[k] += _TAIL[k, g] * area
+            tail[k] += _TAIL[k, g] * (area - centre)
     left = np.abs(tail).max()
     # Coefficients that fall as a geometric series from the range of the values to these end there squared.
-    missed = 2.0 * left * min(1.0, left / (high - low)) if high > low else 0.0
+    missed = 2.0 * left * min(1.0, left / (high - low)) if left > _TAIL_ROUNDING * high else 0.0
     return half * total, abs(half) * missed

@@ -90,8 +90,6 @@ def repeat(
         The first output that is left.
     """
     walk = _new_walk(count)
-    for i in range(count):
-        walk.as_powers[i] = _made_powers(kept.series[i])
     for begin, end in _calls(periods, count):
         first = _repeat(kept, walk, period, begin + 1, end + 1, drifts, first, t_out, left, out)
         if first >= t_out.size:
@@ -108,6 +106,8 @@ def _repeat(
     times, series = borrow(kept.times), borrow(kept.series)
     t_out, left, out, drifts = borrow(t_out), borrow(left), borrow(out), borrow(drifts)
     held, as_powers = borrow(walk.held), borrow(walk.as_powers)
+    if begin == 1:
+        _make_powers(series, np.zeros((0, 0, 0, 0)), as_powers)
     work = np.zeros((2, WRITTEN_AT_ONCE))
     for k in range(begin, end):
         shift = k * period
@@ -135,31 +135,24 @@ def _repeat(
 
 
 @jit
-def _made_powers(series: FloatArray) -> bool:
-    """Turn columns (n_column, ROWS) into coefficients of 1, x, x^2, ... where that is as exact; whether it was done."""
-    if _may_be_powers(series):
-        _make_powers(series)
-        return True
-    return False
+def _make_powers(series: FloatArray, by: FloatArray, made: NDArray[np.bool_]) -> None:
+    """Turn coefficients (n_step, n_column, ROWS) into those of 1, x, x^2, ... where these are as exact: half the work.
 
-
-@jit
-def _may_be_powers(series: FloatArray) -> bool:
-    """Whether columns of coefficients (n_column, ROWS) are as exact as those of 1, x, x^2, ..., half the work."""
+    `made` (n_step,) takes for which steps; their derivatives `by` (n, n_step, n_column, ROWS) are turned as well.
+    """
     room = np.zeros(NODES)
-    small = True
-    for c in range(series.shape[0]):
-        small &= to_powers(series[c, :NODES], room)
-    return small
-
-
-@jit
-def _make_powers(series: FloatArray) -> None:
-    """Turn columns (n_column, ROWS) into coefficients of 1, x, x^2, ..."""
-    room = np.zeros(NODES)
-    for c in range(series.shape[0]):
-        to_powers(series[c, :NODES], room)
-        series[c, :NODES] = room
+    for i in range(made.size):
+        made[i] = True
+        for c in range(series.shape[1]):
+            made[i] &= to_powers(series[i, c, :NODES], room)
+        if not made[i]:
+            continue
+        for c in range(series.shape[1]):
+            to_powers(series[i, c, :NODES], room)
+            series[i, c, :NODES] = room
+            for m in range(by.shape[0]):
+                to_powers(by[m, i, c, :NODES], room)
+                by[m, i, c, :NODES] = room
 
 
 def approach(
@@ -201,11 +194,6 @@ def approach(
         The first output that is left.
     """
     walk = _new_walk(series.shape[0])
-    for i in range(series.shape[0]):
-        walk.as_powers[i] = _made_powers(series[i])
-        if walk.as_powers[i]:
-            for m in range(x.size):
-                _make_powers(by[m, i])
     formed = _Formed(np.full(x.size, np.inf), np.zeros(marks.size), np.zeros_like(series), np.ones(1, np.bool_))
     for begin, stop in _calls(periods, series.shape[0]):
         first = _approach(
@@ -245,6 +233,8 @@ def _approach(
     n = x.size
     work = np.zeros((2, WRITTEN_AT_ONCE))
     held, stops, made = walk.held, formed.stops, formed.series
+    if begin == 0:
+        _make_powers(series, by, walk.as_powers)
     delta = np.zeros(n)
     for k in range(begin, stop):
         shift = k * period
