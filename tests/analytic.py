@@ -1165,24 +1165,25 @@ class Transient:
             for step in self.steps:
                 if step.t + step.h <= t0 or step.t >= t1:
                     continue
-                x = np.linspace(max(step.t, t0), min(step.t + step.h, t1), samples)
-                y = self._on_step(step, x, name)
-                best_low = min(best_low, _refine(lambda t, s=step, q=name: self._on_step(s, t, q), x, y))
-                best_high = max(best_high, -_refine(lambda t, s=step, q=name: -self._on_step(s, t, q), x, -y))
+                x = np.linspace(max(0.0, (t0 - step.t) / step.h), min(1.0, (t1 - step.t) / step.h), samples)
+                y = self.at_fractions(step, x, name)
+                best_low = min(best_low, _refine(lambda f, s=step, q=name: self.at_fractions(s, f, q), x, y))
+                best_high = max(best_high, -_refine(lambda f, s=step, q=name: -self.at_fractions(s, f, q), x, -y))
             lows[f"{name}_min"], lows[f"{name}_max"] = best_low, best_high
         return lows
 
-    def _on_step(self, step: _Step, t: np.ndarray, name: str) -> np.ndarray:
-        u, a = _on_step(self.stack, self.nodes, step, t)
+    def at_fractions(self, step: _Step, theta: np.ndarray, name: str) -> np.ndarray:
+        """|u_a| (V) or F_el (N) at fractions of a step, whose length may be a rounding of its time."""
+        u, a, _ = _fields_at(self.stack, self.nodes, step, theta)
         ua = np.abs(u[:, self.stack.gap])
         return ua if name == "u_gap" else self.stack.sigma_per_u2 * ua**2 * a
 
 
 def _refine(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, y: np.ndarray) -> float:
-    """Minimum of a smooth function near its smallest sample: three rounds of zoomed sampling."""
+    """Minimum of a smooth function on [0, 1] near its smallest sample: five rounds of zoomed sampling."""
     for _ in range(5):
         j = int(np.argmin(y))
-        if j in (0, len(x) - 1) and x[-1] - x[0] < 1e-12 * abs(x[-1]):
+        if j in (0, len(x) - 1) and x[-1] - x[0] < 1e-12:
             break
         x = np.linspace(x[max(j - 1, 0)], x[min(j + 1, len(x) - 1)], 21)
         y = function(x)

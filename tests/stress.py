@@ -291,7 +291,7 @@ def mean_force(expected: ref.Transient, stop: float) -> float:
     inside = edges[:-1, None] + half * (1.0 + x)
     total = 0.0
     for step in expected.steps:
-        force = expected._on_step(step, step.t + step.h * inside.ravel(), "force").reshape(inside.shape)
+        force = expected.at_fractions(step, inside.ravel(), "force").reshape(inside.shape)
         total += step.h * float((half * w * force).sum())
     return total / stop
 
