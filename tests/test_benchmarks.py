@@ -24,6 +24,20 @@ def test_run_times_runs_and_writes_nothing_when_quick(monkeypatch, capsys):
     assert written.stat().st_mtime_ns == before
 
 
+def test_the_baseline_runs_and_compares_with_itself(monkeypatch, capsys, tmp_path):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    baseline = importlib.import_module("baseline")
+    results = baseline.main(["--quick"])
+    assert all(scene["status"] == "SUCCESS" and scene["calls"] > 0 for scene in results["scenes"].values())
+    for row in results["times"]:
+        assert all(row[method]["stated_error_over_peak"] <= 1e-6 for method in ("exponential", "auto"))
+    # A scene is the same to the byte when it runs again; one whose figures moved is told.
+    moved = json.loads(json.dumps(results))
+    name = next(iter(moved["scenes"]))
+    moved["scenes"][name]["digest"] = "another"
+    assert [text.split(":")[0] for text in baseline.compare(results, moved) if "digest" in text] == [name]
+
+
 @pytest.fixture
 def work_precision(monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -33,7 +34,7 @@ class _Combination(Waveform):
     def settled(self) -> float:
         return max(part.settled for part in self.parts)
 
-    @property
+    @cached_property
     def period(self) -> float | None:  # type: ignore[override]
         """Least common period of the parts, where their ratio is a ratio of integers below 1000."""
         total: float | None = None

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.combinations import Product, Sum
-from fingerspice.circuit.topology import Hop, find_loop
+from fingerspice.circuit.topology import Hop, Loop, find_loop
 from fingerspice.circuit.waveforms import DC, Waveform
 from fingerspice.errors import InputError
 from fingerspice.physics.contact import Contact
@@ -223,7 +223,13 @@ def is_stack(circuit: Circuit) -> bool:
     InputError
         As `topology.find_branches`.
     """
-    return bool(circuit.remember("is stack", lambda: find_loop(circuit) is not None))
+    return _loop(circuit) is not None
+
+
+def _loop(circuit: Circuit) -> Loop | None:
+    """The circuit's loop, looked for once."""
+    loop: Loop | None = circuit.remember("loop", lambda: find_loop(circuit))
+    return loop
 
 
 def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
@@ -237,7 +243,7 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
     InputError
         As `topology.find_branches`, and for a network that is no such stack.
     """
-    loop = find_loop(circuit)
+    loop = _loop(circuit)
     if loop is None:
         raise InputError(
             "this needs a series chain of LAYER, SLAB, SKIN and GAP driven by V sources, and the circuit is another "

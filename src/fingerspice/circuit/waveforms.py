@@ -114,8 +114,11 @@ class Waveform:
         if self.period is not None:
             # Later periods are alike.
             t1 = min(t1, max(t0, self.settled) + self.period)
-        knots = np.unique(np.concatenate([self.breakpoints(t0, t1), np.linspace(t0, t1, 513)]))
-        return float(max(np.abs(self.value(knots)).max(), np.abs(self.value(knots, "left")).max()))
+        values = [self.value(np.linspace(t0, t1, 513))]
+        breakpoints = self.breakpoints(t0, t1)
+        if breakpoints.size:
+            values += [self.value(breakpoints), self.value(breakpoints, "left")]
+        return float(np.abs(np.concatenate(values)).max())
 
     def __add__(self, other: Waveform | float) -> Waveform:
         return _combined("Sum", self, other)
@@ -163,18 +166,20 @@ def require(condition: bool, what: str, given: Any, allowed: str) -> None:
         raise InputError(f"{what} is {given}; allowed: {allowed}")
 
 
+_GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(24)
+
+
 def fourier_integral(waveform: Waveform, frequency: float, t0: float, t1: float) -> complex:
     """Integral of U(t) exp(-i 2 pi f t) over [t0, t1], by Gauss-Legendre panels between breakpoints."""
     inner = waveform.breakpoints(t0, t1)
     edges = np.unique(np.concatenate([[t0], inner[(inner > t0) & (inner < t1)], [t1]]))
-    x, w = np.polynomial.legendre.leggauss(24)
     panel = min(0.5 / frequency, waveform.shortest_time())
     total = 0j
     for a, b in itertools.pairwise(edges):
         cuts = np.linspace(a, b, max(1, math.ceil((b - a) / panel)) + 1)
         half = 0.5 * np.diff(cuts)[:, None]
-        t = 0.5 * (cuts[1:] + cuts[:-1])[:, None] + half * x
-        total += complex(np.sum(half * w * waveform.value(t) * np.exp(-1j * TAU * frequency * t)))
+        t = 0.5 * (cuts[1:] + cuts[:-1])[:, None] + half * _GAUSS_X
+        total += complex(np.sum(half * _GAUSS_W * waveform.value(t) * np.exp(-1j * TAU * frequency * t)))
     return total
 
 

@@ -17,10 +17,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
+from fingerspice.compiled import jit
 from fingerspice.engine.model import Model
+from fingerspice.numerics.chebyshev import evaluate, to_powers
 from fingerspice.numerics.modes import modes
 from fingerspice.physics.contact import N_PACKED, inverse_area
 
@@ -168,15 +169,30 @@ def area_polynomial(curve: FloatArray, tol: float) -> tuple[FloatArray, FloatArr
     slopes = np.zeros(DEGREE + 1)
     lo, hi = float(curve[0]), float(curve[1])
     series = curve[2 + N_PACKED :]
-    kept = series[: DEGREE + 1]
     if series.size == 0 or not lo < hi or np.abs(series[DEGREE + 1 :]).sum() > tol * abs(series[0]):
         return powers, slopes, lo, 0.0
-    found = chebyshev.cheb2poly(kept)
-    powers[: found.size] = found
-    slopes[:-1] = np.arange(1, DEGREE + 1) * powers[1:]
-    x = np.linspace(-1.0, 1.0, 33)
-    miss = np.abs(np.polynomial.polynomial.polyval(x, powers) - chebyshev.chebval(x, series)).max()
-    return powers, slopes, lo, (2.0 / (hi - lo) if miss <= max(2.0 * tol, 4e-15) * abs(series[0]) else 0.0)
+    exact = _to_polynomial(series, powers, slopes, max(2.0 * tol, 4e-15) * abs(series[0]))
+    return powers, slopes, lo, 2.0 / (hi - lo) if exact else 0.0
+
+
+@jit
+def _to_polynomial(series: FloatArray, powers: FloatArray, slopes: FloatArray, allowed: float) -> bool:
+    """Turn as many terms of a Chebyshev series into powers as there is room for, with their derivative.
+
+    Whether the powers miss no more than `allowed` of the whole series, looked for at 33 points.
+    """
+    kept = min(series.size, powers.size)
+    to_powers(series[:kept], powers[:kept])
+    for j in range(1, kept):
+        slopes[j - 1] = j * powers[j]
+    worst = 0.0
+    for i in range(33):
+        x = i / 16.0 - 1.0
+        value = 0.0
+        for j in range(kept - 1, -1, -1):
+            value = value * x + powers[j]
+        worst = max(worst, abs(value - evaluate(series, x)[0]))
+    return worst <= allowed
 
 
 def area_range(model: Model, u_max: float) -> tuple[float, float]:

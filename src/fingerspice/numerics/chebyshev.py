@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,12 @@ FloatArray = NDArray[np.float64]
 
 def nodes(n: int, lo: float, hi: float) -> FloatArray:
     """Chebyshev points of the first kind on [lo, hi], ascending, shape (n,)."""
-    angle = (np.arange(n)[::-1] + 0.5) * np.pi / n
-    return 0.5 * (lo + hi) + 0.5 * (hi - lo) * np.cos(angle)
+    return 0.5 * (lo + hi) + 0.5 * (hi - lo) * np.cos(_angles(n))
+
+
+@lru_cache(maxsize=32)
+def _angles(n: int) -> FloatArray:
+    return np.asarray((np.arange(n)[::-1] + 0.5) * np.pi / n)
 
 
 def coefficients(values: FloatArray) -> FloatArray:
@@ -24,16 +29,11 @@ def coefficients(values: FloatArray) -> FloatArray:
     return _transform(n) @ values
 
 
-_TRANSFORMS: dict[int, FloatArray] = {}
-
-
+@lru_cache(maxsize=32)
 def _transform(n: int) -> FloatArray:
-    if n not in _TRANSFORMS:
-        angle = (np.arange(n)[::-1] + 0.5) * np.pi / n
-        matrix = np.cos(np.outer(np.arange(n), angle)) * (2.0 / n)
-        matrix[0] *= 0.5
-        _TRANSFORMS[n] = matrix
-    return _TRANSFORMS[n]
+    matrix: FloatArray = np.cos(np.outer(np.arange(n), _angles(n))) * (2.0 / n)
+    matrix[0] *= 0.5
+    return matrix
 
 
 def fit(

@@ -14,12 +14,13 @@ The sizes are constants, so that the compiler unrolls every inner loop.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import chebyshev, legendre
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.compiled import jit_fused
 
 FloatArray = NDArray[np.float64]
 
@@ -64,10 +65,21 @@ _GAUSS_X, _GAUSS_W = legendre.leggauss(32)
 _GAUSS_X, _GAUSS_W = 0.5 * (_GAUSS_X + 1.0), 0.5 * _GAUSS_W
 # exp(-45) of the largest value is below rounding.
 _REACH = 45.0
+_END_WEIGHT = _GAUSS_W * np.exp(-_REACH * _GAUSS_X)
 _INVERSE_SCALE = 1.0 / _SCALE
 
 
-@jit
+# Where Gauss's rule over [0, c_i] stands: basis polynomials, shape (ROWS, 32, NODES), and the node polynomial.
+_AT = POINTS[:, None] * (1.0 - _GAUSS_X)
+_OFF = _AT[:, :, None] - _X
+# The node at 0 and 1 is no Gauss point; only the row of c = 0, which has no integral, meets one.
+_OFF[_OFF == 0.0] = 1e-300
+_BASIS = BARYCENTRIC / _OFF
+_BASIS = np.ascontiguousarray(_BASIS / _BASIS.sum(axis=2, keepdims=True))
+_PRODUCT = np.prod(_OFF, axis=2) / _SCALE
+
+
+@jit_fused
 def fill_table(z: float, decay: FloatArray, phi: FloatArray, miss: FloatArray) -> None:
     """Tables of one mode for z = rate * h >= 0, in units of h.
 
@@ -75,35 +87,43 @@ def fill_table(z: float, decay: FloatArray, phi: FloatArray, miss: FloatArray) -
     the node polynomial, of largest size 1.
     """
     basis = np.empty(NODES)
+    sums = np.empty(NODES)
     for i in range(ROWS):
         x = z * POINTS[i]
         # Denormal numbers would slow every later product down.
         decay[i] = math.exp(-x) if x < 690.0 else 0.0
-        miss[i] = 0.0
         for j in range(NODES):
-            phi[j, i] = 0.0
-        reach = POINTS[i]
-        if reach * z > _REACH:
+            sums[j] = 0.0
+        missed = 0.0
+        if x > _REACH:
+            # All that counts of exp(-z (c_i - s)) is close to the end.
             reach = _REACH / z
-        if reach == 0.0:
-            continue
-        for g in range(_GAUSS_X.size):
-            back = reach * _GAUSS_X[g]
-            s = POINTS[i] - back
-            weight = reach * _GAUSS_W[g] * math.exp(-z * back)
-            total = 0.0
-            product = 1.0
-            for j in range(NODES):
-                distance = s - POINTS[j]
-                product *= distance
-                basis[j] = BARYCENTRIC[j] / distance if distance != 0.0 else 1e300
-                total += basis[j]
-            weight_over = weight / total
-            for j in range(NODES):
-                phi[j, i] += weight_over * basis[j]
-            miss[i] += weight * product * _INVERSE_SCALE
+            for g in range(_GAUSS_X.size):
+                s = POINTS[i] - reach * _GAUSS_X[g]
+                total = 0.0
+                product = _INVERSE_SCALE
+                for j in range(NODES):
+                    distance = s - POINTS[j]
+                    product *= distance
+                    basis[j] = BARYCENTRIC[j] / distance if distance != 0.0 else 1e300
+                    total += basis[j]
+                weight = reach * _END_WEIGHT[g]
+                share = weight / total
+                for j in range(NODES):
+                    sums[j] += share * basis[j]
+                missed += weight * product
+        elif i > 0:
+            for g in range(_GAUSS_X.size):
+                weight = POINTS[i] * _GAUSS_W[g] * math.exp(-x * _GAUSS_X[g])
+                for j in range(NODES):
+                    sums[j] += weight * _BASIS[i, g, j]
+                missed += weight * _PRODUCT[i, g]
+        miss[i] = missed
+        for j in range(NODES):
+            phi[j, i] = sums[j]
 
 
+@lru_cache(maxsize=1)
 def integral_table() -> FloatArray:
     """`phi` of a mode with rate zero: integrals over [0, c_i] of the interpolant, shape (NODES, ROWS)."""
     phi = np.empty((NODES, ROWS))
