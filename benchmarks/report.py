@@ -1,7 +1,8 @@
-"""Tables and picture of the work-precision results, from results/work_precision.json alone.
+"""Tables and picture of the measured times, from the files in results/ alone.
 
-Run: python benchmarks/report.py [--results FILE] [--readme FILE]. Writes results/work_precision.md (every contestant),
-results/work_precision.png, and the README's table between its `speed` markers.
+Run: python benchmarks/report.py [--results FILE] [--page FILE] [--readme FILE]. From work_precision.json come
+results/work_precision.md (every contestant), results/work_precision.png and the table between the `speed` markers of
+docs/speed.md; from run_times.json, baseline.json and throughput.json beside it that between the README's.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "work_precision.json"
-README = HERE.parent / "README.md"
+README, PAGE = HERE.parent / "README.md", HERE.parent / "docs" / "speed.md"
 BEGIN, END = "<!-- speed:begin -->", "<!-- speed:end -->"
 TARGETS = (1e-3, 1e-6, 1e-10)
 NGSPICE_TARGET = 1e-4
@@ -152,8 +153,51 @@ def conditions(results: Report) -> str:
     return text + (f"; absent: {', '.join(absent)}" if absent else "")
 
 
-def readme_text(results: Report) -> str:
-    """What stands between the README's markers."""
+def waits(folder: Path) -> str:
+    """What a user waits for, as the README's table, from the results in a folder."""
+    run, base, rate = (
+        json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+        for name in ("run_times", "baseline", "throughput")
+    )
+    calls = {what: 1e3 * seconds for what, seconds in base["calls"].items()}
+
+    def call(deck: str) -> str:
+        ways = ("the same", "another parameter", "another source")
+        return " / ".join(number(calls[f"{deck}: {way}"]) for way in ways) + " ms"
+
+    def period(circuit: str, method: str) -> str:
+        found = {row["source"]: row[method]["us_per_period"] for row in base["times"] if row["circuit"] == circuit}
+        return " / ".join(number(us) for us in found.values()) + " µs"
+
+    sources = ", ".join(row["source"] for row in base["times"] if row["circuit"] == "fingerpad")
+    rows = [
+        ["what you wait for", "time"],
+        ["`import fingerspice`", f"{run['import_s']:.2f} s"],
+        [
+            "`fingerspice run` of Table 1, without / with picture",
+            f"{run['run_no_plot_s']:.1f} / {run['run_s']:.1f} s",
+        ],
+        ["`fs.simulate`, five periods: the same circuit again / another parameter / another source", call("fingerpad")],
+        ["the same with the dispersive skin", call("fingerpad_dispersive")],
+        ["the same behind an amplifier and a cable", call("amplifier")],
+        [f"a period, outputs included, of 100: {sources}", period("fingerpad", "auto")],
+        ["the same, every period stepped", period("fingerpad", "exponential")],
+        ["the same behind an amplifier and a cable, stepped", period("amplifier", "exponential")],
+        ["the same with two fingers and a floating body, stepped", period("two_fingers", "exponential")],
+        [
+            "a sample of a recording, with the area given",
+            f"{rate['samples']['ns_per_sample']['fingerspice']:.1f} ns",
+        ],
+    ]  # fmt: skip
+    text = (
+        f"Medians of 7 at an error of 1e-6 of the peak, after the first use, on {base['machine']}, commit "
+        f"{base['revision']} (`benchmarks/run_times.py`, `baseline.py`, `throughput.py`)."
+    )
+    return "\n".join([*markdown(rows), "", *textwrap.wrap(text, 118, break_long_words=False, break_on_hyphens=False)])
+
+
+def page_text(results: Report) -> str:
+    """What stands between the markers of the page on speed."""
     aims = " / ".join(f"{t:.0e}".replace("e-0", "e-") for t in TARGETS)
     spread = max(p["reference_agreement"] for p in results["problems"].values())
     text = (
@@ -164,7 +208,7 @@ def readme_text(results: Report) -> str:
         "a period that no longer changes the state (200 periods at 100 Hz, 500 at 5 kHz); *every period* steps them "
         f"all, as its peers do. Two independent references agree to {spread:.0e}. Medians of {results['repeats']} "
         f"(slow peers: fewer) by `python benchmarks/work_precision.py` on {results['machine']}; versions, every "
-        "method, what failed, and the law `mobile`: [`work_precision.md`](benchmarks/results/work_precision.md)."
+        "method, what failed, and the law `mobile`: [`work_precision.md`](../benchmarks/results/work_precision.md)."
     )
     ratio = (
         f"Times our time, the worst of the four scenes of Table 1, at {aims}: {ratios(results, OURS)}; with every "
@@ -178,7 +222,7 @@ def readme_text(results: Report) -> str:
             "",
             *textwrap.wrap(ratio, 118, break_long_words=False, break_on_hyphens=False),
             "",
-            "![Error against time and against evaluations](benchmarks/results/work_precision.png)",
+            "![Error against time and against evaluations](../benchmarks/results/work_precision.png)",
         ]
     )
 
@@ -263,8 +307,8 @@ def picture(results: Report, path: Path) -> None:
         plt.close(figure)
 
 
-def into_readme(text: str, readme: Path) -> None:
-    """Put the text between the markers of a README.
+def put_into(text: str, readme: Path) -> None:
+    """Put the text between the markers of a page.
 
     Raises
     ------
@@ -283,12 +327,14 @@ def main(arguments: list[str] | None = None) -> None:
     """Write tables and picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--page", type=Path, default=PAGE)
     parser.add_argument("--readme", type=Path, default=README)
     options = parser.parse_args(arguments)
     results = json.loads(options.results.read_text(encoding="utf-8"))
     options.results.with_suffix(".md").write_text(details(results), encoding="utf-8")
     picture(results, options.results.with_suffix(".png"))
-    into_readme(readme_text(results), options.readme)
+    put_into(page_text(results), options.page)
+    put_into(waits(options.results.parent), options.readme)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from scenes import table1
 RTOL = 1e-6
 # Steps tried in a scene of two periods, at most: work is bounded.
 MOST_STEPS = 50_000
-# A run, and the reference's, may take so long, s.
+# A run, and the reference's, may take so long, s of processor time.
 LONGEST = 10
 # What the reference itself may be off: of the source's amplitude, of area and force; and of the charge, both delivered
 # and standing on the layers.
@@ -299,8 +299,8 @@ def mean_force(expected: ref.Transient, stop: float) -> float:
 def judge(scene: Scene) -> Verdict:
     """How a scene ended; raises `WrongError`."""
     compiled()
-    signal.signal(signal.SIGALRM, _late)
-    signal.alarm(LONGEST)
+    signal.signal(signal.SIGPROF, _late)
+    signal.setitimer(signal.ITIMER_PROF, LONGEST)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", fs.FingerspiceWarning)
@@ -311,20 +311,20 @@ def judge(scene: Scene) -> Verdict:
                 return Verdict("refused: no contact")
             raise WrongError(f"refused, though it is legal: {error}") from None
         except SlowError:
-            raise WrongError(f"no answer within {LONGEST} s") from None
+            raise WrongError(f"no answer within {LONGEST} s of processor time") from None
         finally:
-            signal.alarm(0)
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
     tried = solution.stats.get("steps", 0) + solution.stats.get("rejected", 0)
     if tried > MOST_STEPS:
         raise WrongError(f"{tried} steps")
     with np.errstate(all="ignore"):
-        signal.alarm(LONGEST)
+        signal.setitimer(signal.ITIMER_PROF, LONGEST)
         try:
             expected = scene.expected(solution.t)
         except (RuntimeError, ValueError, ZeroDivisionError, np.linalg.LinAlgError, SlowError):
             return Verdict(f"not judged: the reference gave up, ours says {solution.status.name}")
         finally:
-            signal.alarm(0)
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
     period = 1.0 / scene.frequency
     peak = float(np.nanmax(np.abs(expected.u_gap), initial=0.0))
     if solution.status is fs.Status.ERROR_NOT_MET:

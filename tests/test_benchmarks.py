@@ -88,15 +88,19 @@ def test_the_report_needs_nothing_but_the_results(work_precision, tmp_path):
             for error in (1e-4, 1e-7, 1e-11)
         ],
     }  # fmt: skip
-    path, readme = tmp_path / "work_precision.json", tmp_path / "README.md"
+    path, page, readme = (tmp_path / name for name in ("work_precision.json", "speed.md", "README.md"))
     path.write_text(json.dumps(results))
-    readme.write_text(f"before\n{report.BEGIN}\nstale\n{report.END}\nafter\n")
-    report.main(["--results", str(path), "--readme", str(readme)])
-    page = readme.read_text()
-    assert page.startswith("before\n")
-    assert page.endswith("\nafter\n")
-    assert "stale" not in page
-    assert "| best peer over ours, times | 15 / 15 / 15 |" in page
+    for name in ("run_times", "baseline", "throughput"):
+        (tmp_path / f"{name}.json").write_text((FOLDER / "results" / f"{name}.json").read_text())
+    for written in (page, readme):
+        written.write_text(f"before\n{report.BEGIN}\nstale\n{report.END}\nafter\n")
+    report.main(["--results", str(path), "--page", str(page), "--readme", str(readme)])
+    for text in (page.read_text(), readme.read_text()):
+        assert text.startswith("before\n")
+        assert text.endswith("\nafter\n")
+        assert "stale" not in text
+    assert "| best peer over ours, times | 15 / 15 / 15 |" in page.read_text()
+    assert "| `import fingerspice` | " in readme.read_text()
     assert path.with_suffix(".png").stat().st_size > 0
 
 

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from fingerspice.engine import charge, netcharge, readout, rows
 from fingerspice.engine.exponential import N_PLACES
 from fingerspice.engine.model import Model
-from fingerspice.numerics.lobatto import END, FIRST, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import END, FIRST, POINTS, ROWS
 
 PLACES = np.array([0, FIRST, FIRST + 1, FIRST + 2, END])
 A0, H = 35e-6, 1e-3
@@ -133,7 +133,7 @@ def stack(rng: np.random.Generator, law: str, parts: str) -> Stack:
 
 def engine_account(step: Stack, collected: float = 0.0, last_area: float | None = None) -> np.ndarray:
     """`control` after the engine's account of the step, with a jump before it from an area (m^2) if that is given."""
-    u, slow_voltage, area = step.at(POINTS, 0.0)
+    u, _, area = step.at(POINTS, 0.0)
     w = np.array([m(POINTS) for m in step.modes])
     places = np.array([e(POINTS[PLACES]) for e in step.errors])
     r = np.zeros((rows.N_FLAT, ROWS))
@@ -142,8 +142,7 @@ def engine_account(step: Stack, collected: float = 0.0, last_area: float | None 
     control = np.zeros(readout.N_CONTROL)
     control[readout.COLLECTED] = collected
     control[readout.LAST_Q] = 0.0 if last_area is None else 1.0 / last_area
-    voltage = slow_voltage[:NODES] if not step.mobile else (step.slow @ w)[:NODES].copy()
-    charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, voltage.copy(), control)
+    charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, control)
     return control
 
 
