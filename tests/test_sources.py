@@ -151,7 +151,7 @@ def test_square_is_ours_with_a_duty() -> None:
         ("WAVEFILE(sound.wav 100)", "WAVEFILE is not supported by this version"),
         ("TABLE(data.csv)", "TABLE is not supported by this version"),
         ("PWL(file=data.txt)", "PWL(file=...) is not supported"),
-        ("SINE(0 200 100)", "did you mean 'sin'?"),
+        ("SINN(0 200 100)", "did you mean 'sin'?"),
         ("TRNOISE(1 2 3 4)", "unknown source 'TRNOISE'"),
         ("SIN(0)", "SIN needs 2 values, 1 given"),
         ("SIN(0 1 2 3 4 5 6)", "SIN takes at most 6 values, 7 given"),

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from fingerspice.circuit.circuit import Element
+from fingerspice.circuit.usual import LARGEST_FORCE, beyond_fingers
 from fingerspice.netruns import NetworkRun
 from fingerspice.network_record import NetworkRecord
 from fingerspice.networks import NetworkProblem
@@ -32,8 +33,10 @@ def stack_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
         yield outside
     stack = problem.stack
     if stack.contact is not None:
-        least = 1.0 / inverse_area(run.peak_u, problem.model.curve)[0]
-        yield from _gap_warnings("", run.peak_u, problem.model.area0, least if problem.model.coupled else math.inf)
+        at_rest, follows = problem.model.area0, problem.model.coupled
+        loaded = 1.0 / inverse_area(run.peak_u, problem.model.curve)[0] if follows else at_rest
+        yield from _gap_warnings("", run.peak_u, at_rest, loaded if follows else math.inf)
+        yield from beyond_fingers("", run.peak_f, float(stack.contact.stress(run.peak_u)), max(at_rest, loaded))
     if run.status is Status.SUCCESS and 0.0 < run.peak_u <= run.error.u_gap:
         yield (
             f"the gap takes no more than rounding of the source's voltage: of its {run.peak_u:.2g} V nothing is known "
@@ -49,12 +52,16 @@ def network_warnings(problem: NetworkProblem, run: NetworkRun, record: NetworkRe
         yield outside
     several = len(record.fingers) > 1
     for finger, i in enumerate(problem.network.fingers):
-        least = float(record.finger_area(finger).min(initial=math.inf))
+        area = record.finger_area(finger)
+        least, largest = float(area.min(initial=math.inf)), float(area.max(initial=0.0))
         where = f" of {record.fingers[finger][0]}" if several else ""
         follows = problem.scene.fixed[i] is None
         yield from _gap_warnings(
             where, float(run.peaks[i]), float(problem.scene.area0[i]), least if follows else math.inf
         )
+        pressure = float(record.fingers[finger][1].stress(float(run.peaks[i])))
+        force = float(record.finger_force(finger).max(initial=0.0)) if pressure * largest > LARGEST_FORCE else 0.0
+        yield from beyond_fingers(where, force, pressure, largest)
     yield from _fold_warning(run)
     yield from _strength_warnings(problem.network.layers, record)
 

@@ -81,7 +81,7 @@ def _sweep(
         changes: dict[str, float | Waveform] = {f"{name}.f": float(f) for name in skins}
         changes[source.name] = Sine(amplitude, float(f))
         state = steady_state(
-            circuit.replace(changes), charge_law=charge_law, rtol=rtol, points=POINTS, charge=False
+            circuit.varied(changes), charge_law=charge_law, rtol=rtol, points=POINTS, charge=False
         )  # fmt: skip
         s = state.solution
         # The start of the period is a multiple of it: phases are those of the source.

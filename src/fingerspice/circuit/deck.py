@@ -11,12 +11,12 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from fingerspice.circuit.devices import layer_devices
 from fingerspice.circuit.flatten import Flattener, Statement
 from fingerspice.circuit.lexer import Line, group, lex
 from fingerspice.circuit.reader import (
     DIRECTIVES,
     MAX_BYTES,
-    NATIVE_DEVICES,
     NATIVE_LIBRARIES,
     Reader,
     Subcircuit,
@@ -26,7 +26,6 @@ from fingerspice.circuit.scope import Call, Number, Scope, Token, Value
 from fingerspice.errors import InputError, Where, printable
 
 __all__ = [
-    "NATIVE_DEVICES",
     "NATIVE_LIBRARIES",
     "Call",
     "Deck",
@@ -41,9 +40,9 @@ __all__ = [
 #: Characters of a title that are shown; of a longer one the middle is left out.
 LONGEST_TITLE = 200
 
-_VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sin|pulse|exp|pwl|square|wavefile|table)\b)"
+_VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|wavefile|table)\b)"
 _ELEMENT_TITLE = re.compile(rf"[rcvi]\w*\s+\S+\s+\S+\s+{_VALUE}", re.IGNORECASE)
-_DEVICE_TITLE = re.compile(rf"x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(NATIVE_DEVICES)})(?:\s|$)", re.IGNORECASE)
+_DEVICE_TITLE = re.compile(rf"x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(layer_devices())})(?:\s|$)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
