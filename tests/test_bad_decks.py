@@ -46,7 +46,8 @@ VALUES = [
     (("d=1u", "d=0"), 4, ["Xcoat d is 0 m; allowed: more than 0"]),
     (("d=350u", "d={-350u}"), 6, ["Xskin d is {-350u} (-0.00035 m); allowed: more than 0"]),
     (("d=1u", "d=inf"), 4, ["Xcoat d is 'inf'; allowed: a number m"]),
-    (("d=1u", "d=thick"), 4, ["Xcoat d is 'thick'; allowed: a number m"]),
+    (("d=1u", "d=thick"), 4, ["Xcoat d is 'thick'; allowed: a number m, or the name of a .param"]),
+    (("mu=0.3", "mu=30%"), 5, ["'30%' is not a number: write 0.3"]),
     (("d=1u", "d=1 um"), 4, ["'um' follows the parameters"]),
     (("eps_r=3.9", "eps_r=0"), 4, ["Xcoat eps_r is 0; allowed: more than 0"]),
     (("r=0.2meg", "r=-5"), 4, ["Xcoat r is -5 ohm; allowed: more than 0 or inf"]),
@@ -103,7 +104,9 @@ CONTACT = [
 
 CIRCUIT = [
     (("Vdrive drive 0 SIN(0 200 100)", "*"), 0, ["the circuit has no source; allowed: a V element"]),
-    (("Xskin skin 0", "Xskin skn 0"), 5, ["node 'skin' is floating: only Xgap touches it"]),
+    (("Xskin skin 0", "Xskin skn 0"), 5, ["node 'skin' is floating: only Xgap touches it", "is 'skn' the same node?"]),
+    (("Xskin skin 0", "Xskin skin gnd1"), 6, ["node 'gnd1' is floating", "ground is 0 or gnd"]),
+    (("Xskin skin 0 area", "Xskin skin 0 0"), 6, ["Xskin has ground as its area; allowed: the area node of a GAP"]),
     (("Xskin skin 0", "Xskin skin far"), 6, ["node 'far' is floating: only Xskin touches it"]),
     (("Xskin skin 0", "Xskin skin skin"), 6, ["Xskin has both ends on node 'skin'"]),
     (
@@ -113,8 +116,10 @@ CIRCUIT = [
     ),
     (("Xcoat", "Xgap"), 5, ["element 'Xgap' is defined twice, first at deck.cir:4:1"]),
     ((".end", "Vb drive 0 5"), 8, ["Vdrive and Vb are voltage sources in parallel"]),
-    ((".end", "Va area 0 35"), 8, ["Va and Xgap both drive the area node 'area'"]),
+    ((".end", "Va area 0 35"), 8, ["Va and Xgap both drive the area node 'area'", "allowed: a_fix= on Xgap"]),
     ((".end", "R1 drive loose 1k"), 8, ["node 'loose' is floating: only R1 touches it"]),
+    ((".end", "# note"), 8, ["'#' is no element", "a comment with *"]),
+    ((".end", "B1 drive 0 V=5*time"), 8, ["a behavioural source (a function of time is given in Python"]),
     ((".end", "D1 drive 0 diode"), 8, ["'D1' is a diode, which is not supported"]),
     ((".include fingerspice.lib", ".include ../fingers.lib"), 2, ["lies outside the netlist's folder"]),
     ((".include fingerspice.lib", ".include /etc/passwd"), 2, ["lies outside the netlist's folder"]),
@@ -178,6 +183,9 @@ SOURCES = [
     (("SIN(0 200 100)", "SINE(0 200 100 0 0 0 5)"), 3, ["SINE takes at most 6", "Ncycles is not supported"]),
     (("SIN(0 200 100)", "PULSE(0 1 0 1u 1u 1m 2m 5)"), 3, ["PULSE takes at most 7", "Ncycles is not supported"]),
     (("SIN(0 200 100)", "SIN(0 200 100) Lser=1"), 3, ["Vdrive takes no parameter 'lser'; allowed: Rser, Cpar"]),
+    (("SIN(0 200 100)", "SIN(0 200 100 0 0 90°)"), 3, ["'90°' is not a number: write 90"]),
+    (("SIN(0 200 100)", "200*sin(2*pi*100*t)"), 3, ["in braces"]),
+    (("SIN(0 200 100)", "sin(2*pi*100*t)"), 3, ["a function of time is SIN(VO VA FREQ), PULSE or PWL"]),
     (("SIN(0 200 100)", "SIN(0 200 0,1)"), 3, ["frequency is 0 Hz", "0,1 is two numbers", "write 0.1"]),
     (("SIN(0 200 100)", ""), 3, ["missing value", "Vdrive node node value"]),
 ]

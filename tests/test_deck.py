@@ -260,7 +260,7 @@ REFUSED = {
     "X1 a b area LAYRE d=1": "did you mean 'LAYER'",
     "X1 a b area nothing d=1": "devices are LAYER SLAB",
     "X1 a b area LAYER 1u": "follows the device LAYER",
-    "X1 a b LAYER d=1": r"missing value: X1: LAYER has 3 nodes \(p n area\), 2 given",
+    "X1 a b LAYER d=1": r"X1: LAYER has 3 nodes \(p n area\), 2 given",
     "X1 a b c d LAYER d=1": "has 3 nodes",
     'X1 a b area "LAYER"': "where a device's name belongs",
     "X1 a b area LAYER d=": "missing value of 'd'",

@@ -127,6 +127,14 @@ def test_relative_times_of_ltspices_pwl_are_named() -> None:
     ]
 
 
+def test_a_sine_without_its_frequency_is_named() -> None:
+    circuit, said = read(("SIN(0 200 100)", "SIN(200 100)"))
+    assert circuit["Vdrive"].waveform == fs.Sine(100.0, 20.0, 200.0)
+    assert said == [
+        "deck.cir:3:16: Vdrive: SIN leaves out FREQ, which is 1/TSTOP then, 20 Hz; its values are VO VA FREQ"
+    ]
+
+
 def test_a_netlist_in_utf_16_with_its_mark_is_read(tmp_path: Path) -> None:
     path = tmp_path / "finger.net"
     path.write_bytes(DECK.replace("3.5u", "3.5\u00b5").encode("utf-16"))

@@ -246,6 +246,15 @@ def test_values_are_changed_by_numbers_and_in_spices_notation(path: str, text: o
     assert changed.warnings == ()
 
 
+def test_what_is_doubtful_in_a_sources_text_is_warned_about() -> None:
+    with pytest.warns(fs.FingerspiceWarning, match=r"'SIN\(0,5 200 100\)': 0,5 is two numbers, 0 and 5"):
+        read().replace({"Vdrive": "SIN(0,5 200 100)"})
+    with pytest.warns(fs.FingerspiceWarning, match=r"'SIN\(0 5\)': source: SIN leaves out FREQ"):
+        read().replace({"Vdrive": "SIN(0 5)"})
+    with pytest.raises(fs.InputError, match=r"frequency is 0 Hz; allowed: > 0; note 0,1k is two numbers, 0 and 1k"):
+        read().replace({"Vdrive": "SIN(0 5 0,1k)"})
+
+
 def test_a_source_is_changed_by_its_text() -> None:
     changed = read().replace({"vdrive": "SQUARE(150 1k)"})
     assert changed["Vdrive"].waveform == fs.Square(150.0, 1e3)

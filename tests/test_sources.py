@@ -62,7 +62,8 @@ def test_sin_takes_degrees_and_holds_its_first_value_before_the_delay() -> None:
 
 
 def test_sin_without_a_frequency_runs_once_over_the_analysis() -> None:
-    assert wave("SIN(0 5)") == fs.Sine(5.0, 10.0)
+    with pytest.warns(fs.FingerspiceWarning, match="SIN leaves out FREQ, which is 1/TSTOP then, 10 Hz"):
+        assert wave("SIN(0 5)") == fs.Sine(5.0, 10.0)
     assert "FREQ" in str(refusal_without_tran("SIN(0 5)"))
 
 

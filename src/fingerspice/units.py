@@ -170,6 +170,10 @@ def _why_not_a_number(text: str) -> str:
         if letters.lower().startswith(tuple(SCALES)) or letters.lower() in ("r", "v"):
             scale = "" if letters.lower() in ("r", "v") else letters
             return f"'{text}' differs between simulators: write {whole}.{fraction}{scale}"
+    bare = text.rstrip("%°")
+    if bare != text and _NUMBER.fullmatch(bare):
+        plain = f"{float(parse_number(bare)) / 100.0:g}" if text.endswith("%") else bare
+        return f"'{text}' is not a number: write {plain}"
     plain = text.translate(_DASHES)
     if plain != text and _NUMBER.fullmatch(plain):
         return f"'{text}' is not a number, its minus is a typographic one: write {plain}"

@@ -47,6 +47,10 @@ def read_elements(statement: Statement, timing: Timing, notes: list[str]) -> lis
     beside = {key: statement.params[key] for key in _PARASITICS.get(device, ()) if key in statement.params}
     own = replace(statement, params={k: v for k, v in statement.params.items() if k not in beside})
     if DEVICES[device].is_layer:
+        if statement.nodes[2] == "0":
+            raise InputError(
+                f"{statement.name} has ground as its area; allowed: the area node of a GAP", statement.where
+            )
         values = _device_values(own, device, notes)
     elif device in "VI":
         source = _source(own, timing)
@@ -149,7 +153,8 @@ def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> fl
     if isinstance(given, Token):
         if spec.may_be_infinite and given.text.lower() in ("inf", "none"):
             return math.inf
-        raise InputError(f"{name} {spec.name} is {given.text!r}; allowed: a number{unit}", given.where)
+        allowed = f"a number{unit}, or the name of a .param"
+        raise InputError(f"{name} {spec.name} is {given.text!r}; allowed: {allowed}", given.where)
     trap = unit_trap(spec, given.text)
     if trap:
         raise InputError(f"{name} {spec.name} {trap}", given.where)

@@ -21,7 +21,7 @@ MAX_NAME = 400
 _VALUED = {"R": "resistor", "C": "capacitor", "V": "voltage source", "I": "current source"}
 _ELSEWHERE = {
     "A": "an XSPICE model",
-    "B": "a behavioural source",
+    "B": "a behavioural source (a function of time is given in Python, sources={'V1': f})",
     "D": "a diode",
     "E": "a controlled source",
     "F": "a controlled source",
@@ -145,7 +145,9 @@ class Flattener:
         where = line.where(first.position)
         letter = first.text[:1].upper()
         if first.kind != "word" or not (letter.isascii() and letter.isalpha()):
-            problem = f"'{line.written(first)}' is no element: a line begins with R, C, V, I, X or a dot"
+            problem = (
+                f"'{line.written(first)}' is no element: a line begins with R, C, V, I, X or a dot, a comment with *"
+            )
             raise InputError(problem, where)
         if letter != "X" and letter not in _VALUED:
             raise InputError(_unknown_element(lexemes), where)
@@ -273,8 +275,7 @@ def _check_nodes(name: str, device: str, given: int, wanted: tuple[str, ...], wh
     if given != len(wanted):
         plural = "" if len(wanted) == 1 else "s"
         nodes = f" ({' '.join(wanted)})" if wanted else ""
-        problem = f"missing value: {name}:" if given < len(wanted) else f"{name}:"
-        raise InputError(f"{problem} {device} has {len(wanted)} node{plural}{nodes}, {given} given", where)
+        raise InputError(f"{name}: {device} has {len(wanted)} node{plural}{nodes}, {given} given", where)
 
 
 def _unknown_device(line: Line, words: list[Lexeme], instance: _Instance) -> str:

@@ -11,6 +11,7 @@ from fingerspice.circuit.deck import Deck, parse_deck, read_deck
 from fingerspice.circuit.directives import read_ac, read_initial, read_options, read_tran, unused_starts
 from fingerspice.circuit.elements import read_elements
 from fingerspice.circuit.network import build_network
+from fingerspice.circuit.slips import decimal_comma
 from fingerspice.circuit.sources import Timing, read_source
 from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.circuit.usual import REST_AREA
@@ -137,6 +138,10 @@ def source_from_text(text: str, circuit: Circuit) -> Waveform:
         source = read_source("source", deck.statements[0].body, timing, deck.statements[0].where)
         if source.ac is not None:
             raise InputError("AC belongs into the deck; allowed: the source function alone, whose fundamental drives")
-        return source.waveform
     except InputError as error:
-        raise InputError(f"{text!r}: {error.message}") from None
+        comma = decimal_comma(f"V1 a 0 {text}")
+        raise InputError(f"{text!r}: {error.message}" + (f"; note {comma}" if comma else "")) from None
+    for note in (*deck.warnings, *source.notes):
+        # Its place is one in the text.
+        warnings.warn(f"{text!r}: {note.partition(': ')[2]}", FingerspiceWarning, stacklevel=2)
+    return source.waveform

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import codecs
 from dataclasses import dataclass, field
+from encodings import cp1252
 from pathlib import Path
 
 from fingerspice.circuit.devices import layer_devices
@@ -273,7 +274,7 @@ def read_text(path: Path, shown: str, where: Where | None = None) -> str:
         broken = error.start
     try:
         # Windows' Latin-1, in which LTspice writes its micro sign.
-        return data.decode("cp1252")
+        return cp1252.Codec().decode(data)[0]
     except UnicodeDecodeError:
         number = data[:broken].count(b"\n") + 1
         problem = f"'{shown}' is neither UTF-8 nor Latin-1 text (byte 0x{data[broken]:02x} in line {number})"

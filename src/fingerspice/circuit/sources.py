@@ -249,6 +249,12 @@ def _differences(name: str, key: str, waveform: Waveform, call: Call) -> tuple[s
             f"{call.where}: {name}: {key.upper()} has {which} = 0, which is 0 s here and not in ngspice 39, which "
             "takes TSTEP for TD1 = 0 and TD1 + TSTEP for TD2 = 0; write 1f for both to start at once",
         )
+    if key == "sin" and len(call.args) < 3:
+        assert isinstance(waveform, Sine)
+        return (
+            f"{call.where}: {name}: {call.name.upper()} leaves out FREQ, which is 1/TSTOP then, "
+            f"{waveform.frequency:g} Hz; its values are VO VA FREQ",
+        )
     later = [arg.text for arg in call.args[2::2] if isinstance(arg, Number) and arg.text.startswith("+")]
     if key == "pwl" and later:
         return (
