@@ -118,6 +118,12 @@ CIRCUIT = [
     ((".end", "Vb drive 0 5"), 8, ["Vdrive and Vb are voltage sources in parallel"]),
     ((".end", "Va area 0 35"), 8, ["Va and Xgap both drive the area node 'area'", "allowed: a_fix= on Xgap"]),
     ((".end", "R1 drive loose 1k"), 8, ["node 'loose' is floating: only R1 touches it"]),
+    ((".end", ".subckt a p\n.op"), 9, [".op is not supported"]),
+    (
+        (".end", ".subckt a p\n.ac dec 1 1 2"),
+        9,
+        ["inside .subckt a, which begins at deck.cir:8:1; is its .ends missing?"],
+    ),
     ((".end", "# note"), 8, ["'#' is no element", "a comment with *"]),
     ((".end", "B1 drive 0 V=5*time"), 8, ["a behavioural source (a function of time is given in Python"]),
     ((".end", "D1 drive 0 diode"), 8, ["'D1' is a diode, which is not supported"]),
@@ -186,6 +192,8 @@ SOURCES = [
     (("SIN(0 200 100)", "SIN(0 200 100 0 0 90°)"), 3, ["'90°' is not a number: write 90"]),
     (("SIN(0 200 100)", "200*sin(2*pi*100*t)"), 3, ["in braces"]),
     (("SIN(0 200 100)", "sin(2*pi*100*t)"), 3, ["a function of time is SIN(VO VA FREQ), PULSE or PWL"]),
+    (("SIN(0 200 100)", "SIN 0 200 5 k"), 3, ["'k' stands apart; a unit joins its number"]),
+    (("SIN(0 200 100)", "200 100"), 3, ["a second value '100'", "such as SIN(0 200 100)"]),
     (("SIN(0 200 100)", "SIN(0 200 0,1)"), 3, ["frequency is 0 Hz", "0,1 is two numbers", "write 0.1"]),
     (("SIN(0 200 100)", ""), 3, ["missing value", "Vdrive node node value"]),
 ]

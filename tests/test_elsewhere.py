@@ -135,6 +135,28 @@ def test_a_sine_without_its_frequency_is_named() -> None:
     ]
 
 
+def test_a_source_of_ac_alone_in_a_deck_with_tran_is_named() -> None:
+    circuit, said = read(("SIN(0 200 100)", "AC 200 100"))
+    assert circuit["Vdrive"].waveform == fs.DC(0.0)
+    assert said == [
+        "deck.cir:3:1: Vdrive has AC alone, which drives .ac sweeps; in .tran it is 0 V, a sine is SIN(VO VA FREQ)"
+    ]
+    assert read(("SIN(0 200 100)", "AC 200"), (TRAN, ".ac dec 1 1 10"))[1] == []
+
+
+def test_a_misspelt_library_is_told_of_ours(tmp_path: Path) -> None:
+    path = tmp_path / "deck.cir"
+    path.write_text(edited(("fingerspice.lib", "finger_spice.lib")))
+    with pytest.raises(fs.InputError, match=r"'finger_spice.lib' does not exist; did you mean 'fingerspice.lib'\?"):
+        fs.read_netlist(path)
+
+
+def test_params_is_param() -> None:
+    circuit, said = read(("d=3.5u", "d={g}"), (".end", ".params g=3u\n.end"))
+    assert circuit["Xgap"].values["d"] == 3e-6
+    assert said == []
+
+
 def test_a_netlist_in_utf_16_with_its_mark_is_read(tmp_path: Path) -> None:
     path = tmp_path / "finger.net"
     path.write_bytes(DECK.replace("3.5u", "3.5\u00b5").encode("utf-16"))

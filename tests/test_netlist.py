@@ -270,6 +270,9 @@ def test_a_source_is_changed_by_its_text() -> None:
         ("Xgap.d", "3,5u", "Xgap.d: '3,5u' is not a number, its comma separates: write 3.5u"),
         ("Xgap.d", "\u22123u", "Xgap.d: '\u22123u' is not a number, its minus is a typographic one: write -3u"),
         ("Xgap.d", "", "Xgap.d: '' is not a number"),
+        ("Xgap.d", "3.5 um", "Xgap.d: '3.5 um' is not a number, its unit stands apart: write 3.5um"),
+        ("Xgap.d", fs.DC(1.0), "Xgap.d is DC(level=1.0); allowed: a number m, or text such as '3.5u'"),
+        ("Vdrive", "200 V", "source: 'V' stands apart; a unit joins its number, such as 5V"),
         ("Xgap.d", "inf", "Xgap d is inf m; allowed: more than 0"),
         ("Xgap.d", "-1u", "Xgap d is -1e-06 m; allowed: more than 0"),
         ("Xgap.d", "{3u}", "'{3u}' is not a number"),
@@ -287,6 +290,20 @@ def test_changes_that_are_no_values_are_one_sentence(path: str, text: object, sa
         read().replace({path: text})  # type: ignore[dict-item]
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("given", [None, 5, ("deck.cir",), np.zeros(2)])
+def test_what_is_no_path_and_no_text_is_one_sentence(given: object) -> None:
+    with pytest.raises(fs.InputError, match=r"read_netlist is given .*; allowed: the path of a netlist"):
+        fs.read_netlist(given)  # type: ignore[arg-type]
+    with pytest.raises(fs.InputError, match=r"parse_netlist is given .*; allowed: a netlist's text"):
+        fs.parse_netlist(given)  # type: ignore[arg-type]
+
+
+def test_a_files_name_where_its_text_belongs_is_named() -> None:
+    assert refusal("circuits/fingerpad.cir") == (
+        "parse_netlist is given 'circuits/fingerpad.cir', a file's name; allowed: read_netlist for a file"
+    )
 
 
 @pytest.mark.parametrize("changes", ["Xgap.d=3u", [("Xgap.d", 3e-6)], None, {5: 3e-6}])

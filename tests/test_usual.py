@@ -42,7 +42,7 @@ SLIPS = {
     ),
     "permittivity": (("eps_r=3.9", "eps_r=0.39"), ("Xcoat.eps_r", 0.39), "Xcoat eps_r is 0.39, outside 1 to", None),
     "fixed area": (("c2=5000", "c2=5000 a_fix=1u"), ("Xgap.a_fix", 1e-6), "Xgap a_fix is 1e-06 mm^2, outside 0.1", "1"),
-    "resistance": (("r=0.2meg", "r=0.2"), ("Xcoat.r", 0.2), "Xcoat r is 200 mohm, outside 1 ohm", "200 or 200k"),
+    "resistance": (("r=0.2meg", "r=0.2"), ("Xcoat.r", 0.2), "Xcoat r is 200 mohm, outside", "200, 200k or 200meg"),
     "frequency": (("SIN(0 200 100)", "SIN(0 200 100meg)"), None, "Vdrive frequency is 100 MHz, outside 10 mHz", "100k"),
     "voltage": (("SIN(0 200 100)", "SIN(0 200k 100)"), None, "Vdrive amplitude is 200 kV, outside 0 V to 10 kV", "200"),
     "skin's f": (("f=100", "f=1meg"), ("Xskin.f", 1e6), "Xskin f is 1 MHz, outside 10 Hz to 100 kHz", "1k"),
@@ -151,6 +151,13 @@ def test_a_pressure_that_no_layer_bears_is_warned_about_from_10_mpa_on(beside: s
         (*pressure,) = (text for text in said if "electric pressure" in text)
         assert len(pressure) == expected
         assert all(text.startswith("the electric pressure reaches 10.02 MPa, over 10 MPa (") for text in pressure)
+
+
+def test_a_large_signal_out_of_this_world_is_warned_about() -> None:
+    with pytest.warns(fs.FingerspiceWarning):
+        circuit = table1(gap={"alpha": "54.4meg"})
+    (result,) = fs.large_signal(circuit, [1e3], rtol=1e-4)
+    assert ["force reaches" in text or "area reaches" in text for text in result.warnings] == [True, True]
 
 
 def test_an_area_given_in_mm2_in_python_is_warned_about() -> None:

@@ -174,6 +174,9 @@ def _why_not_a_number(text: str) -> str:
     if bare != text and _NUMBER.fullmatch(bare):
         plain = f"{float(parse_number(bare)) / 100.0:g}" if text.endswith("%") else bare
         return f"'{text}' is not a number: write {plain}"
+    joined = "".join(text.split())
+    if joined != text.strip() and _NUMBER.fullmatch(joined):
+        return f"'{text}' is not a number, its unit stands apart: write {joined}"
     plain = text.translate(_DASHES)
     if plain != text and _NUMBER.fullmatch(plain):
         return f"'{text}' is not a number, its minus is a typographic one: write {plain}"

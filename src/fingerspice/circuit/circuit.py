@@ -251,7 +251,7 @@ class Circuit:
                 element = elements[path.lower()]
                 # What an .ac sweep took from the old source goes with it.
                 elements[path.lower()] = dataclasses.replace(element, waveform=self._waveform(value), ac=None)
-            elif name in elements and not isinstance(value, Waveform) and not callable(value):
+            elif name in elements:
                 elements[name], trap = _changed(elements[name], parameter, value, path)
                 traps |= {path.lower(): trap} if trap else {}
             else:

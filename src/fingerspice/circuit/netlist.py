@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -31,6 +32,8 @@ def read_netlist(path: str | Path) -> Circuit:
     InputError
         When the file cannot be read or anything in it is wrong; the message says where and what is allowed.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"read_netlist is given {path!r}; allowed: the path of a netlist, such as 'deck.cir'")
     return _circuit(read_deck(path))
 
 
@@ -48,6 +51,10 @@ def parse_netlist(text: str, path: str | Path | None = None) -> Circuit:
     InputError
         When anything in it is wrong; the message says where and what is allowed.
     """
+    if not isinstance(text, str):
+        raise InputError(f"parse_netlist is given {text!r}; allowed: a netlist's text, whose first line is the title")
+    if "\n" not in text.strip() and text.strip().lower().endswith((".cir", ".net", ".sp")):
+        raise InputError(f"parse_netlist is given {text.strip()!r}, a file's name; allowed: read_netlist for a file")
     return _circuit(parse_deck(text, None if path is None else Path(path)))
 
 

@@ -154,7 +154,7 @@ class Reader:
             if self._reading:
                 raise InputError("only the netlist itself, not an included file, has .end", _place(line))
             return True
-        elif word == ".param":
+        elif word in (".param", ".params"):
             here.params.extend(param_formulas(line, rest))
             here.characters += len(line.text)
         elif word in (".include", ".inc", ".lib"):
@@ -165,7 +165,8 @@ class Reader:
             pass
         elif word in ANALYSES:
             if here is not self.root:
-                raise InputError(f"{word} does not belong inside .subckt {here.name}", _place(line))
+                opened = f".subckt {here.name}, which begins at {_where(here)}; is its .ends missing"
+                raise InputError(f"{word} does not belong inside {opened}?", _place(line))
             self.analyses.append((".options" if word == ".option" else word, line, rest))
         else:
             raise InputError(_unknown_directive(word), _place(line))
@@ -304,7 +305,8 @@ def _similar_file(path: Path) -> str:
         names = sorted(entry.name for entry in path.parent.iterdir())[:1000]
     except OSError:
         return ""
-    return nearest(path.name, names)
+    # These need not lie there.
+    return nearest(path.name, [*names, *NATIVE_LIBRARIES])
 
 
 def _inside(root: Path, folder: Path, name: str, where: Where) -> Path:

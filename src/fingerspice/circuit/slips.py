@@ -70,12 +70,17 @@ def _among_blanks(bare: str) -> Iterator[re.Match[str] | None]:
             yield from matches
 
 
+def is_unit(word: str) -> bool:
+    """Whether a word may be a scale, a unit, or both."""
+    return _UNIT.fullmatch(word) is not None and word != ""
+
+
 def stray_word(word: str, before: str) -> str:
     """What to add where a word follows `before`, which ends in ``key=value``; empty if nothing fits."""
     number = before.rpartition("=")[2].rstrip(" \t")
     if number.endswith(","):
         problem = decimal_comma(f"={number}{word}")
         return f"; {problem}" if problem else ""
-    if _NUMBER.fullmatch(number.strip()) and _UNIT.fullmatch(word):
+    if _NUMBER.fullmatch(number.strip()) and is_unit(word):
         return f"; a unit joins its number, {number.strip()}{word}"
     return ""

@@ -11,6 +11,7 @@ from fingerspice.circuit.circuit import SmallSignal
 from fingerspice.circuit.deck import Call, Number, Token
 from fingerspice.circuit.expressions import nearest
 from fingerspice.circuit.ramps import PWL, Pulse, Square
+from fingerspice.circuit.slips import is_unit
 from fingerspice.circuit.waveforms import DC, Exp, Sine, Waveform
 from fingerspice.errors import InputError, Where
 
@@ -203,13 +204,15 @@ def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -
         word = words.popleft()
         if isinstance(word, Number):
             if level is not None or waveform is not None:
-                raise InputError(
-                    f"{name}: a second value {word.text!r}; allowed: one value or source function", word.where
-                )
+                allowed = "one value or source function, such as SIN(0 200 100)"
+                raise InputError(f"{name}: a second value {word.text!r}; allowed: {allowed}", word.where)
             level = word.value
             continue
         key = (word.text if isinstance(word, Token) else word.name).lower()
         key = _ALIASES.get(key, key)
+        if isinstance(word, Token) and is_unit(key) and (level is not None or waveform is not None):
+            problem = f"{name}: {word.text!r} stands apart; a unit joins its number, such as 5{word.text}"
+            raise InputError(problem, word.where)
         call = word if isinstance(word, Call) else None
         if call is None:
             # SIN 0 200 100, without brackets.
@@ -227,6 +230,10 @@ def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -
         else:
             waveform = _read_call(name, key, call, timing)
             notes = _differences(name, key, waveform, call)
+    if waveform is None and level is None and ac is not None and timing.stop is not None:
+        notes = (
+            f"{where}: {name} has AC alone, which drives .ac sweeps; in .tran it is 0 V, a sine is SIN(VO VA FREQ)",
+        )
     if waveform is None and level is None and ac is None:
         raise InputError(f"{name} has no value; allowed: a number or one of {_known()}", where)
     return Source(waveform if waveform is not None else DC(level or 0.0), ac, notes)

@@ -52,13 +52,14 @@ class Usual:
         if self.slip:
             said += f": it is in {self.slip}"
         meant = self._meant(value, unit)
-        return f"{said}; was {' or '.join(meant)} meant?" if meant else said
+        return f"{said}; was {meant} meant?" if meant else said
 
-    def _meant(self, value: float, unit: str) -> list[str]:
-        """The same digits in another unit, where that is usual: at most two, the nearest first."""
+    def _meant(self, value: float, unit: str) -> str:
+        """The same digits in other units, where that is usual: at most three, the nearest first."""
         powers = _THOUSANDS if unit in _PREFIXED else _MILLIONS.get(unit, ())
         found = [float(f"{value:.12g}") * 10.0**power for power in powers]
-        return [spice_text(x) for x in found if self.least <= abs(x) <= self.most][:2]
+        texts = [spice_text(x) for x in found if self.least <= abs(x) <= self.most][:3]
+        return " or ".join([", ".join(texts[:-1]), texts[-1]] if len(texts) > 1 else texts)
 
 
 def _shown(value: float, unit: str) -> str:
