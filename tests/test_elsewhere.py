@@ -135,13 +135,14 @@ def test_a_sine_without_its_frequency_is_named() -> None:
     ]
 
 
-def test_a_source_of_ac_alone_in_a_deck_with_tran_is_named() -> None:
-    circuit, said = read(("SIN(0 200 100)", "AC 200 100"))
-    assert circuit["Vdrive"].waveform == fs.DC(0.0)
-    assert said == [
-        "deck.cir:3:1: Vdrive has AC alone, which drives .ac sweeps; in .tran it is 0 V, a sine is SIN(VO VA FREQ)"
-    ]
-    assert read(("SIN(0 200 100)", "AC 200"), (TRAN, ".ac dec 1 1 10"))[1] == []
+@pytest.mark.parametrize("beside", ["", "R9 drive 0 1k\n"], ids=["stack", "network"])
+def test_a_run_whose_source_has_ac_alone_is_warned_about(beside: str) -> None:
+    circuit, said = read(("SIN(0 200 100)", "AC 200 100"), (".end", f"{beside}.end"))
+    assert said == []
+    with pytest.warns(
+        fs.FingerspiceWarning, match=r"0 all the time: Vdrive has AC alone, which drives sweeps .* SIN\("
+    ):
+        fs.simulate(circuit, t_stop=1e-4)
 
 
 def test_a_misspelt_library_is_told_of_ours(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from fingerspice.circuit.circuit import Element
 from fingerspice.circuit.usual import LARGEST_FORCE, beyond_fingers
+from fingerspice.circuit.waveforms import DC
 from fingerspice.netruns import NetworkRun
 from fingerspice.network_record import NetworkRecord
 from fingerspice.networks import NetworkProblem
@@ -28,9 +29,7 @@ NEAR_FOLD = 0.2
 
 def stack_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Where a run leaves what its model holds for."""
-    outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
-    if outside is not None:
-        yield outside
+    yield from _source_warnings(problem)
     stack = problem.stack
     if stack.contact is not None:
         at_rest, follows = problem.model.area0, problem.model.coupled
@@ -47,9 +46,7 @@ def stack_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
 
 
 def network_warnings(problem: NetworkProblem, run: NetworkRun, record: NetworkRecord) -> Iterator[str]:
-    outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
-    if outside is not None:
-        yield outside
+    yield from _source_warnings(problem)
     several = len(record.fingers) > 1
     for finger, i in enumerate(problem.network.fingers):
         area = record.finger_area(finger)
@@ -64,6 +61,21 @@ def network_warnings(problem: NetworkProblem, run: NetworkRun, record: NetworkRe
         yield from beyond_fingers(where, force, pressure, largest)
     yield from _fold_warning(run)
     yield from _strength_warnings(problem.network.layers, record)
+
+
+def _source_warnings(problem: Problem | NetworkProblem) -> Iterator[str]:
+    """Of sources beyond the band of the skin's data, and of those that drive sweeps alone."""
+    outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
+    if outside is not None:
+        yield outside
+    areas = {e.nodes[2] for e in problem.circuit.elements if e.spec.is_layer}
+    drives = [e for e in problem.circuit.by_device("V", "I") if areas.isdisjoint(e.nodes)]
+    small = ", ".join(e.name for e in drives if e.ac is not None)
+    if small and all(e.waveform == DC(0.0) for e in drives):
+        yield (
+            f"the sources are 0 all the time: {small} has AC alone, which drives sweeps (fingerspice ac); a sine in time "
+            "is SIN(VO VA FREQ)"
+        )
 
 
 def _gap_warnings(where: str, peak: float, unloaded: float, least: float) -> Iterator[str]:

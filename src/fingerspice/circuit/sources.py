@@ -230,10 +230,6 @@ def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -
         else:
             waveform = _read_call(name, key, call, timing)
             notes = _differences(name, key, waveform, call)
-    if waveform is None and level is None and ac is not None and timing.stop is not None:
-        notes = (
-            f"{where}: {name} has AC alone, which drives .ac sweeps; in .tran it is 0 V, a sine is SIN(VO VA FREQ)",
-        )
     if waveform is None and level is None and ac is None:
         raise InputError(f"{name} has no value; allowed: a number or one of {_known()}", where)
     return Source(waveform if waveform is not None else DC(level or 0.0), ac, notes)
