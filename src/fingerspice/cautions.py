@@ -73,8 +73,8 @@ def _source_warnings(problem: Problem | NetworkProblem) -> Iterator[str]:
     small = ", ".join(e.name for e in drives if e.ac is not None)
     if small and all(e.waveform == DC(0.0) for e in drives):
         yield (
-            f"the sources are 0 all the time: {small} has AC alone, which drives sweeps (fingerspice ac); a sine in time "
-            "is SIN(VO VA FREQ)"
+            f"the sources are 0 all the time: {small} has AC alone, which drives sweeps (fingerspice ac); a sine in "
+            "time is SIN(VO VA FREQ)"
         )
 
 
