@@ -100,6 +100,13 @@ def test_sources_of_screens_are_usual(source: str) -> None:
     assert said_by(lambda: fs.parse_netlist(edited(("SIN(0 200 100)", source)))) == []
 
 
+def test_a_deck_that_is_wholly_unusual_does_not_flood() -> None:
+    chain = [f"R{i} n{i} n{i + 1} 1u" for i in range(250)]
+    said = said_by(lambda: fs.parse_netlist("\n".join(["t", "V1 n0 0 5", *chain, "Re n250 0 1k", ".tran 1m 1"])))
+    assert len(said) == 101
+    assert said[-1] == "150 more warnings are not shown"
+
+
 def test_an_area_that_a_source_or_a_start_gives_in_m2_is_warned_about() -> None:
     lines = ["t", "V1 a 0 5", "X1 a 0 area LAYER d=1u eps_r=2", "Varea area 0 35u", ".tran 1m 10m"]
     (said,) = said_by(lambda: fs.parse_netlist("\n".join(lines), "d.cir"))

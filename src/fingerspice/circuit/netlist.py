@@ -12,6 +12,7 @@ from fingerspice.circuit.deck import Deck, parse_deck, read_deck
 from fingerspice.circuit.directives import read_ac, read_initial, read_options, read_tran, unused_starts
 from fingerspice.circuit.elements import read_elements
 from fingerspice.circuit.network import build_network
+from fingerspice.circuit.reader import MAX_WARNINGS
 from fingerspice.circuit.slips import decimal_comma
 from fingerspice.circuit.sources import Timing, read_source
 from fingerspice.circuit.statespace import build_stack, is_stack
@@ -64,9 +65,15 @@ def _circuit(deck: Deck) -> Circuit:
         circuit = _read(deck, notes)
     except InputError as error:
         raise _in_deck(error, deck) from None
-    for note in notes:
+    for note in circuit.warnings:
         warnings.warn(note, FingerspiceWarning, stacklevel=3)
     return circuit
+
+
+def _first(notes: list[str]) -> tuple[str, ...]:
+    """As many warnings as anybody reads."""
+    more = len(notes) - MAX_WARNINGS
+    return (*notes[:MAX_WARNINGS], f"{more} more warnings are not shown") if more > 1 else tuple(notes)
 
 
 def _in_deck(error: InputError, deck: Deck) -> InputError:
@@ -93,7 +100,7 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
         initial=initial,
         charge_law=_charge_law(deck.includes),
         work=work,
-        warnings=tuple(notes),
+        warnings=_first(notes),
         unused=(*deck.unused, *unused, *unused_starts(initial, elements, tran is None or tran.uic)),
         text=deck.text,
         path=deck.path,
