@@ -23,6 +23,7 @@ from fingerspice.circuit.reader import (
     read_text,
 )
 from fingerspice.circuit.scope import Call, Number, Scope, Token, Value
+from fingerspice.circuit.slips import with_comma
 from fingerspice.errors import InputError, Where, printable
 
 __all__ = [
@@ -162,8 +163,11 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
     if _reads_like_a_statement(title):
         problem = f"the first line is the title, but '{title}' reads like a statement: add a title above"
         reader.warn(problem, Where(file, 1))
-    reader.read_deck(lines)
-    return _assemble(reader, title, text, path)
+    try:
+        reader.read_deck(lines)
+        return _assemble(reader, title, text, path)
+    except InputError as error:
+        raise with_comma(error, reader.warnings) from None
 
 
 def _assemble(reader: Reader, title: str, text: str, path: Path | None) -> Deck:

@@ -10,6 +10,7 @@ from fingerspice.circuit.bounds import check_range
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Element, Tran
 from fingerspice.circuit.deck import Directive, Number, Token, parse_deck
 from fingerspice.circuit.expressions import nearest
+from fingerspice.circuit.slips import is_unit
 from fingerspice.errors import InputError, Where
 
 #: Outputs of a run whose .tran has no TSTEP.
@@ -61,7 +62,8 @@ def read_tran(directive: Directive, notes: list[str]) -> Tran:
         if word in _LTSPICE_START:
             raise InputError(f".tran {word}: {_LTSPICE_START[word]}", directive.where)
     if any(w != "uic" for w in words) or not 1 <= len(numbers) <= 4:
-        raise InputError(f"{directive.text.strip()!r} is not understood; allowed: {usage}", directive.where)
+        apart = "; a unit joins its number, such as 20m" if any(is_unit(w) for w in words) else ""
+        raise InputError(f"{directive.text.strip()!r} is not understood; allowed: {usage}{apart}", directive.where)
     step, stop, start, longest = [None, numbers[0], None, None] if len(numbers) == 1 else [*numbers, None, None][:4]
     assert stop is not None
     _require(stop.value > 0.0, "TSTOP", stop, "more than 0 s")

@@ -13,7 +13,7 @@ from fingerspice.circuit.directives import read_ac, read_initial, read_options, 
 from fingerspice.circuit.elements import read_elements
 from fingerspice.circuit.network import build_network
 from fingerspice.circuit.reader import MAX_WARNINGS
-from fingerspice.circuit.slips import decimal_comma
+from fingerspice.circuit.slips import decimal_comma, with_comma
 from fingerspice.circuit.sources import Timing, read_source
 from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.circuit.usual import REST_AREA
@@ -78,11 +78,10 @@ def _first(notes: list[str]) -> tuple[str, ...]:
 
 def _in_deck(error: InputError, deck: Deck) -> InputError:
     """A refusal with the file where it has no place of its own, and with a title that swallowed a statement."""
+    error = with_comma(error, deck.warnings)
     text = error.message if error.where else f"{deck.path or '<netlist>'}: {error.message}"
     title = [note for note in deck.warnings if "the first line is the title" in note]
-    line = f"{error.where.file}:{error.where.line}:" if error.where else "none"
-    comma = [note.partition(": ")[2] for note in deck.warnings if note.startswith(line) and "decimal comma" in note]
-    return InputError("; note ".join([text, *title, *comma]), error.where)
+    return InputError("; note ".join([text, *title]), error.where)
 
 
 def _read(deck: Deck, notes: list[str]) -> Circuit:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+
+from fingerspice.errors import InputError
 
 #: Directives that other simulators know and this one does not, with the way here.
 ELSEWHERE = {
@@ -77,10 +79,12 @@ def is_unit(word: str) -> bool:
 
 def stray_word(word: str, before: str) -> str:
     """What to add where a word follows `before`, which ends in ``key=value``; empty if nothing fits."""
-    number = before.rpartition("=")[2].rstrip(" \t")
-    if number.endswith(","):
-        problem = decimal_comma(f"={number}{word}")
-        return f"; {problem}" if problem else ""
-    if _NUMBER.fullmatch(number.strip()) and is_unit(word):
-        return f"; a unit joins its number, {number.strip()}{word}"
-    return ""
+    number = before.rpartition("=")[2].strip()
+    return f"; a unit joins its number, {number}{word}" if _NUMBER.fullmatch(number) and is_unit(word) else ""
+
+
+def with_comma(error: InputError, warnings: Iterable[str]) -> InputError:
+    """An error with what was said of a comma in its line."""
+    place = f"{error.where.file}:{error.where.line}:" if error.where else "none"
+    found = [text.partition(": ")[2] for text in warnings if text.startswith(place) and "decimal comma" in text]
+    return InputError("; note ".join([error.message, *found]), error.where) if found else error
