@@ -36,7 +36,7 @@ SLIPS = {
     "gap in mm": (("d=3.5u", "d=3.5m"), ("Xgap.d", 3.5e-3), "Xgap d is 3.5 mm, outside 10 nm to 100 um", "3.5u"),
     "skin in nm": (("d=350u", "d=350n"), ("Xskin.d", 350e-9), "Xskin d is 350 nm, outside 1 um to 2 mm", "350u"),
     "coating in m": (("d=1u", "d=1"), ("Xcoat.d", 1.0), "Xcoat d is 1 m, outside 10 nm to 10 mm", "1m or 1u"),
-    "load in mN": (("fn=0.5 mu=0.3", "fn=50 mu=0"), None, "Xgap fn is 50 N, outside 1 mN to 50 N", "50m"),
+    "load in mN": (("fn=0.5 mu=0.3", "fn=50 mu=0"), None, "Xgap fn is 50 N, outside 1 mN to 49.9 N", "50m"),
     "alpha too large": (
         ("alpha=54.4", "alpha=54.4meg"), ("Xgap.alpha", 54.4e6), "Xgap alpha is 5.44e+07 mm^2/N^m, outside", "54.4",
     ),

@@ -134,8 +134,8 @@ _LEAK = Usual(1.0, 1e15, "0.2 to 1 megohm in Table 1, an ohm for sweat, 1e14 ohm
 _RHO = Usual(0.1, 1e17, "sweat has 1 ohm m, skin 1e4, good polymers 1e14 to 1e16")
 # Air has 3 MV/m, glass 10 to 40, thin polymer and oxide films 100 to 1000.
 _STRENGTH = Usual(1e5, 1e10, "air has 3 MV/m, thin oxides 1 GV/m", "V/m, not V/um")
-# Fingers touch with 0.1 to 5 N and press with at most some 50 N, so that 50 itself is more likely millinewton: outside.
-_LOAD = Usual(1e-3, math.nextafter(50.0, 0.0), "a finger touches with 0.1 to 5 N", "newton, not millinewton")
+# Fingers touch with 0.1 to 5 N and press with less than 50 N, so that 50 itself is more likely millinewton.
+_LOAD = Usual(1e-3, 49.9, "a finger touches with 0.1 to 5 N", "newton, not millinewton")
 # Dry skin on glass has 0.1 to 1, moist skin up to 3 and more.
 _FRICTION = Usual(0.01, 5.0, "dry skin on glass has 0.1 to 1, moist skin up to 3")
 # Table 1 has 54.4; at 1 N this is the area (Eq. 5), which may be that of a pencil's tip or of a palm.

@@ -25,7 +25,7 @@ class Usual:
     source : str
         What the range is taken from, in words that fit into brackets.
     slip : str
-        What is often taken for the unit, if anything.
+        The unit, against the one that it is often taken for.
     """
 
     least: float
