@@ -31,7 +31,7 @@ import fuzz_inputs as make
 from fingerspice.circuit import expressions
 from fingerspice.circuit.deck import LONGEST_TITLE
 from fingerspice.circuit.directives import sweep_from_text
-from fingerspice.circuit.netlist import source_from_text, value_from_text
+from fingerspice.circuit.netlist import source_from_text
 from fingerspice.circuit.reader import MAX_WARNINGS
 from fingerspice.errors import FingerspiceWarning, InputError, Where
 from fingerspice.fitting import fit_material
@@ -165,7 +165,7 @@ def _read_option(rng: random.Random, bench: Bench) -> object:
             return bench.circuit.replace({"Vdrive": source_from_text(text, bench.circuit)})
         if kind < 0.85:
             return sweep_from_text(text)
-        return bench.circuit.replace({name: value_from_text(bench.circuit, name, text)[0]})
+        return bench.circuit.replace({name: text})
 
 
 def _read_table(rng: random.Random, bench: Bench) -> object:

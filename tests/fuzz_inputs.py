@@ -63,6 +63,9 @@ LINES = (
       ".options work=total", ".nodeset {w}"),
     *(".step {w}", ".{w}", "+ {w}={n}", "+", "* {w}", "{w}", "D1 a b d", "L1 a 0 {n}", ".title {w}",
       ".meas {w}", ".func f(x) x"),
+    *(".tran {n}", ".tran 0 {n} 0 {n}", ".backanno", "R{w} {w} {w} r={n} m={n} tol={n}", "V{w} {w} 0 {s} Rser={n}",
+      "C{w} {w} {w} c={n} Rser={n} Rpar={n} Cpar={n} Lser={n}", "R1 a b {n},{n} // {w}",
+      "V1 a 0 SINE({n} {n} {n},{n})"),
 )
 DECKS = tuple(
     path.read_text(encoding="utf-8") for path in (*sorted(CIRCUITS.glob("*.cir")), *sorted(CIRCUITS.glob("*.lib")))

@@ -142,18 +142,20 @@ def test_a_voltage_that_air_does_not_bear_is_warned_about_once(command: Command)
 
 
 def test_what_the_reader_notices_is_printed_once_with_its_line(command: Command) -> None:
-    Path("pad.cir").write_text(edited(QUICK, ("r=1meg", "r=1MOhm"), (".end", ".nodeset v(area)=35\n.end")))
+    lines = ".nodeset v(area)=35\n.backanno\n.meas tran x max v(top)\n.end"
+    Path("pad.cir").write_text(edited(QUICK, ("r=1meg", "r=1MOhm"), (".end", lines)))
     first, second = command("ac", "pad.cir", "--no-plot", "--sweep", "lin 2 100 200").lines
     assert first.startswith("fingerspice: warning: pad.cir:5:41: Xgap r: '1MOhm' is milli (0.001 ohm)")
-    assert second == "fingerspice: note: .nodeset has no effect here"
+    assert second == "fingerspice: note: .meas has no effect here"
 
 
 def test_values_on_the_command_line_have_the_traps_of_the_deck(command: Command) -> None:
     words = ["ac", "pad.cir", "--no-plot", "--sweep", "lin 2 100 200"]
     (line,) = command(*words, "--set", "Xcoat.r=0.2M").lines
-    assert line.startswith("fingerspice: warning: --set Xcoat.r: '0.2M' is milli (0.0002 ohm)")
-    (line,) = command(*words, "--area", "35").lines
-    assert line.startswith("fingerspice: warning: --area 35 is in m^2, 3.5e+07 mm^2")
+    assert line.startswith("fingerspice: warning: Xcoat.r: '0.2M' is milli (0.0002 ohm)")
+    first, *rest = command(*words, "--area", "35").lines
+    assert first.startswith("fingerspice: warning: --area 35 is in m^2, 3.5e+07 mm^2")
+    assert rest[-1].startswith("fingerspice: warning: the contact area reaches 35 m^2, over 0.001 m^2 (10 cm^2,")
     assert command(*words, "--area", "35u").err == ""
 
 

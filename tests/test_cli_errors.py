@@ -21,9 +21,9 @@ FINGERSPICE = str(Path(sys.executable).with_name("fingerspice"))
 OPTIONS = [
     (["--set", "Xgap.d"], "--set 'Xgap.d' is not understood; allowed: PATH=VALUE, such as Xgap.d=3u"),
     (["--set", "=3u"], "--set '=3u' is not understood"),
-    (["--set", "Xgap.d="], "--set 'Xgap.d=': '' is not a number (examples: 10, 2.5, 1e-6, 3.5u, 0.2meg)"),
-    (["--set", "Xgap.d=thick"], "--set 'Xgap.d=thick': 'thick' is not a number"),
-    (["--set", "Xgap.d=3x"], "--set 'Xgap.d=3x': '3x' differs between simulators"),
+    (["--set", "Xgap.d="], "--set 'Xgap.d=': Xgap.d: '' is not a number (examples: 10, 2.5, 1e-6, 3.5u, 0.2meg)"),
+    (["--set", "Xgap.d=thick"], "--set 'Xgap.d=thick': Xgap.d: 'thick' is not a number"),
+    (["--set", "Xgap.d=3x"], "--set 'Xgap.d=3x': Xgap.d: '3x' differs between simulators"),
     (["--set", "Xgap.d=nan"], "'nan' is not a number"),
     (["--set", "Xgap.d=inf"], "--set 'Xgap.d=inf': Xgap d is inf m; allowed: more than 0"),
     (["--set", "Xgap.d=-3u"], "--set 'Xgap.d=-3u': Xgap d is -3e-06 m; allowed: more than 0"),
@@ -64,7 +64,7 @@ OTHERS = [
     (["run", "folder"], "'folder' is a folder, not a file"),
     (["ac", "empty.cir"], "'empty.cir' is empty: a netlist begins with a title line"),
     (["compare", "binary.cir"], "'binary.cir' is not a text file (it holds NUL bytes): save it as UTF-8"),
-    (["export", "latin.cir", "-o", "x.cir"], "'latin.cir' is not UTF-8 text (byte 0xb5 in line 2)"),
+    (["export", "latin.cir", "-o", "x.cir"], "'latin.cir' is neither UTF-8 nor Latin-1 text (byte 0x81 in line 2)"),
     (["run", "wrong.cir"], "wrong.cir:4:30: Xcoat d is -1u (-1e-06 m); allowed: more than 0"),
     (["run", "endless.cir"], "endless.cir has no .tran line; allowed: .tran TSTEP TSTOP"),
     (["run", "pad.cir", "--out", "file"], "cannot write file/pad.nc: file is not a folder; allowed: a folder"),
@@ -116,7 +116,7 @@ def folder(command: Command, tmp_path: Path) -> Path:
     (tmp_path / "file").write_text("")
     (tmp_path / "empty.cir").write_text("")
     (tmp_path / "binary.cir").write_bytes(b"title\n\0\1\2")
-    (tmp_path / "latin.cir").write_bytes(b"title\nC1 a 0 1\xb5\n")
+    (tmp_path / "latin.cir").write_bytes(b"title\nC1 a 0 1\x81\n")
     (tmp_path / "wrong.cir").write_text(edited(("d=1u", "d=-1u")))
     (tmp_path / "endless.cir").write_text(edited((".tran 10u 50m uic", "*")))
     (tmp_path / "deck.csv").write_text(edited())

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.export import LIBRARIES, library_text
+from fingerspice.circuit.library import LIBRARIES, library_text
 from ngspice_tools import CIRCUITS, run_ngspice
 from scenes import deck, table1
 

@@ -13,7 +13,6 @@ import analytic as ref
 import fingerspice as fs
 from deck_edits import DECK, edited
 from fingerspice.circuit.circuit import AcSweep, Tran
-from fingerspice.circuit.netlist import value_from_text
 
 
 def read(*changes: tuple[str, str]) -> fs.Circuit:
@@ -158,11 +157,11 @@ def test_the_reading_of_eq_7_is_an_option() -> None:
     assert read((".end", ".option WORK=Gap")).work == "gap"
 
 
-def test_what_ngspice_needs_and_we_do_not_is_listed_once() -> None:
+def test_options_of_ngspice_are_listed_once_and_nodeset_is_not_worth_a_word() -> None:
     circuit = read(
         (".end", ".options reltol=1e-4 trtol=7\n.options reltol=1e-3\n.nodeset v(area)=35\n.nodeset v(top)=1")
     )
-    assert circuit.unused == (".nodeset", ".options reltol", ".options trtol")
+    assert circuit.unused == (".options reltol", ".options trtol")
 
 
 def test_a_deck_without_gap_has_voltages_and_no_forces() -> None:
@@ -199,14 +198,16 @@ def test_a_capital_m_is_warned_about_through_a_parameter_and_on_a_resistivity() 
     assert said.startswith("deck.cir:8:11: Xcoat r: '0.2M' is milli")
     (said,) = warned(edited(("LAYER d=1u eps_r=3.9 r=0.2meg", "SLAB d=1u eps_r=3.9 rho=1M")))
     assert "rho: '1M' is milli (0.001 ohm m)" in said
-    for text in ("r=0.2m", "r=200k", "r=0.2MEG"):
+    for text in ("r=200k", "r=0.2MEG"):
         assert warned(edited(("r=0.2meg", text))) == []
+    (said,) = warned(edited(("r=0.2meg", "r=0.2m")))
+    assert "200 uohm, outside 1 ohm to 1e+15 ohm" in said
 
 
 @pytest.mark.parametrize("f", ["9.99", "100.1k", "1M"])
 def test_a_skin_outside_the_measured_band_is_warned_about(f: str) -> None:
     (said,) = warned(edited(("f=100", f"f={f}")))
-    assert said.startswith("deck.cir:6:1: Xskin f = ")
+    assert said.startswith("deck.cir:6:33: Xskin f is ")
     assert "outside 10 Hz to 100 kHz" in said
 
 
@@ -222,18 +223,99 @@ def test_a_title_that_swallows_the_source_is_named_with_the_error_it_causes() ->
     assert "the first line is the title, but 'Vdrive drive 0 SIN(0 200 100)' reads like a statement" in said
 
 
-def test_values_given_as_text_have_the_traps_of_the_netlist() -> None:
-    circuit = read()
-    assert value_from_text(circuit, "Xgap.d", "3u") == (3e-6, None)
-    assert value_from_text(circuit, "Xcoat.r", "inf") == (math.inf, None)
-    value, warning = value_from_text(circuit, "Xcoat.R", "0.2M")
-    assert value == 2e-4
-    assert warning is not None
-    assert "write 0.2meg" in warning
-    with pytest.raises(fs.InputError, match=r"write the number alone, in newton"):
-        value_from_text(circuit, "Xgap.fn", "0.5N")
-    with pytest.raises(fs.InputError, match="'3x' differs between simulators"):
-        value_from_text(circuit, "Xgap.d", "3x")
+@pytest.mark.parametrize(
+    ("path", "text", "value"),
+    [
+        ("Xgap.d", "3u", 3e-6),
+        ("xGAP.D", " 3.5um ", 3.5e-6),
+        ("Xcoat.r", "inf", math.inf),
+        ("Xcoat.r", "none", math.inf),
+        ("Xcoat.r", "0.2meg", 2e5),
+        ("Xskin.f", "1k", 1e3),
+        ("Vdrive.amplitude", "0.15k", 150.0),
+        ("Vdrive.frequency", "2kHz", 2e3),
+        ("Xgap.fn", np.float64(0.25), 0.25),
+        ("Xgap.fn", np.array(0.25), 0.25),
+        ("Xgap.c2", 4000, 4e3),
+    ],
+)
+def test_values_are_changed_by_numbers_and_in_spices_notation(path: str, text: object, value: float) -> None:
+    changed = read().replace({path: text})  # type: ignore[dict-item]
+    name = next(name for name in changed.parameters if name.lower() == path.lower())
+    assert changed.parameters[name].value == value
+    assert changed.warnings == ()
+
+
+def test_what_is_doubtful_in_a_sources_text_is_warned_about() -> None:
+    with pytest.warns(fs.FingerspiceWarning, match=r"'SIN\(0,5 200 100\)': 0,5 is two numbers, 0 and 5"):
+        read().replace({"Vdrive": "SIN(0,5 200 100)"})
+    with pytest.warns(fs.FingerspiceWarning, match=r"'SIN\(0 5\)': source: SIN leaves out FREQ"):
+        read().replace({"Vdrive": "SIN(0 5)"})
+    with pytest.raises(fs.InputError, match=r"frequency is 0 Hz; allowed: > 0; note 0,1k is two numbers, 0 and 1k"):
+        read().replace({"Vdrive": "SIN(0 5 0,1k)"})
+
+
+def test_a_source_is_changed_by_its_text() -> None:
+    changed = read().replace({"vdrive": "SQUARE(150 1k)"})
+    assert changed["Vdrive"].waveform == fs.Square(150.0, 1e3)
+    assert changed.overrides == {"vdrive": "SQUARE(150 1k)"}
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "said"),
+    [
+        ("Xgap.fn", "0.5N", "Xgap.fn is '0.5N': SPICE reads N as nano (1e-9); write the number alone, in newton"),
+        ("Xgap.d", "3x", "Xgap.d: '3x' differs between simulators"),
+        ("Xgap.d", "2u5", "write 2.5u"),
+        ("Xgap.d", "3,5u", "Xgap.d: '3,5u' is not a number, its comma separates: write 3.5u"),
+        ("Xgap.d", "\u22123u", "Xgap.d: '\u22123u' is not a number, its minus is a typographic one: write -3u"),
+        ("Xgap.d", "", "Xgap.d: '' is not a number"),
+        ("Xgap.d", "3.5 um", "Xgap.d: '3.5 um' is not a number, its unit stands apart: write 3.5um"),
+        ("Xgap.d", fs.DC(1.0), "Xgap.d is DC(level=1.0); allowed: a number m, or text such as '3.5u'"),
+        ("Vdrive", "200 V", "source: 'V' stands apart; a unit joins its number, such as 5V"),
+        ("Xgap.d", "inf", "Xgap d is inf m; allowed: more than 0"),
+        ("Xgap.d", "-1u", "Xgap d is -1e-06 m; allowed: more than 0"),
+        ("Xgap.d", "{3u}", "'{3u}' is not a number"),
+        ("Xgap.d", (1e-6,), "Xgap.d is (1e-06,); allowed: a number m, or text such as '3.5u'"),
+        ("Xgap.d", np.array([1e-6]), "allowed: a number m, or text such as '3.5u'"),
+        ("Xgap.d", None, "Xgap.d is None; allowed: a number m"),
+        ("Xgap.mu", 1j, "Xgap.mu is 1j; allowed: a number, or text"),
+        ("Vdrive", "SQUARE(150)", "'SQUARE(150)': SQUARE needs 2 values"),
+        ("Vdrive", "SQARE(150 1k)", "did you mean 'square'"),
+        ("Vdrive.frequency", "1,5k", "Vdrive.frequency: '1,5k' is not a number, its comma separates: write 1.5k"),
+    ],
+)
+def test_changes_that_are_no_values_are_one_sentence(path: str, text: object, said: str) -> None:
+    with pytest.raises(fs.InputError) as caught:
+        read().replace({path: text})  # type: ignore[dict-item]
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("given", [None, 5, ("deck.cir",), np.zeros(2)])
+def test_what_is_no_path_and_no_text_is_one_sentence(given: object) -> None:
+    with pytest.raises(fs.InputError, match=r"read_netlist is given .*; allowed: the path of a netlist"):
+        fs.read_netlist(given)  # type: ignore[arg-type]
+    with pytest.raises(fs.InputError, match=r"parse_netlist is given .*; allowed: a netlist's text"):
+        fs.parse_netlist(given)  # type: ignore[arg-type]
+
+
+def test_a_files_name_where_its_text_belongs_is_named() -> None:
+    assert refusal("circuits/fingerpad.cir") == (
+        "parse_netlist is given 'circuits/fingerpad.cir', a file's name; allowed: read_netlist for a file"
+    )
+
+
+@pytest.mark.parametrize("changes", ["Xgap.d=3u", [("Xgap.d", 3e-6)], None, {5: 3e-6}])
+def test_changes_that_are_no_mapping_are_one_sentence(changes: object) -> None:
+    with pytest.raises(fs.InputError, match=r"allowed: a mapping such as \{'Xgap.d': 3e-6\}"):
+        read().replace(changes)  # type: ignore[arg-type]
+
+
+def test_a_capital_m_in_a_change_is_milli_and_warned_about() -> None:
+    with pytest.warns(fs.FingerspiceWarning, match=r"Xcoat.R: '0.2M' is milli .* write 0.2meg"):
+        changed = read().replace({"Xcoat.R": "0.2M"})
+    assert changed["Xcoat"].values["r"] == 2e-4
 
 
 def test_a_circuit_cannot_be_changed_in_place() -> None:

@@ -62,7 +62,8 @@ def test_sin_takes_degrees_and_holds_its_first_value_before_the_delay() -> None:
 
 
 def test_sin_without_a_frequency_runs_once_over_the_analysis() -> None:
-    assert wave("SIN(0 5)") == fs.Sine(5.0, 10.0)
+    with pytest.warns(fs.FingerspiceWarning, match="SIN leaves out FREQ, which is 1/TSTOP then, 10 Hz"):
+        assert wave("SIN(0 5)") == fs.Sine(5.0, 10.0)
     assert "FREQ" in str(refusal_without_tran("SIN(0 5)"))
 
 
@@ -151,7 +152,7 @@ def test_square_is_ours_with_a_duty() -> None:
         ("WAVEFILE(sound.wav 100)", "WAVEFILE is not supported by this version"),
         ("TABLE(data.csv)", "TABLE is not supported by this version"),
         ("PWL(file=data.txt)", "PWL(file=...) is not supported"),
-        ("SINE(0 200 100)", "did you mean 'sin'?"),
+        ("SINN(0 200 100)", "did you mean 'sin'?"),
         ("TRNOISE(1 2 3 4)", "unknown source 'TRNOISE'"),
         ("SIN(0)", "SIN needs 2 values, 1 given"),
         ("SIN(0 1 2 3 4 5 6)", "SIN takes at most 6 values, 7 given"),

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from fingerspice.circuit.circuit import Element
+from fingerspice.circuit.usual import LARGEST_FORCE, beyond_fingers
+from fingerspice.circuit.waveforms import DC
 from fingerspice.netruns import NetworkRun
 from fingerspice.network_record import NetworkRecord
 from fingerspice.networks import NetworkProblem
@@ -27,13 +29,13 @@ NEAR_FOLD = 0.2
 
 def stack_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Where a run leaves what its model holds for."""
-    outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
-    if outside is not None:
-        yield outside
+    yield from _source_warnings(problem)
     stack = problem.stack
     if stack.contact is not None:
-        least = 1.0 / inverse_area(run.peak_u, problem.model.curve)[0]
-        yield from _gap_warnings("", run.peak_u, problem.model.area0, least if problem.model.coupled else math.inf)
+        at_rest, follows = problem.model.area0, problem.model.coupled
+        loaded = 1.0 / inverse_area(run.peak_u, problem.model.curve)[0] if follows else at_rest
+        yield from _gap_warnings("", run.peak_u, at_rest, loaded if follows else math.inf)
+        yield from beyond_fingers("", run.peak_f, float(stack.contact.stress(run.peak_u)), max(at_rest, loaded))
     if run.status is Status.SUCCESS and 0.0 < run.peak_u <= run.error.u_gap:
         yield (
             f"the gap takes no more than rounding of the source's voltage: of its {run.peak_u:.2g} V nothing is known "
@@ -44,19 +46,36 @@ def stack_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
 
 
 def network_warnings(problem: NetworkProblem, run: NetworkRun, record: NetworkRecord) -> Iterator[str]:
-    outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
-    if outside is not None:
-        yield outside
+    yield from _source_warnings(problem)
     several = len(record.fingers) > 1
     for finger, i in enumerate(problem.network.fingers):
-        least = float(record.finger_area(finger).min(initial=math.inf))
+        area = record.finger_area(finger)
+        least, largest = float(area.min(initial=math.inf)), float(area.max(initial=0.0))
         where = f" of {record.fingers[finger][0]}" if several else ""
         follows = problem.scene.fixed[i] is None
         yield from _gap_warnings(
             where, float(run.peaks[i]), float(problem.scene.area0[i]), least if follows else math.inf
         )
+        pressure = float(record.fingers[finger][1].stress(float(run.peaks[i])))
+        force = float(record.finger_force(finger).max(initial=0.0)) if pressure * largest > LARGEST_FORCE else 0.0
+        yield from beyond_fingers(where, force, pressure, largest)
     yield from _fold_warning(run)
     yield from _strength_warnings(problem.network.layers, record)
+
+
+def _source_warnings(problem: Problem | NetworkProblem) -> Iterator[str]:
+    """Of sources beyond the band of the skin's data, and of those that drive sweeps alone."""
+    outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
+    if outside is not None:
+        yield outside
+    areas = {e.nodes[2] for e in problem.circuit.elements if e.spec.is_layer}
+    drives = [e for e in problem.circuit.by_device("V", "I") if areas.isdisjoint(e.nodes)]
+    small = ", ".join(e.name for e in drives if e.ac is not None)
+    if small and all(e.waveform == DC(0.0) for e in drives):
+        yield (
+            f"the sources are 0 all the time: {small} has AC alone, which drives sweeps (fingerspice ac); a sine in "
+            "time is SIN(VO VA FREQ)"
+        )
 
 
 def _gap_warnings(where: str, peak: float, unloaded: float, least: float) -> Iterator[str]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 
 import numpy as np
 
 from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.library import LIBRARIES, library_text
 from fingerspice.circuit.ramps import PWL, Pulse
 from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
 from fingerspice.circuit.topology import find_branches
@@ -18,7 +18,6 @@ from fingerspice.networks import prepare_network
 from fingerspice.physics.contact import Contact
 from fingerspice.starting import start_voltage, starts_uncharged
 
-LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
 EDGE = 1e-9
 """Longest rise time (s) of an ideal jump in the export, a thousandth of TSTEP if that is shorter: ngspice has no
 ideal edge."""
@@ -35,16 +34,6 @@ _OPTIONS = ".options reltol=1e-4 trtol=1e4 abstol=1e-4"
 _POINTS_PER_TIME_SCALE = 1000
 _MAX_POINTS = 2_000_000
 _FEW_POINTS = 1000
-
-
-def library_text(law: str) -> str:
-    """The ngspice library of a charge law, from the installed package or the source tree."""
-    here = Path(__file__).resolve().parent
-    for folder in (here / "lib", here.parents[1] / "circuits"):
-        path = folder / LIBRARIES[law]
-        if path.is_file():
-            return path.read_text()
-    raise InputError(f"{LIBRARIES[law]} is missing from this installation; reinstall fingerspice")
 
 
 def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:

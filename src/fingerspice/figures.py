@@ -71,7 +71,7 @@ class Variation:
         """The circuit with this parameter at `value`, in `unit`."""
         factor = value / self.base
         now = circuit.parameters
-        return circuit.replace({path: factor * now[path].value for path in self.paths})
+        return circuit.varied({path: factor * now[path].value for path in self.paths})
 
 
 def variations() -> tuple[Variation, ...]:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
+from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.circuit.waveforms import Sine, Waveform, require
 from fingerspice.errors import InputError
 from fingerspice.measures import weigh_outputs
@@ -81,7 +82,7 @@ def _sweep(
         changes: dict[str, float | Waveform] = {f"{name}.f": float(f) for name in skins}
         changes[source.name] = Sine(amplitude, float(f))
         state = steady_state(
-            circuit.replace(changes), charge_law=charge_law, rtol=rtol, points=POINTS, charge=False
+            circuit.varied(changes), charge_law=charge_law, rtol=rtol, points=POINTS, charge=False
         )  # fmt: skip
         s = state.solution
         # The start of the period is a multiple of it: phases are those of the source.
@@ -95,7 +96,12 @@ def _sweep(
     gain = np.array(gains, np.complex128)
     gap = build_stack(circuit).gap_layer
     assert gap is not None
+    u_gap = gain[:, gap] * amplitude * np.exp(1j * drive.phase)
+    contact = build_stack(circuit).contact
+    assert contact is not None
+    notes, warned = sweep_notes(circuit, frequency)
+    largest = max(forces), float(contact.stress(np.abs(u_gap)).max()), max(areas)
     return PhasorSolution(
-        frequency, gain[:, gap], gain, gain[:, gap] * amplitude * np.exp(1j * drive.phase), np.array(areas),
-        np.array(forces), amplitude, s.layers, drive.phase, drive.text, *sweep_notes(circuit, frequency),
+        frequency, gain[:, gap], gain, u_gap, np.array(areas), np.array(forces), amplitude, s.layers, drive.phase,
+        drive.text, notes, (*warned, *beyond_fingers("", *largest)),
     )  # fmt: skip

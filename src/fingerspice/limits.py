@@ -125,7 +125,7 @@ def fold_limits(circuit: Circuit, *, points: int = 9, span: float = 10.0) -> Fol
     sweeps = []
     for key, name, unit in (("fn", "load", "N"), ("d", "gap", "m")):
         own = float(gap.values[key])
-        changed = [circuit.replace({f"{gap.name}.{key}": own * x}) for x in factors]
+        changed = [circuit.varied({f"{gap.name}.{key}": own * x}) for x in factors]
         sweeps.append(FoldSweep(name, unit, own, own * factors, _along(changed, peak, [t_stop] * points)))
     waves = [e.waveform for e in sources]
     if len(waves) == 1 and isinstance(getattr(waves[0], "frequency", None), float):
@@ -135,7 +135,7 @@ def fold_limits(circuit: Circuit, *, points: int = 9, span: float = 10.0) -> Fol
         for x in factors:
             wave: Waveform = dataclasses.replace(waves[0], frequency=own * x)  # type: ignore[type-var, assignment]
             changes: dict[str, float | Waveform] = {f"{skin}.f": own * x for skin in skins}
-            changed.append(circuit.replace({**changes, sources[0].name: wave}))
+            changed.append(circuit.varied({**changes, sources[0].name: wave}))
         voltages = _along(changed, peak, [t_stop / x for x in factors])
         sweeps.append(FoldSweep("frequency", "Hz", own, own * factors, voltages))
     return FoldLimits(circuit, peak, around, tuple(sweeps))
@@ -159,7 +159,7 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
 
     def folds(voltage: float) -> bool:
         factor = as_waveform(voltage / peak)
-        raised = circuit.replace(
+        raised = circuit.varied(
             {e.name: Product((factor, e.waveform)) for e in circuit.by_device("V") if e.waveform is not None}
         )
         if is_stack(raised):

@@ -33,19 +33,12 @@ def read_circuit(deck: Path, changes: list[str] | None, source: str | None) -> C
 
 def _with_changes(circuit: Circuit, changes: list[str]) -> Circuit:
     """The circuit with every ``--set``, all at once: exponents may have to change together."""
-    from fingerspice.circuit.netlist import value_from_text
-
-    values: dict[str, float] = {}
+    values: dict[str, str] = {}
     for change in changes:
         path, equals, text = (part.strip() for part in change.partition("="))
         if not equals or not path:
             raise InputError(f"--set {change!r} is not understood; allowed: PATH=VALUE, such as Xgap.d=3u")
-        try:
-            values[path], warning = value_from_text(circuit, path, text)
-        except InputError as error:
-            raise InputError(f"--set {change!r}: {error.message}") from None
-        if warning:
-            warnings.warn(f"--set {warning}", FingerspiceWarning, stacklevel=2)
+        values[path] = text
     if not values:
         return circuit
     try:

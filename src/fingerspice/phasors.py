@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element
 from fingerspice.circuit.network import Network, build_network
 from fingerspice.circuit.statespace import Stack, build_stack, is_stack
+from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.circuit.waveforms import Fundamental, require
 from fingerspice.errors import InputError
 from fingerspice.physics.contact import Contact
@@ -407,9 +408,11 @@ def phasor(
         force = 0.5 * scene.contact.stress(np.abs(u_gap)) * own
     _refuse_no_number(f, layers, own, *((u_gap, force) if math.isfinite(drive.amplitude) else ()))
     notes, warnings = sweep_notes(circuit, f, skin)
+    largest = (float(np.max(x)) for x in (force, scene.contact.stress(np.abs(u_gap)), own))
     return PhasorSolution(
-        f, gain, layers, u_gap, own, force, drive.amplitude, scene.layers, drive.phase, drive.text, notes, warnings
-    )
+        f, gain, layers, u_gap, own, force, drive.amplitude, scene.layers, drive.phase, drive.text, notes,
+        (*warnings, *beyond_fingers("", *largest)),
+    )  # fmt: skip
 
 
 def sweep_frequencies(sweep: AcSweep) -> FloatArray:

@@ -30,6 +30,7 @@ _LETTERS = "a-zµμωΩ"
 _NUMBER = re.compile(rf"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?:e([+-]?[0-9]+))?([{_LETTERS}]*)", re.IGNORECASE)
 _LETTER_AS_POINT = re.compile(rf"([+-]?[0-9]+)([{_LETTERS}]+)([0-9]+)[{_LETTERS}]*", re.IGNORECASE)
 _MEGA = re.compile(rf"[+-]?[0-9.]+(?:e[+-]?[0-9]+)?(M(?!eg|il)[{_LETTERS}]*)", re.IGNORECASE)
+_DASHES = {0x2212: "-", 0x2013: "-", 0x2010: "-", 0x2011: "-"}
 _MAX_LENGTH = 400
 _PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
 
@@ -127,6 +128,18 @@ def format_si(value: float, unit: str, digits: int = 4) -> str:
     return f"{scaled:.{max(digits, 3)}g} {_PREFIXES[power]}{unit}".rstrip()
 
 
+def exponent_and_scale(text: str) -> bool:
+    """Whether a number has both, as in ``1e-4u``, which is 1e-10: seldom meant."""
+    match = _NUMBER.fullmatch(text)
+    return match is not None and match[2] is not None and match[3].lower() not in {"", *PLAIN_UNITS}
+
+
+def spice_text(value: float) -> str:
+    """A number as SPICE writes it: ``spice_text(3.5e-6)`` is ``3.5u``, and of 2e6 ``2meg``."""
+    text = format_si(value, "", 12).replace(" ", "")
+    return text.replace("M", "meg").replace("G", "g").replace("T", "t")
+
+
 def _power_of_ten(letters: str, text: str, as_written: str) -> int:
     """Power of ten that the lower-case letters after a number stand for."""
     if letters == "":
@@ -157,4 +170,16 @@ def _why_not_a_number(text: str) -> str:
         if letters.lower().startswith(tuple(SCALES)) or letters.lower() in ("r", "v"):
             scale = "" if letters.lower() in ("r", "v") else letters
             return f"'{text}' differs between simulators: write {whole}.{fraction}{scale}"
+    bare = text.rstrip("%°")
+    if bare != text and _NUMBER.fullmatch(bare):
+        plain = f"{float(parse_number(bare)) / 100.0:g}" if text.endswith("%") else bare
+        return f"'{text}' is not a number: write {plain}"
+    joined = "".join(text.split())
+    if joined != text.strip() and _NUMBER.fullmatch(joined):
+        return f"'{text}' is not a number, its unit stands apart: write {joined}"
+    plain = text.translate(_DASHES)
+    if plain != text and _NUMBER.fullmatch(plain):
+        return f"'{text}' is not a number, its minus is a typographic one: write {plain}"
+    if text.count(",") == 1 and _NUMBER.fullmatch(text.replace(",", ".")):
+        return f"'{text}' is not a number, its comma separates: write {text.replace(',', '.')}"
     return f"'{text}' is not a number (examples: 10, 2.5, 1e-6, 3.5u, 0.2meg)"

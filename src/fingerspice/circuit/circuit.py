@@ -6,6 +6,7 @@ import cmath
 import dataclasses
 import math
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -14,8 +15,9 @@ from types import MappingProxyType
 from typing import Any
 
 from fingerspice.circuit.devices import DEVICES, DeviceSpec
+from fingerspice.circuit.values import unusual, value_of
 from fingerspice.circuit.waveforms import Waveform, as_waveform
-from fingerspice.errors import InputError, Where
+from fingerspice.errors import FingerspiceWarning, InputError, Where
 
 CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
@@ -133,7 +135,7 @@ class Circuit:
         Reading of Eq. 7: ``gap`` (gap voltage held) or ``total`` (total voltage held, of a dispersive skin with its
         permittivity above all poles).
     warnings : tuple of str
-        What the reader noticed.
+        What the reader noticed, and `replace`.
     unused : tuple of str
         Directives accepted and not used here.
     text : str
@@ -204,45 +206,89 @@ class Circuit:
                     if hasattr(element.waveform, name):
                         yield f"{element.name}.{name}", Parameter(getattr(element.waveform, name), unit)
 
-    def replace(self, changes: Mapping[str, float | Waveform | Callable[[float], float]]) -> Circuit:
+    def replace(self, changes: Mapping[str, float | str | Waveform | Callable[[float], float]]) -> Circuit:
         """A changed circuit.
 
         Parameters
         ----------
         changes : mapping
-            Path to value in the netlist's unit (``{"Xgap.d": 3e-6}``), or a source's name to a waveform.
+            Path to value in the netlist's unit, as a number or in SPICE's notation (``{"Xgap.d": 3e-6}`` or
+            ``{"Xgap.d": "3u"}``), or a source's name to a waveform or its text (``"SQUARE(200 100)"``).
 
         Raises
         ------
         InputError
-            For an unknown path (with the nearest one) or a value out of range.
+            For an unknown path (with the nearest one), a text that is no number, or a value out of range.
+
+        Warns
+        -----
+        FingerspiceWarning
+            Of a value outside the usual range, which is probably in another unit.
         """
+        changed, notes = self._replaced(changes)
+        # A warning of the reader has its place before it.
+        gone = tuple(set(_unusual(self)) - set(_unusual(changed)))
+        kept = [said for said in self.warnings if not said.endswith(gone)]
+        for text in notes:
+            warnings.warn(text, FingerspiceWarning, stacklevel=2)
+        return dataclasses.replace(changed, warnings=(*kept, *notes))
+
+    def varied(self, changes: Mapping[str, float | str | Waveform | Callable[[float], float]]) -> Circuit:
+        """As `replace`, without its warnings: for the sweeps of this package, whose values nobody wrote."""
+        return self._replaced(changes)[0]
+
+    def _replaced(
+        self, changes: Mapping[str, float | str | Waveform | Callable[[float], float]]
+    ) -> tuple[Circuit, list[str]]:
+        """A changed circuit, and what the changes are to be warned about."""
+        if not isinstance(changes, Mapping) or not all(isinstance(path, str) for path in changes):
+            raise InputError(f"replace is given {changes!r}; allowed: a mapping such as {{'Xgap.d': 3e-6}}")
         elements = {e.name.lower(): e for e in self.elements}
-        overrides = dict(self.overrides)
+        overrides, traps = dict(self.overrides), dict[str, str]()
         for path, value in changes.items():
-            name, _, parameter = path.rpartition(".")
+            name, _, parameter = path.lower().rpartition(".")
             if path.lower() in elements and elements[path.lower()].device in "VI":
                 element = elements[path.lower()]
                 # What an .ac sweep took from the old source goes with it.
-                elements[path.lower()] = dataclasses.replace(element, waveform=as_waveform(value), ac=None)
-            elif name.lower() in elements and not isinstance(value, Waveform) and not callable(value):
-                elements[name.lower()] = _changed(elements[name.lower()], parameter.lower(), float(value), path)
+                elements[path.lower()] = dataclasses.replace(element, waveform=self._waveform(value), ac=None)
+            elif name in elements:
+                elements[name], trap = _changed(elements[name], parameter, value, path)
+                traps |= {path.lower(): trap} if trap else {}
             else:
                 known = [*self.parameters, *(e.name for e in self.by_device("V", "I"))]
                 raise InputError(_unknown("parameter", path, known))
-            overrides[path] = value.__name__ if hasattr(value, "__name__") else repr(value)
+            overrides[path] = value if isinstance(value, str) else getattr(value, "__name__", repr(value))
         changed = dataclasses.replace(self, elements=tuple(elements.values()), overrides=overrides)
         check(changed)
-        return changed
+        before, after = _unusual(self), _unusual(changed)
+        # One word about a value is enough.
+        new = [text for text, path in after.items() if text not in before and path not in traps]
+        return changed, [*traps.values(), *new]
+
+    def _waveform(self, given: float | str | Waveform | Callable[[float], float]) -> Waveform:
+        if not isinstance(given, str):
+            return as_waveform(given)
+        from fingerspice.circuit.netlist import source_from_text
+
+        return source_from_text(given, self)
 
 
-def _changed(element: Element, parameter: str, value: float, path: str) -> Element:
+def _unusual(circuit: Circuit) -> dict[str, str]:
+    """What is not usual in a circuit, and the path of each, in lower case."""
+    return {text: f"{e.name}.{name}".lower() for e in circuit.elements for name, text in unusual(e)}
+
+
+def _changed(element: Element, parameter: str, given: Any, path: str) -> tuple[Element, str | None]:
+    """An element with another value, and what to warn about in how it is written."""
     if parameter in element.values:
+        spec = element.spec.parameter(parameter)
+        value, note = value_of(path, given, spec, spec.unit)
         values = {**element.values, parameter: value}
-        return dataclasses.replace(element, values=MappingProxyType(values))
+        return dataclasses.replace(element, values=MappingProxyType(values)), note
     if element.waveform is not None and parameter in type(element.waveform).units:
+        value, note = value_of(path, given, None, type(element.waveform).units[parameter])
         waveform = dataclasses.replace(element.waveform, **{parameter: value})  # type: ignore[type-var]
-        return dataclasses.replace(element, waveform=waveform)
+        return dataclasses.replace(element, waveform=waveform), note
     known = [*element.values, *(type(element.waveform).units if element.waveform else ())]
     raise InputError(_unknown("parameter", path, [f"{element.name}.{name}" for name in known]))
 
@@ -289,9 +335,10 @@ def _check_contact(gap: Element) -> None:
     area = gap.values["alpha"] * gap.values["fn"] ** m
     loss = math.sqrt(gap.values["c2"]) * gap.values["mu"] * gap.values["fn"]
     if gap.values["a_fix"] == 0.0 and not area > loss:
+        hint = "".join(f"; note {text}" for _, text in unusual(gap))
         raise InputError(
             f"{gap.name} has no contact: friction takes the whole ridge area at 0 V "
             f"(A0 = alpha fn^m_exp = {area:.4g} mm^2, sqrt(c2) mu fn = {loss:.4g} mm^2); allowed: "
-            "A0^2 > c2 mu^2 fn^2, so less load fn, less friction mu or less c2",
+            f"A0^2 > c2 mu^2 fn^2, so less load fn, less friction mu or less c2{hint}",
             gap.where,
         )

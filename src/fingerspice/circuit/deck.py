@@ -11,22 +11,22 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from fingerspice.circuit.devices import layer_devices
 from fingerspice.circuit.flatten import Flattener, Statement
 from fingerspice.circuit.lexer import Line, group, lex
 from fingerspice.circuit.reader import (
     DIRECTIVES,
     MAX_BYTES,
-    NATIVE_DEVICES,
     NATIVE_LIBRARIES,
     Reader,
     Subcircuit,
     read_text,
 )
 from fingerspice.circuit.scope import Call, Number, Scope, Token, Value
+from fingerspice.circuit.slips import with_comma
 from fingerspice.errors import InputError, Where, printable
 
 __all__ = [
-    "NATIVE_DEVICES",
     "NATIVE_LIBRARIES",
     "Call",
     "Deck",
@@ -41,9 +41,9 @@ __all__ = [
 #: Characters of a title that are shown; of a longer one the middle is left out.
 LONGEST_TITLE = 200
 
-_VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sin|pulse|exp|pwl|square|wavefile|table)\b)"
+_VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|wavefile|table)\b)"
 _ELEMENT_TITLE = re.compile(rf"[rcvi]\w*\s+\S+\s+\S+\s+{_VALUE}", re.IGNORECASE)
-_DEVICE_TITLE = re.compile(rf"x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(NATIVE_DEVICES)})(?:\s|$)", re.IGNORECASE)
+_DEVICE_TITLE = re.compile(rf"x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(layer_devices())})(?:\s|$)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,8 +163,11 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
     if _reads_like_a_statement(title):
         problem = f"the first line is the title, but '{title}' reads like a statement: add a title above"
         reader.warn(problem, Where(file, 1))
-    reader.read_deck(lines)
-    return _assemble(reader, title, text, path)
+    try:
+        reader.read_deck(lines)
+        return _assemble(reader, title, text, path)
+    except InputError as error:
+        raise with_comma(error, reader.warnings) from None
 
 
 def _assemble(reader: Reader, title: str, text: str, path: Path | None) -> Deck:

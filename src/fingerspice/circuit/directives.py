@@ -10,14 +10,27 @@ from fingerspice.circuit.bounds import check_range
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Element, Tran
 from fingerspice.circuit.deck import Directive, Number, Token, parse_deck
 from fingerspice.circuit.expressions import nearest
+from fingerspice.circuit.slips import is_unit
 from fingerspice.errors import InputError, Where
 
-"""Start values of voltages, V: far from any circuit's, so that products stay numbers."""
+#: Outputs of a run whose .tran has no TSTEP.
+LTSPICE_OUTPUTS = 10_000
+_LTSPICE_START = {
+    "startup": "sources are not ramped up here; allowed: a source that rises by itself, such as PWL(0 0 20u 5)",
+    "steady": "no run stops by itself here; allowed: fs.steady_state(circuit), which finds the periodic state",
+    "nodiscard": "outputs begin at TSTART here; allowed: TSTART left out",
+    "step": "loads are not stepped here; allowed: a source with steps, PULSE or PWL",
+}
 _NGSPICE_OPTIONS = frozenset(
     """abstol acct bypass chgtol defad defas defl defw gmin gminsteps interp itl1 itl2 itl3 itl4 itl5 itl6 keepopinfo
     klu list maxevtiter maxopalter maxord method minbreak noacct noinit nomod nopage node noopalter numdgt opts
     pivrel pivtol ramptime reltol rshunt savecurrents seed seedinfo sparse srcsteps temp tnom trtol trytocompact
     vntol warn xmu""".split()  # noqa: SIM905
+)
+_LTSPICE_OPTIONS = frozenset(
+    """baudrate cshunt delay fastaccess flagloads gfloat gshunt measdgt meascplxfmt minclockguide mindeltagmin nomarch
+    noopiter plotabstol plotreltol plotvntol plotwinsize ptranmax ptrantau srcstepmethod sstol thev_induc
+    topologycheck""".split()  # noqa: SIM905
 )
 
 
@@ -38,35 +51,39 @@ def _numbers(directive: Directive, usage: str) -> tuple[list[Number], list[str]]
     return numbers, words
 
 
-def read_tran(directive: Directive) -> Tran:
-    """``.tran TSTEP TSTOP [TSTART [TMAX]] [uic]``."""
+def read_tran(directive: Directive, notes: list[str]) -> Tran:
+    """``.tran TSTEP TSTOP [TSTART [TMAX]] [uic]``, and LTspice's ``.tran TSTOP`` and ``.tran 0 TSTOP [TSTART [TMAX]]``.
+
+    `notes` takes what TSTEP is where none is given.
+    """
     usage = ".tran TSTEP TSTOP [TSTART [TMAX]] [uic]"
     numbers, words = _numbers(directive, usage)
-    if any(w != "uic" for w in words) or not 2 <= len(numbers) <= 4:
-        raise InputError(f"{directive.text.strip()!r} is not understood; allowed: {usage}", directive.where)
-    step, stop = numbers[0], numbers[1]
-    start = numbers[2] if len(numbers) > 2 else None
-    longest = numbers[3] if len(numbers) > 3 else None
-    _require(step.value > 0.0, "TSTEP", step, "more than 0 s")
+    for word in words:
+        if word in _LTSPICE_START:
+            raise InputError(f".tran {word}: {_LTSPICE_START[word]}", directive.where)
+    if any(w != "uic" for w in words) or not 1 <= len(numbers) <= 4:
+        apart = "; a unit joins its number, such as 20m" if any(is_unit(w) for w in words) else ""
+        raise InputError(f"{directive.text.strip()!r} is not understood; allowed: {usage}{apart}", directive.where)
+    step, stop, start, longest = [None, numbers[0], None, None] if len(numbers) == 1 else [*numbers, None, None][:4]
+    assert stop is not None
     _require(stop.value > 0.0, "TSTOP", stop, "more than 0 s")
-    for what, number in (("TSTEP", step), ("TSTOP", stop), ("TMAX", longest)):
+    for what, number in (("TSTOP", stop), ("TMAX", longest)):
         _require(number is None or 1e-30 <= number.value <= 1e30, what, number, "1e-30 to 1e30 s")
+    if step is None or step.value == 0.0:
+        every = longest.value if longest else stop.value / LTSPICE_OUTPUTS
+        step = Number(every, f"{every:g}", directive.where) if longest is None else longest
+        if longest is None:
+            notes.append(
+                f"{directive.where}: {directive.text.strip()!r} has no TSTEP, which LTspice does not need: "
+                f"{LTSPICE_OUTPUTS:,} outputs, one every {every:g} s"
+            )
+    _require(step.value > 0.0, "TSTEP", step, "more than 0 s")
+    _require(1e-30 <= step.value <= 1e30, "TSTEP", step, "1e-30 to 1e30 s")
     _require(step.value <= stop.value, "TSTEP", step, f"at most TSTOP = {stop.text} (the output step comes first)")
-    _require(start is None or 0.0 <= start.value < stop.value, "TSTART", start, f"0 to TSTOP = {stop.text}")
-    _require(longest is None or longest.value > 0.0, "TMAX", longest, "more than 0 s")
-    _require(
-        (stop.value - (start.value if start else 0.0)) / step.value <= 1e8,
-        "TSTEP",
-        step,
-        "at most 1e8 output steps in a run",
-    )
-    return Tran(
-        step.value,
-        stop.value,
-        start.value if start else 0.0,
-        longest.value if longest else None,
-        "uic" in words,
-    )
+    begin = start.value if start else 0.0
+    _require(0.0 <= begin < stop.value, "TSTART", start, f"0 to TSTOP = {stop.text}")
+    _require((stop.value - begin) / step.value <= 1e8, "TSTEP", step, "at most 1e8 output steps in a run")
+    return Tran(step.value, stop.value, begin, longest.value if longest else None, "uic" in words)
 
 
 def _require(condition: bool, what: str, given: Number | None, allowed: str) -> None:
@@ -167,11 +184,11 @@ def read_options(directives: tuple[Directive, ...]) -> tuple[str, tuple[str, ...
                 if work not in (None, text):
                     raise InputError(f".options work is given twice, first {work}, then {text}", place)
                 work = text
-            elif key in _NGSPICE_OPTIONS:
+            elif key in _NGSPICE_OPTIONS or key in _LTSPICE_OPTIONS:
                 unused.append(f".options {key}")
             else:
                 hint = nearest(key, [*_NGSPICE_OPTIONS, "work"])
-                known = f"work={'|'.join(WORK_READINGS)}, and ngspice's own, which have no effect here"
+                known = f"work={'|'.join(WORK_READINGS)}, and those of ngspice and LTspice, which have no effect here"
                 raise InputError(f"unknown option {key!r}{hint}; allowed: {known}", place)
     return work or "gap", tuple(dict.fromkeys(unused))
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from fingerspice.circuit.devices import DEVICES, layer_devices
 from fingerspice.circuit.expressions import nearest
 from fingerspice.circuit.lexer import Group, Lexeme, Line, group, lex
-from fingerspice.circuit.reader import DIRECTIVES, NATIVE_DEVICES, NATIVE_NODES, Subcircuit
+from fingerspice.circuit.reader import DIRECTIVES, Subcircuit
 from fingerspice.circuit.scope import Bare, Call, Number, Scope, Token, Value
+from fingerspice.circuit.slips import stray_word
 from fingerspice.errors import InputError, Where
 
 #: Lines and characters read in all subcircuit calls together, calls inside each other, characters of a flat name.
@@ -19,7 +21,7 @@ MAX_NAME = 400
 _VALUED = {"R": "resistor", "C": "capacitor", "V": "voltage source", "I": "current source"}
 _ELSEWHERE = {
     "A": "an XSPICE model",
-    "B": "a behavioural source",
+    "B": "a behavioural source (a function of time is given in Python, sources={'V1': f})",
     "D": "a diode",
     "E": "a controlled source",
     "F": "a controlled source",
@@ -106,7 +108,7 @@ class _Instance:
 
     def visible(self) -> list[str]:
         """Names an X line may call from here."""
-        names = list(NATIVE_DEVICES)
+        names = list(layer_devices())
         instance: _Instance | None = self
         while instance is not None:
             names += [sub.name for sub in instance.definition.inner.values()]
@@ -143,7 +145,9 @@ class Flattener:
         where = line.where(first.position)
         letter = first.text[:1].upper()
         if first.kind != "word" or not (letter.isascii() and letter.isalpha()):
-            problem = f"'{line.written(first)}' is no element: a line begins with R, C, V, I, X or a dot"
+            problem = (
+                f"'{line.written(first)}' is no element: a line begins with R, C, V, I, X or a dot, a comment with *"
+            )
             raise InputError(problem, where)
         if letter != "X" and letter not in _VALUED:
             raise InputError(_unknown_element(lexemes), where)
@@ -162,7 +166,8 @@ class Flattener:
         """An X line: a native device becomes a statement, a subcircuit is expanded."""
         words = group(line, lexemes[1:], plain=len(lexemes))
         if words.stray is not None:
-            problem = f"'{words.stray.text}' follows the parameters: nodes and the device's name come first"
+            hint = stray_word(words.stray.text, line.text[: words.stray.position])
+            problem = f"'{words.stray.text}' follows the parameters: nodes and the device's name come first{hint}"
             raise InputError(problem, line.where(words.stray.position))
         plain = [word for word in words.words if isinstance(word, Lexeme) and word.text.lower() != "params:"]
         if not plain:
@@ -173,8 +178,8 @@ class Flattener:
         if device.kind != "word":
             raise InputError(f"{line.written(device)} stands where a device's name belongs", where)
         native = device.text.upper()
-        if native in NATIVE_DEVICES:
-            _check_nodes(name, native, len(nodes), NATIVE_NODES, where)
+        if native in layer_devices():
+            _check_nodes(name, native, len(nodes), DEVICES[native].nodes, where)
             canonical, written = _nodes(line, nodes, instance)
             params = instance.scope.pairs(line, words, bare="arithmetic")
             given = {key: value.value for key, value in params[0].items() if isinstance(value, Number)}
@@ -270,8 +275,7 @@ def _check_nodes(name: str, device: str, given: int, wanted: tuple[str, ...], wh
     if given != len(wanted):
         plural = "" if len(wanted) == 1 else "s"
         nodes = f" ({' '.join(wanted)})" if wanted else ""
-        problem = f"missing value: {name}:" if given < len(wanted) else f"{name}:"
-        raise InputError(f"{problem} {device} has {len(wanted)} node{plural}{nodes}, {given} given", where)
+        raise InputError(f"{name}: {device} has {len(wanted)} node{plural}{nodes}, {given} given", where)
 
 
 def _unknown_device(line: Line, words: list[Lexeme], instance: _Instance) -> str:
@@ -290,10 +294,10 @@ def _unknown_device(line: Line, words: list[Lexeme], instance: _Instance) -> str
 def _unknown_element(lexemes: list[Lexeme]) -> str:
     """Why a line that begins with this word is no element."""
     name = lexemes[0].text
-    if any(lexeme.text.upper() in NATIVE_DEVICES for lexeme in lexemes[3:]):
+    if any(lexeme.text.upper() in layer_devices() for lexeme in lexemes[3:]):
         return f"'{name}': a device's name begins with X, as in X{name}"
     if f".{name.lower()}" in DIRECTIVES:
         return f"'{name}': a directive begins with a dot, as in .{name.lower()}"
     kind = _ELSEWHERE.get(name[0].upper())
     what = f"'{name}' is {kind}, which is not supported" if kind else f"'{name}' is no known element"
-    return f"{what}; elements are R, C, V, I, and X with {', '.join(NATIVE_DEVICES)} or a .subckt"
+    return f"{what}; elements are R, C, V, I, and X with {', '.join(layer_devices())} or a .subckt"

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 from fingerspice.errors import InputError, Where
 
-#: A `;` or a free-standing `$` starts a comment, unless it stands between double quotes.
-_COMMENT = re.compile(r'"[^"]*"|(;|(?<!\S)\$(?!\S))')
+#: A `;`, a `//` after a blank or a free-standing `$` starts a comment, as in ngspice, unless between double quotes.
+_COMMENT = re.compile(r'"[^"]*"|(;|(?<!\S)//|(?<!\S)\$(?!\S))')
 _LEX = re.compile(r"""[\s,]+|([()=])|("[^"]*")|('[^']*')|([^\s,()={}'"]+)""")
 #: A word, bracket or text begins at the start of a line or after one of these, or is one of them.
 _SPLIT = re.compile(r"""[\s,]+|[()={}'"]""")
@@ -143,7 +143,7 @@ def _finished(file: str, parts: list[tuple[int, int, str]]) -> Line:
 
 
 def _without_comment(raw: str) -> str:
-    if ";" in raw or "$" in raw:
+    if ";" in raw or "$" in raw or "//" in raw:
         for match in _COMMENT.finditer(raw):
             if match[1]:
                 return raw[: match.start()].rstrip()

@@ -6,12 +6,17 @@ folder and no others.
 
 from __future__ import annotations
 
+import codecs
 from dataclasses import dataclass, field
+from encodings import cp1252
 from pathlib import Path
 
+from fingerspice.circuit.devices import layer_devices
 from fingerspice.circuit.expressions import nearest
 from fingerspice.circuit.lexer import Group, Lexeme, Line, group, lex, logical_lines, split_lines
+from fingerspice.circuit.library import LIBRARIES, library_text
 from fingerspice.circuit.scope import Formula, param_formulas
+from fingerspice.circuit.slips import ELSEWHERE, decimal_comma
 from fingerspice.errors import InputError, Where
 
 MAX_BYTES = 64 * 2**20
@@ -22,23 +27,15 @@ MAX_WARNINGS = 100
 MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 32
 
-#: Devices that need no definition; each has the nodes p, n, area.
-NATIVE_DEVICES = ("LAYER", "SLAB", "SKIN", "SKIN_DISPERSIVE", "GAP")
-NATIVE_NODES = ("p", "n", "area")
 #: ngspice's bodies of the native devices: which one is included says which charge law is meant.
-NATIVE_LIBRARIES = ("fingerspice.lib", "fingerspice_mobile.lib")
+NATIVE_LIBRARIES = tuple(LIBRARIES.values())
 
-UNUSED = (".print", ".plot", ".save", ".probe", ".nodeset", ".meas", ".measure", ".title")
+#: Accepted and not used here; those that say nothing about results, only to ngspice or LTspice, without a word.
+UNUSED = (".print", ".plot", ".save", ".probe", ".meas", ".measure", ".title")
+SILENT = (".nodeset", ".backanno")
 ANALYSES = (".tran", ".ac", ".ic", ".options", ".option")
 STRUCTURE = (".param", ".subckt", ".ends", ".include", ".inc", ".lib", ".control", ".end")
-DIRECTIVES = (*ANALYSES, *STRUCTURE, *UNUSED, ".endc")
-#: Directives that other simulators know: a nearest spelling would mislead.
-_ELSEWHERE = frozenset(
-    (
-        *(".step", ".temp", ".model", ".global", ".func", ".op", ".dc", ".noise", ".four", ".tf", ".sens"),
-        *(".data", ".if", ".elseif", ".else", ".endif", ".csparam", ".alter", ".width", ".endl", ".pz"),
-    )
-)
+DIRECTIVES = (*ANALYSES, *STRUCTURE, *UNUSED, *SILENT, ".endc")
 
 
 @dataclass(slots=True)
@@ -129,6 +126,9 @@ class Reader:
         if self._words > MAX_WORDS:
             problem = f"the netlist has more than {MAX_WORDS:,} words and brackets; allowed: no more"
             raise InputError(f"{problem}, samples go in by Python: fs.Samples(values, rate)", _place(line))
+        comma = decimal_comma(line.text) if "," in line.text and not self._open[-1].skipped else None
+        if comma:
+            self.warn(comma, _place(line))
         if word[0] != ".":
             here = self._open[-1]
             if not here.skipped:
@@ -154,16 +154,19 @@ class Reader:
             if self._reading:
                 raise InputError("only the netlist itself, not an included file, has .end", _place(line))
             return True
-        elif word == ".param":
+        elif word in (".param", ".params"):
             here.params.extend(param_formulas(line, rest))
             here.characters += len(line.text)
         elif word in (".include", ".inc", ".lib"):
             self._include(word, line, rest, folder)
         elif word in UNUSED:
             self.unused[word] = None
+        elif word in SILENT:
+            pass
         elif word in ANALYSES:
             if here is not self.root:
-                raise InputError(f"{word} does not belong inside .subckt {here.name}", _place(line))
+                opened = f".subckt {here.name}, which begins at {_where(here)}; is its .ends missing"
+                raise InputError(f"{word} does not belong inside {opened}?", _place(line))
             self.analyses.append((".options" if word == ".option" else word, line, rest))
         else:
             raise InputError(_unknown_directive(word), _place(line))
@@ -181,7 +184,7 @@ class Reader:
             raise InputError("write .subckt NAME node node ... key=value ...", _place(line))
         name = names[0].text
         defined = Subcircuit(name, line)
-        if name.upper() in NATIVE_DEVICES:
+        if name.upper() in layer_devices():
             problem = f"{name.upper()} is a native device: its .subckt is not read"
             self.warn(problem, line.where(names[0].position))
             defined.skipped = True
@@ -210,6 +213,12 @@ class Reader:
         base = name.replace("\\", "/").rpartition("/")[2]
         if base.lower() in NATIVE_LIBRARIES:
             self.libraries.append(base)
+            if self.folder is not None and folder is not None and library_changed(self.folder, folder, name):
+                self.warn(
+                    f"'{name}' differs from this version's and is not read: the devices are built in here, and only "
+                    "ngspice would run the changed ones",
+                    where,
+                )
             return
         if folder is None or self.folder is None:
             problem = f"'{name}' cannot be included: a netlist given as text has no folder to look in"
@@ -238,7 +247,7 @@ def read_text(path: Path, shown: str, where: Where | None = None) -> str:
     Raises
     ------
     InputError
-        When the file is missing, no file, too large, or not UTF-8 text.
+        When the file is missing, no file, too large, or no text (UTF-8, Latin-1, or UTF-16 with its mark).
     """
     try:
         if path.is_dir():
@@ -255,14 +264,40 @@ def read_text(path: Path, shown: str, where: Where | None = None) -> str:
             raise
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise InputError(f"'{shown}' cannot be read: {reason}", where) from None
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        # LTspice's, where a name has letters that Latin-1 has not.
+        return data.decode("utf-16", "replace")
     if b"\0" in data:
         raise InputError(f"'{shown}' is not a text file (it holds NUL bytes): save it as UTF-8", where)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        number = data[: error.start].count(b"\n") + 1
-        problem = f"'{shown}' is not UTF-8 text (byte 0x{data[error.start]:02x} in line {number})"
+        broken = error.start
+    try:
+        # Windows' Latin-1, in which LTspice writes its micro sign.
+        return cp1252.Codec().decode(data)[0]
+    except UnicodeDecodeError:
+        number = data[:broken].count(b"\n") + 1
+        problem = f"'{shown}' is neither UTF-8 nor Latin-1 text (byte 0x{data[broken]:02x} in line {number})"
         raise InputError(f"{problem}: save it as UTF-8", where) from None
+
+
+def library_changed(root: Path, folder: Path, name: str) -> bool:
+    """Whether the library of that name in the netlist's folder is there and is another one than this version's."""
+    try:
+        path = (folder / name.replace("\\", "/")).resolve()
+        if not path.is_relative_to(root) or not path.is_file():
+            return False
+        own = library_text(next(law for law, file in LIBRARIES.items() if file == path.name.lower()))
+        # A character has up to four bytes.
+        return path.stat().st_size > 4 * len(own) or _lines(read_text(path, name)) != _lines(own)
+    except (OSError, ValueError, RuntimeError):
+        # What cannot be read is not this version's.
+        return True
+
+
+def _lines(text: str) -> list[str]:
+    return [line.rstrip() for line in split_lines(text.rstrip())]
 
 
 def _similar_file(path: Path) -> str:
@@ -270,7 +305,8 @@ def _similar_file(path: Path) -> str:
         names = sorted(entry.name for entry in path.parent.iterdir())[:1000]
     except OSError:
         return ""
-    return nearest(path.name, names)
+    # These need not lie there.
+    return nearest(path.name, [*names, *NATIVE_LIBRARIES])
 
 
 def _inside(root: Path, folder: Path, name: str, where: Where) -> Path:
@@ -341,8 +377,9 @@ def _refuse_second(around: Subcircuit, defined: Subcircuit) -> None:
 def _unknown_directive(word: str) -> str:
     if word == ".endc":
         return ".endc without a .control before it"
-    hint = "" if word in _ELSEWHERE else nearest(word, DIRECTIVES)
-    known = hint or f"; directives are {' '.join((*ANALYSES[:-1], *STRUCTURE))}"
+    if word in ELSEWHERE:
+        return f"{word} is not supported: {ELSEWHERE[word]}"
+    known = nearest(word, DIRECTIVES) or f"; directives are {' '.join((*ANALYSES[:-1], *STRUCTURE))}"
     return f"{word} is not supported{known}"
 
 

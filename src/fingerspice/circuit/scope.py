@@ -16,6 +16,7 @@ from fingerspice.units import parse_number, suspicious_mega
 _NUMERIC = re.compile(r"[+-]|\.?[0-9]")
 _FILE_NAME = re.compile(r".*[/\\].*|.*\.[A-Za-z]\w*")
 _PLAIN_NUMBER = re.compile(r"[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?[A-Za-z]*")
+_OF_TIME = re.compile(r"(?<![A-Za-z])(?:t|time)(?![A-Za-z])", re.IGNORECASE)
 _OPERATOR = re.compile(r"[-+*/^]")
 _PAIR = re.compile(r"[({]|[)}]|'[^']*'|(?<![\w.])([A-Za-z_]\w*)\s*=(?!=)|[<>!=]=|=")
 
@@ -235,6 +236,8 @@ class Scope:
             if _FILE_NAME.fullmatch(text):
                 return Token(text, where)
             hint = f"; arithmetic goes in braces: {{{text}}}" if _OPERATOR.search(text) else ""
+            if _OF_TIME.search(text):
+                hint = "; a function of time is SIN(VO VA FREQ), PULSE or PWL, or given in Python, sources={'V1': f}"
             raise InputError(f"{error}{hint}", where) from None
 
     def _is_arithmetic(self, text: str) -> bool:

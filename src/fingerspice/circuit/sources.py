@@ -11,10 +11,17 @@ from fingerspice.circuit.circuit import SmallSignal
 from fingerspice.circuit.deck import Call, Number, Token
 from fingerspice.circuit.expressions import nearest
 from fingerspice.circuit.ramps import PWL, Pulse, Square
+from fingerspice.circuit.slips import is_unit
 from fingerspice.circuit.waveforms import DC, Exp, Sine, Waveform
 from fingerspice.errors import InputError, Where
 
 Word = Number | Token | Call
+_SIN = ("VO", "VA", "FREQ", "TD", "THETA", "PHASE")
+_PULSE = ("V1", "V2", "TD", "TR", "TF", "PW", "PER")
+#: LTspice counts their periods.
+_COUNTED = (_SIN, _PULSE)
+#: LTspice's names.
+_ALIASES = {"sine": "sin"}
 
 
 @dataclass(frozen=True)
@@ -43,6 +50,9 @@ class _Arguments:
                 self.call.where,
             )
         if given > len(self.names):
+            # LTspice's last one.
+            hint = "; Ncycles is not supported, in Python a burst is a product, fs.Sine(...) * fs.Pulse(...)"
+            usage += hint if self.names in _COUNTED and given == len(self.names) + 1 else ""
             raise InputError(
                 f"{self.call.name.upper()} takes at most {len(self.names)} values, {given} given; allowed: {usage}",
                 self.call.where,
@@ -76,7 +86,7 @@ def _number(word: Word, what: str) -> float:
 
 
 def _sin(call: Call, timing: Timing) -> Waveform:
-    a = _Arguments(call, ("VO", "VA", "FREQ", "TD", "THETA", "PHASE"), 2, timing)
+    a = _Arguments(call, _SIN, 2, timing)
     frequency = a.get("FREQ", 1.0 / timing.stop if timing.stop else math.nan)
     if math.isnan(frequency):
         raise InputError("SIN leaves out FREQ, which defaults to 1/TSTOP, and there is no .tran line", call.where)
@@ -84,7 +94,7 @@ def _sin(call: Call, timing: Timing) -> Waveform:
 
 
 def _pulse(call: Call, timing: Timing) -> Waveform:
-    a = _Arguments(call, ("V1", "V2", "TD", "TR", "TF", "PW", "PER"), 2, timing)
+    a = _Arguments(call, _PULSE, 2, timing)
     # An explicit 0 is an ideal edge here; for PW and PER, 0 means "for ever", as in ngspice.
     return Pulse(
         a.get("V1"),
@@ -109,7 +119,11 @@ def _pwl(call: Call, timing: Timing) -> Waveform:
         if key not in ("r", "td"):
             place = call.param_where.get(key, call.where)
             if key == "file":
-                raise InputError("PWL(file=...) is not supported (it aborts ngspice 39); write the points out", place)
+                raise InputError(
+                    "PWL(file=...) is not supported (it aborts ngspice 39); write the points, PWL(t1 v1 t2 v2 ...), or "
+                    "give them in Python, fs.PWL(times, values) or fs.Samples(values, rate)",
+                    place,
+                )
             raise InputError(f"PWL has no parameter {key!r}; allowed: r and td", place)
         _number(value, f"PWL {key}")
     values = [_number(arg, "PWL value") for arg in call.args]
@@ -190,12 +204,15 @@ def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -
         word = words.popleft()
         if isinstance(word, Number):
             if level is not None or waveform is not None:
-                raise InputError(
-                    f"{name}: a second value {word.text!r}; allowed: one value or source function", word.where
-                )
+                allowed = "one value or source function, such as SIN(0 200 100)"
+                raise InputError(f"{name}: a second value {word.text!r}; allowed: {allowed}", word.where)
             level = word.value
             continue
         key = (word.text if isinstance(word, Token) else word.name).lower()
+        key = _ALIASES.get(key, key)
+        if isinstance(word, Token) and is_unit(key) and (level is not None or waveform is not None):
+            problem = f"{name}: {word.text!r} stands apart; a unit joins its number, such as 5{word.text}"
+            raise InputError(problem, word.where)
         call = word if isinstance(word, Call) else None
         if call is None:
             # SIN 0 200 100, without brackets.
@@ -234,6 +251,18 @@ def _differences(name: str, key: str, waveform: Waveform, call: Call) -> tuple[s
         return (
             f"{call.where}: {name}: {key.upper()} has {which} = 0, which is 0 s here and not in ngspice 39, which "
             "takes TSTEP for TD1 = 0 and TD1 + TSTEP for TD2 = 0; write 1f for both to start at once",
+        )
+    if key == "sin" and len(call.args) < 3:
+        assert isinstance(waveform, Sine)
+        return (
+            f"{call.where}: {name}: {call.name.upper()} leaves out FREQ, which is 1/TSTOP then, "
+            f"{waveform.frequency:g} Hz; its values are VO VA FREQ",
+        )
+    later = [arg.text for arg in call.args[2::2] if isinstance(arg, Number) and arg.text.startswith("+")]
+    if key == "pwl" and later:
+        return (
+            f"{call.where}: {name}: the time {later[0]} is counted from 0, as in ngspice; LTspice counts it from the "
+            "point before",
         )
     return ()
 

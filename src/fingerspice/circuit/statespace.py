@@ -23,7 +23,6 @@ from fingerspice.circuit.topology import Hop, Loop, find_loop
 from fingerspice.circuit.waveforms import DC, Waveform
 from fingerspice.errors import InputError
 from fingerspice.physics.contact import Contact
-from fingerspice.physics.ladder import SKIN_LADDER
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 
 FloatArray = NDArray[np.float64]
@@ -168,18 +167,8 @@ def layer_constants(layer: Element, skin_at: float | None = None) -> FloatArray:
 
     With `skin_at` a dispersive skin's data are those at that frequency (Hz).
     """
-    v = layer.values
-    if layer.device == "LAYER" or layer.device == "GAP":
-        return np.array([[EPS0 * v["eps_r"] / v["d"], 1.0 / v["r"], 0.0]])
-    if layer.device == "SKIN_DISPERSIVE" and skin_at is not None:
-        eps_r, rho = SKIN_LADDER.permittivity([skin_at]), SKIN_LADDER.resistivity([skin_at])
-    elif layer.device == "SKIN_DISPERSIVE":
-        eps_r, rho = SKIN_LADDER.cells()
-    elif layer.device == "SKIN":
-        eps_r, rho = skin_permittivity([v["f"]]), skin_resistivity([v["f"]])
-    else:
-        eps_r, rho = np.array([v["eps_r"]]), np.array([v["rho"]])
-    return np.column_stack([EPS0 * eps_r / v["d"], np.zeros(eps_r.size), 1.0 / (rho * v["d"])])
+    assert layer.spec.cells is not None
+    return layer.spec.cells(layer.values, skin_at)
 
 
 def contact_of(gap: Element) -> Contact:

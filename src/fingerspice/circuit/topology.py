@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.waveforms import DC
@@ -12,6 +14,7 @@ from fingerspice.physics.ladder import SKIN_LADDER
 
 #: Elements of a circuit: every matrix of a network is dense.
 MAX_ELEMENTS = 2000
+_GROUNDS = ("gnd", "ground", "earth", "vss")
 
 
 @dataclass(frozen=True)
@@ -129,7 +132,8 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
             continue
         if on_node:
             raise InputError(
-                f"{on_node[0].name} and {owner.name} both drive the area node {owner.node_names[2]!r}",
+                f"{on_node[0].name} and {owner.name} both drive the area node {owner.node_names[2]!r}, which is a "
+                f"signal; allowed: a_fix= on {owner.name} for a given area, another node for what carries current",
                 on_node[0].where,
             )
         a_fix = owner.values["a_fix"]
@@ -190,7 +194,7 @@ def _refuse_floating(branches: list[Element]) -> None:
             e = elements[0]
             raise InputError(
                 f"node {_as_written(node, e)!r} is floating: only {e.name} touches it; allowed: two or more elements "
-                "at every node",
+                f"at every node{_lookalike(node, at)}",
                 e.where,
             )
     if "0" not in at:
@@ -203,6 +207,14 @@ def _refuse_floating(branches: list[Element]) -> None:
                 f"node {_as_written(node, e)!r} ({e.name}) is floating: nothing connects it to ground",
                 e.where,
             )
+
+
+def _lookalike(node: str, at: Mapping[str, list[Element]]) -> str:
+    """Another node that may be the same, misspelt; ground by one of its other names."""
+    if node.startswith(_GROUNDS):
+        return "; ground is 0 or gnd"
+    near = get_close_matches(node, [other for other in at if other not in (node, "0")], 1, 0.7)
+    return f"; is {_as_written(near[0], at[near[0]][0])!r} the same node?" if near else ""
 
 
 def _refuse_source_conflicts(branches: list[Element]) -> None:

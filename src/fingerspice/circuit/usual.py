@@ -1,0 +1,105 @@
+"""What values usually are, beside what they may be: what lies outside is computed all the same, and warned about."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from fingerspice.units import format_si, spice_text
+
+# Units that take a prefix, so that a slip is a factor of a thousand; in the others it is m^2 for mm^2, a million.
+_PREFIXED = ("m", "N", "Pa", "ohm", "ohm m", "V", "V/m", "F", "Hz", "s")
+_THOUSANDS = tuple(sign * 3 * k for k in (1, 2, 3, 4, 5) for sign in (-1, 1))
+_MILLIONS = {"mm^2": (6, -6), "mm^2/N^m": (6, -6), "mm^4/N^2": (12, -12)}
+
+
+@dataclass(frozen=True)
+class Usual:
+    """Range of a quantity in its unit, both ends inside.
+
+    Attributes
+    ----------
+    least, most : float
+        Of the quantity's size; 0 and inf stand for "none" where they are allowed, and are never warned about.
+    source : str
+        What the range is taken from, in words that fit into brackets.
+    slip : str
+        The unit, against the one that it is often taken for.
+    """
+
+    least: float
+    most: float
+    source: str
+    slip: str = ""
+
+    def warning(self, what: str, value: float, unit: str) -> str | None:
+        """What to say about a value that lies outside; None where it lies inside.
+
+        Parameters
+        ----------
+        what : str
+            Such as ``Xgap d``.
+        value : float
+            In the unit.
+        unit : str
+        """
+        size = abs(value)
+        if size == 0.0 or not math.isfinite(size) or self.least <= size <= self.most:
+            return None
+        ends = f"{_shown(self.least, unit if unit in _PREFIXED else '')} to {_shown(self.most, unit)}"
+        said = f"{what} is {_shown(value, unit)}, outside {ends}, the usual range ({self.source})"
+        if self.slip:
+            said += f": it is in {self.slip}"
+        meant = self._meant(value, unit)
+        return f"{said}; was {meant} meant?" if meant else said
+
+    def _meant(self, value: float, unit: str) -> str:
+        """The same digits in other units, where that is usual: at most three, the nearest first."""
+        powers = _THOUSANDS if unit in _PREFIXED else _MILLIONS.get(unit, ())
+        found = [float(f"{value:.12g}") * 10.0**power for power in powers]
+        texts = [spice_text(x) for x in found if self.least <= abs(x) <= self.most][:3]
+        return " or ".join([", ".join(texts[:-1]), texts[-1]] if len(texts) > 1 else texts)
+
+
+def _shown(value: float, unit: str) -> str:
+    return format_si(value, unit) if unit in _PREFIXED else f"{value:.4g} {unit}".rstrip()
+
+
+#: The area of a finger's ridges on the screen, mm^2: 35 in Table 1. A hair's tip has 0.01, a palm some thousand.
+REST_AREA = Usual(0.1, 2000.0, "a fingertip has 20 to 400, a palm some 1000", "mm^2, not m^2")
+
+#: Of a source, by the unit of its parameter. Screens for electrovibration take 10 to 400 V, electroadhesive grippers up
+#: to some kV. The skin feels up to 1 kHz; carriers lie up to some 100 kHz, and the skin's data end at 100 kHz.
+SOURCES = {
+    "V": Usual(0.0, 10e3, "screens take up to 400 V, grippers some kV"),
+    "Hz": Usual(10e-3, 10e6, "a finger feels up to 1 kHz, carriers have up to some 100 kHz"),
+}
+
+#: Largest of results, N, Pa and m^2. A finger bears 100 N; air breaks down long before an electric pressure of 10 MPa
+#: (1.5 GV/m), and most solids do; no finger has 10 cm^2.
+LARGEST_FORCE = 100.0
+LARGEST_PRESSURE = 10e6
+LARGEST_AREA = 1e-3
+
+
+def beyond_fingers(where: str, force: float, pressure: float, area: float) -> Iterator[str]:
+    """Warnings of results that are out of this world.
+
+    Parameters
+    ----------
+    where : str
+        Empty, or such as `` of Xgap``.
+    force, pressure, area : float
+        The largest, N, Pa and m^2.
+    """
+    for what, value, largest, unit, source in (
+        ("electroadhesive force", force, LARGEST_FORCE, "N", "as much as a finger bears"),
+        ("electric pressure", pressure, LARGEST_PRESSURE, "Pa", "that of 1.5 GV/m, beyond the strength of any layer"),
+        ("contact area", area, LARGEST_AREA, "m^2", "10 cm^2, more than a finger has"),
+    ):
+        if value > largest:
+            yield (
+                f"the {what}{where} reaches {_shown(value, unit)}, over {_shown(largest, unit)} ({source}): some value "
+                "is probably in another unit"
+            )

@@ -1,0 +1,96 @@
+"""Values of parameters: numbers in SPICE's notation with the traps of its units, and what is not usual."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from numbers import Real
+from typing import TYPE_CHECKING, Any
+
+from fingerspice.circuit.devices import ParameterSpec
+from fingerspice.circuit.usual import REST_AREA, SOURCES
+from fingerspice.errors import InputError
+from fingerspice.units import parse_number, suggest_mega, suspicious_mega, unit_read_as_scale
+
+if TYPE_CHECKING:
+    from fingerspice.circuit.circuit import Element
+
+_UNIT_TRAPS = {"F": "farad", "N": "newton"}
+
+
+def unit_trap(spec: ParameterSpec, text: str) -> str | None:
+    """Why a number whose unit SPICE takes for a scale is refused."""
+    word = _UNIT_TRAPS.get(spec.unit)
+    if not word or not unit_read_as_scale(text, spec.unit, word):
+        return None
+    prefix = {"F": "femto (1e-15)", "N": "nano (1e-9)"}[spec.unit]
+    return f"is {text!r}: SPICE reads {spec.unit} as {prefix}; write the number alone, in {word}"
+
+
+def is_resistance(spec: ParameterSpec) -> bool:
+    """Whether a capital M is likely to be meant as mega."""
+    return spec.unit in ("ohm", "ohm m")
+
+
+def mega_note(text: str, value: float, spec: ParameterSpec) -> str:
+    """What to say where a resistance holds a capital M."""
+    return (
+        f"{text!r} is milli ({value:g} {spec.unit}), as everywhere in SPICE; for mega{spec.unit.partition(' ')[0]} "
+        f"write {suggest_mega(text)}"
+    ).replace("megaohm", "megohm")
+
+
+def value_of(path: str, given: Any, spec: ParameterSpec | None, unit: str) -> tuple[float, str | None]:
+    """A parameter's new value, a number or text such as ``3.5u``; and a warning where its unit is a trap.
+
+    Parameters
+    ----------
+    path : str
+        Such as ``Xgap.d``.
+    given : float or str
+        In the netlist's unit.
+    spec : ParameterSpec or None
+        None of a waveform's parameter.
+    unit : str
+
+    Raises
+    ------
+    InputError
+        When it is no number, or its unit is one that SPICE takes for a scale.
+    """
+    if isinstance(given, Real) or (hasattr(given, "__float__") and getattr(given, "ndim", 1) == 0):
+        return float(given), None
+    if not isinstance(given, str):
+        what = f"a number {unit}".rstrip()
+        raise InputError(f"{path} is {given!r}; allowed: {what}, or text such as '3.5u'")
+    text = given.strip()
+    if text.lower() in ("inf", "none"):
+        return math.inf, None
+    try:
+        value = parse_number(text)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    if spec is None:
+        return value, None
+    trap = unit_trap(spec, text)
+    if trap:
+        raise InputError(f"{path} {trap}")
+    mega = is_resistance(spec) and suspicious_mega(text)
+    return value, f"{path}: {mega_note(text, value, spec)}" if mega else None
+
+
+def unusual(element: Element) -> Iterator[tuple[str, str]]:
+    """What is legal in an element and not usual: the parameter, or none of them, and what to say."""
+    found = [(p.name, p.unusual(element.name, element.values[p.name])) for p in element.spec.parameters]
+    if element.waveform is not None:
+        found = [
+            (name, SOURCES[unit].warning(f"{element.name} {name}", getattr(element.waveform, name), unit))
+            for name, unit in type(element.waveform).units.items()
+            if unit in SOURCES and hasattr(element.waveform, name)
+        ]
+    if element.device == "GAP" and not any(text for _, text in found):
+        v = element.values
+        area = (v["alpha"] * v["fn"] ** v["m_exp"]) ** 2 - v["c2"] * (v["mu"] * v["fn"]) ** 2
+        if v["a_fix"] == 0.0 and area > 0.0:
+            found.append(("", REST_AREA.warning(f"{element.name} area at 0 V", math.sqrt(area), "mm^2")))
+    yield from ((name, text) for name, text in found if text is not None)

@@ -1,0 +1,302 @@
+"""Decks that were written for LTspice, ngspice or by another hand: what loads, and what is said of the rest."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import analytic as ref
+import fingerspice as fs
+from commands import Command
+from deck_edits import DECK, edited
+from fingerspice.circuit.circuit import Tran
+from fingerspice.circuit.library import LIBRARIES, library_text
+from fingerspice.circuit.slips import ELSEWHERE, decimal_comma
+from ngspice_tools import run_ngspice
+
+TRAN = ".tran 10u 50m uic"
+
+
+def read(*changes: tuple[str, str]) -> tuple[fs.Circuit, list[str]]:
+    """The deck, and what was said of it."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        circuit = fs.parse_netlist(edited(*changes), "deck.cir")
+    return circuit, [str(w.message) for w in caught]
+
+
+# LTspice
+
+#: As LTspice XVII saves a schematic: Latin-1, CRLF, SINE, two numbers less in .tran, parasitics, parts' data.
+LTSPICE = """\
+* C:\\Users\\M\xfcller\\finger.asc
+V1 N001 0 SINE(0 200 100) Rser=1k
+XU1 N001 N002 area LAYER d=1\xb5 eps_r=3.9 r=0.2Meg
+XU2 N002 N003 area GAP d=3.5\xb5 r=1Meg
+XU3 N003 0 area SKIN d=350\xb5m f=100
+R1 N001 0 10Meg tol=1 pwr=0.1
+C1 N001 0 100p V=250 Irms=0 Rser=50 Rpar=1G Cpar=1p mfg="KEMET" pn="C0402" type="X7R"
+.tran 0 20m 0 10\xb5
+.lib fingerspice.lib
+.options plotwinsize=0 numdgt=7
+.backanno
+.end
+"""
+
+
+def test_what_ltspice_saves_loads_and_is_the_same_circuit_as_ours(tmp_path: Path) -> None:
+    path = tmp_path / "finger.net"
+    path.write_bytes(LTSPICE.replace("\n", "\r\n").encode("latin-1"))
+    theirs = fs.read_netlist(path)
+    assert theirs.title == "* C:\\Users\\M\xfcller\\finger.asc"
+    assert theirs.warnings == ()
+    assert theirs.unused == (".options plotwinsize", ".options numdgt")
+    assert theirs.tran == Tran(1e-5, 0.02, 0.0, 1e-5)
+    ours = fs.parse_netlist(
+        "t\nV1 s 0 SIN(0 200 100)\nRs a s 1k\nXU1 a b area LAYER d=1u eps_r=3.9 r=0.2meg\n"
+        "XU2 b c area GAP d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000\n"
+        "XU3 c 0 area SKIN d=350u f=100\nR1 a 0 10meg\nC1 e 0 100p\nRe a e 50\nRp a 0 1g\nCp a 0 1p\n"
+        ".tran 10u 20m 0 10u\n"
+    )
+    one, other = fs.simulate(theirs, rtol=1e-9), fs.simulate(ours, rtol=1e-9)
+    np.testing.assert_allclose(one.u_gap, other.u_gap, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(one.node_voltages["N001"], other.node_voltages["a"], rtol=0, atol=1e-6)
+    assert {e.name for e in theirs.elements} >= {"V1.Rser", "C1.Rser", "C1.Rpar", "C1.Cpar"}
+
+
+def test_a_source_with_rser_is_exported_with_it_and_runs_in_ngspice() -> None:
+    circuit, said = read(("SIN(0 200 100)", "SIN(0 200 100) Rser=1meg Cpar=10p"), (TRAN, ".tran 10u 20m 0 2u uic"))
+    assert said == []
+    text = fs.export_netlist(circuit)
+    assert "RVdrive_Rser drive Vdrive_Rser 1000000.0" in text
+    theirs = run_ngspice(text, signals=["v(top)-v(skin)"])
+    t, keep = np.unique(np.minimum(theirs["time"], 0.02), return_index=True)
+    t, keep = t[t > 1e-4], keep[t > 1e-4]
+    ours = fs.simulate(circuit, t_eval=t).u_gap
+    assert ours is not None
+    assert np.abs(ours - theirs["v(top)-v(skin)"][keep]).max() <= 1e-4 * np.abs(ours).max()
+
+
+def test_an_rser_is_the_resistor_that_it_stands_for_by_hand() -> None:
+    # A capacitor behind 1 kohm, at a constant voltage: 5 (1 - exp(-t/RC)).
+    circuit = fs.parse_netlist("t\nV1 a 0 5 Rser=400\nC1 a 0 1u Rser=600 IC=0 Lser=0\n.tran 10u 5m uic\n")
+    solution = fs.simulate(circuit)
+    v = solution.node_voltages["C1.Rser"]
+    np.testing.assert_allclose(v, 5.0 * (1.0 - np.exp(-solution.t / 1e-3)), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("key", ["Rser=0", "Cpar=0", "Rser=0 Cpar=0"])
+def test_no_parasitics_are_no_elements(key: str) -> None:
+    circuit, said = read(("SIN(0 200 100)", f"SIN(0 200 100) {key}"))
+    assert said == []
+    assert len(circuit.elements) == 4
+
+
+@pytest.mark.parametrize(
+    ("line", "tran", "noted"),
+    [
+        (".tran 20m", Tran(2e-6, 0.02), True),
+        (".tran 20m uic", Tran(2e-6, 0.02, uic=True), True),
+        (".tran 0 20m", Tran(2e-6, 0.02), True),
+        (".tran 0 20m 5m", Tran(2e-6, 0.02, 0.005), True),
+        (".tran 0 20m 0 10u", Tran(1e-5, 0.02, 0.0, 1e-5), False),
+        (".tran 0 20m 5m 10u uic", Tran(1e-5, 0.02, 0.005, 1e-5, True), False),
+    ],
+)
+def test_ltspices_tran_needs_no_step(line: str, tran: Tran, noted: bool) -> None:
+    circuit, said = read((TRAN, line))
+    assert circuit.tran == tran
+    expected = f"deck.cir:7:1: '{line}' has no TSTEP, which LTspice does not need: 10,000 outputs, one every 2e-06 s"
+    assert said == ([expected] if noted else [])
+
+
+def test_sine_is_sin() -> None:
+    circuit, said = read(("SIN(0 200 100)", "SINE(1 200 100 1m 2 30)"))
+    assert circuit["Vdrive"].waveform == fs.Sine(200.0, 100.0, 1.0, 30.0, 1e-3, 2.0)
+    assert said == []
+
+
+def test_relative_times_of_ltspices_pwl_are_named() -> None:
+    circuit, said = read(("SIN(0 200 100)", "PWL(0 0 1m 5 +2m 0)"))
+    assert circuit["Vdrive"].waveform == fs.PWL((0.0, 1e-3, 2e-3), (0.0, 5.0, 0.0))
+    assert said == [
+        "deck.cir:3:16: Vdrive: the time +2m is counted from 0, as in ngspice; LTspice counts it from the point before"
+    ]
+
+
+def test_a_sine_without_its_frequency_is_named() -> None:
+    circuit, said = read(("SIN(0 200 100)", "SIN(200 100)"))
+    assert circuit["Vdrive"].waveform == fs.Sine(100.0, 20.0, 200.0)
+    assert said == [
+        "deck.cir:3:16: Vdrive: SIN leaves out FREQ, which is 1/TSTOP then, 20 Hz; its values are VO VA FREQ"
+    ]
+
+
+@pytest.mark.parametrize("beside", ["", "R9 drive 0 1k\n"], ids=["stack", "network"])
+def test_a_run_whose_source_has_ac_alone_is_warned_about(beside: str) -> None:
+    circuit, said = read(("SIN(0 200 100)", "AC 200 100"), (".end", f"{beside}.end"))
+    assert said == []
+    with pytest.warns(
+        fs.FingerspiceWarning, match=r"0 all the time: Vdrive has AC alone, which drives sweeps .* SIN\("
+    ):
+        fs.simulate(circuit, t_stop=1e-4)
+
+
+def test_a_misspelt_library_is_told_of_ours(tmp_path: Path) -> None:
+    path = tmp_path / "deck.cir"
+    path.write_text(edited(("fingerspice.lib", "finger_spice.lib")))
+    with pytest.raises(fs.InputError, match=r"'finger_spice.lib' does not exist; did you mean 'fingerspice.lib'\?"):
+        fs.read_netlist(path)
+
+
+def test_params_is_param() -> None:
+    circuit, said = read(("d=3.5u", "d={g}"), (".end", ".params g=3u\n.end"))
+    assert circuit["Xgap"].values["d"] == 3e-6
+    assert said == []
+
+
+def test_a_netlist_in_utf_16_with_its_mark_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "finger.net"
+    path.write_bytes(DECK.replace("3.5u", "3.5\u00b5").encode("utf-16"))
+    assert fs.read_netlist(path)["Xgap"].values["d"] == 3.5e-6
+
+
+# R, C and GAP as ngspice takes them
+
+
+@pytest.mark.parametrize(
+    ("line", "value"),
+    [
+        ("R9 drive 0 r=10k", 1e4),
+        ("R9 drive 0 R={2*5k}", 1e4),
+        ("R9 drive 0 10k m=4", 2.5e3),
+        ("R9 drive 0 r=10k m=0.5", 2e4),
+        ("R9 drive 0 resistance=10k", 1e4),
+        ("C9 drive 0 c=1n", 1e-9),
+        ("C9 drive 0 c='2*1n' m=3 ic=0", 6e-9),
+        ("C9 drive 0 1n m=2", 2e-9),
+    ],
+)
+def test_values_of_r_and_c_by_name_and_by_number_of_parts(line: str, value: float) -> None:
+    circuit, said = read((".end", f"{line}\n.end"))
+    assert circuit[line[:2]].values["value"] == pytest.approx(value, rel=1e-15)
+    assert said == []
+
+
+def test_named_values_and_parts_are_those_of_ngspice() -> None:
+    text = (
+        "t\nV1 a 0 SIN(0 10 1k)\nR1 a b r=10k // behind a divider\nR2 b 0 10k m=2 ; two\nC1 b 0 c=2n m=5 $ five\n"
+        ".tran 1u 2m 0 0.5u uic\n.end\n"
+    )
+    theirs = run_ngspice(text, signals=["v(b)"])
+    t, keep = np.unique(np.minimum(theirs["time"], 2e-3), return_index=True)
+    ours = fs.simulate(fs.parse_netlist(text), t_eval=t).node_voltages["b"]
+    assert np.abs(ours - theirs["v(b)"][keep]).max() <= 1e-5 * np.abs(ours).max()
+
+
+def test_a_gap_has_the_librarys_defaults_which_are_table_1() -> None:
+    values = " d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
+    short, said = read((values, " r=1meg"))
+    assert said == []
+    assert dict(short["Xgap"].values) == dict(fs.parse_netlist(DECK)["Xgap"].values)
+    assert fs.simulate(short, area="frozen", t_stop=1e-3).area[0] == pytest.approx(float(ref.area(0.0)), rel=1e-12)
+
+
+# What is said
+
+
+@pytest.mark.parametrize("word", ELSEWHERE)
+def test_a_directive_of_another_simulator_says_the_way_here(word: str) -> None:
+    with pytest.raises(fs.InputError) as caught:
+        read((".end", f"{word} 1 2 3\n.end"))
+    assert str(caught.value) == f"deck.cir:8:1: {word} is not supported: {ELSEWHERE[word]}"
+
+
+@pytest.mark.parametrize("word", [".nodeset v(area)=35", ".backanno", ".NODESET v(top)=1 v(skin)=2"])
+def test_what_only_ngspice_or_ltspice_needs_is_not_worth_a_word(word: str, command: Command) -> None:
+    circuit, said = read((".end", f"{word}\n.end"))
+    assert said == []
+    assert circuit.unused == ()
+    Path("pad.cir").write_text(edited((TRAN, ".tran 50u 1m uic"), (".end", f"{word}\n.end")))
+    assert command("run", "pad.cir", "--no-plot").err == ""
+
+
+DOUBTFUL = {
+    "V1 a 0 SIN(0 200 0,1)": "0,1 is two numbers, 0 and 1, for a comma separates; if it is a decimal comma write 0.1",
+    "X1 a b c LAYER d=3,5u eps_r=1": "write 3.5u",
+    "X1 a b c LAYER d= 3,5um eps_r=1": "write 3.5um",
+    "V1 a 0 PULSE(0 5 0 1,5n 1n 1m 2m)": "write 1.5n",
+    "V1 a 0 PULSE 0 5 0 -1,5n 1n": "write -1.5n",
+    ".tran 10u 0,05 uic": "write 0.05",
+    ".param w=3,5u": "write 3.5u",
+    "R1 a b 3,5k": "write 3.5k",
+    "R1 1 2 3,5k": "write 3.5k",
+    "V1 a 0 DC 1,5": "write 1.5",
+    ".ac dec 10 0,5 100k": "write 0.5",
+}
+RIGHT = [
+    *("V1 a 0 SIN(0,200,100)", "V1 a 0 SIN(0, 200, 100)", "V1 a 0 PWL(0,0 1m,5 2m,0)", "V1 a 0 PWL(0 0, 1m 5, 2m 0)"),
+    *("R1 1,2 10k", "R1 a b {max(1,2)*1k}", "R1 a b '1k*max(1,2)'", ".param w={min(3,5)}", ".ic v(a)=1, v(b)=2"),
+    *("X1 a,b,c LAYER d=1u,eps_r=2", ".tran 1u,50m", "V1 a 0 SIN 0,200,100", "V1 a 0 PWL(0,0,1m,5)", ".title a 1,5"),
+]
+
+
+@pytest.mark.parametrize("line", DOUBTFUL)
+def test_a_decimal_comma_is_named(line: str) -> None:
+    assert (decimal_comma(line) or "").endswith(DOUBTFUL[line])
+
+
+@pytest.mark.parametrize("line", RIGHT)
+def test_a_comma_that_separates_is_right(line: str) -> None:
+    if not line.startswith(".title"):
+        assert decimal_comma(line) is None
+
+
+def test_a_decimal_comma_that_makes_another_circuit_is_warned_about() -> None:
+    circuit, said = read(("SIN(0 200 100)", "SIN(0,5 200 100)"))
+    assert circuit["Vdrive"].waveform == fs.Sine(5.0, 200.0, 0.0, delay=100.0) or said
+    assert any("0,5 is two numbers, 0 and 5" in text for text in said)
+
+
+# The library beside the deck
+
+
+@pytest.mark.parametrize("name", LIBRARIES.values())
+def test_a_changed_library_beside_the_deck_is_warned_about_for_it_is_not_read(name: str, tmp_path: Path) -> None:
+    law = next(law for law, file in LIBRARIES.items() if file == name)
+    path = tmp_path / "deck.cir"
+    path.write_text(edited(("fingerspice.lib", name)))
+    for text, expected in (
+        (None, 0),
+        (library_text(law), 0),
+        (library_text(law).replace("\n", "\r\n") + "\r\n", 0),
+        (library_text(law).replace("8.854e-12", "8.9e-12"), 1),
+        ("", 1),
+        ("x" * 10_000_000, 1),
+    ):
+        if text is not None:
+            (tmp_path / name).write_text(text, newline="")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            circuit = fs.read_netlist(path)
+        said = (
+            f"{path}:2:10: '{name}' differs from this version's and is not read: the devices are built in here, and "
+            "only ngspice would run the changed ones"
+        )
+        assert [str(w.message) for w in caught] == [said][:expected]
+        assert circuit.warnings == (said,)[:expected]
+    assert circuit.charge_law == law
+
+
+def test_a_library_outside_the_decks_folder_is_not_looked_at(tmp_path: Path) -> None:
+    (tmp_path / "fingerspice.lib").write_text("changed")
+    (tmp_path / "in").mkdir()
+    path = tmp_path / "in" / "deck.cir"
+    path.write_text(edited((".include fingerspice.lib", ".include ../fingerspice.lib")))
+    (tmp_path / "in" / "fingerspice.lib").symlink_to(tmp_path / "fingerspice.lib")
+    assert fs.read_netlist(path).warnings == ()
+    path.write_text(DECK)
+    assert fs.read_netlist(path).warnings == ()
