@@ -19,14 +19,17 @@ MAX_LINES = 450
 
 # From the bottom up: a part imports its own files and the parts above it in this list, nothing below.
 ORDER = (
-    *("errors", "units", "files", "streams", "compiled", "numerics", "physics", "engine", "circuit"),
+    *("errors", "units", "files", "streams", "compiled", "numerics", "physics", "pages", "engine", "circuit", "report"),
     *(
         "record",
         "network_record",
+        "stored_record",
         "measures",
         "refined",
         "steps",
         "outcome",
+        "signals",
+        "summary",
         "datafiles",
         "solution",
         "phasors",
@@ -60,7 +63,6 @@ ORDER = (
         "largesignal",
         "limits",
         "comparison",
-        "report",
     ),
     *("figures", "terminal", "options", "cli", "__main__"),
 )
@@ -71,7 +73,7 @@ STRANGERS = (
     ("physics.phasor", "engine"),
 )
 # Methods and commands that lend a hand upwards, inside a function, so that nothing is loaded before it is used.
-LENT = {("solution", "plotting")}
+LENT = {("solution", "plotting"), ("circuit", "report")}
 THIRD_PARTY = {
     "numerics": {"numpy", "numba"},
     "physics": {"numpy", "numba"},

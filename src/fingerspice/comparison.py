@@ -10,6 +10,7 @@ import numpy as np
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.errors import InputError
+from fingerspice.pages import Page, Shown
 from fingerspice.phasors import phasor
 from fingerspice.solution import Solution
 from fingerspice.steady import steady_state
@@ -37,8 +38,8 @@ class Figures:
     area_mean: float
 
 
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Shown):
     """The same scene solved three ways.
 
     Attributes
@@ -60,6 +61,11 @@ class Comparison:
     coupled: Figures
     frequency: float
     solution: Solution
+
+    def _page(self) -> Page:
+        from fingerspice.report import comparison_table
+
+        return comparison_table(self)
 
     def rows(self) -> list[tuple[str, str, float, float, float, float, float]]:
         """Table: quantity, unit, phasor, transient at mean area, coupled, difference, share of the ripple in it."""

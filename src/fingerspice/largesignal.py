@@ -87,11 +87,10 @@ def _sweep(
         # The start of the period is a multiple of it: phases are those of the source.
         assert s.area is not None
         assert s.f_el is not None
-        layers = {name: s.u_layer[:, i] for i, name in enumerate(s.layers)}
-        period = weigh_outputs(s.t - s.t[0], {**layers, "area": s.area, "f_el": s.f_el})
-        gains.append([period.phasor(name, float(f)) * sign / amplitude for name in s.layers])
-        areas.append(period.mean("area"))
-        forces.append(period.mean("f_el"))
+        period = s.t - s.t[0]
+        gains.append([weigh_outputs(period, u).phasor(float(f)) * sign / amplitude for u in s.u_layer.T])
+        areas.append(weigh_outputs(period, s.area).mean())
+        forces.append(weigh_outputs(period, s.f_el).mean())
     gain = np.array(gains, np.complex128)
     gap = build_stack(circuit).gap_layer
     assert gap is not None

@@ -17,6 +17,7 @@ from fingerspice.circuit.waveforms import Waveform, as_waveform, require
 from fingerspice.errors import InputError, SolveError
 from fingerspice.folding import meets_fold
 from fingerspice.outcome import Status
+from fingerspice.pages import Page, Shown
 from fingerspice.problem import prepare
 from fingerspice.simulation import simulate
 
@@ -51,8 +52,8 @@ class FoldSweep:
     voltages: FloatArray
 
 
-@dataclass(frozen=True)
-class FoldLimits:
+@dataclass(frozen=True, repr=False)
+class FoldLimits(Shown):
     """Where a circuit folds under the `mobile` law.
 
     Attributes
@@ -70,6 +71,11 @@ class FoldLimits:
     peak: float
     voltage: float
     sweeps: tuple[FoldSweep, ...]
+
+    def _page(self) -> Page:
+        from fingerspice.report import limits_text
+
+        return limits_text(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, SI units."""

@@ -15,6 +15,7 @@ from fingerspice.circuit.network import Network, build_network
 from fingerspice.circuit.statespace import Stack, build_stack, is_stack
 from fingerspice.circuit.waveforms import Fundamental, require
 from fingerspice.errors import InputError
+from fingerspice.pages import Page, Shown
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import SKIN_BAND, skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
@@ -43,8 +44,8 @@ class Drive:
     text: str
 
 
-@dataclass(frozen=True)
-class PhasorSolution:
+@dataclass(frozen=True, repr=False)
+class PhasorSolution(Shown):
     """Phasors against frequency; arrays of shape (n_frequency,).
 
     Attributes
@@ -86,6 +87,11 @@ class PhasorSolution:
     drive: str = ""
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+
+    def _page(self) -> Page:
+        from fingerspice.report import phasor_table
+
+        return phasor_table(self, most=20)
 
 
 class _Scene(Protocol):

@@ -16,6 +16,7 @@ from typing import Any
 from fingerspice.circuit.devices import DEVICES, DeviceSpec
 from fingerspice.circuit.waveforms import Waveform, as_waveform
 from fingerspice.errors import InputError, Where
+from fingerspice.pages import Page, Shown
 
 CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
@@ -115,8 +116,8 @@ class Parameter:
     unit: str
 
 
-@dataclass(frozen=True)
-class Circuit:
+@dataclass(frozen=True, repr=False)
+class Circuit(Shown):
     """A netlist, read.
 
     Attributes
@@ -159,6 +160,11 @@ class Circuit:
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_memory": {}}
+
+    def _page(self) -> Page:
+        from fingerspice.report import circuit_page
+
+        return circuit_page(self)
 
     def remember(self, key: Any, make: Callable[[], Any]) -> Any:
         """What `make` gives, kept for the next call with the same key: circuits do not change."""
