@@ -118,14 +118,16 @@ class Stretch:
     def __init__(self, run: Run, since: float, until: float, rtol: float) -> None:
         self.run, self.rtol = run, rtol
         self.panels = run.panels(since, until)
-        self._shares = _shares(self.panels)
+        self._share, self._shares = _shares(self.panels)
 
     def weigh(self, read: Read) -> Weighed:
         """A signal for means."""
         t, x = self.run.at_points(read, self.panels)
-        # What all panels together miss: where that is little, means need no finer ones.
-        missed = float((_missed(x) * self.panels.duration).sum() / self.panels.duration.sum())
-        if missed <= max(_FINEST, 1e-3 * self.rtol) * float(np.abs(x).max(initial=0.0)):
+        peak = float(np.abs(x).max(initial=0.0)) or 1.0
+        missed = _missed(x) / peak
+        # The first term that a polynomial misses has no integral, nor have the next ten: were the terms to fall evenly,
+        # the integral's error would be the 1.85th power of what is missed.
+        if float((self._share * missed**1.5).sum()) <= max(_FINEST, 1e-3 * self.rtol):
             return Weighed(t[:, :NODES], self._shares, x[:, :NODES])
         return self._cut(read, t, x, _FINEST)[0]
 
@@ -160,7 +162,7 @@ class Stretch:
             t, x = self.run.at_points(read, panels)
         every = Panels(*(np.concatenate(column) for column in zip(*(part[0] for part in parts), strict=True)))
         t, x = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
-        return Weighed(t, _shares(every), x), every
+        return Weighed(t, _shares(every)[1], x), every
 
 
 def _missed(x: FloatArray) -> FloatArray:
@@ -168,9 +170,10 @@ def _missed(x: FloatArray) -> FloatArray:
     return np.asarray(np.abs(x[:, :NODES] @ BETWEEN - x[:, NODES:]).max(axis=1, initial=0.0))
 
 
-def _shares(panels: Panels) -> FloatArray:
-    """Of the whole duration, what the value at each node stands for, shape (p, NODES)."""
-    return np.asarray((panels.duration / panels.duration.sum())[:, None] * _WEIGHTS)
+def _shares(panels: Panels) -> tuple[FloatArray, FloatArray]:
+    """Of the whole duration, what each panel is, shape (p,), and the value at each of its nodes, shape (p, NODES)."""
+    share = panels.duration / panels.duration.sum()
+    return share, share[:, None] * _WEIGHTS
 
 
 def weigh_outputs(t: FloatArray, x: FloatArray) -> Weighed:

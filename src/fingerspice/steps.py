@@ -200,9 +200,13 @@ class Stretches:
 
     @cached_property
     def _whole(self) -> tuple[FloatArray, AnyRecord]:
-        """Times (k, ROWS) and record of all steps at their own points, each with its own full length."""
+        """Times (k, ROWS) and record at the points of every step, as far as it reaches."""
         columns = np.concatenate([self.values, self.values @ BETWEEN], axis=2)
-        t, left = self._times(slice(None), np.broadcast_to(POINTS, (self.start.size, ROWS)))
+        fraction = self.reach[:, None] * POINTS
+        short = np.flatnonzero(self.reach != 1.0)
+        if short.size:
+            columns[short] = np.einsum("pcn,pqn->pcq", self.values[short], _basis(fraction[short]))
+        t, left = self._times(slice(None), fraction)
         return t, self._make(t.ravel(), left.ravel(), columns.transpose(1, 0, 2).reshape(columns.shape[1], -1))
 
     def _times(self, index: IntArray | slice, fraction: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -211,8 +215,8 @@ class Stretches:
         return np.where(left, self.reached[index, None], t), left
 
     def at_points(self, read: Read, panels: Panels) -> tuple[FloatArray, FloatArray]:
-        """As `measures.Run` says: the steps' own points where a panel is a whole one, read once for all panels."""
-        own = (panels.low == 0.0) & (panels.high == 1.0)
+        """As `measures.Run` says: for panels that are whole steps the signal is made once."""
+        own = (panels.low == 0.0) & (panels.high == self.reach[panels.step])
         if not own.any():
             return self.values_at(read, panels.step, panels.fractions(POINTS))
         t_own, record = self._whole
