@@ -35,7 +35,9 @@ ORDER = (
         "phasors",
         "fitting",
         "table1",
-        "plotting",
+        "picture",
+        "drawing",
+        "traces",
         "spectrum",
         "times",
         "starting",
@@ -63,6 +65,7 @@ ORDER = (
         "largesignal",
         "limits",
         "comparison",
+        "plotting",
     ),
     *("figures", "terminal", "options", "cli", "__main__"),
 )
@@ -73,7 +76,7 @@ STRANGERS = (
     ("physics.phasor", "engine"),
 )
 # Methods and commands that lend a hand upwards, inside a function, so that nothing is loaded before it is used.
-LENT = {("solution", "plotting"), ("circuit", "report")}
+LENT = {("solution", "traces"), ("circuit", "report"), ("comparison", "plotting")}
 THIRD_PARTY = {
     "numerics": {"numpy", "numba"},
     "physics": {"numpy", "numba"},

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 import fingerspice as fs
-from fingerspice import plotting
+from fingerspice import drawing, plotting, traces
 from fingerspice.comparison import compare
 from fingerspice.simulation import simulate
 from scenes import deck, table1
@@ -51,7 +51,7 @@ def sine() -> fs.Solution:
 
 
 def test_a_run_is_shown_in_four_panels_with_units(sine: fs.Solution) -> None:
-    figure = plotting.plot_solution(sine)
+    figure = traces.plot_solution(sine)
     assert labels(figure) == ["Voltage [V]", "Force [N]", "Ridge area [mm²]", "Friction [N]"]
     assert figure.axes[3].get_xlabel() == "Time [ms]"
     t, u = curve(figure.axes[0], "gap")
@@ -61,19 +61,19 @@ def test_a_run_is_shown_in_four_panels_with_units(sine: fs.Solution) -> None:
 
 
 def test_the_mean_shown_is_that_of_the_last_period(sine: fs.Solution) -> None:
-    ax = plotting.plot_solution(sine).axes[1]
+    ax = traces.plot_solution(sine).axes[1]
     _, level = curve(ax, "mean of the last period, 0.109 N")
     np.testing.assert_allclose(level, sine.summary()["f_el_mean_periodic"])
 
 
 def test_the_small_print_says_how_it_was_made(sine: fs.Solution) -> None:
-    text = small_print(plotting.plot_solution(sine))
+    text = small_print(traces.plot_solution(sine))
     for part in ("Table 1", "local charge law", "area: coupled", "rtol 1e-08", f"{sine.error.u_gap:.2g} V"):
         assert part in text
 
 
 def test_the_friction_coefficient_is_the_right_scale_of_the_friction_panel(sine: fs.Solution) -> None:
-    figure = plotting.plot_solution(sine)
+    figure = traces.plot_solution(sine)
     figure.canvas.draw()
     force, right = figure.axes[3].get_ylim(), figure.axes[3].child_axes[0].get_ylim()
     np.testing.assert_allclose(right, np.array(force) / 0.5)
@@ -81,7 +81,7 @@ def test_the_friction_coefficient_is_the_right_scale_of_the_friction_panel(sine:
 
 def test_both_sides_of_a_jump_are_drawn() -> None:
     solution = simulate(table1(), sources={"Vdrive": fs.Square(200.0, 100.0)}, t_stop=0.01, rtol=1e-6)
-    t, u = curve(plotting.plot_solution(solution).axes[0], "source")
+    t, u = curve(traces.plot_solution(solution).axes[0], "source")
     np.testing.assert_array_equal(u[np.isclose(t, 5.0)], [200.0, -200.0])
 
 
@@ -91,7 +91,7 @@ def test_without_a_gap_the_layers_voltages_are_shown_alone() -> None:
         "Xs b 0 area SKIN d=350u f=100", "Varea area 0 35", ".tran 10u 20m",
     )  # fmt: skip
     solution = simulate(circuit)
-    figure = plotting.plot_solution(solution)
+    figure = traces.plot_solution(solution)
     assert labels(figure) == ["Voltage [V]"]
     legend = figure.axes[0].get_legend()
     assert legend is not None
@@ -104,7 +104,7 @@ def test_a_run_that_stopped_shows_where_and_why() -> None:
     source = fs.Function(lambda t: 1e4 * t if t < 0.0123 else math.nan)
     solution = with_source(source, t_stop=0.02)
     assert not solution.success
-    figure = plotting.plot_solution(solution)
+    figure = traces.plot_solution(solution)
     assert [t.get_text().strip() for t in figure.axes[0].texts] == ["stopped"]
     for ax in figure.axes:
         assert any(np.allclose(line.get_xdata(), 12.3) for line in ax.lines)
@@ -126,21 +126,21 @@ def test_a_run_that_stopped_at_once_still_makes_a_picture(sine: fs.Solution, row
     solution = dataclasses.replace(sine, t=sine.t[:rows].copy(), record=record, state=state, status=status)
     assert solution.u_gap is not None
     assert solution.u_gap.size == rows
-    figure = plotting.plot_solution(solution)
+    figure = traces.plot_solution(solution)
     assert "stopped" in figure.axes[0].texts[0].get_text()
-    assert plotting.save(figure, tmp_path / "x.png").stat().st_size > 0
+    assert drawing.save(figure, tmp_path / "x.png").stat().st_size > 0
 
 
 def test_a_fixed_area_is_drawn_flat_not_as_its_rounding() -> None:
-    figure = plotting.plot_solution(simulate(table1(), area="frozen", t_stop=0.01))
+    figure = traces.plot_solution(simulate(table1(), area="frozen", t_stop=0.01))
     low, high = figure.axes[2].get_ylim()
     assert low < 34.0 < 36.0 < high
 
 
 def test_no_voltage_is_no_force_and_still_a_picture(tmp_path: Path) -> None:
-    figure = plotting.plot_solution(with_source(fs.DC(0.0), t_stop=0.01))
+    figure = traces.plot_solution(with_source(fs.DC(0.0), t_stop=0.01))
     assert figure.axes[1].get_ylim() == pytest.approx((0.0, figure.axes[1].get_ylim()[1]))
-    plotting.save(figure, tmp_path / "x.png")
+    drawing.save(figure, tmp_path / "x.png")
 
 
 def test_a_sweep_shows_gain_phase_force_and_area() -> None:
@@ -169,7 +169,7 @@ def test_a_single_frequency_and_a_source_without_fundamental_are_drawn_too(tmp_p
     circuit = table1().replace({"Vdrive": fs.DC(100.0)})
     figure = plotting.plot_phasor((fs.phasor(circuit, 100.0, area="frozen"),), circuit)
     assert figure.axes[2].texts[0].get_text() == "the source has no fundamental"
-    plotting.save(figure, tmp_path / "x.png")
+    drawing.save(figure, tmp_path / "x.png")
 
 
 @pytest.mark.parametrize("phase", [0.0, 70.0])
@@ -191,8 +191,8 @@ def test_the_comparison_shows_its_table() -> None:
 
 
 def test_a_picture_has_150_dots_an_inch_or_more(sine: fs.Solution, tmp_path: Path) -> None:
-    figure = plotting.plot_solution(sine)
-    with Image.open(plotting.save(figure, tmp_path / "new" / "run.png")) as image:
+    figure = traces.plot_solution(sine)
+    with Image.open(drawing.save(figure, tmp_path / "new" / "run.png")) as image:
         assert image.format == "PNG"
         assert image.width >= 150 * figure.get_size_inches()[0]
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["run.png"]
@@ -201,7 +201,7 @@ def test_a_picture_has_150_dots_an_inch_or_more(sine: fs.Solution, tmp_path: Pat
 def test_a_folder_that_cannot_be_written_is_bad_input(sine: fs.Solution, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(fs.InputError, match="cannot write"):
-        plotting.save(plotting.plot_solution(sine), tmp_path / "file" / "run.png")
+        drawing.save(traces.plot_solution(sine), tmp_path / "file" / "run.png")
 
 
 @pytest.mark.parametrize(
@@ -219,7 +219,7 @@ def test_a_folder_that_cannot_be_written_is_bad_input(sine: fs.Solution, tmp_pat
     ],
 )
 def test_engineering_units(peak: float, unit: str, least: float, expected: tuple[float, str]) -> None:
-    factor, name = plotting.engineering(peak, unit, least)
+    factor, name = drawing.engineering(peak, unit, least)
     assert (factor, name) == (pytest.approx(expected[0]), expected[1])
 
 
@@ -227,8 +227,8 @@ def test_thinning_keeps_every_extreme_and_both_ends() -> None:
     t = np.linspace(0.0, 1.0, 123_457)
     x = np.sin(2e4 * t)
     x[77_777] = 9.0
-    thin_t, thin_x = plotting.thin(t, x)
-    assert thin_t.size < 5 * plotting.MAX_BINS
+    thin_t, thin_x = drawing.thin(t, x)
+    assert thin_t.size < 5 * drawing.MAX_BINS
     assert np.all(np.diff(thin_t) > 0.0)
     assert (thin_t[0], thin_t[-1]) == (0.0, 1.0)
     assert thin_x.max() == 9.0
@@ -238,9 +238,9 @@ def test_thinning_keeps_every_extreme_and_both_ends() -> None:
 def test_pictures_need_no_pyplot_and_their_module_no_matplotlib() -> None:
     code = (
         "import sys, numpy, fingerspice as fs\n"
-        "from fingerspice import figures, plotting\n"
+        "from fingerspice import drawing, figures, plotting, traces\n"
         "assert not any(m.startswith('matplotlib') for m in sys.modules)\n"
-        "plotting.new_figure(1)\n"
+        "drawing.new_figure(1)\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=60)
@@ -253,8 +253,8 @@ def test_what_a_deck_names_is_drawn_without_formulas_floods_or_warnings(tmp_path
     # Warnings are errors here: matplotlib has one for each picture that the font lacks, and for what finds no room.
     circuit = fs.parse_netlist("\n".join((title, *lines)))
     figure = simulate(circuit).plot()
-    plotting.save(figure, tmp_path / "odd.png")
+    drawing.save(figure, tmp_path / "odd.png")
     shown = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     assert any(text.startswith("n$x^$□\\x1b[31myyy") for text in shown)
-    assert max(map(len, shown)) <= plotting.LONGEST_LABEL
+    assert max(map(len, shown)) <= drawing.LONGEST_LABEL
     assert "$\\frac{$ □□ 😀 \\x1b[31mxxx" in small_print(figure)

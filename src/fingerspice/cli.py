@@ -125,7 +125,7 @@ def run(
 
 def _written(solution: Solution, data: Path, picture: Path | None) -> list[Callable[[], Path]]:
     """How the files of a run are written: the data, then the picture where one is wanted."""
-    from fingerspice.plotting import save
+    from fingerspice.drawing import save
 
     if not solution.t.size:
         return []
@@ -190,7 +190,8 @@ def ac(
             warnings.warn(text, FingerspiceWarning, stacklevel=1)
     writes = [lambda: phasor_csv(results, data)]
     if picture is not None:
-        from fingerspice.plotting import plot_phasor, save
+        from fingerspice.drawing import save
+        from fingerspice.plotting import plot_phasor
 
         writes.append(lambda: save(plot_phasor(results, circuit), picture))
     sweeps = [phasor_dict(r) for r in results] if as_json else []
@@ -261,7 +262,8 @@ def compare(
             result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
     writes: list[Callable[[], Path]] = []
     if picture is not None:
-        from fingerspice.plotting import plot_comparison, save
+        from fingerspice.drawing import save
+        from fingerspice.plotting import plot_comparison
 
         writes.append(lambda: save(plot_comparison(result), picture))
     report(as_json, result.to_dict, lambda: comparison_table(result), writes)
@@ -294,7 +296,7 @@ def limits(
         result = fold_limits(circuit, points=points, span=span)
     writes = [lambda: limits_csv(result, table)]
     if picture is not None:
-        from fingerspice.plotting import save
+        from fingerspice.drawing import save
 
         writes.append(lambda: save(plot_limits(result), picture))
     report(as_json, result.to_dict, lambda: limits_text(result), writes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from fingerspice.pages import Page, Shown
 from fingerspice.phasors import phasor
 from fingerspice.solution import Solution
 from fingerspice.steady import steady_state
+
+if TYPE_CHECKING:
+    from fingerspice.picture import Picture
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,12 @@ class Comparison(Shown):
         from fingerspice.report import comparison_table
 
         return comparison_table(self)
+
+    def plot(self) -> Picture:
+        """One period of the transient over the phasor's, and the figures of both."""
+        from fingerspice.plotting import plot_comparison
+
+        return plot_comparison(self)
 
     def rows(self) -> list[tuple[str, str, float, float, float, float, float]]:
         """Table: quantity, unit, phasor, transient at mean area, coupled, difference, share of the ripple in it."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.combinations import Product
+from fingerspice.circuit.describe import heading
 from fingerspice.circuit.statespace import is_stack
 from fingerspice.circuit.waveforms import Waveform, as_waveform, require
 from fingerspice.errors import InputError, SolveError
@@ -22,7 +23,7 @@ from fingerspice.problem import prepare
 from fingerspice.simulation import simulate
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from fingerspice.picture import Picture
 
 FloatArray = NDArray[np.float64]
 
@@ -76,6 +77,10 @@ class FoldLimits(Shown):
         from fingerspice.report import limits_text
 
         return limits_text(self)
+
+    def plot(self) -> Picture:
+        """The fold's voltage against every parameter, the deck's own point marked."""
+        return plot_limits(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, SI units."""
@@ -208,9 +213,9 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
     return math.sqrt(low * high)
 
 
-def plot_limits(limits: FoldLimits) -> Figure:
+def plot_limits(limits: FoldLimits) -> Picture:
     """The fold's voltage against every parameter, the deck's own point marked."""
-    from fingerspice.plotting import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
+    from fingerspice.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
 
     figure, axes = new_figure(1, len(limits.sweeps), height=3.2, sharey=True)
     for ax, sweep in zip(axes, limits.sweeps, strict=True):
@@ -226,5 +231,5 @@ def plot_limits(limits: FoldLimits) -> Figure:
     axes[0].set_ylim(0.5 * shown.min(), 2.0 * shown.max())
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=3, fontsize=FONT - 0.5, frameon=False)
-    caption(figure, f"{limits.circuit.title} · charge law mobile; the other parameters as in the deck")
+    caption(figure, f"{heading(limits.circuit)} · charge law mobile; the other parameters as in the deck")
     return figure

@@ -71,7 +71,9 @@ class Page(str):
                 continue
             # What is set in columns keeps them.
             lines = [html.escape(printable(line)) for line in block.split("\n")]
-            parts.append(f"<pre>{chr(10).join(lines)}</pre>" if len(lines) > 1 else f"<div>{lines[0] or '&nbsp;'}</div>")
+            parts.append(
+                f"<pre>{chr(10).join(lines)}</pre>" if len(lines) > 1 else f"<div>{lines[0] or '&nbsp;'}</div>"
+            )
         page.blocks = tuple(blocks)
         page.html = "\n".join(["<div>", *parts, "</div>"])
         return page

@@ -145,11 +145,12 @@ def _cut(text: str, longest: int) -> str:
 def steady_page(state: SteadyState) -> Page:
     """A periodic state: what vouches for it, and the figures of its period."""
     largest = 1.0 - state.stability_margin
-    found = (
-        f"periodic state of {format_si(state.period, 's')}, found in {state.periods:.3g} periods: a further one changes "
-        f"the layers by {state.defect:.2g} V at most, and leaves {100.0 * largest:.3g} % of a small disturbance"
+    found = f"periodic state of {format_si(state.period, 's')}, found in {state.periods:.3g} periods"
+    left = (
+        f"a further period changes the layers by {state.defect:.2g} V at most, and leaves {100.0 * largest:.3g} % of a "
+        "small disturbance"
     )
-    return Page([found, *summary_table(state.solution).blocks])
+    return Page([found, left, "", *summary_table(state.solution).blocks])
 
 
 def fit_page(fit: MaterialFit) -> Page:
@@ -167,7 +168,7 @@ def fit_page(fit: MaterialFit) -> Page:
             f"misfit of the admittivity: {100.0 * fit.rms:.2g} % rms, {100.0 * fit.largest:.2g} % at most",
             f"no causal and passive material comes nearer than {100.0 * fit.kramers_kronig.rms:.2g} % rms",
             "",
-            f"{ladder.conductivity:.4g} S/m at zero frequency, eps_r = {ladder.eps_inf:.4g} above all poles, and the branches",
+            f"{ladder.conductivity:.4g} S/m at zero frequency, eps_r = {ladder.eps_inf:.4g} above all poles, and",
             Table(("pole", "weight"), rows),
         ]
     )

@@ -19,13 +19,13 @@ from fingerspice.signals import SIGNALS, AnyRecord, Signals
 from fingerspice.summary import Figured, Figures, KeptFigures
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     import xarray
-    from matplotlib.figure import Figure
 
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.circuit.waveforms import Fundamental
+    from fingerspice.picture import Picture
     from fingerspice.planning import Plan
     from fingerspice.refined import ClosedForm
     from fingerspice.steps import Recorded
@@ -302,8 +302,37 @@ class Solution(Sealed, Shown, Figured):
         """
         return write_netcdf(self, Path(path), jumps)
 
-    def plot(self) -> Figure:
-        """Source and gap voltage, force and area against time."""
-        from fingerspice.plotting import plot_solution
+    def plot(
+        self,
+        signals: str | Sequence[str] | None = None,
+        *,
+        window: tuple[float, float] | None = None,
+        others: Solution | Sequence[Solution] | Mapping[str, Solution] = (),
+    ) -> Picture:
+        """Signals against time, as a figure that a notebook shows; from a script ``plot().show()`` opens a window.
 
-        return plot_solution(self)
+        Where the window holds more than about 30 oscillations they are drawn as envelopes, with the last few beside.
+
+        Parameters
+        ----------
+        signals : str or sequence of str, optional
+            Keys of `signals`, such as ``"f_el"``, ``"u_layer:Xcoat"``, or ``"u_layer"`` for all layers; those of one
+            quantity share a panel. By default source and gap voltage, force, area and friction.
+        window : tuple of float, optional
+            Start and end, s; the whole run by default.
+        others : Solution, sequence or mapping of str to Solution, optional
+            Runs to lay over this one; without names they are called by what sets them apart.
+
+        Returns
+        -------
+        Picture
+            A matplotlib Figure: ``savefig("x.pdf")`` saves it.
+
+        Raises
+        ------
+        InputError
+            For an unknown signal, or a window without outputs.
+        """
+        from fingerspice.traces import plot_solution
+
+        return plot_solution(self, signals, window, others)

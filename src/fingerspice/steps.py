@@ -14,7 +14,7 @@ from fingerspice.circuit.sampling import same_time
 from fingerspice.engine.readout import RECORDED, Steps, new_steps
 from fingerspice.measures import Panels, Read
 from fingerspice.network_record import NetworkRecord
-from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS
 from fingerspice.record import Record
 
 AnyRecord = Record | NetworkRecord

@@ -41,13 +41,17 @@ def waveform_text(waveform: Waveform, unit: str = "V") -> str:
 
 
 def drive_text(circuit: Circuit) -> str:
-    """Every source that is not 0 with its waveform: ``Vdrive: Sine(200 V, 100 Hz)``."""
+    """Every source that is not 0 with its waveform: ``Vdrive: Sine(200 V, 100 Hz)``; not those that were replaced.
+
+    Those stand in `changes_text`.
+    """
     said = []
+    replaced = {path.lower() for path in circuit.overrides}
     areas = {node for element in circuit.elements if element.spec.is_layer for node in element.nodes[2:]}
     for element in circuit.by_device("V", "I"):
         wave = element.waveform
         # A V element on an area's node says how large the area is: it drives nothing.
-        if wave is None or wave == DC(0.0) or element.nodes[0] in areas:
+        if wave is None or wave == DC(0.0) or element.nodes[0] in areas or element.name.lower() in replaced:
             continue
         said.append(f"{element.name}: {waveform_text(wave, 'A' if element.device == 'I' else 'V')}")
     return _joined(said)
