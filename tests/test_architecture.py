@@ -60,6 +60,7 @@ ORDER = (
         "foreign",
         "periodic",
         "planning",
+        "loading",
         "simulation",
         "steady",
         "largesignal",

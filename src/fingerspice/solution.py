@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.datafiles import variables, write_csv, write_netcdf
+from fingerspice.datafiles import dataset, to_dataframe, write_csv, write_netcdf
 from fingerspice.outcome import ErrorEstimate, Failure, NetworkState, State, Status
 from fingerspice.pages import Page, Shown
 from fingerspice.record import Sealed, sealed
@@ -21,6 +21,7 @@ from fingerspice.summary import Figured, Figures, KeptFigures
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    import pandas
     import xarray
 
     from fingerspice.circuit.circuit import Circuit
@@ -277,6 +278,9 @@ class Solution(Sealed, Shown, Figured):
     def to_xarray(self, *, jumps: str = "right") -> xarray.Dataset:
         """The run as an xarray Dataset with units and provenance.
 
+        Where a circuit has several GAPs, what belongs to them has the dimension ``gap`` beside ``time``, and signals of
+        several sources ``source``; layer voltages have ``layer`` and node voltages ``node``.
+
         Parameters
         ----------
         jumps : str
@@ -289,11 +293,26 @@ class Solution(Sealed, Shown, Figured):
         """
         import xarray
 
-        data, coords = variables(self, jumps)
+        data, coords = dataset(self, jumps)
         return xarray.Dataset(data, coords=coords, attrs=self.provenance())
 
+    def to_dataframe(self, *, jumps: str = "right") -> pandas.DataFrame:
+        """The run as a pandas DataFrame: a row for each time (s, the index), a column for each of `signals`.
+
+        Parameters
+        ----------
+        jumps : str
+            As in `to_xarray`.
+
+        Raises
+        ------
+        InputError
+            For another value of `jumps`.
+        """
+        return to_dataframe(self, jumps)
+
     def to_netcdf(self, path: str | Path, *, jumps: str = "right") -> Path:
-        """Write `to_xarray` as a NetCDF file, without the cost of loading xarray.
+        """Write `to_xarray` as a NetCDF file, without the cost of loading xarray; `fs.load` reads it back.
 
         Raises
         ------

@@ -67,11 +67,18 @@ def changes_text(circuit: Circuit) -> str:
             name, parameter = known[path]
             said.append(f"{name} = {_quantity(parameter.value, parameter.unit)}")
             continue
-        for element in circuit.elements:
-            if element.name.lower() == path and element.waveform is not None:
-                text = waveform_text(element.waveform, "A" if element.device == "I" else "V")
-                said.append(f"{element.name} = {text}")
+        said += [
+            f"{element.name} = {waveform_text(element.waveform, 'A' if element.device == 'I' else 'V')}"
+            for element in circuit.elements
+            if element.name.lower() == path and element.waveform is not None
+        ] or [f"{name} = {_as_given(text)}" for name, text in circuit.overrides.items() if name.lower() == path][-1:]
     return _joined(said)
+
+
+def _as_given(text: str) -> str:
+    """What a parameter was set to, as far as that is worth reading."""
+    kind = text.partition("(")[0]
+    return text if len(text) <= 40 else f"{kind}(...)" if kind.isidentifier() else f"{text[:36]} ..."
 
 
 def heading(circuit: Circuit) -> str:
