@@ -68,7 +68,7 @@ ORDER = (
         "comparison",
         "plotting",
     ),
-    *("figures", "terminal", "options", "cli", "__main__"),
+    *("figures", "terminal", "options", "results", "cli", "__main__"),
 )
 # Beside each other, not one on the other.
 STRANGERS = (

@@ -266,9 +266,9 @@ def phasor_dict(result: PhasorSolution) -> dict[str, Any]:
     }
 
 
-def phasor_tables(results: Sequence[PhasorSolution]) -> str:
-    """Sweeps at several amplitudes as tables."""
-    return "\n\n".join(phasor_table(r) for r in results)
+def phasor_tables(results: Sequence[PhasorSolution], circuit: Circuit) -> str:
+    """Sweeps of a circuit at several amplitudes as tables."""
+    return "\n\n".join([heading(circuit), *(phasor_table(r) for r in results)])
 
 
 def phasor_table(result: PhasorSolution, most: int = 40) -> Page:

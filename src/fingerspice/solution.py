@@ -252,6 +252,7 @@ class Solution(Sealed, Shown, Figured):
         return {
             "program": f"fingerspice {__version__}",
             "title": self.circuit.title,
+            "file": str(self.circuit.path or ""),
             "deck": self.circuit.text,
             "overrides": json.dumps(dict(self.circuit.overrides)),
             "charge_law": self.charge_law,
