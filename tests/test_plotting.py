@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import math
+import os
 import subprocess
 import sys
 import warnings
@@ -258,3 +260,148 @@ def test_what_a_deck_names_is_drawn_without_formulas_floods_or_warnings(tmp_path
     assert any(text.startswith("n$x^$□\\x1b[31myyy") for text in shown)
     assert max(map(len, shown)) <= drawing.LONGEST_LABEL
     assert "$\\frac{$ □□ 😀 \\x1b[31mxxx" in small_print(figure)
+
+
+# Signals, windows, several runs, long runs
+
+
+def legend(ax: Axes) -> list[str]:
+    found = ax.get_legend()
+    return [] if found is None else [text.get_text() for text in found.get_texts()]
+
+
+def test_signals_that_are_asked_for_share_a_panel_with_their_like(sine: fs.Solution) -> None:
+    figure = sine.plot(["u_layer", "f_el", "v:skin", "q_source"])
+    assert labels(figure) == ["Voltage [V]", "Force [N]", "Charge [nC]"]
+    assert legend(figure.axes[0]) == ["layer Xcoat", "layer Xgap", "layer Xskin", "skin"]
+    np.testing.assert_array_equal(curve(figure.axes[0], "skin")[1], sine.node_voltages["skin"])
+    assert labels(sine.plot("friction")) == ["Friction coefficient"]
+
+
+def test_a_signal_that_there_is_none_of_is_refused_with_the_nearest(sine: fs.Solution) -> None:
+    with pytest.raises(fs.InputError, match=r"unknown signal 'fel'; nearest: 'f_el'; allowed: u_source, "):
+        sine.plot("fel")
+    with pytest.raises(fs.InputError, match="unknown signal 3"):
+        sine.plot([3])  # type: ignore[list-item]
+    with pytest.raises(fs.InputError, match="signals is empty"):
+        sine.plot([])
+
+
+def test_a_window_is_what_is_shown(sine: fs.Solution) -> None:
+    figure = sine.plot("f_el", window=(0.012, 0.021))
+    assert figure.axes[0].get_xlim() == pytest.approx((12.0, 21.0))
+    t, _ = curve(figure.axes[0], "electroadhesive force")
+    # A neighbour on either side leads the line out.
+    assert 11.98 < t[0] < 12.0 < 21.0 < t[-1] < 21.02
+    for window in ((0.02, 0.01), (1.0, 2.0), (0.01, 0.010001)):
+        with pytest.raises(fs.InputError, match=r"window is .* s; allowed: ascending, with two outputs"):
+            sine.plot(window=window)
+    with pytest.raises(fs.InputError, match="window is 3; allowed: two times in s"):
+        sine.plot(window=3)  # type: ignore[arg-type]
+
+
+def test_other_runs_lie_over_it_called_by_what_sets_them_apart(sine: fs.Solution) -> None:
+    thick = simulate(table1().replace({"Xgap.d": 5e-6}))
+    figure = sine.plot("f_el", others=thick)
+    names = ["electroadhesive force, the deck as it is", "electroadhesive force, Xgap.d = 5 um"]
+    assert legend(figure.axes[0]) == names
+    np.testing.assert_array_equal(curve(figure.axes[0], names[1])[1], thick.f_el)
+    first, second = figure.axes[0].lines[:2]
+    assert first.get_color() != second.get_color()
+    assert first.get_linestyle() != second.get_linestyle()
+    assert first.get_linewidth() > second.get_linewidth()
+    named = sine.plot("f_el", others={"thick": thick})
+    assert legend(named.axes[0])[1] == "electroadhesive force, thick"
+    # What drives both alike is drawn once.
+    assert legend(sine.plot(others=[thick]).axes[0])[0] == "source"
+    with pytest.raises(fs.InputError, match="others is 'x'; allowed: Solutions"):
+        sine.plot(others="x")  # type: ignore[arg-type]
+
+
+def test_each_finger_keeps_its_colour_in_every_panel_and_has_a_legend_in_each() -> None:
+    run = simulate(fs.read_netlist("circuits/two_fingers.cir"))
+    figure = run.plot()
+    colors: dict[str, set[object]] = {gap: set() for gap in run.gaps}
+    for ax in figure.axes:
+        assert len([text for text in legend(ax) if "Xgap" in text]) == 2
+        for line in ax.lines:
+            for gap, seen in colors.items():
+                if str(line.get_label()).endswith(gap):
+                    seen.add(line.get_color())
+    firm, light = colors.values()
+    assert len(firm) == len(light) == 1
+    assert firm != light
+    # Their voltages all but coincide.
+    first, second = (line for line in figure.axes[0].lines if "Xgap" in str(line.get_label()))
+    assert first.get_linestyle() == "-" != second.get_linestyle()
+    assert first.get_linewidth() > second.get_linewidth()
+
+
+def test_a_long_run_is_an_envelope_beside_its_last_oscillations() -> None:
+    run = simulate(table1("SIN(0 200 5k)", f=5000.0, tran="5u 50m uic"))
+    figure = run.plot()
+    left, right = figure.axes[:8:2], figure.axes[1:8:2]
+    assert left[3].get_xlabel() == "Time [ms]: envelope of 250 oscillations"
+    assert right[3].get_xlabel() == "Time [ms]: the last 4"
+    assert right[3].get_xlim()[1] - right[3].get_xlim()[0] == pytest.approx(0.8, abs=0.06)
+    assert run.f_el is not None
+    upper = curve(left[1], "electroadhesive force")[1]
+    # Each part of the envelope reaches the force's peak, which the last periods have all of.
+    np.testing.assert_allclose(upper[100:-1], run.f_el[5000:].max(), rtol=1e-6)
+    assert len(upper) <= 250
+    assert figure.axes[0].lines[0].get_xdata().size < 1000
+    # A window of a few is drawn as lines.
+    assert len(labels(run.plot(window=(0.0, 0.002)))) == 4
+
+
+def test_the_caption_names_source_and_changes(sine: fs.Solution) -> None:
+    assert "Vdrive: Sine(200 V, 100 Hz)" in small_print(sine.plot())
+    changed = simulate(table1().replace({"Xgap.d": 5e-6}))
+    assert "Table 1 (changed: Xgap.d = 5 um)" in small_print(changed.plot())
+
+
+# Pictures show themselves
+
+
+def test_a_picture_shows_itself_where_a_notebook_asks_it(sine: fs.Solution) -> None:
+    content, size = sine.plot()._repr_png_()
+    with Image.open(io.BytesIO(content)) as image:
+        assert image.width == 2 * size["width"] == 1400
+
+
+def test_where_there_is_no_window_show_says_what_to_do(sine: fs.Solution) -> None:
+    with pytest.raises(fs.InputError, match=r"no window can be opened here .*; allowed: savefig"):
+        sine.plot().show()
+
+
+WINDOW = """
+import sys, types
+import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backend_bases import FigureManagerBase
+shown = []
+class Manager(FigureManagerBase):
+    def show(self):
+        shown.append(self.canvas.figure)
+    @classmethod
+    def start_main_loop(cls):
+        shown.append("until closed")
+class Canvas(FigureCanvasAgg):
+    manager_class = Manager
+    required_interactive_framework = "headless"
+window = types.ModuleType("window")
+window.FigureCanvas, window.FigureManager = Canvas, Manager
+sys.modules["window"] = window
+matplotlib.use("module://window")
+from fingerspice.drawing import new_figure
+figure, _ = new_figure(1)
+figure.show()
+assert shown == [figure, "until closed"], shown
+figure.savefig(sys.argv[1])
+"""
+
+
+def test_from_a_script_a_picture_opens_a_window(tmp_path: Path) -> None:
+    code = [sys.executable, "-W", "error", "-c", WINDOW, str(tmp_path / "x.png")]
+    subprocess.run(code, check=True, timeout=60, env={**os.environ, "DISPLAY": ":none"})
+    assert (tmp_path / "x.png").stat().st_size > 0

@@ -6,6 +6,7 @@ import io
 import sys
 from typing import Any
 
+from matplotlib.backend_bases import FigureManagerBase
 from matplotlib.figure import Figure
 
 from fingerspice.errors import InputError
@@ -43,11 +44,13 @@ class Picture(Figure):
         backend = matplotlib.get_backend()
         registry: Any = backend_registry
         canvas = registry.load_backend_module(backend).FigureCanvas
-        if canvas.required_interactive_framework is None:
+        if not _opens(canvas.manager_class):
             raise InputError(
                 f"no window can be opened here (matplotlib's backend is {backend}); allowed: savefig('picture.png')"
             )
-        Gcf.set_active(canvas.new_manager(self, max(pyplot.get_fignums(), default=0) + 1))
+        # As pyplot does it: no public way leads from a figure to a window.
+        manager = canvas.new_manager(self, max(pyplot.get_fignums(), default=0) + 1)
+        Gcf._set_new_active_manager(manager)
         pyplot.show()
 
 
@@ -55,3 +58,9 @@ def _in_notebook() -> bool:
     interactive = sys.modules.get("IPython")
     shell = interactive.get_ipython() if interactive is not None else None
     return shell is not None and hasattr(shell, "kernel")
+
+
+def _opens(manager: Any) -> bool:
+    """Whether a backend's manager has a window of its own."""
+    own = ("pyplot_show", "start_main_loop")
+    return any(getattr(manager, name).__func__ is not getattr(FigureManagerBase, name).__func__ for name in own)

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.errors import InputError
 from fingerspice.network_record import NetworkRecord
 from fingerspice.physics.contact import Contact
 from fingerspice.record import Record, sealed
@@ -115,7 +116,18 @@ class Signals:
         return self.layers if key == "u_layer" else self.sources if key.endswith("_source") else self.gaps
 
     def names(self, key: str) -> tuple[str, ...]:
-        """``key`` itself, or ``key:element`` where several elements have it; none where there is none."""
+        """``key`` itself, or ``key:element`` where several elements have it; none where there is none.
+
+        Raises
+        ------
+        InputError
+            For a name that no signal has.
+        """
+        base, colon, _ = key.partition(":")
+        if base not in SIGNALS or (colon and key not in self.names(base)):
+            raise InputError(f"unknown signal {key!r}; allowed: {', '.join(SIGNALS)}")
+        if colon:
+            return (key,)
         several = self.columns(key)
         if key in ("u_layer", "v"):
             return tuple(f"{key}:{name}" for name in several)

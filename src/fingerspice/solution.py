@@ -176,7 +176,7 @@ class Solution(Sealed, Shown, Figured):
         """Electroadhesive force, N, shape (n_t,); None for a circuit without GAP.
 
         Its mean is `f_el_mean`, and over the last period `f_el_mean_periodic`: ``f_el.mean()`` weighs every output
-        alike, both ends of a period and both rows of a jump included, and is 0.5 to 2 % off at 50 to 200 outputs a
+        alike, both ends of a period and both rows of a jump included, and is some per cent off at 50 to 200 outputs a
         period.
         """
         return self.all_signals.f_el

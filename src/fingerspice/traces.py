@@ -217,7 +217,8 @@ def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[floa
     first, last = min((float(t[0]) for t in times), default=0.0), max(_end(run.solution) for run in runs)
     if window is None:
         return first, last
-    good = len(window) == 2 and all(isinstance(x, (int, float, np.number)) for x in window)
+    pair = isinstance(window, Sequence) and len(window) == 2
+    good = pair and all(isinstance(x, (int, float, np.number)) for x in window)
     require(good, "window", repr(window), "two times in s, (start, stop)")
     start, stop = max(float(window[0]), first), min(float(window[1]), last)
     shown = any(np.count_nonzero((t >= start) & (t <= stop)) >= 2 for t in times)
@@ -257,7 +258,7 @@ def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
     driven = {run.solution.u_source.tobytes() for run in runs}
     for number, run in enumerate(runs):
         for key in keys:
-            found = {key: run.solution.all_signals.one(key)} if ":" in key else run.solution.by_name(key)
+            found = run.solution.by_name(key)
             for place, (name, x) in enumerate(found.items()):
                 kind, _, element = name.partition(":")
                 source = kind == "u_source"
