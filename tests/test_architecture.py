@@ -32,6 +32,7 @@ ORDER = (
         "summary",
         "datafiles",
         "solution",
+        "phasor_solution",
         "phasors",
         "fitting",
         "table1",
@@ -77,7 +78,12 @@ STRANGERS = (
     ("physics.phasor", "engine"),
 )
 # Methods and commands that lend a hand upwards, inside a function, so that nothing is loaded before it is used.
-LENT = {("solution", "traces"), ("circuit", "report"), ("comparison", "plotting")}
+LENT = {
+    ("solution", "traces"),
+    ("circuit", "report"),
+    ("comparison", "plotting"),
+    ("phasor_solution", "plotting"),
+}
 THIRD_PARTY = {
     "numerics": {"numpy", "numba"},
     "physics": {"numpy", "numba"},

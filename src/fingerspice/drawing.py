@@ -5,6 +5,7 @@ Figures are made with matplotlib's object API, and matplotlib is imported when o
 
 from __future__ import annotations
 
+import itertools
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -92,6 +93,20 @@ def legend_above(ax: Axes, columns: int = 4, *, right: bool = False, math: bool 
     for text in legend.get_texts():
         text.set_parse_math(math)
         text.set_text(drawable(text.get_text(), LONGEST_LABEL))
+
+
+def legend_within(ax: Axes, room: int) -> None:
+    """A legend over the panel in as many columns as so many letters have room for."""
+    names = ax.get_legend_handles_labels()[1]
+    columns = next(n for n in range(len(names), 0, -1) if n == 1 or sum(_columns(names, n)) <= room)
+    legend_above(ax, columns)
+
+
+def _columns(names: list[str], columns: int) -> list[int]:
+    """Widths of a legend's columns, letters, filled one after the other, the first of them one longer."""
+    rows, longer = divmod(len(names), columns)
+    begins = [place * rows + min(place, longer) for place in range(columns + 1)]
+    return [max(map(len, names[a:b])) + 6 for a, b in itertools.pairwise(begins)]
 
 
 def drawable(text: str, longest: int = 1000) -> str:

@@ -12,7 +12,8 @@ from fingerspice.circuit.statespace import build_stack
 from fingerspice.circuit.waveforms import Sine, Waveform, require
 from fingerspice.errors import InputError
 from fingerspice.measures import weigh_outputs
-from fingerspice.phasors import Drive, PhasorSolution, sweep_drive, sweep_notes
+from fingerspice.phasor_solution import PhasorSolution
+from fingerspice.phasors import Drive, sweep_drive, sweep_notes
 from fingerspice.steady import steady_state
 
 FloatArray = NDArray[np.float64]
@@ -96,5 +97,5 @@ def _sweep(
     assert gap is not None
     return PhasorSolution(
         frequency, gain[:, gap], gain, gain[:, gap] * amplitude * np.exp(1j * drive.phase), np.array(areas),
-        np.array(forces), amplitude, s.layers, drive.phase, drive.text, *sweep_notes(circuit, frequency),
+        np.array(forces), amplitude, s.layers, drive.phase, drive.text, *sweep_notes(circuit, frequency), circuit,
     )  # fmt: skip

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.comparison import Comparison
-    from fingerspice.phasors import PhasorSolution
+    from fingerspice.phasor_solution import PhasorSolution
     from fingerspice.picture import Picture
 
 FloatArray = NDArray[np.float64]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from fingerspice.comparison import Comparison
     from fingerspice.fitting import MaterialFit
     from fingerspice.limits import FoldLimits
-    from fingerspice.phasors import PhasorSolution
+    from fingerspice.phasor_solution import PhasorSolution
     from fingerspice.planning import Plan
     from fingerspice.solution import Solution
     from fingerspice.steady import SteadyState
@@ -69,6 +69,8 @@ def summary_table(solution: Solution) -> Page:
                     )
                 )
         out.append(Table(("", "min", "max", "mean", "last period", "rms", "ripple"), rows))
+        if any(s.get(f"{name}_mean_periodic") is not None for name in ("u_source", "f_el")):
+            out.append("last period: the mean over it, and so are rms and ripple (max - min)")
         if "u_gap_amplitude" in s:
             lead = s["u_gap_phase_deg"] - s["u_source_phase_deg"]
             lead = (lead + 180.0) % 360.0 - 180.0
@@ -114,7 +116,7 @@ def circuit_page(circuit: Circuit) -> Page:
         said = [f"{name}={_deck_value(value)}" for name, value in element.values.items() if math.isfinite(value)]
         if element.waveform is not None:
             said.append(waveform_text(element.waveform, "A" if element.device == "I" else "V"))
-        rows.append((element.name, element.device, " ".join(element.node_names), _cut(" ".join(said), 70)))
+        rows.append((element.name, element.device, " ".join(element.node_names), _cut(" ".join(said), 96)))
     lines: list[str | Table] = [heading(circuit), ""]
     lines.append(Table(("", "device", "nodes", "values, in the units of the netlist"), rows, left=4))
     if len(circuit.elements) > MOST_ELEMENTS:
@@ -132,7 +134,9 @@ def circuit_page(circuit: Circuit) -> Page:
 
 
 def _deck_value(value: float) -> str:
-    """A number as a deck has it: ``3.5u``, ``0.2meg``."""
+    """A number as a deck has it: ``3.5u``, ``0.2meg``, ``0.3``."""
+    if 0.01 <= abs(value) < 1e4:
+        return f"{value:.4g}"
     text = format_si(value, "").replace(" ", "")
     # SPICE reads M as milli, and knows no P and E.
     return f"{text[:-1]}meg" if text.endswith("M") else f"{value:.4g}" if text[-1:] in "PEZY" else text

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,9 @@ from fingerspice.problem import Problem, prepare
 from fingerspice.simulation import RTOL_RANGE, run_problem
 from fingerspice.solution import Solution
 from fingerspice.summary import Figured, Figures, KeptFigures
+
+if TYPE_CHECKING:
+    from fingerspice.picture import Picture
 
 FloatArray = NDArray[np.float64]
 
@@ -57,6 +62,10 @@ class SteadyState(Shown, Figured):
         from fingerspice.report import steady_page
 
         return steady_page(self)
+
+    def plot(self, signals: str | Sequence[str] | None = None) -> Picture:
+        """The period's signals against time; `signals` as in `Solution.plot`."""
+        return self.solution.plot(signals)
 
     @property
     def period(self) -> float:

@@ -29,6 +29,7 @@ from fingerspice.drawing import (
     flat,
     from_zero,
     legend_above,
+    legend_within,
     new_figure,
     peak_of,
     thin,
@@ -122,14 +123,14 @@ def plot_solution(
         options["width_ratios"] = [1.5, 1.0]
     figure, axes = new_figure(len(panels), 2 if dense else 1, height=max(3.4, 0.7 + 1.15 * sum(heights)), **options)
     left, right = (axes[::2], axes[1::2]) if dense else (axes, [])
-    last = float(marks[-2 * ZOOMED - 1]) if dense else start
+    zoomed = _zoom(marks, stop) if dense else (start, stop)
     for row, (quantity, keys) in enumerate(panels):
         traces = traces_of(runs, keys)
         factor, unit = scale_of(quantity, traces, start, stop)
         for trace in traces:
             draw_line(left[row], trace, factor, start, stop, runs, envelope=marks if dense else None)
             if dense:
-                draw_line(right[row], replace(trace, label="_"), factor, last, stop, runs)
+                draw_line(right[row], replace(trace, label="_"), factor, *zoomed, runs)
         if keys == ["f_el"] and len(traces) == 1:
             draw_mean(left[row], traces[0], factor, unit, told=not dense)
             if dense:
@@ -140,7 +141,7 @@ def plot_solution(
             _coefficient(right[row] if dense else left[row], traces[0].solution, factor)
     time_axis(left, runs, start, stop)
     if dense:
-        time_axis(right, runs, last, stop)
+        time_axis(right, runs, *zoomed)
         for ax in right:
             # Times with many digits have room for a few only.
             ax.locator_params(axis="x", nbins=3)
@@ -149,7 +150,7 @@ def plot_solution(
         right[-1].set_xlabel(f"{right[-1].get_xlabel()}: the last {ZOOMED}", fontsize=FONT)
     small = _about(runs)
     t = solution.t
-    if dense and np.count_nonzero((t >= last) & (t <= stop)) < _FEWEST * ZOOMED:
+    if dense and np.count_nonzero((t >= zoomed[0]) & (t <= zoomed[1])) < _FEWEST * ZOOMED:
         small += f" · fewer than {_FEWEST} outputs an oscillation: their shape needs a shorter TSTEP"
     caption(figure, small, GREY if all(run.solution.success for run in runs) else VERMILION)
     figure.align_ylabels(left)
@@ -239,7 +240,7 @@ def _turns(runs: list[Drawn], panels: list[tuple[Quantity, list[str]]], start: f
         t = run.solution.t
         kept = (t >= start) & (t <= stop)
         for key in panels[0][1]:
-            for x in run.solution.by_name(key).values():
+            for x in _found(run.solution, key).values():
                 step = np.diff(x[kept])
                 # Rounding turns, too.
                 steep = np.flatnonzero(np.abs(step) > 1e-6 * peak_of(x))
@@ -247,6 +248,18 @@ def _turns(runs: list[Drawn], panels: list[tuple[Quantity, list[str]]], start: f
                 if turns.size > best.size:
                     best = t[kept][turns]
     return best
+
+
+def _zoom(marks: FloatArray, stop: float) -> tuple[float, float]:
+    """Start and end of the last oscillations, s; not of the silence that may follow them."""
+    first, last = float(marks[-2 * ZOOMED - 1]), float(marks[-1])
+    return first, min(stop, last + 0.1 * (last - first))
+
+
+def _found(solution: Solution, key: str) -> dict[str, FloatArray]:
+    """A signal by name; nothing where another of the runs has that element only."""
+    kind, colon, _ = key.partition(":")
+    return solution.by_name(key) if not colon or key in solution.all_signals.names(kind) else {}
 
 
 def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
@@ -258,7 +271,7 @@ def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
     driven = {run.solution.u_source.tobytes() for run in runs}
     for number, run in enumerate(runs):
         for key in keys:
-            found = run.solution.by_name(key)
+            found = _found(run.solution, key)
             for place, (name, x) in enumerate(found.items()):
                 kind, _, element = name.partition(":")
                 source = kind == "u_source"
@@ -309,7 +322,9 @@ def draw_line(
         t, x = thin(t, x)
         ax.plot(scale * t, x, label=trace.label, **{"solid_joinstyle": "round", **trace.style})
         return
-    edges = np.linspace(start, stop, min(_PARTS, max(envelope.size // 2, 1)) + 1)
+    # Each part holds an oscillation, where there are any.
+    parts = (stop - start) / (2.0 * float(np.median(np.diff(envelope))))
+    edges = np.linspace(start, stop, max(1, int(min(parts, _PARTS))) + 1)
     begin = np.searchsorted(t, edges[:-1])
     kept = np.diff(np.append(begin, t.size)) > 0
     begin, middle = begin[kept], 0.5 * (edges[:-1] + edges[1:])[kept]
@@ -341,16 +356,7 @@ def finish_panel(ax: Axes, quantity: Quantity, unit: str, values: Sequence[Float
     else:
         ax.ticklabel_format(axis="y", useOffset=False)
         flat(ax, np.concatenate(values) if values else np.zeros(0))
-    names = ax.get_legend_handles_labels()[1]
-    # As many columns as there is room for.
-    columns = next(n for n in range(len(names), 0, -1) if n == 1 or sum(_columns_of(names, n)) <= room)
-    legend_above(ax, columns)
-
-
-def _columns_of(names: list[str], columns: int) -> list[int]:
-    """Widths of a legend's columns, letters, filled one after the other."""
-    rows = -(-len(names) // columns)
-    return [max(len(name) for name in names[i : i + rows]) + 6 for i in range(0, len(names), rows)]
+    legend_within(ax, room)
 
 
 def _coefficient(ax: Axes, solution: Solution, factor: float) -> None:
