@@ -135,14 +135,12 @@ class Stretch:
         """Smallest and largest value of a signal: where its polynomials have them, the signal itself."""
         # An error of the place counts by its square.
         weighed, panels = self._cut(read, *self.run.at_points(read, self.panels), max(_FINEST, self.rtol))
-        ends = []
-        for sign in (-1.0, 1.0):
-            panel, place, _ = largest(weighed.x, sign)
-            at = panels.low[panel] * (1.0 - place) + panels.high[panel] * place
-            _, exact = self.run.values_at(read, panels.step[panel : panel + 1], np.array([[at]]))
-            nodes = float(weighed.x.max() if sign > 0.0 else weighed.x.min())
-            ends.append(sign * max(sign * float(exact[0, 0]), sign * nodes))
-        return ends[0], ends[1]
+        found = [largest(weighed.x, sign) for sign in (-1.0, 1.0)]
+        panel, place = np.array([p for p, _, _ in found]), np.array([x for _, x, _ in found])
+        at = panels.low[panel] * (1.0 - place) + panels.high[panel] * place
+        _, exact = self.run.values_at(read, panels.step[panel], at[:, None])
+        low, high = exact[:, 0].tolist()
+        return min(low, float(weighed.x.min())), max(high, float(weighed.x.max()))
 
     def _cut(self, read: Read, t: FloatArray, x: FloatArray, tol: float) -> tuple[Weighed, Panels]:
         """A signal, and the panels on which its polynomials miss it by at most `tol` of its peak."""

@@ -48,11 +48,12 @@ class ClosedForm:
     first: float
     stop: float
 
-    def run(self, readers: Mapping[str, Read], since: float, until: float) -> Refined | None:
+    def run(self, readers: Callable[[], Mapping[str, Read]], since: float, until: float) -> Refined | None:
         """Panels between two times (s) on which every voltage is a polynomial; None where they would be too many.
 
         `readers` gives every signal that figures may be asked of by name.
         """
+        every = readers()
         longest = _LONGEST * self.waveform.shortest_time()
         rate = self.waveform.breakpoint_rate() + 1.0 / longest
         # Each look goes through the run from its start.
@@ -69,7 +70,7 @@ class ClosedForm:
         done: list[tuple[FloatArray, FloatArray]] = []
         peaks: dict[str, float] = {}
         for _ in range(_MOST_ROUNDS):
-            wrong = self._is_rough(readers, begin, end, peaks)
+            wrong = self._is_rough(every, begin, end, peaks)
             done.append((begin[~wrong], end[~wrong]))
             if not wrong.any():
                 break
@@ -78,7 +79,7 @@ class ClosedForm:
             if begin.size + sum(x.size for x, _ in done) > MOST_PANELS:
                 return None
         begin, end = (np.sort(np.concatenate(x)) for x in zip(*done, strict=True))
-        return self._cut_at_zeros(readers, Refined(self.look, begin, end))
+        return self._cut_at_zeros(every, Refined(self.look, begin, end))
 
     def _is_rough(
         self, readers: Mapping[str, Read], begin: FloatArray, end: FloatArray, peaks: dict[str, float]

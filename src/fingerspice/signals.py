@@ -131,8 +131,10 @@ class Signals:
         several = self.columns(key)
         if key in ("u_layer", "v"):
             return tuple(f"{key}:{name}" for name in several)
-        # Not by looking at the signal where that would make it.
-        missing = not several if key in _OF_A_GAP else not (several and key == "area") and getattr(self, key) is None
+        # Asking for a signal would make it.
+        missing = not several if key in _OF_A_GAP else False
+        if key in ("q_source", "i_source") or (key == "area" and not several):
+            missing = getattr(self, key) is None
         return () if missing else (key,) if len(several) < 2 else tuple(f"{key}:{name}" for name in several)
 
     def one(self, name: str) -> FloatArray:
