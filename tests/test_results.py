@@ -41,14 +41,14 @@ def test_the_result_of_another_circuit_is_not_replaced(command: Command) -> None
     assert command(*QUIET, "--set", "Xgap.d=5u").code == 0
     before = tree(Path())
     for words, said in (
-        ((), "there is a result already, with Xgap.d=5e-06, this one of the deck as it is; allowed: --name NAME"),
-        (("--set", "Xgap.d=6u"), "with Xgap.d=5e-06, this one with Xgap.d=6e-06"),
-        (("--set", "Xgap.d=5u", "--charge-law", "mobile"), "under the local law, this one under the mobile law"),
+        ((), "out/pad.nc holds a result with Xgap.d=5e-06, and this one is of the deck as it is; allowed"),
+        (("--set", "Xgap.d=6u"), "with Xgap.d=5e-06, and this one is with Xgap.d=6e-06"),
+        (("--set", "Xgap.d=5u", "--charge-law", "mobile"), "under the local law, and this one is under the mobile law"),
     ):
         result = command(*QUIET, *words)
         assert result.code == 2
         assert said in result.lines[0]
-        assert result.lines[0].endswith("--overwrite; it is not replaced: out/pad.nc")
+        assert result.lines[0].endswith("allowed: --name NAME, another --out, or --overwrite")
         assert tree(Path()) == before
     assert command(*QUIET, "--set", "Xgap.d=5u").code == 0
     assert command(*QUIET, "--overwrite").code == 0
@@ -61,7 +61,7 @@ def test_another_deck_of_the_same_name_is_another_circuit(command: Command) -> N
     Path("else/pad.cir").write_text(edited(("d=3.5u", "d=4u")))
     result = command("run", "else/pad.cir", "--no-plot")
     assert result.code == 2
-    assert "of another deck, pad.cir" in result.lines[0]
+    assert "holds a result of the deck pad.cir, and this one is of else/pad.cir" in result.lines[0]
 
 
 def test_a_deck_that_was_edited_replaces_its_own_results_and_says_so(command: Command) -> None:
@@ -112,3 +112,11 @@ def test_reports_pictures_and_files_say_what_was_changed(command: Command) -> No
         assert report["title"] == "Fingerpad"
         assert report["overrides"]["Xgap.d"] == "5e-06"
         assert report["overrides"]["Vdrive"].startswith("Square(")
+
+
+def test_a_picture_from_before_is_known_by_the_data_beside_it(command: Command) -> None:
+    assert command("run", "pad.cir").code == 0
+    Image.open("out/pad.png").save("out/pad.png")
+    assert command("run", "pad.cir").code == 0
+    Image.open("out/pad.png").save("out/pad.png")
+    assert command("run", "pad.cir", "--set", "Xgap.d=5u").code == 2

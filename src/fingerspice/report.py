@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fingerspice.circuit.describe import drive_text, heading, waveform_text
+from fingerspice.errors import SolveError
 from fingerspice.files import write_aside
 from fingerspice.pages import Page, Table
 from fingerspice.units import format_si
@@ -154,7 +155,11 @@ def steady_page(state: SteadyState) -> Page:
         f"a further period changes the layers by {state.defect:.2g} V at most, and leaves {100.0 * largest:.3g} % of a "
         "small disturbance"
     )
-    return Page([found, left, "", *summary_table(state.solution).blocks])
+    try:
+        period = summary_table(state.solution).blocks
+    except SolveError as error:
+        period = (error.message,)
+    return Page([found, left, "", *period])
 
 
 def fit_page(fit: MaterialFit) -> Page:

@@ -96,23 +96,25 @@ class Results:
 
     def _check(self, file: Path) -> None:
         held = _held(file)
-        ways = f"allowed: --name NAME, another --out, or --overwrite; it is not replaced: {file}"
+        ways = "allowed: --name NAME, another --out, or --overwrite"
         if held is None and _is_table(file):
             complain(f"note: {file} is replaced; a table alone does not say which circuit it is of")
             return
         if held is None:
-            raise InputError(f"there is a file of that name already, and nothing says which circuit it is of; {ways}")
+            raise InputError(f"{file} is there already, and nothing says which circuit it is of; {ways}")
         same_deck = held["deck_sha256"] == self._own["deck_sha256"]
         if json.loads(held["overrides"]) != dict(self.circuit.overrides):
-            raise InputError(f"there is a result already, {_of(held)}, this one {_of(self._own)}; {ways}")
-        if held["charge_law"] != self._own["charge_law"]:
-            laws = f"under the {held['charge_law']} law, this one under the {self._own['charge_law']} law"
-            raise InputError(f"there is a result already, {laws}; {ways}")
-        if not same_deck and (held.get("file", "") != self._own["file"] or not held.get("file")):
-            raise InputError(f"there is a result already, of another deck, {held.get('file') or 'unnamed'}; {ways}")
-        if not same_deck and not self.noted:
-            self.noted = True
-            complain(f"note: the results in {self.folder} are of an earlier text of {self.deck} and are replaced")
+            said, own = _of(held), _of(self._own)
+        elif held["charge_law"] != self._own["charge_law"]:
+            said, own = (f"under the {x['charge_law']} law" for x in (held, self._own))
+        elif not same_deck and (held.get("file", "") != self._own["file"] or not held.get("file")):
+            said, own = f"of the deck {held.get('file') or 'of another text'}", f"of {self.deck}"
+        else:
+            if not same_deck and not self.noted:
+                self.noted = True
+                complain(f"note: the results in {self.folder} are of an earlier text of {self.deck} and are replaced")
+            return
+        raise InputError(f"{file} holds a result {said}, and this one is {own}; {ways}")
 
 
 def scene_dict(circuit: Circuit) -> dict[str, Any]:
@@ -169,4 +171,8 @@ def _of_picture(file: Path) -> dict[str, str] | None:
     with Image.open(picture) as image:
         image.load()
         text: dict[str, Any] = dict(getattr(image, "text", {}))
+    data = file.with_suffix(".nc")
+    if not text.get("files") and file.suffix == ".png" and data.is_file():
+        # Pictures did not always say it; the data beside them did.
+        return _of_data(data)
     return text if file.name in json.loads(text.get("files", "[]")) else None
