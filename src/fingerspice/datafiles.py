@@ -100,11 +100,13 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
             for key, text in solution.provenance().items():
                 file.attrs[key] = text
             group = file.create_group(GROUP)
-            # The rows before jumps, which other readers need not meet.
-            data, coords = variables(solution, ~keep)
-            rows = (("time",), np.flatnonzero(~keep), {"long_name": "row of the whole run"})
-            _fill(group, {**data, "row": rows}, coords)
             group.attrs["run"] = json.dumps(_run(solution))
+            if not keep.all():
+                # The rows before jumps, which other readers need not meet: as one table, for variables take time.
+                group.dimensions["jump"] = int(np.count_nonzero(~keep))
+                group.dimensions["signal"] = 1 + len(solution.signals)
+                rows = [np.flatnonzero(~keep), *(x[~keep] for x, _, _ in solution.signals.values())]
+                group.create_variable("before", ("jump", "signal"), dtype=float, data=np.column_stack(rows))
         write_pieces(target, content.getbuffer())
 
     return write_aside(path, write)
@@ -135,6 +137,7 @@ def _run(solution: Solution) -> dict[str, Any]:
         "fundamental": None if fundamental is None else vars(fundamental), "period": solution.period,
         "fold_margin_min": solution.fold_margin_min, "warnings": list(solution.warnings), "first": solution.first,
         "t_stop": solution.t_stop, "sources": list(solution.sources),
+        "signals": list(solution.signals),
         "contacts": [[name, vars(contact)] for name, contact in solution.record.fingers],
         "overrides": dict(solution.circuit.overrides), "state": state, "summary": solution.summary(),
     }  # fmt: skip

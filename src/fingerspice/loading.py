@@ -119,20 +119,27 @@ def _solution(file: Any) -> Solution:
 
 def _record(file: Any, run: dict[str, Any]) -> StoredRecord:
     """The outputs, those before jumps back in their places."""
+    names = {key: tuple(_text(x) for x in file.variables[key][...]) for key in ("layer", "node")}
     group = file.groups[GROUP]
-    rows = np.asarray(group.variables["row"][...], int)
+    signals = [str(name) for name in run["signals"]]
+    before = np.zeros((0, 1 + len(signals)))
+    if "before" in group.variables:
+        before = np.asarray(group.variables["before"][...], float)
+    rows = before[:, 0].astype(int)
+    t_before = np.asarray(file.variables["time"][...], float)[rows - np.arange(rows.size)]
 
     def whole(name: str) -> FloatArray | None:
         if name not in file.variables:
             return None
         kept = np.asarray(file.variables[name][...], float)
+        own = [1 + i for i, signal in enumerate(signals) if signal == name or signal.startswith(f"{name}:")]
+        added = t_before if name == "time" else before[:, own].reshape(rows.size, *kept.shape[1:])
         # Each place as it is while the rows before it are in already.
-        return np.insert(kept, rows - np.arange(rows.size), np.asarray(group.variables[name][...], float), axis=0)
+        return np.insert(kept, rows - np.arange(rows.size), added, axis=0)
 
     t = whole("time")
     if t is None or np.any(np.diff(t) < 0.0):
         raise ValueError("its times do not ascend")
-    names = {key: tuple(_text(x) for x in file.variables[key][...]) for key in ("layer", "node")}
     u_layer, nodes, u_source, margin = (whole(name) for name in ("u_layer", "v", "u_source", "fold_margin"))
     if u_layer is None or nodes is None or u_source is None or margin is None:
         raise ValueError("a voltage is missing")
