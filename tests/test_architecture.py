@@ -19,20 +19,26 @@ MAX_LINES = 450
 
 # From the bottom up: a part imports its own files and the parts above it in this list, nothing below.
 ORDER = (
-    *("errors", "units", "files", "streams", "compiled", "numerics", "physics", "engine", "circuit"),
+    *("errors", "units", "files", "streams", "compiled", "numerics", "physics", "pages", "engine", "circuit", "report"),
     *(
         "record",
         "network_record",
+        "stored_record",
         "measures",
         "refined",
         "steps",
         "outcome",
+        "signals",
+        "summary",
         "datafiles",
         "solution",
+        "phasor_solution",
         "phasors",
         "fitting",
         "table1",
-        "plotting",
+        "picture",
+        "drawing",
+        "traces",
         "spectrum",
         "times",
         "starting",
@@ -55,14 +61,15 @@ ORDER = (
         "foreign",
         "periodic",
         "planning",
+        "loading",
         "simulation",
         "steady",
         "largesignal",
         "limits",
         "comparison",
-        "report",
+        "plotting",
     ),
-    *("figures", "terminal", "options", "cli", "__main__"),
+    *("figures", "terminal", "options", "results", "cli", "__main__"),
 )
 # Beside each other, not one on the other.
 STRANGERS = (
@@ -71,7 +78,12 @@ STRANGERS = (
     ("physics.phasor", "engine"),
 )
 # Methods and commands that lend a hand upwards, inside a function, so that nothing is loaded before it is used.
-LENT = {("solution", "plotting")}
+LENT = {
+    ("solution", "traces"),
+    ("circuit", "report"),
+    ("comparison", "plotting"),
+    ("phasor_solution", "plotting"),
+}
 THIRD_PARTY = {
     "numerics": {"numpy", "numba"},
     "physics": {"numpy", "numba"},

@@ -74,7 +74,7 @@ OTHERS = [
     (["export", "pad.cir", "-o", "file/x.cir"], "cannot write file/x.cir: file is not a folder"),
     (["export", "pad.cir", "-o", "folder"], "cannot write folder: it is a folder; allowed: a file's name"),
     (["export", "pad.cir", "-o", "./folder/../pad.cir"], "it is the deck itself; allowed: another name or folder"),
-    (["run", "deck.csv", "--csv"], "cannot write deck.csv: it is the deck itself"),
+    (["run", "deck.csv", "--csv", "--out", "."], "cannot write deck.csv: it is the deck itself"),
     (["export", "pad.cir", "-o", "x.cir", "--charge-law", "both"], "charge_law is 'both'"),
     (["ac", "pad.cir", "--sweep", "dec 10 10"], "--sweep 'dec 10 10': '.ac dec 10 10' is not understood; allowed: .ac"),
     (["ac", "pad.cir", "--sweep", ""], "--sweep '': '.ac' is not understood"),
@@ -200,8 +200,9 @@ def test_a_disk_that_is_full_is_told_and_leaves_no_half_file(
     before = tree(tmp_path)
     monkeypatch.setattr(Path, "replace", full)
     result = command("run", "pad.cir", "--no-plot")
+    Path("out").rmdir()
     assert result.code == 2
-    assert result.lines == ["fingerspice: cannot write pad.nc: No space left on device"]
+    assert result.lines == ["fingerspice: cannot write out/pad.nc: No space left on device"]
     assert tree(tmp_path) == before
 
 
@@ -227,8 +228,9 @@ def test_the_installed_command_exits_with_0_1_and_2(tmp_path: Path) -> None:
     (tmp_path / "pad.cir").write_text(edited())
     done = process("run", "pad.cir", "--no-plot", folder=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    assert "wrote pad.nc" in done.stdout
-    failed = process("run", "pad.cir", "--no-plot", "--charge-law", "mobile", "--set", "Xgap.d=10n", folder=tmp_path)
+    assert "wrote out/pad.nc" in done.stdout
+    words = ["--charge-law", "mobile", "--set", "Xgap.d=10n", "--name", "thin"]
+    failed = process("run", "pad.cir", "--no-plot", *words, folder=tmp_path)
     assert failed.returncode == 1
     assert failed.stderr.startswith("fingerspice: stopped at t = ")
     wrong = process("run", "nothing.cir", folder=tmp_path)

@@ -24,7 +24,7 @@ import pytest
 import scipy.integrate
 
 import fingerspice as fs
-from fingerspice.plotting import save
+from fingerspice.drawing import save
 from scenes import table1
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"

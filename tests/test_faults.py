@@ -26,10 +26,10 @@ from fingerspice.files import write_aside
 from processes import ended, no_room, start
 
 COMMANDS = {
-    "run": (["run", "pad.cir", "--out", "out"], ["pad.nc", "pad.png"]),
-    "csv": (["run", "pad.cir", "--out", "out", "--csv", "--no-plot"], ["pad.csv"]),
-    "ac": (["ac", "pad.cir", "--out", "out"], ["pad_ac.csv", "pad_ac.png"]),
-    "compare": (["compare", "pad.cir", "--out", "out"], ["pad_compare.png"]),
+    "run": (["run", "pad.cir", "--overwrite", "--out", "out"], ["pad.nc", "pad.png"]),
+    "csv": (["run", "pad.cir", "--overwrite", "--out", "out", "--csv", "--no-plot"], ["pad.csv"]),
+    "ac": (["ac", "pad.cir", "--overwrite", "--out", "out"], ["pad_ac.csv", "pad_ac.png"]),
+    "compare": (["compare", "pad.cir", "--overwrite", "--out", "out"], ["pad_compare.png"]),
     "export": (["export", "pad.cir", "-o", "out/spice.cir"], ["spice.cir"]),
     "figures": (["figures", "--out", "out", "--only", "2"], ["fig2.csv", "fig2.png"]),
 }
@@ -314,7 +314,7 @@ def test_a_folder_in_the_place_of_a_picture_is_refused_before_the_run(command: C
 
 def test_a_deck_named_as_the_picture_is_not_overwritten(command: Command) -> None:
     Path("pad.cir").rename("pad.png")
-    result = command("run", "pad.png")
+    result = command("run", "pad.png", "--out", ".")
     assert result.code == 2
     assert result.lines == ["fingerspice: cannot write pad.png: it is the deck itself; allowed: another name or folder"]
     assert Path("pad.png").read_text() == edited(QUICK)

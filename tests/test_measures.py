@@ -90,7 +90,7 @@ def test_figures_are_the_same_whatever_tstep(law, source, name):
         circuit, sources={drive: waveform}, t_stop=3e-3, t_eval=np.linspace(0.0, 3e-3, 60_001), charge_law=law,
         rtol=1e-10, throw=False,
     )  # fmt: skip
-    signals = fine._summarised()
+    signals = {name: fine.all_signals.one(name) for name in fine._figures.shown}
     for key in (k for k in signals if k.startswith(("u_gap", "f_el"))):
         x = signals[key]
         error = fine.error.u_gap + 1e-7 * np.abs(x).max()
@@ -196,8 +196,8 @@ def test_weights_of_outputs_integrate_cubics_between_jumps_and_lines_where_point
 def test_weights_of_four_hundred_thousand_outputs_with_a_jump_at_every_tenth():
     # A loop over the pieces in Python took 18 s.
     t = np.repeat(np.linspace(0.0, 1.0, 360_001), np.where(np.arange(360_001) % 9 == 8, 2, 1))
-    weighed = measures.weigh_outputs(t, {"x": np.sin(7.0 * t)})
-    assert weighed.mean("x") == pytest.approx((1.0 - np.cos(7.0)) / 7.0, rel=1e-12)
+    weighed = measures.weigh_outputs(t, np.sin(7.0 * t))
+    assert weighed.mean() == pytest.approx((1.0 - np.cos(7.0)) / 7.0, rel=1e-12)
 
 
 def test_a_pickled_solution_has_the_same_figures():

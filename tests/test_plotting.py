@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import math
+import os
 import subprocess
 import sys
 import warnings
@@ -15,7 +17,7 @@ import pytest
 from PIL import Image
 
 import fingerspice as fs
-from fingerspice import plotting
+from fingerspice import drawing, plotting, traces
 from fingerspice.comparison import compare
 from fingerspice.simulation import simulate
 from scenes import deck, table1
@@ -51,7 +53,7 @@ def sine() -> fs.Solution:
 
 
 def test_a_run_is_shown_in_four_panels_with_units(sine: fs.Solution) -> None:
-    figure = plotting.plot_solution(sine)
+    figure = traces.plot_solution(sine)
     assert labels(figure) == ["Voltage [V]", "Force [N]", "Ridge area [mm²]", "Friction [N]"]
     assert figure.axes[3].get_xlabel() == "Time [ms]"
     t, u = curve(figure.axes[0], "gap")
@@ -61,19 +63,19 @@ def test_a_run_is_shown_in_four_panels_with_units(sine: fs.Solution) -> None:
 
 
 def test_the_mean_shown_is_that_of_the_last_period(sine: fs.Solution) -> None:
-    ax = plotting.plot_solution(sine).axes[1]
+    ax = traces.plot_solution(sine).axes[1]
     _, level = curve(ax, "mean of the last period, 0.109 N")
     np.testing.assert_allclose(level, sine.summary()["f_el_mean_periodic"])
 
 
 def test_the_small_print_says_how_it_was_made(sine: fs.Solution) -> None:
-    text = small_print(plotting.plot_solution(sine))
+    text = small_print(traces.plot_solution(sine))
     for part in ("Table 1", "local charge law", "area: coupled", "rtol 1e-08", f"{sine.error.u_gap:.2g} V"):
         assert part in text
 
 
 def test_the_friction_coefficient_is_the_right_scale_of_the_friction_panel(sine: fs.Solution) -> None:
-    figure = plotting.plot_solution(sine)
+    figure = traces.plot_solution(sine)
     figure.canvas.draw()
     force, right = figure.axes[3].get_ylim(), figure.axes[3].child_axes[0].get_ylim()
     np.testing.assert_allclose(right, np.array(force) / 0.5)
@@ -81,7 +83,7 @@ def test_the_friction_coefficient_is_the_right_scale_of_the_friction_panel(sine:
 
 def test_both_sides_of_a_jump_are_drawn() -> None:
     solution = simulate(table1(), sources={"Vdrive": fs.Square(200.0, 100.0)}, t_stop=0.01, rtol=1e-6)
-    t, u = curve(plotting.plot_solution(solution).axes[0], "source")
+    t, u = curve(traces.plot_solution(solution).axes[0], "source")
     np.testing.assert_array_equal(u[np.isclose(t, 5.0)], [200.0, -200.0])
 
 
@@ -91,7 +93,7 @@ def test_without_a_gap_the_layers_voltages_are_shown_alone() -> None:
         "Xs b 0 area SKIN d=350u f=100", "Varea area 0 35", ".tran 10u 20m",
     )  # fmt: skip
     solution = simulate(circuit)
-    figure = plotting.plot_solution(solution)
+    figure = traces.plot_solution(solution)
     assert labels(figure) == ["Voltage [V]"]
     legend = figure.axes[0].get_legend()
     assert legend is not None
@@ -104,7 +106,7 @@ def test_a_run_that_stopped_shows_where_and_why() -> None:
     source = fs.Function(lambda t: 1e4 * t if t < 0.0123 else math.nan)
     solution = with_source(source, t_stop=0.02)
     assert not solution.success
-    figure = plotting.plot_solution(solution)
+    figure = traces.plot_solution(solution)
     assert [t.get_text().strip() for t in figure.axes[0].texts] == ["stopped"]
     for ax in figure.axes:
         assert any(np.allclose(line.get_xdata(), 12.3) for line in ax.lines)
@@ -126,21 +128,21 @@ def test_a_run_that_stopped_at_once_still_makes_a_picture(sine: fs.Solution, row
     solution = dataclasses.replace(sine, t=sine.t[:rows].copy(), record=record, state=state, status=status)
     assert solution.u_gap is not None
     assert solution.u_gap.size == rows
-    figure = plotting.plot_solution(solution)
+    figure = traces.plot_solution(solution)
     assert "stopped" in figure.axes[0].texts[0].get_text()
-    assert plotting.save(figure, tmp_path / "x.png").stat().st_size > 0
+    assert drawing.save(figure, tmp_path / "x.png").stat().st_size > 0
 
 
 def test_a_fixed_area_is_drawn_flat_not_as_its_rounding() -> None:
-    figure = plotting.plot_solution(simulate(table1(), area="frozen", t_stop=0.01))
+    figure = traces.plot_solution(simulate(table1(), area="frozen", t_stop=0.01))
     low, high = figure.axes[2].get_ylim()
     assert low < 34.0 < 36.0 < high
 
 
 def test_no_voltage_is_no_force_and_still_a_picture(tmp_path: Path) -> None:
-    figure = plotting.plot_solution(with_source(fs.DC(0.0), t_stop=0.01))
+    figure = traces.plot_solution(with_source(fs.DC(0.0), t_stop=0.01))
     assert figure.axes[1].get_ylim() == pytest.approx((0.0, figure.axes[1].get_ylim()[1]))
-    plotting.save(figure, tmp_path / "x.png")
+    drawing.save(figure, tmp_path / "x.png")
 
 
 def test_a_sweep_shows_gain_phase_force_and_area() -> None:
@@ -169,7 +171,7 @@ def test_a_single_frequency_and_a_source_without_fundamental_are_drawn_too(tmp_p
     circuit = table1().replace({"Vdrive": fs.DC(100.0)})
     figure = plotting.plot_phasor((fs.phasor(circuit, 100.0, area="frozen"),), circuit)
     assert figure.axes[2].texts[0].get_text() == "the source has no fundamental"
-    plotting.save(figure, tmp_path / "x.png")
+    drawing.save(figure, tmp_path / "x.png")
 
 
 @pytest.mark.parametrize("phase", [0.0, 70.0])
@@ -191,8 +193,8 @@ def test_the_comparison_shows_its_table() -> None:
 
 
 def test_a_picture_has_150_dots_an_inch_or_more(sine: fs.Solution, tmp_path: Path) -> None:
-    figure = plotting.plot_solution(sine)
-    with Image.open(plotting.save(figure, tmp_path / "new" / "run.png")) as image:
+    figure = traces.plot_solution(sine)
+    with Image.open(drawing.save(figure, tmp_path / "new" / "run.png")) as image:
         assert image.format == "PNG"
         assert image.width >= 150 * figure.get_size_inches()[0]
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["run.png"]
@@ -201,7 +203,7 @@ def test_a_picture_has_150_dots_an_inch_or_more(sine: fs.Solution, tmp_path: Pat
 def test_a_folder_that_cannot_be_written_is_bad_input(sine: fs.Solution, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(fs.InputError, match="cannot write"):
-        plotting.save(plotting.plot_solution(sine), tmp_path / "file" / "run.png")
+        drawing.save(traces.plot_solution(sine), tmp_path / "file" / "run.png")
 
 
 @pytest.mark.parametrize(
@@ -219,7 +221,7 @@ def test_a_folder_that_cannot_be_written_is_bad_input(sine: fs.Solution, tmp_pat
     ],
 )
 def test_engineering_units(peak: float, unit: str, least: float, expected: tuple[float, str]) -> None:
-    factor, name = plotting.engineering(peak, unit, least)
+    factor, name = drawing.engineering(peak, unit, least)
     assert (factor, name) == (pytest.approx(expected[0]), expected[1])
 
 
@@ -227,8 +229,8 @@ def test_thinning_keeps_every_extreme_and_both_ends() -> None:
     t = np.linspace(0.0, 1.0, 123_457)
     x = np.sin(2e4 * t)
     x[77_777] = 9.0
-    thin_t, thin_x = plotting.thin(t, x)
-    assert thin_t.size < 5 * plotting.MAX_BINS
+    thin_t, thin_x = drawing.thin(t, x)
+    assert thin_t.size < 5 * drawing.MAX_BINS
     assert np.all(np.diff(thin_t) > 0.0)
     assert (thin_t[0], thin_t[-1]) == (0.0, 1.0)
     assert thin_x.max() == 9.0
@@ -238,9 +240,9 @@ def test_thinning_keeps_every_extreme_and_both_ends() -> None:
 def test_pictures_need_no_pyplot_and_their_module_no_matplotlib() -> None:
     code = (
         "import sys, numpy, fingerspice as fs\n"
-        "from fingerspice import figures, plotting\n"
+        "from fingerspice import drawing, figures, plotting, traces\n"
         "assert not any(m.startswith('matplotlib') for m in sys.modules)\n"
-        "plotting.new_figure(1)\n"
+        "drawing.new_figure(1)\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=60)
@@ -253,8 +255,153 @@ def test_what_a_deck_names_is_drawn_without_formulas_floods_or_warnings(tmp_path
     # Warnings are errors here: matplotlib has one for each picture that the font lacks, and for what finds no room.
     circuit = fs.parse_netlist("\n".join((title, *lines)))
     figure = simulate(circuit).plot()
-    plotting.save(figure, tmp_path / "odd.png")
+    drawing.save(figure, tmp_path / "odd.png")
     shown = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     assert any(text.startswith("n$x^$□\\x1b[31myyy") for text in shown)
-    assert max(map(len, shown)) <= plotting.LONGEST_LABEL
+    assert max(map(len, shown)) <= drawing.LONGEST_LABEL
     assert "$\\frac{$ □□ 😀 \\x1b[31mxxx" in small_print(figure)
+
+
+# Signals, windows, several runs, long runs
+
+
+def legend(ax: Axes) -> list[str]:
+    found = ax.get_legend()
+    return [] if found is None else [text.get_text() for text in found.get_texts()]
+
+
+def test_signals_that_are_asked_for_share_a_panel_with_their_like(sine: fs.Solution) -> None:
+    figure = sine.plot(["u_layer", "f_el", "v:skin", "q_source"])
+    assert labels(figure) == ["Voltage [V]", "Force [N]", "Charge [nC]"]
+    assert legend(figure.axes[0]) == ["layer Xcoat", "layer Xgap", "layer Xskin", "skin"]
+    np.testing.assert_array_equal(curve(figure.axes[0], "skin")[1], sine.node_voltages["skin"])
+    assert labels(sine.plot("friction")) == ["Friction coefficient"]
+
+
+def test_a_signal_that_there_is_none_of_is_refused_with_the_nearest(sine: fs.Solution) -> None:
+    with pytest.raises(fs.InputError, match=r"unknown signal 'fel'; nearest: 'f_el'; allowed: u_source, "):
+        sine.plot("fel")
+    with pytest.raises(fs.InputError, match="unknown signal 3"):
+        sine.plot([3])  # type: ignore[list-item]
+    with pytest.raises(fs.InputError, match="signals is empty"):
+        sine.plot([])
+
+
+def test_a_window_is_what_is_shown(sine: fs.Solution) -> None:
+    figure = sine.plot("f_el", window=(0.012, 0.021))
+    assert figure.axes[0].get_xlim() == pytest.approx((12.0, 21.0))
+    t, _ = curve(figure.axes[0], "electroadhesive force")
+    # A neighbour on either side leads the line out.
+    assert 11.98 < t[0] < 12.0 < 21.0 < t[-1] < 21.02
+    for window in ((0.02, 0.01), (1.0, 2.0), (0.01, 0.010001)):
+        with pytest.raises(fs.InputError, match=r"window is .* s; allowed: ascending, with two outputs"):
+            sine.plot(window=window)
+    with pytest.raises(fs.InputError, match="window is 3; allowed: two times in s"):
+        sine.plot(window=3)  # type: ignore[arg-type]
+
+
+def test_other_runs_lie_over_it_called_by_what_sets_them_apart(sine: fs.Solution) -> None:
+    thick = simulate(table1().replace({"Xgap.d": 5e-6}))
+    figure = sine.plot("f_el", others=thick)
+    names = ["electroadhesive force, the deck as it is", "electroadhesive force, Xgap.d = 5 um"]
+    assert legend(figure.axes[0]) == names
+    np.testing.assert_array_equal(curve(figure.axes[0], names[1])[1], thick.f_el)
+    first, second = figure.axes[0].lines[:2]
+    assert first.get_color() != second.get_color()
+    assert first.get_linestyle() != second.get_linestyle()
+    assert first.get_linewidth() > second.get_linewidth()
+    named = sine.plot("f_el", others={"thick": thick})
+    assert legend(named.axes[0])[1] == "electroadhesive force, thick"
+    # What drives both alike is drawn once.
+    assert legend(sine.plot(others=[thick]).axes[0])[0] == "source"
+    with pytest.raises(fs.InputError, match="others is 'x'; allowed: Solutions"):
+        sine.plot(others="x")  # type: ignore[arg-type]
+
+
+def test_each_finger_keeps_its_colour_in_every_panel_and_has_a_legend_in_each() -> None:
+    run = simulate(fs.read_netlist("circuits/two_fingers.cir"))
+    figure = run.plot()
+    colors: dict[str, set[object]] = {gap: set() for gap in run.gaps}
+    for ax in figure.axes:
+        assert len([text for text in legend(ax) if "Xgap" in text]) == 2
+        for line in ax.lines:
+            for gap, seen in colors.items():
+                if str(line.get_label()).endswith(gap):
+                    seen.add(line.get_color())
+    firm, light = colors.values()
+    assert len(firm) == len(light) == 1
+    assert firm != light
+    # Their voltages all but coincide.
+    first, second = (line for line in figure.axes[0].lines if "Xgap" in str(line.get_label()))
+    assert first.get_linestyle() == "-" != second.get_linestyle()
+    assert first.get_linewidth() > second.get_linewidth()
+
+
+def test_a_long_run_is_an_envelope_beside_its_last_oscillations() -> None:
+    run = simulate(table1("SIN(0 200 5k)", f=5000.0, tran="5u 50m uic"))
+    figure = run.plot()
+    left, right = figure.axes[:8:2], figure.axes[1:8:2]
+    assert left[3].get_xlabel() == "Time [ms]: envelope of 250 oscillations"
+    assert right[3].get_xlabel() == "Time [ms]: the last 4"
+    assert right[3].get_xlim()[1] - right[3].get_xlim()[0] == pytest.approx(0.8, abs=0.06)
+    assert run.f_el is not None
+    upper = curve(left[1], "electroadhesive force")[1]
+    # Each part of the envelope reaches the force's peak, which the last periods have all of.
+    np.testing.assert_allclose(upper[100:-1], run.f_el[5000:].max(), rtol=1e-6)
+    assert len(upper) <= 250
+    assert figure.axes[0].lines[0].get_xdata().size < 1000
+    # A window of a few is drawn as lines.
+    assert len(labels(run.plot(window=(0.0, 0.002)))) == 4
+
+
+def test_the_caption_names_source_and_changes(sine: fs.Solution) -> None:
+    assert "Vdrive: Sine(200 V, 100 Hz)" in small_print(sine.plot())
+    changed = simulate(table1().replace({"Xgap.d": 5e-6}))
+    assert "Table 1 (changed: Xgap.d = 5 um)" in small_print(changed.plot())
+
+
+# Pictures show themselves
+
+
+def test_a_picture_shows_itself_where_a_notebook_asks_it(sine: fs.Solution) -> None:
+    content, size = sine.plot()._repr_png_()
+    with Image.open(io.BytesIO(content)) as image:
+        assert image.width == 2 * size["width"] == 1400
+
+
+def test_where_there_is_no_window_show_says_what_to_do(sine: fs.Solution) -> None:
+    with pytest.raises(fs.InputError, match=r"no window can be opened here .*; allowed: savefig"):
+        sine.plot().show()
+
+
+WINDOW = """
+import sys, types
+import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backend_bases import FigureManagerBase
+shown = []
+class Manager(FigureManagerBase):
+    def show(self):
+        shown.append(self.canvas.figure)
+    @classmethod
+    def start_main_loop(cls):
+        shown.append("until closed")
+class Canvas(FigureCanvasAgg):
+    manager_class = Manager
+    required_interactive_framework = "headless"
+window = types.ModuleType("window")
+window.FigureCanvas, window.FigureManager = Canvas, Manager
+sys.modules["window"] = window
+matplotlib.use("module://window")
+from fingerspice.drawing import new_figure
+figure, _ = new_figure(1)
+figure.show()
+assert shown == [figure, "until closed"], shown
+figure.savefig(sys.argv[1])
+"""
+
+
+def test_from_a_script_a_picture_opens_a_window(tmp_path: Path) -> None:
+    code = [sys.executable, "-W", "error", "-c", WINDOW, str(tmp_path / "x.png")]
+    subprocess.run(code, check=True, timeout=60, env={**os.environ, "DISPLAY": ":none"})
+    assert (tmp_path / "x.png").stat().st_size > 0

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from fingerspice.largesignal import large_signal as large_signal
     from fingerspice.limits import FoldLimits as FoldLimits
     from fingerspice.limits import fold_limits as fold_limits
+    from fingerspice.loading import load as load
     from fingerspice.outcome import Status as Status
     from fingerspice.phasors import phasor as phasor
     from fingerspice.planning import Plan as Plan
@@ -69,6 +70,7 @@ _HOMES = {
     "fitting": ("ColeCole", "MaterialFit", "fit_material"),
     "largesignal": ("large_signal",),
     "limits": ("FoldLimits", "fold_limits"),
+    "loading": ("load",),
     "phasors": ("phasor",),
     "planning": ("Plan",),
     "simulation": ("plan", "simulate"),

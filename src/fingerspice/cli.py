@@ -14,6 +14,7 @@ import typer
 from fingerspice import options
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError
 from fingerspice.options import area_from_text, check_output, note_skin_frequency, read_circuit
+from fingerspice.results import FOLDER, Results, scene_dict
 from fingerspice.terminal import (
     failure_as_json,
     listen,
@@ -38,7 +39,11 @@ app = typer.Typer(
 )
 
 Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir).")]
-Out = Annotated[Path, typer.Option("--out", metavar="FOLDER", help="Where the files go.")]
+Out = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Where the files go; else out.")]
+Name = Annotated[
+    str | None, typer.Option("--name", metavar="NAME", help="What they are called; as the deck by default.")
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of other circuits, and other files.")]
 Rtol = Annotated[float, typer.Option(help="Largest error of gap voltage and force, relative to their peaks.")]
 ChargeLaw = Annotated[str | None, typer.Option(help="local or mobile; the included library's by default.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Change a value: Xgap.d=3u.")]
@@ -60,17 +65,12 @@ def main() -> None:
             say(end="")
 
 
-def _target(deck: Path, out: Path, end: str) -> Path:
-    """A file named after a deck, which may be written."""
-    file = out / f"{deck.stem}{end}"
-    check_output(file, deck)
-    return file
-
-
 @app.command()
 def run(
     deck: Deck,
-    out: Out = Path(),
+    out: Out = None,
+    name: Name = None,
+    overwrite: Overwrite = False,
     rtol: Rtol = 1e-8,
     charge_law: ChargeLaw = None,
     area: Annotated[str, typer.Option(help="coupled, mean, frozen, or an area in m^2.")] = "coupled",
@@ -104,8 +104,9 @@ def run(
         if circuit.tran is None:
             raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic]")
         note_skin_frequency(circuit)
-        data = _target(deck, out, ".csv" if csv else ".nc")
-        picture = None if no_plot else _target(deck, out, ".png")
+        results = Results(deck, circuit, out, name, overwrite, charge_law)
+        data = results.file(".csv" if csv else ".nc")
+        picture = None if no_plot else results.file(".png")
         with progress() as update:
             solution = simulate(
                 circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method, jumps=jumps,
@@ -116,29 +117,32 @@ def run(
     failure = None if solution.failure is None else solution.failure.to_dict()
     ended = {"success": solution.success, "message": solution.message, "failure": failure}
     report(
-        as_json, lambda: {**solution.summary(), **ended}, lambda: summary_table(solution),
-        _written(solution, data, picture),
+        as_json, lambda: {**solution.summary(), **ended, **scene_dict(circuit)}, lambda: summary_table(solution),
+        _written(solution, data, picture, results),
     )  # fmt: skip
     if solution.failure is not None:
         raise SolveError(solution.failure, solution)
 
 
-def _written(solution: Solution, data: Path, picture: Path | None) -> list[Callable[[], Path]]:
+def _written(solution: Solution, data: Path, picture: Path | None, results: Results) -> list[Callable[[], Path]]:
     """How the files of a run are written: the data, then the picture where one is wanted."""
-    from fingerspice.plotting import save
+    from fingerspice.drawing import save
 
     if not solution.t.size:
         return []
+    results.open()
     writes: list[Callable[[], Path]] = [partial(solution.to_csv if data.suffix == ".csv" else solution.to_netcdf, data)]
     if picture is not None:
-        writes.append(lambda: save(solution.plot(), picture))
+        writes.append(lambda: save(solution.plot(), picture, about=results.about))
     return writes
 
 
 @app.command()
 def ac(
     deck: Deck,
-    out: Out = Path(),
+    out: Out = None,
+    name: Name = None,
+    overwrite: Overwrite = False,
     sweep: Annotated[
         str | None, typer.Option(metavar="'dec N F1 F2'", help="Sweep; the deck's .ac line by default.")
     ] = None,
@@ -171,8 +175,9 @@ def ac(
 
     with warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
-        data = _target(deck, out, "_ac.csv")
-        picture = None if no_plot else _target(deck, out, "_ac.png")
+        results = Results(deck, circuit, out, name, overwrite, charge_law)
+        data = results.file("_ac.csv")
+        picture = None if no_plot else results.file("_ac.png")
         frequencies = sweep_frequencies(options.sweep(sweep, circuit))
         if area == "coupled":
             from fingerspice.largesignal import large_signal
@@ -181,21 +186,26 @@ def ac(
                 raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
 
             with failure_as_json(as_json):
-                results = large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol)
+                found = large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol)
         elif amplitude:
             raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
         else:
-            results = (phasor(circuit, frequencies, area=area_from_text(area), skin=skin),)
-        for text in results[0].warnings:
+            found = (phasor(circuit, frequencies, area=area_from_text(area), skin=skin),)
+        for text in found[0].warnings:
             warnings.warn(text, FingerspiceWarning, stacklevel=1)
-    writes = [lambda: phasor_csv(results, data)]
+    results.open()
+    writes = [lambda: phasor_csv(found, data)]
     if picture is not None:
-        from fingerspice.plotting import plot_phasor, save
+        from fingerspice.drawing import save
+        from fingerspice.plotting import plot_phasor
 
-        writes.append(lambda: save(plot_phasor(results, circuit), picture))
-    sweeps = [phasor_dict(r) for r in results] if as_json else []
+        writes.append(lambda: save(plot_phasor(found, circuit), picture, about=results.about))
+    sweeps = [phasor_dict(r) for r in found] if as_json else []
     report(
-        as_json, lambda: sweeps[0] if len(sweeps) == 1 else {"sweeps": sweeps}, lambda: phasor_tables(results), writes
+        as_json,
+        lambda: {**(sweeps[0] if len(sweeps) == 1 else {"sweeps": sweeps}), **scene_dict(circuit)},
+        lambda: phasor_tables(found, circuit),
+        writes,
     )
 
 
@@ -226,7 +236,7 @@ def plan(
         note_skin_frequency(circuit)
         result = make(circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge)
     if as_json:
-        say_json(result.to_dict())
+        say_json({**result.to_dict(), **scene_dict(circuit)})
     else:
         say(plan_text(result, circuit))
 
@@ -234,7 +244,9 @@ def plan(
 @app.command()
 def compare(
     deck: Deck,
-    out: Out = Path(),
+    out: Out = None,
+    name: Name = None,
+    overwrite: Overwrite = False,
     rtol: Rtol = 1e-8,
     charge_law: ChargeLaw = None,
     changes: Set = None,
@@ -256,21 +268,26 @@ def compare(
     with warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
         note_skin_frequency(circuit)
-        picture = None if no_plot else _target(deck, out, "_compare.png")
+        results = Results(deck, circuit, out, name, overwrite, charge_law)
+        picture = None if no_plot else results.file("_compare.png")
         with failure_as_json(as_json):
             result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
     writes: list[Callable[[], Path]] = []
     if picture is not None:
-        from fingerspice.plotting import plot_comparison, save
+        results.open()
+        from fingerspice.drawing import save
+        from fingerspice.plotting import plot_comparison
 
-        writes.append(lambda: save(plot_comparison(result), picture))
-    report(as_json, result.to_dict, lambda: comparison_table(result), writes)
+        writes.append(lambda: save(plot_comparison(result), picture, about=results.about))
+    report(as_json, lambda: {**result.to_dict(), **scene_dict(circuit)}, lambda: comparison_table(result), writes)
 
 
 @app.command()
 def limits(
     deck: Deck,
-    out: Out = Path(),
+    out: Out = None,
+    name: Name = None,
+    overwrite: Overwrite = False,
     points: Annotated[int, typer.Option(help="Values of each parameter.")] = 9,
     span: Annotated[float, typer.Option(help="Each goes from its own value over this to this times it.")] = 10.0,
     changes: Set = None,
@@ -289,15 +306,17 @@ def limits(
 
     with warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
-        table = _target(deck, out, "_limits.csv")
-        picture = None if no_plot else _target(deck, out, "_limits.png")
+        results = Results(deck, circuit, out, name, overwrite, "mobile")
+        table = results.file("_limits.csv")
+        picture = None if no_plot else results.file("_limits.png")
         result = fold_limits(circuit, points=points, span=span)
+    results.open()
     writes = [lambda: limits_csv(result, table)]
     if picture is not None:
-        from fingerspice.plotting import save
+        from fingerspice.drawing import save
 
-        writes.append(lambda: save(plot_limits(result), picture))
-    report(as_json, result.to_dict, lambda: limits_text(result), writes)
+        writes.append(lambda: save(plot_limits(result), picture, about=results.about))
+    report(as_json, lambda: {**result.to_dict(), **scene_dict(circuit)}, lambda: limits_text(result), writes)
 
 
 @app.command()
@@ -327,7 +346,7 @@ def export(
 
 @app.command()
 def figures(
-    out: Out = Path("out"),
+    out: Out = None,
     only: Annotated[list[int] | None, typer.Option(help="Only these of the paper's figures 2 to 5.")] = None,
 ) -> None:
     """Draw the paper's Figs. 2 to 5 from scratch, each as PNG with its data as CSV.
@@ -338,11 +357,12 @@ def figures(
     """
     from fingerspice.figures import FIGURES, make_figures
 
+    folder = out or FOLDER
     for number in only or FIGURES:
         for kind in ("png", "csv"):
-            check_output(out / f"fig{number}.{kind}")
+            check_output(folder / f"fig{number}.{kind}")
     with warnings_as_lines():
-        for file in make_figures(out, only=only):
+        for file in make_figures(folder, only=only):
             say(f"wrote {file}")
 
 

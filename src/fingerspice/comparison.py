@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.errors import InputError
+from fingerspice.pages import Page, Shown
 from fingerspice.phasors import phasor
 from fingerspice.solution import Solution
 from fingerspice.steady import steady_state
+
+if TYPE_CHECKING:
+    from fingerspice.picture import Picture
 
 
 @dataclass(frozen=True)
@@ -37,8 +41,8 @@ class Figures:
     area_mean: float
 
 
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Shown):
     """The same scene solved three ways.
 
     Attributes
@@ -60,6 +64,17 @@ class Comparison:
     coupled: Figures
     frequency: float
     solution: Solution
+
+    def _page(self) -> Page:
+        from fingerspice.report import comparison_table
+
+        return comparison_table(self)
+
+    def plot(self) -> Picture:
+        """One period of the transient over the phasor's, and the figures of both."""
+        from fingerspice.plotting import plot_comparison
+
+        return plot_comparison(self)
 
     def rows(self) -> list[tuple[str, str, float, float, float, float, float]]:
         """Table: quantity, unit, phasor, transient at mean area, coupled, difference, share of the ripple in it."""

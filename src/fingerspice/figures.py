@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice import plotting
+from fingerspice import drawing
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.ramps import Square
 from fingerspice.circuit.waveforms import Sine, Waveform, require
@@ -133,7 +133,7 @@ def make_figures(folder: str | Path, *, only: int | Iterable[int] | None = None)
     written = []
     for number in sorted(set(wanted)):
         figure, table = FIGURES[number]()
-        written.append(plotting.save(figure, Path(folder) / f"fig{number}.png"))
+        written.append(drawing.save(figure, Path(folder) / f"fig{number}.png"))
         written.append(table.write(Path(folder) / f"fig{number}.csv"))
     return written
 
@@ -142,20 +142,20 @@ def figure_2() -> tuple[Figure, Table]:
     """Resistivity and relative permittivity of stratum corneum against frequency."""
     f = np.geomspace(*SKIN_BAND, 161)
     rho, eps = skin_resistivity(f), skin_permittivity(f)
-    figure, (left, right) = plotting.new_figure(1, 2, height=2.7)
+    figure, (left, right) = drawing.new_figure(1, 2, height=2.7)
     for ax, y, label, title, color in (
         (
             left,
             rho,
             r"Resistivity $\rho_\mathrm{sc}$ [Ω m]",
             r"Eq. 18, read as a cubic in $\log_{10} f$",
-            plotting.BLUE,
+            drawing.BLUE,
         ),
-        (right, eps, r"Relative permittivity $\varepsilon_\mathrm{r,sc}$", "Eq. 19", plotting.VERMILION),
+        (right, eps, r"Relative permittivity $\varepsilon_\mathrm{r,sc}$", "Eq. 19", drawing.VERMILION),
     ):
         ax.loglog(f, y, color=color, linewidth=1.6)
-        plotting.dress(ax, label, "Frequency $f$ [Hz]")
-        ax.set_title(title, fontsize=plotting.FONT, loc="left")
+        drawing.dress(ax, label, "Frequency $f$ [Hz]")
+        ax.set_title(title, fontsize=drawing.FONT, loc="left")
         ax.set_xlim(*SKIN_BAND)
     left.set_ylim(5e2, 1e5)
     right.set_ylim(1e3, 1e4)
@@ -167,7 +167,7 @@ def figure_3(points: int = 46) -> tuple[Figure, Table]:
     f = np.geomspace(10.0, 1e4, points)
     circuit = table1_circuit().replace({"Vdrive.amplitude": U0_FORCE})
     base = phasor(circuit, f).f_el_mean
-    figure, axes = plotting.new_figure(2, 2, height=5.0, sharex=True)
+    figure, axes = drawing.new_figure(2, 2, height=5.0, sharex=True)
     header, columns = ["frequency [Hz]", "f_el_mean [N] Table 1"], [f, base]
     for ax, variation in zip(axes, variations(), strict=True):
         for value, style in zip(variation.values, _styles(variation), strict=True):
@@ -180,27 +180,27 @@ def figure_3(points: int = 46) -> tuple[Figure, Table]:
             ax.semilogx(f, force, label=label, **style)
         ax.set_title(
             variation.title + (" (other scale)" if variation.name == "d_a" else ""),
-            fontsize=plotting.FONT,
+            fontsize=drawing.FONT,
             loc="left",
         )
         ax.set_xlim(f[0], f[-1])
         ax.set_ylim(0.0, 0.25 if variation.name == "d_a" else 0.125)
         # Where the curves of the panel leave room.
         corner: Any = "lower right" if variation.name == "r_a" else "upper left"
-        ax.legend(loc=corner, fontsize=plotting.FONT - 1.0, frameon=False)
+        ax.legend(loc=corner, fontsize=drawing.FONT - 1.0, frameon=False)
     for ax in axes[::2]:
-        plotting.dress(ax, r"Mean force $F_\mathrm{el}$ [N]")
+        drawing.dress(ax, r"Mean force $F_\mathrm{el}$ [N]")
     for ax in axes[2:]:
-        plotting.dress(ax, "", "Frequency $f$ [Hz]")
+        drawing.dress(ax, "", "Frequency $f$ [Hz]")
     return figure, Table(tuple(header), tuple(columns))
 
 
 def _styles(variation: Variation) -> Iterator[dict[str, Any]]:
     """Table 1 in black; the others differ in colour and in dashes."""
-    others = iter(zip((plotting.BLUE, plotting.VERMILION, plotting.GREEN), plotting.DASHES[1:], strict=True))
+    others = iter(zip((drawing.BLUE, drawing.VERMILION, drawing.GREEN), drawing.DASHES[1:], strict=True))
     for value in variation.values:
         if value == variation.base:
-            yield {"color": plotting.BLACK, "linewidth": 1.8}
+            yield {"color": drawing.BLACK, "linewidth": 1.8}
         else:
             color, dash = next(others)
             yield {"color": color, "linestyle": dash, "linewidth": 1.5}
@@ -239,7 +239,7 @@ def _time_figure(shape: type[Sine] | type[Square]) -> tuple[Figure, Table]:
     A square is broad: with it, what a dispersive skin makes of it.
     """
     dispersive = shape is Square
-    figure, axes = plotting.new_figure(2, 2, height=4.3, sharex="col", sharey="row")
+    figure, axes = drawing.new_figure(2, 2, height=4.3, sharex="col", sharey="row")
     parts = []
     for column, frequency in enumerate(FREQUENCIES):
         data = two_periods(time_response(shape, frequency))
@@ -248,8 +248,8 @@ def _time_figure(shape: type[Sine] | type[Square]) -> tuple[Figure, Table]:
             data |= {f"{name}_dispersive": broad[name] for name in ("u_gap", "f_el")}
         parts.append((np.full(data["t"].size, frequency), *data.values()))
         _time_column((axes[column], axes[column + 2]), data, frequency)
-    plotting.dress(axes[0], "Voltage [V]")
-    plotting.dress(axes[2], r"Force $F_\mathrm{el}$ [N]")
+    drawing.dress(axes[0], "Voltage [V]")
+    drawing.dress(axes[2], r"Force $F_\mathrm{el}$ [N]")
     for ax in axes[2:]:
         ax.set_ylim(0.0, None)
     header = ["frequency [Hz]", "t [s]", "u_source [V]", "u_gap [V]", "f_el [N]", "area [m^2]"]
@@ -260,27 +260,27 @@ def _time_figure(shape: type[Sine] | type[Square]) -> tuple[Figure, Table]:
 
 def _time_column(axes: Sequence[Axes], data: dict[str, FloatArray], frequency: float) -> None:
     upper, lower = axes
-    factor, unit = plotting.engineering(2.0 / frequency, "s")
+    factor, unit = drawing.engineering(2.0 / frequency, "s")
     mean = float(np.trapezoid(data["f_el"], data["t"]) / data["t"][-1])
-    dash = plotting.DASHES[1]
+    dash = drawing.DASHES[1]
     # What came before t = 0 is what ends a period: an edge there is drawn, too.
     t = factor * np.append(0.0, data["t"])
     y = {name: np.append(x[-1], x) for name, x in data.items()}
-    upper.plot(t, y["u_source"], color=plotting.GREY, linewidth=1.2, linestyle=dash, label="source $U$")
-    upper.plot(t, y["u_gap"], color=plotting.BLUE, linewidth=1.6, label=r"gap $U_\mathrm{a}$")
-    lower.plot(t, y["f_el"], color=plotting.VERMILION, linewidth=1.6, label=r"force $F_\mathrm{el}$")
+    upper.plot(t, y["u_source"], color=drawing.GREY, linewidth=1.2, linestyle=dash, label="source $U$")
+    upper.plot(t, y["u_gap"], color=drawing.BLUE, linewidth=1.6, label=r"gap $U_\mathrm{a}$")
+    lower.plot(t, y["f_el"], color=drawing.VERMILION, linewidth=1.6, label=r"force $F_\mathrm{el}$")
     for ax, name in ((upper, "u_gap_dispersive"), (lower, "f_el_dispersive")):
         if name in y:
             # Said once: beside the force there is room for it.
             label = "dispersive" if ax is lower else "_"
-            ax.plot(t, y[name], color=plotting.BLACK, linewidth=0.9, linestyle=plotting.DASHES[3], label=label)
-    lower.axhline(mean, color=plotting.BLACK, linewidth=1.0, linestyle=dash, label=f"mean {mean:.3f} N")
+            ax.plot(t, y[name], color=drawing.BLACK, linewidth=0.9, linestyle=drawing.DASHES[3], label=label)
+    lower.axhline(mean, color=drawing.BLACK, linewidth=1.0, linestyle=dash, label=f"mean {mean:.3f} N")
     for ax in axes:
-        plotting.legend_above(ax, right=True, math=True)
-    upper.set_title(f"{frequency:g} Hz", fontsize=plotting.FONT + 0.5, loc="left", weight="bold")
+        drawing.legend_above(ax, right=True, math=True)
+    upper.set_title(f"{frequency:g} Hz", fontsize=drawing.FONT + 0.5, loc="left", weight="bold")
     upper.set_xlim(-0.02 * t[-1], 1.02 * t[-1])
     upper.set_xticks(np.linspace(0.0, t[-1], 5))
-    plotting.dress(lower, "", f"Time [{unit}]")
+    drawing.dress(lower, "", f"Time [{unit}]")
 
 
 FIGURES: dict[int, Callable[[], tuple[Figure, Table]]] = {

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from fingerspice.circuit.reader import read_text
 from fingerspice.circuit.waveforms import require
 from fingerspice.errors import InputError
+from fingerspice.pages import Page, Shown
 from fingerspice.physics.ladder import Ladder
 from fingerspice.physics.materials import EPS0
 
@@ -81,8 +82,8 @@ class Consistency:
     misfit: FloatArray
 
 
-@dataclass(frozen=True)
-class MaterialFit:
+@dataclass(frozen=True, repr=False)
+class MaterialFit(Shown):
     """A ladder fitted to data.
 
     Attributes
@@ -104,6 +105,11 @@ class MaterialFit:
     frequency: FloatArray
     misfit: FloatArray
     kramers_kronig: Consistency
+
+    def _page(self) -> Page:
+        from fingerspice.report import fit_page
+
+        return fit_page(self)
 
     def to_netlist(self, name: str) -> str:
         """A subcircuit of slabs in series, with its thickness as parameter; for decks here and for ngspice.

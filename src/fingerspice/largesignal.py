@@ -13,7 +13,8 @@ from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.circuit.waveforms import Sine, Waveform, require
 from fingerspice.errors import InputError
 from fingerspice.measures import weigh_outputs
-from fingerspice.phasors import Drive, PhasorSolution, sweep_drive, sweep_notes
+from fingerspice.phasor_solution import PhasorSolution
+from fingerspice.phasors import Drive, sweep_drive, sweep_notes
 from fingerspice.steady import steady_state
 
 FloatArray = NDArray[np.float64]
@@ -88,11 +89,10 @@ def _sweep(
         # The start of the period is a multiple of it: phases are those of the source.
         assert s.area is not None
         assert s.f_el is not None
-        layers = {name: s.u_layer[:, i] for i, name in enumerate(s.layers)}
-        period = weigh_outputs(s.t - s.t[0], {**layers, "area": s.area, "f_el": s.f_el})
-        gains.append([period.phasor(name, float(f)) * sign / amplitude for name in s.layers])
-        areas.append(period.mean("area"))
-        forces.append(period.mean("f_el"))
+        period = s.t - s.t[0]
+        gains.append([weigh_outputs(period, u).phasor(float(f)) * sign / amplitude for u in s.u_layer.T])
+        areas.append(weigh_outputs(period, s.area).mean())
+        forces.append(weigh_outputs(period, s.f_el).mean())
     gain = np.array(gains, np.complex128)
     gap = build_stack(circuit).gap_layer
     assert gap is not None
@@ -103,5 +103,5 @@ def _sweep(
     largest = max(forces), float(contact.stress(np.abs(u_gap)).max()), max(areas)
     return PhasorSolution(
         frequency, gain[:, gap], gain, u_gap, np.array(areas), np.array(forces), amplitude, s.layers, drive.phase,
-        drive.text, notes, (*warned, *beyond_fingers("", *largest)),
+        drive.text, notes, (*warned, *beyond_fingers("", *largest)), circuit,
     )  # fmt: skip

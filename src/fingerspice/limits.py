@@ -12,16 +12,18 @@ from numpy.typing import NDArray
 
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.combinations import Product
+from fingerspice.circuit.describe import heading
 from fingerspice.circuit.statespace import is_stack
 from fingerspice.circuit.waveforms import Waveform, as_waveform, require
 from fingerspice.errors import InputError, SolveError
 from fingerspice.folding import meets_fold
 from fingerspice.outcome import Status
+from fingerspice.pages import Page, Shown
 from fingerspice.problem import prepare
 from fingerspice.simulation import simulate
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from fingerspice.picture import Picture
 
 FloatArray = NDArray[np.float64]
 
@@ -51,8 +53,8 @@ class FoldSweep:
     voltages: FloatArray
 
 
-@dataclass(frozen=True)
-class FoldLimits:
+@dataclass(frozen=True, repr=False)
+class FoldLimits(Shown):
     """Where a circuit folds under the `mobile` law.
 
     Attributes
@@ -70,6 +72,15 @@ class FoldLimits:
     peak: float
     voltage: float
     sweeps: tuple[FoldSweep, ...]
+
+    def _page(self) -> Page:
+        from fingerspice.report import limits_text
+
+        return limits_text(self)
+
+    def plot(self) -> Picture:
+        """The fold's voltage against every parameter, the deck's own point marked."""
+        return plot_limits(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, SI units."""
@@ -202,9 +213,9 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
     return math.sqrt(low * high)
 
 
-def plot_limits(limits: FoldLimits) -> Figure:
+def plot_limits(limits: FoldLimits) -> Picture:
     """The fold's voltage against every parameter, the deck's own point marked."""
-    from fingerspice.plotting import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
+    from fingerspice.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
 
     figure, axes = new_figure(1, len(limits.sweeps), height=3.2, sharey=True)
     for ax, sweep in zip(axes, limits.sweeps, strict=True):
@@ -220,5 +231,5 @@ def plot_limits(limits: FoldLimits) -> Figure:
     axes[0].set_ylim(0.5 * shown.min(), 2.0 * shown.max())
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=3, fontsize=FONT - 0.5, frameon=False)
-    caption(figure, f"{limits.circuit.title} · charge law mobile; the other parameters as in the deck")
+    caption(figure, f"{heading(limits.circuit)} · charge law mobile; the other parameters as in the deck")
     return figure

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -15,13 +15,16 @@ from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-Signals = Mapping[str, FloatArray]
-#: From the outputs of a run, as it wrote them down, to the signals that figures are taken of, shape (n_t,) each.
-Read = Callable[[Any], Signals]
+#: From the outputs of a run, as it wrote them down, to the signal that figures are taken of, shape (n_t,).
+Read = Callable[[Any], FloatArray]
 
 _NODES = POINTS[:NODES]
+#: What a polynomial need not meet of a signal, over its peak.
+_FINEST = 1e-12
 #: Halves of panels that are looked at, beside four for each panel.
 _MOST_CUT = 4096
+#: Halvings of one panel.
+_MOST_ROUNDS = 60
 #: Gauss-Lobatto weights on [0, 1]: exact for polynomials of degree 23.
 _WEIGHTS = 1.0 / (NODES * (NODES - 1) * legendre.Legendre.basis(NODES - 1)(2.0 * _NODES - 1.0) ** 2)
 
@@ -65,93 +68,116 @@ class Run(Protocol):
     def panels(self, since: float, until: float) -> Panels:
         """Parts of the run between two times, s."""
 
-    def signals(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, Signals]:
-        """Times (s) and signals at fractions (p, n) of the steps with these indices (p,), shape (p, n) each."""
+    def at_points(self, read: Read, panels: Panels) -> tuple[FloatArray, FloatArray]:
+        """Times (s) and a signal at the `POINTS` of panels, shape (p, ROWS) each."""
+
+    def values_at(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Times (s) and a signal at fractions (p, n) of the steps with these indices (p,), shape (p, n) each."""
 
 
 @dataclass(frozen=True)
 class Weighed:
-    """Signals with the durations that their values stand for.
+    """A signal with the durations that its values stand for.
 
     Attributes
     ----------
-    t, weight : ndarray, shape (n,)
-        s.
-    signals : mapping of str to ndarray, shape (n,)
+    t, weight, x : ndarray, shape (n,)
+        s, the share of the whole duration, and the signal's unit.
     """
 
     t: FloatArray
     weight: FloatArray
-    signals: Signals
+    x: FloatArray
 
-    def mean(self, name: str, power: int = 1) -> float:
-        """Mean of a signal, or of a power of it."""
+    def mean(self, power: int = 1) -> float:
+        """Mean of the signal, or of a power of it."""
         # Not by BLAS, whose threads cost more than the sum and may round otherwise.
-        return float(np.sum(self.weight * self.signals[name] ** power) / self.weight.sum())
+        return float((self.weight * (self.x if power == 1 else self.x**power)).sum())
 
-    def phasor(self, name: str, frequency: float) -> complex:
+    def phasor(self, frequency: float) -> complex:
         """Complex amplitude P of a signal x ~ Im(P exp(i 2 pi f t)); the times are a whole number of periods."""
         turning = self.weight * np.exp(-2j * np.pi * frequency * self.t)
-        return complex(2j * np.sum(turning * self.signals[name]) / self.weight.sum())
+        return complex(2j * (turning * self.x).sum())
 
 
-def weigh_run(
-    run: Run, read: Read, since: float, until: float, tol: float
-) -> tuple[Weighed, dict[str, tuple[float, float]]]:
-    """Signals of a run between two times (s) for means, and the smallest and largest value of each.
+class Stretch:
+    """A run between two times (s): each signal with its weights, and its extremes.
 
-    A panel on which a polynomial through the nodes misses some signal between them, by more than `tol` of its peak, is
-    cut in halves: steps follow the gap voltage, and the area may change on a small part of its range.
+    Panels on which the polynomial through the nodes misses the signal between them are cut in halves: steps follow the
+    gap voltage, and the area may change on a small part of its range.
+
+    Parameters
+    ----------
+    run : Run
+    since, until : float
+        s.
+    rtol : float
+        Error of the run, relative to its peaks: figures are taken more exactly than that.
     """
-    panels, parts = run.panels(since, until), []
-    most = _MOST_CUT + 4 * panels.step.size
-    peaks: dict[str, float] = {}
-    while panels.step.size:
-        t, signals = run.signals(read, panels.step, panels.fractions(POINTS))
-        wrong = np.zeros(panels.step.size, bool)
-        for name, x in signals.items():
-            peaks[name] = max(peaks.get(name, 0.0), float(np.abs(x).max()))
-            missed = np.abs(x[:, :NODES] @ BETWEEN - x[:, NODES:]).max(axis=1)
-            wrong |= missed > tol * peaks[name]
-        if most <= 0:
-            # What still is not smooth is rounding.
-            wrong[:] = False
-        kept = panels.take(np.flatnonzero(~wrong))
-        parts.append((kept, t[~wrong, :NODES], {name: x[~wrong, :NODES] for name, x in signals.items()}))
-        panels = panels.take(np.flatnonzero(wrong)).halved()
-        most -= panels.step.size
-    every = [part[0] for part in parts]
-    panels = Panels(
-        np.concatenate([p.step for p in every]), np.concatenate([p.low for p in every]),
-        np.concatenate([p.high for p in every]), np.concatenate([p.duration for p in every]),
-    )  # fmt: skip
-    signals = {name: np.concatenate([part[2][name] for part in parts]) for name in peaks}
-    t = np.concatenate([part[1] for part in parts])
-    weight = panels.duration[:, None] * _WEIGHTS
-    flat = {name: x.ravel() for name, x in signals.items()}
-    return Weighed(t.ravel(), weight.ravel(), flat), _extremes(run, read, panels, signals)
+
+    def __init__(self, run: Run, since: float, until: float, rtol: float) -> None:
+        self.run, self.rtol = run, rtol
+        self.panels = run.panels(since, until)
+        self._share, self._shares = _shares(self.panels)
+
+    def weigh(self, read: Read) -> Weighed:
+        """A signal for means."""
+        t, x = self.run.at_points(read, self.panels)
+        peak = float(np.abs(x).max(initial=0.0)) or 1.0
+        missed = _missed(x) / peak
+        # The first term that a polynomial misses has no integral, nor have the next ten: were the terms to fall evenly,
+        # the integral's error would be the 1.85th power of what is missed.
+        if float((self._share * missed**1.5).sum()) <= max(_FINEST, 1e-3 * self.rtol):
+            return Weighed(t[:, :NODES], self._shares, x[:, :NODES])
+        return self._cut(read, t, x, _FINEST)[0]
+
+    def extremes(self, read: Read) -> tuple[float, float]:
+        """Smallest and largest value of a signal: where its polynomials have them, the signal itself."""
+        # An error of the place counts by its square.
+        weighed, panels = self._cut(read, *self.run.at_points(read, self.panels), max(_FINEST, self.rtol))
+        found = [largest(weighed.x, sign) for sign in (-1.0, 1.0)]
+        panel, place = np.array([p for p, _, _ in found]), np.array([x for _, x, _ in found])
+        at = panels.low[panel] * (1.0 - place) + panels.high[panel] * place
+        _, exact = self.run.values_at(read, panels.step[panel], at[:, None])
+        low, high = exact[:, 0].tolist()
+        return min(low, float(weighed.x.min())), max(high, float(weighed.x.max()))
+
+    def _cut(self, read: Read, t: FloatArray, x: FloatArray, tol: float) -> tuple[Weighed, Panels]:
+        """A signal, and the panels on which its polynomials miss it by at most `tol` of its peak."""
+        smooth = tol * float(np.abs(x).max(initial=0.0))
+        panels, parts = self.panels, []
+        most = _MOST_CUT + 4 * panels.step.size
+        for left in range(_MOST_ROUNDS, 0, -1):
+            wrong = _missed(x) > smooth
+            if most <= 0 or left == 1:
+                # What still is not smooth is rounding, or a jump that rounding has put to the other side.
+                wrong[:] = False
+            parts.append((panels.take(np.flatnonzero(~wrong)), t[~wrong, :NODES], x[~wrong, :NODES]))
+            if not wrong.any():
+                break
+            panels = panels.take(np.flatnonzero(wrong)).halved()
+            most -= panels.step.size
+            t, x = self.run.at_points(read, panels)
+        every = Panels(*(np.concatenate(column) for column in zip(*(part[0] for part in parts), strict=True)))
+        t, x = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
+        return Weighed(t, _shares(every)[1], x), every
 
 
-def _extremes(run: Run, read: Read, panels: Panels, signals: Signals) -> dict[str, tuple[float, float]]:
-    """Smallest and largest value of each signal: where its polynomials have them, the signals themselves."""
-    sought = [(name, sign) for name in signals for sign in (-1.0, 1.0)]
-    found = [largest(signals[name], sign) for name, sign in sought]
-    panel = np.array([p for p, _, _ in found])
-    # Its own time for each: looking at a run sorts them.
-    low, high, place = panels.low[panel], panels.high[panel], np.array([x for _, x, _ in found])
-    _, exact = run.signals(read, panels.step[panel], (low * (1.0 - place) + high * place)[:, None])
-    ends = [sign * max(sign * float(exact[name][i, 0]), sign * float(_at_nodes(signals[name], sign)))
-            for i, (name, sign) in enumerate(sought)]  # fmt: skip
-    return {name: (ends[2 * i], ends[2 * i + 1]) for i, name in enumerate(signals)}
+def _missed(x: FloatArray) -> FloatArray:
+    """Largest miss of the polynomial through the nodes of each panel, of values (p, ROWS), shape (p,)."""
+    return np.asarray(np.abs(x[:, :NODES] @ BETWEEN - x[:, NODES:]).max(axis=1, initial=0.0))
 
 
-def _at_nodes(values: FloatArray, sign: float) -> float:
-    return float(values.max() if sign > 0.0 else values.min())
+def _shares(panels: Panels) -> tuple[FloatArray, FloatArray]:
+    """Of the whole duration, what each panel is, shape (p,), and the value at each of its nodes, shape (p, NODES)."""
+    share = panels.duration / panels.duration.sum()
+    return share, share[:, None] * _WEIGHTS
 
 
-def weigh_outputs(t: FloatArray, signals: Signals) -> Weighed:
-    """Outputs for means, by cubics through neighbouring values; a repeated time is a jump."""
-    return Weighed(t, output_weights(t), signals)
+def weigh_outputs(t: FloatArray, x: FloatArray) -> Weighed:
+    """A signal's outputs for means, by cubics through neighbouring values; a repeated time is a jump."""
+    weight = output_weights(t)
+    return Weighed(t, weight / weight.sum(), x)
 
 
 def output_weights(t: FloatArray) -> FloatArray:

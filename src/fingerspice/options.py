@@ -113,11 +113,11 @@ def check_output(file: Path, deck: Path | None = None) -> None:
 
 
 def _check_output(file: Path, deck: Path | None) -> None:
-    # A name that is too long is found only by looking for the file itself.
-    file.exists()
     folder = file.parent
     while not folder.exists() and folder != folder.parent and not folder.is_symlink():
         folder = folder.parent
+    # A name that is too long is found only by looking for a file, in a folder that is there.
+    (folder / file.name).exists()
     if not folder.is_dir():
         raise InputError(f"cannot write {file}: {folder} is not a folder; allowed: a folder that can be written")
     if not os.access(folder, os.W_OK | os.X_OK):

@@ -16,6 +16,7 @@ from fingerspice.circuit.statespace import Stack, build_stack, is_stack
 from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.circuit.waveforms import Fundamental, require
 from fingerspice.errors import InputError
+from fingerspice.phasor_solution import PhasorSolution
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import SKIN_BAND, skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
@@ -42,51 +43,6 @@ class Drive:
     amplitude: float
     phase: float
     text: str
-
-
-@dataclass(frozen=True)
-class PhasorSolution:
-    """Phasors against frequency; arrays of shape (n_frequency,).
-
-    Attributes
-    ----------
-    frequency : ndarray
-        Hz.
-    gain : ndarray of complex
-        u_gap / source: modulus is Eq. 11, angle Eq. 13 (V/A for a current source).
-    layer_gain : ndarray of complex, shape (n_frequency, n_layer)
-        The same for every layer.
-    u_gap : ndarray of complex
-        Gap voltage amplitude with the source's phase, V (NaN for a source without fundamental or AC).
-    area : ndarray
-        Ridge contact area, m^2.
-    f_el_mean : ndarray
-        Mean electroadhesive force, N.
-    amplitude : float
-        Source amplitude, V (A of a current source).
-    layers : tuple of str
-    phase : float
-        Of the source, rad.
-    drive : str
-        What the amplitude and the phase are those of.
-    notes : tuple of str
-        How the sweep was made where a deck may mean it otherwise.
-    warnings : tuple of str
-        Where it leaves what is known.
-    """
-
-    frequency: FloatArray
-    gain: ComplexArray
-    layer_gain: ComplexArray
-    u_gap: ComplexArray
-    area: FloatArray
-    f_el_mean: FloatArray
-    amplitude: float
-    layers: tuple[str, ...]
-    phase: float = 0.0
-    drive: str = ""
-    notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
 
 
 class _Scene(Protocol):
@@ -411,7 +367,7 @@ def phasor(
     largest = (float(np.max(x)) for x in (force, scene.contact.stress(np.abs(u_gap)), own))
     return PhasorSolution(
         f, gain, layers, u_gap, own, force, drive.amplitude, scene.layers, drive.phase, drive.text, notes,
-        (*warnings, *beyond_fingers("", *largest)),
+        (*warnings, *beyond_fingers("", *largest)), circuit,
     )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from fingerspice.errors import InputError
 from fingerspice.networks import NetworkProblem
 from fingerspice.numerics.modes import modes
+from fingerspice.pages import Page, Shown
 from fingerspice.physics.contact import areas
 from fingerspice.problem import Problem
 from fingerspice.settling import FEWEST_PERIODS
@@ -20,8 +21,8 @@ STIFF = 300.0
 REPEATS = "periodic: once a period no longer changes the state, later ones repeat it"
 
 
-@dataclass(frozen=True)
-class Plan:
+@dataclass(frozen=True, repr=False)
+class Plan(Shown):
     """The model chosen for a run.
 
     Attributes
@@ -54,6 +55,11 @@ class Plan:
     sensitivity: float
     error_bound: float
     area: float
+
+    def _page(self) -> Page:
+        from fingerspice.report import plan_text
+
+        return plan_text(self)
 
     def to_dict(self) -> dict[str, object]:
         """The plan as plain data."""

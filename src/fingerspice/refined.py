@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from fingerspice.circuit.waveforms import Waveform
-from fingerspice.measures import Panels, Read, Signals
+from fingerspice.measures import Panels, Read
 from fingerspice.network_record import NetworkRecord
 from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS, TO_SERIES
 from fingerspice.record import Record
@@ -25,7 +26,6 @@ _MISSED = 1e-11
 MOST_PANELS, _MOST_ROUNDS = 20_000, 60
 #: Segments of the source that a look may have to pass, and the first panels over the source's shortest time.
 _MOST_PASSED, _LONGEST = 200_000, 0.5
-_ASCENDING = np.argsort(POINTS)
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,12 @@ class ClosedForm:
     first: float
     stop: float
 
-    def run(self, read: Read, since: float, until: float) -> Refined | None:
-        """Panels between two times (s) on which every voltage is a polynomial; None where they would be too many."""
+    def run(self, readers: Callable[[], Mapping[str, Read]], since: float, until: float) -> Refined | None:
+        """Panels between two times (s) on which every voltage is a polynomial; None where they would be too many.
+
+        `readers` gives every signal that figures may be asked of by name.
+        """
+        every = readers()
         longest = _LONGEST * self.waveform.shortest_time()
         rate = self.waveform.breakpoint_rate() + 1.0 / longest
         # Each look goes through the run from its start.
@@ -66,7 +70,7 @@ class ClosedForm:
         done: list[tuple[FloatArray, FloatArray]] = []
         peaks: dict[str, float] = {}
         for _ in range(_MOST_ROUNDS):
-            wrong = self._is_rough(read, begin, end, peaks)
+            wrong = self._is_rough(every, begin, end, peaks)
             done.append((begin[~wrong], end[~wrong]))
             if not wrong.any():
                 break
@@ -75,35 +79,37 @@ class ClosedForm:
             if begin.size + sum(x.size for x, _ in done) > MOST_PANELS:
                 return None
         begin, end = (np.sort(np.concatenate(x)) for x in zip(*done, strict=True))
-        return self._cut_at_zeros(read, Refined(self.look, begin, end))
+        return self._cut_at_zeros(every, Refined(self.look, begin, end))
 
-    def _is_rough(self, read: Read, begin: FloatArray, end: FloatArray, peaks: dict[str, float]) -> BoolArray:
+    def _is_rough(
+        self, readers: Mapping[str, Read], begin: FloatArray, end: FloatArray, peaks: dict[str, float]
+    ) -> BoolArray:
         """Whether a polynomial through the nodes misses some voltage between them."""
         every = Refined(self.look, begin, end)
-        _, signals = every.signals(read, np.arange(begin.size), np.tile(POINTS[_ASCENDING], (begin.size, 1)))
         wrong = np.zeros(begin.size, bool)
-        for name, ascending in signals.items():
+        for name, read in readers.items():
             if not name.startswith(("u_", "v:")):
                 # What follows from the gap voltage is smooth where that is, but at its zeros.
                 continue
-            values = np.empty_like(ascending)
-            values[:, _ASCENDING] = ascending
+            _, values = every.at_own_points(read)
             peaks[name] = max(peaks.get(name, 0.0), float(np.abs(values).max(initial=0.0)))
             missed = np.abs(values[:, :NODES] @ BETWEEN - values[:, NODES:]).max(axis=1)
             wrong |= missed > _MISSED * peaks[name]
         return wrong & (0.5 * (begin + end) > begin) & (0.5 * (begin + end) < end)
 
-    def _cut_at_zeros(self, read: Read, run: Refined) -> Refined:
+    def _cut_at_zeros(self, readers: Mapping[str, Read], run: Refined) -> Refined:
         """The panels cut where a gap voltage is zero: the area has a kink there."""
-        _, signals = run.signals(read, np.arange(run.begin.size), np.tile(POINTS[:NODES], (run.begin.size, 1)))
         zeros = []
-        for name, values in signals.items():
+        for name, read in readers.items():
             if name.partition(":")[0] != "u_gap":
                 continue
+            values = run.at_own_points(read)[1][:, :NODES]
             for i in np.flatnonzero((values.max(axis=1) > 0.0) & (values.min(axis=1) < 0.0)):
                 roots = chebyshev.chebroots(values[i] @ TO_SERIES[:, :NODES])
                 inside = roots.real[(np.abs(roots.imag) < 1e-8) & (np.abs(roots.real) < 1.0)]
                 zeros.append(run.begin[i] + (run.end[i] - run.begin[i]) * 0.5 * (1.0 + inside))
+        if not zeros:
+            return run
         marks = np.unique(np.concatenate([run.begin, run.end[-1:], *zeros]))
         return Refined(self.look, marks[:-1], marks[1:])
 
@@ -124,15 +130,39 @@ class Refined:
         some = np.flatnonzero(high > low)
         return Panels(some, low[some], high[some], (high - low)[some] * length[some])
 
-    def signals(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, Signals]:
-        """As `measures.Run` says, by looking."""
+    @cached_property
+    def _own(self) -> tuple[FloatArray, IntArray, Record | NetworkRecord]:
+        """Times of all panels at their points (p, ROWS), in which order they ascend, and the record at them so."""
+        return self._looked_at(slice(None), np.broadcast_to(POINTS, (self.begin.size, POINTS.size)))
+
+    def _looked_at(
+        self, index: IntArray | slice, fraction: FloatArray
+    ) -> tuple[FloatArray, IntArray, Record | NetworkRecord]:
         begin, end = self.begin[index, None], self.end[index, None]
         left = fraction >= 1.0
         t = np.where(left, end, begin + fraction * (end - begin))
         order = np.lexsort((~left.ravel(), t.ravel()))
-        found = read(self.look(t.ravel()[order], left.ravel()[order]))
-        out = {}
-        for name, x in found.items():
-            out[name] = np.empty(t.size)
-            out[name][order] = x
-        return t, {name: x.reshape(t.shape) for name, x in out.items()}
+        return t, order, self.look(t.ravel()[order], left.ravel()[order])
+
+    def at_own_points(self, read: Read) -> tuple[FloatArray, FloatArray]:
+        """Times (s) and a signal at the points of every panel, shape (p, ROWS) each."""
+        return _in_place(read, *self._own)
+
+    def at_points(self, read: Read, panels: Panels) -> tuple[FloatArray, FloatArray]:
+        """As `measures.Run` says."""
+        if panels.step.size == self.begin.size and not panels.low.any() and (panels.high == 1.0).all():
+            return self.at_own_points(read)
+        return self.values_at(read, panels.step, panels.fractions(POINTS))
+
+    def values_at(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As `measures.Run` says, by looking."""
+        return _in_place(read, *self._looked_at(index, fraction))
+
+
+def _in_place(
+    read: Read, t: FloatArray, order: IntArray, record: Record | NetworkRecord
+) -> tuple[FloatArray, FloatArray]:
+    """Times, and a signal of a record of them in ascending order, where each belongs."""
+    x = np.empty(t.size)
+    x[order] = read(record)
+    return t, x.reshape(t.shape)

@@ -10,33 +10,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fingerspice.errors import printable
+from fingerspice.circuit.describe import drive_text, heading, waveform_text
+from fingerspice.errors import SolveError
 from fingerspice.files import write_aside
+from fingerspice.pages import Page, Table
 from fingerspice.units import format_si
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.comparison import Comparison
+    from fingerspice.fitting import MaterialFit
     from fingerspice.limits import FoldLimits
-    from fingerspice.phasors import PhasorSolution
+    from fingerspice.phasor_solution import PhasorSolution
     from fingerspice.planning import Plan
     from fingerspice.solution import Solution
+    from fingerspice.steady import SteadyState
 
-
-#: Characters of a row's name in a table.
-LONGEST_LABEL = 60
-
-
-def _aligned(rows: Sequence[tuple[str, ...]], head: tuple[str, ...]) -> str:
-    """Rows as text columns, the first left-aligned."""
-    table = [(printable(r[0], LONGEST_LABEL), *r[1:]) for r in (head, *rows)]
-    widths = [max(len(r[i]) for r in table) for i in range(len(head))]
-    lines = []
-    for r in table:
-        cells = [r[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(r[1:], widths[1:], strict=True))]
-        lines.append("  ".join(cells).rstrip())
-    lines.insert(1, "-" * max(map(len, lines)))
-    return "\n".join(lines)
+#: Elements of a circuit that are listed.
+MOST_ELEMENTS = 25
 
 
 def _value(value: float | None, unit: str, factor: float = 1.0, peak: float = 0.0) -> str:
@@ -49,10 +40,10 @@ def _value(value: float | None, unit: str, factor: float = 1.0, peak: float = 0.
     return format_si(value * factor, unit)
 
 
-def summary_table(solution: Solution) -> str:
+def summary_table(solution: Solution) -> Page:
     """The figures of a run as a table."""
     s = solution.summary()
-    out = [solution.circuit.title, _scene(solution), ""]
+    out: list[str | Table] = [heading(solution.circuit), *_driven(solution.circuit), _scene(solution), ""]
     if solution.t.size >= 2:
         rows = []
         for key, label, unit, factor in (
@@ -78,7 +69,9 @@ def summary_table(solution: Solution) -> str:
                         ),
                     )
                 )
-        out.append(_aligned(rows, ("", "min", "max", "mean", "last period", "rms", "ripple")))
+        out.append(Table(("", "min", "max", "mean", "last period", "rms", "ripple"), rows))
+        if any(s.get(f"{name}_mean_periodic") is not None for name in ("u_source", "f_el")):
+            out.append("last period: the mean over it, and so are rms and ripple (max - min)")
         if "u_gap_amplitude" in s:
             lead = s["u_gap_phase_deg"] - s["u_source_phase_deg"]
             lead = (lead + 180.0) % 360.0 - 180.0
@@ -101,7 +94,12 @@ def summary_table(solution: Solution) -> str:
     out.append(f"status: {solution.message}")
     if solution.failure is not None and solution.failure.tried:
         out += ["", "last steps tried:", solution.failure.history()]
-    return "\n".join(out)
+    return Page(out)
+
+
+def _driven(circuit: Circuit) -> list[str]:
+    drive = drive_text(circuit)
+    return [drive] if drive else []
 
 
 def _scene(solution: Solution) -> str:
@@ -112,17 +110,91 @@ def _scene(solution: Solution) -> str:
     )
 
 
-def plan_text(plan: Plan, circuit: Circuit) -> str:
-    """A plan in words."""
+def circuit_page(circuit: Circuit) -> Page:
+    """What a circuit is made of, and what its deck asks for."""
+    rows = []
+    for element in circuit.elements[:MOST_ELEMENTS]:
+        said = [f"{name}={_deck_value(value)}" for name, value in element.values.items() if math.isfinite(value)]
+        if element.waveform is not None:
+            said.append(waveform_text(element.waveform, "A" if element.device == "I" else "V"))
+        rows.append((element.name, element.device, " ".join(element.node_names), _cut(" ".join(said), 96)))
+    lines: list[str | Table] = [heading(circuit), ""]
+    lines.append(Table(("", "device", "nodes", "values, in the units of the netlist"), rows, left=4))
+    if len(circuit.elements) > MOST_ELEMENTS:
+        lines.append(f"... and {len(circuit.elements) - MOST_ELEMENTS} more elements")
+    lines.append("")
+    if circuit.tran is not None:
+        since = f" from {format_si(circuit.tran.start, 's')} on" if circuit.tran.start else ""
+        lines.append(
+            f".tran: {format_si(circuit.tran.stop, 's')}, an output every {format_si(circuit.tran.step, 's')}{since}"
+        )
+    if circuit.ac is not None:
+        lines.append(f".ac: {format_si(circuit.ac.start, 'Hz')} to {format_si(circuit.ac.stop, 'Hz')}")
+    lines.append(f"charge law: {circuit.charge_law or 'local (the deck names none)'}")
+    return Page(lines)
+
+
+def _deck_value(value: float) -> str:
+    """A number as a deck has it: ``3.5u``, ``0.2meg``, ``0.3``."""
+    if 0.01 <= abs(value) < 1e4:
+        return f"{value:.4g}"
+    text = format_si(value, "").replace(" ", "")
+    # SPICE reads M as milli, and knows no P and E.
+    return f"{text[:-1]}meg" if text.endswith("M") else f"{value:.4g}" if text[-1:] in "PEZY" else text
+
+
+def _cut(text: str, longest: int) -> str:
+    return text if len(text) <= longest else f"{text[: longest - 4]} ..."
+
+
+def steady_page(state: SteadyState) -> Page:
+    """A periodic state: what vouches for it, and the figures of its period."""
+    largest = 1.0 - state.stability_margin
+    found = f"periodic state of {format_si(state.period, 's')}, found in {state.periods:.3g} periods"
+    left = (
+        f"a further period changes the layers by {state.defect:.2g} V at most, and leaves {100.0 * largest:.3g} % of a "
+        "small disturbance"
+    )
+    try:
+        period = summary_table(state.solution).blocks
+    except SolveError as error:
+        period = (error.message,)
+    return Page([found, left, "", *period])
+
+
+def fit_page(fit: MaterialFit) -> Page:
+    """A fitted ladder: its branches, and how far it is from the data."""
+    ladder = fit.ladder
+    rows = [
+        (format_si(p / (2.0 * math.pi), "Hz"), f"{k:.4g} S/m")
+        for p, k in zip(ladder.poles, ladder.weights, strict=True)
+    ]
+    f = fit.frequency
+    return Page(
+        [
+            f"material fitted at {f.size} frequencies from {format_si(float(f[0]), 'Hz')} to "
+            f"{format_si(float(f[-1]), 'Hz')}",
+            f"misfit of the admittivity: {100.0 * fit.rms:.2g} % rms, {100.0 * fit.largest:.2g} % at most",
+            f"no causal and passive material comes nearer than {100.0 * fit.kramers_kronig.rms:.2g} % rms",
+            "",
+            f"{ladder.conductivity:.4g} S/m at zero frequency, eps_r = {ladder.eps_inf:.4g} above all poles, and",
+            Table(("pole", "weight"), rows),
+        ]
+    )
+
+
+def plan_text(plan: Plan, circuit: Circuit | None = None) -> Page:
+    """A plan in words, under the heading of its circuit where that is given."""
     rates = ", ".join(f"{r:.4g}" for r in plan.rates) or "none"
-    lines = [circuit.title, "", f"model: {plan.tier}", *(f"  because {r}" for r in plan.reasons)]
+    head: list[str | Table] = [] if circuit is None else [heading(circuit), *_driven(circuit), ""]
+    lines = [*head, f"model: {plan.tier}", *(f"  because {r}" for r in plan.reasons)]
     lines.append(f"rates, area frozen: {rates} 1/s ({'' if plan.stiff else 'not '}stiff for this source)")
     if not math.isnan(plan.sensitivity):
         lines.append(f"the area moves the leaks by at most {100.0 * plan.sensitivity:.3g} %")
-    return "\n".join(lines)
+    return Page(lines)
 
 
-def comparison_table(comparison: Comparison) -> str:
+def comparison_table(comparison: Comparison) -> Page:
     """A comparison as a table, with what it says in words."""
     names = {
         "amplitude": "gap voltage amplitude",
@@ -138,12 +210,13 @@ def comparison_table(comparison: Comparison) -> str:
     # Rounded here, and 0.0 added: -0.00 is not a figure.
     total = round(100.0 * (comparison.coupled.f_el_mean / reference - 1.0), 2) + 0.0
     waveform = round(100.0 * (comparison.mean.f_el_mean / reference - 1.0), 2) + 0.0
-    return "\n".join(
+    return Page(
         [
-            comparison.solution.circuit.title,
+            heading(comparison.solution.circuit),
+            *_driven(comparison.solution.circuit),
             f"periodic state at {format_si(comparison.frequency, 'Hz')}, charge law {comparison.solution.charge_law}",
             "",
-            _aligned(rows, head),
+            Table(head, rows),
             "",
             f"mean force: {total:+.2f} % against the phasor; {total - waveform:+.2f} % of that is the ripple of the "
             f"area, {waveform:+.2f} % is the waveform's (zero for a sine)",
@@ -151,7 +224,7 @@ def comparison_table(comparison: Comparison) -> str:
     )
 
 
-def limits_text(limits: FoldLimits) -> str:
+def limits_text(limits: FoldLimits) -> Page:
     """Where the mobile law folds, in words and a table per parameter."""
     own = format_si(limits.peak, "V")
     if math.isfinite(limits.voltage):
@@ -161,14 +234,14 @@ def limits_text(limits: FoldLimits) -> str:
         )
     else:
         head = f"under the mobile law this deck does not fold; its source reaches {own}"
-    lines = [limits.circuit.title, head]
+    lines: list[str | Table] = [heading(limits.circuit), *_driven(limits.circuit), head]
     for sweep in limits.sweeps:
         rows = [
             (format_si(x, sweep.unit), format_si(u, "V") if math.isfinite(u) else "none")
             for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True)
         ]
-        lines += ["", _aligned(rows, (sweep.name, "folds at"))]
-    return "\n".join(lines)
+        lines += ["", Table((sweep.name, "folds at"), rows)]
+    return Page(lines)
 
 
 def limits_csv(limits: FoldLimits, path: Path) -> Path:
@@ -202,12 +275,12 @@ def phasor_dict(result: PhasorSolution) -> dict[str, Any]:
     }
 
 
-def phasor_tables(results: Sequence[PhasorSolution]) -> str:
-    """Sweeps at several amplitudes as tables."""
-    return "\n\n".join(phasor_table(r) for r in results)
+def phasor_tables(results: Sequence[PhasorSolution], circuit: Circuit) -> str:
+    """Sweeps of a circuit at several amplitudes as tables."""
+    return "\n\n".join([heading(circuit), *(phasor_table(r) for r in results)])
 
 
-def phasor_table(result: PhasorSolution, most: int = 40) -> str:
+def phasor_table(result: PhasorSolution, most: int = 40) -> Page:
     """A sweep as a table, thinned to about `most` rows."""
     data = phasor_dict(result)
     keep = range(0, result.frequency.size, max(1, -(-result.frequency.size // most)))
@@ -225,7 +298,7 @@ def phasor_table(result: PhasorSolution, most: int = 40) -> str:
     head = ("frequency [Hz]", "|u_gap/U|", "phase [deg]", "u_gap [V]", "area [mm^2]", "mean force [N]")
     drive = f"source amplitude {format_si(result.amplitude, 'V')}, phase {math.degrees(result.phase):.4g} deg"
     said = [f"{drive}: {result.drive}", *result.notes]
-    return "\n".join([*said, _aligned(rows, head)])
+    return Page([*said, Table(head, rows)])
 
 
 def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:

@@ -112,6 +112,8 @@ def simulate(
     require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
     if sources:
         circuit = _with_sources(circuit, sources)
+    if isinstance(start, Solution) and start.stored is not None:
+        raise InputError("start is a solution read from a file, which a run cannot go on from; allowed: one just made")
     times = None if t_eval is None else np.asarray(t_eval, float)
     if not is_stack(circuit):
         if start == "periodic":

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import cmath
-import dataclasses
 import json
-import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,34 +11,31 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.datafiles import variables, write_csv, write_netcdf
-from fingerspice.measures import Weighed, weigh_outputs, weigh_run
-from fingerspice.network_record import NetworkRecord
+from fingerspice.datafiles import dataset, to_dataframe, write_csv, write_netcdf
 from fingerspice.outcome import ErrorEstimate, Failure, NetworkState, State, Status
-from fingerspice.record import Record, Sealed, sealed
+from fingerspice.pages import Page, Shown
+from fingerspice.record import Sealed, sealed
+from fingerspice.signals import SIGNALS, AnyRecord, Signals
+from fingerspice.summary import Figured, Figures, KeptFigures
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Mapping, Sequence
 
+    import pandas
     import xarray
-    from matplotlib.figure import Figure
 
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.circuit.waveforms import Fundamental
-    from fingerspice.physics.contact import Contact
+    from fingerspice.picture import Picture
     from fingerspice.planning import Plan
     from fingerspice.refined import ClosedForm
     from fingerspice.steps import Recorded
 
 FloatArray = NDArray[np.float64]
-# What a polynomial may miss of a signal where figures are taken of it, over its peak.
-_SMOOTH = 1e-12
-# Signals with what their values weigh, and the range of each.
-_Figures = tuple[Weighed, dict[str, tuple[float, float]]]
 
 
-@dataclass(frozen=True)
-class Solution(Sealed):
+@dataclass(frozen=True, repr=False)
+class Solution(Sealed, Shown, Figured):
     """Time response of a circuit.
 
     Signals are read-only arrays in SI units, computed when first asked for; at a jump of the source two rows share a
@@ -53,7 +47,7 @@ class Solution(Sealed):
     ----------
     t : ndarray, shape (n_t,)
         s.
-    record : Record or NetworkRecord
+    record : Record, NetworkRecord or StoredRecord
         What the run wrote down.
     status : Status
     failure : Failure or None
@@ -74,10 +68,12 @@ class Solution(Sealed):
         TSTART and the end of the run, s.
     continuous : Recorded or ClosedForm or None
         The run between its outputs, where that is known.
+    stored : mapping or None
+        The summary, where the run was read from a file.
     """
 
     t: FloatArray
-    record: Record | NetworkRecord
+    record: AnyRecord
     status: Status
     failure: Failure | None
     nfev: int
@@ -96,10 +92,21 @@ class Solution(Sealed):
     warnings: tuple[str, ...] = field(default=())
     first: float = 0.0
     t_stop: float = 0.0
-    continuous: Recorded | ClosedForm | None = field(default=None, repr=False)
+    continuous: Recorded | ClosedForm | None = None
+    stored: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         sealed(self.t)
+
+    def _page(self) -> Page:
+        from fingerspice.report import summary_table
+
+        return summary_table(self)
+
+    @cached_property
+    def all_signals(self) -> Signals:
+        """The signals by name, with what their columns belong to."""
+        return Signals(self.record)
 
     @property
     def layers(self) -> tuple[str, ...]:
@@ -109,7 +116,7 @@ class Solution(Sealed):
     @property
     def gaps(self) -> tuple[str, ...]:
         """Names of the GAPs."""
-        return tuple(name for name, _ in self.record.fingers)
+        return self.all_signals.gaps
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -157,46 +164,42 @@ class Solution(Sealed):
     @property
     def u_gap(self) -> FloatArray | None:
         """Gap voltage, V, shape (n_t,); None for a circuit without GAP."""
-        return self.record.u_gap if self.gaps else None
+        return self.all_signals.u_gap
 
-    @cached_property
+    @property
     def sigma_el(self) -> FloatArray | None:
         """Electroadhesive stress (Eq. 2), Pa, shape (n_t,); None for a circuit without GAP."""
-        return self._per_gap(self.u_gap, lambda contact, u: contact.stress(u))
+        return self.all_signals.sigma_el
 
     @property
     def f_el(self) -> FloatArray | None:
-        """Electroadhesive force, N, shape (n_t,); None for a circuit without GAP."""
-        return self.record.force if self.gaps else None
+        """Electroadhesive force, N, shape (n_t,); None for a circuit without GAP.
 
-    @cached_property
+        Its mean is `f_el_mean`, and over the last period `f_el_mean_periodic`: ``f_el.mean()`` weighs every output
+        alike, both ends of a period and both rows of a jump included, and is some per cent off at 50 to 200 outputs a
+        period.
+        """
+        return self.all_signals.f_el
+
+    @property
     def f_t(self) -> FloatArray | None:
         """Friction force (Eq. 1), N, shape (n_t,); None for a circuit without GAP."""
-        return self._per_gap(self.f_el, lambda contact, f: contact.mu * (contact.f_n + f))
+        return self.all_signals.f_t
 
-    @cached_property
+    @property
     def friction(self) -> FloatArray | None:
         """Friction coefficient f_t / f_n, shape (n_t,); None for a circuit without GAP."""
-        return self._per_gap(self.f_t, lambda contact, f: f / contact.f_n)
-
-    def _per_gap(self, x: FloatArray | None, make: Callable[[Contact, FloatArray], FloatArray]) -> FloatArray | None:
-        """Another signal of every gap from one of them."""
-        if x is None:
-            return None
-        contacts = [contact for _, contact in self.record.fingers]
-        if len(contacts) == 1:
-            return sealed(make(contacts[0], x))
-        return sealed(np.column_stack([make(contact, x[:, i]) for i, contact in enumerate(contacts)]))
+        return self.all_signals.friction
 
     def by_name(self, key: str) -> dict[str, FloatArray]:
-        """A signal under its name, or the columns of several gaps or sources under ``name:element``."""
-        value = getattr(self, key)
-        if value is None:
-            return {}
-        if value.ndim == 1:
-            return {key: value}
-        names = self.sources if key.endswith("_source") else self.gaps
-        return {f"{key}:{name}": value[:, i] for i, name in enumerate(names)}
+        """A signal under its name, or the columns of several elements under ``name:element``.
+
+        Raises
+        ------
+        InputError
+            For a name that no signal has.
+        """
+        return {name: self.all_signals.one(name) for name in self.all_signals.names(key)}
 
     @property
     def message(self) -> str:
@@ -209,38 +212,22 @@ class Solution(Sealed):
         return self.status is Status.SUCCESS
 
     @property
-    def f_el_mean(self) -> float | None:
-        """Mean electroadhesive force over the run, N; None without a GAP."""
-        return self.summary().get("f_el_mean")
-
-    @property
-    def f_el_mean_periodic(self) -> float | None:
-        """Mean electroadhesive force over the source's last period, N; None where the run holds none."""
-        return self.summary().get("f_el_mean_periodic")
-
-    @property
     def signals(self) -> dict[str, tuple[FloatArray, str, str]]:
         """Every time series by name: values (n_t,), unit, long name."""
-        out: dict[str, tuple[FloatArray, str, str]] = {
-            name: (value, "V", "source voltage") for name, value in self.by_name("u_source").items()
-        }
-        for i, name in enumerate(self.layers):
-            out[f"u_layer:{name}"] = (self.u_layer[:, i], "V", f"voltage of {name}")
-        for key, unit, text in (
-            ("u_gap", "V", "gap voltage"),
-            ("area", "m^2", "ridge contact area"),
-            ("sigma_el", "Pa", "electroadhesive stress"),
-            ("f_el", "N", "electroadhesive force"),
-            ("f_t", "N", "friction force"),
-            ("friction", "1", "friction coefficient f_t / f_n"),
-            ("q_source", "C", "charge delivered by the source"),
-            ("i_source", "A", "source current, regular part"),
-            ("fold_margin", "1", "distance to the fold of the mobile law"),
-        ):
-            out.update({name: (value, unit, text) for name, value in self.by_name(key).items()})
-        for name, value in self.node_voltages.items():
-            out[f"v:{name}"] = (value, "V", f"voltage of node {name}")
+        out: dict[str, tuple[FloatArray, str, str]] = {}
+        for key, (unit, text) in SIGNALS.items():
+            for name, value in self.by_name(key).items():
+                element = name.partition(":")[2]
+                said = {"u_layer": f"voltage of {element}", "v": f"voltage of node {element}"}.get(key, text)
+                out[name] = value, unit, said
         return out
+
+    @cached_property
+    def _figures(self) -> Figures | KeptFigures:
+        return Figures(self) if self.stored is None else KeptFigures(self.all_signals, self.stored)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in vars(self).items() if key not in ("_figures", "all_signals", "_summary")}
 
     def summary(self) -> dict[str, Any]:
         """Figures of the run: peak, rms, mean, ripple, amplitude and phase at the fundamental; SI units.
@@ -256,81 +243,7 @@ class Solution(Sealed):
 
     @cached_property
     def _summary(self) -> dict[str, Any]:
-        out: dict[str, Any] = {
-            "t_stop": float(self.t[-1]) if self.t.size else None,
-            "status": self.status.name,
-        }
-        out.update({f"error_{k}": v for k, v in vars(self.error).items()})
-        whole = self._measured(self.first, self.t_stop)
-        if whole is None and self.t.size < 2:
-            return out
-        out["figures_from"] = "outputs" if whole is None else "steps"
-        values, ranges = whole or self._of_outputs(0)
-        last = self._last_period()
-        for key, (low, high) in ranges.items():
-            out[f"{key}_max"], out[f"{key}_min"], out[f"{key}_peak"] = high, low, max(high, -low)
-            out[f"{key}_mean"], out[f"{key}_rms"] = values.mean(key), math.sqrt(values.mean(key, 2))
-            out[f"{key}_mean_periodic"] = None if last is None else last[0].mean(key)
-            if last is not None and key.partition(":")[0] in ("area", "f_el", "f_t", "friction"):
-                out[f"{key}_ripple"] = last[1][key][1] - last[1][key][0]
-            elif last is not None:
-                out[f"{key}_rms_periodic"] = math.sqrt(last[0].mean(key, 2))
-        if last is not None and self.fundamental is not None:
-            for key in ("u_source", "u_gap"):
-                if key in last[1]:
-                    p = last[0].phasor(key, self.fundamental.frequency)
-                    out[f"{key}_amplitude"], out[f"{key}_phase_deg"] = abs(p), math.degrees(cmath.phase(p))
-            out["fundamental"] = self.fundamental.frequency
-        if self.f_el is not None:
-            out["fold_margin_min"] = min(self.fold_margin_min, float(self.fold_margin.min(initial=1.0)))
-        return out
-
-    def _measured(self, since: float, until: float) -> _Figures | None:
-        """Figures between two times (s) from the run between its outputs; None where that is not known."""
-        run = None if self.continuous is None else self.continuous.run(self._read, since, until)
-        return None if run is None else weigh_run(run, self._read, since, until, _SMOOTH)
-
-    def _read(self, record: Record | NetworkRecord) -> dict[str, FloatArray]:
-        """The signals that figures are taken of, from other outputs of this run."""
-        return dataclasses.replace(self, t=record.t, record=record)._summarised()
-
-    def _of_outputs(self, first: int) -> _Figures:
-        """Figures of the outputs from number `first` on."""
-        t, signals = self.t[first:], {name: x[first:] for name, x in self._summarised().items()}
-        ranges = {name: (float(x.min()), float(x.max())) for name, x in signals.items()}
-        return weigh_outputs(t, signals), ranges
-
-    def _summarised(self) -> dict[str, FloatArray]:
-        """What the summary gives figures of; without a gap, every layer."""
-        if self.u_gap is not None:
-            shown = ("u_source", "u_gap", "area", "f_el", "f_t", "friction")
-            return {name: x for key in shown for name, x in self.by_name(key).items()}
-        # Without layers either, what there is to see are the nodes.
-        inside = {f"u_layer:{name}": self.u_layer[:, i] for i, name in enumerate(self.layers)} or {
-            f"v:{name}": v for name, v in self.node_voltages.items()
-        }
-        return {**self.by_name("u_source"), **inside, **self.by_name("area")}
-
-    def _last_period(self) -> _Figures | None:
-        """Figures of the last period of the source; None where the run holds none."""
-        if self.period is None or not self.t.size:
-            return None
-        tolerance = 1e-9 * self.period
-        if self.continuous is not None and self.t_stop - self.period >= self.first - tolerance:
-            found = self._measured(max(self.t_stop - self.period, self.first), self.t_stop)
-            if found is not None:
-                return found
-        start = self.t[-1] - self.period
-        if start < self.t[0] - tolerance or np.count_nonzero(self.t >= start) < 8:
-            return None
-        first = int(np.searchsorted(self.t, start - tolerance, side="right"))
-        if abs(self.t[first] - start) <= tolerance:
-            # At a jump the period starts with the right-hand value.
-            return self._of_outputs(int(np.searchsorted(self.t, start + tolerance, side="right")) - 1)
-        t, signals = self.t[first:], self._summarised()
-        cut = {name: np.append(np.interp(start, self.t, x), x[first:]) for name, x in signals.items()}
-        ranges = {name: (float(x.min()), float(x.max())) for name, x in cut.items()}
-        return weigh_outputs(np.append(start, t), cut), ranges
+        return self._figures.summary()
 
     def provenance(self) -> dict[str, str]:
         """What it takes to repeat the run, as text."""
@@ -339,6 +252,7 @@ class Solution(Sealed):
         return {
             "program": f"fingerspice {__version__}",
             "title": self.circuit.title,
+            "file": str(self.circuit.path or ""),
             "deck": self.circuit.text,
             "overrides": json.dumps(dict(self.circuit.overrides)),
             "charge_law": self.charge_law,
@@ -365,6 +279,9 @@ class Solution(Sealed):
     def to_xarray(self, *, jumps: str = "right") -> xarray.Dataset:
         """The run as an xarray Dataset with units and provenance.
 
+        Where a circuit has several GAPs, what belongs to them has the dimension ``gap`` beside ``time``, and signals of
+        several sources ``source``; layer voltages have ``layer`` and node voltages ``node``.
+
         Parameters
         ----------
         jumps : str
@@ -377,11 +294,26 @@ class Solution(Sealed):
         """
         import xarray
 
-        data, coords = variables(self, jumps)
+        data, coords = dataset(self, jumps)
         return xarray.Dataset(data, coords=coords, attrs=self.provenance())
 
+    def to_dataframe(self, *, jumps: str = "right") -> pandas.DataFrame:
+        """The run as a pandas DataFrame: a row for each time (s, the index), a column for each of `signals`.
+
+        Parameters
+        ----------
+        jumps : str
+            As in `to_xarray`.
+
+        Raises
+        ------
+        InputError
+            For another value of `jumps`.
+        """
+        return to_dataframe(self, jumps)
+
     def to_netcdf(self, path: str | Path, *, jumps: str = "right") -> Path:
-        """Write `to_xarray` as a NetCDF file, without the cost of loading xarray.
+        """Write `to_xarray` as a NetCDF file, without the cost of loading xarray; `fs.load` reads it back.
 
         Raises
         ------
@@ -390,8 +322,37 @@ class Solution(Sealed):
         """
         return write_netcdf(self, Path(path), jumps)
 
-    def plot(self) -> Figure:
-        """Source and gap voltage, force and area against time."""
-        from fingerspice.plotting import plot_solution
+    def plot(
+        self,
+        signals: str | Sequence[str] | None = None,
+        *,
+        window: tuple[float, float] | None = None,
+        others: Solution | Sequence[Solution] | Mapping[str, Solution] = (),
+    ) -> Picture:
+        """Signals against time, as a figure that a notebook shows; from a script ``plot().show()`` opens a window.
 
-        return plot_solution(self)
+        Where the window holds more than about 30 oscillations they are drawn as envelopes, with the last few beside.
+
+        Parameters
+        ----------
+        signals : str or sequence of str, optional
+            Keys of `signals`, such as ``"f_el"``, ``"u_layer:Xcoat"``, or ``"u_layer"`` for all layers; those of one
+            quantity share a panel. By default source and gap voltage, force, area and friction.
+        window : tuple of float, optional
+            Start and end, s; the whole run by default.
+        others : Solution, sequence or mapping of str to Solution, optional
+            Runs to lay over this one; without names they are called by what sets them apart.
+
+        Returns
+        -------
+        Picture
+            A matplotlib Figure: ``savefig("x.pdf")`` saves it.
+
+        Raises
+        ------
+        InputError
+            For an unknown signal, or a window without outputs.
+        """
+        from fingerspice.traces import plot_solution
+
+        return plot_solution(self, signals, window, others)

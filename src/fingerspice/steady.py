@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,17 +16,22 @@ from fingerspice.circuit.statespace import build_stack
 from fingerspice.circuit.waveforms import require
 from fingerspice.errors import InputError, SolveError
 from fingerspice.outcome import ErrorEstimate
+from fingerspice.pages import Page, Shown
 from fingerspice.periodic import close_period
 from fingerspice.problem import Problem, prepare
 from fingerspice.simulation import RTOL_RANGE, run_problem
 from fingerspice.solution import Solution
+from fingerspice.summary import Figured, Figures, KeptFigures
+
+if TYPE_CHECKING:
+    from fingerspice.picture import Picture
 
 FloatArray = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class SteadyState:
-    """The periodic state, and what vouches for it.
+@dataclass(frozen=True, repr=False)
+class SteadyState(Shown, Figured):
+    """The periodic state, and what vouches for it; its figures (`f_el_mean` and others) are those of the period.
 
     Attributes
     ----------
@@ -51,6 +58,21 @@ class SteadyState:
     error: ErrorEstimate
     periods: float
 
+    def _page(self) -> Page:
+        from fingerspice.report import steady_page
+
+        return steady_page(self)
+
+    def plot(self, signals: str | Sequence[str] | None = None) -> Picture:
+        """The period's signals against time; `signals` as in `Solution.plot`."""
+        return self.solution.plot(signals)
+
+    @property
+    def period(self) -> float:
+        """Of the source, s."""
+        assert self.problem.waveform.period is not None
+        return self.problem.waveform.period
+
     @property
     def multipliers(self) -> FloatArray:
         """Sizes of the Floquet multipliers: what a period leaves of a small disturbance, shape (n_cell - 1,)."""
@@ -60,6 +82,10 @@ class SteadyState:
     def stability_margin(self) -> float:
         """One less the largest multiplier: 0 where a disturbance stays for ever."""
         return 1.0 - float(self.multipliers.max(initial=0.0))
+
+    @property
+    def _figures(self) -> Figures | KeptFigures:
+        return self.solution._figures
 
     @cached_property
     def solution(self) -> Solution:

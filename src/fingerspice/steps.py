@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from fingerspice.circuit.sampling import same_time
 from fingerspice.engine.readout import RECORDED, Steps, new_steps
-from fingerspice.measures import Panels, Read, Signals
+from fingerspice.measures import Panels, Read
 from fingerspice.network_record import NetworkRecord
-from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS
 from fingerspice.record import Record
 
 AnyRecord = Record | NetworkRecord
@@ -145,7 +145,7 @@ class Recorded:
     stop: float
     make: Callable[[FloatArray, BoolArray, FloatArray], AnyRecord]
 
-    def run(self, read: Read, since: float, until: float) -> Stretches | None:
+    def run(self, readers: Callable[[], Mapping[str, Read]], since: float, until: float) -> Stretches | None:
         """The steps as one array; None where they are too many."""
         return self._stretches
 
@@ -176,6 +176,10 @@ class Stretches:
         """The parts of the steps between two times (s); those of periods that are alike and inside only once."""
         begin, end = self.start + self.shift, self.reached + self.shift
         slack = same_time(1.0) * np.abs(end)
+        last_end = end + (self.count - 1) * self.period
+        index = np.arange(self.start.size)
+        if ((begin >= since - slack) & (last_end <= until + slack)).all():
+            return Panels(index, np.zeros(index.size), self.reach, self.count * self.reach * self.length)
         period = np.where(self.count > 1, self.period, 1.0)
         # Of the periods that a step stands for, those from number `first` to `last` lie inside as a whole.
         first = np.clip(np.ceil((since - slack - begin) / period), 0, self.count)
@@ -185,29 +189,51 @@ class Stretches:
         for k, once in ((first - 1.0, True), (last + 1.0, last + 1.0 != first - 1.0)):
             cut = once & (k >= 0) & (k < self.count)
             low = np.maximum((since - begin - k * period) / self.length, 0.0)
-            high = np.minimum((until - begin - k * period) / self.length, self.reach)
-            found.append((low, high, np.where(cut & (high > low), 1.0, 0.0)))
-        index = np.tile(np.arange(self.start.size), 3)
+            # What ends with the stretch but for rounding ends as its step does: at a jump on the left.
+            whole = end + k * period <= until + slack
+            high = np.where(whole, self.reach, np.minimum((until - begin - k * period) / self.length, self.reach))
+            found.append((low, high, np.where(cut & (high - low > slack / self.length), 1.0, 0.0)))
+        index = np.tile(index, 3)
         low, high, weight = (np.concatenate(x) for x in zip(*found, strict=True))
         some = weight > 0.0
         return Panels(index[some], low[some], high[some], (weight * (high - low))[some] * self.length[index[some]])
 
-    def signals(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, Signals]:
-        """As `measures.Run` says, from the polynomials of the steps."""
-        columns = np.empty((self.values.shape[1], *fraction.shape))
-        cut = np.ones(index.size, bool)
-        if fraction.shape[1] == ROWS:
-            # Whole steps at their own points.
-            cut = (fraction != POINTS).any(axis=1)
-            whole = self.values[index[~cut]].swapaxes(0, 1)
-            columns[:, ~cut] = np.concatenate([whole, np.einsum("cpn,nb->cpb", whole, BETWEEN)], axis=2)
-        columns[:, cut] = np.einsum("pcn,pqn->cpq", self.values[index[cut]], _basis(fraction[cut]))
+    @cached_property
+    def _whole(self) -> tuple[FloatArray, AnyRecord]:
+        """Times (k, ROWS) and record at the points of every step, as far as it reaches."""
+        columns = np.concatenate([self.values, self.values @ BETWEEN], axis=2)
+        fraction = self.reach[:, None] * POINTS
+        short = np.flatnonzero(self.reach != 1.0)
+        if short.size:
+            columns[short] = np.einsum("pcn,pqn->pcq", self.values[short], _basis(fraction[short]))
+        t, left = self._times(slice(None), fraction)
+        return t, self._make(t.ravel(), left.ravel(), columns.transpose(1, 0, 2).reshape(columns.shape[1], -1))
+
+    def _times(self, index: IntArray | slice, fraction: FloatArray) -> tuple[FloatArray, BoolArray]:
         t = self.start[index, None] + fraction * self.length[index, None]
-        reached = self.reached[index, None]
         left = fraction >= self.reach[index, None]
-        t = np.where(left, reached, t)
+        return np.where(left, self.reached[index, None], t), left
+
+    def at_points(self, read: Read, panels: Panels) -> tuple[FloatArray, FloatArray]:
+        """As `measures.Run` says: for panels that are whole steps the signal is made once."""
+        own = (panels.low == 0.0) & (panels.high == self.reach[panels.step])
+        if not own.any():
+            return self.values_at(read, panels.step, panels.fractions(POINTS))
+        t_own, record = self._whole
+        x_own = read(record).reshape(t_own.shape)
+        if own.all():
+            every = panels.step.size == t_own.shape[0]
+            return (t_own, x_own) if every else (t_own[panels.step], x_own[panels.step])
+        t, x = t_own[panels.step], x_own[panels.step]
+        t[~own], x[~own] = self.values_at(read, panels.step[~own], panels.fractions(POINTS)[~own])
+        return t, x
+
+    def values_at(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As `measures.Run` says, from the polynomials of the steps."""
+        columns = np.einsum("pcn,pqn->cpq", self.values[index], _basis(fraction))
+        t, left = self._times(index, fraction)
         record = self._make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], -1))
-        return t, {name: x.reshape(t.shape) for name, x in read(record).items()}
+        return t, read(record).reshape(t.shape)
 
 
 def _basis(fraction: FloatArray) -> FloatArray:

@@ -18,6 +18,7 @@ from fingerspice.circuit.devices import DEVICES, DeviceSpec
 from fingerspice.circuit.values import unusual, value_of
 from fingerspice.circuit.waveforms import Waveform, as_waveform
 from fingerspice.errors import FingerspiceWarning, InputError, Where
+from fingerspice.pages import Page, Shown
 
 CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
@@ -117,8 +118,8 @@ class Parameter:
     unit: str
 
 
-@dataclass(frozen=True)
-class Circuit:
+@dataclass(frozen=True, repr=False)
+class Circuit(Shown):
     """A netlist, read.
 
     Attributes
@@ -161,6 +162,11 @@ class Circuit:
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_memory": {}}
+
+    def _page(self) -> Page:
+        from fingerspice.report import circuit_page
+
+        return circuit_page(self)
 
     def remember(self, key: Any, make: Callable[[], Any]) -> Any:
         """What `make` gives, kept for the next call with the same key: circuits do not change."""

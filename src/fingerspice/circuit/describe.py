@@ -1,0 +1,97 @@
+"""A circuit's sources and what was changed in it, in words: for titles, captions and file headers."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.combinations import Product, Sum
+from fingerspice.circuit.ramps import PWL, Samples
+from fingerspice.circuit.sampling import Function
+from fingerspice.circuit.waveforms import DC, Waveform
+from fingerspice.units import format_si
+
+#: Changes and sources named in one line; of more, how many there are.
+_MOST = 8
+
+
+def waveform_text(waveform: Waveform, unit: str = "V") -> str:
+    """A waveform with its figures, ``Square(200 V, 100 Hz)``; `unit` is A for a current source's."""
+    if isinstance(waveform, DC):
+        return f"DC {format_si(waveform.level, unit)}"
+    if isinstance(waveform, Sum | Product):
+        sign = " + " if isinstance(waveform, Sum) else " * "
+        return f"({sign.join(waveform_text(part, unit) for part in waveform.parts)})"
+    if isinstance(waveform, Function):
+        return f"function {getattr(waveform.function, '__name__', 'of time')}"
+    said = []
+    if isinstance(waveform, PWL):
+        said.append(f"{len(waveform.times)} points")
+    if isinstance(waveform, Samples):
+        said.append(f"{waveform.values.size} values")
+    for field in dataclasses.fields(waveform):  # type: ignore[arg-type]
+        value = getattr(waveform, field.name)
+        if field.name not in waveform.units or value == field.default:
+            continue
+        own = waveform.units[field.name].replace("V", unit)
+        text = _quantity(value, own)
+        # What has no default is known by its place; what has one needs its name.
+        said.append(text if field.default is dataclasses.MISSING else f"{field.name} {text}")
+    return f"{type(waveform).__name__}({', '.join(said)})"
+
+
+def drive_text(circuit: Circuit) -> str:
+    """Every source that is not 0 with its waveform: ``Vdrive: Sine(200 V, 100 Hz)``; not those that were replaced.
+
+    Those stand in `changes_text`.
+    """
+    said = []
+    replaced = {path.lower() for path in circuit.overrides}
+    areas = {node for element in circuit.elements if element.spec.is_layer for node in element.nodes[2:]}
+    for element in circuit.by_device("V", "I"):
+        wave = element.waveform
+        # A V element on an area's node says how large the area is: it drives nothing.
+        if wave is None or wave == DC(0.0) or element.nodes[0] in areas or element.name.lower() in replaced:
+            continue
+        said.append(f"{element.name}: {waveform_text(wave, 'A' if element.device == 'I' else 'V')}")
+    return _joined(said)
+
+
+def changes_text(circuit: Circuit) -> str:
+    """What was changed after the deck was read, with the values now: ``Xgap.d = 5 um``; empty without changes."""
+    known = {path.lower(): (path, parameter) for path, parameter in circuit.parameters.items()}
+    said = []
+    # A path may have been changed twice, in two spellings.
+    for path in dict.fromkeys(path.lower() for path in circuit.overrides):
+        if path in known:
+            name, parameter = known[path]
+            said.append(f"{name} = {_quantity(parameter.value, parameter.unit)}")
+            continue
+        said += [
+            f"{element.name} = {waveform_text(element.waveform, 'A' if element.device == 'I' else 'V')}"
+            for element in circuit.elements
+            if element.name.lower() == path and element.waveform is not None
+        ] or [f"{name} = {_as_given(text)}" for name, text in circuit.overrides.items() if name.lower() == path][-1:]
+    return _joined(said)
+
+
+def _as_given(text: str) -> str:
+    """What a parameter was set to, as far as that is worth reading."""
+    kind = text.partition("(")[0]
+    return text if len(text) <= 40 else f"{kind}(...)" if kind.isidentifier() else f"{text[:36]} ..."
+
+
+def heading(circuit: Circuit) -> str:
+    """The deck's title, and what was changed in it."""
+    changed = changes_text(circuit)
+    return f"{circuit.title} (changed: {changed})" if changed else circuit.title
+
+
+def _quantity(value: float, unit: str) -> str:
+    # No prefix to a power of a unit or to an angle: a kmm^2 is no thousand mm^2.
+    return f"{value:.4g} {unit}".rstrip() if "^" in unit or unit in ("", "deg") else format_si(value, unit)
+
+
+def _joined(said: list[str]) -> str:
+    more = [f"and {len(said) - _MOST} more"] if len(said) > _MOST else []
+    return ", ".join([*said[:_MOST], *more])

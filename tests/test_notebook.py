@@ -1,0 +1,68 @@
+"""A notebook, executed: results show themselves as tables and pictures without a magic line."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+CELLS = (
+    f"import fingerspice as fs\ncircuit = fs.read_netlist({str(ROOT / 'circuits' / 'fingerpad.cir')!r})\ncircuit",
+    "solution = fs.simulate(circuit)\nsolution",
+    "solution.plot()",
+    "solution.plot('f_el', others=fs.simulate(circuit.replace({'Xgap.d': 5e-6})))",
+    "fs.steady_state(circuit)",
+    "comparison = fs.compare(circuit)\ncomparison.plot().show()",
+    "fs.phasor(circuit, [100, 1e3, 1e4])",
+    "fs.load(solution.to_netcdf('run.nc')).plot(window=(0.0, 0.02))",
+    "solution.to_dataframe()[['u_gap', 'f_el']].describe()",
+    "%matplotlib inline\nsolution.plot()",
+)
+
+
+@pytest.fixture(scope="module")
+def outputs(tmp_path_factory: pytest.TempPathFactory) -> list[list[Any]]:
+    """What every cell showed."""
+    nbformat = pytest.importorskip("nbformat", reason="nbformat is not installed: pip install '.[test]'")
+    nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed: pip install '.[test]'")
+    pytest.importorskip("ipykernel", reason="ipykernel is not installed: pip install '.[test]'")
+    book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in CELLS])
+    folder = tmp_path_factory.mktemp("notebook")
+    client = nbclient.NotebookClient(book, timeout=300, resources={"metadata": {"path": str(folder)}})
+    with pytest.MonkeyPatch.context() as patch:
+        # The kernel imports what these tests import.
+        import fingerspice
+
+        here = str(Path(fingerspice.__file__).parents[1])
+        patch.setenv("PYTHONPATH", os.pathsep.join([here, os.environ.get("PYTHONPATH", "")]))
+        patch.setenv("IPYTHONDIR", str(folder / "ipython"))
+        client.execute()
+    return [cell.outputs for cell in book.cells]
+
+
+def shown(cell: list[Any]) -> dict[str, str]:
+    """The one thing that a cell shows, by kind."""
+    assert all(output.output_type in ("execute_result", "display_data") for output in cell), cell
+    (output,) = cell
+    return dict(output.data)
+
+
+@pytest.mark.parametrize("number", [2, 3, 5, 7, 9])
+def test_a_picture_is_shown_once(outputs: list[list[Any]], number: int) -> None:
+    assert len(shown(outputs[number])["image/png"]) > 10_000
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (0, "Sine(200 V, 100 Hz)"), (1, "electroadhesive force"), (4, "electroadhesive force"), (6, "mean force"),
+        (8, "f_el"),
+    ],
+)  # fmt: skip
+def test_a_result_is_shown_as_a_table(outputs: list[list[Any]], number: int, said: str) -> None:
+    page = shown(outputs[number])["text/html"]
+    assert "<table" in page
+    assert said in page
