@@ -18,7 +18,7 @@ from analytic import GAP, Layer, area, coupled_phasor, periodic_state, sine_segm
 from commands import Command
 from deck_edits import edited
 from fingerspice.circuit.circuit import AcSweep
-from fingerspice.phasors import sweep_frequencies
+from fingerspice.sweeps import sweep_frequencies
 from ngspice_tools import CIRCUITS
 from scenes import table1
 
@@ -185,9 +185,11 @@ def test_a_sweep_says_where_the_skins_data_are_taken_and_how_far_outside_them() 
         "the skin's data are taken at each frequency of the sweep, not at the deck's own (Xskin f = 100 Hz)",
     )
     assert inside.warnings == ()
-    (far,) = fs.phasor(table1(), [1e-3, 1e9]).warnings
+    with pytest.warns(fs.FingerspiceWarning, match="the sweep goes down to"):
+        (far,) = fs.phasor(table1(), [1e-3, 1e9]).warnings
     assert "down to 0.001 Hz, 4 decades below and up to 1e+09 Hz, 4 decades above the 10 Hz to 100 kHz" in far
-    (above,) = fs.large_signal(table1(), [2e5], 1.0)[0].warnings
+    with pytest.warns(fs.FingerspiceWarning, match="the sweep goes up to"):
+        (above,) = fs.large_signal(table1(), [2e5], 1.0)[0].warnings
     assert "up to 200000 Hz, 0.3 decades above" in above
     held = fs.phasor(table1(), [1e-3, 1e9], skin="own")
     assert held.warnings == ()

@@ -11,6 +11,7 @@ from fingerspice.circuit.circuit import Element
 from fingerspice.netruns import NetworkRun
 from fingerspice.network_record import NetworkRecord
 from fingerspice.networks import NetworkProblem
+from fingerspice.notices import circuit_warnings
 from fingerspice.outcome import Status
 from fingerspice.physics.contact import inverse_area
 from fingerspice.problem import Problem
@@ -27,6 +28,7 @@ NEAR_FOLD = 0.2
 
 def stack_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Where a run leaves what its model holds for."""
+    yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit))
     outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
     if outside is not None:
         yield outside
@@ -44,6 +46,7 @@ def stack_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
 
 
 def network_warnings(problem: NetworkProblem, run: NetworkRun, record: NetworkRecord) -> Iterator[str]:
+    yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit))
     outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
     if outside is not None:
         yield outside

@@ -13,7 +13,7 @@ import typer
 
 from fingerspice import options
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError
-from fingerspice.options import area_from_text, check_output, note_skin_frequency, read_circuit
+from fingerspice.options import area_from_text, check_output, read_circuit
 from fingerspice.terminal import (
     failure_as_json,
     listen,
@@ -103,7 +103,6 @@ def run(
         circuit = read_circuit(deck, changes, source)
         if circuit.tran is None:
             raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic]")
-        note_skin_frequency(circuit)
         data = _target(deck, out, ".csv" if csv else ".nc")
         picture = None if no_plot else _target(deck, out, ".png")
         with progress() as update:
@@ -166,8 +165,9 @@ def ac(
 
       fingerspice ac circuits/fingerpad.cir --area coupled --amplitude 50 --amplitude 200
     """
-    from fingerspice.phasors import phasor, sweep_frequencies
+    from fingerspice.phasors import phasor
     from fingerspice.report import phasor_csv, phasor_dict, phasor_tables
+    from fingerspice.sweeps import sweep_frequencies
 
     with warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
@@ -223,7 +223,6 @@ def plan(
 
     with warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
-        note_skin_frequency(circuit)
         result = make(circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge)
     if as_json:
         say_json(result.to_dict())
@@ -255,7 +254,6 @@ def compare(
 
     with warnings_as_lines():
         circuit = read_circuit(deck, changes, source)
-        note_skin_frequency(circuit)
         picture = None if no_plot else _target(deck, out, "_compare.png")
         with failure_as_json(as_json):
             result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.circuit.waveforms import Sine, Waveform, require
-from fingerspice.errors import InputError
+from fingerspice.errors import FingerspiceWarning, InputError
 from fingerspice.measures import weigh_outputs
-from fingerspice.phasors import Drive, PhasorSolution, sweep_drive, sweep_notes
+from fingerspice.phasors import PhasorSolution
 from fingerspice.steady import steady_state
+from fingerspice.sweeps import Drive, sweep_drive, sweep_notes
 
 FloatArray = NDArray[np.float64]
 # Outputs in a period: cubics through them are good to 1e-9 of a sine.
@@ -53,6 +56,7 @@ def large_signal(
     SolveError
         Where there is no periodic state.
     """
+    require_circuit(circuit)
     stack = build_stack(circuit)
     if stack.gap is None:
         raise InputError("a large-signal sweep needs a GAP; this circuit has none")
@@ -67,6 +71,8 @@ def large_signal(
     for what, values, unit in (("frequency", f, "Hz"), ("amplitude", given, "V")):
         good = bool(np.all(np.isfinite(values) & (np.asarray(values) > 0.0)))
         require(good, what, f"{values} {unit}", "positive numbers")
+    for text in sweep_notes(circuit, f)[1]:
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
     drives = [own] if amplitude is None else [Drive(float(a), 0.0, "the amplitude given") for a in given]
     return tuple(_sweep(circuit, f, drive, charge_law, rtol) for drive in drives)
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.combinations import Product
 from fingerspice.circuit.statespace import is_stack
@@ -106,6 +107,7 @@ def fold_limits(circuit: Circuit, *, points: int = 9, span: float = 10.0) -> Fol
     SolveError
         Where a run fails for another reason than a fold.
     """
+    require_circuit(circuit)
     require(3 <= points <= 1000, "points", points, "3 to 1000")
     require(1.0 < span <= 1e6, "span", span, "more than 1, at most 1e6")
     gaps = circuit.by_device("GAP")

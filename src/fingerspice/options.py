@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fingerspice.errors import FingerspiceWarning, InputError
-from fingerspice.terminal import complain
 from fingerspice.units import parse_number
 
 if TYPE_CHECKING:
@@ -19,15 +18,17 @@ LARGEST_AREA = 0.01
 
 
 def read_circuit(deck: Path, changes: list[str] | None, source: str | None) -> Circuit:
-    """The deck's circuit with ``--set`` and ``--source``; what has no effect here is noted on stderr."""
+    """The deck's circuit with ``--set`` and ``--source``; what has no effect here is warned about."""
     from fingerspice.circuit.netlist import read_netlist
+    from fingerspice.notices import directive_warnings
 
     circuit = read_netlist(deck)
     circuit = _with_changes(circuit, changes or [])
     if source is not None:
         circuit = _with_source(circuit, source)
-    for directive in circuit.unused:
-        complain(f"note: {directive} has no effect here")
+    # Said here for the commands that make no run of the circuit as it is.
+    for text in directive_warnings(circuit):
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
     return circuit
 
 
@@ -67,33 +68,6 @@ def _with_source(circuit: Circuit, text: str) -> Circuit:
         return circuit.replace({sources[0].name: source_from_text(text, circuit)})
     except InputError as error:
         raise InputError(f"--source {error.message}") from None
-
-
-def note_skin_frequency(circuit: Circuit) -> None:
-    """Warn where a SKIN's data are not taken at the source's fundamental."""
-    from fingerspice.circuit.statespace import build_stack, is_stack
-    from fingerspice.circuit.topology import find_branches
-
-    if is_stack(circuit):
-        fundamental = build_stack(circuit).waveform.fundamental
-    else:
-        waves = [e.waveform for e in find_branches(circuit)[1] if e.waveform is not None]
-        fundamental = waves[0].fundamental if len(waves) == 1 else None
-        if len(waves) > 1:
-            # Which of several sources the skin's data should match is the user's to know.
-            return
-    for skin in circuit.by_device("SKIN"):
-        f = skin.values["f"]
-        if fundamental is None:
-            text = f"{skin.name} takes its data at {f:g} Hz, and the source has no fundamental"
-        elif abs(f / fundamental.frequency - 1.0) > 1e-9:
-            text = (
-                f"{skin.name} takes its data at f = {f:g} Hz, the source's fundamental is "
-                f"{fundamental.frequency:g} Hz; --set {skin.name}.f={fundamental.frequency:g} would match"
-            )
-        else:
-            continue
-        warnings.warn(text, FingerspiceWarning, stacklevel=2)
 
 
 def area_from_text(text: str) -> str | float:

@@ -6,15 +6,15 @@ import dataclasses
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice.arguments import Parameters, Sources, overridden, require_area, require_number, times_given
 from fingerspice.cautions import network_warnings, stack_warnings
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import is_stack
-from fingerspice.circuit.waveforms import Waveform, as_waveform, require
+from fingerspice.circuit.waveforms import require
 from fingerspice.diagnosis import network_failure, stack_failure
 from fingerspice.direct import solve_algebraic, solve_linear
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError
@@ -24,6 +24,7 @@ from fingerspice.netruns import NetworkRun
 from fingerspice.network_record import NetworkRecord
 from fingerspice.networks import NetworkProblem, prepare_network
 from fingerspice.nodal import solve_coupled
+from fingerspice.notices import circuit_warnings
 from fingerspice.numerics.tableaus import TABLEAUS
 from fingerspice.outcome import ErrorEstimate, Failure, Status
 from fingerspice.outputs import asked_for, at_breakpoints
@@ -46,7 +47,8 @@ def simulate(
     *,
     t_stop: float | None = None,
     t_eval: ArrayLike | None = None,
-    sources: Mapping[str, Waveform | float | Callable[[float], float]] | None = None,
+    sources: Sources | None = None,
+    parameters: Parameters | None = None,
     charge_law: str | None = None,
     area: str | float = "coupled",
     rtol: float = 1e-8,
@@ -68,8 +70,11 @@ def simulate(
     t_eval : array_like, optional
         Output times, s, ascending; right-hand values at jumps. By default TSTART:TSTEP:TSTOP, and both
         one-sided values at each jump.
-    sources : mapping, optional
-        Source name to a waveform, a constant (V) or a plain function of time (s) in V.
+    sources : mapping or waveform, optional
+        Source name to a waveform, a constant (V) or a plain function of time (s) in V; or one of these alone where the
+        circuit has one source. Sources that are not named stay as they are.
+    parameters : mapping, optional
+        Path to value, as in `Circuit.replace`: ``{"Xgap.d": 3e-6}``.
     charge_law : str, optional
         ``"local"`` or ``"mobile"``; the included library's by default, else local.
     area : str or float
@@ -110,9 +115,12 @@ def simulate(
     """
     _check_rtol(rtol)
     require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
-    if sources:
-        circuit = _with_sources(circuit, sources)
-    times = None if t_eval is None else np.asarray(t_eval, float)
+    if t_stop is not None:
+        require_number("t_stop", t_stop, "a number in s")
+    require_area(area)
+    require(isinstance(method, str), "method", repr(method), "a name, such as 'auto'")
+    circuit = overridden(circuit, sources, parameters)
+    times = times_given("t_eval", t_eval)
     if not is_stack(circuit):
         if start == "periodic":
             raise InputError("start='periodic' needs a series stack; allowed for a network: 'deck', 'uncharged', 'dc'")
@@ -144,11 +152,12 @@ def _check_rtol(rtol: float) -> None:
 
 
 def _given_back(solution: Solution, throw: bool) -> Solution:
-    """A solution with its warnings said, or the error of a failed run."""
+    """A solution with its warnings said, but for those of the circuit, which came first; or a failed run's error."""
     if solution.failure is not None and throw:
         raise SolveError(solution.failure, solution)
     for text in solution.warnings:
-        warnings.warn(text, FingerspiceWarning, stacklevel=3)
+        if text not in solution.circuit.warnings:
+            warnings.warn(text, FingerspiceWarning, stacklevel=3)
     return solution
 
 
@@ -156,6 +165,8 @@ def plan(
     circuit: Circuit,
     *,
     t_stop: float | None = None,
+    sources: Sources | None = None,
+    parameters: Parameters | None = None,
     charge_law: str | None = None,
     area: str | float = "coupled",
     rtol: float = 1e-8,
@@ -170,8 +181,12 @@ def plan(
         For a request that cannot be run.
     """
     _check_rtol(rtol)
+    require_area(area)
+    circuit = overridden(circuit, sources, parameters)
     if t_stop is None and circuit.tran is None:
         t_stop = 1.0
+    for text in circuit_warnings(circuit):
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
     if not is_stack(circuit):
         network = prepare_network(
             circuit, t_stop=t_stop, t_eval=None, charge_law=charge_law, area=area, start="deck", charge=charge
@@ -280,13 +295,6 @@ def _add_error(run: Run, u_gap: float, f_el: float | None = None) -> None:
     if f_el is None:
         f_el = 2.0 * u_gap / run.peak_u * run.peak_f if run.peak_u > 0.0 else 0.0
     run.error = dataclasses.replace(run.error, u_gap=run.error.u_gap + u_gap, f_el=run.error.f_el + f_el)
-
-
-def _with_sources(circuit: Circuit, sources: Mapping[str, Waveform | float | Callable[[float], float]]) -> Circuit:
-    for name in sources:
-        if circuit[name].device != "V":
-            raise InputError(f"sources names {name!r}, which is a {circuit[name].device}; allowed: a V element")
-    return circuit.replace({circuit[name].name: as_waveform(value) for name, value in sources.items()})
 
 
 def _run(
