@@ -63,7 +63,7 @@ ORDER = (
         "comparison",
         "report",
     ),
-    *("figures", "terminal", "options", "cli", "__main__"),
+    *("figures", "answers", "terminal", "options", "cli", "__main__"),
 )
 # Beside each other, not one on the other.
 STRANGERS = (

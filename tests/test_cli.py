@@ -22,6 +22,12 @@ def figures(result: Result) -> Any:
     return json.loads(result.out)
 
 
+def row(report: Any, signal: str) -> Any:
+    """Figures of the only signal of that name."""
+    (found,) = [row for row in report["signals"] if row["signal"] == signal]
+    return found
+
+
 # run
 
 
@@ -48,20 +54,21 @@ def test_json_is_all_that_is_printed_and_null_stands_for_no_number(command: Comm
     report = figures(command("run", "pad.cir", "--json", "--no-plot", "--csv"))
     solution = fs.simulate(fs.read_netlist("pad.cir"))
     assert report["success"] is True
-    assert report["u_gap_amplitude"] == solution.summary()["u_gap_amplitude"]
-    assert report["files"] == ["pad.csv"]
-    assert set(tree(Path())) == {"pad.cir", "pad.csv"}
+    assert row(report, "u_gap")["amplitude"] == solution.summary()["u_gap_amplitude"]
+    assert report["files"] == ["out/pad.csv"]
+    assert set(tree(Path())) == {"pad.cir", "out", "out/pad.csv"}
     frozen = figures(command("ac", "pad.cir", "--area", "frozen", "--source", "DC 5", "--json", "--no-plot"))
-    assert frozen["amplitude"] is None
-    assert frozen["u_gap"][0] is None
-    assert frozen["gain"][0] > 0.0
+    (sweep,) = frozen["sweeps"]
+    assert sweep["amplitude"] is None
+    assert sweep["u_gap"][0] is None
+    assert sweep["gain"][0] > 0.0
 
 
 def test_two_decks_that_differ_after_a_dot_do_not_share_their_files(command: Command) -> None:
     for name in ("pad.v1.cir", "pad.v2.cir"):
         Path(name).write_text(edited(QUICK))
         assert command("run", name, "--no-plot").code == 0
-    assert {"pad.v1.nc", "pad.v2.nc"} <= set(tree(Path()))
+    assert {"pad.v1.nc", "pad.v2.nc"} <= set(tree(Path("out")))
 
 
 def test_set_changes_values_all_at_once_with_units_and_in_any_case(command: Command) -> None:
@@ -69,8 +76,8 @@ def test_set_changes_values_all_at_once_with_units_and_in_any_case(command: Comm
     changes = ["--set", "Xgap.m_exp=1.5", "--set", "xgap.N_EXP = 1.9", "--set", "Xcoat.r=inf"]
     report = figures(command("run", "pad.cir", "--json", "--no-plot", *changes))
     circuit = fs.read_netlist("pad.cir").replace({"Xgap.m_exp": 1.5, "Xgap.n_exp": 1.9, "Xcoat.r": float("inf")})
-    assert report["f_el_mean"] == fs.simulate(circuit).summary()["f_el_mean"]
-    with xarray.open_dataset("pad.nc") as data:
+    assert row(report, "f_el")["mean"] == fs.simulate(circuit).summary()["f_el_mean"]
+    with xarray.open_dataset("out/pad.nc") as data:
         assert json.loads(data.attrs["overrides"])["Xgap.m_exp"] == "1.5"
 
 
@@ -81,8 +88,8 @@ def test_source_area_method_law_and_rtol_are_those_of_the_interface(command: Com
     )
     circuit = fs.read_netlist("pad.cir").replace({"Vdrive": fs.Pulse(-150, 150, 0, 0, 0, 2e-3, 0.01)})
     solution = fs.simulate(circuit, area=30e-6, method="dp5", charge_law="mobile", rtol=1e-6)
-    assert report["u_gap_max"] == solution.summary()["u_gap_max"]
-    with xarray.open_dataset("pad.nc") as data:
+    assert row(report, "u_gap")["max"] == solution.summary()["u_gap_max"]
+    with xarray.open_dataset("out/pad.nc") as data:
         used = {key: data.attrs[key] for key in ("method", "charge_law", "rtol", "area")}
     assert used == {"method": "dp5", "charge_law": "mobile", "rtol": "1e-06", "area": "3e-05 m^2"}
 
@@ -113,7 +120,7 @@ def test_a_solve_that_fails_keeps_what_it_has_and_says_when_and_how_close(comman
         line,
     )
     assert said
-    with xarray.open_dataset("pad.nc") as data:
+    with xarray.open_dataset("out/pad.nc") as data:
         assert data.attrs["status"] == "FOLD"
         assert float(data.time[-1]) == pytest.approx(float(said[1]), rel=1e-9)
         assert f"{float(data.u_gap[-1]):.4g}" == said[2]
@@ -131,7 +138,7 @@ def test_a_skin_at_another_frequency_than_the_source_is_warned_about_once(comman
     assert line.startswith(
         "fingerspice: warning: Xskin takes its data at f = 200 Hz, the source's fundamental is 100 Hz"
     )
-    assert line.endswith("--set Xskin.f=100 would match")
+    assert line.endswith("Xskin.f=100 would match")
     assert command(name, "pad.cir", "--no-plot").err == ""
 
 
@@ -142,10 +149,10 @@ def test_a_voltage_that_air_does_not_bear_is_warned_about_once(command: Command)
 
 
 def test_what_the_reader_notices_is_printed_once_with_its_line(command: Command) -> None:
-    Path("pad.cir").write_text(edited(QUICK, ("r=1meg", "r=1MOhm"), (".end", ".nodeset v(area)=35\n.end")))
+    Path("pad.cir").write_text(edited(QUICK, ("r=1meg", "r=1MOhm"), (".end", ".meas tran top max v(top)\n.end")))
     first, second = command("ac", "pad.cir", "--no-plot", "--sweep", "lin 2 100 200").lines
     assert first.startswith("fingerspice: warning: pad.cir:5:41: Xgap r: '1MOhm' is milli (0.001 ohm)")
-    assert second == "fingerspice: note: .nodeset has no effect here"
+    assert second == "fingerspice: warning: .meas has no effect here"
 
 
 def test_values_on_the_command_line_have_the_traps_of_the_deck(command: Command) -> None:
@@ -164,8 +171,8 @@ def test_ac_sweeps_the_decks_line_or_the_one_given(command: Command) -> None:
     Path("pad.cir").write_text(edited((".end", ".ac dec 2 10 1k\n.end")))
     result = command("ac", "pad.cir")
     assert result.code == 0
-    assert set(tree(Path())) == {"pad.cir", "pad_ac.csv", "pad_ac.png"}
-    with Path("pad_ac.csv").open(newline="") as stream:
+    assert set(tree(Path())) == {"pad.cir", "out", "out/pad_ac.csv", "out/pad_ac.png"}
+    with Path("out/pad_ac.csv").open(newline="") as stream:
         head, *body = csv.reader(stream)
     assert head[:5] == ["frequency [Hz]", "gain [1]", "phase_deg [deg]", "u_gap [V]", "area [m^2]"]
     assert head[5:] == ["f_el_mean [N]", "amplitude [V]"]
@@ -174,8 +181,8 @@ def test_ac_sweeps_the_decks_line_or_the_one_given(command: Command) -> None:
     expected = fs.phasor(fs.read_netlist("pad.cir"), table[:, 0])
     np.testing.assert_array_equal(table[:, 5], expected.f_el_mean)
     given = figures(command("ac", "pad.cir", "--sweep", "LIN 3 100 300", "--area", "frozen", "--json", "--no-plot"))
-    assert given["frequency"] == [100.0, 200.0, 300.0]
-    assert given["files"] == ["pad_ac.csv"]
+    assert given["sweeps"][0]["frequency"] == [100.0, 200.0, 300.0]
+    assert given["files"] == ["out/pad_ac.csv"]
 
 
 def test_compare_sets_the_transient_beside_the_phasor(command: Command) -> None:
@@ -185,7 +192,7 @@ def test_compare_sets_the_transient_beside_the_phasor(command: Command) -> None:
     assert result.code == 0
     assert "gap voltage amplitude [V]" in result.out
     assert "-0.00 %" not in result.out
-    assert set(tree(Path())) == {"pad.cir", "pad_compare.png"}
+    assert set(tree(Path())) == {"pad.cir", "out", "out/pad_compare.png"}
     report = figures(command("compare", "pad.cir", "--json", "--no-plot"))
     assert report["transient_mean_area"]["f_el_mean"] == pytest.approx(report["phasor"]["f_el_mean"], rel=1e-5)
     assert report["transient_coupled"]["f_el_mean"] < 0.99 * report["phasor"]["f_el_mean"]
@@ -229,7 +236,7 @@ def test_ac_with_the_area_coupled_sweeps_amplitudes_too(command: Command) -> Non
     frozen = fs.phasor(fs.read_netlist("pad.cir"), [100.0, 5000.0], area="frozen")
     np.testing.assert_allclose(low["gain"], np.abs(frozen.gain), rtol=1e-3)
     np.testing.assert_allclose(high["f_el_mean"], [0.1090, 0.1833], rtol=1e-3)
-    assert set(tree(Path())) == {"pad.cir", "pad_ac.csv", "pad_ac.png"}
+    assert set(tree(Path())) == {"pad.cir", "out", "out/pad_ac.csv", "out/pad_ac.png"}
 
 
 def test_plan_says_which_model_and_why(command: Command) -> None:
@@ -239,3 +246,19 @@ def test_plan_says_which_model_and_why(command: Command) -> None:
     assert frozen["tier"] == "linear"
     assert frozen["reasons"]
     assert set(tree(Path())) == {"pad.cir"}
+
+
+def test_stop_and_start_are_those_of_the_interface(command: Command) -> None:
+    report = figures(command("run", "pad.cir", "--stop", "10m", "--start", "periodic", "--json", "--no-plot"))
+    solution = fs.simulate(fs.read_netlist("pad.cir"), t_stop=0.01, start="periodic")
+    assert row(report, "f_el")["mean"] == solution.summary()["f_el_mean"]
+    # A deck without .tran needs no more than an end.
+    Path("endless.cir").write_text(edited((".tran 10u 50m uic", "*")))
+    assert figures(command("run", "endless.cir", "--stop", "10m", "--json", "--no-plot"))["t_stop"] == 0.01
+    assert figures(command("plan", "endless.cir", "--stop", "10m", "--json"))["tier"] == "coupled"
+
+
+def test_results_go_to_a_folder_that_git_ignores(command: Command) -> None:
+    ignored = (Path(__file__).parents[1] / ".gitignore").read_text().splitlines()
+    assert command("run", "pad.cir", "--no-plot").out.splitlines()[-1] == "wrote out/pad.nc"
+    assert "/out/" in ignored

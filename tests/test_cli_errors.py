@@ -53,6 +53,9 @@ OPTIONS = [
     (["--source", "SIN(0 1e-320 100)"], "the source's peak is 9.99989e-321 V; allowed: 0, or 1e-300 V or more"),
     (["--source", "PULSE(0 1 0 1e-300 1e-300 1e-300 1e-299)"], "pulse rise is 1e-300 s; allowed: 0, or a size from"),
     (["--source", "SIN(0 200 1e300)"], "Sine frequency is 1e+300 Hz; allowed: 0, or a size from 1e-30 to 1e+30"),
+    (["--stop", "soon"], "--stop 'soon': 'soon' is not a number"),
+    (["--stop", "-1"], "t_stop is -1 s; allowed: more than 0 s"),
+    (["--start", "warm"], "start is 'warm'; allowed: 'deck', 'uncharged', 'dc', 'periodic' or a Solution"),
     (["--area", "frozn"], "area is 'frozn'; allowed: 'coupled', 'mean', 'frozen' or m^2"),
     (["--area", "-1u"], "area is -1e-06 m^2; allowed: a positive area in m^2"),
     (["--area", "nan"], "area is 'nan'; allowed"),
@@ -74,7 +77,7 @@ OTHERS = [
     (["export", "pad.cir", "-o", "file/x.cir"], "cannot write file/x.cir: file is not a folder"),
     (["export", "pad.cir", "-o", "folder"], "cannot write folder: it is a folder; allowed: a file's name"),
     (["export", "pad.cir", "-o", "./folder/../pad.cir"], "it is the deck itself; allowed: another name or folder"),
-    (["run", "deck.csv", "--csv"], "cannot write deck.csv: it is the deck itself"),
+    (["run", "deck.csv", "--csv", "--out", "."], "cannot write deck.csv: it is the deck itself"),
     (["export", "pad.cir", "-o", "x.cir", "--charge-law", "both"], "charge_law is 'both'"),
     (["ac", "pad.cir", "--sweep", "dec 10 10"], "--sweep 'dec 10 10': '.ac dec 10 10' is not understood; allowed: .ac"),
     (["ac", "pad.cir", "--sweep", ""], "--sweep '': '.ac' is not understood"),
@@ -197,11 +200,12 @@ def test_a_disk_that_is_full_is_told_and_leaves_no_half_file(
     def full(self: Path, target: Any) -> Path:
         raise OSError(errno.ENOSPC, "No space left on device")
 
+    (tmp_path / "out").mkdir()
     before = tree(tmp_path)
     monkeypatch.setattr(Path, "replace", full)
     result = command("run", "pad.cir", "--no-plot")
     assert result.code == 2
-    assert result.lines == ["fingerspice: cannot write pad.nc: No space left on device"]
+    assert result.lines == ["fingerspice: cannot write out/pad.nc: No space left on device"]
     assert tree(tmp_path) == before
 
 
@@ -227,7 +231,7 @@ def test_the_installed_command_exits_with_0_1_and_2(tmp_path: Path) -> None:
     (tmp_path / "pad.cir").write_text(edited())
     done = process("run", "pad.cir", "--no-plot", folder=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    assert "wrote pad.nc" in done.stdout
+    assert "wrote out/pad.nc" in done.stdout
     failed = process("run", "pad.cir", "--no-plot", "--charge-law", "mobile", "--set", "Xgap.d=10n", folder=tmp_path)
     assert failed.returncode == 1
     assert failed.stderr.startswith("fingerspice: stopped at t = ")

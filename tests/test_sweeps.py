@@ -235,6 +235,7 @@ def test_the_command_says_what_drives_where_the_data_are_taken_and_where_they_en
     (line,) = result.lines
     assert line.startswith("fingerspice: warning: the sweep goes down to 1 Hz, 1 decades below the 10 Hz to 100 kHz")
     report = json.loads(command("ac", "pad.cir", "--sweep", "lin 2 10 20", "--skin", "own", "--json", "--no-plot").out)
+    (report,) = report["sweeps"]
     assert report["amplitude"] == pytest.approx(5.0)
     assert report["source_phase_deg"] == pytest.approx(30.0)
     assert report["drive"] == "AC 5 30 of Vdrive"

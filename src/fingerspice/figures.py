@@ -24,6 +24,7 @@ from fingerspice.circuit.waveforms import Sine, Waveform, require
 from fingerspice.files import write_aside
 from fingerspice.phasors import phasor
 from fingerspice.physics.materials import SKIN_BAND, skin_permittivity, skin_resistivity
+from fingerspice.runs import Progress
 from fingerspice.solution import Solution
 from fingerspice.steady import steady_state
 from fingerspice.table1 import table1_circuit
@@ -107,7 +108,9 @@ class Table:
         return write_aside(path, write)
 
 
-def make_figures(folder: str | Path, *, only: int | Iterable[int] | None = None) -> list[Path]:
+def make_figures(
+    folder: str | Path, *, only: int | Iterable[int] | None = None, progress: Progress | None = None
+) -> list[Path]:
     """Write the paper's figures, each as ``figN.png`` with its data in ``figN.csv``.
 
     Parameters
@@ -116,6 +119,8 @@ def make_figures(folder: str | Path, *, only: int | Iterable[int] | None = None)
         Made where it does not exist.
     only : int or iterable of int, optional
         Numbers of the figures wanted, 2 to 5; all by default.
+    progress : callable, optional
+        Called with the fraction done.
 
     Returns
     -------
@@ -131,7 +136,9 @@ def make_figures(folder: str | Path, *, only: int | Iterable[int] | None = None)
     for number in wanted:
         require(number in FIGURES, "figure", f"{number}", ", ".join(map(str, FIGURES)))
     written = []
-    for number in sorted(set(wanted)):
+    for place, number in enumerate(sorted(set(wanted))):
+        if progress is not None:
+            progress(place / len(set(wanted)))
         figure, table = FIGURES[number]()
         written.append(plotting.save(figure, Path(folder) / f"fig{number}.png"))
         written.append(table.write(Path(folder) / f"fig{number}.csv"))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +17,7 @@ from fingerspice.circuit.waveforms import Sine, Waveform, require
 from fingerspice.errors import FingerspiceWarning, InputError
 from fingerspice.measures import weigh_outputs
 from fingerspice.phasors import PhasorSolution
+from fingerspice.runs import Progress
 from fingerspice.steady import steady_state
 from fingerspice.sweeps import Drive, sweep_drive, sweep_notes
 
@@ -30,6 +33,7 @@ def large_signal(
     *,
     charge_law: str | None = None,
     rtol: float = 1e-8,
+    progress: Progress | None = None,
 ) -> tuple[PhasorSolution, ...]:
     """Periodic states under sines, by frequency and amplitude; SKIN evaluated at each frequency.
 
@@ -41,7 +45,7 @@ def large_signal(
         Hz, positive.
     amplitude : array_like, optional
         V, positive; by default that of the source's own ``AC``, or without it of its fundamental.
-    charge_law, rtol
+    charge_law, rtol, progress
         As in `simulate`.
 
     Returns
@@ -74,11 +78,17 @@ def large_signal(
     for text in sweep_notes(circuit, f)[1]:
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     drives = [own] if amplitude is None else [Drive(float(a), 0.0, "the amplitude given") for a in given]
-    return tuple(_sweep(circuit, f, drive, charge_law, rtol) for drive in drives)
+    found = itertools.count(1)
+
+    def one() -> None:
+        if progress is not None:
+            progress(next(found) / (f.size * len(drives)))
+
+    return tuple(_sweep(circuit, f, drive, charge_law, rtol, one) for drive in drives)
 
 
 def _sweep(
-    circuit: Circuit, frequency: FloatArray, drive: Drive, charge_law: str | None, rtol: float
+    circuit: Circuit, frequency: FloatArray, drive: Drive, charge_law: str | None, rtol: float, one: Callable[[], None]
 ) -> PhasorSolution:
     (source, sign), *_ = build_stack(circuit).sources
     skins = [e.name for e in circuit.by_device("SKIN")]
@@ -98,6 +108,7 @@ def _sweep(
         gains.append([period.phasor(name, float(f)) * sign / amplitude for name in s.layers])
         areas.append(period.mean("area"))
         forces.append(period.mean("f_el"))
+        one()
     gain = np.array(gains, np.complex128)
     gap = build_stack(circuit).gap_layer
     assert gap is not None

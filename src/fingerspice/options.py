@@ -70,6 +70,14 @@ def _with_source(circuit: Circuit, text: str) -> Circuit:
         raise InputError(f"--source {error.message}") from None
 
 
+def time_from_text(option: str, text: str | None) -> float | None:
+    """A time in s, such as ``50m``."""
+    try:
+        return None if text is None else parse_number(text)
+    except ValueError as error:
+        raise InputError(f"{option} {text!r}: {error}") from None
+
+
 def area_from_text(text: str) -> str | float:
     """A mode's name, or an area in m^2."""
     try:
@@ -94,11 +102,11 @@ def check_output(file: Path, deck: Path | None = None) -> None:
 
 
 def _check_output(file: Path, deck: Path | None) -> None:
-    # A name that is too long is found only by looking for the file itself.
-    file.exists()
     folder = file.parent
     while not folder.exists() and folder != folder.parent and not folder.is_symlink():
         folder = folder.parent
+    # A name that is too long is found only by looking for the file itself, in a folder that is there.
+    (folder / file.name).exists()
     if not folder.is_dir():
         raise InputError(f"cannot write {file}: {folder} is not a folder; allowed: a folder that can be written")
     if not os.access(folder, os.W_OK | os.X_OK):

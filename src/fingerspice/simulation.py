@@ -40,6 +40,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 RTOL_RANGE = (1e-13, 0.1)
+STARTS = ("deck", "uncharged", "dc", "periodic")
 
 
 def simulate(
@@ -119,6 +120,8 @@ def simulate(
         require_number("t_stop", t_stop, "a number in s")
     require_area(area)
     require(isinstance(method, str), "method", repr(method), "a name, such as 'auto'")
+    known = isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)
+    require(known, "start", repr(start), f"{', '.join(map(repr, STARTS))} or a Solution")
     circuit = overridden(circuit, sources, parameters)
     times = times_given("t_eval", t_eval)
     if not is_stack(circuit):
