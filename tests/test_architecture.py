@@ -19,7 +19,7 @@ MAX_LINES = 450
 
 # From the bottom up: a part imports its own files and the parts above it in this list, nothing below.
 ORDER = (
-    *("errors", "units", "files", "streams", "compiled", "numerics", "physics", "engine", "circuit"),
+    *("errors", "units", "files", "streams", "announcing", "compiled", "numerics", "physics", "engine", "circuit"),
     *("arguments", "notices", "sweeps"),
     *(
         "record",

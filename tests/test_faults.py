@@ -314,7 +314,7 @@ def test_a_folder_in_the_place_of_a_picture_is_refused_before_the_run(command: C
 
 def test_a_deck_named_as_the_picture_is_not_overwritten(command: Command) -> None:
     Path("pad.cir").rename("pad.png")
-    result = command("run", "pad.png")
+    result = command("run", "pad.png", "--out", ".")
     assert result.code == 2
     assert result.lines == ["fingerspice: cannot write pad.png: it is the deck itself; allowed: another name or folder"]
     assert Path("pad.png").read_text() == edited(QUICK)

@@ -7,6 +7,7 @@ import logging
 import math
 import os
 import sys
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
+from fingerspice.announcing import Bar
 from fingerspice.answers import OWN, blank
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError, printable
 
@@ -204,23 +206,14 @@ def progress(what: str = "simulating") -> Iterator[Callable[[float], None] | Non
     if not sys.stderr.isatty():
         yield None
         return
-    import time
-
-    from rich.console import Console
-    from rich.progress import Progress
-
-    bar = Progress(console=Console(stderr=True), transient=True)
+    bar = Bar(what)
     begin = time.perf_counter()
-    task = bar.add_task(what, total=1.0)
 
     def update(done: float) -> None:
         if time.perf_counter() - begin > 1.0:
-            if not bar.live.is_started:
-                bar.start()
-            bar.update(task, completed=done)
+            bar.show(done)
 
     try:
         yield update
     finally:
-        if bar.live.is_started:
-            bar.stop()
+        bar.stop()
