@@ -5,7 +5,6 @@ from __future__ import annotations
 import cmath
 import json
 import math
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from commands import Command
 from deck_edits import edited
 from fingerspice.circuit.circuit import AcSweep
 from fingerspice.sweeps import sweep_frequencies
-from ngspice_tools import CIRCUITS
+from ngspice_tools import CIRCUITS, call_ngspice
 from scenes import table1
 
 FREQUENCIES = (20.0, 300.0, 5e3, 8e4)
@@ -103,7 +102,7 @@ def ac_in_ngspice(text: str, signal: str, folder: Path) -> tuple[NDArray[np.floa
     # Of subcircuits the ends stay.
     lines = [line for line in text.splitlines() if not line.startswith(".tran") and line.strip() != ".end"]
     (folder / "deck.cir").write_text("\n".join([*lines, *control]))
-    done = subprocess.run(["ngspice", "-b", "deck.cir"], cwd=folder, capture_output=True, text=True, timeout=30)
+    done = call_ngspice(folder, "deck.cir")
     assert (folder / "out.txt").exists(), done.stdout + done.stderr
     f, x, y = np.loadtxt(folder / "out.txt").T
     return f, x + 1j * y
