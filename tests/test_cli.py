@@ -262,3 +262,19 @@ def test_results_go_to_a_folder_that_git_ignores(command: Command) -> None:
     ignored = (Path(__file__).parents[1] / ".gitignore").read_text().splitlines()
     assert command("run", "pad.cir", "--no-plot").out.splitlines()[-1] == "wrote out/pad.nc"
     assert "/out/" in ignored
+
+
+def test_each_of_several_sources_is_replaced_by_its_name(command: Command) -> None:
+    text = edited(QUICK, ("Vdrive drive 0", "Vbias drive b DC 5\nVdrive b 0"))
+    Path("pad.cir").write_text(text)
+    words = ["run", "pad.cir", "--json", "--no-plot"]
+    both = command(*words, "--source", "Vdrive=SQUARE(100 100)", "--source", "vbias = DC 7")
+    assert row(figures(both), "u_source")["max"] == 107.0
+    one = command(*words, "--source", "Vdrive=SQUARE(100 100)")
+    assert row(figures(one), "u_source")["max"] == 105.0
+    assert one.lines == [
+        "fingerspice: warning: sources names Vdrive only: Vbias stays on, as in the deck; 0 would switch it off"
+    ]
+    none = command(*words, "--source", "SQUARE(100 100)")
+    assert none.code == 2
+    assert "the circuit has Vbias, Vdrive; allowed: NAME=SPEC with one of these names" in none.err

@@ -34,7 +34,10 @@ Out = Annotated[Path, typer.Option("--out", metavar="FOLDER", help="Where the fi
 Rtol = Annotated[float, typer.Option(help="Largest error of gap voltage and force, relative to their peaks.")]
 ChargeLaw = Annotated[str | None, typer.Option(help="local or mobile; the included library's by default.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Change a value: Xgap.d=3u.")]
-Source = Annotated[str | None, typer.Option("--source", metavar="SPEC", help="Replace the source: 'SQUARE(200 100)'.")]
+Source = Annotated[
+    list[str] | None,
+    typer.Option("--source", metavar="[NAME=]SPEC", help="Replace a source: 'SQUARE(200 100)', 'Vdrive=DC 5'."),
+]
 Stop = Annotated[str | None, typer.Option(metavar="TIME", help="End of the run, such as 50m (s); the deck's TSTOP.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON (docs/json.md), nothing else on stdout.")]
 NoPlot = Annotated[bool, typer.Option("--no-plot", help="Write no picture.")]
@@ -110,6 +113,7 @@ def run(
         t_stop = time_from_text("--stop", stop)
         if circuit.tran is None and t_stop is None:
             raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
+        options.check_stop(circuit, t_stop)
         data = _target(deck, out, ".csv" if csv else ".nc")
         picture = None if no_plot else _target(deck, out, ".png")
         with progress() as update:

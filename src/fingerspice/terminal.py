@@ -186,8 +186,9 @@ class Answering:
                 files.append(str(write()))
         except InputError as error:
             failed = error
-        if not self.as_json:
-            say("\n".join([*filter(None, [text()]), *(f"wrote {file}" for file in files)]))
+        said = [*filter(None, [text()]), *(f"wrote {file}" for file in files)]
+        if said and not self.as_json:
+            say("\n".join(said))
         if failed is not None:
             raise failed
 
