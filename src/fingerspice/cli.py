@@ -33,12 +33,16 @@ Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir).
 Out = Annotated[Path, typer.Option("--out", metavar="FOLDER", help="Where the files go.")]
 Rtol = Annotated[float, typer.Option(help="Largest error of gap voltage and force, relative to their peaks.")]
 ChargeLaw = Annotated[str | None, typer.Option(help="local or mobile; the included library's by default.")]
-Set = Annotated[list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Change a value: Xgap.d=3u.")]
+Set = Annotated[
+    list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Change a value: Xgap.d=3u. May be repeated.")
+]
 Source = Annotated[
     list[str] | None,
-    typer.Option("--source", metavar="[NAME=]SPEC", help="Replace a source: 'SQUARE(200 100)', 'Vdrive=DC 5'."),
+    typer.Option(
+        "--source", metavar="[NAME=]SPEC", help="Replace a source: 'SQUARE(200 100)', or of several 'Vdrive=DC 5'."
+    ),
 ]
-Stop = Annotated[str | None, typer.Option(metavar="TIME", help="End of the run, such as 50m (s); the deck's TSTOP.")]
+Stop = Annotated[str | None, typer.Option(metavar="TIME", help="End of the run, s: 50m; TSTOP by default.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON (docs/json.md), nothing else on stdout.")]
 NoPlot = Annotated[bool, typer.Option("--no-plot", help="Write no picture.")]
 
@@ -96,7 +100,7 @@ def run(
 
     Examples:
 
-      fingerspice run circuits/fingerpad.cir --out out
+      fingerspice run circuits/fingerpad.cir
 
       fingerspice run circuits/fingerpad.cir --source 'SQUARE(200 100)' --set Xgap.d=3u --csv
 

@@ -77,7 +77,8 @@ class SteadyState:
             raise SolveError(solution.failure, solution)
         for text in solution.warnings:
             if text not in self.problem.circuit.warnings:
-                warnings.warn(text, FingerspiceWarning, stacklevel=2)
+                # Past functools, to the line that asked.
+                warnings.warn(text, FingerspiceWarning, stacklevel=3)
         return solution
 
 
