@@ -38,9 +38,7 @@ Set = Annotated[
 ]
 Source = Annotated[
     list[str] | None,
-    typer.Option(
-        "--source", metavar="[NAME=]SPEC", help="Replace a source: 'SQUARE(200 100)', or of several 'Vdrive=DC 5'."
-    ),
+    typer.Option("--source", metavar="[NAME=]SPEC", help="Replace a source: 'SQUARE(200 100)', 'Vdrive=DC 5'."),
 ]
 Stop = Annotated[str | None, typer.Option(metavar="TIME", help="End of the run, s: 50m; TSTOP by default.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON (docs/json.md), nothing else on stdout.")]
