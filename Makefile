@@ -12,6 +12,7 @@ $(BIN)/python:
 
 # Stamps: what is installed, and from which pyproject.toml.
 $(VENV)/.run: pyproject.toml | $(BIN)/python
+	@echo "installing into $(VENV), about a minute ..."
 	$(BIN)/pip install --quiet --editable .
 	touch $@
 
@@ -21,6 +22,7 @@ $(VENV)/.check: pyproject.toml | $(BIN)/python
 
 # The pinned torch first: an open range would bring a build for graphics cards.
 $(VENV)/.test: pyproject.toml | $(BIN)/python
+	@echo "installing into $(VENV), about three minutes: torch alone is 200 MB ..."
 	$(BIN)/pip install --quiet torch==2.13.0
 	$(BIN)/pip install --quiet --editable '.[test]'
 	touch $@
@@ -32,6 +34,8 @@ figures: $(VENV)/.run
 	$(BIN)/fingerspice figures --out out
 
 test: $(VENV)/.test
+	@sh tests/get_ngspice.sh
+	@echo "running the whole suite: about 15 minutes on two cores, the first time 2 more for compiling"
 	$(BIN)/python -m pytest
 
 stress: $(VENV)/.test

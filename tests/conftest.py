@@ -10,6 +10,7 @@ import pytest
 
 from commands import QUICK, Command, run_here
 from deck_edits import edited
+from ngspice_tools import WITHOUT
 
 
 @pytest.fixture
@@ -21,3 +22,15 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
     threshold = gc.get_threshold()
     yield lambda *arguments: run_here(monkeypatch, capsys, *arguments)
     gc.set_threshold(*threshold)
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """The last line says what was not run for want of ngspice."""
+    reporter = config.pluginmanager.get_plugin("terminalreporter")
+    skipped = [] if reporter is None else reporter.stats.get("skipped", [])
+    without = sum(WITHOUT in str(report.longrepr) for report in skipped)
+    if without:
+        reporter.write_line(
+            f"{without} comparisons with ngspice were not run, as it is not installed; to run them: apt-get install "
+            "ngspice (or your system's way), then make test again"
+        )

@@ -19,7 +19,8 @@ MAX_LINES = 450
 
 # From the bottom up: a part imports its own files and the parts above it in this list, nothing below.
 ORDER = (
-    *("errors", "units", "files", "streams", "compiled", "numerics", "physics", "pages", "engine", "circuit", "report"),
+    *("errors", "units", "files", "streams", "announcing", "compiled", "numerics", "physics", "pages", "engine"),
+    *("circuit", "report", "arguments", "notices", "sweeps"),
     *(
         "record",
         "network_record",
@@ -34,11 +35,12 @@ ORDER = (
         "solution",
         "phasor_solution",
         "phasors",
-        "fitting",
+        "materialdata",
         "table1",
         "picture",
         "drawing",
         "traces",
+        "fitting",
         "spectrum",
         "times",
         "starting",
@@ -69,7 +71,7 @@ ORDER = (
         "comparison",
         "plotting",
     ),
-    *("figures", "terminal", "options", "results", "cli", "__main__"),
+    *("figures", "answers", "terminal", "options", "results", "cli", "__main__"),
 )
 # Beside each other, not one on the other.
 STRANGERS = (

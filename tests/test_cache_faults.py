@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +47,7 @@ tempfile.TemporaryFile = refuse
 """
 # What the package logs, as the command line shows it.
 LOGGED = "import logging; logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
-ONCE = "compiling what this needs, about 20 s; later runs take 2 s"
+ONCE = "compiling what this needs, about 40 s, only once: later runs find it on the disk"
 
 
 @pytest.fixture
@@ -58,11 +60,15 @@ def copy(tmp_path: Path) -> Iterator[Path]:
 
 
 def area(copy: Path, *arguments: str, before: str = "", **options: Any) -> tuple[int, list[str], str]:
+    return ended(begun(copy, *arguments, before=before, **options))
+
+
+def begun(copy: Path, *arguments: str, before: str = "", **options: Any) -> subprocess.Popen[str]:
     home = str(copy / "__init__.py" / "no")
     hidden = {"PYTHONPATH": str(copy.parent), "HOME": home, "XDG_CACHE_HOME": home, "PYTHONDONTWRITEBYTECODE": "1"}
     environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | hidden
     entry = [sys.executable, "-c", before + AREA]
-    return ended(start(copy, *arguments, entry=entry, env=environment, **options))
+    return start(copy, *arguments, entry=entry, env=environment, **options)
 
 
 def test_no_room_for_compiled_code_means_compiling_again(copy: Path) -> None:
@@ -90,11 +96,34 @@ def test_compiled_code_that_came_with_the_package_is_used_where_nothing_can_be_w
     assert area(copy, before=SHUT + LOGGED) == (0, [], first[2])
 
 
+def test_compiling_is_announced_in_python_too_by_one_line_and_only_once(copy: Path) -> None:
+    out, err = begun(copy).communicate(timeout=120)
+    assert err == f"fingerspice: note: {ONCE}\n"
+    assert begun(copy).communicate(timeout=120) == (out, "")
+
+
+def test_on_a_terminal_compiling_shows_a_bar_that_goes_away(copy: Path) -> None:
+    ours, theirs = os.openpty()
+    process = begun(copy, stderr=theirs)
+    os.close(theirs)
+    seen = b""
+    with suppress(OSError):
+        while piece := os.read(ours, 4096):
+            seen += piece
+    os.close(ours)
+    assert process.wait(timeout=120) == 0
+    assert process.stdout is not None
+    assert float(process.stdout.read()) > 0.0
+    assert b"compiling what this needs" in seen
+    assert b"\x1b[?25h" in seen.rpartition(b"compiling")[2]
+    process.stdout.close()
+
+
 def test_where_compiled_code_cannot_be_kept_it_is_said_what_to_set(copy: Path) -> None:
     code, (said,), out = area(copy, before=SHUT + LOGGED)
     assert code == 0
     assert float(out) > 0.0
-    assert said.startswith("compiling, about 20 s, as at every run: no folder for compiled code can be written")
+    assert said.startswith("compiling, about 40 s, as at every run: no folder for compiled code can be written")
     assert said.endswith("set NUMBA_CACHE_DIR to one that can")
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import pytest
 from scipy.optimize import brentq
 
 import analytic as ref
 import fingerspice as fs
-from scenes import deck, table1_deck
+from scenes import deck, table1, table1_deck
 
 every_kind = pytest.mark.parametrize("beside", ["", "Rbeside drive 0 1meg"], ids=["stack", "network"])
 
@@ -21,7 +22,7 @@ def said(volt: float, beside: str) -> list[str]:
         warnings.simplefilter("always", fs.FingerspiceWarning)
         run = fs.simulate(fs.parse_netlist(text), rtol=1e-6)
     assert list(run.warnings) == [str(w.message) for w in caught]
-    return list(run.warnings)
+    return [text for text in run.warnings if "has no fundamental" not in text]
 
 
 def jumps_to(u_gap: float) -> float:
@@ -60,3 +61,48 @@ def test_each_of_two_fingers_is_warned_about_by_its_name() -> None:
     with pytest.warns(fs.FingerspiceWarning, match="the gap voltage of Xfar reaches 320 V") as caught:
         fs.simulate(circuit, rtol=1e-6)
     assert len(caught) == 1
+
+
+# The circuit -------------------------------------------------------------------------------------------------
+
+
+def of(circuit: fs.Circuit, **options: Any) -> list[str]:
+    """Warnings of a run of 1 ms, which Python's own show as well."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", fs.FingerspiceWarning)
+        run = fs.simulate(circuit, t_stop=1e-3, rtol=1e-6, **options)
+    assert [str(w.message) for w in caught] == list(run.warnings)
+    return list(run.warnings)
+
+
+def test_a_skin_at_another_frequency_than_the_sources_is_warned_about() -> None:
+    assert of(table1()) == []
+    (text,) = of(table1(), sources=fs.Square(200, 5000))
+    assert text == ("Xskin takes its data at f = 100 Hz, the source's fundamental is 5000 Hz; Xskin.f=5000 would match")
+    assert of(table1(), sources=fs.Square(200, 5000), parameters={"Xskin.f": 5000}) == []
+    with pytest.warns(fs.FingerspiceWarning, match=r"Xskin\.f=5000 would match"):
+        fs.plan(table1(), sources=fs.Square(200, 5000))
+    state = fs.steady_state(table1(), sources=fs.Square(200, 5000), rtol=1e-6)
+    with pytest.warns(fs.FingerspiceWarning, match=r"Xskin\.f=5000 would match"):
+        assert state.solution.warnings == (text,)
+
+
+def test_a_recording_on_a_skin_of_one_frequency_is_warned_about() -> None:
+    (text,) = of(table1(), sources=fs.Samples([0.0, 100.0, -50.0, 0.0], 4000.0))
+    assert "the source has no fundamental: the mean force may be 5 to 10 % off; SKIN_DISPERSIVE d=350u is right" in text
+
+
+def test_directives_without_effect_are_warned_about_but_not_those_for_ngspice() -> None:
+    (text,) = of(table1(extra=".meas tran top max v(top)\n.nodeset v(area)=35\n.options reltol=1e-4"))
+    assert text == ".meas has no effect here"
+
+
+def test_a_source_that_is_not_named_stays_on_and_is_warned_about() -> None:
+    lines = table1_deck(skin={"f": 5000}).splitlines()
+    lines[2:4] = ["Vdrive drive bias SIN(0 200 5000)", "Vbias bias 0 DC 20", lines[3]]
+    circuit = fs.parse_netlist("\n".join(lines))
+    with pytest.warns(fs.FingerspiceWarning, match=r"sources names vdrive only: Vbias stays on, as in the deck"):
+        run = fs.simulate(circuit, sources={"vdrive": fs.Sine(100, 5000)}, t_stop=1e-3)
+    assert run.u_source[0] == 20.0
+    assert [text for text in run.warnings if "stays on" in text]
+    assert of(circuit, sources={"Vdrive": fs.Sine(100, 5000), "Vbias": 0}) == []

@@ -25,6 +25,12 @@ def figures(result: Result) -> Any:
     return json.loads(result.out)
 
 
+def row(report: Any, signal: str) -> Any:
+    """Figures of the only signal of that name."""
+    (found,) = [row for row in report["signals"] if row["signal"] == signal]
+    return found
+
+
 # run
 
 
@@ -51,13 +57,14 @@ def test_json_is_all_that_is_printed_and_null_stands_for_no_number(command: Comm
     report = figures(command("run", "pad.cir", "--json", "--no-plot", "--csv"))
     solution = fs.simulate(fs.read_netlist("pad.cir"))
     assert report["success"] is True
-    assert report["u_gap_amplitude"] == solution.summary()["u_gap_amplitude"]
+    assert row(report, "u_gap")["amplitude"] == solution.summary()["u_gap_amplitude"]
     assert report["files"] == ["out/pad.csv"]
     assert set(tree(Path())) == {"pad.cir", *OUT, "out/pad.csv"}
     frozen = figures(command("ac", "pad.cir", "--area", "frozen", "--source", "DC 5", "--json", "--no-plot"))
-    assert frozen["amplitude"] is None
-    assert frozen["u_gap"][0] is None
-    assert frozen["gain"][0] > 0.0
+    (sweep,) = frozen["sweeps"]
+    assert sweep["amplitude"] is None
+    assert sweep["u_gap"][0] is None
+    assert sweep["gain"][0] > 0.0
 
 
 def test_two_decks_that_differ_after_a_dot_do_not_share_their_files(command: Command) -> None:
@@ -72,7 +79,7 @@ def test_set_changes_values_all_at_once_with_units_and_in_any_case(command: Comm
     changes = ["--set", "Xgap.m_exp=1.5", "--set", "xgap.N_EXP = 1.9", "--set", "Xcoat.r=inf"]
     report = figures(command("run", "pad.cir", "--json", "--no-plot", *changes))
     circuit = fs.read_netlist("pad.cir").replace({"Xgap.m_exp": 1.5, "Xgap.n_exp": 1.9, "Xcoat.r": float("inf")})
-    assert report["f_el_mean"] == fs.simulate(circuit).summary()["f_el_mean"]
+    assert row(report, "f_el")["mean"] == fs.simulate(circuit).summary()["f_el_mean"]
     with xarray.open_dataset("out/pad.nc") as data:
         assert json.loads(data.attrs["overrides"])["Xgap.m_exp"] == "1.5"
 
@@ -84,7 +91,7 @@ def test_source_area_method_law_and_rtol_are_those_of_the_interface(command: Com
     )
     circuit = fs.read_netlist("pad.cir").replace({"Vdrive": fs.Pulse(-150, 150, 0, 0, 0, 2e-3, 0.01)})
     solution = fs.simulate(circuit, area=30e-6, method="dp5", charge_law="mobile", rtol=1e-6)
-    assert report["u_gap_max"] == solution.summary()["u_gap_max"]
+    assert row(report, "u_gap")["max"] == solution.summary()["u_gap_max"]
     with xarray.open_dataset("out/pad.nc") as data:
         used = {key: data.attrs[key] for key in ("method", "charge_law", "rtol", "area")}
     assert used == {"method": "dp5", "charge_law": "mobile", "rtol": "1e-06", "area": "3e-05 m^2"}
@@ -134,7 +141,7 @@ def test_a_skin_at_another_frequency_than_the_source_is_warned_about_once(comman
     assert line.startswith(
         "fingerspice: warning: Xskin takes its data at f = 200 Hz, the source's fundamental is 100 Hz"
     )
-    assert line.endswith("--set Xskin.f=100 would match")
+    assert line.endswith("Xskin.f=100 would match")
     assert command(name, "pad.cir", "--no-plot", "--name", "matched").err == ""
 
 
@@ -149,7 +156,7 @@ def test_what_the_reader_notices_is_printed_once_with_its_line(command: Command)
     Path("pad.cir").write_text(edited(QUICK, ("r=1meg", "r=1MOhm"), (".end", lines)))
     first, second = command("ac", "pad.cir", "--no-plot", "--sweep", "lin 2 100 200").lines
     assert first.startswith("fingerspice: warning: pad.cir:5:41: Xgap r: '1MOhm' is milli (0.001 ohm)")
-    assert second == "fingerspice: note: .meas has no effect here"
+    assert second == "fingerspice: warning: .meas has no effect here"
 
 
 def test_values_on_the_command_line_have_the_traps_of_the_deck(command: Command) -> None:
@@ -179,7 +186,7 @@ def test_ac_sweeps_the_decks_line_or_the_one_given(command: Command) -> None:
     expected = fs.phasor(fs.read_netlist("pad.cir"), table[:, 0])
     np.testing.assert_array_equal(table[:, 5], expected.f_el_mean)
     given = figures(command("ac", "pad.cir", "--sweep", "LIN 3 100 300", "--area", "frozen", "--json", "--no-plot"))
-    assert given["frequency"] == [100.0, 200.0, 300.0]
+    assert given["sweeps"][0]["frequency"] == [100.0, 200.0, 300.0]
     assert given["files"] == ["out/pad_ac.csv"]
 
 
@@ -244,3 +251,35 @@ def test_plan_says_which_model_and_why(command: Command) -> None:
     assert frozen["tier"] == "linear"
     assert frozen["reasons"]
     assert set(tree(Path())) == {"pad.cir"}
+
+
+def test_stop_and_start_are_those_of_the_interface(command: Command) -> None:
+    report = figures(command("run", "pad.cir", "--stop", "10m", "--start", "periodic", "--json", "--no-plot"))
+    solution = fs.simulate(fs.read_netlist("pad.cir"), t_stop=0.01, start="periodic")
+    assert row(report, "f_el")["mean"] == solution.summary()["f_el_mean"]
+    # A deck without .tran needs no more than an end.
+    Path("endless.cir").write_text(edited((".tran 10u 50m uic", "*")))
+    assert figures(command("run", "endless.cir", "--stop", "10m", "--json", "--no-plot"))["t_stop"] == 0.01
+    assert figures(command("plan", "endless.cir", "--stop", "10m", "--json"))["tier"] == "coupled"
+
+
+def test_results_go_to_a_folder_that_git_ignores(command: Command) -> None:
+    ignored = (Path(__file__).parents[1] / ".gitignore").read_text().splitlines()
+    assert command("run", "pad.cir", "--no-plot").out.splitlines()[-1] == "wrote out/pad.nc"
+    assert "/out/" in ignored
+
+
+def test_each_of_several_sources_is_replaced_by_its_name(command: Command) -> None:
+    text = edited(QUICK, ("Vdrive drive 0", "Vbias drive b DC 5\nVdrive b 0"))
+    Path("pad.cir").write_text(text)
+    words = ["run", "pad.cir", "--json", "--no-plot"]
+    both = command(*words, "--source", "Vdrive=SQUARE(100 100)", "--source", "vbias = DC 7")
+    assert row(figures(both), "u_source")["max"] == 107.0
+    one = command(*words, "--source", "Vdrive=SQUARE(100 100)")
+    assert row(figures(one), "u_source")["max"] == 105.0
+    assert one.lines == [
+        "fingerspice: warning: sources names Vdrive only: Vbias stays on, as in the deck; 0 would switch it off"
+    ]
+    none = command(*words, "--source", "SQUARE(100 100)")
+    assert none.code == 2
+    assert "the circuit has Vbias, Vdrive; allowed: NAME=SPEC with one of these names" in none.err

@@ -53,6 +53,12 @@ OPTIONS = [
     (["--source", "SIN(0 1e-320 100)"], "the source's peak is 9.99989e-321 V; allowed: 0, or 1e-300 V or more"),
     (["--source", "PULSE(0 1 0 1e-300 1e-300 1e-300 1e-299)"], "pulse rise is 1e-300 s; allowed: 0, or a size from"),
     (["--source", "SIN(0 200 1e300)"], "Sine frequency is 1e+300 Hz; allowed: 0, or a size from 1e-30 to 1e+30"),
+    (["--stop", "soon"], "--stop 'soon': 'soon' is not a number"),
+    (["--stop", "1u"], "--stop 1e-06 s is before the second output; allowed: TSTART + TSTEP = 5e-05 s or more"),
+    (["--source", "Vdriv=DC 5"], "--source 'Vdriv=DC 5': Vdriv is not a source of the circuit; allowed: Vdrive"),
+    (["--source", "DC 5", "--source", "vdrive=DC 6"], "--source 'vdrive=DC 6': vdrive is given twice"),
+    (["--stop", "-1"], "t_stop is -1 s; allowed: more than 0 s"),
+    (["--start", "warm"], "start is 'warm'; allowed: 'deck', 'uncharged', 'dc', 'periodic' or a Solution"),
     (["--area", "frozn"], "area is 'frozn'; allowed: 'coupled', 'mean', 'frozen' or m^2"),
     (["--area", "-1u"], "area is -1e-06 m^2; allowed: a positive area in m^2"),
     (["--area", "nan"], "area is 'nan'; allowed"),
@@ -197,6 +203,7 @@ def test_a_disk_that_is_full_is_told_and_leaves_no_half_file(
     def full(self: Path, target: Any) -> Path:
         raise OSError(errno.ENOSPC, "No space left on device")
 
+    (tmp_path / "out").mkdir()
     before = tree(tmp_path)
     monkeypatch.setattr(Path, "replace", full)
     result = command("run", "pad.cir", "--no-plot")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 
 import fingerspice as fs
 from fingerspice.circuit.library import LIBRARIES, library_text
-from ngspice_tools import CIRCUITS, run_ngspice
+from ngspice_tools import CIRCUITS, call_ngspice, run_ngspice
 from scenes import deck, table1
 
 LAWS = ["local", "mobile"]
@@ -143,9 +142,7 @@ def test_the_exported_deck_needs_no_other_file(law: str, tmp_path: Path) -> None
     assert library_text(law).strip() in text
     assert library_text("local") != library_text("mobile")
     (tmp_path / "alone.cir").write_text(text)
-    done = subprocess.run(
-        ["ngspice", "-b", "-r", "out.raw", "alone.cir"], cwd=tmp_path, capture_output=True, text=True, timeout=20
-    )
+    done = call_ngspice(tmp_path, "-r", "out.raw", "alone.cir", timeout=20.0)
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "out.raw").stat().st_size > 1000
 

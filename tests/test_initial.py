@@ -15,6 +15,8 @@ from scenes import deck, table1
 from start_reference import deck_of, random_network
 from test_networks import finger
 
+pytestmark = pytest.mark.filterwarnings("ignore:.* has no effect here")
+
 LAWS = ("local", "mobile")
 DC_AMPLIFIER = (("1m uic", "1m"), ("SIN(0 200 5k)", "SIN(26 100 5k)"))
 STEP, STOP = 2e-9, 2e-6

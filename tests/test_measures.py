@@ -70,6 +70,7 @@ RANDOM = [
 ]  # fmt: skip
 
 
+@pytest.mark.filterwarnings("ignore:sources names")
 @pytest.mark.parametrize(("law", "source", "name"), RANDOM)
 def test_figures_are_the_same_whatever_tstep(law, source, name):
     rng = np.random.default_rng(len(source) + len(name))
@@ -98,6 +99,7 @@ def test_figures_are_the_same_whatever_tstep(law, source, name):
         assert abs(seen[0][f"{key}_rms"] - np.sqrt(simpson(x**2, x=fine.t) / 3e-3)) <= 3e-6 * np.abs(x).max()
 
 
+@pytest.mark.filterwarnings("ignore:sources names")
 @pytest.mark.parametrize("law", ["local", "mobile"])
 def test_a_run_of_many_periods_has_the_figures_of_its_stepped_twin(law):
     # Periods that stand for many, and those on the way to the periodic state that a map gives.

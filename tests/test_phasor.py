@@ -26,8 +26,8 @@ from analytic import (
     work_factor,
 )
 from fingerspice.circuit.circuit import AcSweep
-from fingerspice.phasors import sweep_frequencies
 from fingerspice.physics.phasor import coupled_area, layer_gains
+from fingerspice.sweeps import sweep_frequencies
 from scenes import deck, table1, table1_deck
 
 MM2 = 1e6
@@ -38,6 +38,7 @@ AREAS = [10e-6, 34.97e-6]
 # Gains at a given area --------------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:the sweep goes")
 @pytest.mark.parametrize("a", AREAS)
 @pytest.mark.parametrize("f", FREQUENCIES)
 def test_the_gain_is_equation_11_and_the_repaired_equations_12_and_13(f: float, a: float) -> None:

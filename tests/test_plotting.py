@@ -147,7 +147,8 @@ def test_no_voltage_is_no_force_and_still_a_picture(tmp_path: Path) -> None:
 
 def test_a_sweep_shows_gain_phase_force_and_area() -> None:
     circuit = table1()
-    result = fs.phasor(circuit, np.geomspace(1.0, 1e4, 21))
+    with pytest.warns(fs.FingerspiceWarning, match="the sweep goes down to 1 Hz"):
+        result = fs.phasor(circuit, np.geomspace(1.0, 1e4, 21))
     figure = plotting.plot_phasor((result,), circuit)
     assert len(labels(figure)) == 4
     assert all(ax.get_xscale() == "log" for ax in figure.axes)

@@ -236,3 +236,48 @@ def test_a_function_that_fades_below_the_smallest_numbers_is_not_followed_there(
     run = fs.simulate(table1(), sources={"Vdrive": counted}, t_stop=0.2, rtol=1e-8, t_eval=np.linspace(0.0, 0.2, 100))
     assert run.success
     assert calls < 2_000_000
+
+
+# Noise ------------------------------------------------------------------------------------------------------
+
+
+DICE = np.random.default_rng(5)
+
+
+def rough(t):
+    """The same at the same time, and smooth only below 1e-15 s."""
+    return 100.0 * np.sin(1e15 * np.asarray(t) ** 2)
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [lambda t: DICE.random(), lambda t: np.where(np.asarray(t) < 0.013, 5.0, DICE.random(np.shape(t)))],
+)
+def test_noise_is_refused_with_what_it_gave_twice_at_one_time(noise) -> None:
+    with pytest.raises(fs.InputError, match=r"V and then .* V at the same t = .*give fs\.Samples\(values, rate\)"):
+        source_table(fs.Function(noise), 0.0, 0.02, TOL, STEP)
+
+
+@pytest.mark.parametrize("run", [fs.simulate, lambda c, sources: fs.steady_state(c.replace(sources))])
+def test_noise_as_a_source_is_refused_at_once(run) -> None:
+    noise = fs.Function(lambda t: DICE.random(), repeat=0.01)
+    with pytest.raises(fs.InputError, match="allowed: the same value at the same time"):
+        run(table1(), sources={"Vdrive": noise})
+
+
+def test_a_function_that_never_becomes_smooth_is_refused_after_a_bounded_number_of_calls() -> None:
+    calls = []
+
+    def counted(t):
+        calls.append(np.size(t))
+        return rough(t)
+
+    with pytest.raises(fs.InputError, match=r"too rough to be followed near t = .*give fs\.Samples\(values, rate\)"):
+        source_table(fs.Function(counted), 0.0, 2.0 * STEP, TOL, STEP)
+    assert len(calls) < 100_000
+
+
+def test_jumps_that_are_many_but_far_apart_are_still_followed() -> None:
+    held = np.random.default_rng(1).normal(size=200)
+    with pytest.warns(fs.FingerspiceWarning, match="and 197 more times"):
+        source_table(fs.Function(lambda t: held[(np.asarray(t) * 1e4).astype(int)]), 0.0, 0.0199, TOL, STEP)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import random
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
 
 import fingerspice as fs
 from fingerspice.circuit.deck import parse_deck
+from ngspice_tools import call_ngspice
 
 INNER = ".subckt inner a b\nR1 a b {w}\n.ends\n"
 CASES = {
@@ -55,7 +55,7 @@ def theirs(body: str, folder: Path) -> float:
     """The resistance between a and 0 that ngspice finds, ohm."""
     text = f"a resistance\n{body}\nI1 0 a DC 1\n.op\n.control\nrun\nset numdgt=12\nprint v(a)\nquit 0\n.endc\n.end\n"
     (folder / "deck.cir").write_text(text)
-    done = subprocess.run(["ngspice", "-b", "deck.cir"], cwd=folder, capture_output=True, text=True, timeout=20)
+    done = call_ngspice(folder, "deck.cir", timeout=20.0)
     found = re.search(r"v\(a\) = (\S+)", done.stdout)
     assert found, done.stdout + done.stderr
     return float(found[1])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import cmath
 import json
 import math
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,8 +17,8 @@ from analytic import GAP, Layer, area, coupled_phasor, periodic_state, sine_segm
 from commands import Command
 from deck_edits import edited
 from fingerspice.circuit.circuit import AcSweep
-from fingerspice.phasors import sweep_frequencies
-from ngspice_tools import CIRCUITS
+from fingerspice.sweeps import sweep_frequencies
+from ngspice_tools import CIRCUITS, call_ngspice
 from scenes import table1
 
 FREQUENCIES = (20.0, 300.0, 5e3, 8e4)
@@ -103,7 +102,7 @@ def ac_in_ngspice(text: str, signal: str, folder: Path) -> tuple[NDArray[np.floa
     # Of subcircuits the ends stay.
     lines = [line for line in text.splitlines() if not line.startswith(".tran") and line.strip() != ".end"]
     (folder / "deck.cir").write_text("\n".join([*lines, *control]))
-    done = subprocess.run(["ngspice", "-b", "deck.cir"], cwd=folder, capture_output=True, text=True, timeout=30)
+    done = call_ngspice(folder, "deck.cir")
     assert (folder / "out.txt").exists(), done.stdout + done.stderr
     f, x, y = np.loadtxt(folder / "out.txt").T
     return f, x + 1j * y
@@ -185,9 +184,11 @@ def test_a_sweep_says_where_the_skins_data_are_taken_and_how_far_outside_them() 
         "the skin's data are taken at each frequency of the sweep, not at the deck's own (Xskin f = 100 Hz)",
     )
     assert inside.warnings == ()
-    (far,) = fs.phasor(table1(), [1e-3, 1e9]).warnings
+    with pytest.warns(fs.FingerspiceWarning, match="the sweep goes down to"):
+        (far,) = fs.phasor(table1(), [1e-3, 1e9]).warnings
     assert "down to 0.001 Hz, 4 decades below and up to 1e+09 Hz, 4 decades above the 10 Hz to 100 kHz" in far
-    (above,) = fs.large_signal(table1(), [2e5], 1.0)[0].warnings
+    with pytest.warns(fs.FingerspiceWarning, match="the sweep goes up to"):
+        (above,) = fs.large_signal(table1(), [2e5], 1.0)[0].warnings
     assert "up to 200000 Hz, 0.3 decades above" in above
     held = fs.phasor(table1(), [1e-3, 1e9], skin="own")
     assert held.warnings == ()
@@ -233,6 +234,7 @@ def test_the_command_says_what_drives_where_the_data_are_taken_and_where_they_en
     (line,) = result.lines
     assert line.startswith("fingerspice: warning: the sweep goes down to 1 Hz, 1 decades below the 10 Hz to 100 kHz")
     report = json.loads(command("ac", "pad.cir", "--sweep", "lin 2 10 20", "--skin", "own", "--json", "--no-plot").out)
+    (report,) = report["sweeps"]
     assert report["amplitude"] == pytest.approx(5.0)
     assert report["source_phase_deg"] == pytest.approx(30.0)
     assert report["drive"] == "AC 5 30 of Vdrive"

@@ -13,6 +13,7 @@ from fingerspice.circuit.waveforms import DC
 from fingerspice.netruns import NetworkRun
 from fingerspice.network_record import NetworkRecord
 from fingerspice.networks import NetworkProblem
+from fingerspice.notices import circuit_warnings
 from fingerspice.outcome import Status
 from fingerspice.physics.contact import inverse_area
 from fingerspice.problem import Problem
@@ -29,6 +30,7 @@ NEAR_FOLD = 0.2
 
 def stack_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Where a run leaves what its model holds for."""
+    yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit))
     yield from _source_warnings(problem)
     stack = problem.stack
     if stack.contact is not None:
@@ -46,6 +48,7 @@ def stack_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
 
 
 def network_warnings(problem: NetworkProblem, run: NetworkRun, record: NetworkRecord) -> Iterator[str]:
+    yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit))
     yield from _source_warnings(problem)
     several = len(record.fingers) > 1
     for finger, i in enumerate(problem.network.fingers):

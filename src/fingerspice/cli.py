@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -11,20 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fingerspice import options
-from fingerspice.errors import FingerspiceWarning, InputError, SolveError
-from fingerspice.options import area_from_text, check_output, note_skin_frequency, read_circuit
-from fingerspice.results import FOLDER, Results, scene_dict
-from fingerspice.terminal import (
-    failure_as_json,
-    listen,
-    plain_errors,
-    progress,
-    report,
-    say,
-    say_json,
-    warnings_as_lines,
-)
+from fingerspice import answers, options
+from fingerspice.errors import InputError, SolveError
+from fingerspice.options import area_from_text, check_output, read_circuit, time_from_text
+from fingerspice.results import FOLDER, Results
+from fingerspice.terminal import Answering, answer_usage, listen, plain_errors, progress, say
 
 if TYPE_CHECKING:
     from fingerspice.solution import Solution
@@ -46,9 +36,15 @@ Name = Annotated[
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of other circuits, and other files.")]
 Rtol = Annotated[float, typer.Option(help="Largest error of gap voltage and force, relative to their peaks.")]
 ChargeLaw = Annotated[str | None, typer.Option(help="local or mobile; the included library's by default.")]
-Set = Annotated[list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Change a value: Xgap.d=3u.")]
-Source = Annotated[str | None, typer.Option("--source", metavar="SPEC", help="Replace the source: 'SQUARE(200 100)'.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the figures as JSON, nothing else on stdout.")]
+Set = Annotated[
+    list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Change a value: Xgap.d=3u. May be repeated.")
+]
+Source = Annotated[
+    list[str] | None,
+    typer.Option("--source", metavar="[NAME=]SPEC", help="Replace a source: 'SQUARE(200 100)', 'Vdrive=DC 5'."),
+]
+Stop = Annotated[str | None, typer.Option(metavar="TIME", help="End of the run, s: 50m; TSTOP by default.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON (docs/json.md), nothing else on stdout.")]
 NoPlot = Annotated[bool, typer.Option("--no-plot", help="Write no picture.")]
 
 
@@ -60,6 +56,12 @@ def main() -> None:
     with plain_errors():
         try:
             app(standalone_mode=True)
+        except SystemExit as exit_:
+            # Usage that typer refused, and has said on stderr.
+            refused = getattr(exit_.__context__, "format_message", None)
+            if refused is not None:
+                answer_usage(refused())
+            raise
         finally:
             # What typer printed.
             say(end="")
@@ -79,6 +81,10 @@ def run(
     ] = "auto",
     changes: Set = None,
     source: Source = None,
+    stop: Stop = None,
+    start: Annotated[
+        str, typer.Option(help="deck (as its .tran says), uncharged, dc, or periodic (the periodic state).")
+    ] = "deck",
     jumps: Annotated[
         str, typer.Option(help="Rows at jumps of the source: both, or none, so that time rises strictly.")
     ] = "both",
@@ -90,38 +96,37 @@ def run(
 
     Examples:
 
-      fingerspice run circuits/fingerpad.cir --out out
+      fingerspice run circuits/fingerpad.cir
 
       fingerspice run circuits/fingerpad.cir --source 'SQUARE(200 100)' --set Xgap.d=3u --csv
+
+      fingerspice run circuits/fingerpad.cir --stop 20m --start periodic
 
       fingerspice run circuits/fingerpad.cir --charge-law mobile --rtol 1e-6 --json --no-plot
     """
     from fingerspice.report import summary_table
     from fingerspice.simulation import simulate
 
-    with warnings_as_lines():
+    with Answering("run", as_json, charge_law=charge_law, method=method, rtol=rtol, area=area) as answer:
         circuit = read_circuit(deck, changes, source)
-        if circuit.tran is None:
-            raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic]")
-        note_skin_frequency(circuit)
+        answer.update(**answers.of_circuit(circuit, charge_law))
+        t_stop = time_from_text("--stop", stop)
+        if circuit.tran is None and t_stop is None:
+            raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
+        options.check_stop(circuit, t_stop)
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         data = results.file(".csv" if csv else ".nc")
         picture = None if no_plot else results.file(".png")
         with progress() as update:
             solution = simulate(
-                circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method, jumps=jumps,
-                throw=False, progress=update,
+                circuit, t_stop=t_stop, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method,
+                start=start, jumps=jumps, throw=False, progress=update,
             )  # fmt: skip
-        for text in solution.warnings:
-            warnings.warn(text, FingerspiceWarning, stacklevel=1)
-    failure = None if solution.failure is None else solution.failure.to_dict()
-    ended = {"success": solution.success, "message": solution.message, "failure": failure}
-    report(
-        as_json, lambda: {**solution.summary(), **ended, **scene_dict(circuit)}, lambda: summary_table(solution),
-        _written(solution, data, picture, results),
-    )  # fmt: skip
-    if solution.failure is not None:
-        raise SolveError(solution.failure, solution)
+        if as_json:
+            answer.update(**answers.of_run(solution))
+        answer.give(lambda: summary_table(solution), _written(solution, data, picture, results))
+        if solution.failure is not None:
+            raise SolveError(solution.failure, solution)
 
 
 def _written(solution: Solution, data: Path, picture: Path | None, results: Results) -> list[Callable[[], Path]]:
@@ -170,11 +175,14 @@ def ac(
 
       fingerspice ac circuits/fingerpad.cir --area coupled --amplitude 50 --amplitude 200
     """
-    from fingerspice.phasors import phasor, sweep_frequencies
+    from fingerspice.phasors import phasor
     from fingerspice.report import phasor_csv, phasor_dict, phasor_tables
+    from fingerspice.sweeps import sweep_frequencies
 
-    with warnings_as_lines():
+    how = "steady_state" if area == "coupled" else "phasor"
+    with Answering("ac", as_json, charge_law=charge_law, method=how, rtol=rtol, area=area, skin=skin) as answer:
         circuit = read_circuit(deck, changes, source)
+        answer.update(**answers.of_circuit(circuit, charge_law))
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         data = results.file("_ac.csv")
         picture = None if no_plot else results.file("_ac.png")
@@ -184,29 +192,21 @@ def ac(
 
             if skin != "swept":
                 raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
-
-            with failure_as_json(as_json):
-                found = large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol)
+            with progress("sweeping") as update:
+                found = large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, progress=update)
         elif amplitude:
             raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
         else:
             found = (phasor(circuit, frequencies, area=area_from_text(area), skin=skin),)
-        for text in found[0].warnings:
-            warnings.warn(text, FingerspiceWarning, stacklevel=1)
-    results.open()
-    writes = [lambda: phasor_csv(found, data)]
-    if picture is not None:
-        from fingerspice.drawing import save
-        from fingerspice.plotting import plot_phasor
+        results.open()
+        writes = [lambda: phasor_csv(found, data)]
+        if picture is not None:
+            from fingerspice.drawing import save
+            from fingerspice.plotting import plot_phasor
 
-        writes.append(lambda: save(plot_phasor(found, circuit), picture, about=results.about))
-    sweeps = [phasor_dict(r) for r in found] if as_json else []
-    report(
-        as_json,
-        lambda: {**(sweeps[0] if len(sweeps) == 1 else {"sweeps": sweeps}), **scene_dict(circuit)},
-        lambda: phasor_tables(found, circuit),
-        writes,
-    )
+            writes.append(lambda: save(plot_phasor(found, circuit), picture, about=results.about))
+        answer.update(sweeps=[phasor_dict(r) for r in found] if as_json else None)
+        answer.give(lambda: phasor_tables(found, circuit), writes)
 
 
 @app.command()
@@ -215,6 +215,7 @@ def plan(
     rtol: Rtol = 1e-8,
     charge_law: ChargeLaw = None,
     area: Annotated[str, typer.Option(help="coupled, mean, frozen, or an area in m^2.")] = "coupled",
+    stop: Stop = None,
     charge: Annotated[bool, typer.Option(help="Whether the source's charge and current are wanted.")] = True,
     changes: Set = None,
     source: Source = None,
@@ -231,14 +232,15 @@ def plan(
     from fingerspice.report import plan_text
     from fingerspice.simulation import plan as make
 
-    with warnings_as_lines():
+    with Answering("plan", as_json, charge_law=charge_law, rtol=rtol, area=area) as answer:
         circuit = read_circuit(deck, changes, source)
-        note_skin_frequency(circuit)
-        result = make(circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge)
-    if as_json:
-        say_json({**result.to_dict(), **scene_dict(circuit)})
-    else:
-        say(plan_text(result, circuit))
+        answer.update(**answers.of_circuit(circuit, charge_law))
+        t_stop = time_from_text("--stop", stop)
+        result = make(
+            circuit, t_stop=t_stop, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge
+        )
+        answer.update(**answers.of_plan(result))
+        answer.give(lambda: plan_text(result, circuit))
 
 
 @app.command()
@@ -265,21 +267,21 @@ def compare(
     from fingerspice.comparison import compare as run_comparison
     from fingerspice.report import comparison_table
 
-    with warnings_as_lines():
+    with Answering("compare", as_json, charge_law=charge_law, rtol=rtol) as answer:
         circuit = read_circuit(deck, changes, source)
-        note_skin_frequency(circuit)
+        answer.update(**answers.of_circuit(circuit, charge_law))
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         picture = None if no_plot else results.file("_compare.png")
-        with failure_as_json(as_json):
-            result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
-    writes: list[Callable[[], Path]] = []
-    if picture is not None:
-        results.open()
-        from fingerspice.drawing import save
-        from fingerspice.plotting import plot_comparison
+        result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
+        writes: list[Callable[[], Path]] = []
+        if picture is not None:
+            results.open()
+            from fingerspice.drawing import save
+            from fingerspice.plotting import plot_comparison
 
-        writes.append(lambda: save(plot_comparison(result), picture, about=results.about))
-    report(as_json, lambda: {**result.to_dict(), **scene_dict(circuit)}, lambda: comparison_table(result), writes)
+            writes.append(lambda: save(plot_comparison(result), picture, about=results.about))
+        answer.update(method=result.solution.method, **result.to_dict())
+        answer.give(lambda: comparison_table(result), writes)
 
 
 @app.command()
@@ -304,19 +306,22 @@ def limits(
     from fingerspice.limits import fold_limits, plot_limits
     from fingerspice.report import limits_csv, limits_text
 
-    with warnings_as_lines():
+    with Answering("limits", as_json, charge_law="mobile") as answer:
         circuit = read_circuit(deck, changes, source)
+        answer.update(**answers.of_circuit(circuit, "mobile"))
         results = Results(deck, circuit, out, name, overwrite, "mobile")
         table = results.file("_limits.csv")
         picture = None if no_plot else results.file("_limits.png")
-        result = fold_limits(circuit, points=points, span=span)
-    results.open()
-    writes = [lambda: limits_csv(result, table)]
-    if picture is not None:
-        from fingerspice.drawing import save
+        with progress("looking for folds") as update:
+            result = fold_limits(circuit, points=points, span=span, progress=update)
+        results.open()
+        writes = [lambda: limits_csv(result, table)]
+        if picture is not None:
+            from fingerspice.drawing import save
 
-        writes.append(lambda: save(plot_limits(result), picture, about=results.about))
-    report(as_json, lambda: {**result.to_dict(), **scene_dict(circuit)}, lambda: limits_text(result), writes)
+            writes.append(lambda: save(plot_limits(result), picture, about=results.about))
+        answer.update(**result.to_dict())
+        answer.give(lambda: limits_text(result), writes)
 
 
 @app.command()
@@ -326,6 +331,7 @@ def export(
     charge_law: ChargeLaw = None,
     changes: Set = None,
     source: Source = None,
+    as_json: AsJson = False,
 ) -> None:
     """Write DECK as one self-contained ngspice deck: bodies included, parameters folded in.
 
@@ -336,18 +342,19 @@ def export(
     from fingerspice.export import export_netlist
     from fingerspice.files import write_aside
 
-    with warnings_as_lines():
+    with Answering("export", as_json, charge_law=charge_law) as answer:
         circuit = read_circuit(deck, changes, source)
+        answer.update(**answers.of_circuit(circuit, charge_law))
         check_output(output, deck)
-    text = export_netlist(circuit, charge_law=charge_law)
-    write_aside(output, lambda path: path.write_text(text, encoding="utf-8"))
-    say(f"wrote {output}")
+        text = export_netlist(circuit, charge_law=charge_law)
+        answer.give(str, [lambda: write_aside(output, lambda path: path.write_text(text, encoding="utf-8"))])
 
 
 @app.command()
 def figures(
     out: Out = None,
     only: Annotated[list[int] | None, typer.Option(help="Only these of the paper's figures 2 to 5.")] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Draw the paper's Figs. 2 to 5 from scratch, each as PNG with its data as CSV.
 
@@ -358,12 +365,13 @@ def figures(
     from fingerspice.figures import FIGURES, make_figures
 
     folder = out or FOLDER
-    for number in only or FIGURES:
-        for kind in ("png", "csv"):
-            check_output(folder / f"fig{number}.{kind}")
-    with warnings_as_lines():
-        for file in make_figures(folder, only=only):
-            say(f"wrote {file}")
+    with Answering("figures", as_json) as answer:
+        for number in only or FIGURES:
+            for kind in ("png", "csv"):
+                check_output(folder / f"fig{number}.{kind}")
+        with progress("drawing") as update:
+            files = make_figures(folder, only=only, progress=update)
+        answer.give(str, [partial(Path, file) for file in files])
 
 
 @app.callback(invoke_without_command=True)

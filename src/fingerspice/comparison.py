@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fingerspice.arguments import Parameters, Sources, overridden
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.errors import InputError
@@ -99,14 +100,21 @@ class Comparison(Shown):
         }
 
 
-def compare(circuit: Circuit, *, charge_law: str | None = None, rtol: float = 1e-8) -> Comparison:
+def compare(
+    circuit: Circuit,
+    *,
+    sources: Sources | None = None,
+    parameters: Parameters | None = None,
+    charge_law: str | None = None,
+    rtol: float = 1e-8,
+) -> Comparison:
     """Set the periodic state of the transient beside the phasor.
 
     Parameters
     ----------
     circuit : Circuit
         With a GAP and a periodic source that has a fundamental.
-    charge_law : str, optional
+    sources, parameters, charge_law
         As in `simulate`.
     rtol : float
         Error of the transients, relative to their peaks.
@@ -122,6 +130,7 @@ def compare(circuit: Circuit, *, charge_law: str | None = None, rtol: float = 1e
     SolveError
         Where a transient fails.
     """
+    circuit = overridden(circuit, sources, parameters)
     fundamental = build_stack(circuit).waveform.fundamental
     if fundamental is None:
         raise InputError("compare needs a source with a fundamental: a periodic one; this source has none")

@@ -8,7 +8,6 @@ compiled code may call: those of the folders below, as compiled functions elsewh
 from __future__ import annotations
 
 import hashlib
-import logging
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +20,7 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataC
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
+from fingerspice.announcing import Compiling
 from fingerspice.errors import InputError
 
 Array = TypeVar("Array", bound=np.ndarray)
@@ -31,7 +31,7 @@ SHARED_FOLDERS = ("engine", "numerics", "physics")
 _SOURCES = [Path(__file__).resolve(), *sorted(p for name in SHARED_FOLDERS for p in (_PACKAGE / name).rglob("*.py"))]
 # By content: a package that is copied, or packed into an image, brings along what was compiled for it.
 _STAMP = hashlib.sha256(b"".join(p.name.encode() + p.read_bytes() for p in _SOURCES)).hexdigest()
-_LOG = logging.getLogger("fingerspice")
+_COMPILER = Compiling()
 
 
 def _drop_stale_cache() -> None:
@@ -68,11 +68,10 @@ class _Cache(FunctionCache):
     """numba's, for this state of the shared folders.
 
     What came with the package is read even where nothing can be written; a disk that is full means that the next
-    process compiles again. The first function that is found nowhere is logged: compiling takes its time.
+    process compiles again. What is found nowhere is announced: compiling takes its time.
     """
 
     _impl_class = _Place
-    told = False
 
     def __init__(self, function: Callable[..., Any]) -> None:
         cast(Any, super()).__init__(function)
@@ -91,9 +90,7 @@ class _Cache(FunctionCache):
                 data = place.load(key)
                 if data is not None:
                     return cast(Any, self._impl).rebuild(target_context, data)
-        if not _Cache.told:
-            _Cache.told = True
-            _LOG.info(_EVERY_TIME if isinstance(self._impl.locator, _ReadOnly) else _COMPILING)
+        _COMPILER.begins(_EVERY_TIME if isinstance(self._impl.locator, _ReadOnly) else _ONCE)
         return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -101,9 +98,9 @@ class _Cache(FunctionCache):
             cast(Any, super()).save_overload(sig, data)
 
 
-_COMPILING = "compiling what this needs, about 20 s; later runs take 2 s"
+_ONCE = "compiling what this needs, about 40 s, only once: later runs find it on the disk"
 _EVERY_TIME = (
-    "compiling, about 20 s, as at every run: no folder for compiled code can be written, neither the package's nor "
+    "compiling, about 40 s, as at every run: no folder for compiled code can be written, neither the package's nor "
     "the user's; set NUMBA_CACHE_DIR to one that can"
 )
 
@@ -114,6 +111,13 @@ def _cached(**options: Any) -> Callable[[Function], Function]:
     def compile_when_called(function: Function) -> Function:
         compiled = njit(error_model="numpy", **options)(function)
         compiled._cache = cast(Any, _Cache)(function)
+        compile_signature = compiled.compile
+
+        def announced(signature: Any) -> Any:
+            with _COMPILER.around():
+                return compile_signature(signature)
+
+        compiled.compile = announced
         return cast(Function, compiled)
 
     return compile_when_called

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from fingerspice.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.library import LIBRARIES, library_text
 from fingerspice.circuit.ramps import PWL, Pulse
@@ -56,6 +57,7 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
         For a circuit without .tran line where a source has to be written as points, and for names that would become
         one.
     """
+    require_circuit(circuit)
     law = charge_law or circuit.charge_law or "local"
     if law not in LIBRARIES:
         raise InputError(f"charge_law is {law!r}; allowed: {' or '.join(map(repr, LIBRARIES))}")

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-import csv
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.circuit.reader import read_text
 from fingerspice.circuit.waveforms import require
-from fingerspice.errors import InputError
+from fingerspice.errors import FingerspiceWarning, InputError
+from fingerspice.materialdata import ALLOWED, COLUMNS, likely_slips, read_table
 from fingerspice.pages import Page, Shown
 from fingerspice.physics.ladder import Ladder
 from fingerspice.physics.materials import EPS0
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -22,6 +27,8 @@ ComplexArray = NDArray[np.complex128]
 MOST_POLES = 12
 # Poles per decade and decades beyond the band, of the fit that any causal and passive material would match.
 _DENSE, _BEYOND = 8, 2.0
+# Misfit (rms) of a fit, or of data to any material, that is worth a warning, and that is no fit and no material.
+NOTABLE, TOO_MUCH = 0.1, 0.3
 # Of data, in Hz, ohm m and 1: far from any material's, so that products and quotients stay numbers.
 _LEAST, _MOST = 1e-20, 1e20
 
@@ -97,6 +104,8 @@ class MaterialFit(Shown):
         |y_fit / y - 1| at each.
     kramers_kronig : Consistency
         What no ladder can do better than.
+    data : ndarray of complex, shape (n,)
+        Admittivity of the data, S/m.
     """
 
     ladder: Ladder
@@ -105,6 +114,7 @@ class MaterialFit(Shown):
     frequency: FloatArray
     misfit: FloatArray
     kramers_kronig: Consistency
+    data: ComplexArray
 
     def _page(self) -> Page:
         from fingerspice.report import fit_page
@@ -114,7 +124,8 @@ class MaterialFit(Shown):
     def to_netlist(self, name: str) -> str:
         """A subcircuit of slabs in series, with its thickness as parameter; for decks here and for ngspice.
 
-        Use it as ``Xskin p n area NAME d=350u``.
+        Written to ``myskin.lib`` beside the deck, ``.include myskin.lib`` and ``Xskin skin 0 area NAME d=350u`` put it
+        there in place of a SKIN.
 
         Raises
         ------
@@ -123,6 +134,10 @@ class MaterialFit(Shown):
         """
         require(name.isidentifier(), "name", repr(name), "letters, digits and _, not first a digit")
         return subcircuit(self.ladder, name)
+
+    def plot(self) -> Figure:
+        """Resistivity and permittivity of the data and of the ladder, and the misfit, against frequency."""
+        return plot_material(self)
 
 
 def subcircuit(ladder: Ladder, name: str) -> str:
@@ -144,7 +159,8 @@ def fit_material(
     ----------
     data : ColeCole, array_like or path
         Cole-Cole parameters; or rows of frequency (Hz), resistivity (ohm m) and relative permittivity, as an array
-        (n, 3) or a CSV file of three columns, with or without a line of names.
+        (n, 3) or a CSV file of three columns. Where the file has a line of names, these say what the columns hold, in
+        which order and in which units: ``omega [rad/s],sigma [S/m],eps_r`` will do.
     poles : int, optional
         How many branches.
     error : float, optional
@@ -158,7 +174,21 @@ def fit_material(
     Raises
     ------
     InputError
-        For data that cannot be read or are no material's, and where both `poles` and `error` are given.
+        For data that cannot be read or are no material's (then with the likely slip), for a misfit above 30 %, and
+        where both `poles` and `error` are given.
+
+    Warns
+    -----
+    FingerspiceWarning
+        Where the data are more than 10 % from any causal and passive material, or the fit from the data.
+
+    Examples
+    --------
+    From data to a deck that has ``.include myskin.lib`` and ``Xskin skin 0 area MYSKIN d=350u``::
+
+        fit = fs.fit_material("skin.csv")
+        fit.plot()
+        Path("myskin.lib").write_text(fit.to_netlist("MYSKIN"))
     """
     if poles is not None and error is not None:
         raise InputError("poles and error are both given; allowed: one of them")
@@ -166,28 +196,41 @@ def fit_material(
         require(1 <= poles <= MOST_POLES, "poles", poles, f"1 to {MOST_POLES}")
     error = 0.02 if error is None else error
     require(error > 0.0, "error", f"{error:g}", "more than 0")
-    f, y = _admittivity(data)
-    consistency = _consistency(f, y)
-    for count in [poles] if poles is not None else range(1, MOST_POLES + 1):
-        ladder, misfit = _fit(f, y, count)
-        rms = float(np.sqrt(np.mean(misfit**2)))
-        if rms <= max(error, 1.05 * consistency.rms):
-            break
-    return MaterialFit(ladder, rms, float(misfit.max()), f, misfit, consistency)
-
-
-def _admittivity(data: ColeCole | ArrayLike | str | Path) -> tuple[FloatArray, ComplexArray]:
-    """Frequencies (Hz) and admittivities (S/m) of the data."""
     if isinstance(data, ColeCole):
         low, high = data.band
         f = np.geomspace(low, high, max(2, round(40 * np.log10(high / low)) + 1))
-        return f, data.admittivity(f)
-    table = _read_csv(Path(data)) if isinstance(data, (str, Path)) else np.asarray(data, float)
+        y = data.admittivity(f)
+        consistency, doubt = _consistency(f, y), ""
+    else:
+        table = _checked(read_table(Path(data)) if isinstance(data, (str, Path)) else data)
+        f, y = _admittivity(table)
+        consistency = _consistency(f, y)
+        doubt = _doubt(table, consistency)
+    try:
+        ladder, misfit, rms = _least_ladder(
+            f, y, [poles] if poles is not None else range(1, MOST_POLES + 1), max(error, 1.05 * consistency.rms)
+        )
+    except InputError as refused:
+        raise InputError(f"{doubt}; {refused.message}" if doubt else refused.message) from None
+    said = f"the ladder misses the data by {100.0 * rms:.2g} % rms"
+    if rms > TOO_MUCH:
+        raise InputError(f"{said}; allowed: at most {100.0 * TOO_MUCH:g} %, so more poles, or data of a narrower band")
+    if rms > max(NOTABLE, 1.05 * consistency.rms):
+        warnings.warn(f"{said}; more poles would come nearer", FingerspiceWarning, stacklevel=2)
+    return MaterialFit(ladder, rms, float(misfit.max()), f, misfit, consistency, y)
+
+
+def _checked(data: ArrayLike) -> FloatArray:
+    """Rows of frequency (Hz, ascending), resistivity (ohm m) and relative permittivity."""
+    try:
+        table = np.asarray(data, float)
+    except (TypeError, ValueError):
+        raise InputError(f"material data are a {type(data).__name__}; allowed: rows of {ALLOWED}, or a file") from None
     require(
         table.ndim == 2 and table.shape[1] == 3, "material data", f"of shape {table.shape}", "rows of f, rho, eps_r"
     )
     require(table.shape[0] >= 3, "material data", f"{table.shape[0]} rows", "three frequencies or more")
-    for column, name in enumerate(("frequency", "resistivity", "permittivity")):
+    for column, name in enumerate(COLUMNS):
         bad = np.flatnonzero(~((table[:, column] >= _LEAST) & (table[:, column] <= _MOST)))
         if bad.size:
             raise InputError(
@@ -195,27 +238,47 @@ def _admittivity(data: ColeCole | ArrayLike | str | Path) -> tuple[FloatArray, C
                 f"{_MOST:g}"
             )
     table = table[np.argsort(table[:, 0])]
+    require(bool(np.all(np.diff(table[:, 0]) > 0.0)), "frequencies", "repeated", "each once")
+    return table
+
+
+def _admittivity(table: FloatArray) -> tuple[FloatArray, ComplexArray]:
+    """Frequencies (Hz) and admittivities (S/m) of a table."""
     f = table[:, 0].copy()
-    require(bool(np.all(np.diff(f) > 0.0)), "frequencies", "repeated", "each once")
     return f, 1.0 / table[:, 1] + 2j * np.pi * f * EPS0 * table[:, 2]
 
 
-def _read_csv(path: Path) -> FloatArray:
-    try:
-        lines = read_text(path, str(path)).splitlines(keepends=True)
-        rows = [row for row in csv.reader(lines) if row and not row[0].lstrip().startswith("#")]
-    except csv.Error as error:
-        raise InputError(f"{path} cannot be read as CSV: {error}") from error
-    numbers = []
-    for place, row in enumerate(rows):
+def _doubt(table: FloatArray, found: Consistency) -> str:
+    """What is wrong with data that are no material's, and the slip that would explain it: a warning, or a refusal."""
+    if found.rms <= NOTABLE:
+        return ""
+    slips = likely_slips(table, lambda other: _consistency(*_admittivity(other)).rms, found.rms)
+    said = f"the data are {100.0 * found.rms:.2g} % (rms) from any causal and passive material (Kramers-Kronig)"
+    said += f"; likely {' or '.join(slips)}" if slips else ""
+    if found.rms > TOO_MUCH:
+        raise InputError(f"{said}; allowed: at most {100.0 * TOO_MUCH:g} %, columns of {ALLOWED}")
+    warnings.warn(said, FingerspiceWarning, stacklevel=3)
+    return said
+
+
+def _least_ladder(
+    f: FloatArray, y: ComplexArray, counts: Sequence[int], error: float
+) -> tuple[Ladder, FloatArray, float]:
+    """The first ladder of so many branches that misses the data by no more than the error, or the last one, rms."""
+    found, refused = None, InputError("")
+    for count in counts:
         try:
-            numbers.append([float(x) for x in row])
-        except ValueError:
-            if place > 0:
-                raise InputError(f"{path}, row {place + 1}: {','.join(row)!r}; allowed: three numbers") from None
-    if any(len(row) != 3 for row in numbers):
-        raise InputError(f"{path} has rows that are not three numbers: frequency (Hz), rho (ohm m), eps_r")
-    return np.array(numbers, float).reshape(-1, 3)
+            ladder, misfit = _fit(f, y, count)
+        except InputError as problem:
+            # With more branches something may be left.
+            refused = problem
+            continue
+        found = ladder, misfit, float(np.sqrt(np.mean(misfit**2)))
+        if found[2] <= error:
+            break
+    if found is None:
+        raise refused
+    return found
 
 
 def _weights(f: FloatArray, y: ComplexArray, poles: FloatArray) -> tuple[FloatArray, ComplexArray]:
@@ -262,3 +325,32 @@ def _consistency(f: FloatArray, y: ComplexArray) -> Consistency:
     _, left = _weights(f, y, np.logspace(low - _BEYOND, high + _BEYOND, count))
     misfit = np.abs(left)
     return Consistency(float(np.sqrt(np.mean(misfit**2))), float(misfit.max()), f, misfit)
+
+
+def plot_material(fit: MaterialFit) -> Figure:
+    """What was measured and what was fitted: resistivity, permittivity, and the misfit of the two together."""
+    from fingerspice.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, new_figure
+
+    figure, axes = new_figure(1, 3, height=2.7)
+    f = np.geomspace(fit.frequency[0], fit.frequency[-1], 400)
+    measured = 1.0 / fit.data.real, fit.data.imag / (2.0 * np.pi * fit.frequency * EPS0)
+    fitted = fit.ladder.resistivity(f), fit.ladder.permittivity(f)
+    labels = "Resistivity [Ω m]", "Relative permittivity"
+    for ax, points, line, label in zip(axes[:2], measured, fitted, labels, strict=True):
+        ax.loglog(fit.frequency, points, color=GREY, marker="o", markersize=2.5, linestyle="none", label="data")
+        ax.loglog(f, line, color=BLUE, linewidth=1.4, label=f"ladder of {len(fit.ladder.poles)} poles")
+        dress(ax, label, "Frequency [Hz]")
+    limit = fit.kramers_kronig
+    axes[2].semilogx(fit.frequency, 100.0 * fit.misfit, color=BLUE, linewidth=1.4, label="ladder")
+    axes[2].semilogx(
+        limit.frequency, 100.0 * limit.misfit, color=VERMILION, linewidth=1.0, linestyle="--", label="any material"
+    )
+    dress(axes[2], "Misfit [%]", "Frequency [Hz]")
+    for ax in (axes[0], axes[2]):
+        ax.legend(fontsize=FONT - 0.5, frameon=False)
+    caption(
+        figure,
+        f"misfit {100.0 * fit.rms:.2g} % rms; no causal and passive material is nearer than "
+        f"{100.0 * limit.rms:.2g} % rms",
+    )
+    return figure

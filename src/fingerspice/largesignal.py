@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import warnings
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.circuit.waveforms import Sine, Waveform, require
-from fingerspice.errors import InputError
+from fingerspice.errors import FingerspiceWarning, InputError
 from fingerspice.measures import weigh_outputs
 from fingerspice.phasor_solution import PhasorSolution
-from fingerspice.phasors import Drive, sweep_drive, sweep_notes
+from fingerspice.runs import Progress
 from fingerspice.steady import steady_state
+from fingerspice.sweeps import Drive, sweep_drive, sweep_notes
 
 FloatArray = NDArray[np.float64]
 # Outputs in a period: cubics through them are good to 1e-9 of a sine.
@@ -29,6 +34,7 @@ def large_signal(
     *,
     charge_law: str | None = None,
     rtol: float = 1e-8,
+    progress: Progress | None = None,
 ) -> tuple[PhasorSolution, ...]:
     """Periodic states under sines, by frequency and amplitude; SKIN evaluated at each frequency.
 
@@ -40,7 +46,7 @@ def large_signal(
         Hz, positive.
     amplitude : array_like, optional
         V, positive; by default that of the source's own ``AC``, or without it of its fundamental.
-    charge_law, rtol
+    charge_law, rtol, progress
         As in `simulate`.
 
     Returns
@@ -55,6 +61,7 @@ def large_signal(
     SolveError
         Where there is no periodic state.
     """
+    require_circuit(circuit)
     stack = build_stack(circuit)
     if stack.gap is None:
         raise InputError("a large-signal sweep needs a GAP; this circuit has none")
@@ -69,12 +76,20 @@ def large_signal(
     for what, values, unit in (("frequency", f, "Hz"), ("amplitude", given, "V")):
         good = bool(np.all(np.isfinite(values) & (np.asarray(values) > 0.0)))
         require(good, what, f"{values} {unit}", "positive numbers")
+    for text in sweep_notes(circuit, f)[1]:
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
     drives = [own] if amplitude is None else [Drive(float(a), 0.0, "the amplitude given") for a in given]
-    return tuple(_sweep(circuit, f, drive, charge_law, rtol) for drive in drives)
+    found = itertools.count(1)
+
+    def one() -> None:
+        if progress is not None:
+            progress(next(found) / (f.size * len(drives)))
+
+    return tuple(_sweep(circuit, f, drive, charge_law, rtol, one) for drive in drives)
 
 
 def _sweep(
-    circuit: Circuit, frequency: FloatArray, drive: Drive, charge_law: str | None, rtol: float
+    circuit: Circuit, frequency: FloatArray, drive: Drive, charge_law: str | None, rtol: float, one: Callable[[], None]
 ) -> PhasorSolution:
     (source, sign), *_ = build_stack(circuit).sources
     skins = [e.name for e in circuit.by_device("SKIN")]
@@ -93,6 +108,7 @@ def _sweep(
         gains.append([weigh_outputs(period, u).phasor(float(f)) * sign / amplitude for u in s.u_layer.T])
         areas.append(weigh_outputs(period, s.area).mean())
         forces.append(weigh_outputs(period, s.f_el).mean())
+        one()
     gain = np.array(gains, np.complex128)
     gap = build_stack(circuit).gap_layer
     assert gap is not None

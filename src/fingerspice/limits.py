@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.combinations import Product
 from fingerspice.circuit.describe import heading
@@ -20,6 +21,7 @@ from fingerspice.folding import meets_fold
 from fingerspice.outcome import Status
 from fingerspice.pages import Page, Shown
 from fingerspice.problem import prepare
+from fingerspice.runs import Progress
 from fingerspice.simulation import simulate
 
 if TYPE_CHECKING:
@@ -94,7 +96,9 @@ class FoldLimits(Shown):
         }  # fmt: skip
 
 
-def fold_limits(circuit: Circuit, *, points: int = 9, span: float = 10.0) -> FoldLimits:
+def fold_limits(
+    circuit: Circuit, *, points: int = 9, span: float = 10.0, progress: Progress | None = None
+) -> FoldLimits:
     """Find the source voltage at which runs under the `mobile` law meet their fold, to 1e-3.
 
     Every run starts as the deck's does (uncharged, from the operating point of the source so raised, or from .ic as it
@@ -109,6 +113,8 @@ def fold_limits(circuit: Circuit, *, points: int = 9, span: float = 10.0) -> Fol
         Values of each parameter, 3 or more.
     span : float
         Above 1.
+    progress : callable, optional
+        Called with the fraction done.
 
     Raises
     ------
@@ -117,6 +123,7 @@ def fold_limits(circuit: Circuit, *, points: int = 9, span: float = 10.0) -> Fol
     SolveError
         Where a run fails for another reason than a fold.
     """
+    require_circuit(circuit)
     require(3 <= points <= 1000, "points", points, "3 to 1000")
     require(1.0 < span <= 1e6, "span", span, "more than 1, at most 1e6")
     gaps = circuit.by_device("GAP")
@@ -132,14 +139,17 @@ def fold_limits(circuit: Circuit, *, points: int = 9, span: float = 10.0) -> Fol
         raise InputError("a map of the fold needs a V element with a voltage to raise; this circuit has none")
     gap = gaps[0]
     factors = np.geomspace(1.0 / span, span, points)
+    waves = [e.waveform for e in sources]
+    tuned = len(waves) == 1 and isinstance(getattr(waves[0], "frequency", None), float)
+    done = _Count(1 + points * (3 if tuned else 2), progress)
     around = fold_voltage(circuit, peak, t_stop)
+    done.one()
     sweeps = []
     for key, name, unit in (("fn", "load", "N"), ("d", "gap", "m")):
         own = float(gap.values[key])
         changed = [circuit.varied({f"{gap.name}.{key}": own * x}) for x in factors]
-        sweeps.append(FoldSweep(name, unit, own, own * factors, _along(changed, peak, [t_stop] * points)))
-    waves = [e.waveform for e in sources]
-    if len(waves) == 1 and isinstance(getattr(waves[0], "frequency", None), float):
+        sweeps.append(FoldSweep(name, unit, own, own * factors, _along(changed, peak, [t_stop] * points, done)))
+    if tuned:
         own = float(waves[0].frequency)  # type: ignore[union-attr]
         skins = [e.name for e in circuit.by_device("SKIN")]
         changed = []
@@ -147,17 +157,33 @@ def fold_limits(circuit: Circuit, *, points: int = 9, span: float = 10.0) -> Fol
             wave: Waveform = dataclasses.replace(waves[0], frequency=own * x)  # type: ignore[type-var, assignment]
             changes: dict[str, float | Waveform] = {f"{skin}.f": own * x for skin in skins}
             changed.append(circuit.varied({**changes, sources[0].name: wave}))
-        voltages = _along(changed, peak, [t_stop / x for x in factors])
+        voltages = _along(changed, peak, [t_stop / x for x in factors], done)
         sweeps.append(FoldSweep("frequency", "Hz", own, own * factors, voltages))
     return FoldLimits(circuit, peak, around, tuple(sweeps))
 
 
-def _along(circuits: list[Circuit], peak: float, ends: list[float]) -> FloatArray:
+@dataclass
+class _Count:
+    """Voltages found, of how many."""
+
+    all: int
+    told: Progress | None
+    found: int = 0
+
+    def one(self) -> None:
+        """Count one more."""
+        self.found += 1
+        if self.told is not None:
+            self.told(self.found / self.all)
+
+
+def _along(circuits: list[Circuit], peak: float, ends: list[float], done: _Count) -> FloatArray:
     """Fold voltages of circuits, each looked for near that of the one before."""
     out = []
     guess = peak
     for circuit, t_stop in zip(circuits, ends, strict=True):
         out.append(fold_voltage(circuit, peak, t_stop, guess))
+        done.one()
         guess = out[-1] if math.isfinite(out[-1]) else HIGHEST
     return np.array(out)
 

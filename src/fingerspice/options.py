@@ -8,26 +8,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fingerspice.errors import FingerspiceWarning, InputError
-from fingerspice.terminal import complain
 from fingerspice.units import parse_number
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import AcSweep, Circuit
+    from fingerspice.circuit.waveforms import Waveform
 
 LARGEST_AREA = 0.01
 """m^2; an area above it was probably given in mm^2."""
 
 
-def read_circuit(deck: Path, changes: list[str] | None, source: str | None) -> Circuit:
-    """The deck's circuit with ``--set`` and ``--source``; what has no effect here is noted on stderr."""
+def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | None) -> Circuit:
+    """The deck's circuit with ``--set`` and ``--source``; what has no effect here is warned about."""
     from fingerspice.circuit.netlist import read_netlist
+    from fingerspice.notices import directive_warnings
 
     circuit = read_netlist(deck)
     circuit = _with_changes(circuit, changes or [])
-    if source is not None:
-        circuit = _with_source(circuit, source)
-    for directive in circuit.unused:
-        complain(f"note: {directive} has no effect here")
+    circuit = _with_sources(circuit, sources or [])
+    # Said here for the commands that make no run of the circuit as it is.
+    for text in directive_warnings(circuit):
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
     return circuit
 
 
@@ -48,45 +49,51 @@ def _with_changes(circuit: Circuit, changes: list[str]) -> Circuit:
         raise InputError(f"--set {' '.join(map(repr, changes))}: {error.message}") from None
 
 
-def _with_source(circuit: Circuit, text: str) -> Circuit:
+def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
+    """The circuit with every ``--source``: the name may be left out where there is one source."""
+    from fingerspice.arguments import overridden
     from fingerspice.circuit.netlist import source_from_text
     from fingerspice.circuit.topology import find_branches
 
-    sources = [e for e in find_branches(circuit)[1] if e.device in "VI"]
-    if len(sources) != 1:
-        names = ", ".join(e.name for e in sources)
-        raise InputError(f"--source needs a circuit with one source; this one has {names}")
+    if not texts:
+        return circuit
+    names = {e.name.lower(): e.name for e in find_branches(circuit)[1] if e.device in "VI"}
+    sources: dict[str, Waveform] = {}
+    for text in texts:
+        named, equals, spec = (part.strip() for part in text.partition("="))
+        # The = of a parameter, as in PWL(...) r=10m, follows no name alone.
+        if not (equals and named.replace(".", "").isidentifier()):
+            named, spec = "", text
+        known = ", ".join(names.values())
+        if not named and len(names) != 1:
+            raise InputError(f"--source {text!r}: the circuit has {known}; allowed: NAME=SPEC with one of these names")
+        name = names.get(named.lower(), "") if named else next(iter(names.values()))
+        if not name or name in sources:
+            problem = "is given twice" if name else f"is not a source of the circuit; allowed: {known}"
+            raise InputError(f"--source {text!r}: {named or name} {problem}")
+        try:
+            sources[name] = source_from_text(spec, circuit)
+        except InputError as error:
+            raise InputError(f"--source {error.message}") from None
+    return overridden(circuit, sources)
+
+
+def time_from_text(option: str, text: str | None) -> float | None:
+    """A time in s, such as ``50m``."""
     try:
-        return circuit.replace({sources[0].name: source_from_text(text, circuit)})
-    except InputError as error:
-        raise InputError(f"--source {error.message}") from None
+        return None if text is None else parse_number(text)
+    except ValueError as error:
+        raise InputError(f"{option} {text!r}: {error}") from None
 
 
-def note_skin_frequency(circuit: Circuit) -> None:
-    """Warn where a SKIN's data are not taken at the source's fundamental."""
-    from fingerspice.circuit.statespace import build_stack, is_stack
-    from fingerspice.circuit.topology import find_branches
-
-    if is_stack(circuit):
-        fundamental = build_stack(circuit).waveform.fundamental
-    else:
-        waves = [e.waveform for e in find_branches(circuit)[1] if e.waveform is not None]
-        fundamental = waves[0].fundamental if len(waves) == 1 else None
-        if len(waves) > 1:
-            # Which of several sources the skin's data should match is the user's to know.
-            return
-    for skin in circuit.by_device("SKIN"):
-        f = skin.values["f"]
-        if fundamental is None:
-            text = f"{skin.name} takes its data at {f:g} Hz, and the source has no fundamental"
-        elif abs(f / fundamental.frequency - 1.0) > 1e-9:
-            text = (
-                f"{skin.name} takes its data at f = {f:g} Hz, the source's fundamental is "
-                f"{fundamental.frequency:g} Hz; --set {skin.name}.f={fundamental.frequency:g} would match"
-            )
-        else:
-            continue
-        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+def check_stop(circuit: Circuit, t_stop: float | None) -> None:
+    """Refuse an end (s) before the deck's first output step is over."""
+    tran = circuit.tran
+    if t_stop is not None and tran is not None and 0.0 < t_stop < tran.start + tran.step:
+        raise InputError(
+            f"--stop {t_stop:g} s is before the second output; allowed: TSTART + TSTEP = {tran.start + tran.step:g} s "
+            "or more"
+        )
 
 
 def area_from_text(text: str) -> str | float:
@@ -116,7 +123,7 @@ def _check_output(file: Path, deck: Path | None) -> None:
     folder = file.parent
     while not folder.exists() and folder != folder.parent and not folder.is_symlink():
         folder = folder.parent
-    # A name that is too long is found only by looking for a file, in a folder that is there.
+    # A name that is too long is found only by looking for the file itself, in a folder that is there.
     (folder / file.name).exists()
     if not folder.is_dir():
         raise InputError(f"cannot write {file}: {folder} is not a folder; allowed: a folder that can be written")

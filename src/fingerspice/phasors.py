@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Protocol
@@ -10,39 +11,21 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.circuit.circuit import AcSweep, Circuit, Element
+from fingerspice.arguments import Parameters, Sources, overridden, require_area
+from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.network import Network, build_network
 from fingerspice.circuit.statespace import Stack, build_stack, is_stack
 from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.circuit.waveforms import Fundamental, require
-from fingerspice.errors import InputError
+from fingerspice.errors import FingerspiceWarning, InputError
 from fingerspice.phasor_solution import PhasorSolution
 from fingerspice.physics.contact import Contact
-from fingerspice.physics.materials import SKIN_BAND, skin_permittivity, skin_resistivity
+from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
+from fingerspice.sweeps import sweep_drive, sweep_notes
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-MAX_FREQUENCIES = 1_000_000
-
-
-@dataclass(frozen=True)
-class Drive:
-    """What drives a sweep.
-
-    Attributes
-    ----------
-    amplitude : float
-        V (A of a current source); NaN where there is nothing to take it from.
-    phase : float
-        rad.
-    text : str
-        Where it comes from.
-    """
-
-    amplitude: float
-    phase: float
-    text: str
 
 
 class _Scene(Protocol):
@@ -249,20 +232,6 @@ def _frequencies(frequency: ArrayLike | None, fundamental: Fundamental | None) -
     return f
 
 
-def sweep_drive(sources: tuple[tuple[Element, float], ...], fundamental: Fundamental | None, swept: bool) -> Drive:
-    """What drives a circuit: ``AC`` of its sources in a sweep, where the deck has it, else the fundamental."""
-    given = [(e, sign) for e, sign in sources if e.ac is not None]
-    if swept and given:
-        # As in ngspice, a source without AC is silent.
-        total = sum(sign * e.ac.phasor for e, sign in given if e.ac is not None)
-        words = [f"AC {e.ac.magnitude:g} {e.ac.phase_deg:g} of {e.name}" for e, _ in given if e.ac is not None]
-        return Drive(abs(total), math.atan2(total.imag, total.real), " and ".join(words))
-    names = " and ".join(e.name for e, _ in sources)
-    if fundamental is None:
-        return Drive(math.nan, 0.0, f"no fundamental of {names}")
-    return Drive(fundamental.amplitude, fundamental.phase, f"the fundamental of {names}")
-
-
 def _check_area(area: str | float, amplitude: float, fixed: bool) -> None:
     """Refuse what is no area or mode, and a coupled one without an amplitude to couple it to."""
     if not isinstance(area, str):
@@ -288,30 +257,6 @@ def _with_skin_held(circuit: Circuit) -> Circuit:
     return replace(circuit, elements=tuple(held(e) if e.device == "SKIN" else e for e in circuit.elements))
 
 
-def sweep_notes(circuit: Circuit, f: FloatArray, skin: str = "swept") -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Notes and warnings of a sweep over frequencies (Hz): where a skin's data are taken, and how far outside them."""
-    skins = {e.name: e.values["f"] for e in circuit.by_device("SKIN")}
-    own = ", ".join(f"{name} f = {x:g} Hz" for name, x in skins.items())
-    notes: tuple[str, ...] = ()
-    if skins and skin == "own":
-        notes = (f"the skin's data are held at the deck's own frequency ({own}) over the whole sweep",)
-    elif any(np.any(np.abs(f / x - 1.0) > 1e-9) for x in skins.values()):
-        notes = (f"the skin's data are taken at each frequency of the sweep, not at the deck's own ({own})",)
-    swept = bool(circuit.by_device("SKIN_DISPERSIVE")) or (bool(skins) and skin != "own")
-    low, high = float(f.min()), float(f.max())
-    beyond = []
-    if low < SKIN_BAND[0]:
-        beyond.append(f"down to {low:g} Hz, {math.log10(SKIN_BAND[0] / low):.2g} decades below")
-    if high > SKIN_BAND[1]:
-        beyond.append(f"up to {high:g} Hz, {math.log10(high / SKIN_BAND[1]):.2g} decades above")
-    if not swept or not beyond:
-        return notes, ()
-    return notes, (
-        f"the sweep goes {' and '.join(beyond)} the 10 Hz to 100 kHz of the skin's data (Eqs. 18, 19): what it shows "
-        "there is extrapolated",
-    )
-
-
 def _refuse_no_number(f: FloatArray, *results: NDArray[np.inexact]) -> None:
     """Refuse a sweep whose figures are beyond the range of numbers."""
     bad = ~np.logical_and.reduce([np.isfinite(x).reshape(f.size, -1).all(axis=1) for x in results])
@@ -323,7 +268,13 @@ def _refuse_no_number(f: FloatArray, *results: NDArray[np.inexact]) -> None:
 
 
 def phasor(
-    circuit: Circuit, frequency: ArrayLike | None = None, *, area: str | float = "mean", skin: str = "swept"
+    circuit: Circuit,
+    frequency: ArrayLike | None = None,
+    *,
+    sources: Sources | None = None,
+    parameters: Parameters | None = None,
+    area: str | float = "mean",
+    skin: str = "swept",
 ) -> PhasorSolution:
     """Phasor solution of a circuit.
 
@@ -333,6 +284,8 @@ def phasor(
     frequency : array_like, optional
         Hz, positive; the source's fundamental by default. Over given frequencies a deck's ``AC magnitude [phase]`` is
         what drives, as in ngspice; without it, and at the fundamental, the source's fundamental.
+    sources, parameters
+        As in `simulate`.
     area : str or float
         ``"mean"``: coupled through the mean stress at the source's own amplitude (its fundamental's, if it is
         not a sine); ``"frozen"``: the area at 0 V; or an area in m^2. An area fixed by the deck comes before
@@ -351,6 +304,8 @@ def phasor(
         needed, frequencies or an area not positive, or a result beyond the range of numbers.
     """
     require(skin in ("swept", "own"), "skin", repr(skin), "'swept' or 'own'")
+    require_area(area)
+    circuit = overridden(circuit, sources, parameters)
     scene = _scene(circuit if skin == "swept" else _with_skin_held(circuit))
     f = _frequencies(frequency, scene.fundamental)
     drive = sweep_drive(scene.sources, scene.fundamental, frequency is not None)
@@ -363,28 +318,12 @@ def phasor(
         # Mean of sigma A over a period of a sine: half the peak.
         force = 0.5 * scene.contact.stress(np.abs(u_gap)) * own
     _refuse_no_number(f, layers, own, *((u_gap, force) if math.isfinite(drive.amplitude) else ()))
-    notes, warnings = sweep_notes(circuit, f, skin)
+    notes, warned = sweep_notes(circuit, f, skin)
     largest = (float(np.max(x)) for x in (force, scene.contact.stress(np.abs(u_gap)), own))
+    warned = (*warned, *beyond_fingers("", *largest))
+    for text in warned:
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
     return PhasorSolution(
-        f, gain, layers, u_gap, own, force, drive.amplitude, scene.layers, drive.phase, drive.text, notes,
-        (*warnings, *beyond_fingers("", *largest)), circuit,
+        f, gain, layers, u_gap, own, force, drive.amplitude, scene.layers, drive.phase, drive.text, notes, warned,
+        circuit,
     )  # fmt: skip
-
-
-def sweep_frequencies(sweep: AcSweep) -> FloatArray:
-    """Frequencies (Hz) of an ``.ac`` line.
-
-    Raises
-    ------
-    InputError
-        For more than `MAX_FREQUENCIES` of them.
-    """
-    base, ratio = (10.0 if sweep.scale == "dec" else 2.0), sweep.stop / sweep.start
-    count = sweep.points - 1.0 if sweep.scale == "lin" else math.log(ratio) / math.log(base) * sweep.points
-    if not count < MAX_FREQUENCIES:
-        raise InputError(f"the sweep has {count + 1.0:.3g} frequencies; allowed: at most {MAX_FREQUENCIES}")
-    if sweep.scale == "lin":
-        return np.linspace(sweep.start, sweep.stop, sweep.points)
-    n = math.floor(count + 1e-9)
-    out = sweep.start * base ** (np.arange(n + 1) / sweep.points)
-    return np.asarray(np.append(out, sweep.stop) if count - n > 1e-9 else out)

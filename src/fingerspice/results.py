@@ -117,11 +117,6 @@ class Results:
         raise InputError(f"{file} holds a result {said}, and this one is {own}; {ways}")
 
 
-def scene_dict(circuit: Circuit) -> dict[str, Any]:
-    """Which circuit a report is of, as plain data."""
-    return {"title": circuit.title, "overrides": dict(circuit.overrides)}
-
-
 def _of(held: Mapping[str, str]) -> str:
     changed = json.loads(held["overrides"])
     if not changed:

@@ -6,15 +6,15 @@ import dataclasses
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice.arguments import Parameters, Sources, overridden, require_area, require_number, times_given
 from fingerspice.cautions import network_warnings, stack_warnings
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import is_stack
-from fingerspice.circuit.waveforms import Waveform, as_waveform, require
+from fingerspice.circuit.waveforms import require
 from fingerspice.diagnosis import network_failure, stack_failure
 from fingerspice.direct import solve_algebraic, solve_linear
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError
@@ -24,6 +24,7 @@ from fingerspice.netruns import NetworkRun
 from fingerspice.network_record import NetworkRecord
 from fingerspice.networks import NetworkProblem, prepare_network
 from fingerspice.nodal import solve_coupled
+from fingerspice.notices import circuit_warnings
 from fingerspice.numerics.tableaus import TABLEAUS
 from fingerspice.outcome import ErrorEstimate, Failure, Status
 from fingerspice.outputs import asked_for, at_breakpoints
@@ -39,6 +40,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 RTOL_RANGE = (1e-13, 0.1)
+STARTS = ("deck", "uncharged", "dc", "periodic")
 
 
 def simulate(
@@ -46,7 +48,8 @@ def simulate(
     *,
     t_stop: float | None = None,
     t_eval: ArrayLike | None = None,
-    sources: Mapping[str, Waveform | float | Callable[[float], float]] | None = None,
+    sources: Sources | None = None,
+    parameters: Parameters | None = None,
     charge_law: str | None = None,
     area: str | float = "coupled",
     rtol: float = 1e-8,
@@ -68,8 +71,11 @@ def simulate(
     t_eval : array_like, optional
         Output times, s, ascending; right-hand values at jumps. By default TSTART:TSTEP:TSTOP, and both
         one-sided values at each jump.
-    sources : mapping, optional
-        Source name to a waveform, a constant (V) or a plain function of time (s) in V.
+    sources : mapping or waveform, optional
+        Source name to a waveform, a constant (V) or a plain function of time (s) in V; or one of these alone where the
+        circuit has one source. Sources that are not named stay as they are.
+    parameters : mapping, optional
+        Path to value, as in `Circuit.replace`: ``{"Xgap.d": 3e-6}``.
     charge_law : str, optional
         ``"local"`` or ``"mobile"``; the included library's by default, else local.
     area : str or float
@@ -110,11 +116,16 @@ def simulate(
     """
     _check_rtol(rtol)
     require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
-    if sources:
-        circuit = _with_sources(circuit, sources)
+    if t_stop is not None:
+        require_number("t_stop", t_stop, "a number in s")
+    require_area(area)
+    require(isinstance(method, str), "method", repr(method), "a name, such as 'auto'")
+    known = isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)
+    require(known, "start", repr(start), f"{', '.join(map(repr, STARTS))} or a Solution")
     if isinstance(start, Solution) and start.stored is not None:
         raise InputError("start is a solution read from a file, which a run cannot go on from; allowed: one just made")
-    times = None if t_eval is None else np.asarray(t_eval, float)
+    circuit = overridden(circuit, sources, parameters)
+    times = times_given("t_eval", t_eval)
     if not is_stack(circuit):
         if start == "periodic":
             raise InputError("start='periodic' needs a series stack; allowed for a network: 'deck', 'uncharged', 'dc'")
@@ -146,11 +157,12 @@ def _check_rtol(rtol: float) -> None:
 
 
 def _given_back(solution: Solution, throw: bool) -> Solution:
-    """A solution with its warnings said, or the error of a failed run."""
+    """A solution with its warnings said, but for those of the circuit, which came first; or a failed run's error."""
     if solution.failure is not None and throw:
         raise SolveError(solution.failure, solution)
     for text in solution.warnings:
-        warnings.warn(text, FingerspiceWarning, stacklevel=3)
+        if text not in solution.circuit.warnings:
+            warnings.warn(text, FingerspiceWarning, stacklevel=3)
     return solution
 
 
@@ -158,6 +170,8 @@ def plan(
     circuit: Circuit,
     *,
     t_stop: float | None = None,
+    sources: Sources | None = None,
+    parameters: Parameters | None = None,
     charge_law: str | None = None,
     area: str | float = "coupled",
     rtol: float = 1e-8,
@@ -172,8 +186,12 @@ def plan(
         For a request that cannot be run.
     """
     _check_rtol(rtol)
+    require_area(area)
+    circuit = overridden(circuit, sources, parameters)
     if t_stop is None and circuit.tran is None:
         t_stop = 1.0
+    for text in circuit_warnings(circuit):
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
     if not is_stack(circuit):
         network = prepare_network(
             circuit, t_stop=t_stop, t_eval=None, charge_law=charge_law, area=area, start="deck", charge=charge
@@ -282,13 +300,6 @@ def _add_error(run: Run, u_gap: float, f_el: float | None = None) -> None:
     if f_el is None:
         f_el = 2.0 * u_gap / run.peak_u * run.peak_f if run.peak_u > 0.0 else 0.0
     run.error = dataclasses.replace(run.error, u_gap=run.error.u_gap + u_gap, f_el=run.error.f_el + f_el)
-
-
-def _with_sources(circuit: Circuit, sources: Mapping[str, Waveform | float | Callable[[float], float]]) -> Circuit:
-    for name in sources:
-        if circuit[name].device != "V":
-            raise InputError(f"sources names {name!r}, which is a {circuit[name].device}; allowed: a V element")
-    return circuit.replace({circuit[name].name: as_waveform(value) for name, value in sources.items()})
 
 
 def _run(

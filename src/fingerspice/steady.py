@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,10 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.arguments import Parameters, Sources, overridden, require_area
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.circuit.waveforms import require
-from fingerspice.errors import InputError, SolveError
+from fingerspice.errors import FingerspiceWarning, InputError, SolveError
 from fingerspice.outcome import ErrorEstimate
 from fingerspice.pages import Page, Shown
 from fingerspice.periodic import close_period
@@ -89,7 +91,7 @@ class SteadyState(Shown, Figured):
 
     @cached_property
     def solution(self) -> Solution:
-        """The period's signals, integrated when first asked for.
+        """The period's signals, integrated when first asked for; its warnings are said then.
 
         Raises
         ------
@@ -99,12 +101,18 @@ class SteadyState(Shown, Figured):
         solution = run_problem(self.problem, rtol=self.rtol, start="periodic", begun=self.error)
         if solution.failure is not None:
             raise SolveError(solution.failure, solution)
+        for text in solution.warnings:
+            if text not in self.problem.circuit.warnings:
+                # Past functools, to the line that asked.
+                warnings.warn(text, FingerspiceWarning, stacklevel=3)
         return solution
 
 
 def steady_state(
     circuit: Circuit,
     *,
+    sources: Sources | None = None,
+    parameters: Parameters | None = None,
     charge_law: str | None = None,
     area: str | float = "coupled",
     rtol: float = 1e-8,
@@ -117,7 +125,7 @@ def steady_state(
     ----------
     circuit : Circuit
         With a periodic source.
-    charge_law, area, rtol, charge
+    sources, parameters, charge_law, area, rtol, charge
         As in `simulate`: the error is relative to the peaks over the period.
     points : int
         Output steps in the period.
@@ -135,6 +143,8 @@ def steady_state(
     """
     require(RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-13 to 0.1")
     require(points >= 1, "points", points, "1 or more")
+    require_area(area)
+    circuit = overridden(circuit, sources, parameters)
     waveform = circuit.remember("waveform", lambda: build_stack(circuit).waveform)
     if waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")

@@ -7,6 +7,7 @@ import logging
 import math
 import os
 import sys
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
+from fingerspice.announcing import Bar
+from fingerspice.answers import OWN, blank
 from fingerspice.errors import FingerspiceWarning, InputError, SolveError, printable
 
 #: Characters of a printed line; of a longer one the middle is left out.
@@ -86,16 +89,24 @@ def plain_errors() -> Iterator[None]:
     """One sentence instead of a traceback, and the exit code that says which kind."""
     try:
         yield
-    except InputError as error:
-        _fail(str(error), 2)
-    except SolveError as error:
-        _fail(str(error), 1)
-    except MemoryError:
-        _fail("not enough memory; allowed: fewer outputs (a longer TSTEP, or TSTART), or a shorter run", 2)
     except Exception as error:
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        said = f"{type(error).__name__} in {Path(place.filename).name}:{place.lineno}, {error}"
-        _fail(f"this is a fault of fingerspice, please report it with the deck ({said})", 1)
+        _fail(said_of(error), 2 if is_input(error) else 1)
+
+
+def is_input(error: Exception) -> bool:
+    """Whether it is the input, or what it asks for, that has to change."""
+    return isinstance(error, (InputError, MemoryError))
+
+
+def said_of(error: Exception) -> str:
+    """An error in one sentence."""
+    if isinstance(error, (InputError, SolveError)):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return "not enough memory; allowed: fewer outputs (a longer TSTEP, or TSTART), or a shorter run"
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    said = f"{type(error).__name__} in {Path(place.filename).name}:{place.lineno}, {error}"
+    return f"this is a fault of fingerspice, please report it with the deck ({said})"
 
 
 def _fail(message: str, code: int) -> NoReturn:
@@ -103,90 +114,107 @@ def _fail(message: str, code: int) -> NoReturn:
     raise SystemExit(code)
 
 
-def report(as_json: bool, figures: Callable[[], Report], text: Callable[[], str], writes: Sequence[Write]) -> None:
-    """Write what a command found, then say it in the language asked for.
+class Answering:
+    """One command's answer: gathered on the way, said at its end in the language asked for.
 
-    Where a file cannot be written, what was found is said all the same, and then why the file is missing.
+    Used as a context: warnings become lines on stderr, each once, and part of the answer; where JSON is wanted it is
+    printed however the command ends.
 
     Parameters
     ----------
+    command : str
     as_json : bool
-    figures, text : callable
-        What was found, as data and in words.
-    writes : sequence of callable
-        Each writes a file and returns its path.
-
-    Raises
-    ------
-    InputError
-        Where a file cannot be written.
+    known : any
+        What the answer holds from the start.
     """
-    files: list[Path] = []
-    failed = None
-    try:
-        for write in writes:
-            files.append(write())
-    except InputError as error:
-        failed = error
-    if as_json:
-        say_json({**figures(), "files": [str(f) for f in files]})
-    else:
-        say("\n".join([text(), *(f"wrote {f}" for f in files)]))
-    if failed is not None:
-        raise failed
 
+    def __init__(self, command: str, as_json: bool, **known: Any) -> None:
+        self.as_json = as_json
+        self.data = {**blank(command), **known}
+        self._warnings = warnings.catch_warnings()
 
-@contextmanager
-def warnings_as_lines() -> Iterator[None]:
-    """Our own warnings as plain lines on stderr, each once."""
-    with warnings.catch_warnings():
+    def __enter__(self) -> Answering:
+        self._warnings.__enter__()
         warnings.simplefilter("always", FingerspiceWarning)
-        seen: set[str] = set()
+        warnings.showwarning = self._show
+        return self
 
-        def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-            text = str(message)
-            if text not in seen:
-                seen.add(text)
-                complain(f"warning: {text}")
+    def _show(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        text = str(message)
+        if text not in self.data["warnings"]:
+            self.data["warnings"].append(text)
+            complain(f"warning: {text}")
 
-        warnings.showwarning = show
-        yield
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: Any) -> None:
+        self._warnings.__exit__(kind, error, None)
+        if not self.as_json or not (error is None or isinstance(error, Exception)):
+            return
+        if error is None:
+            self.data.update(success=True, status="SUCCESS", message="success")
+        elif isinstance(error, SolveError):
+            failure = error.failure
+            self.data.update(status=failure.status.name, message=error.message, failure=failure.to_dict())
+        else:
+            self.data.update(status="BAD_INPUT" if is_input(error) else "FAULT", message=said_of(error))
+        say_json(self.data)
+
+    def update(self, **found: Any) -> None:
+        """Add what was found."""
+        self.data.update(found)
+
+    def give(self, text: Callable[[], str], writes: Sequence[Write] = ()) -> None:
+        """Write files, then say in words what was found, and where JSON is not wanted instead.
+
+        Where a file cannot be written, what was found is said all the same, and then why the file is missing.
+
+        Parameters
+        ----------
+        text : callable
+            What was found.
+        writes : sequence of callable
+            Each writes a file and returns its path.
+
+        Raises
+        ------
+        InputError
+            Where a file cannot be written.
+        """
+        files: list[str] = self.data["files"]
+        failed = None
+        try:
+            for write in writes:
+                files.append(str(write()))
+        except InputError as error:
+            failed = error
+        said = [*filter(None, [text()]), *(f"wrote {file}" for file in files)]
+        if said and not self.as_json:
+            say("\n".join(said))
+        if failed is not None:
+            raise failed
+
+
+def answer_usage(message: str) -> None:
+    """The answer to a command line that is none, where it asks for JSON."""
+    words = sys.argv[1:]
+    if "--json" in words:
+        command = next((word for word in words if word in OWN), None)
+        say_json({**blank(command), "status": "BAD_INPUT", "message": message})
 
 
 @contextmanager
-def failure_as_json(wanted: bool) -> Iterator[None]:
-    """A failed solve as JSON too, where that is the language spoken."""
-    try:
-        yield
-    except SolveError as error:
-        if wanted:
-            say_json({"success": False, "message": error.message, "failure": error.failure.to_dict()})
-        raise
-
-
-@contextmanager
-def progress() -> Iterator[Callable[[float], None] | None]:
-    """A bar on a terminal, shown only once a run takes more than a second."""
+def progress(what: str = "simulating") -> Iterator[Callable[[float], None] | None]:
+    """A bar on a terminal, shown only once what is done takes more than a second."""
     if not sys.stderr.isatty():
         yield None
         return
-    import time
-
-    from rich.console import Console
-    from rich.progress import Progress
-
-    bar = Progress(console=Console(stderr=True), transient=True)
+    bar = Bar(what)
     begin = time.perf_counter()
-    task = bar.add_task("simulating", total=1.0)
 
     def update(done: float) -> None:
         if time.perf_counter() - begin > 1.0:
-            if not bar.live.is_started:
-                bar.start()
-            bar.update(task, completed=done)
+            bar.show(done)
 
     try:
         yield update
     finally:
-        if bar.live.is_started:
-            bar.stop()
+        bar.stop()

@@ -157,7 +157,10 @@ def as_waveform(value: Waveform | float | Callable[[float], float]) -> Waveform:
         from fingerspice.circuit.sampling import Function
 
         return Function(value)
-    raise InputError(f"a source must be a waveform, a number or a function of time, got {type(value).__name__}")
+    kind = type(value).__name__
+    if isinstance(value, (np.ndarray, list, tuple)):
+        kind += "; values at a rate are fs.Samples(values, rate)"
+    raise InputError(f"a source must be a waveform, a number or a function of time, got {kind}")
 
 
 def require(condition: bool, what: str, given: Any, allowed: str) -> None:

@@ -1,0 +1,90 @@
+"""What takes its time says so: a bar on a terminal, one line elsewhere."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, ClassVar
+
+_LOG = logging.getLogger("fingerspice")
+
+
+class Bar:
+    """A progress bar on a terminal's stderr, gone once stopped; where another one stands, or elsewhere, nothing.
+
+    Parameters
+    ----------
+    what : str
+        What is done.
+    endless : bool
+        Whether nobody knows how much there is to do: then it shows the time taken.
+    """
+
+    _standing: ClassVar[Bar | None] = None
+
+    def __init__(self, what: str, *, endless: bool = False) -> None:
+        self._what, self._endless = what, endless
+        self._bar: Any = None
+
+    def show(self, done: float = 0.0) -> None:
+        """Let it stand at a fraction."""
+        if self._bar is None:
+            if Bar._standing is not None or not sys.stderr.isatty():
+                return
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+            columns = [TextColumn("{task.description}"), BarColumn()]
+            columns += [TimeElapsedColumn()] if self._endless else [TextColumn("{task.percentage:3.0f} %")]
+            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+            self._bar.add_task(self._what, total=None if self._endless else 1.0)
+            self._bar.start()
+            Bar._standing = self
+        self._bar.update(self._bar.task_ids[0], completed=done)
+
+    def stop(self) -> None:
+        """Take it away."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar, Bar._standing = None, None
+
+
+class Compiling:
+    """Announces that code is compiled, once in a process as a line, each time as a bar."""
+
+    def __init__(self) -> None:
+        self._depth, self._told = 0, False
+        self._bar: Bar | None = None
+
+    @contextmanager
+    def around(self) -> Iterator[None]:
+        """Around whatever may compile: functions are compiled inside each other."""
+        self._depth += 1
+        try:
+            yield
+        finally:
+            self._depth -= 1
+            if self._depth == 0 and self._bar is not None:
+                self._bar.stop()
+                self._bar = None
+
+    def begins(self, text: str) -> None:
+        """Something is compiled."""
+        wanted = _LOG.level in (logging.NOTSET, logging.INFO)
+        if wanted and self._bar is None and sys.stderr is not None and sys.stderr.isatty():
+            self._bar = Bar(text, endless=True)
+            self._bar.show()
+        elif not self._told and self._bar is None:
+            _tell(text)
+        self._told = True
+
+
+def _tell(text: str) -> None:
+    """One line to whoever listens, or where nobody was set to, on stderr."""
+    if _LOG.isEnabledFor(logging.INFO) and _LOG.hasHandlers():
+        _LOG.info(text)
+    elif _LOG.level == logging.NOTSET and sys.stderr is not None:
+        sys.stderr.write(f"fingerspice: note: {text}\n")
+        sys.stderr.flush()

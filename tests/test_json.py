@@ -1,0 +1,131 @@
+"""`--json`: the same keys whatever the circuit and however a command ends, and nothing else on stdout."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fingerspice as fs
+from commands import Command, Result
+from deck_edits import edited
+from fingerspice.answers import COMMON, FIGURES, OWN
+
+CIRCUITS = Path(__file__).parents[1] / "circuits"
+DOCUMENT = (Path(__file__).parents[1] / "docs" / "json.md").read_text()
+FLAT = "t\nV1 a 0 SIN(0 10 100)\nXcoat a 0 area LAYER d=1u eps_r=2 r=1k\nVarea area 0 35\n.tran 100u 20m uic\n"
+RC = "t\nV1 a 0 SIN(0 10 100)\nR1 a b 1k\nC1 b 0 1u\n.tran 100u 20m uic\n"
+
+
+def answer(result: Result, command: str) -> Any:
+    data = json.loads(result.out)
+    assert set(data) == {*COMMON, *OWN[command]}
+    assert data["command"] == command
+    assert data["version"] == fs.__version__
+    assert data["success"] is (result.code == 0)
+    assert (data["status"] == "SUCCESS") is data["success"]
+    assert isinstance(data["message"], str)
+    assert (data["failure"] is not None) is (result.code == 1)
+    for kind in ("warnings", "files"):
+        assert isinstance(data[kind], list)
+    return data
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["run", "pad.cir", "--no-plot"], 0),
+        (["run", "flat.cir", "--no-plot"], 0),
+        (["run", "rc.cir", "--no-plot"], 0),
+        (["run", "two_fingers.cir", "--no-plot", "--stop", "0.2m"], 0),
+        (["run", "pad.cir", "--no-plot", "--charge-law", "mobile", "--set", "Xgap.d=10n"], 1),
+        (["run", "pad.cir", "--set", "Xgap.d=-1"], 2),
+        (["run", "none.cir"], 2),
+        (["run", "pad.cir", "--plott"], 2),
+        (["run"], 2),
+        (["ac", "pad.cir", "--no-plot", "--sweep", "lin 2 100 200"], 0),
+        (["ac", "pad.cir", "--no-plot", "--sweep", "lin 1 100 100", "--area", "coupled", "--rtol", "1e-6"], 0),
+        (["ac", "flat.cir", "--no-plot"], 2),
+        (["plan", "pad.cir"], 0),
+        (["plan", "rc.cir"], 0),
+        (["plan", "pad.cir", "--rtol", "7"], 2),
+        (["plan", "pad.cir", "--rtol", "small"], 2),
+        (["compare", "pad.cir", "--no-plot", "--rtol", "1e-6"], 0),
+        (["compare", "pad.cir", "--no-plot", "--charge-law", "mobile", "--set", "Xgap.d=10n"], 1),
+        (["compare", "pad.cir", "--source", "DC 5"], 2),
+        (["limits", "pad.cir", "--no-plot", "--points", "3", "--span", "1.01", "--set", "Xgap.d=100n"], 0),
+        (["limits", "rc.cir", "--no-plot"], 2),
+        (["export", "pad.cir", "-o", "x.cir"], 0),
+        (["export", "pad.cir"], 2),
+        (["figures", "--only", "2"], 0),
+        (["figures", "--only", "9"], 2),
+    ],
+    ids=lambda x: " ".join(x) if isinstance(x, list) else "",
+)
+def test_the_keys_are_the_same_however_a_command_ends(command: Command, words: list[str], code: int) -> None:
+    Path("flat.cir").write_text(FLAT)
+    Path("rc.cir").write_text(RC)
+    Path("two_fingers.cir").write_text((CIRCUITS / "two_fingers.cir").read_text())
+    result = command(*words, "--json")
+    assert result.code == code
+    data = answer(result, words[0])
+    assert all(Path(file).is_file() for file in data["files"])
+    if code == 2:
+        assert data["status"] == "BAD_INPUT"
+        assert data["files"] == []
+
+
+def test_a_command_line_without_a_command_answers_too(command: Command) -> None:
+    result = command("rnu", "pad.cir", "--json")
+    data = json.loads(result.out)
+    assert (result.code, set(data)) == (2, set(COMMON))
+    assert (data["command"], data["status"]) == (None, "BAD_INPUT")
+    assert data["message"].startswith("No such command 'rnu'")
+
+
+def test_an_answer_says_what_was_asked_changed_and_warned_of(command: Command) -> None:
+    words = ["--set", "Xskin.f=200", "--source", "SQUARE(100 100)", "--charge-law", "mobile", "--rtol", "1e-6"]
+    data = answer(command("run", "pad.cir", "--no-plot", "--json", *words), "run")
+    assert (data["title"], data["charge_law"], data["method"], data["rtol"]) == (
+        *("Fingerpad", "mobile", "exponential", 1e-6),
+    )
+    assert set(data["overrides"]) == {"Xskin.f", "Vdrive"}
+    (said,) = data["warnings"]
+    assert said.endswith("Xskin.f=100 would match")
+
+
+def test_the_rows_are_the_figures_of_the_summary_by_element(command: Command) -> None:
+    data = answer(command("run", str(CIRCUITS / "two_fingers.cir"), "--json", "--no-plot"), "run")
+    solution = fs.simulate(fs.read_netlist(CIRCUITS / "two_fingers.cir"))
+    rows = {(row["signal"], row["element"]): row for row in data["signals"]}
+    assert {element for signal, element in rows if signal == "f_el"} == set(solution.gaps)
+    for i, name in enumerate(solution.gaps):
+        assert rows["f_el", name]["mean"] == solution.summary()[f"f_el:{name}_mean"]
+        assert rows["u_gap", name]["max"] >= solution.u_gap[:, i].max()  # type: ignore[index]
+    for row in data["signals"]:
+        assert set(row) == {"signal", "element", "unit", *FIGURES}
+    pad = answer(command("run", "pad.cir", "--json", "--no-plot"), "run")
+    assert [row["element"] for row in pad["signals"] if row["signal"] == "f_el"] == ["Xgap"]
+
+
+def test_every_key_is_documented() -> None:
+    for key in {*COMMON, *(key for keys in OWN.values() for key in keys), *FIGURES}:
+        assert f"`{key}`" in DOCUMENT, key
+
+
+def test_nothing_but_json_is_printed_with_stderr_closed_too(tmp_path: Path) -> None:
+    (tmp_path / "pad.cir").write_text(edited((".end", ".meas tran top max v(top)\n.end")))
+    for words, code in (
+        ("run pad.cir --no-plot --set Xskin.f=200 --json 2>&-", 0),
+        ("run pad.cir --no-plot --charge-law mobile --set Xgap.d=10n --json 0<&- 2>&-", 1),
+        ("run none.cir --json 2>&-", 2),
+    ):
+        line = f"{shlex.quote(sys.executable)} -m fingerspice {words}"
+        done = subprocess.run(["sh", "-c", line], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+        assert (done.returncode, done.stderr) == (code, "")
+        assert json.loads(done.stdout)["success"] is (code == 0)

@@ -1,0 +1,131 @@
+"""Tables of measured materials: what their headers say, and the slip that is named where data are none."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+from fingerspice.materialdata import read_table
+from fingerspice.physics.materials import EPS0, SKIN_BAND, skin_permittivity, skin_resistivity
+
+F = np.geomspace(*SKIN_BAND, 41)
+RHO, EPS = skin_resistivity(F), skin_permittivity(F)
+TABLE = np.column_stack([F, RHO, EPS])
+
+
+def written(path: Path, head: str, columns: tuple[np.ndarray, ...], mark: str = ",") -> Path:
+    """A file of columns with a line of names."""
+    rows = [mark.join(f"{x:.17g}" for x in row) for row in zip(*columns, strict=True)]
+    if mark == ";":
+        rows = [row.replace(".", ",") for row in rows]
+    path.write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("head", "columns"),
+    [
+        ("f,rho,eps_r", (F, RHO, EPS)),
+        ("frequency [Hz],resistivity [ohm m],relative permittivity [1]", (F, RHO, EPS)),
+        ("f (kHz),rho (ohm cm),eps'", (F / 1e3, RHO * 100.0, EPS)),
+        ("f_MHz,rho/kΩm,eps_r", (F / 1e6, RHO / 1e3, EPS)),
+        ("omega [rad/s],rho,eps_r", (2.0 * np.pi * F, RHO, EPS)),
+        ("f [rad/s],rho,eps_r", (2.0 * np.pi * F, RHO, EPS)),
+        ("f,sigma [mS/m],eps_r", (F, 1e3 / RHO, EPS)),
+        ("f,conductivity / uS/cm,eps_r", (F, 1e4 / RHO, EPS)),
+        ("eps_r,f,rho", (EPS, F, RHO)),
+        ("sigma [S/m],eps [F/m],frequency [Hz]", (1.0 / RHO, EPS * EPS0, F)),
+        ("first,second,third", (F, RHO, EPS)),
+        ("eps_r,one,two", (EPS, F, RHO)),
+    ],
+)
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_a_header_says_what_the_columns_are(
+    tmp_path: Path, head: str, columns: tuple[np.ndarray, ...], mark: str
+) -> None:
+    path = written(tmp_path / "skin.csv", head.replace(",", mark), columns, mark)
+    np.testing.assert_allclose(read_table(path), TABLE, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("head", "said"),
+    [
+        ("f [furlong],rho,eps_r", r"the unit of column 'f \[furlong\]' is not known; allowed: Hz, rad/s, ohm m"),
+        ("f,rho [ohm],eps_r", r"the unit of column 'rho \[ohm\]' is not known"),
+        ("f,rho,sigma", "two columns are a resistivity by their names, f, rho, sigma; allowed: frequency"),
+    ],
+)
+def test_a_header_that_cannot_be_is_refused(tmp_path: Path, head: str, said: str) -> None:
+    with pytest.raises(fs.InputError, match=said):
+        fs.fit_material(written(tmp_path / "skin.csv", head, (F, RHO, EPS)))
+
+
+def turned(*order: int) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda t: t[:, list(order)]
+
+
+@pytest.mark.parametrize(
+    ("slip", "named"),
+    [
+        (lambda t: t * [2.0 * np.pi, 1.0, 1.0], "the frequency is in rad/s"),
+        (lambda t: t * [1e-3, 1.0, 1.0], "the frequency is in kHz"),
+        (lambda t: t * [1.0, 100.0, 1.0], "the resistivity is in ohm cm"),
+        (lambda t: t * [1.0, 1e-3, 1.0], "the resistivity is in kohm m"),
+        (lambda t: np.column_stack([t[:, 0], 1.0 / t[:, 1], t[:, 2]]), "the second column is a conductivity in S/m"),
+        (lambda t: np.column_stack([t[:, 0], 1e3 / t[:, 1], t[:, 2]]), "the second column is a conductivity in mS/m"),
+        (turned(0, 2, 1), "resistivity and permittivity have changed places"),
+        (turned(1, 0, 2), "frequency and resistivity have changed places"),
+        (turned(2, 1, 0), "frequency and permittivity have changed places"),
+    ],
+)
+def test_the_likely_slip_is_named(slip: Callable[[np.ndarray], np.ndarray], named: str) -> None:
+    # A slip of a factor of 6 is a fifth off a material, one of 1000 is none.
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            fs.fit_material(slip(TABLE))
+        except fs.InputError as error:
+            said = str(error)
+        else:
+            said = str(caught[0].message)
+    assert "% (rms) from any causal and passive material (Kramers-Kronig); likely " in said
+    assert named in said
+
+
+def test_data_that_are_no_material_for_no_known_reason_are_warned_about_then_refused() -> None:
+    rough = np.random.default_rng(2).normal(size=(F.size, 2))
+    some, much = (TABLE * np.column_stack([np.ones(F.size), np.exp(x * rough)]) for x in (0.25, 1.0))
+    with pytest.warns(fs.FingerspiceWarning, match=r"the data are .* % .rms. from any causal .*Kramers-Kronig.$"):
+        fit = fs.fit_material(some)
+    assert 0.1 < fit.kramers_kronig.rms < fit.rms < 0.3
+    with pytest.raises(fs.InputError, match=r"passive material \(Kramers-Kronig\); allowed: at most"):
+        fs.fit_material(much)
+
+
+def test_too_few_poles_are_warned_about_then_refused() -> None:
+    broad = fs.ColeCole(5.0, ((1000.0, 1e-3, 0.2), (60.0, 3e-6, 0.1)), 2e-5)
+    with pytest.warns(fs.FingerspiceWarning, match="the ladder misses the data by .* % rms; more poles would come"):
+        assert 0.1 < fs.fit_material(broad, poles=1).rms < 0.3
+    steep = fs.ColeCole(3.0, ((1e6, 1e-2, 0.0), (1e4, 1e-4, 0.0), (100.0, 1e-6, 0.0)), 1e-7, (1.0, 1e7))
+    with pytest.raises(fs.InputError, match=r"the ladder misses the data by .* % rms; allowed: at most 30 %, so more"):
+        fs.fit_material(steep, poles=1)
+
+
+def test_a_fit_draws_itself_and_gives_the_lines_for_a_deck(tmp_path: Path) -> None:
+    fit = fs.fit_material(TABLE)
+    axes = fit.plot().axes
+    np.testing.assert_allclose(axes[0].lines[0].get_ydata(), RHO, rtol=1e-12)
+    np.testing.assert_allclose(axes[1].lines[0].get_ydata(), EPS, rtol=1e-12)
+    assert np.asarray(axes[2].lines[0].get_ydata()).max() == pytest.approx(100.0 * fit.largest)
+    # As the docstring has it.
+    (tmp_path / "myskin.lib").write_text(fit.to_netlist("MYSKIN"))
+    deck = (Path(__file__).parents[1] / "circuits" / "fingerpad_dispersive.cir").read_text()
+    lines = deck.replace("SKIN_DISPERSIVE", "MYSKIN").splitlines()
+    (tmp_path / "deck.cir").write_text("\n".join([lines[0], ".include myskin.lib", *lines[1:]]))
+    circuit = fs.read_netlist(tmp_path / "deck.cir")
+    assert len(circuit.by_device("SLAB")) == len(fit.ladder.poles) + 1

@@ -1,0 +1,82 @@
+"""What `make test` does where ngspice is missing."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).parent
+
+
+def bare(folder: Path, *commands: str, **scripts: str) -> dict[str, str]:
+    """An environment of those commands, and of scripts of shell."""
+    for name in commands:
+        found = shutil.which(name)
+        assert found is not None
+        (folder / name).symlink_to(found)
+    for name, text in scripts.items():
+        (folder / name.replace("_", "-")).write_text(f"#!/bin/sh\n{text}\n")
+        (folder / name.replace("_", "-")).chmod(0o755)
+    return {**{k: v for k, v in os.environ.items() if k != "CI"}, "PATH": str(folder)}
+
+
+def suite(environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-p",
+        "no:cacheprovider",
+        "-x",
+        "tests/test_export.py",
+        "-k",
+        "needs_no_other_file",
+    ]
+    return subprocess.run(command, cwd=TESTS.parent, env=environment, capture_output=True, text=True, timeout=120)
+
+
+def test_without_ngspice_the_last_line_says_what_was_not_run(tmp_path: Path) -> None:
+    environment = bare(tmp_path)
+    done = suite(environment)
+    assert done.returncode == 0, done.stdout
+    last = done.stdout.splitlines()[-1]
+    assert (
+        " comparisons with ngspice were not run, as it is not installed; to run them: apt-get install ngspice" in last
+    )
+    failed = suite({**environment, "CI": "true"})
+    assert failed.returncode == 1
+    assert "ngspice is not installed, which CI asks for" in failed.stdout
+
+
+@pytest.mark.parametrize(
+    ("scripts", "said"),
+    [
+        (
+            {"id": "echo 0", "apt_get": "echo $@ >> {log}; [ $1 = update ] || cp {true} {here}/ngspice"},
+            "installing ngspice",
+        ),
+        (
+            {"id": "echo 0", "apt_get": "exit 100"},
+            "ngspice could not be installed; the comparisons with it are left out",
+        ),
+        ({"id": "echo 1000"}, "ngspice is not installed, and installing it takes a password: sudo apt-get install"),
+        ({"id": "echo 1000", "sudo": "exit 1"}, "takes a password"),
+        ({"ngspice": "exit 0"}, ""),
+    ],
+)
+def test_ngspice_is_installed_where_that_takes_no_question(tmp_path: Path, scripts: dict[str, str], said: str) -> None:
+    log, true = tmp_path / "log", shutil.which("true")
+    filled = {k: v.format(log=log, here=tmp_path, true=true) for k, v in scripts.items()}
+    environment = bare(tmp_path, "sh", "env", "cp", **filled)
+    done = subprocess.run(["sh", TESTS / "get_ngspice.sh"], env=environment, capture_output=True, text=True, timeout=20)
+    assert done.returncode == 0
+    assert said in done.stdout
+    assert bool(done.stdout) is bool(said)
+    if "log" in scripts.get("apt_get", ""):
+        assert "install -y -qq ngspice" in log.read_text()
+        assert "could not" not in done.stdout
