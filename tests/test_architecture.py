@@ -20,7 +20,7 @@ MAX_LINES = 450
 # From the bottom up: a part imports its own files and the parts above it in this list, nothing below.
 ORDER = (
     *("errors", "units", "files", "streams", "announcing", "compiled", "numerics", "physics", "pages", "engine"),
-    *("circuit", "report", "arguments", "notices", "sweeps"),
+    *("circuit", "report", "arguments", "spectrum", "notices", "sweeps"),
     *(
         "record",
         "network_record",
@@ -41,7 +41,6 @@ ORDER = (
         "drawing",
         "traces",
         "fitting",
-        "spectrum",
         "times",
         "starting",
         "problem",

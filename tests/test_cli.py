@@ -275,11 +275,11 @@ def test_each_of_several_sources_is_replaced_by_its_name(command: Command) -> No
     words = ["run", "pad.cir", "--json", "--no-plot"]
     both = command(*words, "--source", "Vdrive=SQUARE(100 100)", "--source", "vbias = DC 7")
     assert row(figures(both), "u_source")["max"] == 107.0
-    one = command(*words, "--source", "Vdrive=SQUARE(100 100)")
+    one = command(*words, "--source", "Vdrive=SQUARE(100 100)", "--name", "one")
     assert row(figures(one), "u_source")["max"] == 105.0
     assert one.lines == [
         "fingerspice: warning: sources names Vdrive only: Vbias stays on, as in the deck; 0 would switch it off"
     ]
-    none = command(*words, "--source", "SQUARE(100 100)")
+    none = command(*words, "--source", "SQUARE(100 100)", "--name", "none")
     assert none.code == 2
     assert "the circuit has Vbias, Vdrive; allowed: NAME=SPEC with one of these names" in none.err

@@ -41,8 +41,8 @@ def test_the_result_of_another_circuit_is_not_replaced(command: Command) -> None
     assert command(*QUIET, "--set", "Xgap.d=5u").code == 0
     before = tree(Path())
     for words, said in (
-        ((), "out/pad.nc holds a result with Xgap.d=5e-06, and this one is of the deck as it is; allowed"),
-        (("--set", "Xgap.d=6u"), "with Xgap.d=5e-06, and this one is with Xgap.d=6e-06"),
+        ((), "out/pad.nc holds a result with Xgap.d=5u, and this one is of the deck as it is; allowed"),
+        (("--set", "Xgap.d=6u"), "with Xgap.d=5u, and this one is with Xgap.d=6u"),
         (("--set", "Xgap.d=5u", "--charge-law", "mobile"), "under the local law, and this one is under the mobile law"),
     ):
         result = command(*QUIET, *words)
@@ -104,13 +104,13 @@ def test_reports_pictures_and_files_say_what_was_changed(command: Command) -> No
     assert command("run", "pad.cir", *words).out.splitlines()[0] == said
     with Image.open("out/pad.png") as image:
         image.load()
-        assert json.loads(image.text["overrides"])["Xgap.d"] == "5e-06"  # type: ignore[attr-defined]
+        assert json.loads(image.text["overrides"])["Xgap.d"] == "5u"  # type: ignore[attr-defined]
     for name in ("run", "ac", "plan", "compare"):
         files = () if name == "plan" else ("--name", "plain")
         assert command(name, "pad.cir", *words, *files).out.startswith(said)
         report = json.loads(command(name, "pad.cir", *words, *files, "--json").out)
         assert report["title"] == "Fingerpad"
-        assert report["overrides"]["Xgap.d"] == "5e-06"
+        assert report["overrides"]["Xgap.d"] == "5u"
         assert report["overrides"]["Vdrive"].startswith("Square(")
 
 

@@ -228,7 +228,7 @@ def test_the_command_says_what_drives_where_the_data_are_taken_and_where_they_en
     Path("pad.cir").write_text(edited(("SIN(0 200 100)", "SIN(0 200 100) AC 5 30")))
     result = command("ac", "pad.cir", "--sweep", "dec 1 1 100k", "--no-plot")
     assert result.code == 0
-    first, second, *_ = result.out.splitlines()
+    _, _, first, second, *_ = result.out.splitlines()
     assert first == "source amplitude 5 V, phase 30 deg: AC 5 30 of Vdrive"
     assert second.startswith("the skin's data are taken at each frequency of the sweep, not at the deck's own")
     (line,) = result.lines

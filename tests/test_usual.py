@@ -135,7 +135,7 @@ def test_a_load_that_leaves_no_contact_is_refused_with_the_likely_slip() -> None
 def test_results_out_of_this_world_are_warned_about() -> None:
     with pytest.warns(fs.FingerspiceWarning):
         circuit = table1(gap={"alpha": "54.4meg"}, tran="50u 10m uic")
-    for said in (said_by(lambda: fs.simulate(circuit)), fs.phasor(circuit).warnings):
+    for said in (said_by(lambda: fs.simulate(circuit)), said_by(lambda: fs.phasor(circuit))):
         force, ridges = (text.partition(": ") for text in said if "reaches" in text)
         assert force[0].startswith("the electroadhesive force reaches ")
         assert force[0].endswith("N, over 100 N (as much as a finger bears)")
@@ -163,8 +163,8 @@ def test_a_pressure_that_no_layer_bears_is_warned_about_from_10_mpa_on(beside: s
 def test_a_large_signal_out_of_this_world_is_warned_about() -> None:
     with pytest.warns(fs.FingerspiceWarning):
         circuit = table1(gap={"alpha": "54.4meg"})
-    (result,) = fs.large_signal(circuit, [1e3], rtol=1e-4)
-    assert ["force reaches" in text or "area reaches" in text for text in result.warnings] == [True, True]
+    said = said_by(lambda: fs.large_signal(circuit, [1e3], rtol=1e-4))
+    assert sum("force reaches" in text or "area reaches" in text for text in said) == 2
 
 
 def test_an_area_given_in_mm2_in_python_is_warned_about() -> None:
@@ -182,7 +182,8 @@ def test_shipped_decks_are_usual() -> None:
 
 def test_a_sweep_of_this_package_is_not_warned_about_value_by_value(command: Command) -> None:
     Path("pad.cir").write_text(edited(QUICK))
-    assert said_by(lambda: fs.large_signal(table1(), [200e3], rtol=1e-4)) == []
+    said = said_by(lambda: fs.large_signal(table1(), [200e3], rtol=1e-4))
+    assert not [text for text in said if "the usual range" in text]
 
 
 # The table

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.circuit.topology import find_branches
+from fingerspice.circuit.waveforms import Waveform
+from fingerspice.spectrum import energy_outside
 
+# A band about a frequency, relative, over which the skin's data change by 3 %, and the energy that may lie outside.
+_NEAR, _FAR = 0.05, 0.01
 # Directives that a deck has for ngspice's sake.
 _FOR_NGSPICE = (".nodeset", ".options")
 
@@ -22,20 +27,30 @@ def directive_warnings(circuit: Circuit) -> tuple[str, ...]:
     return tuple(f"{name} has no effect here" for name in circuit.unused if not name.startswith(_FOR_NGSPICE))
 
 
+def _is_near(circuit: Circuit, wave: Waveform, f: float) -> bool:
+    """Whether a source has its energy close to a frequency (Hz), as a carrier under a slow envelope has."""
+    stop = circuit.tran.stop if circuit.tran is not None else math.nan
+    band = f * (1.0 - _NEAR), f * (1.0 + _NEAR)
+    return stop > 0.0 and sum(energy_outside(wave, stop, band)) < _FAR
+
+
 def _skin_warnings(circuit: Circuit) -> Iterator[str]:
     skins = circuit.by_device("SKIN")
     if not skins:
         return
     if is_stack(circuit):
-        fundamental = build_stack(circuit).waveform.fundamental
+        wave: Waveform | None = build_stack(circuit).waveform
     else:
         waves = [e.waveform for e in find_branches(circuit)[1] if e.waveform is not None]
         if len(waves) > 1:
             # Which of several sources the skin's data should match is the user's to know.
             return
-        fundamental = waves[0].fundamental if waves else None
+        wave = waves[0] if waves else None
+    fundamental = None if wave is None else wave.fundamental
     for skin in skins:
         f = skin.values["f"]
+        if fundamental is None and wave is not None and _is_near(circuit, wave, f):
+            continue
         if fundamental is None:
             yield (
                 f"{skin.name} takes its data at f = {f:g} Hz, and the source has no fundamental: the mean force may be "

@@ -31,13 +31,15 @@ def _samples(waveform: Waveform, t0: float, t1: float, rate: float) -> FloatArra
     return np.asarray(waveform.value(t0 + (np.arange(count) + 0.5) * ((t1 - t0) / count)))
 
 
-def energy_outside(waveform: Waveform, t_stop: float) -> tuple[float, float]:
-    """Shares of the source's energy below and above the band of the skin's data (`SKIN_BAND`).
+def energy_outside(
+    waveform: Waveform, t_stop: float, band: tuple[float, float] = SKIN_BAND
+) -> tuple[float, float]:  # fmt: skip
+    """Shares of the source's energy below and above a band (Hz), by default that of the skin's data.
 
     Over one period of a periodic source, else over the run to `t_stop` (s), weighted by a Hann window so that its ends
     are no jumps. Sources that are not finite count as inside.
     """
-    low, high = SKIN_BAND
+    low, high = band
     periodic = waveform.period is not None
     t0 = waveform.settled if periodic else 0.0
     span = waveform.period if waveform.period is not None else t_stop
