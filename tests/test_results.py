@@ -43,6 +43,7 @@ def test_the_result_of_another_circuit_is_not_replaced(command: Command) -> None
     for words, said in (
         ((), "out/pad.nc holds a result with Xgap.d=5u, and this one is of the deck as it is; allowed"),
         (("--set", "Xgap.d=6u"), "with Xgap.d=5u, and this one is with Xgap.d=6u"),
+        (("--charge-law", "mobil"), "charge_law is 'mobil'; allowed: 'local' or 'mobile'"),
         (("--set", "Xgap.d=5u", "--charge-law", "mobile"), "under the local law, and this one is under the mobile law"),
     ):
         result = command(*QUIET, *words)

@@ -40,8 +40,18 @@ def blank(command: str | None) -> Answer:
 
 
 def of_circuit(circuit: Circuit, charge_law: str | None) -> Answer:
-    """What an answer says of its circuit."""
+    """What an answer says of its circuit.
+
+    Raises
+    ------
+    InputError
+        For an unknown charge law.
+    """
+    from fingerspice.circuit.circuit import CHARGE_LAWS
+    from fingerspice.circuit.waveforms import require
+
     law = charge_law or circuit.charge_law or "local"
+    require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
     return {"title": circuit.title, "overrides": dict(circuit.overrides), "charge_law": law}
 
 
