@@ -43,7 +43,6 @@ def test_the_result_of_another_circuit_is_not_replaced(command: Command) -> None
     for words, said in (
         ((), "out/pad.nc holds a result with Xgap.d=5u, and this one is of the deck as it is; allowed"),
         (("--set", "Xgap.d=6u"), "with Xgap.d=5u, and this one is with Xgap.d=6u"),
-        (("--charge-law", "mobil"), "charge_law is 'mobil'; allowed: 'local' or 'mobile'"),
         (("--set", "Xgap.d=5u", "--charge-law", "mobile"), "under the local law, and this one is under the mobile law"),
     ):
         result = command(*QUIET, *words)
@@ -51,6 +50,9 @@ def test_the_result_of_another_circuit_is_not_replaced(command: Command) -> None
         assert said in result.lines[0]
         assert result.lines[0].endswith("allowed: --name NAME, another --out, or --overwrite")
         assert tree(Path()) == before
+    # What is wrong with the request itself comes first.
+    wrong = command(*QUIET, "--charge-law", "mobil")
+    assert wrong.lines == ["fingerspice: charge_law is 'mobil'; allowed: 'local' or 'mobile'"]
     assert command(*QUIET, "--set", "Xgap.d=5u").code == 0
     assert command(*QUIET, "--overwrite").code == 0
     assert fs.load("out/pad.nc").circuit.overrides == {}
