@@ -118,8 +118,8 @@ def test_an_area_that_a_source_or_a_start_gives_in_m2_is_warned_about() -> None:
 
 def test_a_finger_too_small_by_values_that_are_each_usual_is_warned_about() -> None:
     (said,) = said_by(lambda: table1(gap={"alpha": 1, "fn": "10m", "mu": 0.5, "m_exp": 0.5, "c2": 320, "n_exp": 1.4}))
-    # alpha fn^m_exp = 0.1 mm^2, and sqrt(c2) mu fn = 0.0894 mm^2.
-    area = math.sqrt(0.1**2 - 320 * (0.5 * 0.01) ** 2)
+    # Eqs. 3 and 5 without voltage: alpha fn^m_exp = 0.1 mm^2, less c2 (mu fn)^2 over that.
+    area = 0.1 - 320 * (0.5 * 0.01) ** 2 / 0.1
     assert f"Xgap area at 0 V is {area:.4g} mm^2, outside 0.1 to 2000 mm^2" in said
 
 

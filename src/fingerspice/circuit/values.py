@@ -92,5 +92,6 @@ def unusual(element: Element) -> Iterator[tuple[str, str]]:
         v = element.values
         area = (v["alpha"] * v["fn"] ** v["m_exp"]) ** 2 - v["c2"] * (v["mu"] * v["fn"]) ** 2
         if v["a_fix"] == 0.0 and area > 0.0:
-            found.append(("", REST_AREA.warning(f"{element.name} area at 0 V", math.sqrt(area), "mm^2")))
+            at_rest = area / (v["alpha"] * v["fn"] ** v["m_exp"])
+            found.append(("", REST_AREA.warning(f"{element.name} area at 0 V", at_rest, "mm^2")))
     yield from ((name, text) for name, text in found if text is not None)

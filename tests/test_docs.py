@@ -1,0 +1,201 @@
+"""`docs/netlist.md`: its decks and commands run, its figures are right, and nothing that a deck may hold is missing."""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+import subprocess
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+from commands import Command
+from fingerspice.circuit.devices import DEVICES, ParameterSpec
+from fingerspice.circuit.reader import DIRECTIVES
+from fingerspice.circuit.slips import ELSEWHERE
+from fingerspice.circuit.sources import SOURCES
+from fingerspice.circuit.usual import SOURCES as USUAL_OF_SOURCES
+from fingerspice.units import SCALES, parse_number, spice_text
+from ngspice_tools import CIRCUITS, run_ngspice
+
+PAGE = (CIRCUITS.parent / "docs" / "netlist.md").read_text(encoding="utf-8")
+EPS0 = 8.8541878128e-12
+
+
+def blocks(language: str) -> list[str]:
+    """The page's code blocks of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+
+
+def rows(heading: str) -> list[list[str]]:
+    """Cells of the table whose first column has that heading."""
+    table = PAGE.split(f"\n| {heading} | ", 1)[1].split("\n\n", 1)[0]
+    return [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in table.split("\n")[2:]]
+
+
+FINGER, FILM, TWO_FINGERS, CREEP, LTSPICE = DECKS = blocks("spice")
+
+
+def run(text: str) -> fs.Solution:
+    """The run of a deck, which nothing is to be warned about."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        solution = fs.simulate(fs.parse_netlist(text))
+    assert solution.success
+    return solution
+
+
+def area_at_rest(load: float) -> float:
+    """The page's formula for the area at 0 V, m^2, with Table 1's contact."""
+    unloaded = 54.4 * load**0.52
+    return 1e-6 * (unloaded - 5000.0 * (0.3 * load) ** 2 / unloaded)
+
+
+def test_every_code_block_is_a_deck_or_commands() -> None:
+    assert PAGE.count("```") == 2 * (len(DECKS) + len(blocks("sh")))
+    assert all(deck.endswith("\n.end\n") for deck in DECKS)
+
+
+def test_the_finger_has_the_area_that_the_page_states() -> None:
+    solution = run(FINGER)
+    assert solution.area[0] == pytest.approx(area_at_rest(0.5), rel=1e-12)
+    assert f"{1e6 * solution.area[0]:.2f} mm²" in " ".join(PAGE.split())
+
+
+def test_a_current_charges_the_film_by_its_capacitance() -> None:
+    solution = run(FILM)
+    slope = 1e-6 / (EPS0 * 3.0 * 35e-6 / 10e-6)
+    np.testing.assert_allclose(solution.node_voltages["top"], slope * solution.t, rtol=0, atol=1e-4 * slope * 1e-3)
+
+
+def test_two_fingers_have_an_area_and_parameters_each() -> None:
+    solution = run(TWO_FINGERS)
+    np.testing.assert_allclose(solution.area[0], [area_at_rest(0.5), area_at_rest(0.2)], rtol=1e-12)
+    values = {path: p.value for path, p in solution.circuit.parameters.items()}
+    assert (values["Xfirm.Xgap.r"], values["Xlight.Xgap.r"]) == (1e6, 2e6)
+    assert values["Xfirm.Xcoat.r"] == values["Xlight.Xcoat.r"] == 2e5
+    assert {"Xlight.Xgap.fn", "Xlight.Xgap.tau"} <= values.keys()
+    assert "Xlight.top" in solution.node_voltages
+
+
+def test_the_area_creeps_with_its_time_constant() -> None:
+    solution = run(CREEP)
+    # Resistances of 0.2 and 1 megohm share 100 V at rest.
+    np.testing.assert_allclose(solution.u_gap, 100.0 / 1.2, rtol=1e-9)
+    start, later, last = np.interp([0.0, 2e-3, 4e-3], solution.t, 1e6 * solution.area)
+    assert start == pytest.approx(30.0, rel=1e-12)
+    assert (last - later) / (later - start) == pytest.approx(math.exp(-1.0), rel=1e-6)
+
+
+def test_a_deck_of_ltspice_runs_with_its_parasitics() -> None:
+    solution = run(LTSPICE)
+    values = {path: p.value for path, p in solution.circuit.parameters.items() if path.startswith(("V1.R", "C1."))}
+    assert values == {"V1.Rser.value": 1e3, "C1.value": 150e-12, "C1.Rser.value": 10.0, "C1.Rpar.value": 1e9}
+    assert solution.circuit["XU1"].values["d"] == 1e-6
+    assert solution.area[0] == pytest.approx(area_at_rest(0.5), rel=1e-12)
+
+
+@pytest.mark.parametrize("text", [FINGER, FILM, TWO_FINGERS, CREEP], ids=["finger", "film", "two fingers", "creep"])
+def test_the_other_decks_run_unchanged_in_ngspice(text: str) -> None:
+    ours = run(text)
+    nodes = [node for node in ours.node_voltages if "." not in node]
+    areas = {e.node_names[2] for e in ours.circuit.elements if e.spec.is_layer and "." not in e.node_names[2]}
+    theirs = run_ngspice(text, signals=[f"v({node})" for node in [*nodes, *areas]])
+    for node in nodes:
+        peak = np.abs(ours.node_voltages[node]).max()
+        assert theirs[f"v({node})"][-1] == pytest.approx(ours.node_voltages[node][-1], abs=2e-3 * peak)
+    assert {round(theirs[f"v({node})"][-1], 1) for node in areas} == set(np.round(1e6 * np.ravel(ours.area[-1]), 1))
+
+
+def test_the_commands_run(command: Command, tmp_path: Path) -> None:
+    (tmp_path / "finger.cir").write_text(FINGER, encoding="utf-8")
+    for line in "".join(blocks("sh")).splitlines():
+        program, *words = shlex.split(line)
+        assert program == "fingerspice"
+        result = command(*words, *([] if words[0] == "export" else ["--no-plot"]))
+        assert (result.code, result.err) == (0, ""), line
+    # The exported deck is alone in its folder: the library is inside.
+    subprocess.run(["ngspice", "-b", "-r", "out.raw", "finger_ngspice.cir"], check=True, capture_output=True)
+    assert (tmp_path / "out.raw").stat().st_size > 1000
+
+
+def test_the_table_of_parameters_is_that_of_the_devices() -> None:
+    plain = ("m", "V/m", "ohm", "F", "Hz", "s")
+
+    def shown(value: float, spec: ParameterSpec) -> str:
+        return spice_text(value) if spec.unit in plain else f"{value:g}"
+
+    expected = {}
+    for device, entry in DEVICES.items():
+        for spec in entry.parameters:
+            default = "required" if spec.default is None else shown(spec.default, spec)
+            legal = (">= 0" if spec.may_be_zero else "> 0") + (" or inf" if spec.may_be_infinite else "")
+            assert spec.usual is not None
+            usual = f"{shown(spec.usual.least, spec)} to {shown(spec.usual.most, spec)}"
+            expected[device, f"`{spec.name}`"] = [spec.unit or "1", default, legal, usual]
+    table = {(device, row[1]): row[2:6] for row in rows("device") for device in row[0].split(", ")}
+    assert table == expected
+    assert all(row[6] for row in rows("device"))
+    others = {(s.least, s.most) for entry in DEVICES.values() for s in entry.parameters if s.name != "f"}
+    frequency = DEVICES["SKIN"].parameter("f")
+    assert others == {(1e-30, 1e30)}
+    assert (frequency.least, frequency.most) == (parse_number("1m"), parse_number("1g"))
+
+
+def test_every_device_source_and_directive_is_named() -> None:
+    words = set(re.findall(r"[\w.]+", PAGE))
+    assert DEVICES.keys() <= words
+    assert {name.upper() for name in SOURCES} <= words
+    assert {word for word in (*DIRECTIVES, *ELSEWHERE) if word not in words} == set()
+    assert {unit: (usual.least, usual.most) for unit, usual in USUAL_OF_SOURCES.items()} == {
+        "V": (0.0, 10e3),
+        "Hz": (10e-3, 10e6),
+    }
+    assert "Usual are up to 10 kV, and 10 mHz to 10 MHz." in " ".join(PAGE.split())
+    assert {f"`{scale}`" for scale in SCALES if scale != "μ"} <= set(re.findall(r"`[^`]*`", PAGE))
+
+
+@pytest.mark.parametrize("row", rows("example"), ids=lambda row: row[0])
+def test_the_sources_are_read(row: list[str]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        circuit = fs.parse_netlist(FINGER.replace("SIN(0 200 100)", row[0].strip("`")))
+    assert fs.simulate(circuit, t_stop=2e-3).success
+
+
+@pytest.mark.parametrize(
+    ("written", "value"),
+    [("0.2meg", 2e5), ("200kOhm", 2e5), ("{2*0.1meg}", 2e5), ("'2*0.1meg'", 2e5), ("0.2e12µ", 2e5), ("inf", math.inf)],
+)
+def test_numbers_mean_what_the_page_says(written: str, value: float) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert fs.parse_netlist(FINGER.replace("0.2meg", written))["Xcoat"].values["r"] == value
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("d=3.5u", "d=3,5u", "if it is a decimal comma write 3.5u"),
+        ("0.2meg", "2k7", "write 2.7k"),
+        ("0.2meg", "1x", "write 1meg"),
+        ("0.2meg", "1a", "write 1"),
+        ("fn=0.5", "fn=1N", "write the number alone, in newton"),
+        ("uic\n", "uic\nC1 drive 0 1F\n", "write the number alone, in farad"),
+        ("mu=0.3", "mu=5", "no contact"),
+        ("mu=0.3", "m_exp=2", "0 < m_exp < n_exp"),
+        ("uic\n", "startup\n", "startup"),
+        ("SIN(0 200 100)", "AM(1 1 1 1)", "AM"),
+        ("SIN(0 200 100)", "SIN(0 200 100 0 0 0 5)", "Ncycles"),
+        ("uic\n", "uic\n.include fingerspice_mobile.lib\n", "both"),
+    ],
+)
+def test_what_the_page_calls_refused_is_refused(old: str, new: str, said: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(fs.InputError, match=re.escape(said)):
+            fs.parse_netlist(FINGER.replace(old, new))
