@@ -133,8 +133,8 @@ class Stretch:
 
     def extremes(self, read: Read) -> tuple[float, float]:
         """Smallest and largest value of a signal: where its polynomials have them, the signal itself."""
-        # An error of the place counts by its square.
-        weighed, panels = self._cut(read, *self.run.at_points(read, self.panels), max(_FINEST, self.rtol))
+        # What the polynomials miss moves the place, and the value by the square of that.
+        weighed, panels = self._cut(read, *self.run.at_points(read, self.panels), max(_FINEST, 1e-3 * self.rtol))
         found = [largest(weighed.x, sign) for sign in (-1.0, 1.0)]
         panel, place = np.array([p for p, _, _ in found]), np.array([x for _, x, _ in found])
         at = panels.low[panel] * (1.0 - place) + panels.high[panel] * place
