@@ -228,7 +228,9 @@ def quantities(
         doubt = 0.0 if other is None else 2.0 * float(np.abs(getattr(other, signal) - theirs)[between].max())
         return Quantity(name, off, allowed + doubt, floor + doubt, stated)
 
-    u, strongest = np.abs(expected.u_gap), float(expected.force.max())
+    # Errors are relative to the peaks of the run, which its outputs may miss.
+    extremes = expected.extremes(0.0, float(solution.t[-1]))
+    u, strongest = np.append(np.abs(expected.u_gap), extremes["u_gap_max"]), extremes["force_max"]
     rounded = REFERENCE * scene.amplitude
     may = RTOL * float(u.max()) + rounded
     # Of A = g(|u|) and F = sigma A the steepest slopes that the run comes by.
@@ -253,13 +255,14 @@ def quantities(
         ),
         beside("area", "area", steep * may + REFERENCE * largest, math.inf, None),
         beside("q_source", "q", may_q, unsure, stated.q_source),
-        *figures(solution, expected, may, push * may + REFERENCE * strongest, rounded, push * rounded),
+        *figures(solution, expected, extremes, may, push * may + REFERENCE * strongest, rounded, push * rounded),
     ]  # fmt: skip
 
 
 def figures(
-    solution: fs.Solution, expected: ref.Transient, may_u: float, may_f: float, floor_u: float, floor_f: float
-) -> list[Quantity]:
+    solution: fs.Solution, expected: ref.Transient, extremes: dict[str, float], may_u: float, may_f: float,
+    floor_u: float, floor_f: float,
+) -> list[Quantity]:  # fmt: skip
     """Peaks and mean of the summary, which TSTEP (twenty outputs in a period) must not touch, beside the reference's.
 
     The errors (V and N) that they may have, and what the reference itself may be off, are those of the signals.
@@ -268,7 +271,6 @@ def figures(
     if found["figures_from"] != "steps":
         return []
     stop = float(solution.t[-1])
-    extremes = expected.extremes(0.0, stop)
     # The reference looks for its extremes between sixty points of a step, and its mean adds up its steps' rounding.
     floor_f += REFERENCE * extremes["force_max"]
     stated = solution.error
