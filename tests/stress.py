@@ -228,8 +228,12 @@ def quantities(
         doubt = 0.0 if other is None else 2.0 * float(np.abs(getattr(other, signal) - theirs)[between].max())
         return Quantity(name, off, allowed + doubt, floor + doubt, stated)
 
+    summary = solution.summary()
+    from_steps = summary["figures_from"] == "steps"
     # Errors are relative to the peaks of the run, which its outputs may miss.
-    extremes = expected.extremes(0.0, float(solution.t[-1]))
+    extremes = {"u_gap_max": float(np.abs(expected.u_gap).max()), "force_max": float(expected.force.max())}
+    if from_steps:
+        extremes = expected.extremes(0.0, float(solution.t[-1]))
     u, strongest = np.append(np.abs(expected.u_gap), extremes["u_gap_max"]), extremes["force_max"]
     rounded = REFERENCE * scene.amplitude
     may = RTOL * float(u.max()) + rounded
@@ -255,7 +259,8 @@ def quantities(
         ),
         beside("area", "area", steep * may + REFERENCE * largest, math.inf, None),
         beside("q_source", "q", may_q, unsure, stated.q_source),
-        *figures(solution, expected, extremes, may, push * may + REFERENCE * strongest, rounded, push * rounded),
+        *(figures(solution, expected, extremes, may, push * may + REFERENCE * strongest, rounded, push * rounded)
+          if from_steps else ()),
     ]  # fmt: skip
 
 
@@ -268,8 +273,6 @@ def figures(
     The errors (V and N) that they may have, and what the reference itself may be off, are those of the signals.
     """
     found = solution.summary()
-    if found["figures_from"] != "steps":
-        return []
     stop = float(solution.t[-1])
     # The reference looks for its extremes between sixty points of a step, and its mean adds up its steps' rounding.
     floor_f += REFERENCE * extremes["force_max"]
