@@ -11,6 +11,8 @@ from scipy.integrate import simpson
 import analytic as ref
 import fingerspice as fs
 from fingerspice import measures, steps
+from fingerspice.numerics.extremes import largest
+from fingerspice.numerics.lobatto import NODES, POINTS
 from scenes import deck, table1, table1_deck
 
 LAWS = pytest.mark.parametrize("law", ["local", "mobile"])
@@ -207,3 +209,19 @@ def test_a_pickled_solution_has_the_same_figures():
     closed = fs.simulate(table1(), area="frozen")
     for one in (solution, closed):
         assert pickle.loads(pickle.dumps(one)).summary() == one.summary()
+
+
+@pytest.mark.parametrize("side", [0, -1])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_summit_between_a_panel_s_last_two_nodes_is_found_behind_another_one(side: int, sign: float) -> None:
+    # Both nodes lie alike on its two sides, below the summit of the panel that is looked at first.
+    x = POINTS[:NODES]
+    middle = 0.5 * (x[0] + x[1]) if side == 0 else 0.5 * (x[-1] + x[-2])
+    half = middle if side == 0 else 1.0 - middle
+    height = 1.0 + 0.5 * half**2
+    values = np.array([1.0 - (x - x[6]) ** 2, height - (x - middle) ** 2])
+    assert values[1].max() < 1.0
+    panel, place, top = largest(sign * values, sign)
+    assert panel == 1
+    assert place == pytest.approx(middle, abs=1e-7)
+    assert top == pytest.approx(height, rel=1e-14)

@@ -32,10 +32,14 @@ def largest(values: FloatArray, sign: float) -> tuple[int, float, float]:
         here = sign * values[p, j]
         if here > best:
             panel, place, best = p, POINTS[j], here
-        # A smooth signal rises over its largest node by less than it falls to both neighbours.
-        hidden = (here - sign * values[p, j - 1] if j > 0 else 0.0) + (
-            here - sign * values[p, j + 1] if j < NODES - 1 else 0.0
-        )
+        # A smooth signal rises over its largest node by less than it falls to both neighbours, and over one at the end
+        # by less than it falls to the second node from there: the first may lie as high on the other side of a summit.
+        if j == 0:
+            hidden = here - sign * values[p, 2]
+        elif j == NODES - 1:
+            hidden = here - sign * values[p, NODES - 3]
+        else:
+            hidden = 2.0 * here - sign * (values[p, j - 1] + values[p, j + 1])
         if here + hidden <= best:
             continue
         for d in range(NODES):
