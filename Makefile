@@ -22,7 +22,7 @@ $(VENV)/.check: pyproject.toml | $(BIN)/python
 
 # The pinned torch first: an open range would bring a build for graphics cards.
 $(VENV)/.test: pyproject.toml | $(BIN)/python
-	@echo "installing into $(VENV), about three minutes: torch alone is 200 MB ..."
+	@echo "installing into $(VENV); torch is most of it ..."
 	$(BIN)/pip install --quiet torch==2.13.0
 	$(BIN)/pip install --quiet --editable '.[test]'
 	touch $@
