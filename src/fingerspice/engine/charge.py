@@ -17,8 +17,9 @@ from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, END, FIRST, NODES
 FloatArray = NDArray[np.float64]
 
 # What a polynomial misses of a rate changes its sign at every node: of its integral over the step's length so much is
-# left (0.03 to 0.14 where what is missed are Chebyshev polynomials of degree 13 to 21).
-_LOBE = 0.15
+# left (0.03 to 0.14 where what is missed are Chebyshev polynomials of degree 13 to 21); and twice that, as the three
+# points where it is measured need not be those where it is largest.
+_LOBE = 0.3
 # Slope at each node, per step length, of the polynomial through values at the nodes.
 DERIVATIVE = np.zeros((NODES, NODES))
 for _i in range(NODES):
