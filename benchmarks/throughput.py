@@ -30,7 +30,7 @@ Report = dict[str, Any]
 def modal_gap(area: float) -> tuple[list[float], list[float], float, list[float]]:
     """Rates, gains, direct share and weights of the gap voltage of Table 1's stack at one area (m^2)."""
     from fingerspice.engine.system import build_system
-    from fingerspice.problem import scene_of
+    from fingerspice.solve.problem import scene_of
 
     scene = scene_of(fs.read_netlist(DECK), "local", area, 1.0)
     system = build_system(scene.model, 1e-13, (1.0 / area, 1.0 / area), scene.stack.grouping)

@@ -28,14 +28,14 @@ from typing import Any
 
 import fingerspice as fs
 import fuzz_inputs as make
-from fingerspice.circuit import expressions
-from fingerspice.circuit.deck import LONGEST_TITLE
-from fingerspice.circuit.directives import sweep_from_text
-from fingerspice.circuit.netlist import source_from_text
-from fingerspice.circuit.reader import MAX_WARNINGS
-from fingerspice.errors import FingerspiceWarning, InputError, Where
-from fingerspice.fitting import fit_material
-from fingerspice.materialdata import read_table
+from fingerspice.base.errors import FingerspiceWarning, InputError, Where
+from fingerspice.netlist import expressions
+from fingerspice.netlist.deck import LONGEST_TITLE
+from fingerspice.netlist.directives import sweep_from_text
+from fingerspice.netlist.netlist import source_from_text
+from fingerspice.netlist.reader import MAX_WARNINGS
+from fingerspice.studies.fitting import fit_material
+from fingerspice.studies.materialdata import read_table
 
 #: One input may take so long, s, and so much memory, MiB; and the whole run so much more than its first quarter, MiB.
 SECONDS, ROOM, MEMORY = 10, 1024, 100

@@ -11,9 +11,9 @@ import pytest
 
 import fingerspice as fs
 from deck_edits import edited
-from fingerspice.circuit import bounds
 from fingerspice.engine import repeat
-from fingerspice.times import MOST_BYTES
+from fingerspice.solve.times import MOST_BYTES
+from fingerspice.waveforms import bounds
 from processes import ended, start
 from scenes import table1
 

@@ -11,7 +11,7 @@ import analytic as ref
 import fingerspice as fs
 import stress
 from fingerspice.engine.model import branch_area, gap_voltage, ramp, turns_at_zero
-from fingerspice.simulation import prepare
+from fingerspice.solve.simulation import prepare
 
 
 def model_of(scene, law="mobile"):

@@ -155,7 +155,7 @@ def test_a_fault_of_the_program_is_one_sentence_with_its_place(
     def fail(*_: object, **__: object) -> None:
         raise errors.pop()
 
-    monkeypatch.setattr("fingerspice.simulation.simulate", fail)
+    monkeypatch.setattr("fingerspice.solve.simulation.simulate", fail)
     errors = [ZeroDivisionError("float division by zero"), MemoryError()]
     result = command("run", "pad.cir")
     assert (result.code, result.lines) == (2, ["fingerspice: " + SAID_OF_MEMORY])
@@ -186,8 +186,8 @@ def test_a_folder_without_permission_is_refused_before_the_run(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Root may write anywhere, so the answer of the system is put in its mouth.
-    monkeypatch.setattr("fingerspice.options.os.access", lambda path, mode: not mode & os.W_OK)
-    monkeypatch.setattr("fingerspice.simulation.simulate", lambda *a, **k: pytest.fail("it ran"))
+    monkeypatch.setattr("fingerspice.cli.options.os.access", lambda path, mode: not mode & os.W_OK)
+    monkeypatch.setattr("fingerspice.solve.simulation.simulate", lambda *a, **k: pytest.fail("it ran"))
     before = tree(tmp_path)
     result = command("run", "pad.cir", "--out", "x/y")
     assert result.code == 2
@@ -216,7 +216,7 @@ def test_an_interrupt_is_one_line_and_code_130(command: Command, monkeypatch: py
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("fingerspice.simulation.simulate", interrupt)
+    monkeypatch.setattr("fingerspice.solve.simulation.simulate", interrupt)
     result = command("run", "pad.cir")
     assert result.code == 130
     assert set(tree(Path())) == {"pad.cir"}

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fingerspice.circuit import flatten
-from fingerspice.circuit.deck import Call, Deck, Number, Statement, Token, parse_deck, read_deck
-from fingerspice.errors import InputError, Where
+from fingerspice.base.errors import InputError, Where
+from fingerspice.netlist import flatten
+from fingerspice.netlist.deck import Call, Deck, Number, Statement, Token, parse_deck, read_deck
 
 PAPER = """Fingerpad on a 3M-coated touchscreen, Table 1
 .include fingerspice.lib
@@ -418,7 +418,7 @@ def test_missing_files_folders_and_huge_files_are_refused(tmp_path: Path) -> Non
 
 
 def test_reading_a_deck_imports_nothing_heavy() -> None:
-    code = "import sys; import fingerspice.circuit.deck; print(*sys.modules)"
+    code = "import sys; import fingerspice.netlist.deck; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert not {"numba", "scipy", "torch", "matplotlib", "xarray"} & set(loaded.split())
 

@@ -24,7 +24,7 @@ import pytest
 import scipy.integrate
 
 import fingerspice as fs
-from fingerspice.drawing import save
+from fingerspice.plots.drawing import save
 from scenes import table1
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
@@ -267,7 +267,7 @@ def test_scipys_methods_in_threads_leave_the_warning_filters_as_they_were(monkey
 def test_nothing_is_left_in_shared_arrays_from_one_call_to_the_next(
     right: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from fingerspice.marching import Track
+    from fingerspice.solve.marching import Track
 
     advance, calls = Track.advance, []
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
+from fingerspice.base.units import parse_number
 from fingerspice.circuit.devices import DEVICES, DeviceSpec, ParameterSpec, layer_devices
-from fingerspice.circuit.library import LIBRARIES, library_text
 from fingerspice.circuit.statespace import layer_constants
 from fingerspice.circuit.usual import Usual
+from fingerspice.netlist.library import LIBRARIES, library_text
 from fingerspice.physics.materials import EPS0
-from fingerspice.units import parse_number
 from ngspice_tools import run_ngspice
 
 #: Parameters of the bodies that say how a run starts, and the reading of Eq. 7: the export writes them.

@@ -13,7 +13,7 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice import direct
+from fingerspice.solve import direct
 from scenes import deck, table1
 
 AREA = 34.9715871843e-6

@@ -374,7 +374,7 @@ def test_energy_inside_is_not(waveform: fs.Waveform, recwarn: pytest.WarningsRec
 
 
 def test_the_share_above_the_band_is_that_of_the_squares_harmonics() -> None:
-    from fingerspice.spectrum import energy_outside
+    from fingerspice.circuit.spectrum import energy_outside
 
     below, above = energy_outside(fs.Square(200.0, 3000.0), 1.0)
     n = np.arange(1, 34, 2)

@@ -14,12 +14,12 @@ import pytest
 
 import fingerspice as fs
 from commands import Command
+from fingerspice.base.units import SCALES, parse_number, spice_text
 from fingerspice.circuit.devices import DEVICES, ParameterSpec
-from fingerspice.circuit.reader import DIRECTIVES
-from fingerspice.circuit.slips import ELSEWHERE
-from fingerspice.circuit.sources import SOURCES
 from fingerspice.circuit.usual import SOURCES as USUAL_OF_SOURCES
-from fingerspice.units import SCALES, parse_number, spice_text
+from fingerspice.netlist.reader import DIRECTIVES
+from fingerspice.netlist.slips import ELSEWHERE
+from fingerspice.netlist.sources import SOURCES
 from ngspice_tools import CIRCUITS, run_ngspice
 
 PAGE = (CIRCUITS.parent / "docs" / "netlist.md").read_text(encoding="utf-8")

@@ -13,8 +13,8 @@ import fingerspice as fs
 from commands import Command
 from deck_edits import DECK, edited
 from fingerspice.circuit.circuit import Tran
-from fingerspice.circuit.library import LIBRARIES, library_text
-from fingerspice.circuit.slips import ELSEWHERE, decimal_comma
+from fingerspice.netlist.library import LIBRARIES, library_text
+from fingerspice.netlist.slips import ELSEWHERE, decimal_comma
 from ngspice_tools import run_ngspice
 
 TRAN = ".tran 10u 50m uic"

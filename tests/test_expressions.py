@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fingerspice.circuit.expressions import FUNCTIONS, evaluate
-from fingerspice.errors import InputError, Where
+from fingerspice.base.errors import InputError, Where
+from fingerspice.netlist.expressions import FUNCTIONS, evaluate
 
 HERE = Where("deck.cir", 3, 10)
 NAMES = {"thick": 2.0, "Rho": 3.0, "if": 5.0}

@@ -8,7 +8,7 @@ import pytest
 
 import fingerspice as fs
 from conftest import Command
-from fingerspice.outcome import Attempt, Failure, last_tried
+from fingerspice.results.outcome import Attempt, Failure, last_tried
 from scenes import table1
 
 

@@ -22,7 +22,7 @@ import pytest
 import fingerspice as fs
 from commands import QUICK, Command
 from deck_edits import edited
-from fingerspice.files import write_aside
+from fingerspice.base.files import write_aside
 from processes import ended, no_room, start
 
 COMMANDS = {
@@ -36,7 +36,7 @@ COMMANDS = {
 # The command, with what ends it just where it would hurt: PLACE is patched to strike when called for the N-th time.
 STRUCK = """
 import os, pathlib, sys
-from fingerspice import datafiles
+from fingerspice.cli.result_files import datafiles
 from fingerspice.__main__ import main
 place, count, number = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 sys.argv[1:4] = []
@@ -197,10 +197,10 @@ def test_ctrl_c_is_heard_while_a_billion_periods_are_walked_over(tmp_path: Path)
 
 # As the command, with another thing to do than its arguments say.
 SOLVING = """
-import fingerspice.cli
+import fingerspice.cli.app
 def solve():
     {}
-fingerspice.cli.main = solve
+fingerspice.cli.app.main = solve
 m.main()
 """
 

@@ -7,7 +7,7 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.steady import steady_state
+from fingerspice.studies.steady import steady_state
 from scenes import deck, table1
 
 AREA = 34.9715871843e-6

@@ -20,9 +20,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fuzz
-from fingerspice.circuit.expressions import FUNCTIONS, evaluate
-from fingerspice.circuit.lexer import group, lex, logical_lines, split_lines
-from fingerspice.errors import InputError, Where
+from fingerspice.base.errors import InputError, Where
+from fingerspice.netlist.expressions import FUNCTIONS, evaluate
+from fingerspice.netlist.lexer import group, lex, logical_lines, split_lines
 
 HERE = Where("deck.cir", 1)
 

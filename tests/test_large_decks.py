@@ -13,10 +13,11 @@ import pytest
 
 import fingerspice as fs
 import fuzz
-from fingerspice.circuit import flatten, reader, topology
-from fingerspice.circuit.deck import LONGEST_TITLE, Number, parse_deck
-from fingerspice.circuit.expressions import evaluate, nearest
-from fingerspice.errors import LONGEST_MESSAGE, FingerspiceWarning, InputError, Where
+from fingerspice.base.errors import LONGEST_MESSAGE, FingerspiceWarning, InputError, Where
+from fingerspice.circuit import topology
+from fingerspice.netlist import flatten, reader
+from fingerspice.netlist.deck import LONGEST_TITLE, Number, parse_deck
+from fingerspice.netlist.expressions import evaluate, nearest
 
 MANY = 20_000
 

@@ -13,7 +13,7 @@ import pytest
 import xarray
 
 import fingerspice as fs
-from fingerspice.datafiles import GROUP
+from fingerspice.results.datafiles import GROUP
 from scenes import table1
 
 AM = fs.AM(150.0, 5000.0, 50.0) + 3.0 * fs.Square(1.0, 50.0, duty=0.25)

@@ -14,10 +14,10 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.marching import integrate, prepare_system
 from fingerspice.numerics.lobatto import NODES
-from fingerspice.problem import prepare
-from fingerspice.runs import Tables
+from fingerspice.solve.marching import integrate, prepare_system
+from fingerspice.solve.problem import prepare
+from fingerspice.solve.runs import Tables
 from scenes import table1
 
 every_law = pytest.mark.parametrize("law", ["local", "mobile"])

@@ -10,7 +10,7 @@ from scipy.integrate import simpson
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice import measures, steps
+from fingerspice.cli.result_files import measures, steps
 from fingerspice.numerics.extremes import largest
 from fingerspice.numerics.lobatto import NODES, POINTS
 from scenes import deck, table1, table1_deck

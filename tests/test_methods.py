@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.foreign import SCIPY_METHODS, TORCH_METHODS
 from fingerspice.numerics.tableaus import TABLEAUS
+from fingerspice.solve.foreign import SCIPY_METHODS, TORCH_METHODS
 from scenes import deck, table1
 
 OWN = ("exponential", *TABLEAUS)

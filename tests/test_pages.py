@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
+from fingerspice.base.pages import SCREEN, Page, Table
 from fingerspice.circuit.describe import changes_text, drive_text, heading, waveform_text
-from fingerspice.pages import SCREEN, Page, Table
-from fingerspice.report import summary_table
+from fingerspice.results.report import summary_table
 from scenes import table1
 
 MAKERS: dict[str, Callable[[], Any]] = {

@@ -10,7 +10,7 @@ import pytest
 import analytic as ref
 import fingerspice as fs
 from fingerspice.circuit.statespace import build_stack
-from fingerspice.steady import steady_state
+from fingerspice.studies.steady import steady_state
 from scenes import table1
 
 

@@ -27,7 +27,7 @@ from analytic import (
 )
 from fingerspice.circuit.circuit import AcSweep
 from fingerspice.physics.phasor import coupled_area, layer_gains
-from fingerspice.sweeps import sweep_frequencies
+from fingerspice.studies.sweeps import sweep_frequencies
 from scenes import deck, table1, table1_deck
 
 MM2 = 1e6

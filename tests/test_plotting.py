@@ -17,9 +17,9 @@ import pytest
 from PIL import Image
 
 import fingerspice as fs
-from fingerspice import drawing, plotting, traces
-from fingerspice.comparison import compare
-from fingerspice.simulation import simulate
+from fingerspice.plots import drawing, plotting, traces
+from fingerspice.solve.simulation import simulate
+from fingerspice.studies.comparison import compare
 from scenes import deck, table1
 
 if TYPE_CHECKING:
@@ -241,7 +241,8 @@ def test_thinning_keeps_every_extreme_and_both_ends() -> None:
 def test_pictures_need_no_pyplot_and_their_module_no_matplotlib() -> None:
     code = (
         "import sys, numpy, fingerspice as fs\n"
-        "from fingerspice import drawing, figures, plotting, traces\n"
+        "from fingerspice.plots import drawing, plotting, traces\n"
+        "from fingerspice.studies import figures\n"
         "assert not any(m.startswith('matplotlib') for m in sys.modules)\n"
         "drawing.new_figure(1)\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
@@ -394,7 +395,7 @@ window = types.ModuleType("window")
 window.FigureCanvas, window.FigureManager = Canvas, Manager
 sys.modules["window"] = window
 matplotlib.use("module://window")
-from fingerspice.drawing import new_figure
+from fingerspice.plots.drawing import new_figure
 figure, _ = new_figure(1)
 figure.show()
 assert shown == [figure, "until closed"], shown

@@ -10,7 +10,7 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.report import summary_table
+from fingerspice.results.report import summary_table
 from scenes import table1
 
 F = 100.0

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fingerspice as fs
-from fingerspice.circuit.sampling import SourceTable, source_table
 from fingerspice.engine.segment import Segment, source
+from fingerspice.waveforms.sampling import SourceTable, source_table
 from scenes import table1
 
 STEP = 1e-5

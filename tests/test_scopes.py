@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import fingerspice as fs
-from fingerspice.circuit.deck import parse_deck
+from fingerspice.netlist.deck import parse_deck
 from ngspice_tools import call_ngspice
 
 INNER = ".subckt inner a b\nR1 a b {w}\n.ends\n"

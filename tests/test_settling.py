@@ -9,7 +9,7 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice import settling
+from fingerspice.solve import settling
 from scenes import table1, table1_deck
 
 # A square's edges reach beyond the band of the dispersive skin's data.

@@ -16,8 +16,8 @@ from scipy.integrate import simpson
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice import files
-from fingerspice.files import write_aside
+from fingerspice.base import files
+from fingerspice.base.files import write_aside
 from scenes import deck, table1
 
 SQUARE = "SQUARE(200 100)"
@@ -295,7 +295,7 @@ def test_a_file_is_whole_or_as_it_was_when_the_disk_is_full(
 
         return write_aside(path, half)
 
-    monkeypatch.setattr("fingerspice.datafiles.write_aside", full)
+    monkeypatch.setattr("fingerspice.results.datafiles.write_aside", full)
     with pytest.raises(fs.InputError, match=r"cannot write .*run\.dat: No space left on device"):
         getattr(square, write)(path)
     assert [p.name for p in tmp_path.iterdir()] == (["run.dat"] if there else [])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.circuit.netlist import source_from_text
+from fingerspice.netlist.netlist import source_from_text
 from scenes import table1
 from waveform_cases import spice_exp, spice_pulse
 

@@ -11,8 +11,8 @@ import pytest
 import fingerspice as fs
 from analytic import sine_segments, square_segments, transient
 from fingerspice.numerics.tableaus import TABLEAUS, Tableau
-from fingerspice.problem import Problem, prepare
-from fingerspice.stepping import integrate
+from fingerspice.solve.problem import Problem, prepare
+from fingerspice.solve.stepping import integrate
 from scenes import table1
 
 every_tableau = pytest.mark.parametrize("tableau", TABLEAUS.values(), ids=lambda t: t.name)

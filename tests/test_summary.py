@@ -7,8 +7,8 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice import steps
-from fingerspice.summary import Figures
+from fingerspice.cli.result_files import steps
+from fingerspice.results.summary import Figures
 from scenes import deck, table1
 
 NAMES = {

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fingerspice.units import format_si, parse_number, suggest_mega, suspicious_mega, unit_read_as_scale
+from fingerspice.base.units import format_si, parse_number, suggest_mega, suspicious_mega, unit_read_as_scale
 
 VALUES = {
     "10": 10.0,

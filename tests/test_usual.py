@@ -13,9 +13,9 @@ import pytest
 import fingerspice as fs
 from commands import QUICK, Command
 from deck_edits import edited
+from fingerspice.base.units import parse_number, spice_text
 from fingerspice.circuit.devices import DEVICES, ParameterSpec
 from fingerspice.circuit.usual import REST_AREA, SOURCES, Usual
-from fingerspice.units import parse_number, spice_text
 from scenes import table1, table1_deck
 
 

@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 import fingerspice as fs
-from fingerspice.circuit import ramps, sampling, waveforms
-from fingerspice.circuit.sampling import source_table
-from fingerspice.circuit.waveforms import as_waveform
 from fingerspice.engine.segment import Segment, source
+from fingerspice.waveforms import ramps, sampling
+from fingerspice.waveforms import waveform as waveforms
+from fingerspice.waveforms.sampling import source_table
+from fingerspice.waveforms.waveform import as_waveform
 from scenes import table1
 from waveform_cases import CASES, Case, turns
 

@@ -6,8 +6,8 @@ import os
 import signal
 from types import FrameType
 
-from fingerspice.files import discard_unfinished
-from fingerspice.streams import mend_streams
+from fingerspice.base.files import discard_unfinished
+from fingerspice.base.streams import mend_streams
 
 _STOPS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
@@ -31,7 +31,7 @@ def main() -> None:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _stop)
     mend_streams()
-    from fingerspice.cli import main as command
+    from fingerspice.cli.app import main as command
 
     try:
         command()

@@ -1,1 +1,1 @@
-"""Circuits: netlist text, devices, waveforms, state space."""
+"""A circuit, its devices, and its equations."""

@@ -14,11 +14,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from fingerspice.base.errors import FingerspiceWarning, InputError, Where
+from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.devices import DEVICES, DeviceSpec
 from fingerspice.circuit.values import unusual, value_of
-from fingerspice.circuit.waveforms import Waveform, as_waveform
-from fingerspice.errors import FingerspiceWarning, InputError, Where
-from fingerspice.pages import Page, Shown
+from fingerspice.waveforms.waveform import Waveform, as_waveform
 
 CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
@@ -164,7 +164,7 @@ class Circuit(Shown):
         return {**vars(self), "_memory": {}}
 
     def _page(self) -> Page:
-        from fingerspice.report import circuit_page
+        from fingerspice.results.report import circuit_page
 
         return circuit_page(self)
 
@@ -274,7 +274,7 @@ class Circuit(Shown):
     def _waveform(self, given: float | str | Waveform | Callable[[float], float]) -> Waveform:
         if not isinstance(given, str):
             return as_waveform(given)
-        from fingerspice.circuit.netlist import source_from_text
+        from fingerspice.netlist.netlist import source_from_text
 
         return source_from_text(given, self)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 
+from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.combinations import Product, Sum
-from fingerspice.circuit.ramps import PWL, Samples
-from fingerspice.circuit.sampling import Function
-from fingerspice.circuit.waveforms import DC, Waveform
-from fingerspice.units import format_si
+from fingerspice.waveforms.combinations import Product, Sum
+from fingerspice.waveforms.ramps import PWL, Samples
+from fingerspice.waveforms.sampling import Function
+from fingerspice.waveforms.waveform import DC, Waveform
 
 #: Changes and sources named in one line; of more, how many there are.
 _MOST = 8

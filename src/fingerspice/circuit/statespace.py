@@ -17,13 +17,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.combinations import Product, Sum
 from fingerspice.circuit.topology import Hop, Loop, find_loop
-from fingerspice.circuit.waveforms import DC, Waveform
-from fingerspice.errors import InputError
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
+from fingerspice.waveforms.combinations import Product, Sum
+from fingerspice.waveforms.waveform import DC, Waveform
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 
+from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.waveforms import DC
-from fingerspice.errors import InputError
 from fingerspice.physics.ladder import SKIN_LADDER
+from fingerspice.waveforms.waveform import DC
 
 #: Elements of a circuit: every matrix of a network is dense.
 MAX_ELEMENTS = 2000

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from fingerspice.units import format_si, spice_text
+from fingerspice.base.units import format_si, spice_text
 
 # Units that take a prefix, so that a slip is a factor of a thousand; in the others it is m^2 for mm^2, a million.
 _PREFIXED = ("m", "N", "Pa", "ohm", "ohm m", "V", "V/m", "F", "Hz", "s")

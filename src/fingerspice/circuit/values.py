@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
+from fingerspice.base.errors import InputError
+from fingerspice.base.units import parse_number, suggest_mega, suspicious_mega, unit_read_as_scale
 from fingerspice.circuit.devices import ParameterSpec
 from fingerspice.circuit.usual import REST_AREA, SOURCES
-from fingerspice.errors import InputError
-from fingerspice.units import parse_number, suggest_mega, suspicious_mega, unit_read_as_scale
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Element

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.base.compiled import jit
 from fingerspice.engine.crossing import first_zero
 from fingerspice.engine.model import (
     Model,

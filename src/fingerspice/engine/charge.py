@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit, jit_rows
+from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.exponential import N_PLACES
 from fingerspice.engine.model import Model
 from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, PEAK_Q, SPREAD, at

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import borrow, jit
+from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine.network import (
     Net,
     Room,

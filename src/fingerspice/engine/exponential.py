@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit, jit_inline, jit_rows
+from fingerspice.base.compiled import jit, jit_inline, jit_rows
 from fingerspice.engine.rows import DQ, GUESS, SOURCE, X_GAP, Q, U, evaluate, moved
 from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
 

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.base.compiled import jit
 from fingerspice.engine.model import Model, branch_area
 from fingerspice.engine.rows import DQ, SOURCE, X_GAP, Q, U
 from fingerspice.numerics.lobatto import END, NODES, POINTS

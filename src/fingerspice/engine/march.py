@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import borrow, jit
+from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine.charge import charge_step
 from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, weigh
 from fingerspice.engine.growth import carry

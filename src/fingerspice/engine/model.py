@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.base.compiled import jit
 from fingerspice.physics.contact import inverse_area
 
 FloatArray = NDArray[np.float64]

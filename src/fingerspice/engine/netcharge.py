@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit, jit_rows
+from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.charge import DERIVATIVE
 from fingerspice.engine.exponential import N_PLACES, between
 from fingerspice.engine.readout import ERROR_Q

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.base.compiled import jit
 from fingerspice.engine.exponential import respond
 from fingerspice.engine.netrows import FREE, FREE_RATE, LIN, PULL, Form, W, Work, evaluate
 from fingerspice.numerics.lobatto import END, NODES, ROWS

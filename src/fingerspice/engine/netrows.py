@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit, jit_inline, jit_rows
+from fingerspice.base.compiled import jit, jit_inline, jit_rows
 from fingerspice.engine.charge import DERIVATIVE
 from fingerspice.engine.exponential import N_PLACES
 from fingerspice.engine.readout import WRITTEN_AT_ONCE

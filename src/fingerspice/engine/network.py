@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import borrow, jit, jit_inline
+from fingerspice.base.compiled import borrow, jit, jit_inline
 from fingerspice.engine.segment import Segment, source
 from fingerspice.physics.contact import inverse_area
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.base.compiled import jit
 from fingerspice.engine.model import Model, choose_branch, dot, gap_voltage, jump_charge, ramp
 from fingerspice.engine.readout import BRANCH_LENGTH, BRANCH_START, ERROR_Q, SIGN, U_BEFORE, U_GAP, H, T
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import borrow, jit, jit_inline
+from fingerspice.base.compiled import borrow, jit, jit_inline
 from fingerspice.engine.network import Net, Room, Sources, at_sources, capacitances, rates, residual
 from fingerspice.numerics.small import invert
 

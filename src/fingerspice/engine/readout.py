@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit, jit_fused, jit_rows
+from fingerspice.base.compiled import jit, jit_fused, jit_rows
 from fingerspice.numerics.lobatto import BARYCENTRIC, FIRST, NODES, POINTS, ROWS, SECOND, THIRD, TO_SERIES
 
 FloatArray = NDArray[np.float64]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import borrow, jit
+from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine.readout import WRITTEN_AT_ONCE, write_outputs
 from fingerspice.numerics.chebyshev import to_powers
 from fingerspice.numerics.lobatto import NODES, ROWS

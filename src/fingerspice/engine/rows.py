@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit, jit_fused, jit_inline, jit_rows
+from fingerspice.base.compiled import jit, jit_fused, jit_inline, jit_rows
 from fingerspice.engine.system import DEGREE
 from fingerspice.numerics import chebyshev
 from fingerspice.numerics.lobatto import POINTS, ROWS

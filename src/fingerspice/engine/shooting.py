@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.base.compiled import jit
 from fingerspice.engine.exponential import Tables
 from fingerspice.engine.march import DONE, march
 from fingerspice.engine.pace import Pace

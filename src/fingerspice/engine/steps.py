@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.base.compiled import jit
 from fingerspice.engine.model import Model, branch_area, charge_rate, dot, jacobian, rates_at, right_hand_side
 from fingerspice.engine.segment import Segment, source
 from fingerspice.numerics.small import inverse

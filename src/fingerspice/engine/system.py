@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.base.compiled import jit
 from fingerspice.engine.model import Model
 from fingerspice.numerics.chebyshev import evaluate, to_powers
 from fingerspice.numerics.modes import modes

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import borrow, jit, jit_rows
+from fingerspice.base.compiled import borrow, jit, jit_rows
 
 FloatArray = NDArray[np.float64]
 

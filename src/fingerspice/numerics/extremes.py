@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.base.compiled import jit
 from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
 
 FloatArray = NDArray[np.float64]

@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.base.compiled import jit
 
 FloatArray = NDArray[np.float64]
 Lanes: TypeAlias = tuple[float, float, float, float, float, float, float, float]

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.polynomial import chebyshev, legendre
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit_fused
+from fingerspice.base.compiled import jit_fused
 
 FloatArray = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.base.compiled import jit
 
 FloatArray = NDArray[np.float64]
 

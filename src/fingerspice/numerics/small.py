@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.compiled import jit
+from fingerspice.base.compiled import jit
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

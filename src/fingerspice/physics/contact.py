@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.compiled import jit, jit_rows
+from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.materials import EPS0
 

@@ -1,0 +1,157 @@
+"""The compiler's decorator, with a cache on disk that no change of the sources outlives.
+
+numba keys its cache by the one file a function stands in, while the compiled code holds every function it calls: after
+a change of one file it would go on running the old code of the others. So the key holds a stamp of all files that
+compiled code may call: those of the folders below, as compiled functions elsewhere are private to their own file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from numba import njit
+from numba.core import cgutils, config
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
+
+from fingerspice.base.announcing import Compiling
+from fingerspice.base.errors import InputError
+
+Array = TypeVar("Array", bound=np.ndarray)
+Function = TypeVar("Function", bound=Callable[..., Any])
+_PACKAGE = Path(__file__).resolve().parents[1]
+#: Where functions stand that compiled code of other files may call.
+SHARED_FOLDERS = ("engine", "numerics", "physics")
+_SOURCES = [Path(__file__).resolve(), *sorted(p for name in SHARED_FOLDERS for p in (_PACKAGE / name).rglob("*.py"))]
+# By content: a package that is copied, or packed into an image, brings along what was compiled for it.
+_STAMP = hashlib.sha256(b"".join(p.name.encode() + p.read_bytes() for p in _SOURCES)).hexdigest()
+_COMPILER = Compiling()
+
+
+def _drop_stale_cache() -> None:
+    """Delete what no key leads to any more, where it stands in the package."""
+    record = _PACKAGE / "__pycache__" / "compiled.stamp"
+    try:
+        if record.is_file() and record.read_text() == _STAMP:
+            return
+        for kind in ("*.nbi", "*.nbc"):
+            for file in _PACKAGE.rglob(kind):
+                file.unlink(missing_ok=True)
+        record.parent.mkdir(exist_ok=True)
+        record.write_text(_STAMP)
+    except OSError:
+        # A package that cannot be written has its cache elsewhere, and is replaced as a whole.
+        return
+
+
+_InPackage: Any = next(c for c in CompileResultCacheImpl._locator_classes if c.__name__.endswith("InTreeCacheLocator"))
+
+
+class _ReadOnly(_InPackage):  # type: ignore[misc]
+    """The package's own folder, where neither that nor any other can be written."""
+
+    def ensure_cache_path(self) -> None:
+        return
+
+
+class _Place(CompileResultCacheImpl):
+    _locator_classes = [*CompileResultCacheImpl._locator_classes, _ReadOnly]  # noqa: RUF012
+
+
+class _Cache(FunctionCache):
+    """numba's, for this state of the shared folders.
+
+    What came with the package is read even where nothing can be written; a disk that is full means that the next
+    process compiles again. What is found nowhere is announced: compiling takes its time.
+    """
+
+    _impl_class = _Place
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        cast(Any, super()).__init__(function)
+        place: Any = self._impl
+        came = _InPackage(function, function.__code__.co_filename).get_cache_path()
+        self._came = cast(Any, IndexDataCacheFile)(came, place.filename_base, place.locator.get_source_stamp())
+
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        return (*cast(Any, super())._index_key(sig, codegen), _STAMP)
+
+    def _load_overload(self, sig: Any, target_context: Any) -> Any:
+        key = self._index_key(sig, target_context.codegen())
+        for place in (self._cache_file, self._came):
+            # What cannot be read is not there.
+            with suppress(OSError):
+                data = place.load(key)
+                if data is not None:
+                    return cast(Any, self._impl).rebuild(target_context, data)
+        _COMPILER.begins(_EVERY_TIME if isinstance(self._impl.locator, _ReadOnly) else _ONCE)
+        return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with suppress(OSError):
+            cast(Any, super()).save_overload(sig, data)
+
+
+_ONCE = "compiling what this needs, about 40 s, only once: later runs find it on the disk"
+_EVERY_TIME = (
+    "compiling, about 40 s, as at every run: no folder for compiled code can be written, neither the package's nor "
+    "the user's; set NUMBA_CACHE_DIR to one that can"
+)
+
+
+def _cached(**options: Any) -> Callable[[Function], Function]:
+    """`njit` with a cache."""
+
+    def compile_when_called(function: Function) -> Function:
+        compiled = njit(error_model="numpy", **options)(function)
+        compiled._cache = cast(Any, _Cache)(function)
+        compile_signature = compiled.compile
+
+        def announced(signature: Any) -> Any:
+            with _COMPILER.around():
+                return compile_signature(signature)
+
+        compiled.compile = announced
+        return cast(Function, compiled)
+
+    return compile_when_called
+
+
+if cast(Any, config).DISABLE_JIT:
+    raise InputError("NUMBA_DISABLE_JIT is set: uncompiled, a run of seconds would take a day; allowed: unset, or 0")
+_drop_stale_cache()
+# A division by zero is an infinity that the step control refuses, not an exception out of compiled code.
+jit = _cached()
+# For loops over the rows of a step: fused, so that they vectorise; and where sums may be reordered (always alike).
+jit_fused = _cached(fastmath={"contract"})
+jit_rows = _cached(fastmath={"contract", "reassoc"})
+# Put into its caller before compilation: handing over twenty arrays would cost as much as the work.
+jit_inline = _cached(inline="always")
+
+
+@intrinsic
+def _borrow(typing: Any, array: Any) -> Any:
+    """The same array without a count of its users, which would be an atomic operation at every view.
+
+    The array given must outlive the one returned: borrow only arguments of the function, never what it allocates,
+    for that is freed after its last use by name.
+    """
+
+    make: Any = make_array
+    null: Any = cgutils.get_null_value
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        view = make(signature.args[0])(context, builder, values[0])
+        view.meminfo, view.parent = null(view.meminfo.type), null(view.parent.type)
+        return view._getvalue()
+
+    return array(array), generate
+
+
+borrow: Callable[[Array], Array] = cast(Any, _borrow)

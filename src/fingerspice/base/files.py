@@ -1,0 +1,71 @@
+"""Files that are whole or absent: written aside, then renamed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from fingerspice.base.errors import InputError
+
+_UNFINISHED: set[Path] = set()
+_PIECE = 64 * 2**20
+
+
+def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
+    """Call `write` with a temporary path in the same folder, then move it to `path`.
+
+    Where `path` is a link, the file it names is written; a device is written as it stands.
+
+    Raises
+    ------
+    InputError
+        Where the folder does not exist or cannot be written, or the disk is full.
+    """
+    if path.exists() and not path.is_file():
+        try:
+            write(path)
+        except OSError as error:
+            raise InputError(f"cannot write {path}: {error.strerror or error}") from None
+        return path
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".fingerspice-{os.urandom(6).hex()}")
+    # Known before it is there: whenever a signal comes, `discard_unfinished` finds it.
+    _UNFINISHED.add(temporary)
+    try:
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            temporary.touch(exist_ok=False)
+        except OSError as error:
+            raise InputError(f"cannot write {path}: {error.strerror}; allowed: a folder that can be written") from None
+        try:
+            write(temporary)
+            temporary.replace(target)
+        except OSError as error:
+            raise InputError(f"cannot write {path}: {error.strerror or error}") from None
+    finally:
+        _discard(temporary)
+    return path
+
+
+def write_pieces(path: Path, data: memoryview) -> None:
+    """Write bytes a piece at a time: one write of gigabytes would let a Ctrl-C wait for seconds."""
+    with path.open("wb") as stream:
+        for begin in range(0, data.nbytes, _PIECE):
+            stream.write(data[begin : begin + _PIECE])
+
+
+def discard_unfinished() -> None:
+    """Remove what is being written: for a process that is about to end."""
+    for temporary in list(_UNFINISHED):
+        _discard(temporary)
+
+
+def _discard(temporary: Path) -> None:
+    try:
+        temporary.unlink(missing_ok=True)
+    except OSError:
+        # Where the folder is no folder, or is gone, there is nothing to remove.
+        return
+    finally:
+        _UNFINISHED.discard(temporary)

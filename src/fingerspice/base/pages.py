@@ -1,0 +1,98 @@
+"""Reports as text for a terminal and as HTML for a notebook, from one list of lines and tables."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fingerspice.base.errors import printable
+
+#: Characters of a row's name in a table.
+LONGEST_LABEL = 60
+#: Lines that Python's prompt shows of a result.
+SCREEN = 40
+_CELL = "padding: 0.1em 0.7em; white-space: nowrap;"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text under a head; the first `left` columns are words, those after them figures."""
+
+    head: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+    left: int = 1
+
+    def text(self) -> str:
+        """As columns, words left-aligned and figures right-aligned."""
+        table = [(printable(r[0], LONGEST_LABEL), *r[1:]) for r in (self.head, *self.rows)]
+        widths = [max(len(r[i]) for r in table) for i in range(len(self.head))]
+        lines = []
+        for r in table:
+            pairs = enumerate(zip(r, widths, strict=True))
+            cells = [c.ljust(w) if place < self.left else c.rjust(w) for place, (c, w) in pairs]
+            lines.append("  ".join(cells).rstrip())
+        lines.insert(1, "-" * max(map(len, lines)))
+        return "\n".join(lines)
+
+    def html(self) -> str:
+        """As a table."""
+        lines = ["<table>"]
+        for number, row in enumerate((self.head, *self.rows)):
+            kind = "td" if number else "th"
+            cells = []
+            for place, cell in enumerate(row):
+                align = "left" if place < self.left else "right"
+                text = html.escape(printable(cell, LONGEST_LABEL))
+                cells.append(f'<{kind} style="text-align: {align}; {_CELL}">{text}</{kind}>')
+            lines.append(f"<tr>{''.join(cells)}</tr>")
+        return "\n".join([*lines, "</table>"])
+
+
+class Page(str):
+    """A report: the text itself, and the same as `html`.
+
+    Parameters
+    ----------
+    blocks : sequence of str or Table
+        From top to bottom; an empty line stands between a table and what is around it only where it is given.
+    """
+
+    __slots__ = ("blocks", "html")
+    blocks: tuple[str | Table, ...]
+    html: str
+
+    def __new__(cls, blocks: Sequence[str | Table]) -> Page:
+        page = super().__new__(cls, "\n".join(b.text() if isinstance(b, Table) else b for b in blocks))
+        parts = []
+        for block in blocks:
+            if isinstance(block, Table):
+                parts.append(block.html())
+                continue
+            # What is set in columns keeps them.
+            lines = [html.escape(printable(line)) for line in block.split("\n")]
+            parts.append(
+                f"<pre>{chr(10).join(lines)}</pre>" if len(lines) > 1 else f"<div>{lines[0] or '&nbsp;'}</div>"
+            )
+        page.blocks = tuple(blocks)
+        page.html = "\n".join(["<div>", *parts, "</div>"])
+        return page
+
+
+class Shown:
+    """A result that shows itself as its page: to `print`, on Python's prompt, and in a notebook."""
+
+    def _page(self) -> Page:
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return "\n".join(printable(line) for line in self._page().split("\n"))
+
+    def __repr__(self) -> str:
+        lines = str(self).split("\n")
+        if len(lines) <= SCREEN:
+            return "\n".join(lines)
+        return "\n".join([*lines[: SCREEN - 1], f"... and {len(lines) - SCREEN + 1} lines more: print() shows them"])
+
+    def _repr_html_(self) -> str:
+        return self._page().html

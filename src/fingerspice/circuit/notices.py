@@ -1,0 +1,63 @@
+"""What a user should be told of a circuit before it runs: what has no effect, and a skin of another frequency."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.spectrum import energy_outside
+from fingerspice.circuit.statespace import build_stack, is_stack
+from fingerspice.circuit.topology import find_branches
+from fingerspice.waveforms.waveform import Waveform
+
+# A band about a frequency, relative, over which the skin's data change by 3 %, and the energy that may lie outside.
+_NEAR, _FAR = 0.05, 0.01
+# Directives that a deck has for ngspice's sake.
+_FOR_NGSPICE = (".nodeset", ".options")
+
+
+def circuit_warnings(circuit: Circuit) -> tuple[str, ...]:
+    """What of a deck has no effect, and where a SKIN's data are not taken at the source's fundamental."""
+    return (*directive_warnings(circuit), *_skin_warnings(circuit))
+
+
+def directive_warnings(circuit: Circuit) -> tuple[str, ...]:
+    """What of a deck has no effect."""
+    return tuple(f"{name} has no effect here" for name in circuit.unused if not name.startswith(_FOR_NGSPICE))
+
+
+def _is_near(circuit: Circuit, wave: Waveform, f: float) -> bool:
+    """Whether a source has its energy close to a frequency (Hz), as a carrier under a slow envelope has."""
+    stop = circuit.tran.stop if circuit.tran is not None else math.nan
+    band = f * (1.0 - _NEAR), f * (1.0 + _NEAR)
+    return stop > 0.0 and sum(energy_outside(wave, stop, band)) < _FAR
+
+
+def _skin_warnings(circuit: Circuit) -> Iterator[str]:
+    skins = circuit.by_device("SKIN")
+    if not skins:
+        return
+    if is_stack(circuit):
+        wave: Waveform | None = build_stack(circuit).waveform
+    else:
+        waves = [e.waveform for e in find_branches(circuit)[1] if e.waveform is not None]
+        if len(waves) > 1:
+            # Which of several sources the skin's data should match is the user's to know.
+            return
+        wave = waves[0] if waves else None
+    fundamental = None if wave is None else wave.fundamental
+    for skin in skins:
+        f = skin.values["f"]
+        if fundamental is None and wave is not None and _is_near(circuit, wave, f):
+            continue
+        if fundamental is None:
+            yield (
+                f"{skin.name} takes its data at f = {f:g} Hz, and the source has no fundamental: the mean force may be "
+                f"5 to 10 % off; SKIN_DISPERSIVE d={1e6 * skin.values['d']:g}u is right for any source"
+            )
+        elif abs(f / fundamental.frequency - 1.0) > 1e-9:
+            yield (
+                f"{skin.name} takes its data at f = {f:g} Hz, the source's fundamental is "
+                f"{fundamental.frequency:g} Hz; {skin.name}.f={fundamental.frequency:g} would match"
+            )

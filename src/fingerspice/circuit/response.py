@@ -1,0 +1,210 @@
+"""Linear response of a circuit at one frequency: voltages of its layers, and the areas that follow them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.errors import InputError
+from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.network import Network, build_network
+from fingerspice.circuit.statespace import Stack, build_stack, is_stack
+from fingerspice.physics.contact import Contact
+from fingerspice.physics.phasor import coupled_area, layer_gains
+from fingerspice.waveforms.waveform import Fundamental
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+class LinearScene(Protocol):
+    """A circuit with one contact as its phasors see it."""
+
+    @property
+    def contact(self) -> Contact: ...
+    @property
+    def fundamental(self) -> Fundamental | None: ...
+    @property
+    def sources(self) -> tuple[tuple[Element, float], ...]:
+        """Each source with the sign it drives with."""
+        ...
+
+    @property
+    def layers(self) -> tuple[str, ...]: ...
+    @property
+    def gap(self) -> int:
+        """Index of the GAP among the layers."""
+        ...
+
+    @property
+    def finger(self) -> int:
+        """Index of the GAP's area."""
+        ...
+
+    @property
+    def fixed(self) -> bool:
+        """Whether the deck gives that area."""
+        ...
+
+    def areas(self, f: float, area: str | float, amplitude: float) -> FloatArray:
+        """Areas at one frequency (Hz), m^2, shape (n_area,)."""
+        ...
+
+    def layer_gain(self, f: float, areas: FloatArray) -> ComplexArray:
+        """Voltage of each layer from p to n over the source's, shape (n_layer,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class _StackScene:
+    """A series stack."""
+
+    stack: Stack
+    contact: Contact
+    gap: int
+    finger: int = 0
+
+    @property
+    def fixed(self) -> bool:
+        return self.stack.area_given is not None
+
+    @property
+    def fundamental(self) -> Fundamental | None:
+        return self.stack.waveform.fundamental
+
+    @property
+    def sources(self) -> tuple[tuple[Element, float], ...]:
+        return self.stack.sources
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.stack.layers)
+
+    def areas(self, f: float, area: str | float, amplitude: float) -> FloatArray:
+        if not isinstance(area, str):
+            return np.array([area])
+        if self.stack.area_given is not None:
+            return np.array([self.stack.area_given])
+        frozen = area == "frozen"
+        return np.array([float(self.contact.area(0.0)) if frozen else mean_area(self.stack, f, amplitude)])
+
+    def layer_gain(self, f: float, areas: FloatArray) -> ComplexArray:
+        sign = self.stack.sign[self.stack.first_cell]
+        return np.asarray(layer_gains(self.stack.admittance(np.array([f]), areas))[0] * sign)
+
+
+@dataclass(frozen=True)
+class _NetworkScene:
+    """Any other circuit."""
+
+    network: Network
+    contact: Contact
+    gap: int
+    finger: int
+
+    @property
+    def fixed(self) -> bool:
+        return self.network.areas[self.finger].given is not None
+
+    @property
+    def fundamental(self) -> Fundamental | None:
+        waveform = self.network.sources[0].waveform
+        return None if waveform is None else waveform.fundamental
+
+    @property
+    def sources(self) -> tuple[tuple[Element, float], ...]:
+        return tuple((e, 1.0) for e in self.network.sources)
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.network.layers)
+
+    def areas(self, f: float, area: str | float, amplitude: float) -> FloatArray:
+        if not isinstance(area, str):
+            return np.full(len(self.network.areas), area)
+        return _areas_at_rest(self.network) if area == "frozen" else _coupled_areas(self.network, f, amplitude)
+
+    def layer_gain(self, f: float, areas: FloatArray) -> ComplexArray:
+        return np.asarray(self.network.grouping @ self.network.phasors(f, areas, np.ones(1, complex)))
+
+
+def linear_scene(circuit: Circuit) -> LinearScene:
+    """The circuit's contact and what drives it."""
+    if is_stack(circuit):
+        stack = build_stack(circuit)
+        if stack.gap_layer is None or stack.contact is None:
+            raise InputError("a phasor solution needs a GAP; this circuit has none")
+        return _StackScene(stack, stack.contact, stack.gap_layer)
+    network = build_network(circuit)
+    if len(network.fingers) != 1 or len(network.sources) != 1:
+        raise InputError(
+            f"a phasor solution needs one GAP and one source; this circuit has {len(network.fingers)} and "
+            f"{len(network.sources)}"
+        )
+    place = network.fingers[0]
+    contact, gap = network.contacts[place], network.areas[place].gap
+    assert contact is not None
+    assert gap is not None
+    return _NetworkScene(network, contact, network.layers.index(gap), place)
+
+
+def mean_area(stack: Stack, frequency: float, amplitude: float) -> float:
+    """Area of the coupled phasor at one frequency (Hz) and source amplitude (V), m^2."""
+    contact, gap = stack.contact, stack.gap_layer
+    assert contact is not None
+    assert gap is not None
+    f = np.array([frequency])
+
+    def gain(area: float) -> float:
+        return float(np.abs(layer_gains(stack.admittance(f, np.array([area])))[0, gap]))
+
+    return coupled_area(lambda u: float(contact.area(u)), gain, amplitude)
+
+
+def mean_network_areas(circuit: Circuit, network: Network, frequency: float | None = None) -> FloatArray:
+    """Areas of a network's coupled phasor at one frequency (Hz; its source's by default), m^2, shape (n_area,).
+
+    Raises
+    ------
+    InputError
+        Where there are several sources, or one without fundamental; where the areas do not settle.
+    """
+    source = network.sources[0]
+    fundamental = None if source.waveform is None else source.waveform.fundamental
+    if len(network.sources) > 1 or fundamental is None:
+        what = "several sources" if len(network.sources) > 1 else "a source without fundamental"
+        raise InputError(
+            f"area='mean' is the area of the phasor of one source at its fundamental, and this circuit has {what}; "
+            "allowed: 'coupled', 'frozen' or an area in m^2"
+        )
+    f = fundamental.frequency if frequency is None else frequency
+    return _coupled_areas(network, f, fundamental.amplitude)
+
+
+def _areas_at_rest(network: Network) -> FloatArray:
+    """Areas at 0 V, or as the deck gives them, m^2, shape (n_area,)."""
+    pairs = zip(network.areas, network.contacts, strict=True)
+    return np.array([float(c.area(0.0)) if c is not None and a.given is None else a.given for a, c in pairs])
+
+
+def _coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
+    """Areas under one source's amplitude (V or A) at one frequency (Hz), each at its gap's rms voltage."""
+    s = np.array([complex(amplitude)])
+    area = _areas_at_rest(network)
+    for attempt in range(500):
+        u = np.abs(network.phasors(f, area, s))
+        new = area.copy()
+        for i in network.fingers:
+            contact, gap = network.contacts[i], network.gaps[i]
+            if network.areas[i].given is None and contact is not None and gap is not None:
+                new[i] = float(contact.area(float(u[gap]) / math.sqrt(2.0)))
+        # What is no number never settles, and is refused where it is used.
+        if np.all(np.abs(new - area) <= 4e-16 * area) or not np.all(np.isfinite(new)):
+            return new
+        # Two areas may swing against each other.
+        area = new if attempt < 50 else 0.5 * (area + new)
+    raise InputError("the phasor's areas do not settle; allowed: area='frozen' or an area in m^2")

@@ -1,0 +1,385 @@
+"""The command line. Exits: 0, done; 1, the solve failed; 2, bad input or a full disk."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fingerspice.base.errors import InputError, SolveError
+from fingerspice.cli import answers, options
+from fingerspice.cli.options import area_from_text, check_output, read_circuit, time_from_text
+from fingerspice.cli.result_files import FOLDER, Results
+from fingerspice.cli.terminal import Answering, answer_usage, listen, plain_errors, progress, say
+
+if TYPE_CHECKING:
+    from fingerspice.results.solution import Solution
+
+app = typer.Typer(
+    context_settings={"help_option_names": ["--help", "-h"]},
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="SPICE for the sliding fingertip: voltages, contact area and friction on an electroadhesive touchscreen.",
+)
+
+Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir).")]
+Out = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Where the files go; else out.")]
+Name = Annotated[
+    str | None, typer.Option("--name", metavar="NAME", help="What they are called; as the deck by default.")
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of other circuits, and other files.")]
+Rtol = Annotated[float, typer.Option(help="Largest error of gap voltage and force, relative to their peaks.")]
+ChargeLaw = Annotated[str | None, typer.Option(help="local or mobile; the included library's by default.")]
+Set = Annotated[
+    list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Change a value: Xgap.d=3u. May be repeated.")
+]
+Source = Annotated[
+    list[str] | None,
+    typer.Option("--source", metavar="[NAME=]SPEC", help="Replace a source: 'SQUARE(200 100)', 'Vdrive=DC 5'."),
+]
+Stop = Annotated[str | None, typer.Option(metavar="TIME", help="End of the run, s: 50m; TSTOP by default.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON (docs/json.md), nothing else on stdout.")]
+NoPlot = Annotated[bool, typer.Option("--no-plot", help="Write no picture.")]
+
+
+def main() -> None:
+    """Entry point of the `fingerspice` command."""
+    # Loading libraries makes a million objects and no garbage: looking for it would take a fifth of a run.
+    gc.set_threshold(500_000)
+    listen()
+    with plain_errors():
+        try:
+            app(standalone_mode=True)
+        except SystemExit as exit_:
+            # Usage that typer refused, and has said on stderr.
+            refused = getattr(exit_.__context__, "format_message", None)
+            if refused is not None:
+                answer_usage(refused())
+            raise
+        finally:
+            # What typer printed.
+            say(end="")
+
+
+@app.command()
+def run(
+    deck: Deck,
+    out: Out = None,
+    name: Name = None,
+    overwrite: Overwrite = False,
+    rtol: Rtol = 1e-8,
+    charge_law: ChargeLaw = None,
+    area: Annotated[str, typer.Option(help="coupled, mean, frozen, or an area in m^2.")] = "coupled",
+    method: Annotated[
+        str, typer.Option(help="auto, dp5, dop853, radau9, scipy:LSODA, torchdiffeq:dopri5, ...")
+    ] = "auto",
+    changes: Set = None,
+    source: Source = None,
+    stop: Stop = None,
+    start: Annotated[
+        str, typer.Option(help="deck (as its .tran says), uncharged, dc, or periodic (the periodic state).")
+    ] = "deck",
+    jumps: Annotated[
+        str, typer.Option(help="Rows at jumps of the source: both, or none, so that time rises strictly.")
+    ] = "both",
+    csv: Annotated[bool, typer.Option("--csv", help="Write CSV instead of NetCDF.")] = False,
+    as_json: AsJson = False,
+    no_plot: NoPlot = False,
+) -> None:
+    """Simulate DECK in time: a summary, a data file and a picture.
+
+    Examples:
+
+      fingerspice run circuits/fingerpad.cir
+
+      fingerspice run circuits/fingerpad.cir --source 'SQUARE(200 100)' --set Xgap.d=3u --csv
+
+      fingerspice run circuits/fingerpad.cir --stop 20m --start periodic
+
+      fingerspice run circuits/fingerpad.cir --charge-law mobile --rtol 1e-6 --json --no-plot
+    """
+    from fingerspice.results.report import summary_table
+    from fingerspice.solve.simulation import simulate
+
+    with Answering("run", as_json, charge_law=charge_law, method=method, rtol=rtol, area=area) as answer:
+        circuit = read_circuit(deck, changes, source)
+        answer.update(**answers.of_circuit(circuit, charge_law))
+        t_stop = time_from_text("--stop", stop)
+        if circuit.tran is None and t_stop is None:
+            raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
+        options.check_stop(circuit, t_stop)
+        results = Results(deck, circuit, out, name, overwrite, charge_law)
+        data = results.file(".csv" if csv else ".nc")
+        picture = None if no_plot else results.file(".png")
+        with progress() as update:
+            solution = simulate(
+                circuit, t_stop=t_stop, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method,
+                start=start, jumps=jumps, throw=False, progress=update,
+            )  # fmt: skip
+        if as_json:
+            answer.update(**answers.of_run(solution))
+        answer.give(lambda: summary_table(solution), _written(solution, data, picture, results))
+        if solution.failure is not None:
+            raise SolveError(solution.failure, solution)
+
+
+def _written(solution: Solution, data: Path, picture: Path | None, results: Results) -> list[Callable[[], Path]]:
+    """How the files of a run are written: the data, then the picture where one is wanted."""
+    from fingerspice.plots.drawing import save
+
+    if not solution.t.size:
+        return []
+    results.open()
+    writes: list[Callable[[], Path]] = [partial(solution.to_csv if data.suffix == ".csv" else solution.to_netcdf, data)]
+    if picture is not None:
+        writes.append(lambda: save(solution.plot(), picture, about=results.about))
+    return writes
+
+
+@app.command()
+def ac(
+    deck: Deck,
+    out: Out = None,
+    name: Name = None,
+    overwrite: Overwrite = False,
+    sweep: Annotated[
+        str | None, typer.Option(metavar="'dec N F1 F2'", help="Sweep; the deck's .ac line by default.")
+    ] = None,
+    area: Annotated[str, typer.Option(help="mean, frozen, coupled (large signal), or an area in m^2.")] = "mean",
+    amplitude: Annotated[
+        list[float] | None, typer.Option(help="With --area coupled: source amplitude in V; may be repeated.")
+    ] = None,
+    skin: Annotated[str, typer.Option(help="SKIN's data: swept, at each frequency; own, at its f.")] = "swept",
+    charge_law: ChargeLaw = None,
+    rtol: Rtol = 1e-8,
+    changes: Set = None,
+    source: Source = None,
+    as_json: AsJson = False,
+    no_plot: NoPlot = False,
+) -> None:
+    """Phasor sweep of DECK: gap voltage, phase, area and mean force against frequency.
+
+    The source's AC magnitude and phase drive it; without AC its fundamental does.
+
+    Examples:
+
+      fingerspice ac circuits/fingerpad.cir --sweep 'dec 10 10 100k' --out out
+
+      fingerspice ac circuits/fingerpad.cir --area frozen --json
+
+      fingerspice ac circuits/fingerpad.cir --area coupled --amplitude 50 --amplitude 200
+    """
+    from fingerspice.results.report import phasor_csv, phasor_dict, phasor_tables
+    from fingerspice.studies.phasors import phasor
+    from fingerspice.studies.sweeps import sweep_frequencies
+
+    how = "steady_state" if area == "coupled" else "phasor"
+    with Answering("ac", as_json, charge_law=charge_law, method=how, rtol=rtol, area=area, skin=skin) as answer:
+        circuit = read_circuit(deck, changes, source)
+        answer.update(**answers.of_circuit(circuit, charge_law))
+        results = Results(deck, circuit, out, name, overwrite, charge_law)
+        data = results.file("_ac.csv")
+        picture = None if no_plot else results.file("_ac.png")
+        frequencies = sweep_frequencies(options.sweep(sweep, circuit))
+        if area == "coupled":
+            from fingerspice.studies.largesignal import large_signal
+
+            if skin != "swept":
+                raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
+            with progress("sweeping") as update:
+                found = large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, progress=update)
+        elif amplitude:
+            raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
+        else:
+            found = (phasor(circuit, frequencies, area=area_from_text(area), skin=skin),)
+        results.open()
+        writes = [lambda: phasor_csv(found, data)]
+        if picture is not None:
+            from fingerspice.plots.drawing import save
+            from fingerspice.plots.plotting import plot_phasor
+
+            writes.append(lambda: save(plot_phasor(found, circuit), picture, about=results.about))
+        answer.update(sweeps=[phasor_dict(r) for r in found] if as_json else None)
+        answer.give(lambda: phasor_tables(found, circuit), writes)
+
+
+@app.command()
+def plan(
+    deck: Deck,
+    rtol: Rtol = 1e-8,
+    charge_law: ChargeLaw = None,
+    area: Annotated[str, typer.Option(help="coupled, mean, frozen, or an area in m^2.")] = "coupled",
+    stop: Stop = None,
+    charge: Annotated[bool, typer.Option(help="Whether the source's charge and current are wanted.")] = True,
+    changes: Set = None,
+    source: Source = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say which model DECK needs for the error asked for, and why, without running it.
+
+    Examples:
+
+      fingerspice plan circuits/fingerpad.cir
+
+      fingerspice plan circuits/fingerpad.cir --area frozen --rtol 1e-6 --json
+    """
+    from fingerspice.results.report import plan_text
+    from fingerspice.solve.simulation import plan as make
+
+    with Answering("plan", as_json, charge_law=charge_law, rtol=rtol, area=area) as answer:
+        circuit = read_circuit(deck, changes, source)
+        answer.update(**answers.of_circuit(circuit, charge_law))
+        t_stop = time_from_text("--stop", stop)
+        result = make(
+            circuit, t_stop=t_stop, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge
+        )
+        answer.update(**answers.of_plan(result))
+        answer.give(lambda: plan_text(result, circuit))
+
+
+@app.command()
+def compare(
+    deck: Deck,
+    out: Out = None,
+    name: Name = None,
+    overwrite: Overwrite = False,
+    rtol: Rtol = 1e-8,
+    charge_law: ChargeLaw = None,
+    changes: Set = None,
+    source: Source = None,
+    as_json: AsJson = False,
+    no_plot: NoPlot = False,
+) -> None:
+    """Set the transient's periodic state of DECK beside the phasor, and say what the area's ripple does.
+
+    Examples:
+
+      fingerspice compare circuits/fingerpad.cir
+
+      fingerspice compare circuits/fingerpad_5khz.cir --json --no-plot
+    """
+    from fingerspice.results.report import comparison_table
+    from fingerspice.studies.comparison import compare as run_comparison
+
+    with Answering("compare", as_json, charge_law=charge_law, rtol=rtol) as answer:
+        circuit = read_circuit(deck, changes, source)
+        answer.update(**answers.of_circuit(circuit, charge_law))
+        results = Results(deck, circuit, out, name, overwrite, charge_law)
+        picture = None if no_plot else results.file("_compare.png")
+        result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
+        writes: list[Callable[[], Path]] = []
+        if picture is not None:
+            results.open()
+            from fingerspice.plots.drawing import save
+            from fingerspice.plots.plotting import plot_comparison
+
+            writes.append(lambda: save(plot_comparison(result), picture, about=results.about))
+        answer.update(method=result.solution.method, **result.to_dict())
+        answer.give(lambda: comparison_table(result), writes)
+
+
+@app.command()
+def limits(
+    deck: Deck,
+    out: Out = None,
+    name: Name = None,
+    overwrite: Overwrite = False,
+    points: Annotated[int, typer.Option(help="Values of each parameter.")] = 9,
+    span: Annotated[float, typer.Option(help="Each goes from its own value over this to this times it.")] = 10.0,
+    changes: Set = None,
+    source: Source = None,
+    as_json: AsJson = False,
+    no_plot: NoPlot = False,
+) -> None:
+    """Map where DECK folds under the mobile charge law: source voltage against load, gap and frequency.
+
+    Example:
+
+      fingerspice limits circuits/fingerpad.cir --set Xgap.d=100n --points 7 --out out
+    """
+    from fingerspice.results.report import limits_csv, limits_text
+    from fingerspice.studies.limits import fold_limits, plot_limits
+
+    with Answering("limits", as_json, charge_law="mobile") as answer:
+        circuit = read_circuit(deck, changes, source)
+        answer.update(**answers.of_circuit(circuit, "mobile"))
+        results = Results(deck, circuit, out, name, overwrite, "mobile")
+        table = results.file("_limits.csv")
+        picture = None if no_plot else results.file("_limits.png")
+        with progress("looking for folds") as update:
+            result = fold_limits(circuit, points=points, span=span, progress=update)
+        results.open()
+        writes = [lambda: limits_csv(result, table)]
+        if picture is not None:
+            from fingerspice.plots.drawing import save
+
+            writes.append(lambda: save(plot_limits(result), picture, about=results.about))
+        answer.update(**result.to_dict())
+        answer.give(lambda: limits_text(result), writes)
+
+
+@app.command()
+def export(
+    deck: Deck,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The ngspice deck to write.")],
+    charge_law: ChargeLaw = None,
+    changes: Set = None,
+    source: Source = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write DECK as one self-contained ngspice deck: bodies included, parameters folded in.
+
+    Example:
+
+      fingerspice export circuits/fingerpad.cir -o fingerpad_ngspice.cir
+    """
+    from fingerspice.base.files import write_aside
+    from fingerspice.studies.export import export_netlist
+
+    with Answering("export", as_json, charge_law=charge_law) as answer:
+        circuit = read_circuit(deck, changes, source)
+        answer.update(**answers.of_circuit(circuit, charge_law))
+        check_output(output, deck)
+        text = export_netlist(circuit, charge_law=charge_law)
+        answer.give(str, [lambda: write_aside(output, lambda path: path.write_text(text, encoding="utf-8"))])
+
+
+@app.command()
+def figures(
+    out: Out = None,
+    only: Annotated[list[int] | None, typer.Option(help="Only these of the paper's figures 2 to 5.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Draw the paper's Figs. 2 to 5 from scratch, each as PNG with its data as CSV.
+
+    Example:
+
+      fingerspice figures --out out --only 4 --only 5
+    """
+    from fingerspice.studies.figures import FIGURES, make_figures
+
+    folder = out or FOLDER
+    with Answering("figures", as_json) as answer:
+        for number in only or FIGURES:
+            for kind in ("png", "csv"):
+                check_output(folder / f"fig{number}.{kind}")
+        with progress("drawing") as update:
+            files = make_figures(folder, only=only, progress=update)
+        answer.give(str, [partial(Path, file) for file in files])
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False,
+) -> None:
+    if version:
+        from fingerspice import __version__
+
+        say(f"fingerspice {__version__}")
+        raise typer.Exit

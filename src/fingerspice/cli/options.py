@@ -1,0 +1,148 @@
+"""What the command line's options mean, and the checks before a run: nothing here writes a file."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.units import parse_number
+
+if TYPE_CHECKING:
+    from fingerspice.circuit.circuit import AcSweep, Circuit
+    from fingerspice.waveforms.waveform import Waveform
+
+LARGEST_AREA = 0.01
+"""m^2; an area above it was probably given in mm^2."""
+
+
+def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | None) -> Circuit:
+    """The deck's circuit with ``--set`` and ``--source``; what has no effect here is warned about."""
+    from fingerspice.circuit.notices import directive_warnings
+    from fingerspice.netlist.netlist import read_netlist
+
+    circuit = read_netlist(deck)
+    circuit = _with_changes(circuit, changes or [])
+    circuit = _with_sources(circuit, sources or [])
+    # Said here for the commands that make no run of the circuit as it is.
+    for text in directive_warnings(circuit):
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    return circuit
+
+
+def _with_changes(circuit: Circuit, changes: list[str]) -> Circuit:
+    """The circuit with every ``--set``, all at once: exponents may have to change together."""
+    values: dict[str, str] = {}
+    for change in changes:
+        path, equals, text = (part.strip() for part in change.partition("="))
+        if not equals or not path:
+            raise InputError(f"--set {change!r} is not understood; allowed: PATH=VALUE, such as Xgap.d=3u")
+        values[path] = text
+    if not values:
+        return circuit
+    try:
+        return circuit.replace(values)
+    except InputError as error:
+        # The deck's line is not at fault.
+        raise InputError(f"--set {' '.join(map(repr, changes))}: {error.message}") from None
+
+
+def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
+    """The circuit with every ``--source``: the name may be left out where there is one source."""
+    from fingerspice.circuit.arguments import overridden
+    from fingerspice.circuit.topology import find_branches
+    from fingerspice.netlist.netlist import source_from_text
+
+    if not texts:
+        return circuit
+    names = {e.name.lower(): e.name for e in find_branches(circuit)[1] if e.device in "VI"}
+    sources: dict[str, Waveform] = {}
+    for text in texts:
+        named, equals, spec = (part.strip() for part in text.partition("="))
+        # The = of a parameter, as in PWL(...) r=10m, follows no name alone.
+        if not (equals and named.replace(".", "").isidentifier()):
+            named, spec = "", text
+        known = ", ".join(names.values())
+        if not named and len(names) != 1:
+            raise InputError(f"--source {text!r}: the circuit has {known}; allowed: NAME=SPEC with one of these names")
+        name = names.get(named.lower(), "") if named else next(iter(names.values()))
+        if not name or name in sources:
+            problem = "is given twice" if name else f"is not a source of the circuit; allowed: {known}"
+            raise InputError(f"--source {text!r}: {named or name} {problem}")
+        try:
+            sources[name] = source_from_text(spec, circuit)
+        except InputError as error:
+            raise InputError(f"--source {error.message}") from None
+    return overridden(circuit, sources)
+
+
+def time_from_text(option: str, text: str | None) -> float | None:
+    """A time in s, such as ``50m``."""
+    try:
+        return None if text is None else parse_number(text)
+    except ValueError as error:
+        raise InputError(f"{option} {text!r}: {error}") from None
+
+
+def check_stop(circuit: Circuit, t_stop: float | None) -> None:
+    """Refuse an end (s) before the deck's first output step is over."""
+    tran = circuit.tran
+    if t_stop is not None and tran is not None and 0.0 < t_stop < tran.start + tran.step:
+        raise InputError(
+            f"--stop {t_stop:g} s is before the second output; allowed: TSTART + TSTEP = {tran.start + tran.step:g} s "
+            "or more"
+        )
+
+
+def area_from_text(text: str) -> str | float:
+    """A mode's name, or an area in m^2."""
+    try:
+        area = parse_number(text)
+    except ValueError:
+        return text
+    if area > LARGEST_AREA:
+        warnings.warn(
+            f"--area {text} is in m^2, {area * 1e6:g} mm^2; a fingerpad has tens of mm^2, which is 35e-6 or 35u here",
+            FingerspiceWarning,
+            stacklevel=2,
+        )
+    return area
+
+
+def check_output(file: Path, deck: Path | None = None) -> None:
+    """Refuse an output that cannot be written, or is the deck, before spending time on the run; writes nothing."""
+    try:
+        _check_output(file, deck)
+    except OSError as error:
+        raise InputError(f"cannot write {file}: {error.strerror}; allowed: a folder that can be written") from None
+
+
+def _check_output(file: Path, deck: Path | None) -> None:
+    folder = file.parent
+    while not folder.exists() and folder != folder.parent and not folder.is_symlink():
+        folder = folder.parent
+    # A name that is too long is found only by looking for the file itself, in a folder that is there.
+    (folder / file.name).exists()
+    if not folder.is_dir():
+        raise InputError(f"cannot write {file}: {folder} is not a folder; allowed: a folder that can be written")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"cannot write {file}: no permission in {folder}; allowed: a folder that can be written")
+    if file.is_dir():
+        raise InputError(f"cannot write {file}: it is a folder; allowed: a file's name")
+    if deck is not None and file.exists() and deck.exists() and file.samefile(deck):
+        raise InputError(f"cannot write {file}: it is the deck itself; allowed: another name or folder")
+
+
+def sweep(text: str | None, circuit: Circuit) -> AcSweep:
+    """The sweep of ``--sweep``, or without it the deck's; else the band of the skin's data."""
+    from fingerspice.circuit.circuit import AcSweep
+    from fingerspice.netlist.directives import sweep_from_text
+
+    if text is None:
+        return circuit.ac or AcSweep("dec", 20, 10.0, 1e5)
+    try:
+        return sweep_from_text(text)
+    except InputError as error:
+        raise InputError(f"--sweep {error.message}") from None

@@ -1,0 +1,173 @@
+"""Where a command's results go: files named after the deck, and which of those there already may be replaced."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fingerspice.base.errors import InputError
+from fingerspice.base.files import write_aside
+from fingerspice.cli.options import check_output
+from fingerspice.cli.terminal import complain
+
+if TYPE_CHECKING:
+    from fingerspice.circuit.circuit import Circuit
+
+#: Where results go unless another folder is named.
+FOLDER = Path("out")
+#: How the commands' tables begin.
+_HEADS = (b"t [s],u_source", b"frequency [Hz],gain [1],", b"parameter,value [SI],unit,")
+#: What a file has to say for its circuit to be known.
+_KNOWN = ("deck_sha256", "overrides", "charge_law")
+
+
+class Results:
+    """The files of one command.
+
+    Parameters
+    ----------
+    deck : Path
+    circuit : Circuit
+        With everything that was changed.
+    folder : Path or None
+        `FOLDER` by default.
+    name : str or None
+        Of the files, without their ends; the deck's by default.
+    overwrite : bool
+        Whether files of other circuits, or of none that is known, may be replaced.
+    charge_law : str or None
+        As asked for.
+    """
+
+    def __init__(
+        self,
+        deck: Path,
+        circuit: Circuit,
+        folder: Path | None,
+        name: str | None,
+        overwrite: bool,
+        charge_law: str | None,
+    ) -> None:
+        if name is not None and (name in ("", ".", "..") or Path(name).name != name or not name.isprintable()):
+            raise InputError(
+                f"--name is {name!r}; allowed: a file's name without folder and end; --out names the folder"
+            )
+        self.deck, self.folder, self.name, self.overwrite = deck, folder or FOLDER, name or deck.stem, overwrite
+        self.named = folder is not None
+        self.names: list[str] = []
+        self.noted = False
+        self.circuit = circuit
+        self._own = {
+            "program": "fingerspice", "title": circuit.title, "file": str(circuit.path or ""),
+            "deck_sha256": _hash(circuit.text), "overrides": json.dumps(dict(circuit.overrides)),
+            "charge_law": charge_law or circuit.charge_law or "local",
+        }  # fmt: skip
+
+    def file(self, end: str) -> Path:
+        """A file with this end, which may be written; nothing is written yet.
+
+        Raises
+        ------
+        InputError
+            Where it cannot be written, or holds what must not be replaced.
+        """
+        file = self.folder / f"{self.name}{end}"
+        check_output(file, self.deck)
+        self.names.append(file.name)
+        if file.is_file() and not self.overwrite:
+            self._check(file)
+        return file
+
+    @property
+    def about(self) -> dict[str, str]:
+        """What a picture keeps as text: what it and the files beside it were made from."""
+        return {**self._own, "files": json.dumps(self.names)}
+
+    def open(self) -> None:
+        """Make the folder, where it is the one that nobody named: so that no version control takes it for sources."""
+        if not self.named and not self.folder.exists():
+            # Where that fails the results do too, with their own message.
+            with suppress(InputError):
+                write_aside(self.folder / ".gitignore", lambda path: path.write_text("*\n"))
+
+    def _check(self, file: Path) -> None:
+        held = _held(file)
+        ways = "allowed: --name NAME, another --out, or --overwrite"
+        if held is None and _is_table(file):
+            complain(f"note: {file} is replaced; a table alone does not say which circuit it is of")
+            return
+        if held is None:
+            raise InputError(f"{file} is there already, and nothing says which circuit it is of; {ways}")
+        same_deck = held["deck_sha256"] == self._own["deck_sha256"]
+        if json.loads(held["overrides"]) != dict(self.circuit.overrides):
+            said, own = _of(held), _of(self._own)
+        elif held["charge_law"] != self._own["charge_law"]:
+            said, own = (f"under the {x['charge_law']} law" for x in (held, self._own))
+        elif not same_deck and (held.get("file", "") != self._own["file"] or not held.get("file")):
+            said, own = f"of the deck {held.get('file') or 'of another text'}", f"of {self.deck}"
+        else:
+            if not same_deck and not self.noted:
+                self.noted = True
+                complain(f"note: the results in {self.folder} are of an earlier text of {self.deck} and are replaced")
+            return
+        raise InputError(f"{file} holds a result {said}, and this one is {own}; {ways}")
+
+
+def _of(held: Mapping[str, str]) -> str:
+    changed = json.loads(held["overrides"])
+    if not changed:
+        return "of the deck as it is"
+    said = [f"{path}={value if len(value) <= 40 else value[:36] + ' ...'}" for path, value in changed.items()]
+    return f"with {', '.join(said[:8])}"
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "replace")).hexdigest()
+
+
+def _held(file: Path) -> dict[str, str] | None:
+    """What a file says that it was made from; None where it does not."""
+    try:
+        found = _of_data(file) if file.suffix == ".nc" else _of_picture(file)
+        if found is None or not all(isinstance(found.get(key), str) for key in _KNOWN):
+            return None
+        return found if isinstance(json.loads(found["overrides"]), dict) else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, SyntaxError):
+        # Whatever it is, it is not ours.
+        return None
+
+
+def _is_table(file: Path) -> bool:
+    """Whether a file begins as the tables that the commands write."""
+    with suppress(OSError), file.open("rb") as stream:
+        return stream.read(100).startswith(_HEADS)
+    return False
+
+
+def _of_data(file: Path) -> dict[str, str]:
+    import h5netcdf
+
+    with h5netcdf.File(file, "r") as data:
+        attributes = {str(key): str(value) for key, value in data.attrs.items()}
+    return {**attributes, "deck_sha256": _hash(attributes["deck"])}
+
+
+def _of_picture(file: Path) -> dict[str, str] | None:
+    """Of a picture its own text; of a table that of the picture beside it, which names the files it was made with."""
+    from PIL import Image
+
+    picture = file.with_suffix(".png")
+    if not picture.is_file():
+        return None
+    with Image.open(picture) as image:
+        image.load()
+        text: dict[str, Any] = dict(getattr(image, "text", {}))
+    data = file.with_suffix(".nc")
+    if not text.get("files") and file.suffix == ".png" and data.is_file():
+        # Pictures did not always say it; the data beside them did.
+        return _of_data(data)
+    return text if file.name in json.loads(text.get("files", "[]")) else None

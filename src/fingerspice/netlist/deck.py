@@ -1,0 +1,226 @@
+"""A netlist file as a flat list of evaluated statements.
+
+What the statements mean is decided elsewhere: here names are names and values are numbers. The work is done
+in `lexer` (text to words), `reader` (lines by kind, included files), `scope` (parameters and values) and
+`flatten` (subcircuit calls); every refusal carries its place in the file.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from fingerspice.base.errors import InputError, Where, printable
+from fingerspice.circuit.devices import layer_devices
+from fingerspice.netlist.flatten import Flattener, Statement
+from fingerspice.netlist.lexer import Line, group, lex
+from fingerspice.netlist.reader import (
+    DIRECTIVES,
+    MAX_BYTES,
+    NATIVE_LIBRARIES,
+    Reader,
+    Subcircuit,
+    read_text,
+)
+from fingerspice.netlist.scope import Call, Number, Scope, Token, Value
+from fingerspice.netlist.slips import with_comma
+
+__all__ = [
+    "NATIVE_LIBRARIES",
+    "Call",
+    "Deck",
+    "Directive",
+    "Number",
+    "Statement",
+    "Token",
+    "parse_deck",
+    "read_deck",
+]
+
+#: Characters of a title that are shown; of a longer one the middle is left out.
+LONGEST_TITLE = 200
+
+_VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|wavefile|table)\b)"
+_ELEMENT_TITLE = re.compile(rf"[rcvi]\w*\s+\S+\s+\S+\s+{_VALUE}", re.IGNORECASE)
+_DEVICE_TITLE = re.compile(rf"x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(layer_devices())})(?:\s|$)", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class Directive:
+    """A line such as `.tran 10u 50m uic`.
+
+    Attributes
+    ----------
+    name : str
+        With its dot, lower case.
+    args : tuple of Number, Token or Call
+        Words; numbers are evaluated.
+    params : dict
+        `key=value` pairs by lower-case key; those of `.ic v(area)=1` have keys such as ``v(area)``.
+    param_where : dict
+        Places of the keys.
+    where : Where
+        Place of the dot.
+    text : str
+        The line as written, continuations joined.
+    """
+
+    name: str
+    args: tuple[Number | Token | Call, ...]
+    params: dict[str, Value]
+    param_where: dict[str, Where]
+    where: Where
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Deck:
+    """A netlist, read and flattened.
+
+    Attributes
+    ----------
+    title : str
+        The first line, made fit to be shown (see `errors.printable`); as written it is in `text`.
+    statements : tuple of Statement
+        Elements in the order of the file, subcircuit calls expanded.
+    tran, ac : Directive or None
+        The analyses; each may be given once.
+    ic, options : tuple of Directive
+        Start values and options, in the order of the file.
+    includes : tuple of str
+        Base names, as written, of the included libraries of native devices; these files are not read.
+    files : tuple of Path
+        Other included files, which were read.
+    unused : tuple of str
+        Directives that are accepted and have no effect here, each once.
+    warnings : tuple of str
+        What is legal but probably not meant, each with its place.
+    params : dict
+        Values of the deck's own `.param` definitions by lower-case name.
+    text : str
+        The netlist as read.
+    path : Path or None
+        Where it was read from.
+    """
+
+    title: str
+    statements: tuple[Statement, ...]
+    tran: Directive | None
+    ac: Directive | None
+    ic: tuple[Directive, ...]
+    options: tuple[Directive, ...]
+    includes: tuple[str, ...]
+    files: tuple[Path, ...]
+    unused: tuple[str, ...]
+    warnings: tuple[str, ...]
+    params: dict[str, float]
+    text: str
+    path: Path | None
+
+
+def read_deck(path: str | Path) -> Deck:
+    """Read a netlist file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; others are included from its folder only.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read (missing, a folder, empty, too large, not UTF-8 text) or is wrong.
+    """
+    return parse_deck(read_text(Path(path), str(path)), Path(path))
+
+
+def parse_deck(text: str, path: Path | None = None) -> Deck:
+    """Read a netlist.
+
+    Parameters
+    ----------
+    text : str
+        The whole netlist; its first line is the title.
+    path : Path, optional
+        Where it came from; without it only the libraries of native devices can be included.
+
+    Raises
+    ------
+    InputError
+        When anything in it is wrong or unknown; the message says where and what is allowed.
+    """
+    file = str(path) if path is not None else "<netlist>"
+    if not text.strip("\ufeff \t\r\n"):
+        raise InputError(f"'{file}' is empty: a netlist begins with a title line")
+    if len(text) > MAX_BYTES:
+        raise InputError(f"'{file}' is larger than {MAX_BYTES >> 20} MiB")
+    if "\0" in text:
+        raise InputError(f"'{file}' is not text (it holds NUL characters)")
+    reader = Reader(file, path)
+    lines = reader.split(text.removeprefix("\ufeff"))
+    title = printable(lines[0].strip(), LONGEST_TITLE)
+    if _reads_like_a_statement(title):
+        problem = f"the first line is the title, but '{title}' reads like a statement: add a title above"
+        reader.warn(problem, Where(file, 1))
+    try:
+        reader.read_deck(lines)
+        return _assemble(reader, title, text, path)
+    except InputError as error:
+        raise with_comma(error, reader.warnings) from None
+
+
+def _assemble(reader: Reader, title: str, text: str, path: Path | None) -> Deck:
+    """Evaluate parameters, statements and directives, in this order."""
+    scope = Scope()
+    for formula in reader.root.params:
+        scope.define(formula)
+    scope.solve()
+    flattener = Flattener()
+    flattener.run(reader.root, scope)
+    directives = [_directive(*analysis, scope) for analysis in reader.analyses]
+    _warn_uncalled(reader, reader.root)
+    return Deck(
+        title=title,
+        statements=tuple(flattener.statements),
+        tran=_only(directives, ".tran"),
+        ac=_only(directives, ".ac"),
+        ic=tuple(d for d in directives if d.name == ".ic"),
+        options=tuple(d for d in directives if d.name == ".options"),
+        includes=tuple(reader.libraries),
+        files=tuple(reader.files),
+        unused=tuple(reader.unused),
+        warnings=tuple(reader.warnings),
+        params=dict(scope.values),
+        text=text,
+        path=path,
+    )
+
+
+def _directive(name: str, line: Line, rest: int, scope: Scope) -> Directive:
+    words = group(line, lex(line, rest), probes=True)
+    args = scope.words(line, words.words)
+    start = line.start
+    return Directive(name, args, *scope.pairs(line, words), line.where(start), line.text[start:])
+
+
+def _only(directives: list[Directive], name: str) -> Directive | None:
+    found = [directive for directive in directives if directive.name == name]
+    if len(found) > 1:
+        raise InputError(f"{name} is given twice, first at {found[0].where}", found[1].where)
+    return found[0] if found else None
+
+
+def _warn_uncalled(reader: Reader, root: Subcircuit) -> None:
+    """Say which of the deck's own subcircuits were never read (a library's usually are not all used)."""
+    for defined in root.inner.values():
+        where = defined.line.where(defined.line.start) if defined.line is not None else None
+        if where is not None and where.file == reader.file and not (defined.called or defined.skipped):
+            reader.warn(f"subcircuit '{defined.name}' is never called, and its body was not read", where)
+
+
+def _reads_like_a_statement(title: str) -> bool:
+    """Whether a title is probably the netlist's first statement."""
+    if title.startswith("."):
+        return title.split(None, 1)[0].lower() in DIRECTIVES
+    return _ELEMENT_TITLE.match(title) is not None or _DEVICE_TITLE.match(title) is not None

@@ -1,0 +1,204 @@
+"""From a statement of a deck to elements: what its values mean, and what comes with it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import MappingProxyType
+
+from fingerspice.base.errors import InputError
+from fingerspice.base.units import exponent_and_scale
+from fingerspice.circuit.circuit import Element
+from fingerspice.circuit.devices import DEVICES, ParameterSpec
+from fingerspice.circuit.values import is_resistance, mega_note, unit_trap, unusual
+from fingerspice.netlist.deck import Call, Number, Statement, Token
+from fingerspice.netlist.directives import start_volts
+from fingerspice.netlist.expressions import nearest
+from fingerspice.netlist.scope import Value
+from fingerspice.netlist.sources import Source, Timing, read_source
+
+#: LTspice's parasitics, as elements of their own: in series at the first node, or beside the element.
+_PARASITICS = {"V": ("rser", "cpar"), "C": ("rser", "rpar", "cpar")}
+#: What LTspice writes about a part and no calculation needs.
+_PART_DATA = {"R": ("tol", "pwr"), "C": ("tol", "v", "irms", "mfg", "pn", "type")}
+#: Other names of the value, and ngspice's and LTspice's number of parts side by side.
+_VALUE_NAMES = {"R": ("r", "resistance"), "C": ("c", "capacitance")}
+_COPIES = "m"
+
+
+def read_elements(statement: Statement, timing: Timing, notes: list[str]) -> list[Element]:
+    """The element of a statement, and those that LTspice's ``Rser``, ``Rpar`` and ``Cpar`` stand for.
+
+    Parameters
+    ----------
+    statement : Statement
+    timing : Timing
+    notes : list of str
+        Takes what is to be warned about.
+
+    Raises
+    ------
+    InputError
+        One sentence with the place.
+    """
+    device = statement.device or statement.letter
+    values: dict[str, float] = {}
+    source, initial = None, None
+    beside = {key: statement.params[key] for key in _PARASITICS.get(device, ()) if key in statement.params}
+    own = replace(statement, params={k: v for k, v in statement.params.items() if k not in beside})
+    if DEVICES[device].is_layer:
+        if statement.nodes[2] == "0":
+            raise InputError(
+                f"{statement.name} has ground as its area; allowed: the area node of a GAP", statement.where
+            )
+        values = _device_values(own, device, notes)
+    elif device in "VI":
+        source = _source(own, timing)
+        notes.extend(source.notes)
+    else:
+        values, initial = _passive_value(own, notes)
+    element = Element(
+        statement.name,
+        device,
+        statement.nodes,
+        statement.node_names,
+        MappingProxyType(values),
+        None if source is None else source.waveform,
+        initial,
+        statement.where,
+        None if source is None else source.ac,
+    )
+    for parameter, text in unusual(element):
+        given = _given(statement, parameter)
+        if not (isinstance(given, Number) and _is_noted(given, element.spec.parameter(parameter))):
+            notes.append(f"{statement.where if given is None else given.where}: {text}")
+    return _with_parasitics(element, beside, notes)
+
+
+def _given(statement: Statement, parameter: str) -> Value | Call | None:
+    if parameter == "value" and statement.body:
+        return statement.body[0]
+    return statement.params.get(parameter)
+
+
+def _is_noted(given: Number, spec: ParameterSpec) -> bool:
+    """Whether `_value` has said something about a number: one word is enough."""
+    return (given.mega is not None and is_resistance(spec)) or exponent_and_scale(given.text)
+
+
+def _with_parasitics(element: Element, beside: dict[str, Value], notes: list[str]) -> list[Element]:
+    out = [element]
+    for key, given in beside.items():
+        written = f"{element.name}.{key.capitalize()}"
+        device = key[0].upper()
+        spec = DEVICES[device].parameter("value")
+        if isinstance(given, Number) and given.value == 0.0 and key != "rpar":
+            continue
+        value = MappingProxyType({"value": _value(written, spec, given, notes)})
+        nodes, names = element.nodes, element.node_names
+        if key == "rser":
+            inner = written.lower()
+            nodes, names = (element.nodes[0], inner), (element.node_names[0], written)
+            out[0] = replace(out[0], nodes=(inner, element.nodes[1]), node_names=(written, element.node_names[1]))
+        out.append(Element(written, device, nodes, names, value, where=element.where))
+    return out
+
+
+def _source(statement: Statement, timing: Timing) -> Source:
+    body = list(statement.body)
+    last = body[-1] if body else None
+    if isinstance(last, Token) and last.text.lower() == "pwl":
+        # PWL file=...: the brackets are left out.
+        last = Call(last.text, (), {}, {}, last.where)
+    if statement.params:
+        if not isinstance(last, Call) or last.name.lower() != "pwl" or set(last.params) & set(statement.params):
+            key = next(iter(statement.params))
+            takes = ", ".join(p.capitalize() for p in _PARASITICS.get(statement.letter, ()))
+            hint = f"; allowed: {takes}, besides its value" if takes else ""
+            raise InputError(f"{statement.name} takes no parameter {key!r}{hint}", statement.param_where[key])
+        # ngspice takes PWL(...) r=10m as well as PWL(... r=10m).
+        body[-1] = replace(
+            last,
+            params={**last.params, **statement.params},
+            param_where={**last.param_where, **statement.param_where},
+        )
+    return read_source(statement.name, body, timing, statement.where)
+
+
+def _device_values(statement: Statement, device: str, notes: list[str]) -> dict[str, float]:
+    known = {p.name: p for p in DEVICES[device].parameters}
+    for key in statement.params:
+        if key not in known:
+            place = statement.param_where[key]
+            # ngspice reads m=... on an X line as so many copies.
+            hint = "; the exponent is m_exp" if key == _COPIES and "m_exp" in known else nearest(key, known)
+            raise InputError(
+                f"{statement.name}: {device} has no parameter {key!r}{hint}; allowed: {', '.join(known)}", place
+            )
+    out = {}
+    for name, spec in known.items():
+        if name in statement.params:
+            out[name] = _value(statement.name, spec, statement.params[name], notes)
+        elif spec.default is not None:
+            out[name] = spec.default
+        else:
+            unit = f" ({spec.unit})" if spec.unit else ""
+            raise InputError(f"{statement.name}: {device} needs {name}{unit}, missing here", statement.where)
+    return out
+
+
+def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> float:
+    """One parameter's number, with the unit traps of SPICE caught."""
+    unit = f" {spec.unit}" if spec.unit else ""
+    if isinstance(given, Token):
+        if spec.may_be_infinite and given.text.lower() in ("inf", "none"):
+            return math.inf
+        allowed = f"a number{unit}, or the name of a .param"
+        raise InputError(f"{name} {spec.name} is {given.text!r}; allowed: {allowed}", given.where)
+    trap = unit_trap(spec, given.text)
+    if trap:
+        raise InputError(f"{name} {spec.name} {trap}", given.where)
+    if given.mega is not None and is_resistance(spec):
+        notes.append(f"{given.mega.where}: {name} {spec.name}: {mega_note(given.mega.text, given.value, spec)}")
+    if exponent_and_scale(given.text):
+        notes.append(
+            f"{given.where}: {name} {spec.name}: {given.text} is {given.value:g}: exponent and scale both count"
+        )
+    if not spec.accepts(given.value):
+        plain = f"{given.value:g}{unit}"
+        written = plain if given.text == f"{given.value:g}" else f"{given.text} ({plain})"
+        raise InputError(f"{name} {spec.name} is {written}; allowed: {spec.allowed()}", given.where)
+    return given.value
+
+
+def _passive_value(statement: Statement, notes: list[str]) -> tuple[dict[str, float], float | None]:
+    """Value of an R or C, and what a C starts with, V."""
+    name, letter = statement.name, statement.letter
+    spec = DEVICES[letter].parameter("value")
+    own = (*_VALUE_NAMES[letter], _COPIES, *(("ic",) if letter == "C" else ()), *_PART_DATA[letter])
+    for key, part in statement.params.items():
+        if key == "lser" and isinstance(part, Number) and part.value == 0.0:
+            continue
+        if key not in own:
+            shown = ", ".join(f"{k}=" for k in (*own, *_PARASITICS.get(letter, ())))
+            reason = ", there are no inductors here" if key == "lser" else ""
+            raise InputError(f"{name} takes no parameter {key!r}{reason}; allowed: {shown}", statement.param_where[key])
+    named = [statement.params[key] for key in _VALUE_NAMES[letter] if key in statement.params]
+    given = [*statement.body, *named]
+    if len(given) != 1:
+        raise InputError(f"{name} needs one value in {spec.unit}, {len(given)} are given", statement.where)
+    word = given[0]
+    if not isinstance(word, Number):
+        text = word.text if isinstance(word, Token) else word.name
+        raise InputError(f"{name} value is {text!r}; allowed: a number {spec.unit}", word.where)
+    value = _value(name, spec, word, notes)
+    if _COPIES in statement.params:
+        copies = statement.params[_COPIES]
+        if not isinstance(copies, Number) or not 1e-6 <= copies.value <= 1e6:
+            raise InputError(f"{name} m is {copies.text!r}; allowed: a number of parts side by side", copies.where)
+        value = value / copies.value if letter == "R" else value * copies.value
+    initial = statement.params.get("ic")
+    if isinstance(initial, Token):
+        raise InputError(f"{name} IC is {initial.text!r}; allowed: a number V", initial.where)
+    start = None if initial is None else start_volts(f"{name} IC", initial)
+    return {"value": value}, start

@@ -1,0 +1,160 @@
+"""From a deck's statements to a circuit: what devices, parameters and directives mean."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from fingerspice.base.errors import FingerspiceWarning, InputError, Where
+from fingerspice.circuit.circuit import Circuit, Element, check
+from fingerspice.circuit.network import build_network
+from fingerspice.circuit.statespace import build_stack, is_stack
+from fingerspice.circuit.usual import REST_AREA
+from fingerspice.netlist.deck import Deck, parse_deck, read_deck
+from fingerspice.netlist.directives import read_ac, read_initial, read_options, read_tran, unused_starts
+from fingerspice.netlist.elements import read_elements
+from fingerspice.netlist.reader import MAX_WARNINGS
+from fingerspice.netlist.slips import decimal_comma, with_comma
+from fingerspice.netlist.sources import Timing, read_source
+from fingerspice.waveforms.waveform import DC, Waveform
+
+
+def read_netlist(path: str | Path) -> Circuit:
+    """Read a circuit from a netlist file.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read or anything in it is wrong; the message says where and what is allowed.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"read_netlist is given {path!r}; allowed: the path of a netlist, such as 'deck.cir'")
+    return _circuit(read_deck(path))
+
+
+def parse_netlist(text: str, path: str | Path | None = None) -> Circuit:
+    """Read a circuit from a netlist's text.
+
+    Parameters
+    ----------
+    text : str
+    path : str or Path, optional
+        Where the text came from: its folder is the one includes may use.
+
+    Raises
+    ------
+    InputError
+        When anything in it is wrong; the message says where and what is allowed.
+    """
+    if not isinstance(text, str):
+        raise InputError(f"parse_netlist is given {text!r}; allowed: a netlist's text, whose first line is the title")
+    if "\n" not in text.strip() and text.strip().lower().endswith((".cir", ".net", ".sp")):
+        raise InputError(f"parse_netlist is given {text.strip()!r}, a file's name; allowed: read_netlist for a file")
+    return _circuit(parse_deck(text, None if path is None else Path(path)))
+
+
+def _circuit(deck: Deck) -> Circuit:
+    notes: list[str] = list(deck.warnings)
+    try:
+        circuit = _read(deck, notes)
+    except InputError as error:
+        raise _in_deck(error, deck) from None
+    for note in circuit.warnings:
+        warnings.warn(note, FingerspiceWarning, stacklevel=3)
+    return circuit
+
+
+def _first(notes: list[str]) -> tuple[str, ...]:
+    """As many warnings as anybody reads."""
+    more = len(notes) - MAX_WARNINGS
+    return (*notes[:MAX_WARNINGS], f"{more} more warnings are not shown") if more > 1 else tuple(notes)
+
+
+def _in_deck(error: InputError, deck: Deck) -> InputError:
+    """A refusal with the file where it has no place of its own, and with a title that swallowed a statement."""
+    error = with_comma(error, deck.warnings)
+    text = error.message if error.where else f"{deck.path or '<netlist>'}: {error.message}"
+    title = [note for note in deck.warnings if "the first line is the title" in note]
+    return InputError("; note ".join([text, *title]), error.where)
+
+
+def _read(deck: Deck, notes: list[str]) -> Circuit:
+    tran = read_tran(deck.tran, notes) if deck.tran else None
+    timing = Timing(tran.step if tran else None, tran.stop if tran else None)
+    elements = tuple(e for statement in deck.statements for e in read_elements(statement, timing, notes))
+    work, unused = read_options(deck.options)
+    initial = read_initial(deck.ic, elements)
+    notes.extend(_unusual_areas(elements, initial))
+    circuit = Circuit(
+        title=deck.title,
+        elements=elements,
+        tran=tran,
+        ac=read_ac(deck.ac) if deck.ac else None,
+        initial=initial,
+        charge_law=_charge_law(deck.includes),
+        work=work,
+        warnings=_first(notes),
+        unused=(*deck.unused, *unused, *unused_starts(initial, elements, tran is None or tran.uic)),
+        text=deck.text,
+        path=deck.path,
+    )
+    check(circuit)
+    if is_stack(circuit):
+        build_stack(circuit)
+    else:
+        build_network(circuit)
+    return circuit
+
+
+def _unusual_areas(elements: tuple[Element, ...], initial: Mapping[str, float]) -> Iterator[str]:
+    """What is not usual in the areas that sources and start values give."""
+    nodes = {e.nodes[2] for e in elements if e.spec.is_layer}
+    given: list[tuple[str, float, Where | None]]
+    given = [(f".ic v({node})", value, None) for node, value in initial.items() if node in nodes]
+    for e in elements:
+        if e.device == "V" and e.nodes[0] in nodes and isinstance(e.waveform, DC):
+            given.append((f"{e.name}, an area,", e.waveform.level, e.where))
+    for what, value, where in given:
+        text = REST_AREA.warning(what, value, "mm^2")
+        if text:
+            yield f"{where}: {text}" if where else text
+
+
+def _charge_law(includes: tuple[str, ...]) -> str | None:
+    laws = {"mobile" if "mobile" in name.lower() else "local" for name in includes}
+    if len(laws) > 1:
+        raise InputError("both fingerspice.lib (local law) and fingerspice_mobile.lib (mobile law) are included")
+    return laws.pop() if laws else None
+
+
+def source_from_text(text: str, circuit: Circuit) -> Waveform:
+    """A waveform from netlist text such as ``SQUARE(200 100)``, with SPICE's defaults from the circuit's .tran.
+
+    Raises
+    ------
+    InputError
+        When the text is not a source.
+    """
+    tran = circuit.tran
+    line = f".tran {tran.step!r} {tran.stop!r}\n" if tran else ""
+    timing = Timing(tran.step if tran else None, tran.stop if tran else None)
+    try:
+        deck = parse_deck(f"source\nVsource a 0 {text}\n{line}")
+        if len(deck.statements) != 1 or deck.statements[0].params:
+            raise InputError("not one source; allowed: such as SQUARE(200 100)")
+        source = read_source("source", deck.statements[0].body, timing, deck.statements[0].where)
+        if source.ac is not None:
+            raise InputError("AC belongs into the deck; allowed: the source function alone, whose fundamental drives")
+    except InputError as error:
+        comma = decimal_comma(f"V1 a 0 {text}")
+        raise InputError(f"{text!r}: {error.message}" + (f"; note {comma}" if comma else "")) from None
+    for note in (*deck.warnings, *source.notes):
+        # Its place is one in the text.
+        warnings.warn(f"{text!r}: {note.partition(': ')[2]}", FingerspiceWarning, stacklevel=2)
+    return source.waveform

@@ -1,0 +1,90 @@
+"""What is written in a netlist by mistake or for another simulator, and the sentence that helps."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+
+from fingerspice.base.errors import InputError
+
+#: Directives that other simulators know and this one does not, with the way here.
+ELSEWHERE = {
+    ".step": "give one value a run by --set PATH=VALUE, or loop over circuit.replace({path: value}) in Python",
+    ".four": "mean, peaks and amplitude are in the summary of a run, and any harmonic in the data that it writes",
+    ".temp": "nothing depends on temperature; give the values at the one that is meant",
+    ".model": "there are no models; write the device's parameters on its own line",
+    ".global": "give the node to each .subckt as one of its nodes",
+    ".func": "write the expression where it is used, {a*b}, or into .param",
+    ".op": "a .tran without uic starts from the operating point, fs.simulate(circuit, start='dc') too",
+    ".dc": "run once per value by --set, such as --set Vdrive.level=5",
+    ".noise": "there is no noise analysis",
+    ".tf": "gains against frequency are given by fingerspice ac",
+    ".pz": "gains against frequency are given by fingerspice ac",
+    ".sens": "run once per value by --set",
+    ".data": "run once per value by --set",
+    ".alter": "run once per value by --set",
+    ".wave": "run writes every signal as NetCDF, or as CSV with --csv",
+    ".net": "gains against frequency are given by fingerspice ac",
+    ".savebias": "a run goes on from another in Python, fs.simulate(circuit, start=solution)",
+    ".loadbias": "a run goes on from another in Python, fs.simulate(circuit, start=solution)",
+    ".csparam": "write .param",
+    ".if": "write the case that is meant",
+    ".elseif": "write the case that is meant",
+    ".else": "write the case that is meant",
+    ".endif": "write the case that is meant",
+    ".endl": "put the section of the library into a file and .include it",
+    ".width": "leave it out",
+}
+
+_LISTS = re.compile(r"\{[^{}]*\}|'[^']*'|\"[^\"]*\"")
+_CALL = re.compile(r"\(([^()]*)\)")
+_COMMA = re.compile(r"(?<![\w.,])([+-]?[0-9]+),([0-9]+[a-zµμ]*)(?![\w.,])", re.IGNORECASE)
+_ASSIGNED = re.compile(rf"=\s*{_COMMA.pattern}", re.IGNORECASE)
+_NUMBER = re.compile(r"[+-]?\.?[0-9][\w.+-]*")
+_UNIT = re.compile(r"(?:[tgkmunpfµμ]|meg|mil)?(?:m|v|a|s|n|f|hz|ohm|ω)?", re.IGNORECASE)
+
+
+def decimal_comma(text: str) -> str | None:
+    """What to say about a line in which a comma is likely to stand for a decimal point; None where none does.
+
+    A comma separates numbers, so ``SIN(0,200,100)`` is right; beside numbers that a blank separates, as in
+    ``SIN(0 200 0,1)``, or in ``d=3,5u`` it is doubtful.
+    """
+    bare = _LISTS.sub("x", text)
+    for found in (_ASSIGNED.search(bare), *_among_blanks(bare)):
+        if found:
+            whole, part = found[1], found[2]
+            return (
+                f"{whole},{part} is two numbers, {whole} and {part}, for a comma separates; if it is a decimal comma "
+                f"write {whole}.{part}"
+            )
+    return None
+
+
+def _among_blanks(bare: str) -> Iterator[re.Match[str] | None]:
+    outside = _CALL.sub(" ", bare)
+    # Name and nodes may be numbers, and stand with commas between them.
+    words = outside.split()[1 if outside.lstrip().startswith(".") else 3 :]
+    for chunks in ([c for c in words if "=" not in c], *(m[1].split() for m in _CALL.finditer(bare))):
+        matches = [_COMMA.fullmatch(chunk) for chunk in chunks]
+        others = [c for c, m in zip(chunks, matches, strict=True) if m is None]
+        if all(_NUMBER.fullmatch(c) or c.isalpha() for c in others) and (others or len(chunks) == len(words) == 1):
+            yield from matches
+
+
+def is_unit(word: str) -> bool:
+    """Whether a word may be a scale, a unit, or both."""
+    return _UNIT.fullmatch(word) is not None and word != ""
+
+
+def stray_word(word: str, before: str) -> str:
+    """What to add where a word follows `before`, which ends in ``key=value``; empty if nothing fits."""
+    number = before.rpartition("=")[2].strip()
+    return f"; a unit joins its number, {number}{word}" if _NUMBER.fullmatch(number) and is_unit(word) else ""
+
+
+def with_comma(error: InputError, warnings: Iterable[str]) -> InputError:
+    """An error with what was said of a comma in its line."""
+    place = f"{error.where.file}:{error.where.line}:" if error.where else "none"
+    found = [text.partition(": ")[2] for text in warnings if text.startswith(place) and "decimal comma" in text]
+    return InputError("; note ".join([error.message, *found]), error.where) if found else error

@@ -1,0 +1,194 @@
+"""What every picture is drawn with: figure, axes, legend, caption, colours, units, file.
+
+Figures are made with matplotlib's object API, and matplotlib is imported when one is made: no pyplot, no global state.
+"""
+
+from __future__ import annotations
+
+import itertools
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.errors import printable
+from fingerspice.base.files import write_aside
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from fingerspice.plots.picture import Picture
+
+FloatArray = NDArray[np.float64]
+
+# Okabe and Ito's palette, which the common colour blindnesses tell apart.
+BLACK, GREY, BLUE, VERMILION = "#000000", "#777777", "#0072B2", "#D55E00"
+GREEN, PURPLE, ORANGE, SKY = "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
+
+FONT, SMALL = 8.5, 7.0
+WIDTH = 7.0
+"""Font sizes (points) and width (inches) of a figure across a page."""
+
+MAX_BINS = 4000
+#: Characters of a name in a legend.
+LONGEST_LABEL = 60
+CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (1, 1.2)))
+_PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+
+
+def new_figure(rows: int, columns: int = 1, height: float = 3.0, **options: Any) -> tuple[Picture, list[Axes]]:
+    """A figure of `rows` by `columns` panels, 7 inches wide and `height` inches high.
+
+    Parameters
+    ----------
+    rows, columns : int
+    height : float
+        Inches.
+    **options
+        For ``Figure.subplots``: ``sharex``, ``height_ratios``, ...
+
+    Returns
+    -------
+    figure : Picture
+        With an Agg canvas, so that it saves without a display.
+    axes : list of Axes
+        Row by row.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    from fingerspice.plots.picture import Picture
+
+    figure = Picture(figsize=(WIDTH, height), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    figure.get_layout_engine().set(w_pad=0.06, h_pad=0.05)  # type: ignore[union-attr, call-arg]
+    axes = figure.subplots(rows, columns, squeeze=False, **options).ravel().tolist()
+    for ax in axes:
+        dress(ax)
+    return figure, axes
+
+
+def dress(ax: Axes, ylabel: str = "", xlabel: str = "") -> None:
+    """Labels, light grid, no box."""
+    if ylabel:
+        ax.set_ylabel(ylabel, fontsize=FONT)
+    if xlabel:
+        ax.set_xlabel(xlabel, fontsize=FONT)
+    ax.tick_params(labelsize=FONT - 0.5, color="#999999", which="both")
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.spines[["left", "bottom"]].set_color("#999999")
+    ax.grid(True, color="#E4E4E4", linewidth=0.6)
+    ax.set_axisbelow(True)
+
+
+def legend_above(ax: Axes, columns: int = 4, *, right: bool = False, math: bool = False) -> None:
+    """A legend over the panel, where it covers no data; without `math` names keep their ``$``."""
+    place: dict[str, Any] = {"loc": "lower right" if right else "lower left", "bbox_to_anchor": (right, 1.0)}
+    place |= {"borderaxespad": 0.1, "borderpad": 0.2, "handlelength": 1.8, "columnspacing": 1.2}
+    legend = ax.legend(ncols=columns, fontsize=FONT - 0.5, frameon=False, **place)
+    for text in legend.get_texts():
+        text.set_parse_math(math)
+        text.set_text(drawable(text.get_text(), LONGEST_LABEL))
+
+
+def legend_within(ax: Axes, room: int) -> None:
+    """A legend over the panel in as many columns as so many letters have room for."""
+    names = ax.get_legend_handles_labels()[1]
+    columns = next(n for n in range(len(names), 0, -1) if n == 1 or sum(_columns(names, n)) <= room)
+    legend_above(ax, columns)
+
+
+def _columns(names: list[str], columns: int) -> list[int]:
+    """Widths of a legend's columns, letters, filled one after the other, the first of them one longer."""
+    rows, longer = divmod(len(names), columns)
+    begins = [place * rows + min(place, longer) for place in range(columns + 1)]
+    return [max(map(len, names[a:b])) + 6 for a, b in itertools.pairwise(begins)]
+
+
+def drawable(text: str, longest: int = 1000) -> str:
+    """Text of a deck as it may be drawn: printable, not long, and with a box for what the font has no picture of."""
+    text = printable(text, longest)
+    if text.isascii():
+        return text
+    from matplotlib import font_manager
+
+    known = font_manager.get_font(font_manager.findfont(font_manager.FontProperties())).get_charmap()
+    return "".join(c if ord(c) in known else "□" for c in text)
+
+
+def caption(figure: Figure, text: str, color: str = GREY) -> None:
+    """Small print under the figure, wrapped to its width."""
+    lines = textwrap.fill(drawable(text), 120, break_on_hyphens=False)
+    small = figure.supxlabel(lines, x=0.012, ha="left", fontsize=SMALL, color=color)
+    small.set_parse_math(False)
+
+
+def save(figure: Figure, path: str | Path, *, about: Mapping[str, str] | None = None, dpi: float = 160.0) -> Path:
+    """Write a figure as PNG; the file is whole or absent.
+
+    Parameters
+    ----------
+    figure : Figure
+    path : str or Path
+    about : mapping, optional
+        What it was made from, kept in the file as text.
+    dpi : float
+        Dots per inch.
+
+    Raises
+    ------
+    InputError
+        Where the folder cannot be written.
+    """
+    options: dict[str, Any] = {"format": "png", "dpi": dpi, "pil_kwargs": {"compress_level": 3}}
+    return write_aside(Path(path), lambda target: figure.savefig(target, metadata=dict(about or {}), **options))
+
+
+def engineering(peak: float, unit: str, least: float = 1.0) -> tuple[float, str]:
+    """Factor and unit that bring `peak` to at least `least` and under 1000 of it: (1e3, "ms") for 0.05 s."""
+    size = abs(peak) / least
+    if not np.isfinite(size) or size == 0.0:
+        return 1.0, unit
+    power = int(np.clip(3 * np.floor(np.log10(size * (1.0 + 1e-12)) / 3.0), -12, 9))
+    return 10.0**-power, _PREFIXES[power] + unit
+
+
+def thin(t: FloatArray, x: FloatArray, bins: int = MAX_BINS) -> tuple[FloatArray, FloatArray]:
+    """The same curve to the eye in at most about 4 points per bin: first, last, least and largest of each.
+
+    Parameters
+    ----------
+    t, x : ndarray, shape (n,)
+    bins : int
+        More than there are dots across the page.
+    """
+    width = t.size // bins
+    if width < 8:
+        return t, x
+    blocks = x[: width * bins].reshape(bins, width)
+    start = width * np.arange(bins)
+    tail = np.arange(width * bins, t.size)
+    ends = (start, start + width - 1, start + blocks.argmin(1), start + blocks.argmax(1))
+    keep = np.unique(np.concatenate([*ends, tail]))
+    return t[keep], x[keep]
+
+
+def peak_of(values: FloatArray) -> float:
+    """Largest size, 0 of nothing."""
+    return float(np.abs(values).max(initial=0.0))
+
+
+def from_zero(ax: Axes) -> None:
+    """A scale from 0, so that ripple is seen at its size."""
+    top = ax.get_ylim()[1]
+    ax.set_ylim(0.0, top if top > 0.0 else 1.0)
+
+
+def flat(ax: Axes, values: FloatArray) -> None:
+    """A constant is shown as one, not its rounding."""
+    if values.any() and np.ptp(values) <= 1e-6 * peak_of(values):
+        ax.set_ylim(0.95 * values.flat[0], 1.05 * values.flat[0])

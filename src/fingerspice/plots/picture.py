@@ -1,0 +1,66 @@
+"""The figure that the package draws on: it shows itself in a notebook, and in a window where there is one."""
+
+from __future__ import annotations
+
+import io
+import sys
+from typing import Any
+
+from matplotlib.backend_bases import FigureManagerBase
+from matplotlib.figure import Figure
+
+from fingerspice.base.errors import InputError
+
+#: Dots an inch of what a notebook shows, and of those how many it makes one of its own.
+_DPI, _SHARPER = 200, 2
+
+
+class Picture(Figure):
+    """A matplotlib figure: save it with ``savefig``, change it as any other, show it with `show`."""
+
+    def _repr_png_(self) -> tuple[bytes, dict[str, Any]]:
+        content = io.BytesIO()
+        self.savefig(content, format="png", dpi=_DPI)
+        width, height = (int(_DPI * x / _SHARPER) for x in self.get_size_inches())
+        return content.getvalue(), {"width": width, "height": height}
+
+    def show(self, warn: bool = True) -> None:
+        """Show the picture: in a notebook under the cell, from a script in a window until that is closed.
+
+        Raises
+        ------
+        InputError
+            Where there is neither.
+        """
+        if _in_notebook():
+            # As IPython is here already, whatever is installed.
+            sys.modules["IPython"].display.display(self)
+            return
+        import matplotlib
+        from matplotlib import pyplot
+        from matplotlib._pylab_helpers import Gcf
+        from matplotlib.backends.registry import backend_registry
+
+        backend = matplotlib.get_backend()
+        registry: Any = backend_registry
+        canvas = registry.load_backend_module(backend).FigureCanvas
+        if not _opens(canvas.manager_class):
+            raise InputError(
+                f"no window can be opened here (matplotlib's backend is {backend}); allowed: savefig('picture.png')"
+            )
+        # As pyplot does it: no public way leads from a figure to a window.
+        manager = canvas.new_manager(self, max(pyplot.get_fignums(), default=0) + 1)
+        Gcf._set_new_active_manager(manager)
+        pyplot.show()
+
+
+def _in_notebook() -> bool:
+    interactive = sys.modules.get("IPython")
+    shell = interactive.get_ipython() if interactive is not None else None
+    return shell is not None and hasattr(shell, "kernel")
+
+
+def _opens(manager: Any) -> bool:
+    """Whether a backend's manager has a window of its own."""
+    own = ("pyplot_show", "start_main_loop")
+    return any(getattr(manager, name).__func__ is not getattr(FigureManagerBase, name).__func__ for name in own)

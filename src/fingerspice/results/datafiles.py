@@ -1,0 +1,143 @@
+"""A solution as files and tables: CSV, NetCDF, xarray, pandas."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.files import write_aside, write_pieces
+from fingerspice.results.signals import SIGNALS
+from fingerspice.waveforms.waveform import require
+
+if TYPE_CHECKING:
+    import pandas
+
+    from fingerspice.results.solution import Solution
+
+#: Of a file, what besides its variables makes a run of it, and how that is written.
+GROUP, FORMAT = "fingerspice", 1
+
+# Dimensions, values, attributes: what both xarray and NetCDF take.
+Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]
+
+
+def write_csv(solution: Solution, path: Path) -> Path:
+    """Write every signal as CSV, names and units in the header; both rows of a jump are kept."""
+    signals = solution.signals
+    header = ["t [s]", *(f"{name} [{unit}]" for name, (_, unit, _) in signals.items())]
+    table = np.column_stack([solution.t, *(value for value, _, _ in signals.values())])
+
+    def write(target: Path) -> None:
+        with target.open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(header)
+            writer.writerows([repr(float(x)) for x in row] for row in table)
+
+    return write_aside(path, write)
+
+
+def _kept(solution: Solution, jumps: str) -> NDArray[np.bool_]:
+    """Which rows are written, shape (n_t,)."""
+    require(jumps in ("right", "both"), "jumps", repr(jumps), "'right' or 'both'")
+    keep = np.ones(solution.t.size, bool)
+    if jumps == "right" and solution.t.size:
+        keep[:-1] = np.diff(solution.t) > 0.0
+    return keep
+
+
+def variables(solution: Solution, keep: NDArray[np.bool_]) -> tuple[dict[str, Variable], dict[str, Variable]]:
+    """Variables and coordinates of the data files, of the rows to keep."""
+    signals = solution.all_signals
+    data: dict[str, Variable] = {}
+    coords: dict[str, Variable] = {"time": (("time",), solution.t[keep], {"units": "s", "long_name": "time"})}
+    for key, (unit, text) in SIGNALS.items():
+        names = signals.names(key)
+        several = key in ("u_layer", "v")
+        if not names and not several:
+            continue
+        columns = [signals.one(name)[keep] for name in names]
+        if several or len(names) > 1:
+            dimension = {"u_layer": "layer", "v": "node"}.get(key, "source" if key.endswith("_source") else "gap")
+            coords[dimension] = ((dimension,), np.array(signals.columns(key), dtype=object), {})
+            values = np.column_stack(columns) if columns else np.zeros((int(keep.sum()), 0))
+            data[key] = (("time", dimension), values, {"units": unit, "long_name": text})
+        else:
+            data[key] = (("time",), columns[0], {"units": unit, "long_name": text})
+    return data, coords
+
+
+def dataset(solution: Solution, jumps: str) -> tuple[dict[str, Variable], dict[str, Variable]]:
+    """Variables and coordinates for xarray."""
+    return variables(solution, _kept(solution, jumps))
+
+
+def to_dataframe(solution: Solution, jumps: str) -> pandas.DataFrame:
+    """Every signal as a column, a row for each time."""
+    import pandas
+
+    keep = _kept(solution, jumps)
+    index = pandas.Index(solution.t[keep], name="time")
+    return pandas.DataFrame({name: x[keep] for name, (x, _, _) in solution.signals.items()}, index=index)
+
+
+def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
+    """Write the variables as a NetCDF file, and in a group of their own what else `load` needs."""
+    import h5netcdf
+
+    keep = _kept(solution, jumps)
+
+    def write(target: Path) -> None:
+        # HDF5 ends the process where the disk is full, so it gets to see memory only.
+        content = io.BytesIO()
+        with h5netcdf.File(content, "w") as file:
+            _fill(file, *variables(solution, keep))
+            for key, text in solution.provenance().items():
+                file.attrs[key] = text
+            group = file.create_group(GROUP)
+            group.attrs["run"] = json.dumps(_run(solution))
+            if not keep.all():
+                # The rows before jumps, which other readers need not meet: as one table, for variables take time.
+                group.dimensions["jump"] = int(np.count_nonzero(~keep))
+                group.dimensions["signal"] = 1 + len(solution.signals)
+                rows = [np.flatnonzero(~keep), *(x[~keep] for x, _, _ in solution.signals.values())]
+                group.create_variable("before", ("jump", "signal"), dtype=float, data=np.column_stack(rows))
+        write_pieces(target, content.getbuffer())
+
+    return write_aside(path, write)
+
+
+def _fill(file: Any, data: dict[str, Variable], coords: dict[str, Variable]) -> None:
+    import h5py
+
+    for name, (_, values, _) in coords.items():
+        file.dimensions[name] = values.size
+    for name, (dimensions, values, attributes) in {**coords, **data}.items():
+        kind = h5py.string_dtype() if values.dtype == object else values.dtype
+        variable = file.create_variable(name, dimensions, dtype=kind, data=values)
+        variable.attrs.update(attributes)
+
+
+def _run(solution: Solution) -> dict[str, Any]:
+    """What a run is besides its signals, as plain data."""
+    state = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(solution.state).items()}
+    fundamental = solution.fundamental
+    return {
+        "format": FORMAT, "nfev": int(solution.nfev), "error": vars(solution.error), "rtol": solution.rtol,
+        # The same run is the same file: not how long it took.
+        "stats": {k: v for k, v in solution.stats.items() if isinstance(v, (int, float, str)) and k != "wall_s"},
+        "charge_law": solution.charge_law, "area_mode": solution.area_mode, "method": solution.method,
+        "plan": solution.plan.to_dict(), "status": solution.status.name,
+        "failure": None if solution.failure is None else solution.failure.to_dict(),
+        "fundamental": None if fundamental is None else vars(fundamental), "period": solution.period,
+        "fold_margin_min": solution.fold_margin_min, "warnings": list(solution.warnings), "first": solution.first,
+        "t_stop": solution.t_stop, "sources": list(solution.sources),
+        "signals": list(solution.signals),
+        "contacts": [[name, vars(contact)] for name, contact in solution.record.fingers],
+        "overrides": dict(solution.circuit.overrides), "state": state, "summary": solution.summary(),
+    }  # fmt: skip

@@ -1,0 +1,204 @@
+"""What a network's run wrote down, and every signal that follows; `Record` is the same for a series stack."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.circuit.network import Network
+from fingerspice.engine.network import Net
+from fingerspice.physics.contact import Contact, areas, inverse_area_array
+from fingerspice.results.record import Sealed, sealed, sided
+from fingerspice.waveforms.waveform import Waveform
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkRecord(Sealed):
+    """Outputs of a network's run as they were computed, and what they mean.
+
+    Signals of fingers and sources have the shape (n_t,) where there is one of them, else (n_t, n).
+
+    Attributes
+    ----------
+    network : Network
+    net : Net
+    waveforms : tuple of Waveform
+        Of each source.
+    t : ndarray, shape (n_t,)
+        s; at a jump two entries share a time.
+    left : ndarray of bool, shape (n_t,)
+        Whether the left-hand value at a jump is meant.
+    rows : ndarray, shape (n_t, size)
+        The state as in `engine.network`, then, with `has_charge`, the sources' currents.
+    has_charge : bool
+    """
+
+    network: Network
+    net: Net
+    waveforms: tuple[Waveform, ...]
+    t: FloatArray
+    left: BoolArray
+    rows: FloatArray
+    has_charge: bool
+
+    def __post_init__(self) -> None:
+        for array in (self.t, self.left, self.rows):
+            array.flags.writeable = False
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the layers, in the order of `u_layer`."""
+        return tuple(e.name for e in self.network.layers)
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the sources, in the order of the columns of what belongs to them."""
+        return tuple(e.name for e in self.network.sources)
+
+    @cached_property
+    def fingers(self) -> tuple[tuple[str, Contact], ...]:
+        """Each GAP's name and contact."""
+        found = []
+        for i in self.network.fingers:
+            contact, gap = self.network.contacts[i], self.network.areas[i].gap
+            assert contact is not None
+            assert gap is not None
+            found.append((gap.name, contact))
+        return tuple(found)
+
+    @cached_property
+    def _x(self) -> FloatArray:
+        return self.rows[:, : self.network.k.shape[0]]
+
+    @cached_property
+    def _s(self) -> FloatArray:
+        """Values of the sources, V or A, shape (n_t, n_s)."""
+        return np.column_stack([sided(wave, self.t, self.left) for wave in self.waveforms])
+
+    def cell_voltage(self, cell: int) -> FloatArray:
+        """Voltage of a cell from p to n, V, shape (n_t,)."""
+        # Not by BLAS, whose threads may round otherwise.
+        return np.asarray((self._x * self.network.p[cell]).sum(1) + (self._s * self.network.q[cell]).sum(1))
+
+    def finger_voltage(self, finger: int) -> FloatArray:
+        """Gap voltage of a finger, V, shape (n_t,)."""
+        gap = self.network.gaps[self.network.fingers[finger]]
+        assert gap is not None
+        return self.cell_voltage(gap)
+
+    def _area_of(self, i: int) -> FloatArray:
+        if self.net.slow[i] >= 0:
+            return np.asarray(self.rows[:, self._x.shape[1] + int(self.net.slow[i])] * self.net.area0[i])
+        if self.net.gap[i] < 0:
+            return np.full(self.t.size, self.net.area0[i])
+        return areas(self.cell_voltage(int(self.net.gap[i])), self.net.curves[i])
+
+    def finger_area(self, finger: int) -> FloatArray:
+        """Contact area of a finger, m^2, shape (n_t,)."""
+        return self._area_of(self.network.fingers[finger])
+
+    def finger_force(self, finger: int) -> FloatArray:
+        """Electroadhesive force (Eq. 2 times A_R) of a finger, N, shape (n_t,)."""
+        _, contact = self.fingers[finger]
+        stress = contact.stress(self.finger_voltage(finger))
+        return np.asarray(stress * self.finger_area(finger))
+
+    @cached_property
+    def u_source(self) -> FloatArray:
+        """Voltage of each source, V: of a V from p to n, of an I from n to p, as it drives."""
+        n_v = self.network.n_voltage
+        out = self._s.copy()
+        if n_v < out.shape[1]:
+            for j, element in enumerate(self.network.sources[n_v:]):
+                ends = [self._at_node(node) for node in element.nodes[:2]]
+                out[:, n_v + j] = ends[1] - ends[0]
+        return _columns(out)
+
+    def _at_node(self, node: str) -> FloatArray:
+        for name, row in zip(self.network.node_names, self.network.nodes, strict=True):
+            if name.lower() == node:
+                n = self._x.shape[1]
+                return np.asarray((self._x * row[:n]).sum(1) + (self._s * row[n:]).sum(1))
+        return np.zeros(self.t.size)
+
+    @cached_property
+    def u_layer(self) -> FloatArray:
+        """Layer voltages from p to n, V, shape (n_t, n_layer)."""
+        cells = np.column_stack(
+            [np.zeros((self.t.size, 0)), *(self.cell_voltage(i) for i in range(len(self.network.cells)))]
+        )
+        return sealed(np.einsum("tc,lc->tl", cells, self.network.grouping))
+
+    @cached_property
+    def u_gap(self) -> FloatArray:
+        """Gap voltage, V."""
+        return _columns(np.column_stack([self.finger_voltage(i) for i in range(len(self.fingers))]))
+
+    @cached_property
+    def area(self) -> FloatArray | None:
+        """Contact area, m^2: the fingers', or without one the circuit's first; None where nothing has an area."""
+        shown = self.network.fingers or ((0,) if self.network.areas else ())
+        return _columns(np.column_stack([self._area_of(i) for i in shown])) if shown else None
+
+    @cached_property
+    def force(self) -> FloatArray:
+        """Electroadhesive force, N."""
+        return _columns(np.column_stack([self.finger_force(i) for i in range(len(self.fingers))]))
+
+    @cached_property
+    def charge(self) -> FloatArray | None:
+        """Charge that each source has delivered out of its p node, or an I out of its n node, C."""
+        n_s = len(self.network.sources)
+        end = self.rows.shape[1] - n_s
+        return _columns(self.rows[:, end - n_s : end].copy()) if self.has_charge else None
+
+    @cached_property
+    def current(self) -> FloatArray | None:
+        """Regular part of each source's current out of that node, A."""
+        return _columns(self.rows[:, -len(self.network.sources) :].copy()) if self.has_charge else None
+
+    @cached_property
+    def fold_margin(self) -> FloatArray:
+        """Distance to the fold of the `mobile` law, 1 where no area feels a voltage, shape (n_t,).
+
+        The determinant of the capacitances that small changes meet, over that with every area held.
+        """
+        net, n = self.net, self._x.shape[1]
+        out = np.ones(self.t.size)
+        if not net.mobile or not np.any((net.gap >= 0) & (net.slow < 0)):
+            return sealed(out)
+        area = np.column_stack([self._area_of(i) for i in range(net.gap.size)])
+        held, met = np.zeros((2, self.t.size, n, n))
+        for cell in range(net.c.size):
+            i, row = int(net.place[cell]), net.p[cell]
+            own = net.c[cell] * (np.ones(self.t.size) if i < 0 else area[:, i])
+            held += own[:, None, None] * np.outer(row, row)
+            if i >= 0 and net.gap[i] >= 0 and net.slow[i] < 0:
+                u = self.cell_voltage(int(net.gap[i]))
+                inverse, slope = inverse_area_array(np.abs(u), net.curves[i])
+                cross = net.c[cell] * self.cell_voltage(cell) * -np.sign(u) * slope / inverse**2
+                met += cross[:, None, None] * np.outer(row, net.p[net.gap[i]])
+        return sealed(np.linalg.det(held + met) / np.linalg.det(held))
+
+    @cached_property
+    def node_voltages(self) -> dict[str, FloatArray]:
+        """Voltage of every node against ground, V, shape (n_t,) each."""
+        return {name: sealed(self._at_node(name.lower())) for name in self.network.node_names}
+
+
+def _columns(x: FloatArray) -> FloatArray:
+    """A single column as one row of numbers."""
+    return sealed(np.ascontiguousarray(x[:, 0]) if x.shape[1] == 1 else x)
+
+
+def bare_record(
+    network: Network, net: Net, waveforms: tuple[Waveform, ...], t: FloatArray, left: BoolArray, rows: FloatArray
+) -> NetworkRecord:  # fmt: skip
+    """A record without charge, of rows of voltages and slow areas as columns (size, n_t)."""
+    return NetworkRecord(network, net, waveforms, t, left, np.ascontiguousarray(rows.T), False)

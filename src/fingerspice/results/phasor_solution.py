@@ -1,0 +1,80 @@
+"""The result of a sweep of phasors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.pages import Page, Shown
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.waveforms.waveform import require
+
+if TYPE_CHECKING:
+    from fingerspice.plots.picture import Picture
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, repr=False)
+class PhasorSolution(Shown):
+    """Phasors against frequency; arrays of shape (n_frequency,).
+
+    Attributes
+    ----------
+    frequency : ndarray
+        Hz.
+    gain : ndarray of complex
+        u_gap / source: modulus is Eq. 11, angle Eq. 13 (V/A for a current source).
+    layer_gain : ndarray of complex, shape (n_frequency, n_layer)
+        The same for every layer.
+    u_gap : ndarray of complex
+        Gap voltage amplitude with the source's phase, V (NaN for a source without fundamental or AC).
+    area : ndarray
+        Ridge contact area, m^2.
+    f_el_mean : ndarray
+        Mean electroadhesive force, N.
+    amplitude : float
+        Source amplitude, V (A of a current source).
+    layers : tuple of str
+    phase : float
+        Of the source, rad.
+    drive : str
+        What the amplitude and the phase are those of.
+    notes : tuple of str
+        How the sweep was made where a deck may mean it otherwise.
+    warnings : tuple of str
+        Where it leaves what is known.
+    circuit : Circuit or None
+        It was made of.
+    """
+
+    frequency: FloatArray
+    gain: ComplexArray
+    layer_gain: ComplexArray
+    u_gap: ComplexArray
+    area: FloatArray
+    f_el_mean: FloatArray
+    amplitude: float
+    layers: tuple[str, ...]
+    phase: float = 0.0
+    drive: str = ""
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    circuit: Circuit | None = None
+
+    def _page(self) -> Page:
+        from fingerspice.results.report import phasor_table
+
+        return phasor_table(self, most=20)
+
+    def plot(self) -> Picture:
+        """Gain, phase, mean force and area against frequency."""
+        from fingerspice.plots.plotting import plot_phasor
+
+        require(self.circuit is not None, "circuit", self.circuit, "a sweep that phasor or large_signal made")
+        assert self.circuit is not None
+        return plot_phasor((self,), self.circuit)

@@ -1,0 +1,168 @@
+"""A run in closed form between its outputs: looked at where its signals are not yet known from their neighbours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS, TO_SERIES
+from fingerspice.results.measures import Panels, Read
+from fingerspice.results.network_record import NetworkRecord
+from fingerspice.results.record import Record
+from fingerspice.waveforms.waveform import Waveform
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+#: What the polynomial of a panel may miss between its nodes, over the signal's peak.
+_MISSED = 1e-11
+#: Panels at most: of a longer run figures rest on its outputs. And halvings of one.
+MOST_PANELS, _MOST_ROUNDS = 20_000, 60
+#: Segments of the source that a look may have to pass, and the first panels over the source's shortest time.
+_MOST_PASSED, _LONGEST = 200_000, 0.5
+
+
+@dataclass(frozen=True)
+class ClosedForm:
+    """A run that can be looked at at any time.
+
+    Attributes
+    ----------
+    look : callable
+        From times (s, ascending) and whether the left-hand value is meant to a record.
+    waveform : Waveform
+        The sources', all together.
+    t_start, first, stop : float
+        Where the run starts, and what figures are taken of, s.
+    """
+
+    look: Callable[[FloatArray, BoolArray], Record | NetworkRecord]
+    waveform: Waveform
+    t_start: float
+    first: float
+    stop: float
+
+    def run(self, readers: Callable[[], Mapping[str, Read]], since: float, until: float) -> Refined | None:
+        """Panels between two times (s) on which every voltage is a polynomial; None where they would be too many.
+
+        `readers` gives every signal that figures may be asked of by name.
+        """
+        every = readers()
+        longest = _LONGEST * self.waveform.shortest_time()
+        rate = self.waveform.breakpoint_rate() + 1.0 / longest
+        # Each look goes through the run from its start.
+        if (until - since) * rate > MOST_PANELS or (until - self.t_start) * rate > _MOST_PASSED:
+            return None
+        inner = self.waveform.breakpoints(since, until)
+        edges = np.unique(np.concatenate([[since], inner[(inner > since) & (inner < until)], [until]]))
+        pieces = np.maximum(np.ceil(np.diff(edges) / longest), 1.0)
+        if pieces.sum() > MOST_PANELS:
+            return None
+        cuts = [np.linspace(a, b, int(n) + 1)[:-1] for a, b, n in zip(edges, edges[1:], pieces, strict=False)]
+        marks = np.concatenate([*cuts, edges[-1:]])
+        begin, end = marks[:-1], marks[1:]
+        done: list[tuple[FloatArray, FloatArray]] = []
+        peaks: dict[str, float] = {}
+        for _ in range(_MOST_ROUNDS):
+            wrong = self._is_rough(every, begin, end, peaks)
+            done.append((begin[~wrong], end[~wrong]))
+            if not wrong.any():
+                break
+            middle = 0.5 * (begin[wrong] + end[wrong])
+            begin, end = np.sort(np.append(begin[wrong], middle)), np.sort(np.append(middle, end[wrong]))
+            if begin.size + sum(x.size for x, _ in done) > MOST_PANELS:
+                return None
+        begin, end = (np.sort(np.concatenate(x)) for x in zip(*done, strict=True))
+        return self._cut_at_zeros(every, Refined(self.look, begin, end))
+
+    def _is_rough(
+        self, readers: Mapping[str, Read], begin: FloatArray, end: FloatArray, peaks: dict[str, float]
+    ) -> BoolArray:
+        """Whether a polynomial through the nodes misses some voltage between them."""
+        every = Refined(self.look, begin, end)
+        wrong = np.zeros(begin.size, bool)
+        for name, read in readers.items():
+            if not name.startswith(("u_", "v:")):
+                # What follows from the gap voltage is smooth where that is, but at its zeros.
+                continue
+            _, values = every.at_own_points(read)
+            peaks[name] = max(peaks.get(name, 0.0), float(np.abs(values).max(initial=0.0)))
+            missed = np.abs(values[:, :NODES] @ BETWEEN - values[:, NODES:]).max(axis=1)
+            wrong |= missed > _MISSED * peaks[name]
+        return wrong & (0.5 * (begin + end) > begin) & (0.5 * (begin + end) < end)
+
+    def _cut_at_zeros(self, readers: Mapping[str, Read], run: Refined) -> Refined:
+        """The panels cut where a gap voltage is zero: the area has a kink there."""
+        zeros = []
+        for name, read in readers.items():
+            if name.partition(":")[0] != "u_gap":
+                continue
+            values = run.at_own_points(read)[1][:, :NODES]
+            for i in np.flatnonzero((values.max(axis=1) > 0.0) & (values.min(axis=1) < 0.0)):
+                roots = chebyshev.chebroots(values[i] @ TO_SERIES[:, :NODES])
+                inside = roots.real[(np.abs(roots.imag) < 1e-8) & (np.abs(roots.real) < 1.0)]
+                zeros.append(run.begin[i] + (run.end[i] - run.begin[i]) * 0.5 * (1.0 + inside))
+        if not zeros:
+            return run
+        marks = np.unique(np.concatenate([run.begin, run.end[-1:], *zeros]))
+        return Refined(self.look, marks[:-1], marks[1:])
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Panels of a run in closed form, one behind the other; see `measures.Run`."""
+
+    look: Callable[[FloatArray, BoolArray], Record | NetworkRecord]
+    begin: FloatArray
+    end: FloatArray
+
+    def panels(self, since: float, until: float) -> Panels:
+        """The panels between two times, s, cut at them."""
+        length = self.end - self.begin
+        low = np.maximum((since - self.begin) / length, 0.0)
+        high = np.minimum((until - self.begin) / length, 1.0)
+        some = np.flatnonzero(high > low)
+        return Panels(some, low[some], high[some], (high - low)[some] * length[some])
+
+    @cached_property
+    def _own(self) -> tuple[FloatArray, IntArray, Record | NetworkRecord]:
+        """Times of all panels at their points (p, ROWS), in which order they ascend, and the record at them so."""
+        return self._looked_at(slice(None), np.broadcast_to(POINTS, (self.begin.size, POINTS.size)))
+
+    def _looked_at(
+        self, index: IntArray | slice, fraction: FloatArray
+    ) -> tuple[FloatArray, IntArray, Record | NetworkRecord]:
+        begin, end = self.begin[index, None], self.end[index, None]
+        left = fraction >= 1.0
+        t = np.where(left, end, begin + fraction * (end - begin))
+        order = np.lexsort((~left.ravel(), t.ravel()))
+        return t, order, self.look(t.ravel()[order], left.ravel()[order])
+
+    def at_own_points(self, read: Read) -> tuple[FloatArray, FloatArray]:
+        """Times (s) and a signal at the points of every panel, shape (p, ROWS) each."""
+        return _in_place(read, *self._own)
+
+    def at_points(self, read: Read, panels: Panels) -> tuple[FloatArray, FloatArray]:
+        """As `measures.Run` says."""
+        if panels.step.size == self.begin.size and not panels.low.any() and (panels.high == 1.0).all():
+            return self.at_own_points(read)
+        return self.values_at(read, panels.step, panels.fractions(POINTS))
+
+    def values_at(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As `measures.Run` says, by looking."""
+        return _in_place(read, *self._looked_at(index, fraction))
+
+
+def _in_place(
+    read: Read, t: FloatArray, order: IntArray, record: Record | NetworkRecord
+) -> tuple[FloatArray, FloatArray]:
+    """Times, and a signal of a record of them in ascending order, where each belongs."""
+    x = np.empty(t.size)
+    x[order] = read(record)
+    return t, x.reshape(t.shape)

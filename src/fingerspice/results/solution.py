@@ -1,0 +1,358 @@
+"""The result of a run: read-only arrays with their status, error and provenance."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.pages import Page, Shown
+from fingerspice.results.datafiles import dataset, to_dataframe, write_csv, write_netcdf
+from fingerspice.results.outcome import ErrorEstimate, Failure, NetworkState, State, Status
+from fingerspice.results.record import Sealed, sealed
+from fingerspice.results.signals import SIGNALS, AnyRecord, Signals
+from fingerspice.results.summary import Figured, Figures, KeptFigures
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    import pandas
+    import xarray
+
+    from fingerspice.circuit.circuit import Circuit
+    from fingerspice.plots.picture import Picture
+    from fingerspice.results.plan import Plan
+    from fingerspice.results.refined import ClosedForm
+    from fingerspice.results.steps import Recorded
+    from fingerspice.waveforms.waveform import Fundamental
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, repr=False)
+class Solution(Sealed, Shown, Figured):
+    """Time response of a circuit.
+
+    Signals are read-only arrays in SI units, computed when first asked for; at a jump of the source two rows share a
+    time. Where a circuit has several GAPs, what belongs to them (`u_gap`, `area`, `sigma_el`, `f_el`, `f_t`,
+    `friction`) has the shape (n_t, n_gap), in the order of `gaps`; likewise `u_source`, `q_source` and `i_source` with
+    several sources of a network, in the order of `sources`.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n_t,)
+        s.
+    record : Record, NetworkRecord or StoredRecord
+        What the run wrote down.
+    status : Status
+    failure : Failure or None
+        Why, when and where the run failed, and what to do.
+    nfev : int
+        Evaluations of the right-hand side.
+    stats : dict
+        Steps, rejections, zeros met, method, wall time.
+    error : ErrorEstimate
+    rtol : float
+        Error asked for, relative to the peaks.
+    charge_law, area_mode, method : str
+    plan : Plan
+        Which model was run, and why.
+    circuit : Circuit
+    state : State
+    first, t_stop : float
+        TSTART and the end of the run, s.
+    continuous : Recorded or ClosedForm or None
+        The run between its outputs, where that is known.
+    stored : mapping or None
+        The summary, where the run was read from a file.
+    """
+
+    t: FloatArray
+    record: AnyRecord
+    status: Status
+    failure: Failure | None
+    nfev: int
+    stats: dict[str, Any]
+    error: ErrorEstimate
+    rtol: float
+    charge_law: str
+    area_mode: str
+    method: str
+    plan: Plan
+    circuit: Circuit
+    state: State | NetworkState
+    fundamental: Fundamental | None = None
+    period: float | None = None
+    fold_margin_min: float = 1.0
+    warnings: tuple[str, ...] = field(default=())
+    first: float = 0.0
+    t_stop: float = 0.0
+    continuous: Recorded | ClosedForm | None = None
+    stored: Mapping[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        sealed(self.t)
+
+    def _page(self) -> Page:
+        from fingerspice.results.report import summary_table
+
+        return summary_table(self)
+
+    @cached_property
+    def all_signals(self) -> Signals:
+        """The signals by name, with what their columns belong to."""
+        return Signals(self.record)
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the columns of `u_layer`."""
+        return self.record.layers
+
+    @property
+    def gaps(self) -> tuple[str, ...]:
+        """Names of the GAPs."""
+        return self.all_signals.gaps
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the sources of a network; a series stack has one loop."""
+        return self.record.sources
+
+    @property
+    def u_source(self) -> FloatArray:
+        """Voltage around the loop, V, shape (n_t,)."""
+        return self.record.u_source
+
+    @property
+    def u_layer(self) -> FloatArray:
+        """Voltage of each layer from its p to its n node, V, shape (n_t, n_layer)."""
+        return self.record.u_layer
+
+    @property
+    def node_voltages(self) -> dict[str, FloatArray]:
+        """Node name to its voltage, V, shape (n_t,)."""
+        return self.record.node_voltages
+
+    @property
+    def area(self) -> FloatArray | None:
+        """Ridge contact area, m^2, shape (n_t,); None for a circuit without any."""
+        return self.record.area
+
+    @property
+    def q_source(self) -> FloatArray | None:
+        """Charge delivered by the source since the start, C, shape (n_t,); a jump adds its integral of A dD.
+
+        None where the run was asked to leave it out.
+        """
+        return self.record.charge
+
+    @property
+    def i_source(self) -> FloatArray | None:
+        """Regular part of the source's current, A, shape (n_t,); a jump is an impulse, seen in `q_source` only."""
+        return self.record.current
+
+    @property
+    def fold_margin(self) -> FloatArray:
+        """Distance to the fold of the `mobile` law: 1 without stored charge, 0 at the fold; 1 under `local`."""
+        return self.record.fold_margin
+
+    @property
+    def u_gap(self) -> FloatArray | None:
+        """Gap voltage, V, shape (n_t,); None for a circuit without GAP."""
+        return self.all_signals.u_gap
+
+    @property
+    def sigma_el(self) -> FloatArray | None:
+        """Electroadhesive stress (Eq. 2), Pa, shape (n_t,); None for a circuit without GAP."""
+        return self.all_signals.sigma_el
+
+    @property
+    def f_el(self) -> FloatArray | None:
+        """Electroadhesive force, N, shape (n_t,); None for a circuit without GAP.
+
+        Its mean is `f_el_mean`, and over the last period `f_el_mean_periodic`: ``f_el.mean()`` weighs every output
+        alike, both ends of a period and both rows of a jump included, and is some per cent off at 50 to 200 outputs a
+        period.
+        """
+        return self.all_signals.f_el
+
+    @property
+    def f_t(self) -> FloatArray | None:
+        """Friction force (Eq. 1), N, shape (n_t,); None for a circuit without GAP."""
+        return self.all_signals.f_t
+
+    @property
+    def friction(self) -> FloatArray | None:
+        """Friction coefficient f_t / f_n, shape (n_t,); None for a circuit without GAP."""
+        return self.all_signals.friction
+
+    def by_name(self, key: str) -> dict[str, FloatArray]:
+        """A signal under its name, or the columns of several elements under ``name:element``.
+
+        Raises
+        ------
+        InputError
+            For a name that no signal has.
+        """
+        return {name: self.all_signals.one(name) for name in self.all_signals.names(key)}
+
+    @property
+    def message(self) -> str:
+        """How the run ended, in words."""
+        return self.status.cause if self.failure is None else str(self.failure)
+
+    @property
+    def success(self) -> bool:
+        """Whether the run reached its end with the error met."""
+        return self.status is Status.SUCCESS
+
+    @property
+    def signals(self) -> dict[str, tuple[FloatArray, str, str]]:
+        """Every time series by name: values (n_t,), unit, long name."""
+        out: dict[str, tuple[FloatArray, str, str]] = {}
+        for key, (unit, text) in SIGNALS.items():
+            for name, value in self.by_name(key).items():
+                element = name.partition(":")[2]
+                said = {"u_layer": f"voltage of {element}", "v": f"voltage of node {element}"}.get(key, text)
+                out[name] = value, unit, said
+        return out
+
+    @cached_property
+    def _figures(self) -> Figures | KeptFigures:
+        return Figures(self) if self.stored is None else KeptFigures(self.all_signals, self.stored)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in vars(self).items() if key not in ("_figures", "all_signals", "_summary")}
+
+    def summary(self) -> dict[str, Any]:
+        """Figures of the run: peak, rms, mean, ripple, amplitude and phase at the fundamental; SI units.
+
+        They are those of the run itself, from TSTART to its end, whatever outputs were asked for: ``figures_from`` is
+        ``"steps"``. Where the run between its outputs is not known, because another method or a failed run made them or
+        because it is too long, it is ``"outputs"``: means are integrals of cubics through the outputs then, and
+        extremes those of the outputs. `f_el_mean` is over the whole run, `f_el_mean_periodic` over the last period of
+        the source; the entries of a period are None where the run holds none. A circuit without GAP has its layer
+        voltages (``u_layer:Xcoat_max``) in place of gap voltage and forces.
+        """
+        return dict(self._summary)
+
+    @cached_property
+    def _summary(self) -> dict[str, Any]:
+        return self._figures.summary()
+
+    def provenance(self) -> dict[str, str]:
+        """What it takes to repeat the run, as text."""
+        from fingerspice import __version__
+
+        return {
+            "program": f"fingerspice {__version__}",
+            "title": self.circuit.title,
+            "file": str(self.circuit.path or ""),
+            "deck": self.circuit.text,
+            "overrides": json.dumps(dict(self.circuit.overrides)),
+            "charge_law": self.charge_law,
+            "area": self.area_mode,
+            "method": self.method,
+            "rtol": repr(self.rtol),
+            "error_u_gap_V": repr(self.error.u_gap),
+            "error_f_el_N": repr(self.error.f_el),
+            "error_q_source_C": repr(self.error.q_source),
+            "status": self.status.name,
+            "message": self.message,
+        }
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write every signal as CSV, names and units in the header; both rows of a jump are kept.
+
+        Raises
+        ------
+        InputError
+            Where the folder cannot be written.
+        """
+        return write_csv(self, Path(path))
+
+    def to_xarray(self, *, jumps: str = "right") -> xarray.Dataset:
+        """The run as an xarray Dataset with units and provenance.
+
+        Where a circuit has several GAPs, what belongs to them has the dimension ``gap`` beside ``time``, and signals of
+        several sources ``source``; layer voltages have ``layer`` and node voltages ``node``.
+
+        Parameters
+        ----------
+        jumps : str
+            ``"right"``: times are unique, with the right-hand value at a jump; ``"both"``: as in the arrays.
+
+        Raises
+        ------
+        InputError
+            For another value of `jumps`.
+        """
+        import xarray
+
+        data, coords = dataset(self, jumps)
+        return xarray.Dataset(data, coords=coords, attrs=self.provenance())
+
+    def to_dataframe(self, *, jumps: str = "right") -> pandas.DataFrame:
+        """The run as a pandas DataFrame: a row for each time (s, the index), a column for each of `signals`.
+
+        Parameters
+        ----------
+        jumps : str
+            As in `to_xarray`.
+
+        Raises
+        ------
+        InputError
+            For another value of `jumps`.
+        """
+        return to_dataframe(self, jumps)
+
+    def to_netcdf(self, path: str | Path, *, jumps: str = "right") -> Path:
+        """Write `to_xarray` as a NetCDF file, without the cost of loading xarray; `fs.load` reads it back.
+
+        Raises
+        ------
+        InputError
+            Where the folder cannot be written, or for another value of `jumps`.
+        """
+        return write_netcdf(self, Path(path), jumps)
+
+    def plot(
+        self,
+        signals: str | Sequence[str] | None = None,
+        *,
+        window: tuple[float, float] | None = None,
+        others: Solution | Sequence[Solution] | Mapping[str, Solution] = (),
+    ) -> Picture:
+        """Signals against time, as a figure that a notebook shows; from a script ``plot().show()`` opens a window.
+
+        Where the window holds more than about 30 oscillations they are drawn as envelopes, with the last few beside.
+
+        Parameters
+        ----------
+        signals : str or sequence of str, optional
+            Keys of `signals`, such as ``"f_el"``, ``"u_layer:Xcoat"``, or ``"u_layer"`` for all layers; those of one
+            quantity share a panel. By default source and gap voltage, force, area and friction.
+        window : tuple of float, optional
+            Start and end, s; the whole run by default.
+        others : Solution, sequence or mapping of str to Solution, optional
+            Runs to lay over this one; without names they are called by what sets them apart.
+
+        Returns
+        -------
+        Picture
+            A matplotlib Figure: ``savefig("x.pdf")`` saves it.
+
+        Raises
+        ------
+        InputError
+            For an unknown signal, or a window without outputs.
+        """
+        from fingerspice.plots.traces import plot_solution
+
+        return plot_solution(self, signals, window, others)

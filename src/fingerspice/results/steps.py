@@ -1,0 +1,245 @@
+"""A run between its outputs: the steps that were taken, and how many periods each of them stands for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from fingerspice.engine.readout import RECORDED, Steps, new_steps
+from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS
+from fingerspice.results.measures import Panels, Read
+from fingerspice.results.network_record import NetworkRecord
+from fingerspice.results.record import Record
+from fingerspice.waveforms.sampling import same_time
+
+AnyRecord = Record | NetworkRecord
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+#: Steps recorded between two looks from Python, and numbers at the nodes of all of them, at most.
+CAPACITY, _AT_ONCE = 512, 16_384
+#: Numbers kept of a run's steps (64 MB): of a longer run figures rest on its outputs.
+MOST_NUMBERS = 8_000_000
+#: Periods of a leap that differ, at most.
+_MOST_PERIODS = 20_000
+_NODES = POINTS[:NODES]
+#: From Chebyshev coefficients to values at the nodes.
+_FROM_SERIES = chebyshev.chebvander(2.0 * _NODES - 1.0, NODES - 1).T
+
+
+@dataclass(frozen=True)
+class Block:
+    """Steps that follow one another, and the periods they stand for.
+
+    Attributes
+    ----------
+    times : ndarray, shape (k, 4)
+        Start and length of each step, the end reached (s), and which fraction of the length that is.
+    values : ndarray, shape (k, n_column, NODES)
+        At the nodes of the whole length.
+    count : int
+        Periods that are alike, these steps' own included or not (see `shift`).
+    shift, period : float
+        The first of them comes `shift` after the steps' own times, each further one `period` later, s.
+    """
+
+    times: FloatArray
+    values: FloatArray
+    count: int = 1
+    shift: float = 0.0
+    period: float = 0.0
+
+
+@dataclass(frozen=True)
+class Leap:
+    """Periods that follow one another by an affine map: arguments as those of `engine.repeat.approach`."""
+
+    marks: FloatArray
+    marks_by: FloatArray
+    series: FloatArray
+    by: FloatArray
+    slope: FloatArray
+    x: FloatArray
+    end: FloatArray
+    start: FloatArray
+    still: float
+    period: float
+    periods: int
+
+    def blocks(self) -> list[Block] | None:
+        """The periods one by one until they no longer change; None where they do so for too long."""
+        n = self.x.size
+        out: list[Block] = []
+        delta = self.start[:n] - self.x
+        last = None
+        for k in range(self.periods):
+            if last is not None and float(np.abs(delta - last).max(initial=0.0)) <= self.still:
+                moved = self._block(last, k * self.period)
+                out.append(Block(moved.times, moved.values, self.periods - k, moved.shift, self.period))
+                return out
+            if k >= _MOST_PERIODS:
+                return None
+            out.append(self._block(delta, k * self.period))
+            last, delta = delta, self.end[:n] - self.x + self.slope[:n] @ delta
+        return out
+
+    def _block(self, delta: FloatArray, shift: float) -> Block:
+        marks = self.marks + self.marks_by @ delta
+        series = self.series + np.tensordot(delta, self.by, 1)
+        times = np.column_stack([marks[:-1], np.diff(marks), marks[1:], np.ones(marks.size - 1)])
+        return Block(times, series[:, :, :NODES] @ _FROM_SERIES, 1, shift, self.period)
+
+
+@dataclass
+class Recorder:
+    """Takes the steps of one integration, call by call of its loop."""
+
+    columns: int
+    capacity: int = CAPACITY
+    room: Steps = field(init=False)
+    parts: list[Block | Leap] = field(default_factory=list)
+    numbers: int = 0
+    full: bool = False
+
+    def __post_init__(self) -> None:
+        self.room = new_steps(min(self.capacity, 1 + _AT_ONCE // max(self.columns, 1)), self.columns)
+
+    def drain(self, counters: IntArray) -> Block | None:
+        """Take what the loop has recorded; the steps as a block, None where there are none or too many."""
+        count = int(counters[RECORDED])
+        counters[RECORDED] = 0
+        self.numbers += count * self.columns * NODES
+        self.full = self.full or self.numbers > MOST_NUMBERS
+        if self.full:
+            self.parts.clear()
+            return None
+        if count == 0:
+            return None
+        block = Block(self.room.times[:count].copy(), self.room.values[:count].copy())
+        self.parts.append(block)
+        return block
+
+    def repeat(self, since: int, periods: int, period: float) -> None:
+        """Let the blocks from number `since` on stand for whole periods that follow."""
+        for part in self.parts[since:]:
+            if isinstance(part, Block) and periods > 0:
+                self.parts.append(Block(part.times, part.values, periods, period, period))
+
+    def finish(self, first: float, stop: float, make: Callable[..., AnyRecord]) -> Recorded | None:
+        """What was recorded, from `first` to `stop` (s)."""
+        return None if self.full or not self.parts else Recorded(tuple(self.parts), first, stop, make)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Recorded steps; `make` turns times, sides and columns into a record."""
+
+    parts: tuple[Block | Leap, ...]
+    first: float
+    stop: float
+    make: Callable[[FloatArray, BoolArray, FloatArray], AnyRecord]
+
+    def run(self, readers: Callable[[], Mapping[str, Read]], since: float, until: float) -> Stretches | None:
+        """The steps as one array; None where they are too many."""
+        return self._stretches
+
+    @cached_property
+    def _stretches(self) -> Stretches | None:
+        blocks: list[Block] = []
+        for part in self.parts:
+            made = part.blocks() if isinstance(part, Leap) else [part]
+            if made is None:
+                return None
+            blocks += made
+        return Stretches(blocks, self.make)
+
+
+class Stretches:
+    """Steps of a run, and their signals at any fraction of each."""
+
+    def __init__(self, blocks: list[Block], make: Callable[[FloatArray, BoolArray, FloatArray], AnyRecord]) -> None:
+        sizes = [len(b.times) for b in blocks]
+        self._make = make
+        self.start, self.length, self.reached, self.reach = np.concatenate([b.times for b in blocks]).T
+        self.values = np.concatenate([b.values for b in blocks])
+        self.count = np.repeat([b.count for b in blocks], sizes)
+        self.shift = np.repeat([b.shift for b in blocks], sizes)
+        self.period = np.repeat([b.period for b in blocks], sizes)
+
+    def panels(self, since: float, until: float) -> Panels:
+        """The parts of the steps between two times (s); those of periods that are alike and inside only once."""
+        begin, end = self.start + self.shift, self.reached + self.shift
+        slack = same_time(1.0) * np.abs(end)
+        last_end = end + (self.count - 1) * self.period
+        index = np.arange(self.start.size)
+        if ((begin >= since - slack) & (last_end <= until + slack)).all():
+            return Panels(index, np.zeros(index.size), self.reach, self.count * self.reach * self.length)
+        period = np.where(self.count > 1, self.period, 1.0)
+        # Of the periods that a step stands for, those from number `first` to `last` lie inside as a whole.
+        first = np.clip(np.ceil((since - slack - begin) / period), 0, self.count)
+        last = np.clip(np.floor((until + slack - end) / period), -1, self.count - 1)
+        inside = np.maximum(last - first + 1.0, 0.0)
+        found = [(np.zeros_like(self.reach), self.reach, inside)]
+        for k, once in ((first - 1.0, True), (last + 1.0, last + 1.0 != first - 1.0)):
+            cut = once & (k >= 0) & (k < self.count)
+            low = np.maximum((since - begin - k * period) / self.length, 0.0)
+            # What ends with the stretch but for rounding ends as its step does: at a jump on the left.
+            whole = end + k * period <= until + slack
+            high = np.where(whole, self.reach, np.minimum((until - begin - k * period) / self.length, self.reach))
+            found.append((low, high, np.where(cut & (high - low > slack / self.length), 1.0, 0.0)))
+        index = np.tile(index, 3)
+        low, high, weight = (np.concatenate(x) for x in zip(*found, strict=True))
+        some = weight > 0.0
+        return Panels(index[some], low[some], high[some], (weight * (high - low))[some] * self.length[index[some]])
+
+    @cached_property
+    def _whole(self) -> tuple[FloatArray, AnyRecord]:
+        """Times (k, ROWS) and record at the points of every step, as far as it reaches."""
+        columns = np.concatenate([self.values, self.values @ BETWEEN], axis=2)
+        fraction = self.reach[:, None] * POINTS
+        short = np.flatnonzero(self.reach != 1.0)
+        if short.size:
+            columns[short] = np.einsum("pcn,pqn->pcq", self.values[short], _basis(fraction[short]))
+        t, left = self._times(slice(None), fraction)
+        return t, self._make(t.ravel(), left.ravel(), columns.transpose(1, 0, 2).reshape(columns.shape[1], -1))
+
+    def _times(self, index: IntArray | slice, fraction: FloatArray) -> tuple[FloatArray, BoolArray]:
+        t = self.start[index, None] + fraction * self.length[index, None]
+        left = fraction >= self.reach[index, None]
+        return np.where(left, self.reached[index, None], t), left
+
+    def at_points(self, read: Read, panels: Panels) -> tuple[FloatArray, FloatArray]:
+        """As `measures.Run` says: for panels that are whole steps the signal is made once."""
+        own = (panels.low == 0.0) & (panels.high == self.reach[panels.step])
+        if not own.any():
+            return self.values_at(read, panels.step, panels.fractions(POINTS))
+        t_own, record = self._whole
+        x_own = read(record).reshape(t_own.shape)
+        if own.all():
+            every = panels.step.size == t_own.shape[0]
+            return (t_own, x_own) if every else (t_own[panels.step], x_own[panels.step])
+        t, x = t_own[panels.step], x_own[panels.step]
+        t[~own], x[~own] = self.values_at(read, panels.step[~own], panels.fractions(POINTS)[~own])
+        return t, x
+
+    def values_at(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As `measures.Run` says, from the polynomials of the steps."""
+        columns = np.einsum("pcn,pqn->cpq", self.values[index], _basis(fraction))
+        t, left = self._times(index, fraction)
+        record = self._make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], -1))
+        return t, read(record).reshape(t.shape)
+
+
+def _basis(fraction: FloatArray) -> FloatArray:
+    """Weights (p, q, NODES) of the values at the nodes in those at fractions (p, q) of a step."""
+    distance = fraction[:, :, None] - _NODES
+    hit = distance == 0.0
+    weight = np.where(hit.any(axis=2, keepdims=True), hit, BARYCENTRIC / np.where(hit, 1.0, distance))
+    weight /= weight.sum(axis=2, keepdims=True)
+    return np.asarray(weight)

@@ -1,0 +1,115 @@
+"""What a user should be warned of in a run that ended well: beyond what the models, or the materials, are made for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from fingerspice.circuit.circuit import Element
+from fingerspice.circuit.notices import circuit_warnings
+from fingerspice.circuit.spectrum import spectrum_warning
+from fingerspice.circuit.usual import LARGEST_FORCE, beyond_fingers
+from fingerspice.physics.contact import inverse_area
+from fingerspice.results.network_record import NetworkRecord
+from fingerspice.results.outcome import Status
+from fingerspice.results.record import Record
+from fingerspice.solve.netruns import NetworkRun
+from fingerspice.solve.networks import NetworkProblem
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.runs import Run
+from fingerspice.waveforms.waveform import DC
+
+BREAKDOWN_VOLTAGE = 300.0
+# Contact area over that at 0 V.
+LEAST_AREA = 0.2
+# Distance to the fold of the mobile law: the voltage that would reach it is a few percent larger.
+NEAR_FOLD = 0.2
+
+
+def stack_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
+    """Where a run leaves what its model holds for."""
+    yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit))
+    yield from _source_warnings(problem)
+    stack = problem.stack
+    if stack.contact is not None:
+        at_rest, follows = problem.model.area0, problem.model.coupled
+        loaded = 1.0 / inverse_area(run.peak_u, problem.model.curve)[0] if follows else at_rest
+        yield from _gap_warnings("", run.peak_u, at_rest, loaded if follows else math.inf)
+        yield from beyond_fingers("", run.peak_f, float(stack.contact.stress(run.peak_u)), max(at_rest, loaded))
+    if run.status is Status.SUCCESS and 0.0 < run.peak_u <= run.error.u_gap:
+        yield (
+            f"the gap takes no more than rounding of the source's voltage: of its {run.peak_u:.2g} V nothing is known "
+            "but that they are as good as 0"
+        )
+    yield from _fold_warning(run)
+    yield from _strength_warnings(stack.layers, record)
+
+
+def network_warnings(problem: NetworkProblem, run: NetworkRun, record: NetworkRecord) -> Iterator[str]:
+    yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit))
+    yield from _source_warnings(problem)
+    several = len(record.fingers) > 1
+    for finger, i in enumerate(problem.network.fingers):
+        area = record.finger_area(finger)
+        least, largest = float(area.min(initial=math.inf)), float(area.max(initial=0.0))
+        where = f" of {record.fingers[finger][0]}" if several else ""
+        follows = problem.scene.fixed[i] is None
+        yield from _gap_warnings(
+            where, float(run.peaks[i]), float(problem.scene.area0[i]), least if follows else math.inf
+        )
+        pressure = float(record.fingers[finger][1].stress(float(run.peaks[i])))
+        force = float(record.finger_force(finger).max(initial=0.0)) if pressure * largest > LARGEST_FORCE else 0.0
+        yield from beyond_fingers(where, force, pressure, largest)
+    yield from _fold_warning(run)
+    yield from _strength_warnings(problem.network.layers, record)
+
+
+def _source_warnings(problem: Problem | NetworkProblem) -> Iterator[str]:
+    """Of sources beyond the band of the skin's data, and of those that drive sweeps alone."""
+    outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
+    if outside is not None:
+        yield outside
+    areas = {e.nodes[2] for e in problem.circuit.elements if e.spec.is_layer}
+    drives = [e for e in problem.circuit.by_device("V", "I") if areas.isdisjoint(e.nodes)]
+    small = ", ".join(e.name for e in drives if e.ac is not None)
+    if small and all(e.waveform == DC(0.0) for e in drives):
+        yield (
+            f"the sources are 0 all the time: {small} has AC alone, which drives sweeps (fingerspice ac); a sine in "
+            "time is SIN(VO VA FREQ)"
+        )
+
+
+def _gap_warnings(where: str, peak: float, unloaded: float, least: float) -> Iterator[str]:
+    """Of a gap with its largest voltage (V), its area at 0 V and its smallest one (m^2)."""
+    if peak > BREAKDOWN_VOLTAGE:
+        yield (
+            f"the gap voltage{where} reaches {peak:.4g} V; air breaks down above about {BREAKDOWN_VOLTAGE:g} V "
+            "(Paschen minimum 327 V), which the model does not contain"
+        )
+    if least < LEAST_AREA * unloaded:
+        yield (
+            f"the contact area{where} falls to {1e6 * least:.3g} mm^2, below {100.0 * LEAST_AREA:g} % of the "
+            f"{1e6 * unloaded:.3g} mm^2 at 0 V: the contact model was not made for so little"
+        )
+
+
+def _fold_warning(run: Run | NetworkRun) -> Iterator[str]:
+    if run.margin < NEAR_FOLD and run.status is Status.SUCCESS:
+        yield (
+            f"the fold of the mobile charge law is near: the distance to it falls to {run.margin:.2g} (1 far, 0 at the "
+            "fold)"
+        )
+
+
+def _strength_warnings(layers: tuple[Element, ...], record: Record | NetworkRecord) -> Iterator[str]:
+    for i, layer in enumerate(layers):
+        strength = layer.values.get("e_max", math.inf)
+        if math.isfinite(strength) and record.t.size:
+            field = float(np.abs(record.u_layer[:, i]).max()) / layer.values["d"]
+            if field > strength:
+                yield (
+                    f"the field in {layer.name} reaches {field:.3g} V/m at the outputs; its dielectric strength is "
+                    f"{strength:.3g} V/m"
+                )

@@ -1,0 +1,242 @@
+"""Where a run under the `mobile` law meets its fold.
+
+With m the distance to the fold, m u' = v for a gap voltage u and a v that stays finite. In time u runs into the fold
+with a square root, or creeps up to it as its own mode turns infinitely fast: no step length suits either. In the
+variable s with dt/ds = m, du/ds = v both are smooth: the path crosses m = 0, or comes to rest there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import OdeSolution, solve_ivp
+
+from fingerspice.base.errors import SolveError
+from fingerspice.engine.model import branch_area, dot, ramp, voltage_by_time, write_row_at
+from fingerspice.engine.segment import Segment, source
+from fingerspice.results.outcome import Failure, State, Status
+from fingerspice.solve.marching import solve as solve_marching
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.runs import BoolArray, Run, Tables, from_rows, row_width
+
+FloatArray = NDArray[np.float64]
+
+FINEST_RTOL = 1e-12
+# Where leaks are fast beside a path to a fold, their rounding leaves no tight tolerance to be met: a second try's, and
+# a third one's that starts as near as this to the fold, so that it has no way to stray.
+LOOSER_RTOL, LOOSEST_RTOL, NEAR = 1e-9, 1e-6, 3e-3
+# What a path may leave of the area equation, over the gap voltage.
+STRAYED = 1e-3
+# A fold is met at this distance, and looked for over so many of the shortest time constants.
+NOTHING_LEFT, LONGEST = 1e-10, 1e12
+# A path to a fold takes a few thousand evaluations.
+MOST_EVALUATIONS = 10_000
+
+
+class _LostError(Exception):
+    """A path took too many evaluations, found no step small enough, or strayed."""
+
+
+def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | None:
+    """A run under the `mobile` law that meets a fold, or jumps past one, up to that; None where it meets none.
+
+    Parameters
+    ----------
+    problem : Problem
+    t_out, left : ndarray, shape (n_out,)
+        Output times (s, ascending) and whether the left-hand value is meant.
+    """
+    run = solve_marching(problem, FINEST_RTOL, t_out, left, repeat=False)
+    if run.status is Status.FOLD:
+        return lead_to_fold(problem, run, t_out, left)
+    return run if run.status is Status.SUCCESS else None
+
+
+def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray) -> Run | None:
+    """A run that stopped for a fold, led on until it meets it; None where it meets none."""
+    begun = _start(problem, run.state)
+    if run.margin <= 0.0 or math.isnan(begun.u):
+        return run
+    path = _ahead(problem, run.state, begun, run.margin, FINEST_RTOL)
+    if path is None:
+        return None
+    # The row of where the steps stopped is no output.
+    stopped = run.t.size > 0 and (run.t.size > t_out.size or run.t[-1] != t_out[run.t.size - 1])
+    done = run.t.size - int(stopped)
+    later = t_out[done:]
+    t = np.append(later[later < path.t], path.t)
+    rows = path.rows(problem, t)
+    live, z, current = from_rows(problem, rows)
+    run.t, run.left = np.append(run.t[:done], t), np.append(left[: done + t.size - 1], True)
+    run.live = np.hstack([run.live[:, :done], live])
+    if run.z is not None and run.current is not None:
+        run.z, run.current = np.append(run.z[:done], z), np.append(run.current[:done], current)
+    run.t_failed, run.margin = path.t, 0.0
+    force = problem.scene.force(rows[:, 1], rows[:, 2])
+    run.peak_u = max(run.peak_u, float(np.abs(rows[:, 1]).max()))
+    run.peak_f = max(run.peak_f, float(force.max()))
+    n = problem.model.gap.size
+    run.state = dataclasses.replace(
+        run.state, t=path.t, y=rows[-1, -n - 1 :].copy(), u_before=float(rows[-1, 0]), u_gap=float(rows[-1, 1])
+    )
+    return run
+
+
+def meets_fold(problem: Problem, rtol: float) -> bool:
+    """Whether a problem meets a fold, or a jump of its source goes past one; what follows a near miss is not looked at.
+
+    Raises
+    ------
+    SolveError
+        Where the run fails otherwise.
+    """
+    nothing = np.empty(0)
+    run = solve_marching(problem, rtol, nothing, nothing.astype(bool))
+    if run.status is Status.SUCCESS:
+        return False
+    if run.status is not Status.FOLD:
+        raise SolveError(Failure(run.status, run.status.cause, run.status.action, run.t_failed, tried=run.tried))
+    begun = _start(problem, run.state)
+    return run.margin <= 0.0 or math.isnan(begun.u) or _ahead(problem, run.state, begun, run.margin, rtol) is not None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Path:
+    """State (n + 1,), time since `begin` (s) and gap voltage (V) over the variable s, up to the fold."""
+
+    begin: float
+    segment: Segment
+    sign: float
+    scale: FloatArray
+    solution: OdeSolution
+
+    @property
+    def t(self) -> float:
+        """Time of the fold, s."""
+        return self.begin + float(self.solution(self.solution.t_max)[-2] * self.scale[-2])
+
+    def rows(self, problem: Problem, t: FloatArray) -> FloatArray:
+        """Rows of `engine.model.write_row` at times (s) on the path."""
+        low, high = np.zeros(t.size), np.full(t.size, self.solution.t_max)
+        # Time rises along the path, ever slower: halving has no trouble with that.
+        for _ in range(64):
+            middle = 0.5 * (low + high)
+            early = self.solution(middle)[-2] * self.scale[-2] < t - self.begin
+            low, high = np.where(early, middle, low), np.where(early, high, middle)
+        rows = np.empty((t.size, row_width(problem)))
+        for row, z, time in zip(rows, (self.solution(high).T * self.scale), t, strict=True):
+            u, du = source(self.segment, time - self.segment.start)
+            write_row_at(problem.model, u, du, z[:-2].copy(), self.sign, z[-1], row)
+        return rows
+
+
+class _Start(NamedTuple):
+    """Where a path starts: the segment of the source, its end (s), the area's branch, and the gap voltage (V).
+
+    The voltage is NaN where a jump of the source has gone past the fold.
+    """
+
+    segment: Segment
+    end: float
+    sign: float
+    u: float
+
+
+def _start(problem: Problem, state: State) -> _Start:
+    t, model = state.t, problem.model
+    tables = list(Tables(problem, FINEST_RTOL))
+    table = next((table for table in tables if table.edges[-1] > t), tables[-1])
+    i = min(max(int(np.searchsorted(table.edges, t, side="right")) - 1, 0), table.edges.size - 2)
+    start, end = float(table.edges[i]), float(table.edges[i + 1])
+    segment = Segment(start, end - start, table.terms[i], table.series[i])
+    u = state.u_gap
+    if t == start:
+        u_source, _ = source(segment, 0.0)
+        u = float(ramp(model, model.k_gap * u_source, dot(model.gap, state.y), u))
+    return _Start(segment, end, math.copysign(1.0, u), u)
+
+
+def _ahead(problem: Problem, state: State, begun: _Start, margin: float, rtol: float) -> _Path | None:
+    """The path from a state, so far from a fold, to that in its segment of the source; None where none is found."""
+    tries = (rtol, LOOSER_RTOL, LOOSEST_RTOL) if margin < NEAR else (rtol, LOOSER_RTOL)
+    for tried in sorted({max(rtol, x) for x in tries}):
+        try:
+            return _path(problem, state, begun, tried)
+        except _LostError:
+            continue
+    return None
+
+
+def _path(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path | None:
+    t, y, model, n = state.t, state.y, problem.model, state.y.size
+    segment, end, sign, u = begun
+    if u == 0.0:
+        return None
+    pace = model.tau if math.isfinite(model.tau) else segment.length
+    scale = np.concatenate([
+        np.full(n - 1, max(np.abs(y[:-1]).max(), abs(u))), [model.area0 / model.s * abs(u), pace, abs(u)]
+    ])  # fmt: skip
+    dy = np.empty(n)
+
+    def at(z: FloatArray) -> tuple[float, float]:
+        here = z * scale
+        u_here, du_here = source(segment, t - segment.start + here[n])
+        margin, speed = voltage_by_time(model, u_here, du_here, here[:n], sign, here[n + 1], dy)
+        return float(margin), float(speed)
+
+    left = MOST_EVALUATIONS
+
+    def slope(_: float, z: FloatArray) -> FloatArray:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise _LostError
+        margin, speed = at(z)
+        along: FloatArray = np.concatenate([dy * margin, [margin, speed]]) * pace / scale
+        return along
+
+    def distance(_: float, z: FloatArray) -> float:
+        return at(z)[0] - NOTHING_LEFT
+
+    def ahead(_: float, z: FloatArray) -> float:
+        return end - t - float(z[n]) * pace
+
+    begin = np.concatenate([y, [0.0, u]]) / scale
+    far = 3.0 * at(begin)[0]
+
+    def away(_: float, z: FloatArray) -> float:
+        return far - at(z)[0]
+
+    events: list[Any] = [distance, ahead, away]
+    for event in events:
+        event.terminal = True
+
+    def jacobian(s: float, z: FloatArray) -> FloatArray:
+        # By plain differences: scipy's widen theirs for ever where nothing depends on an entry, as on the charge.
+        here, columns = slope(s, z), []
+        for i in range(z.size):
+            moved = z.copy()
+            moved[i] += 1e-7 * abs(z[i]) + 1e-13
+            columns.append((slope(s, moved) - here) / (moved[i] - z[i]))
+        return np.array(columns).T
+
+    # The mode that is to fold may be faster than all else and follow it: an explicit method would not get there.
+    found = solve_ivp(
+        slope, (0.0, LONGEST), begin, "Radau",
+        rtol=rtol, atol=rtol, jac=jacobian, events=events, dense_output=True,
+    )  # fmt: skip
+    if found.status < 1:
+        raise _LostError
+    if not found.t_events[0].size:
+        return None
+    # The voltage is carried along by its rate: it has to be a solution still.
+    last = found.y[:, -1] * scale
+    q, _ = branch_area(model, sign, last[n + 1])
+    k_u = model.k_gap * source(segment, t - segment.start + last[n])[0]
+    if abs(last[n + 1] - k_u - model.area0 * q * dot(model.gap, last[:n])) > STRAYED * abs(last[n + 1]):
+        raise _LostError
+    return _Path(t, segment, sign, scale, found.sol)

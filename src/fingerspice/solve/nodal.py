@@ -1,0 +1,221 @@
+"""Runs of a network by Radau collocation, with a coarser run beside each for the error."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.engine import collocation
+from fingerspice.engine.collocation import advance
+from fingerspice.engine.network import Sources, new_room
+from fingerspice.engine.radau import Scheme, new_work
+from fingerspice.engine.readout import TRIED
+from fingerspice.numerics.tableaus import radau
+from fingerspice.results.outcome import Status
+from fingerspice.solve.netruns import Integration, NetworkRun, gap_signals, integrate, ramp, state_error, values_at
+from fingerspice.solve.networks import NetworkProblem
+from fingerspice.solve.runs import Progress
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# Of a run, and of the coarser one beside it, with its tolerance over the run's. Their difference is the error stated:
+# where a step is cut short by an edge or a zero, the order alone keeps them apart.
+STAGES, STAGES_BESIDE, BESIDE = 7, 5, 10.0
+# What Newton's method may leave in both alike, over the error allowed in a step.
+ALIKE = 0.05
+# The error allowed in a step, over the one asked for.
+LOCAL_SHARE = 0.2
+FINEST = 1e-14
+# Steps per shortest time scale of the sources: the stages of a step must not alias it.
+LONGEST_STEP = 0.5
+# Times that errors are looked for at.
+PROBES, PROBES_PER_PERIOD, MOST_PROBES = 512, 32, 20_000
+ATTEMPTS = 6
+# Two runs that meet a fold agree on its time to this, relative.
+FOLD_TIME = 1e-10
+
+
+@cache
+def _scheme(stages: int) -> Scheme:
+    """Radau IIA with its matrix diagonalised."""
+    tableau = radau(stages)
+    values, vectors = np.linalg.eig(tableau.a)
+    back = np.linalg.inv(vectors)
+    upper = np.flatnonzero(values.imag > -1e-12)
+    # A conjugate pair gives twice the real part of one.
+    twice = np.where(values.imag[upper] > 1e-12, 2.0, 1.0)
+    return Scheme(
+        tableau.a, tableau.c, np.ascontiguousarray(tableau.e[0]), tableau.dense, values[upper].astype(complex),
+        np.ascontiguousarray(back[upper].astype(complex)),
+        np.ascontiguousarray((vectors[:, upper] * twice).astype(complex)), np.inf,
+    )  # fmt: skip
+
+
+class Collocation(Integration):
+    """One integration in progress; see `engine.collocation.advance`."""
+
+    def __init__(
+        self, problem: NetworkProblem, scheme: Scheme, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray
+    ) -> None:
+        super().__init__(problem, tol, t_out, left)
+        self.scheme = scheme
+        n_s = self.s_before.size
+        stored = u_scale * float(np.abs(problem.network.capacitance(problem.scene.area0)).sum()) or u_scale
+        # A charge's own error is not looked at where nobody asked for it.
+        charge = stored if problem.charge else np.inf
+        self.scale = np.concatenate([np.full(self.n, u_scale), np.ones(self.n_slow), np.full(n_s, charge)])
+        self.control = np.zeros(collocation.N_CONTROL)
+        self.control[collocation.BASE] = problem.t_start
+        self.counters = np.zeros(collocation.N_COUNTERS, np.int64)
+        self.peaks = np.zeros(self.net.gap.size)
+        self.room = new_room(self.net, self.y.size)
+        self.work = new_work(self.net, scheme.c.size, scheme.eigenvalues.size, self.y.size)
+
+    @property
+    def t(self) -> float:
+        return float(self.control[collocation.BASE] + self.control[collocation.T])
+
+    def through(self, sources: Sources, t_end: float) -> Status:
+        while True:
+            code = advance(
+                self.net, self.room, self.scheme, self.work, sources, False, self.problem.charge, t_end, self.y,
+                self.sign, self.s_before, self.scale, self.tol, self.control, self.counters, self.peaks, self.t_out,
+                self.left, self.rows, self.tried,
+            )  # fmt: skip
+            if code == collocation.DONE:
+                return Status.SUCCESS
+            if code == collocation.TOO_MANY:
+                return Status.TOO_MANY_STEPS
+            if code == collocation.STEP_UNDERFLOW or (
+                code == collocation.JUMP and not self.jump(values_at(sources, self.t))
+            ):
+                return self.stuck()
+
+    def jump(self, after: FloatArray) -> bool:
+        control = np.zeros(collocation.N_CONTROL)
+        code = advance(
+            self.net, self.room, self.scheme._replace(h_max=1.0), self.work, ramp(self.s_before, after), True, False,
+            1.0, self.y, self.sign, self.s_before.copy(), self.scale, self.tol, control, self.counters, self.peaks,
+            np.empty(0), np.empty(0, bool), np.empty((0, self.y.size)), np.zeros((TRIED, 4)),
+        )  # fmt: skip
+        self.s_before[:] = after
+        self.control[collocation.H] = self.control[collocation.H_AFTER_JUMP]
+        self.control[collocation.JUMPED] = 1.0
+        return code == collocation.DONE
+
+
+def _integrate(
+    problem: NetworkProblem, scheme: Scheme, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray,
+    progress: Progress | None,
+) -> NetworkRun:  # fmt: skip
+    return integrate(Collocation(problem, scheme, tol, u_scale, t_out, left), progress)
+
+
+def solve_coupled(
+    problem: NetworkProblem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None = None
+) -> NetworkRun:
+    """Integrate until the stated error is within `rtol` of the peaks of every gap's voltage and force.
+
+    The error is stated from a second run with a larger tolerance.
+    """
+    longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
+    fine, coarse = (_scheme(stages)._replace(h_max=longest) for stages in (STAGES, STAGES_BESIDE))
+    at, side, probed = _with_probes(problem, t_out, left)
+    n = problem.network.k.shape[0]
+    u_scale = max(problem.scene.u_peak, float(np.abs(problem.initial.y[:n]).max(initial=0.0)))
+    if problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
+        u_scale = _voltage_scale(problem, coarse, max(u_scale, 1.0))
+    tol, nfev = LOCAL_SHARE * rtol, 0
+    folded: float | None = None
+    for attempt in range(ATTEMPTS):
+        beside = _integrate(problem, coarse, BESIDE * tol, u_scale, at[probed], side[probed], None)
+        run = _integrate(problem, fine, tol, u_scale, at, side, progress)
+        nfev += beside.nfev + run.nfev
+        run.nfev = nfev
+        worst = _stated(problem, run, _only(run, probed), beside, u_scale, ALIKE * tol) / rtol
+        if run.status is Status.FOLD and run.t_failed is not None and tol > FINEST:
+            # What the state is off moves the fold: closer, until its time stays.
+            if folded is not None and abs(run.t_failed - folded) <= FOLD_TIME * run.t_failed:
+                break
+            folded, tol = run.t_failed, max(0.03 * tol, FINEST)
+            continue
+        if run.status is not Status.SUCCESS or worst <= 1.0:
+            break
+        if tol <= FINEST or attempt == ATTEMPTS - 1:
+            run.status = Status.ERROR_NOT_MET
+            break
+        tol = max(tol * min(0.3, 0.5 / worst), FINEST)
+    if problem.scene.net.mobile:
+        run.margin = float(problem.record(run).fold_margin.min(initial=1.0))
+    run = _only(run, ~probed)
+    t_end = run.state.t
+    if run.here is not None and np.all(np.isfinite(run.here)) and (run.t.size == 0 or t_end > run.t[-1]):
+        # A failed run's arrays end at the time it reached.
+        run.t, run.left = np.append(run.t, t_end), np.append(run.left, True)
+        run.rows = np.vstack([run.rows, run.here])
+    return run
+
+
+def _voltage_scale(problem: NetworkProblem, scheme: Scheme, guess: float) -> float:
+    """Largest live voltage, V, from rough runs: that of a current drive is not known beforehand.
+
+    From above: what is small beside the guess costs nothing, what is large beside it would be followed far too closely.
+    """
+    at = np.linspace(problem.t_start, problem.t_stop, PROBES)
+    for _ in range(20):
+        rough = _integrate(problem, scheme, 1e-2, guess, at, np.ones(at.size, bool), None)
+        n = problem.network.k.shape[0]
+        largest = float(np.abs(rough.rows[:, :n]).max(initial=0.0))
+        if not 0.0 < largest < math.inf or 0.05 * guess <= largest <= guess:
+            break
+        guess = 1.5 * largest
+    return guess
+
+
+def _with_probes(problem: NetworkProblem, t: FloatArray, left: BoolArray) -> tuple[FloatArray, BoolArray, BoolArray]:
+    """Times asked for together with those that errors are looked for at, and which are the latter.
+
+    These are the same whichever outputs are asked for, so that no result depends on that.
+    """
+    span = problem.t_stop - problem.t_start
+    count = int(min(max(PROBES, PROBES_PER_PERIOD * span / problem.waveform.shortest_time()), MOST_PROBES))
+    probes = np.linspace(problem.t_start, problem.t_stop, count + 2)[1:-1]
+    every = np.concatenate([t, probes])
+    side = np.concatenate([left, np.ones(count, bool)])
+    order = np.lexsort((~side, every))
+    return every[order], side[order], (np.arange(every.size) >= t.size)[order]
+
+
+def _only(run: NetworkRun, keep: BoolArray) -> NetworkRun:
+    """A run with only some of its outputs."""
+    keep = keep[: run.t.size]
+    return dataclasses.replace(run, t=run.t[keep], left=run.left[keep], rows=run.rows[keep])
+
+
+def _stated(
+    problem: NetworkProblem, run: NetworkRun, probed: NetworkRun, beside: NetworkRun, u_scale: float, alike: float
+) -> float:
+    """Write the stated error into a run: the largest difference, what both have alike, and rounding.
+
+    Returns it over the peaks of each gap, the larger of voltage and force.
+    """
+    count = min(probed.t.size, beside.t.size)
+    both = (alike + 4e-15) * u_scale
+    gaps = []
+    for (u, f), (v, g) in zip(gap_signals(problem, probed), gap_signals(problem, beside), strict=True):
+        peak, force = float(np.abs(u).max(initial=0.0)), float(f.max(initial=0.0))
+        u_error = float(np.abs(u[:count] - v[:count]).max(initial=0.0)) + both
+        # F ~ u^2: what moves u by du moves F by 2 F du / u.
+        moved = 2.0 * both / peak * force if peak > 0.0 else 0.0
+        gaps.append((peak, force, u_error, float(np.abs(f[:count] - g[:count]).max(initial=0.0)) + moved))
+    charge = None
+    if problem.charge:
+        n_s = problem.initial.s_before.size
+        at = slice(problem.initial.y.size - n_s, problem.initial.y.size)
+        charge = float(np.abs(probed.rows[:count, at] - beside.rows[:count, at]).max(initial=0.0))
+    return state_error(run, np.array(gaps).reshape(-1, 4), u_scale, charge)

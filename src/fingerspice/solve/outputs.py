@@ -1,0 +1,104 @@
+"""When a run writes: its output times, both sides of the jumps of its sources, and times that mean a jump."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.solve.networks import NetworkProblem
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.times import check_length, check_outputs
+from fingerspice.waveforms.sampling import misses, same_time
+from fingerspice.waveforms.waveform import Waveform
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# A time is resolved to so many of its roundings; what a source does within them is no jump.
+_RESOLVED = 8.0
+# Of a long run, so that its memory does not grow with its length.
+_BREAKPOINTS_AT_ONCE = 65_536
+
+
+def at_breakpoints(problem: Problem | NetworkProblem, t: FloatArray) -> FloatArray:
+    """Times moved onto the breakpoint they miss by rounding, so that 5 ms means the jump at 5 ms."""
+    span = problem.t_start, problem.t_stop
+    windows = 1 + int((span[1] - span[0]) * problem.waveform.breakpoint_rate() / _BREAKPOINTS_AT_ONCE)
+    moved = t
+    for w0, w1 in itertools.pairwise(span if windows == 1 else np.linspace(*span, windows + 1)):
+        edges = problem.breakpoints() if windows == 1 else problem.waveform.breakpoints(w0, w1)
+        near = edges[misses(t, edges, same_time(1.0))] if edges.size else edges
+        moved = t.copy() if near.size and moved is t else moved
+        slack = same_time(1.0) * np.abs(near)
+        for edge, first, last in zip(
+            near, t.searchsorted(near - slack), t.searchsorted(near + slack, "right"), strict=True
+        ):
+            moved[first:last] = edge
+    return moved
+
+
+def asked_for(
+    problem: Problem | NetworkProblem, t_eval: FloatArray | None, jumps: str
+) -> tuple[FloatArray, BoolArray]:  # fmt: skip
+    """Output times and sides: those given, or the deck's.
+
+    Raises
+    ------
+    InputError
+        For a run that is too long, or one of too many outputs.
+    """
+    check_length(problem.waveform, problem.t_start, problem.t_stop)
+    if t_eval is not None:
+        return t_eval, np.zeros(t_eval.size, bool)
+    check_outputs(problem.circuit, (problem.t_stop - problem.first) / problem.step)
+    t_out, left = output_times(problem, jumps)
+    # Jumps have two each.
+    check_outputs(problem.circuit, t_out.size)
+    return t_out, left
+
+
+def output_times(problem: Problem | NetworkProblem, jumps: str = "both") -> tuple[FloatArray, BoolArray]:
+    """TSTART:TSTEP:TSTOP and which of them are left-hand; with `jumps` "both" two more at each jump, left and right.
+
+    t = 0 stands once, right-hand.
+    """
+    step, first = problem.step, problem.first
+    count = int(np.floor((problem.t_stop - first) / step * (1.0 + 1e-12) + 1e-9))
+    grid = np.asarray(first + step * np.arange(count + 1), float)
+    if grid.size and abs(grid[-1] - problem.t_stop) <= 1e-9 * step:
+        grid[-1] = problem.t_stop
+    if jumps == "none":
+        return grid, np.zeros(grid.size, bool)
+    at = _jumps(problem)
+    if at.size:
+        near = np.clip(np.searchsorted(at, grid), 1, max(at.size - 1, 1))
+        distance = np.minimum(np.abs(grid - at[near - 1]), np.abs(grid - at[np.minimum(near, at.size - 1)]))
+        grid = grid[distance > 1e-9 * step]
+    t = np.concatenate([grid, at, at])
+    left = np.concatenate([np.zeros(grid.size, bool), np.ones(at.size, bool), np.zeros(at.size, bool)])
+    order = np.lexsort((~left, t))
+    return np.ascontiguousarray(t[order]), np.ascontiguousarray(left[order])
+
+
+def _jumps(problem: Problem | NetworkProblem) -> FloatArray:
+    """Times (s, ascending) of the jumps of any source in the run, after its start."""
+    stop = problem.t_stop
+    rounding = same_time(stop)
+    found = []
+    for wave in problem.waveforms:
+        edges = wave.breakpoints(problem.t_start, stop + rounding)
+        edges = edges[(edges > problem.t_start + same_time(problem.t_start)) & (edges >= problem.first)]
+        if edges.size:
+            edges = edges[_is_jump(wave, edges)]
+            found.append(np.where(edges > stop - rounding, stop, edges))
+    return np.unique(np.concatenate(found)) if found else np.empty(0)
+
+
+def _is_jump(wave: Waveform, edges: FloatArray) -> BoolArray:
+    """Whether a waveform's two values at its edges (s) differ by more than it moves within the resolution of time."""
+    right, left = wave.value(edges), wave.value(edges, "left")
+    late = _RESOLVED * same_time(1.0) * np.abs(edges)
+    moved = np.abs(wave.value(edges + late) - right) + np.abs(left - wave.value(edges - late, "left"))
+    return np.asarray(np.abs(right - left) > moved + 1e-12 * np.maximum(np.abs(right), np.abs(left)))

@@ -1,0 +1,318 @@
+"""How a circuit starts: what its capacitors hold at t = 0 by its deck, and what that settles to at once.
+
+As SPICE does it, tried on ngspice 39:
+
+- With ``uic`` each capacitor holds its own ``IC=``, else the difference of its nodes' ``.ic``, 0 V where there is none.
+- Without ``uic`` the start is the DC operating point with the nodes of ``.ic`` held, which are then let go; ``IC=`` has
+  no effect. A voltage source is stronger than ``.ic``, and of nodes that voltage sources tie together the mean counts.
+- ``.ic`` of an area node (mm^2) holds the area in the operating point, and starts an area with dynamics of its own.
+
+Voltages that Kirchhoff's law does not allow beside each other settle at once: charge flows round the loops of
+capacitors and sources as through vanishing resistances, and on every island of nodes it is conserved. With fixed areas
+that is the least sum of C (u - u_start)^2. Where areas follow the voltage, what the loops miss is taken away at a
+steady pace, as a jump of the sources is the limit of a ramp.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.errors import InputError
+from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.network import Network, build_network
+from fingerspice.engine.network import Net
+from fingerspice.numerics.tableaus import TABLEAUS
+from fingerspice.physics.contact import Contact, inverse_area
+from fingerspice.waveforms.waveform import DC
+
+FloatArray = NDArray[np.float64]
+
+# What start voltages may miss Kirchhoff's law by, over the largest of them: the rounding of a deck's decimals.
+ROUNDING = 1e-12
+# The error of a step on the way to where start voltages settle, over the largest of them, and the shortest step.
+STEP_ERROR, SHORTEST = 1e-14, 1e-13
+PAST_FOLD = "past the fold of the mobile law; allowed: less voltage, more load, or the local law"
+
+
+def starts_uncharged(circuit: Circuit) -> bool:
+    """Whether capacitors start with what ``IC=`` and ``.ic`` say, else 0 V, and not from the operating point."""
+    return circuit.tran is None or circuit.tran.uic
+
+
+def start_voltage(element: Element, initial: Mapping[str, float]) -> float:
+    """Voltage (V) from p to n that a capacitor or layer holds at the start with ``uic``."""
+    if element.initial is not None:
+        return element.initial
+    return initial.get(element.nodes[0], 0.0) - initial.get(element.nodes[1], 0.0)
+
+
+def start_voltages(elements: Sequence[Element], c: FloatArray, initial: Mapping[str, float]) -> FloatArray:
+    """The same of every cell (n_cell,), given the element that it is part of and its capacitance.
+
+    The slabs of a dispersive layer share its voltage as in a jump.
+    """
+    total: dict[str, float] = {}
+    for element, one in zip(elements, c, strict=True):
+        total[element.name] = total.get(element.name, 0.0) + 1.0 / one
+    return np.array([start_voltage(e, initial) / (one * total[e.name]) for e, one in zip(elements, c, strict=True)])
+
+
+def held_sources(circuit: Circuit, initial: Mapping[str, float]) -> tuple[Element, ...]:
+    """Voltage sources that hold the nodes of ``.ic`` (V) while the operating point is found."""
+    tied: dict[str, dict[str, float]] = {}
+    for element in circuit.by_device("V"):
+        # Nodes that sources tie together, and how far each stands above one of them.
+        p, n = (tied.setdefault(node, {node: 0.0}) for node in element.nodes)
+        assert element.waveform is not None
+        shift = n[element.nodes[1]] + float(element.waveform.value(0.0, "left")) - p[element.nodes[0]]
+        n.update({node: above + shift for node, above in p.items()})
+        tied.update(dict.fromkeys(p, n))
+    out = []
+    done: set[str] = set()
+    for node in initial:
+        group = tied.get(node, {node: 0.0})
+        if node in done or "0" in group or node == "0":
+            continue
+        done |= group.keys()
+        value = float(np.mean([initial[x] - group[x] for x in group if x in initial])) + group[node]
+        # No netlist can write such a name.
+        out.append(Element(f"v({node}) held", "V", (node, "0"), (node, "0"), MappingProxyType({}), DC(value)))
+    return tuple(out)
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """Voltages of all cells (n_cell,) in V and areas (n_area,) in m^2 at rest.
+
+    `held` tells the areas that ``.ic`` holds.
+    """
+
+    u: FloatArray
+    area: FloatArray
+    held: NDArray[np.bool_]
+
+
+def operating_point(
+    circuit: Circuit,
+    network: Network,
+    area0: FloatArray,
+    contacts: Sequence[Contact | None],
+    initial: Mapping[str, float],
+) -> OperatingPoint:
+    """The DC operating point of U(0-), the nodes in `initial` held.
+
+    Areas follow their gaps by `contacts`; where that is None they are `area0` (m^2).
+
+    Raises
+    ------
+    InputError
+        Where a node has no path for direct current, or the areas find no rest.
+    """
+    conductors = {node for e in circuit.elements for node in e.nodes[:2]} - {a.node for a in network.areas}
+    held = held_sources(circuit, {node: v for node, v in initial.items() if node in conductors})
+    if held:
+        network = build_network(replace(circuit, work="gap"), held)
+    waves = [e.waveform for e in network.sources]
+    s = np.array([float(w.value(0.0, "left")) for w in waves if w is not None])
+    area = area0.copy()
+    fixed = np.array([contact is None for contact in contacts], bool)
+    asked = np.array([a.node in initial for a in network.areas], bool) & ~fixed
+    area[asked] = [1e-6 * initial[a.node] for a, mark in zip(network.areas, asked, strict=True) if mark]
+    _refuse_floating_at_dc(network, area)
+    part, before = 1.0, math.inf
+    for _ in range(500):
+        k, b = network.stiffness(area)
+        x = np.linalg.solve(k, -b @ s) if k.size else np.zeros(0)
+        u = network.p @ x + network.q @ s
+        new = area.copy()
+        for i, (contact, gap) in enumerate(zip(contacts, network.gaps, strict=True)):
+            if contact is not None and gap is not None and not asked[i]:
+                new[i] = float(contact.area(abs(float(u[gap]))))
+        off = float(np.max(np.abs(new / area - 1.0), initial=0.0))
+        # Or as near as rounding lets it come.
+        if off <= 4e-16 or 0.8 * before < off <= 1e-13:
+            return OperatingPoint(u, area, asked)
+        # A part of the way: a leak that scales with the area may make it swing.
+        part *= 0.7 if off > 0.8 * before else 1.0
+        area, before = area + part * (new - area), off
+    raise InputError("the areas find no DC operating point; allowed: uic in .tran, to start uncharged")
+
+
+def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
+    """Voltages that only capacitors hold have no DC value."""
+    factor = np.vstack([network.resistor_factor, np.sqrt(network.leak(area))[:, None] * network.p])
+    if not factor.shape[1]:
+        return
+    # Columns of like size: conductances range over many decades.
+    size = np.linalg.norm(factor, axis=0)
+    _, sigma, turned = np.linalg.svd(factor / np.where(size > 0.0, size, 1.0))
+    rank = int(np.count_nonzero(sigma > 1e-12 * max(1.0, sigma.max(initial=0.0))))
+    if rank == factor.shape[1]:
+        return
+    held = np.abs(network.p @ turned[rank:].T).max(axis=1) > 1e-9
+    names = dict.fromkeys(c.element.name for c, mark in zip(network.cells, held, strict=True) if mark)
+    raise InputError(
+        f"no DC operating point: {' and '.join(names)} leave nodes that are reached by capacitors only; allowed: a "
+        "leakage (r=... or an R), or uic in .tran to start uncharged"
+    )
+
+
+def at_own_area(u: float, area: float, curve: FloatArray) -> float:
+    """The gap voltage (V) with the charge that `u` has on `area` (m^2), the area following it, under ``mobile``.
+
+    Raises
+    ------
+    InputError
+        Past the fold: no voltage has that charge.
+    """
+
+    def charge(v: float) -> float:
+        return v / inverse_area(v, curve)[0]
+
+    wanted, low, high = area * abs(u), 0.0, 1e-3 * abs(u)
+    # The charge grows up to the fold: the first interval that holds it holds the root on the branch of 0 V.
+    while charge(high) < wanted:
+        low, high = high, 1.05 * high
+        if high > 100.0 * abs(u):
+            raise InputError(f"the start has {u:.4g} V across a gap of {area * 1e6:.4g} mm^2, {PAST_FOLD}")
+    while low < 0.5 * (low + high) < high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if charge(middle) < wanted else (low, middle)
+    return math.copysign(high, u)
+
+
+@dataclass(frozen=True)
+class Settled:
+    """What start voltages settle to.
+
+    Attributes
+    ----------
+    x : ndarray, shape (n,)
+        Live voltages, V.
+    slow : ndarray, shape (n_slow,)
+        Areas with dynamics of their own over their value at 0 V.
+    charge : ndarray, shape (n_s,)
+        What each source delivered, C.
+    """
+
+    x: FloatArray
+    slow: FloatArray
+    charge: FloatArray
+
+
+def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> Settled:
+    """What cells that hold `u` (n_cell,) V settle to, the sources at `s` (n_s,).
+
+    Areas with dynamics of their own that are NaN in `slow` are where they rest at the voltages settled to.
+
+    Raises
+    ------
+    InputError
+        Where that goes past a fold.
+    """
+    n = net.k.shape[0]
+    free = np.isnan(slow)
+    area = np.where(free, 1.0, slow)
+    end = _along(_Loops(net, u - net.q @ s, s, area))
+    for _ in range(60):
+        at_end = net.p @ end[:n] + net.q @ s
+        new = area.copy()
+        for i in np.flatnonzero(net.slow >= 0):
+            if free[net.slow[i]]:
+                rest = 1.0 / inverse_area(abs(float(at_end[net.gap[i]])), net.curves[i])[0]
+                new[net.slow[i]] = rest / net.area0[i]
+        if np.all(np.abs(new - area) <= 1e-15):
+            break
+        area = new
+        end = _along(_Loops(net, u - net.q @ s, s, area))
+    return Settled(end[:n], area, end[n:])
+
+
+@dataclass(frozen=True)
+class _Loops:
+    """Live voltages and delivered charges on the way to u = P x + Q s, as `off` (n_cell,) V beyond it goes to 0."""
+
+    net: Net
+    off: FloatArray
+    s: FloatArray
+    slow: FloatArray
+
+    @property
+    def follows(self) -> list[int]:
+        """Areas that change on the way."""
+        return [int(i) for i in np.flatnonzero((self.net.gap >= 0) & (self.net.slow < 0))]
+
+    def rate(self, theta: float, y: FloatArray) -> FloatArray:
+        """Derivative of (x, charges) by the part `theta` of the way; NaN past a fold."""
+        net, n = self.net, self.net.k.shape[0]
+        u = net.p @ y[:n] + net.q @ self.s + (1.0 - theta) * self.off
+        area, slope = self._areas(u)
+        held = net.c * np.append(area, 1.0)[net.place]
+        met = net.p.T @ (held[:, None] * net.p)
+        if not np.linalg.slogdet(met)[0] > 0.0:
+            return np.full(y.size, math.nan)
+        x = np.linalg.solve(met, net.p.T @ (held * self.off))
+        along = net.p @ x - self.off
+        current = held * along
+        if net.mobile and self.follows:
+            # What the areas add to the capacitances, by the gap that they follow.
+            more = np.zeros((net.c.size, area.size))
+            gaps = net.gap[self.follows]
+            for i, gap in zip(self.follows, gaps, strict=True):
+                at = net.place == i
+                # At 0 V the branch is that of where it goes.
+                more[at, i] = (net.c * u)[at] * slope[i] * (np.sign(u[gap]) or np.sign(along[gap]))
+            more = more[:, self.follows]
+            met += net.p.T @ more @ net.p[gaps]
+            if not np.linalg.slogdet(met)[0] > 0.0:
+                return np.full(y.size, math.nan)
+            x = np.linalg.solve(met, net.p.T @ (held * self.off + more @ self.off[gaps]))
+            along = net.p @ x - self.off
+            current = held * along + more @ along[gaps]
+        return np.concatenate([x, net.through @ current])
+
+    def _areas(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Areas (m^2) at cell voltages `u`, and what their change by |u_gap| is (m^2/V)."""
+        net = self.net
+        area, slope = net.area0.copy(), np.zeros(net.area0.size)
+        for i in range(area.size):
+            if net.slow[i] >= 0:
+                area[i] *= self.slow[net.slow[i]]
+            elif net.gap[i] >= 0:
+                inverse, change = inverse_area(abs(float(u[net.gap[i]])), net.curves[i])
+                area[i], slope[i] = 1.0 / inverse, -change / inverse**2
+        return area, slope
+
+
+def _along(loops: _Loops) -> FloatArray:
+    """(x, charges) at the end of the way."""
+    net = loops.net
+    y = np.zeros(net.k.shape[0] + net.q.shape[1])
+    if not np.any(loops.off):
+        return y
+    if not loops.follows:
+        return loops.rate(0.0, y)
+    tableau = TABLEAUS["dop853"]
+    scale = np.concatenate([np.ones(net.k.shape[0]), np.full(net.q.shape[1], math.inf)]) * np.abs(loops.off).max()
+    theta, h = 0.0, 0.1
+    while theta < 1.0:
+        h = min(h, 1.0 - theta)
+        stages = np.zeros((tableau.n_end, y.size))
+        for j in range(tableau.n_end):
+            stages[j] = loops.rate(theta + tableau.c[j] * h, y + h * tableau.a[j, :j] @ stages[:j])
+        missed = h * float(np.abs((tableau.e[0, : tableau.n_end] @ stages) / scale).max()) / STEP_ERROR
+        # Across a kink steps get no better, but short enough not to matter.
+        if missed <= 1.0 or (h <= SHORTEST and math.isfinite(missed)):
+            theta = 1.0 if h == 1.0 - theta else theta + h
+            y = y + h * tableau.a[tableau.n_end, : tableau.n_end] @ stages
+        elif h <= SHORTEST:
+            where = PAST_FOLD if net.mobile else "where no area is left; allowed: less voltage"
+            raise InputError(f"the capacitors' start voltages settle {where}")
+        h *= min(4.0, max(0.2, 0.9 * max(missed, 1e-9) ** -0.125)) if math.isfinite(missed) else 0.2
+    return y

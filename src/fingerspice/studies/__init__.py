@@ -1,0 +1,1 @@
+"""What is asked of many solutions, or beside them."""

@@ -1,0 +1,327 @@
+"""A circuit as one self-contained ngspice deck."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from fingerspice.base.errors import InputError
+from fingerspice.circuit.arguments import require_circuit
+from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
+from fingerspice.circuit.topology import find_branches
+from fingerspice.netlist.library import LIBRARIES, library_text
+from fingerspice.physics.contact import Contact
+from fingerspice.solve.networks import prepare_network
+from fingerspice.solve.starting import start_voltage, starts_uncharged
+from fingerspice.waveforms.ramps import PWL, Pulse
+from fingerspice.waveforms.waveform import DC, Exp, Sine, Waveform
+
+EDGE = 1e-9
+"""Longest rise time (s) of an ideal jump in the export, a thousandth of TSTEP if that is shorter: ngspice has no
+ideal edge."""
+NOW = 1e-30
+"""What stands for a time of 0 (s) that ngspice takes for "not given"."""
+
+# Measured on ngspice 39, over edges, constant stretches and sines, both laws. Its step control cuts the step to nothing
+# at an edge: trtol turns it off, so that TMAX (TSTEP by default) sets the accuracy. Inside a capacitor C='...' flows
+# du/dt in A, which at a constant voltage is rounding over the step, 1e-6 or so in the first ones, above the usual
+# abstol of 1e-12. The last of several lines counts, so it follows the library.
+_OPTIONS = ".options reltol=1e-4 trtol=1e4 abstol=1e-4"
+
+# Straight lines between them miss a sine by 5e-6 of its amplitude.
+_POINTS_PER_TIME_SCALE = 1000
+_MAX_POINTS = 2_000_000
+_FEW_POINTS = 1000
+
+
+def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
+    """A deck that ngspice 39 runs by itself: bodies included, parameters folded in, foreign sources as PWL.
+
+    Parameters
+    ----------
+    circuit : Circuit
+    charge_law : str, optional
+        ``"local"`` or ``"mobile"``; the circuit's own by default.
+
+    Returns
+    -------
+    str
+        The deck.
+
+    Raises
+    ------
+    InputError
+        For a circuit without .tran line where a source has to be written as points, and for names that would become
+        one.
+    """
+    require_circuit(circuit)
+    law = charge_law or circuit.charge_law or "local"
+    if law not in LIBRARIES:
+        raise InputError(f"charge_law is {law!r}; allowed: {' or '.join(map(repr, LIBRARIES))}")
+    _refuse_merged_names(circuit)
+    ratio = max((contact.work_ratio for contact in _contacts(circuit).values()), default=1.0)
+    lines = [
+        circuit.title or "fingerspice export",
+        f"* Written by fingerspice; charge law {law}. Run: ngspice -b -r out.raw FILE",
+    ]
+    if circuit.overrides:
+        changed = ", ".join(f"{k} = {v}" for k, v in circuit.overrides.items())
+        lines.append(f"* Changed from the deck: {' '.join(changed.split())}"[:1000])
+    areas = _start_areas(circuit, law)
+    for element in circuit.elements:
+        lines += _element_lines(element, circuit, ratio, areas)
+    lines += _analysis_lines(circuit)
+    lines += _start_lines(circuit, areas)
+    lines += ["", library_text(law).rstrip(), "", _OPTIONS, ".end", ""]
+    return "\n".join(lines)
+
+
+def _name(name: str) -> str:
+    # ngspice uses the dot for what is inside a subcircuit; here the circuit is flat. A node called temper ends it.
+    return "temper_" if name.lower() == "temper" else name.replace(".", "_")
+
+
+def _element_name(element: Element) -> str:
+    name = _name(element.name)
+    letter = element.device if len(element.device) == 1 else "X"
+    # ngspice tells elements by their first letter, which inside a subcircuit call is the call's.
+    return name if name[0].upper() == letter else f"{letter}{name}"
+
+
+def _refuse_merged_names(circuit: Circuit) -> None:
+    nodes = {n: _name(n) for e in circuit.elements for n in e.node_names}
+    for names in (nodes, {e.name: _element_name(e) for e in circuit.elements}):
+        seen: dict[str, str] = {}
+        for name in sorted(names):
+            other = seen.setdefault(names[name].lower(), name)
+            if other.lower() != name.lower():
+                raise InputError(f"{other} and {name} would be one name in the export; allowed: rename one of them")
+
+
+def _contacts(circuit: Circuit) -> dict[str, Contact]:
+    """The contact of each GAP by its area node."""
+    if is_stack(circuit):
+        stack = build_stack(circuit)
+        return {e.nodes[2]: stack.contact for e in stack.layers if stack.contact is not None}
+    return {gap.nodes[2]: contact_of(gap) for gap in circuit.by_device("GAP")}
+
+
+def _start_areas(circuit: Circuit, law: str) -> dict[str, float]:
+    """Area (mm^2) of each area node just as a ``uic`` run starts; none where a run starts otherwise."""
+    if circuit.tran is None or not starts_uncharged(circuit):
+        return {}
+    areas, _ = find_branches(circuit)
+    contacts = _contacts(circuit)
+    out = {}
+    for area in areas:
+        value = area.given
+        if value is None and area.gap is not None:
+            value = float(contacts[area.node].area(abs(start_voltage(area.gap, circuit.initial))))
+        assert value is not None
+        out[area.node] = 1e6 * value
+    if any(area.gap and area.gap.values["tau"] > 0.0 for area in areas):
+        out |= _slow_areas(circuit, law)
+    return out
+
+
+def _slow_areas(circuit: Circuit, law: str) -> dict[str, float]:
+    """Where areas with dynamics of their own start, mm^2."""
+    problem = prepare_network(
+        circuit, t_stop=None, t_eval=None, charge_law=law, area="coupled", start="deck", charge=False
+    )
+    net, n = problem.scene.net, problem.scene.net.k.shape[0]
+    slow = problem.initial.y[n:]
+    return {
+        area.node: 1e6 * float(slow[place] * area0)
+        for area, place, area0 in zip(problem.network.areas, net.slow, net.area0, strict=True)
+        if place >= 0
+    }
+
+
+def _start_lines(circuit: Circuit, areas: Mapping[str, float]) -> Iterator[str]:
+    """Start values and guesses of nodes; what layers hold with ``uic`` stands with the layers."""
+    written = {node: name for e in circuit.elements for node, name in zip(e.nodes, e.node_names, strict=True)}
+    gaps = {gap.nodes[2]: gap for gap in circuit.by_device("GAP")}
+    contacts = _contacts(circuit)
+    for node, value in circuit.initial.items():
+        if node != "0" and node not in gaps:
+            yield f".ic v({_name(written[node])})={value!r}"
+    for node, gap in gaps.items():
+        guess = gap.values["a_fix"] or 1e6 * float(contacts[node].area(0.0))
+        held = circuit.initial.get(node)
+        if areas:
+            # An area with dynamics of its own has to start somewhere; a guess is enough for one that follows at once.
+            held = areas[node] if gap.values["tau"] > 0.0 else None
+            guess = areas[node]
+        word, value = (".nodeset", guess) if held is None else (".ic", held)
+        yield f"{word} v({_name(written[node])})={value!r}"
+        if areas and circuit.initial and not gap.values["a_fix"]:
+            yield from _guesses_inside(gap, contacts[node], start_voltage(gap, circuit.initial))
+
+
+def _guesses_inside(gap: Element, contact: Contact, u: float) -> Iterator[str]:
+    """Guesses for the nodes inside a GAP at `u` V: with charge to hold ngspice finds no first point without them."""
+    at_rest, adhesive = (float(contact.area_adhesive(v)) for v in (0.0, u))
+    y = adhesive / at_rest
+    guesses = {
+        "x": math.log(y),
+        "y": y,
+        "v": float(contact.stress(u)) * at_rest / contact.f_n,
+        "follow": 1e6 * float(contact.area(u)),
+    }
+    name = _element_name(gap)
+    yield ".nodeset " + " ".join(f"v({name}.{node})={value!r}" for node, value in guesses.items())
+
+
+def _element_lines(
+    element: Element, circuit: Circuit, work_ratio: float, start_areas: Mapping[str, float]
+) -> Iterator[str]:
+    nodes = " ".join(_name(n) for n in element.node_names)
+    name = _element_name(element)
+    if element.waveform is not None:
+        ac = "" if element.ac is None else f" AC {float(element.ac.magnitude)!r} {float(element.ac.phase_deg)!r}"
+        yield from _wrapped(f"{name} {nodes} {_source_text(element.waveform, element, circuit)}{ac}")
+        return
+    if not element.spec.is_layer:
+        initial = f" IC={element.initial!r}" if element.initial is not None else ""
+        yield f"{name} {nodes} {element.values['value']!r}{initial}"
+        return
+    # The strength of a dielectric is for a warning here; ngspice has no use for it.
+    values = " ".join(f"{k}={_number(v)}" for k, v in element.values.items() if k != "e_max")
+    extra = f" wk={work_ratio!r}" if element.device == "GAP" and work_ratio != 1.0 else ""
+    area = start_areas.get(element.nodes[2])
+    held = 0.0 if area is None else start_voltage(element, circuit.initial)
+    extra += f" ic={held!r} a_ic={area!r}" if held else ""
+    yield from _wrapped(f"{name} {nodes} {element.device} {values}{extra}")
+
+
+def _number(value: float) -> str:
+    return "1e30" if math.isinf(value) else repr(float(value))
+
+
+def _wrapped(line: str, width: int = 100) -> Iterator[str]:
+    words = line.split(" ")
+    current = words[0]
+    for word in words[1:]:
+        if len(current) + len(word) + 1 > width:
+            yield current
+            current = "+ " + word
+        else:
+            current += " " + word
+    yield current
+
+
+def _source_text(waveform: Waveform, element: Element, circuit: Circuit) -> str:
+    if isinstance(waveform, DC):
+        return f"DC {waveform.level!r}"
+    if isinstance(waveform, Sine):
+        w = waveform
+        numbers = (w.offset, w.amplitude, w.frequency, w.delay, w.damping, w.phase_deg)
+        return f"SIN({' '.join(repr(float(x)) for x in numbers)})"
+    pulse = _pulse_text(waveform, circuit) if isinstance(waveform, Pulse) else None
+    if pulse is not None:
+        return pulse
+    if isinstance(waveform, Exp):
+        e = waveform
+        return f"EXP({' '.join(repr(float(x)) for x in (e.v1, e.v2, e.td1 or NOW, e.tau1, e.td2 or NOW, e.tau2))})"
+    if isinstance(waveform, PWL) and waveform.repeat is None:
+        t, v = np.asarray(waveform.times), np.asarray(waveform.values)
+    else:
+        t, v = _sampled(waveform, element, circuit)
+    if _starts_empty(circuit):
+        # Everything is at 0 V before, and the source jumps from there: a first step without one is hard for ngspice.
+        t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append([0.0, waveform.value(0.0)], v[t > 0.0])
+    return _pwl_text(t, v, _edge(circuit))
+
+
+def _starts_empty(circuit: Circuit) -> bool:
+    given = circuit.initial or any(e.initial is not None for e in circuit.elements)
+    return circuit.tran is not None and starts_uncharged(circuit) and not given
+
+
+def _stop(circuit: Circuit) -> float:
+    return circuit.tran.stop if circuit.tran else 1.0
+
+
+def _edge(circuit: Circuit) -> float:
+    """Rise time of an ideal jump, s."""
+    return min(EDGE, 1e-3 * circuit.tran.step) if circuit.tran else EDGE
+
+
+def _pulse_text(p: Pulse, circuit: Circuit) -> str | None:
+    """A pulse, where ngspice has it: its width and period are not 0, its edges have room, its start is at rest."""
+    if _starts_empty(circuit) and p.value(0.0) != 0.0 and p.breakpoint_rate() * _stop(circuit) < _FEW_POINTS:
+        return None
+    edge, span = _edge(circuit), _stop(circuit) + abs(p.delay)
+    # A jump takes its edge from the time after it: what follows keeps its own time.
+    width = p.width - (0.0 if p.rise else edge) if math.isfinite(p.width) else 10.0 * span
+    rise, fall = p.rise or edge, p.fall or edge
+    period = p.pulse_period if math.isfinite(p.pulse_period) else 20.0 * span + rise + width + fall
+    if width <= 0.0 or rise + width + fall > period:
+        return None
+    numbers = (p.v1, p.v2, p.delay, rise, fall, width, period)
+    return f"PULSE({' '.join(repr(float(x)) for x in numbers)})"
+
+
+def _sampled(waveform: Waveform, element: Element, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a waveform over the run: its breakpoints, both sides, and enough in between."""
+    if circuit.tran is None:
+        raise InputError(f"{element.name}: exporting this source as PWL needs a .tran line to know how far")
+    stop = circuit.tran.stop
+    spacing = waveform.shortest_time() / _POINTS_PER_TIME_SCALE
+    terms = waveform.terms(np.array([0.0]), np.array([stop]))
+    if not math.isfinite(spacing) and terms is None:
+        spacing = circuit.tran.step / 4.0
+    count = 1 if not math.isfinite(spacing) else math.ceil(stop / spacing)
+    points = count + 2.0 * waveform.breakpoint_rate() * stop
+    breaks = np.empty(0)
+    # The rate is an upper estimate; the breakpoints themselves may be too many to list.
+    if points <= 10 * _MAX_POINTS:
+        breaks = waveform.breakpoints(0.0, stop)
+        points = count + 2 * breaks.size
+    if points > _MAX_POINTS:
+        raise InputError(
+            f"{element.name}: the source would take {points:.0f} PWL points; allowed: at most {_MAX_POINTS}; shorten "
+            "the run (.tran)"
+        )
+    if circuit.tran.uic:
+        # What the source was before 0 matters to the operating point only.
+        breaks = breaks[breaks > 0.0]
+    smooth = np.linspace(0.0, stop, count + 1)
+    t = np.concatenate([smooth, breaks, breaks])
+    v = np.concatenate([waveform.value(smooth), waveform.value(breaks, "left"), waveform.value(breaks)])
+    rank = np.concatenate([np.full(smooth.size, 1), np.zeros(breaks.size), np.full(breaks.size, 2)])
+    order = np.lexsort((rank, t))
+    return t[order], v[order]
+
+
+def _pwl_text(t: np.ndarray, v: np.ndarray, edge: float) -> str:
+    """PWL text; a jump becomes an edge of `edge` seconds, and repeated points are left out."""
+    times: list[float] = []
+    values: list[float] = []
+    for time, value in zip(t.tolist(), v.tolist(), strict=True):
+        if times and time <= times[-1]:
+            if value == values[-1]:
+                continue
+            # Late in a long run an edge may be less than the rounding of the time.
+            time = max(times[-1] + edge, np.nextafter(times[-1], math.inf).item())
+        times.append(time)
+        values.append(value)
+    return "PWL(" + " ".join(f"{a!r} {b!r}" for a, b in zip(times, values, strict=True)) + ")"
+
+
+def _analysis_lines(circuit: Circuit) -> Iterator[str]:
+    if circuit.tran is not None:
+        tran = circuit.tran
+        words = [f"{tran.step!r}", f"{tran.stop!r}"]
+        if tran.start or tran.max_step:
+            words.append(f"{tran.start!r}")
+        if tran.max_step:
+            words.append(f"{tran.max_step!r}")
+        yield f".tran {' '.join(words)}{' uic' if tran.uic else ''}"
+    if circuit.ac is not None:
+        ac = circuit.ac
+        yield f".ac {ac.scale} {ac.points} {ac.start!r} {ac.stop!r}"

@@ -1,0 +1,374 @@
+"""The paper's Figs. 2 to 5 from scratch, each as a picture with its data, and the figures its text claims.
+
+Every curve is this package's own: the skin of Eqs. 18 (read as a cubic) and 19, the phasor for Fig. 3, the
+periodic state of the transient for Figs. 4 and 5. The measured points the paper shows in grey are not
+reproduced here.
+"""
+
+from __future__ import annotations
+
+import csv
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.errors import FingerspiceWarning
+from fingerspice.base.files import write_aside
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.physics.materials import SKIN_BAND, skin_permittivity, skin_resistivity
+from fingerspice.plots import drawing
+from fingerspice.results.solution import Solution
+from fingerspice.solve.runs import Progress
+from fingerspice.studies.phasors import phasor
+from fingerspice.studies.steady import steady_state
+from fingerspice.studies.table1 import table1_circuit
+from fingerspice.waveforms.ramps import Square
+from fingerspice.waveforms.waveform import Sine, Waveform, require
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FloatArray = NDArray[np.float64]
+
+U0_FORCE, U0_TIME = 140.0, 200.0
+"""Source amplitudes of Fig. 3, and of Figs. 4 and 5, V."""
+
+FREQUENCIES = (100.0, 5000.0)
+"""Of Figs. 4 and 5, Hz."""
+
+
+@dataclass(frozen=True)
+class Variation:
+    """One panel of Fig. 3: a parameter, its values and what they do to the circuit.
+
+    Attributes
+    ----------
+    title, symbol, unit : str
+        For the picture; the symbol in TeX.
+    name : str
+        For the data.
+    paths : tuple of str
+        Circuit parameters that scale with it.
+    base : float
+        Its value in Table 1, in `unit`.
+    values : tuple of float
+        The curves, in `unit`.
+    """
+
+    title: str
+    symbol: str
+    unit: str
+    name: str
+    paths: tuple[str, ...]
+    base: float
+    values: tuple[float, ...]
+
+    def apply(self, circuit: Circuit, value: float) -> Circuit:
+        """The circuit with this parameter at `value`, in `unit`."""
+        factor = value / self.base
+        now = circuit.parameters
+        return circuit.varied({path: factor * now[path].value for path in self.paths})
+
+
+def variations() -> tuple[Variation, ...]:
+    """The four panels of Fig. 3, in the paper's order."""
+    gap = table1_circuit().parameters
+    # Ridge area without voltage and friction (Eq. 5); alpha and beta scale together, the exponents stay.
+    area = gap["Xgap.alpha"].value * gap["Xgap.fn"].value ** gap["Xgap.m_exp"].value
+    scale_area = ("Xgap.alpha", "Xgap.beta")
+    return (
+        Variation("Skin thickness", r"d_\mathrm{sc}", "µm", "d_sc", ("Xskin.d",), 350.0, (200.0, 350.0, 450.0)),
+        Variation("Ridge contact area", r"A_\mathrm{R0}", "mm²", "area", scale_area, area, (30.0, area, 45.0)),
+        Variation("Gap resistance", r"R_\mathrm{a}", "MΩ", "r_a", ("Xgap.r",), 1.0, (0.5, 1.0, 2.0, 7.0)),
+        Variation("Gap thickness", r"d_\mathrm{a}", "µm", "d_a", ("Xgap.d",), 3.5, (2.0, 3.5, 5.0)),
+    )
+
+
+@dataclass(frozen=True)
+class Table:
+    """Data of a figure: names with units, columns of equal length."""
+
+    header: tuple[str, ...]
+    columns: tuple[FloatArray, ...]
+
+    def write(self, path: Path) -> Path:
+        """As CSV, ten digits."""
+
+        def write(target: Path) -> None:
+            with target.open("w", newline="", encoding="utf-8") as stream:
+                writer = csv.writer(stream)
+                writer.writerow(self.header)
+                writer.writerows([f"{x:.10g}" for x in row] for row in zip(*self.columns, strict=True))
+
+        return write_aside(path, write)
+
+
+def make_figures(
+    folder: str | Path, *, only: int | Iterable[int] | None = None, progress: Progress | None = None
+) -> list[Path]:
+    """Write the paper's figures, each as ``figN.png`` with its data in ``figN.csv``.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Made where it does not exist.
+    only : int or iterable of int, optional
+        Numbers of the figures wanted, 2 to 5; all by default.
+    progress : callable, optional
+        Called with the fraction done.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+
+    Raises
+    ------
+    InputError
+        For a figure the paper's model does not make, or a folder that cannot be written.
+    """
+    wanted = list(FIGURES) if only is None else [only] if isinstance(only, int) else list(only)
+    for number in wanted:
+        require(number in FIGURES, "figure", f"{number}", ", ".join(map(str, FIGURES)))
+    written = []
+    for place, number in enumerate(sorted(set(wanted))):
+        if progress is not None:
+            progress(place / len(set(wanted)))
+        figure, table = FIGURES[number]()
+        written.append(drawing.save(figure, Path(folder) / f"fig{number}.png"))
+        written.append(table.write(Path(folder) / f"fig{number}.csv"))
+    return written
+
+
+def figure_2() -> tuple[Figure, Table]:
+    """Resistivity and relative permittivity of stratum corneum against frequency."""
+    f = np.geomspace(*SKIN_BAND, 161)
+    rho, eps = skin_resistivity(f), skin_permittivity(f)
+    figure, (left, right) = drawing.new_figure(1, 2, height=2.7)
+    for ax, y, label, title, color in (
+        (
+            left,
+            rho,
+            r"Resistivity $\rho_\mathrm{sc}$ [Ω m]",
+            r"Eq. 18, read as a cubic in $\log_{10} f$",
+            drawing.BLUE,
+        ),
+        (right, eps, r"Relative permittivity $\varepsilon_\mathrm{r,sc}$", "Eq. 19", drawing.VERMILION),
+    ):
+        ax.loglog(f, y, color=color, linewidth=1.6)
+        drawing.dress(ax, label, "Frequency $f$ [Hz]")
+        ax.set_title(title, fontsize=drawing.FONT, loc="left")
+        ax.set_xlim(*SKIN_BAND)
+    left.set_ylim(5e2, 1e5)
+    right.set_ylim(1e3, 1e4)
+    return figure, Table(("frequency [Hz]", "rho_sc [ohm m]", "eps_r_sc [1]"), (f, rho, eps))
+
+
+def figure_3(points: int = 46) -> tuple[Figure, Table]:
+    """Mean electroadhesive force against frequency, with one parameter at a time varied."""
+    f = np.geomspace(10.0, 1e4, points)
+    circuit = table1_circuit().replace({"Vdrive.amplitude": U0_FORCE})
+    base = phasor(circuit, f).f_el_mean
+    figure, axes = drawing.new_figure(2, 2, height=5.0, sharex=True)
+    header, columns = ["frequency [Hz]", "f_el_mean [N] Table 1"], [f, base]
+    for ax, variation in zip(axes, variations(), strict=True):
+        for value, style in zip(variation.values, _styles(variation), strict=True):
+            force = base
+            if value != variation.base:
+                force = phasor(variation.apply(circuit, value), f).f_el_mean
+                header.append(f"f_el_mean [N] {variation.name}={value:g} {_ascii(variation.unit)}")
+                columns.append(force)
+            label = f"${variation.symbol}$ = {value:.3g} {variation.unit}"
+            ax.semilogx(f, force, label=label, **style)
+        ax.set_title(
+            variation.title + (" (other scale)" if variation.name == "d_a" else ""),
+            fontsize=drawing.FONT,
+            loc="left",
+        )
+        ax.set_xlim(f[0], f[-1])
+        ax.set_ylim(0.0, 0.25 if variation.name == "d_a" else 0.125)
+        # Where the curves of the panel leave room.
+        corner: Any = "lower right" if variation.name == "r_a" else "upper left"
+        ax.legend(loc=corner, fontsize=drawing.FONT - 1.0, frameon=False)
+    for ax in axes[::2]:
+        drawing.dress(ax, r"Mean force $F_\mathrm{el}$ [N]")
+    for ax in axes[2:]:
+        drawing.dress(ax, "", "Frequency $f$ [Hz]")
+    return figure, Table(tuple(header), tuple(columns))
+
+
+def _styles(variation: Variation) -> Iterator[dict[str, Any]]:
+    """Table 1 in black; the others differ in colour and in dashes."""
+    others = iter(zip((drawing.BLUE, drawing.VERMILION, drawing.GREEN), drawing.DASHES[1:], strict=True))
+    for value in variation.values:
+        if value == variation.base:
+            yield {"color": drawing.BLACK, "linewidth": 1.8}
+        else:
+            color, dash = next(others)
+            yield {"color": color, "linestyle": dash, "linewidth": 1.5}
+
+
+def _ascii(unit: str) -> str:
+    return {"µm": "um", "mm²": "mm^2", "MΩ": "Mohm"}[unit]
+
+
+def time_response(shape: type[Sine] | type[Square], frequency: float, *, dispersive: bool = False) -> Solution:
+    """One period of the periodic state of Table 1 at 200 V, its skin taken at `frequency` (Hz), or dispersive."""
+    changes: dict[str, float | Waveform] = {"Vdrive": shape(U0_TIME, frequency)}
+    if not dispersive:
+        changes["Xskin.f"] = frequency
+    with warnings.catch_warnings():
+        # Of a square wave 2 % of the energy lie above the skin's data, in the paper as here.
+        warnings.simplefilter("ignore", FingerspiceWarning)
+        return steady_state(table1_circuit(dispersive=dispersive).replace(changes), points=1000).solution
+
+
+def two_periods(solution: Solution) -> dict[str, FloatArray]:
+    """Columns ``t``, ``u_source``, ``u_gap``, ``f_el``, ``area`` of one period, twice over, from t = 0.
+
+    The end of the first copy is left out where it says what the start of the second does.
+    """
+    assert solution.period is not None
+    t = solution.t - solution.t[0]
+    # At a jump the period ends with a left-hand row, then the right-hand one that begins the next.
+    end = t.size - 1
+    rows = np.concatenate([np.arange(end), np.arange(end), [] if t[-1] == t[-2] else [end]]).astype(int)
+    shift = np.where(np.arange(rows.size) < end, 0.0, solution.period)
+    names = ("u_source", "u_gap", "f_el", "area")
+    return {"t": t[rows] + shift, **{name: getattr(solution, name)[rows] for name in names}}
+
+
+def _time_figure(shape: type[Sine] | type[Square]) -> tuple[Figure, Table]:
+    """Gap voltage and force over two periods of the periodic state, 100 Hz left, 5000 Hz right.
+
+    A square is broad: with it, what a dispersive skin makes of it.
+    """
+    dispersive = shape is Square
+    figure, axes = drawing.new_figure(2, 2, height=4.3, sharex="col", sharey="row")
+    parts = []
+    for column, frequency in enumerate(FREQUENCIES):
+        data = two_periods(time_response(shape, frequency))
+        if dispersive:
+            broad = two_periods(time_response(shape, frequency, dispersive=True))
+            data |= {f"{name}_dispersive": broad[name] for name in ("u_gap", "f_el")}
+        parts.append((np.full(data["t"].size, frequency), *data.values()))
+        _time_column((axes[column], axes[column + 2]), data, frequency)
+    drawing.dress(axes[0], "Voltage [V]")
+    drawing.dress(axes[2], r"Force $F_\mathrm{el}$ [N]")
+    for ax in axes[2:]:
+        ax.set_ylim(0.0, None)
+    header = ["frequency [Hz]", "t [s]", "u_source [V]", "u_gap [V]", "f_el [N]", "area [m^2]"]
+    if dispersive:
+        header += ["u_gap_dispersive [V]", "f_el_dispersive [N]"]
+    return figure, Table(tuple(header), tuple(np.concatenate(c) for c in zip(*parts, strict=True)))
+
+
+def _time_column(axes: Sequence[Axes], data: dict[str, FloatArray], frequency: float) -> None:
+    upper, lower = axes
+    factor, unit = drawing.engineering(2.0 / frequency, "s")
+    mean = float(np.trapezoid(data["f_el"], data["t"]) / data["t"][-1])
+    dash = drawing.DASHES[1]
+    # What came before t = 0 is what ends a period: an edge there is drawn, too.
+    t = factor * np.append(0.0, data["t"])
+    y = {name: np.append(x[-1], x) for name, x in data.items()}
+    upper.plot(t, y["u_source"], color=drawing.GREY, linewidth=1.2, linestyle=dash, label="source $U$")
+    upper.plot(t, y["u_gap"], color=drawing.BLUE, linewidth=1.6, label=r"gap $U_\mathrm{a}$")
+    lower.plot(t, y["f_el"], color=drawing.VERMILION, linewidth=1.6, label=r"force $F_\mathrm{el}$")
+    for ax, name in ((upper, "u_gap_dispersive"), (lower, "f_el_dispersive")):
+        if name in y:
+            # Said once: beside the force there is room for it.
+            label = "dispersive" if ax is lower else "_"
+            ax.plot(t, y[name], color=drawing.BLACK, linewidth=0.9, linestyle=drawing.DASHES[3], label=label)
+    lower.axhline(mean, color=drawing.BLACK, linewidth=1.0, linestyle=dash, label=f"mean {mean:.3f} N")
+    for ax in axes:
+        drawing.legend_above(ax, right=True, math=True)
+    upper.set_title(f"{frequency:g} Hz", fontsize=drawing.FONT + 0.5, loc="left", weight="bold")
+    upper.set_xlim(-0.02 * t[-1], 1.02 * t[-1])
+    upper.set_xticks(np.linspace(0.0, t[-1], 5))
+    drawing.dress(lower, "", f"Time [{unit}]")
+
+
+FIGURES: dict[int, Callable[[], tuple[Figure, Table]]] = {
+    2: figure_2,
+    3: figure_3,
+    4: partial(_time_figure, Sine),
+    5: partial(_time_figure, Square),
+}
+"""What makes each figure of the paper."""
+
+
+def figure_numbers() -> dict[str, float]:
+    """What the paper's text says about its figures, as this package computes it.
+
+    Returns
+    -------
+    dict of str to float
+        ``area_unloaded`` (m^2); at 200 V ``gain_100Hz``, ``lead_100Hz`` (degrees), the same at 5000 Hz; at
+        140 V ``rise`` (mean force at 10 kHz over 100 Hz, also per gap resistance) and ``rise_above_2kHz``;
+        for the time responses least, largest and mean force (N); then `trends`.
+    """
+    circuit = table1_circuit()
+    out: dict[str, float] = {"area_unloaded": variations()[1].base * 1e-6}
+    p = phasor(circuit, FREQUENCIES)
+    for i, f in enumerate(FREQUENCIES):
+        out[f"gain_{f:g}Hz"] = float(abs(p.gain[i]))
+        out[f"lead_{f:g}Hz"] = float(np.degrees(np.angle(p.gain[i])))
+    low = circuit.replace({"Vdrive.amplitude": U0_FORCE})
+    f100, f2k, f10k = phasor(low, (100.0, 2000.0, 10000.0)).f_el_mean
+    out |= {"rise": float(f10k / f100), "rise_above_2kHz": float(f10k / f2k)}
+    resistance = variations()[2]
+    for value in resistance.values:
+        a, b = phasor(resistance.apply(low, value), (100.0, 10000.0)).f_el_mean
+        out[f"rise_r_a_{value:g}"] = float(b / a)
+    for name, shape in (("sine", Sine), ("square", Square)):
+        for f in FREQUENCIES:
+            s = time_response(shape, f)
+            assert s.f_el is not None
+            out[f"{name}_{f:g}Hz_min"], out[f"{name}_{f:g}Hz_max"] = float(s.f_el.min()), float(s.f_el.max())
+            out[f"{name}_{f:g}Hz_mean"] = s.summary()["f_el_mean_periodic"]
+    return out | trends()
+
+
+def trends(frequencies: Sequence[float] = (10.0, 100.0, 1000.0, 10000.0)) -> dict[str, float]:
+    """How the mean force of Fig. 3 follows its parameters.
+
+    Parameters
+    ----------
+    frequencies : sequence of float
+        Hz.
+
+    Returns
+    -------
+    dict of str to float
+        Per parameter and frequency: ``elasticity_...``, relative change of force per relative change of the
+        parameter at Table 1; ``bend_...``, largest distance from the best straight line over the panel's
+        range, as a share of the force's change over it; ``span_...``, that change, relative to Table 1's force.
+    """
+    circuit = table1_circuit().replace({"Vdrive.amplitude": U0_FORCE})
+    base = phasor(circuit, frequencies).f_el_mean
+    out: dict[str, float] = {}
+    for variation in variations():
+
+        def force(value: float, variation: Variation = variation) -> FloatArray:
+            return phasor(variation.apply(circuit, value), frequencies).f_el_mean
+
+        step = 1e-3
+        slope = (force(variation.base * (1.0 + step)) - force(variation.base * (1.0 - step))) / (2.0 * step * base)
+        x = np.linspace(min(variation.values), max(variation.values), 11)
+        y = np.array([force(v) for v in x])
+        line = np.column_stack([np.ones_like(x), x])
+        off = np.abs(y - line @ np.linalg.lstsq(line, y, rcond=None)[0]).max(axis=0)
+        change = np.abs(y[-1] - y[0])
+        for i, f in enumerate(frequencies):
+            key = f"{variation.name}_{f:g}Hz"
+            out[f"elasticity_{key}"] = float(slope[i])
+            out[f"bend_{key}"] = float(off[i] / change[i])
+            out[f"span_{key}"] = float(change[i] / base[i])
+    return out

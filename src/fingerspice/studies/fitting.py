@@ -1,0 +1,356 @@
+"""From measured resistivity and permittivity to a passive ladder, and how consistent the data are."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.pages import Page, Shown
+from fingerspice.physics.ladder import Ladder
+from fingerspice.physics.materials import EPS0
+from fingerspice.studies.materialdata import ALLOWED, COLUMNS, likely_slips, read_table
+from fingerspice.waveforms.waveform import require
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+MOST_POLES = 12
+# Poles per decade and decades beyond the band, of the fit that any causal and passive material would match.
+_DENSE, _BEYOND = 8, 2.0
+# Misfit (rms) of a fit, or of data to any material, that is worth a warning, and that is no fit and no material.
+NOTABLE, TOO_MUCH = 0.1, 0.3
+# Of data, in Hz, ohm m and 1: far from any material's, so that products and quotients stay numbers.
+_LEAST, _MOST = 1e-20, 1e20
+
+
+@dataclass(frozen=True)
+class ColeCole:
+    """A material by Cole and Cole's equation (J. Chem. Phys. 9, 341, 1941; Gabriel 1996 with several terms).
+
+    eps = eps_inf + sum of delta / (1 + (2 pi i f tau)^(1 - alpha)) + conductivity / (2 pi i f eps0)
+
+    Attributes
+    ----------
+    eps_inf : float
+    terms : tuple of (delta, tau, alpha)
+        Drop of the permittivity, time constant (s), and 0 <= alpha < 1.
+    conductivity : float
+        S/m.
+    band : tuple of float
+        Frequencies to fit over, Hz.
+    """
+
+    eps_inf: float
+    terms: tuple[tuple[float, float, float], ...]
+    conductivity: float = 0.0
+    band: tuple[float, float] = (10.0, 1e5)
+
+    def __post_init__(self) -> None:
+        require(self.eps_inf > 0.0, "eps_inf", f"{self.eps_inf:g}", "more than 0")
+        require(self.conductivity >= 0.0, "conductivity", f"{self.conductivity:g} S/m", "0 or more")
+        require(0.0 < self.band[0] < self.band[1], "band", self.band, "two frequencies above 0 Hz, ascending")
+        for delta, tau, alpha in self.terms:
+            require(delta > 0.0, "delta", f"{delta:g}", "more than 0")
+            require(tau > 0.0, "tau", f"{tau:g} s", "more than 0")
+            require(0.0 <= alpha < 1.0, "alpha", f"{alpha:g}", "0 up to, not including, 1")
+
+    def admittivity(self, frequency: ArrayLike) -> ComplexArray:
+        """y = 2 pi i f eps0 eps, S/m, at frequencies in Hz."""
+        s = 2j * np.pi * np.asarray(frequency, float)
+        eps = self.eps_inf + sum(delta / (1.0 + (s * tau) ** (1.0 - alpha)) for delta, tau, alpha in self.terms)
+        return np.asarray(self.conductivity + s * EPS0 * eps)
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """How near the data are to any causal and passive material (Kramers and Kronig's relations).
+
+    Attributes
+    ----------
+    rms, largest : float
+        Misfit |y_fit / y - 1| of the best sum of Debye terms with poles everywhere.
+    frequency, misfit : ndarray, shape (n,)
+        The same by frequency, Hz.
+    """
+
+    rms: float
+    largest: float
+    frequency: FloatArray
+    misfit: FloatArray
+
+
+@dataclass(frozen=True, repr=False)
+class MaterialFit(Shown):
+    """A ladder fitted to data.
+
+    Attributes
+    ----------
+    ladder : Ladder
+    rms, largest : float
+        |y_fit / y - 1| over the data.
+    frequency : ndarray, shape (n,)
+        Of the data, Hz.
+    misfit : ndarray, shape (n,)
+        |y_fit / y - 1| at each.
+    kramers_kronig : Consistency
+        What no ladder can do better than.
+    data : ndarray of complex, shape (n,)
+        Admittivity of the data, S/m.
+    """
+
+    ladder: Ladder
+    rms: float
+    largest: float
+    frequency: FloatArray
+    misfit: FloatArray
+    kramers_kronig: Consistency
+    data: ComplexArray
+
+    def _page(self) -> Page:
+        from fingerspice.results.report import fit_page
+
+        return fit_page(self)
+
+    def to_netlist(self, name: str) -> str:
+        """A subcircuit of slabs in series, with its thickness as parameter; for decks here and for ngspice.
+
+        Written to ``myskin.lib`` beside the deck, ``.include myskin.lib`` and ``Xskin skin 0 area NAME d=350u`` put it
+        there in place of a SKIN.
+
+        Raises
+        ------
+        InputError
+            For a name that a netlist cannot hold.
+        """
+        require(name.isidentifier(), "name", repr(name), "letters, digits and _, not first a digit")
+        return subcircuit(self.ladder, name)
+
+    def plot(self) -> Figure:
+        """Resistivity and permittivity of the data and of the ladder, and the misfit, against frequency."""
+        return plot_material(self)
+
+
+def subcircuit(ladder: Ladder, name: str) -> str:
+    """Netlist text of a ladder as slabs in series."""
+    eps_r, rho = ladder.cells()
+    nodes = ["p", *(f"c{i}" for i in range(1, eps_r.size)), "n"]
+    lines = [f".subckt {name} p n area params: d=350u"]
+    for i, (eps, resistivity) in enumerate(zip(eps_r, rho, strict=True)):
+        lines.append(f"X{i + 1} {nodes[i]} {nodes[i + 1]} area SLAB d={{d}} eps_r={eps:.10g} rho={resistivity:.10g}")
+    return "\n".join([*lines, ".ends", ""])
+
+
+def fit_material(
+    data: ColeCole | ArrayLike | str | Path, *, poles: int | None = None, error: float | None = None
+) -> MaterialFit:
+    """Fit a passive ladder: non-negative least squares of the relative misfit, the poles placed by Gauss-Newton.
+
+    Parameters
+    ----------
+    data : ColeCole, array_like or path
+        Cole-Cole parameters; or rows of frequency (Hz), resistivity (ohm m) and relative permittivity, as an array
+        (n, 3) or a CSV file of three columns. Where the file has a line of names, these say what the columns hold, in
+        which order and in which units: ``omega [rad/s],sigma [S/m],eps_r`` will do.
+    poles : int, optional
+        How many branches.
+    error : float, optional
+        Fewest branches whose rms misfit is at most this, or within a twentieth of what the data's own inconsistency
+        leaves. 0.02 if neither is given.
+
+    Returns
+    -------
+    MaterialFit
+
+    Raises
+    ------
+    InputError
+        For data that cannot be read or are no material's (then with the likely slip), for a misfit above 30 %, and
+        where both `poles` and `error` are given.
+
+    Warns
+    -----
+    FingerspiceWarning
+        Where the data are more than 10 % from any causal and passive material, or the fit from the data.
+
+    Examples
+    --------
+    From data to a deck that has ``.include myskin.lib`` and ``Xskin skin 0 area MYSKIN d=350u``::
+
+        fit = fs.fit_material("skin.csv")
+        fit.plot()
+        Path("myskin.lib").write_text(fit.to_netlist("MYSKIN"))
+    """
+    if poles is not None and error is not None:
+        raise InputError("poles and error are both given; allowed: one of them")
+    if poles is not None:
+        require(1 <= poles <= MOST_POLES, "poles", poles, f"1 to {MOST_POLES}")
+    error = 0.02 if error is None else error
+    require(error > 0.0, "error", f"{error:g}", "more than 0")
+    if isinstance(data, ColeCole):
+        low, high = data.band
+        f = np.geomspace(low, high, max(2, round(40 * np.log10(high / low)) + 1))
+        y = data.admittivity(f)
+        consistency, doubt = _consistency(f, y), ""
+    else:
+        table = _checked(read_table(Path(data)) if isinstance(data, (str, Path)) else data)
+        f, y = _admittivity(table)
+        consistency = _consistency(f, y)
+        doubt = _doubt(table, consistency)
+    try:
+        ladder, misfit, rms = _least_ladder(
+            f, y, [poles] if poles is not None else range(1, MOST_POLES + 1), max(error, 1.05 * consistency.rms)
+        )
+    except InputError as refused:
+        raise InputError(f"{doubt}; {refused.message}" if doubt else refused.message) from None
+    said = f"the ladder misses the data by {100.0 * rms:.2g} % rms"
+    if rms > TOO_MUCH:
+        raise InputError(f"{said}; allowed: at most {100.0 * TOO_MUCH:g} %, so more poles, or data of a narrower band")
+    if rms > max(NOTABLE, 1.05 * consistency.rms):
+        warnings.warn(f"{said}; more poles would come nearer", FingerspiceWarning, stacklevel=2)
+    return MaterialFit(ladder, rms, float(misfit.max()), f, misfit, consistency, y)
+
+
+def _checked(data: ArrayLike) -> FloatArray:
+    """Rows of frequency (Hz, ascending), resistivity (ohm m) and relative permittivity."""
+    try:
+        table = np.asarray(data, float)
+    except (TypeError, ValueError):
+        raise InputError(f"material data are a {type(data).__name__}; allowed: rows of {ALLOWED}, or a file") from None
+    require(
+        table.ndim == 2 and table.shape[1] == 3, "material data", f"of shape {table.shape}", "rows of f, rho, eps_r"
+    )
+    require(table.shape[0] >= 3, "material data", f"{table.shape[0]} rows", "three frequencies or more")
+    for column, name in enumerate(COLUMNS):
+        bad = np.flatnonzero(~((table[:, column] >= _LEAST) & (table[:, column] <= _MOST)))
+        if bad.size:
+            raise InputError(
+                f"{name} in row {bad[0] + 1} is {table[bad[0], column]:g}; allowed: more than 0, from {_LEAST:g} to "
+                f"{_MOST:g}"
+            )
+    table = table[np.argsort(table[:, 0])]
+    require(bool(np.all(np.diff(table[:, 0]) > 0.0)), "frequencies", "repeated", "each once")
+    return table
+
+
+def _admittivity(table: FloatArray) -> tuple[FloatArray, ComplexArray]:
+    """Frequencies (Hz) and admittivities (S/m) of a table."""
+    f = table[:, 0].copy()
+    return f, 1.0 / table[:, 1] + 2j * np.pi * f * EPS0 * table[:, 2]
+
+
+def _doubt(table: FloatArray, found: Consistency) -> str:
+    """What is wrong with data that are no material's, and the slip that would explain it: a warning, or a refusal."""
+    if found.rms <= NOTABLE:
+        return ""
+    slips = likely_slips(table, lambda other: _consistency(*_admittivity(other)).rms, found.rms)
+    said = f"the data are {100.0 * found.rms:.2g} % (rms) from any causal and passive material (Kramers-Kronig)"
+    said += f"; likely {' or '.join(slips)}" if slips else ""
+    if found.rms > TOO_MUCH:
+        raise InputError(f"{said}; allowed: at most {100.0 * TOO_MUCH:g} %, columns of {ALLOWED}")
+    warnings.warn(said, FingerspiceWarning, stacklevel=3)
+    return said
+
+
+def _least_ladder(
+    f: FloatArray, y: ComplexArray, counts: Sequence[int], error: float
+) -> tuple[Ladder, FloatArray, float]:
+    """The first ladder of so many branches that misses the data by no more than the error, or the last one, rms."""
+    found, refused = None, InputError("")
+    for count in counts:
+        try:
+            ladder, misfit = _fit(f, y, count)
+        except InputError as problem:
+            # With more branches something may be left.
+            refused = problem
+            continue
+        found = ladder, misfit, float(np.sqrt(np.mean(misfit**2)))
+        if found[2] <= error:
+            break
+    if found is None:
+        raise refused
+    return found
+
+
+def _weights(f: FloatArray, y: ComplexArray, poles: FloatArray) -> tuple[FloatArray, ComplexArray]:
+    """Best weights (g0, eps0 eps_inf, k_j), none negative, and the relative misfit they leave."""
+    from scipy.optimize import nnls
+
+    s = 2j * np.pi * f
+    columns = np.column_stack([np.ones_like(s), s, *(s / (s + p) for p in poles)]) / y[:, None]
+    matrix = np.vstack([columns.real, columns.imag])
+    size = np.linalg.norm(matrix, axis=0)
+    x, _ = nnls(matrix / size, np.concatenate([np.ones(f.size), np.zeros(f.size)]))
+    x = x / size
+    return x, columns @ x - 1.0
+
+
+def _fit(f: FloatArray, y: ComplexArray, count: int) -> tuple[Ladder, FloatArray]:
+    """The ladder of so many branches, and its misfit."""
+    from scipy.optimize import least_squares
+
+    low, high = np.log10(2.0 * np.pi * f[[0, -1]])
+    start = low + (high - low) * (np.arange(count) + 0.5) / count
+
+    def residual(place: FloatArray) -> FloatArray:
+        _, left = _weights(f, y, 10.0**place)
+        return np.concatenate([left.real, left.imag])
+
+    # A pole far above the band would do eps_inf's work, and none would be left for it.
+    found = least_squares(residual, start, bounds=(low - 0.5, high + 0.25), max_nfev=60)
+    poles = 10.0 ** np.sort(found.x)
+    x, left = _weights(f, y, poles)
+    if not (x[0] > 0.0 and x[1] > 0.0):
+        missing = "conductivity at zero frequency" if x[0] <= 0.0 else "eps_inf"
+        raise InputError(f"the data leave no {missing} above 0 with {count} poles; allowed: fewer poles, or more data")
+    kept = x[2:] > 0.0
+    ladder = Ladder(
+        float(x[0]), float(x[1] / EPS0), tuple(map(float, poles[kept])), tuple(map(float, x[2:][kept]))
+    )  # fmt: skip
+    return ladder, np.abs(left)
+
+
+def _consistency(f: FloatArray, y: ComplexArray) -> Consistency:
+    low, high = np.log10(2.0 * np.pi * f[[0, -1]])
+    count = round(_DENSE * (high - low + 2.0 * _BEYOND)) + 1
+    _, left = _weights(f, y, np.logspace(low - _BEYOND, high + _BEYOND, count))
+    misfit = np.abs(left)
+    return Consistency(float(np.sqrt(np.mean(misfit**2))), float(misfit.max()), f, misfit)
+
+
+def plot_material(fit: MaterialFit) -> Figure:
+    """What was measured and what was fitted: resistivity, permittivity, and the misfit of the two together."""
+    from fingerspice.plots.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, new_figure
+
+    figure, axes = new_figure(1, 3, height=2.7)
+    f = np.geomspace(fit.frequency[0], fit.frequency[-1], 400)
+    measured = 1.0 / fit.data.real, fit.data.imag / (2.0 * np.pi * fit.frequency * EPS0)
+    fitted = fit.ladder.resistivity(f), fit.ladder.permittivity(f)
+    labels = "Resistivity [Ω m]", "Relative permittivity"
+    for ax, points, line, label in zip(axes[:2], measured, fitted, labels, strict=True):
+        ax.loglog(fit.frequency, points, color=GREY, marker="o", markersize=2.5, linestyle="none", label="data")
+        ax.loglog(f, line, color=BLUE, linewidth=1.4, label=f"ladder of {len(fit.ladder.poles)} poles")
+        dress(ax, label, "Frequency [Hz]")
+    limit = fit.kramers_kronig
+    axes[2].semilogx(fit.frequency, 100.0 * fit.misfit, color=BLUE, linewidth=1.4, label="ladder")
+    axes[2].semilogx(
+        limit.frequency, 100.0 * limit.misfit, color=VERMILION, linewidth=1.0, linestyle="--", label="any material"
+    )
+    dress(axes[2], "Misfit [%]", "Frequency [Hz]")
+    for ax in (axes[0], axes[2]):
+        ax.legend(fontsize=FONT - 0.5, frameon=False)
+    caption(
+        figure,
+        f"misfit {100.0 * fit.rms:.2g} % rms; no causal and passive material is nearer than "
+        f"{100.0 * limit.rms:.2g} % rms",
+    )
+    return figure

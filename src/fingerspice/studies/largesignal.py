@@ -1,0 +1,123 @@
+"""Response to sines of given amplitude, the area coupled at every instant: a phasor's figures without its mean area."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.circuit.arguments import require_circuit
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.statespace import build_stack
+from fingerspice.circuit.usual import beyond_fingers
+from fingerspice.results.measures import weigh_outputs
+from fingerspice.results.phasor_solution import PhasorSolution
+from fingerspice.solve.runs import Progress
+from fingerspice.studies.steady import steady_state
+from fingerspice.studies.sweeps import Drive, sweep_drive, sweep_notes
+from fingerspice.waveforms.waveform import Sine, Waveform, require
+
+FloatArray = NDArray[np.float64]
+# Outputs in a period: cubics through them are good to 1e-9 of a sine.
+POINTS = 400
+
+
+def large_signal(
+    circuit: Circuit,
+    frequency: ArrayLike,
+    amplitude: ArrayLike | None = None,
+    *,
+    charge_law: str | None = None,
+    rtol: float = 1e-8,
+    progress: Progress | None = None,
+) -> tuple[PhasorSolution, ...]:
+    """Periodic states under sines, by frequency and amplitude; SKIN evaluated at each frequency.
+
+    Parameters
+    ----------
+    circuit : Circuit
+        With a GAP and one source.
+    frequency : array_like
+        Hz, positive.
+    amplitude : array_like, optional
+        V, positive; by default that of the source's own ``AC``, or without it of its fundamental.
+    charge_law, rtol, progress
+        As in `simulate`.
+
+    Returns
+    -------
+    tuple of PhasorSolution
+        One per amplitude. Gains are those of the fundamental; area and force are means over the period.
+
+    Raises
+    ------
+    InputError
+        For a circuit without GAP or with several sources, or frequencies or amplitudes that are not positive.
+    SolveError
+        Where there is no periodic state.
+    """
+    require_circuit(circuit)
+    stack = build_stack(circuit)
+    if stack.gap is None:
+        raise InputError("a large-signal sweep needs a GAP; this circuit has none")
+    if len(stack.sources) != 1:
+        names = ", ".join(e.name for e, _ in stack.sources)
+        raise InputError(f"a large-signal sweep drives one source, and this circuit has {names}")
+    own = sweep_drive(stack.sources, stack.waveform.fundamental, swept=True)
+    if amplitude is None and math.isnan(own.amplitude):
+        raise InputError("the source has no fundamental to take the amplitude of: give the amplitudes in V")
+    given = np.atleast_1d(own.amplitude if amplitude is None else amplitude)
+    f = np.atleast_1d(np.asarray(frequency, float))
+    for what, values, unit in (("frequency", f, "Hz"), ("amplitude", given, "V")):
+        good = bool(np.all(np.isfinite(values) & (np.asarray(values) > 0.0)))
+        require(good, what, f"{values} {unit}", "positive numbers")
+    for text in sweep_notes(circuit, f)[1]:
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    drives = [own] if amplitude is None else [Drive(float(a), 0.0, "the amplitude given") for a in given]
+    found = itertools.count(1)
+
+    def one() -> None:
+        if progress is not None:
+            progress(next(found) / (f.size * len(drives)))
+
+    return tuple(_sweep(circuit, f, drive, charge_law, rtol, one) for drive in drives)
+
+
+def _sweep(
+    circuit: Circuit, frequency: FloatArray, drive: Drive, charge_law: str | None, rtol: float, one: Callable[[], None]
+) -> PhasorSolution:
+    (source, sign), *_ = build_stack(circuit).sources
+    skins = [e.name for e in circuit.by_device("SKIN")]
+    gains, areas, forces, amplitude = [], [], [], drive.amplitude
+    for f in frequency:
+        changes: dict[str, float | Waveform] = {f"{name}.f": float(f) for name in skins}
+        changes[source.name] = Sine(amplitude, float(f))
+        state = steady_state(
+            circuit.varied(changes), charge_law=charge_law, rtol=rtol, points=POINTS, charge=False
+        )  # fmt: skip
+        s = state.solution
+        # The start of the period is a multiple of it: phases are those of the source.
+        assert s.area is not None
+        assert s.f_el is not None
+        period = s.t - s.t[0]
+        gains.append([weigh_outputs(period, u).phasor(float(f)) * sign / amplitude for u in s.u_layer.T])
+        areas.append(weigh_outputs(period, s.area).mean())
+        forces.append(weigh_outputs(period, s.f_el).mean())
+        one()
+    gain = np.array(gains, np.complex128)
+    gap = build_stack(circuit).gap_layer
+    assert gap is not None
+    u_gap = gain[:, gap] * amplitude * np.exp(1j * drive.phase)
+    contact = build_stack(circuit).contact
+    assert contact is not None
+    notes, warned = sweep_notes(circuit, frequency)
+    largest = max(forces), float(contact.stress(np.abs(u_gap)).max()), max(areas)
+    return PhasorSolution(
+        frequency, gain[:, gap], gain, u_gap, np.array(areas), np.array(forces), amplitude, s.layers, drive.phase,
+        drive.text, notes, (*warned, *beyond_fingers("", *largest)), circuit,
+    )  # fmt: skip

@@ -1,0 +1,261 @@
+"""Where the `mobile` charge law folds: the source voltage it takes, against load, gap and frequency."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.errors import InputError, SolveError
+from fingerspice.base.pages import Page, Shown
+from fingerspice.circuit.arguments import require_circuit
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.describe import heading
+from fingerspice.circuit.statespace import is_stack
+from fingerspice.results.outcome import Status
+from fingerspice.solve.folding import meets_fold
+from fingerspice.solve.problem import prepare
+from fingerspice.solve.runs import Progress
+from fingerspice.solve.simulation import simulate
+from fingerspice.waveforms.combinations import Product
+from fingerspice.waveforms.waveform import Waveform, as_waveform, require
+
+if TYPE_CHECKING:
+    from fingerspice.plots.picture import Picture
+
+FloatArray = NDArray[np.float64]
+
+# Voltages looked at, V, how exactly the fold's is found, relative, and the error of each run.
+LOWEST, HIGHEST = 1e-3, 1e5
+EXACT = 1e-3
+RTOL = 1e-5
+
+
+@dataclass(frozen=True)
+class FoldSweep:
+    """Voltage at which the law folds against one parameter.
+
+    Attributes
+    ----------
+    name, unit : str
+    own : float
+        The deck's value.
+    values, voltages : ndarray, shape (n,)
+        The parameter, and the source's peak voltage at the fold (V); NaN where there is none up to `HIGHEST`.
+    """
+
+    name: str
+    unit: str
+    own: float
+    values: FloatArray
+    voltages: FloatArray
+
+
+@dataclass(frozen=True, repr=False)
+class FoldLimits(Shown):
+    """Where a circuit folds under the `mobile` law.
+
+    Attributes
+    ----------
+    circuit : Circuit
+    peak : float
+        The deck's own source voltage, V.
+    voltage : float
+        Peak source voltage at the fold with the deck's values, V; NaN where there is none up to `HIGHEST`.
+    sweeps : tuple of FoldSweep
+        Load, gap, and where the source has one, frequency.
+    """
+
+    circuit: Circuit
+    peak: float
+    voltage: float
+    sweeps: tuple[FoldSweep, ...]
+
+    def _page(self) -> Page:
+        from fingerspice.results.report import limits_text
+
+        return limits_text(self)
+
+    def plot(self) -> Picture:
+        """The fold's voltage against every parameter, the deck's own point marked."""
+        return plot_limits(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, SI units."""
+        return {
+            "peak": self.peak, "voltage": self.voltage,
+            "sweeps": [
+                {"name": s.name, "unit": s.unit, "own": s.own, "values": s.values.tolist(),
+                 "voltages": s.voltages.tolist()}
+                for s in self.sweeps
+            ],
+        }  # fmt: skip
+
+
+def fold_limits(
+    circuit: Circuit, *, points: int = 9, span: float = 10.0, progress: Progress | None = None
+) -> FoldLimits:
+    """Find the source voltage at which runs under the `mobile` law meet their fold, to 1e-3.
+
+    Every run starts as the deck's does (uncharged, from the operating point of the source so raised, or from .ic as it
+    is) and lasts as many periods. Each parameter goes from its own value over `span` to `span` times it, the others as
+    in the deck; SKIN is evaluated at each frequency.
+
+    Parameters
+    ----------
+    circuit : Circuit
+        With one GAP, a source and a .tran line.
+    points : int
+        Values of each parameter, 3 or more.
+    span : float
+        Above 1.
+    progress : callable, optional
+        Called with the fraction done.
+
+    Raises
+    ------
+    InputError
+        For a circuit without these, and where .ic stands past the fold itself.
+    SolveError
+        Where a run fails for another reason than a fold.
+    """
+    require_circuit(circuit)
+    require(3 <= points <= 1000, "points", points, "3 to 1000")
+    require(1.0 < span <= 1e6, "span", span, "more than 1, at most 1e6")
+    gaps = circuit.by_device("GAP")
+    if len(gaps) != 1:
+        found = ", ".join(g.name for g in gaps) or "none"
+        raise InputError(f"a map of the fold needs one GAP whose area follows it; this circuit has {found}")
+    if circuit.tran is None:
+        raise InputError("a map of the fold needs a .tran line that says how long a run is")
+    sources = circuit.by_device("V")
+    t_stop = circuit.tran.stop
+    peak = max((e.waveform.peak(0.0, t_stop) for e in sources if e.waveform is not None), default=0.0)
+    if not 0.0 < peak < math.inf:
+        raise InputError("a map of the fold needs a V element with a voltage to raise; this circuit has none")
+    gap = gaps[0]
+    factors = np.geomspace(1.0 / span, span, points)
+    waves = [e.waveform for e in sources]
+    tuned = len(waves) == 1 and isinstance(getattr(waves[0], "frequency", None), float)
+    done = _Count(1 + points * (3 if tuned else 2), progress)
+    around = fold_voltage(circuit, peak, t_stop)
+    done.one()
+    sweeps = []
+    for key, name, unit in (("fn", "load", "N"), ("d", "gap", "m")):
+        own = float(gap.values[key])
+        changed = [circuit.varied({f"{gap.name}.{key}": own * x}) for x in factors]
+        sweeps.append(FoldSweep(name, unit, own, own * factors, _along(changed, peak, [t_stop] * points, done)))
+    if tuned:
+        own = float(waves[0].frequency)  # type: ignore[union-attr]
+        skins = [e.name for e in circuit.by_device("SKIN")]
+        changed = []
+        for x in factors:
+            wave: Waveform = dataclasses.replace(waves[0], frequency=own * x)  # type: ignore[type-var, assignment]
+            changes: dict[str, float | Waveform] = {f"{skin}.f": own * x for skin in skins}
+            changed.append(circuit.varied({**changes, sources[0].name: wave}))
+        voltages = _along(changed, peak, [t_stop / x for x in factors], done)
+        sweeps.append(FoldSweep("frequency", "Hz", own, own * factors, voltages))
+    return FoldLimits(circuit, peak, around, tuple(sweeps))
+
+
+@dataclass
+class _Count:
+    """Voltages found, of how many."""
+
+    all: int
+    told: Progress | None
+    found: int = 0
+
+    def one(self) -> None:
+        """Count one more."""
+        self.found += 1
+        if self.told is not None:
+            self.told(self.found / self.all)
+
+
+def _along(circuits: list[Circuit], peak: float, ends: list[float], done: _Count) -> FloatArray:
+    """Fold voltages of circuits, each looked for near that of the one before."""
+    out = []
+    guess = peak
+    for circuit, t_stop in zip(circuits, ends, strict=True):
+        out.append(fold_voltage(circuit, peak, t_stop, guess))
+        done.one()
+        guess = out[-1] if math.isfinite(out[-1]) else HIGHEST
+    return np.array(out)
+
+
+def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | None = None) -> float:
+    """Peak source voltage (V) at which a run up to `t_stop` (s) meets the fold, to 1e-3; NaN for none up to `HIGHEST`.
+
+    It starts as the deck's run does. `peak` is what the circuit's sources reach now, V; `guess` where to look first.
+    """
+
+    def folds(voltage: float) -> bool:
+        factor = as_waveform(voltage / peak)
+        raised = circuit.varied(
+            {e.name: Product((factor, e.waveform)) for e in circuit.by_device("V") if e.waveform is not None}
+        )
+        if is_stack(raised):
+            try:
+                problem = prepare(
+                    raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="deck",
+                    charge=False, rtol=RTOL,
+                )  # fmt: skip
+            except InputError as error:
+                # An operating point goes with the source, and may itself stand past the fold; a given start does not.
+                if circuit.initial or "past the fold" not in str(error):
+                    raise
+                return True
+            return meets_fold(problem, RTOL)
+        run = simulate(
+            raised, t_stop=t_stop, t_eval=[0.0, t_stop], charge_law="mobile", rtol=RTOL, charge=False, throw=False
+        )  # fmt: skip
+        if run.failure is not None and run.status is not Status.FOLD:
+            raise SolveError(run.failure, run)
+        return run.status is Status.FOLD
+
+    low = high = min(max(guess or peak, LOWEST), HIGHEST)
+    if folds(low):
+        while True:
+            low, high = 0.7 * low, low
+            if not folds(low):
+                break
+            if low < LOWEST:
+                return low
+    else:
+        while True:
+            if high >= HIGHEST:
+                return math.nan
+            low, high = high, min(high / 0.7, HIGHEST)
+            if folds(high):
+                break
+    while high > low * (1.0 + EXACT):
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if folds(middle) else (middle, high)
+    return math.sqrt(low * high)
+
+
+def plot_limits(limits: FoldLimits) -> Picture:
+    """The fold's voltage against every parameter, the deck's own point marked."""
+    from fingerspice.plots.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
+
+    figure, axes = new_figure(1, len(limits.sweeps), height=3.2, sharey=True)
+    for ax, sweep in zip(axes, limits.sweeps, strict=True):
+        factor, unit = engineering(sweep.own, sweep.unit)
+        x, own = factor * sweep.values, factor * sweep.own
+        ax.plot(x, sweep.voltages, color=BLUE, marker="o", markersize=3, label="fold of the mobile law")
+        ax.fill_between(x, sweep.voltages, 1e6, color=GREY, alpha=0.2, linewidth=0, label="no solution")
+        ax.plot([own], [limits.peak], color=VERMILION, marker="D", linestyle="none", label="this deck")
+        ax.set_xscale("log")
+        ax.set_yscale("log")
+        dress(ax, "Peak source voltage [V]" if ax is axes[0] else "", f"{sweep.name.capitalize()} [{unit}]")
+    shown = np.concatenate([s.voltages[np.isfinite(s.voltages)] for s in limits.sweeps] + [[limits.peak]])
+    axes[0].set_ylim(0.5 * shown.min(), 2.0 * shown.max())
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=3, fontsize=FONT - 0.5, frameon=False)
+    caption(figure, f"{heading(limits.circuit)} · charge law mobile; the other parameters as in the deck")
+    return figure

@@ -1,0 +1,184 @@
+"""Measured resistivity and permittivity as tables: what their headers say, and which slip would explain bad ones."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.errors import InputError
+from fingerspice.netlist.reader import read_text
+from fingerspice.physics.materials import EPS0
+
+FloatArray = NDArray[np.float64]
+
+COLUMNS = ("frequency", "resistivity", "permittivity")
+ALLOWED = "frequency (Hz), resistivity (ohm m), relative permittivity"
+_PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "G": 1e9, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9, "p": 1e-12}
+_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_PREFIX = f"(?P<prefix>[{''.join(_PREFIXES)}]?)"
+_METRE = "(?P<metre>cm|mm|m)"
+# Names of what a column holds, and how its unit is written: the value in SI is value * prefix * metre^power * factor.
+_NAMES = {
+    "frequency": "f|freq|frequency|frequenz|hz",
+    "angular frequency": "w|omega|ω|angular frequency|angular_frequency",
+    "resistivity": "rho|ρ|rho_sc|resistivity|resistance",
+    "conductivity": "sigma|σ|kappa|conductivity|conductance",
+    "permittivity": "eps|eps_r|epsr|eps'|eps_r'|epsilon|epsilon_r|ε|ε_r|εr|ε'|eps_r_sc|permittivity|"
+    "relative permittivity|relative_permittivity|dielectric constant|dk",
+}
+_UNITS: dict[str, tuple[tuple[str, float, int], ...]] = {
+    "frequency": ((f"{_PREFIX}[Hh]z|1/s", 1.0, 0),),
+    "angular frequency": (("rad/s|1/s", 1.0, 0),),
+    "resistivity": ((f"{_PREFIX}(?:[Oo]hms?|[\u03a9\u2126])[ *·.-]?{_METRE}", 1.0, 1),),
+    "conductivity": ((f"{_PREFIX}S/{_METRE}", 1.0, -1),),
+    "permittivity": (("1|-", 1.0, 0), (f"{_PREFIX}F/{_METRE}", 1.0 / EPS0, -1)),
+}
+
+
+def read_table(path: Path) -> FloatArray:
+    """Rows of frequency (Hz), resistivity (ohm m) and relative permittivity from a text file of three columns.
+
+    Columns are separated by commas, semicolons (then with a decimal comma or point) or tabs. A line of names says what
+    they hold, in which order and in which units, conductivities and angular frequencies too.
+
+    Raises
+    ------
+    InputError
+        For what cannot be read, with its row.
+    """
+    try:
+        lines = read_text(path, str(path)).splitlines(keepends=True)
+        mark = next((mark for mark in ";\t" if any(mark in line for line in lines)), ",")
+        rows = [row for row in csv.reader(lines, delimiter=mark) if row and not row[0].lstrip().startswith("#")]
+    except csv.Error as error:
+        raise InputError(f"{path} cannot be read as CSV: {error}") from error
+    head: list[str] = []
+    numbers = []
+    for place, row in enumerate(rows):
+        try:
+            numbers.append([float(x.replace(",", ".") if mark == ";" else x) for x in row])
+        except ValueError:
+            if place > 0:
+                raise InputError(f"{path}, row {place + 1}: {','.join(row)!r}; allowed: three numbers") from None
+            head = row
+    if any(len(row) != 3 for row in numbers):
+        raise InputError(f"{path} has rows that are not three numbers; allowed: {ALLOWED}")
+    table = np.array(numbers, float).reshape(-1, 3)
+    return _as_named(table, head, str(path)) if len(head) == 3 else table
+
+
+def _as_named(table: FloatArray, head: list[str], file: str) -> FloatArray:
+    """Columns in their order and SI units, as their names say; those without a name of use keep their place."""
+    named = [_column(name, file) for name in head]
+    out = table.copy()
+    left = [k for k in range(3) if named[k] is None]
+    used: set[int] = set()
+    for k, found in enumerate(named):
+        if found is None:
+            continue
+        quantity, factor = found
+        values = factor * table[:, k]
+        with np.errstate(divide="ignore"):
+            if quantity == "conductivity":
+                quantity, values = "resistivity", 1.0 / values
+        if quantity == "angular frequency":
+            quantity, values = "frequency", values / (2.0 * np.pi)
+        place = COLUMNS.index(quantity)
+        if place in used:
+            raise InputError(
+                f"{file}: two columns are a {quantity} by their names, {', '.join(head)}; allowed: {ALLOWED}"
+            )
+        used.add(place)
+        out[:, place] = values
+    for place, k in zip([p for p in range(3) if p not in used], left, strict=True):
+        out[:, place] = table[:, k]
+    return out
+
+
+def _column(name: str, file: str) -> tuple[str, float] | None:
+    """What a column holds by its name, and what makes SI of it; None for a name that says nothing."""
+    bare = name.strip().strip("\"'")
+    match = re.fullmatch(r"(?P<what>[^\[(/]*?)\s*(?:[\[(](?P<bracket>[^\])]*)[\])]|/\s*(?P<slash>.+))?", bare)
+    if match is None:
+        return None
+    what, unit = match["what"].strip(), (match["bracket"] or match["slash"] or "").strip()
+    quantity = next((q for q, names in _NAMES.items() if re.fullmatch(names, what, re.IGNORECASE)), None)
+    if quantity is None and "_" in what and not unit:
+        # f_kHz
+        what, _, unit = what.rpartition("_")
+        quantity = next((q for q, names in _NAMES.items() if re.fullmatch(names, what, re.IGNORECASE)), None)
+    if quantity is None:
+        return None
+    if quantity == "frequency" and unit == "rad/s":
+        quantity = "angular frequency"
+    if not unit:
+        return quantity, 1.0
+    for pattern, factor, power in _UNITS[quantity]:
+        found = re.fullmatch(pattern, unit)
+        if found:
+            groups = found.groupdict()
+            scale = _PREFIXES[groups.get("prefix") or ""] * _METRES[groups.get("metre") or "m"] ** power
+            return quantity, factor * scale
+    raise InputError(
+        f"{file}: the unit of column {name.strip()!r} is not known; allowed: Hz, rad/s, ohm m, S/m, and 1 or F/m"
+    )
+
+
+#: What data may be by mistake, and the table that they were meant as.
+_SLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
+    ("the frequency is in rad/s", lambda t: _scaled(t, 0, 0.5 / np.pi)),
+    ("the second column is a conductivity in S/m", lambda t: _inverse(t, 1.0)),
+    ("the frequency is in kHz", lambda t: _scaled(t, 0, 1e3)),
+    ("the resistivity is in ohm cm", lambda t: _scaled(t, 1, 1e-2)),
+    ("the resistivity is in kohm m", lambda t: _scaled(t, 1, 1e3)),
+    ("resistivity and permittivity have changed places", lambda t: t[:, [0, 2, 1]]),
+    ("frequency and resistivity have changed places", lambda t: t[:, [1, 0, 2]]),
+    ("frequency and permittivity have changed places", lambda t: t[:, [2, 1, 0]]),
+    ("the columns are resistivity, permittivity, frequency", lambda t: t[:, [2, 0, 1]]),
+    ("the columns are permittivity, frequency, resistivity", lambda t: t[:, [1, 2, 0]]),
+    ("the second column is a conductivity in mS/m", lambda t: _inverse(t, 1e-3)),
+    ("the second column is a conductivity in uS/cm", lambda t: _inverse(t, 1e-4)),
+    ("the second column is a conductivity in S/cm", lambda t: _inverse(t, 1e2)),
+    ("the frequency is in MHz", lambda t: _scaled(t, 0, 1e6)),
+    ("the permittivity is in F/m", lambda t: _scaled(t, 2, 1.0 / EPS0)),
+)
+
+
+def _scaled(table: FloatArray, column: int, factor: float) -> FloatArray:
+    out = table.copy()
+    out[:, column] *= factor
+    return out
+
+
+def _inverse(table: FloatArray, unit: float) -> FloatArray:
+    out = table.copy()
+    out[:, 1] = 1.0 / (unit * table[:, 1])
+    return out
+
+
+def likely_slips(table: FloatArray, misfit: Callable[[FloatArray], float], least: float) -> list[str]:
+    """What would make a material of data that are none: slips that leave less than a third of the misfit, best first.
+
+    Parameters
+    ----------
+    table : ndarray, shape (n, 3)
+        Frequency (Hz), resistivity (ohm m) and relative permittivity.
+    misfit : callable
+        How far a table is from any causal and passive material.
+    least : float
+        That of the data as they are.
+    """
+    found = []
+    for text, meant in _SLIPS:
+        other = meant(table)
+        other = other[np.argsort(other[:, 0])]
+        if np.all(np.diff(other[:, 0]) > 0.0):
+            found.append((misfit(other), text))
+    best = min((value for value, _ in found), default=np.inf)
+    # Two slips of the same factor, kHz and kohm m, cannot be told apart.
+    return [text for value, text in found if value <= min(1.1 * best, least / 3.0)][:2]

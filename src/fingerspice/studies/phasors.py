@@ -1,0 +1,136 @@
+"""Phasors of a circuit: gain, gap voltage, area and mean force against frequency (Eqs. 9 to 15)."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import replace
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_area
+from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.response import linear_scene
+from fingerspice.circuit.usual import beyond_fingers
+from fingerspice.physics.materials import skin_permittivity, skin_resistivity
+from fingerspice.results.phasor_solution import PhasorSolution
+from fingerspice.studies.sweeps import sweep_drive, sweep_notes
+from fingerspice.waveforms.waveform import Fundamental, require
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+def _frequencies(frequency: ArrayLike | None, fundamental: Fundamental | None) -> FloatArray:
+    if frequency is None:
+        if fundamental is None:
+            raise InputError("the source has no fundamental: give the frequencies in Hz")
+        frequency = fundamental.frequency
+    f = np.atleast_1d(np.asarray(frequency, float))
+    require(
+        f.ndim == 1 and bool(np.all(np.isfinite(f) & (f > 0.0))),
+        "frequency",
+        f"{frequency} Hz",
+        "positive numbers",
+    )
+    return f
+
+
+def _check_area(area: str | float, amplitude: float, fixed: bool) -> None:
+    """Refuse what is no area or mode, and a coupled one without an amplitude to couple it to."""
+    if not isinstance(area, str):
+        require(math.isfinite(area) and area > 0.0, "area", f"{area:g} m^2", "a positive area in m^2")
+        return
+    require(area in ("mean", "frozen"), "area", repr(area), "'mean', 'frozen' or a number in m^2")
+    if area == "mean" and math.isnan(amplitude) and not fixed:
+        raise InputError(
+            "area='mean' needs the amplitude of the source's fundamental, and this source has none; allowed: "
+            "'frozen' or an area in m^2"
+        )
+
+
+def _with_skin_held(circuit: Circuit) -> Circuit:
+    """A circuit whose SKINs are slabs of their data at their own frequency."""
+
+    def held(skin: Element) -> Element:
+        d, f = skin.values["d"], skin.values["f"]
+        eps_r, rho = float(skin_permittivity(f)), float(skin_resistivity(f))
+        values = MappingProxyType({"d": d, "eps_r": eps_r, "rho": rho, "e_max": math.inf})
+        return replace(skin, device="SLAB", values=values)
+
+    return replace(circuit, elements=tuple(held(e) if e.device == "SKIN" else e for e in circuit.elements))
+
+
+def _refuse_no_number(f: FloatArray, *results: NDArray[np.inexact]) -> None:
+    """Refuse a sweep whose figures are beyond the range of numbers."""
+    bad = ~np.logical_and.reduce([np.isfinite(x).reshape(f.size, -1).all(axis=1) for x in results])
+    if np.any(bad):
+        raise InputError(
+            f"the phasor at {f[np.argmax(bad)]:g} Hz is beyond the range of numbers; allowed: frequencies nearer to "
+            "the 10 Hz to 100 kHz of the skin's data, and values nearer to Table 1's"
+        )
+
+
+def phasor(
+    circuit: Circuit,
+    frequency: ArrayLike | None = None,
+    *,
+    sources: Sources | None = None,
+    parameters: Parameters | None = None,
+    area: str | float = "mean",
+    skin: str = "swept",
+) -> PhasorSolution:
+    """Phasor solution of a circuit.
+
+    Parameters
+    ----------
+    circuit : Circuit
+    frequency : array_like, optional
+        Hz, positive; the source's fundamental by default. Over given frequencies a deck's ``AC magnitude [phase]`` is
+        what drives, as in ngspice; without it, and at the fundamental, the source's fundamental.
+    sources, parameters
+        As in `simulate`.
+    area : str or float
+        ``"mean"``: coupled through the mean stress at the source's own amplitude (its fundamental's, if it is
+        not a sine); ``"frozen"``: the area at 0 V; or an area in m^2. An area fixed by the deck comes before
+        ``"mean"`` and ``"frozen"``.
+    skin : str
+        ``"swept"``: SKIN's data at each frequency; ``"own"``: at SKIN's own f, as in ngspice.
+
+    Returns
+    -------
+    PhasorSolution
+
+    Raises
+    ------
+    InputError
+        For a circuit without GAP, a network with several GAPs or sources, a source without fundamental where one is
+        needed, frequencies or an area not positive, or a result beyond the range of numbers.
+    """
+    require(skin in ("swept", "own"), "skin", repr(skin), "'swept' or 'own'")
+    require_area(area)
+    circuit = overridden(circuit, sources, parameters)
+    scene = linear_scene(circuit if skin == "swept" else _with_skin_held(circuit))
+    f = _frequencies(frequency, scene.fundamental)
+    drive = sweep_drive(scene.sources, scene.fundamental, frequency is not None)
+    _check_area(area, drive.amplitude, scene.fixed)
+    with np.errstate(all="ignore"):
+        areas = np.array([scene.areas(float(x), area, drive.amplitude) for x in f])
+        layers = np.array([scene.layer_gain(float(x), a) for x, a in zip(f, areas, strict=True)])
+        gain, own = layers[:, scene.gap], areas[:, scene.finger].copy()
+        u_gap = gain * drive.amplitude * np.exp(1j * drive.phase)
+        # Mean of sigma A over a period of a sine: half the peak.
+        force = 0.5 * scene.contact.stress(np.abs(u_gap)) * own
+    _refuse_no_number(f, layers, own, *((u_gap, force) if math.isfinite(drive.amplitude) else ()))
+    notes, warned = sweep_notes(circuit, f, skin)
+    largest = (float(np.max(x)) for x in (force, scene.contact.stress(np.abs(u_gap)), own))
+    warned = (*warned, *beyond_fingers("", *largest))
+    for text in warned:
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    return PhasorSolution(
+        f, gain, layers, u_gap, own, force, drive.amplitude, scene.layers, drive.phase, drive.text, notes, warned,
+        circuit,
+    )  # fmt: skip

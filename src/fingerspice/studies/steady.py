@@ -1,0 +1,158 @@
+"""Periodic state of a circuit under a periodic source, found directly, with its certificate and its stability."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.errors import FingerspiceWarning, InputError, SolveError
+from fingerspice.base.pages import Page, Shown
+from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_area
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.statespace import build_stack
+from fingerspice.results.outcome import ErrorEstimate
+from fingerspice.results.solution import Solution
+from fingerspice.results.summary import Figured, Figures, KeptFigures
+from fingerspice.solve.periodic import close_period
+from fingerspice.solve.problem import Problem, prepare
+from fingerspice.solve.simulation import RTOL_RANGE, run_problem
+from fingerspice.waveforms.waveform import require
+
+if TYPE_CHECKING:
+    from fingerspice.plots.picture import Picture
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, repr=False)
+class SteadyState(Shown, Figured):
+    """The periodic state, and what vouches for it; its figures (`f_el_mean` and others) are those of the period.
+
+    Attributes
+    ----------
+    problem : Problem
+        One period from the periodic state on, at the first whole period after the source has settled.
+    rtol : float
+    defect : float
+        Largest change of a layer voltage over a further period, V.
+    map_slope : ndarray, shape (n_cell - 1, n_cell - 1)
+        Derivative of the stack's modes after a period by those before it, to about 1e-5.
+    memory : float
+        Error of the periodic state over that of one period; large where a disturbance outlasts many periods.
+    error : ErrorEstimate
+        What the state may be off, as its effect on the gap voltage and the force of the period.
+    periods : float
+        Periods integrated to find it.
+    """
+
+    problem: Problem
+    rtol: float
+    defect: float
+    map_slope: FloatArray
+    memory: float
+    error: ErrorEstimate
+    periods: float
+
+    def _page(self) -> Page:
+        from fingerspice.results.report import steady_page
+
+        return steady_page(self)
+
+    def plot(self, signals: str | Sequence[str] | None = None) -> Picture:
+        """The period's signals against time; `signals` as in `Solution.plot`."""
+        return self.solution.plot(signals)
+
+    @property
+    def period(self) -> float:
+        """Of the source, s."""
+        assert self.problem.waveform.period is not None
+        return self.problem.waveform.period
+
+    @property
+    def multipliers(self) -> FloatArray:
+        """Sizes of the Floquet multipliers: what a period leaves of a small disturbance, shape (n_cell - 1,)."""
+        return np.abs(np.linalg.eigvals(self.map_slope)) if self.map_slope.size else np.zeros(0)
+
+    @property
+    def stability_margin(self) -> float:
+        """One less the largest multiplier: 0 where a disturbance stays for ever."""
+        return 1.0 - float(self.multipliers.max(initial=0.0))
+
+    @property
+    def _figures(self) -> Figures | KeptFigures:
+        return self.solution._figures
+
+    @cached_property
+    def solution(self) -> Solution:
+        """The period's signals, integrated when first asked for; its warnings are said then.
+
+        Raises
+        ------
+        SolveError
+            Where that fails.
+        """
+        solution = run_problem(self.problem, rtol=self.rtol, start="periodic", begun=self.error)
+        if solution.failure is not None:
+            raise SolveError(solution.failure, solution)
+        for text in solution.warnings:
+            if text not in self.problem.circuit.warnings:
+                # Past functools, to the line that asked.
+                warnings.warn(text, FingerspiceWarning, stacklevel=3)
+        return solution
+
+
+def steady_state(
+    circuit: Circuit,
+    *,
+    sources: Sources | None = None,
+    parameters: Parameters | None = None,
+    charge_law: str | None = None,
+    area: str | float = "coupled",
+    rtol: float = 1e-8,
+    points: int = 200,
+    charge: bool = True,
+) -> SteadyState:
+    """Periodic state of a circuit, by Newton's method on the map of one period.
+
+    Parameters
+    ----------
+    circuit : Circuit
+        With a periodic source.
+    sources, parameters, charge_law, area, rtol, charge
+        As in `simulate`: the error is relative to the peaks over the period.
+    points : int
+        Output steps in the period.
+
+    Returns
+    -------
+    SteadyState
+
+    Raises
+    ------
+    InputError
+        For a source without a period.
+    SolveError
+        Where a period cannot be integrated, or the iteration does not close it.
+    """
+    require(RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-13 to 0.1")
+    require(points >= 1, "points", points, "1 or more")
+    require_area(area)
+    circuit = overridden(circuit, sources, parameters)
+    waveform = circuit.remember("waveform", lambda: build_stack(circuit).waveform)
+    if waveform.period is None:
+        raise InputError("the source has no period, so there is no periodic state to find")
+    problem = prepare(
+        circuit, t_stop=waveform.period, t_eval=None, charge_law=charge_law, area=area, start="uncharged",
+        charge=charge,
+    )  # fmt: skip
+    closed = close_period(dataclasses.replace(problem, first=0.0, step=waveform.period / points), 0.5 * rtol)
+    return SteadyState(
+        closed.problem, rtol, closed.defect, closed.map_slope, closed.memory, closed.error, closed.periods
+    )

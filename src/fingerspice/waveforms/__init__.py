@@ -1,0 +1,1 @@
+"""Source voltages as functions of time."""

@@ -1,0 +1,424 @@
+"""Waveforms made of straight pieces: PWL, square, triangle, sawtooth, pulse and samples.
+
+One class does the work: a subclass only lists its knots.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fingerspice.base.errors import InputError
+from fingerspice.waveforms.bounds import check_finite, check_range, in_windows, runs_through
+from fingerspice.waveforms.waveform import Waveform, blank_terms, require
+
+FloatArray = NDArray[np.float64]
+
+# Knots that fit any window of a source.
+_FEW_KNOTS = 1000
+
+
+class _Ramps(Waveform):
+    """Straight lines between knots (t, v), two knots at one time being a jump; held outside, or repeated.
+
+    Subclasses give `_knots` for one run through; a repeated waveform runs through once per `period`, from
+    `_first` on, and its knots then span exactly one period.
+    """
+
+    _first: float = 0.0
+
+    def _knots(self) -> tuple[FloatArray, FloatArray]:
+        raise NotImplementedError
+
+    def _phase(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Start of the run that holds each time, and the time since."""
+        if self.period is None:
+            return np.zeros_like(t), t
+        start = self._first + np.maximum(np.floor((t - self._first) / self.period), 0.0) * self.period
+        return start, t - start
+
+    def _times(self, t0: float, t1: float) -> FloatArray:
+        """Absolute knot times around [t0, t1], ascending, repeated at jumps."""
+        times, _ = self._knots()
+        if self.period is None:
+            return times
+        low = max(0.0, np.floor((t0 - self._first) / self.period) - 1.0)
+        high = max(low, np.ceil((t1 - self._first) / self.period) + 1.0)
+        starts = self._first + runs_through(low, high, times.size, t0, t1) * self.period
+        return np.asarray((starts[:, None] + times[None, :]).ravel())
+
+    def _edges(self, t0: float, t1: float) -> FloatArray:
+        times = np.unique(self._times(t0, t1))
+        # A run's last knot and the next run's first differ by rounding.
+        keep = np.ones(times.size, bool)
+        keep[1:] = np.diff(times) > 1e-15 * np.abs(times[1:])
+        return times[keep]
+
+    def breakpoints(self, t0: float, t1: float) -> FloatArray:
+        times = self._edges(t0, t1)
+        return times[(times >= t0) & (times <= t1)]
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        t = np.asarray(t, float)
+        flat = t.ravel()
+        out = np.empty(flat.size)
+        for window in in_windows(flat, self.breakpoint_rate() if self.period else 0.0):
+            out[window] = self._values(flat[window], side)
+        return out.reshape(t.shape)
+
+    def _values(self, flat: FloatArray, side: str) -> FloatArray:
+        """As `value`, at times (n_t,) that are not far apart."""
+        edges = self._edges(flat.min(), flat.max())
+        index = np.searchsorted(edges, flat, side="right" if side == "right" else "left")
+        bounds = np.concatenate([[-math.inf], edges, [math.inf]])
+        start, stop = bounds[index], bounds[index + 1]
+        v0, slope = self._line(start, stop)
+        tau = np.where(np.isfinite(start), flat - np.where(np.isfinite(start), start, 0.0), 0.0)
+        return np.asarray(v0 + slope * tau)
+
+    def _line(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Value at the start and slope of the pieces from `start` to `stop`, told apart by their midpoints."""
+        times, values = self._knots()
+        middle = 0.5 * (start + stop)
+        run, tau = self._phase(np.where(np.isfinite(middle), middle, 0.0))
+        index = np.searchsorted(times, tau, side="right")
+        before = np.where(np.isfinite(middle), index == 0, start == -math.inf)
+        after = np.where(np.isfinite(middle), index == times.size, start != -math.inf)
+        j = np.clip(index, 1, times.size - 1)
+        width = times[j] - times[j - 1]
+        inside = ~before & ~after & (width > 0.0)
+        slope = np.where(inside, (values[j] - values[j - 1]) / np.where(width > 0.0, width, 1.0), 0.0)
+        offset = np.where(np.isfinite(start), start - run, 0.0) - times[j - 1]
+        # The start of a piece is a knot up to rounding: use the knot's value exactly.
+        offset = np.where(np.abs(offset) <= 1e-9 * width, 0.0, offset)
+        v0 = np.where(inside, values[j - 1] + slope * offset, np.where(before, values[0], values[-1]))
+        return v0, slope
+
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
+        out = blank_terms(start.size, 2)
+        out[:, 0, 0], out[:, 1, 0] = self._line(start, stop)
+        out[:, 1, 1] = 1.0
+        return out
+
+    def breakpoint_rate(self) -> float:
+        times, _ = self._knots()
+        if self.period is None and times.size <= _FEW_KNOTS:
+            # They are all there will ever be, however close they stand.
+            return 0.0
+        span = self.period or (times[-1] - times[0])
+        return times.size / span if span > 0.0 else 0.0
+
+
+@dataclass(frozen=True)
+class PWL(_Ramps):
+    """Piecewise linear through (times, values); held before the first and after the last; equal times jump.
+
+    Parameters
+    ----------
+    times : tuple of float
+        s, not decreasing, at most two equal in a row.
+    values : tuple of float
+        V.
+    repeat : float, optional
+        s; from the last time on, the stretch from `repeat` to the last time runs again and again.
+    """
+
+    times: tuple[float, ...]
+    values: tuple[float, ...]
+    repeat: float | None = None
+
+    def __post_init__(self) -> None:
+        t = np.asarray(self.times, float)
+        v = np.asarray(self.values, float)
+        object.__setattr__(self, "times", tuple(t.tolist()))
+        object.__setattr__(self, "values", tuple(v.tolist()))
+        require(t.size >= 1 and t.size == v.size, "PWL", f"{t.size} times and {v.size} values", "as many of each")
+        for name, array in (("time", t), ("value", v)):
+            bad = np.flatnonzero(~np.isfinite(array))
+            if bad.size:
+                raise InputError(f"PWL {name} number {bad[0] + 1} is {array[bad[0]]}; allowed: finite numbers")
+        check_range("PWL time", t, "s")
+        check_range("PWL value", v, "V")
+        back = t[1:] < t[:-1]
+        if np.any(back):
+            i = int(np.argmax(back))
+            raise InputError(f"PWL times decrease: {t[i + 1]:g} s follows {t[i]:g} s; allowed: not decreasing")
+        thrice = t[2:] == t[:-2]
+        if np.any(thrice):
+            i = int(np.argmax(thrice))
+            raise InputError(f"PWL time {t[i]:g} s stands three times; two equal times are a jump")
+        if self.repeat is not None:
+            require(
+                t.size > 1 and any(self.repeat == x for x in t[:-1]) and self.repeat < t[-1],
+                "PWL repeat time",
+                f"{self.repeat:g} s",
+                "one of the PWL's own times before the last",
+            )
+
+    @property
+    def period(self) -> float | None:  # type: ignore[override]
+        return None if self.repeat is None else self.times[-1] - self.repeat
+
+    @property
+    def settled(self) -> float:
+        return max(0.0, self.times[-1]) if self.repeat is not None else 0.0
+
+    def _knots(self) -> tuple[FloatArray, FloatArray]:
+        return np.asarray(self.times), np.asarray(self.values)
+
+    # A repeated PWL has a head before the part that repeats, so its runs are not all alike.
+    def _phase(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        if self.repeat is None:
+            return np.zeros_like(t), t
+        period = self.times[-1] - self.repeat
+        k = np.maximum(np.floor((t - self.repeat) / period), 0.0)
+        return k * period, t - k * period
+
+    def _times(self, t0: float, t1: float) -> FloatArray:
+        times = np.asarray(self.times)
+        if self.repeat is None:
+            return times
+        period = self.times[-1] - self.repeat
+        body = times[times >= self.repeat]
+        low = max(1.0, np.floor((t0 - self.repeat) / period) - 1.0)
+        high = max(low, np.ceil((t1 - self.repeat) / period) + 1.0)
+        runs = (runs_through(low, high, body.size, t0, t1) * period)[:, None] + body[None, :]
+        return np.concatenate([times, runs.ravel()])
+
+
+@dataclass(frozen=True)
+class _Periodic(_Ramps):
+    """Ramps repeated for ever, the phase fixed by delay and phase."""
+
+    amplitude: float
+    frequency: float
+    offset: float = 0.0
+    phase_deg: float = 0.0
+    delay: float = 0.0
+    units: ClassVar[dict[str, str]] = {
+        "amplitude": "V",
+        "frequency": "Hz",
+        "duty": "",
+        "offset": "V",
+        "phase_deg": "deg",
+        "delay": "s",
+    }
+
+    def __post_init__(self) -> None:
+        check_finite(self)
+        kind = type(self).__name__.lower()
+        require(self.frequency > 0.0, f"{kind} frequency", f"{self.frequency:g} Hz", "> 0")
+
+    @property
+    def period(self) -> float | None:  # type: ignore[override]
+        return 1.0 / self.frequency
+
+    def _times(self, t0: float, t1: float) -> FloatArray:
+        # (k + x) / f rounds to the time a user writes; k (1 / f) + x (1 / f) often misses it.
+        x = self._knots()[0] * self.frequency
+        shift = self.delay - self.phase_deg / 360.0 / self.frequency
+        low = np.floor((t0 - shift) * self.frequency) - 1.0
+        high = np.ceil((t1 - shift) * self.frequency) + 1.0
+        runs = runs_through(low, high, x.size, t0, t1)
+        return np.asarray(((runs[:, None] + x) / self.frequency + shift).ravel())
+
+    @property
+    def _first(self) -> float:  # type: ignore[override]
+        # A whole number of periods early enough that the shape covers t = 0 and the delay only shifts it.
+        shift = self.delay - self.phase_deg / 360.0 / self.frequency
+        period = 1.0 / self.frequency
+        return shift - math.ceil(shift / period - 1e-12) * period if shift > 0.0 else shift
+
+    def breakpoint_rate(self) -> float:
+        return 4.0 * self.frequency
+
+
+@dataclass(frozen=True)
+class Square(_Periodic):
+    """offset + amplitude for the first `duty` of each period, offset - amplitude for the rest, with ideal edges.
+
+    Amplitude and offset in V, frequency in Hz, duty between 0 and 1, phase in degrees, delay in s (a shift).
+    """
+
+    duty: float = 0.5
+
+    def __init__(
+        self,
+        amplitude: float,
+        frequency: float,
+        duty: float = 0.5,
+        offset: float = 0.0,
+        phase_deg: float = 0.0,
+        delay: float = 0.0,
+    ) -> None:
+        for name, value in (
+            ("amplitude", amplitude),
+            ("frequency", frequency),
+            ("duty", duty),
+            ("offset", offset),
+            ("phase_deg", phase_deg),
+            ("delay", delay),
+        ):
+            object.__setattr__(self, name, value)
+        self.__post_init__()
+        require(0.0 < duty < 1.0, "square duty", f"{duty:g}", "between 0 and 1")
+
+    @property
+    def half_wave(self) -> bool:
+        return self.offset == 0.0 and self.duty == 0.5
+
+    def _knots(self) -> tuple[FloatArray, FloatArray]:
+        period = 1.0 / self.frequency
+        t = np.array([0.0, 0.0, self.duty, self.duty, 1.0]) * period
+        sign = np.array([-1.0, 1.0, 1.0, -1.0, -1.0])
+        return t, self.offset + self.amplitude * sign
+
+
+@dataclass(frozen=True)
+class Triangle(_Periodic):
+    """Triangle in phase with the sine: 0, +amplitude at a quarter, -amplitude at three quarters of a period."""
+
+    @property
+    def half_wave(self) -> bool:
+        return self.offset == 0.0
+
+    def _knots(self) -> tuple[FloatArray, FloatArray]:
+        period = 1.0 / self.frequency
+        t = np.array([0.0, 0.25, 0.75, 1.0]) * period
+        return t, self.offset + self.amplitude * np.array([0.0, 1.0, -1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Sawtooth(_Periodic):
+    """Rises from offset - amplitude to offset + amplitude over each period, then jumps back."""
+
+    def _knots(self) -> tuple[FloatArray, FloatArray]:
+        period = 1.0 / self.frequency
+        t = np.array([0.0, 0.0, 1.0]) * period
+        return t, self.offset + self.amplitude * np.array([1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Pulse(_Ramps):
+    """SPICE's PULSE: v1 until `delay`, then per `pulse_period` a rise to v2, a width, a fall back to v1.
+
+    Voltages in V, times in s. A rise or fall of 0 is an ideal jump. Without `pulse_period` there is one pulse.
+    """
+
+    v1: float
+    v2: float
+    delay: float = 0.0
+    rise: float = 0.0
+    fall: float = 0.0
+    width: float = math.inf
+    pulse_period: float = math.inf
+    units: ClassVar[dict[str, str]] = {
+        "v1": "V",
+        "v2": "V",
+        "delay": "s",
+        "rise": "s",
+        "fall": "s",
+        "width": "s",
+        "pulse_period": "s",
+    }
+
+    def __post_init__(self) -> None:
+        for name in ("v1", "v2", "delay"):
+            require(math.isfinite(getattr(self, name)), f"pulse {name}", getattr(self, name), "a finite number")
+        for name in ("rise", "fall", "width"):
+            require(getattr(self, name) >= 0.0, f"pulse {name}", f"{getattr(self, name):g} s", ">= 0")
+        require(self.pulse_period > 0.0, "pulse period", f"{self.pulse_period:g} s", "> 0")
+        for name, unit in self.units.items():
+            check_range(f"pulse {name.replace('_', ' ')}", getattr(self, name), unit)
+        require(math.isfinite(self.rise + self.fall), "pulse rise + fall", "infinite", "finite times")
+        busy = self.rise + self.width + self.fall
+        if math.isfinite(self.pulse_period):
+            require(
+                busy <= self.pulse_period * (1.0 + 1e-12),
+                "pulse rise + width + fall",
+                f"{busy:g} s",
+                f"at most the period, {self.pulse_period:g} s",
+            )
+
+    @property
+    def period(self) -> float | None:  # type: ignore[override]
+        return self.pulse_period if math.isfinite(self.pulse_period) else None
+
+    @property
+    def settled(self) -> float:
+        return max(0.0, self.delay)
+
+    @property
+    def half_wave(self) -> bool:
+        return (
+            self.v1 == -self.v2
+            and self.rise == self.fall
+            and abs(2.0 * (self.rise + self.width) - self.pulse_period) <= 4e-16 * self.pulse_period
+        )
+
+    @property
+    def _first(self) -> float:  # type: ignore[override]
+        return self.delay
+
+    def _knots(self) -> tuple[FloatArray, FloatArray]:
+        start = 0.0 if self.period else self.delay
+        up = start + self.rise
+        if not math.isfinite(self.width):
+            return np.array([start, up]), np.array([self.v1, self.v2])
+        t = [start, up, up + self.width, up + self.width + self.fall]
+        v = [self.v1, self.v2, self.v2, self.v1]
+        if self.period:
+            t.append(max(t[-1], self.pulse_period))
+            v.append(self.v1)
+            if t[-2] >= t[-1]:
+                t, v = t[:-1], v[:-1]
+        return np.array(t), np.array(v)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples(_Ramps):
+    """Samples at a constant rate, linear in between, held before the first and after the last.
+
+    Parameters
+    ----------
+    values : array_like, shape (n,)
+        V, n >= 2.
+    rate : float
+        Samples per second.
+    start : float
+        Time of the first sample, s.
+    """
+
+    values: FloatArray
+    rate: float
+    start: float = 0.0
+    units: ClassVar[dict[str, str]] = {"rate": "Hz", "start": "s"}
+
+    def __post_init__(self) -> None:
+        values = np.array(self.values, float)
+        values.flags.writeable = False
+        object.__setattr__(self, "values", values)
+        require(
+            values.ndim == 1 and values.size >= 2,
+            "samples",
+            f"shape {values.shape}",
+            "one row of two or more",
+        )
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            raise InputError(f"sample number {bad[0]} is {values[bad[0]]}; allowed: finite numbers")
+        check_range("a sample", values, "V")
+        check_finite(self)
+        require(self.rate > 0.0, "sample rate", f"{self.rate:g} Hz", "> 0")
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        # numpy's own copies can be written.
+        self.values.flags.writeable = False
+
+    def _knots(self) -> tuple[FloatArray, FloatArray]:
+        return self.start + np.arange(self.values.size) / self.rate, self.values

@@ -1,0 +1,250 @@
+"""A user's function of time as a waveform, and any waveform as a table that compiled code can step through.
+
+A function is represented between its breakpoints by Chebyshev series, refined until they reproduce it at points
+they were not built from. What will not refine is a jump or a spike that was not declared: it is located,
+kept as a segment edge, and warned about.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fingerspice.base.compiled import jit
+from fingerspice.base.errors import InputError
+from fingerspice.waveforms.bounds import in_windows, runs_through
+from fingerspice.waveforms.refining import POINTS, Refiner
+from fingerspice.waveforms.waveform import Waveform, blank_terms, require
+
+FloatArray = NDArray[np.float64]
+
+_PERIODS_PER_SEGMENT = 64.0
+
+
+@dataclass(frozen=True, eq=False)
+class Function(Waveform):
+    """A Python function of time, U(t) in V, t in s; array-aware functions are called with arrays.
+
+    Parameters
+    ----------
+    function : callable
+        Takes a time or an array of times.
+    breaks : tuple of float
+        Times (s) at which it jumps or has a kink. With a period: within the first period.
+    repeat : float, optional
+        Its period, s, where it has one; the fundamental is then known.
+    """
+
+    function: Callable[..., object]
+    breaks: tuple[float, ...] = ()
+    repeat: float | None = None
+
+    def __post_init__(self) -> None:
+        require(callable(self.function), "source function", repr(self.function), "a function of time in s")
+        require(self.repeat is None or self.repeat > 0.0, "function period", self.repeat, "> 0 s")
+        breaks = {float(b) for b in self.breaks}
+        if self.repeat is not None:
+            # The end of a period is the start of the next.
+            breaks = {math.fmod(b, self.repeat) if b >= self.repeat else b for b in breaks}
+        object.__setattr__(self, "breaks", tuple(sorted(breaks)))
+
+    @property
+    def period(self) -> float | None:  # type: ignore[override]
+        return self.repeat
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        t = np.asarray(t, float)
+        if side == "left":
+            windows = [t.ravel()[window] for window in in_windows(t.ravel(), self.breakpoint_rate())]
+            edges = np.concatenate([self.breakpoints(x.min(), x.max()) for x in windows if x.size] or [np.empty(0)])
+            t = np.where(np.isin(t, edges), np.nextafter(t, -1), t)
+        if t.ndim == 0:
+            return np.asarray(self._scalar(float(t)))
+        try:
+            # A function written for one number may misread an array without raising: prove the two agree.
+            out = np.asarray(self.function(t), float)
+            if out.shape == t.shape and (
+                t.size == 0 or np.array_equal(out.flat[t.size // 2], self._scalar(t.flat[t.size // 2]), True)
+            ):
+                return out
+        except (TypeError, ValueError):
+            pass
+        return np.array([self._scalar(x) for x in t.ravel()]).reshape(t.shape)
+
+    def _scalar(self, t: float) -> float:
+        value = self.function(t)
+        try:
+            return float(value)  # type: ignore[arg-type]
+        except (TypeError, ValueError):
+            raise InputError(f"the source function returned {value!r} at t = {t:g} s; allowed: one number") from None
+
+    def breakpoints(self, t0: float, t1: float) -> FloatArray:
+        times = np.asarray(self.breaks, float)
+        if self.repeat is not None and times.size:
+            runs = runs_through(np.floor(t0 / self.repeat) - 1.0, np.ceil(t1 / self.repeat), times.size, t0, t1)
+            times = np.unique((runs[:, None] * self.repeat + times).ravel())
+        return times[(times >= t0) & (times <= t1)]
+
+    def breakpoint_rate(self) -> float:
+        return len(self.breaks) / self.repeat if self.repeat else 0.0
+
+
+@dataclass(frozen=True)
+class SourceTable:
+    """A waveform on a window of time: what compiled code steps through.
+
+    Attributes
+    ----------
+    edges : ndarray, shape (m + 1,)
+        Segment edges, s.
+    terms : ndarray, shape (m, k, 6)
+    series : ndarray, shape (m, l)
+        Chebyshev coefficients of each segment; l = 0 where the terms say it all.
+    scale : float
+        Largest |U| (V) seen in making a table of series; 0 where there are none.
+    not_finite : float or None
+        Time (s) of the first NaN or inf; the table then ends just before it.
+    rough : float
+        Largest misfit (V) that no finer series would mend: the rounding of a user's function.
+    """
+
+    edges: FloatArray
+    terms: FloatArray
+    series: FloatArray
+    scale: float = 0.0
+    not_finite: float | None = None
+    rough: float = 0.0
+
+    def values(self, t: FloatArray) -> FloatArray:
+        """A table of series at times within it (s), V."""
+        i = np.clip(np.searchsorted(self.edges, t, side="right") - 1, 0, self.edges.size - 2)
+        x = 2.0 * (t - self.edges[i]) / (self.edges[i + 1] - self.edges[i]) - 1.0
+        out = np.empty(t.size)
+        for k in np.unique(i):
+            here = i == k
+            out[here] = np.polynomial.chebyshev.chebval(x[here], self.series[k])
+        return out
+
+    def unseen(self, waveform: Waveform, t: FloatArray, tol: float) -> tuple[float, float] | None:
+        """The first of some times (s) at which a function is not what its table says, and by how much (V)."""
+        t = t[(t > self.edges[0]) & (t < self.edges[-1])]
+        if t.size == 0 or self.series.size == 0:
+            return None
+        # An edge is where the table itself found the function to jump.
+        right = np.clip(np.searchsorted(self.edges, t), 1, self.edges.size - 1)
+        near = np.minimum(np.abs(t - self.edges[right]), np.abs(t - self.edges[right - 1]))
+        t = t[near > 8e-15 * np.abs(t)]
+        off = np.abs(waveform.value(t) - self.values(t))
+        # NaN is not below anything.
+        wrong = np.flatnonzero(~(off <= max(1e3 * tol * self.scale, 30.0 * self.rough)))
+        return (float(t[wrong[0]]), float(off[wrong[0]])) if wrong.size else None
+
+
+def same_time(t: float) -> float:
+    """Distance (s) within which a time near `t` is that time: a few roundings of t."""
+    return 8e-16 * abs(t)
+
+
+@jit
+def misses(t: FloatArray, marks: FloatArray, slack: float) -> NDArray[np.bool_]:
+    """Whether a time comes within `slack` (relative) of each mark without being it; times and marks ascending."""
+    out = np.zeros(marks.size, np.bool_)
+    first = 0
+    for k in range(marks.size):
+        low = marks[k] - slack * abs(marks[k])
+        # Doubled strides, then halved ones, to the first time that is not below.
+        stride = 1
+        while first + stride < t.size and t[first + stride] < low:
+            stride *= 2
+        last = min(first + stride, t.size)
+        first += stride // 2
+        while first < last and t[first] < low:
+            middle = (first + last) // 2
+            if t[middle] < low:
+                first = middle + 1
+            else:
+                last = middle
+        i = first
+        while i < t.size and t[i] <= marks[k] + slack * abs(marks[k]):
+            out[k] |= t[i] != marks[k]
+            i += 1
+    return out
+
+
+def breakpoints_at(waveform: Waveform, t: float) -> FloatArray:
+    """Breakpoints that are at `t` (s) but for rounding."""
+    return waveform.breakpoints(t - same_time(t), t + same_time(t))
+
+
+def on_breakpoint(waveform: Waveform, t: float) -> float:
+    """Time t (s), on the breakpoint that it misses by rounding: a run to "three periods" ends at the jump there."""
+    near = breakpoints_at(waveform, t)
+    return float(near[0]) if near.size else t
+
+
+def is_sampled(waveform: Waveform) -> bool:
+    """Whether a waveform has no terms and is represented by series."""
+    return waveform.terms(np.zeros(1), np.ones(1)) is None
+
+
+def source_table(
+    waveform: Waveform, t0: float, t1: float, tol: float, step: float, *, no_chirps: bool = False, scale: float = 0.0
+) -> SourceTable:
+    """Table of a waveform over [t0, t1].
+
+    Parameters
+    ----------
+    waveform : Waveform
+    t0, t1 : float
+        Window, s.
+    tol : float
+        Error allowed of a Chebyshev series relative to the largest |U| met.
+    step : float
+        Output step, s: a function is looked at no less finely than this.
+    no_chirps : bool
+        Whether a term with a changing frequency, which has no closed-form response, becomes a series too.
+    scale : float
+        |U| (V) already met in windows before: what is tiny beside it need not be followed to its own last digit.
+    """
+    inner = waveform.breakpoints(t0, t1)
+    # A breakpoint that misses the window's edge by rounding is at the edge: no segment is shorter than that.
+    inner = inner[(inner > t0 + same_time(t0)) & (inner < t1 - same_time(t1))]
+    edges = np.concatenate([[t0], inner, [t1]])
+    if not is_sampled(waveform):
+        edges = _rephased(edges, waveform.shortest_time())
+        terms = waveform.terms(edges[:-1], edges[1:])
+        assert terms is not None
+        if no_chirps and np.any(terms[:, :, 5] != 0.0):
+            # Not the outputs' step: no result depends on which are asked for.
+            step = 0.1 * waveform.shortest_time()
+        else:
+            return SourceTable(edges, np.ascontiguousarray(terms), np.zeros((edges.size - 1, 0)))
+    pieces = Refiner(waveform, tol, step, scale)
+    for a, b in itertools.pairwise(edges):
+        if not pieces.cover(float(a), float(b)):
+            break
+    if is_sampled(waveform):
+        pieces.warn()
+    m = len(pieces.series)
+    return SourceTable(
+        np.array(pieces.edges) if m else np.array([t0]),
+        blank_terms(m, 1),
+        np.array(pieces.series).reshape(m, POINTS),
+        pieces.scale,
+        pieces.not_finite,
+        pieces.rough,
+    )
+
+
+def _rephased(edges: FloatArray, period: float) -> FloatArray:
+    """Edges with more between them, so that no phase inside a segment grows to where its rounding shows."""
+    longest = _PERIODS_PER_SEGMENT * period
+    if not np.any(np.diff(edges) > longest):
+        return edges
+    pieces = [np.linspace(a, b, max(1, math.ceil((b - a) / longest)) + 1)[:-1] for a, b in itertools.pairwise(edges)]
+    return np.concatenate([*pieces, edges[-1:]])
