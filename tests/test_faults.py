@@ -36,7 +36,7 @@ COMMANDS = {
 # The command, with what ends it just where it would hurt: PLACE is patched to strike when called for the N-th time.
 STRUCK = """
 import os, pathlib, sys
-from fingerspice.cli.result_files import datafiles
+from fingerspice.results import datafiles
 from fingerspice.__main__ import main
 place, count, number = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 sys.argv[1:4] = []

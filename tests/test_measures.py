@@ -10,9 +10,9 @@ from scipy.integrate import simpson
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.cli.result_files import measures, steps
 from fingerspice.numerics.extremes import largest
 from fingerspice.numerics.lobatto import NODES, POINTS
+from fingerspice.results import measures, steps
 from scenes import deck, table1, table1_deck
 
 LAWS = pytest.mark.parametrize("law", ["local", "mobile"])

@@ -7,7 +7,7 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.cli.result_files import steps
+from fingerspice.results import steps
 from fingerspice.results.summary import Figures
 from scenes import deck, table1
 
