@@ -8,8 +8,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import find_branches
@@ -115,7 +116,7 @@ def require_area(area: Any) -> None:
         require_number("area", area, "'coupled', 'mean', 'frozen' or a number in m^2")
 
 
-def times_given(what: str, given: ArrayLike | None) -> NDArray[np.float64] | None:
+def times_given(what: str, given: ArrayLike | None) -> FloatArray | None:
     """Times as an array, s.
 
     Raises

@@ -12,13 +12,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.usual import REST_AREA, Usual
 from fingerspice.physics.ladder import SKIN_LADDER
 from fingerspice.physics.materials import EPS0, SKIN_BAND, skin_permittivity, skin_resistivity
 
-FloatArray = NDArray[np.float64]
 #: Values in the netlist's units, and the frequency (Hz) whose data a dispersive material takes, or None for its cells:
 #: c (F/m^2), total leakage (S) and leakage per area (S/m^2) of cells in series, shape (n_cell, 3).
 Cells = Callable[[Mapping[str, float], float | None], FloatArray]

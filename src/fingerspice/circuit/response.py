@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.network import Network, build_network
@@ -16,9 +16,6 @@ from fingerspice.circuit.statespace import Stack, build_stack, is_stack
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.phasor import coupled_area, layer_gains
 from fingerspice.waveforms.waveform import Fundamental
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 class LinearScene(Protocol):

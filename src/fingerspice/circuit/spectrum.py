@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.physics.phasor import layer_gains
 from fingerspice.waveforms.waveform import Waveform
-
-FloatArray = NDArray[np.float64]
 
 # Samples of a spectrum, at most; and the periods of a periodic source that stand for a run of many.
 _MOST_SAMPLES = 2**19

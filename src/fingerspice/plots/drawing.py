@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import printable
 from fingerspice.base.files import write_aside
 
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from fingerspice.plots.picture import Picture
-
-FloatArray = NDArray[np.float64]
 
 # Okabe and Ito's palette, which the common colour blindnesses tell apart.
 BLACK, GREY, BLUE, VERMILION = "#000000", "#777777", "#0072B2", "#D55E00"

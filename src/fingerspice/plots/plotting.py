@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.describe import heading
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.plots.drawing import (
@@ -45,8 +45,6 @@ if TYPE_CHECKING:
     from fingerspice.plots.picture import Picture
     from fingerspice.results.phasor_solution import PhasorSolution
     from fingerspice.studies.comparison import Comparison
-
-FloatArray = NDArray[np.float64]
 
 
 def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:

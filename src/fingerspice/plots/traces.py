@@ -9,8 +9,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.describe import changes_text, drive_text, heading
 from fingerspice.plots.drawing import (
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
 
     from fingerspice.plots.picture import Picture
     from fingerspice.results.solution import Solution
-
-FloatArray = NDArray[np.float64]
 
 #: Oscillations in a window that are drawn as lines; of more the envelope, beside the last few of them.
 MOST_DRAWN, ZOOMED = 30, 4

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.arrays import BoolArray
 from fingerspice.base.files import write_aside, write_pieces
 from fingerspice.results.signals import SIGNALS
 from fingerspice.waveforms.waveform import require
@@ -42,7 +43,7 @@ def write_csv(solution: Solution, path: Path) -> Path:
     return write_aside(path, write)
 
 
-def _kept(solution: Solution, jumps: str) -> NDArray[np.bool_]:
+def _kept(solution: Solution, jumps: str) -> BoolArray:
     """Which rows are written, shape (n_t,)."""
     require(jumps in ("right", "both"), "jumps", repr(jumps), "'right' or 'both'")
     keep = np.ones(solution.t.size, bool)
@@ -51,7 +52,7 @@ def _kept(solution: Solution, jumps: str) -> NDArray[np.bool_]:
     return keep
 
 
-def variables(solution: Solution, keep: NDArray[np.bool_]) -> tuple[dict[str, Variable], dict[str, Variable]]:
+def variables(solution: Solution, keep: BoolArray) -> tuple[dict[str, Variable], dict[str, Variable]]:
     """Variables and coordinates of the data files, of the rows to keep."""
     signals = solution.all_signals
     data: dict[str, Variable] = {}

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.netlist.netlist import parse_netlist
@@ -25,8 +25,6 @@ from fingerspice.results.stored_record import StoredRecord
 from fingerspice.waveforms import combinations, ramps
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.waveform import Fundamental, Waveform
-
-FloatArray = NDArray[np.float64]
 
 # What may stand in the text of a waveform that a run was given.
 _WAVEFORMS = {

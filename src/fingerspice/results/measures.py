@@ -8,13 +8,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.numerics.extremes import largest
 from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 #: From the outputs of a run, as it wrote them down, to the signal that figures are taken of, shape (n_t,).
 Read = Callable[[Any], FloatArray]
 

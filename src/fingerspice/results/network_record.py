@@ -6,16 +6,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.circuit.network import Network
 from fingerspice.engine.network import Net
 from fingerspice.physics.contact import Contact, areas, inverse_area_array
 from fingerspice.results.record import Sealed, sealed, sided
 from fingerspice.waveforms.waveform import Waveform
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,8 @@ from enum import Enum
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from fingerspice.base.arrays import FloatArray
 
 
 class Status(Enum):

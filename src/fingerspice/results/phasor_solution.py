@@ -5,18 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
+from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
     from fingerspice.plots.picture import Picture
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, repr=False)

@@ -7,15 +7,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.circuit.statespace import Stack
 from fingerspice.engine.model import Model
 from fingerspice.physics.contact import Contact, areas, forces, inverse_area_array
 from fingerspice.waveforms.waveform import Waveform
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 def sealed(x: FloatArray) -> FloatArray:

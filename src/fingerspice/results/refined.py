@@ -8,17 +8,13 @@ from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS, TO_SERIES
 from fingerspice.results.measures import Panels, Read
 from fingerspice.results.network_record import NetworkRecord
 from fingerspice.results.record import Record
 from fingerspice.waveforms.waveform import Waveform
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 #: What the polynomial of a panel may miss between its nodes, over the signal's peak.
 _MISSED = 1e-11

@@ -6,15 +6,14 @@ from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.physics.contact import Contact
 from fingerspice.results.network_record import NetworkRecord
 from fingerspice.results.record import Record, sealed
 from fingerspice.results.stored_record import StoredRecord
 
-FloatArray = NDArray[np.float64]
 AnyRecord = Record | NetworkRecord | StoredRecord
 
 #: Unit and long name of each signal; layers and nodes are ``u_layer:NAME`` and ``v:NAME``.

@@ -8,9 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.pages import Page, Shown
 from fingerspice.results.datafiles import dataset, to_dataframe, write_csv, write_netcdf
 from fingerspice.results.outcome import ErrorEstimate, Failure, NetworkState, State, Status
@@ -30,8 +28,6 @@ if TYPE_CHECKING:
     from fingerspice.results.refined import ClosedForm
     from fingerspice.results.steps import Recorded
     from fingerspice.waveforms.waveform import Fundamental
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, repr=False)

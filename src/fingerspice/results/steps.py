@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.readout import RECORDED, Steps, new_steps
 from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS
 from fingerspice.results.measures import Panels, Read
@@ -18,9 +18,6 @@ from fingerspice.results.record import Record
 from fingerspice.waveforms.sampling import same_time
 
 AnyRecord = Record | NetworkRecord
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 #: Steps recorded between two looks from Python, and numbers at the nodes of all of them, at most.
 CAPACITY, _AT_ONCE = 512, 16_384

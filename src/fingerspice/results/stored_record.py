@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.physics.contact import Contact
 from fingerspice.results.record import Sealed, sealed
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

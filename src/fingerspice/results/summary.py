@@ -9,8 +9,8 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.results.measures import Stretch, Weighed, weigh_outputs
 from fingerspice.results.record import sealed
 from fingerspice.results.signals import AnyRecord, Signals
@@ -18,7 +18,6 @@ from fingerspice.results.signals import AnyRecord, Signals
 if TYPE_CHECKING:
     from fingerspice.results.solution import Solution
 
-FloatArray = NDArray[np.float64]
 Value = float | FloatArray | None
 
 # Signals whose ripple is told, instead of their rms.

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning
 from fingerspice.base.files import write_aside
 from fingerspice.circuit.circuit import Circuit
@@ -34,8 +34,6 @@ from fingerspice.waveforms.waveform import Sine, Waveform, require
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-FloatArray = NDArray[np.float64]
 
 U0_FORCE, U0_TIME = 140.0, 200.0
 """Source amplitudes of Fig. 3, and of Figs. 4 and 5, V."""

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown
 from fingerspice.physics.ladder import Ladder
@@ -20,9 +21,6 @@ from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 MOST_POLES = 12
 # Poles per decade and decades beyond the band, of the fit that any causal and passive material would match.

@@ -8,13 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.netlist.reader import read_text
 from fingerspice.physics.materials import EPS0
-
-FloatArray = NDArray[np.float64]
 
 COLUMNS = ("frequency", "resistivity", "permittivity")
 ALLOWED = "frequency (Hz), resistivity (ohm m), relative permittivity"

@@ -10,6 +10,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_area
 from fingerspice.circuit.circuit import Circuit, Element
@@ -19,9 +20,6 @@ from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 from fingerspice.results.phasor_solution import PhasorSolution
 from fingerspice.studies.sweeps import sweep_drive, sweep_notes
 from fingerspice.waveforms.waveform import Fundamental, require
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 def _frequencies(frequency: ArrayLike | None, fundamental: Fundamental | None) -> FloatArray:

@@ -6,14 +6,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.waveforms.waveform import Fundamental
 
-FloatArray = NDArray[np.float64]
 MAX_FREQUENCIES = 1_000_000
 
 

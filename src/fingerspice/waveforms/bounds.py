@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 
 if TYPE_CHECKING:
     from fingerspice.waveforms.waveform import Waveform
-
-FloatArray = NDArray[np.float64]
 
 #: Largest and smallest size of a number that is not 0, by unit: of voltages and currents, of angles, of all others.
 RANGES = {"V": (1e12, 0.0), "deg": (1e9, 0.0)}

@@ -9,12 +9,11 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.waveforms.bounds import check_finite
 from fingerspice.waveforms.waveform import DC, Sine, Waveform, blank_terms, require
-
-FloatArray = NDArray[np.float64]
 
 
 class _Combination(Waveform):

@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.waveforms.bounds import check_finite, check_range, in_windows, runs_through
 from fingerspice.waveforms.waveform import Waveform, blank_terms, require
-
-FloatArray = NDArray[np.float64]
 
 # Knots that fit any window of a source.
 _FEW_KNOTS = 1000

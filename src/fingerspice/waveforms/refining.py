@@ -8,13 +8,11 @@ import warnings
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.numerics import chebyshev
 from fingerspice.waveforms.waveform import Waveform
-
-FloatArray = NDArray[np.float64]
 
 POINTS = 20
 # Points between the nodes at which a series has to prove itself; irregular, so that no period hides from them.

@@ -13,15 +13,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
 from fingerspice.waveforms.bounds import in_windows, runs_through
 from fingerspice.waveforms.refining import POINTS, Refiner
 from fingerspice.waveforms.waveform import Waveform, blank_terms, require
-
-FloatArray = NDArray[np.float64]
 
 _PERIODS_PER_SEGMENT = 64.0
 
@@ -151,7 +150,7 @@ def same_time(t: float) -> float:
 
 
 @jit
-def misses(t: FloatArray, marks: FloatArray, slack: float) -> NDArray[np.bool_]:
+def misses(t: FloatArray, marks: FloatArray, slack: float) -> BoolArray:
     """Whether a time comes within `slack` (relative) of each mark without being it; times and marks ascending."""
     out = np.zeros(marks.size, np.bool_)
     first = 0
