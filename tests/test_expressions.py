@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fingerspice.base.errors import InputError, Where
-from fingerspice.netlist.expressions import FUNCTIONS, evaluate
+from fingerspice.netlist.expressions import evaluate
+from fingerspice.netlist.functions import FUNCTIONS
 
 HERE = Where("deck.cir", 3, 10)
 NAMES = {"thick": 2.0, "Rho": 3.0, "if": 5.0}

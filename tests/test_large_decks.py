@@ -17,7 +17,8 @@ from fingerspice.base.errors import LONGEST_MESSAGE, FingerspiceWarning, InputEr
 from fingerspice.circuit import topology
 from fingerspice.netlist import flatten, reader
 from fingerspice.netlist.deck import LONGEST_TITLE, Number, parse_deck
-from fingerspice.netlist.expressions import evaluate, nearest
+from fingerspice.netlist.expressions import evaluate
+from fingerspice.netlist.spelling import nearest
 
 MANY = 20_000
 

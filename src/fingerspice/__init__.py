@@ -5,7 +5,7 @@
     solution = fs.simulate(circuit)
     solution.plot()
 
-Names are loaded on first use, so that importing the package costs nothing.
+Each name is loaded when it is first used, so that importing the package takes next to no time.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from fingerspice.base.errors import FingerspiceError as FingerspiceError
     from fingerspice.base.errors import FingerspiceWarning as FingerspiceWarning
     from fingerspice.base.errors import InputError as InputError
-    from fingerspice.base.errors import SolveError as SolveError
     from fingerspice.circuit.circuit import Circuit as Circuit
     from fingerspice.netlist.netlist import parse_netlist as parse_netlist
     from fingerspice.netlist.netlist import read_netlist as read_netlist
     from fingerspice.results.loading import load as load
+    from fingerspice.results.outcome import SolveError as SolveError
     from fingerspice.results.outcome import Status as Status
     from fingerspice.results.plan import Plan as Plan
     from fingerspice.results.solution import Solution as Solution
@@ -44,28 +44,30 @@ if TYPE_CHECKING:
     from fingerspice.waveforms.combinations import AM as AM
     from fingerspice.waveforms.combinations import Product as Product
     from fingerspice.waveforms.combinations import Sum as Sum
+    from fingerspice.waveforms.periodic import Sawtooth as Sawtooth
+    from fingerspice.waveforms.periodic import Square as Square
+    from fingerspice.waveforms.periodic import Triangle as Triangle
     from fingerspice.waveforms.ramps import PWL as PWL
     from fingerspice.waveforms.ramps import Pulse as Pulse
     from fingerspice.waveforms.ramps import Samples as Samples
-    from fingerspice.waveforms.ramps import Sawtooth as Sawtooth
-    from fingerspice.waveforms.ramps import Square as Square
-    from fingerspice.waveforms.ramps import Triangle as Triangle
     from fingerspice.waveforms.sampling import Function as Function
+    from fingerspice.waveforms.transients import Chirp as Chirp
+    from fingerspice.waveforms.transients import Exp as Exp
     from fingerspice.waveforms.waveform import DC as DC
-    from fingerspice.waveforms.waveform import Chirp as Chirp
-    from fingerspice.waveforms.waveform import Exp as Exp
     from fingerspice.waveforms.waveform import Sine as Sine
     from fingerspice.waveforms.waveform import Waveform as Waveform
 
 _HOMES = {
     "circuit.circuit": ("Circuit",),
     "netlist.netlist": ("parse_netlist", "read_netlist"),
-    "waveforms.ramps": ("PWL", "Pulse", "Samples", "Sawtooth", "Square", "Triangle"),
+    "waveforms.periodic": ("Sawtooth", "Square", "Triangle"),
+    "waveforms.ramps": ("PWL", "Pulse", "Samples"),
+    "waveforms.transients": ("Chirp", "Exp"),
     "waveforms.sampling": ("Function",),
     "waveforms.combinations": ("AM", "Product", "Sum"),
-    "waveforms.waveform": ("DC", "Chirp", "Exp", "Sine", "Waveform"),
+    "waveforms.waveform": ("DC", "Sine", "Waveform"),
     "studies.comparison": ("Comparison", "compare"),
-    "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError", "SolveError"),
+    "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "studies.export": ("export_netlist",),
     "studies.fitting": ("ColeCole", "MaterialFit", "fit_material"),
     "studies.largesignal": ("large_signal",),
@@ -74,7 +76,7 @@ _HOMES = {
     "studies.phasors": ("phasor",),
     "results.plan": ("Plan",),
     "solve.simulation": ("plan", "simulate"),
-    "results.outcome": ("Status",),
+    "results.outcome": ("SolveError", "Status"),
     "results.solution": ("Solution",),
     "studies.steady": ("SteadyState", "steady_state"),
 }

@@ -3,12 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from fingerspice.results.outcome import Failure
-    from fingerspice.results.solution import Solution
-
 
 #: Characters of a message; of a longer one, which holds a long text of the user's, the middle is left out.
 LONGEST_MESSAGE = 1000
@@ -58,16 +52,6 @@ def printable(text: str, longest: int = LONGEST_MESSAGE) -> str:
 
 def _shortened(text: str, longest: int) -> str:
     return text if len(text) <= longest else f"{text[: longest // 2]} ... {text[-(longest // 4) :]}"
-
-
-class SolveError(FingerspiceError, RuntimeError):
-    """The solve did not reach its end: `failure` says why, when and where, `solution` holds what came before."""
-
-    def __init__(self, failure: Failure, solution: Solution | None = None) -> None:
-        self.failure = failure
-        self.message = printable(str(failure))
-        self.solution = solution
-        super().__init__(self.message)
 
 
 class FingerspiceWarning(UserWarning):

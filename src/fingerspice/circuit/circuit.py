@@ -164,7 +164,7 @@ class Circuit(Shown):
         return {**vars(self), "_memory": {}}
 
     def _page(self) -> Page:
-        from fingerspice.results.report import circuit_page
+        from fingerspice.circuit.describe import circuit_page
 
         return circuit_page(self)
 

@@ -1,9 +1,11 @@
-"""A circuit's sources and what was changed in it, in words: for titles, captions and file headers."""
+"""A circuit in words: its elements, its sources, and what was changed in it after its deck was read."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 
+from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.waveforms.combinations import Product, Sum
@@ -13,6 +15,8 @@ from fingerspice.waveforms.waveform import DC, Waveform
 
 #: Changes and sources named in one line; of more, how many there are.
 _MOST = 8
+#: Elements of a circuit that its page lists.
+MOST_ELEMENTS = 25
 
 
 def waveform_text(waveform: Waveform, unit: str = "V") -> str:
@@ -85,6 +89,49 @@ def heading(circuit: Circuit) -> str:
     """The deck's title, and what was changed in it."""
     changed = changes_text(circuit)
     return f"{circuit.title} (changed: {changed})" if changed else circuit.title
+
+
+def head_lines(circuit: Circuit) -> list[str]:
+    """Lines at the top of a report: the heading, and the sources where any of them drives the circuit."""
+    drive = drive_text(circuit)
+    return [heading(circuit), *([drive] if drive else [])]
+
+
+def circuit_page(circuit: Circuit) -> Page:
+    """What a circuit is made of, and what its deck asks for."""
+    rows = []
+    for element in circuit.elements[:MOST_ELEMENTS]:
+        said = [f"{name}={_deck_value(value)}" for name, value in element.values.items() if math.isfinite(value)]
+        if element.waveform is not None:
+            said.append(waveform_text(element.waveform, "A" if element.device == "I" else "V"))
+        rows.append((element.name, element.device, " ".join(element.node_names), _cut(" ".join(said), 96)))
+    lines: list[str | Table] = [heading(circuit), ""]
+    lines.append(Table(("", "device", "nodes", "values, in the units of the netlist"), rows, left=4))
+    if len(circuit.elements) > MOST_ELEMENTS:
+        lines.append(f"... and {len(circuit.elements) - MOST_ELEMENTS} more elements")
+    lines.append("")
+    if circuit.tran is not None:
+        since = f" from {format_si(circuit.tran.start, 's')} on" if circuit.tran.start else ""
+        lines.append(
+            f".tran: {format_si(circuit.tran.stop, 's')}, an output every {format_si(circuit.tran.step, 's')}{since}"
+        )
+    if circuit.ac is not None:
+        lines.append(f".ac: {format_si(circuit.ac.start, 'Hz')} to {format_si(circuit.ac.stop, 'Hz')}")
+    lines.append(f"charge law: {circuit.charge_law or 'local (the deck names none)'}")
+    return Page(lines)
+
+
+def _deck_value(value: float) -> str:
+    """A number as a deck has it: ``3.5u``, ``0.2meg``, ``0.3``."""
+    if 0.01 <= abs(value) < 1e4:
+        return f"{value:.4g}"
+    text = format_si(value, "").replace(" ", "")
+    # SPICE reads M as milli, and knows no P and E.
+    return f"{text[:-1]}meg" if text.endswith("M") else f"{value:.4g}" if text[-1:] in "PEZY" else text
+
+
+def _cut(text: str, longest: int) -> str:
+    return text if len(text) <= longest else f"{text[: longest - 4]} ..."
 
 
 def _quantity(value: float, unit: str) -> str:

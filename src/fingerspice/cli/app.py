@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fingerspice.base.errors import InputError, SolveError
+from fingerspice.base.errors import InputError
 from fingerspice.cli import answers, options
 from fingerspice.cli.options import area_from_text, check_output, read_circuit, time_from_text
 from fingerspice.cli.result_files import FOLDER, Results
 from fingerspice.cli.terminal import Answering, answer_usage, listen, plain_errors, progress, say
+from fingerspice.results.outcome import SolveError
 
 if TYPE_CHECKING:
     from fingerspice.results.solution import Solution
@@ -202,7 +203,7 @@ def ac(
         writes = [lambda: phasor_csv(found, data)]
         if picture is not None:
             from fingerspice.plots.drawing import save
-            from fingerspice.plots.plotting import plot_phasor
+            from fingerspice.plots.phasors import plot_phasor
 
             writes.append(lambda: save(plot_phasor(found, circuit), picture, about=results.about))
         answer.update(sweeps=[phasor_dict(r) for r in found] if as_json else None)
@@ -264,8 +265,8 @@ def compare(
 
       fingerspice compare circuits/fingerpad_5khz.cir --json --no-plot
     """
-    from fingerspice.results.report import comparison_table
     from fingerspice.studies.comparison import compare as run_comparison
+    from fingerspice.studies.reports import comparison_table
 
     with Answering("compare", as_json, charge_law=charge_law, rtol=rtol) as answer:
         circuit = read_circuit(deck, changes, source)
@@ -277,7 +278,7 @@ def compare(
         if picture is not None:
             results.open()
             from fingerspice.plots.drawing import save
-            from fingerspice.plots.plotting import plot_comparison
+            from fingerspice.studies.pictures import plot_comparison
 
             writes.append(lambda: save(plot_comparison(result), picture, about=results.about))
         answer.update(method=result.solution.method, **result.to_dict())
@@ -303,8 +304,8 @@ def limits(
 
       fingerspice limits circuits/fingerpad.cir --set Xgap.d=100n --points 7 --out out
     """
-    from fingerspice.results.report import limits_csv, limits_text
     from fingerspice.studies.limits import fold_limits, plot_limits
+    from fingerspice.studies.reports import limits_csv, limits_text
 
     with Answering("limits", as_json, charge_law="mobile") as answer:
         circuit = read_circuit(deck, changes, source)

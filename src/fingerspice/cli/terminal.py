@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from fingerspice.base.announcing import Bar
-from fingerspice.base.errors import FingerspiceWarning, InputError, SolveError, printable
+from fingerspice.base.errors import FingerspiceWarning, InputError, printable
 from fingerspice.cli.answers import OWN, blank
+from fingerspice.results.outcome import SolveError
 
 #: Characters of a printed line; of a longer one the middle is left out.
 LONGEST_LINE = 2000

@@ -1,8 +1,8 @@
 """A netlist file as a flat list of evaluated statements.
 
-What the statements mean is decided elsewhere: here names are names and values are numbers. The work is done
-in `lexer` (text to words), `reader` (lines by kind, included files), `scope` (parameters and values) and
-`flatten` (subcircuit calls); every refusal carries its place in the file.
+Statements have names, nodes and values here; what they mean is decided in `elements`, `sources` and `directives`. The
+work is done by `lexer` (from text to words), `reader` (lines by kind, included files), `scope` (parameters and values)
+and `flatten` (subcircuit calls). Every refusal has its place in the file.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ __all__ = [
     "read_deck",
 ]
 
-#: Characters of a title that are shown; of a longer one the middle is left out.
+#: Characters of a title that are shown; the middle of a longer one is left out.
 LONGEST_TITLE = 200
 
 _VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|wavefile|table)\b)"
@@ -57,7 +57,7 @@ class Directive:
     args : tuple of Number, Token or Call
         Words; numbers are evaluated.
     params : dict
-        `key=value` pairs by lower-case key; those of `.ic v(area)=1` have keys such as ``v(area)``.
+        Values of `key=value` pairs by key in lower case; `.ic v(area)=1` has the key ``v(area)``.
     param_where : dict
         Places of the keys.
     where : Where
@@ -81,7 +81,7 @@ class Deck:
     Attributes
     ----------
     title : str
-        The first line, made fit to be shown (see `errors.printable`); as written it is in `text`.
+        The first line in printable characters (see `errors.printable`); `text` has it as written.
     statements : tuple of Statement
         Elements in the order of the file, subcircuit calls expanded.
     tran, ac : Directive or None
@@ -89,13 +89,13 @@ class Deck:
     ic, options : tuple of Directive
         Start values and options, in the order of the file.
     includes : tuple of str
-        Base names, as written, of the included libraries of native devices; these files are not read.
+        Names, without folder, of the included libraries of native devices, whose files are not read.
     files : tuple of Path
-        Other included files, which were read.
+        The other included files, which were read.
     unused : tuple of str
-        Directives that are accepted and have no effect here, each once.
+        Names of the directives that are accepted and have no effect here.
     warnings : tuple of str
-        What is legal but probably not meant, each with its place.
+        Sentences about what is legal and probably not meant, each with its place.
     params : dict
         Values of the deck's own `.param` definitions by lower-case name.
     text : str
@@ -125,7 +125,7 @@ def read_deck(path: str | Path) -> Deck:
     Parameters
     ----------
     path : str or Path
-        The file; others are included from its folder only.
+        The file. It may include files from its own folder only.
 
     Raises
     ------
@@ -171,7 +171,7 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
 
 
 def _assemble(reader: Reader, title: str, text: str, path: Path | None) -> Deck:
-    """Evaluate parameters, statements and directives, in this order."""
+    """Evaluate parameters, then statements, then directives."""
     scope = Scope()
     for formula in reader.root.params:
         scope.define(formula)
@@ -212,7 +212,7 @@ def _only(directives: list[Directive], name: str) -> Directive | None:
 
 
 def _warn_uncalled(reader: Reader, root: Subcircuit) -> None:
-    """Say which of the deck's own subcircuits were never read (a library's usually are not all used)."""
+    """Warn of subcircuits that the deck itself defines and never calls; of a library usually some are not called."""
     for defined in root.inner.values():
         where = defined.line.where(defined.line.start) if defined.line is not None else None
         if where is not None and where.file == reader.file and not (defined.called or defined.skipped):

@@ -1,4 +1,4 @@
-"""Directives of a deck: the analyses, start values and options, with what SPICE's forms of them allow."""
+"""Directives of a deck: analyses, start values and options, in the forms of ngspice and of LTspice."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Literal
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Element, Tran
 from fingerspice.netlist.deck import Directive, Number, Token, parse_deck
-from fingerspice.netlist.expressions import nearest
 from fingerspice.netlist.slips import is_unit
+from fingerspice.netlist.spelling import nearest
 from fingerspice.waveforms.bounds import check_range
 
-#: Outputs of a run whose .tran has no TSTEP.
+#: Number of outputs where .tran has no TSTEP.
 LTSPICE_OUTPUTS = 10_000
 _LTSPICE_START = {
     "startup": "sources are not ramped up here; allowed: a source that rises by itself, such as PWL(0 0 20u 5)",
@@ -35,7 +35,7 @@ _LTSPICE_OPTIONS = frozenset(
 
 
 def _numbers(directive: Directive, usage: str) -> tuple[list[Number], list[str]]:
-    """Numbers and bare words of a directive's line."""
+    """The numbers and the other words of a directive's line."""
     numbers: list[Number] = []
     words: list[str] = []
     for arg in directive.args:
@@ -54,7 +54,7 @@ def _numbers(directive: Directive, usage: str) -> tuple[list[Number], list[str]]
 def read_tran(directive: Directive, notes: list[str]) -> Tran:
     """``.tran TSTEP TSTOP [TSTART [TMAX]] [uic]``, and LTspice's ``.tran TSTOP`` and ``.tran 0 TSTOP [TSTART [TMAX]]``.
 
-    `notes` takes what TSTEP is where none is given.
+    Where no TSTEP is given, a sentence about the one that is taken is added to `notes`.
     """
     usage = ".tran TSTEP TSTOP [TSTART [TMAX]] [uic]"
     numbers, words = _numbers(directive, usage)
@@ -111,7 +111,7 @@ def read_ac(directive: Directive) -> AcSweep:
 
 
 def read_initial(directives: tuple[Directive, ...], elements: tuple[Element, ...]) -> dict[str, float]:
-    """``.ic v(node)=value``: canonical node to V, or to mm^2 where it is an area's."""
+    """``.ic v(node)=value``: start values by canonical node, in V, or in mm^2 of an area node."""
     usage = "allowed: .ic v(node)=value"
     nodes = {node: None for e in elements for node in e.nodes}  # an ordered set
     area_nodes = {e.nodes[2] for e in elements if e.spec.is_layer}
@@ -140,7 +140,7 @@ def read_initial(directives: tuple[Directive, ...], elements: tuple[Element, ...
 
 
 def start_volts(what: str, number: Number) -> float:
-    """A voltage to start from, V, within the range of a source's."""
+    """A start voltage (V), which has to be within the range allowed for sources."""
     try:
         check_range(what, number.value, "V")
     except InputError as error:
@@ -149,7 +149,7 @@ def start_volts(what: str, number: Number) -> float:
 
 
 def unused_starts(initial: Mapping[str, float], elements: tuple[Element, ...], uic: bool) -> tuple[str, ...]:
-    """Start values that have no effect: of other nodes than capacitors' with ``uic``, ``IC=`` without."""
+    """Start values without effect: with ``uic`` those of nodes without capacitor or layer; without it every ``IC=``."""
     layers = [e for e in elements if e.spec.is_layer]
     gaps = {e.nodes[2]: e.values for e in layers if e.device == "GAP" and e.values["a_fix"] == 0.0}
     taken = {node for e in elements if e.device == "C" or e.spec.is_layer for node in e.nodes[:2]}
@@ -165,7 +165,7 @@ def unused_starts(initial: Mapping[str, float], elements: tuple[Element, ...], u
 
 
 def read_options(directives: tuple[Directive, ...]) -> tuple[str, tuple[str, ...]]:
-    """The reading of Eq. 7, and the ngspice options that have no meaning here."""
+    """The reading of Eq. 7 that ``work`` selects, and the options of ngspice and LTspice, which have no effect."""
     work, unused = None, []
     for directive in directives:
         names: list[tuple[str, Number | Token | None, Where]] = [

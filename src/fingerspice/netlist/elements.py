@@ -1,4 +1,4 @@
-"""From a statement of a deck to elements: what its values mean, and what comes with it."""
+"""From a statement of a deck to the element that it describes, and those that LTspice's parasitics stand for."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from fingerspice.circuit.devices import DEVICES, ParameterSpec
 from fingerspice.circuit.values import is_resistance, mega_note, unit_trap, unusual
 from fingerspice.netlist.deck import Call, Number, Statement, Token
 from fingerspice.netlist.directives import start_volts
-from fingerspice.netlist.expressions import nearest
 from fingerspice.netlist.scope import Value
 from fingerspice.netlist.sources import Source, Timing, read_source
+from fingerspice.netlist.spelling import nearest
 
-#: LTspice's parasitics, as elements of their own: in series at the first node, or beside the element.
+#: LTspice's parasitics, which become elements: ``rser`` in series at the first node, the others in parallel.
 _PARASITICS = {"V": ("rser", "cpar"), "C": ("rser", "rpar", "cpar")}
-#: What LTspice writes about a part and no calculation needs.
+#: Data of a part that LTspice writes and no calculation needs.
 _PART_DATA = {"R": ("tol", "pwr"), "C": ("tol", "v", "irms", "mfg", "pn", "type")}
-#: Other names of the value, and ngspice's and LTspice's number of parts side by side.
+#: Other names of the value; and the name of the number of equal parts in parallel.
 _VALUE_NAMES = {"R": ("r", "resistance"), "C": ("c", "capacitance")}
 _COPIES = "m"
 
@@ -34,7 +34,7 @@ def read_elements(statement: Statement, timing: Timing, notes: list[str]) -> lis
     statement : Statement
     timing : Timing
     notes : list of str
-        Takes what is to be warned about.
+        Warnings are added to it.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def _given(statement: Statement, parameter: str) -> Value | Call | None:
 
 
 def _is_noted(given: Number, spec: ParameterSpec) -> bool:
-    """Whether `_value` has said something about a number: one word is enough."""
+    """Whether `_value` warns of a number already: one warning of each number is enough."""
     return (given.mega is not None and is_resistance(spec)) or exponent_and_scale(given.text)
 
 
@@ -108,7 +108,7 @@ def _source(statement: Statement, timing: Timing) -> Source:
     body = list(statement.body)
     last = body[-1] if body else None
     if isinstance(last, Token) and last.text.lower() == "pwl":
-        # PWL file=...: the brackets are left out.
+        # The brackets of PWL(file=...) may be left out.
         last = Call(last.text, (), {}, {}, last.where)
     if statement.params:
         if not isinstance(last, Call) or last.name.lower() != "pwl" or set(last.params) & set(statement.params):
@@ -130,7 +130,7 @@ def _device_values(statement: Statement, device: str, notes: list[str]) -> dict[
     for key in statement.params:
         if key not in known:
             place = statement.param_where[key]
-            # ngspice reads m=... on an X line as so many copies.
+            # On an X line m=... is ngspice's number of copies.
             hint = "; the exponent is m_exp" if key == _COPIES and "m_exp" in known else nearest(key, known)
             raise InputError(
                 f"{statement.name}: {device} has no parameter {key!r}{hint}; allowed: {', '.join(known)}", place
@@ -148,7 +148,7 @@ def _device_values(statement: Statement, device: str, notes: list[str]) -> dict[
 
 
 def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> float:
-    """One parameter's number, with the unit traps of SPICE caught."""
+    """The number of one parameter; units that SPICE takes for scales are refused or warned of."""
     unit = f" {spec.unit}" if spec.unit else ""
     if isinstance(given, Token):
         if spec.may_be_infinite and given.text.lower() in ("inf", "none"):
@@ -172,7 +172,7 @@ def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> fl
 
 
 def _passive_value(statement: Statement, notes: list[str]) -> tuple[dict[str, float], float | None]:
-    """Value of an R or C, and what a C starts with, V."""
+    """Value of an R or C, and the voltage (V) with which a C starts, where it is given."""
     name, letter = statement.name, statement.letter
     spec = DEVICES[letter].parameter("value")
     own = (*_VALUE_NAMES[letter], _COPIES, *(("ic",) if letter == "C" else ()), *_PART_DATA[letter])

@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.devices import DEVICES, layer_devices
-from fingerspice.netlist.expressions import nearest
 from fingerspice.netlist.lexer import Group, Lexeme, Line, group, lex
 from fingerspice.netlist.reader import DIRECTIVES, Subcircuit
 from fingerspice.netlist.scope import Bare, Call, Number, Scope, Token, Value
 from fingerspice.netlist.slips import stray_word
+from fingerspice.netlist.spelling import nearest
 
-#: Lines and characters read in all subcircuit calls together, calls inside each other, characters of a flat name.
+#: Limits of subcircuit calls: lines and characters in all of them together, nesting, and characters of a flat name.
 MAX_EXPANDED = 100_000
 MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
@@ -49,19 +49,19 @@ class Statement:
     Attributes
     ----------
     name : str
-        As written; inside a subcircuit with the calls before it, as in ``Xfinger.Xgap``.
+        As written, after the names of the calls around it: ``Xfinger.Xgap``.
     letter : str
         R, C, V, I, or X for a native device.
     nodes : tuple of str
-        Lower case, ground as ``0``, a subcircuit's inner nodes with the calls before them.
+        In lower case, ground as ``0``; a node inside a subcircuit follows the names of the calls around it.
     node_names : tuple of str
         The same nodes as written.
     device : str or None
         A native device's name in upper case.
     body : tuple of Number, Token or Call
-        What stands after the nodes (of X: nothing).
+        The words after the nodes; none of an X.
     params : dict
-        Values of `key=value` pairs; keys are lower case.
+        Values of `key=value` pairs by key in lower case.
     param_where : dict
         Places of the keys.
     where : Where
@@ -81,7 +81,7 @@ class Statement:
 
 @dataclass(slots=True)
 class _Instance:
-    """One subcircuit call under expansion, or the deck."""
+    """A subcircuit call that is being expanded, or the deck."""
 
     definition: Subcircuit
     scope: Scope
@@ -98,7 +98,7 @@ class _Instance:
         return self.ports.get(lower) or (f"{self.prefix}{lower}".lower(), f"{self.prefix}{name}")
 
     def find(self, name: str) -> tuple[Subcircuit, _Instance] | None:
-        """A definition visible here, and the instance in which it stands."""
+        """The definition of that name visible here, and the instance that contains it; None where there is none."""
         instance: _Instance | None = self
         while instance is not None:
             if name in instance.definition.inner:
@@ -122,7 +122,7 @@ class Flattener:
     Attributes
     ----------
     statements : list of Statement
-        In the order of the deck, each call's in its place.
+        In the order of the deck; those of a call stand in place of the call.
     """
 
     def __init__(self) -> None:
@@ -132,7 +132,7 @@ class Flattener:
         self._expanded_text = 0
 
     def run(self, root: Subcircuit, scope: Scope) -> None:
-        """Flatten a deck whose parameters are known."""
+        """Add the statements of a deck, whose parameters have their values."""
         self._expand(_Instance(root, scope))
 
     def _expand(self, instance: _Instance) -> None:
@@ -163,7 +163,7 @@ class Flattener:
             self.statements.append(_valued(line, lexemes, name, instance))
 
     def _call(self, line: Line, lexemes: list[Lexeme], name: str, instance: _Instance) -> None:
-        """An X line: a native device becomes a statement, a subcircuit is expanded."""
+        """An X line: a native device becomes a statement, and a subcircuit is expanded."""
         words = group(line, lexemes[1:], plain=len(lexemes))
         if words.stray is not None:
             hint = stray_word(words.stray.text, line.text[: words.stray.position])
@@ -216,7 +216,7 @@ class Flattener:
 
 
 def _bind(inner: _Instance, line: Line, words: Group, caller: Scope) -> None:
-    """Give a call's parameters their values: the call's own in the caller's scope, the rest inside."""
+    """Evaluate the parameters of a call: those given on the call with the caller's names, the others with its own."""
     definition = inner.definition
     for formula in (*definition.defaults, *definition.params):
         inner.scope.define(formula)
@@ -232,7 +232,7 @@ def _bind(inner: _Instance, line: Line, words: Group, caller: Scope) -> None:
 
 
 def _refuse_captured(device: str, own: dict[str, float], line: Line, words: Group, caller: Scope) -> None:
-    """Refuse a value on an X line whose name is the caller's here, and another parameter of the device in ngspice."""
+    """Refuse a value on an X line that names a parameter of the caller where ngspice would take the device's own."""
     for key, pair in words.params.items():
         for name, value in caller.references(line, pair.value).items():
             if name != key and own.get(name, value) != value:
@@ -254,7 +254,7 @@ def _valued(line: Line, lexemes: list[Lexeme], name: str, instance: _Instance) -
         problem = f"missing {missing}: a {_VALUED[letter]} is written {name} node node value"
         raise InputError(problem, where)
     canonical, written = _nodes(line, nodes, instance)
-    # A source's words are keywords (DC, SIN); a resistor's can only be a parameter's name.
+    # The words of a source are keywords (DC, SIN); a word of a resistor or capacitor names a parameter.
     bare: Bare = "name" if letter in "RC" else "nothing"
     body = instance.scope.words(line, words.words[2:], bare)
     params = instance.scope.pairs(line, words, bare)
@@ -284,7 +284,7 @@ def _unknown_device(line: Line, words: list[Lexeme], instance: _Instance) -> str
     visible = instance.visible()
     known = {name.lower() for name in visible}
     for word in words[:-1]:
-        # Behind three nodes a device's name is the device: what follows lost its `key=`.
+        # A device's name after two words or more is the device, and what follows it lacks its `key=`.
         if word.text.lower() in known and word is not words[0] and words.index(word) >= 2:
             return f"{last} follows the device {word.text}: its parameters are written key=value"
     hint = nearest(words[-1].text, visible) or f"; devices are {' '.join(visible[:40])}"
@@ -292,7 +292,7 @@ def _unknown_device(line: Line, words: list[Lexeme], instance: _Instance) -> str
 
 
 def _unknown_element(lexemes: list[Lexeme]) -> str:
-    """Why a line that begins with this word is no element."""
+    """Why a line with these words is no element."""
     name = lexemes[0].text
     if any(lexeme.text.upper() in layer_devices() for lexeme in lexemes[3:]):
         return f"'{name}': a device's name begins with X, as in X{name}"

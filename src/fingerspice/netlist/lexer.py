@@ -1,6 +1,6 @@
-"""Netlist text to logical lines, lexemes and groups, each of which knows its physical line and column.
+"""From netlist text to logical lines, lexemes and groups, each with its line and column in the file.
 
-Nothing here knows what a word means: names, values and directives are told apart by the callers.
+Nothing here depends on what a word means: the callers distinguish names, values and directives.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where
 
-#: A `;`, a `//` after a blank or a free-standing `$` starts a comment, as in ngspice, unless between double quotes.
+#: As in ngspice a `;`, a `//` after a blank, or a `$` between blanks starts a comment, except in double quotes.
 _COMMENT = re.compile(r'"[^"]*"|(;|(?<!\S)//|(?<!\S)\$(?!\S))')
 _LEX = re.compile(r"""[\s,]+|([()=])|("[^"]*")|('[^']*')|([^\s,()={}'"]+)""")
-#: A word, bracket or text begins at the start of a line or after one of these, or is one of them.
+#: What separates words, or is one: their number bounds the number of words.
 _SPLIT = re.compile(r"""[\s,]+|[()={}'"]""")
 _BRACE = re.compile(r"[{}]")
 _MARKS = ("(", ")", "=")
@@ -26,7 +26,7 @@ _NUMERIC = re.compile(r"[+-]?\.?[0-9]")
 
 
 class Line:
-    """A logical line: a physical line without its comment, and its `+` continuations.
+    """A logical line: a physical line without its comment, joined with the `+` lines that continue it.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Line:
         return self.text[lexeme.position : lexeme.position + len(lexeme.text) + marks]
 
     def words(self, most: int) -> int:
-        """How many lexemes there are at most, counted no further than `most`; blanks count as one."""
+        """An upper bound of the number of lexemes, counted up to `most`."""
         return len(self._numbers) + sum(1 for _ in islice(_SPLIT.finditer(self.text), most))
 
     @property
@@ -95,7 +95,7 @@ class Assignment(NamedTuple):
 
 @dataclass(slots=True)
 class Group:
-    """Words and `key=value` pairs of a line, or of one function call such as `SIN(0 200 100)` in it."""
+    """Words and `key=value` pairs of a line, or of a call in it such as `SIN(0 200 100)`."""
 
     name: Lexeme | None = None
     words: list[Lexeme | Group] = field(default_factory=list)
@@ -104,14 +104,14 @@ class Group:
 
 
 def split_lines(text: str) -> list[str]:
-    """Physical lines, counted as an editor counts them: only LF, CRLF and CR end a line."""
+    """Physical lines as an editor counts them, which only LF, CRLF and CR end."""
     if "\r" in text:
         text = text.replace("\r\n", "\n").replace("\r", "\n")
     return text.split("\n")
 
 
 def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]:
-    """Join continuations and drop comments and blank lines; `first` is the number of the first line.
+    """Logical lines, without comments and blank lines; `first` is the number of the first physical line.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def _without_comment(raw: str) -> str:
 
 
 def lex(line: Line, start: int = 0) -> list[Lexeme]:
-    """Lexemes of a line from a position on; blanks and commas separate.
+    """Lexemes of a line from a position on; blanks and commas separate them.
 
     Raises
     ------
@@ -184,7 +184,7 @@ def lex(line: Line, start: int = 0) -> list[Lexeme]:
 
 
 def _braced(line: Line, position: int) -> str:
-    """Text between the brace at a position and its partner."""
+    """Text between the opening brace at a position and the brace that closes it."""
     opening = line.text[position]
     if opening != "{":
         problem = "'}' without an opening '{'" if opening == "}" else f"{opening} is never closed"
@@ -205,11 +205,11 @@ def group(line: Line, lexemes: list[Lexeme], plain: int = 0, *, probes: bool = F
     line : Line
         The line, for places.
     lexemes : list of Lexeme
-        What follows the line's first word.
+        Those after the line's first word.
     plain : int
-        So many first words are never calls: nodes may stand in brackets, and before one.
+        Number of words at the beginning that are no calls, because they are nodes, which may stand in brackets.
     probes : bool
-        Whether `v(node)=value` is a pair, with the key ``v(node)`` in lower case.
+        Whether `v(node)=value` is a pair with the key ``v(node)``.
 
     Raises
     ------
@@ -281,7 +281,7 @@ def _probe(lexemes: list[Lexeme], index: int) -> tuple[Lexeme, int] | None:
 
 
 def _assign(line: Line, inside: Group, key: Lexeme, lexemes: list[Lexeme], equals: int) -> None:
-    """Enter `key = value`, whose `=` stands at an index."""
+    """Enter the pair `key = value` whose `=` is the lexeme number `equals`."""
     name = key.text.lower()
     if key.kind not in ("word", "probe") or (key.kind == "word" and not _KEY.fullmatch(key.text)):
         problem = f"{line.written(key)} cannot be a parameter's name: letters, digits and _ are allowed"

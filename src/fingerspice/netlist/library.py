@@ -1,4 +1,4 @@
-"""The ngspice libraries of the layers that ship with this version: one for each charge law."""
+"""The libraries with which ngspice knows the layers, one for each charge law, as shipped with this version."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a deck's statements to a circuit: what devices, parameters and directives mean."""
+"""Reading a netlist: from a file or a text to a `Circuit`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def parse_netlist(text: str, path: str | Path | None = None) -> Circuit:
     ----------
     text : str
     path : str or Path, optional
-        Where the text came from: its folder is the one includes may use.
+        Where the text came from; it may include files from that folder.
 
     Raises
     ------
@@ -71,13 +71,13 @@ def _circuit(deck: Deck) -> Circuit:
 
 
 def _first(notes: list[str]) -> tuple[str, ...]:
-    """As many warnings as anybody reads."""
+    """The first `MAX_WARNINGS` warnings, and how many more there are."""
     more = len(notes) - MAX_WARNINGS
     return (*notes[:MAX_WARNINGS], f"{more} more warnings are not shown") if more > 1 else tuple(notes)
 
 
 def _in_deck(error: InputError, deck: Deck) -> InputError:
-    """A refusal with the file where it has no place of its own, and with a title that swallowed a statement."""
+    """A refusal with the deck's name where it has no place, and with a note where the title reads like a statement."""
     error = with_comma(error, deck.warnings)
     text = error.message if error.where else f"{deck.path or '<netlist>'}: {error.message}"
     title = [note for note in deck.warnings if "the first line is the title" in note]
@@ -113,7 +113,7 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
 
 
 def _unusual_areas(elements: tuple[Element, ...], initial: Mapping[str, float]) -> Iterator[str]:
-    """What is not usual in the areas that sources and start values give."""
+    """Warnings of unusual areas among those that sources and start values give."""
     nodes = {e.nodes[2] for e in elements if e.spec.is_layer}
     given: list[tuple[str, float, Where | None]]
     given = [(f".ic v({node})", value, None) for node, value in initial.items() if node in nodes]
@@ -134,7 +134,7 @@ def _charge_law(includes: tuple[str, ...]) -> str | None:
 
 
 def source_from_text(text: str, circuit: Circuit) -> Waveform:
-    """A waveform from netlist text such as ``SQUARE(200 100)``, with SPICE's defaults from the circuit's .tran.
+    """A waveform from netlist text such as ``SQUARE(200 100)``; SPICE's defaults are taken from the circuit's .tran.
 
     Raises
     ------
@@ -155,6 +155,6 @@ def source_from_text(text: str, circuit: Circuit) -> Waveform:
         comma = decimal_comma(f"V1 a 0 {text}")
         raise InputError(f"{text!r}: {error.message}" + (f"; note {comma}" if comma else "")) from None
     for note in (*deck.warnings, *source.notes):
-        # Its place is one in the text.
+        # The place that the note begins with is one in this text, not in the deck.
         warnings.warn(f"{text!r}: {note.partition(': ')[2]}", FingerspiceWarning, stacklevel=2)
     return source.waveform

@@ -1,7 +1,6 @@
-"""Netlist files to lines sorted by what they are: elements, parameters, subcircuits, directives.
+"""From netlist files to lines by kind: elements, parameters, subcircuits and directives.
 
-This is the only part of the netlist reader that touches the disk. It reads files inside the netlist's own
-folder and no others.
+No other part of the netlist reader reads from the disk. Included files have to lie in the netlist's own folder.
 """
 
 from __future__ import annotations
@@ -13,24 +12,24 @@ from pathlib import Path
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.devices import layer_devices
-from fingerspice.netlist.expressions import nearest
 from fingerspice.netlist.lexer import Group, Lexeme, Line, group, lex, logical_lines, split_lines
 from fingerspice.netlist.library import LIBRARIES, library_text
 from fingerspice.netlist.scope import Formula, param_formulas
 from fingerspice.netlist.slips import ELSEWHERE, decimal_comma
+from fingerspice.netlist.spelling import nearest
 
 MAX_BYTES = 64 * 2**20
-#: Of a netlist with what it includes: a word takes up to 500 bytes and a line 200 while it is read.
+#: Limits of a netlist with its included files; a word takes up to 500 bytes of memory and a line 200.
 MAX_WORDS, MAX_LINES = 1_000_000, 2_000_000
-#: More of them nobody reads.
+#: Number of warnings that are shown.
 MAX_WARNINGS = 100
 MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 32
 
-#: ngspice's bodies of the native devices: which one is included says which charge law is meant.
+#: Libraries with ngspice's bodies of the native devices; the one that is included says which charge law is meant.
 NATIVE_LIBRARIES = tuple(LIBRARIES.values())
 
-#: Accepted and not used here; those that say nothing about results, only to ngspice or LTspice, without a word.
+#: Directives without effect here: of those in UNUSED a note says so; those in SILENT matter to another simulator only.
 UNUSED = (".print", ".plot", ".save", ".probe", ".meas", ".measure", ".title")
 SILENT = (".nodeset", ".backanno")
 ANALYSES = (".tran", ".ac", ".ic", ".options", ".option")
@@ -40,7 +39,7 @@ DIRECTIVES = (*ANALYSES, *STRUCTURE, *UNUSED, *SILENT, ".endc")
 
 @dataclass(slots=True)
 class Subcircuit:
-    """A definition, or (without a name) the deck itself."""
+    """The definition of a subcircuit, or, without a name, the deck itself."""
 
     name: str
     line: Line | None = None
@@ -83,7 +82,7 @@ class Reader:
         self._words = 0
 
     def split(self, text: str, where: Where | None = None) -> list[str]:
-        """Physical lines of the deck or of a file it includes; refuses more than there may be in all."""
+        """Physical lines of the deck or of a file it includes; refused where there are too many in all."""
         self._lines += 1 + text.count("\n") + text.count("\r")
         if self._lines > MAX_LINES:
             problem = f"the netlist has {self._lines:,} lines; allowed: {MAX_LINES:,}, included files counted"
@@ -91,7 +90,7 @@ class Reader:
         return split_lines(text)
 
     def read_deck(self, lines: list[str]) -> None:
-        """Read the deck's own lines, of which the first is the title and not read here."""
+        """Read the deck's own lines after the first, which is the title."""
         source = logical_lines(lines[1:], self.file, first=2)
         for line in source:
             if self._take(line, self.folder):
@@ -115,7 +114,7 @@ class Reader:
             self.warn("text after .end is not read", line.where(line.start))
 
     def _take(self, line: Line, folder: Path | None) -> bool:
-        """Put one line where it belongs; True when it ends the deck."""
+        """Enter one line where it belongs; True where it ends the deck."""
         start = line.start
         word = line.text[start:].split(None, 1)[0].lower()
         if self._control is not None:
@@ -139,7 +138,7 @@ class Reader:
         return self._directive(word, line, start + len(word), folder)
 
     def _directive(self, word: str, line: Line, rest: int, folder: Path | None) -> bool:
-        """Sort a line that begins with a dot, whose arguments start at `rest`."""
+        """Enter a line that begins with a dot and whose arguments start at `rest`; True where it ends the deck."""
         here = self._open[-1]
         if word == ".subckt":
             self._open_subcircuit(line, rest)
@@ -247,7 +246,7 @@ def read_text(path: Path, shown: str, where: Where | None = None) -> str:
     Raises
     ------
     InputError
-        When the file is missing, no file, too large, or no text (UTF-8, Latin-1, or UTF-16 with its mark).
+        When the file is missing, no ordinary file, too large, or not text in UTF-8, Latin-1 or marked UTF-16.
     """
     try:
         if path.is_dir():
@@ -265,7 +264,7 @@ def read_text(path: Path, shown: str, where: Where | None = None) -> str:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise InputError(f"'{shown}' cannot be read: {reason}", where) from None
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        # LTspice's, where a name has letters that Latin-1 has not.
+        # LTspice writes UTF-16 where a name has letters that Latin-1 lacks.
         return data.decode("utf-16", "replace")
     if b"\0" in data:
         raise InputError(f"'{shown}' is not a text file (it holds NUL bytes): save it as UTF-8", where)
@@ -274,7 +273,7 @@ def read_text(path: Path, shown: str, where: Where | None = None) -> str:
     except UnicodeDecodeError as error:
         broken = error.start
     try:
-        # Windows' Latin-1, in which LTspice writes its micro sign.
+        # LTspice writes its micro sign in the Latin-1 of Windows.
         return cp1252.Codec().decode(data)[0]
     except UnicodeDecodeError:
         number = data[:broken].count(b"\n") + 1
@@ -283,7 +282,7 @@ def read_text(path: Path, shown: str, where: Where | None = None) -> str:
 
 
 def library_changed(root: Path, folder: Path, name: str) -> bool:
-    """Whether the library of that name in the netlist's folder is there and is another one than this version's."""
+    """Whether there is a library of that name in the netlist's folder that differs from this version's."""
     try:
         path = (folder / name.replace("\\", "/")).resolve()
         if not path.is_relative_to(root) or not path.is_file():
@@ -292,7 +291,7 @@ def library_changed(root: Path, folder: Path, name: str) -> bool:
         # A character has up to four bytes.
         return path.stat().st_size > 4 * len(own) or _lines(read_text(path, name)) != _lines(own)
     except (OSError, ValueError, RuntimeError):
-        # What cannot be read is not this version's.
+        # A file that cannot be read is not this version's library.
         return True
 
 
@@ -310,7 +309,7 @@ def _similar_file(path: Path) -> str:
 
 
 def _inside(root: Path, folder: Path, name: str, where: Where) -> Path:
-    """Resolved path of an included file, which has to lie in the netlist's folder."""
+    """Resolved path of an included file; one outside the netlist's folder is refused."""
     try:
         path = (folder / name.replace("\\", "/")).resolve()
         allowed = path.is_relative_to(root)
@@ -322,7 +321,7 @@ def _inside(root: Path, folder: Path, name: str, where: Where) -> Path:
 
 
 def _file_name(word: str, line: Line, rest: int) -> tuple[str, int]:
-    """File name on an include line, and its position."""
+    """The file name on an include line, and its position."""
     raw = line.text[rest:]
     position = rest + len(raw) - len(raw.lstrip())
     name = raw.strip()
@@ -357,7 +356,7 @@ def _ports(line: Line, words: list[Lexeme]) -> tuple[str, ...]:
 
 
 def _defaults(line: Line, words: Group) -> list[Formula]:
-    """Parameters on a .subckt line, with their defaults."""
+    """Parameters of a .subckt line, with their defaults."""
     found = []
     for key, value in words.params.values():
         if value.kind == "string":

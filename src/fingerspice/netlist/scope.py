@@ -1,4 +1,4 @@
-"""Values of netlist words: numbers, tokens, and the parameters that expressions refer to."""
+"""Values of a netlist's words: numbers, keywords, and the parameters to which expressions refer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Literal, TypeAlias
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import parse_number, suspicious_mega
-from fingerspice.netlist.expressions import CONSTANTS, Expression, compile_expression
+from fingerspice.netlist.expressions import Expression, compile_expression
+from fingerspice.netlist.functions import CONSTANTS
 from fingerspice.netlist.lexer import Group, Lexeme, Line
 
 _NUMERIC = re.compile(r"[+-]|\.?[0-9]")
@@ -23,7 +24,7 @@ _PAIR = re.compile(r"[({]|[)}]|'[^']*'|(?<![\w.])([A-Za-z_]\w*)\s*=(?!=)|[<>!=]=
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """A word that is not a number: a keyword, a file name, `inf`; `quoted` when it stood in double quotes."""
+    """A word that is no number, such as a keyword, a file name or `inf`; `quoted` where it stood in double quotes."""
 
     text: str
     where: Where
@@ -43,7 +44,7 @@ class Number:
     where : Where
         The place of its first character.
     mega : Token, optional
-        A number with a capital M (milli, but perhaps meant as mega) that this value is, or was computed from.
+        The number with a capital M, which is milli and perhaps meant as mega, from which this value was computed.
     """
 
     value: float
@@ -53,15 +54,15 @@ class Number:
 
 
 Value: TypeAlias = Number | Token
-#: What counts without braces: nothing, a parameter's name, or also arithmetic. As in ngspice, which takes
-#: `R1 a b rho` and `X1 a b sub w=2*rho`, but not `R1 a b 2*rho`.
+#: What is evaluated without braces: nothing, the name of a parameter, or arithmetic, too. This is as in ngspice, which
+#: takes `R1 a b rho` and `X1 a b sub w=2*rho`, but not `R1 a b 2*rho`.
 Bare: TypeAlias = Literal["nothing", "name", "arithmetic"]
 Pairs: TypeAlias = tuple[dict[str, Value], dict[str, Where]]
 
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A word with arguments in brackets, such as `SIN(0 200 100)`; also `SIN (0 200 100)`."""
+    """A word with arguments in brackets: `SIN(0 200 100)` or `SIN (0 200 100)`."""
 
     name: str
     args: tuple[Value, ...]
@@ -72,7 +73,7 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Formula:
-    """The right side of a parameter's definition, before it has a value."""
+    """A parameter's definition, not yet evaluated: its name, the text of its right side, and where both stand."""
 
     name: str  # as written
     text: str
@@ -93,13 +94,13 @@ class Formula:
 class Scope:
     """The parameters of the deck or of one subcircuit call, which also sees those of its callers.
 
-    As in ngspice, which looks a name up along the calls: a name that a subcircuit does not define is its caller's, then
-    that one's caller's, and the deck's last, wherever the definition stands.
+    As in ngspice a name that a subcircuit does not define is looked up in its caller, then in the caller of that, and
+    at last in the deck, wherever the subcircuit's definition stands.
 
     Parameters
     ----------
     parent : Scope, optional
-        The scope of the call.
+        The scope of the caller.
     """
 
     def __init__(self, parent: Scope | None = None) -> None:
@@ -112,7 +113,7 @@ class Scope:
         self._mega: dict[str, Token] = {}
 
     def define(self, formula: Formula) -> None:
-        """Enter a definition; its value is found by `solve`, so that the order does not matter."""
+        """Enter a definition. It is evaluated by `solve`, so that the order of definitions does not matter."""
         name = formula.name.lower()
         if name in self._formulas:
             first = self._formulas[name].where
@@ -120,13 +121,13 @@ class Scope:
         self._formulas[name] = formula
 
     def preset(self, name: str, number: Number) -> None:
-        """Give a parameter the value of the call, in place of its default."""
+        """Give a parameter the value that the call has for it, instead of its default."""
         self.values[name] = number.value
         if number.mega is not None:
             self._mega[name] = number.mega
 
     def solve(self) -> None:
-        """Evaluate every definition after those it refers to.
+        """Evaluate every definition, after those to which it refers.
 
         Raises
         ------
@@ -148,11 +149,11 @@ class Scope:
                 if not waiting:
                     self.preset(name, self._evaluate(compiled[name], formula.text, formula.place))
                 elif any(n in compiled for n in waiting):
-                    raise self._circle(compiled, name)  # compiled without a value: below on the stack
+                    raise self._circle(compiled, name)  # it is compiled and waits on the stack
                 stack.extend(waiting)
 
     def _circle(self, compiled: dict[str, Expression], start: str) -> InputError:
-        """The error that names the parameters of a circle; every unfinished one leads into it."""
+        """The error that names the parameters of a circle, into which every definition without a value leads."""
         order = {start: 0}
         name = start
         while True:
@@ -174,7 +175,7 @@ class Scope:
         return scope
 
     def _evaluate(self, expression: Expression, written: str, place: Callable[[int], Where]) -> Number:
-        """Number of a compiled expression in this scope."""
+        """Value of a compiled expression in this scope."""
         mega = None
         if expression.mega:
             mega = Token(expression.mega, place(expression.mega_position))
@@ -185,7 +186,7 @@ class Scope:
         return Number(expression.evaluate(self._visible, place), written, place(0), mega)
 
     def number(self, line: Line, lexeme: Lexeme) -> Number:
-        """Number of a lexeme that has to be arithmetic, with or without braces."""
+        """Value of a lexeme that has to be arithmetic, with or without braces."""
         inner = lexeme.position + (lexeme.kind != "word")
         if lexeme.kind == "string":
             problem = f"a number is needed, not the text {line.written(lexeme)}"
@@ -198,7 +199,7 @@ class Scope:
         return Number(number.value, number.text, line.where(lexeme.position), number.mega)
 
     def references(self, line: Line, lexeme: Lexeme) -> dict[str, float]:
-        """Parameters that a value refers to, with their values here; none for what is no arithmetic."""
+        """Values in this scope of the parameters to which a lexeme refers; empty where it is no arithmetic."""
         try:
             names = compile_expression(lexeme.text, lambda _: line.where(lexeme.position)).names
         except InputError:
@@ -241,7 +242,7 @@ class Scope:
             raise InputError(f"{error}{hint}", where) from None
 
     def _is_arithmetic(self, text: str) -> bool:
-        """Whether a bare word is made of numbers and of parameters that exist, and of nothing else."""
+        """Whether a word without braces is arithmetic of numbers and known parameters only."""
         if self._find(text.lower()) is not None:
             return True
         if _OPERATOR.search(text) is None or _PLAIN_NUMBER.fullmatch(text):
@@ -253,7 +254,7 @@ class Scope:
         return all(self._find(name) is not None or name in CONSTANTS for name in names)
 
     def call(self, line: Line, group: Group, name: Lexeme) -> Call:
-        """Call with its arguments evaluated."""
+        """A call with its arguments evaluated."""
         args = tuple(self.value(line, word) for word in group.words if isinstance(word, Lexeme))
         return Call(name.text, args, *self.pairs(line, group), line.where(name.position))
 
@@ -263,7 +264,7 @@ class Scope:
         return values, {key: line.where(pair.key.position) for key, pair in group.params.items()}
 
     def words(self, line: Line, words: list[Lexeme | Group], bare: Bare = "nothing") -> tuple[Value | Call, ...]:
-        """Values of positional words."""
+        """Values of the words that belong to no pair."""
         return tuple(
             self.value(line, word, bare)
             if isinstance(word, Lexeme)
@@ -273,7 +274,7 @@ class Scope:
 
 
 def param_formulas(line: Line, start: int) -> list[Formula]:
-    """Definitions on a `.param` line, whose right sides may be arithmetic without braces, blanks included.
+    """Definitions on a `.param` line; right sides may be arithmetic without braces, and with blanks.
 
     Parameters
     ----------
@@ -287,7 +288,7 @@ def param_formulas(line: Line, start: int) -> list[Formula]:
     InputError
         When the line is not a row of `name=value`.
     """
-    keys: list[tuple[int, int, str]] = []  # where the name starts, where the value may start, the name
+    keys: list[tuple[int, int, str]] = []  # start of the name, start of the value, the name
     depth = 0
     for match in _PAIR.finditer(line.text, start):
         found = match.group()

@@ -1,4 +1,4 @@
-"""What is written in a netlist by mistake or for another simulator, and the sentence that helps."""
+"""Common slips in netlists, and directives of other simulators, each with a sentence that says what to write."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 from fingerspice.base.errors import InputError
 
-#: Directives that other simulators know and this one does not, with the way here.
+#: Directives that only other simulators know, with what to do instead.
 ELSEWHERE = {
     ".step": "give one value a run by --set PATH=VALUE, or loop over circuit.replace({path: value}) in Python",
     ".four": "mean, peaks and amplitude are in the summary of a run, and any harmonic in the data that it writes",
@@ -45,10 +45,10 @@ _UNIT = re.compile(r"(?:[tgkmunpfµμ]|meg|mil)?(?:m|v|a|s|n|f|hz|ohm|ω)?", re.
 
 
 def decimal_comma(text: str) -> str | None:
-    """What to say about a line in which a comma is likely to stand for a decimal point; None where none does.
+    """A warning of a comma that is probably meant as a decimal point; None where there is none.
 
-    A comma separates numbers, so ``SIN(0,200,100)`` is right; beside numbers that a blank separates, as in
-    ``SIN(0 200 0,1)``, or in ``d=3,5u`` it is doubtful.
+    Commas separate numbers, as in ``SIN(0,200,100)``. A comma is doubtful where blanks separate the other numbers, as
+    in ``SIN(0 200 0,1)``, and in ``d=3,5u``.
     """
     bare = _LISTS.sub("x", text)
     for found in (_ASSIGNED.search(bare), *_among_blanks(bare)):
@@ -63,7 +63,7 @@ def decimal_comma(text: str) -> str | None:
 
 def _among_blanks(bare: str) -> Iterator[re.Match[str] | None]:
     outside = _CALL.sub(" ", bare)
-    # Name and nodes may be numbers, and stand with commas between them.
+    # An element's name and nodes are left out: they may be numbers, and commas may separate them.
     words = outside.split()[1 if outside.lstrip().startswith(".") else 3 :]
     for chunks in ([c for c in words if "=" not in c], *(m[1].split() for m in _CALL.finditer(bare))):
         matches = [_COMMA.fullmatch(chunk) for chunk in chunks]
@@ -78,13 +78,13 @@ def is_unit(word: str) -> bool:
 
 
 def stray_word(word: str, before: str) -> str:
-    """What to add where a word follows `before`, which ends in ``key=value``; empty if nothing fits."""
+    """A hint for a word that stands after ``key=value``, where it is a unit that a blank separates from its number."""
     number = before.rpartition("=")[2].strip()
     return f"; a unit joins its number, {number}{word}" if _NUMBER.fullmatch(number) and is_unit(word) else ""
 
 
 def with_comma(error: InputError, warnings: Iterable[str]) -> InputError:
-    """An error with what was said of a comma in its line."""
+    """The error, with the warning of a decimal comma where there is one of the same line."""
     place = f"{error.where.file}:{error.where.line}:" if error.where else "none"
     found = [text.partition(": ")[2] for text in warnings if text.startswith(place) and "decimal comma" in text]
     return InputError("; note ".join([error.message, *found]), error.where) if found else error

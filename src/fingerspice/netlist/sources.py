@@ -1,4 +1,4 @@
-"""Source functions of a netlist, as waveforms: SPICE's portable set, and SQUARE; and ``AC`` beside them."""
+"""Source functions of a netlist as waveforms: those that all SPICEs share, and SQUARE; and ``AC``."""
 
 from __future__ import annotations
 
@@ -10,23 +10,25 @@ from dataclasses import dataclass
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.circuit import SmallSignal
 from fingerspice.netlist.deck import Call, Number, Token
-from fingerspice.netlist.expressions import nearest
 from fingerspice.netlist.slips import is_unit
-from fingerspice.waveforms.ramps import PWL, Pulse, Square
-from fingerspice.waveforms.waveform import DC, Exp, Sine, Waveform
+from fingerspice.netlist.spelling import nearest
+from fingerspice.waveforms.periodic import Square
+from fingerspice.waveforms.ramps import PWL, Pulse
+from fingerspice.waveforms.transients import Exp
+from fingerspice.waveforms.waveform import DC, Sine, Waveform
 
 Word = Number | Token | Call
 _SIN = ("VO", "VA", "FREQ", "TD", "THETA", "PHASE")
 _PULSE = ("V1", "V2", "TD", "TR", "TF", "PW", "PER")
-#: LTspice counts their periods.
+#: Functions to which LTspice adds a number of periods.
 _COUNTED = (_SIN, _PULSE)
-#: LTspice's names.
+#: Names in LTspice.
 _ALIASES = {"sine": "sin"}
 
 
 @dataclass(frozen=True)
 class Timing:
-    """What SPICE's defaults depend on: TSTEP and TSTOP of the deck, s, where it has a .tran line."""
+    """TSTEP and TSTOP of the deck (s), on which SPICE's defaults depend; None without a .tran line."""
 
     step: float | None
     stop: float | None
@@ -50,7 +52,7 @@ class _Arguments:
                 self.call.where,
             )
         if given > len(self.names):
-            # LTspice's last one.
+            # LTspice has one more, Ncycles.
             hint = "; Ncycles is not supported, in Python a burst is a product, fs.Sine(...) * fs.Pulse(...)"
             usage += hint if self.names in _COUNTED and given == len(self.names) + 1 else ""
             raise InputError(
@@ -95,7 +97,7 @@ def _sin(call: Call, timing: Timing) -> Waveform:
 
 def _pulse(call: Call, timing: Timing) -> Waveform:
     a = _Arguments(call, _PULSE, 2, timing)
-    # An explicit 0 is an ideal edge here; for PW and PER, 0 means "for ever", as in ngspice.
+    # TR and TF of 0 mean ideal edges here. PW and PER of 0 mean "for ever", as in ngspice.
     return Pulse(
         a.get("V1"),
         a.get("V2"),
@@ -133,7 +135,7 @@ def _pwl(call: Call, timing: Timing) -> Waveform:
     repeat = _number(call.params["r"], "PWL r") if "r" in call.params else -1.0
     times = [t + shift for t in values[0::2]]
     if repeat >= 0.0 and repeat not in values[0::2] and repeat < values[0]:
-        # A repeat from before the first point starts with the first value held.
+        # Where the repeated part begins before the first point, it begins with the first value.
         times, values = [repeat + shift, *times], [repeat, values[1], *values]
     return PWL(tuple(times), tuple(values[1::2]), repeat + shift if repeat >= 0.0 else None)
 
@@ -162,14 +164,14 @@ _REFUSED = {
 
 @dataclass(frozen=True)
 class Source:
-    """What the words after the nodes of a V or I element say.
+    """A V or I element as the words after its nodes describe it.
 
     Attributes
     ----------
     waveform : Waveform
     ac : SmallSignal or None
     notes : tuple of str
-        Where ngspice takes something else.
+        Warnings of words that ngspice reads differently.
     """
 
     waveform: Waveform
@@ -178,7 +180,7 @@ class Source:
 
 
 def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -> Source:
-    """The words after the nodes of a V or I element.
+    """Read the words after the nodes of a V or I element.
 
     Parameters
     ----------
@@ -215,7 +217,7 @@ def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -
             raise InputError(problem, word.where)
         call = word if isinstance(word, Call) else None
         if call is None:
-            # SIN 0 200 100, without brackets.
+            # A call may also be written without brackets: SIN 0 200 100.
             call = Call(key, tuple(_leading_numbers(words)), {}, {}, word.where)
         if key == "dc":
             if len(call.args) != 1:
@@ -236,7 +238,7 @@ def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -
 
 
 def _small_signal(name: str, call: Call) -> SmallSignal:
-    """``AC [magnitude [phase]]``: 1 and 0 degrees where left out."""
+    """``AC [magnitude [phase]]``, by default 1 and 0 degrees."""
     numbers = [_number(arg, f"{name} AC") for arg in call.args]
     if len(numbers) > 2:
         raise InputError(f"{name}: AC takes at most 2 values, {len(numbers)} given; allowed: AC [magnitude [phase]]",
@@ -245,7 +247,7 @@ def _small_signal(name: str, call: Call) -> SmallSignal:
 
 
 def _differences(name: str, key: str, waveform: Waveform, call: Call) -> tuple[str, ...]:
-    """Where ngspice 39 takes another number than the one written, and this reader does not."""
+    """Warnings of numbers that ngspice 39 or LTspice reads differently, or that were left out."""
     if isinstance(waveform, Exp) and 0.0 in (waveform.td1, waveform.td2):
         which = " and ".join(n for n, x in (("TD1", waveform.td1), ("TD2", waveform.td2)) if x == 0.0)
         return (

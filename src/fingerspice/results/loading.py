@@ -22,7 +22,7 @@ from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, Network
 from fingerspice.results.plan import Plan
 from fingerspice.results.solution import Solution
 from fingerspice.results.stored_record import StoredRecord
-from fingerspice.waveforms import combinations, ramps
+from fingerspice.waveforms import combinations, periodic, ramps, transients
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.waveform import Fundamental, Waveform
 
@@ -30,8 +30,8 @@ from fingerspice.waveforms.waveform import Fundamental, Waveform
 _WAVEFORMS = {
     kind.__name__: kind
     for kind in (
-        waveforms.DC, waveforms.Sine, waveforms.Chirp, waveforms.Exp, ramps.PWL, ramps.Square, ramps.Triangle,
-        ramps.Sawtooth, ramps.Pulse, combinations.Sum, combinations.Product, combinations.AM,
+        waveforms.DC, waveforms.Sine, transients.Chirp, transients.Exp, ramps.PWL, ramps.Pulse, periodic.Square,
+        periodic.Triangle, periodic.Sawtooth, combinations.Sum, combinations.Product, combinations.AM,
     )
 }  # fmt: skip
 _DEEPEST = 20

@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import FingerspiceError, printable
+
+if TYPE_CHECKING:
+    from fingerspice.results.solution import Solution
 
 
 class Status(Enum):
@@ -124,6 +128,26 @@ class Failure:
             "element": self.element, "u_gap": self.u_gap, "area": self.area, "fold_margin": self.fold_margin,
             "tried": [a._asdict() for a in self.tried],
         }  # fmt: skip
+
+
+class SolveError(FingerspiceError, RuntimeError):
+    """The solve did not reach its end.
+
+    Attributes
+    ----------
+    failure : Failure
+        Why, when and where it stopped.
+    message : str
+        The failure as one sentence.
+    solution : Solution or None
+        The run up to where it stopped; None where there is none.
+    """
+
+    def __init__(self, failure: Failure, solution: Solution | None = None) -> None:
+        self.failure = failure
+        self.message = printable(str(failure))
+        self.solution = solution
+        super().__init__(self.message)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
-    from fingerspice.plots.picture import Picture
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, repr=False)
@@ -66,9 +66,9 @@ class PhasorSolution(Shown):
 
         return phasor_table(self, most=20)
 
-    def plot(self) -> Picture:
+    def plot(self) -> Figure:
         """Gain, phase, mean force and area against frequency."""
-        from fingerspice.plots.plotting import plot_phasor
+        from fingerspice.plots.phasors import plot_phasor
 
         require(self.circuit is not None, "circuit", self.circuit, "a sweep that phasor or large_signal made")
         assert self.circuit is not None

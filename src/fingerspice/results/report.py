@@ -10,24 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fingerspice.base.errors import SolveError
 from fingerspice.base.files import write_aside
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
-from fingerspice.circuit.describe import drive_text, heading, waveform_text
+from fingerspice.circuit.describe import head_lines, heading
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.results.phasor_solution import PhasorSolution
     from fingerspice.results.plan import Plan
     from fingerspice.results.solution import Solution
-    from fingerspice.studies.comparison import Comparison
-    from fingerspice.studies.fitting import MaterialFit
-    from fingerspice.studies.limits import FoldLimits
-    from fingerspice.studies.steady import SteadyState
-
-#: Elements of a circuit that are listed.
-MOST_ELEMENTS = 25
 
 
 def _value(value: float | None, unit: str, factor: float = 1.0, peak: float = 0.0) -> str:
@@ -43,7 +35,7 @@ def _value(value: float | None, unit: str, factor: float = 1.0, peak: float = 0.
 def summary_table(solution: Solution) -> Page:
     """The figures of a run as a table."""
     s = solution.summary()
-    out: list[str | Table] = [heading(solution.circuit), *_driven(solution.circuit), _scene(solution), ""]
+    out: list[str | Table] = [*head_lines(solution.circuit), _scene(solution), ""]
     if solution.t.size >= 2:
         rows = []
         for key, label, unit, factor in (
@@ -97,11 +89,6 @@ def summary_table(solution: Solution) -> Page:
     return Page(out)
 
 
-def _driven(circuit: Circuit) -> list[str]:
-    drive = drive_text(circuit)
-    return [drive] if drive else []
-
-
 def _scene(solution: Solution) -> str:
     end = format_si(float(solution.t[-1]), "s") if solution.t.size else "nothing"
     return (
@@ -110,152 +97,15 @@ def _scene(solution: Solution) -> str:
     )
 
 
-def circuit_page(circuit: Circuit) -> Page:
-    """What a circuit is made of, and what its deck asks for."""
-    rows = []
-    for element in circuit.elements[:MOST_ELEMENTS]:
-        said = [f"{name}={_deck_value(value)}" for name, value in element.values.items() if math.isfinite(value)]
-        if element.waveform is not None:
-            said.append(waveform_text(element.waveform, "A" if element.device == "I" else "V"))
-        rows.append((element.name, element.device, " ".join(element.node_names), _cut(" ".join(said), 96)))
-    lines: list[str | Table] = [heading(circuit), ""]
-    lines.append(Table(("", "device", "nodes", "values, in the units of the netlist"), rows, left=4))
-    if len(circuit.elements) > MOST_ELEMENTS:
-        lines.append(f"... and {len(circuit.elements) - MOST_ELEMENTS} more elements")
-    lines.append("")
-    if circuit.tran is not None:
-        since = f" from {format_si(circuit.tran.start, 's')} on" if circuit.tran.start else ""
-        lines.append(
-            f".tran: {format_si(circuit.tran.stop, 's')}, an output every {format_si(circuit.tran.step, 's')}{since}"
-        )
-    if circuit.ac is not None:
-        lines.append(f".ac: {format_si(circuit.ac.start, 'Hz')} to {format_si(circuit.ac.stop, 'Hz')}")
-    lines.append(f"charge law: {circuit.charge_law or 'local (the deck names none)'}")
-    return Page(lines)
-
-
-def _deck_value(value: float) -> str:
-    """A number as a deck has it: ``3.5u``, ``0.2meg``, ``0.3``."""
-    if 0.01 <= abs(value) < 1e4:
-        return f"{value:.4g}"
-    text = format_si(value, "").replace(" ", "")
-    # SPICE reads M as milli, and knows no P and E.
-    return f"{text[:-1]}meg" if text.endswith("M") else f"{value:.4g}" if text[-1:] in "PEZY" else text
-
-
-def _cut(text: str, longest: int) -> str:
-    return text if len(text) <= longest else f"{text[: longest - 4]} ..."
-
-
-def steady_page(state: SteadyState) -> Page:
-    """A periodic state: what vouches for it, and the figures of its period."""
-    largest = 1.0 - state.stability_margin
-    found = f"periodic state of {format_si(state.period, 's')}, found in {state.periods:.3g} periods"
-    left = (
-        f"a further period changes the layers by {state.defect:.2g} V at most, and leaves {100.0 * largest:.3g} % of a "
-        "small disturbance"
-    )
-    try:
-        period = summary_table(state.solution).blocks
-    except SolveError as error:
-        period = (error.message,)
-    return Page([found, left, "", *period])
-
-
-def fit_page(fit: MaterialFit) -> Page:
-    """A fitted ladder: its branches, and how far it is from the data."""
-    ladder = fit.ladder
-    rows = [
-        (format_si(p / (2.0 * math.pi), "Hz"), f"{k:.4g} S/m")
-        for p, k in zip(ladder.poles, ladder.weights, strict=True)
-    ]
-    f = fit.frequency
-    return Page(
-        [
-            f"material fitted at {f.size} frequencies from {format_si(float(f[0]), 'Hz')} to "
-            f"{format_si(float(f[-1]), 'Hz')}",
-            f"misfit of the admittivity: {100.0 * fit.rms:.2g} % rms, {100.0 * fit.largest:.2g} % at most",
-            f"no causal and passive material comes nearer than {100.0 * fit.kramers_kronig.rms:.2g} % rms",
-            "",
-            f"{ladder.conductivity:.4g} S/m at zero frequency, eps_r = {ladder.eps_inf:.4g} above all poles, and",
-            Table(("pole", "weight"), rows),
-        ]
-    )
-
-
 def plan_text(plan: Plan, circuit: Circuit | None = None) -> Page:
     """A plan in words, under the heading of its circuit where that is given."""
     rates = ", ".join(f"{r:.4g}" for r in plan.rates) or "none"
-    head: list[str | Table] = [] if circuit is None else [heading(circuit), *_driven(circuit), ""]
-    lines = [*head, f"model: {plan.tier}", *(f"  because {r}" for r in plan.reasons)]
+    head = [] if circuit is None else [*head_lines(circuit), ""]
+    lines: list[str | Table] = [*head, f"model: {plan.tier}", *(f"  because {r}" for r in plan.reasons)]
     lines.append(f"rates, area frozen: {rates} 1/s ({'' if plan.stiff else 'not '}stiff for this source)")
     if not math.isnan(plan.sensitivity):
         lines.append(f"the area moves the leaks by at most {100.0 * plan.sensitivity:.3g} %")
     return Page(lines)
-
-
-def comparison_table(comparison: Comparison) -> Page:
-    """A comparison as a table, with what it says in words."""
-    names = {
-        "amplitude": "gap voltage amplitude",
-        "phase_deg": "lead over the source",
-        "f_el_mean": "mean force",
-        "area_mean": "mean area",
-    }
-    rows = []
-    for name, unit, p, m, c, difference, ripple in comparison.rows():
-        rows.append((f"{names[name]} [{unit}]", *(f"{x:.6g}" for x in (p, m, c, difference, ripple))))
-    head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
-    reference = comparison.phasor.f_el_mean
-    # Rounded here, and 0.0 added: -0.00 is not a figure.
-    total = round(100.0 * (comparison.coupled.f_el_mean / reference - 1.0), 2) + 0.0
-    waveform = round(100.0 * (comparison.mean.f_el_mean / reference - 1.0), 2) + 0.0
-    return Page(
-        [
-            heading(comparison.solution.circuit),
-            *_driven(comparison.solution.circuit),
-            f"periodic state at {format_si(comparison.frequency, 'Hz')}, charge law {comparison.solution.charge_law}",
-            "",
-            Table(head, rows),
-            "",
-            f"mean force: {total:+.2f} % against the phasor; {total - waveform:+.2f} % of that is the ripple of the "
-            f"area, {waveform:+.2f} % is the waveform's (zero for a sine)",
-        ]
-    )
-
-
-def limits_text(limits: FoldLimits) -> Page:
-    """Where the mobile law folds, in words and a table per parameter."""
-    own = format_si(limits.peak, "V")
-    if math.isfinite(limits.voltage):
-        head = (
-            f"under the mobile law this deck folds at {format_si(limits.voltage, 'V')} peak; its source reaches {own}, "
-            f"{100.0 * limits.peak / limits.voltage:.3g} % of that"
-        )
-    else:
-        head = f"under the mobile law this deck does not fold; its source reaches {own}"
-    lines: list[str | Table] = [heading(limits.circuit), *_driven(limits.circuit), head]
-    for sweep in limits.sweeps:
-        rows = [
-            (format_si(x, sweep.unit), format_si(u, "V") if math.isfinite(u) else "none")
-            for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True)
-        ]
-        lines += ["", Table((sweep.name, "folds at"), rows)]
-    return Page(lines)
-
-
-def limits_csv(limits: FoldLimits, path: Path) -> Path:
-    """Write a map of the fold as CSV; no voltage where there is no fold."""
-
-    def write(target: Path) -> None:
-        with target.open("w", newline="") as stream:
-            writer = csv.writer(stream)
-            writer.writerow(["parameter", "value [SI]", "unit", "fold [V]"])
-            for sweep in limits.sweeps:
-                for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True):
-                    writer.writerow([sweep.name, repr(x), sweep.unit, repr(u) if math.isfinite(u) else ""])
-
-    return write_aside(path, write)
 
 
 def phasor_dict(result: PhasorSolution) -> dict[str, Any]:

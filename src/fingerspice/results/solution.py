@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
     import pandas
     import xarray
+    from matplotlib.figure import Figure
 
     from fingerspice.circuit.circuit import Circuit
-    from fingerspice.plots.picture import Picture
     from fingerspice.results.plan import Plan
     from fingerspice.results.refined import ClosedForm
     from fingerspice.results.steps import Recorded
@@ -324,7 +324,7 @@ class Solution(Sealed, Shown, Figured):
         *,
         window: tuple[float, float] | None = None,
         others: Solution | Sequence[Solution] | Mapping[str, Solution] = (),
-    ) -> Picture:
+    ) -> Figure:
         """Signals against time, as a figure that a notebook shows; from a script ``plot().show()`` opens a window.
 
         Where the window holds more than about 30 oscillations they are drawn as envelopes, with the last few beside.
@@ -341,8 +341,8 @@ class Solution(Sealed, Shown, Figured):
 
         Returns
         -------
-        Picture
-            A matplotlib Figure: ``savefig("x.pdf")`` saves it.
+        matplotlib.figure.Figure
+            ``savefig("x.pdf")`` saves it, ``show()`` shows it.
 
         Raises
         ------

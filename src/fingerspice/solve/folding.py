@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import OdeSolution, solve_ivp
 
-from fingerspice.base.errors import SolveError
 from fingerspice.engine.model import branch_area, dot, ramp, voltage_by_time, write_row_at
 from fingerspice.engine.segment import Segment, source
-from fingerspice.results.outcome import Failure, State, Status
+from fingerspice.results.outcome import Failure, SolveError, State, Status
 from fingerspice.solve.marching import solve as solve_marching
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import BoolArray, Run, Tables, from_rows, row_width

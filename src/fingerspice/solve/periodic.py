@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.errors import InputError, SolveError
+from fingerspice.base.errors import InputError
 from fingerspice.engine import march, shooting
 from fingerspice.engine.pace import Pace
 from fingerspice.numerics import linear
-from fingerspice.results.outcome import ErrorEstimate, Failure, Status
+from fingerspice.results.outcome import ErrorEstimate, Failure, SolveError, Status
 from fingerspice.solve.marching import LOCAL_SHARE, LONGEST_STEP
 from fingerspice.solve.problem import Problem, state_from
 from fingerspice.solve.track import FINEST, SAFETY, prepare_system

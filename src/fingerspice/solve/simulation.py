@@ -10,14 +10,14 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.errors import FingerspiceWarning, InputError, SolveError
+from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_area, require_number, times_given
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.notices import circuit_warnings
 from fingerspice.circuit.statespace import is_stack
 from fingerspice.numerics.tableaus import TABLEAUS
 from fingerspice.results.network_record import NetworkRecord
-from fingerspice.results.outcome import ErrorEstimate, Failure, Status
+from fingerspice.results.outcome import ErrorEstimate, Failure, SolveError, Status
 from fingerspice.results.plan import Plan
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution

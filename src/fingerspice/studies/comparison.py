@@ -67,13 +67,13 @@ class Comparison(Shown):
     solution: Solution
 
     def _page(self) -> Page:
-        from fingerspice.results.report import comparison_table
+        from fingerspice.studies.reports import comparison_table
 
         return comparison_table(self)
 
     def plot(self) -> Picture:
         """One period of the transient over the phasor's, and the figures of both."""
-        from fingerspice.plots.plotting import plot_comparison
+        from fingerspice.studies.pictures import plot_comparison
 
         return plot_comparison(self)
 

@@ -17,7 +17,8 @@ from fingerspice.physics.contact import Contact
 from fingerspice.solve.networks import prepare_network
 from fingerspice.solve.starting import start_voltage, starts_uncharged
 from fingerspice.waveforms.ramps import PWL, Pulse
-from fingerspice.waveforms.waveform import DC, Exp, Sine, Waveform
+from fingerspice.waveforms.transients import Exp
+from fingerspice.waveforms.waveform import DC, Sine, Waveform
 
 EDGE = 1e-9
 """Longest rise time (s) of an ideal jump in the export, a thousandth of TSTEP if that is shorter: ngspice has no

@@ -28,7 +28,7 @@ from fingerspice.solve.runs import Progress
 from fingerspice.studies.phasors import phasor
 from fingerspice.studies.steady import steady_state
 from fingerspice.studies.table1 import table1_circuit
-from fingerspice.waveforms.ramps import Square
+from fingerspice.waveforms.periodic import Square
 from fingerspice.waveforms.waveform import Sine, Waveform, require
 
 if TYPE_CHECKING:

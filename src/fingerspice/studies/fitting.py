@@ -115,7 +115,7 @@ class MaterialFit(Shown):
     data: ComplexArray
 
     def _page(self) -> Page:
-        from fingerspice.results.report import fit_page
+        from fingerspice.studies.reports import fit_page
 
         return fit_page(self)
 
@@ -135,6 +135,8 @@ class MaterialFit(Shown):
 
     def plot(self) -> Figure:
         """Resistivity and permittivity of the data and of the ladder, and the misfit, against frequency."""
+        from fingerspice.studies.pictures import plot_material
+
         return plot_material(self)
 
 
@@ -323,32 +325,3 @@ def _consistency(f: FloatArray, y: ComplexArray) -> Consistency:
     _, left = _weights(f, y, np.logspace(low - _BEYOND, high + _BEYOND, count))
     misfit = np.abs(left)
     return Consistency(float(np.sqrt(np.mean(misfit**2))), float(misfit.max()), f, misfit)
-
-
-def plot_material(fit: MaterialFit) -> Figure:
-    """What was measured and what was fitted: resistivity, permittivity, and the misfit of the two together."""
-    from fingerspice.plots.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, new_figure
-
-    figure, axes = new_figure(1, 3, height=2.7)
-    f = np.geomspace(fit.frequency[0], fit.frequency[-1], 400)
-    measured = 1.0 / fit.data.real, fit.data.imag / (2.0 * np.pi * fit.frequency * EPS0)
-    fitted = fit.ladder.resistivity(f), fit.ladder.permittivity(f)
-    labels = "Resistivity [Ω m]", "Relative permittivity"
-    for ax, points, line, label in zip(axes[:2], measured, fitted, labels, strict=True):
-        ax.loglog(fit.frequency, points, color=GREY, marker="o", markersize=2.5, linestyle="none", label="data")
-        ax.loglog(f, line, color=BLUE, linewidth=1.4, label=f"ladder of {len(fit.ladder.poles)} poles")
-        dress(ax, label, "Frequency [Hz]")
-    limit = fit.kramers_kronig
-    axes[2].semilogx(fit.frequency, 100.0 * fit.misfit, color=BLUE, linewidth=1.4, label="ladder")
-    axes[2].semilogx(
-        limit.frequency, 100.0 * limit.misfit, color=VERMILION, linewidth=1.0, linestyle="--", label="any material"
-    )
-    dress(axes[2], "Misfit [%]", "Frequency [Hz]")
-    for ax in (axes[0], axes[2]):
-        ax.legend(fontsize=FONT - 0.5, frameon=False)
-    caption(
-        figure,
-        f"misfit {100.0 * fit.rms:.2g} % rms; no causal and passive material is nearer than "
-        f"{100.0 * limit.rms:.2g} % rms",
-    )
-    return figure

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.errors import InputError, SolveError
+from fingerspice.base.errors import InputError
 from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import heading
 from fingerspice.circuit.statespace import is_stack
-from fingerspice.results.outcome import Status
+from fingerspice.results.outcome import SolveError, Status
 from fingerspice.solve.folding import meets_fold
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.runs import Progress
@@ -76,7 +76,7 @@ class FoldLimits(Shown):
     sweeps: tuple[FoldSweep, ...]
 
     def _page(self) -> Page:
-        from fingerspice.results.report import limits_text
+        from fingerspice.studies.reports import limits_text
 
         return limits_text(self)
 

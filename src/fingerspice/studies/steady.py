@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.errors import FingerspiceWarning, InputError, SolveError
+from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_area
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
-from fingerspice.results.outcome import ErrorEstimate
+from fingerspice.results.outcome import ErrorEstimate, SolveError
 from fingerspice.results.solution import Solution
 from fingerspice.results.summary import Figured, Figures, KeptFigures
 from fingerspice.solve.periodic import close_period
@@ -26,7 +26,7 @@ from fingerspice.solve.simulation import RTOL_RANGE, run_problem
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
-    from fingerspice.plots.picture import Picture
+    from matplotlib.figure import Figure
 
 FloatArray = NDArray[np.float64]
 
@@ -61,11 +61,11 @@ class SteadyState(Shown, Figured):
     periods: float
 
     def _page(self) -> Page:
-        from fingerspice.results.report import steady_page
+        from fingerspice.studies.reports import steady_page
 
         return steady_page(self)
 
-    def plot(self, signals: str | Sequence[str] | None = None) -> Picture:
+    def plot(self, signals: str | Sequence[str] | None = None) -> Figure:
         """The period's signals against time; `signals` as in `Solution.plot`."""
         return self.solution.plot(signals)
 

@@ -1,4 +1,4 @@
-"""What the numbers of a source may be, and how much of it is looked at once: known before anything is spent on it."""
+"""Limits of a source: the range of its numbers, and how many of its breakpoints are handled at once."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from fingerspice.base.errors import InputError
 if TYPE_CHECKING:
     from fingerspice.waveforms.waveform import Waveform
 
-#: Largest and smallest size of a number that is not 0, by unit: of voltages and currents, of angles, of all others.
+#: Largest and smallest size allowed of a number other than 0, by unit (V stands for A, too); and for other units.
 RANGES = {"V": (1e12, 0.0), "deg": (1e9, 0.0)}
 ANY_RANGE = (1e30, 1e-30)
-#: Breakpoints that are listed at once; they and what is made of them take 40 bytes each.
+#: Breakpoints that are listed at once; each takes about 40 bytes, with what is computed from it.
 MOST_LISTED = 20_000_000
-#: Breakpoints among which values are looked up at once.
+#: Breakpoints of one window, within which values are looked up together.
 _WINDOW = 1_000_000
 
 
 def check_finite(waveform: Waveform) -> None:
-    """Refuse NaN, inf and what no calculation bears in any numeric field of a waveform dataclass."""
+    """Refuse NaN, inf and numbers out of range in any numeric field of a waveform."""
     for field in fields(waveform):  # type: ignore[arg-type]
         value = getattr(waveform, field.name)
         if isinstance(value, (float, int)):
@@ -37,7 +37,7 @@ def check_finite(waveform: Waveform) -> None:
 
 
 def check_range(what: str, values: ArrayLike, unit: str) -> None:
-    """Refuse finite numbers whose products and quotients would leave the range of a double."""
+    """Refuse finite numbers so large or small that products and quotients of them would overflow or underflow."""
     largest, smallest = RANGES.get(unit, ANY_RANGE)
     size = np.abs(np.asarray(values, float))
     bad = np.flatnonzero(np.isfinite(size) & (((size < smallest) & (size > 0.0)) | (size > largest)))
@@ -48,12 +48,12 @@ def check_range(what: str, values: ArrayLike, unit: str) -> None:
 
 
 def runs_through(first: float, last: float, count: int, t0: float, t1: float) -> FloatArray:
-    """Numbers `first` to `last` of the periods, of `count` breakpoints each, that hold the times from t0 to t1 (s).
+    """Numbers of the periods from `first` to `last`, which cover t0 to t1 (s) and have `count` breakpoints each.
 
     Raises
     ------
     InputError
-        Where that are more breakpoints than are listed at once.
+        Where that makes more breakpoints than may be listed at once.
     """
     total = (last - first + 1.0) * count
     if not total <= MOST_LISTED:
@@ -65,9 +65,9 @@ def runs_through(first: float, last: float, count: int, t0: float, t1: float) ->
 
 
 def in_windows(t: FloatArray, rate: float) -> Iterator[slice | NDArray[np.intp]]:
-    """Times (s) in groups that no more than `_WINDOW` breakpoints lie between, of which there are `rate` a second.
+    """Indices of times (s) in groups, each within a window of `_WINDOW` breakpoints at `rate` breakpoints per second.
 
-    Ten times in a year of square waves are ten windows, and the breakpoints between them are never listed.
+    So the value at ten times in a year of square waves needs ten windows, and not every breakpoint of the year.
     """
     if t.size == 0:
         return

@@ -35,7 +35,7 @@ class _Combination(Waveform):
 
     @cached_property
     def period(self) -> float | None:  # type: ignore[override]
-        """Least common period of the parts, where their ratio is a ratio of integers below 1000."""
+        """Least common period of the parts (s); None unless their periods are in ratios of integers up to 1000."""
         total: float | None = None
         for part in self.parts:
             if isinstance(part, DC):
@@ -58,7 +58,7 @@ class _Combination(Waveform):
 
 @dataclass(frozen=True)
 class Sum(_Combination):
-    """Sum of waveforms. Its fundamental is its lowest tone, where every other tone is a harmonic of it."""
+    """Sum of waveforms; its fundamental is the lowest tone of its parts, if all others are harmonics of that."""
 
     parts: tuple[Waveform, ...]
 
@@ -80,7 +80,7 @@ class Sum(_Combination):
 
 @dataclass(frozen=True)
 class Product(_Combination):
-    """Product of waveforms. Its fundamental is that of its fastest factor: the carrier."""
+    """Product of waveforms; its fundamental is that of the factor with the highest tone, the carrier."""
 
     parts: tuple[Waveform, ...]
 
@@ -102,7 +102,7 @@ class Product(_Combination):
 
 
 def _multiply(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Product of two blocks of terms; cos x cos y = (cos(x + y) + cos(x - y)) / 2."""
+    """Product of two blocks of terms, by cos x cos y = (cos(x + y) + cos(x - y)) / 2."""
     a = a[:, np.any(a[:, :, 0] != 0.0, axis=0)]
     b = b[:, np.any(b[:, :, 0] != 0.0, axis=0)]
     columns = []
@@ -131,7 +131,7 @@ class AM(_Combination):
     carrier, modulation : float
         Hz, positive.
     depth : float
-        0 (plain carrier) to 1 (envelope falls to zero).
+        From 0 (the carrier alone) to 1 (the envelope falls to zero).
     phase_deg : float
         Phase of the envelope, degrees.
     """

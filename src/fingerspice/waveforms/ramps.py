@@ -1,6 +1,6 @@
-"""Waveforms made of straight pieces: PWL, square, triangle, sawtooth, pulse and samples.
+"""Waveforms made of straight pieces: `PWL`, `Pulse`, `Samples`, and the class on which all such waveforms rest.
 
-One class does the work: a subclass only lists its knots.
+A subclass of `Ramps` only lists its knots.
 """
 
 from __future__ import annotations
@@ -17,31 +17,32 @@ from fingerspice.base.errors import InputError
 from fingerspice.waveforms.bounds import check_finite, check_range, in_windows, runs_through
 from fingerspice.waveforms.waveform import Waveform, blank_terms, require
 
-# Knots that fit any window of a source.
+# So few knots need not be divided into windows, however close together they are.
 _FEW_KNOTS = 1000
 
 
-class _Ramps(Waveform):
-    """Straight lines between knots (t, v), two knots at one time being a jump; held outside, or repeated.
+class Ramps(Waveform):
+    """Straight lines between knots (t, v), constant outside them or repeated; two knots at one time are a jump.
 
-    Subclasses give `_knots` for one run through; a repeated waveform runs through once per `period`, from
-    `_first` on, and its knots then span exactly one period.
+    Subclasses implement `_knots`. A periodic waveform repeats its knots once per `period` from the time `_first` on,
+    and they span exactly one period.
     """
 
     _first: float = 0.0
 
     def _knots(self) -> tuple[FloatArray, FloatArray]:
+        """Times (s, ascending) and values (V) of the knots, shape (n,) each."""
         raise NotImplementedError
 
     def _phase(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Start of the run that holds each time, and the time since."""
+        """Start of the period that contains each time, and the time since then, s."""
         if self.period is None:
             return np.zeros_like(t), t
         start = self._first + np.maximum(np.floor((t - self._first) / self.period), 0.0) * self.period
         return start, t - start
 
     def _times(self, t0: float, t1: float) -> FloatArray:
-        """Absolute knot times around [t0, t1], ascending, repeated at jumps."""
+        """Times of the knots (s, ascending) over [t0, t1] and somewhat beyond; a jump appears twice."""
         times, _ = self._knots()
         if self.period is None:
             return times
@@ -52,7 +53,7 @@ class _Ramps(Waveform):
 
     def _edges(self, t0: float, t1: float) -> FloatArray:
         times = np.unique(self._times(t0, t1))
-        # A run's last knot and the next run's first differ by rounding.
+        # The last knot of a period and the first of the next are the same time but for rounding.
         keep = np.ones(times.size, bool)
         keep[1:] = np.diff(times) > 1e-15 * np.abs(times[1:])
         return times[keep]
@@ -70,7 +71,7 @@ class _Ramps(Waveform):
         return out.reshape(t.shape)
 
     def _values(self, flat: FloatArray, side: str) -> FloatArray:
-        """As `value`, at times (n_t,) that are not far apart."""
+        """As `value`, at times (n_t,) within one window."""
         edges = self._edges(flat.min(), flat.max())
         index = np.searchsorted(edges, flat, side="right" if side == "right" else "left")
         bounds = np.concatenate([[-math.inf], edges, [math.inf]])
@@ -80,7 +81,10 @@ class _Ramps(Waveform):
         return np.asarray(v0 + slope * tau)
 
     def _line(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Value at the start and slope of the pieces from `start` to `stop`, told apart by their midpoints."""
+        """Values (V) at `start` and slopes (V/s) of the straight pieces between `start` and `stop` (s).
+
+        A piece is identified by its midpoint, which rounding cannot move into a neighbour.
+        """
         times, values = self._knots()
         middle = 0.5 * (start + stop)
         run, tau = self._phase(np.where(np.isfinite(middle), middle, 0.0))
@@ -92,7 +96,7 @@ class _Ramps(Waveform):
         inside = ~before & ~after & (width > 0.0)
         slope = np.where(inside, (values[j] - values[j - 1]) / np.where(width > 0.0, width, 1.0), 0.0)
         offset = np.where(np.isfinite(start), start - run, 0.0) - times[j - 1]
-        # The start of a piece is a knot up to rounding: use the knot's value exactly.
+        # A piece that starts at a knot, but for rounding, starts with exactly the knot's value.
         offset = np.where(np.abs(offset) <= 1e-9 * width, 0.0, offset)
         v0 = np.where(inside, values[j - 1] + slope * offset, np.where(before, values[0], values[-1]))
         return v0, slope
@@ -106,15 +110,15 @@ class _Ramps(Waveform):
     def breakpoint_rate(self) -> float:
         times, _ = self._knots()
         if self.period is None and times.size <= _FEW_KNOTS:
-            # They are all there will ever be, however close they stand.
+            # No window can contain more breakpoints than these few.
             return 0.0
         span = self.period or (times[-1] - times[0])
         return times.size / span if span > 0.0 else 0.0
 
 
 @dataclass(frozen=True)
-class PWL(_Ramps):
-    """Piecewise linear through (times, values); held before the first and after the last; equal times jump.
+class PWL(Ramps):
+    """Piecewise linear through (times, values), constant before and after them; two equal times are a jump.
 
     Parameters
     ----------
@@ -123,7 +127,7 @@ class PWL(_Ramps):
     values : tuple of float
         V.
     repeat : float, optional
-        s; from the last time on, the stretch from `repeat` to the last time runs again and again.
+        s; after the last time, the part from `repeat` to the last time is repeated for ever.
     """
 
     times: tuple[float, ...]
@@ -169,7 +173,7 @@ class PWL(_Ramps):
     def _knots(self) -> tuple[FloatArray, FloatArray]:
         return np.asarray(self.times), np.asarray(self.values)
 
-    # A repeated PWL has a head before the part that repeats, so its runs are not all alike.
+    # What comes before `repeat` is passed once only, so that the knots are not those of one period.
     def _phase(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         if self.repeat is None:
             return np.zeros_like(t), t
@@ -190,120 +194,8 @@ class PWL(_Ramps):
 
 
 @dataclass(frozen=True)
-class _Periodic(_Ramps):
-    """Ramps repeated for ever, the phase fixed by delay and phase."""
-
-    amplitude: float
-    frequency: float
-    offset: float = 0.0
-    phase_deg: float = 0.0
-    delay: float = 0.0
-    units: ClassVar[dict[str, str]] = {
-        "amplitude": "V",
-        "frequency": "Hz",
-        "duty": "",
-        "offset": "V",
-        "phase_deg": "deg",
-        "delay": "s",
-    }
-
-    def __post_init__(self) -> None:
-        check_finite(self)
-        kind = type(self).__name__.lower()
-        require(self.frequency > 0.0, f"{kind} frequency", f"{self.frequency:g} Hz", "> 0")
-
-    @property
-    def period(self) -> float | None:  # type: ignore[override]
-        return 1.0 / self.frequency
-
-    def _times(self, t0: float, t1: float) -> FloatArray:
-        # (k + x) / f rounds to the time a user writes; k (1 / f) + x (1 / f) often misses it.
-        x = self._knots()[0] * self.frequency
-        shift = self.delay - self.phase_deg / 360.0 / self.frequency
-        low = np.floor((t0 - shift) * self.frequency) - 1.0
-        high = np.ceil((t1 - shift) * self.frequency) + 1.0
-        runs = runs_through(low, high, x.size, t0, t1)
-        return np.asarray(((runs[:, None] + x) / self.frequency + shift).ravel())
-
-    @property
-    def _first(self) -> float:  # type: ignore[override]
-        # A whole number of periods early enough that the shape covers t = 0 and the delay only shifts it.
-        shift = self.delay - self.phase_deg / 360.0 / self.frequency
-        period = 1.0 / self.frequency
-        return shift - math.ceil(shift / period - 1e-12) * period if shift > 0.0 else shift
-
-    def breakpoint_rate(self) -> float:
-        return 4.0 * self.frequency
-
-
-@dataclass(frozen=True)
-class Square(_Periodic):
-    """offset + amplitude for the first `duty` of each period, offset - amplitude for the rest, with ideal edges.
-
-    Amplitude and offset in V, frequency in Hz, duty between 0 and 1, phase in degrees, delay in s (a shift).
-    """
-
-    duty: float = 0.5
-
-    def __init__(
-        self,
-        amplitude: float,
-        frequency: float,
-        duty: float = 0.5,
-        offset: float = 0.0,
-        phase_deg: float = 0.0,
-        delay: float = 0.0,
-    ) -> None:
-        for name, value in (
-            ("amplitude", amplitude),
-            ("frequency", frequency),
-            ("duty", duty),
-            ("offset", offset),
-            ("phase_deg", phase_deg),
-            ("delay", delay),
-        ):
-            object.__setattr__(self, name, value)
-        self.__post_init__()
-        require(0.0 < duty < 1.0, "square duty", f"{duty:g}", "between 0 and 1")
-
-    @property
-    def half_wave(self) -> bool:
-        return self.offset == 0.0 and self.duty == 0.5
-
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
-        period = 1.0 / self.frequency
-        t = np.array([0.0, 0.0, self.duty, self.duty, 1.0]) * period
-        sign = np.array([-1.0, 1.0, 1.0, -1.0, -1.0])
-        return t, self.offset + self.amplitude * sign
-
-
-@dataclass(frozen=True)
-class Triangle(_Periodic):
-    """Triangle in phase with the sine: 0, +amplitude at a quarter, -amplitude at three quarters of a period."""
-
-    @property
-    def half_wave(self) -> bool:
-        return self.offset == 0.0
-
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
-        period = 1.0 / self.frequency
-        t = np.array([0.0, 0.25, 0.75, 1.0]) * period
-        return t, self.offset + self.amplitude * np.array([0.0, 1.0, -1.0, 0.0])
-
-
-@dataclass(frozen=True)
-class Sawtooth(_Periodic):
-    """Rises from offset - amplitude to offset + amplitude over each period, then jumps back."""
-
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
-        period = 1.0 / self.frequency
-        t = np.array([0.0, 0.0, 1.0]) * period
-        return t, self.offset + self.amplitude * np.array([1.0, -1.0, 1.0])
-
-
-@dataclass(frozen=True)
-class Pulse(_Ramps):
-    """SPICE's PULSE: v1 until `delay`, then per `pulse_period` a rise to v2, a width, a fall back to v1.
+class Pulse(Ramps):
+    """SPICE's PULSE: v1 until `delay`; then, in every `pulse_period`, a rise to v2, a width, and a fall back to v1.
 
     Voltages in V, times in s. A rise or fall of 0 is an ideal jump. Without `pulse_period` there is one pulse.
     """
@@ -379,8 +271,8 @@ class Pulse(_Ramps):
 
 
 @dataclass(frozen=True, eq=False)
-class Samples(_Ramps):
-    """Samples at a constant rate, linear in between, held before the first and after the last.
+class Samples(Ramps):
+    """Samples at a constant rate, linear between them, constant before the first and after the last.
 
     Parameters
     ----------
@@ -416,7 +308,7 @@ class Samples(_Ramps):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        # numpy's own copies can be written.
+        # An unpickled array would be writable.
         self.values.flags.writeable = False
 
     def _knots(self) -> tuple[FloatArray, FloatArray]:

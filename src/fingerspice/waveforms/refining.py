@@ -1,4 +1,4 @@
-"""A function as Chebyshev series, refined until they reproduce it at points that they were not built from."""
+"""A function as Chebyshev series, refined until they reproduce it at points from which they were not built."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import itertools
 import math
 import warnings
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,26 +16,88 @@ from fingerspice.numerics import chebyshev
 from fingerspice.waveforms.waveform import Waveform
 
 POINTS = 20
-# Points between the nodes at which a series has to prove itself; irregular, so that no period hides from them.
+# Points between the nodes at which a series is compared with the function. They are irregular, so that no periodic
+# function can pass through all of them unnoticed.
 _AT_START = (-1.0) ** np.arange(POINTS)
 _PROOF = 2.0 * np.modf(np.arange(1, 28) * 0.6180339887498949)[0] - 1.0
 _PLACES = np.concatenate([chebyshev.nodes(POINTS, -1.0, 1.0), _PROOF])
 _NODE_STEPS = np.diff(_PLACES[:POINTS])
 
-# Halvings in a row that mend nothing, and the misfit over the largest |U| that may then be called rounding.
+# After this many halvings in a row without gain, a misfit below the second number (relative to the largest |U|) is
+# taken for rounding of the function's values.
 _IDLE, _ROUGHEST = 3, 1e-8
-# Change over the largest |U| that makes a short series an edge, and not one of those that stand around a kink.
+# Change, relative to the largest |U|, from which on short series are reported as an edge; around a kink it is smaller.
 _STEEP = 0.05
-# V; below, doubles lose their digits, and no function is smooth.
+# Smallest tolerance, V: below it doubles lose digits, and no function appears smooth.
 _NOTHING = 1e-290
-# Halvings beyond which an interval is one around a jump or a kink, which takes about 60 intervals of that depth; and
-# how many of these a table may have, at once and for each interval that it starts from.
+# An interval halved more often than this lies at a jump or a kink, around which some 60 such intervals are needed. A
+# table may have so many of them, and so many more for each interval that it starts from.
 _DEEP, _MOST_DEEP, _MOST_DEEP_EACH = 12, 10_000, 100
+
+
+class _Interval(NamedTuple):
+    """An interval (s) that waits for its series.
+
+    Attributes
+    ----------
+    lo, hi : float
+    depth : int
+        Number of halvings that led to it.
+    misfit, largest : float
+        Misfit (V) before the last halving, and the largest before any.
+    idle : int
+        Number of halvings in a row that did not reduce the misfit.
+    """
+
+    lo: float
+    hi: float
+    depth: int = 0
+    misfit: float = math.inf
+    largest: float = 0.0
+    idle: int = 0
+
+    def halves(self, misfit: float = math.inf, largest: float | None = None, idle: int = 0) -> list[_Interval]:
+        """Both halves, the second one first: the list that they go to is a stack."""
+        middle, known = 0.5 * (self.lo + self.hi), self.largest if largest is None else largest
+        return [
+            _Interval(lo, hi, self.depth + 1, misfit, known, idle) for lo, hi in ((middle, self.hi), (self.lo, middle))
+        ]
+
+    def points(self) -> FloatArray:
+        """Times (s) at which the waveform is evaluated: the nodes, then the points between them."""
+        return 0.5 * (self.lo + self.hi) + 0.5 * (self.hi - self.lo) * _PLACES
 
 
 @dataclass
 class Refiner:
-    """Covers intervals with Chebyshev series by bisection."""
+    """Covers intervals with Chebyshev series by bisection.
+
+    Attributes
+    ----------
+    waveform : Waveform
+    tol : float
+        Error allowed of a series, relative to `scale`.
+    step : float
+        Output step, s.
+    scale, steepest : float
+        Largest |U| (V) and |dU/dt| (V/s) seen.
+    edges : list of float
+        Ends of the series' intervals, s.
+    series : list of ndarray, shape (POINTS,)
+        Chebyshev coefficients on each interval.
+    jumps : list of (float, float)
+        Times (s) at which neighbouring series differ, and by how much (V).
+    located, narrow : list of float
+        Times (s) of the jumps found by bisection, and of intervals much shorter than the output step.
+    short : list of (float, float)
+        Start (s) of each short interval, and the change (V) over it.
+    not_finite : float or None
+        Time (s) of the first NaN or inf.
+    rough : float
+        Largest misfit (V) taken for rounding of the function's values.
+    allowed, deep : int
+        How many often halved intervals there may be, and are.
+    """
 
     waveform: Waveform
     tol: float
@@ -53,101 +116,112 @@ class Refiner:
     deep: int = 0
 
     def cover(self, a: float, b: float) -> bool:
-        """Add series for [a, b]; False where the waveform stops being finite inside."""
+        """Add series for [a, b] (s); False where the waveform stops being finite inside."""
         if not self.edges:
             self.edges.append(a)
-        # A window between breakpoints is open at its ends: the series use inner points only.
+        # The ends of a window are breakpoints, where the waveform may jump: series use interior points only.
         longest = min(8.0 * self.step, 2.0 * self.waveform.shortest_time())
         count = max(1, math.ceil((b - a) / longest))
-        cuts = np.linspace(a, b, count + 1)
-        # Intervals with how often they were halved, the misfit before the last halving, the largest before any, and how
-        # often halving was no use.
-        stack = [(float(x), float(y), 0, math.inf, 0.0, 0) for x, y in itertools.pairwise(cuts)][::-1]
+        cuts = np.linspace(a, b, count + 1).tolist()
+        waiting = [_Interval(lo, hi) for lo, hi in itertools.pairwise(cuts)][::-1]
         self.allowed += _MOST_DEEP_EACH * count
-        while stack:
-            lo, hi, depth, before, most, idle = stack.pop()
-            series, values, misfit = self._try(lo, hi, depth)
-            if depth > _DEEP and series is None and np.all(np.isfinite(values)):
-                self._mind_noise(lo, hi, values)
-            idle = idle + 1 if misfit > 0.7 * before else 0
-            if series is None and idle >= _IDLE and misfit <= _ROUGHEST * self.scale:
-                # A smooth function's misfit falls by 2^20, that of a kink by two: this is the rounding of its values.
-                self.rough = max(self.rough, misfit)
-                series = chebyshev.coefficients(values)
+        while waiting:
+            piece = waiting.pop()
+            lo, hi = piece.lo, piece.hi
+            series, values, misfit = self._try(piece)
             if not np.all(np.isfinite(values)):
-                if hi - lo <= 1e-12 * max(abs(hi), self.step) or depth > 60:
+                if hi - lo <= 1e-12 * max(abs(hi), self.step) or piece.depth > 60:
                     self.not_finite = lo if lo == self.edges[0] else hi
                     return False
-                middle = 0.5 * (lo + hi)
-                stack += [(middle, hi, depth + 1, math.inf, most, 0), (lo, middle, depth + 1, math.inf, most, 0)]
+                waiting += piece.halves()
                 continue
+            idle = piece.idle + 1 if misfit > 0.7 * piece.misfit else 0
+            if series is None:
+                if piece.depth > _DEEP:
+                    self._refuse_noise(piece, values)
+                if idle >= _IDLE and misfit <= _ROUGHEST * self.scale:
+                    # Halving divides the misfit of a smooth function by 2^20 and that of a kink by 2. A misfit that
+                    # stays as it is comes from the rounding of the function's own values.
+                    self.rough = max(self.rough, misfit)
+                    series = chebyshev.coefficients(values)
             floor = max(4e-15 * max(abs(lo), abs(hi)), 1e-13 * self.step)
-            if series is None and hi - lo <= floor:
-                # What does not refine at this width is a jump (or a kink): an edge, not a steep ramp.
+            if series is not None:
+                waiting += self._add(piece, series, floor, first=lo == a)
+            elif hi - lo > floor:
+                waiting += piece.halves(misfit, max(piece.largest, misfit), idle)
+            else:
+                # What cannot be refined at this width is a jump (or a kink), and becomes an edge.
                 self.jumps.append((hi, float(values[-1] - values[0])))
                 self.located.append(hi)
                 if self.series:
                     self.edges[-1] = hi
-                continue
-            if series is None:
-                middle = 0.5 * (lo + hi)
-                most = max(most, misfit)
-                stack += [(middle, hi, depth + 1, misfit, most, idle), (lo, middle, depth + 1, misfit, most, idle)]
-                continue
-            if hi - lo < 0.75 * self.step and most > _ROUGHEST * self.scale:
-                self.narrow.append(0.5 * (lo + hi))
-            if hi - lo < 0.75 * self.step:
-                self.short.append((lo, float(series.sum() - series @ _AT_START)))
-            if self.series and lo > a and not (self.jumps and self.jumps[-1][0] >= lo):
-                # A jump, or a steep edge, may stand on a cut, where no point of either side sees it.
-                change = float(series @ _AT_START - self.series[-1].sum())
-                if abs(change) > self._least and hi - lo > floor:
-                    first, middle, behind = self.edges[-2], 0.5 * (lo + hi), 0.5 * (self.edges[-2] + lo)
-                    stack += [(middle, hi, depth + 1, math.inf, most, 0), (lo, middle, depth + 1, math.inf, most, 0)]
-                    if lo - first > floor:
-                        del self.edges[-1], self.series[-1]
-                        stack += [
-                            (behind, lo, depth + 1, math.inf, most, 0),
-                            (first, behind, depth + 1, math.inf, most, 0),
-                        ]
-                    continue
-                self.jumps.append((lo, change))
-            self.edges.append(hi)
-            self.series.append(series)
         return True
 
-    @staticmethod
-    def _places(lo: float, hi: float) -> FloatArray:
-        """Where an interval is looked at: the nodes, then the points of the proof, s."""
-        return 0.5 * (lo + hi) + 0.5 * (hi - lo) * _PLACES
+    def _add(self, piece: _Interval, series: FloatArray, floor: float, first: bool) -> list[_Interval]:
+        """Add an interval's series, or return the intervals to look at again where the waveform jumps at its start."""
+        if piece.hi - piece.lo < 0.75 * self.step:
+            self.short.append((piece.lo, float(series.sum() - series @ _AT_START)))
+            if piece.largest > _ROUGHEST * self.scale:
+                self.narrow.append(0.5 * (piece.lo + piece.hi))
+        if self.series and not first and not (self.jumps and self.jumps[-1][0] >= piece.lo):
+            # A jump, or a steep edge, may lie exactly on a cut, where no point of either side shows it.
+            change = float(series @ _AT_START - self.series[-1].sum())
+            if abs(change) > self._least and piece.hi - piece.lo > floor:
+                again = piece.halves(largest=piece.largest)
+                before = _Interval(self.edges[-2], piece.lo, piece.depth)
+                if before.hi - before.lo > floor:
+                    del self.edges[-1], self.series[-1]
+                    again += before.halves(largest=piece.largest)
+                return again
+            self.jumps.append((piece.lo, change))
+        self.edges.append(piece.hi)
+        self.series.append(series)
+        return []
 
-    def _try(self, lo: float, hi: float, depth: int) -> tuple[FloatArray | None, FloatArray, float]:
-        """Series of one interval if it proves itself, the values at its nodes, and its misfit between them, V."""
-        t = self._places(lo, hi)
+    def _try(self, piece: _Interval) -> tuple[FloatArray | None, FloatArray, float]:
+        """Fit a series to one interval.
+
+        Returns
+        -------
+        series : ndarray, shape (POINTS,), or None
+            Chebyshev coefficients; None where they miss the waveform between the nodes by more than is allowed.
+        values : ndarray
+            The waveform at the nodes, V; also between them where one of the values is not finite.
+        misfit : float
+            Largest difference of series and waveform between the nodes, V.
+        """
+        lo, hi = piece.lo, piece.hi
+        t = piece.points()
         values = self.waveform.value(t)
         if not np.all(np.isfinite(values)):
             return None, values, math.inf
         self.scale = max(self.scale, float(np.abs(values).max()))
         c = chebyshev.coefficients(values[:POINTS])
         proof = np.polynomial.chebyshev.chebval(_PROOF, c)
-        if depth == 0:
+        if piece.depth == 0:
             self.steepest = float(np.abs(np.diff(values[:POINTS]) / (0.5 * (hi - lo) * _NODE_STEPS)).max())
-        # A function cannot be smoother than the rounding of its own argument lets it be.
+        # Rounding of the time itself changes the value by up to this much.
         noise = 2e-15 * max(abs(lo), abs(hi)) * self.steepest
         misfit = float(np.abs(proof - values[POINTS:]).max())
         good = misfit <= max(self.tol * self.scale, noise, _NOTHING)
         return (c if good else None), values[:POINTS], misfit
 
-    def _mind_noise(self, lo: float, hi: float, values: FloatArray) -> None:
-        """Count an interval that will not refine; refuse what no refining would ever end with."""
+    def _refuse_noise(self, piece: _Interval, values: FloatArray) -> None:
+        """Count an interval that stays rough, and refuse a waveform with so many of them that refining never ends.
+
+        Raises
+        ------
+        InputError
+            Where the function gives another value at the same time, or is too rough.
+        """
         self.deep += 1
         if self.deep not in (1, self.allowed):
             return
-        t = self._places(lo, hi)
+        t = piece.points()
         again = self.waveform.value(t)[:POINTS]
         i = int(np.argmax(np.abs(again - values)))
         remedy = "of noise draw the values once and give fs.Samples(values, rate)"
-        # Not to the last digit: a function of arrays may sum in another order.
+        # A function of arrays may sum in another order, so the last digits may differ.
         if abs(again[i] - values[i]) > _ROUGHEST * self.scale:
             raise InputError(
                 f"the source function gives {values[i]:.4g} V and then {again[i]:.4g} V at the same t = {t[i]:.9g} s; "
@@ -155,18 +229,18 @@ class Refiner:
             )
         if self.deep == self.allowed:
             raise InputError(
-                f"the source function is too rough to be followed near t = {lo:.9g} s: {self.deep} pieces as short as "
-                f"{hi - lo:.2g} s were not smooth; allowed: smooth between jumps that are few, or declared by "
-                f"Function(f, breaks=(...)); {remedy}"
+                f"the source function is too rough to be followed near t = {piece.lo:.9g} s: {self.deep} pieces as "
+                f"short as {piece.hi - piece.lo:.2g} s were not smooth; allowed: smooth between jumps that are few, or "
+                f"declared by Function(f, breaks=(...)); {remedy}"
             )
 
     @property
     def _least(self) -> float:
-        """Smallest change that is a jump, V."""
+        """Smallest change between neighbouring series that counts as a jump, V."""
         return max(1e3 * self.tol * self.scale, 10.0 * self.rough)
 
     def warn(self) -> None:
-        """One warning for the jumps, one for the narrow features, found and not declared."""
+        """Warn once of jumps, and once of narrow features, that were found without having been declared."""
         real = [(t, dv) for t, dv in self.jumps if abs(dv) > self._least]
         if real:
             t, dv = real[0]
@@ -177,7 +251,7 @@ class Refiner:
                 FingerspiceWarning,
                 stacklevel=2,
             )
-        # Around a jump, a kink or the end of what is finite, short series are natural.
+        # Short series are to be expected around a jump, a kink, or where the waveform stops being finite.
         known = [*self.located, *(t for t, _ in real), *([] if self.not_finite is None else [self.not_finite])]
         apart = [t for t in self.narrow if all(abs(t - k) > 8.0 * self.step for k in known)]
         apart = sorted(apart + self._edges_found())
@@ -191,7 +265,7 @@ class Refiner:
             )
 
     def _edges_found(self) -> list[float]:
-        """Where short series change much within a tenth of a step: edges that were not declared, and resolved."""
+        """Time (s) of the first edge found by short series that together change much within a tenth of a step."""
         if not self.short:
             return []
         t, change = np.array(self.short).T

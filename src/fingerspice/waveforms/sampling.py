@@ -1,8 +1,8 @@
-"""A user's function of time as a waveform, and any waveform as a table that compiled code can step through.
+"""A user's function of time as a waveform, and any waveform as a table for compiled code.
 
-A function is represented between its breakpoints by Chebyshev series, refined until they reproduce it at points
-they were not built from. What will not refine is a jump or a spike that was not declared: it is located,
-kept as a segment edge, and warned about.
+Between its breakpoints a function is represented by Chebyshev series, which are refined until they reproduce it at
+points from which they were not built. Where refining does not help there is a jump that was not declared: it is
+located, becomes an edge of a segment, and a warning says so.
 """
 
 from __future__ import annotations
@@ -22,21 +22,24 @@ from fingerspice.waveforms.bounds import in_windows, runs_through
 from fingerspice.waveforms.refining import POINTS, Refiner
 from fingerspice.waveforms.waveform import Waveform, blank_terms, require
 
+#: Longer segments of an oscillation are divided, since the rounding of a phase grows with the phase.
 _PERIODS_PER_SEGMENT = 64.0
 
 
 @dataclass(frozen=True, eq=False)
 class Function(Waveform):
-    """A Python function of time, U(t) in V, t in s; array-aware functions are called with arrays.
+    """A Python function of time, U(t) in V with t in s.
+
+    It is called with arrays where it accepts them, and otherwise with one time after the other.
 
     Parameters
     ----------
     function : callable
-        Takes a time or an array of times.
+        A function of a time, or of an array of times.
     breaks : tuple of float
-        Times (s) at which it jumps or has a kink. With a period: within the first period.
+        Times (s) at which it jumps or has a kink; of a periodic function those of its first period.
     repeat : float, optional
-        Its period, s, where it has one; the fundamental is then known.
+        Its period (s), where it has one; only then is there a fundamental.
     """
 
     function: Callable[..., object]
@@ -48,7 +51,7 @@ class Function(Waveform):
         require(self.repeat is None or self.repeat > 0.0, "function period", self.repeat, "> 0 s")
         breaks = {float(b) for b in self.breaks}
         if self.repeat is not None:
-            # The end of a period is the start of the next.
+            # The end of a period is the start of the next one.
             breaks = {math.fmod(b, self.repeat) if b >= self.repeat else b for b in breaks}
         object.__setattr__(self, "breaks", tuple(sorted(breaks)))
 
@@ -65,7 +68,7 @@ class Function(Waveform):
         if t.ndim == 0:
             return np.asarray(self._scalar(float(t)))
         try:
-            # A function written for one number may misread an array without raising: prove the two agree.
+            # A function written for one number may give wrong values for an array without raising: compare one value.
             out = np.asarray(self.function(t), float)
             if out.shape == t.shape and (
                 t.size == 0 or np.array_equal(out.flat[t.size // 2], self._scalar(t.flat[t.size // 2]), True)
@@ -95,7 +98,7 @@ class Function(Waveform):
 
 @dataclass(frozen=True)
 class SourceTable:
-    """A waveform on a window of time: what compiled code steps through.
+    """A waveform on a window of time, in the form that compiled code reads.
 
     Attributes
     ----------
@@ -103,13 +106,13 @@ class SourceTable:
         Segment edges, s.
     terms : ndarray, shape (m, k, 6)
     series : ndarray, shape (m, l)
-        Chebyshev coefficients of each segment; l = 0 where the terms say it all.
+        Chebyshev coefficients of each segment, to be added to its terms; l = 0 where there are none.
     scale : float
-        Largest |U| (V) seen in making a table of series; 0 where there are none.
+        Largest |U| (V) seen in making series; 0 where there are none.
     not_finite : float or None
         Time (s) of the first NaN or inf; the table then ends just before it.
     rough : float
-        Largest misfit (V) that no finer series would mend: the rounding of a user's function.
+        Largest misfit (V) that finer series do not reduce, because it is rounding of the function's own values.
     """
 
     edges: FloatArray
@@ -120,7 +123,7 @@ class SourceTable:
     rough: float = 0.0
 
     def values(self, t: FloatArray) -> FloatArray:
-        """A table of series at times within it (s), V."""
+        """Values (V) of the series at times (s) within the table."""
         i = np.clip(np.searchsorted(self.edges, t, side="right") - 1, 0, self.edges.size - 2)
         x = 2.0 * (t - self.edges[i]) / (self.edges[i + 1] - self.edges[i]) - 1.0
         out = np.empty(t.size)
@@ -130,33 +133,36 @@ class SourceTable:
         return out
 
     def unseen(self, waveform: Waveform, t: FloatArray, tol: float) -> tuple[float, float] | None:
-        """The first of some times (s) at which a function is not what its table says, and by how much (V)."""
+        """The first of the times (s) at which a function differs from its table, and the difference (V), or None."""
         t = t[(t > self.edges[0]) & (t < self.edges[-1])]
         if t.size == 0 or self.series.size == 0:
             return None
-        # An edge is where the table itself found the function to jump.
+        # At an edge the function may jump, so that either value is right.
         right = np.clip(np.searchsorted(self.edges, t), 1, self.edges.size - 1)
         near = np.minimum(np.abs(t - self.edges[right]), np.abs(t - self.edges[right - 1]))
         t = t[near > 8e-15 * np.abs(t)]
-        off = np.abs(waveform.value(t) - self.values(t))
-        # NaN is not below anything.
-        wrong = np.flatnonzero(~(off <= max(1e3 * tol * self.scale, 30.0 * self.rough)))
-        return (float(t[wrong[0]]), float(off[wrong[0]])) if wrong.size else None
+        difference = np.abs(waveform.value(t) - self.values(t))
+        # Written with `not <=`, so that NaN counts as a difference.
+        wrong = np.flatnonzero(~(difference <= max(1e3 * tol * self.scale, 30.0 * self.rough)))
+        return (float(t[wrong[0]]), float(difference[wrong[0]])) if wrong.size else None
 
 
 def same_time(t: float) -> float:
-    """Distance (s) within which a time near `t` is that time: a few roundings of t."""
+    """Distance (s) within which two times near `t` count as the same: a few roundings of t."""
     return 8e-16 * abs(t)
 
 
 @jit
 def misses(t: FloatArray, marks: FloatArray, slack: float) -> BoolArray:
-    """Whether a time comes within `slack` (relative) of each mark without being it; times and marks ascending."""
+    """For each mark, whether a time lies within the relative distance `slack` of it without being equal to it.
+
+    Times and marks ascend.
+    """
     out = np.zeros(marks.size, np.bool_)
     first = 0
     for k in range(marks.size):
         low = marks[k] - slack * abs(marks[k])
-        # Doubled strides, then halved ones, to the first time that is not below.
+        # Find the first time that is not below `low`: double the stride until it is passed, then bisect.
         stride = 1
         while first + stride < t.size and t[first + stride] < low:
             stride *= 2
@@ -176,18 +182,18 @@ def misses(t: FloatArray, marks: FloatArray, slack: float) -> BoolArray:
 
 
 def breakpoints_at(waveform: Waveform, t: float) -> FloatArray:
-    """Breakpoints that are at `t` (s) but for rounding."""
+    """Breakpoints that are equal to `t` (s) but for rounding."""
     return waveform.breakpoints(t - same_time(t), t + same_time(t))
 
 
 def on_breakpoint(waveform: Waveform, t: float) -> float:
-    """Time t (s), on the breakpoint that it misses by rounding: a run to "three periods" ends at the jump there."""
+    """The breakpoint equal to `t` (s) but for rounding, else `t`: a run of three periods ends at the jump there."""
     near = breakpoints_at(waveform, t)
     return float(near[0]) if near.size else t
 
 
 def is_sampled(waveform: Waveform) -> bool:
-    """Whether a waveform has no terms and is represented by series."""
+    """Whether a waveform has no terms, so that it is represented by series."""
     return waveform.terms(np.zeros(1), np.ones(1)) is None
 
 
@@ -202,16 +208,16 @@ def source_table(
     t0, t1 : float
         Window, s.
     tol : float
-        Error allowed of a Chebyshev series relative to the largest |U| met.
+        Error allowed of a Chebyshev series, relative to the largest |U| seen.
     step : float
-        Output step, s: a function is looked at no less finely than this.
+        Output step, s; a function is sampled at least that finely.
     no_chirps : bool
-        Whether a term with a changing frequency, which has no closed-form response, becomes a series too.
+        Whether a term with a changing frequency, for which there is no closed-form response, becomes a series too.
     scale : float
-        |U| (V) already met in windows before: what is tiny beside it need not be followed to its own last digit.
+        Largest |U| (V) seen in earlier windows; the error allowed is relative to it, too.
     """
     inner = waveform.breakpoints(t0, t1)
-    # A breakpoint that misses the window's edge by rounding is at the edge: no segment is shorter than that.
+    # A breakpoint equal to an end of the window but for rounding is that end, and makes no segment of its own.
     inner = inner[(inner > t0 + same_time(t0)) & (inner < t1 - same_time(t1))]
     edges = np.concatenate([[t0], inner, [t1]])
     if not is_sampled(waveform):
@@ -219,7 +225,7 @@ def source_table(
         terms = waveform.terms(edges[:-1], edges[1:])
         assert terms is not None
         if no_chirps and np.any(terms[:, :, 5] != 0.0):
-            # Not the outputs' step: no result depends on which are asked for.
+            # The output step is not used here, so that no result depends on the outputs asked for.
             step = 0.1 * waveform.shortest_time()
         else:
             return SourceTable(edges, np.ascontiguousarray(terms), np.zeros((edges.size - 1, 0)))
@@ -241,7 +247,7 @@ def source_table(
 
 
 def _rephased(edges: FloatArray, period: float) -> FloatArray:
-    """Edges with more between them, so that no phase inside a segment grows to where its rounding shows."""
+    """Edges (s) with others inserted, so that no phase within a segment grows until its rounding matters."""
     longest = _PERIODS_PER_SEGMENT * period
     if not np.any(np.diff(edges) > longest):
         return edges

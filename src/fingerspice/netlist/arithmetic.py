@@ -1,0 +1,186 @@
+"""Arithmetic of netlists as Python text: lexemes, a check of their order and nesting, and the translation.
+
+The check finds every syntax error, so that Python's parser is given correct and shallow text only.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from fingerspice.base.units import parse_number
+from fingerspice.netlist.functions import FUNCTIONS, Problem
+from fingerspice.netlist.spelling import nearest
+
+#: Nesting of brackets (and number of `?`), and signs in a row.
+MAX_DEPTH, MAX_SIGNS = 25, 3
+_COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
+_SPELLING = {"^": "**", "&&": "and", "||": "or"}
+
+
+_LEX = re.compile(
+    r"(?P<space>\s+)"
+    r"|(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?[\w.]*)"
+    r"|(?P<name>[A-Za-z_]\w*)"
+    r"|(?P<op>\*\*|&&|\|\||[<>=!]=|[-+*/^<>(),?:])"
+)
+
+
+class Lexeme(NamedTuple):
+    """A piece of an expression, and the position of its first character."""
+
+    kind: str  # number, name, call or op
+    text: str
+    position: int
+
+
+def lexemes_of(text: str) -> list[Lexeme]:
+    """Divide a text into numbers, names, calls and operators."""
+    lexemes: list[Lexeme] = []
+    position = 0
+    while position < len(text):
+        match = _LEX.match(text, position)
+        if match is None:
+            hint = ": a comparison is ==" if text[position] == "=" else ""
+            raise Problem(f"{text[position]!r} does not belong in arithmetic{hint}", position)
+        kind = match.lastgroup or ""
+        if kind != "space":
+            lexeme = Lexeme(kind, match.group(), position)
+            if lexeme.text == "(" and lexemes and lexemes[-1].kind == "name":
+                lexemes[-1] = lexemes[-1]._replace(kind="call")
+            lexemes.append(lexeme)
+        position = match.end()
+    return lexemes
+
+
+def check_order(lexemes: list[Lexeme], end: int) -> None:
+    """Refuse every sequence of lexemes that is not an expression, or is nested too deeply to be parsed."""
+    open_brackets: list[tuple[Lexeme, bool]] = []  # and whether each holds a function's arguments
+    wants_value, previous, signs, questions = True, "", 0, 0
+    for index, (kind, text, position) in enumerate(lexemes):
+        if wants_value and kind in ("number", "name", "call"):
+            wants_value, signs = kind == "call", 0
+        elif text == "(" and wants_value:
+            open_brackets.append((lexemes[index], previous == "call"))
+            if len(open_brackets) > MAX_DEPTH:
+                raise Problem(f"brackets nested deeper than {MAX_DEPTH}", position)
+        elif wants_value and text in ("+", "-"):
+            signs += 1
+            if signs > MAX_SIGNS:
+                raise Problem(f"more than {MAX_SIGNS} signs in a row", position)
+        elif wants_value:
+            raise Problem(f"a value is missing before '{text}'", position)
+        elif kind != "op" or text == "(":
+            raise Problem(f"an operator is missing before '{text}'", position)
+        elif text == ")":
+            if not open_brackets:
+                raise Problem("')' without an opening '('", position)
+            open_brackets.pop()
+        elif text == "," and not (open_brackets and open_brackets[-1][1]):
+            raise Problem("',' outside the arguments of a function", position)
+        else:
+            wants_value = True
+            questions += text == "?"
+            if questions > MAX_DEPTH:
+                raise Problem(f"more than {MAX_DEPTH} '?' in one expression", position)
+        previous = kind
+    if open_brackets:
+        raise Problem("'(' is never closed", open_brackets[-1][0].position)
+    if wants_value:
+        raise Problem("a value is missing at the end" if lexemes else "the expression is empty", end)
+
+
+class _Level:
+    """Python text inside one pair of brackets: `done` up to the last comma, then pieces with their positions."""
+
+    def __init__(self, opening: str) -> None:
+        self.done = opening
+        self.pieces: list[tuple[str, int]] = []
+
+    def close(self) -> str:
+        """Text of the pieces, of which inner brackets are one each; the next argument begins without pieces."""
+        _refuse_chains(self.pieces)
+        text = _conditional(self.pieces)
+        self.pieces = []
+        return text
+
+
+def to_python(lexemes: list[Lexeme], order: Mapping[str, int]) -> str:
+    """Python text of checked lexemes: numbers in full, names by their number in `order`, functions with a prefix.
+
+    A name written by its number can be no keyword of Python, and the parser cannot change it by normalising Unicode.
+    """
+    levels = [_Level("")]
+    for lexeme in lexemes:
+        kind, text, position = lexeme
+        level = levels[-1]
+        if kind == "number":
+            level.pieces.append((repr(number_of(lexeme)), position))
+        elif kind == "call" and text.lower() not in FUNCTIONS:
+            hint = nearest(text, FUNCTIONS) or f"; functions are {' '.join(FUNCTIONS)}"
+            raise Problem(f"'{text}' is not a function{hint}", position)
+        elif kind == "call":
+            level.pieces.append((f"f_{text.lower()}", position))
+        elif kind == "name":
+            level.pieces.append((f"n{order[text.lower()]}", position))
+        elif text == "(":
+            levels.append(_Level("("))
+        elif text == ")":
+            levels.pop()
+            levels[-1].pieces.append((f"{level.done}{level.close()})", position))
+        elif text == ",":
+            level.done += f"{level.close()}, "
+        else:
+            level.pieces.append((_SPELLING.get(text, text), position))
+    return levels[0].close()
+
+
+def _refuse_chains(pieces: list[tuple[str, int]]) -> None:
+    """Refuse `a^b^c`, grouped to the left in ngspice and to the right in mathematics, and `a<b<c`, which is ambiguous."""
+    power = comparison = ""
+    previous = ""
+    for text, position in pieces:
+        if (text == "**" and power) or (text in _COMPARISONS and comparison):
+            shown = "^" if text == "**" else text
+            raise Problem(f"a second '{shown}' in a row has two readings: use brackets", position)
+        if text == "**":
+            power = text
+        elif text in "+-*/" and previous != "**":
+            power = ""
+        elif text in _COMPARISONS:
+            power, comparison = "", text
+        elif text in ("and", "or", "?", ":"):
+            power = comparison = ""
+        previous = text
+
+
+def _conditional(pieces: list[tuple[str, int]]) -> str:
+    """Join pieces, and write `a ? b : c` as `(b) if (a) else (c)`; nested conditions group to the right, as in C."""
+    waiting: list[int] = []  # indices of `?` without their `:`
+    pairs: dict[int, int] = {}
+    for index, (text, position) in enumerate(pieces):
+        if text == "?":
+            waiting.append(index)
+        elif text == ":" and not waiting:
+            raise Problem("':' without its '?' (a ? b : c)", position)
+        elif text == ":":
+            pairs[waiting.pop()] = index
+    if waiting:
+        raise Problem("'?' without its ':' (a ? b : c)", pieces[waiting[-1]][1])
+
+    def join(start: int, end: int) -> str:
+        question = next((i for i in range(start, end) if i in pairs), None)
+        if question is None:
+            return " ".join(text for text, _ in pieces[start:end])
+        yes, no = join(question + 1, pairs[question]), join(pairs[question] + 1, end)
+        return f"(({yes}) if ({join(start, question)}) else ({no}))"
+
+    return join(0, len(pieces))
+
+
+def number_of(lexeme: Lexeme) -> float:
+    try:
+        return parse_number(lexeme.text)
+    except ValueError as error:
+        raise Problem(str(error), lexeme.position) from None

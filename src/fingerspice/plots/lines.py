@@ -1,0 +1,283 @@
+"""Pictures against time: their panels, lines, time axis and caption."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.circuit.describe import drive_text, heading
+from fingerspice.plots import drawing
+from fingerspice.results.outcome import Status
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from fingerspice.results.solution import Solution
+
+#: An envelope divides the window into at most this many parts, each at least one oscillation long.
+_PARTS = 240
+#: Number of letters for which a legend has room: across the page, and over the left one of two columns.
+PAGE, HALF = 90, 50
+#: Line widths (points) in one panel: later lines are narrower and dashed, so that all stay visible where they coincide.
+_WIDTHS = (2.0, 1.5, 1.2, 1.0)
+#: A source is drawn wide and pale, and the other lines are drawn on top of it.
+_PALE: dict[str, Any] = {"linewidth": 3.2, "alpha": 0.45, "linestyle": "-", "solid_capstyle": "butt"}
+
+
+class Quantity(NamedTuple):
+    """What a panel shows.
+
+    Attributes
+    ----------
+    label, unit, color : str
+    least : float
+        The unit's prefix is chosen so that the peak is at least this number; 0 means no prefix.
+    from_zero : bool
+        Whether the scale starts at 0.
+    """
+
+    label: str
+    unit: str
+    least: float
+    color: str
+    from_zero: bool
+
+
+VOLTAGE = Quantity("Voltage", "V", 2.0, drawing.BLUE, False)
+QUANTITIES = {
+    **dict.fromkeys(("u_source", "u_gap", "u_layer", "v"), VOLTAGE),
+    "f_el": Quantity("Force", "N", 0.05, drawing.VERMILION, True),
+    "area": Quantity("Ridge area", "mm²", 0.0, drawing.GREEN, False),
+    "f_t": Quantity("Friction", "N", 0.05, drawing.PURPLE, True),
+    "friction": Quantity("Friction coefficient", "", 0.0, drawing.PURPLE, True),
+    "sigma_el": Quantity("Stress", "Pa", 2.0, drawing.VERMILION, True),
+    "q_source": Quantity("Charge", "C", 2.0, drawing.BLUE, False),
+    "i_source": Quantity("Current", "A", 2.0, drawing.BLUE, False),
+    "fold_margin": Quantity("Distance to the fold", "", 0.0, drawing.BLACK, True),
+}
+_CALLED = {"u_source": "source", "u_gap": "gap", "f_el": "electroadhesive force", "f_t": "friction", "v": "node",
+           "u_layer": "layer", "friction": "coefficient", "sigma_el": "electroadhesive stress", "q_source": "charge",
+           "i_source": "current", "fold_margin": "distance to the fold"}  # fmt: skip
+
+
+class Drawn(NamedTuple):
+    """A run in a picture, with its name in the legend."""
+
+    solution: Solution
+    label: str
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One line of a panel: signal `name` of a run with its values `x`, its label, and matplotlib's line style."""
+
+    solution: Solution
+    name: str
+    label: str
+    x: FloatArray
+    style: dict[str, Any]
+
+
+def end_of(solution: Solution) -> float:
+    """Where the run stopped, s."""
+    return float(max(solution.state.t, solution.t[-1])) if solution.t.size else float(solution.state.t)
+
+
+def signal_of(solution: Solution, key: str) -> dict[str, FloatArray]:
+    """A signal by name; empty where this run has no such element, although another run of the picture has it."""
+    kind, colon, _ = key.partition(":")
+    return solution.by_name(key) if not colon or key in solution.all_signals.names(kind) else {}
+
+
+def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
+    """The lines of one panel. A finger has the same colour in every panel; so has each of several runs."""
+    out: list[Trace] = []
+    gaps = list(dict.fromkeys(gap for run in runs for gap in run.solution.gaps))
+    above = 0
+    # A source that drives all runs alike is drawn once, without the name of a run.
+    shared = len({run.solution.u_source.tobytes() for run in runs}) == 1
+    for number, run in enumerate(runs):
+        for key in keys:
+            found = signal_of(run.solution, key)
+            for place, (name, x) in enumerate(found.items()):
+                kind, _, element = name.partition(":")
+                source = kind == "u_source"
+                if source and shared and number > 0:
+                    continue
+                word = _CALLED.get(kind, kind)
+                label = element if kind == "v" else f"{word} {element}".rstrip()
+                if len(gaps) > 1 and element in gaps:
+                    color = drawing.CYCLE[gaps.index(element) % len(drawing.CYCLE)]
+                elif len(runs) > 1 and not (source and shared):
+                    color = drawing.CYCLE[number % len(drawing.CYCLE)]
+                elif source:
+                    color = (drawing.GREY, *drawing.CYCLE[::-1])[place % (len(drawing.CYCLE) + 1)]
+                elif len(found) == 1 and len(keys) <= 2:
+                    color = QUANTITIES[kind].color
+                else:
+                    color = drawing.CYCLE[above % len(drawing.CYCLE)]
+                style: dict[str, Any] = {"color": color}
+                if source:
+                    style |= _PALE
+                else:
+                    style |= {"linewidth": _WIDTHS[above % 4], "linestyle": drawing.DASHES[above % 4]}
+                    above += 1
+                if run.label and not (source and shared):
+                    label = f"{label}, {run.label}"
+                out.append(Trace(run.solution, name, label, x, style))
+    return out
+
+
+def scale_of(quantity: Quantity, traces: list[Trace], start: float, stop: float) -> tuple[float, str]:
+    """Factor and unit of a panel."""
+    if quantity.unit == "mm²":
+        return 1e6, "mm²"
+    if quantity.least == 0.0:
+        return 1.0, quantity.unit
+    peaks = [drawing.peak_of(t.x[(t.solution.t >= start) & (t.solution.t <= stop)]) for t in traces]
+    return drawing.engineering(max(peaks, default=0.0), quantity.unit, quantity.least)
+
+
+def draw_line(
+    ax: Axes, trace: Trace, factor: float, start: float, stop: float, runs: Sequence[Drawn],
+    envelope: FloatArray | None = None,
+) -> None:  # fmt: skip
+    """Draw a line from `start` to `stop` (s), or its envelope.
+
+    One output beyond each end of the window is drawn too, so that the line reaches the edges of the picture.
+
+    Parameters
+    ----------
+    ax : Axes
+    trace : Trace
+    factor : float
+        From the signal's SI unit to the panel's.
+    start, stop : float
+    runs : sequence of Drawn
+        All runs of the picture, which determine the unit of the time axis.
+    envelope : ndarray, optional
+        Times (s) of the turning points, two to each oscillation; given where an envelope is wanted.
+    """
+    t = trace.solution.t
+    first, last = max(int(np.searchsorted(t, start)) - 1, 0), int(np.searchsorted(t, stop, side="right")) + 1
+    t, x = t[first:last], factor * trace.x[first:last]
+    scale = time_unit(runs)[0]
+    if envelope is None:
+        t, x = drawing.thin(t, x)
+        ax.plot(scale * t, x, label=trace.label, **{"solid_joinstyle": "round", **trace.style})
+        return
+    # Each part is at least one oscillation long, so that it contains a maximum and a minimum.
+    parts = (stop - start) / (2.0 * float(np.median(np.diff(envelope))))
+    edges = np.linspace(start, stop, max(1, int(min(parts, _PARTS))) + 1)
+    begin = np.searchsorted(t, edges[:-1])
+    kept = np.diff(np.append(begin, t.size)) > 0
+    begin, middle = begin[kept], 0.5 * (edges[:-1] + edges[1:])[kept]
+    low, high = np.minimum.reduceat(x, begin), np.maximum.reduceat(x, begin)
+    pale = "alpha" in trace.style
+    color = trace.style["color"]
+    ax.fill_between(scale * middle, low, high, color=color, alpha=0.3 if pale else 0.2, linewidth=0.0)
+    edge = {**trace.style, "linewidth": 1.6 if pale else 0.7 * trace.style["linewidth"]}
+    ax.plot(scale * middle, low, **edge)
+    ax.plot(scale * middle, high, **edge, label=trace.label)
+
+
+def draw_mean(ax: Axes, trace: Trace, factor: float, unit: str, *, told: bool = True) -> None:
+    """Draw the mean force as a horizontal line, named in the legend where `told`."""
+    summary = trace.solution.summary()
+    periodic = summary.get("f_el_mean_periodic")
+    mean = periodic if periodic is not None else summary.get("f_el_mean")
+    if mean is not None:
+        text = f"mean {'of the last period' if periodic is not None else 'of the run'}, {factor * mean:.4g} {unit}"
+        label = text if told else "_"
+        ax.axhline(factor * mean, color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
+
+
+def finish_panel(ax: Axes, quantity: Quantity, unit: str, values: Sequence[FloatArray], room: int = PAGE) -> None:
+    """Labels, limits and legend of a panel; `room` is the number of letters that the legend has room for."""
+    drawing.dress(ax, f"{quantity.label} [{unit}]" if unit else quantity.label)
+    if quantity.from_zero:
+        drawing.from_zero(ax)
+    else:
+        ax.ticklabel_format(axis="y", useOffset=False)
+        drawing.flat(ax, np.concatenate(values) if values else np.zeros(0))
+    drawing.legend_within(ax, room)
+
+
+def coefficient_axis(ax: Axes, solution: Solution, factor: float) -> None:
+    """Add a second scale to the friction panel: friction force divided by the normal load."""
+    ((_, contact),) = solution.record.fingers
+    load = factor * contact.f_n
+    right = ax.secondary_yaxis("right", functions=(partial(np.multiply, 1.0 / load), partial(np.multiply, load)))
+    right.set_ylabel("coefficient", fontsize=drawing.FONT, color=drawing.GREY)
+    right.tick_params(labelsize=drawing.FONT - 0.5, color="#999999", labelcolor=drawing.GREY)
+    right.spines["right"].set_color("#999999")
+
+
+def time_unit(runs: Sequence[Drawn]) -> tuple[float, str]:
+    """Factor and unit of the time axis."""
+    return drawing.engineering(max(max(end_of(run.solution), drawing.peak_of(run.solution.t)) for run in runs), "s")
+
+
+def time_axis(axes: Sequence[Axes], runs: Sequence[Drawn], start: float, stop: float) -> None:
+    """Set limits (s) and label of the time axis, and mark where a run stopped early."""
+    factor, unit = time_unit(runs)
+    span = (stop - start) or 1.0
+    stopped = [r.solution for r in runs if r.solution.status not in (Status.SUCCESS, Status.ERROR_NOT_MET)]
+    early = [s for s in stopped if start <= end_of(s) <= stop]
+    # Room on the right shows that the run goes no further.
+    wide = 1.08 if early else 1.0
+    for ax in axes:
+        ax.set_xlim(factor * start, factor * (start + span * wide))
+        ax.ticklabel_format(axis="x", useOffset=False)
+        for solution in early:
+            end = end_of(solution)
+            if len(runs) == 1:
+                ax.axvspan(factor * end, factor * (start + wide * span), color="#EEEEEE", zorder=0.5)
+            ax.axvline(factor * end, color=drawing.VERMILION, linewidth=1.2, linestyle=drawing.DASHES[3])
+    if early:
+        place: dict[str, Any] = {"transform": axes[0].get_xaxis_transform(), "ha": "right", "va": "top"}
+        place |= {"fontsize": drawing.FONT - 0.5, "color": drawing.VERMILION}
+        axes[0].text(factor * end_of(early[0]), 0.98, "stopped ", **place)
+    axes[-1].set_xlabel(f"Time [{unit}]", fontsize=drawing.FONT)
+
+
+def about(solution: Solution) -> str:
+    """How a run was made, in one line."""
+    text = " · ".join(fact for fact in _facts(solution) if fact)
+    return text if solution.success else f"{text} · {solution.message}"
+
+
+def _facts(solution: Solution) -> list[str]:
+    """Facts of a run for its caption, each always at the same index; an empty text where a fact does not apply."""
+    error = f"error estimate {solution.error.u_gap:.2g} V"
+    if solution.gaps:
+        error += f", {solution.error.f_el:.2g} N"
+    return [
+        heading(solution.circuit),
+        drive_text(solution.circuit),
+        f"{solution.charge_law} charge law",
+        f"area: {solution.area_mode}" if solution.gaps else "",
+        f"method {solution.method}, rtol {solution.rtol:.2g}",
+        error,
+    ]
+
+
+def about_all(runs: list[Drawn]) -> str:
+    """How the runs were made: first the facts that all share, then the own facts of each."""
+    if len(runs) == 1:
+        return about(runs[0].solution)
+    facts = [_facts(run.solution) for run in runs]
+    shared = [f for i, f in enumerate(facts[0]) if f and all(other[i] == f for other in facts)]
+    own = []
+    for run, fact in zip(runs, facts, strict=True):
+        # The first fact, title and changed parameters, is left out: the run's label has the changes.
+        differs = [f for i, f in enumerate(fact[1:], 1) if f and any(other[i] != f for other in facts)]
+        own.append(f"{run.label}: {', '.join(differs)}" if differs else run.label)
+    title = runs[0].solution.circuit.title
+    alike = all(run.solution.circuit.title == title for run in runs)
+    return " · ".join([*([title] if alike and title not in shared else []), *shared, *own])

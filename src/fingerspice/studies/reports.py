@@ -1,0 +1,120 @@
+"""Pages and tables of the studies: periodic states, comparisons, folds and fitted materials."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fingerspice.base.files import write_aside
+from fingerspice.base.pages import Page, Table
+from fingerspice.base.units import format_si
+from fingerspice.circuit.describe import head_lines
+from fingerspice.results.outcome import SolveError
+from fingerspice.results.report import summary_table
+
+if TYPE_CHECKING:
+    from fingerspice.studies.comparison import Comparison
+    from fingerspice.studies.fitting import MaterialFit
+    from fingerspice.studies.limits import FoldLimits
+    from fingerspice.studies.steady import SteadyState
+
+
+def steady_page(state: SteadyState) -> Page:
+    """A periodic state: what vouches for it, and the figures of its period."""
+    largest = 1.0 - state.stability_margin
+    found = f"periodic state of {format_si(state.period, 's')}, found in {state.periods:.3g} periods"
+    left = (
+        f"a further period changes the layers by {state.defect:.2g} V at most, and leaves {100.0 * largest:.3g} % of a "
+        "small disturbance"
+    )
+    try:
+        period = summary_table(state.solution).blocks
+    except SolveError as error:
+        period = (error.message,)
+    return Page([found, left, "", *period])
+
+
+def fit_page(fit: MaterialFit) -> Page:
+    """A fitted ladder: its branches, and how far it is from the data."""
+    ladder = fit.ladder
+    rows = [
+        (format_si(p / (2.0 * math.pi), "Hz"), f"{k:.4g} S/m")
+        for p, k in zip(ladder.poles, ladder.weights, strict=True)
+    ]
+    f = fit.frequency
+    return Page(
+        [
+            f"material fitted at {f.size} frequencies from {format_si(float(f[0]), 'Hz')} to "
+            f"{format_si(float(f[-1]), 'Hz')}",
+            f"misfit of the admittivity: {100.0 * fit.rms:.2g} % rms, {100.0 * fit.largest:.2g} % at most",
+            f"no causal and passive material comes nearer than {100.0 * fit.kramers_kronig.rms:.2g} % rms",
+            "",
+            f"{ladder.conductivity:.4g} S/m at zero frequency, eps_r = {ladder.eps_inf:.4g} above all poles, and",
+            Table(("pole", "weight"), rows),
+        ]
+    )
+
+
+def comparison_table(comparison: Comparison) -> Page:
+    """A comparison as a table, with what it says in words."""
+    names = {
+        "amplitude": "gap voltage amplitude",
+        "phase_deg": "lead over the source",
+        "f_el_mean": "mean force",
+        "area_mean": "mean area",
+    }
+    rows = []
+    for name, unit, p, m, c, difference, ripple in comparison.rows():
+        rows.append((f"{names[name]} [{unit}]", *(f"{x:.6g}" for x in (p, m, c, difference, ripple))))
+    head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
+    reference = comparison.phasor.f_el_mean
+    # Rounded here, and 0.0 added: -0.00 is not a figure.
+    total = round(100.0 * (comparison.coupled.f_el_mean / reference - 1.0), 2) + 0.0
+    waveform = round(100.0 * (comparison.mean.f_el_mean / reference - 1.0), 2) + 0.0
+    return Page(
+        [
+            *head_lines(comparison.solution.circuit),
+            f"periodic state at {format_si(comparison.frequency, 'Hz')}, charge law {comparison.solution.charge_law}",
+            "",
+            Table(head, rows),
+            "",
+            f"mean force: {total:+.2f} % against the phasor; {total - waveform:+.2f} % of that is the ripple of the "
+            f"area, {waveform:+.2f} % is the waveform's (zero for a sine)",
+        ]
+    )
+
+
+def limits_text(limits: FoldLimits) -> Page:
+    """Where the mobile law folds, in words and a table per parameter."""
+    own = format_si(limits.peak, "V")
+    if math.isfinite(limits.voltage):
+        head = (
+            f"under the mobile law this deck folds at {format_si(limits.voltage, 'V')} peak; its source reaches {own}, "
+            f"{100.0 * limits.peak / limits.voltage:.3g} % of that"
+        )
+    else:
+        head = f"under the mobile law this deck does not fold; its source reaches {own}"
+    lines: list[str | Table] = [*head_lines(limits.circuit), head]
+    for sweep in limits.sweeps:
+        rows = [
+            (format_si(x, sweep.unit), format_si(u, "V") if math.isfinite(u) else "none")
+            for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True)
+        ]
+        lines += ["", Table((sweep.name, "folds at"), rows)]
+    return Page(lines)
+
+
+def limits_csv(limits: FoldLimits, path: Path) -> Path:
+    """Write a map of the fold as CSV; no voltage where there is no fold."""
+
+    def write(target: Path) -> None:
+        with target.open("w", newline="") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(["parameter", "value [SI]", "unit", "fold [V]"])
+            for sweep in limits.sweeps:
+                for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True):
+                    writer.writerow([sweep.name, repr(x), sweep.unit, repr(u) if math.isfinite(u) else ""])
+
+    return write_aside(path, write)
