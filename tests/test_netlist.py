@@ -300,6 +300,14 @@ def test_what_is_no_path_and_no_text_is_one_sentence(given: object) -> None:
         fs.parse_netlist(given)  # type: ignore[arg-type]
 
 
+def test_a_parameter_of_a_subcircuit_is_refused_with_the_elements_inside_it() -> None:
+    circuit = fs.parse_netlist("t\nV1 a 0 5\n.subckt pair p n params: r=1k\nR1 p m {r}\nR2 m n 5\n.ends\nX1 a 0 pair\n")
+    for path in ("X1.r", "x1.nothing", "X1"):
+        with pytest.raises(fs.InputError, match=r"is a subcircuit, whose own .* inside it \(X1\.R1, X1\.R2\)$"):
+            circuit.replace({path: 5})
+    assert circuit.replace({"X1.R1.value": 5})["X1.R1"].values["value"] == 5.0
+
+
 def test_a_files_name_where_its_text_belongs_is_named() -> None:
     assert refusal("circuits/fingerpad.cir") == (
         "parse_netlist is given 'circuits/fingerpad.cir', a file's name; allowed: read_netlist for a file"

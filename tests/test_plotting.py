@@ -17,8 +17,9 @@ import pytest
 from PIL import Image
 
 import fingerspice as fs
-from fingerspice.plots import drawing, plotting, traces
+from fingerspice.plots import drawing, phasors, traces
 from fingerspice.solve.simulation import simulate
+from fingerspice.studies import pictures
 from fingerspice.studies.comparison import compare
 from scenes import deck, table1
 
@@ -149,7 +150,7 @@ def test_a_sweep_shows_gain_phase_force_and_area() -> None:
     circuit = table1()
     with pytest.warns(fs.FingerspiceWarning, match="the sweep goes down to 1 Hz"):
         result = fs.phasor(circuit, np.geomspace(1.0, 1e4, 21))
-    figure = plotting.plot_phasor((result,), circuit)
+    figure = phasors.plot_phasor((result,), circuit)
     assert len(labels(figure)) == 4
     assert all(ax.get_xscale() == "log" for ax in figure.axes)
     for ax, values in zip(
@@ -163,14 +164,14 @@ def test_a_sweep_shows_gain_phase_force_and_area() -> None:
 
 def test_within_the_skin_data_nothing_is_shaded() -> None:
     circuit = table1()
-    figure = plotting.plot_phasor((fs.phasor(circuit, np.geomspace(10.0, 1e5, 9)),), circuit)
+    figure = phasors.plot_phasor((fs.phasor(circuit, np.geomspace(10.0, 1e5, 9)),), circuit)
     assert "outside" not in small_print(figure)
     assert not any(ax.patches for ax in figure.axes)
 
 
 def test_a_single_frequency_and_a_source_without_fundamental_are_drawn_too(tmp_path: Path) -> None:
     circuit = table1().replace({"Vdrive": fs.DC(100.0)})
-    figure = plotting.plot_phasor((fs.phasor(circuit, 100.0, area="frozen"),), circuit)
+    figure = phasors.plot_phasor((fs.phasor(circuit, 100.0, area="frozen"),), circuit)
     assert figure.axes[2].texts[0].get_text() == "the source has no fundamental"
     drawing.save(figure, tmp_path / "x.png")
 
@@ -178,7 +179,7 @@ def test_a_single_frequency_and_a_source_without_fundamental_are_drawn_too(tmp_p
 @pytest.mark.parametrize("phase", [0.0, 70.0])
 def test_the_phasor_lies_on_the_transient_where_the_area_is_fixed(phase: float) -> None:
     circuit = table1(f"SIN(0 200 100 0 0 {phase})", gap={"a_fix": 35})
-    figure = plotting.plot_comparison(compare(circuit))
+    figure = pictures.plot_comparison(compare(circuit))
     for ax, transient, p, scale in (
         (figure.axes[0], "gap", "gap, phasor", 200.0),
         (figure.axes[1], "electroadhesive force", "electroadhesive force, phasor", 0.2),
@@ -188,7 +189,7 @@ def test_the_phasor_lies_on_the_transient_where_the_area_is_fixed(phase: float) 
 
 def test_the_comparison_shows_its_table() -> None:
     comparison = compare(table1())
-    table = plotting.plot_comparison(comparison).axes[2].tables[0].get_celld()
+    table = pictures.plot_comparison(comparison).axes[2].tables[0].get_celld()
     assert table[1, 0].get_text().get_text() == "Gap voltage at the fundamental [V]"
     assert table[3, 3].get_text().get_text() == f"{comparison.coupled.f_el_mean:.5g}"
 
@@ -241,7 +242,7 @@ def test_thinning_keeps_every_extreme_and_both_ends() -> None:
 def test_pictures_need_no_pyplot_and_their_module_no_matplotlib() -> None:
     code = (
         "import sys, numpy, fingerspice as fs\n"
-        "from fingerspice.plots import drawing, plotting, traces\n"
+        "from fingerspice.plots import drawing, lines, phasors, traces\n"
         "from fingerspice.studies import figures\n"
         "assert not any(m.startswith('matplotlib') for m in sys.modules)\n"
         "drawing.new_figure(1)\n"

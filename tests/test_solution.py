@@ -18,6 +18,7 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.base import files
 from fingerspice.base.files import write_aside
+from fingerspice.results.signals import SIGNALS
 from scenes import deck, table1
 
 SQUARE = "SQUARE(200 100)"
@@ -319,3 +320,19 @@ def test_a_folder_that_cannot_be_made_is_refused(square: fs.Solution, tmp_path: 
             square.to_netcdf(path)
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
     assert files.write_aside(tmp_path / "new" / "x.txt", lambda p: p.write_text("x")).read_text() == "x"
+
+
+def test_states_status_and_elements_show_themselves_in_one_short_line(square: fs.Solution) -> None:
+    assert repr(square.status) == "Status.SUCCESS"
+    assert repr(square.state) == "<State at t = 0.03 s, 3 numbers, local law>"
+    gap = repr(table1()["Xgap"])
+    assert gap.startswith("<GAP Xgap top skin area d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3 ")
+    assert repr(table1()["Vdrive"]) == "<V Vdrive drive 0 Sine(200 V, 100 Hz)>"
+
+
+def test_a_signal_of_a_solution_is_that_of_its_name(square: fs.Solution) -> None:
+    for key in SIGNALS:
+        if key not in ("u_layer", "v"):
+            assert square.by_name(key)[key] is getattr(square, key)
+    np.testing.assert_array_equal(square.f_t, 0.3 * (0.5 + square.f_el))
+    np.testing.assert_array_equal(square.friction, square.f_t / 0.5)

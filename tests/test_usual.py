@@ -220,3 +220,31 @@ def test_a_number_as_spice_writes_it_reads_as_itself(value: float) -> None:
 
 def test_a_deck_of_usual_values_is_read_without_a_word() -> None:
     assert said_by(lambda: fs.parse_netlist(table1_deck())) == []
+
+
+def test_a_change_on_the_command_line_silences_the_warning_of_the_value_it_replaces(command: Command) -> None:
+    Path("slip.cir").write_text(edited(("d=3.5u", "d=3.5"), ("r=0.2meg", "r=0.2M"), (".tran 10u", ".tran 20m")))
+    said = command("plan", "slip.cir").lines
+    assert [line.partition(" is ")[0].partition(": ")[2] for line in said] == [
+        "warning: slip.cir:4:45: Xcoat r: '0.2M'",
+        "warning: slip.cir:5:26: Xgap d",
+        "warning: slip.cir:7:1: Vdrive: TSTEP",
+    ]
+    for change, gone in (
+        (("--set", "Xgap.d=3.5u"), "Xgap d"),
+        (("--set", "Xcoat.r=0.2meg"), "Xcoat r"),
+        (("--set", "Vdrive.frequency=10", "--set", "Xskin.f=10"), "TSTEP"),
+        (("--source", "DC 5"), "TSTEP"),
+    ):
+        left = [line for line in command("plan", "slip.cir", *change).lines if "slip.cir:" in line]
+        assert left == [line for line in said if gone not in line]
+    # A change that is refused may have its cause in the deck.
+    assert command("plan", "slip.cir", "--set", "Xgap.d=-1").lines[:-1] == said
+
+
+def test_a_tstep_longer_than_the_sources_period_is_warned_about() -> None:
+    for change in ((".tran 10u", ".tran 10.01m"), ("SIN(0 200 100)", "SIN(0 200 101k)")):
+        (said,) = said_by(lambda c=change: fs.parse_netlist(edited(c), "deck.cir"))  # type: ignore[misc]
+        assert said.startswith("deck.cir:7:1: Vdrive: TSTEP is ")
+        assert "longer than this source's period" in said
+    assert said_by(lambda: fs.parse_netlist(edited((".tran 10u", ".tran 10m")))) == []

@@ -43,7 +43,7 @@ class SmallSignal:
         return cmath.rect(self.magnitude, math.radians(self.phase_deg))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Element:
     """One device of a circuit.
 
@@ -76,6 +76,11 @@ class Element:
     initial: float | None = None
     where: Where | None = None
     ac: SmallSignal | None = None
+
+    def __repr__(self) -> str:
+        from fingerspice.circuit.describe import values_text
+
+        return f"<{' '.join([self.device, self.name, *self.node_names, values_text(self)]).rstrip()}>"
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "values": dict(self.values)}
@@ -232,9 +237,9 @@ class Circuit(Shown):
             Of a value outside the usual range, which is probably in another unit.
         """
         changed, notes = self._replaced(changes)
-        # A warning of the reader has its place before it.
+        # Warnings of values that are no longer there go; those of the reader begin with a place.
         gone = tuple(set(_unusual(self)) - set(_unusual(changed)))
-        kept = [said for said in self.warnings if not said.endswith(gone)]
+        kept = [said for said in self.warnings if not said.endswith(gone) and not _concerns(said, changes)]
         for text in notes:
             warnings.warn(text, FingerspiceWarning, stacklevel=2)
         return dataclasses.replace(changed, warnings=(*kept, *notes))
@@ -261,8 +266,7 @@ class Circuit(Shown):
                 elements[name], trap = _changed(elements[name], parameter, value, path)
                 traps |= {path.lower(): trap} if trap else {}
             else:
-                known = [*self.parameters, *(e.name for e in self.by_device("V", "I"))]
-                raise InputError(_unknown("parameter", path, known))
+                raise InputError(self._unknown_path(path))
             overrides[path] = value if isinstance(value, str) else getattr(value, "__name__", repr(value))
         changed = dataclasses.replace(self, elements=tuple(elements.values()), overrides=overrides)
         check(changed)
@@ -270,6 +274,19 @@ class Circuit(Shown):
         # One word about a value is enough.
         new = [text for text, path in after.items() if text not in before and path not in traps]
         return changed, [*traps.values(), *new]
+
+    def _unknown_path(self, path: str) -> str:
+        """Why `replace` does not know a path."""
+        name = path.rpartition(".")[0] or path
+        inside = [e.name for e in self.elements if e.name.lower().startswith(f"{name.lower()}.")]
+        if inside:
+            shown = ", ".join([*inside[:8], *(["..."] if len(inside) > 8 else [])])
+            return (
+                f"unknown parameter {path!r}: {name} is a subcircuit, whose own parameters got their values when "
+                f"the deck was read; allowed: a parameter of an element inside it ({shown})"
+            )
+        known = [*self.parameters, *(e.name for e in self.by_device("V", "I"))]
+        return _unknown("parameter", path, known)
 
     def _waveform(self, given: float | str | Waveform | Callable[[float], float]) -> Waveform:
         if not isinstance(given, str):
@@ -282,6 +299,17 @@ class Circuit(Shown):
 def _unusual(circuit: Circuit) -> dict[str, str]:
     """What is not usual in a circuit, and the path of each, in lower case."""
     return {text: f"{e.name}.{name}".lower() for e in circuit.elements for name, text in unusual(e)}
+
+
+def _concerns(warning: str, changes: Mapping[str, Any]) -> bool:
+    """Whether a warning of the reader is about how something was written that is replaced now."""
+    for path in changes:
+        name, _, parameter = path.lower().rpartition(".")
+        # A warning of a source as a whole may be about its frequency.
+        subjects = [path.lower(), f"{name} {parameter}", *([name] if parameter == "frequency" else [])]
+        if any(f": {subject}: " in warning.lower() for subject in subjects):
+            return True
+    return False
 
 
 def _changed(element: Element, parameter: str, given: Any, path: str) -> tuple[Element, str | None]:

@@ -7,7 +7,7 @@ import math
 
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
-from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.waveforms.combinations import Product, Sum
 from fingerspice.waveforms.ramps import PWL, Samples
 from fingerspice.waveforms.sampling import Function
@@ -101,10 +101,7 @@ def circuit_page(circuit: Circuit) -> Page:
     """What a circuit is made of, and what its deck asks for."""
     rows = []
     for element in circuit.elements[:MOST_ELEMENTS]:
-        said = [f"{name}={_deck_value(value)}" for name, value in element.values.items() if math.isfinite(value)]
-        if element.waveform is not None:
-            said.append(waveform_text(element.waveform, "A" if element.device == "I" else "V"))
-        rows.append((element.name, element.device, " ".join(element.node_names), _cut(" ".join(said), 96)))
+        rows.append((element.name, element.device, " ".join(element.node_names), _cut(values_text(element), 96)))
     lines: list[str | Table] = [heading(circuit), ""]
     lines.append(Table(("", "device", "nodes", "values, in the units of the netlist"), rows, left=4))
     if len(circuit.elements) > MOST_ELEMENTS:
@@ -119,6 +116,14 @@ def circuit_page(circuit: Circuit) -> Page:
         lines.append(f".ac: {format_si(circuit.ac.start, 'Hz')} to {format_si(circuit.ac.stop, 'Hz')}")
     lines.append(f"charge law: {circuit.charge_law or 'local (the deck names none)'}")
     return Page(lines)
+
+
+def values_text(element: Element) -> str:
+    """Values of an element in the units of the netlist, without those that are infinite, and its waveform."""
+    said = [f"{name}={_deck_value(value)}" for name, value in element.values.items() if math.isfinite(value)]
+    if element.waveform is not None:
+        said.append(waveform_text(element.waveform, "A" if element.device == "I" else "V"))
+    return " ".join(said)
 
 
 def _deck_value(value: float) -> str:

@@ -1,4 +1,4 @@
-"""The command line. Exits: 0, done; 1, the solve failed; 2, bad input or a full disk."""
+"""The command line. Exit codes: 0 for success, 1 for a solve that failed, 2 for bad input or a full disk."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ from fingerspice.cli.terminal import Answering, answer_usage, listen, plain_erro
 from fingerspice.results.outcome import SolveError
 
 if TYPE_CHECKING:
+    from fingerspice.base.arrays import FloatArray
+    from fingerspice.circuit.circuit import Circuit
+    from fingerspice.results.phasor_solution import PhasorSolution
     from fingerspice.results.solution import Solution
 
 app = typer.Typer(
@@ -30,9 +33,9 @@ app = typer.Typer(
 )
 
 Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir).")]
-Out = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Where the files go; else out.")]
+Out = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder of the files; out by default.")]
 Name = Annotated[
-    str | None, typer.Option("--name", metavar="NAME", help="What they are called; as the deck by default.")
+    str | None, typer.Option("--name", metavar="NAME", help="Name of the files; that of the deck by default.")
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of other circuits, and other files.")]
 Rtol = Annotated[float, typer.Option(help="Largest error of gap voltage and force, relative to their peaks.")]
@@ -51,20 +54,20 @@ NoPlot = Annotated[bool, typer.Option("--no-plot", help="Write no picture.")]
 
 def main() -> None:
     """Entry point of the `fingerspice` command."""
-    # Loading libraries makes a million objects and no garbage: looking for it would take a fifth of a run.
+    # Loading libraries creates a million objects and no garbage; collecting so often would take a fifth of a run.
     gc.set_threshold(500_000)
     listen()
     with plain_errors():
         try:
             app(standalone_mode=True)
         except SystemExit as exit_:
-            # Usage that typer refused, and has said on stderr.
+            # typer has refused the usage and has said so on stderr; with --json there has to be an answer as well.
             refused = getattr(exit_.__context__, "format_message", None)
             if refused is not None:
                 answer_usage(refused())
             raise
         finally:
-            # What typer printed.
+            # Flush what typer has printed.
             say(end="")
 
 
@@ -131,7 +134,7 @@ def run(
 
 
 def _written(solution: Solution, data: Path, picture: Path | None, results: Results) -> list[Callable[[], Path]]:
-    """How the files of a run are written: the data, then the picture where one is wanted."""
+    """Functions that write the files of a run: the data, then the picture where one is wanted."""
     from fingerspice.plots.drawing import save
 
     if not solution.t.size:
@@ -189,12 +192,9 @@ def ac(
         picture = None if no_plot else results.file("_ac.png")
         frequencies = sweep_frequencies(options.sweep(sweep, circuit))
         if area == "coupled":
-            from fingerspice.studies.largesignal import large_signal
-
             if skin != "swept":
                 raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
-            with progress("sweeping") as update:
-                found = large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, progress=update)
+            found = _large_signal(circuit, frequencies, amplitude, charge_law, rtol)
         elif amplitude:
             raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
         else:
@@ -210,6 +210,16 @@ def ac(
         answer.give(lambda: phasor_tables(found, circuit), writes)
 
 
+def _large_signal(
+    circuit: Circuit, frequencies: FloatArray, amplitude: list[float] | None, charge_law: str | None, rtol: float
+) -> tuple[PhasorSolution, ...]:
+    """The sweep with ``--area coupled``: the periodic state at every frequency (Hz) and amplitude (V)."""
+    from fingerspice.studies.largesignal import large_signal
+
+    with progress("sweeping") as update:
+        return large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, progress=update)
+
+
 @app.command()
 def plan(
     deck: Deck,
@@ -222,7 +232,7 @@ def plan(
     source: Source = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say which model DECK needs for the error asked for, and why, without running it.
+    """Tell which model DECK needs for the error asked for, and why, without a run.
 
     Examples:
 
@@ -257,7 +267,7 @@ def compare(
     as_json: AsJson = False,
     no_plot: NoPlot = False,
 ) -> None:
-    """Set the transient's periodic state of DECK beside the phasor, and say what the area's ripple does.
+    """Compare the periodic state of DECK with its phasor solution, and say what the ripple of the area does.
 
     Examples:
 
@@ -292,7 +302,7 @@ def limits(
     name: Name = None,
     overwrite: Overwrite = False,
     points: Annotated[int, typer.Option(help="Values of each parameter.")] = 9,
-    span: Annotated[float, typer.Option(help="Each goes from its own value over this to this times it.")] = 10.0,
+    span: Annotated[float, typer.Option(help="Each goes from its value over this to its value times this.")] = 10.0,
     changes: Set = None,
     source: Source = None,
     as_json: AsJson = False,

@@ -7,7 +7,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.errors import FingerspiceWarning, InputError, printable
 from fingerspice.base.units import parse_number
 
 if TYPE_CHECKING:
@@ -19,14 +19,27 @@ LARGEST_AREA = 0.01
 
 
 def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | None) -> Circuit:
-    """The deck's circuit with ``--set`` and ``--source``; what has no effect here is warned about."""
+    """The deck's circuit with ``--set`` and ``--source``.
+
+    Warns as the reader does, except of values of the deck that are replaced, and of directives without effect.
+    """
     from fingerspice.circuit.notices import directive_warnings
     from fingerspice.netlist.netlist import read_netlist
 
-    circuit = read_netlist(deck)
-    circuit = _with_changes(circuit, changes or [])
-    circuit = _with_sources(circuit, sources or [])
-    # Said here for the commands that make no run of the circuit as it is.
+    with warnings.catch_warnings(record=True) as noticed:
+        warnings.simplefilter("always", FingerspiceWarning)
+        circuit = read_netlist(deck)
+    given = circuit.warnings
+    try:
+        circuit = _with_changes(circuit, changes or [])
+        circuit = _with_sources(circuit, sources or [])
+        given = circuit.warnings
+    finally:
+        # Where a change is refused, every warning of the deck may explain why.
+        for warning in noticed:
+            if str(warning.message) in map(printable, given):
+                warnings.warn(str(warning.message), FingerspiceWarning, stacklevel=2)
+    # Commands that do not run the circuit as it is would not say this otherwise.
     for text in directive_warnings(circuit):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     return circuit

@@ -137,7 +137,7 @@ def to_python(lexemes: list[Lexeme], order: Mapping[str, int]) -> str:
 
 
 def _refuse_chains(pieces: list[tuple[str, int]]) -> None:
-    """Refuse `a^b^c`, grouped to the left in ngspice and to the right in mathematics, and `a<b<c`, which is ambiguous."""
+    """Refuse `a^b^c`, which ngspice groups to the left, mathematics to the right, and `a<b<c`, which is ambiguous."""
     power = comparison = ""
     previous = ""
     for text, position in pieces:

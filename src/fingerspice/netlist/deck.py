@@ -13,16 +13,10 @@ from pathlib import Path
 
 from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import layer_devices
+from fingerspice.netlist.files import MAX_BYTES, NATIVE_LIBRARIES, read_text
 from fingerspice.netlist.flatten import Flattener, Statement
 from fingerspice.netlist.lexer import Line, group, lex
-from fingerspice.netlist.reader import (
-    DIRECTIVES,
-    MAX_BYTES,
-    NATIVE_LIBRARIES,
-    Reader,
-    Subcircuit,
-    read_text,
-)
+from fingerspice.netlist.reader import DIRECTIVES, Reader, Subcircuit
 from fingerspice.netlist.scope import Call, Number, Scope, Token, Value
 from fingerspice.netlist.slips import with_comma
 

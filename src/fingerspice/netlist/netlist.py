@@ -8,10 +8,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
-from fingerspice.circuit.circuit import Circuit, Element, check
+from fingerspice.base.units import format_si
+from fingerspice.circuit.circuit import Circuit, Element, Tran, check
 from fingerspice.circuit.network import build_network
 from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.circuit.usual import REST_AREA
+from fingerspice.circuit.values import unusual
 from fingerspice.netlist.deck import Deck, parse_deck, read_deck
 from fingerspice.netlist.directives import read_ac, read_initial, read_options, read_tran, unused_starts
 from fingerspice.netlist.elements import read_elements
@@ -91,6 +93,7 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
     work, unused = read_options(deck.options)
     initial = read_initial(deck.ic, elements)
     notes.extend(_unusual_areas(elements, initial))
+    notes.extend(_coarse_outputs(deck, elements, tran))
     circuit = Circuit(
         title=deck.title,
         elements=elements,
@@ -124,6 +127,19 @@ def _unusual_areas(elements: tuple[Element, ...], initial: Mapping[str, float]) 
         text = REST_AREA.warning(what, value, "mm^2")
         if text:
             yield f"{where}: {text}" if where else text
+
+
+def _coarse_outputs(deck: Deck, elements: tuple[Element, ...], tran: Tran | None) -> Iterator[str]:
+    """A warning of each source whose period is shorter than TSTEP; not where its frequency is warned of already."""
+    if deck.tran is None or tran is None:
+        return
+    for e in elements:
+        period = e.waveform.period if e.waveform is not None else None
+        if period is not None and tran.step > period * (1.0 + 1e-9) and not any(unusual(e)):
+            yield (
+                f"{deck.tran.where}: {e.name}: TSTEP is {format_si(tran.step, 's')}, longer than this source's period "
+                f"of {format_si(period, 's')}: the outputs do not show its course, and the figures of a run still do"
+            )
 
 
 def _charge_law(includes: tuple[str, ...]) -> str | None:

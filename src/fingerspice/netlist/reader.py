@@ -1,33 +1,27 @@
 """From netlist files to lines by kind: elements, parameters, subcircuits and directives.
 
-No other part of the netlist reader reads from the disk. Included files have to lie in the netlist's own folder.
+Included files have to lie in the netlist's own folder.
 """
 
 from __future__ import annotations
 
-import codecs
 from dataclasses import dataclass, field
-from encodings import cp1252
 from pathlib import Path
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.devices import layer_devices
+from fingerspice.netlist.files import MAX_BYTES, NATIVE_LIBRARIES, inside, library_changed, read_text
 from fingerspice.netlist.lexer import Group, Lexeme, Line, group, lex, logical_lines, split_lines
-from fingerspice.netlist.library import LIBRARIES, library_text
 from fingerspice.netlist.scope import Formula, param_formulas
 from fingerspice.netlist.slips import ELSEWHERE, decimal_comma
 from fingerspice.netlist.spelling import nearest
 
-MAX_BYTES = 64 * 2**20
 #: Limits of a netlist with its included files; a word takes up to 500 bytes of memory and a line 200.
 MAX_WORDS, MAX_LINES = 1_000_000, 2_000_000
 #: Number of warnings that are shown.
 MAX_WARNINGS = 100
 MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 32
-
-#: Libraries with ngspice's bodies of the native devices; the one that is included says which charge law is meant.
-NATIVE_LIBRARIES = tuple(LIBRARIES.values())
 
 #: Directives without effect here: of those in UNUSED a note says so; those in SILENT matter to another simulator only.
 UNUSED = (".print", ".plot", ".save", ".probe", ".meas", ".measure", ".title")
@@ -222,14 +216,14 @@ class Reader:
         if folder is None or self.folder is None:
             problem = f"'{name}' cannot be included: a netlist given as text has no folder to look in"
             raise InputError(problem, where)
-        path = _inside(self.folder, folder, name, where)
+        path = inside(self.folder, folder, name, where)
         if path == self._top or path in self._reading:
             raise InputError(f"'{name}' includes itself", where)
         self.files.append(path)
         if len(self.files) > MAX_INCLUDES or len(self._reading) >= MAX_INCLUDE_DEPTH:
             problem = f"too many included files: at most {MAX_INCLUDES}, nested {MAX_INCLUDE_DEPTH} deep"
             raise InputError(problem, where)
-        text = read_text(path, name, where)
+        text = read_text(path, name, where, self.folder)
         self._size += len(text)
         if self._size > MAX_BYTES:
             raise InputError(f"the included files are larger than {MAX_BYTES >> 20} MiB in all", where)
@@ -238,86 +232,6 @@ class Reader:
         for inner in logical_lines(self.split(text, where), shown):
             self._take(inner, path.parent)
         self._reading.pop()
-
-
-def read_text(path: Path, shown: str, where: Where | None = None) -> str:
-    """Text of a netlist or table.
-
-    Raises
-    ------
-    InputError
-        When the file is missing, no ordinary file, too large, or not text in UTF-8, Latin-1 or marked UTF-16.
-    """
-    try:
-        if path.is_dir():
-            raise InputError(f"'{shown}' is a folder, not a file", where)
-        if not path.exists():
-            raise InputError(f"'{shown}' does not exist{_similar_file(path)}", where)
-        if not path.is_file():
-            raise InputError(f"'{shown}' is not an ordinary file", where)
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"'{shown}' is larger than {MAX_BYTES >> 20} MiB", where)
-        data = path.read_bytes()
-    except (OSError, ValueError) as error:  # InputError is a ValueError
-        if isinstance(error, InputError):
-            raise
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise InputError(f"'{shown}' cannot be read: {reason}", where) from None
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        # LTspice writes UTF-16 where a name has letters that Latin-1 lacks.
-        return data.decode("utf-16", "replace")
-    if b"\0" in data:
-        raise InputError(f"'{shown}' is not a text file (it holds NUL bytes): save it as UTF-8", where)
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        broken = error.start
-    try:
-        # LTspice writes its micro sign in the Latin-1 of Windows.
-        return cp1252.Codec().decode(data)[0]
-    except UnicodeDecodeError:
-        number = data[:broken].count(b"\n") + 1
-        problem = f"'{shown}' is neither UTF-8 nor Latin-1 text (byte 0x{data[broken]:02x} in line {number})"
-        raise InputError(f"{problem}: save it as UTF-8", where) from None
-
-
-def library_changed(root: Path, folder: Path, name: str) -> bool:
-    """Whether there is a library of that name in the netlist's folder that differs from this version's."""
-    try:
-        path = (folder / name.replace("\\", "/")).resolve()
-        if not path.is_relative_to(root) or not path.is_file():
-            return False
-        own = library_text(next(law for law, file in LIBRARIES.items() if file == path.name.lower()))
-        # A character has up to four bytes.
-        return path.stat().st_size > 4 * len(own) or _lines(read_text(path, name)) != _lines(own)
-    except (OSError, ValueError, RuntimeError):
-        # A file that cannot be read is not this version's library.
-        return True
-
-
-def _lines(text: str) -> list[str]:
-    return [line.rstrip() for line in split_lines(text.rstrip())]
-
-
-def _similar_file(path: Path) -> str:
-    try:
-        names = sorted(entry.name for entry in path.parent.iterdir())[:1000]
-    except OSError:
-        return ""
-    # These need not lie there.
-    return nearest(path.name, [*names, *NATIVE_LIBRARIES])
-
-
-def _inside(root: Path, folder: Path, name: str, where: Where) -> Path:
-    """Resolved path of an included file; one outside the netlist's folder is refused."""
-    try:
-        path = (folder / name.replace("\\", "/")).resolve()
-        allowed = path.is_relative_to(root)
-    except (OSError, ValueError, RuntimeError):  # RuntimeError: a circle of links
-        raise InputError(f"'{name}' is not a usable file name", where) from None
-    if not allowed:
-        raise InputError(f"'{name}' lies outside the netlist's folder, where nothing is read", where)
-    return path
 
 
 def _file_name(word: str, line: Line, rest: int) -> tuple[str, int]:

@@ -1,4 +1,4 @@
-"""How a run ended: its status, its stated error, and the state for another one to go on from."""
+"""How a run ended: its status or failure, its stated error, and the state from which another run may start."""
 
 from __future__ import annotations
 
@@ -45,6 +45,9 @@ class Status(Enum):
         "simulate more periods from rest instead, and see what they do",
     )
 
+    def __repr__(self) -> str:
+        return f"Status.{self.name}"
+
     @property
     def cause(self) -> str:
         """What happened."""
@@ -57,7 +60,7 @@ class Status(Enum):
 
 
 class Attempt(NamedTuple):
-    """A step tried: its start and length (s), and its error over the one allowed; inf where it found no solution."""
+    """An attempted step: start and length (s), and its error relative to the allowed one, inf without a solution."""
 
     t: float
     step: float
@@ -65,7 +68,7 @@ class Attempt(NamedTuple):
 
 
 def last_tried(rows: FloatArray) -> tuple[Attempt, ...]:
-    """Steps from rows of start, length, error and number (from 1; 0: no step), oldest first."""
+    """Attempted steps, oldest first, from rows of start, length, error and number, where number 0 means no step."""
     rows = rows[rows[:, 3] > 0.0]
     return tuple(Attempt(*map(float, row[:3])) for row in rows[np.argsort(rows[:, 3])])
 
@@ -80,13 +83,13 @@ class Failure:
     cause, action : str
         What happened, with the figures known, and what to change.
     t : float or None
-        Time reached, s; None where the whole run is meant.
+        Time reached, s; None where the failure concerns the run as a whole.
     step : float or None
-        Last step tried, s.
+        Length of the last step tried, s.
     element : str
-        Names of the elements it happened at, with commas.
+        Names of the elements concerned, separated by commas.
     u_gap, area, fold_margin : float or None
-        Gap voltage (V), ridge contact area (m^2) and distance to the fold there.
+        Gap voltage (V), ridge contact area (m^2) and distance to the fold at that time.
     tried : tuple of Attempt
         The last steps tried.
     """
@@ -154,9 +157,9 @@ class SolveError(FingerspiceError, RuntimeError):
 class ErrorEstimate:
     """Estimated largest error over the run: of the gap voltage (V), the electroadhesive force (N) and the charge (C).
 
-    Without a GAP, `u_gap` is that of the voltage of the layer with the smallest capacitance, and `f_el` is 0.
-    `q_source` is None where the charge was left out or has no estimate: only the coupled tier's own steps and the
-    algebraic tier give one, and not from the periodic state on.
+    Without a GAP, `u_gap` is the error of the voltage across the layer with the smallest capacitance, and `f_el` is 0.
+    `q_source` is None where the charge was left out, or where its error is not estimated: only the coupled tier's own
+    steps and the algebraic tier estimate it, and not in runs that start from the periodic state.
     """
 
     u_gap: float
@@ -164,21 +167,33 @@ class ErrorEstimate:
     q_source: float | None = None
 
     def at_least(self, u_gap: float, f_el: float) -> ErrorEstimate:
-        """With no less than these, V and N."""
+        """The same with errors of at least these, V and N."""
         return ErrorEstimate(max(self.u_gap, u_gap), max(self.f_el, f_el), self.q_source)
 
     def excess(self, rtol: float, peak_u: float, peak_f: float) -> float:
-        """How many times the error asked for it is, relative to the peaks (V, N), the larger of voltage and force."""
+        """Ratio of the estimated error to the one asked for, `rtol` times the peak (V, N): of voltage or force, the larger."""
         pairs = ((self.u_gap, peak_u), (self.f_el, peak_f))
-        # A product that underflows asks for nothing.
+        # Where the product underflows no error can be asked for.
         return max(error / (rtol * peak) if rtol * peak > 0.0 else 0.0 for error, peak in pairs)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class State:
-    """Where a run stopped, for another one to go on from.
+    """Where a run of a series stack stopped; another run may start from it.
 
-    `u_gap` (V) tells which of several gap voltages that the mobile law allows it is; NaN: the one connected to rest.
+    Attributes
+    ----------
+    t : float
+        s.
+    y : ndarray, shape (n,)
+        The engine's state.
+    u_before : float
+        Source voltage just before `t`, V.
+    charge_offset : float
+        Subtracted from the charge so that it starts at zero, C.
+    charge_law : str
+    u_gap : float
+        Gap voltage (V), which selects one of several solutions of the mobile law; NaN: the one connected to rest.
     """
 
     t: float
@@ -188,12 +203,30 @@ class State:
     charge_law: str
     u_gap: float = math.nan
 
+    def __repr__(self) -> str:
+        return f"<State at t = {self.t:g} s, {self.y.size} numbers, {self.charge_law} law>"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class NetworkState:
-    """Where the run of a network stopped: `y` as in `engine.network`, sources before a jump, branches of the areas."""
+    """Where the run of a network stopped; another run may start from it.
+
+    Attributes
+    ----------
+    t : float
+        s.
+    y : ndarray, shape (n,)
+        The state as in `engine.network`.
+    s_before : ndarray, shape (n_source,)
+        Source values just before `t`, V or A.
+    sign : ndarray, shape (n_area,)
+        Branch of each area.
+    """
 
     t: float
     y: FloatArray
     s_before: FloatArray
     sign: FloatArray
+
+    def __repr__(self) -> str:
+        return f"<NetworkState at t = {self.t:g} s, {self.y.size} numbers>"

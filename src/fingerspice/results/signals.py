@@ -1,9 +1,8 @@
-"""The signals of a run by name: what its record holds, and what follows from that for each finger."""
+"""The signals of a run by name: those of its record, and those that follow from them for each gap."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
 
 import numpy as np
 
@@ -33,89 +32,60 @@ SIGNALS = {
 }
 #: Signals that every gap has.
 _OF_A_GAP = ("u_gap", "sigma_el", "f_el", "f_t", "friction")
+#: Signals whose name in the record is another one.
+_IN_RECORD = {"f_el": "force", "q_source": "charge", "i_source": "current"}
+#: Signals that are computed from another one, with the contact of the gap.
+_DERIVED: dict[str, tuple[str, Callable[[Contact, FloatArray], FloatArray]]] = {
+    "sigma_el": ("u_gap", lambda contact, u: contact.stress(u)),
+    "f_t": ("f_el", lambda contact, f: contact.mu * (contact.f_n + f)),
+    "friction": ("f_t", lambda contact, f: f / contact.f_n),
+}
 
 
 class Signals:
-    """Signals of a record, each made when first asked for; shapes and units as in `Solution`."""
+    """Signals of a record by name, each computed when it is first asked for; shapes and units as in `Solution`."""
 
     def __init__(self, record: AnyRecord) -> None:
         self.record = record
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        return self.record.layers
+        self._derived: dict[str, FloatArray] = {}
 
     @property
     def gaps(self) -> tuple[str, ...]:
+        """Names of the GAPs."""
         return tuple(name for name, _ in self.record.fingers)
 
-    @property
-    def sources(self) -> tuple[str, ...]:
-        return self.record.sources
-
-    @property
-    def u_source(self) -> FloatArray:
-        return self.record.u_source
-
-    @property
-    def u_layer(self) -> FloatArray:
-        return self.record.u_layer
-
-    @property
-    def area(self) -> FloatArray | None:
-        return self.record.area
-
-    @property
-    def q_source(self) -> FloatArray | None:
-        return self.record.charge
-
-    @property
-    def i_source(self) -> FloatArray | None:
-        return self.record.current
-
-    @property
-    def fold_margin(self) -> FloatArray:
-        return self.record.fold_margin
-
-    @property
-    def u_gap(self) -> FloatArray | None:
-        return self.record.u_gap if self.record.fingers else None
-
-    @property
-    def f_el(self) -> FloatArray | None:
-        return self.record.force if self.record.fingers else None
-
-    @cached_property
-    def sigma_el(self) -> FloatArray | None:
-        return self._per_gap(self.u_gap, lambda contact, u: contact.stress(u))
-
-    @cached_property
-    def f_t(self) -> FloatArray | None:
-        return self._per_gap(self.f_el, lambda contact, f: contact.mu * (contact.f_n + f))
-
-    @cached_property
-    def friction(self) -> FloatArray | None:
-        return self._per_gap(self.f_t, lambda contact, f: f / contact.f_n)
-
-    def _per_gap(self, x: FloatArray | None, make: Callable[[Contact, FloatArray], FloatArray]) -> FloatArray | None:
-        """Another signal of every gap from one of them."""
-        if x is None:
+    def value(self, key: str) -> FloatArray | None:
+        """A signal, shape (n_t,), or (n_t, n) where n elements have it; None where the run has no such signal."""
+        if key in _OF_A_GAP and not self.gaps:
             return None
+        if key in _DERIVED:
+            if key not in self._derived:
+                base, make = _DERIVED[key]
+                self._derived[key] = self._per_gap(self.value(base), make)
+            return self._derived[key]
+        held: FloatArray | None = getattr(self.record, _IN_RECORD.get(key, key))
+        return held
+
+    def _per_gap(self, x: FloatArray | None, make: Callable[[Contact, FloatArray], FloatArray]) -> FloatArray:
+        """A signal of every gap computed from another one."""
+        assert x is not None
         contacts = [contact for _, contact in self.record.fingers]
         if len(contacts) == 1:
             return sealed(make(contacts[0], x))
         return sealed(np.column_stack([make(contact, x[:, i]) for i, contact in enumerate(contacts)]))
 
     def columns(self, key: str) -> tuple[str, ...]:
-        """What the columns of a signal belong to: layers, gaps, sources or nodes."""
+        """Names of the layers, gaps, sources or nodes to which the columns of a signal belong."""
         if key == "v":
             return tuple(self.record.node_voltages)
         if key == "fold_margin":
             return ()
-        return self.layers if key == "u_layer" else self.sources if key.endswith("_source") else self.gaps
+        if key == "u_layer":
+            return self.record.layers
+        return self.record.sources if key.endswith("_source") else self.gaps
 
     def names(self, key: str) -> tuple[str, ...]:
-        """``key`` itself, or ``key:element`` where several elements have it; none where there is none.
+        """``key`` itself, or ``key:element`` for each of several elements; empty where the run has no such signal.
 
         Raises
         ------
@@ -130,10 +100,10 @@ class Signals:
         several = self.columns(key)
         if key in ("u_layer", "v"):
             return tuple(f"{key}:{name}" for name in several)
-        # Asking for a signal would make it.
+        # Whether a signal exists is told, where possible, without computing it.
         missing = not several if key in _OF_A_GAP else False
         if key in ("q_source", "i_source") or (key == "area" and not several):
-            missing = getattr(self, key) is None
+            missing = self.value(key) is None
         return () if missing else (key,) if len(several) < 2 else tuple(f"{key}:{name}" for name in several)
 
     def one(self, name: str) -> FloatArray:
@@ -141,5 +111,6 @@ class Signals:
         key, colon, element = name.partition(":")
         if key == "v":
             return self.record.node_voltages[element]
-        value: FloatArray = getattr(self, key)
+        value = self.value(key)
+        assert value is not None
         return value[:, self.columns(key).index(element)] if colon else value

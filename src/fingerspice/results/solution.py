@@ -160,12 +160,12 @@ class Solution(Sealed, Shown, Figured):
     @property
     def u_gap(self) -> FloatArray | None:
         """Gap voltage, V, shape (n_t,); None for a circuit without GAP."""
-        return self.all_signals.u_gap
+        return self.all_signals.value("u_gap")
 
     @property
     def sigma_el(self) -> FloatArray | None:
         """Electroadhesive stress (Eq. 2), Pa, shape (n_t,); None for a circuit without GAP."""
-        return self.all_signals.sigma_el
+        return self.all_signals.value("sigma_el")
 
     @property
     def f_el(self) -> FloatArray | None:
@@ -175,17 +175,17 @@ class Solution(Sealed, Shown, Figured):
         alike, both ends of a period and both rows of a jump included, and is some per cent off at 50 to 200 outputs a
         period.
         """
-        return self.all_signals.f_el
+        return self.all_signals.value("f_el")
 
     @property
     def f_t(self) -> FloatArray | None:
         """Friction force (Eq. 1), N, shape (n_t,); None for a circuit without GAP."""
-        return self.all_signals.f_t
+        return self.all_signals.value("f_t")
 
     @property
     def friction(self) -> FloatArray | None:
         """Friction coefficient f_t / f_n, shape (n_t,); None for a circuit without GAP."""
-        return self.all_signals.friction
+        return self.all_signals.value("friction")
 
     def by_name(self, key: str) -> dict[str, FloatArray]:
         """A signal under its name, or the columns of several elements under ``name:element``.

@@ -159,7 +159,13 @@ def fold_limits(
             changed.append(circuit.varied({**changes, sources[0].name: wave}))
         voltages = _along(changed, peak, [t_stop / x for x in factors], done)
         sweeps.append(FoldSweep("frequency", "Hz", own, own * factors, voltages))
-    return FoldLimits(circuit, peak, around, tuple(sweeps))
+    return FoldLimits(circuit, peak, around, tuple(_with_own(sweep, around) for sweep in sweeps))
+
+
+def _with_own(sweep: FoldSweep, voltage: float) -> FoldSweep:
+    """The sweep with the fold voltage already found at the deck's own value: another bisection ends elsewhere in it."""
+    own = np.abs(sweep.values - sweep.own) <= 1e-12 * sweep.own
+    return dataclasses.replace(sweep, voltages=np.where(own, voltage, sweep.voltages))
 
 
 @dataclass

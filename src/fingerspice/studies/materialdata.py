@@ -11,7 +11,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
-from fingerspice.netlist.reader import read_text
+from fingerspice.netlist.files import read_text
 from fingerspice.physics.materials import EPS0
 
 COLUMNS = ("frequency", "resistivity", "permittivity")
