@@ -1,4 +1,4 @@
-"""Entry of the `fingerspice` command and of `python -m fingerspice`: signals are minded before anything is loaded."""
+"""Entry of the `fingerspice` command and of `python -m fingerspice`; it handles signals before loading anything."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _STOPS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
 
 def _stop(number: int, _: FrameType | None) -> None:
-    """End here and now: an exception would have to find its way through callbacks of libraries that swallow it."""
+    """End the process at once: libraries would catch an exception in their callbacks."""
     discard_unfinished()
-    # On a terminal a bar may stand, with the cursor hidden.
+    # A progress bar may be shown on a terminal, with the cursor hidden.
     tidy = b"\r\x1b[K\x1b[?25h" if os.isatty(2) else b""
     text = f"fingerspice: {_STOPS[signal.Signals(number)]}; nothing half-written is left\n"
     try:
@@ -27,7 +27,7 @@ def _stop(number: int, _: FrameType | None) -> None:
 def main() -> None:
     """Run the command."""
     for number in _STOPS:
-        # Whoever started this in the background may have chosen to have it left alone.
+        # A signal that is ignored was switched off by whoever started this process, as nohup does.
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _stop)
     mend_streams()
@@ -36,7 +36,7 @@ def main() -> None:
     try:
         command()
     finally:
-        # All is written: what comes while Python tidies up comes too late.
+        # Everything has been written: a signal during the interpreter's shutdown is ignored.
         for number in _STOPS:
             signal.signal(number, signal.SIG_IGN)
 

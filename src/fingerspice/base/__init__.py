@@ -1,1 +1,1 @@
-"""What every part stands on: refusals, units, files, compiled code."""
+"""What all parts use: errors, units, files, reports as text and HTML, compiled code."""

@@ -1,4 +1,4 @@
-"""What takes its time says so: a bar on a terminal, one line elsewhere."""
+"""Progress of what takes long: a bar on a terminal, one line elsewhere."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ _LOG = logging.getLogger("fingerspice")
 
 
 class Bar:
-    """A progress bar on a terminal's stderr, gone once stopped; where another one stands, or elsewhere, nothing.
+    """A progress bar on stderr, removed when stopped; none where stderr is no terminal, or another bar is shown.
 
     Parameters
     ----------
     what : str
-        What is done.
+        Description of the work.
     endless : bool
-        Whether nobody knows how much there is to do: then it shows the time taken.
+        Whether the amount of work is unknown, so that the bar shows the time taken.
     """
 
     _standing: ClassVar[Bar | None] = None
@@ -29,7 +29,7 @@ class Bar:
         self._bar: Any = None
 
     def show(self, done: float = 0.0) -> None:
-        """Let it stand at a fraction."""
+        """Show the bar with this fraction done."""
         if self._bar is None:
             if Bar._standing is not None or not sys.stderr.isatty():
                 return
@@ -45,14 +45,14 @@ class Bar:
         self._bar.update(self._bar.task_ids[0], completed=done)
 
     def stop(self) -> None:
-        """Take it away."""
+        """Remove the bar."""
         if self._bar is not None:
             self._bar.stop()
             self._bar, Bar._standing = None, None
 
 
 class Compiling:
-    """Announces that code is compiled, once in a process as a line, each time as a bar."""
+    """Announces that code is compiled: on a terminal by a bar each time, elsewhere by one line in a process."""
 
     def __init__(self) -> None:
         self._depth, self._told = 0, False
@@ -60,7 +60,7 @@ class Compiling:
 
     @contextmanager
     def around(self) -> Iterator[None]:
-        """Around whatever may compile: functions are compiled inside each other."""
+        """Context of whatever may compile; contexts nest, as compiling a function compiles those that it calls."""
         self._depth += 1
         try:
             yield
@@ -71,7 +71,7 @@ class Compiling:
                 self._bar = None
 
     def begins(self, text: str) -> None:
-        """Something is compiled."""
+        """Announce that something is compiled."""
         wanted = _LOG.level in (logging.NOTSET, logging.INFO)
         if wanted and self._bar is None and sys.stderr is not None and sys.stderr.isatty():
             self._bar = Bar(text, endless=True)
@@ -82,7 +82,7 @@ class Compiling:
 
 
 def _tell(text: str) -> None:
-    """One line to whoever listens, or where nobody was set to, on stderr."""
+    """Log one line, or write it to stderr where no logging was set up."""
     if _LOG.isEnabledFor(logging.INFO) and _LOG.hasHandlers():
         _LOG.info(text)
     elif _LOG.level == logging.NOTSET and sys.stderr is not None:

@@ -1,10 +1,13 @@
-"""The two ways a request can fail: the input is wrong, or the solve did not finish."""
+"""Errors of wrong input, with their place in a netlist, and warnings.
+
+The other error that users meet, of a solve that did not reach its end, is `fingerspice.results.outcome.SolveError`.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-#: Characters of a message; of a longer one, which holds a long text of the user's, the middle is left out.
+#: Characters of a message; the middle of a longer one, which contains a long text of the user, is left out.
 LONGEST_MESSAGE = 1000
 
 
@@ -21,7 +24,7 @@ class Where:
 
 
 class FingerspiceError(Exception):
-    """Base of every error this package raises on purpose."""
+    """Base of every error that this package raises on purpose."""
 
 
 class InputError(FingerspiceError, ValueError):
@@ -30,9 +33,9 @@ class InputError(FingerspiceError, ValueError):
     Parameters
     ----------
     message : str
-        One clear sentence; whatever was given and stands in it, the error's own is short and printable.
+        One sentence. The error's own `message` is shortened and printable, whatever the text of the user in it.
     where : Where, optional
-        The place in the netlist, where there is one.
+        Place in the netlist, where it has one.
     """
 
     def __init__(self, message: str, where: Where | None = None) -> None:
@@ -42,8 +45,8 @@ class InputError(FingerspiceError, ValueError):
 
 
 def printable(text: str, longest: int = LONGEST_MESSAGE) -> str:
-    """One line that may be shown whoever wrote it: control characters escaped, the middle of a long text left out."""
-    # Cut first, so that little is escaped, and again, as what is escaped is longer.
+    """One line that is safe to show: control characters are escaped, and the middle of a long text is left out."""
+    # Shortened before escaping, which then has little to do, and after it, since it lengthens the text.
     text = _shortened(text, longest)
     if text.isprintable():
         return text

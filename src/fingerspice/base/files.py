@@ -1,4 +1,4 @@
-"""Files that are whole or absent: written aside, then renamed."""
+"""Files that are complete or absent: written under a temporary name, then renamed."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _PIECE = 64 * 2**20
 
 
 def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
-    """Call `write` with a temporary path in the same folder, then move it to `path`.
+    """Call `write` with a temporary path in the same folder, then rename that file to `path`.
 
-    Where `path` is a link, the file it names is written; a device is written as it stands.
+    Where `path` is a link the file that it names is replaced; a device is written directly.
 
     Raises
     ------
@@ -30,7 +30,7 @@ def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
         return path
     target = Path(os.path.realpath(path))
     temporary = target.with_name(f".fingerspice-{os.urandom(6).hex()}")
-    # Known before it is there: whenever a signal comes, `discard_unfinished` finds it.
+    # Entered before the file exists, so that `discard_unfinished` finds it whenever a signal comes.
     _UNFINISHED.add(temporary)
     try:
         try:
@@ -49,14 +49,14 @@ def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
 
 
 def write_pieces(path: Path, data: memoryview) -> None:
-    """Write bytes a piece at a time: one write of gigabytes would let a Ctrl-C wait for seconds."""
+    """Write bytes in pieces, since a Ctrl-C would have to wait for a single write of gigabytes."""
     with path.open("wb") as stream:
         for begin in range(0, data.nbytes, _PIECE):
             stream.write(data[begin : begin + _PIECE])
 
 
 def discard_unfinished() -> None:
-    """Remove what is being written: for a process that is about to end."""
+    """Remove unfinished files, before the process ends."""
     for temporary in list(_UNFINISHED):
         _discard(temporary)
 
@@ -65,7 +65,7 @@ def _discard(temporary: Path) -> None:
     try:
         temporary.unlink(missing_ok=True)
     except OSError:
-        # Where the folder is no folder, or is gone, there is nothing to remove.
+        # Where the folder is gone, or is none, there is nothing to remove.
         return
     finally:
         _UNFINISHED.discard(temporary)

@@ -1,4 +1,4 @@
-"""Reports as text for a terminal and as HTML for a notebook, from one list of lines and tables."""
+"""Reports as text for a terminal and as HTML for a notebook, both from one list of lines and tables."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from dataclasses import dataclass
 
 from fingerspice.base.errors import printable
 
-#: Characters of a row's name in a table.
+#: Largest number of characters of a row's name in a table.
 LONGEST_LABEL = 60
-#: Lines that Python's prompt shows of a result.
+#: Number of lines of a result that Python's prompt shows.
 SCREEN = 40
 _CELL = "padding: 0.1em 0.7em; white-space: nowrap;"
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text under a head; the first `left` columns are words, those after them figures."""
+    """Rows of text under a head; the first `left` columns are words, and the others are figures."""
 
     head: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
     left: int = 1
 
     def text(self) -> str:
-        """As columns, words left-aligned and figures right-aligned."""
+        """The table as text: words aligned to the left, figures to the right."""
         table = [(printable(r[0], LONGEST_LABEL), *r[1:]) for r in (self.head, *self.rows)]
         widths = [max(len(r[i]) for r in table) for i in range(len(self.head))]
         lines = []
@@ -36,7 +36,7 @@ class Table:
         return "\n".join(lines)
 
     def html(self) -> str:
-        """As a table."""
+        """The table as HTML."""
         lines = ["<table>"]
         for number, row in enumerate((self.head, *self.rows)):
             kind = "td" if number else "th"
@@ -50,12 +50,12 @@ class Table:
 
 
 class Page(str):
-    """A report: the text itself, and the same as `html`.
+    """A report: a text, which has the same report as HTML in `html`.
 
     Parameters
     ----------
     blocks : sequence of str or Table
-        From top to bottom; an empty line stands between a table and what is around it only where it is given.
+        From top to bottom; empty lines around a table have to be given.
     """
 
     __slots__ = ("blocks", "html")
@@ -69,7 +69,7 @@ class Page(str):
             if isinstance(block, Table):
                 parts.append(block.html())
                 continue
-            # What is set in columns keeps them.
+            # Text of several lines may be set in columns, which <pre> keeps.
             lines = [html.escape(printable(line)) for line in block.split("\n")]
             parts.append(
                 f"<pre>{chr(10).join(lines)}</pre>" if len(lines) > 1 else f"<div>{lines[0] or '&nbsp;'}</div>"
@@ -80,7 +80,7 @@ class Page(str):
 
 
 class Shown:
-    """A result that shows itself as its page: to `print`, on Python's prompt, and in a notebook."""
+    """A result that `print`, Python's prompt and notebooks show as its page."""
 
     def _page(self) -> Page:
         raise NotImplementedError

@@ -1,4 +1,4 @@
-"""Standard streams that hold whatever is done to them: closed, a pipe without a reader, an encoding without µ."""
+"""Standard streams that can be written in any case: closed, a pipe without reader, an encoding without µ."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 class _Raw(io.FileIO):
-    """A stream to a reader that may go: what is written then is gone too, and no error."""
+    """A stream whose reader may go away, after which writing to it does nothing and is no error."""
 
     def write(self, data: Any) -> int:
         try:
@@ -17,7 +17,7 @@ class _Raw(io.FileIO):
         except BrokenPipeError:
             return len(data)
         except OSError:
-            # Of what stderr says nothing depends on; a full disk under stdout is for the caller to tell.
+            # Failing to write to stderr is ignored; of a full disk under stdout the caller has to tell.
             if self.fileno() != 2:
                 raise
             return len(data)
@@ -29,7 +29,7 @@ def mend_streams() -> None:
         try:
             os.fstat(number)
         except OSError:
-            # The lowest number that is free, which is this one: else the first file opened would become a stream.
+            # Opens the lowest free number, which is this one; else the first file opened would become this stream.
             os.open(os.devnull, os.O_RDWR)
     sys.stdout = _mended(sys.stdout, 1)
     sys.stderr = _mended(sys.stderr, 2)

@@ -1,16 +1,16 @@
-"""SPICE numbers in, engineering notation out."""
+"""Numbers: SPICE's notation read and written, and engineering notation written."""
 
 from __future__ import annotations
 
 import math
 import re
 
-#: Power of ten of each scale suffix. `mil` (25.4e-6) is the one suffix that is not a power of ten.
+#: Power of ten of each scale suffix; the suffix `mil` (25.4e-6) is not a power of ten.
 SCALES = {"t": 12, "g": 9, "meg": 6, "k": 3, "m": -3, "u": -6, "µ": -6, "μ": -6, "n": -9, "p": -12, "f": -15}
 MIL = 25.4e-6
 
-#: Letters that may follow a number without a scale. A unit that begins with a scale letter (farad, newton,
-#: tesla ...) cannot be here, because SPICE takes that letter as the scale; nor can `a`, atto elsewhere.
+#: Units that may follow a number without a scale. Units that begin with the letter of a scale (farad, newton, tesla
+#: ...) are not among them, because SPICE takes that letter as the scale; nor is `a`, which elsewhere means atto.
 PLAIN_UNITS = frozenset(
     (
         *("v", "vdc", "vac", "vpp", "volt", "volts", "h", "henry", "hz", "hertz", "o", "ohm", "ohms", "ω"),
@@ -19,7 +19,7 @@ PLAIN_UNITS = frozenset(
     )
 )
 
-# Words whose first letters SPICE reads as something else than their writer means.
+# Words whose first letters SPICE reads as another scale than is meant, with that scale and the right one.
 _MISREAD = {
     "milli": ("mil (25.4e-6)", "m"),
     "micro": ("m (milli)", "u"),
@@ -41,12 +41,12 @@ def parse_number(text: str) -> float:
     Parameters
     ----------
     text : str
-        The whole token; nothing before or after the number is allowed.
+        The number, with nothing before or after it.
 
     Returns
     -------
     float
-        The correctly rounded value (``3.5u`` is exactly ``3.5e-6``).
+        The correctly rounded value: ``3.5u`` gives ``3.5e-6``.
 
     Raises
     ------
@@ -72,31 +72,31 @@ def parse_number(text: str) -> float:
 
 
 def suspicious_mega(text: str) -> bool:
-    """Whether a number is written with a capital M, which SPICE reads as milli and a reader as mega.
+    """Whether a number is written with a capital M, which SPICE reads as milli and people read as mega.
 
-    ``1M`` and ``0.2MOhm`` are; ``0.2meg``, ``1MEG``, ``1MIL`` and ``0.2mohm`` are not.
+    So it is for ``1M`` and ``0.2MOhm``, and not for ``0.2meg``, ``1MEG``, ``1MIL`` and ``0.2mohm``.
     """
     match = _MEGA.fullmatch(text)
     return match is not None and match[1][0] == "M"
 
 
 def suggest_mega(text: str) -> str:
-    """The same digits with ``meg`` for the letters that follow them: ``0.2MOhm`` gives ``0.2meg``."""
+    """The same digits followed by ``meg``: ``0.2MOhm`` gives ``0.2meg``."""
     match = _MEGA.fullmatch(text)
     return text if match is None else f"{text[: match.start(1)]}meg"
 
 
 def unit_read_as_scale(text: str, unit: str, word: str = "") -> bool:
-    """Whether a number's only letters are a unit that SPICE takes for a scale.
+    """Whether a number is followed by nothing but a unit that SPICE takes for a scale.
 
     Parameters
     ----------
     text : str
         A number as written, such as ``1F``.
     unit : str
-        The unit's symbol, compared with its case: ``1F`` is suspicious, ``1f`` an ordinary femto.
+        The unit's symbol; its case counts, as ``1F`` is suspicious and ``1f`` an ordinary femto.
     word : str
-        The unit's name, compared without case and with or without a plural s: ``1farad``.
+        The unit's name, in any case and with or without a plural s, as in ``1farad``.
     """
     match = _NUMBER.fullmatch(text)
     if match is None:
@@ -105,7 +105,7 @@ def unit_read_as_scale(text: str, unit: str, word: str = "") -> bool:
 
 
 def format_si(value: float, unit: str, digits: int = 4) -> str:
-    """Engineering notation: ``format_si(3.5e-6, "m")`` is ``3.5 um``.
+    """A value in engineering notation: ``format_si(3.5e-6, "m")`` gives ``3.5 um``.
 
     Parameters
     ----------
@@ -114,11 +114,11 @@ def format_si(value: float, unit: str, digits: int = 4) -> str:
     unit : str
         The unit's symbol, or an empty string.
     digits : int
-        Significant digits kept; trailing zeros are not written.
+        Number of significant digits, of which trailing zeros are not written.
     """
     if not math.isfinite(value) or value == 0.0:
         return f"{value + 0.0:g} {unit}".rstrip()
-    # Round first: 999.96 to four digits is 1 k, not 1000.
+    # Rounded first, as 999.96 to four digits is 1 k and not 1000.
     mantissa, _, exponent_text = f"{value:.{digits - 1}e}".partition("e")
     exponent = int(exponent_text)
     power = 3 * (exponent // 3)
@@ -129,19 +129,19 @@ def format_si(value: float, unit: str, digits: int = 4) -> str:
 
 
 def exponent_and_scale(text: str) -> bool:
-    """Whether a number has both, as in ``1e-4u``, which is 1e-10: seldom meant."""
+    """Whether a number has both, as ``1e-4u`` has, which is 1e-10 and seldom meant."""
     match = _NUMBER.fullmatch(text)
     return match is not None and match[2] is not None and match[3].lower() not in {"", *PLAIN_UNITS}
 
 
 def spice_text(value: float) -> str:
-    """A number as SPICE writes it: ``spice_text(3.5e-6)`` is ``3.5u``, and of 2e6 ``2meg``."""
+    """A number in SPICE's notation: 3.5e-6 gives ``3.5u``, and 2e6 gives ``2meg``."""
     text = format_si(value, "", 12).replace(" ", "")
     return text.replace("M", "meg").replace("G", "g").replace("T", "t")
 
 
 def _power_of_ten(letters: str, text: str, as_written: str) -> int:
-    """Power of ten that the lower-case letters after a number stand for."""
+    """Power of ten for which the letters after a number, given in lower case, stand."""
     if letters == "":
         return 0
     digits = text[: len(text) - len(letters)]
@@ -163,7 +163,7 @@ def _power_of_ten(letters: str, text: str, as_written: str) -> int:
 
 
 def _why_not_a_number(text: str) -> str:
-    """Why a text that does not match the pattern of a number is none."""
+    """Why a text is not a number, with what to write where that can be guessed."""
     match = _LETTER_AS_POINT.fullmatch(text)
     if match is not None:
         whole, letters, fraction = match.groups()

@@ -1,4 +1,4 @@
-"""What a call is given, minded at the border: the circuit and what it changes of it, numbers and times."""
+"""Checks of a call's arguments: the circuit, the sources and parameters changed for the call, numbers and times."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import find_branches
 from fingerspice.waveforms.waveform import DC, Waveform
 
-#: A waveform, a constant (V; A of a current source) or a function of time (s).
+#: A waveform, a constant (V, or A of a current source), or a function of time (s).
 Source = Waveform | float | Callable[[float], float]
 Sources = Mapping[str, Source] | Source
 Parameters = Mapping[str, float]
 
 
 def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Parameters | None = None) -> Circuit:
-    """The circuit that a call means.
+    """The circuit with the sources and parameters of a call.
 
     Parameters
     ----------
     circuit : Circuit
     sources : mapping or waveform, optional
-        Source name to a waveform, a constant (V) or a function of time (s); or one of these alone, where the circuit
-        has one source.
+        From the name of a source to a waveform, a constant (V) or a function of time (s); or one of these alone, where
+        the circuit has one source.
     parameters : mapping, optional
-        Path to value, as in `Circuit.replace`.
+        From path to value, as in `Circuit.replace`.
 
     Raises
     ------
     InputError
-        For what is no circuit, an unknown name, or a source for a circuit of several.
+        For anything but a circuit, an unknown name, or a source without its name where the circuit has several.
 
     Warns
     -----
     FingerspiceWarning
-        Where a source that `sources` does not name stays on.
+        Where other sources than those named in `sources` remain switched on.
     """
     require_circuit(circuit)
     if parameters:
@@ -79,7 +79,7 @@ def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Par
 
 
 def require_circuit(circuit: Any) -> None:
-    """Refuse what is no circuit.
+    """Refuse anything but a circuit.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def require_circuit(circuit: Any) -> None:
 
 
 def require_number(what: str, given: Any, allowed: str) -> None:
-    """Refuse what is no real number.
+    """Refuse anything but a real number.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def require_number(what: str, given: Any, allowed: str) -> None:
 
 
 def require_area(area: Any) -> None:
-    """Refuse what is neither a name of a mode nor a number; which of these there are is the model's to know.
+    """Refuse anything but a text or a number; which names of modes there are is checked by the model.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def times_given(what: str, given: ArrayLike | None) -> FloatArray | None:
     Raises
     ------
     InputError
-        Where they are no numbers.
+        For anything but numbers.
     """
     try:
         return None if given is None else np.asarray(given, float)

@@ -1,4 +1,4 @@
-"""A circuit as data: elements with their values in the netlist's units, and the analyses its deck asks for."""
+"""A circuit as data: elements with values in the netlist's units, and the analyses for which its deck asks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _REMEMBERING = threading.Lock()
 
 @dataclass(frozen=True)
 class SmallSignal:
-    """``AC magnitude [phase]`` of a source: what drives it in an ``.ac`` sweep, V or A, and degrees."""
+    """``AC magnitude [phase]`` of a source: its amplitude (V or A) and phase (degrees) in an ``.ac`` sweep."""
 
     magnitude: float = 1.0
     phase_deg: float = 0.0
@@ -39,7 +39,7 @@ class SmallSignal:
 
     @property
     def phasor(self) -> complex:
-        """Complex amplitude; a negative magnitude turns it round."""
+        """Complex amplitude; a negative magnitude adds 180 degrees to the phase."""
         return cmath.rect(self.magnitude, math.radians(self.phase_deg))
 
 
@@ -50,17 +50,17 @@ class Element:
     Attributes
     ----------
     name : str
-        As written; inside a subcircuit with the path, ``Xfinger.Xgap``.
+        As written; inside a subcircuit with its path, as in ``Xfinger.Xgap``.
     device : str
         Entry of `DEVICES`.
     nodes, node_names : tuple of str
-        Canonical (lower case, ground is ``0``) and as written.
+        Nodes in lower case with ground as ``0``, and the same nodes as written.
     values : mapping of str to float
-        Every parameter of the device, in the netlist's units.
+        Value of every parameter of the device, in the netlist's unit.
     waveform : Waveform or None
         Of a source.
     ac : SmallSignal or None
-        Of a source that has one.
+        ``AC`` of a source that has it.
     initial : float or None
         ``IC=`` of a capacitor, V.
     where : Where or None
@@ -96,7 +96,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Tran:
-    """``.tran TSTEP TSTOP [TSTART [TMAX]] [uic]``, in s; TSTEP is the output spacing, never the accuracy."""
+    """``.tran TSTEP TSTOP [TSTART [TMAX]] [uic]``, s; TSTEP, the spacing of outputs, does not affect the accuracy."""
 
     step: float
     stop: float
@@ -134,21 +134,21 @@ class Circuit(Shown):
     tran : Tran or None
     ac : AcSweep or None
     initial : mapping of str to float
-        ``.ic``: canonical node to V, or to mm^2 where it is an area's.
+        ``.ic``: from canonical node to V, or to mm^2 of an area node.
     charge_law : str or None
-        Of the included library: ``local``, ``mobile`` or None.
+        ``local`` or ``mobile``, as the included library says; None without one.
     work : str
-        Reading of Eq. 7: ``gap`` (gap voltage held) or ``total`` (total voltage held, of a dispersive skin with its
-        permittivity above all poles).
+        Reading of Eq. 7: ``gap`` (the gap voltage is held) or ``total`` (the voltage of the whole stack is held, where
+        a dispersive skin has its permittivity above all poles).
     warnings : tuple of str
-        What the reader noticed, and `replace`.
+        Warnings of the reader and of `replace`.
     unused : tuple of str
-        Directives accepted and not used here.
+        Directives that are accepted and have no effect here.
     text : str
         The deck.
     path : Path or None
     overrides : mapping of str to str
-        What `replace` changed, for the record.
+        What `replace` has changed, from path to value as text.
     """
 
     title: str
@@ -174,20 +174,20 @@ class Circuit(Shown):
         return circuit_page(self)
 
     def remember(self, key: Any, make: Callable[[], Any]) -> Any:
-        """What `make` gives, kept for the next call with the same key: circuits do not change."""
+        """The result of `make`, kept for later calls with the same key, as circuits do not change."""
         kept = self._memory.get(key)
         if kept is None:
-            # Two threads may both make it: it is the same.
+            # Two threads may both call `make`, with the same result.
             kept = (make(),)
             with _REMEMBERING:
-                # The oldest goes: a sweep over stop times must not fill the memory.
+                # The oldest entry goes, so that a sweep over stop times cannot fill the memory.
                 if len(self._memory) >= 16:
                     self._memory.pop(next(iter(self._memory)))
                 self._memory[key] = kept
         return kept[0]
 
     def __getitem__(self, name: str) -> Element:
-        """The element of that name, whatever its case.
+        """The element of that name, in upper or lower case.
 
         Raises
         ------
@@ -234,7 +234,7 @@ class Circuit(Shown):
         Warns
         -----
         FingerspiceWarning
-            Of a value outside the usual range, which is probably in another unit.
+            Of a value outside the usual range, which was probably meant in another unit.
         """
         changed, notes = self._replaced(changes)
         # Warnings of values that are no longer there go; those of the reader begin with a place.
@@ -245,13 +245,13 @@ class Circuit(Shown):
         return dataclasses.replace(changed, warnings=(*kept, *notes))
 
     def varied(self, changes: Mapping[str, float | str | Waveform | Callable[[float], float]]) -> Circuit:
-        """As `replace`, without its warnings: for the sweeps of this package, whose values nobody wrote."""
+        """As `replace`, without warnings: for the sweeps of this package, whose values no user has written."""
         return self._replaced(changes)[0]
 
     def _replaced(
         self, changes: Mapping[str, float | str | Waveform | Callable[[float], float]]
     ) -> tuple[Circuit, list[str]]:
-        """A changed circuit, and what the changes are to be warned about."""
+        """A changed circuit, and the warnings about the changes."""
         if not isinstance(changes, Mapping) or not all(isinstance(path, str) for path in changes):
             raise InputError(f"replace is given {changes!r}; allowed: a mapping such as {{'Xgap.d': 3e-6}}")
         elements = {e.name.lower(): e for e in self.elements}
@@ -260,7 +260,7 @@ class Circuit(Shown):
             name, _, parameter = path.lower().rpartition(".")
             if path.lower() in elements and elements[path.lower()].device in "VI":
                 element = elements[path.lower()]
-                # What an .ac sweep took from the old source goes with it.
+                # The AC magnitude belonged to the source that is replaced.
                 elements[path.lower()] = dataclasses.replace(element, waveform=self._waveform(value), ac=None)
             elif name in elements:
                 elements[name], trap = _changed(elements[name], parameter, value, path)
@@ -271,7 +271,7 @@ class Circuit(Shown):
         changed = dataclasses.replace(self, elements=tuple(elements.values()), overrides=overrides)
         check(changed)
         before, after = _unusual(self), _unusual(changed)
-        # One word about a value is enough.
+        # One warning of each value is enough.
         new = [text for text, path in after.items() if text not in before and path not in traps]
         return changed, [*traps.values(), *new]
 
@@ -297,7 +297,7 @@ class Circuit(Shown):
 
 
 def _unusual(circuit: Circuit) -> dict[str, str]:
-    """What is not usual in a circuit, and the path of each, in lower case."""
+    """Warnings of unusual values in a circuit, each with the path (in lower case) that it is about."""
     return {text: f"{e.name}.{name}".lower() for e in circuit.elements for name, text in unusual(e)}
 
 
@@ -313,7 +313,7 @@ def _concerns(warning: str, changes: Mapping[str, Any]) -> bool:
 
 
 def _changed(element: Element, parameter: str, given: Any, path: str) -> tuple[Element, str | None]:
-    """An element with another value, and what to warn about in how it is written."""
+    """An element with another value, and a warning about how that is written, or None."""
     if parameter in element.values:
         spec = element.spec.parameter(parameter)
         value, note = value_of(path, given, spec, spec.unit)

@@ -13,14 +13,14 @@ from fingerspice.waveforms.ramps import PWL, Samples
 from fingerspice.waveforms.sampling import Function
 from fingerspice.waveforms.waveform import DC, Waveform
 
-#: Changes and sources named in one line; of more, how many there are.
+#: Number of changes, or of sources, that are named in one line; of more their number is told.
 _MOST = 8
 #: Elements of a circuit that its page lists.
 MOST_ELEMENTS = 25
 
 
 def waveform_text(waveform: Waveform, unit: str = "V") -> str:
-    """A waveform with its figures, ``Square(200 V, 100 Hz)``; `unit` is A for a current source's."""
+    """A waveform with its figures, as in ``Square(200 V, 100 Hz)``; `unit` is A for a current source."""
     if isinstance(waveform, DC):
         return f"DC {format_si(waveform.level, unit)}"
     if isinstance(waveform, Sum | Product):
@@ -39,22 +39,22 @@ def waveform_text(waveform: Waveform, unit: str = "V") -> str:
             continue
         own = waveform.units[field.name].replace("V", unit)
         text = _quantity(value, own)
-        # What has no default is known by its place; what has one needs its name.
+        # Figures that are always there need no name; those with a default do.
         said.append(text if field.default is dataclasses.MISSING else f"{field.name} {text}")
     return f"{type(waveform).__name__}({', '.join(said)})"
 
 
 def drive_text(circuit: Circuit) -> str:
-    """Every source that is not 0 with its waveform: ``Vdrive: Sine(200 V, 100 Hz)``; not those that were replaced.
+    """Every source that is not 0 with its waveform: ``Vdrive: Sine(200 V, 100 Hz)``.
 
-    Those stand in `changes_text`.
+    Sources that were replaced are left out, as `changes_text` has them.
     """
     said = []
     replaced = {path.lower() for path in circuit.overrides}
     areas = {node for element in circuit.elements if element.spec.is_layer for node in element.nodes[2:]}
     for element in circuit.by_device("V", "I"):
         wave = element.waveform
-        # A V element on an area's node says how large the area is: it drives nothing.
+        # A V element at an area node gives the area, and drives nothing.
         if wave is None or wave == DC(0.0) or element.nodes[0] in areas or element.name.lower() in replaced:
             continue
         said.append(f"{element.name}: {waveform_text(wave, 'A' if element.device == 'I' else 'V')}")
@@ -62,7 +62,7 @@ def drive_text(circuit: Circuit) -> str:
 
 
 def changes_text(circuit: Circuit) -> str:
-    """What was changed after the deck was read, with the values now: ``Xgap.d = 5 um``; empty without changes."""
+    """What was changed after the deck was read, with its present value: ``Xgap.d = 5 um``; empty without changes."""
     known = {path.lower(): (path, parameter) for path, parameter in circuit.parameters.items()}
     said = []
     # A path may have been changed twice, in two spellings.
@@ -80,7 +80,7 @@ def changes_text(circuit: Circuit) -> str:
 
 
 def _as_given(text: str) -> str:
-    """What a parameter was set to, as far as that is worth reading."""
+    """The text to which a parameter was set, shortened where it is long."""
     kind = text.partition("(")[0]
     return text if len(text) <= 40 else f"{kind}(...)" if kind.isidentifier() else f"{text[:36]} ..."
 
@@ -98,7 +98,7 @@ def head_lines(circuit: Circuit) -> list[str]:
 
 
 def circuit_page(circuit: Circuit) -> Page:
-    """What a circuit is made of, and what its deck asks for."""
+    """The elements of a circuit and the analyses of its deck."""
     rows = []
     for element in circuit.elements[:MOST_ELEMENTS]:
         rows.append((element.name, element.device, " ".join(element.node_names), _cut(values_text(element), 96)))
@@ -131,7 +131,7 @@ def _deck_value(value: float) -> str:
     if 0.01 <= abs(value) < 1e4:
         return f"{value:.4g}"
     text = format_si(value, "").replace(" ", "")
-    # SPICE reads M as milli, and knows no P and E.
+    # SPICE reads M as milli, and does not know P and E.
     return f"{text[:-1]}meg" if text.endswith("M") else f"{value:.4g}" if text[-1:] in "PEZY" else text
 
 
@@ -140,7 +140,7 @@ def _cut(text: str, longest: int) -> str:
 
 
 def _quantity(value: float, unit: str) -> str:
-    # No prefix to a power of a unit or to an angle: a kmm^2 is no thousand mm^2.
+    # Powers of a unit and angles take no prefix: 1 kmm^2 would not be 1000 mm^2.
     return f"{value:.4g} {unit}".rstrip() if "^" in unit or unit in ("", "deg") else format_si(value, unit)
 
 

@@ -1,8 +1,8 @@
-"""Devices a netlist may use: one entry each, with nodes, parameters, and what a layer is made of.
+"""The devices of netlists: an entry for each, with its nodes, its parameters, and the cells of a layer.
 
-An entry is all that the reader, a run, a phasor and the export need. For ngspice a layer has a body of the same name,
-nodes, parameters and defaults in `fingerspice.lib` and `fingerspice_mobile.lib`; `tests/test_devices.py` goes through
-the entries and says what is missing there.
+The reader, runs, phasors and the export need nothing but the entry. For ngspice a layer also needs a body of the same
+name, nodes, parameters and defaults in `fingerspice.lib` and `fingerspice_mobile.lib`; `tests/test_devices.py` compares
+the two.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from fingerspice.circuit.usual import REST_AREA, Usual
 from fingerspice.physics.ladder import SKIN_LADDER
 from fingerspice.physics.materials import EPS0, SKIN_BAND, skin_permittivity, skin_resistivity
 
-#: Values in the netlist's units, and the frequency (Hz) whose data a dispersive material takes, or None for its cells:
-#: c (F/m^2), total leakage (S) and leakage per area (S/m^2) of cells in series, shape (n_cell, 3).
+#: From the values of an element (in the netlist's units) to its cells in series, shape (n_cell, 3): capacitance per
+#: area (F/m^2), total leakage (S) and leakage per area (S/m^2). The second argument is a frequency (Hz) at which a
+#: dispersive material is taken as one cell; None means all its cells.
 Cells = Callable[[Mapping[str, float], float | None], FloatArray]
 
 
@@ -31,13 +32,13 @@ class ParameterSpec:
     ----------
     name, unit : str
     default : float or None
-        None: required.
+        None where it has to be given.
     usual : Usual or None
-        Outside it a warning is given.
+        Range outside which a warning is given.
     may_be_zero, may_be_infinite : bool
-        Besides the positive numbers.
+        Whether 0, or infinity, is allowed besides positive numbers.
     least, most : float
-        Of the other numbers; far from any device's, so that products and quotients stay numbers.
+        Range of the other numbers: far beyond any device, and such that products and quotients do not overflow.
     """
 
     name: str
@@ -50,7 +51,7 @@ class ParameterSpec:
     most: float = 1e30
 
     def allowed(self) -> str:
-        """What the parameter may be, in words."""
+        """The allowed values in words."""
         words = ("0 or more" if self.may_be_zero else "more than 0") + (" or inf" if self.may_be_infinite else "")
         return f"{words}, from {self.least:g} to {self.most:g}"
 
@@ -67,7 +68,7 @@ class ParameterSpec:
 
 @dataclass(frozen=True)
 class DeviceSpec:
-    """A device: its nodes and parameters, and of a layer the cells it is made of."""
+    """A device: its nodes, its parameters, and for a layer the function that gives its cells."""
 
     name: str
     nodes: tuple[str, ...]
@@ -113,7 +114,7 @@ def _dispersive_cells(v: Mapping[str, float], at: float | None) -> FloatArray:
 _P = ParameterSpec
 _LAYER_NODES = ("p", "n", "area")
 
-# Usual ranges, each with what it is taken from.
+# Usual ranges, each with its source.
 
 # Sputtered and spun films have 10 nm to 10 um, foils up to 1 mm, cover glasses and screen protectors up to some mm.
 _COATING = Usual(10e-9, 1e-2, "from a sputtered film to a thick glass")
@@ -124,7 +125,7 @@ _SKIN = Usual(1e-6, 2e-3, "skin has 10 um, a fingertip 0.2 to 0.6 mm, callus ove
 _AIR = Usual(10e-9, 100e-6, "from van der Waals contact to ridges off the screen; 3.5 um in Table 1")
 # Air has 1, polymers 2 to 10, ceramics up to some thousand.
 _EPS_R = Usual(1.0, 1e4, "air has 1, polymers 2 to 10, ceramics up to some thousand")
-# Of what conducts a little, such as skin at low frequencies (the ladder's first slab), it is up to 1e5.
+# Weak conductors, such as skin at low frequencies (the first slab of its ladder), have up to 1e5.
 _EPS_R_MATERIAL = Usual(1.0, 1e6, "polymers have 2 to 10, skin at low frequencies up to 1e5")
 # 0.2 and 1 megohm in Table 1. Sweat in the gap (some ohm m, a few um, 35 mm^2) gives an ohm; a good polymer, 1e14 ohm m
 # at 100 um, gives 1e14 ohm.
@@ -139,17 +140,17 @@ _LOAD = Usual(1e-3, 49.9, "a finger touches with 0.1 to 5 N", "newton, not milli
 _FRICTION = Usual(0.01, 5.0, "dry skin on glass has 0.1 to 1, moist skin up to 3")
 # Table 1 has 54.4; at 1 N this is the area (Eq. 5), which may be that of a pencil's tip or of a palm.
 _ALPHA = Usual(1.0, 2000.0, "the ridge area at 1 N; 54.4 in Table 1", "mm^2 and N")
-# 2/3 for a smooth ball (Hertz), up to 1 for a rough plane; measured fingers have 0.2 to 0.8, Table 1 0.52.
+# A smooth ball has 2/3 (Hertz), a rough plane up to 1; measured fingers have 0.2 to 0.8, Table 1 has 0.52.
 _M_EXP = Usual(0.1, 1.0, "2/3 for a ball, 1 for a rough plane, 0.52 in Table 1")
-# Table 1 has 32 and 1.41: area against the contact's radius, pi and 2 for a disc that is all in contact.
+# Table 1 has 32 and 1.41; a disc that is wholly in contact has pi and 2.
 _BETA = Usual(0.3, 1e4, "pi for a full disc, 32 in Table 1", "mm")
 _N_EXP = Usual(0.5, 3.0, "2 for a full disc, 1.41 in Table 1")
-# Table 1 has 5000: at 0.15 N of friction a tenth of a fingertip's area squared.
+# Table 1 has 5000: with 0.15 N of friction that is a tenth of the square of a fingertip's area.
 _C2 = Usual(1.0, 1e6, "5000 in Table 1", "mm^4/N^2")
 # Skin creeps within 1 ms to some seconds.
 _TAU = Usual(1e-5, 60.0, "skin creeps within 1 ms to some seconds")
 _BAND = Usual(*SKIN_BAND, "where the data of Eqs. 18 and 19 were measured")
-# From a lead to an insulator; from a picofarad's fraction between leads to a supply's capacitor.
+# Resistances of leads to insulators; capacitances of a fraction of a picofarad between leads to that of a supply.
 _OHM = Usual(1e-3, 1e15, "a lead has milliohms, an insulator up to 1e15 ohm")
 _FARAD = Usual(1e-16, 1e-2, "a body has 150 pF to ground, a supply's capacitor some mF")
 
@@ -205,9 +206,9 @@ DEVICES: dict[str, DeviceSpec] = {
         DeviceSpec("I", ("p", "n"), ()),
     )
 }
-"""Every device the reader knows."""
+"""Every device that the reader knows, by name."""
 
 
 def layer_devices() -> tuple[str, ...]:
-    """Names of the layers, which need no definition in a netlist: X lines call them."""
+    """Names of the layers, which X lines call without a definition in the netlist."""
     return tuple(name for name, spec in DEVICES.items() if spec.is_layer)

@@ -1,4 +1,4 @@
-"""What a user should be told of a circuit before it runs: what has no effect, and a skin of another frequency."""
+"""Warnings of a circuit before it runs: directives without effect, and a skin taken at another frequency."""
 
 from __future__ import annotations
 
@@ -11,27 +11,28 @@ from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.circuit.topology import find_branches
 from fingerspice.waveforms.waveform import Waveform
 
-# A band about a frequency, relative, over which the skin's data change by 3 %, and the energy that may lie outside.
-_NEAR, _FAR = 0.05, 0.01
-# Directives that a deck has for ngspice's sake.
+# Half width of a band around a frequency, relative to it, in which the skin's data change by 3 %; and the share of the
+# source's energy that may lie outside the band.
+_BAND, _OUTSIDE = 0.05, 0.01
+# Directives that only ngspice needs, of which no warning is given.
 _FOR_NGSPICE = (".nodeset", ".options")
 
 
 def circuit_warnings(circuit: Circuit) -> tuple[str, ...]:
-    """What of a deck has no effect, and where a SKIN's data are not taken at the source's fundamental."""
+    """Warnings of what has no effect in a deck, and of a SKIN whose frequency is not the source's fundamental."""
     return (*directive_warnings(circuit), *_skin_warnings(circuit))
 
 
 def directive_warnings(circuit: Circuit) -> tuple[str, ...]:
-    """What of a deck has no effect."""
+    """Warnings of directives without effect."""
     return tuple(f"{name} has no effect here" for name in circuit.unused if not name.startswith(_FOR_NGSPICE))
 
 
 def _is_near(circuit: Circuit, wave: Waveform, f: float) -> bool:
-    """Whether a source has its energy close to a frequency (Hz), as a carrier under a slow envelope has."""
+    """Whether nearly all of a source's energy is close to a frequency (Hz), as for a carrier with a slow envelope."""
     stop = circuit.tran.stop if circuit.tran is not None else math.nan
-    band = f * (1.0 - _NEAR), f * (1.0 + _NEAR)
-    return stop > 0.0 and sum(energy_outside(wave, stop, band)) < _FAR
+    band = f * (1.0 - _BAND), f * (1.0 + _BAND)
+    return stop > 0.0 and sum(energy_outside(wave, stop, band)) < _OUTSIDE
 
 
 def _skin_warnings(circuit: Circuit) -> Iterator[str]:
@@ -43,7 +44,7 @@ def _skin_warnings(circuit: Circuit) -> Iterator[str]:
     else:
         waves = [e.waveform for e in find_branches(circuit)[1] if e.waveform is not None]
         if len(waves) > 1:
-            # Which of several sources the skin's data should match is the user's to know.
+            # With several sources only the user can know at which frequency the skin should be taken.
             return
         wave = waves[0] if waves else None
     fundamental = None if wave is None else wave.fundamental

@@ -1,4 +1,4 @@
-"""Linear response of a circuit at one frequency: voltages of its layers, and the areas that follow them."""
+"""Linear response of a circuit at one frequency: the voltages of its layers and the areas that belong to them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fingerspice.waveforms.waveform import Fundamental
 
 
 class LinearScene(Protocol):
-    """A circuit with one contact as its phasors see it."""
+    """What the phasors of a circuit with one contact need to know of it."""
 
     @property
     def contact(self) -> Contact: ...
@@ -27,7 +27,7 @@ class LinearScene(Protocol):
     def fundamental(self) -> Fundamental | None: ...
     @property
     def sources(self) -> tuple[tuple[Element, float], ...]:
-        """Each source with the sign it drives with."""
+        """Each source with its sign along the loop."""
         ...
 
     @property
@@ -44,7 +44,7 @@ class LinearScene(Protocol):
 
     @property
     def fixed(self) -> bool:
-        """Whether the deck gives that area."""
+        """Whether the deck fixes that area."""
         ...
 
     def areas(self, f: float, area: str | float, amplitude: float) -> FloatArray:
@@ -52,7 +52,7 @@ class LinearScene(Protocol):
         ...
 
     def layer_gain(self, f: float, areas: FloatArray) -> ComplexArray:
-        """Voltage of each layer from p to n over the source's, shape (n_layer,)."""
+        """Ratio of each layer's voltage (from p to n) to the source's, shape (n_layer,)."""
         ...
 
 
@@ -130,7 +130,13 @@ class _NetworkScene:
 
 
 def linear_scene(circuit: Circuit) -> LinearScene:
-    """The circuit's contact and what drives it."""
+    """What the phasors of a circuit need: its contact, sources and layers, and its response.
+
+    Raises
+    ------
+    InputError
+        For a circuit without GAP, or a network with several GAPs or sources.
+    """
     if is_stack(circuit):
         stack = build_stack(circuit)
         if stack.gap_layer is None or stack.contact is None:
@@ -199,9 +205,9 @@ def _coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
             contact, gap = network.contacts[i], network.gaps[i]
             if network.areas[i].given is None and contact is not None and gap is not None:
                 new[i] = float(contact.area(float(u[gap]) / math.sqrt(2.0)))
-        # What is no number never settles, and is refused where it is used.
+        # Areas that are no numbers do not converge; the caller refuses them.
         if np.all(np.abs(new - area) <= 4e-16 * area) or not np.all(np.isfinite(new)):
             return new
-        # Two areas may swing against each other.
+        # Two areas may oscillate against each other: take the mean.
         area = new if attempt < 50 else 0.5 * (area + new)
     raise InputError("the phasor's areas do not settle; allowed: area='frozen' or an area in m^2")

@@ -1,4 +1,4 @@
-"""What a source's spectrum says about the skin: how much of it lies off the data, and what one frequency would miss."""
+"""A source's spectrum and the skin: the energy outside the skin's data, and the error of data at one frequency."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.physics.phasor import layer_gains
 from fingerspice.waveforms.waveform import Waveform
 
-# Samples of a spectrum, at most; and the periods of a periodic source that stand for a run of many.
+# Largest number of samples of a spectrum, and number of periods that represent a longer run of a periodic source.
 _MOST_SAMPLES = 2**19
 _PERIODS = 16
-# Share of the source's energy outside the band of the skin's data that is worth a warning.
+# Share of the source's energy outside the band of the skin's data from which on a warning is given.
 NOTABLE = 0.01
-# Of the change of the area over the run, what its harmonics lose where the skin stands still at the fundamental: 0.004
-# was found where the area changes by a quarter (sine of 200 V and 100 Hz).
+# The area's harmonics also meet the skin's data. Taken at the fundamental, these cause a further relative error of at
+# most this times the relative change of the area: 0.004 was found where the area changes by a quarter (sine of 200 V
+# and 100 Hz).
 _COUPLING = 0.05
 
 
 def _samples(waveform: Waveform, t0: float, t1: float, rate: float) -> FloatArray:
-    """The source at the middles of equal intervals, at least `rate` per second where that many are allowed."""
+    """The source at the midpoints of equal intervals, `rate` or more per second unless that is too many."""
     count = int(min(_MOST_SAMPLES, max(1024, 2 ** math.ceil(math.log2((t1 - t0) * rate)))))
     return np.asarray(waveform.value(t0 + (np.arange(count) + 0.5) * ((t1 - t0) / count)))
 
@@ -34,8 +35,8 @@ def energy_outside(
 ) -> tuple[float, float]:  # fmt: skip
     """Shares of the source's energy below and above a band (Hz), by default that of the skin's data.
 
-    Over one period of a periodic source, else over the run to `t_stop` (s), weighted by a Hann window so that its ends
-    are no jumps. Sources that are not finite count as inside.
+    They are taken over one period of a periodic source, and else over the run to `t_stop` (s) with a Hann window, so
+    that its ends are no jumps. A source that is not finite counts as inside.
     """
     low, high = band
     periodic = waveform.period is not None
@@ -50,13 +51,13 @@ def energy_outside(
     energy[1:] *= 2.0
     f = np.arange(energy.size) / span
     total = float(energy.sum())
-    # A bin is as wide as the window is short: what lies within one of the band's lower edge is in the band.
+    # The window spreads a line over the neighbouring bins, so one bin below the band counts as inside.
     below = f < low - (0.0 if periodic else 1.0 / span)
     return (float(energy[below].sum() / total), float(energy[f > high].sum() / total)) if total > 0.0 else (0.0, 0.0)
 
 
 def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> str | None:
-    """A sentence where a dispersive skin is driven outside the band of its data."""
+    """A warning where a dispersive skin is driven outside the band of its data, or None."""
     skins = circuit.by_device("SKIN_DISPERSIVE")
     if not skins or not (math.isfinite(t_stop) and t_stop > 0.0):
         return None
@@ -72,9 +73,10 @@ def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> str
 
 
 def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity: float, t_stop: float) -> float:
-    """What the gap voltage would be off, relative to its peak, with a dispersive skin's data taken at one frequency.
+    """Error of the gap voltage, relative to its peak, with a dispersive skin's data taken at one frequency.
 
-    The linear response at one area, by superposition of phasors, from the uncharged start; and what the area adds.
+    It is that of the linear response at one area from the uncharged start, by superposition of phasors, plus an
+    estimate of what the change of the area adds.
 
     Parameters
     ----------
@@ -93,7 +95,7 @@ def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity:
     assert gap is not None
     span = min(t_stop, _PERIODS / frequency)
     u = _samples(dispersive.waveform, 0.0, span, 200.0 * frequency)
-    # As much silence after the run: its end does not come round to its start.
+    # The run is followed by silence of equal length, so that the discrete transform does not wrap its end round.
     lines = np.fft.rfft(u, 2 * u.size)
     f = np.arange(1, lines.size) / (2.0 * span)
     gains = [layer_gains(stack.admittance(f, np.array([area])))[:, gap] for stack in (dispersive, frozen)]

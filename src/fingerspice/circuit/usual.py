@@ -1,4 +1,4 @@
-"""What values usually are, beside what they may be: what lies outside is computed all the same, and warned about."""
+"""Usual ranges of values: values outside are allowed and computed, with a warning."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from fingerspice.base.units import format_si, spice_text
 
-# Units that take a prefix, so that a slip is a factor of a thousand; in the others it is m^2 for mm^2, a million.
+# Units that take a prefix, in which slips are powers of 1000; in the other units m^2 is written for mm^2.
 _PREFIXED = ("m", "N", "Pa", "ohm", "ohm m", "V", "V/m", "F", "Hz", "s")
 _THOUSANDS = tuple(sign * 3 * k for k in (1, 2, 3, 4, 5) for sign in (-1, 1))
 _MILLIONS = {"mm^2": (6, -6), "mm^2/N^m": (6, -6), "mm^4/N^2": (12, -12)}
@@ -16,16 +16,16 @@ _MILLIONS = {"mm^2": (6, -6), "mm^2/N^m": (6, -6), "mm^4/N^2": (12, -12)}
 
 @dataclass(frozen=True)
 class Usual:
-    """Range of a quantity in its unit, both ends inside.
+    """Usual range of a quantity, both ends included.
 
     Attributes
     ----------
     least, most : float
-        Of the quantity's size; 0 and inf stand for "none" where they are allowed, and are never warned about.
+        Of the quantity's size, in its unit. 0 and inf stand for "none" where they are allowed; they cause no warning.
     source : str
-        What the range is taken from, in words that fit into brackets.
+        Where the range comes from, in words for brackets.
     slip : str
-        The unit, against the one that it is often taken for.
+        The unit and the one for which it is often taken, such as ``newton, not millinewton``.
     """
 
     least: float
@@ -34,7 +34,7 @@ class Usual:
     slip: str = ""
 
     def warning(self, what: str, value: float, unit: str) -> str | None:
-        """What to say about a value that lies outside; None where it lies inside.
+        """The warning of a value outside the range; None for one inside.
 
         Parameters
         ----------
@@ -55,7 +55,7 @@ class Usual:
         return f"{said}; was {meant} meant?" if meant else said
 
     def _meant(self, value: float, unit: str) -> str:
-        """The same digits in other units, where that is usual: at most three, the nearest first."""
+        """The same digits with other prefixes that would be usual: at most three, the nearest first."""
         powers = _THOUSANDS if unit in _PREFIXED else _MILLIONS.get(unit, ())
         found = [float(f"{value:.12g}") * 10.0**power for power in powers]
         texts = [spice_text(x) for x in found if self.least <= abs(x) <= self.most][:3]
@@ -66,32 +66,32 @@ def _shown(value: float, unit: str) -> str:
     return format_si(value, unit) if unit in _PREFIXED else f"{value:.4g} {unit}".rstrip()
 
 
-#: The area of a finger's ridges on the screen, mm^2: 35 in Table 1. A hair's tip has 0.01, a palm some thousand.
+#: Area of a finger's ridges on the screen, mm^2: Table 1 has 35, the tip of a hair 0.01, a palm some thousand.
 REST_AREA = Usual(0.1, 2000.0, "a fingertip has 20 to 400, a palm some 1000", "mm^2, not m^2")
 
-#: Of a source, by the unit of its parameter. Screens for electrovibration take 10 to 400 V, electroadhesive grippers up
-#: to some kV. The skin feels up to 1 kHz; carriers lie up to some 100 kHz, and the skin's data end at 100 kHz.
+#: Usual ranges of sources, by the unit of the parameter. Screens for electrovibration take 10 to 400 V, electroadhesive
+#: grippers some kV. The skin feels up to 1 kHz; carriers have up to some 100 kHz, where the skin's data end.
 SOURCES = {
     "V": Usual(0.0, 10e3, "screens take up to 400 V, grippers some kV"),
     "Hz": Usual(10e-3, 10e6, "a finger feels up to 1 kHz, carriers have up to some 100 kHz"),
 }
 
-#: Largest of results, N, Pa and m^2. A finger bears 100 N; air breaks down long before an electric pressure of 10 MPa
-#: (1.5 GV/m), and most solids do; no finger has 10 cm^2.
+#: Largest plausible results, N, Pa and m^2. A finger bears 100 N. Air, and most solids, break down far below an
+#: electric pressure of 10 MPa (1.5 GV/m). No finger has a contact of 10 cm^2.
 LARGEST_FORCE = 100.0
 LARGEST_PRESSURE = 10e6
 LARGEST_AREA = 1e-3
 
 
 def beyond_fingers(where: str, force: float, pressure: float, area: float) -> Iterator[str]:
-    """Warnings of results that are out of this world.
+    """Warnings of results that no finger can have.
 
     Parameters
     ----------
     where : str
         Empty, or such as `` of Xgap``.
     force, pressure, area : float
-        The largest, N, Pa and m^2.
+        Largest values of the run, N, Pa and m^2.
     """
     for what, value, largest, unit, source in (
         ("electroadhesive force", force, LARGEST_FORCE, "N", "as much as a finger bears"),

@@ -1,4 +1,4 @@
-"""Values of parameters: numbers in SPICE's notation with the traps of its units, and what is not usual."""
+"""Values of parameters: numbers in SPICE's notation, units that SPICE takes for scales, and unusual values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _UNIT_TRAPS = {"F": "farad", "N": "newton"}
 
 
 def unit_trap(spec: ParameterSpec, text: str) -> str | None:
-    """Why a number whose unit SPICE takes for a scale is refused."""
+    """Why a number is refused whose unit SPICE would take for a scale; None where it is not."""
     word = _UNIT_TRAPS.get(spec.unit)
     if not word or not unit_read_as_scale(text, spec.unit, word):
         return None
@@ -28,12 +28,12 @@ def unit_trap(spec: ParameterSpec, text: str) -> str | None:
 
 
 def is_resistance(spec: ParameterSpec) -> bool:
-    """Whether a capital M is likely to be meant as mega."""
+    """Whether the parameter is a resistance, in which a capital M is probably meant as mega."""
     return spec.unit in ("ohm", "ohm m")
 
 
 def mega_note(text: str, value: float, spec: ParameterSpec) -> str:
-    """What to say where a resistance holds a capital M."""
+    """The warning of a capital M in a resistance."""
     return (
         f"{text!r} is milli ({value:g} {spec.unit}), as everywhere in SPICE; for mega{spec.unit.partition(' ')[0]} "
         f"write {suggest_mega(text)}"
@@ -41,22 +41,22 @@ def mega_note(text: str, value: float, spec: ParameterSpec) -> str:
 
 
 def value_of(path: str, given: Any, spec: ParameterSpec | None, unit: str) -> tuple[float, str | None]:
-    """A parameter's new value, a number or text such as ``3.5u``; and a warning where its unit is a trap.
+    """A parameter's new value, and a warning about how it is written, or None.
 
     Parameters
     ----------
     path : str
         Such as ``Xgap.d``.
     given : float or str
-        In the netlist's unit.
+        In the netlist's unit; a text such as ``3.5u``.
     spec : ParameterSpec or None
-        None of a waveform's parameter.
+        None for a parameter of a waveform.
     unit : str
 
     Raises
     ------
     InputError
-        When it is no number, or its unit is one that SPICE takes for a scale.
+        When it is no number, or has a unit that SPICE takes for a scale.
     """
     if isinstance(given, Real) or (hasattr(given, "__float__") and getattr(given, "ndim", 1) == 0):
         return float(given), None
@@ -80,7 +80,7 @@ def value_of(path: str, given: Any, spec: ParameterSpec | None, unit: str) -> tu
 
 
 def unusual(element: Element) -> Iterator[tuple[str, str]]:
-    """What is legal in an element and not usual: the parameter, or none of them, and what to say."""
+    """Warnings of unusual values in an element, each with the parameter's name, empty for the element as a whole."""
     found = [(p.name, p.unusual(element.name, element.values[p.name])) for p in element.spec.parameters]
     if element.waveform is not None:
         found = [

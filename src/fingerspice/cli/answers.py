@@ -1,4 +1,4 @@
-"""What `--json` answers: for each command the same keys whatever the circuit and however it ended (docs/json.md)."""
+"""The answers of `--json`: each command has the same keys for every circuit and every outcome (docs/json.md)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COMMON = (
     *("version", "command", "success", "status", "message", "failure", "warnings", "files"),
     *("title", "overrides", "charge_law", "method", "rtol"),
 )
-#: Keys that a command has beside them.
+#: Further keys of each command.
 OWN: dict[str, tuple[str, ...]] = {
     "run": ("area", "tier", "t_stop", "figures_from", "error", "fundamental", "fold_margin_min", "signals"),
     "ac": ("area", "skin", "sweeps"),
@@ -27,20 +27,20 @@ OWN: dict[str, tuple[str, ...]] = {
     "export": (),
     "figures": (),
 }
-#: Figures of a signal, each null where it has none.
+#: Figures of a signal; those that a signal lacks are null.
 FIGURES = ("min", "max", "peak", "mean", "rms", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
 _UNITS = {"u_source": "V", "u_gap": "V", "u_layer": "V", "v": "V", "area": "m^2", "f_el": "N", "f_t": "N"}
 
 
 def blank(command: str | None) -> Answer:
-    """An answer of which nothing is known yet."""
+    """An answer in which nothing is known yet."""
     keys = (*COMMON, *OWN.get(command or "", ()))
     known = {"version": __version__, "command": command, "success": False}
     return {**dict.fromkeys(keys), "warnings": [], "files": [], "overrides": {}, **known}
 
 
 def of_circuit(circuit: Circuit, charge_law: str | None) -> Answer:
-    """What an answer says of its circuit.
+    """The part of an answer that describes the circuit.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def of_circuit(circuit: Circuit, charge_law: str | None) -> Answer:
 
 
 def of_run(solution: Solution) -> Answer:
-    """A run: how it was made, and a row of figures for every signal, SI units."""
+    """The part of an answer that describes a run: how it was made, and figures of every signal in SI units."""
     s = solution.summary()
     names = [key.removesuffix("_peak") for key in s if key.endswith("_peak")]
     return {
@@ -74,7 +74,7 @@ def of_run(solution: Solution) -> Answer:
 
 
 def of_plan(plan: Plan) -> Answer:
-    """A plan; its own area is that of a model with one area."""
+    """The part of an answer that describes a plan; `plan_area` is the area of a model with one area."""
     found = plan.to_dict()
     return {**{key: found[key] for key in OWN["plan"] if key in found and key != "area"}, "plan_area": plan.area}
 

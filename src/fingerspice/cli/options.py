@@ -1,4 +1,4 @@
-"""What the command line's options mean, and the checks before a run: nothing here writes a file."""
+"""Meaning of the command line's options, and checks before a run; nothing here writes a file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from fingerspice.waveforms.waveform import Waveform
 
 LARGEST_AREA = 0.01
-"""m^2; an area above it was probably given in mm^2."""
+"""m^2; a larger area was probably given in mm^2."""
 
 
 def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | None) -> Circuit:
@@ -46,7 +46,7 @@ def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | Non
 
 
 def _with_changes(circuit: Circuit, changes: list[str]) -> Circuit:
-    """The circuit with every ``--set``, all at once: exponents may have to change together."""
+    """The circuit with all ``--set`` at once, as exponents may have to change together."""
     values: dict[str, str] = {}
     for change in changes:
         path, equals, text = (part.strip() for part in change.partition("="))
@@ -58,12 +58,12 @@ def _with_changes(circuit: Circuit, changes: list[str]) -> Circuit:
     try:
         return circuit.replace(values)
     except InputError as error:
-        # The deck's line is not at fault.
+        # The place in the deck is left out, as the fault is not there.
         raise InputError(f"--set {' '.join(map(repr, changes))}: {error.message}") from None
 
 
 def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
-    """The circuit with every ``--source``: the name may be left out where there is one source."""
+    """The circuit with every ``--source``; its name may be left out where the circuit has one source."""
     from fingerspice.circuit.arguments import overridden
     from fingerspice.circuit.topology import find_branches
     from fingerspice.netlist.netlist import source_from_text
@@ -74,7 +74,7 @@ def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
     sources: dict[str, Waveform] = {}
     for text in texts:
         named, equals, spec = (part.strip() for part in text.partition("="))
-        # The = of a parameter, as in PWL(...) r=10m, follows no name alone.
+        # In PWL(...) r=10m what precedes the = is more than a name.
         if not (equals and named.replace(".", "").isidentifier()):
             named, spec = "", text
         known = ", ".join(names.values())
@@ -100,7 +100,7 @@ def time_from_text(option: str, text: str | None) -> float | None:
 
 
 def check_stop(circuit: Circuit, t_stop: float | None) -> None:
-    """Refuse an end (s) before the deck's first output step is over."""
+    """Refuse an end (s) before the deck's second output."""
     tran = circuit.tran
     if t_stop is not None and tran is not None and 0.0 < t_stop < tran.start + tran.step:
         raise InputError(
@@ -110,7 +110,7 @@ def check_stop(circuit: Circuit, t_stop: float | None) -> None:
 
 
 def area_from_text(text: str) -> str | float:
-    """A mode's name, or an area in m^2."""
+    """The name of a mode, or an area in m^2."""
     try:
         area = parse_number(text)
     except ValueError:
@@ -125,7 +125,7 @@ def area_from_text(text: str) -> str | float:
 
 
 def check_output(file: Path, deck: Path | None = None) -> None:
-    """Refuse an output that cannot be written, or is the deck, before spending time on the run; writes nothing."""
+    """Refuse an output that cannot be written, or is the deck, before time is spent on the run; writes nothing."""
     try:
         _check_output(file, deck)
     except OSError as error:
@@ -136,7 +136,7 @@ def _check_output(file: Path, deck: Path | None) -> None:
     folder = file.parent
     while not folder.exists() and folder != folder.parent and not folder.is_symlink():
         folder = folder.parent
-    # A name that is too long is found only by looking for the file itself, in a folder that is there.
+    # Only looking for the file in a folder that exists shows whether its name is too long.
     (folder / file.name).exists()
     if not folder.is_dir():
         raise InputError(f"cannot write {file}: {folder} is not a folder; allowed: a folder that can be written")
@@ -149,7 +149,7 @@ def _check_output(file: Path, deck: Path | None) -> None:
 
 
 def sweep(text: str | None, circuit: Circuit) -> AcSweep:
-    """The sweep of ``--sweep``, or without it the deck's; else the band of the skin's data."""
+    """The sweep of ``--sweep``, else the deck's, and else the band of the skin's data."""
     from fingerspice.circuit.circuit import AcSweep
     from fingerspice.netlist.directives import sweep_from_text
 

@@ -1,4 +1,4 @@
-"""Where a command's results go: files named after the deck, and which of those there already may be replaced."""
+"""Files of a command's results: named after the deck, and never written over the results of another circuit."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from fingerspice.cli.terminal import complain
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
 
-#: Where results go unless another folder is named.
+#: Folder of the results unless another one is named.
 FOLDER = Path("out")
-#: How the commands' tables begin.
+#: The beginnings of the commands' tables.
 _HEADS = (b"t [s],u_source", b"frequency [Hz],gain [1],", b"parameter,value [SI],unit,")
-#: What a file has to say for its circuit to be known.
+#: Attributes by which a file identifies its circuit.
 _KNOWN = ("deck_sha256", "overrides", "charge_law")
 
 
@@ -32,15 +32,15 @@ class Results:
     ----------
     deck : Path
     circuit : Circuit
-        With everything that was changed.
+        The circuit with all changes.
     folder : Path or None
         `FOLDER` by default.
     name : str or None
-        Of the files, without their ends; the deck's by default.
+        Name of the files without their endings; that of the deck by default.
     overwrite : bool
-        Whether files of other circuits, or of none that is known, may be replaced.
+        Whether files of other circuits, or of an unknown one, may be replaced.
     charge_law : str or None
-        As asked for.
+        The charge law asked for.
     """
 
     def __init__(
@@ -68,12 +68,12 @@ class Results:
         }  # fmt: skip
 
     def file(self, end: str) -> Path:
-        """A file with this end, which may be written; nothing is written yet.
+        """Path of the file with this ending, checked and not yet written.
 
         Raises
         ------
         InputError
-            Where it cannot be written, or holds what must not be replaced.
+            Where it cannot be written, or must not be replaced.
         """
         file = self.folder / f"{self.name}{end}"
         check_output(file, self.deck)
@@ -84,13 +84,13 @@ class Results:
 
     @property
     def about(self) -> dict[str, str]:
-        """What a picture keeps as text: what it and the files beside it were made from."""
+        """Texts kept in a picture: the circuit, and the files that were made with the picture."""
         return {**self._own, "files": json.dumps(self.names)}
 
     def open(self) -> None:
-        """Make the folder, where it is the one that nobody named: so that no version control takes it for sources."""
+        """Put a .gitignore into the default folder when it is made, which keeps results out of version control."""
         if not self.named and not self.folder.exists():
-            # Where that fails the results do too, with their own message.
+            # Where this fails writing the results will fail, too, with a message.
             with suppress(InputError):
                 write_aside(self.folder / ".gitignore", lambda path: path.write_text("*\n"))
 
@@ -130,19 +130,19 @@ def _hash(text: str) -> str:
 
 
 def _held(file: Path) -> dict[str, str] | None:
-    """What a file says that it was made from; None where it does not."""
+    """From what a file was made, by its own attributes; None where it has none."""
     try:
         found = _of_data(file) if file.suffix == ".nc" else _of_picture(file)
         if found is None or not all(isinstance(found.get(key), str) for key in _KNOWN):
             return None
         return found if isinstance(json.loads(found["overrides"]), dict) else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, SyntaxError):
-        # Whatever it is, it is not ours.
+        # The file was not written by this package.
         return None
 
 
 def _is_table(file: Path) -> bool:
-    """Whether a file begins as the tables that the commands write."""
+    """Whether a file begins like the tables that the commands write."""
     with suppress(OSError), file.open("rb") as stream:
         return stream.read(100).startswith(_HEADS)
     return False
@@ -157,7 +157,7 @@ def _of_data(file: Path) -> dict[str, str]:
 
 
 def _of_picture(file: Path) -> dict[str, str] | None:
-    """Of a picture its own text; of a table that of the picture beside it, which names the files it was made with."""
+    """Attributes of a picture, or for a table those of the picture beside it, which names the files made with it."""
     from PIL import Image
 
     picture = file.with_suffix(".png")
@@ -168,6 +168,6 @@ def _of_picture(file: Path) -> dict[str, str] | None:
         text: dict[str, Any] = dict(getattr(image, "text", {}))
     data = file.with_suffix(".nc")
     if not text.get("files") and file.suffix == ".png" and data.is_file():
-        # Pictures did not always say it; the data beside them did.
+        # Pictures of earlier versions have no list of files; the data beside them have the attributes.
         return _of_data(data)
     return text if file.name in json.loads(text.get("files", "[]")) else None

@@ -1,4 +1,4 @@
-"""What the command line prints: nothing that a deck could turn against the terminal, and no traceback."""
+"""Output of the command line: without control characters of a deck, and without tracebacks."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from fingerspice.base.errors import FingerspiceWarning, InputError, printable
 from fingerspice.cli.answers import OWN, blank
 from fingerspice.results.outcome import SolveError
 
-#: Characters of a printed line; of a longer one the middle is left out.
+#: Characters of a printed line; the middle of a longer one is left out.
 LONGEST_LINE = 2000
 Report = dict[str, Any]
 Write = Callable[[], Path]
 
 
 def json_text(data: Report) -> str:
-    """JSON with null for what is not a number: NaN is no JSON."""
+    """Data as JSON, with null for NaN and infinities, which JSON lacks."""
 
     def clean(x: Any) -> Any:
         if isinstance(x, dict):
@@ -40,28 +40,28 @@ def json_text(data: Report) -> str:
 
 
 def say(text: str = "", end: str = "\n") -> None:
-    """Print lines of text, whoever wrote them."""
+    """Print lines of text that may come from a deck."""
     _print("\n".join(printable(line, LONGEST_LINE) for line in text.split("\n")), end)
 
 
 def say_json(data: Report) -> None:
-    """Print data as JSON, in which nothing but ASCII stands."""
+    """Print data as JSON in ASCII."""
     _print(json_text(data), "\n")
 
 
 def _print(text: str, end: str) -> None:
-    """Print, and know that it has arrived: a full disk is bad input, a reader (head, less) that has gone is nothing."""
+    """Print and flush: a full disk is an `InputError`, a reader that has gone away (head, less) is no error."""
     try:
         print(text, end=end, flush=True)
     except OSError as error:
-        # Python would try again at its end, and complain.
+        # Python would flush again at its end, and report the error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(error, BrokenPipeError):
             raise InputError(f"cannot write to the standard output: {error.strerror}") from None
 
 
 def complain(text: str) -> None:
-    """A line on stderr; that nobody reads it changes nothing."""
+    """Write a line to stderr; that nobody reads it is no error."""
     try:
         print(f"fingerspice: {printable(text, LONGEST_LINE)}", file=sys.stderr, flush=True)
     except OSError:
@@ -69,7 +69,7 @@ def complain(text: str) -> None:
 
 
 class _Notes(logging.Handler):
-    """What the package logs (that it compiles, and where it could not keep what it compiled), as lines on stderr."""
+    """Writes what the package logs, such as that it compiles, as lines to stderr."""
 
     def emit(self, record: logging.LogRecord) -> None:
         complain(f"note: {record.getMessage()}")
@@ -79,7 +79,7 @@ _NOTES = _Notes()
 
 
 def listen() -> None:
-    """Show what the package logs."""
+    """Show what the package logs as lines on stderr."""
     logger = logging.getLogger("fingerspice")
     logger.setLevel(logging.INFO)
     logger.addHandler(_NOTES)
@@ -87,7 +87,7 @@ def listen() -> None:
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """One sentence instead of a traceback, and the exit code that says which kind."""
+    """End with one sentence instead of a traceback, and with the exit code of its kind."""
     try:
         yield
     except Exception as error:
@@ -95,7 +95,7 @@ def plain_errors() -> Iterator[None]:
 
 
 def is_input(error: Exception) -> bool:
-    """Whether it is the input, or what it asks for, that has to change."""
+    """Whether the input, or what it asks for, has to change."""
     return isinstance(error, (InputError, MemoryError))
 
 
@@ -116,17 +116,17 @@ def _fail(message: str, code: int) -> NoReturn:
 
 
 class Answering:
-    """One command's answer: gathered on the way, said at its end in the language asked for.
+    """The answer of one command, collected while it runs and printed at its end as text or JSON.
 
-    Used as a context: warnings become lines on stderr, each once, and part of the answer; where JSON is wanted it is
-    printed however the command ends.
+    It is used as a context. Each warning becomes one line on stderr and a part of the answer. JSON, where it is wanted,
+    is printed in whichever way the command ends.
 
     Parameters
     ----------
     command : str
     as_json : bool
     known : any
-        What the answer holds from the start.
+        Values of keys that are known from the start.
     """
 
     def __init__(self, command: str, as_json: bool, **known: Any) -> None:
@@ -160,18 +160,18 @@ class Answering:
         say_json(self.data)
 
     def update(self, **found: Any) -> None:
-        """Add what was found."""
+        """Set keys of the answer."""
         self.data.update(found)
 
     def give(self, text: Callable[[], str], writes: Sequence[Write] = ()) -> None:
-        """Write files, then say in words what was found, and where JSON is not wanted instead.
+        """Write files, then print the result as text unless JSON is wanted.
 
-        Where a file cannot be written, what was found is said all the same, and then why the file is missing.
+        Where a file cannot be written the text is printed all the same, before the error is raised.
 
         Parameters
         ----------
         text : callable
-            What was found.
+            Gives the result as text.
         writes : sequence of callable
             Each writes a file and returns its path.
 
@@ -195,7 +195,7 @@ class Answering:
 
 
 def answer_usage(message: str) -> None:
-    """The answer to a command line that is none, where it asks for JSON."""
+    """Answer a command line that typer refused, where it asks for JSON."""
     words = sys.argv[1:]
     if "--json" in words:
         command = next((word for word in words if word in OWN), None)
@@ -204,7 +204,7 @@ def answer_usage(message: str) -> None:
 
 @contextmanager
 def progress(what: str = "simulating") -> Iterator[Callable[[float], None] | None]:
-    """A bar on a terminal, shown only once what is done takes more than a second."""
+    """A progress bar on a terminal, which appears after one second."""
     if not sys.stderr.isatty():
         yield None
         return

@@ -1,4 +1,4 @@
-"""A solution as files and tables: CSV, NetCDF, xarray, pandas."""
+"""A solution as a file or a table: CSV, NetCDF, xarray, pandas."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 
     from fingerspice.results.solution import Solution
 
-#: Of a file, what besides its variables makes a run of it, and how that is written.
+#: Name of the NetCDF group with what `load` needs besides the variables, and the number of its format.
 GROUP, FORMAT = "fingerspice", 1
 
-# Dimensions, values, attributes: what both xarray and NetCDF take.
+#: Dimensions, values and attributes of a variable, as xarray and NetCDF take them.
 Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]
 
 
 def write_csv(solution: Solution, path: Path) -> Path:
-    """Write every signal as CSV, names and units in the header; both rows of a jump are kept."""
+    """Write every signal as CSV with names and units in the header; a jump has both its rows."""
     signals = solution.signals
     header = ["t [s]", *(f"{name} [{unit}]" for name, (_, unit, _) in signals.items())]
     table = np.column_stack([solution.t, *(value for value, _, _ in signals.values())])
@@ -44,7 +44,7 @@ def write_csv(solution: Solution, path: Path) -> Path:
 
 
 def _kept(solution: Solution, jumps: str) -> BoolArray:
-    """Which rows are written, shape (n_t,)."""
+    """Which rows are written, shape (n_t,): all, or without the left-hand rows of jumps."""
     require(jumps in ("right", "both"), "jumps", repr(jumps), "'right' or 'both'")
     keep = np.ones(solution.t.size, bool)
     if jumps == "right" and solution.t.size:
@@ -53,7 +53,7 @@ def _kept(solution: Solution, jumps: str) -> BoolArray:
 
 
 def variables(solution: Solution, keep: BoolArray) -> tuple[dict[str, Variable], dict[str, Variable]]:
-    """Variables and coordinates of the data files, of the rows to keep."""
+    """Variables and coordinates of the data files, with the rows in `keep`."""
     signals = solution.all_signals
     data: dict[str, Variable] = {}
     coords: dict[str, Variable] = {"time": (("time",), solution.t[keep], {"units": "s", "long_name": "time"})}
@@ -79,7 +79,7 @@ def dataset(solution: Solution, jumps: str) -> tuple[dict[str, Variable], dict[s
 
 
 def to_dataframe(solution: Solution, jumps: str) -> pandas.DataFrame:
-    """Every signal as a column, a row for each time."""
+    """The run as a table with a column for every signal and a row for every time."""
     import pandas
 
     keep = _kept(solution, jumps)
@@ -88,13 +88,13 @@ def to_dataframe(solution: Solution, jumps: str) -> pandas.DataFrame:
 
 
 def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
-    """Write the variables as a NetCDF file, and in a group of their own what else `load` needs."""
+    """Write the variables as a NetCDF file, with a group that has what else `load` needs."""
     import h5netcdf
 
     keep = _kept(solution, jumps)
 
     def write(target: Path) -> None:
-        # HDF5 ends the process where the disk is full, so it gets to see memory only.
+        # HDF5 would end the process on a full disk, so it writes into memory.
         content = io.BytesIO()
         with h5netcdf.File(content, "w") as file:
             _fill(file, *variables(solution, keep))
@@ -103,7 +103,7 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
             group = file.create_group(GROUP)
             group.attrs["run"] = json.dumps(_run(solution))
             if not keep.all():
-                # The rows before jumps, which other readers need not meet: as one table, for variables take time.
+                # The left-hand rows of jumps, of which only `load` has a use, form one table: each variable takes time.
                 group.dimensions["jump"] = int(np.count_nonzero(~keep))
                 group.dimensions["signal"] = 1 + len(solution.signals)
                 rows = [np.flatnonzero(~keep), *(x[~keep] for x, _, _ in solution.signals.values())]
@@ -125,12 +125,12 @@ def _fill(file: Any, data: dict[str, Variable], coords: dict[str, Variable]) -> 
 
 
 def _run(solution: Solution) -> dict[str, Any]:
-    """What a run is besides its signals, as plain data."""
+    """Everything about a run except its signals, as plain data."""
     state = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(solution.state).items()}
     fundamental = solution.fundamental
     return {
         "format": FORMAT, "nfev": int(solution.nfev), "error": vars(solution.error), "rtol": solution.rtol,
-        # The same run is the same file: not how long it took.
+        # Without the time that it took, so that the same run gives the same file.
         "stats": {k: v for k, v in solution.stats.items() if isinstance(v, (int, float, str)) and k != "wall_s"},
         "charge_law": solution.charge_law, "area_mode": solution.area_mode, "method": solution.method,
         "plan": solution.plan.to_dict(), "status": solution.status.name,

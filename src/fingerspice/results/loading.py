@@ -1,4 +1,4 @@
-"""A run read back from the NetCDF file it was written to."""
+"""Reading a run back from its NetCDF file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from fingerspice.waveforms import combinations, periodic, ramps, transients
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.waveform import Fundamental, Waveform
 
-# What may stand in the text of a waveform that a run was given.
+# The waveforms that may appear in the text of a changed source.
 _WAVEFORMS = {
     kind.__name__: kind
     for kind in (
@@ -34,6 +34,7 @@ _WAVEFORMS = {
         periodic.Triangle, periodic.Sawtooth, combinations.Sum, combinations.Product, combinations.AM,
     )
 }  # fmt: skip
+# Deepest nesting in that text.
 _DEEPEST = 20
 _NOT_KEPT = "a source that was a function or samples is not kept in a file"
 
@@ -41,9 +42,9 @@ _NOT_KEPT = "a source that was a function or samples is not kept in a file"
 def load(path: str | Path) -> Solution:
     """Read a run back from a file of `Solution.to_netcdf` or of ``fingerspice run``.
 
-    Signals, figures, error, status and warnings are those of the run, and rows at jumps are both there. The circuit is
-    made again from the deck's text and what was changed in it; where that cannot be (a source that was a function or
-    samples, a deck with files of its own) it has no elements, and a warning says so. A run cannot start from it.
+    Signals with both rows of each jump, figures, error, status and warnings are those of the run. The circuit is made
+    again from the deck's text and the changes; where that is not possible (a source that was a function or samples, a
+    deck that includes files) it has no elements, and a warning says so. No run can start from a loaded one.
 
     Parameters
     ----------
@@ -56,7 +57,7 @@ def load(path: str | Path) -> Solution:
     Raises
     ------
     InputError
-        For a file that is not there, or that this package did not write.
+        For a missing file, or one that this package did not write.
     """
     import h5netcdf
 
@@ -117,7 +118,7 @@ def _solution(file: Any) -> Solution:
 
 
 def _record(file: Any, run: dict[str, Any]) -> StoredRecord:
-    """The outputs, those before jumps back in their places."""
+    """The outputs, with the left-hand rows of jumps put back in their places."""
     names = {key: tuple(_text(x) for x in file.variables[key][...]) for key in ("layer", "node")}
     group = file.groups[GROUP]
     signals = [str(name) for name in run["signals"]]
@@ -133,7 +134,7 @@ def _record(file: Any, run: dict[str, Any]) -> StoredRecord:
         kept = np.asarray(file.variables[name][...], float)
         own = [1 + i for i, signal in enumerate(signals) if signal == name or signal.startswith(f"{name}:")]
         added = t_before if name == "time" else before[:, own].reshape(rows.size, *kept.shape[1:])
-        # Each place as it is while the rows before it are in already.
+        # np.insert takes places in the array without the inserted rows.
         return np.insert(kept, rows - np.arange(rows.size), added, axis=0)
 
     t = whole("time")
@@ -177,12 +178,12 @@ def _circuit(file: Any, overrides: dict[str, str]) -> Circuit:
 
 
 def _value(text: str) -> float | Waveform:
-    """What `Circuit.replace` was given, from its text.
+    """The value that `Circuit.replace` was given, from its text.
 
     Raises
     ------
     ValueError
-        For what is neither a number nor a waveform of numbers.
+        For anything but a number or a waveform made of numbers.
     """
     try:
         return float(text)
@@ -198,7 +199,7 @@ def _value(text: str) -> float | Waveform:
 
 
 def _literal(node: ast.expr, depth: int = 0) -> Any:
-    """Numbers, tuples and waveforms made of them, and nothing else."""
+    """The value of a number, a tuple or a waveform made of these; anything else is refused."""
     if depth < _DEEPEST:
         if isinstance(node, ast.Constant) and (node.value is None or isinstance(node.value, (int, float))):
             return node.value

@@ -1,4 +1,4 @@
-"""Figures of a run: means, extremes and amplitudes of its signals, from its steps or from its outputs."""
+"""Means, extremes and amplitudes of a run's signals, as integrals over its steps or its outputs."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.numerics.extremes import largest
 from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS
 
-#: From the outputs of a run, as it wrote them down, to the signal that figures are taken of, shape (n_t,).
+#: From the record of a run to one of its signals, shape (n_t,).
 Read = Callable[[Any], FloatArray]
 
 _NODES = POINTS[:NODES]
-#: What a polynomial need not meet of a signal, over its peak.
+#: Smallest tolerance of a polynomial's misfit, relative to the signal's peak.
 _FINEST = 1e-12
-#: Halves of panels that are looked at, beside four for each panel.
+#: Number of halves of panels that may be evaluated, besides four for each panel.
 _MOST_CUT = 4096
-#: Halvings of one panel.
+#: Number of halvings of one panel.
 _MOST_ROUNDS = 60
 #: Gauss-Lobatto weights on [0, 1]: exact for polynomials of degree 23.
 _WEIGHTS = 1.0 / (NODES * (NODES - 1) * legendre.Legendre.basis(NODES - 1)(2.0 * _NODES - 1.0) ** 2)
@@ -34,9 +34,9 @@ class Panels(NamedTuple):
     ----------
     step : ndarray of int, shape (p,)
     low, high : ndarray, shape (p,)
-        Fractions of the step of that number.
+        The part of that step that the panel covers, as fractions of its length.
     duration : ndarray, shape (p,)
-        s; longer than the part itself where that stands for many.
+        s; longer than the panel itself where that represents several equal periods.
     """
 
     step: IntArray
@@ -45,23 +45,23 @@ class Panels(NamedTuple):
     duration: FloatArray
 
     def take(self, which: IntArray) -> Panels:
-        """Some of them, by number."""
+        """The panels with these numbers."""
         return Panels(self.step[which], self.low[which], self.high[which], self.duration[which])
 
     def halved(self) -> Panels:
-        """Both halves of each."""
+        """The two halves of every panel."""
         middle, half = 0.5 * (self.low + self.high), 0.5 * self.duration
         low, high = np.append(self.low, middle), np.append(middle, self.high)
         return Panels(np.tile(self.step, 2), low, high, np.tile(half, 2))
 
     def fractions(self, points: FloatArray) -> FloatArray:
         """Points in [0, 1] of each panel as fractions of its step, shape (p, n)."""
-        # Not low + (high - low): the end has to be met exactly.
+        # Written so that the points 0 and 1 give exactly `low` and `high`.
         return np.asarray(self.low[:, None] * (1.0 - points) + self.high[:, None] * points)
 
 
 class Run(Protocol):
-    """What figures are taken of."""
+    """A run whose signals can be evaluated between its outputs."""
 
     def panels(self, since: float, until: float) -> Panels:
         """Parts of the run between two times, s."""
@@ -75,12 +75,12 @@ class Run(Protocol):
 
 @dataclass(frozen=True)
 class Weighed:
-    """A signal with the durations that its values stand for.
+    """Values of a signal with quadrature weights.
 
     Attributes
     ----------
     t, weight, x : ndarray, shape (n,)
-        s, the share of the whole duration, and the signal's unit.
+        Times (s), weights whose sum is 1, and the signal in its unit.
     """
 
     t: FloatArray
@@ -89,20 +89,20 @@ class Weighed:
 
     def mean(self, power: int = 1) -> float:
         """Mean of the signal, or of a power of it."""
-        # Not by BLAS, whose threads cost more than the sum and may round otherwise.
+        # Without BLAS, whose threads cost more than the sum and may round differently.
         return float((self.weight * (self.x if power == 1 else self.x**power)).sum())
 
     def phasor(self, frequency: float) -> complex:
-        """Complex amplitude P of a signal x ~ Im(P exp(i 2 pi f t)); the times are a whole number of periods."""
+        """Complex amplitude P of a signal x ~ Im(P exp(i 2 pi f t)); the times cover whole periods."""
         turning = self.weight * np.exp(-2j * np.pi * frequency * self.t)
         return complex(2j * (turning * self.x).sum())
 
 
 class Stretch:
-    """A run between two times (s): each signal with its weights, and its extremes.
+    """A run between two times (s), with weights and extremes of every signal.
 
-    Panels on which the polynomial through the nodes misses the signal between them are cut in halves: steps follow the
-    gap voltage, and the area may change on a small part of its range.
+    A panel is halved where the polynomial through its nodes misses the signal between them: steps are chosen to resolve
+    the gap voltage, and the area may change within a small part of its range.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ class Stretch:
     since, until : float
         s.
     rtol : float
-        Error of the run, relative to its peaks: figures are taken more exactly than that.
+        Error of the run relative to its peaks; means and extremes are computed more exactly.
     """
 
     def __init__(self, run: Run, since: float, until: float, rtol: float) -> None:
@@ -119,19 +119,20 @@ class Stretch:
         self._share, self._shares = _shares(self.panels)
 
     def weigh(self, read: Read) -> Weighed:
-        """A signal for means."""
+        """A signal with weights for its means."""
         t, x = self.run.at_points(read, self.panels)
         peak = float(np.abs(x).max(initial=0.0)) or 1.0
         missed = _missed(x) / peak
-        # The first term that a polynomial misses has no integral, nor have the next ten: were the terms to fall evenly,
-        # the integral's error would be the 1.85th power of what is missed.
+        # Gauss-Lobatto weights integrate polynomials up to twice the degree of the interpolant exactly. If the series'
+        # terms fall geometrically, the error of the integral is about the misfit to the power 1.85; 1.5 is on the safe
+        # side.
         if float((self._share * missed**1.5).sum()) <= max(_FINEST, 1e-3 * self.rtol):
             return Weighed(t[:, :NODES], self._shares, x[:, :NODES])
         return self._cut(read, t, x, _FINEST)[0]
 
     def extremes(self, read: Read) -> tuple[float, float]:
-        """Smallest and largest value of a signal: where its polynomials have them, the signal itself."""
-        # What the polynomials miss moves the place, and the value by the square of that.
+        """Smallest and largest value of a signal, evaluated where its polynomials have their extremes."""
+        # A misfit shifts the place of an extreme, and changes the value there by its square only.
         weighed, panels = self._cut(read, *self.run.at_points(read, self.panels), max(_FINEST, 1e-3 * self.rtol))
         found = [largest(weighed.x, sign) for sign in (-1.0, 1.0)]
         panel, place = np.array([p for p, _, _ in found]), np.array([x for _, x, _ in found])
@@ -141,14 +142,14 @@ class Stretch:
         return min(low, float(weighed.x.min())), max(high, float(weighed.x.max()))
 
     def _cut(self, read: Read, t: FloatArray, x: FloatArray, tol: float) -> tuple[Weighed, Panels]:
-        """A signal, and the panels on which its polynomials miss it by at most `tol` of its peak."""
+        """A signal, and panels on which its polynomials miss it by at most `tol` times its peak."""
         smooth = tol * float(np.abs(x).max(initial=0.0))
         panels, parts = self.panels, []
         most = _MOST_CUT + 4 * panels.step.size
         for left in range(_MOST_ROUNDS, 0, -1):
             wrong = _missed(x) > smooth
             if most <= 0 or left == 1:
-                # What still is not smooth is rounding, or a jump that rounding has put to the other side.
+                # What is not smooth by now is rounding, or a jump that rounding has shifted across an end.
                 wrong[:] = False
             parts.append((panels.take(np.flatnonzero(~wrong)), t[~wrong, :NODES], x[~wrong, :NODES]))
             if not wrong.any():
@@ -162,18 +163,18 @@ class Stretch:
 
 
 def _missed(x: FloatArray) -> FloatArray:
-    """Largest miss of the polynomial through the nodes of each panel, of values (p, ROWS), shape (p,)."""
+    """Largest misfit between the nodes of each panel's polynomial, from values (p, ROWS), shape (p,)."""
     return np.asarray(np.abs(x[:, :NODES] @ BETWEEN - x[:, NODES:]).max(axis=1, initial=0.0))
 
 
 def _shares(panels: Panels) -> tuple[FloatArray, FloatArray]:
-    """Of the whole duration, what each panel is, shape (p,), and the value at each of its nodes, shape (p, NODES)."""
+    """Weight of each panel, shape (p,), and of the values at its nodes, shape (p, NODES), in a mean."""
     share = panels.duration / panels.duration.sum()
     return share, share[:, None] * _WEIGHTS
 
 
 def weigh_outputs(t: FloatArray, x: FloatArray) -> Weighed:
-    """A signal's outputs for means, by cubics through neighbouring values; a repeated time is a jump."""
+    """A signal's outputs with weights, by cubics through neighbouring values; a repeated time is a jump."""
     weight = output_weights(t)
     return Weighed(t, weight / weight.sum(), x)
 
@@ -181,7 +182,7 @@ def weigh_outputs(t: FloatArray, x: FloatArray) -> Weighed:
 def output_weights(t: FloatArray) -> FloatArray:
     """Weights (n,) of values at times t (s, ascending) in the integral over them, exact for cubics between jumps.
 
-    Trapezoidal between jumps that fewer than four values lie between.
+    Where fewer than four values lie between two jumps the trapezoidal rule is taken.
     """
     weight = np.zeros(t.size)
     begins = np.flatnonzero(np.append(True, np.diff(t) == 0.0))
@@ -196,7 +197,7 @@ def output_weights(t: FloatArray) -> FloatArray:
     index = first[:, None] + np.arange(4)
     nodes = t[index]
     half, middle = 0.5 * (t[i + 1] - t[i]), 0.5 * (t[i + 1] + t[i])
-    # Two Gauss points integrate a cubic; Lagrange's form gives it there.
+    # Two Gauss points integrate a cubic exactly; it is evaluated there in Lagrange's form.
     for at in (middle - half / np.sqrt(3.0), middle + half / np.sqrt(3.0)):
         for j in range(4):
             share = half.copy()

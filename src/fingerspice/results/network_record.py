@@ -1,4 +1,4 @@
-"""What a network's run wrote down, and every signal that follows; `Record` is the same for a series stack."""
+"""Outputs of a network's run, and every signal that follows from them; `Record` has those of a series stack."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from fingerspice.waveforms.waveform import Waveform
 
 @dataclass(frozen=True, eq=False)
 class NetworkRecord(Sealed):
-    """Outputs of a network's run as they were computed, and what they mean.
+    """Outputs of a network's run as they were computed, and the signals that follow from them.
 
-    Signals of fingers and sources have the shape (n_t,) where there is one of them, else (n_t, n).
+    Signals of gaps and of sources have the shape (n_t,) where there is one of them, else (n_t, n).
 
     Attributes
     ----------
     network : Network
     net : Net
     waveforms : tuple of Waveform
-        Of each source.
+        Waveform of each source.
     t : ndarray, shape (n_t,)
         s; at a jump two entries share a time.
     left : ndarray of bool, shape (n_t,)
-        Whether the left-hand value at a jump is meant.
+        Whether an output is the left-hand value at a jump.
     rows : ndarray, shape (n_t, size)
-        The state as in `engine.network`, then, with `has_charge`, the sources' currents.
+        The state as in `engine.network`; with `has_charge` the sources' charges and currents follow.
     has_charge : bool
     """
 
@@ -80,7 +80,7 @@ class NetworkRecord(Sealed):
 
     def cell_voltage(self, cell: int) -> FloatArray:
         """Voltage of a cell from p to n, V, shape (n_t,)."""
-        # Not by BLAS, whose threads may round otherwise.
+        # Without BLAS, whose threads may round differently.
         return np.asarray((self._x * self.network.p[cell]).sum(1) + (self._s * self.network.q[cell]).sum(1))
 
     def finger_voltage(self, finger: int) -> FloatArray:
@@ -108,7 +108,7 @@ class NetworkRecord(Sealed):
 
     @cached_property
     def u_source(self) -> FloatArray:
-        """Voltage of each source, V: of a V from p to n, of an I from n to p, as it drives."""
+        """Voltage of each source, V: from p to n of a V, and from n to p of an I, the direction in which it drives."""
         n_v = self.network.n_voltage
         out = self._s.copy()
         if n_v < out.shape[1]:
@@ -139,7 +139,7 @@ class NetworkRecord(Sealed):
 
     @cached_property
     def area(self) -> FloatArray | None:
-        """Contact area, m^2: the fingers', or without one the circuit's first; None where nothing has an area."""
+        """Contact area of each GAP, m^2; without a GAP the circuit's first area; None where there is none."""
         shown = self.network.fingers or ((0,) if self.network.areas else ())
         return _columns(np.column_stack([self._area_of(i) for i in shown])) if shown else None
 
@@ -150,21 +150,21 @@ class NetworkRecord(Sealed):
 
     @cached_property
     def charge(self) -> FloatArray | None:
-        """Charge that each source has delivered out of its p node, or an I out of its n node, C."""
+        """Charge (C) that each source has delivered at its p node, or at its n node if it is an I."""
         n_s = len(self.network.sources)
         end = self.rows.shape[1] - n_s
         return _columns(self.rows[:, end - n_s : end].copy()) if self.has_charge else None
 
     @cached_property
     def current(self) -> FloatArray | None:
-        """Regular part of each source's current out of that node, A."""
+        """Current (A) that each source delivers at that node, without the impulses at jumps."""
         return _columns(self.rows[:, -len(self.network.sources) :].copy()) if self.has_charge else None
 
     @cached_property
     def fold_margin(self) -> FloatArray:
         """Distance to the fold of the `mobile` law, 1 where no area feels a voltage, shape (n_t,).
 
-        The determinant of the capacitances that small changes meet, over that with every area held.
+        Ratio of the determinant of the differential capacitances to that of the capacitances at fixed areas.
         """
         net, n = self.net, self._x.shape[1]
         out = np.ones(self.t.size)
@@ -190,12 +190,12 @@ class NetworkRecord(Sealed):
 
 
 def _columns(x: FloatArray) -> FloatArray:
-    """A single column as one row of numbers."""
+    """A table of one column as a one-dimensional array; others as they are."""
     return sealed(np.ascontiguousarray(x[:, 0]) if x.shape[1] == 1 else x)
 
 
 def bare_record(
     network: Network, net: Net, waveforms: tuple[Waveform, ...], t: FloatArray, left: BoolArray, rows: FloatArray
 ) -> NetworkRecord:  # fmt: skip
-    """A record without charge, of rows of voltages and slow areas as columns (size, n_t)."""
+    """A record without charge, from states as columns, shape (size, n_t)."""
     return NetworkRecord(network, net, waveforms, t, left, np.ascontiguousarray(rows.T), False)

@@ -1,4 +1,4 @@
-"""The result of a sweep of phasors."""
+"""The result of a phasor sweep."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class PhasorSolution(Shown):
     frequency : ndarray
         Hz.
     gain : ndarray of complex
-        u_gap / source: modulus is Eq. 11, angle Eq. 13 (V/A for a current source).
+        Ratio of gap voltage to source, with the modulus of Eq. 11 and the angle of Eq. 13 (V/A for a current source).
     layer_gain : ndarray of complex, shape (n_frequency, n_layer)
-        The same for every layer.
+        The same ratio for every layer.
     u_gap : ndarray of complex
-        Gap voltage amplitude with the source's phase, V (NaN for a source without fundamental or AC).
+        Complex amplitude of the gap voltage, V; NaN for a source without fundamental or AC.
     area : ndarray
         Ridge contact area, m^2.
     f_el_mean : ndarray
@@ -36,15 +36,15 @@ class PhasorSolution(Shown):
         Source amplitude, V (A of a current source).
     layers : tuple of str
     phase : float
-        Of the source, rad.
+        Phase of the source, rad.
     drive : str
-        What the amplitude and the phase are those of.
+        Where amplitude and phase come from, in words.
     notes : tuple of str
-        How the sweep was made where a deck may mean it otherwise.
+        Remarks on how the sweep was made.
     warnings : tuple of str
-        Where it leaves what is known.
+        Warnings of extrapolation and of implausible results.
     circuit : Circuit or None
-        It was made of.
+        The circuit of the sweep.
     """
 
     frequency: FloatArray

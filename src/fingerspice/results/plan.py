@@ -14,21 +14,21 @@ class Plan(Shown):
     Attributes
     ----------
     tier : str
-        ``algebraic``: the voltages follow the source at once; ``linear``: closed form at one area; ``coupled``:
-        stepped, the area followed at every instant.
+        ``algebraic``: the voltages follow the source instantly; ``linear``: closed form at one area; ``coupled``: steps
+        in which the area follows the voltage at every instant.
     reasons : tuple of str
-        Why, one sentence each.
+        Reasons for the tier, one sentence each.
     start : str
-        ``periodic`` where the run starts from the periodic state, which is solved for directly; else how it starts.
+        How the run starts; ``periodic`` means from the periodic state, which is found directly.
     rates : tuple of float
-        Rates of the stack with its area frozen, 1/s, ascending.
+        Relaxation rates of the circuit at a fixed area, 1/s, ascending.
     stiff : bool
-        Whether an explicit method would be held back by stability.
+        Whether stability would limit the steps of an explicit method.
     sensitivity : float
-        Largest relative change of the leak rates that the area causes over the run; NaN for a network, where it is not
-        what decides.
+        Largest relative change of the leak rates that the area causes over the run; NaN for a network, whose tier does
+        not depend on it.
     error_bound : float
-        What taking one area, or a dispersive skin at one frequency, costs, relative to the peaks.
+        Bound of the error (relative to the peaks) from taking one area, or a dispersive skin at one frequency.
     area : float
         Area of the `linear` tier, m^2.
     """

@@ -1,4 +1,4 @@
-"""What a run wrote down, and every signal that follows from it, each made when first asked for."""
+"""Outputs of a run, and every signal that follows from them, each computed when it is first asked for."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def sealed(x: FloatArray) -> FloatArray:
 
 
 class Sealed:
-    """A result whose arrays are read-only, also where it was copied or unpickled: numpy's own copies can be written."""
+    """A result whose arrays are read-only, also after it was copied or unpickled, which makes arrays writable."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -33,20 +33,20 @@ class Sealed:
 
 
 def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
-    """Values of a waveform at times t (s), from the left where that is meant, shape (n_t,)."""
+    """Values of a waveform at times t (s), from the left where `left` says so, shape (n_t,)."""
     out = np.array(waveform.value(t), float)
     if left.any():
         out[left] = waveform.value(t[left], "left")
     lost = ~np.isfinite(out)
     if lost.any():
-        # A run ends where the source stops being finite, found to 1e-12 of the time: just before, it was.
+        # A run ends where the source stops being finite, a time known to 1e-12; just before, the source was finite.
         out[lost] = waveform.value(t[lost] * (1.0 - 4e-12))
     return sealed(out)
 
 
 @dataclass(frozen=True, eq=False)
 class Record(Sealed):
-    """Outputs of a run as they were computed, and what they mean.
+    """Outputs of a series stack's run as they were computed, and the signals that follow from them.
 
     Attributes
     ----------
@@ -57,13 +57,13 @@ class Record(Sealed):
     t : ndarray, shape (n_t,)
         s; at a jump two entries share a time.
     left : ndarray of bool, shape (n_t,)
-        Whether the left-hand value at a jump is meant.
+        Whether an output is the left-hand value at a jump.
     live : ndarray, shape (n_layer - 1, n_t)
-        Voltages of all layers along the loop but the last of `stack.layer_order`, V.
+        Voltages along the loop of all layers except the last of `stack.layer_order`, V.
     z, current : ndarray, shape (n_t,), or None
-        The charge's own state (C) and the source's regular current (A), where they were asked for.
+        State of the charge (C), and the source's current without impulses (A); None where they were not asked for.
     charge_offset : float
-        C, taken off so that the charge starts at zero.
+        C, subtracted so that the charge starts at zero.
     """
 
     stack: Stack
@@ -88,7 +88,7 @@ class Record(Sealed):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """What signals of the source belong to: the loop as a whole."""
+        """Name of the one source: the loop as a whole."""
         return ("loop",)
 
     @cached_property
@@ -108,7 +108,7 @@ class Record(Sealed):
         *live, last = self.stack.layer_order
         out = np.empty((self.t.size, len(live) + 1))
         out[:, live] = self.live.T
-        # The layers add up to the source exactly.
+        # So the voltages of the layers add up to the source's exactly.
         out[:, last] = self.u_source - self.live.sum(axis=0)
         out *= self.stack.sign[self.stack.first_cell]
         return sealed(out)
@@ -122,7 +122,7 @@ class Record(Sealed):
         if gap in live:
             along = self.live[live.index(gap)]
             return sealed(along if self.stack.sign[self.stack.gap] > 0.0 else -along)
-        # A gap alone is all of the loop.
+        # The gap is the last, or only, layer of `layer_order`.
         return sealed(self.u_layer[:, 0].copy())
 
     @cached_property
@@ -139,7 +139,7 @@ class Record(Sealed):
         u = self.u_gap
         stress = float(self.stack.contact.stress(1.0))
         if self.model.coupled:
-            # The same whether the area was asked for or not.
+            # Computed without `area`, so that the result does not depend on what was asked for before.
             return sealed(forces(u, self.model.curve, stress))
         return sealed(stress * u * self.area * u)
 

@@ -1,4 +1,4 @@
-"""A run in closed form between its outputs: looked at where its signals are not yet known from their neighbours."""
+"""A run in closed form between its outputs, evaluated on panels that are refined until polynomials represent it."""
 
 from __future__ import annotations
 
@@ -16,26 +16,27 @@ from fingerspice.results.network_record import NetworkRecord
 from fingerspice.results.record import Record
 from fingerspice.waveforms.waveform import Waveform
 
-#: What the polynomial of a panel may miss between its nodes, over the signal's peak.
+#: Largest misfit of a panel's polynomial between its nodes, relative to the signal's peak.
 _MISSED = 1e-11
-#: Panels at most: of a longer run figures rest on its outputs. And halvings of one.
+#: Largest number of panels, beyond which figures are computed from the outputs; and of halvings of one panel.
 MOST_PANELS, _MOST_ROUNDS = 20_000, 60
-#: Segments of the source that a look may have to pass, and the first panels over the source's shortest time.
+#: Largest number of the source's segments that an evaluation may pass; length of the first panels relative to the
+#: source's shortest time.
 _MOST_PASSED, _LONGEST = 200_000, 0.5
 
 
 @dataclass(frozen=True)
 class ClosedForm:
-    """A run that can be looked at at any time.
+    """A run in closed form, which can be evaluated at any time.
 
     Attributes
     ----------
     look : callable
-        From times (s, ascending) and whether the left-hand value is meant to a record.
+        From times (s, ascending), and whether each means a left-hand value, to a record.
     waveform : Waveform
-        The sources', all together.
+        Waveform with the breakpoints of all sources.
     t_start, first, stop : float
-        Where the run starts, and what figures are taken of, s.
+        Start of the run, and the interval for figures, s.
     """
 
     look: Callable[[FloatArray, BoolArray], Record | NetworkRecord]
@@ -45,14 +46,14 @@ class ClosedForm:
     stop: float
 
     def run(self, readers: Callable[[], Mapping[str, Read]], since: float, until: float) -> Refined | None:
-        """Panels between two times (s) on which every voltage is a polynomial; None where they would be too many.
+        """Panels between two times (s) on each of which every voltage is a polynomial; None where they are too many.
 
-        `readers` gives every signal that figures may be asked of by name.
+        `readers` gives, by name, the functions that read signals from a record.
         """
         every = readers()
         longest = _LONGEST * self.waveform.shortest_time()
         rate = self.waveform.breakpoint_rate() + 1.0 / longest
-        # Each look goes through the run from its start.
+        # Each evaluation goes through the run from its start.
         if (until - since) * rate > MOST_PANELS or (until - self.t_start) * rate > _MOST_PASSED:
             return None
         inner = self.waveform.breakpoints(since, until)
@@ -80,12 +81,12 @@ class ClosedForm:
     def _is_rough(
         self, readers: Mapping[str, Read], begin: FloatArray, end: FloatArray, peaks: dict[str, float]
     ) -> BoolArray:
-        """Whether a polynomial through the nodes misses some voltage between them."""
+        """Whether the polynomial through a panel's nodes misses some voltage between them, shape (p,)."""
         every = Refined(self.look, begin, end)
         wrong = np.zeros(begin.size, bool)
         for name, read in readers.items():
             if not name.startswith(("u_", "v:")):
-                # What follows from the gap voltage is smooth where that is, but at its zeros.
+                # Signals that follow from the gap voltage are smooth where it is, except at its zeros.
                 continue
             _, values = every.at_own_points(read)
             peaks[name] = max(peaks.get(name, 0.0), float(np.abs(values).max(initial=0.0)))
@@ -94,7 +95,7 @@ class ClosedForm:
         return wrong & (0.5 * (begin + end) > begin) & (0.5 * (begin + end) < end)
 
     def _cut_at_zeros(self, readers: Mapping[str, Read], run: Refined) -> Refined:
-        """The panels cut where a gap voltage is zero: the area has a kink there."""
+        """The panels cut at the zeros of gap voltages, where the area has a kink."""
         zeros = []
         for name, read in readers.items():
             if name.partition(":")[0] != "u_gap":
@@ -112,7 +113,7 @@ class ClosedForm:
 
 @dataclass(frozen=True)
 class Refined:
-    """Panels of a run in closed form, one behind the other; see `measures.Run`."""
+    """Consecutive panels of a run in closed form; see `measures.Run`."""
 
     look: Callable[[FloatArray, BoolArray], Record | NetworkRecord]
     begin: FloatArray
@@ -128,7 +129,7 @@ class Refined:
 
     @cached_property
     def _own(self) -> tuple[FloatArray, IntArray, Record | NetworkRecord]:
-        """Times of all panels at their points (p, ROWS), in which order they ascend, and the record at them so."""
+        """Times at the points of all panels, shape (p, ROWS), their ascending order, and the record in that order."""
         return self._looked_at(slice(None), np.broadcast_to(POINTS, (self.begin.size, POINTS.size)))
 
     def _looked_at(
@@ -151,14 +152,14 @@ class Refined:
         return self.values_at(read, panels.step, panels.fractions(POINTS))
 
     def values_at(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As `measures.Run` says, by looking."""
+        """As `measures.Run` says, by evaluating the closed form."""
         return _in_place(read, *self._looked_at(index, fraction))
 
 
 def _in_place(
     read: Read, t: FloatArray, order: IntArray, record: Record | NetworkRecord
 ) -> tuple[FloatArray, FloatArray]:
-    """Times, and a signal of a record of them in ascending order, where each belongs."""
+    """Times, and the signal of a record in ascending order of time put into the order of the times."""
     x = np.empty(t.size)
     x[order] = read(record)
     return t, x.reshape(t.shape)

@@ -1,4 +1,4 @@
-"""The result of a run: read-only arrays with their status, error and provenance."""
+"""The result of a run: read-only signals with their status, error and provenance."""
 
 from __future__ import annotations
 
@@ -34,38 +34,42 @@ if TYPE_CHECKING:
 class Solution(Sealed, Shown, Figured):
     """Time response of a circuit.
 
-    Signals are read-only arrays in SI units, computed when first asked for; at a jump of the source two rows share a
-    time. Where a circuit has several GAPs, what belongs to them (`u_gap`, `area`, `sigma_el`, `f_el`, `f_t`,
-    `friction`) has the shape (n_t, n_gap), in the order of `gaps`; likewise `u_source`, `q_source` and `i_source` with
-    several sources of a network, in the order of `sources`.
+    Signals are read-only arrays in SI units, computed when they are first asked for. A jump of the source has two rows
+    with the same time. Where a circuit has several GAPs, their signals (`u_gap`, `area`, `sigma_el`, `f_el`, `f_t`,
+    `friction`) have the shape (n_t, n_gap), in the order of `gaps`. In the same way `u_source`, `q_source` and
+    `i_source` have a column for each of several sources, in the order of `sources`.
 
     Attributes
     ----------
     t : ndarray, shape (n_t,)
         s.
     record : Record, NetworkRecord or StoredRecord
-        What the run wrote down.
+        Outputs of the run, from which all signals follow.
     status : Status
     failure : Failure or None
-        Why, when and where the run failed, and what to do.
+        Why, when and where the run failed, and what to change.
     nfev : int
         Evaluations of the right-hand side.
     stats : dict
-        Steps, rejections, zeros met, method, wall time.
+        Numbers of steps, of rejected steps and of zeros of the gap voltage; the method and the wall time.
     error : ErrorEstimate
     rtol : float
         Error asked for, relative to the peaks.
     charge_law, area_mode, method : str
     plan : Plan
-        Which model was run, and why.
+        The model that was run, and the reasons for it.
     circuit : Circuit
     state : State
     first, t_stop : float
         TSTART and the end of the run, s.
     continuous : Recorded or ClosedForm or None
         The run between its outputs, where that is known.
+    fundamental, period : Fundamental or None, float or None
+        Of the source, s; None where it has none.
+    fold_margin_min : float
+        Smallest distance to the fold that the steps met.
     stored : mapping or None
-        The summary, where the run was read from a file.
+        The summary of a run that was read from a file.
     """
 
     t: FloatArray
@@ -101,7 +105,7 @@ class Solution(Sealed, Shown, Figured):
 
     @cached_property
     def all_signals(self) -> Signals:
-        """The signals by name, with what their columns belong to."""
+        """The signals by name, with the elements to which their columns belong."""
         return Signals(self.record)
 
     @property
@@ -116,7 +120,7 @@ class Solution(Sealed, Shown, Figured):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Names of the sources of a network; a series stack has one loop."""
+        """Names of the sources of a network; of a series stack there is one, its loop."""
         return self.record.sources
 
     @property
@@ -141,7 +145,7 @@ class Solution(Sealed, Shown, Figured):
 
     @property
     def q_source(self) -> FloatArray | None:
-        """Charge delivered by the source since the start, C, shape (n_t,); a jump adds its integral of A dD.
+        """Charge delivered by the source since the start, C, shape (n_t,), with the impulses at jumps.
 
         None where the run was asked to leave it out.
         """
@@ -149,7 +153,7 @@ class Solution(Sealed, Shown, Figured):
 
     @property
     def i_source(self) -> FloatArray | None:
-        """Regular part of the source's current, A, shape (n_t,); a jump is an impulse, seen in `q_source` only."""
+        """Current of the source, A, shape (n_t,), without the impulses at jumps, which only `q_source` shows."""
         return self.record.current
 
     @property
@@ -171,9 +175,9 @@ class Solution(Sealed, Shown, Figured):
     def f_el(self) -> FloatArray | None:
         """Electroadhesive force, N, shape (n_t,); None for a circuit without GAP.
 
-        Its mean is `f_el_mean`, and over the last period `f_el_mean_periodic`: ``f_el.mean()`` weighs every output
-        alike, both ends of a period and both rows of a jump included, and is some per cent off at 50 to 200 outputs a
-        period.
+        Its mean is `f_el_mean`, and over the last period `f_el_mean_periodic`. ``f_el.mean()`` is another figure: it
+        gives every output the same weight, including both ends of a period and both rows of a jump, which causes an
+        error of some per cent at 50 to 200 outputs per period.
         """
         return self.all_signals.value("f_el")
 
@@ -188,7 +192,7 @@ class Solution(Sealed, Shown, Figured):
         return self.all_signals.value("friction")
 
     def by_name(self, key: str) -> dict[str, FloatArray]:
-        """A signal under its name, or the columns of several elements under ``name:element``.
+        """A signal by its name, or the columns of several elements by ``name:element``.
 
         Raises
         ------
@@ -209,7 +213,7 @@ class Solution(Sealed, Shown, Figured):
 
     @property
     def signals(self) -> dict[str, tuple[FloatArray, str, str]]:
-        """Every time series by name: values (n_t,), unit, long name."""
+        """Every signal by name, with its values (n_t,), unit and long name."""
         out: dict[str, tuple[FloatArray, str, str]] = {}
         for key, (unit, text) in SIGNALS.items():
             for name, value in self.by_name(key).items():
@@ -228,12 +232,12 @@ class Solution(Sealed, Shown, Figured):
     def summary(self) -> dict[str, Any]:
         """Figures of the run: peak, rms, mean, ripple, amplitude and phase at the fundamental; SI units.
 
-        They are those of the run itself, from TSTART to its end, whatever outputs were asked for: ``figures_from`` is
-        ``"steps"``. Where the run between its outputs is not known, because another method or a failed run made them or
-        because it is too long, it is ``"outputs"``: means are integrals of cubics through the outputs then, and
-        extremes those of the outputs. `f_el_mean` is over the whole run, `f_el_mean_periodic` over the last period of
-        the source; the entries of a period are None where the run holds none. A circuit without GAP has its layer
-        voltages (``u_layer:Xcoat_max``) in place of gap voltage and forces.
+        They are figures of the run itself, from TSTART to its end, whatever outputs were asked for; ``figures_from`` is
+        then ``"steps"``. It is ``"outputs"`` where the run between its outputs is not known, because another method
+        made them, the run failed, or it is too long: means are then integrals of cubics through the outputs, and
+        extremes those of the outputs. `f_el_mean` is the mean over the whole run, and `f_el_mean_periodic` that over
+        the last period of the source; figures of a period are None where the run is shorter. A circuit without GAP has
+        figures of its layer voltages (``u_layer:Xcoat_max``) instead of those of gap voltage and forces.
         """
         return dict(self._summary)
 
@@ -242,7 +246,7 @@ class Solution(Sealed, Shown, Figured):
         return self._figures.summary()
 
     def provenance(self) -> dict[str, str]:
-        """What it takes to repeat the run, as text."""
+        """All that is needed to repeat the run, as text."""
         from fingerspice import __version__
 
         return {
@@ -263,7 +267,7 @@ class Solution(Sealed, Shown, Figured):
         }
 
     def to_csv(self, path: str | Path) -> Path:
-        """Write every signal as CSV, names and units in the header; both rows of a jump are kept.
+        """Write every signal as CSV with names and units in the header; a jump has both its rows.
 
         Raises
         ------
@@ -275,8 +279,8 @@ class Solution(Sealed, Shown, Figured):
     def to_xarray(self, *, jumps: str = "right") -> xarray.Dataset:
         """The run as an xarray Dataset with units and provenance.
 
-        Where a circuit has several GAPs, what belongs to them has the dimension ``gap`` beside ``time``, and signals of
-        several sources ``source``; layer voltages have ``layer`` and node voltages ``node``.
+        Signals of several GAPs have the dimension ``gap`` besides ``time``, and those of several sources ``source``;
+        layer voltages have ``layer`` and node voltages ``node``.
 
         Parameters
         ----------
@@ -325,19 +329,19 @@ class Solution(Sealed, Shown, Figured):
         window: tuple[float, float] | None = None,
         others: Solution | Sequence[Solution] | Mapping[str, Solution] = (),
     ) -> Figure:
-        """Signals against time, as a figure that a notebook shows; from a script ``plot().show()`` opens a window.
+        """Draw signals against time: a notebook shows the figure, and from a script ``plot().show()`` opens a window.
 
-        Where the window holds more than about 30 oscillations they are drawn as envelopes, with the last few beside.
+        More than about 30 oscillations are drawn as envelopes, with the last few of them beside.
 
         Parameters
         ----------
         signals : str or sequence of str, optional
             Keys of `signals`, such as ``"f_el"``, ``"u_layer:Xcoat"``, or ``"u_layer"`` for all layers; those of one
-            quantity share a panel. By default source and gap voltage, force, area and friction.
+            quantity share a panel. The default is source and gap voltage, force, area and friction.
         window : tuple of float, optional
             Start and end, s; the whole run by default.
         others : Solution, sequence or mapping of str to Solution, optional
-            Runs to lay over this one; without names they are called by what sets them apart.
+            Runs to draw over this one; without names they are called by the facts in which they differ.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""A run between its outputs: the steps that were taken, and how many periods each of them stands for."""
+"""A run between its outputs: the steps that were taken, and the number of periods that each represents."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from fingerspice.waveforms.sampling import same_time
 
 AnyRecord = Record | NetworkRecord
 
-#: Steps recorded between two looks from Python, and numbers at the nodes of all of them, at most.
+#: Largest number of steps recorded before Python collects them, and of numbers at their nodes.
 CAPACITY, _AT_ONCE = 512, 16_384
-#: Numbers kept of a run's steps (64 MB): of a longer run figures rest on its outputs.
+#: Largest number of values kept of a run's steps (64 MB); figures of a longer run are computed from its outputs.
 MOST_NUMBERS = 8_000_000
-#: Periods of a leap that differ, at most.
+#: Largest number of different periods in a leap.
 _MOST_PERIODS = 20_000
 _NODES = POINTS[:NODES]
 #: From Chebyshev coefficients to values at the nodes.
@@ -32,18 +32,18 @@ _FROM_SERIES = chebyshev.chebvander(2.0 * _NODES - 1.0, NODES - 1).T
 
 @dataclass(frozen=True)
 class Block:
-    """Steps that follow one another, and the periods they stand for.
+    """Consecutive steps, and the periods that they represent.
 
     Attributes
     ----------
     times : ndarray, shape (k, 4)
-        Start and length of each step, the end reached (s), and which fraction of the length that is.
+        Start and length of each step, the end reached (s), and the fraction of the length at which that is.
     values : ndarray, shape (k, n_column, NODES)
-        At the nodes of the whole length.
+        Values at the nodes of the whole length.
     count : int
-        Periods that are alike, these steps' own included or not (see `shift`).
+        Number of equal periods.
     shift, period : float
-        The first of them comes `shift` after the steps' own times, each further one `period` later, s.
+        The first of these periods is `shift` (s) after the steps' own times, each further one `period` (s) later.
     """
 
     times: FloatArray
@@ -55,7 +55,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Leap:
-    """Periods that follow one another by an affine map: arguments as those of `engine.repeat.approach`."""
+    """Periods that follow one another by an affine map; fields as the arguments of `engine.repeat.approach`."""
 
     marks: FloatArray
     marks_by: FloatArray
@@ -70,7 +70,7 @@ class Leap:
     periods: int
 
     def blocks(self) -> list[Block] | None:
-        """The periods one by one until they no longer change; None where they do so for too long."""
+        """The periods one by one until they no longer change; None where too many of them differ."""
         n = self.x.size
         out: list[Block] = []
         delta = self.start[:n] - self.x
@@ -95,7 +95,7 @@ class Leap:
 
 @dataclass
 class Recorder:
-    """Takes the steps of one integration, call by call of its loop."""
+    """Collects the steps of one integration after each call of its compiled loop."""
 
     columns: int
     capacity: int = CAPACITY
@@ -108,7 +108,7 @@ class Recorder:
         self.room = new_steps(min(self.capacity, 1 + _AT_ONCE // max(self.columns, 1)), self.columns)
 
     def drain(self, counters: IntArray) -> Block | None:
-        """Take what the loop has recorded; the steps as a block, None where there are none or too many."""
+        """Collect the steps that the loop has recorded, as a block; None where there are none, or too many."""
         count = int(counters[RECORDED])
         counters[RECORDED] = 0
         self.numbers += count * self.columns * NODES
@@ -123,19 +123,19 @@ class Recorder:
         return block
 
     def repeat(self, since: int, periods: int, period: float) -> None:
-        """Let the blocks from number `since` on stand for whole periods that follow."""
+        """Let the blocks from number `since` on represent a number of further periods."""
         for part in self.parts[since:]:
             if isinstance(part, Block) and periods > 0:
                 self.parts.append(Block(part.times, part.values, periods, period, period))
 
     def finish(self, first: float, stop: float, make: Callable[..., AnyRecord]) -> Recorded | None:
-        """What was recorded, from `first` to `stop` (s)."""
+        """The recorded run from `first` to `stop` (s); None where nothing, or too much, was recorded."""
         return None if self.full or not self.parts else Recorded(tuple(self.parts), first, stop, make)
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """Recorded steps; `make` turns times, sides and columns into a record."""
+    """Recorded steps; `make` makes a record of times, of which are left-hand values, and of columns of states."""
 
     parts: tuple[Block | Leap, ...]
     first: float
@@ -158,7 +158,7 @@ class Recorded:
 
 
 class Stretches:
-    """Steps of a run, and their signals at any fraction of each."""
+    """Steps of a run, with its signals at any fraction of each step."""
 
     def __init__(self, blocks: list[Block], make: Callable[[FloatArray, BoolArray, FloatArray], AnyRecord]) -> None:
         sizes = [len(b.times) for b in blocks]
@@ -170,7 +170,7 @@ class Stretches:
         self.period = np.repeat([b.period for b in blocks], sizes)
 
     def panels(self, since: float, until: float) -> Panels:
-        """The parts of the steps between two times (s); those of periods that are alike and inside only once."""
+        """Parts of the steps between two times (s); equal periods are one panel with the duration of all of them."""
         begin, end = self.start + self.shift, self.reached + self.shift
         slack = same_time(1.0) * np.abs(end)
         last_end = end + (self.count - 1) * self.period
@@ -178,7 +178,7 @@ class Stretches:
         if ((begin >= since - slack) & (last_end <= until + slack)).all():
             return Panels(index, np.zeros(index.size), self.reach, self.count * self.reach * self.length)
         period = np.where(self.count > 1, self.period, 1.0)
-        # Of the periods that a step stands for, those from number `first` to `last` lie inside as a whole.
+        # Of the periods that a step represents, those from number `first` to `last` lie wholly inside.
         first = np.clip(np.ceil((since - slack - begin) / period), 0, self.count)
         last = np.clip(np.floor((until + slack - end) / period), -1, self.count - 1)
         inside = np.maximum(last - first + 1.0, 0.0)
@@ -186,7 +186,7 @@ class Stretches:
         for k, once in ((first - 1.0, True), (last + 1.0, last + 1.0 != first - 1.0)):
             cut = once & (k >= 0) & (k < self.count)
             low = np.maximum((since - begin - k * period) / self.length, 0.0)
-            # What ends with the stretch but for rounding ends as its step does: at a jump on the left.
+            # A part that ends with the interval, but for rounding, ends as its step does: before a jump.
             whole = end + k * period <= until + slack
             high = np.where(whole, self.reach, np.minimum((until - begin - k * period) / self.length, self.reach))
             found.append((low, high, np.where(cut & (high - low > slack / self.length), 1.0, 0.0)))
@@ -197,7 +197,7 @@ class Stretches:
 
     @cached_property
     def _whole(self) -> tuple[FloatArray, AnyRecord]:
-        """Times (k, ROWS) and record at the points of every step, as far as it reaches."""
+        """Times (k, ROWS) and the record at the points of every step, up to the end that it reached."""
         columns = np.concatenate([self.values, self.values @ BETWEEN], axis=2)
         fraction = self.reach[:, None] * POINTS
         short = np.flatnonzero(self.reach != 1.0)
@@ -212,7 +212,7 @@ class Stretches:
         return np.where(left, self.reached[index, None], t), left
 
     def at_points(self, read: Read, panels: Panels) -> tuple[FloatArray, FloatArray]:
-        """As `measures.Run` says: for panels that are whole steps the signal is made once."""
+        """As `measures.Run` says; panels that are whole steps share one record for all signals."""
         own = (panels.low == 0.0) & (panels.high == self.reach[panels.step])
         if not own.any():
             return self.values_at(read, panels.step, panels.fractions(POINTS))
@@ -234,7 +234,7 @@ class Stretches:
 
 
 def _basis(fraction: FloatArray) -> FloatArray:
-    """Weights (p, q, NODES) of the values at the nodes in those at fractions (p, q) of a step."""
+    """Weights (p, q, NODES) by which values at the nodes give those at fractions (p, q) of a step."""
     distance = fraction[:, :, None] - _NODES
     hit = distance == 0.0
     weight = np.where(hit.any(axis=2, keepdims=True), hit, BARYCENTRIC / np.where(hit, 1.0, distance))

@@ -1,4 +1,4 @@
-"""What a file holds of a run, and every signal that follows; `Record` is the same for a run just made."""
+"""Outputs of a run that was read from a file; `Record` has those of a run just made."""
 
 from __future__ import annotations
 

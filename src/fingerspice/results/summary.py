@@ -1,4 +1,4 @@
-"""Figures of a run: means, peaks and amplitudes of its signals, each computed when first asked for, and kept."""
+"""Figures of a run: means, peaks and amplitudes of its signals, each computed when it is first asked for."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Value = float | FloatArray | None
 
-# Signals whose ripple is told, instead of their rms.
+# Signals whose summary has a ripple instead of an rms.
 _RIPPLE = ("area", "f_el", "f_t", "friction")
 
 
@@ -29,7 +29,7 @@ def _read(name: str, record: AnyRecord) -> FloatArray:
 
 
 class Span(Protocol):
-    """A part of a run that figures are taken of."""
+    """A part of a run, from which figures are computed."""
 
     def weigh(self, name: str) -> Weighed:
         """A signal with its weights."""
@@ -39,7 +39,7 @@ class Span(Protocol):
 
 
 class _Steps:
-    """A part of a run that is known between its outputs."""
+    """A part of a run whose signals are known between the outputs."""
 
     def __init__(self, stretch: Stretch) -> None:
         self.stretch = stretch
@@ -52,7 +52,7 @@ class _Steps:
 
 
 class _Outputs:
-    """Outputs from number `first` on, and before them the values at a time `start` (s) where that is given."""
+    """Outputs from number `first` on, after interpolated values at the time `start` (s) where that is given."""
 
     def __init__(self, t: FloatArray, signals: Signals, first: int = 0, start: float | None = None) -> None:
         self.t, self.signals, self.first, self.start = t, signals, first, start
@@ -72,7 +72,7 @@ class _Outputs:
 
 
 class Figures:
-    """Figures of a solution, each computed when first asked for."""
+    """Figures of a solution, each computed when it is first asked for and then kept."""
 
     def __init__(self, solution: Solution) -> None:
         self.solution = solution
@@ -158,7 +158,7 @@ class Figures:
 
     @cached_property
     def shown(self) -> tuple[str, ...]:
-        """Signals that the summary gives figures of; without a gap every layer, without layers every node."""
+        """Signals in the summary; without a gap those of every layer, and without layers those of every node."""
         names = self.signals.names
         if self.signals.gaps:
             keys = ("u_source", "u_gap", "area", "f_el", "f_t", "friction")
@@ -189,7 +189,7 @@ class Figures:
 
 
 def _together(values: list[float | None]) -> Value:
-    """The figures of every gap or source that has one: a number where there is one of them."""
+    """Figures of several gaps or sources as an array; a single one as a number; None where one is missing."""
     if len(values) < 2:
         return values[0] if values else None
     return None if None in values else sealed(np.array(values, float))
@@ -211,9 +211,9 @@ class KeptFigures:
 
 
 class Figured:
-    """What has figures: each a number, an array (n_gap,) with several gaps, and None where there is none.
+    """A result with figures: each is a number, or an array (n_gap,) with several gaps, or None where there is none.
 
-    They are integrals and extremes of the run itself, not of its outputs, each computed when first asked for.
+    Figures are integrals and extremes of the run itself, not of its outputs.
     """
 
     @property
@@ -272,5 +272,5 @@ class Figured:
 
     @property
     def u_gap_phase_deg(self) -> Value:
-        """Phase of that, of a sine, degrees."""
+        """Phase of the gap voltage at the source's fundamental, as that of a sine, degrees."""
         return self._figures.value("u_gap", "phase_deg")
