@@ -1,6 +1,7 @@
-"""What every picture is drawn with: figure, axes, legend, caption, colours, units, file.
+"""Tools of every picture: figure, axes, legend, caption, colours, units and file.
 
-Figures are made with matplotlib's object API, and matplotlib is imported when one is made: no pyplot, no global state.
+Figures are made with matplotlib's object API, without pyplot and its global state, and matplotlib is imported when the
+first one is made.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
     from fingerspice.plots.picture import Picture
 
-# Okabe and Ito's palette, which the common colour blindnesses tell apart.
+# The palette of Okabe and Ito, whose colours people with the common colour blindnesses can distinguish.
 BLACK, GREY, BLUE, VERMILION = "#000000", "#777777", "#0072B2", "#D55E00"
 GREEN, PURPLE, ORANGE, SKY = "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
 
@@ -31,8 +32,9 @@ FONT, SMALL = 8.5, 7.0
 WIDTH = 7.0
 """Font sizes (points) and width (inches) of a figure across a page."""
 
+#: Bins into which long curves are divided: more than there are dots across the page.
 MAX_BINS = 4000
-#: Characters of a name in a legend.
+#: Largest number of characters of a name in a legend.
 LONGEST_LABEL = 60
 CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (1, 1.2)))
@@ -71,7 +73,7 @@ def new_figure(rows: int, columns: int = 1, height: float = 3.0, **options: Any)
 
 
 def dress(ax: Axes, ylabel: str = "", xlabel: str = "") -> None:
-    """Labels, light grid, no box."""
+    """Set the labels of a panel, a light grid, and no box around it."""
     if ylabel:
         ax.set_ylabel(ylabel, fontsize=FONT)
     if xlabel:
@@ -84,7 +86,7 @@ def dress(ax: Axes, ylabel: str = "", xlabel: str = "") -> None:
 
 
 def legend_above(ax: Axes, columns: int = 4, *, right: bool = False, math: bool = False) -> None:
-    """A legend over the panel, where it covers no data; without `math` names keep their ``$``."""
+    """Put a legend above the panel, where it hides no data; names keep their ``$`` unless `math` is set."""
     place: dict[str, Any] = {"loc": "lower right" if right else "lower left", "bbox_to_anchor": (right, 1.0)}
     place |= {"borderaxespad": 0.1, "borderpad": 0.2, "handlelength": 1.8, "columnspacing": 1.2}
     legend = ax.legend(ncols=columns, fontsize=FONT - 0.5, frameon=False, **place)
@@ -94,21 +96,21 @@ def legend_above(ax: Axes, columns: int = 4, *, right: bool = False, math: bool 
 
 
 def legend_within(ax: Axes, room: int) -> None:
-    """A legend over the panel in as many columns as so many letters have room for."""
+    """Put a legend above the panel, in as many columns as fit into a width of `room` letters."""
     names = ax.get_legend_handles_labels()[1]
     columns = next(n for n in range(len(names), 0, -1) if n == 1 or sum(_columns(names, n)) <= room)
     legend_above(ax, columns)
 
 
 def _columns(names: list[str], columns: int) -> list[int]:
-    """Widths of a legend's columns, letters, filled one after the other, the first of them one longer."""
+    """Widths (letters) of a legend's columns, which are filled one after the other, the first ones with one more."""
     rows, longer = divmod(len(names), columns)
     begins = [place * rows + min(place, longer) for place in range(columns + 1)]
     return [max(map(len, names[a:b])) + 6 for a, b in itertools.pairwise(begins)]
 
 
 def drawable(text: str, longest: int = 1000) -> str:
-    """Text of a deck as it may be drawn: printable, not long, and with a box for what the font has no picture of."""
+    """Text of a deck for a picture: printable, shortened, and with a box for characters that the font lacks."""
     text = printable(text, longest)
     if text.isascii():
         return text
@@ -119,21 +121,21 @@ def drawable(text: str, longest: int = 1000) -> str:
 
 
 def caption(figure: Figure, text: str, color: str = GREY) -> None:
-    """Small print under the figure, wrapped to its width."""
+    """Put small print under the figure, wrapped to its width."""
     lines = textwrap.fill(drawable(text), 120, break_on_hyphens=False)
     small = figure.supxlabel(lines, x=0.012, ha="left", fontsize=SMALL, color=color)
     small.set_parse_math(False)
 
 
 def save(figure: Figure, path: str | Path, *, about: Mapping[str, str] | None = None, dpi: float = 160.0) -> Path:
-    """Write a figure as PNG; the file is whole or absent.
+    """Write a figure as PNG; the file is complete or absent.
 
     Parameters
     ----------
     figure : Figure
     path : str or Path
     about : mapping, optional
-        What it was made from, kept in the file as text.
+        Texts kept in the file, such as what the figure was made from.
     dpi : float
         Dots per inch.
 
@@ -147,7 +149,7 @@ def save(figure: Figure, path: str | Path, *, about: Mapping[str, str] | None = 
 
 
 def engineering(peak: float, unit: str, least: float = 1.0) -> tuple[float, str]:
-    """Factor and unit that bring `peak` to at least `least` and under 1000 of it: (1e3, "ms") for 0.05 s."""
+    """Factor and prefixed unit by which `peak` is from `least` to 1000 times that: (1e3, "ms") for 0.05 s."""
     size = abs(peak) / least
     if not np.isfinite(size) or size == 0.0:
         return 1.0, unit
@@ -156,7 +158,7 @@ def engineering(peak: float, unit: str, least: float = 1.0) -> tuple[float, str]
 
 
 def thin(t: FloatArray, x: FloatArray, bins: int = MAX_BINS) -> tuple[FloatArray, FloatArray]:
-    """The same curve to the eye in at most about 4 points per bin: first, last, least and largest of each.
+    """A curve that looks the same with about 4 points per bin: the first, last, least and largest of each.
 
     Parameters
     ----------
@@ -176,17 +178,17 @@ def thin(t: FloatArray, x: FloatArray, bins: int = MAX_BINS) -> tuple[FloatArray
 
 
 def peak_of(values: FloatArray) -> float:
-    """Largest size, 0 of nothing."""
+    """Largest absolute value; 0 of an empty array."""
     return float(np.abs(values).max(initial=0.0))
 
 
 def from_zero(ax: Axes) -> None:
-    """A scale from 0, so that ripple is seen at its size."""
+    """Let the scale begin at 0, so that ripple is seen in proportion."""
     top = ax.get_ylim()[1]
     ax.set_ylim(0.0, top if top > 0.0 else 1.0)
 
 
 def flat(ax: Axes, values: FloatArray) -> None:
-    """A constant is shown as one, not its rounding."""
+    """Widen the scale of a constant, which would otherwise show its rounding."""
     if values.any() and np.ptp(values) <= 1e-6 * peak_of(values):
         ax.set_ylim(0.95 * values.flat[0], 1.05 * values.flat[0])

@@ -1,4 +1,4 @@
-"""The figure that the package draws on: it shows itself in a notebook, and in a window where there is one."""
+"""The class of this package's figures, which show themselves in notebooks and open windows."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from matplotlib.figure import Figure
 
 from fingerspice.base.errors import InputError
 
-#: Dots an inch of what a notebook shows, and of those how many it makes one of its own.
+#: Resolution (dots per inch) of the picture in a notebook, and the factor by which the notebook reduces its size.
 _DPI, _SHARPER = 200, 2
 
 
 class Picture(Figure):
-    """A matplotlib figure: save it with ``savefig``, change it as any other, show it with `show`."""
+    """A matplotlib figure, saved with ``savefig`` and shown with `show`."""
 
     def _repr_png_(self) -> tuple[bytes, dict[str, Any]]:
         content = io.BytesIO()
@@ -25,7 +25,7 @@ class Picture(Figure):
         return content.getvalue(), {"width": width, "height": height}
 
     def show(self, warn: bool = True) -> None:
-        """Show the picture: in a notebook under the cell, from a script in a window until that is closed.
+        """Show the picture: in a notebook under the cell, and from a script in a window, until that is closed.
 
         Raises
         ------
@@ -33,7 +33,7 @@ class Picture(Figure):
             Where there is neither.
         """
         if _in_notebook():
-            # As IPython is here already, whatever is installed.
+            # A notebook has imported IPython, which need not be installed otherwise.
             sys.modules["IPython"].display.display(self)
             return
         import matplotlib
@@ -48,7 +48,7 @@ class Picture(Figure):
             raise InputError(
                 f"no window can be opened here (matplotlib's backend is {backend}); allowed: savefig('picture.png')"
             )
-        # As pyplot does it: no public way leads from a figure to a window.
+        # As in pyplot: matplotlib has no public way from a figure to a window.
         manager = canvas.new_manager(self, max(pyplot.get_fignums(), default=0) + 1)
         Gcf._set_new_active_manager(manager)
         pyplot.show()
@@ -61,6 +61,6 @@ def _in_notebook() -> bool:
 
 
 def _opens(manager: Any) -> bool:
-    """Whether a backend's manager has a window of its own."""
+    """Whether a backend's manager opens windows."""
     own = ("pyplot_show", "start_main_loop")
     return any(getattr(manager, name).__func__ is not getattr(FigureManagerBase, name).__func__ for name in own)

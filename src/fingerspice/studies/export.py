@@ -21,25 +21,27 @@ from fingerspice.waveforms.transients import Exp
 from fingerspice.waveforms.waveform import DC, Sine, Waveform
 
 EDGE = 1e-9
-"""Longest rise time (s) of an ideal jump in the export, a thousandth of TSTEP if that is shorter: ngspice has no
-ideal edge."""
+"""Rise time (s) of an ideal jump in the export, since ngspice has none; a thousandth of TSTEP if that is shorter."""
 NOW = 1e-30
-"""What stands for a time of 0 (s) that ngspice takes for "not given"."""
+"""Written for a time of 0 (s), which ngspice takes for "not given"."""
 
-# Measured on ngspice 39, over edges, constant stretches and sines, both laws. Its step control cuts the step to nothing
-# at an edge: trtol turns it off, so that TMAX (TSTEP by default) sets the accuracy. Inside a capacitor C='...' flows
-# du/dt in A, which at a constant voltage is rounding over the step, 1e-6 or so in the first ones, above the usual
-# abstol of 1e-12. The last of several lines counts, so it follows the library.
+# Found by tests with ngspice 39 on edges, constant voltages and sines under both laws. At an edge its step control
+# would reduce the step to nothing; a large trtol switches it off, so that TMAX (by default TSTEP) sets the accuracy.
+# Inside a capacitor C='...' a current of du/dt (in A) flows. At a constant voltage that is rounding divided by the
+# step, about 1e-6 in the first steps and thus above the usual abstol of 1e-12. The last of several .options lines
+# counts, so this one follows the library.
 _OPTIONS = ".options reltol=1e-4 trtol=1e4 abstol=1e-4"
 
-# Straight lines between them miss a sine by 5e-6 of its amplitude.
+# With so many points straight lines miss a sine by 5e-6 of its amplitude.
 _POINTS_PER_TIME_SCALE = 1000
 _MAX_POINTS = 2_000_000
 _FEW_POINTS = 1000
 
 
 def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
-    """A deck that ngspice 39 runs by itself: bodies included, parameters folded in, foreign sources as PWL.
+    """A deck that ngspice 39 runs without other files.
+
+    It has the devices' bodies, numbers in place of parameters, and PWL in place of sources that ngspice lacks.
 
     Parameters
     ----------
@@ -55,8 +57,8 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     Raises
     ------
     InputError
-        For a circuit without .tran line where a source has to be written as points, and for names that would become
-        one.
+        For a source that has to be written as points in a circuit without .tran line, and for different names that
+        would become the same.
     """
     require_circuit(circuit)
     law = charge_law or circuit.charge_law or "local"
@@ -81,14 +83,14 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
 
 
 def _name(name: str) -> str:
-    # ngspice uses the dot for what is inside a subcircuit; here the circuit is flat. A node called temper ends it.
+    # In ngspice a dot names what is inside a subcircuit, while this circuit is flat. A node called temper ends ngspice.
     return "temper_" if name.lower() == "temper" else name.replace(".", "_")
 
 
 def _element_name(element: Element) -> str:
     name = _name(element.name)
     letter = element.device if len(element.device) == 1 else "X"
-    # ngspice tells elements by their first letter, which inside a subcircuit call is the call's.
+    # ngspice knows elements by their first letter; the flat name of one in a subcircuit begins with that of the call.
     return name if name[0].upper() == letter else f"{letter}{name}"
 
 
@@ -103,7 +105,7 @@ def _refuse_merged_names(circuit: Circuit) -> None:
 
 
 def _contacts(circuit: Circuit) -> dict[str, Contact]:
-    """The contact of each GAP by its area node."""
+    """The contact of each GAP, by area node."""
     if is_stack(circuit):
         stack = build_stack(circuit)
         return {e.nodes[2]: stack.contact for e in stack.layers if stack.contact is not None}
@@ -111,7 +113,7 @@ def _contacts(circuit: Circuit) -> dict[str, Contact]:
 
 
 def _start_areas(circuit: Circuit, law: str) -> dict[str, float]:
-    """Area (mm^2) of each area node just as a ``uic`` run starts; none where a run starts otherwise."""
+    """Area (mm^2) of each area node at the start of a run with ``uic``; empty where a run starts otherwise."""
     if circuit.tran is None or not starts_uncharged(circuit):
         return {}
     areas, _ = find_branches(circuit)
@@ -129,7 +131,7 @@ def _start_areas(circuit: Circuit, law: str) -> dict[str, float]:
 
 
 def _slow_areas(circuit: Circuit, law: str) -> dict[str, float]:
-    """Where areas with dynamics of their own start, mm^2."""
+    """Start values (mm^2) of areas with dynamics of their own."""
     problem = prepare_network(
         circuit, t_stop=None, t_eval=None, charge_law=law, area="coupled", start="deck", charge=False
     )
@@ -143,7 +145,7 @@ def _slow_areas(circuit: Circuit, law: str) -> dict[str, float]:
 
 
 def _start_lines(circuit: Circuit, areas: Mapping[str, float]) -> Iterator[str]:
-    """Start values and guesses of nodes; what layers hold with ``uic`` stands with the layers."""
+    """Start values and guesses of nodes; with ``uic`` the lines of the layers have their start voltages."""
     written = {node: name for e in circuit.elements for node, name in zip(e.nodes, e.node_names, strict=True)}
     gaps = {gap.nodes[2]: gap for gap in circuit.by_device("GAP")}
     contacts = _contacts(circuit)
@@ -154,7 +156,7 @@ def _start_lines(circuit: Circuit, areas: Mapping[str, float]) -> Iterator[str]:
         guess = gap.values["a_fix"] or 1e6 * float(contacts[node].area(0.0))
         held = circuit.initial.get(node)
         if areas:
-            # An area with dynamics of its own has to start somewhere; a guess is enough for one that follows at once.
+            # An area with dynamics of its own needs a start value; for one that follows instantly a guess is enough.
             held = areas[node] if gap.values["tau"] > 0.0 else None
             guess = areas[node]
         word, value = (".nodeset", guess) if held is None else (".ic", held)
@@ -164,7 +166,7 @@ def _start_lines(circuit: Circuit, areas: Mapping[str, float]) -> Iterator[str]:
 
 
 def _guesses_inside(gap: Element, contact: Contact, u: float) -> Iterator[str]:
-    """Guesses for the nodes inside a GAP at `u` V: with charge to hold ngspice finds no first point without them."""
+    """Guesses for the nodes inside a GAP at `u` V: with stored charge ngspice finds no first point without them."""
     at_rest, adhesive = (float(contact.area_adhesive(v)) for v in (0.0, u))
     y = adhesive / at_rest
     guesses = {
@@ -190,7 +192,7 @@ def _element_lines(
         initial = f" IC={element.initial!r}" if element.initial is not None else ""
         yield f"{name} {nodes} {element.values['value']!r}{initial}"
         return
-    # The strength of a dielectric is for a warning here; ngspice has no use for it.
+    # The strength of a dielectric only serves a warning here.
     values = " ".join(f"{k}={_number(v)}" for k, v in element.values.items() if k != "e_max")
     extra = f" wk={work_ratio!r}" if element.device == "GAP" and work_ratio != 1.0 else ""
     area = start_areas.get(element.nodes[2])
@@ -233,7 +235,7 @@ def _source_text(waveform: Waveform, element: Element, circuit: Circuit) -> str:
     else:
         t, v = _sampled(waveform, element, circuit)
     if _starts_empty(circuit):
-        # Everything is at 0 V before, and the source jumps from there: a first step without one is hard for ngspice.
+        # Everything starts at 0 V, and the source jumps from there: ngspice can hardly take its first step otherwise.
         t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append([0.0, waveform.value(0.0)], v[t > 0.0])
     return _pwl_text(t, v, _edge(circuit))
 
@@ -253,11 +255,11 @@ def _edge(circuit: Circuit) -> float:
 
 
 def _pulse_text(p: Pulse, circuit: Circuit) -> str | None:
-    """A pulse, where ngspice has it: its width and period are not 0, its edges have room, its start is at rest."""
+    """A pulse as ngspice has it; None where its edges have no room, or it does not start from rest."""
     if _starts_empty(circuit) and p.value(0.0) != 0.0 and p.breakpoint_rate() * _stop(circuit) < _FEW_POINTS:
         return None
     edge, span = _edge(circuit), _stop(circuit) + abs(p.delay)
-    # A jump takes its edge from the time after it: what follows keeps its own time.
+    # The edge of a jump takes its time from what follows, which then ends when it should.
     width = p.width - (0.0 if p.rise else edge) if math.isfinite(p.width) else 10.0 * span
     rise, fall = p.rise or edge, p.fall or edge
     period = p.pulse_period if math.isfinite(p.pulse_period) else 20.0 * span + rise + width + fall
@@ -268,7 +270,7 @@ def _pulse_text(p: Pulse, circuit: Circuit) -> str | None:
 
 
 def _sampled(waveform: Waveform, element: Element, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
-    """Points of a waveform over the run: its breakpoints, both sides, and enough in between."""
+    """Points of a waveform over the run: both sides of its breakpoints, and enough points between them."""
     if circuit.tran is None:
         raise InputError(f"{element.name}: exporting this source as PWL needs a .tran line to know how far")
     stop = circuit.tran.stop
@@ -279,7 +281,7 @@ def _sampled(waveform: Waveform, element: Element, circuit: Circuit) -> tuple[np
     count = 1 if not math.isfinite(spacing) else math.ceil(stop / spacing)
     points = count + 2.0 * waveform.breakpoint_rate() * stop
     breaks = np.empty(0)
-    # The rate is an upper estimate; the breakpoints themselves may be too many to list.
+    # The rate is an upper bound, tested first since there may be too many breakpoints to list.
     if points <= 10 * _MAX_POINTS:
         breaks = waveform.breakpoints(0.0, stop)
         points = count + 2 * breaks.size
@@ -289,7 +291,7 @@ def _sampled(waveform: Waveform, element: Element, circuit: Circuit) -> tuple[np
             "the run (.tran)"
         )
     if circuit.tran.uic:
-        # What the source was before 0 matters to the operating point only.
+        # The value before t = 0 only matters to an operating point.
         breaks = breaks[breaks > 0.0]
     smooth = np.linspace(0.0, stop, count + 1)
     t = np.concatenate([smooth, breaks, breaks])
@@ -300,14 +302,14 @@ def _sampled(waveform: Waveform, element: Element, circuit: Circuit) -> tuple[np
 
 
 def _pwl_text(t: np.ndarray, v: np.ndarray, edge: float) -> str:
-    """PWL text; a jump becomes an edge of `edge` seconds, and repeated points are left out."""
+    """PWL text, in which jumps become edges of `edge` seconds and repeated points are left out."""
     times: list[float] = []
     values: list[float] = []
     for time, value in zip(t.tolist(), v.tolist(), strict=True):
         if times and time <= times[-1]:
             if value == values[-1]:
                 continue
-            # Late in a long run an edge may be less than the rounding of the time.
+            # Late in a long run an edge may be shorter than the rounding of the time.
             time = max(times[-1] + edge, np.nextafter(times[-1], math.inf).item())
         times.append(time)
         values.append(value)

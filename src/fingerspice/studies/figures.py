@@ -1,8 +1,7 @@
-"""The paper's Figs. 2 to 5 from scratch, each as a picture with its data, and the figures its text claims.
+"""The paper's Figs. 2 to 5, each as a picture with its data, and the numbers that the paper's text claims.
 
-Every curve is this package's own: the skin of Eqs. 18 (read as a cubic) and 19, the phasor for Fig. 3, the
-periodic state of the transient for Figs. 4 and 5. The measured points the paper shows in grey are not
-reproduced here.
+Every curve is computed by this package: Fig. 2 from Eqs. 18 (read as a cubic) and 19, Fig. 3 by phasors, Figs. 4 and 5
+as periodic states of the transient. The measured points that the paper shows in grey are not reproduced.
 """
 
 from __future__ import annotations
@@ -39,25 +38,25 @@ U0_FORCE, U0_TIME = 140.0, 200.0
 """Source amplitudes of Fig. 3, and of Figs. 4 and 5, V."""
 
 FREQUENCIES = (100.0, 5000.0)
-"""Of Figs. 4 and 5, Hz."""
+"""Frequencies of Figs. 4 and 5, Hz."""
 
 
 @dataclass(frozen=True)
 class Variation:
-    """One panel of Fig. 3: a parameter, its values and what they do to the circuit.
+    """One panel of Fig. 3: a parameter, its values, and the circuit parameters that it changes.
 
     Attributes
     ----------
     title, symbol, unit : str
-        For the picture; the symbol in TeX.
+        Texts of the picture; the symbol is in TeX.
     name : str
-        For the data.
+        Name in the data file.
     paths : tuple of str
-        Circuit parameters that scale with it.
+        Paths of the circuit parameters that are proportional to it.
     base : float
         Its value in Table 1, in `unit`.
     values : tuple of float
-        The curves, in `unit`.
+        Value of each curve, in `unit`.
     """
 
     title: str
@@ -78,7 +77,7 @@ class Variation:
 def variations() -> tuple[Variation, ...]:
     """The four panels of Fig. 3, in the paper's order."""
     gap = table1_circuit().parameters
-    # Ridge area without voltage and friction (Eq. 5); alpha and beta scale together, the exponents stay.
+    # Ridge area without voltage and friction (Eq. 5): alpha and beta are scaled together, and the exponents are kept.
     area = gap["Xgap.alpha"].value * gap["Xgap.fn"].value ** gap["Xgap.m_exp"].value
     scale_area = ("Xgap.alpha", "Xgap.beta")
     return (
@@ -91,13 +90,13 @@ def variations() -> tuple[Variation, ...]:
 
 @dataclass(frozen=True)
 class Table:
-    """Data of a figure: names with units, columns of equal length."""
+    """Data of a figure: column names with units, and columns of equal length."""
 
     header: tuple[str, ...]
     columns: tuple[FloatArray, ...]
 
     def write(self, path: Path) -> Path:
-        """As CSV, ten digits."""
+        """Write the table as CSV with ten digits."""
 
         def write(target: Path) -> None:
             with target.open("w", newline="", encoding="utf-8") as stream:
@@ -118,7 +117,7 @@ def make_figures(
     folder : str or Path
         Made where it does not exist.
     only : int or iterable of int, optional
-        Numbers of the figures wanted, 2 to 5; all by default.
+        Numbers of the figures wanted, from 2 to 5; all by default.
     progress : callable, optional
         Called with the fraction done.
 
@@ -130,7 +129,7 @@ def make_figures(
     Raises
     ------
     InputError
-        For a figure the paper's model does not make, or a folder that cannot be written.
+        For another number of a figure, or a folder that cannot be written.
     """
     wanted = list(FIGURES) if only is None else [only] if isinstance(only, int) else list(only)
     for number in wanted:
@@ -170,7 +169,7 @@ def figure_2() -> tuple[Figure, Table]:
 
 
 def figure_3(points: int = 46) -> tuple[Figure, Table]:
-    """Mean electroadhesive force against frequency, with one parameter at a time varied."""
+    """Mean electroadhesive force against frequency; each panel varies one parameter."""
     f = np.geomspace(10.0, 1e4, points)
     circuit = table1_circuit().replace({"Vdrive.amplitude": U0_FORCE})
     base = phasor(circuit, f).f_el_mean
@@ -192,7 +191,7 @@ def figure_3(points: int = 46) -> tuple[Figure, Table]:
         )
         ax.set_xlim(f[0], f[-1])
         ax.set_ylim(0.0, 0.25 if variation.name == "d_a" else 0.125)
-        # Where the curves of the panel leave room.
+        # The corner in which the panel's curves leave room.
         corner: Any = "lower right" if variation.name == "r_a" else "upper left"
         ax.legend(loc=corner, fontsize=drawing.FONT - 1.0, frameon=False)
     for ax in axes[::2]:
@@ -203,7 +202,7 @@ def figure_3(points: int = 46) -> tuple[Figure, Table]:
 
 
 def _styles(variation: Variation) -> Iterator[dict[str, Any]]:
-    """Table 1 in black; the others differ in colour and in dashes."""
+    """Line styles: black for Table 1, and different colours and dashes for the others."""
     others = iter(zip((drawing.BLUE, drawing.VERMILION, drawing.GREEN), drawing.DASHES[1:], strict=True))
     for value in variation.values:
         if value == variation.base:
@@ -218,12 +217,12 @@ def _ascii(unit: str) -> str:
 
 
 def time_response(shape: type[Sine] | type[Square], frequency: float, *, dispersive: bool = False) -> Solution:
-    """One period of the periodic state of Table 1 at 200 V, its skin taken at `frequency` (Hz), or dispersive."""
+    """One period of the periodic state of Table 1 at 200 V, with the skin taken at `frequency` (Hz) or dispersive."""
     changes: dict[str, float | Waveform] = {"Vdrive": shape(U0_TIME, frequency)}
     if not dispersive:
         changes["Xskin.f"] = frequency
     with warnings.catch_warnings():
-        # Of a square wave 2 % of the energy lie above the skin's data, in the paper as here.
+        # 2 % of a square wave's energy lies above the skin's data, in the paper as here: no warning is needed.
         warnings.simplefilter("ignore", FingerspiceWarning)
         return steady_state(table1_circuit(dispersive=dispersive).replace(changes), points=1000).solution
 
@@ -231,11 +230,11 @@ def time_response(shape: type[Sine] | type[Square], frequency: float, *, dispers
 def two_periods(solution: Solution) -> dict[str, FloatArray]:
     """Columns ``t``, ``u_source``, ``u_gap``, ``f_el``, ``area`` of one period, twice over, from t = 0.
 
-    The end of the first copy is left out where it says what the start of the second does.
+    The end of the first copy is left out where it repeats the start of the second.
     """
     assert solution.period is not None
     t = solution.t - solution.t[0]
-    # At a jump the period ends with a left-hand row, then the right-hand one that begins the next.
+    # A period that ends at a jump ends with a left-hand row and the right-hand row that begins the next period.
     end = t.size - 1
     rows = np.concatenate([np.arange(end), np.arange(end), [] if t[-1] == t[-2] else [end]]).astype(int)
     shift = np.where(np.arange(rows.size) < end, 0.0, solution.period)
@@ -246,7 +245,7 @@ def two_periods(solution: Solution) -> dict[str, FloatArray]:
 def _time_figure(shape: type[Sine] | type[Square]) -> tuple[Figure, Table]:
     """Gap voltage and force over two periods of the periodic state, 100 Hz left, 5000 Hz right.
 
-    A square is broad: with it, what a dispersive skin makes of it.
+    A square wave has many harmonics, so a dispersive skin is shown as well.
     """
     dispersive = shape is Square
     figure, axes = drawing.new_figure(2, 2, height=4.3, sharex="col", sharey="row")
@@ -273,7 +272,7 @@ def _time_column(axes: Sequence[Axes], data: dict[str, FloatArray], frequency: f
     factor, unit = drawing.engineering(2.0 / frequency, "s")
     mean = float(np.trapezoid(data["f_el"], data["t"]) / data["t"][-1])
     dash = drawing.DASHES[1]
-    # What came before t = 0 is what ends a period: an edge there is drawn, too.
+    # Before t = 0 there is the end of a period; with its last value an edge at t = 0 is drawn, too.
     t = factor * np.append(0.0, data["t"])
     y = {name: np.append(x[-1], x) for name, x in data.items()}
     upper.plot(t, y["u_source"], color=drawing.GREY, linewidth=1.2, linestyle=dash, label="source $U$")
@@ -281,7 +280,7 @@ def _time_column(axes: Sequence[Axes], data: dict[str, FloatArray], frequency: f
     lower.plot(t, y["f_el"], color=drawing.VERMILION, linewidth=1.6, label=r"force $F_\mathrm{el}$")
     for ax, name in ((upper, "u_gap_dispersive"), (lower, "f_el_dispersive")):
         if name in y:
-            # Said once: beside the force there is room for it.
+            # Named once, in the legend of the force, where there is room.
             label = "dispersive" if ax is lower else "_"
             ax.plot(t, y[name], color=drawing.BLACK, linewidth=0.9, linestyle=drawing.DASHES[3], label=label)
     lower.axhline(mean, color=drawing.BLACK, linewidth=1.0, linestyle=dash, label=f"mean {mean:.3f} N")
@@ -299,18 +298,18 @@ FIGURES: dict[int, Callable[[], tuple[Figure, Table]]] = {
     4: partial(_time_figure, Sine),
     5: partial(_time_figure, Square),
 }
-"""What makes each figure of the paper."""
+"""The function that makes each figure of the paper."""
 
 
 def figure_numbers() -> dict[str, float]:
-    """What the paper's text says about its figures, as this package computes it.
+    """The numbers that the paper's text states about its figures, as this package computes them.
 
     Returns
     -------
     dict of str to float
         ``area_unloaded`` (m^2); at 200 V ``gain_100Hz``, ``lead_100Hz`` (degrees), the same at 5000 Hz; at
-        140 V ``rise`` (mean force at 10 kHz over 100 Hz, also per gap resistance) and ``rise_above_2kHz``;
-        for the time responses least, largest and mean force (N); then `trends`.
+        140 V ``rise`` (ratio of the mean forces at 10 kHz and 100 Hz, also for each gap resistance) and
+        ``rise_above_2kHz``; least, largest and mean force (N) of the time responses; and those of `trends`.
     """
     circuit = table1_circuit()
     out: dict[str, float] = {"area_unloaded": variations()[1].base * 1e-6}
@@ -335,7 +334,7 @@ def figure_numbers() -> dict[str, float]:
 
 
 def trends(frequencies: Sequence[float] = (10.0, 100.0, 1000.0, 10000.0)) -> dict[str, float]:
-    """How the mean force of Fig. 3 follows its parameters.
+    """How the mean force of Fig. 3 depends on its parameters.
 
     Parameters
     ----------
@@ -345,9 +344,10 @@ def trends(frequencies: Sequence[float] = (10.0, 100.0, 1000.0, 10000.0)) -> dic
     Returns
     -------
     dict of str to float
-        Per parameter and frequency: ``elasticity_...``, relative change of force per relative change of the
-        parameter at Table 1; ``bend_...``, largest distance from the best straight line over the panel's
-        range, as a share of the force's change over it; ``span_...``, that change, relative to Table 1's force.
+        For each parameter and frequency: ``elasticity_...``, the relative change of the force per relative change of
+        the parameter at Table 1; ``span_...``, the change of the force over the panel's range, relative to the force of
+        Table 1; ``bend_...``, the largest distance from the best straight line over that range, relative to that
+        change.
     """
     circuit = table1_circuit().replace({"Vdrive.amplitude": U0_FORCE})
     base = phasor(circuit, frequencies).f_el_mean

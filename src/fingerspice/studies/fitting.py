@@ -1,4 +1,4 @@
-"""From measured resistivity and permittivity to a passive ladder, and how consistent the data are."""
+"""Fits of a passive ladder to measured resistivity and permittivity, and the consistency of such data."""
 
 from __future__ import annotations
 
@@ -23,17 +23,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_POLES = 12
-# Poles per decade and decades beyond the band, of the fit that any causal and passive material would match.
+# The best fit by any causal and passive material has this many poles per decade, and poles this many decades beyond the
+# band.
 _DENSE, _BEYOND = 8, 2.0
-# Misfit (rms) of a fit, or of data to any material, that is worth a warning, and that is no fit and no material.
+# Misfit (rms) of a fit, or of data to any material, from which on there is a warning, and above which it is refused.
 NOTABLE, TOO_MUCH = 0.1, 0.3
-# Of data, in Hz, ohm m and 1: far from any material's, so that products and quotients stay numbers.
+# Range of data in Hz, ohm m and 1: far beyond any material, and such that products and quotients do not overflow.
 _LEAST, _MOST = 1e-20, 1e20
 
 
 @dataclass(frozen=True)
 class ColeCole:
-    """A material by Cole and Cole's equation (J. Chem. Phys. 9, 341, 1941; Gabriel 1996 with several terms).
+    """A material that follows Cole and Cole's equation (J. Chem. Phys. 9, 341, 1941; several terms: Gabriel 1996).
 
     eps = eps_inf + sum of delta / (1 + (2 pi i f tau)^(1 - alpha)) + conductivity / (2 pi i f eps0)
 
@@ -45,7 +46,7 @@ class ColeCole:
     conductivity : float
         S/m.
     band : tuple of float
-        Frequencies to fit over, Hz.
+        Lowest and highest frequency of the fit, Hz.
     """
 
     eps_inf: float
@@ -71,14 +72,14 @@ class ColeCole:
 
 @dataclass(frozen=True)
 class Consistency:
-    """How near the data are to any causal and passive material (Kramers and Kronig's relations).
+    """Distance of data from the nearest causal and passive material (relations of Kramers and Kronig).
 
     Attributes
     ----------
     rms, largest : float
-        Misfit |y_fit / y - 1| of the best sum of Debye terms with poles everywhere.
+        Misfit |y_fit / y - 1| of the best sum of Debye terms with densely placed poles.
     frequency, misfit : ndarray, shape (n,)
-        The same by frequency, Hz.
+        The misfit at each frequency (Hz).
     """
 
     rms: float
@@ -95,13 +96,13 @@ class MaterialFit(Shown):
     ----------
     ladder : Ladder
     rms, largest : float
-        |y_fit / y - 1| over the data.
+        Misfit |y_fit / y - 1| over the data.
     frequency : ndarray, shape (n,)
-        Of the data, Hz.
+        Frequencies of the data, Hz.
     misfit : ndarray, shape (n,)
-        |y_fit / y - 1| at each.
+        Misfit at each frequency.
     kramers_kronig : Consistency
-        What no ladder can do better than.
+        The misfit that no ladder can go below.
     data : ndarray of complex, shape (n,)
         Admittivity of the data, S/m.
     """
@@ -120,10 +121,10 @@ class MaterialFit(Shown):
         return fit_page(self)
 
     def to_netlist(self, name: str) -> str:
-        """A subcircuit of slabs in series, with its thickness as parameter; for decks here and for ngspice.
+        """A subcircuit of slabs in series with the thickness as parameter, for decks here and in ngspice.
 
-        Written to ``myskin.lib`` beside the deck, ``.include myskin.lib`` and ``Xskin skin 0 area NAME d=350u`` put it
-        there in place of a SKIN.
+        Write it to ``myskin.lib`` beside the deck; ``.include myskin.lib`` and ``Xskin skin 0 area NAME d=350u`` then
+        take the place of a SKIN.
 
         Raises
         ------
@@ -153,19 +154,19 @@ def subcircuit(ladder: Ladder, name: str) -> str:
 def fit_material(
     data: ColeCole | ArrayLike | str | Path, *, poles: int | None = None, error: float | None = None
 ) -> MaterialFit:
-    """Fit a passive ladder: non-negative least squares of the relative misfit, the poles placed by Gauss-Newton.
+    """Fit a passive ladder, by non-negative least squares of the relative misfit with poles placed by Gauss-Newton.
 
     Parameters
     ----------
     data : ColeCole, array_like or path
         Cole-Cole parameters; or rows of frequency (Hz), resistivity (ohm m) and relative permittivity, as an array
-        (n, 3) or a CSV file of three columns. Where the file has a line of names, these say what the columns hold, in
-        which order and in which units: ``omega [rad/s],sigma [S/m],eps_r`` will do.
+        (n, 3) or a CSV file of three columns. A line of names in the file gives quantities, order and units of the
+        columns, as in ``omega [rad/s],sigma [S/m],eps_r``.
     poles : int, optional
-        How many branches.
+        Number of branches.
     error : float, optional
-        Fewest branches whose rms misfit is at most this, or within a twentieth of what the data's own inconsistency
-        leaves. 0.02 if neither is given.
+        Take the fewest branches whose rms misfit is at most this, or at most 1.05 times that of the data's own
+        inconsistency. The default, if `poles` is not given either, is 0.02.
 
     Returns
     -------
@@ -174,13 +175,13 @@ def fit_material(
     Raises
     ------
     InputError
-        For data that cannot be read or are no material's (then with the likely slip), for a misfit above 30 %, and
-        where both `poles` and `error` are given.
+        For data that cannot be read or belong to no material (with the likely slip), for a misfit above 30 %, and where
+        both `poles` and `error` are given.
 
     Warns
     -----
     FingerspiceWarning
-        Where the data are more than 10 % from any causal and passive material, or the fit from the data.
+        Where the misfit is above 10 %: of the data to any causal and passive material, or of the fit to the data.
 
     Examples
     --------
@@ -249,7 +250,7 @@ def _admittivity(table: FloatArray) -> tuple[FloatArray, ComplexArray]:
 
 
 def _doubt(table: FloatArray, found: Consistency) -> str:
-    """What is wrong with data that are no material's, and the slip that would explain it: a warning, or a refusal."""
+    """Warn of data that no material can have, or refuse them, with the likely slip; returns the warning, or nothing."""
     if found.rms <= NOTABLE:
         return ""
     slips = likely_slips(table, lambda other: _consistency(*_admittivity(other)).rms, found.rms)
@@ -264,13 +265,13 @@ def _doubt(table: FloatArray, found: Consistency) -> str:
 def _least_ladder(
     f: FloatArray, y: ComplexArray, counts: Sequence[int], error: float
 ) -> tuple[Ladder, FloatArray, float]:
-    """The first ladder of so many branches that misses the data by no more than the error, or the last one, rms."""
+    """The first ladder, in the order of `counts`, with a misfit (rms) of at most `error`, or the last one."""
     found, refused = None, InputError("")
     for count in counts:
         try:
             ladder, misfit = _fit(f, y, count)
         except InputError as problem:
-            # With more branches something may be left.
+            # A fit with more branches may succeed.
             refused = problem
             continue
         found = ladder, misfit, float(np.sqrt(np.mean(misfit**2)))
@@ -282,7 +283,7 @@ def _least_ladder(
 
 
 def _weights(f: FloatArray, y: ComplexArray, poles: FloatArray) -> tuple[FloatArray, ComplexArray]:
-    """Best weights (g0, eps0 eps_inf, k_j), none negative, and the relative misfit they leave."""
+    """Best weights (g0, eps0 eps_inf, k_j) that are not negative, and the relative misfit that remains."""
     from scipy.optimize import nnls
 
     s = 2j * np.pi * f
@@ -295,7 +296,7 @@ def _weights(f: FloatArray, y: ComplexArray, poles: FloatArray) -> tuple[FloatAr
 
 
 def _fit(f: FloatArray, y: ComplexArray, count: int) -> tuple[Ladder, FloatArray]:
-    """The ladder of so many branches, and its misfit."""
+    """The ladder with `count` branches, and its misfit."""
     from scipy.optimize import least_squares
 
     low, high = np.log10(2.0 * np.pi * f[[0, -1]])
@@ -305,7 +306,7 @@ def _fit(f: FloatArray, y: ComplexArray, count: int) -> tuple[Ladder, FloatArray
         _, left = _weights(f, y, 10.0**place)
         return np.concatenate([left.real, left.imag])
 
-    # A pole far above the band would do eps_inf's work, and none would be left for it.
+    # A pole far above the band would act as eps_inf, and leave nothing for it.
     found = least_squares(residual, start, bounds=(low - 0.5, high + 0.25), max_nfev=60)
     poles = 10.0 ** np.sort(found.x)
     x, left = _weights(f, y, poles)

@@ -1,4 +1,4 @@
-"""Measured resistivity and permittivity as tables: what their headers say, and which slip would explain bad ones."""
+"""Tables of measured resistivity and permittivity: units in their headers, and likely slips in their numbers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ _PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "G": 1e9, "m": 1e-3, "u": 1e-6, "µ": 
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _PREFIX = f"(?P<prefix>[{''.join(_PREFIXES)}]?)"
 _METRE = "(?P<metre>cm|mm|m)"
-# Names of what a column holds, and how its unit is written: the value in SI is value * prefix * metre^power * factor.
+# Names of a column's quantity, and patterns of its unit: the value in SI units is value * prefix * metre^power *
+# factor.
 _NAMES = {
     "frequency": "f|freq|frequency|frequenz|hz",
     "angular frequency": "w|omega|ω|angular frequency|angular_frequency",
@@ -41,13 +42,13 @@ _UNITS: dict[str, tuple[tuple[str, float, int], ...]] = {
 def read_table(path: Path) -> FloatArray:
     """Rows of frequency (Hz), resistivity (ohm m) and relative permittivity from a text file of three columns.
 
-    Columns are separated by commas, semicolons (then with a decimal comma or point) or tabs. A line of names says what
-    they hold, in which order and in which units, conductivities and angular frequencies too.
+    Columns are separated by commas, tabs or semicolons; with semicolons decimal commas are allowed. A line of names
+    gives quantities, order and units of the columns, among them conductivities and angular frequencies.
 
     Raises
     ------
     InputError
-        For what cannot be read, with its row.
+        For a file that cannot be read, with the row at fault.
     """
     try:
         lines = read_text(path, str(path)).splitlines(keepends=True)
@@ -71,7 +72,7 @@ def read_table(path: Path) -> FloatArray:
 
 
 def _as_named(table: FloatArray, head: list[str], file: str) -> FloatArray:
-    """Columns in their order and SI units, as their names say; those without a name of use keep their place."""
+    """Columns put into order and SI units by their names; columns whose name is not understood fill what is left."""
     named = [_column(name, file) for name in head]
     out = table.copy()
     left = [k for k in range(3) if named[k] is None]
@@ -99,7 +100,7 @@ def _as_named(table: FloatArray, head: list[str], file: str) -> FloatArray:
 
 
 def _column(name: str, file: str) -> tuple[str, float] | None:
-    """What a column holds by its name, and what makes SI of it; None for a name that says nothing."""
+    """Quantity of a column by its name, and the factor to SI units; None for a name that is not understood."""
     bare = name.strip().strip("\"'")
     match = re.fullmatch(r"(?P<what>[^\[(/]*?)\s*(?:[\[(](?P<bracket>[^\])]*)[\])]|/\s*(?P<slash>.+))?", bare)
     if match is None:
@@ -127,7 +128,7 @@ def _column(name: str, file: str) -> tuple[str, float] | None:
     )
 
 
-#: What data may be by mistake, and the table that they were meant as.
+#: Possible slips, each with the function that gives the table that was meant.
 _SLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
     ("the frequency is in rad/s", lambda t: _scaled(t, 0, 0.5 / np.pi)),
     ("the second column is a conductivity in S/m", lambda t: _inverse(t, 1.0)),
@@ -160,16 +161,16 @@ def _inverse(table: FloatArray, unit: float) -> FloatArray:
 
 
 def likely_slips(table: FloatArray, misfit: Callable[[FloatArray], float], least: float) -> list[str]:
-    """What would make a material of data that are none: slips that leave less than a third of the misfit, best first.
+    """Slips that would explain data of no material: those that reduce the misfit to less than a third, best first.
 
     Parameters
     ----------
     table : ndarray, shape (n, 3)
         Frequency (Hz), resistivity (ohm m) and relative permittivity.
     misfit : callable
-        How far a table is from any causal and passive material.
+        Misfit of a table to the nearest causal and passive material.
     least : float
-        That of the data as they are.
+        Misfit of the data as they are.
     """
     found = []
     for text, meant in _SLIPS:
@@ -178,5 +179,5 @@ def likely_slips(table: FloatArray, misfit: Callable[[FloatArray], float], least
         if np.all(np.diff(other[:, 0]) > 0.0):
             found.append((misfit(other), text))
     best = min((value for value, _ in found), default=np.inf)
-    # Two slips of the same factor, kHz and kohm m, cannot be told apart.
+    # Two slips with the same factor, such as kHz and kohm m, cannot be distinguished.
     return [text for value, text in found if value <= min(1.1 * best, least / 3.0)][:2]

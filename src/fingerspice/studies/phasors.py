@@ -38,7 +38,7 @@ def _frequencies(frequency: ArrayLike | None, fundamental: Fundamental | None) -
 
 
 def _check_area(area: str | float, amplitude: float, fixed: bool) -> None:
-    """Refuse what is no area or mode, and a coupled one without an amplitude to couple it to."""
+    """Refuse anything but a mode or an area, and the mean area of a source without amplitude."""
     if not isinstance(area, str):
         require(math.isfinite(area) and area > 0.0, "area", f"{area:g} m^2", "a positive area in m^2")
         return
@@ -51,7 +51,7 @@ def _check_area(area: str | float, amplitude: float, fixed: bool) -> None:
 
 
 def _with_skin_held(circuit: Circuit) -> Circuit:
-    """A circuit whose SKINs are slabs of their data at their own frequency."""
+    """The circuit with each SKIN replaced by a slab of its data at its own frequency."""
 
     def held(skin: Element) -> Element:
         d, f = skin.values["d"], skin.values["f"]
@@ -63,7 +63,7 @@ def _with_skin_held(circuit: Circuit) -> Circuit:
 
 
 def _refuse_no_number(f: FloatArray, *results: NDArray[np.inexact]) -> None:
-    """Refuse a sweep whose figures are beyond the range of numbers."""
+    """Refuse a sweep in which numbers overflow."""
     bad = ~np.logical_and.reduce([np.isfinite(x).reshape(f.size, -1).all(axis=1) for x in results])
     if np.any(bad):
         raise InputError(
@@ -87,14 +87,13 @@ def phasor(
     ----------
     circuit : Circuit
     frequency : array_like, optional
-        Hz, positive; the source's fundamental by default. Over given frequencies a deck's ``AC magnitude [phase]`` is
-        what drives, as in ngspice; without it, and at the fundamental, the source's fundamental.
+        Hz, positive; the source's fundamental by default. At given frequencies a deck's ``AC magnitude [phase]`` drives
+        the circuit, as in ngspice. Without AC, and by default, the source's fundamental drives it.
     sources, parameters
         As in `simulate`.
     area : str or float
-        ``"mean"``: coupled through the mean stress at the source's own amplitude (its fundamental's, if it is
-        not a sine); ``"frozen"``: the area at 0 V; or an area in m^2. An area fixed by the deck comes before
-        ``"mean"`` and ``"frozen"``.
+        ``"mean"``: the area under the mean stress at the amplitude of the source's fundamental; ``"frozen"``: the area
+        at 0 V; or an area in m^2. An area that the deck fixes takes precedence over ``"mean"`` and ``"frozen"``.
     skin : str
         ``"swept"``: SKIN's data at each frequency; ``"own"``: at SKIN's own f, as in ngspice.
 
@@ -105,8 +104,8 @@ def phasor(
     Raises
     ------
     InputError
-        For a circuit without GAP, a network with several GAPs or sources, a source without fundamental where one is
-        needed, frequencies or an area not positive, or a result beyond the range of numbers.
+        For a circuit without GAP, a network with several GAPs or sources, a source without the fundamental that is
+        needed, frequencies or an area that are not positive, or a result that overflows.
     """
     require(skin in ("swept", "own"), "skin", repr(skin), "'swept' or 'own'")
     require_area(area)
@@ -120,7 +119,7 @@ def phasor(
         layers = np.array([scene.layer_gain(float(x), a) for x, a in zip(f, areas, strict=True)])
         gain, own = layers[:, scene.gap], areas[:, scene.finger].copy()
         u_gap = gain * drive.amplitude * np.exp(1j * drive.phase)
-        # Mean of sigma A over a period of a sine: half the peak.
+        # The mean of stress times area over a period of a sine is half its peak.
         force = 0.5 * scene.contact.stress(np.abs(u_gap)) * own
     _refuse_no_number(f, layers, own, *((u_gap, force) if math.isfinite(drive.amplitude) else ()))
     notes, warned = sweep_notes(circuit, f, skin)

@@ -1,4 +1,4 @@
-"""Frequencies of a sweep, what drives it, and what has to be said about it."""
+"""Frequencies of a phasor sweep, its drive, and remarks and warnings about it."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ MAX_FREQUENCIES = 1_000_000
 
 @dataclass(frozen=True)
 class Drive:
-    """What drives a sweep.
+    """The drive of a sweep.
 
     Attributes
     ----------
     amplitude : float
-        V (A of a current source); NaN where there is nothing to take it from.
+        V (A of a current source); NaN where there is neither AC nor a fundamental.
     phase : float
         rad.
     text : str
-        Where it comes from.
+        Where amplitude and phase come from, in words.
     """
 
     amplitude: float
@@ -36,7 +36,7 @@ class Drive:
 
 
 def sweep_drive(sources: tuple[tuple[Element, float], ...], fundamental: Fundamental | None, swept: bool) -> Drive:
-    """What drives a circuit: ``AC`` of its sources in a sweep, where the deck has it, else the fundamental."""
+    """The drive of a circuit: in a sweep the ``AC`` of its sources, where the deck has it; else the fundamental."""
     given = [(e, sign) for e, sign in sources if e.ac is not None]
     if swept and given:
         # As in ngspice, a source without AC is silent.
@@ -50,7 +50,7 @@ def sweep_drive(sources: tuple[tuple[Element, float], ...], fundamental: Fundame
 
 
 def sweep_notes(circuit: Circuit, f: FloatArray, skin: str = "swept") -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Notes and warnings of a sweep over frequencies (Hz): where a skin's data are taken, and how far outside them."""
+    """Remarks and warnings of a sweep over frequencies (Hz): where a skin's data are taken, and extrapolation."""
     skins = {e.name: e.values["f"] for e in circuit.by_device("SKIN")}
     own = ", ".join(f"{name} f = {x:g} Hz" for name, x in skins.items())
     notes: tuple[str, ...] = ()
@@ -61,7 +61,7 @@ def sweep_notes(circuit: Circuit, f: FloatArray, skin: str = "swept") -> tuple[t
     swept = bool(circuit.by_device("SKIN_DISPERSIVE")) or (bool(skins) and skin != "own")
     low, high = float(f.min()), float(f.max())
     beyond = []
-    # Not for the rounding of a decade's end.
+    # Rounding of the end of a decade is allowed for.
     if low < SKIN_BAND[0] * (1.0 - 1e-6):
         beyond.append(f"down to {low:g} Hz, {math.log10(SKIN_BAND[0] / low):.2g} decades below")
     if high > SKIN_BAND[1] * (1.0 + 1e-6):
