@@ -199,3 +199,15 @@ def test_what_the_page_calls_refused_is_refused(old: str, new: str, said: str) -
         warnings.simplefilter("ignore")
         with pytest.raises(fs.InputError, match=re.escape(said)):
             fs.parse_netlist(FINGER.replace(old, new))
+
+
+def test_the_page_of_the_house_names_every_package_and_only_files_and_names_that_exist() -> None:
+    house = (CIRCUITS.parent / "docs" / "house.md").read_text(encoding="utf-8")
+    source = CIRCUITS.parent / "src" / "fingerspice"
+    packages = {p.parent.name for p in source.glob("*/__init__.py")}
+    assert set(re.findall(r"^\| `(\w+)/` \|", house, re.MULTILINE)) == packages
+    for path in re.findall(r"`((?:\w+/)+\w*(?:\.\w+)?)`", house):
+        assert (source / path).exists() or (CIRCUITS.parent / path).exists(), path
+    # The table's names stand in the files that they are said to stand in.
+    for name, path in re.findall(r"`([A-Z_a-z]+)`, `(\w+/\w+\.py)`", house):
+        assert re.search(rf"^(class |def )?{name}\b", (source / path).read_text(encoding="utf-8"), re.MULTILINE), name
