@@ -58,7 +58,7 @@ class Element:
     values : mapping of str to float
         Value of every parameter of the device, in the netlist's unit.
     waveform : Waveform or None
-        Of a source.
+        Waveform of a source.
     ac : SmallSignal or None
         ``AC`` of a source that has it.
     initial : float or None

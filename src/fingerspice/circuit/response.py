@@ -19,7 +19,7 @@ from fingerspice.waveforms.waveform import Fundamental
 
 
 class LinearScene(Protocol):
-    """What the phasors of a circuit with one contact need to know of it."""
+    """A circuit with one contact, as far as its phasors depend on it."""
 
     @property
     def contact(self) -> Contact: ...
@@ -130,7 +130,7 @@ class _NetworkScene:
 
 
 def linear_scene(circuit: Circuit) -> LinearScene:
-    """What the phasors of a circuit need: its contact, sources and layers, and its response.
+    """Contact, sources, layers and linear response of a circuit, for its phasors.
 
     Raises
     ------

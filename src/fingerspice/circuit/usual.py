@@ -21,7 +21,7 @@ class Usual:
     Attributes
     ----------
     least, most : float
-        Of the quantity's size, in its unit. 0 and inf stand for "none" where they are allowed; they cause no warning.
+        Smallest and largest usual size of the quantity, in its unit. 0 and inf mean "none" and cause no warning.
     source : str
         Where the range comes from, in words for brackets.
     slip : str

@@ -1,1 +1,1 @@
-"""What a run gives back."""
+"""Results of runs: signals, figures, errors, failures and files."""

@@ -65,7 +65,7 @@ class Solution(Sealed, Shown, Figured):
     continuous : Recorded or ClosedForm or None
         The run between its outputs, where that is known.
     fundamental, period : Fundamental or None, float or None
-        Of the source, s; None where it has none.
+        Fundamental and period (s) of the source; None where it has none.
     fold_margin_min : float
         Smallest distance to the fold that the steps met.
     stored : mapping or None

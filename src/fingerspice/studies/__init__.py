@@ -1,1 +1,1 @@
-"""What is asked of many solutions, or beside them."""
+"""Studies: questions that take many runs, or other equations than those of a run."""

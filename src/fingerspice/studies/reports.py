@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def steady_page(state: SteadyState) -> Page:
-    """A periodic state: what vouches for it, and the figures of its period."""
+    """A periodic state: its defect and stability, and the figures of its period."""
     largest = 1.0 - state.stability_margin
     found = f"periodic state of {format_si(state.period, 's')}, found in {state.periods:.3g} periods"
     left = (
@@ -37,7 +37,7 @@ def steady_page(state: SteadyState) -> Page:
 
 
 def fit_page(fit: MaterialFit) -> Page:
-    """A fitted ladder: its branches, and how far it is from the data."""
+    """A fitted ladder: its branches, and its misfit to the data."""
     ladder = fit.ladder
     rows = [
         (format_si(p / (2.0 * math.pi), "Hz"), f"{k:.4g} S/m")
@@ -58,7 +58,7 @@ def fit_page(fit: MaterialFit) -> Page:
 
 
 def comparison_table(comparison: Comparison) -> Page:
-    """A comparison as a table, with what it says in words."""
+    """A comparison as a table, with its result in words."""
     names = {
         "amplitude": "gap voltage amplitude",
         "phase_deg": "lead over the source",
@@ -70,7 +70,7 @@ def comparison_table(comparison: Comparison) -> Page:
         rows.append((f"{names[name]} [{unit}]", *(f"{x:.6g}" for x in (p, m, c, difference, ripple))))
     head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
     reference = comparison.phasor.f_el_mean
-    # Rounded here, and 0.0 added: -0.00 is not a figure.
+    # Rounded here, and 0.0 added, so that -0.00 is not printed.
     total = round(100.0 * (comparison.coupled.f_el_mean / reference - 1.0), 2) + 0.0
     waveform = round(100.0 * (comparison.mean.f_el_mean / reference - 1.0), 2) + 0.0
     return Page(
@@ -87,7 +87,7 @@ def comparison_table(comparison: Comparison) -> Page:
 
 
 def limits_text(limits: FoldLimits) -> Page:
-    """Where the mobile law folds, in words and a table per parameter."""
+    """A map of the mobile law's fold: a sentence, and a table for each parameter."""
     own = format_si(limits.peak, "V")
     if math.isfinite(limits.voltage):
         head = (
@@ -107,7 +107,7 @@ def limits_text(limits: FoldLimits) -> Page:
 
 
 def limits_csv(limits: FoldLimits, path: Path) -> Path:
-    """Write a map of the fold as CSV; no voltage where there is no fold."""
+    """Write a map of the fold as CSV; the voltage is left empty where there is no fold."""
 
     def write(target: Path) -> None:
         with target.open("w", newline="") as stream:
