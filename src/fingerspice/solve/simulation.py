@@ -26,7 +26,8 @@ from fingerspice.solve.diagnosis import network_failure, stack_failure
 from fingerspice.solve.direct import solve_algebraic, solve_linear
 from fingerspice.solve.marching import solve as solve_marching
 from fingerspice.solve.netmarching import solve_network
-from fingerspice.solve.netruns import NetworkRun
+from fingerspice.solve.netruns import NetworkRun, add_start_error
+from fingerspice.solve.network_periodic import close_network_period
 from fingerspice.solve.networks import NetworkProblem, prepare_network
 from fingerspice.solve.nodal import solve_coupled
 from fingerspice.solve.outputs import asked_for, at_breakpoints
@@ -127,29 +128,35 @@ def simulate(
         raise InputError("start is a solution read from a file, which a run cannot go on from; allowed: one just made")
     circuit = overridden(circuit, sources, parameters)
     times = times_given("t_eval", t_eval)
+    how = start if isinstance(start, str) else "given"
+    first = "uncharged" if start == "periodic" else start
     if not is_stack(circuit):
+        network, gap_errors = prepare_network(
+            circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=first, charge=charge
+        ), None  # fmt: skip
         if start == "periodic":
-            raise InputError("start='periodic' needs a series stack; allowed for a network: 'deck', 'uncharged', 'dc'")
-        network = prepare_network(
-            circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=start, charge=charge
-        )
-        how = start if isinstance(start, str) else "given"
-        return _given_back(run_network(network, times, rtol, method, progress, tier, how, jumps), throw)
-    begun = None
-    problem = prepare(
-        circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area,
-        start="uncharged" if start == "periodic" else start, charge=charge, rtol=rtol,
-    )  # fmt: skip
+            begun = close_network_period(network, 0.5 * rtol)
+            network, gap_errors = begun.problem, begun.gap_errors
+            _check_settled(times, network)
+        run = run_network(network, times, rtol, method, progress, tier, how, jumps, gap_errors)
+        return _given_back(run, throw)
+    problem, error = prepare(
+        circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=first, charge=charge, rtol=rtol
+    ), None  # fmt: skip
     if start == "periodic":
         closed = close_period(problem, 0.5 * rtol)
-        problem, begun = closed.problem, closed.error
-        if times is not None and times[0] < problem.t_start:
-            raise InputError(
-                f"t_eval starts at {times[0]:g} s; allowed: from {problem.t_start:g} s on, where the source has "
-                "settled and its periodic state exists"
-            )
-    how = start if isinstance(start, str) else "given"
-    return _given_back(run_problem(problem, times, rtol, method, progress, tier, how, begun, jumps), throw)
+        problem, error = closed.problem, closed.error
+        _check_settled(times, problem)
+    return _given_back(run_problem(problem, times, rtol, method, progress, tier, how, error, jumps), throw)
+
+
+def _check_settled(times: FloatArray | None, problem: Problem | NetworkProblem) -> None:
+    """Refuse outputs (s) before the periodic state that a run starts from."""
+    if times is not None and times[0] < problem.t_start:
+        raise InputError(
+            f"t_eval starts at {times[0]:g} s; allowed: from {problem.t_start:g} s on, where the source has "
+            "settled and its periodic state exists"
+        )
 
 
 def _check_rtol(rtol: float) -> None:
@@ -261,8 +268,9 @@ def run_network(
     tier: str = "auto",
     start: str = "deck",
     jumps: str = "both",
+    begun: FloatArray | None = None,
 ) -> Solution:
-    """As `run_problem`, for a network."""
+    """As `run_problem`, for a network; `begun` has the errors of every gap's voltage and force, V and N (n_gap, 2)."""
     if method not in ("auto", "exponential", "radau"):
         raise InputError(
             f"method {method!r} is for series stacks; allowed for this network: 'auto', 'exponential' or 'radau'"
@@ -271,16 +279,22 @@ def run_network(
     t_out, left = asked_for(problem, t_eval, jumps)
     run_at = t_out if t_eval is None else at_breakpoints(problem, t_eval)
     begin = time.perf_counter()
+    # What the start gives away is part of the error asked for.
+    own = rtol if begun is None else max(0.5 * rtol, RTOL_RANGE[0])
     if plan.tier == "linear":
         run, name = solve_fixed(problem, run_at, left), plan.tier
     else:
         found = None
         if method != "radau" and problem.scene.coupled:
-            found = solve_network(problem, rtol, run_at, left, progress, repeat=method == "auto")
+            found = solve_network(problem, own, run_at, left, progress, repeat=method == "auto")
         name = "radau" if found is None else "exponential"
-        run = solve_coupled(problem, rtol, run_at, left, progress) if found is None else found
+        run = solve_coupled(problem, own, run_at, left, progress) if found is None else found
     wall = time.perf_counter() - begin
+    if begun is not None:
+        add_start_error(run, begun)
     _mind_unseen(run)
+    if run.status is Status.SUCCESS and problem.network.fingers and run.excess(problem.scene.u_peak) > rtol:
+        run.status = Status.ERROR_NOT_MET
     record = problem.record(run)
     t = np.concatenate([t_out[: run.t.size], run.t[t_out.size :]]) if run.status is Status.SUCCESS else run.t.copy()
     failure = None if run.status is Status.SUCCESS else network_failure(problem, run, record)
@@ -291,7 +305,7 @@ def run_network(
 def _mind_unseen(run: Run | NetworkRun) -> None:
     """A run of a source that its outputs show to be another one than was integrated fails there."""
     if run.unseen is not None and run.status in (Status.SUCCESS, Status.ERROR_NOT_MET):
-        run.t_failed, off = run.unseen
+        run.t_failed, off = run.unseen[:2]
         run.status = Status.SOURCE_UNSEEN if math.isfinite(off) else Status.SOURCE_NOT_FINITE
         run.end_before(run.t_failed)
 

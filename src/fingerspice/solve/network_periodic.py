@@ -1,0 +1,418 @@
+"""The periodic state of a network, by Newton's method on the map of one period; `periodic` for networks.
+
+The map is that of z: the modes of the live voltages with the areas as at 0 V, then the areas with dynamics of their own
+over their value at 0 V. Its derivative is at first that of the circuit with its areas held at their means, which
+Broyden's updates better from period to period; only where these do not close the period is it measured.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.errors import InputError, SolveError
+from fingerspice.circuit.network import Modes, network_modes
+from fingerspice.engine import netassess, readout
+from fingerspice.engine.network import Sources
+from fingerspice.numerics import linear
+from fingerspice.results.outcome import ErrorEstimate, Failure, NetworkState, Status
+from fingerspice.solve.netmarching import FINEST, GUESS, LOCAL_SHARE, SAFETY, March
+from fingerspice.solve.netruns import joined
+from fingerspice.solve.networks import NetworkProblem
+from fingerspice.solve.periodic import Closed
+from fingerspice.waveforms.sampling import SourceTable, source_table
+from fingerspice.waveforms.waveform import DC
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# Of the passes before the last ones: what they may be off, over what the state moved last.
+_CRUDE, _FIRST = 1e-3, 1e-4
+# What a measured derivative is moved by, over the voltage scale, and the error allowed in its periods.
+_SHIFT, _SLOPE_TOL, _LEAST_SLOPE_TOL = 0.01, 1e-7, 1e-9
+# A mode that decays by so many powers of e in a period leaves nothing to measure.
+_FORGOTTEN = 40.0
+# Passes until the derivative is measured, and until the search is given up.
+_PATIENCE, _MOST = 14, 60
+# Times of a period at which the areas are averaged, and how often that is done.
+_SAMPLES, _AVERAGES = 64, 3
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """What a period made of z: its end, the error of that (signed), and its figures.
+
+    `met` is (n_area, 4) as `netassess` has it, `rounding` (n_area,) that of the gap voltages over the largest voltage.
+    """
+
+    end: FloatArray
+    error: FloatArray
+    met: FloatArray
+    magnified: float
+    rounding: FloatArray
+
+
+class _Stopped(Exception):
+    """A period that could not be integrated."""
+
+    def __init__(self, status: Status, t: float) -> None:
+        self.status, self.t = status, t
+
+
+class _Period:
+    """One period of a problem, or the half that the other one repeats with its sign turned."""
+
+    def __init__(self, problem: NetworkProblem) -> None:
+        waveform, scene, net = problem.waveform, problem.scene, problem.scene.net
+        assert waveform.period is not None
+        self.begin = waveform.period * float(np.ceil(max(waveform.settled, problem.t_start) / waveform.period))
+        self.modes: Modes = scene.modes
+        self.before = np.array([float(w.value(self.begin, "left")) for w in scene.waveforms])
+        slow = net.slow >= 0
+        self.rates = np.append(self.modes.rates, 1.0 / net.tau[slow])
+        self.n = self.modes.rates.size
+        self.neutral: BoolArray = self.rates == 0.0
+        kept = self.modes.inverse @ (problem.initial.y[: self.n] + self.modes.follow @ problem.initial.s_before)
+        self.kept = np.where(self.neutral[: self.n], kept, 0.0)
+        pushed = np.any(self.modes.gains[self.neutral[: self.n]] != 0.0)
+        half = _turns(problem) and not pushed and not np.any(self.kept)
+        self.parts = 2 if half else 1
+        self.span = waveform.period / self.parts
+        end = self.begin + self.span
+        self.tables: list[SourceTable] = problem.scene.prepared.get(self._key(problem), [])
+        if not self.tables:
+            self.tables = [source_table(w, self.begin, end, 1e-13, problem.step) for w in scene.waveforms]
+            problem.scene.prepared[self._key(problem)] = self.tables
+        broken = [table.not_finite for table in self.tables if table.not_finite is not None]
+        if broken:
+            raise _Stopped(Status.SOURCE_NOT_FINITE, min(broken))
+        self.sources: Sources = joined(self.tables)
+        self.end = float(min(table.edges[-1] for table in self.tables))
+        if pushed and self.begin > problem.t_start:
+            self._push(problem)
+        # The sign that the end of the pass is to have, of voltages and of areas.
+        self.turned = np.where(np.arange(self.rates.size) < self.n, 1.0 if self.parts == 1 else -1.0, 1.0)
+        self.problem = dataclasses.replace(
+            problem, t_start=self.begin, t_stop=self.end, first=self.begin, charge=False,
+            initial=NetworkState(self.begin, problem.initial.y, self.before, np.zeros(net.gap.size)),
+        )  # fmt: skip
+
+    def _key(self, problem: NetworkProblem) -> tuple[object, ...]:
+        """Of the sources' tables; a function's is as fine as the outputs."""
+        return "period", self.begin, self.span, problem.step if problem.scene.is_sampled else 0.0
+
+    def _push(self, problem: NetworkProblem) -> None:
+        """What currents move onto the capacitors that nothing drains before the period begins."""
+        for j, wave in enumerate(problem.scene.waveforms):
+            table = source_table(wave, problem.t_start, self.begin, 1e-13, problem.step)
+            gains = np.where(self.neutral[: self.n], self.modes.gains[:, j], 0.0)
+            start = np.zeros(self.n)
+            _, moved = linear.respond(np.zeros(self.n), gains, table.edges, table.terms, table.series, start, [])
+            self.kept = self.kept + moved
+
+    def voltages(self, z: FloatArray) -> FloatArray:
+        """Live voltages just before the period begins, V, shape (n,)."""
+        return np.asarray(self.modes.shape @ z[: self.n] - self.modes.follow @ self.before)
+
+    def modes_of(self, x: FloatArray) -> FloatArray:
+        """Modes (n,) from live voltages (V) just before the period begins."""
+        return np.asarray(self.modes.inverse @ (x + self.modes.follow @ self.before))
+
+    def linear_state(self, modes: Modes) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Periodic state of a circuit with fixed areas: its modes, at the end of the pass too, and at _SAMPLES times.
+
+        A mode that does not decay starts from what it keeps; NaN where a current charges it from period to period.
+        """
+        rates = modes.rates
+        t = self.begin + (self.end - self.begin) * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+        start, end, along = np.zeros(self.n), np.zeros(self.n), np.zeros((_SAMPLES, self.n))
+        for j, table in enumerate(self.tables):
+            gains = np.ascontiguousarray(modes.gains[:, j])
+            given = table.edges, table.terms, table.series
+            if self.parts == 1:
+                v = linear.periodic_state(rates, gains, *given)
+            else:
+                _, moved = linear.respond(rates, gains, *given, np.zeros(self.n), [])
+                v = -moved / (1.0 + np.exp(-rates * (table.edges[-1] - table.edges[0])))
+            rows, last = linear.respond(rates, gains, *given, v, t)
+            start, end, along = start + v, end + last, along + rows
+        return start, end, along
+
+    def sampled(self) -> FloatArray:
+        """Sources (V or A) at the same times, shape (_SAMPLES, n_s)."""
+        t = self.begin + (self.end - self.begin) * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+        return np.column_stack([wave.value(t) for wave in self.problem.scene.waveforms])
+
+
+def _turns(problem: NetworkProblem) -> bool:
+    """Whether every source repeats its half periods with the sign turned: then so do all voltages.
+
+    The circuit is symmetric: linear but for areas that follow the size of a voltage.
+    """
+    period = problem.waveform.period
+    for wave in problem.scene.waveforms:
+        if wave == DC(0.0):
+            continue
+        if not wave.half_wave or wave.period is None or period is None:
+            return False
+        ratio = period / wave.period
+        if round(ratio) % 2 == 0 or abs(ratio - round(ratio)) > 1e-9:
+            return False
+    return True
+
+
+def close_network_period(problem: NetworkProblem, rtol: float) -> Closed[NetworkProblem]:
+    """Start a network from its periodic state, keeping its length; as `periodic.close_period`.
+
+    Raises
+    ------
+    InputError
+        For sources without a common period.
+    SolveError
+        Where a period cannot be integrated, or the iteration does not close it.
+    """
+    if problem.waveform.period is None:
+        raise InputError("the source has no period, so there is no periodic state to find")
+    try:
+        period = _Period(problem)
+        closed = _closed_form(period) if not problem.scene.coupled else _Search(period, rtol).close()
+    except _Stopped as stopped:
+        raise SolveError(_failure(problem, stopped.status, stopped.t)) from None
+    x, areas, found = closed
+    moved = period.begin - problem.t_start
+    n_s = period.before.size
+    y = np.concatenate([x, areas, np.zeros(n_s)])
+    state = NetworkState(period.begin, y, period.before, np.zeros(problem.scene.net.gap.size))
+    started = dataclasses.replace(
+        problem, t_start=period.begin, t_stop=problem.t_stop + moved, first=problem.first + moved, initial=state
+    )
+    return Closed(started, **vars(found))
+
+
+@dataclass(frozen=True)
+class _Found:
+    """As `periodic.Closed`, but for the problem."""
+
+    defect: float
+    map_slope: FloatArray
+    memory: float
+    error: ErrorEstimate
+    gap_errors: FloatArray
+    periods: float
+
+
+def _closed_form(period: _Period) -> tuple[FloatArray, FloatArray, _Found]:
+    """Live voltages (V) of the periodic state of a circuit with fixed areas."""
+    modes = period.modes
+    start, end, _ = period.linear_state(modes)
+    if not np.all(np.isfinite(start)):
+        raise SolveError(_failure(period.problem, Status.NOT_PERIODIC, None, CHARGING))
+    sign = 1.0 if period.parts == 1 else -1.0
+    defect = float(np.abs(modes.shape @ (sign * end - start)).max(initial=0.0))
+    slope = np.diag(np.exp(-period.rates * period.span * period.parts))
+    x = period.voltages(start + period.kept)
+    # In closed form there is rounding only, which a run states itself.
+    none = np.zeros((len(period.problem.network.fingers), 2))
+    return x, np.zeros(0), _Found(period.parts * defect, slope, 1.0, ErrorEstimate(0.0, 0.0), none, 1)
+
+
+CHARGING = "a current source charges, from period to period, what nothing drains"
+
+
+class _Search:
+    """Newton's method on the map of a period."""
+
+    def __init__(self, period: _Period, rtol: float) -> None:
+        self.period, self.rtol, self.passes = period, rtol, 0
+        self.free = ~period.neutral
+        self.slow = np.arange(period.rates.size) >= period.n
+        problem = period.problem
+        self.fingers = list(problem.network.fingers)
+        self.z, slope = self._guess()
+        largest = float(np.abs(period.voltages(self.z)).max(initial=0.0))
+        self.scale = max(problem.scene.u_peak, largest) or GUESS
+        self.solver = self._inverse(slope)
+        cells = [problem.network.gaps[i] for i in self.fingers]
+        gap = problem.network.p[np.array(cells, int)] @ period.modes.shape
+        # Voltage of every gap by z: a slow area is no voltage.
+        self.gap = np.hstack([gap, np.zeros((gap.shape[0], int(self.slow.sum())))])
+
+    def _guess(self) -> tuple[FloatArray, FloatArray]:
+        """The periodic state with every area held at its mean over the period, and the map's derivative there."""
+        period, problem = self.period, self.period.problem
+        network, net = problem.network, problem.scene.net
+        area, s = problem.scene.area0.copy(), period.sampled()
+        for _ in range(_AVERAGES):
+            modes = network_modes(network, area)
+            start, _, along = period.linear_state(modes)
+            if not np.all(np.isfinite(start)):
+                raise SolveError(_failure(problem, Status.NOT_PERIODIC, None, CHARGING))
+            x = along @ modes.shape.T - s @ modes.follow.T
+            for i in np.flatnonzero(net.gap >= 0):
+                contact = network.contacts[i]
+                assert contact is not None
+                u = x @ net.p[net.gap[i]] + s @ net.q[net.gap[i]]
+                area[i] = float(np.mean(contact.area(np.abs(u))))
+        v = period.modes_of(modes.shape @ start - modes.follow @ period.before)
+        v = np.where(period.neutral[: period.n], period.kept, v)
+        # The same decay seen in the modes of the areas at 0 V.
+        turn = period.modes.inverse @ modes.shape
+        decay = np.exp(-modes.rates * period.span)
+        slope = np.diag(np.exp(-period.rates * period.span))
+        slope[: period.n, : period.n] = turn @ (decay[:, None] * np.linalg.inv(turn))
+        slow = np.flatnonzero(net.slow >= 0)
+        return np.append(v, (area / problem.scene.area0)[slow]), period.turned[:, None] * slope
+
+    def _inverse(self, slope: FloatArray) -> FloatArray:
+        """Inverse of 1 - slope on what decays, zero on the rest."""
+        out = np.zeros_like(slope)
+        free = np.ix_(self.free, self.free)
+        out[free] = np.linalg.inv(np.eye(int(self.free.sum())) - slope[free])
+        return out
+
+    def _largest(self, z: FloatArray) -> float:
+        """Largest voltage that a change of z makes, V; an area counts as its share of the scale."""
+        x = float(np.abs(self.period.modes.shape @ z[~self.slow]).max(initial=0.0))
+        return max(x, self.scale * float(np.abs(z[self.slow]).max(initial=0.0)))
+
+    def passed(self, z: FloatArray, tol: float) -> _Pass:
+        """One pass over the period at an error of `tol` of the scale in every step."""
+        period, n = self.period, self.period.n
+        y = np.concatenate([period.voltages(z), z[n:], np.zeros(period.before.size)])
+        initial = dataclasses.replace(period.problem.initial, y=y)
+        problem = dataclasses.replace(period.problem, initial=initial)
+        none = np.zeros(0)
+        one = March(problem, max(tol, FINEST), self.rtol, self.scale, none, none.astype(bool), False)
+        status = one.through(period.sources, period.end)
+        self.passes += 1
+        if status is not Status.SUCCESS:
+            raise _Stopped(status, one.t)
+        end, error = np.empty(z.size), np.empty(z.size)
+        # The sources end as they began, but for the sign and rounding.
+        end[:n] = period.modes.inverse @ (one.y[:n] + period.modes.follow @ one.s_before)
+        end[n:] = one.y[n : z.size]
+        error[:n] = period.modes.inverse @ (one.reference.form.shape @ one.error[:n])
+        error[n:] = one.error[n:]
+        magnified = max(1.0, float(one.control[readout.MAGNIFIED]))
+        return _Pass(period.turned * end, error, one.met.copy(), magnified, one.reference.magnified)
+
+    def close(self) -> tuple[FloatArray, FloatArray, _Found]:
+        """Live voltages (V) and slow areas that a period leads back to, to the error asked for or as rounding lets."""
+        period = self.period
+        tol = LOCAL_SHARE * self.rtol
+        while True:
+            last, step, defect = self._newton(tol)
+            errors, memory, excess = self._errors(last, step)
+            if excess <= 1.0 or tol <= FINEST:
+                break
+            tol = max(tol * min(0.3, 0.5 / excess), FINEST)
+        slope = self._slope()
+        worst = errors.max(axis=0, initial=0.0)
+        found = _Found(
+            period.parts * defect, slope @ slope if period.parts == 2 else slope, memory,
+            ErrorEstimate(float(worst[0]), float(worst[1])), errors, self.passes / period.parts,
+        )  # fmt: skip
+        return period.voltages(self.z), self.z[period.n :], found
+
+    def _newton(self, tol: float) -> tuple[_Pass, FloatArray, float]:
+        """Close the period; returns its last pass, the last step of z, and the largest change over that pass, V."""
+        moved = self.scale * (_FIRST / _CRUDE if self.passes == 0 else 0.0)
+        change_before, step = None, np.zeros(self.z.size)
+        for count in range(1, _MOST + 1):
+            here = max(tol, min(_FIRST, _CRUDE * moved / self.scale))
+            last = self.passed(self.z, here)
+            change = last.end - self.z
+            if change_before is not None:
+                self._update(step, change_before - np.where(self.free, change, 0.0))
+            if count % _PATIENCE == 0:
+                self.solver = self._inverse(self._measured(here))
+            change_before = np.where(self.free, change, 0.0)
+            step = self.solver @ change_before
+            self.z = self.z + step
+            moved = self._largest(step)
+            defect = self._largest(change)
+            if not math.isfinite(moved):
+                break
+            if here == tol and (moved <= tol * self.scale or self._largest(change_before) <= 1e-15 * self.scale):
+                self._mind_neutral(last, change, tol)
+                return last, step, defect
+        cause = f"{Status.NOT_PERIODIC.cause}: {defect:.3g} V are left after a period"
+        raise SolveError(_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
+
+    def _update(self, step: FloatArray, fell: FloatArray) -> None:
+        """Broyden's update of the solver: the last step made the change over a period fall by so much."""
+        answered = self.solver @ fell
+        along = float(step @ answered)
+        # Without this nothing would be learnt from a step that was all rounding.
+        if abs(along) > 1e-3 * float(step @ step) > 0.0:
+            self.solver = self.solver + np.outer((step - answered) / along, step @ self.solver)
+
+    def _mind_neutral(self, last: _Pass, change: FloatArray, tol: float) -> None:
+        """Refuse a state whose charges that nothing drains wander from period to period."""
+        wandered = np.where(self.free, 0.0, change)
+        allowed = SAFETY * self._largest(np.where(self.free, 0.0, np.abs(last.error))) + 10.0 * tol * self.scale
+        if self._largest(wandered) > allowed:
+            cause = f"a charge that nothing drains moves by {self._largest(wandered):.3g} V in every period"
+            raise SolveError(_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
+
+    def _measured(self, tol: float) -> FloatArray:
+        """Derivative of the pass's end by z, from one pass per mode that outlasts the period."""
+        period = self.period
+        base = self.passed(self.z, tol).end
+        slope = np.diag(period.turned * np.exp(-period.rates * period.span))
+        for k in np.flatnonzero(period.rates * period.span < _FORGOTTEN):
+            if not self.free[k]:
+                continue
+            unit = np.zeros(self.z.size)
+            unit[k] = 1.0
+            by = _SHIFT * self.scale / max(self._largest(unit), 1e-300)
+            slope[:, k] = (self.passed(self.z + by * unit, tol).end - base) / by
+        return slope
+
+    def _slope(self) -> FloatArray:
+        """The same at the solution, to about 1e-5 of what a period forgets."""
+        alive = self.period.rates[self.free]
+        forgets = min(1.0, float(alive.min(initial=math.inf)) * self.period.span)
+        return self._measured(max(_SLOPE_TOL * forgets, _LEAST_SLOPE_TOL))
+
+    def _errors(self, last: _Pass, step: FloatArray) -> tuple[FloatArray, float, float]:
+        """Error of every gap's voltage and force (n_gap, 2), the memory, and the largest error over that asked for.
+
+        An error made in every period grows to what the solver makes of it.
+        """
+        period, solver = self.period, np.abs(self.solver)
+        whole = period.modes.shape @ self.solver[: period.n, : period.n] @ period.modes.inverse
+        memory = max(1.0, float(np.abs(whole).sum(axis=1).max(initial=0.0)))
+        grown = solver @ np.abs(last.error)
+        met = last.met[self.fingers]
+        peak, force = met[:, netassess.PEAK_U], met[:, netassess.PEAK_F]
+        largest = float(peak.max(initial=0.0))
+        # Rounding is an error too; what was moved last is more than what would be moved next.
+        floor = 4e-16 * memory * (last.rounding[self.fingers] * (largest + self.scale) + peak)
+        gap = np.abs(self.gap)
+        u_error = last.magnified * (SAFETY * (gap @ grown) + gap @ np.abs(step)) + floor
+        f_error = 2.0 * force / np.where(peak > 0.0, peak, math.inf) * u_error
+        slow = period.problem.scene.net.slow[self.fingers]
+        off = (SAFETY * grown + np.abs(step))[period.n :]
+        share = np.array([off[i] if i >= 0 else 0.0 for i in slow])
+        u_error, f_error = u_error + peak * share, f_error + 3.0 * force * share
+        live = peak > 4e-15 * self.scale
+        over = np.append((u_error / np.where(live, peak, 1.0))[live], (f_error / np.where(live, force, 1.0))[live])
+        return np.column_stack([u_error, f_error]), memory, float(over.max(initial=0.0)) / self.rtol
+
+
+def _failure(problem: NetworkProblem, status: Status, t: float | None, cause: str = "") -> Failure:
+    """Why no periodic state was reached."""
+    names = [gap.name for a in problem.network.areas if (gap := a.gap) is not None]
+    if status is Status.SOURCE_NOT_FINITE:
+        names = [
+            e.name
+            for e, wave in zip(problem.network.sources, problem.scene.waveforms, strict=True)
+            if t is not None and not np.isfinite(wave.value(t))
+        ]
+    why = cause or f"no periodic state was reached: {status.cause}"
+    return Failure(status, why, status.action, t, ", ".join(names))
