@@ -156,6 +156,7 @@ def ac(
         list[float] | None, typer.Option(help="With --area coupled: source amplitude in V; may be repeated.")
     ] = None,
     skin: Annotated[str, typer.Option(help="SKIN's data: swept, at each frequency; own, at its f.")] = "swept",
+    finger: Annotated[str | None, typer.Option(metavar="GAP", help="Which of several GAPs.")] = None,
     charge_law: ChargeLaw = None,
     rtol: Rtol = 1e-8,
     changes: Set = None,
@@ -193,11 +194,13 @@ def ac(
             if skin != "swept":
                 raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
             with progress("sweeping") as update:
-                found = large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, progress=update)
+                found = large_signal(
+                    circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger, progress=update
+                )
         elif amplitude:
             raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
         else:
-            found = (phasor(circuit, frequencies, area=area_from_text(area), skin=skin),)
+            found = (phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger),)
         results.open()
         writes = [lambda: phasor_csv(found, data)]
         if picture is not None:
