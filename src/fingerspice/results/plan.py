@@ -25,8 +25,8 @@ class Plan(Shown):
     stiff : bool
         Whether an explicit method would be held back by stability.
     sensitivity : float
-        Largest relative change of the leak rates that the area causes over the run; NaN for a network, where it is not
-        what decides.
+        Largest relative change of 1/A over the run, and with it of the leak rates: of the area that changes most, with
+        gap voltages up to twice the sources' peak. NaN where a current source sets them no bound.
     error_bound : float
         What taking one area, or a dispersive skin at one frequency, costs, relative to the peaks.
     area : float

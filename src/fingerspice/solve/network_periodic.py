@@ -20,6 +20,7 @@ from fingerspice.engine import netassess, readout
 from fingerspice.engine.network import Sources
 from fingerspice.numerics import linear
 from fingerspice.results.outcome import ErrorEstimate, Failure, NetworkState, Status
+from fingerspice.solve.diagnosis import not_finite_at
 from fingerspice.solve.netmarching import FINEST, GUESS, LOCAL_SHARE, SAFETY, March
 from fingerspice.solve.netruns import joined
 from fingerspice.solve.networks import NetworkProblem
@@ -408,11 +409,7 @@ class _Search:
 def _failure(problem: NetworkProblem, status: Status, t: float | None, cause: str = "") -> Failure:
     """Why no periodic state was reached."""
     names = [gap.name for a in problem.network.areas if (gap := a.gap) is not None]
-    if status is Status.SOURCE_NOT_FINITE:
-        names = [
-            e.name
-            for e, wave in zip(problem.network.sources, problem.scene.waveforms, strict=True)
-            if t is not None and not np.isfinite(wave.value(t))
-        ]
+    if status is Status.SOURCE_NOT_FINITE and t is not None:
+        names = [not_finite_at(problem, t)]
     why = cause or f"no periodic state was reached: {status.cause}"
     return Failure(status, why, status.action, t, ", ".join(names))

@@ -22,7 +22,7 @@ from fingerspice.results.plan import Plan
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.cautions import network_warnings, stack_warnings
-from fingerspice.solve.diagnosis import network_failure, stack_failure
+from fingerspice.solve.diagnosis import ROUGH, network_failure, stack_failure
 from fingerspice.solve.direct import solve_algebraic, solve_linear
 from fingerspice.solve.marching import solve as solve_marching
 from fingerspice.solve.netmarching import solve_network
@@ -247,7 +247,7 @@ def run_problem(
     _mind_unseen(run)
     if run.rough > 0.0:
         _add_error(run, run.rough)
-        run.detail = run.detail or f"the source function itself is rough by {run.rough:.2g} V"
+        run.detail = run.detail or ROUGH.format(run.rough)
     rounding = ROUNDING * problem.scene.u_peak
     ended = run.status in (Status.SUCCESS, Status.ERROR_NOT_MET) and run.t_failed is None
     if ended and run.state.t == problem.t_stop and run.peak_u <= rounding:

@@ -199,21 +199,21 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
         raised = circuit.varied(
             {e.name: Product((factor, e.waveform)) for e in circuit.by_device("V") if e.waveform is not None}
         )
-        if is_stack(raised):
-            try:
+        try:
+            if is_stack(raised):
                 problem = prepare(
                     raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="deck",
                     charge=False, rtol=RTOL,
                 )  # fmt: skip
-            except InputError as error:
-                # An operating point goes with the source, and may itself stand past the fold; a given start does not.
-                if circuit.initial or "past the fold" not in str(error):
-                    raise
-                return True
-            return meets_fold(problem, RTOL)
-        run = simulate(
-            raised, t_stop=t_stop, t_eval=[0.0, t_stop], charge_law="mobile", rtol=RTOL, charge=False, throw=False
-        )  # fmt: skip
+                return meets_fold(problem, RTOL)
+            run = simulate(
+                raised, t_stop=t_stop, t_eval=[0.0, t_stop], charge_law="mobile", rtol=RTOL, charge=False, throw=False
+            )  # fmt: skip
+        except InputError as error:
+            # An operating point goes with the source, and may itself stand past the fold; a given start does not.
+            if circuit.initial or "past the fold" not in str(error):
+                raise
+            return True
         if run.failure is not None and run.status is not Status.FOLD:
             raise SolveError(run.failure, run)
         return run.status is Status.FOLD
