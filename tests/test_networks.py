@@ -490,7 +490,6 @@ def test_what_no_network_is_gets_one_sentence(case: str) -> None:
         ({"method": "dop853"}, "method 'dop853' is for series stacks"),
         ({"tier": "algebraic"}, "the algebraic tier is not for this network"),
         ({"tier": "linear"}, "the linear tier is not for this network"),
-        ({"start": "periodic"}, "start='periodic' needs a series stack"),
         ({"area": -1.0}, "area is -1 m^2"),
         ({"area": "often"}, "area is 'often'"),
         ({"charge_law": "both"}, "charge_law is 'both'"),

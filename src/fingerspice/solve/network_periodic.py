@@ -30,17 +30,21 @@ from fingerspice.waveforms.waveform import DC
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
 # Of the passes before the last ones: what they may be off, over what the state moved last.
 _CRUDE, _FIRST = 1e-3, 1e-4
 # What a measured derivative is moved by, over the voltage scale, and the error allowed in its periods.
-_SHIFT, _SLOPE_TOL, _LEAST_SLOPE_TOL = 0.01, 1e-7, 1e-9
+_SHIFT, _SLOPE_TOL, _LEAST_SLOPE_TOL = 5e-4, 1e-9, 1e-11
 # A mode that decays by so many powers of e in a period leaves nothing to measure.
 _FORGOTTEN = 40.0
 # Passes until the derivative is measured, and until the search is given up.
 _PATIENCE, _MOST = 14, 60
 # Times of a period at which the areas are averaged, and how often that is done.
 _SAMPLES, _AVERAGES = 64, 3
+# Shares of a voltage and their weights, for integrals from 0 V to it.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+_GAUSS = 0.5 + 0.5 * _NODES, 0.5 * _WEIGHTS
 
 
 @dataclass(frozen=True)
@@ -229,7 +233,8 @@ class _Search:
 
     def __init__(self, period: _Period, rtol: float) -> None:
         self.period, self.rtol, self.passes = period, rtol, 0
-        self.free = ~period.neutral
+        # A charge that nothing drains stays as it is; that half a period turns its sign says that there is none.
+        self.free = ~period.neutral if period.parts == 1 else np.ones(period.rates.size, bool)
         self.slow = np.arange(period.rates.size) >= period.n
         problem = period.problem
         self.fingers = list(problem.network.fingers)
@@ -237,6 +242,7 @@ class _Search:
         largest = float(np.abs(period.voltages(self.z)).max(initial=0.0))
         self.scale = max(problem.scene.u_peak, largest) or GUESS
         self.solver = self._inverse(slope)
+        self.z = self._holding(self.z)
         cells = [problem.network.gaps[i] for i in self.fingers]
         gap = problem.network.p[np.array(cells, int)] @ period.modes.shape
         # Voltage of every gap by z: a slow area is no voltage.
@@ -330,17 +336,20 @@ class _Search:
             if change_before is not None:
                 self._update(step, change_before - np.where(self.free, change, 0.0))
             if count % _PATIENCE == 0:
-                self.solver = self._inverse(self._measured(here))
+                self.solver = self._inverse(self._slope())
             change_before = np.where(self.free, change, 0.0)
             step = self.solver @ change_before
-            self.z = self.z + step
+            self.z = self._holding(self.z + step)
             moved = self._largest(step)
             defect = self._largest(change)
             if not math.isfinite(moved):
                 break
             if here == tol and (moved <= tol * self.scale or self._largest(change_before) <= 1e-15 * self.scale):
-                self._mind_neutral(last, change, tol)
-                return last, step, defect
+                if not self._wanders(last, change, tol):
+                    return last, step, defect
+                # The areas' ripple pumps charge onto what nothing drains, until a voltage there stops it.
+                self.free[:] = True
+                self.solver, change_before = self._inverse(self._slope()), None
         cause = f"{Status.NOT_PERIODIC.cause}: {defect:.3g} V are left after a period"
         raise SolveError(_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
 
@@ -352,17 +361,50 @@ class _Search:
         if abs(along) > 1e-3 * float(step @ step) > 0.0:
             self.solver = self.solver + np.outer((step - answered) / along, step @ self.solver)
 
-    def _mind_neutral(self, last: _Pass, change: FloatArray, tol: float) -> None:
-        """Refuse a state whose charges that nothing drains wander from period to period."""
-        wandered = np.where(self.free, 0.0, change)
-        allowed = SAFETY * self._largest(np.where(self.free, 0.0, np.abs(last.error))) + 10.0 * tol * self.scale
-        if self._largest(wandered) > allowed:
-            cause = f"a charge that nothing drains moves by {self._largest(wandered):.3g} V in every period"
-            raise SolveError(_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
+    def _wanders(self, last: _Pass, change: FloatArray, tol: float) -> bool:
+        """Whether a charge that nothing drains moves by more than errors in the period."""
+        held = ~self.free
+        allowed = SAFETY * self._largest(np.where(held, np.abs(last.error), 0.0)) + 10.0 * tol * self.scale
+        return self._largest(np.where(held, change, 0.0)) > allowed
 
-    def _measured(self, tol: float) -> FloatArray:
-        """Derivative of the pass's end by z, from one pass per mode that outlasts the period."""
+    def _holding(self, z: FloatArray) -> FloatArray:
+        """z with the charge that nothing drains as it began: its modes alone tell it only while areas are as at 0 V."""
+        held = np.flatnonzero(~self.free)
+        if not held.size:
+            return z
+        z = z.copy()
+        for _ in range(_MOST):
+            missing = self._charges(z, held) - self.period.kept[held]
+            z[held] -= missing
+            if np.abs(missing).max() <= 1e-15 * np.abs(z).max():
+                break
+        return z
+
+    def _charges(self, z: FloatArray, held: IntArray) -> FloatArray:
+        """Charges that nothing drains, on the scale of their modes, of the state z.
+
+        Under `local` a capacitor has taken the integral of C dU from 0 V on; under `mobile` it has C U.
+        """
+        network, net = self.period.problem.network, self.period.problem.scene.net
+        u = net.p @ self.period.voltages(z) + net.q @ self.period.before
+        along, weight = (np.ones(1), np.ones(1)) if net.mobile else _GAUSS
+        area, charge = self.period.problem.scene.area0.copy(), np.zeros(u.size)
+        for share, part in zip(along, weight, strict=True):
+            for i in np.flatnonzero(net.gap >= 0):
+                slow, contact = net.slow[i], network.contacts[i]
+                assert contact is not None
+                following = float(contact.area(share * abs(u[net.gap[i]])))
+                area[i] = following if slow < 0 else net.area0[i] * z[self.period.n + slow]
+            charge += part * network.capacitance(area) * u
+        return np.asarray(self.period.modes.shape[:, held].T @ (net.p.T @ charge))
+
+    def _slope(self) -> FloatArray:
+        """Derivative of the pass's end by z, to about 1e-5, from one pass for every mode that outlasts the period."""
         period = self.period
+        decaying = period.rates[~period.neutral]
+        # What a mode forgets in a period must show in its slope.
+        forgets = min(1.0, float(decaying.min(initial=math.inf)) * period.span)
+        tol = max(_SLOPE_TOL * forgets, _LEAST_SLOPE_TOL)
         base = self.passed(self.z, tol).end
         slope = np.diag(period.turned * np.exp(-period.rates * period.span))
         for k in np.flatnonzero(period.rates * period.span < _FORGOTTEN):
@@ -373,12 +415,6 @@ class _Search:
             by = _SHIFT * self.scale / max(self._largest(unit), 1e-300)
             slope[:, k] = (self.passed(self.z + by * unit, tol).end - base) / by
         return slope
-
-    def _slope(self) -> FloatArray:
-        """The same at the solution, to about 1e-5 of what a period forgets."""
-        alive = self.period.rates[self.free]
-        forgets = min(1.0, float(alive.min(initial=math.inf)) * self.period.span)
-        return self._measured(max(_SLOPE_TOL * forgets, _LEAST_SLOPE_TOL))
 
     def _errors(self, last: _Pass, step: FloatArray) -> tuple[FloatArray, float, float]:
         """Error of every gap's voltage and force (n_gap, 2), the memory, and the largest error over that asked for.
