@@ -500,10 +500,3 @@ def test_requests_that_cannot_be_run_are_refused(request_: dict[str, object], me
     with pytest.raises(fs.InputError) as caught:
         fs.simulate(floating("SIN(0 200 5k)"), **request_)  # type: ignore[arg-type]
     assert message in str(caught.value)
-
-
-def test_what_needs_a_stack_says_so() -> None:
-    circuit = floating("SIN(0 200 5k)")
-    for call in (fs.compare, fs.steady_state):
-        with pytest.raises(fs.InputError, match="needs a series chain of LAYER, SLAB, SKIN and GAP"):
-            call(circuit)

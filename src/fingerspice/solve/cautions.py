@@ -39,7 +39,10 @@ def stack_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
         yield from _gap_warnings("", run.peak_u, at_rest, loaded if follows else math.inf)
         yield from beyond_fingers("", run.peak_f, float(stack.contact.stress(run.peak_u)), max(at_rest, loaded))
     if run.status is Status.SUCCESS and 0.0 < run.peak_u <= run.error.u_gap:
-        yield _as_good_as_zero("", run.peak_u)
+        yield (
+            f"the gap takes no more than rounding of the source's voltage: of its {run.peak_u:.2g} V nothing is known "
+            "but that they are as good as 0"
+        )
     yield from _fold_warning(run)
     yield from _strength_warnings(stack.layers, record)
 
@@ -59,17 +62,8 @@ def network_warnings(problem: NetworkProblem, run: NetworkRun, record: NetworkRe
         pressure = float(record.fingers[finger][1].stress(float(run.peaks[i])))
         force = float(record.finger_force(finger).max(initial=0.0)) if pressure * largest > LARGEST_FORCE else 0.0
         yield from beyond_fingers(where, force, pressure, largest)
-        if run.status is Status.SUCCESS and finger < len(run.gaps) and 0.0 < run.gaps[finger, 0] <= run.gaps[finger, 2]:
-            yield _as_good_as_zero(where, run.gaps[finger, 0])
     yield from _fold_warning(run)
     yield from _strength_warnings(problem.network.layers, record)
-
-
-def _as_good_as_zero(where: str, peak: float) -> str:
-    return (
-        f"the gap{where} takes no more than rounding of the source's voltage: of its {peak:.2g} V nothing is known "
-        "but that they are as good as 0"
-    )
 
 
 def _source_warnings(problem: Problem | NetworkProblem) -> Iterator[str]:

@@ -15,21 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.errors import InputError, SolveError
-from fingerspice.circuit.network import Modes, network_modes
+from fingerspice.circuit.network import network_modes
 from fingerspice.engine import netassess, readout
-from fingerspice.engine.network import Sources
-from fingerspice.numerics import linear
 from fingerspice.results.outcome import ErrorEstimate, Failure, NetworkState, Status
 from fingerspice.solve.diagnosis import not_finite_at
-from fingerspice.solve.netmarching import FINEST, GUESS, LOCAL_SHARE, SAFETY, March
-from fingerspice.solve.netruns import joined
+from fingerspice.solve.netmarching import FINEST, GUESS, LOCAL_SHARE, SAFETY, March, reference_at
+from fingerspice.solve.network_period import Period, Stopped
 from fingerspice.solve.networks import NetworkProblem
+from fingerspice.solve.nodal import pass_through
 from fingerspice.solve.periodic import Closed
-from fingerspice.waveforms.sampling import SourceTable, source_table
-from fingerspice.waveforms.waveform import DC
 
 FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
 # Of the passes before the last ones: what they may be off, over what the state moved last.
@@ -40,8 +36,10 @@ _SHIFT, _SLOPE_TOL, _LEAST_SLOPE_TOL = 5e-4, 1e-9, 1e-11
 _FORGOTTEN = 40.0
 # Passes until the derivative is measured, and until the search is given up.
 _PATIENCE, _MOST = 14, 60
-# Times of a period at which the areas are averaged, and how often that is done.
-_SAMPLES, _AVERAGES = 64, 3
+# A step of the search this many times the voltage scale leads nowhere.
+_ASTRAY = 1e3
+# How often the areas are averaged over the period of the linear circuit.
+_AVERAGES = 3
 # Shares of a voltage and their weights, for integrals from 0 V to it.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _GAUSS = 0.5 + 0.5 * _NODES, 0.5 * _WEIGHTS
@@ -61,115 +59,6 @@ class _Pass:
     rounding: FloatArray
 
 
-class _Stopped(Exception):
-    """A period that could not be integrated."""
-
-    def __init__(self, status: Status, t: float) -> None:
-        self.status, self.t = status, t
-
-
-class _Period:
-    """One period of a problem, or the half that the other one repeats with its sign turned."""
-
-    def __init__(self, problem: NetworkProblem) -> None:
-        waveform, scene, net = problem.waveform, problem.scene, problem.scene.net
-        assert waveform.period is not None
-        self.begin = waveform.period * float(np.ceil(max(waveform.settled, problem.t_start) / waveform.period))
-        self.modes: Modes = scene.modes
-        self.before = np.array([float(w.value(self.begin, "left")) for w in scene.waveforms])
-        slow = net.slow >= 0
-        self.rates = np.append(self.modes.rates, 1.0 / net.tau[slow])
-        self.n = self.modes.rates.size
-        self.neutral: BoolArray = self.rates == 0.0
-        kept = self.modes.inverse @ (problem.initial.y[: self.n] + self.modes.follow @ problem.initial.s_before)
-        self.kept = np.where(self.neutral[: self.n], kept, 0.0)
-        pushed = np.any(self.modes.gains[self.neutral[: self.n]] != 0.0)
-        half = _turns(problem) and not pushed and not np.any(self.kept)
-        self.parts = 2 if half else 1
-        self.span = waveform.period / self.parts
-        end = self.begin + self.span
-        self.tables: list[SourceTable] = problem.scene.prepared.get(self._key(problem), [])
-        if not self.tables:
-            self.tables = [source_table(w, self.begin, end, 1e-13, problem.step) for w in scene.waveforms]
-            problem.scene.prepared[self._key(problem)] = self.tables
-        broken = [table.not_finite for table in self.tables if table.not_finite is not None]
-        if broken:
-            raise _Stopped(Status.SOURCE_NOT_FINITE, min(broken))
-        self.sources: Sources = joined(self.tables)
-        self.end = float(min(table.edges[-1] for table in self.tables))
-        if pushed and self.begin > problem.t_start:
-            self._push(problem)
-        # The sign that the end of the pass is to have, of voltages and of areas.
-        self.turned = np.where(np.arange(self.rates.size) < self.n, 1.0 if self.parts == 1 else -1.0, 1.0)
-        self.problem = dataclasses.replace(
-            problem, t_start=self.begin, t_stop=self.end, first=self.begin, charge=False,
-            initial=NetworkState(self.begin, problem.initial.y, self.before, np.zeros(net.gap.size)),
-        )  # fmt: skip
-
-    def _key(self, problem: NetworkProblem) -> tuple[object, ...]:
-        """Of the sources' tables; a function's is as fine as the outputs."""
-        return "period", self.begin, self.span, problem.step if problem.scene.is_sampled else 0.0
-
-    def _push(self, problem: NetworkProblem) -> None:
-        """What currents move onto the capacitors that nothing drains before the period begins."""
-        for j, wave in enumerate(problem.scene.waveforms):
-            table = source_table(wave, problem.t_start, self.begin, 1e-13, problem.step)
-            gains = np.where(self.neutral[: self.n], self.modes.gains[:, j], 0.0)
-            start = np.zeros(self.n)
-            _, moved = linear.respond(np.zeros(self.n), gains, table.edges, table.terms, table.series, start, [])
-            self.kept = self.kept + moved
-
-    def voltages(self, z: FloatArray) -> FloatArray:
-        """Live voltages just before the period begins, V, shape (n,)."""
-        return np.asarray(self.modes.shape @ z[: self.n] - self.modes.follow @ self.before)
-
-    def modes_of(self, x: FloatArray) -> FloatArray:
-        """Modes (n,) from live voltages (V) just before the period begins."""
-        return np.asarray(self.modes.inverse @ (x + self.modes.follow @ self.before))
-
-    def linear_state(self, modes: Modes) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Periodic state of a circuit with fixed areas: its modes, at the end of the pass too, and at _SAMPLES times.
-
-        A mode that does not decay starts from what it keeps; NaN where a current charges it from period to period.
-        """
-        rates = modes.rates
-        t = self.begin + (self.end - self.begin) * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-        start, end, along = np.zeros(self.n), np.zeros(self.n), np.zeros((_SAMPLES, self.n))
-        for j, table in enumerate(self.tables):
-            gains = np.ascontiguousarray(modes.gains[:, j])
-            given = table.edges, table.terms, table.series
-            if self.parts == 1:
-                v = linear.periodic_state(rates, gains, *given)
-            else:
-                _, moved = linear.respond(rates, gains, *given, np.zeros(self.n), [])
-                v = -moved / (1.0 + np.exp(-rates * (table.edges[-1] - table.edges[0])))
-            rows, last = linear.respond(rates, gains, *given, v, t)
-            start, end, along = start + v, end + last, along + rows
-        return start, end, along
-
-    def sampled(self) -> FloatArray:
-        """Sources (V or A) at the same times, shape (_SAMPLES, n_s)."""
-        t = self.begin + (self.end - self.begin) * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-        return np.column_stack([wave.value(t) for wave in self.problem.scene.waveforms])
-
-
-def _turns(problem: NetworkProblem) -> bool:
-    """Whether every source repeats its half periods with the sign turned: then so do all voltages.
-
-    The circuit is symmetric: linear but for areas that follow the size of a voltage.
-    """
-    period = problem.waveform.period
-    for wave in problem.scene.waveforms:
-        if wave == DC(0.0):
-            continue
-        if not wave.half_wave or wave.period is None or period is None:
-            return False
-        ratio = period / wave.period
-        if round(ratio) % 2 == 0 or abs(ratio - round(ratio)) > 1e-9:
-            return False
-    return True
-
-
 def close_network_period(problem: NetworkProblem, rtol: float) -> Closed[NetworkProblem]:
     """Start a network from its periodic state, keeping its length; as `periodic.close_period`.
 
@@ -183,9 +72,9 @@ def close_network_period(problem: NetworkProblem, rtol: float) -> Closed[Network
     if problem.waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
     try:
-        period = _Period(problem)
+        period = Period(problem)
         closed = _closed_form(period) if not problem.scene.coupled else _Search(period, rtol).close()
-    except _Stopped as stopped:
+    except Stopped as stopped:
         raise SolveError(_failure(problem, stopped.status, stopped.t)) from None
     x, areas, found = closed
     moved = period.begin - problem.t_start
@@ -210,7 +99,7 @@ class _Found:
     periods: float
 
 
-def _closed_form(period: _Period) -> tuple[FloatArray, FloatArray, _Found]:
+def _closed_form(period: Period) -> tuple[FloatArray, FloatArray, _Found]:
     """Live voltages (V) of the periodic state of a circuit with fixed areas."""
     modes = period.modes
     start, end, _ = period.linear_state(modes)
@@ -228,11 +117,16 @@ def _closed_form(period: _Period) -> tuple[FloatArray, FloatArray, _Found]:
 CHARGING = "a current source charges, from period to period, what nothing drains"
 
 
+# State and sources at the end of a pass, the error of the state, and what else is known of it.
+_Made = tuple[FloatArray, FloatArray, FloatArray, _Pass]
+
+
 class _Search:
     """Newton's method on the map of a period."""
 
-    def __init__(self, period: _Period, rtol: float) -> None:
+    def __init__(self, period: Period, rtol: float) -> None:
         self.period, self.rtol, self.passes = period, rtol, 0
+        self.implicit, self.decade = False, int(np.floor(np.log10(rtol)))
         # A charge that nothing drains stays as it is; that half a period turns its sign says that there is none.
         self.free = ~period.neutral if period.parts == 1 else np.ones(period.rates.size, bool)
         self.slow = np.arange(period.rates.size) >= period.n
@@ -292,20 +186,41 @@ class _Search:
         y = np.concatenate([period.voltages(z), z[n:], np.zeros(period.before.size)])
         initial = dataclasses.replace(period.problem.initial, y=y)
         problem = dataclasses.replace(period.problem, initial=initial)
-        none = np.zeros(0)
-        one = March(problem, max(tol, FINEST), self.rtol, self.scale, none, none.astype(bool), False)
-        status = one.through(period.sources, period.end)
         self.passes += 1
-        if status is not Status.SUCCESS:
-            raise _Stopped(status, one.t)
-        end, error = np.empty(z.size), np.empty(z.size)
+        made = None if self.implicit else self._marched(problem, tol)
+        if made is None:
+            # Whether exponentials find no way on or there is none, the implicit method tells.
+            self.implicit, made = True, self._collocated(problem, tol)
+        x, s, error_x, figures = made
         # The sources end as they began, but for the sign and rounding.
-        end[:n] = period.modes.inverse @ (one.y[:n] + period.modes.follow @ one.s_before)
-        end[n:] = one.y[n : z.size]
-        error[:n] = period.modes.inverse @ (one.reference.form.shape @ one.error[:n])
-        error[n:] = one.error[n:]
+        end = np.append(period.modes.inverse @ (x[:n] + period.modes.follow @ s), x[n : z.size])
+        error = np.append(period.modes.inverse @ error_x[:n], error_x[n : z.size])
+        return dataclasses.replace(figures, end=period.turned * end, error=error)
+
+    def _marched(self, problem: NetworkProblem, tol: float) -> _Made | None:
+        """State and sources at the end by exponential steps, the state's error, and the figures; None for no way on."""
+        none, n = np.zeros(0), self.period.n
+        one = March(problem, max(tol, FINEST), self.rtol, self.scale, none, none.astype(bool), False)
+        if one.through(self.period.sources, self.period.end) is not Status.SUCCESS:
+            return None
+        error = np.append(one.reference.form.shape @ one.error[:n], one.error[n:])
         magnified = max(1.0, float(one.control[readout.MAGNIFIED]))
-        return _Pass(period.turned * end, error, one.met.copy(), magnified, one.reference.magnified)
+        return one.y, one.s_before, error, _Pass(none, none, one.met.copy(), magnified, one.reference.magnified)
+
+    def _collocated(self, problem: NetworkProblem, tol: float) -> _Made:
+        """The same by an implicit method, its error from a coarser pass."""
+        none, scene, network = np.zeros(0), problem.scene, problem.network
+        status, one, error = pass_through(problem, self.period.sources, tol, self.scale)
+        if status is not Status.SUCCESS:
+            raise Stopped(status, one.t)
+        met = np.zeros((one.peaks.size, 4))
+        for i in network.fingers:
+            peak, contact = float(one.peaks[i]), network.contacts[i]
+            assert contact is not None
+            area = float(contact.area(peak)) if scene.net.gap[i] >= 0 else float(scene.area0[i])
+            met[i, :2] = peak, float(contact.stress(peak)) * area
+        at_rest = reference_at(scene, (0,) * one.peaks.size, self.decade)
+        return one.y, one.s_before, error, _Pass(none, none, met, 1.0, at_rest.magnified)
 
     def close(self) -> tuple[FloatArray, FloatArray, _Found]:
         """Live voltages (V) and slow areas that a period leads back to, to the error asked for or as rounding lets."""
@@ -342,14 +257,11 @@ class _Search:
             self.z = self._holding(self.z + step)
             moved = self._largest(step)
             defect = self._largest(change)
-            if not math.isfinite(moved):
+            if not moved < _ASTRAY * self.scale:
                 break
             if here == tol and (moved <= tol * self.scale or self._largest(change_before) <= 1e-15 * self.scale):
-                if not self._wanders(last, change, tol):
-                    return last, step, defect
-                # The areas' ripple pumps charge onto what nothing drains, until a voltage there stops it.
-                self.free[:] = True
-                self.solver, change_before = self._inverse(self._slope()), None
+                self._mind_wandering(last, change, tol)
+                return last, step, defect
         cause = f"{Status.NOT_PERIODIC.cause}: {defect:.3g} V are left after a period"
         raise SolveError(_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
 
@@ -361,11 +273,17 @@ class _Search:
         if abs(along) > 1e-3 * float(step @ step) > 0.0:
             self.solver = self.solver + np.outer((step - answered) / along, step @ self.solver)
 
-    def _wanders(self, last: _Pass, change: FloatArray, tol: float) -> bool:
-        """Whether a charge that nothing drains moves by more than errors in the period."""
+    def _mind_wandering(self, last: _Pass, change: FloatArray, tol: float) -> None:
+        """Refuse a state whose charges that nothing drains move in the period: an area's ripple pumps them, for ever.
+
+        Under `local` it does so where an insulating layer has another voltage over the area than the gap.
+        """
         held = ~self.free
         allowed = SAFETY * self._largest(np.where(held, np.abs(last.error), 0.0)) + 10.0 * tol * self.scale
-        return self._largest(np.where(held, change, 0.0)) > allowed
+        moved = self._largest(np.where(held, change, 0.0))
+        if moved > allowed:
+            cause = f"a charge that nothing drains moves by {moved:.3g} V in every period"
+            raise SolveError(_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
 
     def _holding(self, z: FloatArray) -> FloatArray:
         """z with the charge that nothing drains as it began: its modes alone tell it only while areas are as at 0 V."""

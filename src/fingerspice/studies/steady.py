@@ -141,10 +141,13 @@ def steady_state(
 ) -> SteadyState:
     """Periodic state of a circuit, by Newton's method on the map of one period.
 
+    A charge that nothing drains has no periodic state of its own: it keeps what it has in a circuit that starts
+    uncharged.
+
     Parameters
     ----------
     circuit : Circuit
-        With a periodic source.
+        With a periodic source, or several with a common period.
     sources, parameters, charge_law, area, rtol, charge
         As in `simulate`: the error is relative to the peaks over the period.
     points : int
