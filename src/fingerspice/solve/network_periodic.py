@@ -19,7 +19,7 @@ from fingerspice.circuit.network import network_modes
 from fingerspice.engine import netassess, readout
 from fingerspice.results.outcome import ErrorEstimate, Failure, NetworkState, Status
 from fingerspice.solve.diagnosis import not_finite_at
-from fingerspice.solve.netmarching import FINEST, GUESS, LOCAL_SHARE, SAFETY, March, reference_at
+from fingerspice.solve.netmarching import FINEST, GUESS, LOCAL_SHARE, SAFETY, March
 from fingerspice.solve.network_period import Period, Stopped
 from fingerspice.solve.networks import NetworkProblem
 from fingerspice.solve.nodal import pass_through
@@ -36,6 +36,10 @@ _SHIFT, _SLOPE_TOL, _LEAST_SLOPE_TOL = 5e-4, 1e-9, 1e-11
 _FORGOTTEN = 40.0
 # Passes until the derivative is measured, and until the search is given up.
 _PATIENCE, _MOST = 14, 60
+# Passes without a step of less than half of the smallest before, and what such steps may be over the voltage scale.
+_HELD_UP, _NOISE = 5, 1e-8
+# A first step this many times the voltage scale is not trusted to the linear circuit's derivative.
+_LONG = 0.1
 # A step of the search this many times the voltage scale leads nowhere.
 _ASTRAY = 1e3
 # How often the areas are averaged over the period of the linear circuit.
@@ -126,7 +130,7 @@ class _Search:
 
     def __init__(self, period: Period, rtol: float) -> None:
         self.period, self.rtol, self.passes = period, rtol, 0
-        self.implicit, self.decade = False, int(np.floor(np.log10(rtol)))
+        self.implicit = False
         # A charge that nothing drains stays as it is; that half a period turns its sign says that there is none.
         self.free = ~period.neutral if period.parts == 1 else np.ones(period.rates.size, bool)
         self.slow = np.arange(period.rates.size) >= period.n
@@ -219,8 +223,9 @@ class _Search:
             assert contact is not None
             area = float(contact.area(peak)) if scene.net.gap[i] >= 0 else float(scene.area0[i])
             met[i, :2] = peak, float(contact.stress(peak)) * area
-        at_rest = reference_at(scene, (0,) * one.peaks.size, self.decade)
-        return one.y, one.s_before, error, _Pass(none, none, met, 1.0, at_rest.magnified)
+        gap = np.array([network.p[0 if cell is None else cell] for cell in network.gaps]) @ self.period.modes.shape
+        rounding = (np.abs(gap) @ np.abs(self.period.modes.inverse)).sum(axis=1)
+        return one.y, one.s_before, error, _Pass(none, none, met, 1.0, 10.0 + rounding)
 
     def close(self) -> tuple[FloatArray, FloatArray, _Found]:
         """Live voltages (V) and slow areas that a period leads back to, to the error asked for or as rounding lets."""
@@ -228,10 +233,16 @@ class _Search:
         tol = LOCAL_SHARE * self.rtol
         while True:
             last, step, defect = self._newton(tol)
-            errors, memory, excess = self._errors(last, step)
-            if excess <= 1.0 or tol <= FINEST:
+            errors, memory, excess, rounding = self._errors(last, step)
+            if excess <= 1.0:
                 break
-            tol = max(tol * min(0.3, 0.5 / excess), FINEST)
+            if excess > 2.0 * rounding and tol > FINEST:
+                tol = max(tol * min(0.3, 0.5 / excess), FINEST)
+            elif not self.implicit:
+                # The modes' rounding is in the way, which an implicit method has less of.
+                self.implicit, tol = True, LOCAL_SHARE * self.rtol
+            else:
+                break
         slope = self._slope()
         worst = errors.max(axis=0, initial=0.0)
         found = _Found(
@@ -243,9 +254,11 @@ class _Search:
     def _newton(self, tol: float) -> tuple[_Pass, FloatArray, float]:
         """Close the period; returns its last pass, the last step of z, and the largest change over that pass, V."""
         moved = self.scale * (_FIRST / _CRUDE if self.passes == 0 else 0.0)
-        change_before, step = None, np.zeros(self.z.size)
+        change_before, step, here, smallest, since = None, np.zeros(self.z.size), _FIRST, math.inf, 0
         for count in range(1, _MOST + 1):
-            here = max(tol, min(_FIRST, _CRUDE * moved / self.scale))
+            # What a pass misses the solver makes larger.
+            memory = self._memory()
+            here = max(tol, min(here, _CRUDE * moved / self.scale / memory, _FIRST / memory))
             last = self.passed(self.z, here)
             change = last.end - self.z
             if change_before is not None:
@@ -254,16 +267,30 @@ class _Search:
                 self.solver = self._inverse(self._slope())
             change_before = np.where(self.free, change, 0.0)
             step = self.solver @ change_before
+            if count == 1 and self._largest(step) > _LONG * self.scale:
+                # A slow mode, whose few decays the areas' ripple may outdo.
+                self.solver = self._inverse(self._slope())
+                step = self.solver @ change_before
             self.z = self._holding(self.z + step)
             moved = self._largest(step)
             defect = self._largest(change)
             if not moved < _ASTRAY * self.scale:
                 break
-            if here == tol and (moved <= tol * self.scale or self._largest(change_before) <= 1e-15 * self.scale):
+            # Rounding may hold the steps up before: what they are then is part of the error.
+            smallest, since = (moved, 0) if moved < 0.5 * smallest or here > tol else (smallest, since + 1)
+            held_up = since >= _HELD_UP and moved <= _NOISE * self.scale
+            closed = moved <= tol * self.scale or self._largest(change_before) <= 1e-15 * self.scale
+            if here == tol and (closed or held_up):
                 self._mind_wandering(last, change, tol)
                 return last, step, defect
         cause = f"{Status.NOT_PERIODIC.cause}: {defect:.3g} V are left after a period"
         raise SolveError(_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
+
+    def _memory(self) -> float:
+        """Largest factor by which an error of the voltages that is made in every period grows; 1 or more."""
+        n, modes = self.period.n, self.period.modes
+        grown = modes.shape @ self.solver[:n, :n] @ modes.inverse
+        return max(1.0, float(np.abs(grown).sum(axis=1).max(initial=0.0)))
 
     def _update(self, step: FloatArray, fell: FloatArray) -> None:
         """Broyden's update of the solver: the last step made the change over a period fall by so much."""
@@ -334,21 +361,23 @@ class _Search:
             slope[:, k] = (self.passed(self.z + by * unit, tol).end - base) / by
         return slope
 
-    def _errors(self, last: _Pass, step: FloatArray) -> tuple[FloatArray, float, float]:
+    def _errors(self, last: _Pass, step: FloatArray) -> tuple[FloatArray, float, float, float]:
         """Error of every gap's voltage and force (n_gap, 2), the memory, and the largest error over that asked for.
 
-        An error made in every period grows to what the solver makes of it.
+        The last figure is that of rounding alone. An error made in every period grows to what the solver makes of it.
         """
         period, solver = self.period, np.abs(self.solver)
-        whole = period.modes.shape @ self.solver[: period.n, : period.n] @ period.modes.inverse
-        memory = max(1.0, float(np.abs(whole).sum(axis=1).max(initial=0.0)))
+        memory = self._memory()
         grown = solver @ np.abs(last.error)
         met = last.met[self.fingers]
         peak, force = met[:, netassess.PEAK_U], met[:, netassess.PEAK_F]
         largest = float(peak.max(initial=0.0))
-        # Rounding is an error too; what was moved last is more than what would be moved next.
-        floor = 4e-16 * memory * (last.rounding[self.fingers] * (largest + self.scale) + peak)
         gap = np.abs(self.gap)
+        # Rounding is an error too; what was moved last is more than what would be moved next.
+        once = np.abs(period.modes.inverse).sum(axis=1)
+        often = solver[: period.n, : period.n] @ once
+        grows = np.maximum(1.0, (gap[:, : period.n] @ often) / (gap[:, : period.n] @ once))
+        floor = 4e-16 * grows * (last.rounding[self.fingers] * (largest + self.scale) + peak)
         u_error = last.magnified * (SAFETY * (gap @ grown) + gap @ np.abs(step)) + floor
         f_error = 2.0 * force / np.where(peak > 0.0, peak, math.inf) * u_error
         slow = period.problem.scene.net.slow[self.fingers]
@@ -357,7 +386,13 @@ class _Search:
         u_error, f_error = u_error + peak * share, f_error + 3.0 * force * share
         live = peak > 4e-15 * self.scale
         over = np.append((u_error / np.where(live, peak, 1.0))[live], (f_error / np.where(live, force, 1.0))[live])
-        return np.column_stack([u_error, f_error]), memory, float(over.max(initial=0.0)) / self.rtol
+        rounding = float((2.0 * floor / np.where(live, peak, 1.0))[live].max(initial=0.0))
+        return (
+            np.column_stack([u_error, f_error]),
+            memory,
+            float(over.max(initial=0.0)) / self.rtol,
+            rounding / self.rtol,
+        )
 
 
 def _failure(problem: NetworkProblem, status: Status, t: float | None, cause: str = "") -> Failure:
