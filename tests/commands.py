@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fingerspice.cli.app import app as cli
+from fingerspice.cli import app as cli
 
 QUICK = (".tran 10u 50m uic", ".tran 50u 20m uic")
 """A change of `deck_edits.DECK` to two periods."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
+from commands import run_here
+from fingerspice.studies.limits import fold_voltage
 from network_reference import Floating
 from scenes import COAT, GAP, assignments, deck, table1
 
@@ -338,3 +341,45 @@ def test_a_rough_function_counts_in_both_errors_and_in_what_is_asked(area: str) 
     assert tight.error.u_gap >= 1e-10
     # What moves the voltage by a part moves the force by twice that.
     assert tight.error.f_el >= 2.0 * 1e-10 / np.abs(tight.u_gap).max() * tight.f_el.max()
+
+
+# The command line, and folds --------------------------------------------------------------------------------
+
+
+def test_the_command_compares_every_finger(monkeypatch: Any, capsys: Any, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    deck_path = str(CIRCUITS / "two_fingers.cir")
+    answer = json.loads(run_here(monkeypatch, capsys, "compare", deck_path, "--json", "--rtol", "1e-7").out)
+    assert answer["success"]
+    assert answer["gaps"] == ["Xfirm.Xgap", "Xlight.Xgap"]
+    result = fs.compare(shipped("two_fingers"), rtol=1e-7)
+    for key, figures in (("phasor", result.phasor), ("transient_coupled", result.coupled)):
+        for name, values in answer[key].items():
+            np.testing.assert_allclose(values, getattr(figures, name), rtol=1e-12)
+    assert Path(answer["files"][0]).stat().st_size > 10_000
+    words = run_here(monkeypatch, capsys, "compare", deck_path, "--no-plot", "--rtol", "1e-7").out
+    assert "mean force of Xfirm.Xgap:" in words
+    assert "mean force of Xlight.Xgap:" in words
+
+
+def test_the_command_sweeps_one_of_several_fingers(monkeypatch: Any, capsys: Any, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ("ac", str(CIRCUITS / "two_fingers.cir"), "--sweep", "lin 2 1k 5k", "--area", "coupled", "--no-plot")
+    refused = run_here(monkeypatch, capsys, *words)
+    assert refused.code == 2
+    assert "allowed: finger= one of Xfirm.Xgap, Xlight.Xgap" in refused.err
+    answer = json.loads(
+        run_here(monkeypatch, capsys, *words, "--finger", "xlight.xgap", "--json", "--rtol", "1e-7").out
+    )
+    (want,) = fs.large_signal(shipped("two_fingers"), [1e3, 5e3], finger="Xlight.Xgap", rtol=1e-7)
+    np.testing.assert_allclose(answer["sweeps"][0]["f_el_mean"], want.f_el_mean, rtol=1e-12)
+
+
+def test_a_stack_with_a_resistor_beside_it_folds_where_the_stack_does() -> None:
+    stack = table1("SIN(0 200 100)").replace({"Xgap.d": 200e-9})
+    text = table1("SIN(0 200 100)").text.replace("\nXcoat", "\nRload drive 0 1meg\nXcoat", 1)
+    network = fs.parse_netlist(text).replace({"Xgap.d": 200e-9})
+    one, other = (fold_voltage(c, 200.0, 0.01) for c in (stack, network))
+    assert math.isfinite(one)
+    # Each is found to 1e-3.
+    assert other == pytest.approx(one, rel=2e-3)
