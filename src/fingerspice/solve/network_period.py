@@ -18,9 +18,13 @@ from fingerspice.waveforms.waveform import DC
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
 # Times of a period at which the areas are averaged.
 SAMPLES = 64
+# Shares of a voltage and their weights, for integrals from 0 V to it.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+_GAUSS = 0.5 + 0.5 * _NODES, 0.5 * _WEIGHTS
 
 
 class Stopped(Exception):
@@ -110,6 +114,25 @@ class Period:
     def modes_of(self, x: FloatArray) -> FloatArray:
         """Modes (n,) from live voltages (V) just before the period begins."""
         return np.asarray(self.modes.inverse @ (x + self.modes.follow @ self.before))
+
+    def charges(self, z: FloatArray, held: IntArray) -> FloatArray:
+        """Charges that nothing drains, on the scale of their modes `held`, of the state z.
+
+        Under `local` a capacitor has taken the integral of C dU from 0 V on; under `mobile` it has C U.
+        """
+        scene = self.problem.scene
+        network, net = scene.network, scene.net
+        u = net.p @ self.voltages(z) + net.q @ self.before
+        along, weight = (np.ones(1), np.ones(1)) if net.mobile else _GAUSS
+        area, charge = scene.area0.copy(), np.zeros(u.size)
+        for share, part in zip(along, weight, strict=True):
+            for i in np.flatnonzero(net.gap >= 0):
+                slow, contact = net.slow[i], network.contacts[i]
+                assert contact is not None
+                following = float(contact.area(share * abs(u[net.gap[i]])))
+                area[i] = following if slow < 0 else net.area0[i] * z[self.n + slow]
+            charge += part * network.capacitance(area) * u
+        return np.asarray(self.modes.shape[:, held].T @ (net.p.T @ charge))
 
     def linear_state(self, modes: Modes) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Periodic state of a circuit with fixed areas: its modes, at the end of the pass too, and at SAMPLES times.

@@ -26,7 +26,6 @@ from fingerspice.solve.nodal import pass_through
 from fingerspice.solve.periodic import Closed
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Of the passes before the last ones: what they may be off, over what the state moved last.
 _CRUDE, _FIRST = 1e-3, 1e-4
@@ -44,9 +43,6 @@ _LONG = 0.1
 _ASTRAY = 1e3
 # How often the areas are averaged over the period of the linear circuit.
 _AVERAGES = 3
-# Shares of a voltage and their weights, for integrals from 0 V to it.
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
-_GAUSS = 0.5 + 0.5 * _NODES, 0.5 * _WEIGHTS
 
 
 @dataclass(frozen=True)
@@ -86,19 +82,20 @@ def close_network_period(problem: NetworkProblem, rtol: float) -> Closed[Network
     y = np.concatenate([x, areas, np.zeros(n_s)])
     state = NetworkState(period.begin, y, period.before, np.zeros(problem.scene.net.gap.size))
     started = dataclasses.replace(
-        problem, t_start=period.begin, t_stop=problem.t_stop + moved, first=problem.first + moved, initial=state
-    )
-    return Closed(started, **vars(found))
+        problem, t_start=period.begin, t_stop=problem.t_stop + moved, first=problem.first + moved, initial=state,
+        begun=found.gap_errors,
+    )  # fmt: skip
+    u_gap, f_el = map(float, found.gap_errors.max(axis=0, initial=0.0))
+    return Closed(started, found.defect, found.map_slope, found.memory, ErrorEstimate(u_gap, f_el), found.periods)
 
 
 @dataclass(frozen=True)
 class _Found:
-    """As `periodic.Closed`, but for the problem."""
+    """As `periodic.Closed`, with the error of every gap's voltage and force (n_gap, 2), V and N."""
 
     defect: float
     map_slope: FloatArray
     memory: float
-    error: ErrorEstimate
     gap_errors: FloatArray
     periods: float
 
@@ -115,7 +112,7 @@ def _closed_form(period: Period) -> tuple[FloatArray, FloatArray, _Found]:
     x = period.voltages(start + period.kept)
     # In closed form there is rounding only, which a run states itself.
     none = np.zeros((len(period.problem.network.fingers), 2))
-    return x, np.zeros(0), _Found(period.parts * defect, slope, 1.0, ErrorEstimate(0.0, 0.0), none, 1)
+    return x, np.zeros(0), _Found(period.parts * defect, slope, 1.0, none, 1)
 
 
 CHARGING = "a current source charges, from period to period, what nothing drains"
@@ -244,11 +241,8 @@ class _Search:
             else:
                 break
         slope = self._slope()
-        worst = errors.max(axis=0, initial=0.0)
-        found = _Found(
-            period.parts * defect, slope @ slope if period.parts == 2 else slope, memory,
-            ErrorEstimate(float(worst[0]), float(worst[1])), errors, self.passes / period.parts,
-        )  # fmt: skip
+        slope = slope @ slope if period.parts == 2 else slope
+        found = _Found(period.parts * defect, slope, memory, errors, self.passes / period.parts)
         return period.voltages(self.z), self.z[period.n :], found
 
     def _newton(self, tol: float) -> tuple[_Pass, FloatArray, float]:
@@ -319,29 +313,11 @@ class _Search:
             return z
         z = z.copy()
         for _ in range(_MOST):
-            missing = self._charges(z, held) - self.period.kept[held]
+            missing = self.period.charges(z, held) - self.period.kept[held]
             z[held] -= missing
             if np.abs(missing).max() <= 1e-15 * np.abs(z).max():
                 break
         return z
-
-    def _charges(self, z: FloatArray, held: IntArray) -> FloatArray:
-        """Charges that nothing drains, on the scale of their modes, of the state z.
-
-        Under `local` a capacitor has taken the integral of C dU from 0 V on; under `mobile` it has C U.
-        """
-        network, net = self.period.problem.network, self.period.problem.scene.net
-        u = net.p @ self.period.voltages(z) + net.q @ self.period.before
-        along, weight = (np.ones(1), np.ones(1)) if net.mobile else _GAUSS
-        area, charge = self.period.problem.scene.area0.copy(), np.zeros(u.size)
-        for share, part in zip(along, weight, strict=True):
-            for i in np.flatnonzero(net.gap >= 0):
-                slow, contact = net.slow[i], network.contacts[i]
-                assert contact is not None
-                following = float(contact.area(share * abs(u[net.gap[i]])))
-                area[i] = following if slow < 0 else net.area0[i] * z[self.period.n + slow]
-            charge += part * network.capacitance(area) * u
-        return np.asarray(self.period.modes.shape[:, held].T @ (net.p.T @ charge))
 
     def _slope(self) -> FloatArray:
         """Derivative of the pass's end by z, to about 1e-5, from one pass for every mode that outlasts the period."""

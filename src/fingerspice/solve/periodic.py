@@ -41,8 +41,6 @@ class Closed(Generic[AnyProblem]):
         Error of the periodic state over that of one period: what a slow mode collects over the periods it remembers.
     error : ErrorEstimate
         What the state may be off, as its effect on the gap voltage and the force of the period.
-    gap_errors : ndarray, shape (n_gap, 2)
-        The same of every gap whose area follows, V and N.
     periods : float
         Periods integrated.
     """
@@ -52,7 +50,6 @@ class Closed(Generic[AnyProblem]):
     map_slope: FloatArray
     memory: float
     error: ErrorEstimate
-    gap_errors: FloatArray
     periods: float
 
 
@@ -90,8 +87,7 @@ def close_period(problem: Problem, rtol: float) -> Closed[Problem]:
     problem = dataclasses.replace(
         problem, t_start=begin, t_stop=problem.t_stop + moved, first=problem.first + moved, initial=initial
     )
-    error: ErrorEstimate = found["error"]
-    return Closed(problem, gap_errors=np.array([[error.u_gap, error.f_el]]), **found)
+    return Closed(problem, **found)
 
 
 def _close(

@@ -131,14 +131,13 @@ def simulate(
     how = start if isinstance(start, str) else "given"
     first = "uncharged" if start == "periodic" else start
     if not is_stack(circuit):
-        network, gap_errors = prepare_network(
+        network = prepare_network(
             circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=first, charge=charge
-        ), None  # fmt: skip
+        )
         if start == "periodic":
-            begun = close_network_period(network, 0.5 * rtol)
-            network, gap_errors = begun.problem, begun.gap_errors
+            network = close_network_period(network, 0.5 * rtol).problem
             _check_settled(times, network)
-        run = run_network(network, times, rtol, method, progress, tier, how, jumps, gap_errors)
+        run = run_network(network, times, rtol, method, progress, tier, how, jumps)
         return _given_back(run, throw)
     problem, error = prepare(
         circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=first, charge=charge, rtol=rtol
@@ -268,9 +267,8 @@ def run_network(
     tier: str = "auto",
     start: str = "deck",
     jumps: str = "both",
-    begun: FloatArray | None = None,
 ) -> Solution:
-    """As `run_problem`, for a network; `begun` has the errors of every gap's voltage and force, V and N (n_gap, 2)."""
+    """As `run_problem`, for a network."""
     if method not in ("auto", "exponential", "radau"):
         raise InputError(
             f"method {method!r} is for series stacks; allowed for this network: 'auto', 'exponential' or 'radau'"
@@ -280,7 +278,7 @@ def run_network(
     run_at = t_out if t_eval is None else at_breakpoints(problem, t_eval)
     begin = time.perf_counter()
     # What the start gives away is part of the error asked for.
-    own = rtol if begun is None else max(0.5 * rtol, RTOL_RANGE[0])
+    own = rtol if problem.begun is None else max(0.5 * rtol, RTOL_RANGE[0])
     if plan.tier == "linear":
         run, name = solve_fixed(problem, run_at, left), plan.tier
     else:
@@ -290,8 +288,8 @@ def run_network(
         name = "radau" if found is None else "exponential"
         run = solve_coupled(problem, own, run_at, left, progress) if found is None else found
     wall = time.perf_counter() - begin
-    if begun is not None:
-        add_start_error(run, begun)
+    if problem.begun is not None:
+        add_start_error(run, problem.begun)
     _mind_unseen(run)
     # The rounding of a closed form is stated, and no reason to refuse it: no other method would do better.
     minded = problem.network.fingers and (plan.tier != "linear" or run.rough > 0.0)

@@ -53,8 +53,6 @@ class SteadyState(Shown, Figured):
         Error of the periodic state over that of one period; large where a disturbance outlasts many periods.
     error : ErrorEstimate
         What the state may be off, as its effect on the gap voltage and the force of the period.
-    gap_errors : ndarray, shape (n_gap, 2)
-        The same of every gap, V and N.
     periods : float
         Periods integrated to find it.
     """
@@ -65,7 +63,6 @@ class SteadyState(Shown, Figured):
     map_slope: FloatArray
     memory: float
     error: ErrorEstimate
-    gap_errors: FloatArray
     periods: float
 
     def _page(self) -> Page:
@@ -107,7 +104,7 @@ class SteadyState(Shown, Figured):
             Where that fails.
         """
         if isinstance(self.problem, NetworkProblem):
-            solution = run_network(self.problem, rtol=self.rtol, start="periodic", begun=self.gap_errors)
+            solution = run_network(self.problem, rtol=self.rtol, start="periodic")
         else:
             solution = run_problem(self.problem, rtol=self.rtol, start="periodic", begun=self.error)
         if solution.failure is not None:
@@ -183,6 +180,5 @@ def steady_state(
         )
         closed = close_network_period(dataclasses.replace(network, first=0.0, step=period / points), 0.5 * rtol)
     return SteadyState(
-        closed.problem, rtol, closed.defect, closed.map_slope, closed.memory, closed.error, closed.gap_errors,
-        closed.periods,
-    )  # fmt: skip
+        closed.problem, rtol, closed.defect, closed.map_slope, closed.memory, closed.error, closed.periods
+    )
