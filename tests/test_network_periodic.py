@@ -184,6 +184,51 @@ def test_layers_without_a_leak_leave_directions_that_nothing_decides(law: str) -
     assert np.abs(period.u_gap[-1] - state.solution.u_gap[-1]) <= state.defect + 1e-6
 
 
+# Hard ones --------------------------------------------------------------------------------------------------
+
+
+@every_law
+@pytest.mark.parametrize("source", ["SIN(40 120 5k)", "SQUARE(100 5k 0.3)"])
+def test_the_error_stated_holds_though_a_disturbance_would_outlast_many_periods(source: str, law: str) -> None:
+    # The body leaks within a second, and the coating within a tenth.
+    circuit = deck(
+        f"Vdrive amp 0 {source}", "Rout amp drive 47k", *finger("drive", "body"), "Cbody body 0 150p", "Rb body 0 5g"
+    ).replace({"Xcoat.r": 1e9, "Xgap.r": 1e9})
+    rough, fine = (fs.steady_state(circuit, charge_law=law, rtol=rtol) for rtol in (1e-6, 1e-9))
+    assert rough.multipliers.max() > 0.999
+    for key, asked in (("u_gap", "u_gap"), ("f_el", "f_el")):
+        one, other = (getattr(state.solution, key) for state in (rough, fine))
+        stated = sum(getattr(state.solution.error, asked) for state in (rough, fine))
+        assert np.abs(one - other).max() <= stated
+        assert np.abs(one - other).max() <= 1e-6 * np.abs(other).max()
+
+
+def test_where_exponential_steps_find_no_way_on_an_implicit_method_does() -> None:
+    circuit = deck(
+        "V1 amp 0 PULSE(-10 10 0 17u 17u 415u 864u)",
+        "Rout amp drive 6",
+        "Cc drive 0 1p",
+        *finger("drive", "0", tau=2e-3),
+    ).replace({"Xcoat.r": 8e9})
+    t = (np.arange(60) + 0.37) / 60.0 * 864e-6
+    run = fs.simulate(circuit, start="periodic", t_eval=t, t_stop=864e-6, rtol=1e-8, charge=False)
+    long = fs.simulate(circuit, t_eval=0.0864 + t, t_stop=0.0864 + 864e-6, rtol=1e-10, charge=False)
+    assert np.abs(run.u_gap - long.u_gap).max() <= run.error.u_gap + long.error.u_gap
+    assert np.abs(run.f_el - long.f_el).max() <= run.error.f_el + long.error.f_el
+
+
+def test_a_charge_that_the_areas_ripple_pumps_for_ever_has_no_periodic_state() -> None:
+    # Behind the insulating coating and the body's capacitance: what the law moves with the area does not come back.
+    circuit = floating("SQUARE(100 5k 0.3)").replace({"Xcoat.r": math.inf})
+    with pytest.raises(fs.SolveError, match="a charge that nothing drains moves by") as caught:
+        fs.steady_state(circuit, charge_law="local")
+    assert caught.value.failure.status is fs.Status.NOT_PERIODIC
+    run = fs.simulate(circuit, t_stop=0.0402, t_eval=[0.02, 0.0202, 0.04, 0.0402], charge_law="local", rtol=1e-9)
+    coat = run.u_layer[:, 0]
+    assert 0.01 < abs(coat[1] - coat[0]) < 0.03
+    assert coat[3] - coat[2] == pytest.approx(coat[1] - coat[0], rel=1e-3)
+
+
 # What has none ----------------------------------------------------------------------------------------------
 
 
