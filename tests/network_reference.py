@@ -121,9 +121,12 @@ class Floating:
     tau: float = 0.0
 
     def response(
-        self, u: Callable[[float], float], times: Sequence[float], rtol: float = 1e-12
+        self, u: Callable[[float], float], times: Sequence[float], rtol: float = 1e-12, start: FloatArray | None = None
     ) -> dict[str, FloatArray]:
-        """Gap voltage (V), area (m^2) and delivered charge (C) at times from 0 on, uncharged; gap voltage >= 0."""
+        """Gap voltage (V), area (m^2), delivered charge (C) and state at times from 0 on, from a state or uncharged.
+
+        The state is the voltages (V) of coat, gap, skin and body, the area (m^2) where it is slow, at a column each.
+        """
         layers = analytic.table1_layers(self.frequency)
         a0 = float(analytic.area(0.0))
         c = np.array([layer.c for layer in layers])
@@ -167,6 +170,12 @@ class Floating:
         y0 = np.zeros(6 if self.tau > 0.0 else 5)
         if self.tau > 0.0:
             y0[5] = a0
+        if start is not None:
+            y0[:4] = start[:4]
+            area = start[4] if self.tau > 0.0 else float(analytic.area(abs(start[gap])))
+            if self.mobile:
+                y0[:3] *= c * area
+            y0[5:] = start[4:]
         scale = np.full(y0.size, 1e-12)
         if self.mobile:
             scale[:3] *= 1e-10
@@ -182,4 +191,5 @@ class Floating:
             "u_gap": np.array([v[gap] for v, _ in states]),
             "area": np.array([a for _, a in states]),
             "charge": run.y[4],
+            "state": np.array([[*v, y[3], *y[5:]] for (v, _), y in zip(states, run.y.T, strict=True)]).T,
         }

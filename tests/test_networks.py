@@ -490,7 +490,6 @@ def test_what_no_network_is_gets_one_sentence(case: str) -> None:
         ({"method": "dop853"}, "method 'dop853' is for series stacks"),
         ({"tier": "algebraic"}, "the algebraic tier is not for this network"),
         ({"tier": "linear"}, "the linear tier is not for this network"),
-        ({"start": "periodic"}, "start='periodic' needs a series stack"),
         ({"area": -1.0}, "area is -1 m^2"),
         ({"area": "often"}, "area is 'often'"),
         ({"charge_law": "both"}, "charge_law is 'both'"),
@@ -501,10 +500,3 @@ def test_requests_that_cannot_be_run_are_refused(request_: dict[str, object], me
     with pytest.raises(fs.InputError) as caught:
         fs.simulate(floating("SIN(0 200 5k)"), **request_)  # type: ignore[arg-type]
     assert message in str(caught.value)
-
-
-def test_what_needs_a_stack_says_so() -> None:
-    circuit = floating("SIN(0 200 5k)")
-    for call in (fs.compare, fs.steady_state):
-        with pytest.raises(fs.InputError, match="needs a series chain of LAYER, SLAB, SKIN and GAP"):
-            call(circuit)

@@ -43,6 +43,11 @@ class LinearScene(Protocol):
         ...
 
     @property
+    def note(self) -> str:
+        """Which of several GAPs it is; empty where there is one."""
+        ...
+
+    @property
     def fixed(self) -> bool:
         """Whether the deck fixes that area."""
         ...
@@ -64,6 +69,7 @@ class _StackScene:
     contact: Contact
     gap: int
     finger: int = 0
+    note: str = ""
 
     @property
     def fixed(self) -> bool:
@@ -102,6 +108,7 @@ class _NetworkScene:
     contact: Contact
     gap: int
     finger: int
+    note: str
 
     @property
     def fixed(self) -> bool:
@@ -129,30 +136,41 @@ class _NetworkScene:
         return np.asarray(self.network.grouping @ self.network.phasors(f, areas, np.ones(1, complex)))
 
 
-def linear_scene(circuit: Circuit) -> LinearScene:
-    """Contact, sources, layers and linear response of a circuit, for its phasors.
+def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
+    """The contact of a circuit's GAP, which has to be named where there are several, and what drives it.
 
     Raises
     ------
     InputError
-        For a circuit without GAP, or a network with several GAPs or sources.
+        For a circuit without GAP, for a name that no GAP has, or none where there are several, and for several sources
+        of a network, which have no one amplitude and frequency.
     """
+    gaps = {e.name.lower(): e.name for e in circuit.by_device("GAP")}
+    if finger is not None and finger.lower() not in gaps:
+        known = ", ".join(gaps.values()) or "none: this circuit has no GAP"
+        raise InputError(f"finger is {finger!r}; allowed: the name of a GAP, {known}")
     if is_stack(circuit):
         stack = build_stack(circuit)
         if stack.gap_layer is None or stack.contact is None:
             raise InputError("a phasor solution needs a GAP; this circuit has none")
         return _StackScene(stack, stack.contact, stack.gap_layer)
     network = build_network(circuit)
-    if len(network.fingers) != 1 or len(network.sources) != 1:
-        raise InputError(
-            f"a phasor solution needs one GAP and one source; this circuit has {len(network.fingers)} and "
-            f"{len(network.sources)}"
-        )
-    place = network.fingers[0]
-    contact, gap = network.contacts[place], network.areas[place].gap
-    assert contact is not None
-    assert gap is not None
-    return _NetworkScene(network, contact, network.layers.index(gap), place)
+    if not gaps:
+        raise InputError("a phasor solution needs a GAP; this circuit has none")
+    if len(network.sources) != 1:
+        names = ", ".join(e.name for e in network.sources)
+        raise InputError(f"a phasor solution needs one source, whose amplitude it takes; this circuit has {names}")
+    if finger is None and len(gaps) > 1:
+        raise InputError(f"this circuit has several GAPs; allowed: finger= one of {', '.join(gaps.values())}")
+    name = next(iter(gaps.values())) if finger is None else gaps[finger.lower()]
+    for place in network.fingers:
+        contact, gap = network.contacts[place], network.areas[place].gap
+        if gap is not None and gap.name == name and contact is not None:
+            break
+    else:
+        raise InputError(f"{name} drives no area; allowed: a GAP with an area of its own")
+    note = f"of several GAPs, {name}" if len(gaps) > 1 else ""
+    return _NetworkScene(network, contact, network.layers.index(gap), place, note)
 
 
 def mean_area(stack: Stack, frequency: float, amplitude: float) -> float:

@@ -22,7 +22,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "run": ("area", "tier", "t_stop", "figures_from", "error", "fundamental", "fold_margin_min", "signals"),
     "ac": ("area", "skin", "sweeps"),
     "plan": ("area", "tier", "reasons", "start", "rates", "stiff", "sensitivity", "error_bound", "plan_area"),
-    "compare": ("frequency", "phasor", "transient_mean_area", "transient_coupled"),
+    "compare": ("frequency", "gaps", "phasor", "transient_mean_area", "transient_coupled"),
     "limits": ("peak", "voltage", "sweeps"),
     "export": (),
     "figures": (),

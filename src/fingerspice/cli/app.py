@@ -160,6 +160,7 @@ def ac(
         list[float] | None, typer.Option(help="With --area coupled: source amplitude in V; may be repeated.")
     ] = None,
     skin: Annotated[str, typer.Option(help="SKIN's data: swept, at each frequency; own, at its f.")] = "swept",
+    finger: Annotated[str | None, typer.Option(metavar="GAP", help="Which of several GAPs.")] = None,
     charge_law: ChargeLaw = None,
     rtol: Rtol = 1e-8,
     changes: Set = None,
@@ -194,11 +195,11 @@ def ac(
         if area == "coupled":
             if skin != "swept":
                 raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
-            found = _large_signal(circuit, frequencies, amplitude, charge_law, rtol)
+            found = _large_signal(circuit, frequencies, amplitude, charge_law, rtol, finger)
         elif amplitude:
             raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
         else:
-            found = (phasor(circuit, frequencies, area=area_from_text(area), skin=skin),)
+            found = (phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger),)
         results.open()
         writes = [lambda: phasor_csv(found, data)]
         if picture is not None:
@@ -211,13 +212,20 @@ def ac(
 
 
 def _large_signal(
-    circuit: Circuit, frequencies: FloatArray, amplitude: list[float] | None, charge_law: str | None, rtol: float
+    circuit: Circuit,
+    frequencies: FloatArray,
+    amplitude: list[float] | None,
+    charge_law: str | None,
+    rtol: float,
+    finger: str | None,
 ) -> tuple[PhasorSolution, ...]:
     """The sweep with ``--area coupled``: the periodic state at every frequency (Hz) and amplitude (V)."""
     from fingerspice.studies.largesignal import large_signal
 
     with progress("sweeping") as update:
-        return large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, progress=update)
+        return large_signal(
+            circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger, progress=update
+        )
 
 
 @app.command()

@@ -25,8 +25,8 @@ class Plan(Shown):
     stiff : bool
         Whether stability would limit the steps of an explicit method.
     sensitivity : float
-        Largest relative change of the leak rates that the area causes over the run; NaN for a network, whose tier does
-        not depend on it.
+        Largest relative change of 1/A over the run, and with it of the leak rates: of the area that changes most, with
+        gap voltages up to twice the sources' peak. NaN where a current source sets them no bound.
     error_bound : float
         Bound of the error (relative to the peaks) from taking one area, or a dispersive skin at one frequency.
     area : float

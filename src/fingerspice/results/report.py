@@ -104,7 +104,7 @@ def plan_text(plan: Plan, circuit: Circuit | None = None) -> Page:
     lines: list[str | Table] = [*head, f"model: {plan.tier}", *(f"  because {r}" for r in plan.reasons)]
     lines.append(f"rates, area frozen: {rates} 1/s ({'' if plan.stiff else 'not '}stiff for this source)")
     if not math.isnan(plan.sensitivity):
-        lines.append(f"the area moves the leaks by at most {100.0 * plan.sensitivity:.3g} %")
+        lines.append(f"the area differs from its middle by at most {100.0 * plan.sensitivity:.3g} %")
     return Page(lines)
 
 

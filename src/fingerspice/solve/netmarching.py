@@ -392,4 +392,4 @@ def _stated(run: NetworkRun, one: March, u_scale: float) -> float:
         charge = 2.0 * SAFETY * float(one.control[readout.ERROR_Q]) + 4e-16 * held * steps
         charge += moved * max((area_missed(curve, one.decade) for curve in one.net.curves), default=0.0)
     run.margin = 1.0 / float(one.control[readout.MAGNIFIED])
-    return state_error(run, gaps[one.net.gap >= 0], u_scale, charge)
+    return state_error(run, gaps[list(one.problem.network.fingers)], u_scale, charge)

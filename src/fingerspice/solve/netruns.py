@@ -41,7 +41,10 @@ class NetworkRun:
     stats: dict[str, int]
     state: NetworkState
     t_failed: float | None = None
-    unseen: tuple[float, float] | None = None
+    # Where a user's function is not what was integrated: time (s), by how much (V), and which source.
+    unseen: tuple[float, float, int] | None = None
+    # Largest misfit of the sources' tables that no finer ones would mend, V.
+    rough: float = 0.0
     margin: float = 1.0
     tried: tuple[Attempt, ...] = ()
     # The row at the time a failed run reached.
@@ -50,6 +53,15 @@ class NetworkRun:
     continuous: Continuous | None = None
     # Of each gap: peaks of voltage (V) and force (N), and the stated errors of both.
     gaps: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
+
+    def excess(self, u_scale: float) -> float:
+        """Largest stated error over the peak it belongs to, in any gap's voltage or force.
+
+        A gap that takes no more than rounding of `u_scale`, the largest voltage of the circuit (V), is at 0 V.
+        """
+        u_peak, f_peak, u_error, f_error = self.gaps[self.gaps[:, 0] > ROUNDING * u_scale].T
+        over = np.append(u_error / u_peak, f_error / np.where(f_peak > 0.0, f_peak, np.inf))
+        return float(over.max(initial=0.0))
 
     def end_before(self, t: float) -> None:
         """Take back the outputs from a time (s) on."""
@@ -92,11 +104,14 @@ def source_tables(problem: NetworkProblem, tol: float, *, no_chirps: bool = Fals
 
 def first_unseen(
     problem: NetworkProblem, tables: list[SourceTable], t_out: FloatArray, tol: float
-) -> tuple[float, float] | None:
-    """The first output at which a user's function is not what its table says, s, and by how much, V."""
-    pairs = zip(problem.scene.waveforms, tables, strict=True)
-    found = (table.unseen(wave, t_out, max(tol, 1e-14)) for wave, table in pairs if is_sampled(wave))
-    return min((x for x in found if x is not None), default=None)
+) -> tuple[float, float, int] | None:
+    """The first output at which a user's function is not what its table says, s, by how much, V, and which it is."""
+    found = []
+    for i, (wave, table) in enumerate(zip(problem.scene.waveforms, tables, strict=True)):
+        off = table.unseen(wave, t_out, max(tol, 1e-14)) if is_sampled(wave) else None
+        if off is not None:
+            found.append((*off, i))
+    return min(found, default=None)
 
 
 def joined(tables: list[SourceTable]) -> Sources:
@@ -206,10 +221,10 @@ def integrate(one: Integration, progress: Progress | None) -> NetworkRun:
     if t_failed is not None and status is not Status.SOURCE_NOT_FINITE and sources and one.t > problem.t_start:
         here = _row(one, sources, "left")
     return NetworkRun(
-        t_out[:done], left[:done], one.rows[:done], status, ErrorEstimate(rough, 0.0), one.peaks,
+        t_out[:done], left[:done], one.rows[:done], status, ErrorEstimate(0.0, 0.0), one.peaks,
         int(one.counters[NFEV]),
         {name: int(one.counters[i]) for name, i in (("steps", ACCEPTED), ("rejected", REJECTED), ("zeros", ZEROS))},
-        state, t_failed, tried=last_tried(one.tried), here=here, unseen=unseen,
+        state, t_failed, tried=last_tried(one.tried), here=here, unseen=unseen, rough=rough,
     )  # fmt: skip
 
 
@@ -249,7 +264,7 @@ def state_error(run: NetworkRun, gaps: FloatArray, u_scale: float, charge: float
     Parameters
     ----------
     run : NetworkRun
-        Its error is so far how rough its sources are, V: they move a gap by no more than that.
+        What its sources are rough by moves a gap by no more than that.
     gaps : ndarray, shape (n_gap, 4)
         Peaks of voltage (V) and force (N) and the errors of both, of every gap.
     u_scale : float
@@ -257,16 +272,25 @@ def state_error(run: NetworkRun, gaps: FloatArray, u_scale: float, charge: float
     charge : float or None
         Error of the charge, C.
     """
-    rough = run.error.u_gap
+    rough = run.rough
     u_peak, f_peak = gaps[:, 0], gaps[:, 1]
-    live = u_peak > ROUNDING * u_scale
     safe = np.where(u_peak > 0.0, u_peak, 1.0)
     u_error = gaps[:, 2] + rough
     f_error = gaps[:, 3] + 2.0 * rough / safe * f_peak
     run.error = ErrorEstimate(float(u_error.max(initial=rough)), float(f_error.max(initial=0.0)), charge)
     run.gaps = np.column_stack([u_peak, f_peak, u_error, f_error])
-    over = np.append(u_error[live] / u_peak[live], (f_error / np.where(f_peak > 0.0, f_peak, np.inf))[live])
-    return float(over.max(initial=0.0))
+    return run.excess(u_scale)
+
+
+def add_start_error(run: NetworkRun, gaps: FloatArray) -> None:
+    """Add what the start is off, as its effect on every gap's voltage and force (n_gap, 2), V and N, to a run's error.
+
+    What the charge collects from such a start is not known.
+    """
+    if len(run.gaps) == len(gaps):
+        run.gaps = run.gaps + np.hstack([np.zeros_like(gaps), gaps])
+    u_gap, f_el = gaps.max(axis=0, initial=0.0)
+    run.error = ErrorEstimate(run.error.u_gap + float(u_gap), run.error.f_el + float(f_el))
 
 
 def gap_signals(problem: NetworkProblem, run: NetworkRun) -> Iterator[tuple[FloatArray, FloatArray]]:

@@ -111,7 +111,11 @@ class Outputs(Protocol):
 
 @dataclass(frozen=True)
 class NetworkProblem:
-    """What a solver of networks needs; attributes as in `problem.Problem`."""
+    """What a solver of networks needs; attributes as in `problem.Problem`.
+
+    `begun` has what the start is off, as its effect on every gap's voltage and force (n_gap, 2), V and N: of a periodic
+    state that was found to half of the error asked for. The run has the other half.
+    """
 
     circuit: Circuit
     scene: NetworkScene
@@ -121,6 +125,7 @@ class NetworkProblem:
     step: float
     initial: NetworkState
     charge: bool = True
+    begun: FloatArray | None = None
 
     @property
     def network(self) -> Network:

@@ -109,6 +109,22 @@ class Collocation(Integration):
         return code == collocation.DONE
 
 
+def pass_through(
+    problem: NetworkProblem, sources: Sources, tol: float, u_scale: float
+) -> tuple[Status, Collocation, FloatArray]:
+    """A problem's run without outputs: how it ended, the run, and what its end differs by from a coarser run's."""
+    longest, none = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step), np.zeros(0)
+    ends = []
+    for stages, share in ((STAGES_BESIDE, BESIDE), (STAGES, 1.0)):
+        scheme = _scheme(stages)._replace(h_max=longest)
+        one = Collocation(problem, scheme, max(share * tol, FINEST), u_scale, none, none.astype(bool))
+        status = one.through(sources, problem.t_stop)
+        ends.append(one.y)
+        if status is not Status.SUCCESS:
+            break
+    return status, one, ends[-1] - ends[0]
+
+
 def _integrate(
     problem: NetworkProblem, scheme: Scheme, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray,
     progress: Progress | None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,25 +15,28 @@ from fingerspice.engine.pace import Pace
 from fingerspice.numerics import linear
 from fingerspice.results.outcome import ErrorEstimate, Failure, SolveError, Status
 from fingerspice.solve.marching import LOCAL_SHARE, LONGEST_STEP
+from fingerspice.solve.networks import NetworkProblem
 from fingerspice.solve.problem import Problem, state_from
 from fingerspice.solve.track import FINEST, SAFETY, prepare_system
 from fingerspice.waveforms.sampling import SourceTable, source_table
 
 FloatArray = NDArray[np.float64]
+AnyProblem = TypeVar("AnyProblem", Problem, NetworkProblem)
 
 
 @dataclass(frozen=True)
-class Closed:
+class Closed(Generic[AnyProblem]):
     """A problem that starts from its periodic state, and what vouches for it.
 
     Attributes
     ----------
-    problem : Problem
+    problem : Problem or NetworkProblem
         From the first whole period after the source has settled, or from where it started if that is later.
     defect : float
         Largest change of a live voltage over a further period, V.
-    map_slope : ndarray, shape (n_cell - 1, n_cell - 1)
-        Derivative of the modes after a period by those before it, to about 1e-5.
+    map_slope : ndarray, shape (n, n)
+        Derivative of the modes after a period by those before it, to about 1e-5; of a network's areas with dynamics of
+        their own too.
     memory : float
         Error of the periodic state over that of one period: what a slow mode collects over the periods it remembers.
     error : ErrorEstimate
@@ -42,7 +45,7 @@ class Closed:
         Periods integrated.
     """
 
-    problem: Problem
+    problem: AnyProblem
     defect: float
     map_slope: FloatArray
     memory: float
@@ -50,7 +53,7 @@ class Closed:
     periods: float
 
 
-def close_period(problem: Problem, rtol: float) -> Closed:
+def close_period(problem: Problem, rtol: float) -> Closed[Problem]:
     """Start a problem from its periodic state, keeping its length.
 
     The error asked for is that of the state alone, relative to the peaks over the period. Where rounding does not let

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fingerspice.base.errors import InputError
 from fingerspice.numerics.modes import modes
@@ -13,6 +14,8 @@ from fingerspice.results.plan import Plan
 from fingerspice.solve.networks import NetworkProblem
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.settling import FEWEST_PERIODS
+
+FloatArray = NDArray[np.float64]
 
 TIERS = ("algebraic", "linear", "coupled")
 # A frozen stack this many times faster than its source would hold an explicit method back by stability alone.
@@ -50,6 +53,9 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", start: str = "d
 def plan_network(problem: NetworkProblem, tier: str = "auto", start: str = "deck") -> Plan:
     """The model for a network: closed form where its areas are fixed, else stepped.
 
+    Beside other capacitors an area that changes by little may still do much to the voltages, over many periods; of that
+    no bound is known beforehand that is any use, so it is stepped however little the area changes.
+
     Raises
     ------
     InputError
@@ -61,11 +67,7 @@ def plan_network(problem: NetworkProblem, tier: str = "auto", start: str = "deck
     best = "coupled" if scene.coupled else "linear"
     if tier == "algebraic" or (tier == "linear" and scene.coupled):
         raise InputError(f"the {tier} tier is not for this network; allowed: auto, {best} or coupled")
-    reason = f"the areas are {scene.area_mode}, so the circuit is linear"
-    if scene.coupled:
-        reason = f"a network whose area{'s follow' if len(problem.network.fingers) > 1 else ' follows'} the gap voltage"
-    elif not problem.network.areas:
-        reason = "no element has an area, so the circuit is linear"
+    sensitivity, reason = _area_of_network(problem)
     rates = scene.modes.rates
     shortest = min(problem.waveform.shortest_time(), problem.t_stop - problem.t_start)
     stiff = float(rates.max(initial=0.0)) * shortest > STIFF
@@ -77,7 +79,26 @@ def plan_network(problem: NetworkProblem, tier: str = "auto", start: str = "deck
     if scene.coupled and period and (problem.t_stop - problem.t_start) / period >= FEWEST_PERIODS:
         reasons = (reason, REPEATS)
     area = float(scene.area0[0]) if scene.area0.size else math.nan
-    return Plan(chosen, reasons, start, tuple(sorted(map(float, rates))), stiff, math.nan, 0.0, area)
+    return Plan(chosen, reasons, start, tuple(sorted(map(float, rates))), stiff, sensitivity, 0.0, area)
+
+
+def _area_of_network(problem: NetworkProblem) -> tuple[float, str]:
+    """Largest relative change of 1/A of any finger over the run, as `_sensitivity`, and what it means for the model.
+
+    NaN where a current source sets no bound to the voltages.
+    """
+    scene, network = problem.scene, problem.network
+    if not network.areas:
+        return 0.0, "no element has an area, so the circuit is linear"
+    if not scene.coupled:
+        return 0.0, f"the areas are {scene.area_mode}, so the circuit is linear"
+    several = len(network.fingers) > 1
+    follows = f"a network whose area{'s follow' if several else ' follows'} the gap voltage"
+    if len(network.sources) > network.n_voltage:
+        return math.nan, f"{follows}; by how much is not known beforehand: a current source sets no bound"
+    curves = [scene.net.curves[i] for i in np.flatnonzero(scene.net.gap >= 0)]
+    largest = max(_change(curve, scene.u_peak)[0] for curve in curves)
+    return largest, f"{follows}, {'each' if several else ''} by up to {100.0 * largest:.2g} % of its middle"
 
 
 def _choose(problem: Problem, rtol: float, tier: str, start: str) -> Plan:
@@ -139,8 +160,13 @@ def _sensitivity(problem: Problem) -> tuple[float, float]:
     model = problem.model
     if not model.coupled:
         return 0.0, model.area0
+    return _change(model.curve, problem.scene.u_peak)
+
+
+def _change(curve: FloatArray, u_peak: float) -> tuple[float, float]:
+    """The same of one area curve under sources of that peak (V)."""
     # A gap may take all of the voltage, and as much again where charge is stored when the source turns.
-    u = np.linspace(0.0, 2.0 * problem.scene.u_peak, 65)
-    a = areas(u, model.curve)
+    u = np.linspace(0.0, 2.0 * u_peak, 65)
+    a = areas(u, curve)
     middle = 2.0 / (1.0 / a.min() + 1.0 / a.max())
     return float(max(a.max() / middle, middle / a.min()) - 1.0), float(middle)

@@ -22,11 +22,12 @@ from fingerspice.results.plan import Plan
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.cautions import network_warnings, stack_warnings
-from fingerspice.solve.diagnosis import network_failure, stack_failure
+from fingerspice.solve.diagnosis import ROUGH, network_failure, stack_failure
 from fingerspice.solve.direct import solve_algebraic, solve_linear
 from fingerspice.solve.marching import solve as solve_marching
 from fingerspice.solve.netmarching import solve_network
-from fingerspice.solve.netruns import NetworkRun
+from fingerspice.solve.netruns import NetworkRun, add_start_error
+from fingerspice.solve.network_periodic import close_network_period
 from fingerspice.solve.networks import NetworkProblem, prepare_network
 from fingerspice.solve.nodal import solve_coupled
 from fingerspice.solve.outputs import asked_for, at_breakpoints
@@ -127,29 +128,34 @@ def simulate(
         raise InputError("start is a solution read from a file, which a run cannot go on from; allowed: one just made")
     circuit = overridden(circuit, sources, parameters)
     times = times_given("t_eval", t_eval)
+    how = start if isinstance(start, str) else "given"
+    first = "uncharged" if start == "periodic" else start
     if not is_stack(circuit):
-        if start == "periodic":
-            raise InputError("start='periodic' needs a series stack; allowed for a network: 'deck', 'uncharged', 'dc'")
         network = prepare_network(
-            circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=start, charge=charge
+            circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=first, charge=charge
         )
-        how = start if isinstance(start, str) else "given"
-        return _given_back(run_network(network, times, rtol, method, progress, tier, how, jumps), throw)
-    begun = None
-    problem = prepare(
-        circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area,
-        start="uncharged" if start == "periodic" else start, charge=charge, rtol=rtol,
-    )  # fmt: skip
+        if start == "periodic":
+            network = close_network_period(network, 0.5 * rtol).problem
+            _check_settled(times, network)
+        run = run_network(network, times, rtol, method, progress, tier, how, jumps)
+        return _given_back(run, throw)
+    problem, error = prepare(
+        circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=first, charge=charge, rtol=rtol
+    ), None  # fmt: skip
     if start == "periodic":
         closed = close_period(problem, 0.5 * rtol)
-        problem, begun = closed.problem, closed.error
-        if times is not None and times[0] < problem.t_start:
-            raise InputError(
-                f"t_eval starts at {times[0]:g} s; allowed: from {problem.t_start:g} s on, where the source has "
-                "settled and its periodic state exists"
-            )
-    how = start if isinstance(start, str) else "given"
-    return _given_back(run_problem(problem, times, rtol, method, progress, tier, how, begun, jumps), throw)
+        problem, error = closed.problem, closed.error
+        _check_settled(times, problem)
+    return _given_back(run_problem(problem, times, rtol, method, progress, tier, how, error, jumps), throw)
+
+
+def _check_settled(times: FloatArray | None, problem: Problem | NetworkProblem) -> None:
+    """Refuse outputs (s) before the periodic state that a run starts from."""
+    if times is not None and times[0] < problem.t_start:
+        raise InputError(
+            f"t_eval starts at {times[0]:g} s; allowed: from {problem.t_start:g} s on, where the source has "
+            "settled and its periodic state exists"
+        )
 
 
 def _check_rtol(rtol: float) -> None:
@@ -240,7 +246,7 @@ def run_problem(
     _mind_unseen(run)
     if run.rough > 0.0:
         _add_error(run, run.rough)
-        run.detail = run.detail or f"the source function itself is rough by {run.rough:.2g} V"
+        run.detail = run.detail or ROUGH.format(run.rough)
     rounding = ROUNDING * problem.scene.u_peak
     ended = run.status in (Status.SUCCESS, Status.ERROR_NOT_MET) and run.t_failed is None
     if ended and run.state.t == problem.t_stop and run.peak_u <= rounding:
@@ -271,16 +277,24 @@ def run_network(
     t_out, left = asked_for(problem, t_eval, jumps)
     run_at = t_out if t_eval is None else at_breakpoints(problem, t_eval)
     begin = time.perf_counter()
+    # What the start gives away is part of the error asked for.
+    own = rtol if problem.begun is None else max(0.5 * rtol, RTOL_RANGE[0])
     if plan.tier == "linear":
         run, name = solve_fixed(problem, run_at, left), plan.tier
     else:
         found = None
         if method != "radau" and problem.scene.coupled:
-            found = solve_network(problem, rtol, run_at, left, progress, repeat=method == "auto")
+            found = solve_network(problem, own, run_at, left, progress, repeat=method == "auto")
         name = "radau" if found is None else "exponential"
-        run = solve_coupled(problem, rtol, run_at, left, progress) if found is None else found
+        run = solve_coupled(problem, own, run_at, left, progress) if found is None else found
     wall = time.perf_counter() - begin
+    if problem.begun is not None:
+        add_start_error(run, problem.begun)
     _mind_unseen(run)
+    # The rounding of a closed form is stated, and no reason to refuse it: no other method would do better.
+    minded = problem.network.fingers and (plan.tier != "linear" or run.rough > 0.0)
+    if run.status is Status.SUCCESS and minded and run.excess(problem.scene.u_peak) > rtol:
+        run.status = Status.ERROR_NOT_MET
     record = problem.record(run)
     t = np.concatenate([t_out[: run.t.size], run.t[t_out.size :]]) if run.status is Status.SUCCESS else run.t.copy()
     failure = None if run.status is Status.SUCCESS else network_failure(problem, run, record)
@@ -291,7 +305,7 @@ def run_network(
 def _mind_unseen(run: Run | NetworkRun) -> None:
     """A run of a source that its outputs show to be another one than was integrated fails there."""
     if run.unseen is not None and run.status in (Status.SUCCESS, Status.ERROR_NOT_MET):
-        run.t_failed, off = run.unseen
+        run.t_failed, off = run.unseen[:2]
         run.status = Status.SOURCE_UNSEEN if math.isfinite(off) else Status.SOURCE_NOT_FINITE
         run.end_before(run.t_failed)
 

@@ -16,7 +16,7 @@ from fingerspice.results.network_record import NetworkRecord
 from fingerspice.results.outcome import ErrorEstimate, NetworkState, Status
 from fingerspice.results.record import sided
 from fingerspice.results.refined import ClosedForm
-from fingerspice.solve.netruns import NetworkRun, first_unseen, gap_signals, source_tables
+from fingerspice.solve.netruns import NetworkRun, first_unseen, gap_signals, source_tables, state_error
 from fingerspice.solve.networks import NetworkProblem
 from fingerspice.waveforms.sampling import SourceTable, breakpoints_at, source_table
 
@@ -89,15 +89,14 @@ def solve_fixed(problem: NetworkProblem, t_out: FloatArray, left: BoolArray) -> 
         ErrorEstimate(0.0, 0.0), np.zeros(len(network.areas)), 0, {},
         NetworkState(end, np.concatenate([x_end, z_end]), s_end, np.ones(len(network.areas))), broken,
     )  # fmt: skip
-    run.unseen = unseen
-    rounding = ROUNDING * max(scene.u_peak, float(np.abs(x).max(initial=0.0))) + rough
-    f_error = 0.0
-    for i, (u, f) in enumerate(gap_signals(problem, run)):
-        peak = float(np.abs(u).max(initial=0.0))
-        if i < len(network.fingers):
-            run.peaks[network.fingers[i]] = peak
-        f_error = max(f_error, 2.0 * rounding / peak * float(f.max(initial=0.0)) if peak > 0.0 else 0.0)
-    run.error = ErrorEstimate(rounding, f_error)
+    run.unseen, run.rough = unseen, rough
+    rounding, gaps = ROUNDING * max(scene.u_peak, float(np.abs(x).max(initial=0.0))), []
+    for u, f in gap_signals(problem, run):
+        peak, force = float(np.abs(u).max(initial=0.0)), float(f.max(initial=0.0))
+        gaps.append((peak, force, rounding, 2.0 * rounding / peak * force if peak > 0.0 else 0.0))
+    run.peaks[list(network.fingers)] = [gap[0] for gap in gaps[: len(network.fingers)]]
+    state_error(run, np.array(gaps).reshape(-1, 4), scene.u_peak, None)
+    run.error = run.error.at_least(rounding + rough, 0.0)
     if not scene.is_sampled:
         look = partial(_look, dataclasses.replace(problem, charge=False))
         run.continuous = ClosedForm(look, problem.waveform, problem.t_start, problem.first, problem.t_stop)

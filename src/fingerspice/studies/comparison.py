@@ -6,13 +6,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fingerspice.base.errors import InputError
 from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import Parameters, Sources, overridden
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.statespace import build_stack
+from fingerspice.circuit.response import linear_scene
+from fingerspice.results.phasor_solution import PhasorSolution
 from fingerspice.results.solution import Solution
+from fingerspice.results.summary import Value
 from fingerspice.studies.phasors import phasor
 from fingerspice.studies.steady import steady_state
 
@@ -24,22 +27,28 @@ if TYPE_CHECKING:
 class Figures:
     """Gap voltage at the fundamental, mean force and mean area of one way of solving.
 
+    Each is a number, or an array (n_gap,) where the circuit has several GAPs.
+
     Attributes
     ----------
-    amplitude : float
+    amplitude : float or ndarray
         V.
-    phase_deg : float
+    phase_deg : float or ndarray
         Lead over the source's fundamental, degrees.
-    f_el_mean : float
+    f_el_mean : float or ndarray
         N.
-    area_mean : float
+    area_mean : float or ndarray
         m^2.
     """
 
-    amplitude: float
-    phase_deg: float
-    f_el_mean: float
-    area_mean: float
+    amplitude: float | NDArray[np.float64]
+    phase_deg: float | NDArray[np.float64]
+    f_el_mean: float | NDArray[np.float64]
+    area_mean: float | NDArray[np.float64]
+
+    def of_gap(self, i: int) -> dict[str, float]:
+        """The figures of one GAP by their names."""
+        return {name: float(np.atleast_1d(value)[i]) for name, value in vars(self).items()}
 
 
 @dataclass(frozen=True, repr=False)
@@ -49,11 +58,11 @@ class Comparison(Shown):
     Attributes
     ----------
     phasor : Figures
-        Eqs. 9 to 15, area coupled through the mean stress.
+        Eqs. 9 to 15, every area coupled through its mean stress.
     mean : Figures
-        Transient with the phasor's area: what it differs by from `phasor` is not the area's doing.
+        Transient with the phasor's areas: what it differs by from `phasor` is not the area's doing.
     coupled : Figures
-        Transient with the area coupled at every instant: what it differs by from `mean` is the area's ripple.
+        Transient with the areas coupled at every instant: what it differs by from `mean` is the area's ripple.
     frequency : float
         Hz.
     solution : Solution
@@ -78,25 +87,39 @@ class Comparison(Shown):
         return plot_comparison(self)
 
     def rows(self) -> list[tuple[str, str, float, float, float, float, float]]:
-        """Table: quantity, unit, phasor, transient at mean area, coupled, difference, share of the ripple in it."""
+        """Table: quantity, unit, phasor, transient at mean area, coupled, difference, share of the ripple in it.
+
+        Where the circuit has several GAPs the quantity is ``name:gap``.
+        """
         out = []
-        for name, unit, factor in (
-            ("amplitude", "V", 1.0),
-            ("phase_deg", "deg", 1.0),
-            ("f_el_mean", "N", 1.0),
-            ("area_mean", "mm^2", 1e6),
-        ):
-            p, m, c = (factor * getattr(f, name) for f in (self.phasor, self.mean, self.coupled))
-            out.append((name, unit, p, m, c, c - p, c - m))
+        for i, gap in enumerate(self.gaps):
+            for name, unit, factor in (
+                ("amplitude", "V", 1.0),
+                ("phase_deg", "deg", 1.0),
+                ("f_el_mean", "N", 1.0),
+                ("area_mean", "mm^2", 1e6),
+            ):
+                p, m, c = (factor * f.of_gap(i)[name] for f in (self.phasor, self.mean, self.coupled))
+                out.append((name if len(self.gaps) == 1 else f"{name}:{gap}", unit, p, m, c, c - p, c - m))
         return out
+
+    @property
+    def gaps(self) -> tuple[str, ...]:
+        """Names of the GAPs."""
+        return self.solution.gaps
 
     def to_dict(self) -> dict[str, Any]:
         """The figures as plain data, SI."""
+
+        def plain(figures: Figures) -> dict[str, Any]:
+            return {name: np.asarray(value).tolist() for name, value in vars(figures).items()}
+
         return {
             "frequency": self.frequency,
-            "phasor": vars(self.phasor),
-            "transient_mean_area": vars(self.mean),
-            "transient_coupled": vars(self.coupled),
+            "gaps": list(self.gaps),
+            "phasor": plain(self.phasor),
+            "transient_mean_area": plain(self.mean),
+            "transient_coupled": plain(self.coupled),
         }
 
 
@@ -113,7 +136,7 @@ def compare(
     Parameters
     ----------
     circuit : Circuit
-        With a GAP and a periodic source that has a fundamental.
+        With one GAP or more, and one periodic source that has a fundamental; a series stack may have several sources.
     sources, parameters, charge_law
         As in `simulate`.
     rtol : float
@@ -126,20 +149,20 @@ def compare(
     Raises
     ------
     InputError
-        For a circuit without GAP, or a source without period or fundamental.
+        For a circuit without GAP, a network with several sources, or a source without period or fundamental.
     SolveError
         Where a transient fails.
     """
     circuit = overridden(circuit, sources, parameters)
-    fundamental = build_stack(circuit).waveform.fundamental
+    names = [e.name for e in circuit.by_device("GAP")]
+    fundamental = linear_scene(circuit, next(iter(names), None)).fundamental
     if fundamental is None:
         raise InputError("compare needs a source with a fundamental: a periodic one; this source has none")
-    p = phasor(circuit)
+    phasors = {name: phasor(circuit, finger=name) for name in names}
     coupled = steady_state(circuit, charge_law=charge_law, rtol=rtol, points=2000).solution
-    mean = steady_state(circuit, charge_law=charge_law, area=float(p.area[0]), rtol=rtol, points=2000).solution
-    lead = float(np.degrees(np.angle(p.gain[0])))
+    mean = steady_state(circuit, charge_law=charge_law, area="mean", rtol=rtol, points=2000).solution
     return Comparison(
-        Figures(float(abs(p.u_gap[0])), lead, float(p.f_el_mean[0]), float(p.area[0])),
+        _phasor_figures([phasors[name] for name in coupled.gaps]),
         _figures(mean, fundamental.phase),
         _figures(coupled, fundamental.phase),
         fundamental.frequency,
@@ -147,9 +170,26 @@ def compare(
     )
 
 
+def _phasor_figures(found: list[PhasorSolution]) -> Figures:
+    """Of the phasors of every GAP."""
+    amplitude = [float(abs(p.u_gap[0])) for p in found]
+    lead = [float(np.degrees(np.angle(p.gain[0]))) for p in found]
+    return _together(amplitude, lead, [float(p.f_el_mean[0]) for p in found], [float(p.area[0]) for p in found])
+
+
 def _figures(solution: Solution, phase: float) -> Figures:
-    summary = solution.summary()
-    lead = (summary["u_gap_phase_deg"] - np.degrees(phase) + 180.0) % 360.0 - 180.0
-    return Figures(
-        summary["u_gap_amplitude"], float(lead), summary["f_el_mean_periodic"], summary["area_mean_periodic"]
+    """Of a period of the transient, whose source has its fundamental at `phase` (rad)."""
+    found = solution._figures
+    lead = np.asarray(solution.u_gap_phase_deg, float) - np.degrees(phase)
+    return _together(
+        solution.u_gap_amplitude,
+        (lead + 180.0) % 360.0 - 180.0,
+        solution.f_el_mean_periodic,
+        found.value("area", "mean_periodic"),
     )
+
+
+def _together(*values: Value | list[float]) -> Figures:
+    """Figures that are numbers where there is one GAP."""
+    arrays = [np.atleast_1d(np.asarray(value, float)) for value in values]
+    return Figures(*(float(x[0]) if x.size == 1 else x for x in arrays))

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.statespace import build_stack
+from fingerspice.circuit.response import LinearScene, linear_scene
 from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.results.measures import weigh_outputs
 from fingerspice.results.phasor_solution import PhasorSolution
@@ -34,6 +34,7 @@ def large_signal(
     *,
     charge_law: str | None = None,
     rtol: float = 1e-8,
+    finger: str | None = None,
     progress: Progress | None = None,
 ) -> tuple[PhasorSolution, ...]:
     """Periodic states under sines, by frequency and amplitude; SKIN evaluated at each frequency.
@@ -45,9 +46,12 @@ def large_signal(
     frequency : array_like
         Hz, positive.
     amplitude : array_like, optional
-        V, positive; by default that of the source's own ``AC``, or without it of its fundamental.
+        V (A of a current source), positive; by default that of the source's own ``AC``, or without it of its
+        fundamental.
     charge_law, rtol, progress
         As in `simulate`.
+    finger : str, optional
+        Name of the GAP whose figures are wanted, where the circuit has several.
 
     Returns
     -------
@@ -57,18 +61,17 @@ def large_signal(
     Raises
     ------
     InputError
-        For a circuit without GAP or with several sources, or frequencies or amplitudes that are not positive.
+        For a circuit without GAP or with several sources, several GAPs of which none is named, or frequencies or
+        amplitudes that are not positive.
     SolveError
         Where there is no periodic state.
     """
     require_circuit(circuit)
-    stack = build_stack(circuit)
-    if stack.gap is None:
-        raise InputError("a large-signal sweep needs a GAP; this circuit has none")
-    if len(stack.sources) != 1:
-        names = ", ".join(e.name for e, _ in stack.sources)
+    scene = linear_scene(circuit, finger)
+    if len(scene.sources) != 1:
+        names = ", ".join(e.name for e, _ in scene.sources)
         raise InputError(f"a large-signal sweep drives one source, and this circuit has {names}")
-    own = sweep_drive(stack.sources, stack.waveform.fundamental, swept=True)
+    own = sweep_drive(scene.sources, scene.fundamental, swept=True)
     if amplitude is None and math.isnan(own.amplitude):
         raise InputError("the source has no fundamental to take the amplitude of: give the amplitudes in V")
     given = np.atleast_1d(own.amplitude if amplitude is None else amplitude)
@@ -85,13 +88,15 @@ def large_signal(
         if progress is not None:
             progress(next(found) / (f.size * len(drives)))
 
-    return tuple(_sweep(circuit, f, drive, charge_law, rtol, one) for drive in drives)
+    return tuple(_sweep(circuit, scene, f, drive, charge_law, rtol, one) for drive in drives)
 
 
 def _sweep(
-    circuit: Circuit, frequency: FloatArray, drive: Drive, charge_law: str | None, rtol: float, one: Callable[[], None]
-) -> PhasorSolution:
-    (source, sign), *_ = build_stack(circuit).sources
+    circuit: Circuit, scene: LinearScene, frequency: FloatArray, drive: Drive, charge_law: str | None, rtol: float,
+    one: Callable[[], None],
+) -> PhasorSolution:  # fmt: skip
+    (source, sign), *_ = scene.sources
+    name = scene.layers[scene.gap]
     skins = [e.name for e in circuit.by_device("SKIN")]
     gains, areas, forces, amplitude = [], [], [], drive.amplitude
     for f in frequency:
@@ -102,22 +107,18 @@ def _sweep(
         )  # fmt: skip
         s = state.solution
         # The start of the period is a multiple of it: phases are those of the source.
-        assert s.area is not None
-        assert s.f_el is not None
         period = s.t - s.t[0]
+        area, force = (s.by_name(key)[key if len(s.gaps) == 1 else f"{key}:{name}"] for key in ("area", "f_el"))
         gains.append([weigh_outputs(period, u).phasor(float(f)) * sign / amplitude for u in s.u_layer.T])
-        areas.append(weigh_outputs(period, s.area).mean())
-        forces.append(weigh_outputs(period, s.f_el).mean())
+        areas.append(weigh_outputs(period, area).mean())
+        forces.append(weigh_outputs(period, force).mean())
         one()
     gain = np.array(gains, np.complex128)
-    gap = build_stack(circuit).gap_layer
-    assert gap is not None
-    u_gap = gain[:, gap] * amplitude * np.exp(1j * drive.phase)
-    contact = build_stack(circuit).contact
-    assert contact is not None
+    u_gap = gain[:, scene.gap] * amplitude * np.exp(1j * drive.phase)
     notes, warned = sweep_notes(circuit, frequency)
-    largest = max(forces), float(contact.stress(np.abs(u_gap)).max()), max(areas)
+    notes = (*notes, scene.note) if scene.note else notes
+    largest = max(forces), float(scene.contact.stress(np.abs(u_gap)).max()), max(areas)
     return PhasorSolution(
-        frequency, gain[:, gap], gain, u_gap, np.array(areas), np.array(forces), amplitude, s.layers, drive.phase,
+        frequency, gain[:, scene.gap], gain, u_gap, np.array(areas), np.array(forces), amplitude, s.layers, drive.phase,
         drive.text, notes, (*warned, *beyond_fingers("", *largest)), circuit,
     )  # fmt: skip

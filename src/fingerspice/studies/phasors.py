@@ -80,6 +80,7 @@ def phasor(
     parameters: Parameters | None = None,
     area: str | float = "mean",
     skin: str = "swept",
+    finger: str | None = None,
 ) -> PhasorSolution:
     """Phasor solution of a circuit.
 
@@ -96,6 +97,8 @@ def phasor(
         at 0 V; or an area in m^2. An area that the deck fixes takes precedence over ``"mean"`` and ``"frozen"``.
     skin : str
         ``"swept"``: SKIN's data at each frequency; ``"own"``: at SKIN's own f, as in ngspice.
+    finger : str, optional
+        Name of the GAP whose figures are wanted, where the circuit has several.
 
     Returns
     -------
@@ -104,13 +107,13 @@ def phasor(
     Raises
     ------
     InputError
-        For a circuit without GAP, a network with several GAPs or sources, a source without the fundamental that is
-        needed, frequencies or an area that are not positive, or a result that overflows.
+        For a circuit without GAP, several GAPs of which none is named, a network with several sources, a source without
+        fundamental where one is needed, frequencies or an area not positive, or a result beyond the range of numbers.
     """
     require(skin in ("swept", "own"), "skin", repr(skin), "'swept' or 'own'")
     require_area(area)
     circuit = overridden(circuit, sources, parameters)
-    scene = linear_scene(circuit if skin == "swept" else _with_skin_held(circuit))
+    scene = linear_scene(circuit if skin == "swept" else _with_skin_held(circuit), finger)
     f = _frequencies(frequency, scene.fundamental)
     drive = sweep_drive(scene.sources, scene.fundamental, frequency is not None)
     _check_area(area, drive.amplitude, scene.fixed)
@@ -123,6 +126,7 @@ def phasor(
         force = 0.5 * scene.contact.stress(np.abs(u_gap)) * own
     _refuse_no_number(f, layers, own, *((u_gap, force) if math.isfinite(drive.amplitude) else ()))
     notes, warned = sweep_notes(circuit, f, skin)
+    notes = (*notes, scene.note) if scene.note else notes
     largest = (float(np.max(x)) for x in (force, scene.contact.stress(np.abs(u_gap)), own))
     warned = (*warned, *beyond_fingers("", *largest))
     for text in warned:

@@ -33,16 +33,20 @@ def plot_comparison(comparison: Comparison) -> Picture:
     runs = [lines.Drawn(solution, "")]
     start, stop = float(solution.t[0]), float(solution.t[-1])
     source_phase = solution.fundamental.phase if solution.fundamental else 0.0
-    angle = 2.0 * np.pi * comparison.frequency * solution.t + source_phase + np.radians(p.phase_deg)
-    curves = (p.amplitude * np.sin(angle), 2.0 * p.f_el_mean * np.sin(angle) ** 2)
-    for ax, keys, curve in zip(axes, (["u_source", "u_gap"], ["f_el"]), curves, strict=False):
+    turns = 2.0 * np.pi * comparison.frequency * solution.t + source_phase
+    of_gaps = [p.of_gap(i) for i in range(len(comparison.gaps))]
+    waves = [np.sin(turns + np.radians(one["phase_deg"])) for one in of_gaps]
+    voltages = [one["amplitude"] * wave for one, wave in zip(of_gaps, waves, strict=True)]
+    forces = [2.0 * one["f_el_mean"] * wave**2 for one, wave in zip(of_gaps, waves, strict=True)]
+    for ax, keys, curves in zip(axes, (["u_source", "u_gap"], ["f_el"]), (voltages, forces), strict=False):
         quantity, traces = lines.QUANTITIES[keys[-1]], lines.traces_of(runs, keys)
         factor, unit = lines.scale_of(quantity, traces, start, stop)
         for trace in traces:
             lines.draw_line(ax, trace, factor, start, stop, runs)
         t = lines.time_unit(runs)[0] * solution.t
         style: dict[str, Any] = {"color": drawing.BLACK, "linestyle": drawing.DASHES[3], "linewidth": 1.5}
-        ax.plot(t, factor * curve, label=f"{traces[-1].label}, phasor", **style)
+        for trace, curve in zip(traces[-len(curves) :], curves, strict=True):
+            ax.plot(t, factor * curve, label=f"{trace.label}, phasor", **style)
         lines.finish_panel(ax, quantity, unit, [factor * trace.x for trace in traces])
     lines.time_axis(axes[:2], runs, start, stop)
     _table(axes[2], comparison)
@@ -60,13 +64,15 @@ def _table(ax: Axes, comparison: Comparison) -> None:
     }
     text = "|phasor|transient,\nmean area|transient,\ncoupled|coupled −\nphasor|of it, ripple\nof the area"
     head = text.split("|")
+    split = [row[0].partition(":") for row in comparison.rows()]
+    labels = [f"{names[name]} {gap}".rstrip() for name, _, gap in split]
     cells = [
         [
-            f"{names[row[0]]} [{row[1].replace('deg', '°').replace('^2', '²')}]",
+            f"{label} [{row[1].replace('deg', '°').replace('^2', '²')}]",
             *(f"{x:.5g}".replace("-", "−") for x in row[2:5]),
             *(f"{x:+.2g}".replace("-", "−") for x in row[5:]),
         ]
-        for row in comparison.rows()
+        for label, row in zip(labels, comparison.rows(), strict=True)
     ]
     ax.axis("off")
     widths = [0.36, *[0.128] * 5]

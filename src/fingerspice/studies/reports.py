@@ -26,8 +26,8 @@ def steady_page(state: SteadyState) -> Page:
     largest = 1.0 - state.stability_margin
     found = f"periodic state of {format_si(state.period, 's')}, found in {state.periods:.3g} periods"
     left = (
-        f"a further period changes the layers by {state.defect:.2g} V at most, and leaves {100.0 * largest:.3g} % of a "
-        "small disturbance"
+        f"a further period changes the voltages by {state.defect:.2g} V at most, and leaves {100.0 * largest:.3g} % of "
+        "a small disturbance"
     )
     try:
         period = summary_table(state.solution).blocks
@@ -66,13 +66,22 @@ def comparison_table(comparison: Comparison) -> Page:
         "area_mean": "mean area",
     }
     rows = []
-    for name, unit, p, m, c, difference, ripple in comparison.rows():
-        rows.append((f"{names[name]} [{unit}]", *(f"{x:.6g}" for x in (p, m, c, difference, ripple))))
+    for row in comparison.rows():
+        name, _, gap = row[0].partition(":")
+        rows.append((f"{names[name]} {gap}".rstrip() + f" [{row[1]}]", *(f"{x:.6g}" for x in row[2:])))
     head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
-    reference = comparison.phasor.f_el_mean
-    # Rounded here, and 0.0 added, so that -0.00 is not printed.
-    total = round(100.0 * (comparison.coupled.f_el_mean / reference - 1.0), 2) + 0.0
-    waveform = round(100.0 * (comparison.mean.f_el_mean / reference - 1.0), 2) + 0.0
+    said = []
+    for i, gap in enumerate(comparison.gaps):
+        figures = comparison.phasor, comparison.mean, comparison.coupled
+        reference, mean, coupled = (f.of_gap(i)["f_el_mean"] for f in figures)
+        # Rounded here, and 0.0 added, so that -0.00 is not printed.
+        total = round(100.0 * (coupled / reference - 1.0), 2) + 0.0
+        waveform = round(100.0 * (mean / reference - 1.0), 2) + 0.0
+        said.append(
+            f"mean force{f' of {gap}' if len(comparison.gaps) > 1 else ''}: {total:+.2f} % against the phasor; "
+            f"{total - waveform:+.2f} % of that is the ripple of the area, {waveform:+.2f} % is the waveform's (zero "
+            "for a sine)"
+        )
     return Page(
         [
             *head_lines(comparison.solution.circuit),
@@ -80,8 +89,7 @@ def comparison_table(comparison: Comparison) -> Page:
             "",
             Table(head, rows),
             "",
-            f"mean force: {total:+.2f} % against the phasor; {total - waveform:+.2f} % of that is the ripple of the "
-            f"area, {waveform:+.2f} % is the waveform's (zero for a sine)",
+            *said,
         ]
     )
 

@@ -16,14 +16,18 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_area
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.statespace import build_stack
+from fingerspice.circuit.statespace import build_stack, is_stack
+from fingerspice.circuit.topology import find_branches
 from fingerspice.results.outcome import ErrorEstimate, SolveError
 from fingerspice.results.solution import Solution
 from fingerspice.results.summary import Figured, Figures, KeptFigures
-from fingerspice.solve.periodic import close_period
+from fingerspice.solve.network_periodic import close_network_period
+from fingerspice.solve.networks import NetworkProblem, prepare_network
+from fingerspice.solve.periodic import Closed, close_period
 from fingerspice.solve.problem import Problem, prepare
-from fingerspice.solve.simulation import RTOL_RANGE, run_problem
-from fingerspice.waveforms.waveform import require
+from fingerspice.solve.simulation import RTOL_RANGE, run_network, run_problem
+from fingerspice.waveforms.combinations import Sum
+from fingerspice.waveforms.waveform import Waveform, require
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,13 +41,14 @@ class SteadyState(Shown, Figured):
 
     Attributes
     ----------
-    problem : Problem
+    problem : Problem or NetworkProblem
         One period from the periodic state on, at the first whole period after the source has settled.
     rtol : float
     defect : float
-        Largest change of a layer voltage over a further period, V.
-    map_slope : ndarray, shape (n_cell - 1, n_cell - 1)
-        Derivative of the stack's modes after a period by those before it, to about 1e-5.
+        Largest change of a capacitor's or layer's voltage over a further period, V.
+    map_slope : ndarray, shape (n, n)
+        Derivative of the circuit's modes after a period by those before it, to about 1e-5: of the n independent
+        voltages (of a stack's n + 1 cells), and of the areas with a time constant.
     memory : float
         Error of the periodic state over that of one period; large where a disturbance outlasts many periods.
     error : ErrorEstimate
@@ -52,7 +57,7 @@ class SteadyState(Shown, Figured):
         Periods integrated to find it.
     """
 
-    problem: Problem
+    problem: Problem | NetworkProblem
     rtol: float
     defect: float
     map_slope: FloatArray
@@ -77,7 +82,7 @@ class SteadyState(Shown, Figured):
 
     @property
     def multipliers(self) -> FloatArray:
-        """Sizes of the Floquet multipliers: what a period leaves of a small disturbance, shape (n_cell - 1,)."""
+        """Sizes of the Floquet multipliers: what a period leaves of a small disturbance, shape (n,)."""
         return np.abs(np.linalg.eigvals(self.map_slope)) if self.map_slope.size else np.zeros(0)
 
     @property
@@ -98,7 +103,10 @@ class SteadyState(Shown, Figured):
         SolveError
             Where that fails.
         """
-        solution = run_problem(self.problem, rtol=self.rtol, start="periodic", begun=self.error)
+        if isinstance(self.problem, NetworkProblem):
+            solution = run_network(self.problem, rtol=self.rtol, start="periodic")
+        else:
+            solution = run_problem(self.problem, rtol=self.rtol, start="periodic", begun=self.error)
         if solution.failure is not None:
             raise SolveError(solution.failure, solution)
         for text in solution.warnings:
@@ -106,6 +114,15 @@ class SteadyState(Shown, Figured):
                 # Past functools, to the line that asked.
                 warnings.warn(text, FingerspiceWarning, stacklevel=3)
         return solution
+
+
+def _waveform(circuit: Circuit) -> Waveform:
+    """All sources of a circuit at once."""
+    if is_stack(circuit):
+        return build_stack(circuit).waveform
+    sources = [e.waveform for e in find_branches(circuit)[1] if e.device in "VI"]
+    known = tuple(wave for wave in sources if wave is not None)
+    return known[0] if len(known) == 1 else Sum(known)
 
 
 def steady_state(
@@ -121,10 +138,13 @@ def steady_state(
 ) -> SteadyState:
     """Periodic state of a circuit, by Newton's method on the map of one period.
 
+    A charge that nothing drains has no periodic state of its own: it keeps what it has in a circuit that starts
+    uncharged.
+
     Parameters
     ----------
     circuit : Circuit
-        With a periodic source.
+        With a periodic source, or several with a common period.
     sources, parameters, charge_law, area, rtol, charge
         As in `simulate`: the error is relative to the peaks over the period.
     points : int
@@ -145,14 +165,20 @@ def steady_state(
     require(points >= 1, "points", points, "1 or more")
     require_area(area)
     circuit = overridden(circuit, sources, parameters)
-    waveform = circuit.remember("waveform", lambda: build_stack(circuit).waveform)
-    if waveform.period is None:
+    period = circuit.remember("waveform", lambda: _waveform(circuit)).period
+    if period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
-    problem = prepare(
-        circuit, t_stop=waveform.period, t_eval=None, charge_law=charge_law, area=area, start="uncharged",
-        charge=charge,
-    )  # fmt: skip
-    closed = close_period(dataclasses.replace(problem, first=0.0, step=waveform.period / points), 0.5 * rtol)
+    closed: Closed[Problem] | Closed[NetworkProblem]
+    if is_stack(circuit):
+        problem = prepare(
+            circuit, t_stop=period, t_eval=None, charge_law=charge_law, area=area, start="uncharged", charge=charge
+        )
+        closed = close_period(dataclasses.replace(problem, first=0.0, step=period / points), 0.5 * rtol)
+    else:
+        network = prepare_network(
+            circuit, t_stop=period, t_eval=None, charge_law=charge_law, area=area, start="uncharged", charge=charge
+        )
+        closed = close_network_period(dataclasses.replace(network, first=0.0, step=period / points), 0.5 * rtol)
     return SteadyState(
         closed.problem, rtol, closed.defect, closed.map_slope, closed.memory, closed.error, closed.periods
     )
