@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.compiled import jit
+from fingerspice.engine.coupling import Coupling
 from fingerspice.engine.exponential import respond
-from fingerspice.engine.netrows import FREE, FREE_RATE, LIN, PULL, Form, W, Work, evaluate
+from fingerspice.engine.netrows import CHI_S, ETA_S, LIN, PULL, U_S, Form, W, Work, evaluate
 from fingerspice.numerics.lobatto import END, NODES, ROWS
 
 FloatArray = NDArray[np.float64]
@@ -26,11 +27,12 @@ _PASSES, _ENOUGH = 6, 0.1
 
 @jit
 def carry(
-    form: Form, work: Work, h: float, decay: FloatArray, phi: FloatArray, error: FloatArray, sign: FloatArray
+    form: Form, work: Work, several: bool, h: float, rates: FloatArray, pace: FloatArray, coupling: Coupling,
+    decay: FloatArray, phi: FloatArray, error: FloatArray, sign: FloatArray,
 ) -> None:  # fmt: skip
     """The error of the modes (m,) at the start of a converged step at the points between and the end: `work.carried`.
 
-    Uses `work.spare`, `matrix`, `small` and one row of `room`, and leaves all else of the step as it is.
+    Uses `work.spare`, `matrix`, `mixed` and one row of `room`, and leaves all else of the step as it is.
     """
     base, forced, off, shifted, d, pull = work.spare
     modes, cells, areas = work.modes, work.spare_cells, work.spare_areas
@@ -44,8 +46,9 @@ def carry(
             size = max(size, abs(modes[W, k, i]))
     step = _SHIFT * size / largest if largest > 0.0 else 0.0
     if 0.0 < step < math.inf:
-        cells[FREE] = work.cells[FREE]
-        cells[FREE_RATE] = work.cells[FREE_RATE]
+        for part in (ETA_S, CHI_S):
+            cells[part] = work.cells[part]
+        areas[U_S] = work.areas[U_S]
         for _ in range(_PASSES):
             before = 0.0
             for k in range(error.size):
@@ -53,9 +56,9 @@ def carry(
                 for i in range(ROWS):
                     shifted[k, i] = modes[W, k, i] + step * off[k, i]
             if not evaluate(
-                form.mobile, h, form.rates, form.feed, form.tap, work.met, form.c, form.g, form.home, form.cell,
-                form.area0, form.unit, form.slow, form.pace, form.powers, form.slopes, form.lo, form.scale,
-                form.curves, sign, shifted, modes[LIN], d, pull, cells, areas, work.matrix, work.small, work.room[1],
+                form.mobile, several, h, rates, coupling, form.home, form.first, form.cell, form.area0, form.unit,
+                form.slow, pace, form.gap, form.powers, form.slopes, form.lo, form.scale, form.curves, sign, shifted,
+                modes[LIN], d, pull, cells, areas, work.matrix, work.mixed, work.room[1],
             ):  # fmt: skip
                 break
             for k in range(error.size):
