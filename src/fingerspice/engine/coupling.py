@@ -41,6 +41,10 @@ IntArray = NDArray[np.int64]
 STIFF = 300.0
 
 
+# Over the areas, each time the currents are evaluated.
+_SWEEPS = 2
+
+
 class Coupling(NamedTuple):
     """See the module; n_f cells in the bases of their areas, n live voltages, n_s sources.
 
@@ -216,22 +220,18 @@ def _fill_matrix(
 
 
 @jit_rows
-def _eliminate(matrix: FloatArray, inverse: FloatArray, least: FloatArray, power: float) -> None:
+def _eliminate(matrix: FloatArray, inverse: FloatArray, least: FloatArray, divide: bool) -> None:
     """Solve the systems (n, n + 1, ROWS) of all rows at once, the solutions in the last column's place.
 
     Without pivoting: they are a unit matrix and as much again as the areas move. `least` is multiplied by the
-    determinant (`power` 1), or divided by it (-1), or left alone (0); `inverse` (ROWS,) is for passing use.
+    determinant or divided by it; `inverse` (ROWS,) is for passing use.
     """
     n = matrix.shape[0]
     for p in range(n):
         for i in range(ROWS):
             inverse[i] = 1.0 / matrix[p, p, i]
-        if power > 0.0:
-            for i in range(ROWS):
-                least[i] *= matrix[p, p, i]
-        elif power < 0.0:
-            for i in range(ROWS):
-                least[i] *= inverse[i]
+        for i in range(ROWS):
+            least[i] *= inverse[i] if divide else matrix[p, p, i]
         for b in range(p + 1, n + 1):
             for i in range(ROWS):
                 matrix[p, b, i] *= inverse[i]
@@ -286,39 +286,65 @@ def _add_rates(
 
 
 @jit
-def answer_all(
-    mobile: bool, several: bool, answer: FloatArray, gap: FloatArray, leak: FloatArray, cross: FloatArray,
-    home: IntArray, first: IntArray, cell: IntArray, u: FloatArray, more: FloatArray, slope: FloatArray,
-    rate: FloatArray, chi: FloatArray, eta: FloatArray, rho: FloatArray, known: FloatArray, share: FloatArray,
-    mixed: FloatArray, matrix: FloatArray, least: FloatArray,
+def answer_mobile(
+    several: bool, answer: FloatArray, gap: FloatArray, leak: FloatArray, cross: FloatArray, home: IntArray,
+    first: IntArray, cell: IntArray, u: FloatArray, more: FloatArray, slope: FloatArray, rate: FloatArray,
+    chi: FloatArray, eta: FloatArray, rho: FloatArray, known: FloatArray, share: FloatArray, mixed: FloatArray,
+    matrix: FloatArray, least: FloatArray,
 ) -> None:  # fmt: skip
-    """rho with all answers of the areas; under `mobile`, `least` (ROWS,) takes the distance to the fold.
+    """rho under `mobile`, with all answers of the areas; `least` (ROWS,) takes the distance to the fold.
 
     That is the determinant of the capacitances that small changes meet, over that with every area held.
     """
     for i in range(ROWS):
         least[i] = 1.0
     spare = mixed[0, more.shape[0]]
-    if mobile:
-        for a in range(cell.size):
-            if cell[a] >= 0:
-                c = first[a]
-                _rate_of_area(
-                    answer, gap, leak[c], c, first[a + 1], u[a], more[a], slope[a], rate[a], chi, known[a], share, spare
-                )  # fmt: skip
-                for i in range(ROWS):
-                    least[i] *= spare[i]
+    for a in range(cell.size):
+        if cell[a] >= 0:
+            c = first[a]
+            _rate_of_area(
+                answer, gap, leak[c], c, first[a + 1], u[a], more[a], slope[a], rate[a], chi, known[a], share, spare
+            )  # fmt: skip
+            for i in range(ROWS):
+                least[i] *= spare[i]
     if several:
-        if mobile:
-            _fill_matrix(False, home, answer, cross, more, eta, known, share, mixed, matrix)
-            _eliminate(matrix, spare, least, -1.0)
-            _mix(home, answer, cross, more, chi, mixed)
-        _fill_matrix(mobile, home, answer, cross, more, eta, known, share, mixed, matrix)
-        _eliminate(matrix, spare, least, 1.0 if mobile else 0.0)
+        _fill_matrix(False, home, answer, cross, more, eta, known, share, mixed, matrix)
+        _eliminate(matrix, spare, least, True)
+        _mix(home, answer, cross, more, chi, mixed)
+        _fill_matrix(True, home, answer, cross, more, eta, known, share, mixed, matrix)
+        _eliminate(matrix, spare, least, False)
         _take_solution(matrix, eta)
     answer_alone(home, answer, more, eta, rho)
-    if mobile:
-        _add_rates(home, answer, more, chi, eta, known, share, rho)
+    _add_rates(home, answer, more, chi, eta, known, share, rho)
+
+
+@jit_rows
+def answer_together(
+    home: IntArray, answer: FloatArray, cross: FloatArray, more: FloatArray, own: FloatArray, eta: FloatArray,
+    rho: FloatArray,
+) -> None:  # fmt: skip
+    """rho under `local` with the answers of other areas, from an earlier one.
+
+    By sweeps over the areas (Gauss-Seidel), each of which leaves a fraction (A - A0)^2 / A0^2 at most; the iteration of
+    the step, which starts each sweep where the last one ended, does the rest. `own` (n_f, ROWS) is for passing use.
+    """
+    n_f = answer.size
+    for _ in range(_SWEEPS):
+        for b in range(n_f):
+            for i in range(ROWS):
+                own[b, i] = eta[b, i]
+            for c in range(n_f):
+                x = cross[b, c]
+                if x != 0.0:
+                    for i in range(ROWS):
+                        own[b, i] += x * rho[c, i]
+            if b + 1 == n_f or home[b + 1] != home[b]:
+                # The cells of an area do not answer one another: all of them at once.
+                for c in range(n_f):
+                    if home[c] == home[b]:
+                        e = more[home[c]]
+                        for i in range(ROWS):
+                            rho[c, i] = e[i] * own[c, i] / (1.0 + e[i] * answer[c])
 
 
 @jit_rows

@@ -11,10 +11,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import jit
+from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.coupling import Coupling
 from fingerspice.engine.exponential import respond
-from fingerspice.engine.netrows import CHI_S, ETA_S, LIN, PULL, U_S, Form, W, Work, evaluate
+from fingerspice.engine.netrows import CHI_S, ETA_S, LIN, PULL, RHO, U_S, Form, W, Work, evaluate
 from fingerspice.numerics.lobatto import END, NODES, ROWS
 
 FloatArray = NDArray[np.float64]
@@ -23,6 +23,20 @@ FloatArray = NDArray[np.float64]
 _SHIFT = 1e-7
 # Answers to answers that are reckoned, at most, and the change from which on the next one matters.
 _PASSES, _ENOUGH = 6, 0.1
+
+
+@jit_rows
+def _shift(w: FloatArray, step: float, off: FloatArray, out: FloatArray) -> None:
+    for k in range(out.shape[0]):
+        for i in range(ROWS):
+            out[k, i] = w[k, i] + step * off[k, i]
+
+
+@jit_rows
+def _difference(a: FloatArray, b: FloatArray, factor: float, out: FloatArray) -> None:
+    for k in range(out.shape[0]):
+        for i in range(ROWS):
+            out[k, i] = factor * (a[k, i] - b[k, i])
 
 
 @jit
@@ -46,29 +60,26 @@ def carry(
             size = max(size, abs(modes[W, k, i]))
     step = _SHIFT * size / largest if largest > 0.0 else 0.0
     if 0.0 < step < math.inf:
-        for part in (ETA_S, CHI_S):
+        for part in (ETA_S, CHI_S, RHO):
             cells[part] = work.cells[part]
         areas[U_S] = work.areas[U_S]
         for _ in range(_PASSES):
             before = 0.0
             for k in range(error.size):
                 before = max(before, abs(off[k, END]))
-                for i in range(ROWS):
-                    shifted[k, i] = modes[W, k, i] + step * off[k, i]
+            _shift(modes[W], step, off, shifted)
             if not evaluate(
-                form.mobile, several, h, rates, coupling, form.home, form.first, form.cell, form.area0, form.unit,
-                form.slow, pace, form.gap, form.powers, form.slopes, form.lo, form.scale, form.curves, sign, shifted,
-                modes[LIN], d, pull, cells, areas, work.matrix, work.mixed, work.room[1],
+                form, coupling, several, h, rates, pace, sign, shifted, modes[LIN], d, pull, cells, areas, work.matrix,
+                work.mixed, work.room[1],
             ):  # fmt: skip
                 break
-            for k in range(error.size):
-                for i in range(ROWS):
-                    forced[k, i] = (pull[k, i] - modes[PULL, k, i]) / step
-                    shifted[k, i] = off[k, i]
-            respond(forced, phi, base, off)
+            _difference(pull, modes[PULL], 1.0 / step, forced)
             moved = 0.0
             for k in range(error.size):
-                moved = max(moved, abs(off[k, END] - shifted[k, END]))
+                shifted[k, 0] = off[k, END]
+            respond(forced, phi, base, off)
+            for k in range(error.size):
+                moved = max(moved, abs(off[k, END] - shifted[k, 0]))
             if not moved > _ENOUGH * before:
                 break
     for k in range(error.size):

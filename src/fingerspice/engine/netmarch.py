@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import borrow, jit, jit_inline
+from fingerspice.base.compiled import borrow, jit, jit_rows
 from fingerspice.engine import netrows, rows
-from fingerspice.engine.coupling import Coupling, answer_all, cell_currents, fill_coupling
+from fingerspice.engine.coupling import Coupling, answer_mobile, cell_currents, fill_coupling
 from fingerspice.engine.exponential import (
     N_PLACES,
     Tables,
@@ -24,7 +24,6 @@ from fingerspice.engine.netassess import (
     account,
     assess,
     charged,
-    clear,
     first_zero,
     load,
     moved,
@@ -34,7 +33,7 @@ from fingerspice.engine.netassess import (
 )
 from fingerspice.engine.netcharge import charge_error, charge_rows
 from fingerspice.engine.netgrowth import carry
-from fingerspice.engine.netrows import Form, Work, combine, evaluate, follow_sources, mode_rates, wanted
+from fingerspice.engine.netrows import Form, Work, clear, combine, evaluate, follow_sources, mode_rates, wanted
 from fingerspice.engine.network import Sources, at_sources
 from fingerspice.engine.pace import Pace, choose_step, rung
 from fingerspice.engine.readout import (
@@ -88,13 +87,118 @@ NEAR_FOLD = 0.02
 AT_ONCE = 40_000
 
 
-@jit_inline
-def _lend(c: Coupling) -> Coupling:
-    """The same coupling without a count of its arrays' users; see `compiled.borrow`."""
-    return Coupling(
-        borrow(c.answer), borrow(c.root), borrow(c.from_modes), borrow(c.from_rates), borrow(c.from_stiff),
-        borrow(c.held), borrow(c.from_sources), borrow(c.from_slopes), borrow(c.feed), borrow(c.gap), borrow(c.leak),
-        borrow(c.cross), borrow(c.stiff),
+@jit
+def area_at(curve: FloatArray, u: float) -> float:
+    """Area (m^2) at a gap voltage (V)."""
+    inverse, _ = inverse_area(abs(u), curve)
+    return 1.0 / inverse
+
+
+@jit
+def _sources(
+    sources: Sources, index: IntArray, t: float, h: float, r: FloatArray, s: FloatArray, ds: FloatArray
+) -> None:
+    """Values and slopes of the sources at all rows of a step."""
+    for e in range(s.shape[0]):
+        row = sources.first[e] + index[e]
+        start = sources.edges[row]
+        rows.source_rows(
+            sources.terms[row - e], sources.series[row - e], sources.edges[row + 1] - start, t - start, h, True, r[e]
+        )
+        for i in range(ROWS):
+            s[e, i] = r[e, rows.SOURCE, i]
+            ds[e, i] = r[e, rows.SLOPE, i]
+
+
+@jit
+def _ramp(t: float, h: float, before: FloatArray, after: FloatArray, s: FloatArray, ds: FloatArray) -> None:
+    """The same within a jump, from the fraction t on."""
+    for e in range(before.size):
+        for i in range(ROWS):
+            ds[e, i] = after[e] - before[e]
+            s[e, i] = before[e] + (t + POINTS[i] * h) * ds[e, i]
+
+
+@jit_rows
+def _free(decay: FloatArray, w0: FloatArray, out: FloatArray) -> None:
+    """Decay of the modes from where they start."""
+    for k in range(w0.size):
+        for i in range(ROWS):
+            out[k, i] = decay[k, i] * w0[k]
+
+
+@jit
+def _iterate(
+    form: Form, work: Work, own: Coupling, several: bool, h: float, rates: FloatArray, area_pace: FloatArray,
+    sign: FloatArray, decay: FloatArray, phi: FloatArray, tol: float,
+) -> tuple[int, bool]:  # fmt: skip
+    """Collocation solution of a step from the modes `work.w0`, by iteration on what the areas add.
+
+    Returns the number of evaluations, and whether the gap voltages are settled to `tol` (V).
+    """
+    modes, cells, areas, weight = work.modes, work.cells, work.areas, work.weight
+    w, base, lin, pull, used = (
+        modes[netrows.W], modes[netrows.BASE], modes[netrows.LIN], modes[netrows.PULL], modes[netrows.USED]
+    )  # fmt: skip
+    pull_before, left_before = modes[netrows.PULL_BEFORE], modes[netrows.LEFT_BEFORE]
+    u, guess = areas[netrows.U], areas[netrows.GUESS]
+    clear(used)
+    clear(guess)
+    clear(cells[netrows.RHO])
+    _free(decay, work.w0, base)
+    respond(lin, phi, base, base)
+    current = base
+    slowly = False
+    step = 0.0
+    for iteration in range(1, 41):
+        if iteration > 1:
+            if slowly:
+                step = mix(pull, used, weight, pull_before, left_before)
+            else:
+                step = plain(pull, used, weight, pull_before, left_before)
+            respond(used, phi, base, w)
+            current = w
+        if not evaluate(
+            form, own, several, h, rates, area_pace, sign, current, lin, modes[netrows.D], pull, cells, areas,
+            work.matrix, work.mixed, work.room[3],
+        ):  # fmt: skip
+            return iteration, False
+        change = moved(u, guess)
+        if iteration == 1:
+            continue
+        # What the gap voltages would move next, by what they moved for the last change of the currents.
+        off = distance(pull, used, weight)
+        if not off < math.inf:
+            return iteration, False
+        if change * off <= tol * step:
+            return iteration, True
+        slowly = off > 0.15 * step
+    return 40, False
+
+
+@jit
+def _charges(
+    form: Form, work: Work, own: Coupling, h: float, rates: FloatArray, g: FloatArray, lost: FloatArray,
+    lost_s: FloatArray, integral: FloatArray, sign: FloatArray, z: FloatArray, current: FloatArray,
+) -> None:  # fmt: skip
+    """Charges gained since the start of a converged step, and currents, of the sources at its nodes."""
+    modes, cells, areas = work.modes, work.cells, work.areas
+    w, cell_u = modes[netrows.W], cells[netrows.CELL_U]
+    mode_rates(h, rates, w, modes[netrows.LIN], modes[netrows.PULL], False, modes[netrows.D])
+    clear(cell_u)
+    combine(form.tap, w[: form.shape.shape[0]], cell_u)
+    combine(form.tap_s, work.s, cell_u)
+    cell_currents(own.root, cells[netrows.RHO], cells[netrows.J])
+    if not form.mobile:
+        for a in range(form.cell.size):
+            if form.cell[a] >= 0 and form.slow[a] < 0:
+                wanted(
+                    True, sign[a], form.powers[a], form.slopes[a], form.lo[a], form.scale[a], form.curves[a],
+                    areas[netrows.U, a], areas[netrows.AREA, a], areas[netrows.SLOPE, a],
+                )  # fmt: skip
+    charge_rows(
+        form.mobile, h, form.stored, form.stored_s, lost, lost_s, form.through, form.c, g, form.home, integral, w,
+        modes[netrows.D], work.s, work.ds, cell_u, areas[netrows.MORE], cells[netrows.J], work.room, z, current,
     )  # fmt: skip
 
 
@@ -158,43 +262,19 @@ def march(
     int
         DONE; NO_STEP is short enough; TOO_MANY steps; REFERENCE: an area is far from its own; or PAUSED: call again.
     """
-    mobile = form.mobile
-    shape, inverse, follow = borrow(form.shape), borrow(form.inverse), borrow(form.follow)
-    feed, tap, tap_s = borrow(form.feed), borrow(form.tap), borrow(form.tap_s)
-    c, home, first, cell = borrow(form.c), borrow(form.home), borrow(form.first), borrow(form.cell)
-    area0, unit, slow = borrow(form.area0), borrow(form.unit), borrow(form.slow)
-    gap, gap_s, stress = borrow(form.gap), borrow(form.gap_s), borrow(form.stress)
-    powers, slopes, lo, scale = borrow(form.powers), borrow(form.slopes), borrow(form.lo), borrow(form.scale)
-    curves = borrow(form.curves)
-    stored, stored_s = borrow(form.stored), borrow(form.stored_s)
-    through = borrow(form.through)
-    keys_h, keys_level, count = borrow(tables.h), borrow(tables.level), borrow(tables.used)
-    all_decay, all_phi, all_miss = borrow(tables.decay), borrow(tables.phi), borrow(tables.miss)
-    sources = Sources(borrow(sources.first), borrow(sources.edges), borrow(sources.terms), borrow(sources.series))
-    r, s, ds = borrow(work.r), borrow(work.s), borrow(work.ds)
-    matrix, mixed = borrow(work.matrix), borrow(work.mixed)
-    modes, cells, areas = borrow(work.modes), borrow(work.cells), borrow(work.areas)
-    w, base, lin, d, pull, used = (
-        modes[netrows.W],
-        modes[netrows.BASE],
-        modes[netrows.LIN],
-        modes[netrows.D],
-        modes[netrows.PULL],
-        modes[netrows.USED],
-    )
-    pull_before, left_before = modes[netrows.PULL_BEFORE], modes[netrows.LEFT_BEFORE]
-    cell_u, j = cells[netrows.CELL_U], cells[netrows.J]
-    area, slope, more = areas[netrows.AREA], areas[netrows.SLOPE], areas[netrows.MORE]
-    u, guess = areas[netrows.U], areas[netrows.GUESS]
-    w0, places, carried, weight = borrow(work.w0), borrow(work.places), borrow(work.carried), borrow(work.weight)
-    room, x_off = borrow(work.room), borrow(work.x)
-    values, coefficients, outputs = borrow(work.values), borrow(work.coefficients), borrow(work.outputs)
+    # Without a count of their users: an atomic operation wherever an array is taken out of its tuple.
+    form, tables, work, sources = borrow(form), borrow(tables), borrow(work), borrow(sources)
+    kept, steps, time_branch = borrow(kept), borrow(steps), borrow(branch)
     y, error, sign, s_before = borrow(y), borrow(error), borrow(sign), borrow(s_before)
-    control, counters, peaks, time_branch = borrow(control), borrow(counters), borrow(peaks), borrow(branch)
+    control, counters, peaks, collected = borrow(control), borrow(counters), borrow(peaks), borrow(collected)
     t_out, left, out, tried = borrow(t_out), borrow(left), borrow(out), borrow(tried)
     integral, size = borrow(integral), borrow(size)
-    kept_times, kept_series = borrow(kept.times), borrow(kept.series)
-    step_times, step_values = borrow(steps.times), borrow(steps.values)
+    mobile = form.mobile
+    shape, follow, home, cell, slow = form.shape, form.follow, form.home, form.cell, form.slow
+    s, ds, modes, cells, areas, values = work.s, work.ds, work.modes, work.cells, work.areas, work.values
+    w, u = modes[netrows.W], areas[netrows.U]
+    w0, places, room = work.w0, work.places, work.room
+    kept_times, kept_series, step_times = kept.times, kept.series, steps.times
     n, n_s, m, n_area = shape.shape[0], s_before.size, form.rates.size, sign.size
     first_z = y.size - n_s
     tol, charge = pace.tol, pace.charge
@@ -209,20 +289,19 @@ def march(
     inside = False
     jump_from, jump_to, aside = np.zeros(n_s), np.zeros(n_s), np.zeros(control.size)
     sign_aside, jump_branch = np.zeros(n_area), np.zeros((n_area, 2))
-    no_rates, no_gain, no_leaks = np.zeros(m), np.zeros((m, n_s)), np.zeros(c.size)
+    no_rates, no_gain, no_leaks = np.zeros(m), np.zeros((m, n_s)), np.zeros(home.size)
     nothing_lost, nothing_lost_s = np.zeros((n_s, n)), np.zeros((n_s, n_s))
-    smooth = _moves_nothing(tap_s, stored_s, follow, gap_s)
+    smooth = _moves_nothing(form.tap_s, form.stored_s, follow, form.gap_s)
     areas[:] = 0.0
     for a in range(n_area):
-        area[a] = area0[a]
+        areas[netrows.AREA, a] = form.area0[a]
     slot, h_slot, flips, fresh, whole, closing, begun = -1, 0.0, 0, -1, True, False, False
     first_out = counters[OUTPUT]
     next_out = t_out[first_out] if first_out < t_out.size else math.inf
     pause = counters[ACCEPTED] + 1 + AT_ONCE // m
-    rates, gain, g, area_pace = borrow(form.rates), borrow(form.gain), borrow(form.g), borrow(form.pace)
-    lost, lost_s = borrow(form.lost), borrow(form.lost_s)
+    rates, gain, g, area_pace, lost, lost_s = form.rates, form.gain, form.g, form.pace, form.lost, form.lost_s
     branch = time_branch
-    own = _lend(work.own)
+    own = work.own
     code = DONE
     while True:
         t = control[T]
@@ -235,9 +314,8 @@ def march(
             for a in range(n_area):
                 if sign[a] != sign_aside[a]:
                     time_branch[a, 0], time_branch[a, 1] = t, math.inf
-            rates, gain, g, area_pace = borrow(form.rates), borrow(form.gain), borrow(form.g), borrow(form.pace)
-            lost, lost_s = borrow(form.lost), borrow(form.lost_s)
-            branch, own, h_slot = time_branch, _lend(work.own), 0.0
+            rates, gain, g, area_pace, lost, lost_s = form.rates, form.gain, form.g, form.pace, form.lost, form.lost_s
+            branch, own, h_slot = time_branch, work.own, 0.0
         if counters[ACCEPTED] + counters[REJECTED] > control[MOST]:
             code = TOO_MANY
             break
@@ -275,7 +353,7 @@ def march(
                 control[ERROR_Q], control[MAGNIFIED], control[MOST] = aside[ERROR_Q], aside[MAGNIFIED], aside[MOST]
                 rates, gain, g, area_pace = no_rates, no_gain, no_leaks, no_rates
                 lost, lost_s = nothing_lost, nothing_lost_s
-                branch, own, h_slot = jump_branch, _lend(work.inside), 0.0
+                branch, own, h_slot = jump_branch, work.inside, 0.0
                 t, stop, at_edge = 0.0, 1.0, False
                 now[:] = jump_from
             if not inside and t >= t_end:
@@ -289,7 +367,7 @@ def march(
             control[TOO_LONG] = 0.0
             control[ALLOWED] = 0.0
             fresh = H_AFTER_EDGE
-        load(inverse, follow, y, now, w0)
+        load(form.inverse, follow, y, now, w0)
         ahead = math.inf
         control[BRANCH_START], control[BRANCH_LENGTH] = t, math.inf
         for a in range(n_area):
@@ -298,15 +376,17 @@ def march(
                 continue
             voltage = 0.0
             for k in range(n):
-                voltage += gap[a, k] * w0[k]
+                voltage += form.gap[a, k] * w0[k]
             for e in range(n_s):
-                voltage += gap_s[a, e] * now[e]
+                voltage += form.gap_s[a, e] * now[e]
             if sign[a] == 0.0:
                 sign[a] = 1.0 if voltage >= 0.0 else -1.0
                 branch[a, 0], branch[a, 1] = t, math.inf
             if not inside:
-                here = unit[a] * y[slow[a]] if slow[a] >= 0 else 1.0 / inverse_area(abs(voltage), curves[a])[0]
-                if max(here / area0[a], area0[a] / here) > FARTHEST:
+                here = (
+                    form.unit[a] * y[slow[a]] if slow[a] >= 0 else 1.0 / inverse_area(abs(voltage), form.curves[a])[0]
+                )
+                if max(here / form.area0[a], form.area0[a] / here) > FARTHEST:
                     code = REFERENCE
             end = branch[a, 0] + 1.02 * branch[a, 1] - t
             if 0.0 < end < ahead:
@@ -321,64 +401,21 @@ def march(
         while True:
             if h != h_slot:
                 slot = make_tables(
-                    rates, 1 if inside else 0, h, keys_h, keys_level, count, all_decay, all_phi, all_miss
-                )
+                    rates, 1 if inside else 0, h, tables.h, tables.level, tables.used, tables.decay, tables.phi,
+                    tables.miss,
+                )  # fmt: skip
                 h_slot = h
-                fill_coupling(own, h, rates, feed, tap, tap_s, c, g, home, cell)
+                fill_coupling(own, h, rates, form.feed, form.tap, form.tap_s, form.c, g, home, cell)
                 whole = own.stiff[0] == 0
-                weigh(rates, size, all_decay[slot], h, weight)
-            decay, phi, miss = all_decay[slot], all_phi[slot], all_miss[slot]
-            for e in range(n_s):
-                if inside:
-                    for i in range(ROWS):
-                        ds[e, i] = jump_to[e] - jump_from[e]
-                        s[e, i] = jump_from[e] + (t + POINTS[i] * h) * ds[e, i]
-                else:
-                    row = sources.first[e] + index[e]
-                    start = sources.edges[row]
-                    rows.source_rows(
-                        sources.terms[row - e], sources.series[row - e], sources.edges[row + 1] - start, t - start, h,
-                        True, r[e],
-                    )  # fmt: skip
-                    for i in range(ROWS):
-                        s[e, i] = r[e, rows.SOURCE, i]
-                        ds[e, i] = r[e, rows.SLOPE, i]
-            follow_sources(gain, own.from_rates, own.from_sources, own.from_slopes, gap_s, s, ds, lin, cells, areas)
-            clear(used)
-            clear(guess)
-            for k in range(m):
-                for i in range(ROWS):
-                    base[k, i] = decay[k, i] * w0[k]
-            respond(lin, phi, base, base)
-            closed = False
-            slowly = False
-            step = 0.0
-            for iteration in range(1, 41):
-                if iteration > 1:
-                    if slowly:
-                        step = mix(pull, used, weight, pull_before, left_before)
-                    else:
-                        step = plain(pull, used, weight, pull_before, left_before)
-                    respond(used, phi, base, w)
-                else:
-                    w[:] = base
-                counters[NFEV] += NODES
-                if not evaluate(
-                    mobile, several, h, rates, own, home, first, cell, area0, unit, slow, area_pace, gap, powers,
-                    slopes, lo, scale, curves, sign, w, lin, d, pull, cells, areas, matrix, mixed, room[3],
-                ):  # fmt: skip
-                    break
-                change = moved(u, guess)
-                if iteration == 1:
-                    continue
-                # What the gap voltages would move next, by what they moved for the last change of the currents.
-                off = distance(pull, used, weight)
-                if not off < math.inf:
-                    break
-                if change * off <= 0.3 * tol * step:
-                    closed = True
-                    break
-                slowly = off > 0.15 * step
+                weigh(rates, size, tables.decay[slot], h, work.weight)
+            decay, phi, miss = tables.decay[slot], tables.phi[slot], tables.miss[slot]
+            if inside:
+                _ramp(t, h, jump_from, jump_to, s, ds)
+            else:
+                _sources(sources, index, t, h, work.r, s, ds)
+            follow_sources(form, own, gain, s, ds, modes[netrows.LIN], cells, areas)
+            passes, closed = _iterate(form, work, own, several, h, rates, area_pace, sign, decay, phi, 0.3 * tol)
+            counters[NFEV] += passes * NODES
             step_error = math.inf
             # What did not close says nothing about where it goes.
             if closed and flips <= n_area and turn_at_start(cell, u, sign, tol, t, branch):
@@ -391,11 +428,11 @@ def march(
                 magnified = 1.0 / lowest
                 carry(form, work, several, h, rates, area_pace, own, decay, phi, error, sign)
                 step_error = assess(
-                    rates, h, shape, follow, gap, size, phi, miss, error, carried, w, lin, pull, used, s, magnified,
-                    x_off, places, early, run,
+                    rates, h, shape, follow, form.gap, size, phi, miss, error, work.carried, w, modes[netrows.LIN],
+                    modes[netrows.PULL], modes[netrows.USED], s, magnified, work.x, places, early, run,
                 )  # fmt: skip
                 if charge:
-                    step_error = max(step_error, charged(cell, u, area))
+                    step_error = max(step_error, charged(cell, u, areas[netrows.AREA]))
             note(tried, counters[ACCEPTED] + counters[REJECTED], t, h, step_error / tol)
             factor = 6.0
             if step_error > 0.0:
@@ -423,7 +460,7 @@ def march(
                 break
             shorter = 1.0
             for a in range(n_area):
-                if cell[a] >= 0 and sign[a] * u[a, END] < lo[a]:
+                if cell[a] >= 0 and sign[a] * u[a, END] < form.lo[a]:
                     # It went far over a zero, where the branch has no meaning: end soon after the zero.
                     found = first_wrong(u[a], sign[a], tol)
                     if found > 1:
@@ -458,22 +495,13 @@ def march(
         control[MAGNIFIED] = max(control[MAGNIFIED], magnified)
         flips = 0
         if charge:
-            mode_rates(h, rates, w, lin, pull, False, d)
-            clear(cell_u)
-            combine(tap, w[:n], cell_u)
-            combine(tap_s, s, cell_u)
-            cell_currents(own.root, cells[netrows.RHO], j)
-            if not mobile:
-                for a in range(n_area):
-                    if cell[a] >= 0 and slow[a] < 0:
-                        wanted(True, sign[a], powers[a], slopes[a], lo[a], scale[a], curves[a], u[a], area[a], slope[a])
-            charge_rows(
-                mobile, h, stored, stored_s, lost, lost_s, through, c, g, home, integral, w, d, s, ds, cell_u, more, j,
-                room, values[first_z:], values[y.size :],
-            )  # fmt: skip
+            _charges(
+                form, work, own, h, rates, g, lost, lost_s, integral, sign, values[first_z : y.size], values[y.size :]
+            )
             charge_error(
-                mobile, h, stored, lost, through, tap, c, g, home, cell, unit, slow, places, early, theta, cell_u, area,
-                slope, more, values[first_z:], collected, control,
+                mobile, h, form.stored, lost, form.through, form.tap, form.c, g, home, cell, form.unit, slow, places,
+                early, theta, cells[netrows.CELL_U], areas[netrows.AREA], areas[netrows.SLOPE], areas[netrows.MORE],
+                values[first_z:], collected, control,
             )  # fmt: skip
         for e in range(n_s):
             gained[e] = at(values[first_z + e], theta) if charge else 0.0
@@ -481,25 +509,25 @@ def march(
             if step_times.shape[0] > 0 or next_out <= t_new or kept_times.size > 0:
                 write_columns(n, first_z, charge, shape, follow, w, s, y, values)
             if step_times.shape[0] > 0:
-                record(step_times, step_values, counters[RECORDED], t, h, t_new, theta, values)
+                record(step_times, steps.values, counters[RECORDED], t, h, t_new, theta, values)
                 counters[RECORDED] += 1
             if next_out <= t_new or kept_times.size > 0:
                 for i in range(out.shape[0]):
-                    series_of(values[i], coefficients[i])
+                    series_of(values[i], work.coefficients[i])
                 place = counters[KEPT]
                 counters[KEPT] += 1
                 if place < kept_times.shape[0]:
                     kept_times[place, 0], kept_times[place, 1], kept_times[place, 2] = t, h, t_new
-                    kept_series[place] = coefficients[: out.shape[0]]
+                    kept_series[place] = work.coefficients[: out.shape[0]]
             if next_out <= t_new:
                 first_out += write_outputs(
-                    t, h, theta, t_new, 0.0, False, coefficients, outputs, first_out, 0, t_out, left, out
+                    t, h, theta, t_new, 0.0, False, work.coefficients, work.outputs, first_out, 0, t_out, left, out
                 )  # fmt: skip
                 counters[OUTPUT] = first_out
                 next_out = t_out[first_out] if first_out < t_out.size else math.inf
         for a in range(n_area):
-            if stress[a] > 0.0:
-                account(u[a], area[a], stress[a], theta, run[a], places, slow[a], peaks[a])
+            if form.stress[a] > 0.0:
+                account(u[a], areas[netrows.AREA, a], form.stress[a], theta, run[a], places, slow[a], peaks[a])
         for k in range(m):
             w0[k] = at(w[k], theta) if theta < 1.0 else w[k, END]
         if theta < 1.0:
@@ -541,8 +569,8 @@ def _magnified(form: Form, work: Work, several: bool) -> float:
     clear(spare[netrows.ETA])
     combine(whole.held, work.modes[netrows.W][: form.shape.shape[0]], spare[netrows.CHI])
     combine(whole.from_slopes, work.s, spare[netrows.CHI])
-    answer_all(
-        True, several, whole.answer, whole.gap, whole.leak, whole.cross, form.home, form.first, form.cell,
+    answer_mobile(
+        several, whole.answer, whole.gap, whole.leak, whole.cross, form.home, form.first, form.cell,
         areas[netrows.U], areas[netrows.MORE], areas[netrows.SLOPE], areas[netrows.RATE], spare[netrows.CHI],
         spare[netrows.ETA], spare[netrows.RHO], work.spare_areas[netrows.KNOWN], spare[netrows.SHARE], work.mixed,
         work.matrix, work.room[3],

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.compiled import jit, jit_inline, jit_rows
 from fingerspice.engine.charge import DERIVATIVE
-from fingerspice.engine.coupling import STIFF, Coupling, answer_all, answer_alone, new_coupling
+from fingerspice.engine.coupling import STIFF, Coupling, answer_alone, answer_mobile, answer_together, new_coupling
 from fingerspice.engine.exponential import N_PLACES
 from fingerspice.engine.readout import WRITTEN_AT_ONCE
 from fingerspice.engine.rows import N_FLAT, polynomial_rows
@@ -190,6 +190,28 @@ def combine(matrix: FloatArray, rows: FloatArray, out: FloatArray) -> None:
 
 
 @jit_rows
+def combine_from(matrix: FloatArray, rows: FloatArray, start: FloatArray, out: FloatArray) -> None:
+    """out = start + matrix @ rows, at all rows of a step."""
+    n = matrix.shape[1]
+    for c in range(matrix.shape[0]):
+        if n == 0:
+            for i in range(ROWS):
+                out[c, i] = start[c, i]
+        else:
+            share = matrix[c, 0]
+            for i in range(ROWS):
+                out[c, i] = start[c, i] + share * rows[0, i]
+        for k in range(1, n - 1, 2):
+            share, other = matrix[c, k], matrix[c, k + 1]
+            for i in range(ROWS):
+                out[c, i] += share * rows[k, i] + other * rows[k + 1, i]
+        if n > 1 and n % 2 == 0:
+            share = matrix[c, n - 1]
+            for i in range(ROWS):
+                out[c, i] += share * rows[n - 1, i]
+
+
+@jit_rows
 def mode_rates(
     h: float, rates: FloatArray, w: FloatArray, lin: FloatArray, pull: FloatArray, stiff_only: bool, out: FloatArray
 ) -> None:
@@ -209,17 +231,30 @@ def mode_rates(
 
 
 @jit_rows
-def _start(rows: FloatArray, out: FloatArray) -> None:
-    for c in range(out.shape[0]):
-        for i in range(ROWS):
-            out[c, i] = rows[c, i]
-
-
-@jit_rows
-def _clear(rows: FloatArray) -> None:
+def clear(rows: FloatArray) -> None:
     for c in range(rows.shape[0]):
         for i in range(ROWS):
             rows[c, i] = 0.0
+
+
+@jit_rows
+def _highest(sign: float, u: FloatArray) -> float:
+    highest = 0.0
+    for i in range(ROWS):
+        highest = max(highest, sign * u[i])
+    return highest
+
+
+@jit_rows
+def _invert(area: FloatArray) -> None:
+    for i in range(ROWS):
+        area[i] = 1.0 / area[i]
+
+
+@jit_rows
+def _scale_slope(factor: float, area: FloatArray, slope: FloatArray) -> None:
+    for i in range(ROWS):
+        slope[i] *= factor * area[i] * area[i]
 
 
 @jit
@@ -228,17 +263,12 @@ def wanted(
     u: FloatArray, area: FloatArray, slope: FloatArray,
 ) -> None:  # fmt: skip
     """Area that the gap voltages u (ROWS,) ask for on the branch of a sign, and perhaps its slope by them."""
-    highest = 0.0
-    for i in range(ROWS):
-        highest = max(highest, sign * u[i])
-    if scale > 0.0 and highest <= curve[1]:
+    if scale > 0.0 and _highest(sign, u) <= curve[1]:
         polynomial_rows(powers, lo, scale, u, sign, area)
-        for i in range(ROWS):
-            area[i] = 1.0 / area[i]
+        _invert(area)
         if slopes_too:
             polynomial_rows(slopes, lo, scale, u, sign, slope)
-            for i in range(ROWS):
-                slope[i] *= -scale * sign * area[i] * area[i]
+            _scale_slope(-scale * sign, area, slope)
     else:
         for i in range(ROWS):
             q, dq = inverse_area(max(sign * u[i], lo), curve)
@@ -246,93 +276,94 @@ def wanted(
             slope[i] = -sign * dq / (q * q)
 
 
-@jit
-def _areas(
-    mobile: bool, h: float, rates: FloatArray, cell: IntArray, area0: FloatArray, unit: FloatArray, slow: IntArray,
-    pace: FloatArray, powers: FloatArray, slopes: FloatArray, lo: FloatArray, scale: FloatArray, curves: FloatArray,
-    sign: FloatArray, w: FloatArray, lin: FloatArray, d: FloatArray, pull: FloatArray, areas: FloatArray,
+@jit_rows
+def _moving(
+    mobile: bool, h: float, rate_k: float, pace: float, unit: float, w: FloatArray, lin: FloatArray, d: FloatArray,
+    forced: FloatArray, area: FloatArray, slope: FloatArray, rate: FloatArray,
 ) -> None:  # fmt: skip
-    """Areas at all rows, what their gap voltages and time move them, and the forcing of those with dynamics."""
-    area, slope, rate, more, u = areas[AREA], areas[SLOPE], areas[RATE], areas[MORE], areas[U]
-    for a in range(cell.size):
-        if cell[a] >= 0:
-            wanted(mobile, sign[a], powers[a], slopes[a], lo[a], scale[a], curves[a], u[a], area[a], slope[a])
-            k = slow[a]
-            if k >= 0:
-                for i in range(ROWS):
-                    pull[k, i] = pace[a] / unit[a] * area[a, i]
-                    area[a, i] = unit[a] * w[k, i]
-                    slope[a, i] = 0.0
-                    rate[a, i] = unit[a] * (
-                        d[k, i] if rates[k] * h > STIFF else lin[k, i] - rates[k] * w[k, i] + pull[k, i]
-                    )
-            for i in range(ROWS):
-                more[a, i] = area[a, i] - area0[a]
+    """An area with dynamics: its forcing by the area wanted, which stands in `area`; then itself, and its rate."""
+    for i in range(ROWS):
+        forced[i] = pace / unit * area[i]
+        area[i] = unit * w[i]
+        slope[i] = 0.0
+    if mobile:
+        for i in range(ROWS):
+            rate[i] = unit * (d[i] if rate_k * h > STIFF else lin[i] - rate_k * w[i] + forced[i])
+
+
+@jit_rows
+def _subtract(area: FloatArray, area0: float, more: FloatArray) -> None:
+    for i in range(ROWS):
+        more[i] = area[i] - area0
 
 
 @jit_inline
 def evaluate(
-    mobile: bool, several: bool, h: float, rates: FloatArray, coupling: Coupling, home: IntArray, first: IntArray,
-    cell: IntArray, area0: FloatArray,
-    unit: FloatArray, slow: IntArray, pace: FloatArray, gap: FloatArray, powers: FloatArray, slopes: FloatArray,
-    lo: FloatArray, scale: FloatArray, curves: FloatArray, sign: FloatArray, w: FloatArray, lin: FloatArray,
-    d: FloatArray, pull: FloatArray, cells: FloatArray, areas: FloatArray, matrix: FloatArray, mixed: FloatArray,
-    least: FloatArray,
+    form: Form, coupling: Coupling, several: bool, h: float, rates: FloatArray, pace: FloatArray, sign: FloatArray,
+    w: FloatArray, lin: FloatArray, d: FloatArray, pull: FloatArray, cells: FloatArray, areas: FloatArray,
+    matrix: FloatArray, mixed: FloatArray, least: FloatArray,
 ) -> bool:  # fmt: skip
     """What the areas add to the modes' rates, into `pull` (m, ROWS), from the modes w (m, ROWS).
 
     `lin` is gain s, and `d` takes the rates of stiff modes. `cells` and `areas` are blocks of rows, whose parts that
     follow the sources are given. False past a fold; under `mobile`, `least` (ROWS,) takes the distance to it.
     """
-    n = gap.shape[1]
-    n_stiff = coupling.stiff[0]
+    mobile = form.mobile
+    n = form.gap.shape[1]
+    stiff = coupling.stiff[0] > 0
     u, eta, chi, rho = areas[U], cells[ETA], cells[CHI], cells[RHO]
-    _start(areas[U_S], u)
-    combine(gap, w[:n], u)
-    _clear(pull)
-    if n_stiff > 0:
+    area, slope, rate, more = areas[AREA], areas[SLOPE], areas[RATE], areas[MORE]
+    combine_from(form.gap, w, areas[U_S], u)
+    clear(pull)
+    if stiff:
         mode_rates(h, rates, w, lin, pull, True, d)
-    _areas(
-        mobile, h, rates, cell, area0, unit, slow, pace, powers, slopes, lo, scale, curves, sign, w, lin, d, pull, areas
-    )
-    _start(cells[ETA_S], eta)
-    combine(coupling.from_modes, w[:n], eta)
-    if n_stiff > 0:
+    for a in range(form.cell.size):
+        if form.cell[a] >= 0:
+            wanted(
+                mobile, sign[a], form.powers[a], form.slopes[a], form.lo[a], form.scale[a], form.curves[a], u[a],
+                area[a], slope[a],
+            )  # fmt: skip
+            k = form.slow[a]
+            if k >= 0:
+                _moving(
+                    mobile, h, rates[k], pace[a], form.unit[a], w[k], lin[k], d[k], pull[k], area[a], slope[a], rate[a]
+                )  # fmt: skip
+            _subtract(area[a], form.area0[a], more[a])
+    combine_from(coupling.from_modes, w, cells[ETA_S], eta)
+    if stiff:
         combine(coupling.from_stiff, d[:n], eta)
     if mobile:
-        _start(cells[CHI_S], chi)
-        combine(coupling.held, w[:n], chi)
-    if mobile or several:
-        answer_all(
-            mobile, several, coupling.answer, coupling.gap, coupling.leak, coupling.cross, home, first, cell, u,
-            areas[MORE], areas[SLOPE],
-            areas[RATE], chi, eta, rho, areas[KNOWN], cells[SHARE], mixed, matrix, least,
+        combine_from(coupling.held, w, cells[CHI_S], chi)
+        answer_mobile(
+            several, coupling.answer, coupling.gap, coupling.leak, coupling.cross, form.home, form.first, form.cell, u,
+            more, slope, rate, chi, eta, rho, areas[KNOWN], cells[SHARE], mixed, matrix, least,
         )  # fmt: skip
-        if mobile:
-            for i in range(ROWS):
-                # NaN is no solution either.
-                if not least[i] > 0.0:
-                    return False
+        for i in range(ROWS):
+            # NaN is no solution either.
+            if not least[i] > 0.0:
+                return False
+    elif several:
+        answer_together(form.home, coupling.answer, coupling.cross, more, cells[SHARE], eta, rho)
     else:
-        answer_alone(home, coupling.answer, areas[MORE], eta, rho)
+        answer_alone(form.home, coupling.answer, more, eta, rho)
     combine(coupling.feed, rho, pull[:n])
     return True
 
 
-@jit_inline
+@jit
 def follow_sources(
-    gain: FloatArray, from_rates: FloatArray, from_sources: FloatArray, from_slopes: FloatArray, gap_s: FloatArray,
-    s: FloatArray, ds: FloatArray, lin: FloatArray, cells: FloatArray, areas: FloatArray,
+    form: Form, coupling: Coupling, gain: FloatArray, s: FloatArray, ds: FloatArray, lin: FloatArray,
+    cells: FloatArray, areas: FloatArray,
 ) -> None:  # fmt: skip
     """What of a step's rows follows the sources alone; see `evaluate`."""
-    n = from_rates.shape[1]
-    _clear(lin)
+    n = form.gap.shape[1]
+    clear(lin)
     combine(gain, s, lin)
-    _clear(cells[ETA_S])
-    combine(from_rates, lin[:n], cells[ETA_S])
-    combine(from_slopes, ds, cells[ETA_S])
-    combine(from_sources, s, cells[ETA_S])
-    _clear(cells[CHI_S])
-    combine(from_slopes, s, cells[CHI_S])
-    _clear(areas[U_S])
-    combine(gap_s, s, areas[U_S])
+    clear(cells[ETA_S])
+    combine(coupling.from_rates, lin[:n], cells[ETA_S])
+    combine(coupling.from_slopes, ds, cells[ETA_S])
+    combine(coupling.from_sources, s, cells[ETA_S])
+    clear(cells[CHI_S])
+    combine(coupling.from_slopes, s, cells[CHI_S])
+    clear(areas[U_S])
+    combine(form.gap_s, s, areas[U_S])
