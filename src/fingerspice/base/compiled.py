@@ -130,7 +130,9 @@ jit = _cached()
 # For loops over the rows of a step: fused, so that they vectorise; and where sums may be reordered (always alike).
 jit_fused = _cached(fastmath={"contract"})
 jit_rows = _cached(fastmath={"contract", "reassoc"})
-# Put into its caller before compilation: handing over twenty arrays would cost as much as the work.
+# Put into its caller by the compiler of machine code: handing over a tuple of arrays would cost as much as the work.
+jit_within = _cached(forceinline=True)
+# Put into its caller before compilation, for the same reason.
 jit_inline = _cached(inline="always")
 
 

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import jit, jit_rows
+from fingerspice.base.compiled import jit_rows, jit_within
 from fingerspice.engine.coupling import Coupling
 from fingerspice.engine.exponential import respond
 from fingerspice.engine.netrows import CHI_S, ETA_S, LIN, PULL, RHO, U_S, Form, W, Work, evaluate
@@ -39,7 +39,7 @@ def _difference(a: FloatArray, b: FloatArray, factor: float, out: FloatArray) ->
             out[k, i] = factor * (a[k, i] - b[k, i])
 
 
-@jit
+@jit_within
 def carry(
     form: Form, work: Work, several: bool, h: float, rates: FloatArray, pace: FloatArray, coupling: Coupling,
     decay: FloatArray, phi: FloatArray, error: FloatArray, sign: FloatArray,

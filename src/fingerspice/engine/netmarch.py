@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import borrow, jit, jit_rows
+from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
 from fingerspice.engine import netrows, rows
 from fingerspice.engine.coupling import Coupling, answer_mobile, cell_currents, fill_coupling
 from fingerspice.engine.exponential import (
@@ -127,7 +127,7 @@ def _free(decay: FloatArray, w0: FloatArray, out: FloatArray) -> None:
             out[k, i] = decay[k, i] * w0[k]
 
 
-@jit
+@jit_within
 def _iterate(
     form: Form, work: Work, own: Coupling, several: bool, h: float, rates: FloatArray, area_pace: FloatArray,
     sign: FloatArray, decay: FloatArray, phi: FloatArray, tol: float,
@@ -176,7 +176,7 @@ def _iterate(
     return 40, False
 
 
-@jit
+@jit_within
 def _charges(
     form: Form, work: Work, own: Coupling, h: float, rates: FloatArray, g: FloatArray, lost: FloatArray,
     lost_s: FloatArray, integral: FloatArray, sign: FloatArray, z: FloatArray, current: FloatArray,

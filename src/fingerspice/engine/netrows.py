@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import jit, jit_inline, jit_rows
+from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.charge import DERIVATIVE
 from fingerspice.engine.coupling import STIFF, Coupling, answer_alone, answer_mobile, answer_together, new_coupling
 from fingerspice.engine.exponential import N_PLACES
@@ -297,7 +297,7 @@ def _subtract(area: FloatArray, area0: float, more: FloatArray) -> None:
         more[i] = area[i] - area0
 
 
-@jit_inline
+@jit_within
 def evaluate(
     form: Form, coupling: Coupling, several: bool, h: float, rates: FloatArray, pace: FloatArray, sign: FloatArray,
     w: FloatArray, lin: FloatArray, d: FloatArray, pull: FloatArray, cells: FloatArray, areas: FloatArray,
@@ -350,7 +350,7 @@ def evaluate(
     return True
 
 
-@jit
+@jit_within
 def follow_sources(
     form: Form, coupling: Coupling, gain: FloatArray, s: FloatArray, ds: FloatArray, lin: FloatArray,
     cells: FloatArray, areas: FloatArray,
