@@ -13,8 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import numpy as np
-from numba import njit
+from numba import njit, types
 from numba.core import cgutils, config
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.extending import intrinsic
@@ -23,7 +22,7 @@ from numba.np.arrayobj import make_array
 from fingerspice.base.announcing import Compiling
 from fingerspice.base.errors import InputError
 
-Array = TypeVar("Array", bound=np.ndarray)
+Lent = TypeVar("Lent")
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGE = Path(__file__).resolve().parents[1]
 #: Where functions stand that compiled code of other files may call.
@@ -131,27 +130,37 @@ jit = _cached()
 # For loops over the rows of a step: fused, so that they vectorise; and where sums may be reordered (always alike).
 jit_fused = _cached(fastmath={"contract"})
 jit_rows = _cached(fastmath={"contract", "reassoc"})
-# Put into its caller before compilation: handing over twenty arrays would cost as much as the work.
+# Put into its caller by the compiler of machine code: handing over a tuple of arrays would cost as much as the work.
+jit_within = _cached(forceinline=True)
+# Put into its caller before compilation, for the same reason.
 jit_inline = _cached(inline="always")
 
 
 @intrinsic
-def _borrow(typing: Any, array: Any) -> Any:
-    """The same array without a count of its users, which would be an atomic operation at every view.
+def _borrow(typing: Any, value: Any) -> Any:
+    """The same array, or tuple of arrays, without a count of its users, which would be an atomic operation a view.
 
-    The array given must outlive the one returned: borrow only arguments of the function, never what it allocates,
-    for that is freed after its last use by name.
+    What is given must outlive what is returned: borrow only arguments of the function, never what it allocates, for
+    that is freed after its last use by name.
     """
 
     make: Any = make_array
     null: Any = cgutils.get_null_value
 
+    def lent(context: Any, builder: Any, kind: Any, item: Any) -> Any:
+        if isinstance(kind, types.Array):
+            view = make(kind)(context, builder, item)
+            view.meminfo, view.parent = null(view.meminfo.type), null(view.parent.type)
+            return view._getvalue()
+        if isinstance(kind, types.BaseTuple):
+            for i, part in enumerate(cast(Any, kind).types):
+                item = builder.insert_value(item, lent(context, builder, part, builder.extract_value(item, i)), i)
+        return item
+
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        view = make(signature.args[0])(context, builder, values[0])
-        view.meminfo, view.parent = null(view.meminfo.type), null(view.parent.type)
-        return view._getvalue()
+        return lent(context, builder, signature.args[0], values[0])
 
-    return array(array), generate
+    return value(value), generate
 
 
-borrow: Callable[[Array], Array] = cast(Any, _borrow)
+borrow: Callable[[Lent], Lent] = cast(Any, _borrow)

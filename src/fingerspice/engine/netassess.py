@@ -23,13 +23,6 @@ _EARLY = POINTS[1] / 3.0
 
 
 @jit
-def clear(block: FloatArray) -> None:
-    for a in range(block.shape[0]):
-        for i in range(ROWS):
-            block[a, i] = 0.0
-
-
-@jit
 def load(inverse: FloatArray, follow: FloatArray, y: FloatArray, s: FloatArray, w: FloatArray) -> None:
     """Modes from the state and the sources' values."""
     n = inverse.shape[0]

@@ -11,9 +11,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import jit
+from fingerspice.base.compiled import jit_rows, jit_within
+from fingerspice.engine.coupling import Coupling
 from fingerspice.engine.exponential import respond
-from fingerspice.engine.netrows import FREE, FREE_RATE, LIN, PULL, Form, W, Work, evaluate
+from fingerspice.engine.netrows import CHI_S, ETA_S, LIN, PULL, RHO, U_S, Form, W, Work, evaluate
 from fingerspice.numerics.lobatto import END, NODES, ROWS
 
 FloatArray = NDArray[np.float64]
@@ -24,13 +25,28 @@ _SHIFT = 1e-7
 _PASSES, _ENOUGH = 6, 0.1
 
 
-@jit
+@jit_rows
+def _shift(w: FloatArray, step: float, off: FloatArray, out: FloatArray) -> None:
+    for k in range(out.shape[0]):
+        for i in range(ROWS):
+            out[k, i] = w[k, i] + step * off[k, i]
+
+
+@jit_rows
+def _difference(a: FloatArray, b: FloatArray, factor: float, out: FloatArray) -> None:
+    for k in range(out.shape[0]):
+        for i in range(ROWS):
+            out[k, i] = factor * (a[k, i] - b[k, i])
+
+
+@jit_within
 def carry(
-    form: Form, work: Work, h: float, decay: FloatArray, phi: FloatArray, error: FloatArray, sign: FloatArray
+    form: Form, work: Work, several: bool, h: float, rates: FloatArray, pace: FloatArray, coupling: Coupling,
+    decay: FloatArray, phi: FloatArray, error: FloatArray, sign: FloatArray,
 ) -> None:  # fmt: skip
     """The error of the modes (m,) at the start of a converged step at the points between and the end: `work.carried`.
 
-    Uses `work.spare`, `matrix`, `small` and one row of `room`, and leaves all else of the step as it is.
+    Uses `work.spare`, `matrix`, `mixed` and one row of `room`, and leaves all else of the step as it is.
     """
     base, forced, off, shifted, d, pull = work.spare
     modes, cells, areas = work.modes, work.spare_cells, work.spare_areas
@@ -44,28 +60,26 @@ def carry(
             size = max(size, abs(modes[W, k, i]))
     step = _SHIFT * size / largest if largest > 0.0 else 0.0
     if 0.0 < step < math.inf:
-        cells[FREE] = work.cells[FREE]
-        cells[FREE_RATE] = work.cells[FREE_RATE]
+        for part in (ETA_S, CHI_S, RHO):
+            cells[part] = work.cells[part]
+        areas[U_S] = work.areas[U_S]
         for _ in range(_PASSES):
             before = 0.0
             for k in range(error.size):
                 before = max(before, abs(off[k, END]))
-                for i in range(ROWS):
-                    shifted[k, i] = modes[W, k, i] + step * off[k, i]
+            _shift(modes[W], step, off, shifted)
             if not evaluate(
-                form.mobile, h, form.rates, form.feed, form.tap, work.met, form.c, form.g, form.home, form.cell,
-                form.area0, form.unit, form.slow, form.pace, form.powers, form.slopes, form.lo, form.scale,
-                form.curves, sign, shifted, modes[LIN], d, pull, cells, areas, work.matrix, work.small, work.room[1],
+                form, coupling, several, h, rates, pace, sign, shifted, modes[LIN], d, pull, cells, areas, work.matrix,
+                work.mixed, work.room[1],
             ):  # fmt: skip
                 break
-            for k in range(error.size):
-                for i in range(ROWS):
-                    forced[k, i] = (pull[k, i] - modes[PULL, k, i]) / step
-                    shifted[k, i] = off[k, i]
-            respond(forced, phi, base, off)
+            _difference(pull, modes[PULL], 1.0 / step, forced)
             moved = 0.0
             for k in range(error.size):
-                moved = max(moved, abs(off[k, END] - shifted[k, END]))
+                shifted[k, 0] = off[k, END]
+            respond(forced, phi, base, off)
+            for k in range(error.size):
+                moved = max(moved, abs(off[k, END] - shifted[k, 0]))
             if not moved > _ENOUGH * before:
                 break
     for k in range(error.size):

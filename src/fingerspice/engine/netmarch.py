@@ -7,8 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import borrow, jit
+from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
 from fingerspice.engine import netrows, rows
+from fingerspice.engine.coupling import Coupling, answer_mobile, cell_currents, fill_coupling
 from fingerspice.engine.exponential import (
     N_PLACES,
     Tables,
@@ -23,7 +24,6 @@ from fingerspice.engine.netassess import (
     account,
     assess,
     charged,
-    clear,
     first_zero,
     load,
     moved,
@@ -33,7 +33,7 @@ from fingerspice.engine.netassess import (
 )
 from fingerspice.engine.netcharge import charge_error, charge_rows
 from fingerspice.engine.netgrowth import carry
-from fingerspice.engine.netrows import STIFF, Form, Work, combine, couple, evaluate, meet
+from fingerspice.engine.netrows import Form, Work, clear, combine, evaluate, follow_sources, mode_rates, wanted
 from fingerspice.engine.network import Sources, at_sources
 from fingerspice.engine.pace import Pace, choose_step, rung
 from fingerspice.engine.readout import (
@@ -41,6 +41,7 @@ from fingerspice.engine.readout import (
     ALLOWED,
     BRANCH_LENGTH,
     BRANCH_START,
+    ERROR_Q,
     H_AFTER_EDGE,
     H_AFTER_ZERO,
     KEPT,
@@ -71,7 +72,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 # Codes returned by `march`.
-DONE, JUMP, NO_STEP, TOO_MANY, REFERENCE, PAUSED = 0, 1, 2, 3, 4, 5
+DONE, NO_STEP, TOO_MANY, REFERENCE, PAUSED = 0, 1, 2, 3, 4
 # One entry of `control` more than `readout` has: steps taken and refused, at most.
 MOST = N_CONTROL
 # Step over the one before, at most; and what of it may be foreseen growth.
@@ -87,14 +88,143 @@ AT_ONCE = 40_000
 
 
 @jit
+def area_at(curve: FloatArray, u: float) -> float:
+    """Area (m^2) at a gap voltage (V)."""
+    inverse, _ = inverse_area(abs(u), curve)
+    return 1.0 / inverse
+
+
+@jit
+def _sources(
+    sources: Sources, index: IntArray, t: float, h: float, r: FloatArray, s: FloatArray, ds: FloatArray
+) -> None:
+    """Values and slopes of the sources at all rows of a step."""
+    for e in range(s.shape[0]):
+        row = sources.first[e] + index[e]
+        start = sources.edges[row]
+        rows.source_rows(
+            sources.terms[row - e], sources.series[row - e], sources.edges[row + 1] - start, t - start, h, True, r[e]
+        )
+        for i in range(ROWS):
+            s[e, i] = r[e, rows.SOURCE, i]
+            ds[e, i] = r[e, rows.SLOPE, i]
+
+
+@jit
+def _ramp(t: float, h: float, before: FloatArray, after: FloatArray, s: FloatArray, ds: FloatArray) -> None:
+    """The same within a jump, from the fraction t on."""
+    for e in range(before.size):
+        for i in range(ROWS):
+            ds[e, i] = after[e] - before[e]
+            s[e, i] = before[e] + (t + POINTS[i] * h) * ds[e, i]
+
+
+@jit_rows
+def _free(decay: FloatArray, w0: FloatArray, out: FloatArray) -> None:
+    """Decay of the modes from where they start."""
+    for k in range(w0.size):
+        for i in range(ROWS):
+            out[k, i] = decay[k, i] * w0[k]
+
+
+@jit_within
+def _iterate(
+    form: Form, work: Work, own: Coupling, several: bool, h: float, rates: FloatArray, area_pace: FloatArray,
+    sign: FloatArray, decay: FloatArray, phi: FloatArray, tol: float,
+) -> tuple[int, bool]:  # fmt: skip
+    """Collocation solution of a step from the modes `work.w0`, by iteration on what the areas add.
+
+    Returns the number of evaluations, and whether the gap voltages are settled to `tol` (V).
+    """
+    modes, cells, areas, weight = work.modes, work.cells, work.areas, work.weight
+    w, base, lin, pull, used = (
+        modes[netrows.W], modes[netrows.BASE], modes[netrows.LIN], modes[netrows.PULL], modes[netrows.USED]
+    )  # fmt: skip
+    pull_before, left_before = modes[netrows.PULL_BEFORE], modes[netrows.LEFT_BEFORE]
+    u, guess = areas[netrows.U], areas[netrows.GUESS]
+    clear(used)
+    clear(guess)
+    clear(cells[netrows.RHO])
+    _free(decay, work.w0, base)
+    respond(lin, phi, base, base)
+    current = base
+    slowly = False
+    step = 0.0
+    for iteration in range(1, 41):
+        if iteration > 1:
+            if slowly:
+                step = mix(pull, used, weight, pull_before, left_before)
+            else:
+                step = plain(pull, used, weight, pull_before, left_before)
+            respond(used, phi, base, w)
+            current = w
+        if not evaluate(
+            form, own, several, h, rates, area_pace, sign, current, lin, modes[netrows.D], pull, cells, areas,
+            work.matrix, work.mixed, work.room[3],
+        ):  # fmt: skip
+            return iteration, False
+        change = moved(u, guess)
+        if iteration == 1:
+            continue
+        # What the gap voltages would move next, by what they moved for the last change of the currents.
+        off = distance(pull, used, weight)
+        if not off < math.inf:
+            return iteration, False
+        if change * off <= tol * step:
+            return iteration, True
+        slowly = off > 0.15 * step
+    return 40, False
+
+
+@jit_within
+def _charges(
+    form: Form, work: Work, own: Coupling, h: float, rates: FloatArray, g: FloatArray, lost: FloatArray,
+    lost_s: FloatArray, integral: FloatArray, sign: FloatArray, z: FloatArray, current: FloatArray,
+) -> None:  # fmt: skip
+    """Charges gained since the start of a converged step, and currents, of the sources at its nodes."""
+    modes, cells, areas = work.modes, work.cells, work.areas
+    w, cell_u = modes[netrows.W], cells[netrows.CELL_U]
+    mode_rates(h, rates, w, modes[netrows.LIN], modes[netrows.PULL], False, modes[netrows.D])
+    clear(cell_u)
+    combine(form.tap, w[: form.shape.shape[0]], cell_u)
+    combine(form.tap_s, work.s, cell_u)
+    cell_currents(own.root, cells[netrows.RHO], cells[netrows.J])
+    if not form.mobile:
+        for a in range(form.cell.size):
+            if form.cell[a] >= 0 and form.slow[a] < 0:
+                wanted(
+                    True, sign[a], form.powers[a], form.slopes[a], form.lo[a], form.scale[a], form.curves[a],
+                    areas[netrows.U, a], areas[netrows.AREA, a], areas[netrows.SLOPE, a],
+                )  # fmt: skip
+    charge_rows(
+        form.mobile, h, form.stored, form.stored_s, lost, lost_s, form.through, form.c, g, form.home, integral, w,
+        modes[netrows.D], work.s, work.ds, cell_u, areas[netrows.MORE], cells[netrows.J], work.room, z, current,
+    )  # fmt: skip
+
+
+@jit
+def _moves_nothing(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> bool:
+    """Whether all entries are 0."""
+    for x in (a, b, c, d):
+        for i in range(x.shape[0]):
+            for j in range(x.shape[1]):
+                if x[i, j] != 0.0:
+                    return False
+    return True
+
+
+@jit
 def march(
     form: Form, pace: Pace, tables: Tables, work: Work, integral: FloatArray, size: FloatArray, sources: Sources,
-    jump: bool, tau: float, t_end: float, y: FloatArray, error: FloatArray, sign: FloatArray, s_before: FloatArray,
+    tau: float, t_end: float, y: FloatArray, error: FloatArray, sign: FloatArray, s_before: FloatArray,
     branch: FloatArray, control: FloatArray, counters: IntArray, peaks: FloatArray, collected: FloatArray,
     t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray, kept: Kept, steps: Steps,
     tried: FloatArray,
 ) -> int:  # fmt: skip
     """Step to `t_end` through the sources' segments, writing outputs on the way.
+
+    A jump of the sources is stepped through in its fraction, while time stands still: the same network with nothing
+    leaking.
 
     Parameters
     ----------
@@ -103,12 +233,10 @@ def march(
     size : ndarray, shape (m,)
         Voltage (V) that each mode moves.
     sources : Sources
-    jump : bool
-        Whether this is the inside of a jump, with time its fraction.
     tau : float
         Shortest time constant, s.
     t_end : float
-        s, not past the last edge.
+        s, not past the last edge; if it is the time reached, only a jump that stands there is taken.
     y : ndarray
         State as in `engine.network`; updated, as all that follow.
     error : ndarray, shape (m,)
@@ -132,98 +260,114 @@ def march(
     Returns
     -------
     int
-        DONE; JUMP: a source jumps here, take that first; NO_STEP is short enough; TOO_MANY steps; REFERENCE: an area is
-        far from its own; or PAUSED: call again.
+        DONE; NO_STEP is short enough; TOO_MANY steps; REFERENCE: an area is far from its own; or PAUSED: call again.
     """
-    mobile = form.mobile
-    rates, gain, shape, inverse, follow = (
-        borrow(form.rates), borrow(form.gain), borrow(form.shape), borrow(form.inverse), borrow(form.follow)
-    )  # fmt: skip
-    feed, tap, tap_s, met = borrow(form.feed), borrow(form.tap), borrow(form.tap_s), borrow(work.met)
-    c, g, home, cell = borrow(form.c), borrow(form.g), borrow(form.home), borrow(form.cell)
-    area0, unit, slow, speed = borrow(form.area0), borrow(form.unit), borrow(form.slow), borrow(form.pace)
-    gap, gap_s, stress = borrow(form.gap), borrow(form.gap_s), borrow(form.stress)
-    powers, slopes, lo, scale = borrow(form.powers), borrow(form.slopes), borrow(form.lo), borrow(form.scale)
-    curves = borrow(form.curves)
-    stored, stored_s, lost, lost_s = (
-        borrow(form.stored), borrow(form.stored_s), borrow(form.lost), borrow(form.lost_s)
-    )  # fmt: skip
-    through = borrow(form.through)
-    keys_h, keys_level, count = borrow(tables.h), borrow(tables.level), borrow(tables.used)
-    all_decay, all_phi, all_miss = borrow(tables.decay), borrow(tables.phi), borrow(tables.miss)
-    sources = Sources(borrow(sources.first), borrow(sources.edges), borrow(sources.terms), borrow(sources.series))
-    r, s, ds, matrix, small = (
-        borrow(work.r), borrow(work.s), borrow(work.ds), borrow(work.matrix), borrow(work.small)
-    )  # fmt: skip
-    modes, cells, areas = borrow(work.modes), borrow(work.cells), borrow(work.areas)
-    w, base, lin, d, pull, used = (
-        modes[netrows.W],
-        modes[netrows.BASE],
-        modes[netrows.LIN],
-        modes[netrows.D],
-        modes[netrows.PULL],
-        modes[netrows.USED],
-    )
-    pull_before, left_before = modes[netrows.PULL_BEFORE], modes[netrows.LEFT_BEFORE]
-    free, free_rate, cell_u, du, j = (
-        cells[netrows.FREE],
-        cells[netrows.FREE_RATE],
-        cells[netrows.CELL_U],
-        cells[netrows.DU],
-        cells[netrows.J],
-    )
-    area, slope, more = areas[netrows.AREA], areas[netrows.SLOPE], areas[netrows.MORE]
-    u, guess = areas[netrows.U], areas[netrows.GUESS]
-    w0, places, carried, weight = borrow(work.w0), borrow(work.places), borrow(work.carried), borrow(work.weight)
-    room, x_off = borrow(work.room), borrow(work.x)
-    values, coefficients, outputs = borrow(work.values), borrow(work.coefficients), borrow(work.outputs)
+    # Without a count of their users: an atomic operation wherever an array is taken out of its tuple.
+    form, tables, work, sources = borrow(form), borrow(tables), borrow(work), borrow(sources)
+    kept, steps, time_branch = borrow(kept), borrow(steps), borrow(branch)
     y, error, sign, s_before = borrow(y), borrow(error), borrow(sign), borrow(s_before)
-    control, counters, peaks, branch = borrow(control), borrow(counters), borrow(peaks), borrow(branch)
+    control, counters, peaks, collected = borrow(control), borrow(counters), borrow(peaks), borrow(collected)
     t_out, left, out, tried = borrow(t_out), borrow(left), borrow(out), borrow(tried)
     integral, size = borrow(integral), borrow(size)
-    kept_times, kept_series = borrow(kept.times), borrow(kept.series)
-    step_times, step_values = borrow(steps.times), borrow(steps.values)
-    step_room = step_times.shape[0]
-    n, n_s, m, n_area = shape.shape[0], s_before.size, rates.size, sign.size
+    mobile = form.mobile
+    shape, follow, home, cell, slow = form.shape, form.follow, form.home, form.cell, form.slow
+    s, ds, modes, cells, areas, values = work.s, work.ds, work.modes, work.cells, work.areas, work.values
+    w, u = modes[netrows.W], areas[netrows.U]
+    w0, places, room = work.w0, work.places, work.room
+    kept_times, kept_series, step_times = kept.times, kept.series, steps.times
+    n, n_s, m, n_area = shape.shape[0], s_before.size, form.rates.size, sign.size
     first_z = y.size - n_s
     tol, charge = pace.tol, pace.charge
     is_series = sources.series.shape[1] > 0
     index = np.zeros(n_s, np.int64)
     now, slopes_now = np.zeros(n_s), np.zeros(n_s)
     run, gained, early = np.zeros(n_area), np.zeros(n_s), np.zeros(m)
+    several = False
+    for b in range(1, home.size):
+        several |= home[b] != home[0]
+    # Inside of a jump: what it starts from and goes to, and what is put aside meanwhile.
+    inside = False
+    jump_from, jump_to, aside = np.zeros(n_s), np.zeros(n_s), np.zeros(control.size)
+    sign_aside, jump_branch = np.zeros(n_area), np.zeros((n_area, 2))
+    no_rates, no_gain, no_leaks = np.zeros(m), np.zeros((m, n_s)), np.zeros(home.size)
+    nothing_lost, nothing_lost_s = np.zeros((n_s, n)), np.zeros((n_s, n_s))
+    smooth = _moves_nothing(form.tap_s, form.stored_s, follow, form.gap_s)
     areas[:] = 0.0
     for a in range(n_area):
-        area[a] = area0[a]
-    slot, h_slot, flips, fresh, whole, closing = -1, 0.0, 0, -1, True, False
+        areas[netrows.AREA, a] = form.area0[a]
+    slot, h_slot, flips, fresh, whole, closing, begun = -1, 0.0, 0, -1, True, False, False
     first_out = counters[OUTPUT]
     next_out = t_out[first_out] if first_out < t_out.size else math.inf
     pause = counters[ACCEPTED] + 1 + AT_ONCE // m
-    while control[T] < t_end:
+    rates, gain, g, area_pace, lost, lost_s = form.rates, form.gain, form.g, form.pace, form.lost, form.lost_s
+    branch = time_branch
+    own = work.own
+    code = DONE
+    while True:
         t = control[T]
+        if inside and t >= 1.0:
+            inside = False
+            aside[ERROR_Q], aside[MAGNIFIED] = control[ERROR_Q], control[MAGNIFIED]
+            control[:] = aside
+            s_before[:] = jump_to
+            t = control[T]
+            for a in range(n_area):
+                if sign[a] != sign_aside[a]:
+                    time_branch[a, 0], time_branch[a, 1] = t, math.inf
+            rates, gain, g, area_pace, lost, lost_s = form.rates, form.gain, form.g, form.pace, form.lost, form.lost_s
+            branch, own, h_slot = time_branch, work.own, 0.0
         if counters[ACCEPTED] + counters[REJECTED] > control[MOST]:
-            return TOO_MANY
-        if counters[ACCEPTED] >= pause or counters[RECORDED] >= step_room > 0:
-            return PAUSED
-        stop = t_end
+            code = TOO_MANY
+            break
+        stop = 1.0
         at_edge = False
-        for i in range(n_s):
-            while sources.edges[sources.first[i] + index[i] + 1] <= t:
-                index[i] += 1
-            at_edge |= sources.edges[sources.first[i] + index[i]] == t
-            stop = min(stop, sources.edges[sources.first[i] + index[i] + 1])
-        at_sources(sources, index, t, 0.0, now, slopes_now)
-        # The time of a call may miss an edge by rounding.
-        least = ROUNDING if at_edge else (UNNOTICED if h_slot == 0.0 else math.inf)
-        for i in range(n_s):
-            if not jump and abs(now[i] - s_before[i]) > least * max(abs(now[i]), abs(s_before[i])):
-                return JUMP
+        if not inside:
+            if begun and t >= t_end:
+                break
+            if counters[ACCEPTED] >= pause or counters[RECORDED] >= step_times.shape[0] > 0:
+                code = PAUSED
+                break
+            stop = t_end
+            for i in range(n_s):
+                while sources.edges[sources.first[i] + index[i] + 1] <= t:
+                    index[i] += 1
+                at_edge |= sources.edges[sources.first[i] + index[i]] == t
+                stop = min(stop, sources.edges[sources.first[i] + index[i] + 1])
+            at_sources(sources, index, t, 0.0, now, slopes_now)
+            # The time of a call may miss an edge by rounding.
+            least = ROUNDING if at_edge else (math.inf if begun else UNNOTICED)
+            begun = True
+            jumps = False
+            for i in range(n_s):
+                jumps |= abs(now[i] - s_before[i]) > least * max(abs(now[i]), abs(s_before[i]))
+            if jumps and smooth:
+                s_before[:] = now
+            elif jumps:
+                inside = True
+                aside[:] = control
+                sign_aside[:] = sign
+                jump_from[:] = s_before
+                jump_to[:] = now
+                jump_branch[:] = 0.0
+                control[:] = 0.0
+                control[ERROR_Q], control[MAGNIFIED], control[MOST] = aside[ERROR_Q], aside[MAGNIFIED], aside[MOST]
+                rates, gain, g, area_pace = no_rates, no_gain, no_leaks, no_rates
+                lost, lost_s = nothing_lost, nothing_lost_s
+                branch, own, h_slot = jump_branch, work.inside, 0.0
+                t, stop, at_edge = 0.0, 1.0, False
+                now[:] = jump_from
+            if not inside and t >= t_end:
+                break
+        else:
+            for e in range(n_s):
+                now[e] = s_before[e]
         if at_edge:
             # The steps after a jump are often those after the one before.
             control[H] = control[H_AFTER_EDGE]
             control[TOO_LONG] = 0.0
             control[ALLOWED] = 0.0
             fresh = H_AFTER_EDGE
-        load(inverse, follow, y, now, w0)
+        load(form.inverse, follow, y, now, w0)
         ahead = math.inf
         control[BRANCH_START], control[BRANCH_LENGTH] = t, math.inf
         for a in range(n_area):
@@ -232,82 +376,46 @@ def march(
                 continue
             voltage = 0.0
             for k in range(n):
-                voltage += gap[a, k] * w0[k]
+                voltage += form.gap[a, k] * w0[k]
             for e in range(n_s):
-                voltage += gap_s[a, e] * now[e]
+                voltage += form.gap_s[a, e] * now[e]
             if sign[a] == 0.0:
                 sign[a] = 1.0 if voltage >= 0.0 else -1.0
                 branch[a, 0], branch[a, 1] = t, math.inf
-            here = unit[a] * y[slow[a]] if slow[a] >= 0 else 1.0 / inverse_area(abs(voltage), curves[a])[0]
-            if not jump and max(here / area0[a], area0[a] / here) > FARTHEST:
-                return REFERENCE
+            if not inside:
+                here = (
+                    form.unit[a] * y[slow[a]] if slow[a] >= 0 else 1.0 / inverse_area(abs(voltage), form.curves[a])[0]
+                )
+                if max(here / form.area0[a], form.area0[a] / here) > FARTHEST:
+                    code = REFERENCE
             end = branch[a, 0] + 1.02 * branch[a, 1] - t
             if 0.0 < end < ahead:
                 ahead = end
                 control[BRANCH_START], control[BRANCH_LENGTH] = branch[a, 0], branch[a, 1]
-        h = choose_step(pace, tau, True, is_series, t, stop - t, control)
-        wanted = control[H]
+        if code != DONE:
+            break
+        longest = Pace(tol, 1.0, True, charge) if inside else pace
+        h = choose_step(longest, math.inf if inside else tau, True, is_series and not inside, t, stop - t, control)
+        wanted_h = control[H]
         which, magnified = -1, 1.0
         while True:
             if h != h_slot:
-                slot = make_tables(rates, 0, h, keys_h, keys_level, count, all_decay, all_phi, all_miss)
-                h_slot = h
-                whole = meet(h, rates, feed, tap, met)
-                weigh(rates, size, all_decay[slot], h, weight)
-            decay, phi, miss = all_decay[slot], all_phi[slot], all_miss[slot]
-            for e in range(n_s):
-                row = sources.first[e] + index[e]
-                start = sources.edges[row]
-                rows.source_rows(
-                    sources.terms[row - e], sources.series[row - e], sources.edges[row + 1] - start, t - start, h, True,
-                    r[e],
+                slot = make_tables(
+                    rates, 1 if inside else 0, h, tables.h, tables.level, tables.used, tables.decay, tables.phi,
+                    tables.miss,
                 )  # fmt: skip
-                for i in range(ROWS):
-                    s[e, i] = r[e, rows.SOURCE, i]
-                    ds[e, i] = r[e, rows.SLOPE, i]
-            clear(lin)
-            combine(gain, s, lin)
-            clear(free)
-            combine(tap_s, s, free)
-            clear(free_rate)
-            combine(tap_s, ds, free_rate)
-            clear(used)
-            clear(guess)
-            for k in range(m):
-                for i in range(ROWS):
-                    base[k, i] = decay[k, i] * w0[k]
-            respond(lin, phi, base, base)
-            closed = False
-            slowly = False
-            step = 0.0
-            for iteration in range(1, 41):
-                if iteration > 1:
-                    if slowly:
-                        step = mix(pull, used, weight, pull_before, left_before)
-                    else:
-                        step = plain(pull, used, weight, pull_before, left_before)
-                respond(used, phi, base, w)
-                counters[NFEV] += NODES
-                if not evaluate(
-                    mobile, h, rates, feed, tap, met, c, g, home, cell, area0, unit, slow, speed, powers, slopes, lo,
-                    scale, curves, sign, w, lin, d, pull, cells, areas, matrix, small,
-                    room[3],
-                ):  # fmt: skip
-                    break
-                clear(u)
-                combine(gap, w[:n], u)
-                combine(gap_s, s, u)
-                change = moved(u, guess)
-                if iteration == 1:
-                    continue
-                # What the gap voltages would move next, by what they moved for the last change of the currents.
-                off = distance(pull, used, weight)
-                if not off < math.inf:
-                    break
-                if change * off <= 0.3 * tol * step:
-                    closed = True
-                    break
-                slowly = off > 0.15 * step
+                h_slot = h
+                fill_coupling(own, h, rates, form.feed, form.tap, form.tap_s, form.c, g, home, cell)
+                whole = own.stiff[0] == 0
+                weigh(rates, size, tables.decay[slot], h, work.weight)
+            decay, phi, miss = tables.decay[slot], tables.phi[slot], tables.miss[slot]
+            if inside:
+                _ramp(t, h, jump_from, jump_to, s, ds)
+            else:
+                _sources(sources, index, t, h, work.r, s, ds)
+            follow_sources(form, own, gain, s, ds, modes[netrows.LIN], cells, areas)
+            passes, closed = _iterate(form, work, own, several, h, rates, area_pace, sign, decay, phi, 0.3 * tol)
+            counters[NFEV] += passes * NODES
             step_error = math.inf
             # What did not close says nothing about where it goes.
             if closed and flips <= n_area and turn_at_start(cell, u, sign, tol, t, branch):
@@ -318,13 +426,13 @@ def march(
                 if mobile:
                     lowest = room[3].min()
                 magnified = 1.0 / lowest
-                carry(form, work, h, decay, phi, error, sign)
+                carry(form, work, several, h, rates, area_pace, own, decay, phi, error, sign)
                 step_error = assess(
-                    rates, h, shape, follow, gap, size, phi, miss, error, carried, w, lin, pull, used, s, magnified,
-                    x_off, places, early, run,
+                    rates, h, shape, follow, form.gap, size, phi, miss, error, work.carried, w, modes[netrows.LIN],
+                    modes[netrows.PULL], modes[netrows.USED], s, magnified, work.x, places, early, run,
                 )  # fmt: skip
                 if charge:
-                    step_error = max(step_error, charged(cell, u, area))
+                    step_error = max(step_error, charged(cell, u, areas[netrows.AREA]))
             note(tried, counters[ACCEPTED] + counters[REJECTED], t, h, step_error / tol)
             factor = 6.0
             if step_error > 0.0:
@@ -335,12 +443,12 @@ def march(
                 growth = h * factor / control[ALLOWED] if control[ALLOWED] > 0.0 else 1.0
                 control[ALLOWED] = h * factor
                 proposed = h * min(_MOST_GROWTH, max(0.5, factor * min(max(growth, 1.0), _MOST_TREND)))
-                proposed = max(proposed, wanted if h < wanted else 0.0)
+                proposed = max(proposed, wanted_h if h < wanted_h else 0.0)
                 if control[TOO_LONG] > 0.0:
                     proposed = min(proposed, 0.93 * control[TOO_LONG])
                     grows = growth if closing else max(growth, factor)
                     control[TOO_LONG] *= grows if grows > 1.5 else 1.03
-                if fresh >= 0 and h >= wanted:
+                if fresh >= 0 and h >= wanted_h:
                     control[fresh] = h * min(2.0, factor)
                 fresh = -1
                 control[H] = proposed
@@ -348,10 +456,11 @@ def march(
             counters[REJECTED] += 1
             # Refused at this length: a singularity, of which rounding hides the last bit.
             if h <= 1e-13 * max(abs(t), 1e-3 * (stop - t)) or (whole and lowest < NEAR_FOLD):
-                return NO_STEP
+                code = NO_STEP
+                break
             shorter = 1.0
             for a in range(n_area):
-                if cell[a] >= 0 and sign[a] * u[a, END] < lo[a]:
+                if cell[a] >= 0 and sign[a] * u[a, END] < form.lo[a]:
                     # It went far over a zero, where the branch has no meaning: end soon after the zero.
                     found = first_wrong(u[a], sign[a], tol)
                     if found > 1:
@@ -363,7 +472,9 @@ def march(
                 closing = not closed
                 control[ALLOWED] = 0.0
                 h = rung(h * min(0.9, max(0.25, factor)))
-                wanted = h
+                wanted_h = h
+        if code != DONE:
+            break
         t_new = t + h
         theta = 1.0
         if t_new >= stop or stop - t_new <= 1e-12 * h:
@@ -377,50 +488,46 @@ def march(
             flips += 1
             continue
         if mobile and not whole:
-            # A mode that follows at once takes no part in the fold of the others, but it does in that of all.
-            couple(mobile, form.met, c, home, cell, cell_u, slope, more, du, j, matrix, small, room[3])
-            magnified = 1.0 / room[3, :NODES].min()
+            magnified = _magnified(form, work, several)
         if not 0.0 < magnified < math.inf:
-            return NO_STEP
+            code = NO_STEP
+            break
         control[MAGNIFIED] = max(control[MAGNIFIED], magnified)
         flips = 0
         if charge:
-            for k in range(m):
-                if not rates[k] * h > STIFF:
-                    for i in range(ROWS):
-                        d[k, i] += pull[k, i]
-            charge_rows(
-                mobile, h, stored, stored_s, lost, lost_s, through, c, g, home, integral, w, d, s, ds, cell_u, more, j,
-                room, values[first_z:], values[y.size :],
-            )  # fmt: skip
+            _charges(
+                form, work, own, h, rates, g, lost, lost_s, integral, sign, values[first_z : y.size], values[y.size :]
+            )
             charge_error(
-                mobile, h, stored, lost, through, tap, c, g, home, cell, unit, slow, places, early, theta, cell_u, area,
-                slope, more, values[first_z:], collected, control,
+                mobile, h, form.stored, lost, form.through, form.tap, form.c, g, home, cell, form.unit, slow, places,
+                early, theta, cells[netrows.CELL_U], areas[netrows.AREA], areas[netrows.SLOPE], areas[netrows.MORE],
+                values[first_z:], collected, control,
             )  # fmt: skip
         for e in range(n_s):
             gained[e] = at(values[first_z + e], theta) if charge else 0.0
-        if step_room > 0 or next_out <= t_new or kept_times.size > 0:
-            write_columns(n, first_z, charge, shape, follow, w, s, y, values)
-        if step_room > 0:
-            record(step_times, step_values, counters[RECORDED], t, h, t_new, theta, values)
-            counters[RECORDED] += 1
-        if next_out <= t_new or kept_times.size > 0:
-            for i in range(out.shape[0]):
-                series_of(values[i], coefficients[i])
-            place = counters[KEPT]
-            counters[KEPT] += 1
-            if place < kept_times.shape[0]:
-                kept_times[place, 0], kept_times[place, 1], kept_times[place, 2] = t, h, t_new
-                kept_series[place] = coefficients[: out.shape[0]]
-        if next_out <= t_new:
-            first_out += write_outputs(
-                t, h, theta, t_new, 0.0, False, coefficients, outputs, first_out, 0, t_out, left, out
-            )  # fmt: skip
-            counters[OUTPUT] = first_out
-            next_out = t_out[first_out] if first_out < t_out.size else math.inf
+        if not inside:
+            if step_times.shape[0] > 0 or next_out <= t_new or kept_times.size > 0:
+                write_columns(n, first_z, charge, shape, follow, w, s, y, values)
+            if step_times.shape[0] > 0:
+                record(step_times, steps.values, counters[RECORDED], t, h, t_new, theta, values)
+                counters[RECORDED] += 1
+            if next_out <= t_new or kept_times.size > 0:
+                for i in range(out.shape[0]):
+                    series_of(values[i], work.coefficients[i])
+                place = counters[KEPT]
+                counters[KEPT] += 1
+                if place < kept_times.shape[0]:
+                    kept_times[place, 0], kept_times[place, 1], kept_times[place, 2] = t, h, t_new
+                    kept_series[place] = work.coefficients[: out.shape[0]]
+            if next_out <= t_new:
+                first_out += write_outputs(
+                    t, h, theta, t_new, 0.0, False, work.coefficients, work.outputs, first_out, 0, t_out, left, out
+                )  # fmt: skip
+                counters[OUTPUT] = first_out
+                next_out = t_out[first_out] if first_out < t_out.size else math.inf
         for a in range(n_area):
-            if stress[a] > 0.0:
-                account(u[a], area[a], stress[a], theta, run[a], places, slow[a], peaks[a])
+            if form.stress[a] > 0.0:
+                account(u[a], areas[netrows.AREA, a], form.stress[a], theta, run[a], places, slow[a], peaks[a])
         for k in range(m):
             w0[k] = at(w[k], theta) if theta < 1.0 else w[k, END]
         if theta < 1.0:
@@ -428,7 +535,11 @@ def march(
         else:
             for k in range(m):
                 error[k] = places[k, N_PLACES - 1]
-        at_sources(sources, index, t_new, 0.0, s_before, slopes_now)
+        if inside:
+            for e in range(n_s):
+                s_before[e] = jump_from[e] + t_new * (jump_to[e] - jump_from[e])
+        else:
+            at_sources(sources, index, t_new, 0.0, s_before, slopes_now)
         store(shape, follow, w0, s_before, gained, y)
         if which >= 0:
             sign[which] = -sign[which]
@@ -442,4 +553,27 @@ def march(
             fresh = H_AFTER_ZERO
         control[T] = t_new
         counters[ACCEPTED] += 1
-    return DONE
+    if inside:
+        # Left in the middle of a jump: at the time where it stands.
+        aside[ERROR_Q], aside[MAGNIFIED] = control[ERROR_Q], control[MAGNIFIED]
+        control[:] = aside
+    return code
+
+
+@jit
+def _magnified(form: Form, work: Work, several: bool) -> float:
+    """Inverse distance of a step to the fold, with the modes that follow at once: they take no part in its own."""
+    whole, areas, spare = work.whole, work.areas, work.spare_cells
+    fill_coupling(whole, 0.0, form.rates, form.feed, form.tap, form.tap_s, form.c, form.g, form.home, form.cell)
+    clear(spare[netrows.CHI])
+    clear(spare[netrows.ETA])
+    combine(whole.held, work.modes[netrows.W][: form.shape.shape[0]], spare[netrows.CHI])
+    combine(whole.from_slopes, work.s, spare[netrows.CHI])
+    answer_mobile(
+        several, whole.answer, whole.gap, whole.leak, whole.cross, form.home, form.first, form.cell,
+        areas[netrows.U], areas[netrows.MORE], areas[netrows.SLOPE], areas[netrows.RATE], spare[netrows.CHI],
+        spare[netrows.ETA], spare[netrows.RHO], work.spare_areas[netrows.KNOWN], spare[netrows.SHARE], work.mixed,
+        work.matrix, work.room[3],
+    )  # fmt: skip
+    least: float = work.room[3, :NODES].min()
+    return 1.0 / least

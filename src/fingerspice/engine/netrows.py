@@ -5,9 +5,9 @@ beside that is a current j in each cell whose area follows a voltage,
 
     v' = -rates v + gain s + feed j,    j = (A - A0) (c u' + g u)  [mobile: + c u A'],    u = tap v + tap_s s.
 
-j holds the voltages' rates, but pointwise and linearly: each row solves for them, in as many unknowns as there are such
-cells, and the determinant of that is the distance to the fold. An area with dynamics of its own is one more mode, of
-rate 1 / tau. A jump of the sources is the same in the fraction of the jump, with nothing leaking: all rates zero.
+j holds the voltages' rates, but pointwise and linearly: each row solves for them (see `fingerspice.engine.coupling`),
+and where that has no solution is the fold. An area with dynamics of its own is one more mode, of rate 1 / tau. A jump
+of the sources is the same in the fraction of the jump, with nothing leaking: all rates zero.
 
 These functions take plain arrays, as those of `fingerspice.engine.rows`.
 """
@@ -19,8 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import jit, jit_inline, jit_rows
+from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.charge import DERIVATIVE
+from fingerspice.engine.coupling import STIFF, Coupling, answer_alone, answer_mobile, answer_together, new_coupling
 from fingerspice.engine.exponential import N_PLACES
 from fingerspice.engine.readout import WRITTEN_AT_ONCE
 from fingerspice.engine.rows import N_FLAT, polynomial_rows
@@ -30,14 +31,13 @@ from fingerspice.physics.contact import inverse_area
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Blocks of the modes' rows, of the cells', and of the areas'; then gap voltages and a guess of them.
+# Blocks of the modes' rows.
 W, BASE, LIN, D, PULL, USED, PULL_BEFORE, LEFT_BEFORE = range(8)
-FREE, FREE_RATE, CELL_U, DU, J = range(5)
-AREA, SLOPE, RATE, MORE, U, GUESS = range(6)
+# Of the cells': what of eta and chi follows the sources, both in whole, rho, shares of A', voltages, currents.
+ETA_S, CHI_S, ETA, CHI, RHO, SHARE, CELL_U, J = range(8)
+# Of the areas': A, dA/du, A' of what time moves, A - A0, A'; gap voltages, their guess, and what follows the sources.
+AREA, SLOPE, RATE, MORE, KNOWN, U, GUESS, U_S = range(8)
 
-# Steps over the time constant of a mode from which on its rate is taken from its polynomial: -rate w + gain s + feed j
-# would be what is left of large numbers, and j hands that on to every other mode.
-STIFF = 300.0
 # From values at the nodes to slopes at all rows, per step length: slopes = values @ TO_RATES.
 TO_RATES = np.ascontiguousarray(np.vstack([DERIVATIVE, BETWEEN.T @ DERIVATIVE]).T)
 
@@ -55,13 +55,13 @@ class Form(NamedTuple):
         v = inverse (x + follow s).
     follow : ndarray, shape (n, n_s)
     feed : ndarray, shape (m, n_f)
-    met : ndarray, shape (n_f, n_f)
-        tap @ feed.
     tap, tap_s : ndarray, shape (n_f, n) and (n_f, n_s)
     c, g : ndarray, shape (n_f,)
         Capacitance and leak of the cells per area.
     home : ndarray of int, shape (n_f,)
-        The area of each of these cells.
+        The area of each of these cells, ascending.
+    first : ndarray of int, shape (n_area + 1,)
+        Where the cells of each area begin.
     cell : ndarray of int, shape (n_area,)
         The one of them whose voltage the area follows; -1 where it is fixed.
     area0, unit : ndarray, shape (n_area,)
@@ -87,12 +87,12 @@ class Form(NamedTuple):
     inverse: FloatArray
     follow: FloatArray
     feed: FloatArray
-    met: FloatArray
     tap: FloatArray
     tap_s: FloatArray
     c: FloatArray
     g: FloatArray
     home: IntArray
+    first: IntArray
     cell: IntArray
     area0: FloatArray
     unit: FloatArray
@@ -114,7 +114,10 @@ class Form(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Arrays that steps work in; those with ROWS behind hold one value for each row of a step."""
+    """Arrays that steps work in; those with ROWS behind hold one value for each row of a step.
+
+    `own` is the coupling of the step at hand, `whole` that with no mode taken for stiff, and `inside` that of a jump.
+    """
 
     r: FloatArray
     s: FloatArray
@@ -123,8 +126,10 @@ class Work(NamedTuple):
     cells: FloatArray
     areas: FloatArray
     matrix: FloatArray
-    small: FloatArray
-    met: FloatArray
+    mixed: FloatArray
+    own: Coupling
+    whole: Coupling
+    inside: Coupling
     w0: FloatArray
     places: FloatArray
     weight: FloatArray
@@ -146,11 +151,13 @@ def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: 
         np.zeros((sources, ROWS)),
         np.zeros((sources, ROWS)),
         np.zeros((8, modes, ROWS)),
-        np.zeros((5, cells, ROWS)),
-        np.zeros((6, areas, ROWS)),
-        np.zeros((cells, cells + 1 + areas, ROWS)),
-        np.zeros((areas, areas + 1, ROWS)),
-        np.zeros((cells, cells)),
+        np.zeros((8, cells, ROWS)),
+        np.zeros((8, areas, ROWS)),
+        np.zeros((cells, cells + 1, ROWS)),
+        np.zeros((cells, areas + 1, ROWS)),
+        new_coupling(n, cells, sources),
+        new_coupling(n, cells, sources),
+        new_coupling(n, cells, sources),
         np.zeros(modes),
         np.zeros((modes, N_PLACES)),
         np.zeros(modes),
@@ -161,24 +168,54 @@ def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: 
         np.zeros((n, 5)),
         np.zeros((modes, N_PLACES - 1)),
         np.zeros((6, modes, ROWS)),
-        np.zeros((5, cells, ROWS)),
-        np.zeros((6, areas, ROWS)),
+        np.zeros((8, cells, ROWS)),
+        np.zeros((8, areas, ROWS)),
     )
 
 
 @jit_rows
 def combine(matrix: FloatArray, rows: FloatArray, out: FloatArray) -> None:
     """out += matrix @ rows, at all rows of a step."""
+    n = matrix.shape[1]
     for c in range(matrix.shape[0]):
-        for k in range(matrix.shape[1]):
-            share = matrix[c, k]
+        # Two at a time: the sum is fetched and put back half as often.
+        for k in range(0, n - 1, 2):
+            share, other = matrix[c, k], matrix[c, k + 1]
             for i in range(ROWS):
-                out[c, i] += share * rows[k, i]
+                out[c, i] += share * rows[k, i] + other * rows[k + 1, i]
+        if n % 2 == 1:
+            share = matrix[c, n - 1]
+            for i in range(ROWS):
+                out[c, i] += share * rows[n - 1, i]
 
 
 @jit_rows
-def _straight(h: float, rates: FloatArray, w: FloatArray, lin: FloatArray, out: FloatArray) -> None:
-    """What the modes' rates are without j; of stiff ones, with it."""
+def combine_from(matrix: FloatArray, rows: FloatArray, start: FloatArray, out: FloatArray) -> None:
+    """out = start + matrix @ rows, at all rows of a step."""
+    n = matrix.shape[1]
+    for c in range(matrix.shape[0]):
+        if n == 0:
+            for i in range(ROWS):
+                out[c, i] = start[c, i]
+        else:
+            share = matrix[c, 0]
+            for i in range(ROWS):
+                out[c, i] = start[c, i] + share * rows[0, i]
+        for k in range(1, n - 1, 2):
+            share, other = matrix[c, k], matrix[c, k + 1]
+            for i in range(ROWS):
+                out[c, i] += share * rows[k, i] + other * rows[k + 1, i]
+        if n > 1 and n % 2 == 0:
+            share = matrix[c, n - 1]
+            for i in range(ROWS):
+                out[c, i] += share * rows[n - 1, i]
+
+
+@jit_rows
+def mode_rates(
+    h: float, rates: FloatArray, w: FloatArray, lin: FloatArray, pull: FloatArray, stiff_only: bool, out: FloatArray
+) -> None:
+    """Rates of the modes; those of stiff ones, which may be all that is wanted, by their polynomials."""
     for k in range(w.shape[0]):
         rate = rates[k]
         if rate * h > STIFF:
@@ -188,51 +225,50 @@ def _straight(h: float, rates: FloatArray, w: FloatArray, lin: FloatArray, out: 
                 share = w[k, m] / h
                 for i in range(ROWS):
                     out[k, i] += TO_RATES[m, i] * share
-        else:
+        elif not stiff_only:
             for i in range(ROWS):
-                out[k, i] = lin[k, i] - rate * w[k, i]
-
-
-@jit
-def meet(h: float, rates: FloatArray, feed: FloatArray, tap: FloatArray, met: FloatArray) -> bool:
-    """Rates of the cells' voltages for each j, into `met` (n_f, n_f): tap @ feed but for the stiff modes.
-
-    Whether that was all of them.
-    """
-    whole = True
-    for a in range(met.shape[0]):
-        for b in range(met.shape[1]):
-            met[a, b] = 0.0
-            for k in range(tap.shape[1]):
-                if rates[k] * h > STIFF:
-                    whole = False
-                else:
-                    met[a, b] += tap[a, k] * feed[k, b]
-    return whole
+                out[k, i] = lin[k, i] - rate * w[k, i] + pull[k, i]
 
 
 @jit_rows
-def _copy(rows: FloatArray, out: FloatArray) -> None:
-    for c in range(out.shape[0]):
+def clear(rows: FloatArray) -> None:
+    for c in range(rows.shape[0]):
         for i in range(ROWS):
-            out[c, i] = rows[c, i]
+            rows[c, i] = 0.0
 
 
-@jit
-def _wanted(
-    sign: float, powers: FloatArray, slopes: FloatArray, lo: float, scale: float, curve: FloatArray, u: FloatArray,
-    area: FloatArray, slope: FloatArray,
-) -> None:  # fmt: skip
-    """Area that the gap voltages u (ROWS,) ask for on the branch of a sign, and its slope by them."""
+@jit_rows
+def _highest(sign: float, u: FloatArray) -> float:
     highest = 0.0
     for i in range(ROWS):
         highest = max(highest, sign * u[i])
-    if scale > 0.0 and highest <= curve[1]:
+    return highest
+
+
+@jit_rows
+def _invert(area: FloatArray) -> None:
+    for i in range(ROWS):
+        area[i] = 1.0 / area[i]
+
+
+@jit_rows
+def _scale_slope(factor: float, area: FloatArray, slope: FloatArray) -> None:
+    for i in range(ROWS):
+        slope[i] *= factor * area[i] * area[i]
+
+
+@jit
+def wanted(
+    slopes_too: bool, sign: float, powers: FloatArray, slopes: FloatArray, lo: float, scale: float, curve: FloatArray,
+    u: FloatArray, area: FloatArray, slope: FloatArray,
+) -> None:  # fmt: skip
+    """Area that the gap voltages u (ROWS,) ask for on the branch of a sign, and perhaps its slope by them."""
+    if scale > 0.0 and _highest(sign, u) <= curve[1]:
         polynomial_rows(powers, lo, scale, u, sign, area)
-        polynomial_rows(slopes, lo, scale, u, sign, slope)
-        for i in range(ROWS):
-            area[i] = 1.0 / area[i]
-            slope[i] *= -scale * sign * area[i] * area[i]
+        _invert(area)
+        if slopes_too:
+            polynomial_rows(slopes, lo, scale, u, sign, slope)
+            _scale_slope(-scale * sign, area, slope)
     else:
         for i in range(ROWS):
             q, dq = inverse_area(max(sign * u[i], lo), curve)
@@ -241,164 +277,93 @@ def _wanted(
 
 
 @jit_rows
-def _known(
-    mobile: bool, c: float, g: float, u: FloatArray, more: FloatArray, rate: FloatArray, known: FloatArray
-) -> None:
-    """The part of a cell's j that does not hold the voltages' rates; `more` is A - A0, `rate` what time makes of A."""
-    for i in range(ROWS):
-        known[i] = g * more[i] * u[i]
-        if mobile:
-            known[i] += c * u[i] * rate[i]
-
-
-@jit_rows
-def _add_column(met: FloatArray, b: int, at: int, factor: float, size: FloatArray, matrix: FloatArray) -> None:
-    """Take met[:, b] factor size from column `at` of the matrices (n_f, n_f + 1, ROWS)."""
-    for a in range(met.shape[0]):
-        share = factor * met[a, b]
-        for i in range(ROWS):
-            matrix[a, at, i] -= share * size[i]
-
-
-@jit_rows
-def _eliminate(matrix: FloatArray, columns: int) -> None:
-    """Solve the systems (n, n + columns, ROWS) of all rows at once; the solutions take the last columns' place.
-
-    Without pivoting: they are a unit matrix and as much again as the areas move. Pivots stay on the diagonal.
-    """
-    n = matrix.shape[0]
-    for p in range(n):
-        for a in range(p + 1, n):
-            for b in range(p + 1, n + columns):
-                for i in range(ROWS):
-                    matrix[a, b, i] -= matrix[a, p, i] / matrix[p, p, i] * matrix[p, b, i]
-    for p in range(n - 1, -1, -1):
-        for c in range(n, n + columns):
-            for b in range(p + 1, n):
-                for i in range(ROWS):
-                    matrix[p, c, i] -= matrix[p, b, i] * matrix[b, c, i]
-            for i in range(ROWS):
-                matrix[p, c, i] /= matrix[p, p, i]
-
-
-@jit
-def _fold(matrix: FloatArray, small: FloatArray, cell: IntArray, least: FloatArray) -> None:
-    """Finish what `matrix` has solved with the rates of the gaps' voltages as given, one more column each.
-
-    `least` takes the distance to the fold: the determinant of the capacitances that small changes meet, over that with
-    every area held.
-    """
-    n, n_area = matrix.shape[0], cell.size
-    for a in range(n_area):
-        for b in range(n_area + 1):
-            for i in range(ROWS):
-                small[a, b, i] = 1.0 if a == b else 0.0
-        if cell[a] >= 0:
-            for i in range(ROWS):
-                small[a, n_area, i] = matrix[cell[a], n, i]
-            for b in range(n_area):
-                for i in range(ROWS):
-                    small[a, b, i] -= matrix[cell[a], n + 1 + b, i]
-    _eliminate(small, 1)
-    for i in range(ROWS):
-        least[i] = 1.0
-    for a in range(n_area):
-        for i in range(ROWS):
-            least[i] *= small[a, a, i]
-        for c in range(n):
-            for i in range(ROWS):
-                matrix[c, n, i] += matrix[c, n + 1 + a, i] * small[a, n_area, i]
-
-
-@jit
-def couple(
-    mobile: bool, met: FloatArray, c: FloatArray, home: IntArray, cell: IntArray, u: FloatArray, slope: FloatArray,
-    more: FloatArray, du: FloatArray, known: FloatArray, matrix: FloatArray, small: FloatArray, least: FloatArray,
+def _moving(
+    mobile: bool, h: float, rate_k: float, pace: float, unit: float, w: FloatArray, lin: FloatArray, d: FloatArray,
+    forced: FloatArray, area: FloatArray, slope: FloatArray, rate: FloatArray,
 ) -> None:  # fmt: skip
-    """Rates of the cells' voltages into column n_f of `matrix`, from those without j and what of j is known.
-
-    Under `mobile`, c u A' holds the rate of the gap's own voltage: one more unknown for each area.
-    """
-    n_f = c.size
-    columns = 1 + cell.size if mobile else 1
-    for a in range(n_f):
-        for b in range(n_f + columns):
-            for i in range(ROWS):
-                matrix[a, b, i] = 1.0 if a == b else 0.0
-        for i in range(ROWS):
-            matrix[a, n_f, i] = du[a, i]
-    for b in range(n_f):
-        _add_column(met, b, b, c[b], more[home[b]], matrix)
-        _add_column(met, b, n_f, -1.0, known[b], matrix)
-        if mobile:
-            for i in range(ROWS):
-                least[i] = u[b, i] * slope[home[b], i]
-            _add_column(met, b, n_f + 1 + home[b], -c[b], least, matrix)
-    _eliminate(matrix, columns)
+    """An area with dynamics: its forcing by the area wanted, which stands in `area`; then itself, and its rate."""
+    for i in range(ROWS):
+        forced[i] = pace / unit * area[i]
+        area[i] = unit * w[i]
+        slope[i] = 0.0
     if mobile:
-        _fold(matrix, small, cell, least)
+        for i in range(ROWS):
+            rate[i] = unit * (d[i] if rate_k * h > STIFF else lin[i] - rate_k * w[i] + forced[i])
 
 
 @jit_rows
-def _times(factor: float, a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+def _subtract(area: FloatArray, area0: float, more: FloatArray) -> None:
     for i in range(ROWS):
-        out[i] += factor * a[i] * b[i]
+        more[i] = area[i] - area0
 
 
-@jit_inline
+@jit_within
 def evaluate(
-    mobile: bool, h: float, rates: FloatArray, feed: FloatArray, tap: FloatArray, met: FloatArray, c: FloatArray,
-    g: FloatArray, home: IntArray, cell: IntArray, area0: FloatArray, unit: FloatArray, slow: IntArray,
-    pace: FloatArray, powers: FloatArray, slopes: FloatArray, lo: FloatArray, scale: FloatArray, curves: FloatArray,
-    sign: FloatArray, w: FloatArray, lin: FloatArray, d: FloatArray, pull: FloatArray, cells: FloatArray,
-    areas: FloatArray, matrix: FloatArray, small: FloatArray, least: FloatArray,
+    form: Form, coupling: Coupling, several: bool, h: float, rates: FloatArray, pace: FloatArray, sign: FloatArray,
+    w: FloatArray, lin: FloatArray, d: FloatArray, pull: FloatArray, cells: FloatArray, areas: FloatArray,
+    matrix: FloatArray, mixed: FloatArray, least: FloatArray,
 ) -> bool:  # fmt: skip
-    """Voltages and currents of the cells from the modes w (m, ROWS), and what the areas add to the modes' rates.
+    """What the areas add to the modes' rates, into `pull` (m, ROWS), from the modes w (m, ROWS).
 
-    `lin` is gain s, and `d` takes the modes' rates without j. `cells` and `areas` are blocks of rows: of the cells what
-    of the voltages and their rates follows the sources, then voltages, rates and j; of the areas A, dA/du, A' of what
-    time moves, and A - A0. False past a fold; under `mobile`, `least` (ROWS,) takes the distance to it.
+    `lin` is gain s, and `d` takes the rates of stiff modes. `cells` and `areas` are blocks of rows, whose parts that
+    follow the sources are given. False past a fold; under `mobile`, `least` (ROWS,) takes the distance to it.
     """
-    n = tap.shape[1]
-    free, free_rate, u, du, j = cells[FREE], cells[FREE_RATE], cells[CELL_U], cells[DU], cells[J]
+    mobile = form.mobile
+    n = form.gap.shape[1]
+    stiff = coupling.stiff[0] > 0
+    u, eta, chi, rho = areas[U], cells[ETA], cells[CHI], cells[RHO]
     area, slope, rate, more = areas[AREA], areas[SLOPE], areas[RATE], areas[MORE]
-    _straight(h, rates, w, lin, d)
-    _copy(free, u)
-    combine(tap, w[:n], u)
-    _copy(free_rate, du)
-    combine(tap, d[:n], du)
-    for k in range(pull.shape[0]):
-        for i in range(ROWS):
-            pull[k, i] = 0.0
-    for a in range(cell.size):
-        if cell[a] >= 0:
-            _wanted(sign[a], powers[a], slopes[a], lo[a], scale[a], curves[a], u[cell[a]], area[a], slope[a])
-            k = slow[a]
+    combine_from(form.gap, w, areas[U_S], u)
+    clear(pull)
+    if stiff:
+        mode_rates(h, rates, w, lin, pull, True, d)
+    for a in range(form.cell.size):
+        if form.cell[a] >= 0:
+            wanted(
+                mobile, sign[a], form.powers[a], form.slopes[a], form.lo[a], form.scale[a], form.curves[a], u[a],
+                area[a], slope[a],
+            )  # fmt: skip
+            k = form.slow[a]
             if k >= 0:
-                for i in range(ROWS):
-                    pull[k, i] = pace[a] / unit[a] * area[a, i]
-                    area[a, i] = unit[a] * w[k, i]
-                    slope[a, i] = 0.0
-                    rate[a, i] = unit[a] * (d[k, i] if rates[k] * h > STIFF else d[k, i] + pull[k, i])
-            for i in range(ROWS):
-                more[a, i] = area[a, i] - area0[a]
-    n_f = c.size
-    for a in range(n_f):
-        _known(mobile, c[a], g[a], u[a], more[home[a]], rate[home[a]], j[a])
-    couple(mobile, met, c, home, cell, u, slope, more, du, j, matrix, small, least)
+                _moving(
+                    mobile, h, rates[k], pace[a], form.unit[a], w[k], lin[k], d[k], pull[k], area[a], slope[a], rate[a]
+                )  # fmt: skip
+            _subtract(area[a], form.area0[a], more[a])
+    combine_from(coupling.from_modes, w, cells[ETA_S], eta)
+    if stiff:
+        combine(coupling.from_stiff, d[:n], eta)
     if mobile:
+        combine_from(coupling.held, w, cells[CHI_S], chi)
+        answer_mobile(
+            several, coupling.answer, coupling.gap, coupling.leak, coupling.cross, form.home, form.first, form.cell, u,
+            more, slope, rate, chi, eta, rho, areas[KNOWN], cells[SHARE], mixed, matrix, least,
+        )  # fmt: skip
         for i in range(ROWS):
             # NaN is no solution either.
             if not least[i] > 0.0:
                 return False
-    for b in range(n_f):
-        for i in range(ROWS):
-            du[b, i] = matrix[b, n_f, i]
-    for b in range(n_f):
-        _times(c[b], more[home[b]], du[b], j[b])
-        if mobile:
-            for i in range(ROWS):
-                matrix[b, n_f, i] = u[b, i] * slope[home[b], i]
-            _times(c[b], matrix[b, n_f], du[cell[home[b]]], j[b])
-    combine(feed, j, pull)
+    elif several:
+        answer_together(form.home, coupling.answer, coupling.cross, more, cells[SHARE], eta, rho)
+    else:
+        answer_alone(form.home, coupling.answer, more, eta, rho)
+    combine(coupling.feed, rho, pull[:n])
     return True
+
+
+@jit_within
+def follow_sources(
+    form: Form, coupling: Coupling, gain: FloatArray, s: FloatArray, ds: FloatArray, lin: FloatArray,
+    cells: FloatArray, areas: FloatArray,
+) -> None:  # fmt: skip
+    """What of a step's rows follows the sources alone; see `evaluate`."""
+    n = form.gap.shape[1]
+    clear(lin)
+    combine(gain, s, lin)
+    clear(cells[ETA_S])
+    combine(coupling.from_rates, lin[:n], cells[ETA_S])
+    combine(coupling.from_slopes, ds, cells[ETA_S])
+    combine(coupling.from_sources, s, cells[ETA_S])
+    clear(cells[CHI_S])
+    combine(coupling.from_slopes, s, cells[CHI_S])
+    clear(areas[U_S])
+    combine(form.gap_s, s, areas[U_S])

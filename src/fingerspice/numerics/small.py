@@ -56,3 +56,42 @@ def invert(matrix: FloatArray | ComplexArray) -> bool:
         for j in range(n):
             matrix[row, j] = swapped[j]
     return True
+
+
+@jit
+def diagonalise(matrix: FloatArray, vectors: FloatArray) -> None:
+    """Eigenvalues of a symmetric matrix (n, n) onto its diagonal, eigenvectors into the columns of `vectors` (n, n).
+
+    By Jacobi's cyclic rotations, which keep small eigenvalues to their own rounding (Golub and Van Loan, section 8.5).
+    """
+    n = matrix.shape[0]
+    for p in range(n):
+        for q in range(n):
+            vectors[p, q] = 1.0 if p == q else 0.0
+    for _ in range(60):
+        rotated = False
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                x = matrix[p, q]
+                if abs(x) <= 1e-17 * np.sqrt(abs(matrix[p, p] * matrix[q, q])) or abs(x) < 1e-300:
+                    continue
+                rotated = True
+                ratio = 0.5 * (matrix[q, q] - matrix[p, p]) / x
+                t = 1.0 / (abs(ratio) + np.sqrt(1.0 + ratio * ratio))
+                if ratio < 0.0:
+                    t = -t
+                c = 1.0 / np.sqrt(1.0 + t * t)
+                s = t * c
+                matrix[p, p] -= t * x
+                matrix[q, q] += t * x
+                matrix[p, q] = matrix[q, p] = 0.0
+                for k in range(n):
+                    if k not in (p, q):
+                        a, b = matrix[k, p], matrix[k, q]
+                        matrix[k, p] = matrix[p, k] = c * a - s * b
+                        matrix[k, q] = matrix[q, k] = s * a + c * b
+                    a, b = vectors[k, p], vectors[k, q]
+                    vectors[k, p] = c * a - s * b
+                    vectors[k, q] = s * a + c * b
+        if not rotated:
+            return

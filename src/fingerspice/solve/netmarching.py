@@ -22,7 +22,7 @@ from fingerspice.physics.contact import inverse_areas
 from fingerspice.results.network_record import bare_record
 from fingerspice.results.outcome import Status
 from fingerspice.results.steps import Recorded, Recorder
-from fingerspice.solve.netruns import Integration, NetworkRun, integrate, ramp, state_error, values_at
+from fingerspice.solve.netruns import Integration, NetworkRun, held, integrate, state_error
 from fingerspice.solve.networks import NetworkProblem, NetworkScene
 from fingerspice.solve.runs import Progress
 from fingerspice.solve.settling import Settling
@@ -52,9 +52,8 @@ class Reference:
 
     Attributes
     ----------
-    form, jump : Form
-        For time, and for the inside of a jump of the sources.
-    tables, jump_tables : Tables
+    form : Form
+    tables : Tables
     size : ndarray, shape (n,)
         Voltage that each mode of the live voltages moves, V.
     tau : float
@@ -64,9 +63,7 @@ class Reference:
     """
 
     form: Form
-    jump: Form
     tables: Tables
-    jump_tables: Tables
     size: FloatArray
     tau: float
     magnified: FloatArray
@@ -95,6 +92,7 @@ def _make_reference(scene: NetworkScene, area: FloatArray, tol: float) -> Refere
     n_slow = int(np.count_nonzero(slow))
     follows = net.gap >= 0
     fed = np.flatnonzero([i >= 0 and follows[i] for i in net.place])
+    fed = fed[np.argsort(net.place[fed], kind="stable")]
     tap, tap_s = network.p @ modes.shape, network.q - network.p @ modes.follow
     feed = np.vstack([-modes.take[:, fed], np.zeros((n_slow, fed.size))])
     gap, gap_s, stress = np.zeros((area.size, n)), np.zeros((area.size, n_s)), np.zeros(area.size)
@@ -117,12 +115,12 @@ def _make_reference(scene: NetworkScene, area: FloatArray, tol: float) -> Refere
         inverse=_packed(modes.inverse),
         follow=_packed(modes.follow),
         feed=_packed(feed),
-        met=_packed(tap[fed] @ feed[:n]),
         tap=_packed(tap[fed]),
         tap_s=_packed(tap_s[fed]),
         c=net.c[fed],
         g=net.g_area[fed],
         home=net.place[fed],
+        first=np.searchsorted(net.place[fed], np.arange(area.size + 1)),
         cell=np.array([int(np.flatnonzero(fed == i)[0]) if i >= 0 else -1 for i in net.gap], np.int64),
         area0=area.copy(),
         unit=scene.area0.copy(),
@@ -142,13 +140,9 @@ def _make_reference(scene: NetworkScene, area: FloatArray, tol: float) -> Refere
         lost_s=_packed(network.through @ (leak * tap_s) - at_x @ modes.follow + at_s),
         through=_packed(network.through[:, fed]),
     )
-    jump = form._replace(
-        rates=np.zeros_like(form.rates), gain=np.zeros_like(form.gain), g=np.zeros_like(form.g),
-        pace=np.zeros_like(form.pace), lost=np.zeros_like(form.lost), lost_s=np.zeros_like(form.lost_s),
-    )  # fmt: skip
     fastest = float(form.rates.max(initial=0.0))
     return Reference(
-        form, jump, new_tables(n + n_slow), new_tables(n + n_slow), np.linalg.norm(modes.shape, axis=0),
+        form, new_tables(n + n_slow), np.linalg.norm(modes.shape, axis=0),
         1.0 / fastest if fastest > 0.0 else math.inf,
         _magnified(modes, gap, gap_s),
     )  # fmt: skip
@@ -209,26 +203,18 @@ class March(Integration):
     def t(self) -> float:
         return float(self.control[readout.T])
 
-    def _march(self, sources: Sources, jump: bool, t_end: float, control: FloatArray, branch: FloatArray) -> int:
+    def _march(self, sources: Sources, t_end: float) -> int:
         reference = self.reference
-        form, tables = (reference.jump, reference.jump_tables) if jump else (reference.form, reference.tables)
-        pace = self.pace._replace(h_max=1.0) if jump else self.pace
-        outputs = (self.t_out[:0], self.left[:0], self.out[:, :0].copy()) if jump else (self.t_out, self.left, self.out)
         size = np.append(reference.size, np.full(self.n_slow, self.u_scale))
-        kept = repetition.new_kept(0, self.width) if jump else self.kept
-        room = readout.new_steps(0, self.recorder.columns) if jump else self.recorder.room
-        # In a jump time stands still: its own are fractions.
-        before = self.s_before.copy() if jump else self.s_before
         taken = int(self.counters[readout.ACCEPTED] + self.counters[readout.REJECTED])
-        times = 0.0 if jump else (t_end - self.t) / self.shortest
-        control[netmarch.MOST] = taken + MOST_STEPS * (4.0 + sources.edges.size + times)
+        self.control[netmarch.MOST] = taken + MOST_STEPS * (4.0 + sources.edges.size + (t_end - self.t) / self.shortest)
         while True:
             code = netmarch.march(
-                form, pace, tables, self.work, self.integral, size, sources, jump,
-                math.inf if jump else reference.tau, t_end, self.y, self.error, self.sign, before, branch, control,
-                self.counters, self.met, self.collected, *outputs, kept, room, self.tried,
+                reference.form, self.pace, reference.tables, self.work, self.integral, size, sources, reference.tau,
+                t_end, self.y, self.error, self.sign, self.s_before, self.branch, self.control, self.counters, self.met,
+                self.collected, self.t_out, self.left, self.out, self.kept, self.recorder.room, self.tried,
             )  # fmt: skip
-            if not jump and self.counters[readout.RECORDED] >= len(room.times):
+            if self.counters[readout.RECORDED] >= len(self.recorder.room.times):
                 self.recorder.drain(self.counters)
             if code != netmarch.PAUSED:
                 return int(code)
@@ -302,25 +288,17 @@ class March(Integration):
 
     def _to(self, sources: Sources, t_end: float) -> Status:
         while True:
-            code = self._march(sources, False, t_end, self.control, self.branch)
+            code = self._march(sources, t_end)
             if code == netmarch.DONE:
                 return Status.SUCCESS
             if code == netmarch.TOO_MANY:
                 return Status.TOO_MANY_STEPS
-            if code == netmarch.REFERENCE:
-                self._change_reference()
-            elif code != netmarch.JUMP or not self.jump(values_at(sources, self.t)):
+            if code != netmarch.REFERENCE:
                 return self.stuck()
+            self._change_reference()
 
     def jump(self, after: FloatArray) -> bool:
-        control, branch, sign = np.zeros_like(self.control), np.zeros_like(self.branch), self.sign.copy()
-        kept = [readout.ERROR_Q, readout.MAGNIFIED]
-        control[kept] = self.control[kept]
-        code = self._march(ramp(self.s_before, after), True, 1.0, control, branch)
-        self.control[kept] = control[kept]
-        self.s_before[:] = after
-        self.branch[self.sign != sign] = self.t, math.inf
-        return code == netmarch.DONE
+        return self._march(held(self.t, after), self.t) == netmarch.DONE
 
     def _change_reference(self) -> None:
         """Go on around the reference nearest to the areas now, and carry the error of the modes over."""
@@ -337,6 +315,8 @@ class March(Integration):
         self.levels = tuple(levels)
         self.reference = reference_at(self.problem.scene, self.levels, self.decade)
         self.error[: self.n] = self.reference.form.inverse @ (old.form.shape @ self.error[: self.n])
+        for coupling in (self.work.own, self.work.whole, self.work.inside):
+            coupling.stiff[0] = -1
 
 
 def solve_network(

@@ -130,6 +130,14 @@ def ramp(before: FloatArray, after: FloatArray) -> Sources:
     return Sources(2 * np.arange(before.size + 1, dtype=np.int64), edges, terms, np.zeros((before.size, 0)))
 
 
+def held(t: float, values: FloatArray) -> Sources:
+    """Sources that stand at these values from t (s) on."""
+    terms = np.zeros((values.size, 1, 6))
+    terms[:, 0, 0] = values
+    edges = np.tile([t, t + 1.0], values.size)
+    return Sources(2 * np.arange(values.size + 1, dtype=np.int64), edges, terms, np.zeros((values.size, 0)))
+
+
 class Integration(ABC):
     """One integration in progress.
 
