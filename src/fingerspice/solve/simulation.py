@@ -15,7 +15,6 @@ from fingerspice.circuit.arguments import Parameters, Sources, overridden, requi
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.notices import circuit_warnings
 from fingerspice.circuit.statespace import is_stack
-from fingerspice.numerics.tableaus import TABLEAUS
 from fingerspice.results.network_record import NetworkRecord
 from fingerspice.results.outcome import ErrorEstimate, Failure, Status
 from fingerspice.results.plan import Plan
@@ -311,27 +310,20 @@ def _run(
         from fingerspice.solve.foreign import solve_foreign
 
         return solve_foreign(problem, library, name, rtol, t_out, left), method
-    if method in ("auto", "exponential"):
-        run = solve_marching(problem, rtol, t_out, left, progress, repeat=method == "auto")
-        if run.status not in (Status.FOLD, Status.TOO_MANY_STEPS) or method == "exponential":
-            return run, "exponential"
-        from fingerspice.solve.folding import lead_to_fold, run_to_fold
-        from fingerspice.solve.stepping import solve
+    from fingerspice.solve.stacked import solve_implicit
 
-        folded = run_to_fold(problem, t_out, left) if run.status is Status.FOLD else None
-        if folded is not None:
-            return folded, "exponential"
-        # No fold is near, or none at all: for an implicit method, which no fast mode holds up.
-        run = solve(problem, rtol, TABLEAUS["radau9"], t_out, left, progress)
-        if run.status is Status.FOLD:
-            run = lead_to_fold(problem, run, t_out, left) or run
-        return run, "radau9"
-    if method not in TABLEAUS:
-        known = ["auto", "exponential", *TABLEAUS, "scipy:NAME", "torchdiffeq:NAME"]
-        raise InputError(f"unknown method {method!r}; allowed: {', '.join(known)}")
-    from fingerspice.solve.stepping import solve
+    if method == "radau":
+        return solve_implicit(problem, rtol, t_out, left, progress), method
+    run = solve_marching(problem, rtol, t_out, left, progress, repeat=method == "auto")
+    if run.status not in (Status.FOLD, Status.TOO_MANY_STEPS) or method == "exponential":
+        return run, "exponential"
+    from fingerspice.solve.folding import run_to_fold
 
-    return solve(problem, rtol, TABLEAUS[method], t_out, left, progress), method
+    folded = run_to_fold(problem, t_out, left) if run.status is Status.FOLD else None
+    if folded is not None:
+        return folded, "exponential"
+    # No fold is near, or none at all: for an implicit method, which no fast mode holds up.
+    return solve_implicit(problem, rtol, t_out, left, progress), "radau"
 
 
 def _solution(
