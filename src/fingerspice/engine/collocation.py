@@ -19,9 +19,18 @@ from fingerspice.engine.network import (
     lend_room,
     rates,
 )
-from fingerspice.engine.radau import NFEV, Scheme, Work, guess, lend_work, linearise, step
+from fingerspice.engine.radau import (
+    NFEV,
+    Scheme,
+    Work,
+    dense_polynomial,
+    dense_state,
+    guess,
+    lend_work,
+    linearise,
+    step,
+)
 from fingerspice.engine.readout import note
-from fingerspice.engine.steps import dense_polynomial, dense_state
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

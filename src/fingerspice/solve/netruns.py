@@ -43,6 +43,7 @@ class NetworkRun:
     t_failed: float | None = None
     unseen: tuple[float, float] | None = None
     margin: float = 1.0
+    detail: str = ""
     tried: tuple[Attempt, ...] = ()
     # The row at the time a failed run reached.
     here: FloatArray | None = None

@@ -16,7 +16,7 @@ from fingerspice.engine.collocation import advance
 from fingerspice.engine.network import Sources, new_room
 from fingerspice.engine.radau import Scheme, new_work
 from fingerspice.engine.readout import TRIED
-from fingerspice.numerics.tableaus import radau
+from fingerspice.numerics.radau_tableau import radau
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import Status
 from fingerspice.solve.netruns import Integration, NetworkRun, gap_signals, integrate, ramp, state_error, values_at
@@ -49,7 +49,7 @@ FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
 
 
 @cache
-def _scheme(stages: int) -> Scheme:
+def radau_scheme(stages: int) -> Scheme:
     """Radau IIA with its matrix diagonalised."""
     tableau = radau(stages)
     values, vectors = np.linalg.eig(tableau.a)
@@ -58,7 +58,7 @@ def _scheme(stages: int) -> Scheme:
     # A conjugate pair gives twice the real part of one.
     twice = np.where(values.imag[upper] > 1e-12, 2.0, 1.0)
     return Scheme(
-        tableau.a, tableau.c, np.ascontiguousarray(tableau.e[0]), tableau.dense, values[upper].astype(complex),
+        tableau.a, tableau.c, tableau.e, np.ascontiguousarray(tableau.dense), values[upper].astype(complex),
         np.ascontiguousarray(back[upper].astype(complex)),
         np.ascontiguousarray((vectors[:, upper] * twice).astype(complex)), np.inf,
     )  # fmt: skip
@@ -144,7 +144,7 @@ def solve_coupled(
     The error is stated from a second run with a larger tolerance.
     """
     longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
-    fine, coarse = (_scheme(stages)._replace(h_max=longest) for stages in (STAGES, STAGES_BESIDE))
+    fine, coarse = (radau_scheme(stages)._replace(h_max=longest) for stages in (STAGES, STAGES_BESIDE))
     at, side, probed = _with_probes(problem, t_out, left)
     n = problem.network.k.shape[0]
     u_scale = max(problem.scene.u_peak, float(np.abs(problem.initial.y[:n]).max(initial=0.0)))
@@ -167,11 +167,12 @@ def solve_coupled(
             if last and moved > FOLD_SPREAD * folded:
                 run.status = Status.ERROR_NOT_MET
             tol = max(0.03 * tol, FINEST)
-        elif run.status is not Status.SUCCESS or worst <= 1.0:
+        elif run.status is not Status.SUCCESS or (worst <= 1.0 and beside.status is not Status.FOLD):
             break
         else:
+            # The coarser run may meet a fold that this one has passed.
             run.status = Status.ERROR_NOT_MET if last else run.status
-            tol = max(tol * min(0.3, 0.5 / worst), FINEST)
+            tol = max(tol * min(0.3, 0.5 / worst if worst > 0.0 else 0.3), FINEST)
         if last:
             break
     if problem.scene.net.mobile:

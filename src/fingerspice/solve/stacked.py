@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fingerspice.circuit.circuit import Element
 from fingerspice.circuit.network import Cell, Network
 from fingerspice.circuit.topology import Area
-from fingerspice.engine.model import branch_area, choose_branch, dot, gap_voltage
+from fingerspice.engine.model import branch_area, choose_branch, dot, fold_margin, gap_voltage
 from fingerspice.engine.network import Net
 from fingerspice.physics.contact import inverse_area, inverse_areas
 from fingerspice.results.outcome import NetworkState, State, Status
@@ -25,19 +25,21 @@ from fingerspice.solve.runs import BoolArray, Progress, Run
 FloatArray = NDArray[np.float64]
 
 
-def solve_implicit(
-    problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None = None
+def solve_otherwise(
+    problem: Problem, method: str, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None = None
 ) -> Run:
-    """Integrate a stack by Radau collocation; see `nodal.solve_coupled`. A fold is met to rounding."""
+    """Integrate a stack by ``"radau"`` or a library's method, as any network. A fold is met to rounding."""
     network = as_network(problem)
-    run = as_stack(problem, network, solve_coupled(network, rtol, t_out, left, progress))
-    if run.status is Status.FOLD:
-        run = lead_to_fold(problem, run, t_out, left) or run
-    return run
+    if method == "radau":
+        run = as_stack(problem, network, solve_coupled(network, rtol, t_out, left, progress))
+        return (lead_to_fold(problem, run, t_out, left) or run) if run.status is Status.FOLD else run
+    from fingerspice.solve.foreign import solve_foreign
+
+    return as_stack(problem, network, solve_foreign(network, method, rtol, t_out, left, progress))
 
 
 def as_network(problem: Problem) -> NetworkProblem:
-    """The problem of a stack in the states of `engine.network`: the voltages of all its cells but one, and the charge."""
+    """The problem of a stack in the states of `engine.network`: all its cells' voltages but one, and the charge."""
     scene: NetworkScene | None = problem.scene.prepared.get("network")
     if scene is None:
         scene = problem.scene.prepared.setdefault("network", _scene(problem.scene))
@@ -48,8 +50,7 @@ def as_network(problem: Problem) -> NetworkProblem:
 
 
 def _scene(scene: Scene) -> NetworkScene:
-    stack, model = scene.stack, scene.model
-    network = _network(scene)
+    model, network = scene.model, _network(scene)
     net = Net(
         mobile=model.mobile,
         p=network.p,
@@ -77,10 +78,9 @@ def _network(scene: Scene) -> Network:
     stack, nodes = scene.stack, ("1", "0")
     order = stack.state_order
     n = len(order) - 1
-    cells = tuple(
-        Cell(stack.layers[stack.layer_of(i)], nodes, float(stack.c[i]), float(stack.g_total[i]), float(stack.g_area[i]), 0)
-        for i in order
-    )
+    layers = [stack.layers[stack.layer_of(i)] for i in order]
+    constants = np.column_stack([stack.c, stack.g_total, stack.g_area])[list(order)].tolist()
+    cells = tuple(Cell(e, nodes, c, g, g_area, 0) for e, (c, g, g_area) in zip(layers, constants, strict=True))
     gap_layer = stack.gap_layer
     # The current is that of the cell that leaks least, where it suffers least from cancellation.
     slowest = order.index(int(np.argmin(stack.leak_rates(scene.model.area0))))
@@ -142,13 +142,17 @@ def as_stack(problem: Problem, network: NetworkProblem, run: NetworkRun) -> Run:
     held = u_before / inverse / model.s if model.mobile else 0.0
     state = np.append((y[:n] - model.k[:-1] * u_before) / scale, y[n] + offset - held)
     peak_u, peak_f = run.gaps[0, :2]
+    margin = run.margin
+    if model.coupled:
+        # At 0 V the branch that follows may be past its fold.
+        margin = min(margin, float(fold_margin(model, float(dot(model.gap, state)), here, run.state.sign[0] or 1.0)))
     return Run(
         run.t, run.left, np.ascontiguousarray(live if len(stack.layers) > n else stack.grouping @ live),
         z if problem.charge else None,
         run.rows[:, n + 1].copy() if problem.charge else None,
         run.status, run.error, max(float(peak_u), float(run.peaks[0])), float(peak_f), run.nfev, run.stats,
         State(run.state.t, state, u_before, offset, problem.scene.charge_law, here),
-        t_failed=run.t_failed, unseen=run.unseen, margin=run.margin, tried=run.tried,
+        t_failed=run.t_failed, detail=run.detail, unseen=run.unseen, margin=margin, tried=run.tried,
     )  # fmt: skip
 
 
