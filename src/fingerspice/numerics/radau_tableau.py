@@ -5,10 +5,12 @@ Hairer and Wanner, Solving Ordinary Differential Equations II (1996), IV.5. The 
 
 from __future__ import annotations
 
+import math
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial import legendre, polynomial
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
@@ -47,21 +49,21 @@ def radau(stages: int) -> Tableau:
         roots -= legendre.legval(roots, coefficients) / legendre.legval(roots, legendre.legder(coefficients))
     c = 0.5 * (roots + 1.0)
     c[-1] = 1.0
-    # The derivative is the interpolant of the stages; its integral is the dense output.
-    power = np.linalg.inv(np.vander(c, increasing=True))
-    dense = (power / np.arange(1.0, s + 1.0)[:, None]).T
-    a = (np.vander(c, s, increasing=True) * c[:, None]) @ dense.T
-    top = np.zeros((s + 1, s))
-    top[1:] = dense.T
-    e = np.array([legendre.poly2leg(_on_symmetric_interval(top[:, i]))[s] for i in range(s)])
-    return Tableau(a, c, e, dense)
+    # The derivative is the interpolant of the stages; its integral is the dense output. In fractions: the coefficients
+    # of the interpolant cancel over many digits, and rounding would leave 3e-13 of a step of seven stages.
+    at = [Fraction(float(x)) for x in c]
+    dense = [[x / (d + 1) for d, x in enumerate(_cardinal(at, i))] for i in range(s)]
+    a = [[sum(x * t ** (d + 1) for d, x in enumerate(row)) for row in dense] for t in at]
+    # The highest coefficient of the shifted Legendre polynomial of degree s is (2 s)! / s!^2.
+    e = [row[-1] / math.comb(2 * s, s) for row in dense]
+    return Tableau(np.array(a, float), c, np.array(e, float), np.array(dense, float))
 
 
-def _on_symmetric_interval(coefficients: FloatArray) -> FloatArray:
-    """Coefficients in x of a polynomial given in theta = (1 + x) / 2."""
-    out = np.zeros(1)
-    for value in coefficients[::-1]:
-        out = polynomial.polyadd(polynomial.polymul(out, [0.5, 0.5]), [value])
-    full = np.zeros(coefficients.size)
-    full[: out.size] = out
-    return full
+def _cardinal(at: list[Fraction], i: int) -> list[Fraction]:
+    """Coefficients of 1, theta, ... of the polynomial that is 1 at one of the nodes and 0 at the others."""
+    out = [Fraction(1)]
+    for j, t in enumerate(at):
+        if j != i:
+            higher, lower = [Fraction(0), *out], [*out, Fraction(0)]
+            out = [(x - t * y) / (at[i] - t) for x, y in zip(higher, lower, strict=True)]
+    return out
