@@ -41,8 +41,8 @@ PROBES, PROBES_PER_PERIOD, MOST_PROBES = 512, 32, 20_000
 # And after so many edges of the sources, in parts of the time to the next one.
 MOST_EDGES, AFTER_EDGE = 256, np.geomspace(1e-15, 0.3, 30)
 ATTEMPTS = 6
-# Two runs that meet a fold agree on its time to this, relative. Where no further attempt does, a fold is believed that
-# the last two meet as near to each other as the second figure.
+# Two runs that meet a fold agree on its time to this, relative. Where none do, a fold is believed that two of them meet
+# as near to each other as the second figure.
 FOLD_TIME, FOLD_SPREAD = 1e-10, 1e-5
 # Steps taken and refused, to begin with and over the run: what needs more has a cause that smaller steps do not mend.
 FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
@@ -152,6 +152,7 @@ def solve_coupled(
         u_scale = _voltage_scale(problem, coarse, max(u_scale, 1.0))
     tol, nfev = LOCAL_SHARE * rtol, 0
     folded = math.inf
+    nearest: tuple[float, NetworkRun] | None = None
     for attempt in range(ATTEMPTS):
         beside = _integrate(problem, coarse, BESIDE * tol, u_scale, at[probed], side[probed], None)
         run = _integrate(problem, fine, tol, u_scale, at, side, progress)
@@ -161,11 +162,11 @@ def solve_coupled(
         last = tol <= FINEST or attempt == ATTEMPTS - 1
         if run.status is Status.FOLD and run.t_failed is not None:
             # What the state is off moves the fold: closer, until its time stays.
-            moved, folded = abs(run.t_failed - folded), run.t_failed
-            if moved <= FOLD_TIME * folded:
+            moved, folded = abs(run.t_failed - folded) / run.t_failed if run.t_failed > 0.0 else 0.0, run.t_failed
+            if nearest is None or moved < nearest[0]:
+                nearest = moved, run
+            if moved <= FOLD_TIME:
                 break
-            if last and moved > FOLD_SPREAD * folded:
-                run.status = Status.ERROR_NOT_MET
             tol = max(0.03 * tol, FINEST)
         elif run.status is not Status.SUCCESS or (worst <= 1.0 and beside.status is not Status.FOLD):
             break
@@ -175,6 +176,11 @@ def solve_coupled(
             tol = max(tol * min(0.3, 0.5 / worst if worst > 0.0 else 0.3), FINEST)
         if last:
             break
+    believed = nearest is not None and nearest[0] <= FOLD_SPREAD
+    if nearest is not None and (run.status is Status.FOLD or (believed and run.status is not Status.SUCCESS)):
+        # The finest tolerances may be those of rounding: the fold is where two runs came nearest to each other.
+        run = nearest[1]
+        run.status, run.nfev = Status.FOLD if believed else Status.ERROR_NOT_MET, nfev
     if problem.scene.net.mobile:
         run.margin = float(problem.record(run).fold_margin.min(initial=1.0))
     run = _only(run, ~probed)
