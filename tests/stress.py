@@ -153,7 +153,7 @@ def compiled() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", fs.FingerspiceWarning)
         for law in ("local", "mobile"):
-            for method in ("auto", "dop853"):
+            for method in ("auto", "radau"):
                 fs.simulate(folding, t_stop=1e-3, charge_law=law, method=method, rtol=1e-3, throw=False)
 
 

@@ -85,16 +85,16 @@ def test_set_changes_values_all_at_once_with_units_and_in_any_case(command: Comm
 
 
 def test_source_area_method_law_and_rtol_are_those_of_the_interface(command: Command) -> None:
-    words = ["--source", "PULSE(-150 150 0 0 0 2m 10m)", "--area", "30u", "--method", "dp5"]
+    words = ["--source", "PULSE(-150 150 0 0 0 2m 10m)", "--area", "30u", "--method", "radau"]
     report = figures(
         command("run", "pad.cir", "--json", "--no-plot", *words, "--charge-law", "mobile", "--rtol", "1e-6")
     )
     circuit = fs.read_netlist("pad.cir").replace({"Vdrive": fs.Pulse(-150, 150, 0, 0, 0, 2e-3, 0.01)})
-    solution = fs.simulate(circuit, area=30e-6, method="dp5", charge_law="mobile", rtol=1e-6)
+    solution = fs.simulate(circuit, area=30e-6, method="radau", charge_law="mobile", rtol=1e-6)
     assert row(report, "u_gap")["max"] == solution.summary()["u_gap_max"]
     with xarray.open_dataset("out/pad.nc") as data:
         used = {key: data.attrs[key] for key in ("method", "charge_law", "rtol", "area")}
-    assert used == {"method": "dp5", "charge_law": "mobile", "rtol": "1e-06", "area": "3e-05 m^2"}
+    assert used == {"method": "radau", "charge_law": "mobile", "rtol": "1e-06", "area": "3e-05 m^2"}
 
 
 def test_a_deck_without_gap_prints_its_layers_and_no_forces(command: Command) -> None:

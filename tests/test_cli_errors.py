@@ -46,7 +46,7 @@ OPTIONS = [
     (["--rtol", "nan"], "rtol is nan; allowed: 1e-13 to 0.1"),
     (
         ["--method", "rk4"],
-        "unknown method 'rk4'; allowed: auto, exponential, dp5, dop853, radau9, scipy:NAME, torchdiffeq:NAME",
+        "unknown method 'rk4'; allowed: auto, exponential, radau, scipy:NAME, torchdiffeq:NAME",
     ),
     (["--method", "scipy:RK4"], "unknown method 'scipy:RK4'; allowed: scipy:RK23"),
     (["--set", "Vdrive.amplitude=1e99"], "Sine amplitude is 1e+99 V; allowed: a size up to 1e+12"),

@@ -56,7 +56,7 @@ STACKS: dict[str, tuple[Callable[[], fs.Circuit], dict[str, Any]]] = {
     "algebraic": (lambda: fs.parse_netlist(DRY), {}),
     "function": (lambda: table1().replace({"Vdrive": fs.Function(wobble)}), {"t_stop": 0.02}),
     "samples": (lambda: table1(), {"sources": {"Vdrive": recorded()}, "t_stop": 0.02, "rtol": 1e-6}),
-    "runge-kutta": (lambda: table1(tran="50u 10m uic"), {"method": "dop853", "rtol": 1e-6}),
+    "radau": (lambda: table1(tran="50u 10m uic"), {"method": "radau", "rtol": 1e-6}),
 }
 NETWORKS: dict[str, tuple[Callable[[], fs.Circuit], dict[str, Any]]] = {
     "network": (lambda: fs.read_netlist(CIRCUITS / "two_fingers.cir"), {"t_stop": 4e-4, "rtol": 1e-5}),

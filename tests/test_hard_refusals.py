@@ -124,7 +124,7 @@ def test_a_fold_is_not_believed_while_a_finer_run_meets_it_elsewhere(gap: float,
     fold = ref.transient(SINE, [], law="mobile", freq=100.0, params=params, tol=1e-12).fold
     assert fold is not None
     circuit = table1().replace({"Xgap.d": gap})
-    kept = fs.simulate(circuit, charge_law="mobile", method="dp5", rtol=rtol, throw=False)
+    kept = fs.simulate(circuit, charge_law="mobile", method="radau", rtol=rtol, throw=False)
     assert kept.status is fs.Status.FOLD
     assert kept.state.t == pytest.approx(fold.t, rel=1e-5)
 

@@ -1,16 +1,19 @@
-"""Every method on the same right-hand side: own steppers, scipy's, torchdiffeq's."""
+"""Every method on every circuit: own steppers, and scipy's and torchdiffeq's on one right-hand side."""
 
 from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.numerics.tableaus import TABLEAUS
 from fingerspice.solve.foreign import SCIPY_METHODS, TORCH_METHODS
 from scenes import deck, table1
 
-OWN = ("exponential", *TABLEAUS)
+CIRCUITS = Path(__file__).parents[1] / "circuits"
+OWN = ("exponential", "radau")
 FOREIGN = tuple(f"scipy:{m}" for m in SCIPY_METHODS) + tuple(f"torchdiffeq:{m}" for m in TORCH_METHODS)
 # First- and second-order methods get a tolerance they can meet in reasonable time.
 LOOSE = {"scipy:RK23", "torchdiffeq:bosh3", "torchdiffeq:adaptive_heun", "torchdiffeq:midpoint", "torchdiffeq:euler"}
@@ -46,7 +49,9 @@ def test_every_method_meets_its_error(method, shape, law, exact):
     assert solution.error.u_gap <= rtol * np.abs(want.u_gap).max() * (1.0 + rtol)
 
 
-@pytest.mark.parametrize("method", ["scipy:RK99", "torchdiffeq:gl4", "euler", "scipy:", "numpy:RK45"])
+@pytest.mark.parametrize(
+    "method", ["scipy:RK99", "torchdiffeq:gl4", "euler", "scipy:", "numpy:RK45", "dp5", "dop853", "radau9"]
+)
 def test_unknown_methods_are_refused_with_what_is_allowed(method):
     with pytest.raises(fs.InputError, match="allowed: "):
         fs.simulate(table1(), method=method)
@@ -61,6 +66,65 @@ def test_the_automatic_method_of_a_coupled_scene_is_exponential_however_stiff(rt
     assert solution.plan.stiff == (r_coat == "1")
 
 
+# With two sources, with an area that has dynamics of its own, and with two areas that follow.
+NETWORKS = {
+    "amplifier": (fs.read_netlist(CIRCUITS / "amplifier.cir"), 1e-4),
+    "two fingers": (fs.read_netlist(CIRCUITS / "two_fingers.cir"), 4e-4),
+    "slow area": (
+        deck(
+            "Vdrive drive 0 SQUARE(150 100)", "Rs drive top 20k", "Xcoat top a area LAYER d=1u eps_r=3.9 r=0.2meg",
+            "Xgap a b area GAP d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000 "
+            "tau=2m", "Xskin b 0 area SKIN d=350u f=100", ".tran 50u 12m uic",
+        ),
+        12e-3,
+    ),
+}  # fmt: skip
+
+
+@lru_cache(None)
+def stepped(name, law):
+    circuit, t_stop = NETWORKS[name]
+    return fs.simulate(circuit, t_stop=t_stop, rtol=1e-9, charge_law=law, method="exponential")
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("method", ["radau", "scipy:DOP853", "scipy:LSODA", "scipy:Radau", "torchdiffeq:dopri5"])
+def test_every_kind_of_method_meets_its_error_on_any_circuit(method, name, law):
+    circuit, t_stop = NETWORKS[name]
+    want = stepped(name, law)
+    assert want.method == "exponential"
+    solution = fs.simulate(circuit, t_stop=t_stop, rtol=1e-5, charge_law=law, method=method)
+    assert (solution.method, solution.success) == (method, True)
+    assert np.array_equal(solution.t, want.t)
+    off = np.abs(solution.u_gap - want.u_gap).reshape(solution.t.size, -1).max(axis=0)
+    assert np.all(off <= 1e-5 * np.abs(want.u_gap).reshape(solution.t.size, -1).max(axis=0))
+    assert off.max() <= solution.error.u_gap + want.error.u_gap
+    # No error is asked of area and charge: they follow the voltages.
+    assert np.abs(solution.area / want.area - 1.0).max() <= 1e-4
+    assert np.abs(solution.q_source - want.q_source).max() <= 1e-4 * np.abs(want.q_source).max()
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+@pytest.mark.parametrize("first", ["radau", "scipy:LSODA"])
+def test_a_run_goes_on_from_one_by_another_method(first, law):
+    # The square jumps at 5 ms: the first run ends just before, inside a half period, or with it.
+    whole = fs.simulate(table1("SQUARE(150 100)", tran="50u 12m uic"), rtol=1e-9, charge_law=law)
+    circuit = table1("SQUARE(150 100)", tran="50u 12m uic")
+    for stop in (2.3e-3, 5e-3):
+        one = fs.simulate(circuit, t_stop=stop, rtol=1e-8, charge_law=law, method=first)
+        for second in ("auto", "radau"):
+            two = fs.simulate(
+                circuit, start=one, t_eval=whole.t[whole.t > stop], rtol=1e-8, charge_law=law, method=second
+            )
+            late = whole.t > stop
+            # At the later jump the run given its times has right-hand values alone.
+            smooth = np.append(np.diff(whole.t[late]) > 0.0, True) & np.append(True, np.diff(whole.t[late]) > 0.0)
+            for name in ("u_gap", "q_source"):
+                theirs, ours = getattr(whole, name)[late][smooth], getattr(two, name)[smooth]
+                assert np.abs(ours - theirs).max() <= 1e-7 * np.abs(getattr(whole, name)).max(), (stop, second, name)
+
+
 def test_what_needs_no_steps_is_not_stepped():
     frozen = fs.simulate(table1(), area="frozen", t_stop=1e-3)
     assert (frozen.method, frozen.plan.tier, frozen.nfev) == ("linear", "linear", 0)
@@ -72,8 +136,8 @@ def test_what_needs_no_steps_is_not_stepped():
 
 
 def test_a_method_that_is_named_steps_the_coupled_model_whatever_the_scene():
-    solution = fs.simulate(table1(), area="frozen", t_stop=1e-3, method="dp5")
-    assert (solution.method, solution.plan.tier) == ("dp5", "coupled")
+    solution = fs.simulate(table1(), area="frozen", t_stop=1e-3, method="radau")
+    assert (solution.method, solution.plan.tier) == ("radau", "coupled")
     assert solution.nfev > 0
 
 

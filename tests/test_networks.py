@@ -487,7 +487,8 @@ def test_what_no_network_is_gets_one_sentence(case: str) -> None:
 @pytest.mark.parametrize(
     ("request_", "message"),
     [
-        ({"method": "dop853"}, "method 'dop853' is for series stacks"),
+        ({"method": "dop853"}, "unknown method 'dop853'; allowed: auto, exponential, radau, scipy:NAME"),
+        ({"method": "scipy:dop853"}, "unknown method 'scipy:dop853'; allowed: scipy:RK23"),
         ({"tier": "algebraic"}, "the algebraic tier is not for this network"),
         ({"tier": "linear"}, "the linear tier is not for this network"),
         ({"area": -1.0}, "area is -1 m^2"),

@@ -302,8 +302,8 @@ def test_an_unknown_model_is_refused_with_what_is_allowed(tier: str) -> None:
 
 
 def test_a_method_steps_whatever_the_model_could_have_been() -> None:
-    solution = fs.simulate(dry(), method="dop853", t_stop=2e-3, rtol=1e-9)
-    assert (solution.plan.tier, solution.method) == ("coupled", "dop853")
+    solution = fs.simulate(dry(), method="radau", t_stop=2e-3, rtol=1e-9)
+    assert (solution.plan.tier, solution.method) == ("coupled", "radau")
     agree(fs.simulate(dry(), t_stop=2e-3), solution)
 
 

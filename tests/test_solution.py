@@ -230,7 +230,7 @@ def test_csv_reads_back_every_bit_and_names_its_units(square: fs.Solution, tmp_p
 
 def test_files_say_what_it_takes_to_repeat_the_run(tmp_path: Path) -> None:
     circuit = table1(library="fingerspice_mobile.lib").replace({"Xgap.d": 4e-6, "Vdrive": fs.Sine(150.0, 100.0)})
-    solution = fs.simulate(circuit, t_stop=2e-3, rtol=1e-7, method="dp5", area="coupled")
+    solution = fs.simulate(circuit, t_stop=2e-3, rtol=1e-7, method="radau", area="coupled")
     attrs = load(solution.to_netcdf(tmp_path / "run.nc")).attrs
     assert attrs == solution.provenance()
     assert attrs["program"] == f"fingerspice {fs.__version__}"
@@ -238,7 +238,7 @@ def test_files_say_what_it_takes_to_repeat_the_run(tmp_path: Path) -> None:
     overrides = json.loads(attrs["overrides"])
     assert float(overrides["Xgap.d"]) == 4e-6
     assert "150" in overrides["Vdrive"]
-    expected = {"charge_law": "mobile", "area": "coupled", "method": "dp5", "rtol": "1e-07", "status": "SUCCESS"}
+    expected = {"charge_law": "mobile", "area": "coupled", "method": "radau", "rtol": "1e-07", "status": "SUCCESS"}
     assert {key: attrs[key] for key in expected} == expected
     assert float(attrs["error_u_gap_V"]) == solution.error.u_gap > 0.0
     assert float(attrs["error_f_el_N"]) == solution.error.f_el > 0.0

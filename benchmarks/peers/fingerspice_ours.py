@@ -9,7 +9,6 @@ from peers.contest import Contestant, Outcome, Plan, installed, tolerances
 from problems import Problem
 
 LIBRARY = "fingerspice"
-METHODS = ("dp5", "dop853", "radau9")
 
 
 def version() -> str | None:
@@ -41,11 +40,7 @@ def contestants() -> list[Contestant]:
         Contestant(library, library, tolerances(2, 12), _setup(method), mobile=True, compile_limit=120.0)
         for library, method in ((LIBRARY, "auto"), (f"{LIBRARY}, every period", "exponential"))
     )
-    others = [
-        Contestant(
-            f"fingerspice {method}", f"{LIBRARY}, Runge-Kutta", (1e-3, 1e-6, 1e-9), _setup(method),
-            slow=True, compile_limit=120.0,
-        )
-        for method in METHODS
-    ]  # fmt: skip
-    return [auto, stepped, *others]
+    radau = Contestant(
+        "fingerspice radau", f"{LIBRARY}, Radau", (1e-3, 1e-6, 1e-9), _setup("radau"), slow=True, compile_limit=120.0
+    )
+    return [auto, stepped, radau]

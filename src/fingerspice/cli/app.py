@@ -81,7 +81,7 @@ def run(
     charge_law: ChargeLaw = None,
     area: Annotated[str, typer.Option(help="coupled, mean, frozen, or an area in m^2.")] = "coupled",
     method: Annotated[
-        str, typer.Option(help="auto, dp5, dop853, radau9, scipy:LSODA, torchdiffeq:dopri5, ...")
+        str, typer.Option(help="auto, exponential, radau, scipy:LSODA, torchdiffeq:dopri5, ...")
     ] = "auto",
     changes: Set = None,
     source: Source = None,

@@ -38,10 +38,10 @@ def charge_step(
 ) -> None:  # fmt: skip
     """z and the current at the nodes of a step of length h that starts with z0.
 
-    Both go through the layer that leaks slowest (see `model.charge_rate`). What that layer stores is taken from its
-    voltages themselves: in w' a fast mode that has died away still holds its rate times the error of w, which a sum
-    over a step much longer than the mode would turn into charge. `places` holds the error of the
-    modes (see `exponential.assess`), of which the part up to fraction `theta` of the step counts.
+    Both go through the layer that leaks slowest: the sum over all leaks would be a small difference of large currents.
+    What that layer stores is taken from its voltages themselves: in w' a fast mode that has died away still holds its
+    rate times the error of w, which a sum over a step much longer than the mode would turn into charge. `places` holds
+    the error of the modes (see `exponential.assess`), of which the part up to fraction `theta` of the step counts.
     """
     n = rates.size
     slow = model.slow

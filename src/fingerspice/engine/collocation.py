@@ -19,15 +19,24 @@ from fingerspice.engine.network import (
     lend_room,
     rates,
 )
-from fingerspice.engine.radau import NFEV, Scheme, Work, guess, lend_work, linearise, step
+from fingerspice.engine.radau import (
+    NFEV,
+    Scheme,
+    Work,
+    dense_polynomial,
+    dense_state,
+    guess,
+    lend_work,
+    linearise,
+    step,
+)
 from fingerspice.engine.readout import note
-from fingerspice.engine.steps import dense_polynomial, dense_state
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 # Codes returned by `advance`.
-DONE, JUMP, STEP_UNDERFLOW, TOO_MANY, PAUSED = 0, 1, 2, 3, 4
+DONE, JUMP, STEP_UNDERFLOW, PAUSED = 0, 1, 2, 3
 # Entries of `control`: an edge, the time since (steps after a jump may be shorter than the rounding of the time
 # itself), the next step (0: choose one), the first step after the last jump, whether that is looked for, and the step
 # before a pause.
@@ -36,10 +45,11 @@ N_CONTROL = 6
 # Entries of `counters`, after the evaluations.
 ACCEPTED, REJECTED, ZEROS, OUTPUT = 1, 2, 3, 4
 N_COUNTERS = 5
-# Steps between pauses: a tenth of a second, after which Python may see to a Ctrl-C.
+# Steps between pauses: a tenth of a second, after which Python may see to a Ctrl-C, and count the steps.
 STEPS_AT_ONCE = 250
-# Steps taken and refused, in a run: what needs more has a cause that smaller steps do not mend.
-MOST_STEPS = 2_000_000
+# No step is shorter than this share of the time since the last edge, and of the time to the next one: what decays right
+# after an edge may be faster than the rounding of the time itself.
+SHORTEST, SHORTEST_FIRST = 1e-15, 1e-25
 # A source's change at an edge, relative, that is its rounding and no jump.
 ROUNDING = 1e-14
 
@@ -175,8 +185,7 @@ def advance(
     Returns
     -------
     int
-        DONE; JUMP: a source jumps at the time reached, take that first; STEP_UNDERFLOW; TOO_MANY steps; or PAUSED: call
-        again.
+        DONE; JUMP: a source jumps at the time reached, take that first; STEP_UNDERFLOW; or PAUSED: call again.
     """
     net, room, work = lend(net), lend_room(room), lend_work(work)
     scheme = Scheme(
@@ -194,13 +203,11 @@ def advance(
     h_before = control[BEFORE]
     control[BEFORE] = 0.0
     flips = 0
-    pause = counters[ACCEPTED] + STEPS_AT_ONCE
+    pause = counters[ACCEPTED] + counters[REJECTED] + STEPS_AT_ONCE
     while control[BASE] + control[T] < t_end:
         base = control[BASE]
         t = control[T]
         work.base[0] = base
-        if counters[ACCEPTED] + counters[REJECTED] > MOST_STEPS:
-            return TOO_MANY
         stop = t_end
         for i in range(n_s):
             while sources.edges[sources.first[i] + work.place[i] + 1] <= base + t:
@@ -244,7 +251,7 @@ def advance(
             counters[REJECTED] += 1
             h *= 0.25 if norm == math.inf else max(0.2, 0.9 * norm ** (-1.0 / scheme.c.size))
             last = False
-            if h <= 1e-15 * max(t, 1e-3 * room_left):
+            if h <= SHORTEST * t + SHORTEST_FIRST * room_left:
                 return STEP_UNDERFLOW
         proposed = h * min(6.0, 0.9 * norm ** (-1.0 / scheme.c.size) if norm > 0.0 else 6.0)
         dense_polynomial(work.k, scheme.dense, h, work.poly)
@@ -282,7 +289,7 @@ def advance(
         control[BASE], control[T] = (stop, 0.0) if last else (base, t_new)
         h_before = h
         counters[ACCEPTED] += 1
-        if counters[ACCEPTED] >= pause and not jump:
+        if counters[ACCEPTED] + counters[REJECTED] >= pause and not jump:
             control[BEFORE] = h_before
             return PAUSED
     return DONE

@@ -252,23 +252,13 @@ def fold_margin(model: Model, x_gap: float, u: float, sign: float) -> float:
 
 
 @jit
-def right_hand_side(
-    model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, guess: float, out: FloatArray
-) -> float:
-    """Write y' into `out` (n + 1,), from the source's voltage and slope; return the gap voltage (V).
-
-    `sign` chooses the branch A(|u|) = A(sign u), continued analytically through 0 V.
-    """
-    u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), sign, guess)
-    rates_at(model, u_source, du_source, y, sign, u, out)
-    return u
-
-
-@jit
 def rates_at(
     model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, u: float, out: FloatArray
 ) -> None:
-    """As `right_hand_side`, where the gap voltage u (V) is known."""
+    """Write y' into `out` (n + 1,), from the source's voltage and slope and the gap voltage u (V).
+
+    `sign` chooses the branch A(|u|) = A(sign u), continued analytically through 0 V.
+    """
     n = model.gap.size
     q, _ = branch_area(model, sign, u)
     scale = model.area0 * q if model.mobile else 1.0
@@ -298,61 +288,6 @@ def voltage_by_time(
     q, _ = branch_area(model, sign, u)
     margin = fold_margin(model, dot(model.gap, y), u, sign)
     return margin, model.k_gap * du_source + dot(model.gap, dy) * model.area0 * q
-
-
-@jit
-def charge_rate(
-    model: Model, u_source: float, du_source: float, y: FloatArray, dy: FloatArray, sign: float, u: float
-) -> float:
-    """z' from x' (given, with the gap voltage u), through the layer that leaks slowest: lam = c v' + g u there.
-
-    In a stiff stack the sum over all leaks, which `right_hand_side` takes, is a small difference of large currents.
-    """
-    n = model.gap.size
-    q, _ = branch_area(model, sign, u)
-    scale = model.area0 * q if model.mobile else 1.0
-    rate = 0.0
-    voltage = model.slow[n] * u_source
-    for j in range(n):
-        rate += model.slow[j] * dy[j] * scale
-        voltage += model.slow[j] * y[j] * scale
-    lam: float = model.slow[n + 1] * rate + (model.slow[n + 2] + q * model.slow[n + 3]) * voltage
-    return lam / q if model.mobile else (lam + du_source / model.s) / q
-
-
-@jit
-def jacobian(
-    model: Model, u_source: float, y: FloatArray, sign: float, u: float, out: FloatArray, by_u: FloatArray
-) -> None:
-    """Write d x'/d x (n, n) along the area equation into `out`, and d x'/d u (n,) at fixed x into `by_u`.
-
-    `u` is the gap voltage (V), whether it solves the area equation or is on its way there.
-    """
-    n = model.gap.size
-    x_gap = dot(model.gap, y)
-    q, dq = branch_area(model, sign, u)
-    scale = model.area0 * q if model.mobile else 1.0
-    # dq/dx_j = slope gap_j, through the area equation under `mobile`.
-    slope = dq * (scale / (1.0 - x_gap * model.area0 * dq) if model.mobile else 1.0)
-    by_q = np.empty(n + 1)
-    total = 0.0
-    rest = 0.0
-    for i in range(n + 1):
-        x = y[i] if i < n else rest
-        rest -= x
-        voltage = model.k[i] * u_source + x * scale
-        # d(leak / scale)/dq at fixed x; leak / scale = rate (k U / scale + x).
-        by_q[i] = model.rate0[i] * voltage / scale
-        if model.mobile:
-            by_q[i] -= (model.rate[i] + q * model.rate0[i]) * model.k[i] * u_source / (scale * q)
-        total += by_q[i]
-    last = model.rate[n] + q * model.rate0[n]
-    for i in range(n):
-        by_u[i] = (model.k[i] * total - by_q[i]) * dq
-        sensitivity = (model.k[i] * total - by_q[i]) * slope
-        for j in range(n):
-            out[i, j] = model.k[i] * (model.rate[j] + q * model.rate0[j] - last) + sensitivity * model.gap[j]
-        out[i, i] -= model.rate[i] + q * model.rate0[i]
 
 
 @jit

@@ -275,15 +275,18 @@ def residual(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray, 
 def capacitances(net: Net, room: Room, y: FloatArray, sign: FloatArray) -> None:
     """The matrix (n, n) in F that small changes of the live voltages meet, into `room.matrix`."""
     n = net.k.shape[0]
+    ds = room.ds.copy()
+    # As in a jump, the sources at rest: beside the current of a small resistance, or of what a fast source pushes, that
+    # of a capacitor would be lost in rounding, and with it the distance to a fold.
     room.k[:] = 0.0
-    # As in a jump: beside the current of a small resistance that of a capacitor would be lost in rounding.
-    residual(net, room, True, y, sign, room.k, room.base)
+    room.ds[:] = 0.0
     for j in range(n):
         room.k[j] = 1.0
         residual(net, room, True, y, sign, room.k, room.probe)
         room.k[j] = 0.0
         for i in range(n):
-            room.matrix[i, j] = room.base[i] - room.probe[i]
+            room.matrix[i, j] = -room.probe[i]
+    room.ds[:] = ds
 
 
 @jit

@@ -25,7 +25,7 @@ FARTHEST = 2.0
 
 
 class Scheme(NamedTuple):
-    """Radau IIA as numbers (see `fingerspice.numerics.tableaus.Tableau`), with its matrix diagonalised.
+    """Radau IIA as numbers (see `fingerspice.numerics.radau_tableau.Tableau`), with its matrix diagonalised.
 
     Attributes
     ----------
@@ -157,17 +157,23 @@ def _solve_newton(scheme: Scheme, work: Work) -> None:
 
 
 @jit
+def _stage(scheme: Scheme, work: Work, i: int, h: float, y: FloatArray) -> None:
+    """State at a stage of the step that starts at `y`, into `work.stage`."""
+    for j in range(y.size):
+        value = 0.0
+        for r in range(scheme.c.size):
+            value += scheme.a[i, r] * work.k[r, j]
+        work.stage[j] = y[j] + h * value
+
+
+@jit
 def _residuals(
     net: Net, room: Room, scheme: Scheme, work: Work, jump: bool, h: float, y: FloatArray, sign: FloatArray
 ) -> None:
     """Weighted residuals of all stages into `work.residual`, and the charges' rates into `work.k`."""
     stages, m = work.residual.shape
     for i in range(stages):
-        for j in range(y.size):
-            value = 0.0
-            for r in range(stages):
-                value += scheme.a[i, r] * work.k[r, j]
-            work.stage[j] = y[j] + h * value
+        _stage(scheme, work, i, h, y)
         room.s[:] = work.s[i]
         room.ds[:] = work.ds[i]
         residual(net, room, jump, work.stage, sign, work.k[i], room.base)
@@ -231,11 +237,13 @@ def step(
         if not value <= norm:
             norm = value
     if net.mobile and norm <= 1.0:
-        # Past a fold there may be a solution that does not continue this one.
-        room.s[:] = work.s[stages - 1]
-        room.ds[:] = work.ds[stages - 1]
-        if not rates(net, room, jump, work.y1, sign, work.rate):
-            return math.inf
+        # Past a fold there may be a solution that does not continue this one, and a step may reach it.
+        for i in range(stages):
+            _stage(scheme, work, i, h, y)
+            room.s[:] = work.s[i]
+            room.ds[:] = work.ds[i]
+            if not rates(net, room, jump, work.stage, sign, work.rate):
+                return math.inf
     return norm if norm == norm else math.inf
 
 
@@ -253,3 +261,24 @@ def guess(scheme: Scheme, work: Work, start: FloatArray, h: float, h_before: flo
                 work.k[i, j] = value / h_before
             else:
                 work.k[i, j] = start[j]
+
+
+@jit
+def dense_polynomial(k: FloatArray, dense: FloatArray, h: float, poly: FloatArray) -> None:
+    """Coefficients (size, stages) of theta, theta^2, ... of the state's increment inside the step."""
+    for j in range(poly.shape[0]):
+        for d in range(poly.shape[1]):
+            value = 0.0
+            for r in range(dense.shape[0]):
+                value += dense[r, d] * k[r, j]
+            poly[j, d] = h * value
+
+
+@jit
+def dense_state(theta: float, y: FloatArray, poly: FloatArray, out: FloatArray) -> None:
+    """State at fraction `theta` of the step that starts at `y`."""
+    for j in range(y.size):
+        value = 0.0
+        for d in range(poly.shape[1] - 1, -1, -1):
+            value = (value + poly[j, d]) * theta
+        out[j] = y[j] + value

@@ -72,8 +72,9 @@ def network_failure(problem: NetworkProblem, run: NetworkRun, record: NetworkRec
         element = names[i]
         u_gap, area = float(record.finger_voltage(i)[-1]), float(record.finger_area(i)[-1])
         margin = float(record.fold_margin[-1])
-    if run.rough > 0.0:
-        cause += f" ({ROUGH.format(run.rough)})"
+    detail = run.detail or (ROUGH.format(run.rough) if run.rough > 0.0 else "")
+    if detail:
+        cause += f" ({detail})"
     if status is Status.ERROR_NOT_MET and len(run.gaps):
         peaks = run.gaps[:, 0]
         worst = int(np.argmax(run.gaps[:, 2] / np.where(peaks > 0.0, peaks, np.inf)))

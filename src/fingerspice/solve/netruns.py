@@ -46,6 +46,7 @@ class NetworkRun:
     # Largest misfit of the sources' tables that no finer ones would mend, V.
     rough: float = 0.0
     margin: float = 1.0
+    detail: str = ""
     tried: tuple[Attempt, ...] = ()
     # The row at the time a failed run reached.
     here: FloatArray | None = None

@@ -39,8 +39,8 @@ class Run:
 
     `t`, `left`, `live`, `z`, `current` are as in `Record`, up to the time reached; `rough` is the source's (see
     `SourceTable`), V, and `unseen` the first output (s) at which it is not what was integrated, by how much (V);
-    `margin` is the smallest distance to the fold met, `fold_spread` how far (s) the shadow run's fold is from its own,
-    `tried` the last steps tried, and `continuous` the run between its outputs, where that is known.
+    `margin` is the smallest distance to the fold met, `tried` the last steps tried, and `continuous` the run between
+    its outputs, where that is known.
     """
 
     t: FloatArray
@@ -60,7 +60,6 @@ class Run:
     rough: float = 0.0
     unseen: tuple[float, float] | None = None
     margin: float = 1.0
-    fold_spread: float = np.inf
     tried: tuple[Attempt, ...] = ()
     continuous: Continuous | None = None
 

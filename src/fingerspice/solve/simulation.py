@@ -15,7 +15,6 @@ from fingerspice.circuit.arguments import Parameters, Sources, overridden, requi
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.notices import circuit_warnings
 from fingerspice.circuit.statespace import is_stack
-from fingerspice.numerics.tableaus import TABLEAUS
 from fingerspice.results.network_record import NetworkRecord
 from fingerspice.results.outcome import ErrorEstimate, Failure, SolveError, Status
 from fingerspice.results.plan import Plan
@@ -42,6 +41,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 RTOL_RANGE = (1e-13, 0.1)
+METHODS, LIBRARIES = ("auto", "exponential", "radau"), ("scipy", "torchdiffeq")
 STARTS = ("deck", "uncharged", "dc", "periodic")
 
 
@@ -86,10 +86,10 @@ def simulate(
     rtol : float
         Largest error of the gap voltage relative to its peak over the run, and of the force likewise.
     method : str
-        ``"auto"``, an own stepper (``"exponential"``, ``"dp5"``, ``"dop853"``, ``"radau9"``), ``"scipy:NAME"`` or
-        ``"torchdiffeq:NAME"``. ``"auto"`` steps as ``"exponential"`` does, and once a period of the source no longer
-        changes the state it lets that period stand for those that follow; the others step every period. Where a fast
-        mode that the area moves lets only short steps converge, ``"auto"`` goes on as ``"radau9"``.
+        ``"auto"``, an own stepper (``"exponential"``, ``"radau"``), ``"scipy:NAME"`` or ``"torchdiffeq:NAME"``.
+        ``"auto"`` steps as ``"exponential"`` does, and once a period of the source no longer changes the state it lets
+        that period stand for those that follow; the others step every period. Where a fast mode that the area moves
+        lets only short steps converge, ``"auto"`` goes on as ``"radau"``, an implicit method.
     tier : str
         ``"auto"``, or the model to take: ``"algebraic"``, ``"linear"`` or ``"coupled"`` (see `Plan`).
     start : str or Solution
@@ -121,7 +121,7 @@ def simulate(
     if t_stop is not None:
         require_number("t_stop", t_stop, "a number in s")
     require_area(area)
-    require(isinstance(method, str), "method", repr(method), "a name, such as 'auto'")
+    _check_method(method)
     known = isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)
     require(known, "start", repr(start), f"{', '.join(map(repr, STARTS))} or a Solution")
     if isinstance(start, Solution) and start.stored is not None:
@@ -161,6 +161,14 @@ def _check_settled(times: FloatArray | None, problem: Problem | NetworkProblem) 
 def _check_rtol(rtol: float) -> None:
     good = isinstance(rtol, (int, float)) and RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1]
     require(good, "rtol", rtol, "1e-13 to 0.1")
+
+
+def _check_method(method: str) -> None:
+    require(isinstance(method, str), "method", repr(method), "a name, such as 'auto'")
+    library, _, name = method.partition(":")
+    if method not in METHODS and not (library in LIBRARIES and name):
+        known = [*METHODS, *(f"{library}:NAME" for library in LIBRARIES)]
+        raise InputError(f"unknown method {method!r}; allowed: {', '.join(known)}")
 
 
 def _given_back(solution: Solution, throw: bool) -> Solution:
@@ -269,10 +277,6 @@ def run_network(
     jumps: str = "both",
 ) -> Solution:
     """As `run_problem`, for a network."""
-    if method not in ("auto", "exponential", "radau"):
-        raise InputError(
-            f"method {method!r} is for series stacks; allowed for this network: 'auto', 'exponential' or 'radau'"
-        )
     plan = plan_network(problem, "coupled" if tier == "auto" and method != "auto" else tier, start)
     t_out, left = asked_for(problem, t_eval, jumps)
     run_at = t_out if t_eval is None else at_breakpoints(problem, t_eval)
@@ -282,11 +286,7 @@ def run_network(
     if plan.tier == "linear":
         run, name = solve_fixed(problem, run_at, left), plan.tier
     else:
-        found = None
-        if method != "radau" and problem.scene.coupled:
-            found = solve_network(problem, own, run_at, left, progress, repeat=method == "auto")
-        name = "radau" if found is None else "exponential"
-        run = solve_coupled(problem, own, run_at, left, progress) if found is None else found
+        run, name = _run_network(problem, method, own, run_at, left, progress)
     wall = time.perf_counter() - begin
     if problem.begun is not None:
         add_start_error(run, problem.begun)
@@ -300,6 +300,21 @@ def run_network(
     failure = None if run.status is Status.SUCCESS else network_failure(problem, run, record)
     warned = tuple(network_warnings(problem, run, record))
     return _packed(problem, run, record, t, failure, rtol, name, plan, wall, warned)
+
+
+def _run_network(
+    problem: NetworkProblem, method: str, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None
+) -> tuple[NetworkRun, str]:
+    """As `_run`, for a network."""
+    if ":" in method:
+        from fingerspice.solve.foreign import solve_foreign
+
+        return solve_foreign(problem, method, rtol, t_out, left, progress), method
+    if method != "radau" and problem.scene.coupled:
+        found = solve_network(problem, rtol, t_out, left, progress, repeat=method == "auto")
+        if found is not None:
+            return found, "exponential"
+    return solve_coupled(problem, rtol, t_out, left, progress), "radau"
 
 
 def _mind_unseen(run: Run | NetworkRun) -> None:
@@ -320,32 +335,20 @@ def _add_error(run: Run, u_gap: float, f_el: float | None = None) -> None:
 def _run(
     problem: Problem, method: str, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None
 ) -> tuple[Run, str]:
-    library, _, name = method.partition(":")
-    if library in ("scipy", "torchdiffeq") and name:
-        from fingerspice.solve.foreign import solve_foreign
+    from fingerspice.solve.stacked import solve_otherwise
 
-        return solve_foreign(problem, library, name, rtol, t_out, left), method
-    if method in ("auto", "exponential"):
-        run = solve_marching(problem, rtol, t_out, left, progress, repeat=method == "auto")
-        if run.status not in (Status.FOLD, Status.TOO_MANY_STEPS) or method == "exponential":
-            return run, "exponential"
-        from fingerspice.solve.folding import lead_to_fold, run_to_fold
-        from fingerspice.solve.stepping import solve
+    if method not in ("auto", "exponential"):
+        return solve_otherwise(problem, method, rtol, t_out, left, progress), method
+    run = solve_marching(problem, rtol, t_out, left, progress, repeat=method == "auto")
+    if run.status not in (Status.FOLD, Status.TOO_MANY_STEPS) or method == "exponential":
+        return run, "exponential"
+    from fingerspice.solve.folding import run_to_fold
 
-        folded = run_to_fold(problem, t_out, left) if run.status is Status.FOLD else None
-        if folded is not None:
-            return folded, "exponential"
-        # No fold is near, or none at all: for an implicit method, which no fast mode holds up.
-        run = solve(problem, rtol, TABLEAUS["radau9"], t_out, left, progress)
-        if run.status is Status.FOLD:
-            run = lead_to_fold(problem, run, t_out, left) or run
-        return run, "radau9"
-    if method not in TABLEAUS:
-        known = ["auto", "exponential", *TABLEAUS, "scipy:NAME", "torchdiffeq:NAME"]
-        raise InputError(f"unknown method {method!r}; allowed: {', '.join(known)}")
-    from fingerspice.solve.stepping import solve
-
-    return solve(problem, rtol, TABLEAUS[method], t_out, left, progress), method
+    folded = run_to_fold(problem, t_out, left) if run.status is Status.FOLD else None
+    if folded is not None:
+        return folded, "exponential"
+    # No fold is near, or none at all: for an implicit method, which no fast mode holds up.
+    return solve_otherwise(problem, "radau", rtol, t_out, left, progress), "radau"
 
 
 def _solution(
