@@ -23,6 +23,8 @@ from fingerspice.waveforms.waveform import Waveform, as_waveform
 CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
 _REMEMBERING = threading.Lock()
+#: What a changed circuit may take over from the one that it was made of, by its key in `Circuit.remember`.
+INHERITED = ("loop",)
 
 
 @dataclass(frozen=True)
@@ -265,6 +267,8 @@ class Circuit(Shown):
                 raise InputError(_unknown("parameter", path, known))
             overrides[path] = value if isinstance(value, str) else getattr(value, "__name__", repr(value))
         changed = dataclasses.replace(self, elements=tuple(elements.values()), overrides=overrides)
+        # Of the same nodes and devices: what follows from those alone is found in it.
+        changed._memory["of"] = ({k: v[0] for k, v in self._memory.items() if k in INHERITED},)
         check(changed)
         before, after = _unusual(self), _unusual(changed)
         # One word about a value is enough.
@@ -281,7 +285,12 @@ class Circuit(Shown):
 
 def _unusual(circuit: Circuit) -> dict[str, str]:
     """What is not usual in a circuit, and the path of each, in lower case."""
-    return {text: f"{e.name}.{name}".lower() for e in circuit.elements for name, text in unusual(e)}
+
+    def make() -> dict[str, str]:
+        return {text: f"{e.name}.{name}".lower() for e in circuit.elements for name, text in unusual(e)}
+
+    found: dict[str, str] = circuit.remember("unusual", make)
+    return found
 
 
 def _changed(element: Element, parameter: str, given: Any, path: str) -> tuple[Element, str | None]:

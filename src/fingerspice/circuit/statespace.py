@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.topology import Hop, Loop, find_loop
+from fingerspice.circuit.topology import Hop, Loop, find_loop, same_loop
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 from fingerspice.waveforms.combinations import Product, Sum
@@ -216,8 +216,13 @@ def is_stack(circuit: Circuit) -> bool:
 
 
 def _loop(circuit: Circuit) -> Loop | None:
-    """The circuit's loop, looked for once."""
-    loop: Loop | None = circuit.remember("loop", lambda: find_loop(circuit))
+    """The circuit's loop, looked for once; in one that `Circuit.replace` made, where that of the other one was."""
+
+    def make() -> Loop | None:
+        before: Loop | None = circuit.remember("of", dict).get("loop")
+        return find_loop(circuit) if before is None else same_loop(circuit, before)
+
+    loop: Loop | None = circuit.remember("loop", make)
     return loop
 
 
@@ -232,6 +237,11 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
     InputError
         As `topology.find_branches`, and for a network that is no such stack.
     """
+    stack: Stack = circuit.remember(("stack", skin_at), lambda: _build(circuit, skin_at))
+    return stack
+
+
+def _build(circuit: Circuit, skin_at: float | None) -> Stack:
     loop = _loop(circuit)
     if loop is None:
         raise InputError(

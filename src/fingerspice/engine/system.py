@@ -28,7 +28,7 @@ from fingerspice.physics.contact import N_PACKED, inverse_area
 FloatArray = NDArray[np.float64]
 
 DEGREE = 27
-"""Of the polynomial for 1/A; where it does not reach rounding, the long series of the model serves."""
+"""Of the polynomial for 1/A; where it does not reach the error asked for, a longer Chebyshev series serves."""
 # Ratio of neighbouring reference values of 1/A: the nonlinear term is at most an eighth of what it perturbs.
 _LEVEL_RATIO = 1.28
 
@@ -57,10 +57,12 @@ class System(NamedTuple):
     shown : ndarray, shape (n_level, n_column, n)
         Recorded voltages over k_shown U, as `live` gives the live ones.
     k_shown : ndarray, shape (n_column,)
-    powers, slopes : ndarray, shape (DEGREE + 1,)
-        1/A as a polynomial in (u - lo) * scale - 1, and its derivative.
+    powers, slopes : ndarray, shape (DEGREE + 1,) or longer
+        1/A as a polynomial in (u - lo) * scale - 1, and its derivative; longer ones hold coefficients of Chebyshev
+        series.
     lo, scale : float
-        Lowest gap voltage (V) of the branch's continuation, and 1/V; scale is 0 where the model's curve serves instead.
+        Lowest gap voltage (V) of the branch's continuation, and 1/V; scale is 0 where Eq. 4 is solved at every
+        evaluation instead.
     u_top : float
         Largest gap voltage (V) that the model's curve covers.
     stress : float
@@ -157,22 +159,58 @@ def area_error(decade: int) -> float:
 
 
 def area_missed(curve: FloatArray, decade: int) -> float:
-    """What the area's polynomial does miss of a `Contact.curve`, relative; 0 where another form of it is taken."""
+    """What the run's form of a `Contact.curve` (see `area_polynomial`) misses of 1/A, relative."""
     series = np.abs(curve[2 + N_PACKED :])
-    missed = float(series[DEGREE + 1 :].sum() / series[0]) if series.size > 1 and series[0] > 0.0 else 0.0
-    return missed if missed <= area_error(decade) else 0.0
+    if series.size <= 1 or not series[0] > 0.0:
+        return 0.0
+    return float(series[_kept(curve, area_error(decade)) :].sum() / series[0])
+
+
+def _kept(curve: FloatArray, tol: float) -> int:
+    """Terms of a curve's series that are taken for an error of `tol` of 1/A: as many as a polynomial has, or more."""
+    series = np.abs(curve[2 + N_PACKED :])
+    left = np.cumsum(series[::-1])[::-1]
+    return max(min(DEGREE + 1, series.size), int(np.count_nonzero(left > tol * series[0])))
 
 
 def area_polynomial(curve: FloatArray, tol: float) -> tuple[FloatArray, FloatArray, float, float]:
-    """1/A as a polynomial of `DEGREE`, its slopes, `lo` and `scale` (see `System`) from a `Contact.curve`."""
-    powers = np.zeros(DEGREE + 1)
-    slopes = np.zeros(DEGREE + 1)
+    """1/A as a polynomial, its slopes, `lo` and `scale` (see `System`) from a `Contact.curve`.
+
+    Of `DEGREE` and in powers where that misses at most `tol` (relative); else a longer Chebyshev series that does.
+    """
     lo, hi = float(curve[0]), float(curve[1])
     series = curve[2 + N_PACKED :]
-    if series.size == 0 or not lo < hi or np.abs(series[DEGREE + 1 :]).sum() > tol * abs(series[0]):
-        return powers, slopes, lo, 0.0
-    exact = _to_polynomial(series, powers, slopes, max(2.0 * tol, 4e-15) * abs(series[0]))
-    return powers, slopes, lo, 2.0 / (hi - lo) if exact else 0.0
+    if series.size == 0 or not lo < hi:
+        return np.zeros(DEGREE + 1), np.zeros(DEGREE + 1), lo, 0.0
+    scale, kept = 2.0 / (hi - lo), _kept(curve, tol)
+    if kept <= DEGREE + 1:
+        powers, slopes = np.zeros(DEGREE + 1), np.zeros(DEGREE + 1)
+        if _to_polynomial(series, powers, slopes, max(2.0 * tol, 4e-15) * abs(series[0])):
+            return powers, slopes, lo, scale
+    long, slope = np.zeros((2, max(kept, DEGREE + 2)))
+    long[:kept] = series[:kept]
+    slope[: kept - 1] = np.polynomial.chebyshev.chebder(series[:kept])
+    return long, slope, lo, scale
+
+
+def area_polynomials(
+    curves: FloatArray, follows: NDArray[np.bool_], tol: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """`area_polynomial` of several areas, one a row, all of them of one length; zeros for those that do not follow."""
+    found = [area_polynomial(curve, tol) for curve in curves[follows]]
+    width = max((powers.size for powers, _, _, _ in found), default=DEGREE + 1)
+    powers, slopes = np.zeros((2, follows.size, width))
+    lo, scale = np.zeros((2, follows.size))
+    for i, curve, one in zip(np.flatnonzero(follows), curves[follows], found, strict=True):
+        if one[3] > 0.0 and one[0].size < width:
+            # Beside a longer series it is one too.
+            kept = _kept(curve, tol)
+            powers[i, :kept] = curve[2 + N_PACKED :][:kept]
+            slopes[i, : kept - 1] = np.polynomial.chebyshev.chebder(powers[i, :kept])
+        else:
+            powers[i, : one[0].size], slopes[i, : one[1].size] = one[0], one[1]
+        lo[i], scale[i] = one[2], one[3]
+    return powers, slopes, lo, scale
 
 
 @jit

@@ -16,7 +16,7 @@ from fingerspice.engine.exponential import Tables, new_tables
 from fingerspice.engine.netrows import Form, new_work
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import Pace
-from fingerspice.engine.system import area_error, area_missed, area_polynomial
+from fingerspice.engine.system import area_error, area_missed, area_polynomials
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.results.network_record import bare_record
@@ -103,10 +103,7 @@ def _make_reference(scene: NetworkScene, area: FloatArray, tol: float) -> Refere
         assert cell is not None
         assert contact is not None
         gap[i], gap_s[i], stress[i] = tap[cell], tap_s[cell], float(contact.stress(1.0))
-    fits = [area_polynomial(curve, tol) if follows[i] else None for i, curve in enumerate(net.curves)]
-    width = next(fit[0].size for fit in fits if fit is not None)
-    none = np.zeros(width), np.zeros(width), 0.0, 0.0
-    powers, slopes, lo, scale = zip(*(fit or none for fit in fits), strict=True)
+    powers, slopes, lo, scale = area_polynomials(net.curves, follows, tol)
     capacitance, leak = network.capacitance(area)[:, None], network.leak(area)[:, None]
     at_x, at_s = network.delivered[:, :n], network.delivered[:, n:]
     form = Form(
@@ -131,10 +128,10 @@ def _make_reference(scene: NetworkScene, area: FloatArray, tol: float) -> Refere
         gap=gap,
         gap_s=gap_s,
         stress=stress,
-        powers=np.array(powers),
-        slopes=np.array(slopes),
-        lo=np.array(lo),
-        scale=np.array(scale),
+        powers=powers,
+        slopes=slopes,
+        lo=lo,
+        scale=scale,
         curves=net.curves,
         stored=_packed(network.through @ (capacitance * tap)),
         stored_s=_packed(network.through @ (capacitance * tap_s)),

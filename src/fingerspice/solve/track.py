@@ -7,11 +7,10 @@ from functools import partial
 
 import numpy as np
 
-from fingerspice.engine import advance, march, readout
+from fingerspice.engine import march, readout
 from fingerspice.engine import repeat as repetition
 from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
-from fingerspice.engine.model import write_row
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.system import System, area_error, area_missed, area_range, build_system
 from fingerspice.engine.work import Work, new_work
@@ -209,15 +208,11 @@ class Track:
         if first == self.t_out.size:
             return
         segment, tau = after_the_end(self.problem, table)
-        control = np.zeros(advance.N_CONTROL)
-        control[advance.U_BEFORE] = self.control[readout.U_BEFORE]
-        control[advance.U_GAP], control[advance.SIGN] = self.control[readout.U_GAP], self.control[readout.SIGN]
-        # Takes the charge of a jump that stands at the end; the state itself stays before it.
-        y = self.y.copy()
-        model = self.prepared.system.model
-        u, du = advance.enter(model, segment, tau, y, control)
+        # Copies take the charge of a jump that stands at the end; the state itself stays before it.
         row = np.empty(row_width(self.problem))
-        write_row(model, u, du, y, control[advance.SIGN], control[advance.U_GAP], row)
+        march.end_row(
+            self.prepared.system.model, segment, tau, self.pace.charge, self.y.copy(), self.control.copy(), row
+        )
         live, z, current = from_rows(self.problem, row[None, :])
         n = live.shape[0]
         self.out[:n, first:] = live
