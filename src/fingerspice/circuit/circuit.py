@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -80,7 +81,7 @@ class Element:
     ac: SmallSignal | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "values": dict(self.values)}
+        return {**{k: v for k, v in vars(self).items() if k != "kept"}, "values": dict(self.values)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update({**state, "values": MappingProxyType(state["values"])})
@@ -89,6 +90,11 @@ class Element:
     def spec(self) -> DeviceSpec:
         """The device's entry in the registry."""
         return DEVICES[self.device]
+
+    @cached_property
+    def kept(self) -> dict[Any, Any]:
+        """What follows from this element alone, for every circuit that has it unchanged."""
+        return {}
 
 
 @dataclass(frozen=True)
@@ -285,11 +291,11 @@ class Circuit(Shown):
 
 def _unusual(circuit: Circuit) -> dict[str, str]:
     """What is not usual in a circuit, and the path of each, in lower case."""
-
-    def make() -> dict[str, str]:
-        return {text: f"{e.name}.{name}".lower() for e in circuit.elements for name, text in unusual(e)}
-
-    found: dict[str, str] = circuit.remember("unusual", make)
+    found: dict[str, str] = {}
+    for e in circuit.elements:
+        if "unusual" not in e.kept:
+            e.kept["unusual"] = {text: f"{e.name}.{name}".lower() for name, text in unusual(e)}
+        found |= e.kept["unusual"]
     return found
 
 
@@ -324,6 +330,8 @@ def check(circuit: Circuit) -> None:
         One sentence: which parameter, what was given with its unit, what is allowed, where.
     """
     for element in circuit.elements:
+        if "checked" in element.kept:
+            continue
         for spec in element.spec.parameters:
             value: Any = element.values[spec.name]
             if not spec.accepts(value):
@@ -333,6 +341,7 @@ def check(circuit: Circuit) -> None:
                 )
         if element.device == "GAP":
             _check_contact(element)
+        element.kept["checked"] = True
     if circuit.tran is not None and not circuit.tran.stop > 0.0:
         raise InputError(f"t_stop is {circuit.tran.stop:g} s; allowed: more than 0")
 

@@ -100,17 +100,17 @@ class Stack:
         marked = np.logical_or.reduceat(cells, self.first_cell)
         return [e.name for e, mark in zip(self.layers, marked, strict=True) if mark]
 
-    @property
+    @cached_property
     def s(self) -> float:
         """Sum of 1/c over the cells, m^2/F."""
         return float(np.sum(1.0 / self.c))
 
-    @property
+    @cached_property
     def k(self) -> FloatArray:
         """Share of a jump of U that each cell takes, shape (n_cell,)."""
         return np.asarray(1.0 / (self.c * self.s))
 
-    @property
+    @cached_property
     def waveform(self) -> Waveform:
         """Voltage around the loop: the sources with their signs."""
         parts: list[Waveform] = []
@@ -168,7 +168,11 @@ def layer_constants(layer: Element, skin_at: float | None = None) -> FloatArray:
     With `skin_at` a dispersive skin's data are those at that frequency (Hz).
     """
     assert layer.spec.cells is not None
-    return layer.spec.cells(layer.values, skin_at)
+    key = ("cells", skin_at)
+    if key not in layer.kept:
+        layer.kept[key] = layer.spec.cells(layer.values, skin_at)
+    constants: FloatArray = layer.kept[key]
+    return constants
 
 
 def contact_of(gap: Element) -> Contact:
@@ -179,6 +183,13 @@ def contact_of(gap: Element) -> Contact:
     InputError
         Where its constants are beyond the range of numbers.
     """
+    if "contact" not in gap.kept:
+        gap.kept["contact"] = _contact_of(gap)
+    contact: Contact = gap.kept["contact"]
+    return contact
+
+
+def _contact_of(gap: Element) -> Contact:
     v = gap.values
     try:
         contact = Contact(

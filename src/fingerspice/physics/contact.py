@@ -26,10 +26,6 @@ N_PACKED = 8
 """Length of the parameter vector that the compiled functions take."""
 
 
-# Terms of the series for 1/A that are tried: 24 suffice up to 100 V across Table 1's gap, 48 to 500 V, 160 to 2.6 kV.
-_SIZES = (16, 24, 32, 48, 64, 96, 128, 160)
-
-
 @dataclass(frozen=True)
 class Contact:
     """A fingerpad pressed on a screen across an air gap, in full slip (Table 1).
@@ -123,7 +119,7 @@ class Contact:
         packed = self.pack()
         # The continuation exists while 1 + x y^p > 0; x = -0.2 is well inside for every legal exponent pair.
         lo, hi = -min(0.3 * u_max, 0.2 / packed[0]), u_max
-        series = chebyshev.fit(lambda u: 1.0 / np.asarray(ridge_area_array(u, packed)), lo, hi, 2e-15, _SIZES)
+        series = chebyshev.fit(lambda u: 1.0 / np.asarray(ridge_area_array(u, packed)), lo, hi, 2e-15, (16, 24, 32, 48))
         return np.concatenate([[lo, hi], packed, [] if series is None else series])
 
 
@@ -199,7 +195,8 @@ def inverse_area(u: float, curve: FloatArray) -> tuple[float, float]:
         return curve[-1], 0.0
     lo = curve[0]
     hi = curve[1]
-    if n > 1 and lo <= u <= hi:
+    # Where none was found, but those of other areas are kept beside it, zeros stand in the series' place.
+    if n > 1 and lo <= u <= hi and curve[2 + N_PACKED] > 0.0:
         scale = 2.0 / (hi - lo)
         value, slope = chebyshev.evaluate(curve[2 + N_PACKED :], (u - lo) * scale - 1.0)
         return value, slope * scale
@@ -213,7 +210,7 @@ def inverse_areas(u: FloatArray, curve: FloatArray) -> FloatArray:
     lo, hi, series = float(curve[0]), float(curve[1]), curve[2 + N_PACKED :]
     if series.size == 1:
         return np.full(u.shape, series[0])
-    if series.size and max(u.max(initial=0.0), -u.min(initial=0.0)) <= hi:
+    if series.size and series[0] > 0.0 and max(u.max(initial=0.0), -u.min(initial=0.0)) <= hi:
         out = np.empty(u.size)
         chebyshev.evaluate_array(series, u, lo, 2.0 / (hi - lo), out)
         return out

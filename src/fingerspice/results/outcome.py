@@ -63,8 +63,8 @@ class Attempt(NamedTuple):
 
 def last_tried(rows: FloatArray) -> tuple[Attempt, ...]:
     """Steps from rows of start, length, error and number (from 1; 0: no step), oldest first."""
-    rows = rows[rows[:, 3] > 0.0]
-    return tuple(Attempt(*map(float, row[:3])) for row in rows[np.argsort(rows[:, 3])])
+    kept = sorted((row for row in rows.tolist() if row[3] > 0.0), key=lambda row: row[3])
+    return tuple(Attempt(*row[:3]) for row in kept)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import dataclass
 from functools import partial
 
@@ -74,7 +75,8 @@ class Reference:
 
 def reference_at(scene: NetworkScene, levels: tuple[int, ...], decade: int) -> Reference:
     """The reference whose areas are the fixed ones, or LEVEL_RATIO to these powers over those at 0 V."""
-    key = ("reference", levels, decade)
+    # One for each thread: compiled code writes into its tables, and other threads run meanwhile.
+    key = ("reference", levels, decade, threading.get_ident())
     if key not in scene.prepared:
         kept = [name for name in list(scene.prepared) if name[0] == "reference"]
         for name in kept if len(kept) >= MOST_REFERENCES else ():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 from functools import partial
 
 import numpy as np
@@ -32,10 +33,7 @@ KEPT_STEPS = 2000
 
 @dataclasses.dataclass(frozen=True)
 class Prepared:
-    """A scene's system with the tables it has needed so far, and arrays to work in.
-
-    Threads may share it: compiled code holds the interpreter's lock, and leaves nothing in `work` for its next call.
-    """
+    """A scene's system with the tables it has needed so far, and arrays to work in, for one thread."""
 
     system: System
     tables: StepTables
@@ -49,7 +47,8 @@ def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
     """The modal system of a scene, made on first use; with the area's curve up to `u_top` (V) if that is given."""
     # One system serves a decade of tolerances.
     decade = int(np.floor(np.log10(rtol)))
-    key = ("system", decade, u_top)
+    # One for each thread: compiled code writes into its tables and its work, and other threads run meanwhile.
+    key = ("system", decade, u_top, threading.get_ident())
     if key not in scene.prepared:
         model = scene.model
         if u_top > 0.0:
