@@ -147,3 +147,19 @@ def test_the_error_is_carried_with_what_the_area_answers(number: int, network: b
     off = np.abs(u_gap - expected.u_gap)[between].max()
     assert off <= solution.error.u_gap
     assert solution.error.u_gap <= 1e-6 * np.abs(u_gap).max() * 4.0
+
+
+@pytest.mark.filterwarnings("ignore:.*(breaks down|contact area|no finger|strength)")
+@pytest.mark.parametrize("rtol", [1e-5, 1e-8])
+@pytest.mark.parametrize(("amplitude", "law"), [(600.0, "local"), (600.0, "mobile"), (2000.0, "local")])
+def test_the_stated_error_covers_the_true_one_where_the_area_is_a_long_series(
+    amplitude: float, law: str, rtol: float
+) -> None:
+    """Beyond 380 V at the source a run takes 1/A as a series of its own accuracy; the reference solves Eqs. 1 to 4."""
+    t = np.linspace(0.0, 0.02, 61)[1:]
+    circuit = table1().replace({"Vdrive": fs.Sine(amplitude, 100.0)})
+    solution = fs.simulate(circuit, t_stop=0.02, t_eval=t, rtol=rtol, charge_law=law, start="uncharged")
+    segments = ref.sine_segments(amplitude, 100.0, 0.02)
+    exact = ref.transient(segments, t, law=law, params=ref.TABLE1, freq=100.0, stages=16, tol=1e-13)
+    assert np.abs(solution.u_gap - exact.u_gap).max() <= solution.error.u_gap <= rtol * np.abs(exact.u_gap).max()
+    assert np.abs(solution.f_el - exact.force).max() <= solution.error.f_el <= rtol * exact.force.max()

@@ -7,15 +7,20 @@ compiled code may call: those of the folders below, as compiled functions elsewh
 
 from __future__ import annotations
 
+import gc
 import hashlib
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from numba import njit, types
 from numba.core import cgutils, config
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Flags, compile_extra
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.typing.templates import make_concrete_template
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
@@ -97,26 +102,102 @@ class _Cache(FunctionCache):
             cast(Any, super()).save_overload(sig, data)
 
 
-_ONCE = "compiling what this needs, about 40 s, only once: later runs find it on the disk"
+_ONCE = "compiling what this needs, about 20 s, only once: later runs find it on the disk"
 _EVERY_TIME = (
-    "compiling, about 40 s, as at every run: no folder for compiled code can be written, neither the package's nor "
+    "compiling, about 20 s, as at every run: no folder for compiled code can be written, neither the package's nor "
     "the user's; set NUMBA_CACHE_DIR to one that can"
 )
+
+
+class _Body(JITCodeLibrary):
+    """Code of a function that compiled code calls, to be put into its callers and never run by itself."""
+
+    def _finalize_final_module(self) -> None:
+        cast(Any, self)._finalize_dynamic_globals()
+        self._finalized = True
+
+
+class _Flags(Flags):
+    """numba's flags of a function, compared by those that are set: it compares all of them 100,000 times."""
+
+    _HASH = hash(cast(Any, Flags)())
+
+    def __eq__(self, other: object) -> bool:
+        mine: Any = self
+        if isinstance(other, Flags) and mine._values == cast(Any, other)._values:
+            return True
+        return bool(cast(Any, super()).__eq__(other))
+
+    def __hash__(self) -> int:
+        return self._HASH
+
+
+@contextmanager
+def _without_collection() -> Iterator[None]:
+    """Without looking for cycles of objects: compiling makes millions that live until it ends."""
+    looking = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if looking:
+            gc.enable()
+
+
+class _Called:
+    """A function as compiled code calls it: without machine code of its own, and without a door to Python.
+
+    numba makes both for every function, and writes them to the disk; but functions are put into those that call them.
+    """
+
+    def __init__(self, dispatcher: Any) -> None:
+        self.of = dispatcher
+        self.found: dict[Any, tuple[object, Any]] = {}
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """What numba asks where it meets a call: the signature, with the function compiled for it."""
+        pysig, args = self.of.fold_argument_types(args, kws)
+        args = tuple(args)
+        with cast(Any, global_compiler_lock):
+            if args not in self.found:
+                self.found[args] = self._compile(args)
+        name = self.of.py_func.__name__
+        signatures = [cres.signature for _, cres in self.found.values()]
+        return cast(Any, make_concrete_template)(f"CallTemplate({name})", name, signatures), pysig, args, {}
+
+    def get_overload(self, args: Any) -> object:
+        """By what numba knows the function of such arguments."""
+        return self.found[tuple(args)][0]
+
+    def _compile(self, args: Any) -> tuple[object, Any]:
+        of, context = self.of, self.of.targetctx
+        flags = cast(Any, _Flags)()
+        of.targetdescr.options.parse_as_flags(flags, of.targetoptions)
+        flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        library = cast(Any, _Body)(context.codegen(), of.py_func.__qualname__)
+        cres = cast(Any, compile_extra)(of.typingctx, context, of.py_func, args, None, flags, {}, library)
+        key = object()
+        context.insert_user_function(key, cres.fndesc, [cres.library])
+        return key, cres
 
 
 def _cached(**options: Any) -> Callable[[Function], Function]:
     """`njit` with a cache."""
 
     def compile_when_called(function: Function) -> Function:
-        compiled = njit(error_model="numpy", **options)(function)
+        # What is not said here, numba takes from whichever caller comes first.
+        compiled = njit(**{"error_model": "numpy", "nogil": True, "fastmath": False, **options})(function)
         compiled._cache = cast(Any, _Cache)(function)
         compile_signature = compiled.compile
 
         def announced(signature: Any) -> Any:
-            with _COMPILER.around():
+            with _COMPILER.around(), _without_collection():
                 return compile_signature(signature)
 
         compiled.compile = announced
+        compiled._compiler._customize_flags = _Flags
+        called = _Called(compiled)
+        compiled.get_call_template, compiled.get_overload = called.get_call_template, called.get_overload
         return cast(Function, compiled)
 
     return compile_when_called

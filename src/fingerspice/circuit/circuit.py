@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -23,6 +24,8 @@ from fingerspice.waveforms.waveform import Waveform, as_waveform
 CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
 _REMEMBERING = threading.Lock()
+#: What a changed circuit may take over from the one that it was made of, by its key in `Circuit.remember`.
+INHERITED = ("loop",)
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,7 @@ class Element:
         return f"<{' '.join([self.device, self.name, *self.node_names, values_text(self)]).rstrip()}>"
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "values": dict(self.values)}
+        return {**{k: v for k, v in vars(self).items() if k != "kept"}, "values": dict(self.values)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update({**state, "values": MappingProxyType(state["values"])})
@@ -92,6 +95,11 @@ class Element:
     def spec(self) -> DeviceSpec:
         """The device's entry in the registry."""
         return DEVICES[self.device]
+
+    @cached_property
+    def kept(self) -> dict[Any, Any]:
+        """What follows from this element alone, for every circuit that has it unchanged."""
+        return {}
 
 
 @dataclass(frozen=True)
@@ -269,6 +277,8 @@ class Circuit(Shown):
                 raise InputError(self._unknown_path(path))
             overrides[path] = value if isinstance(value, str) else getattr(value, "__name__", repr(value))
         changed = dataclasses.replace(self, elements=tuple(elements.values()), overrides=overrides)
+        # Of the same nodes and devices: what follows from those alone is found in it.
+        changed._memory["of"] = ({k: v[0] for k, v in self._memory.items() if k in INHERITED},)
         check(changed)
         before, after = _unusual(self), _unusual(changed)
         # One warning of each value is enough.
@@ -298,7 +308,12 @@ class Circuit(Shown):
 
 def _unusual(circuit: Circuit) -> dict[str, str]:
     """Warnings of unusual values in a circuit, each with the path (in lower case) that it is about."""
-    return {text: f"{e.name}.{name}".lower() for e in circuit.elements for name, text in unusual(e)}
+    found: dict[str, str] = {}
+    for e in circuit.elements:
+        if "unusual" not in e.kept:
+            e.kept["unusual"] = {text: f"{e.name}.{name}".lower() for name, text in unusual(e)}
+        found |= e.kept["unusual"]
+    return found
 
 
 def _concerns(warning: str, changes: Mapping[str, Any]) -> bool:
@@ -343,6 +358,8 @@ def check(circuit: Circuit) -> None:
         One sentence: which parameter, what was given with its unit, what is allowed, where.
     """
     for element in circuit.elements:
+        if "checked" in element.kept:
+            continue
         for spec in element.spec.parameters:
             value: Any = element.values[spec.name]
             if not spec.accepts(value):
@@ -352,6 +369,7 @@ def check(circuit: Circuit) -> None:
                 )
         if element.device == "GAP":
             _check_contact(element)
+        element.kept["checked"] = True
     if circuit.tran is not None and not circuit.tran.stop > 0.0:
         raise InputError(f"t_stop is {circuit.tran.stop:g} s; allowed: more than 0")
 

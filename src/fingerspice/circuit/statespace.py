@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.topology import Hop, Loop, find_loop
+from fingerspice.circuit.topology import Hop, Loop, find_loop, same_loop
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 from fingerspice.waveforms.combinations import Product, Sum
@@ -100,17 +100,17 @@ class Stack:
         marked = np.logical_or.reduceat(cells, self.first_cell)
         return [e.name for e, mark in zip(self.layers, marked, strict=True) if mark]
 
-    @property
+    @cached_property
     def s(self) -> float:
         """Sum of 1/c over the cells, m^2/F."""
         return float(np.sum(1.0 / self.c))
 
-    @property
+    @cached_property
     def k(self) -> FloatArray:
         """Share of a jump of U that each cell takes, shape (n_cell,)."""
         return np.asarray(1.0 / (self.c * self.s))
 
-    @property
+    @cached_property
     def waveform(self) -> Waveform:
         """Voltage around the loop: the sources with their signs."""
         parts: list[Waveform] = []
@@ -168,7 +168,11 @@ def layer_constants(layer: Element, skin_at: float | None = None) -> FloatArray:
     With `skin_at` a dispersive skin's data are those at that frequency (Hz).
     """
     assert layer.spec.cells is not None
-    return layer.spec.cells(layer.values, skin_at)
+    key = ("cells", skin_at)
+    if key not in layer.kept:
+        layer.kept[key] = layer.spec.cells(layer.values, skin_at)
+    constants: FloatArray = layer.kept[key]
+    return constants
 
 
 def contact_of(gap: Element) -> Contact:
@@ -179,6 +183,13 @@ def contact_of(gap: Element) -> Contact:
     InputError
         Where its constants are beyond the range of numbers.
     """
+    if "contact" not in gap.kept:
+        gap.kept["contact"] = _contact_of(gap)
+    contact: Contact = gap.kept["contact"]
+    return contact
+
+
+def _contact_of(gap: Element) -> Contact:
     v = gap.values
     try:
         contact = Contact(
@@ -216,8 +227,13 @@ def is_stack(circuit: Circuit) -> bool:
 
 
 def _loop(circuit: Circuit) -> Loop | None:
-    """The circuit's loop, looked for once."""
-    loop: Loop | None = circuit.remember("loop", lambda: find_loop(circuit))
+    """The circuit's loop, looked for once; in one that `Circuit.replace` made, where that of the other one was."""
+
+    def make() -> Loop | None:
+        before: Loop | None = circuit.remember("of", dict).get("loop")
+        return find_loop(circuit) if before is None else same_loop(circuit, before)
+
+    loop: Loop | None = circuit.remember("loop", make)
     return loop
 
 
@@ -232,6 +248,11 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
     InputError
         As `topology.find_branches`, and for a network that is no such stack.
     """
+    stack: Stack = circuit.remember(("stack", skin_at), lambda: _build(circuit, skin_at))
+    return stack
+
+
+def _build(circuit: Circuit, skin_at: float | None) -> Stack:
     loop = _loop(circuit)
     if loop is None:
         raise InputError(

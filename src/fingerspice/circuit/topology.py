@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 
 from fingerspice.base.errors import InputError
@@ -99,6 +99,21 @@ def find_loop(circuit: Circuit) -> Loop | None:
     if gap is not None and gap.values["tau"] > 0.0 and areas[0].given is None:
         return None
     return Loop(_walk(branches), gap, areas[0].given)
+
+
+def same_loop(circuit: Circuit, before: Loop) -> Loop | None:
+    """The loop of a circuit with the elements of another one on the same nodes, whose loop is known; or None.
+
+    Raises
+    ------
+    InputError
+        For areas, as `find_branches`.
+    """
+    (area,) = _areas(circuit)
+    if area.gap is not None and area.gap.values["tau"] > 0.0 and area.given is None:
+        return None
+    now = {e.name: e for e in circuit.elements}
+    return Loop(tuple(replace(hop, element=now[hop.element.name]) for hop in before.hops), area.gap, area.given)
 
 
 def _refuse_large(circuit: Circuit) -> None:

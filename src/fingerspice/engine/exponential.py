@@ -133,27 +133,27 @@ def converge(
     for k in range(w0.size):
         for i in range(ROWS):
             used[k, i] = 0.0
-    if not evaluate(
-        mobile, k_gap, area0, q0, gap, push, tap, tap_k, feed, tapped, powers, slopes, lo, scale, curve, sign, w, pull,
-        r,
-    ):  # fmt: skip
-        return 1, False
-    if not coupled:
-        return 1, True
-    for i in range(ROWS):
-        r[GUESS, i] = r[U, i]
     slow = False
-    for iteration in range(2, 41):
-        if slow:
-            step = mix(pull, used, weight, pull_before, left_before)
-        else:
-            step = plain(pull, used, weight, pull_before, left_before)
-        respond(used, phi, base, w)
+    step = 0.0
+    # One loop from the first evaluation on: the code that it calls is put into this place, and so is compiled once.
+    for iteration in range(1, 41):
+        if iteration > 1:
+            if slow:
+                step = mix(pull, used, weight, pull_before, left_before)
+            else:
+                step = plain(pull, used, weight, pull_before, left_before)
+            respond(used, phi, base, w)
         if not evaluate(
             mobile, k_gap, area0, q0, gap, push, tap, tap_k, feed, tapped, powers, slopes, lo, scale, curve, sign, w,
             pull, r,
         ):  # fmt: skip
             return iteration, False
+        if not coupled:
+            return 1, True
+        if iteration == 1:
+            for i in range(ROWS):
+                r[GUESS, i] = r[U, i]
+            continue
         # What the gap voltage would move next, by what it moved for the last change of the nonlinear term.
         change = moved(r[U], r[GUESS])
         left = distance(pull, used, weight)

@@ -11,7 +11,7 @@ from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine.charge import charge_step
 from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, weigh
 from fingerspice.engine.growth import carry
-from fingerspice.engine.model import branch_area, dot, turns_at_zero
+from fingerspice.engine.model import Model, branch_area, dot, gap_voltage, turns_at_zero, write_row_at
 from fingerspice.engine.pace import Pace, change_level, choose_step, enter, nearest_level, rung, take_branch
 from fingerspice.engine.readout import (
     ACCEPTED,
@@ -52,8 +52,8 @@ from fingerspice.engine.readout import (
     zero,
 )  # fmt: skip
 from fingerspice.engine.repeat import AT_EDGE, AT_ZERO, Kept
-from fingerspice.engine.rows import DQ, GUESS, SOURCE, X_GAP, Q, U, source_rows
-from fingerspice.engine.segment import Segment, source
+from fingerspice.engine.rows import DQ, GUESS, SOURCE, X_GAP, Q, U, largest_size, source_rows
+from fingerspice.engine.segment import Segment, segment_at, source
 from fingerspice.engine.system import System
 from fingerspice.engine.work import Work
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
@@ -171,12 +171,14 @@ def march(
     since = 0.0
     segment_terms, segment_series = terms[0], series[0]
     if edges[0] < control[T]:
-        index = np.searchsorted(edges, control[T], side="right") - 2
+        index = segment_at(edges, control[T]) - 1
     most = counters[ACCEPTED] + counters[REJECTED] + MOST_STEPS
     begun, evaluated = control[T], counters[NFEV]
     if paused[0] > 0.0:
         # In the middle of a segment: go on as if there had been no pause.
-        index = np.searchsorted(edges, control[T], side="left") - 1
+        index = segment_at(edges, control[T])
+        while edges[index] >= control[T]:
+            index -= 1
         start, edge = edges[index], edges[index + 1]
         segment_terms, segment_series = terms[index], series[index]
         paused[0], since, begun = 0.0, paused[1], paused[2]
@@ -308,7 +310,7 @@ def march(
                 break
             counters[REJECTED] += 1
             # Near the end of the area's polynomial no step ends beyond it: the kink there would be crept up to.
-            if coupled and abs(control[U_GAP]) > 0.9 * u_top and np.abs(u_rows).max() > u_top:
+            if coupled and abs(control[U_GAP]) > 0.9 * u_top and largest_size(u_rows) > u_top:
                 return OUT_OF_RANGE
             # Refused at this length, which is rounding of the time: a singularity.
             if h <= 1e-15 * since + 1e-25 * (edge - start):
@@ -423,3 +425,18 @@ def march(
         if control[PEAK_U] > u_top:
             return OUT_OF_RANGE
     return DONE
+
+
+@jit
+def end_row(
+    model: Model, segment: Segment, tau: float, charge: bool, y: FloatArray, control: FloatArray, row: FloatArray
+) -> None:
+    """Output row (see `model.write_row`) `tau` s into a segment, after the jump of the source that may begin it.
+
+    The jump's charge is put into `y`, and its branch into `control`; NaN where it goes past a fold.
+    """
+    u_source, du_source = source(segment, tau)
+    if tau == 0.0 and not enter(model, charge, u_source, y, control):
+        u_source = math.nan
+    u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), control[SIGN], control[U_GAP])
+    write_row_at(model, u_source, du_source, y, control[SIGN], u, row)

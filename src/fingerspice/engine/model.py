@@ -317,7 +317,9 @@ def write_row_at(
     row[2] = q
     row[3] = current
     row[4] = margin
-    row[5:] = y
+    # A slice on the left would be compiled with a message for every shape.
+    for j in range(y.size):
+        row[5 + j] = y[j]
 
 
 @jit
@@ -366,7 +368,9 @@ def _panel_charge(model: Model, x_gap: float, u_from: float, u_to: float) -> tup
         low, high = min(low, area), max(high, area)
         for k in range(tail.size):
             tail[k] += _TAIL[k, g] * (area - centre)
-    left = np.abs(tail).max()
+    left = 0.0
+    for k in range(tail.size):
+        left = max(left, abs(tail[k]))
     # Coefficients that fall as a geometric series from the range of the values to these end there squared.
     missed = 2.0 * left * min(1.0, left / (high - low)) if left > _TAIL_ROUNDING * high else 0.0
     return half * total, abs(half) * missed

@@ -123,7 +123,23 @@ def _add_general(term: FloatArray, waves: bool, t0: float, h: float, out: FloatA
 
 
 @jit_rows
-def polynomial_rows(powers: FloatArray, lo: float, scale: float, u: FloatArray, sign: float, out: FloatArray) -> None:
+def _series_rows(series: FloatArray, lo: float, scale: float, u: FloatArray, sign: float, out: FloatArray) -> None:
+    """The Chebyshev series in (sign u - lo) scale - 1 at every row (Clenshaw)."""
+    room = np.zeros((3, ROWS))
+    twice, b1, b2 = room[0], room[1], room[2]
+    for i in range(ROWS):
+        twice[i] = 2.0 * min(max((sign * u[i] - lo) * scale - 1.0, -1.0), 1.0)
+    for d in range(series.size - 1, 0, -1):
+        for i in range(ROWS):
+            b0 = twice[i] * b1[i] + (series[d] - b2[i])
+            b2[i] = b1[i]
+            b1[i] = b0
+    for i in range(ROWS):
+        out[i] = 0.5 * twice[i] * b1[i] + (series[0] - b2[i])
+
+
+@jit_rows
+def _powers_rows(powers: FloatArray, lo: float, scale: float, u: FloatArray, sign: float, out: FloatArray) -> None:
     """The polynomial in (sign u - lo) scale - 1 at every row."""
     for i in range(ROWS):
         x = (sign * u[i] - lo) * scale - 1.0
@@ -136,8 +152,17 @@ def polynomial_rows(powers: FloatArray, lo: float, scale: float, u: FloatArray, 
 
 
 @jit
+def polynomial_rows(powers: FloatArray, lo: float, scale: float, u: FloatArray, sign: float, out: FloatArray) -> None:
+    """The polynomial in (sign u - lo) scale - 1 at every row: of `DEGREE` in powers, longer as a Chebyshev series."""
+    if powers.size == DEGREE + 1:
+        _powers_rows(powers, lo, scale, u, sign, out)
+    else:
+        _series_rows(powers, lo, scale, u, sign, out)
+
+
+@jit
 def _long_area(curve: FloatArray, sign: float, r: FloatArray) -> None:
-    """1/A and its slope from the model's own curve, where the polynomial does not reach."""
+    """1/A and its slope from Eq. 4 itself, where no series was found."""
     for i in range(ROWS):
         value, slope = inverse_area(max(sign * r[U, i], curve[0]), curve)
         r[Q, i] = value
@@ -202,8 +227,8 @@ def evaluate(
 ) -> bool:  # fmt: skip
     """Gap voltage, 1/A and nonlinear term from the modes w (see `fingerspice.engine.system.System`).
 
-    With `scale` 0 the area comes from `curve`, else from the polynomial. Under `mobile`, r[GUESS] holds a guess of the
-    gap voltage; False where the area equation was not solved on the branch connected to it.
+    With `scale` 0 the area comes from `curve`, else from the polynomial or series. Under `mobile`, r[GUESS] holds a
+    guess of the gap voltage; False where the area equation was not solved on the branch connected to it.
     """
     _gap_voltage(k_gap, gap, w, r[SOURCE], r[X_GAP], r[U])
     if mobile:
@@ -255,6 +280,15 @@ def _solve_mobile(
         if worst * lowest <= 1e-15 * size:
             return True
     return False
+
+
+@jit
+def largest_size(values: FloatArray) -> float:
+    """The largest of the sizes of values; NaN counts for nothing."""
+    largest = 0.0
+    for i in range(values.size):
+        largest = max(largest, abs(values[i]))
+    return largest
 
 
 @jit_rows

@@ -34,6 +34,19 @@ class Segment(NamedTuple):
 
 
 @jit
+def segment_at(edges: FloatArray, t: float) -> int:
+    """Index of the last edge that is not after t, or -1."""
+    low, high = -1, edges.size
+    while high - low > 1:
+        middle = (low + high) // 2
+        if edges[middle] <= t:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@jit
 def source(segment: Segment, tau: float) -> tuple[float, float]:
     """Source voltage (V) and its slope (V/s), tau seconds into a segment."""
     u = 0.0

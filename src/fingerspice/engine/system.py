@@ -21,14 +21,16 @@ from numpy.typing import NDArray
 
 from fingerspice.base.compiled import jit
 from fingerspice.engine.model import Model
-from fingerspice.numerics.chebyshev import evaluate, to_powers
+from fingerspice.numerics.chebyshev import evaluate, fit, to_powers
 from fingerspice.numerics.modes import modes
-from fingerspice.physics.contact import N_PACKED, inverse_area
+from fingerspice.physics.contact import N_PACKED, inverse_area, ridge_area, ridge_area_array
 
 FloatArray = NDArray[np.float64]
 
 DEGREE = 27
-"""Of the polynomial for 1/A; where it does not reach rounding, the long series of the model serves."""
+"""Of the polynomial for 1/A; where it does not reach the error asked for, a longer Chebyshev series serves."""
+# Terms of the longer series: 35 at 600 V of Table 1 for an error of 1e-9, 89 at 2 kV for 1e-11; and their rounding.
+_LONG_SIZES, _LONG_ROUNDING = (32, 48, 64, 96, 128, 160), 9e-13
 # Ratio of neighbouring reference values of 1/A: the nonlinear term is at most an eighth of what it perturbs.
 _LEVEL_RATIO = 1.28
 
@@ -57,10 +59,12 @@ class System(NamedTuple):
     shown : ndarray, shape (n_level, n_column, n)
         Recorded voltages over k_shown U, as `live` gives the live ones.
     k_shown : ndarray, shape (n_column,)
-    powers, slopes : ndarray, shape (DEGREE + 1,)
-        1/A as a polynomial in (u - lo) * scale - 1, and its derivative.
+    powers, slopes : ndarray, shape (DEGREE + 1,) or longer
+        1/A as a polynomial in (u - lo) * scale - 1, and its derivative; longer ones hold coefficients of Chebyshev
+        series
     lo, scale : float
-        Lowest gap voltage (V) of the branch's continuation, and 1/V; scale is 0 where the model's curve serves instead.
+        Lowest gap voltage (V) of the branch's continuation, and 1/V; scale is 0 where Eq. 4 is solved at every
+        evaluation instead.
     u_top : float
         Largest gap voltage (V) that the model's curve covers.
     stress : float
@@ -157,22 +161,86 @@ def area_error(decade: int) -> float:
 
 
 def area_missed(curve: FloatArray, decade: int) -> float:
-    """What the area's polynomial does miss of a `Contact.curve`, relative; 0 where another form of it is taken."""
+    """What the run's form of a `Contact.curve` (see `area_polynomial`) misses of 1/A at most, relative."""
     series = np.abs(curve[2 + N_PACKED :])
-    missed = float(series[DEGREE + 1 :].sum() / series[0]) if series.size > 1 and series[0] > 0.0 else 0.0
-    return missed if missed <= area_error(decade) else 0.0
+    if series.size == 1 or not curve[0] < curve[1]:
+        return 0.0
+    if not series.size or not series[0] > 0.0:
+        return area_error(decade)
+    return float(series[_kept(curve, area_error(decade)) :].sum() / _at_rest(curve))
+
+
+def _kept(curve: FloatArray, tol: float) -> int:
+    """Terms of a curve's series that are taken for an error of `tol` of 1/A: as many as a polynomial has, or more."""
+    series = np.abs(curve[2 + N_PACKED :])
+    left = np.cumsum(series[::-1])[::-1]
+    return max(min(DEGREE + 1, series.size), int(np.count_nonzero(left > tol * _at_rest(curve))))
+
+
+def _at_rest(curve: FloatArray) -> float:
+    """1/A at 0 V (1/m^2): nowhere, in what a series covers, is it much less."""
+    packed = curve[2 : 2 + N_PACKED]
+    return float(packed[1] / (packed[1] ** 2 - packed[7] * packed[5] ** 2))
 
 
 def area_polynomial(curve: FloatArray, tol: float) -> tuple[FloatArray, FloatArray, float, float]:
-    """1/A as a polynomial of `DEGREE`, its slopes, `lo` and `scale` (see `System`) from a `Contact.curve`."""
-    powers = np.zeros(DEGREE + 1)
-    slopes = np.zeros(DEGREE + 1)
+    """1/A as a polynomial, its slopes, `lo` and `scale` (see `System`) from a `Contact.curve`.
+
+    Of `DEGREE` and in powers where that misses at most `tol` (relative); else a longer Chebyshev series that does.
+    """
     lo, hi = float(curve[0]), float(curve[1])
-    series = curve[2 + N_PACKED :]
-    if series.size == 0 or not lo < hi or np.abs(series[DEGREE + 1 :]).sum() > tol * abs(series[0]):
-        return powers, slopes, lo, 0.0
-    exact = _to_polynomial(series, powers, slopes, max(2.0 * tol, 4e-15) * abs(series[0]))
-    return powers, slopes, lo, 2.0 / (hi - lo) if exact else 0.0
+    series: FloatArray | None = curve[2 + N_PACKED :]
+    none = np.zeros(DEGREE + 1), np.zeros(DEGREE + 1), lo, 0.0
+    if not lo < hi:
+        return none
+    scale = 2.0 / (hi - lo)
+    if series is not None and series.size and series[0] > 0.0:
+        series = series[: _kept(curve, tol)]
+        powers, slopes = np.zeros(DEGREE + 1), np.zeros(DEGREE + 1)
+        enough = series.size <= DEGREE + 1
+        if enough and _to_polynomial(series, powers, slopes, max(2.0 * tol, 4e-15) * _at_rest(curve)):
+            return powers, slopes, lo, scale
+    else:
+        series = _long_series(curve, tol)
+    if series is None:
+        return none
+    long, slope = _both(series, max(series.size, DEGREE + 2))
+    return long, slope, lo, scale
+
+
+def _long_series(curve: FloatArray, tol: float) -> FloatArray | None:
+    """A series over a curve's range that misses at most `tol` of 1/A, longer than those that curves have; or None."""
+    if tol < _LONG_ROUNDING:
+        return None
+    packed = curve[2 : 2 + N_PACKED]
+    # 1/A rises to many times its value at 0 V: what is missed is a smaller share of the largest term.
+    share = 0.1 * tol * _at_rest(curve) * float(ridge_area(curve[1], packed))
+    return fit(lambda u: 1.0 / np.asarray(ridge_area_array(u, packed)), curve[0], curve[1], share, _LONG_SIZES)
+
+
+def _both(series: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
+    """A Chebyshev series and that of its derivative, both with zeros up to `width` terms."""
+    long, slope = np.zeros((2, width))
+    long[: series.size] = series
+    slope[: series.size - 1] = np.polynomial.chebyshev.chebder(series)
+    return long, slope
+
+
+def area_polynomials(
+    curves: FloatArray, follows: NDArray[np.bool_], tol: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """`area_polynomial` of several areas, one a row, all of them of one length; zeros for those that do not follow."""
+    found = [area_polynomial(curve, tol) for curve in curves[follows]]
+    width = max((powers.size for powers, _, _, _ in found), default=DEGREE + 1)
+    powers, slopes = np.zeros((2, follows.size, width))
+    lo, scale = np.zeros((2, follows.size))
+    for i, curve, (power, slope, low, one) in zip(np.flatnonzero(follows), curves[follows], found, strict=True):
+        lo[i], scale[i] = low, one
+        if power.size == DEGREE + 1 < width and one > 0.0:
+            # Beside a longer series it is one too.
+            power, slope = _both(curve[2 + N_PACKED :][: _kept(curve, tol)], width)
+        powers[i, : power.size], slopes[i, : slope.size] = power, slope
+    return powers, slopes, lo, scale
 
 
 @jit

@@ -100,7 +100,8 @@ def to_powers(c: FloatArray, powers: FloatArray) -> bool:
     before = np.zeros(n)
     now = np.zeros(n)
     now[0] = 1.0
-    powers[:] = 0.0
+    for k in range(n):
+        powers[k] = 0.0
     size = 0.0
     for k in range(n):
         for j in range(k + 1):

@@ -57,6 +57,19 @@ def _root_between(r: FloatArray, k: FloatArray, i: int) -> tuple[int, float]:
 
 
 @jit
+def _ascending(r: FloatArray) -> NDArray[np.int64]:
+    """Indices that put the few rates in ascending order; equal ones stay in theirs."""
+    order = np.empty(r.size, np.int64)
+    for i in range(r.size):
+        place = i
+        while place > 0 and r[order[place - 1]] > r[i]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = i
+    return order
+
+
+@jit
 def modes(r: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Modal form of x' = -h + k sum(h) + (-p + k sum(p)).
 
@@ -75,7 +88,7 @@ def modes(r: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
         x = shape @ w.
     """
     n = r.size - 1
-    order = np.argsort(r)
+    order = _ascending(r)
     rates = np.zeros(n)
     gain = np.zeros(n)
     feed = np.zeros((n + 1, n))
@@ -86,7 +99,8 @@ def modes(r: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
     group = np.empty(n + 1, np.int64)
     count = 0
     found = 0
-    for i in order:
+    for m in range(n + 1):
+        i = order[m]
         if count > 0 and r[i] <= poles[count - 1] * (1.0 + 4e-16):
             share = shares[count - 1]
             # Mode of this element against the group so far, orthogonal in 1/k.
@@ -125,9 +139,9 @@ def modes(r: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
 @jit
 def _seen(order: NDArray[np.int64], j: int, i: int) -> bool:
     """Whether j comes before i in `order`."""
-    for m in order:
-        if m == j:
+    for m in range(order.size):
+        if order[m] == j:
             return True
-        if m == i:
+        if order[m] == i:
             return False
     return False

@@ -195,7 +195,8 @@ def inverse_area(u: float, curve: FloatArray) -> tuple[float, float]:
         return curve[-1], 0.0
     lo = curve[0]
     hi = curve[1]
-    if n > 1 and lo <= u <= hi:
+    # Where none was found, but those of other areas are kept beside it, zeros stand in the series' place.
+    if n > 1 and lo <= u <= hi and curve[2 + N_PACKED] > 0.0:
         scale = 2.0 / (hi - lo)
         value, slope = chebyshev.evaluate(curve[2 + N_PACKED :], (u - lo) * scale - 1.0)
         return value, slope * scale
@@ -209,7 +210,7 @@ def inverse_areas(u: FloatArray, curve: FloatArray) -> FloatArray:
     lo, hi, series = float(curve[0]), float(curve[1]), curve[2 + N_PACKED :]
     if series.size == 1:
         return np.full(u.shape, series[0])
-    if series.size and max(u.max(initial=0.0), -u.min(initial=0.0)) <= hi:
+    if series.size and series[0] > 0.0 and max(u.max(initial=0.0), -u.min(initial=0.0)) <= hi:
         out = np.empty(u.size)
         chebyshev.evaluate_array(series, u, lo, 2.0 / (hi - lo), out)
         return out

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceError, printable
 
@@ -69,8 +67,8 @@ class Attempt(NamedTuple):
 
 def last_tried(rows: FloatArray) -> tuple[Attempt, ...]:
     """Attempted steps, oldest first, from rows of start, length, error and number, where number 0 means no step."""
-    rows = rows[rows[:, 3] > 0.0]
-    return tuple(Attempt(*map(float, row[:3])) for row in rows[np.argsort(rows[:, 3])])
+    kept = sorted((row for row in rows.tolist() if row[3] > 0.0), key=lambda row: row[3])
+    return tuple(Attempt(*row[:3]) for row in kept)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,7 +17,7 @@ from fingerspice.engine.exponential import Tables, new_tables
 from fingerspice.engine.netrows import Form, new_work
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import Pace
-from fingerspice.engine.system import area_error, area_missed, area_polynomial
+from fingerspice.engine.system import area_error, area_missed, area_polynomials
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.results.network_record import bare_record
@@ -71,7 +72,8 @@ class Reference:
 
 def reference_at(scene: NetworkScene, levels: tuple[int, ...], decade: int) -> Reference:
     """The reference whose areas are the fixed ones, or LEVEL_RATIO to these powers over those at 0 V."""
-    key = ("reference", levels, decade)
+    # One for each thread: compiled code writes into its tables, and other threads run meanwhile.
+    key = ("reference", levels, decade, threading.get_ident())
     if key not in scene.prepared:
         kept = [name for name in list(scene.prepared) if name[0] == "reference"]
         for name in kept if len(kept) >= MOST_REFERENCES else ():
@@ -101,10 +103,7 @@ def _make_reference(scene: NetworkScene, area: FloatArray, tol: float) -> Refere
         assert cell is not None
         assert contact is not None
         gap[i], gap_s[i], stress[i] = tap[cell], tap_s[cell], float(contact.stress(1.0))
-    fits = [area_polynomial(curve, tol) if follows[i] else None for i, curve in enumerate(net.curves)]
-    width = next(fit[0].size for fit in fits if fit is not None)
-    none = np.zeros(width), np.zeros(width), 0.0, 0.0
-    powers, slopes, lo, scale = zip(*(fit or none for fit in fits), strict=True)
+    powers, slopes, lo, scale = area_polynomials(net.curves, follows, tol)
     capacitance, leak = network.capacitance(area)[:, None], network.leak(area)[:, None]
     at_x, at_s = network.delivered[:, :n], network.delivered[:, n:]
     form = Form(
@@ -129,10 +128,10 @@ def _make_reference(scene: NetworkScene, area: FloatArray, tol: float) -> Refere
         gap=gap,
         gap_s=gap_s,
         stress=stress,
-        powers=np.array(powers),
-        slopes=np.array(slopes),
-        lo=np.array(lo),
-        scale=np.array(scale),
+        powers=powers,
+        slopes=slopes,
+        lo=lo,
+        scale=scale,
         curves=net.curves,
         stored=_packed(network.through @ (capacitance * tap)),
         stored_s=_packed(network.through @ (capacitance * tap_s)),

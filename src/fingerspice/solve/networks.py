@@ -16,7 +16,7 @@ from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.network import Modes, Network, build_network, network_modes
 from fingerspice.circuit.response import mean_network_areas
 from fingerspice.engine.network import Net
-from fingerspice.physics.contact import N_PACKED, inverse_area
+from fingerspice.physics.contact import inverse_area
 from fingerspice.results.network_record import NetworkRecord
 from fingerspice.results.outcome import NetworkState
 from fingerspice.results.solution import Solution
@@ -255,11 +255,8 @@ def _net(network: Network, law: str, fixed: tuple[float | None, ...], u_top: flo
 
 
 def _padded(curve: FloatArray, width: int) -> FloatArray:
-    """A curve as long as the others'; of one without a series no voltage is in reach."""
-    out = np.pad(curve, (0, width - curve.size))
-    if curve.size == 2 + N_PACKED:
-        out[1] = -math.inf
-    return out
+    """A curve as long as the others'."""
+    return np.pad(curve, (0, width - curve.size))
 
 
 def _initial(circuit: Circuit, scene: NetworkScene, start: str | Solution) -> NetworkState:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 from functools import partial
 
 import numpy as np
@@ -11,9 +12,7 @@ from fingerspice.engine import march, readout
 from fingerspice.engine import repeat as repetition
 from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
-from fingerspice.engine.model import write_row
-from fingerspice.engine.pace import Pace, enter
-from fingerspice.engine.segment import source
+from fingerspice.engine.pace import Pace
 from fingerspice.engine.system import System, area_error, area_missed, area_range, build_system
 from fingerspice.engine.work import Work, new_work
 from fingerspice.numerics.lobatto import integral_table
@@ -34,10 +33,7 @@ KEPT_STEPS = 2000
 
 @dataclasses.dataclass(frozen=True)
 class Prepared:
-    """A scene's system with the tables it has needed so far, and arrays to work in.
-
-    Threads may share it: compiled code holds the interpreter's lock, and leaves nothing in `work` for its next call.
-    """
+    """A scene's system with the tables it has needed so far, and arrays to work in, for one thread."""
 
     system: System
     tables: StepTables
@@ -51,7 +47,8 @@ def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
     """The modal system of a scene, made on first use; with the area's curve up to `u_top` (V) if that is given."""
     # One system serves a decade of tolerances.
     decade = int(np.floor(np.log10(rtol)))
-    key = ("system", decade, u_top)
+    # One for each thread: compiled code writes into its tables and its work, and other threads run meanwhile.
+    key = ("system", decade, u_top, threading.get_ident())
     if key not in scene.prepared:
         model = scene.model
         if u_top > 0.0:
@@ -210,13 +207,11 @@ class Track:
         if first == self.t_out.size:
             return
         segment, tau = after_the_end(self.problem, table)
-        # Takes the charge of a jump that stands at the end; the state itself stays before it.
-        y, control, model = self.y.copy(), self.control.copy(), self.prepared.system.model
-        u, du = source(segment, tau)
-        if tau == 0.0 and not enter(model, self.pace.charge, u, y, control):
-            u = np.nan
+        # Copies take the charge of a jump that stands at the end; the state itself stays before it.
         row = np.empty(row_width(self.problem))
-        write_row(model, u, du, y, control[readout.SIGN], control[readout.U_GAP], row)
+        march.end_row(
+            self.prepared.system.model, segment, tau, self.pace.charge, self.y.copy(), self.control.copy(), row
+        )
         live, z, current = from_rows(self.problem, row[None, :])
         n = live.shape[0]
         self.out[:n, first:] = live

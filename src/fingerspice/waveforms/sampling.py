@@ -220,10 +220,10 @@ def source_table(
     # A breakpoint equal to an end of the window but for rounding is that end, and makes no segment of its own.
     inner = inner[(inner > t0 + same_time(t0)) & (inner < t1 - same_time(t1))]
     edges = np.concatenate([[t0], inner, [t1]])
-    if not is_sampled(waveform):
-        edges = _rephased(edges, waveform.shortest_time())
-        terms = waveform.terms(edges[:-1], edges[1:])
-        assert terms is not None
+    between = _rephased(edges, waveform.shortest_time())
+    terms = waveform.terms(between[:-1], between[1:])
+    if terms is not None:
+        edges = between
         if no_chirps and np.any(terms[:, :, 5] != 0.0):
             # The output step is not used here, so that no result depends on the outputs asked for.
             step = 0.1 * waveform.shortest_time()
@@ -233,7 +233,7 @@ def source_table(
     for a, b in itertools.pairwise(edges):
         if not pieces.cover(float(a), float(b)):
             break
-    if is_sampled(waveform):
+    if terms is None:
         pieces.warn()
     m = len(pieces.series)
     return SourceTable(
