@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
+from fingerspice.circuit.statespace import build_stack
 from scenes import deck, table1
 
 V = "Vdrive n0 0 SIN(0 200 100)"
@@ -111,7 +112,7 @@ NETWORKS = {
 def test_what_is_not_a_stack_is_a_network(case: str) -> None:
     circuit = deck(*NETWORKS[case])
     with pytest.raises(fs.InputError, match="needs a series chain of LAYER, SLAB, SKIN and GAP"):
-        fs.steady_state(circuit)
+        build_stack(circuit)
     options = {"t_stop": 1e-4, "t_eval": np.linspace(1e-5, 1e-4, 10)}
     solution = fs.simulate(circuit, rtol=1e-6, **options)
     exact = fs.simulate(circuit, rtol=1e-9, method="radau", **options)

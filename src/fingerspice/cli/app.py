@@ -6,7 +6,7 @@ import gc
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -195,7 +195,7 @@ def ac(
         if area == "coupled":
             if skin != "swept":
                 raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
-            found = _large_signal(circuit, frequencies, amplitude, charge_law, rtol, finger)
+            found = _large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger)
         elif amplitude:
             raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
         else:
@@ -212,20 +212,13 @@ def ac(
 
 
 def _large_signal(
-    circuit: Circuit,
-    frequencies: FloatArray,
-    amplitude: list[float] | None,
-    charge_law: str | None,
-    rtol: float,
-    finger: str | None,
+    circuit: Circuit, frequencies: FloatArray, amplitude: list[float] | None, **how: Any
 ) -> tuple[PhasorSolution, ...]:
     """The sweep with ``--area coupled``: the periodic state at every frequency (Hz) and amplitude (V)."""
     from fingerspice.studies.largesignal import large_signal
 
     with progress("sweeping") as update:
-        return large_signal(
-            circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger, progress=update
-        )
+        return large_signal(circuit, frequencies, amplitude, progress=update, **how)
 
 
 @app.command()

@@ -17,9 +17,9 @@ from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, END, FIRST, NODES
 FloatArray = NDArray[np.float64]
 
 # What a polynomial misses of a rate changes its sign at every node: of its integral over the step's length so much is
-# left (0.03 to 0.14 where what is missed are Chebyshev polynomials of degree 13 to 21); and twice that, as the three
-# points where it is measured need not be those where it is largest.
-_LOBE = 0.3
+# left. It is 0.03 to 0.14 where what is missed are Chebyshev polynomials of degree 13 to 21; where the area changes
+# tenfold within a step it is no such polynomial, and 0.22 in scene 7391 of tests/stress.py.
+_LOBE, _STEEP_LOBE, _STEEP = 0.15, 0.3, 10.0
 # Slope at each node, per step length, of the polynomial through values at the nodes.
 DERIVATIVE = np.zeros((NODES, NODES))
 for _i in range(NODES):
@@ -73,12 +73,20 @@ def charge_step(
     if not model.mobile and model.coupled:
         # A c du, of which A at the start of the step is taken exactly and the rest along the polynomial.
         _add_moves(slow[n + 1] / h, voltage, r[Q], z)
-    missed = _LOBE * h * _missed(model, slow_share, w, r, h, voltage, z)
+    missed = _lobe(r[Q]) * h * _missed(model, slow_share, w, r, h, voltage, z)
     _integrate(integral, h, z0, z)
     for j in range(NODES):
         z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
         control[PEAK_Q] = max(control[PEAK_Q], abs(z[j]))
     _account(model, gap, slow_share, w, r, h, places, theta, missed, control)
+
+
+@jit
+def _lobe(q: FloatArray) -> float:
+    lowest, highest = q[0], q[0]
+    for j in range(1, NODES):
+        lowest, highest = min(lowest, q[j]), max(highest, q[j])
+    return _STEEP_LOBE if highest > _STEEP * lowest else _LOBE
 
 
 @jit_rows

@@ -177,7 +177,7 @@ def march(
     if paused[0] > 0.0:
         # In the middle of a segment: go on as if there had been no pause.
         index = segment_at(edges, control[T])
-        while edges[index] >= control[T]:
+        while index >= 0 and edges[index] >= control[T]:
             index -= 1
         start, edge = edges[index], edges[index + 1]
         segment_terms, segment_series = terms[index], series[index]

@@ -7,17 +7,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
-from fingerspice.engine import netrows, rows
-from fingerspice.engine.coupling import Coupling, answer_mobile, cell_currents, fill_coupling
+from fingerspice.base.compiled import borrow, jit
+from fingerspice.engine import netrows
+from fingerspice.engine.coupling import fill_coupling
 from fingerspice.engine.exponential import (
     N_PLACES,
     Tables,
-    distance,
     make_tables,
-    mix,
-    plain,
-    respond,
     weigh,
 )
 from fingerspice.engine.netassess import (
@@ -26,14 +22,21 @@ from fingerspice.engine.netassess import (
     charged,
     first_zero,
     load,
-    moved,
     store,
     turn_at_start,
     write_columns,
 )
-from fingerspice.engine.netcharge import charge_error, charge_rows
+from fingerspice.engine.netcharge import charge_error
 from fingerspice.engine.netgrowth import carry
-from fingerspice.engine.netrows import Form, Work, clear, combine, evaluate, follow_sources, mode_rates, wanted
+from fingerspice.engine.netrows import Form, Work, follow_sources
+from fingerspice.engine.netstep import (
+    all_zero,
+    magnified_whole,
+    ramp_rows,
+    solve_step,
+    source_rows,
+    step_charges,
+)
 from fingerspice.engine.network import Sources, at_sources
 from fingerspice.engine.pace import Pace, choose_step, rung
 from fingerspice.engine.readout import (
@@ -65,7 +68,7 @@ from fingerspice.engine.readout import (
     write_outputs,
 )
 from fingerspice.engine.repeat import Kept
-from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import END, NODES, POINTS
 from fingerspice.physics.contact import inverse_area
 
 FloatArray = NDArray[np.float64]
@@ -85,132 +88,6 @@ ROUNDING, UNNOTICED = 1e-14, 1e-9
 NEAR_FOLD = 0.02
 # Modes times steps between pauses, after which Python may see to a Ctrl-C.
 AT_ONCE = 40_000
-
-
-@jit
-def area_at(curve: FloatArray, u: float) -> float:
-    """Area (m^2) at a gap voltage (V)."""
-    inverse, _ = inverse_area(abs(u), curve)
-    return 1.0 / inverse
-
-
-@jit
-def _sources(
-    sources: Sources, index: IntArray, t: float, h: float, r: FloatArray, s: FloatArray, ds: FloatArray
-) -> None:
-    """Values and slopes of the sources at all rows of a step."""
-    for e in range(s.shape[0]):
-        row = sources.first[e] + index[e]
-        start = sources.edges[row]
-        rows.source_rows(
-            sources.terms[row - e], sources.series[row - e], sources.edges[row + 1] - start, t - start, h, True, r[e]
-        )
-        for i in range(ROWS):
-            s[e, i] = r[e, rows.SOURCE, i]
-            ds[e, i] = r[e, rows.SLOPE, i]
-
-
-@jit
-def _ramp(t: float, h: float, before: FloatArray, after: FloatArray, s: FloatArray, ds: FloatArray) -> None:
-    """The same within a jump, from the fraction t on."""
-    for e in range(before.size):
-        for i in range(ROWS):
-            ds[e, i] = after[e] - before[e]
-            s[e, i] = before[e] + (t + POINTS[i] * h) * ds[e, i]
-
-
-@jit_rows
-def _free(decay: FloatArray, w0: FloatArray, out: FloatArray) -> None:
-    """Decay of the modes from where they start."""
-    for k in range(w0.size):
-        for i in range(ROWS):
-            out[k, i] = decay[k, i] * w0[k]
-
-
-@jit_within
-def _iterate(
-    form: Form, work: Work, own: Coupling, several: bool, h: float, rates: FloatArray, area_pace: FloatArray,
-    sign: FloatArray, decay: FloatArray, phi: FloatArray, tol: float,
-) -> tuple[int, bool]:  # fmt: skip
-    """Collocation solution of a step from the modes `work.w0`, by iteration on what the areas add.
-
-    Returns the number of evaluations, and whether the gap voltages are settled to `tol` (V).
-    """
-    modes, cells, areas, weight = work.modes, work.cells, work.areas, work.weight
-    w, base, lin, pull, used = (
-        modes[netrows.W], modes[netrows.BASE], modes[netrows.LIN], modes[netrows.PULL], modes[netrows.USED]
-    )  # fmt: skip
-    pull_before, left_before = modes[netrows.PULL_BEFORE], modes[netrows.LEFT_BEFORE]
-    u, guess = areas[netrows.U], areas[netrows.GUESS]
-    clear(used)
-    clear(guess)
-    clear(cells[netrows.RHO])
-    _free(decay, work.w0, base)
-    respond(lin, phi, base, base)
-    current = base
-    slowly = False
-    step = 0.0
-    for iteration in range(1, 41):
-        if iteration > 1:
-            if slowly:
-                step = mix(pull, used, weight, pull_before, left_before)
-            else:
-                step = plain(pull, used, weight, pull_before, left_before)
-            respond(used, phi, base, w)
-            current = w
-        if not evaluate(
-            form, own, several, h, rates, area_pace, sign, current, lin, modes[netrows.D], pull, cells, areas,
-            work.matrix, work.mixed, work.room[3],
-        ):  # fmt: skip
-            return iteration, False
-        change = moved(u, guess)
-        if iteration == 1:
-            continue
-        # What the gap voltages would move next, by what they moved for the last change of the currents.
-        off = distance(pull, used, weight)
-        if not off < math.inf:
-            return iteration, False
-        if change * off <= tol * step:
-            return iteration, True
-        slowly = off > 0.15 * step
-    return 40, False
-
-
-@jit_within
-def _charges(
-    form: Form, work: Work, own: Coupling, h: float, rates: FloatArray, g: FloatArray, lost: FloatArray,
-    lost_s: FloatArray, integral: FloatArray, sign: FloatArray, z: FloatArray, current: FloatArray,
-) -> None:  # fmt: skip
-    """Charges gained since the start of a converged step, and currents, of the sources at its nodes."""
-    modes, cells, areas = work.modes, work.cells, work.areas
-    w, cell_u = modes[netrows.W], cells[netrows.CELL_U]
-    mode_rates(h, rates, w, modes[netrows.LIN], modes[netrows.PULL], False, modes[netrows.D])
-    clear(cell_u)
-    combine(form.tap, w[: form.shape.shape[0]], cell_u)
-    combine(form.tap_s, work.s, cell_u)
-    cell_currents(own.root, cells[netrows.RHO], cells[netrows.J])
-    if not form.mobile:
-        for a in range(form.cell.size):
-            if form.cell[a] >= 0 and form.slow[a] < 0:
-                wanted(
-                    True, sign[a], form.powers[a], form.slopes[a], form.lo[a], form.scale[a], form.curves[a],
-                    areas[netrows.U, a], areas[netrows.AREA, a], areas[netrows.SLOPE, a],
-                )  # fmt: skip
-    charge_rows(
-        form.mobile, h, form.stored, form.stored_s, lost, lost_s, form.through, form.c, g, form.home, integral, w,
-        modes[netrows.D], work.s, work.ds, cell_u, areas[netrows.MORE], cells[netrows.J], work.room, z, current,
-    )  # fmt: skip
-
-
-@jit
-def _moves_nothing(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> bool:
-    """Whether all entries are 0."""
-    for x in (a, b, c, d):
-        for i in range(x.shape[0]):
-            for j in range(x.shape[1]):
-                if x[i, j] != 0.0:
-                    return False
-    return True
 
 
 @jit
@@ -291,7 +168,7 @@ def march(
     sign_aside, jump_branch = np.zeros(n_area), np.zeros((n_area, 2))
     no_rates, no_gain, no_leaks = np.zeros(m), np.zeros((m, n_s)), np.zeros(home.size)
     nothing_lost, nothing_lost_s = np.zeros((n_s, n)), np.zeros((n_s, n_s))
-    smooth = _moves_nothing(form.tap_s, form.stored_s, follow, form.gap_s)
+    smooth = all_zero(form.tap_s, form.stored_s, follow, form.gap_s)
     areas[:] = 0.0
     for a in range(n_area):
         areas[netrows.AREA, a] = form.area0[a]
@@ -410,11 +287,11 @@ def march(
                 weigh(rates, size, tables.decay[slot], h, work.weight)
             decay, phi, miss = tables.decay[slot], tables.phi[slot], tables.miss[slot]
             if inside:
-                _ramp(t, h, jump_from, jump_to, s, ds)
+                ramp_rows(t, h, jump_from, jump_to, s, ds)
             else:
-                _sources(sources, index, t, h, work.r, s, ds)
+                source_rows(sources, index, t, h, work.r, s, ds)
             follow_sources(form, own, gain, s, ds, modes[netrows.LIN], cells, areas)
-            passes, closed = _iterate(form, work, own, several, h, rates, area_pace, sign, decay, phi, 0.3 * tol)
+            passes, closed = solve_step(form, work, own, several, h, rates, area_pace, sign, decay, phi, 0.3 * tol)
             counters[NFEV] += passes * NODES
             step_error = math.inf
             # What did not close says nothing about where it goes.
@@ -488,14 +365,14 @@ def march(
             flips += 1
             continue
         if mobile and not whole:
-            magnified = _magnified(form, work, several)
+            magnified = magnified_whole(form, work, several)
         if not 0.0 < magnified < math.inf:
             code = NO_STEP
             break
         control[MAGNIFIED] = max(control[MAGNIFIED], magnified)
         flips = 0
         if charge:
-            _charges(
+            step_charges(
                 form, work, own, h, rates, g, lost, lost_s, integral, sign, values[first_z : y.size], values[y.size :]
             )
             charge_error(
@@ -558,22 +435,3 @@ def march(
         aside[ERROR_Q], aside[MAGNIFIED] = control[ERROR_Q], control[MAGNIFIED]
         control[:] = aside
     return code
-
-
-@jit
-def _magnified(form: Form, work: Work, several: bool) -> float:
-    """Inverse distance of a step to the fold, with the modes that follow at once: they take no part in its own."""
-    whole, areas, spare = work.whole, work.areas, work.spare_cells
-    fill_coupling(whole, 0.0, form.rates, form.feed, form.tap, form.tap_s, form.c, form.g, form.home, form.cell)
-    clear(spare[netrows.CHI])
-    clear(spare[netrows.ETA])
-    combine(whole.held, work.modes[netrows.W][: form.shape.shape[0]], spare[netrows.CHI])
-    combine(whole.from_slopes, work.s, spare[netrows.CHI])
-    answer_mobile(
-        several, whole.answer, whole.gap, whole.leak, whole.cross, form.home, form.first, form.cell,
-        areas[netrows.U], areas[netrows.MORE], areas[netrows.SLOPE], areas[netrows.RATE], spare[netrows.CHI],
-        spare[netrows.ETA], spare[netrows.RHO], work.spare_areas[netrows.KNOWN], spare[netrows.SHARE], work.mixed,
-        work.matrix, work.room[3],
-    )  # fmt: skip
-    least: float = work.room[3, :NODES].min()
-    return 1.0 / least

@@ -252,6 +252,8 @@ def _solve_mobile(
 ) -> bool:  # fmt: skip
     """u = k U + b q(u) at all rows at once, by Newton; r[U] holds k U + x on entry."""
     size = 0.0
+    # A longer series is rounded more.
+    rounding = 1e-15 if powers.size == DEGREE + 1 else 2e-13
     for i in range(ROWS):
         r[FREE, i] = r[U, i] - r[X_GAP, i]
         r[U, i] = r[GUESS, i]
@@ -277,7 +279,7 @@ def _solve_mobile(
         if not lowest > 0.0 or not worst < math.inf:
             return False
         # Close to the fold the voltage is as uncertain as rounding over the distance to it.
-        if worst * lowest <= 1e-15 * size:
+        if worst * lowest <= rounding * size:
             return True
     return False
 

@@ -1,0 +1,164 @@
+"""What the cells of moving areas answer one another: against a dense solution of the same equations, row by row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from fingerspice.engine.coupling import (
+    STIFF,
+    Coupling,
+    answer_alone,
+    answer_mobile,
+    answer_together,
+    cell_currents,
+    fill_coupling,
+    new_coupling,
+)
+from fingerspice.numerics.lobatto import ROWS
+from fingerspice.numerics.small import diagonalise
+
+H = 1e-3
+AREA0 = 35e-6
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Modes, sources and cells of areas at every row of a step, with numbers like those of fingers."""
+
+    rates: np.ndarray
+    tap: np.ndarray
+    tap_s: np.ndarray
+    c: np.ndarray
+    g: np.ndarray
+    home: np.ndarray
+    cell: np.ndarray
+    w: np.ndarray
+    lin: np.ndarray
+    d: np.ndarray
+    s: np.ndarray
+    ds: np.ndarray
+    more: np.ndarray
+    slope: np.ndarray
+    rate: np.ndarray
+
+    @property
+    def stiff(self) -> np.ndarray:
+        return self.rates * H > STIFF
+
+    @property
+    def u(self) -> np.ndarray:
+        return self.tap @ self.w + self.tap_s @ self.s
+
+    def solved(self, mobile: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Currents of the cells (n_f, ROWS), and the distance to the fold (ROWS,), by elimination."""
+        fast = self.stiff
+        own = np.where(fast[:, None], self.d, self.lin - self.rates[:, None] * self.w)
+        free = self.tap @ own + self.tap_s @ self.ds
+        met = -self.tap[:, ~fast] @ self.tap[:, ~fast].T
+        currents, distance = np.empty_like(free), np.ones(ROWS)
+        one = np.eye(len(self.c))
+        for i in range(ROWS):
+            e, u = self.more[self.home, i], self.u[:, i]
+            held = np.diag(e * self.c)
+            given, turned = e * self.g * u, held.copy()
+            if mobile:
+                given = given + self.c * u * self.rate[self.home, i]
+                for b, a in enumerate(self.home):
+                    turned[b, self.cell[a]] += self.c[b] * u[b] * self.slope[a, i]
+            along = np.linalg.solve(one - met @ turned, free[:, i] + met @ given)
+            currents[:, i] = given + turned @ along
+            distance[i] = np.linalg.det(one - met @ turned) / np.linalg.det(one - met @ held)
+        return currents, distance
+
+
+def cells(seed: int, sizes: tuple[int, ...], fast: int) -> Cells:
+    rng = np.random.default_rng(seed)
+    n, n_f, n_area = sum(sizes) + 1, sum(sizes), len(sizes)
+    rates = np.sort(rng.uniform(10.0, 3e4, n))
+    rates[n - fast :] = rng.uniform(1.0, 9.0, fast) * 1e6
+    home = np.repeat(np.arange(n_area), sizes)
+    c = rng.uniform(0.5, 2.0, n_f) * 1e-5
+    # Voltages of the cells from the modes, of a network whose capacitances with the areas held are one in the modes:
+    # those of the cells are at most all of it.
+    tap = np.linalg.qr(rng.normal(size=(n, n)))[0][:n_f] / np.sqrt(c * AREA0)[:, None]
+    w = rng.normal(size=(n, ROWS)) * np.sqrt(c.mean() * AREA0) * 50.0
+    return Cells(
+        rates, tap, rng.normal(size=(n_f, 1)), c, c * rng.uniform(1e2, 1e4, n_f), home,
+        np.array([int(np.flatnonzero(home == a)[0]) for a in range(n_area)]), w,
+        rates[:, None] * w * rng.uniform(-1.0, 1.0, (n, ROWS)), rng.normal(size=(n, ROWS)) * 1e-5,
+        rng.normal(size=(1, ROWS)) * 100.0, rng.normal(size=(1, ROWS)) * 1e5,
+        AREA0 * rng.uniform(-0.15, 0.15, (n_area, ROWS)), AREA0 * rng.normal(size=(n_area, ROWS)) * 1e-3,
+        AREA0 * rng.normal(size=(n_area, ROWS)) * 10.0,
+    )  # fmt: skip
+
+
+def filled(given: Cells) -> Coupling:
+    out = new_coupling(given.tap.shape[1], len(given.c), 1)
+    fill_coupling(
+        out, H, given.rates, -given.tap.T.copy(), given.tap, given.tap_s, given.c, given.g, given.home, given.cell
+    )
+    return out
+
+
+def eta_of(x: Coupling, given: Cells) -> np.ndarray:
+    eta = x.from_modes @ given.w + x.from_rates @ given.lin + x.from_stiff @ given.d
+    return np.ascontiguousarray(eta + x.from_slopes @ given.ds + x.from_sources @ given.s)
+
+
+def currents_of(x: Coupling, rho: np.ndarray) -> np.ndarray:
+    j = np.empty_like(rho)
+    cell_currents(x.root, rho, j)
+    return j
+
+
+@pytest.mark.parametrize("fast", [0, 2])
+@pytest.mark.parametrize("sizes", [(3,), (3, 3), (2, 4, 3)])
+@pytest.mark.parametrize("seed", range(3))
+def test_currents_under_local_are_those_of_the_dense_equations(seed: int, sizes: tuple[int, ...], fast: int) -> None:
+    given = cells(seed, sizes, fast)
+    x = filled(given)
+    eta, rho, own = eta_of(x, given), np.zeros((len(given.c), ROWS)), np.zeros((len(given.c), ROWS))
+    if len(sizes) == 1:
+        answer_alone(given.home, x.answer, given.more, eta, rho)
+    else:
+        # As often as the iteration of a step would call for it.
+        for _ in range(12):
+            answer_together(given.home, x.answer, x.cross, given.more, own, eta, rho)
+    want, _ = given.solved(mobile=False)
+    np.testing.assert_allclose(currents_of(x, rho), want, rtol=0.0, atol=1e-11 * np.abs(want).max())
+
+
+@pytest.mark.parametrize("fast", [0, 2])
+@pytest.mark.parametrize("sizes", [(3,), (3, 3), (2, 4, 3)])
+@pytest.mark.parametrize("seed", range(3))
+def test_currents_and_the_distance_to_the_fold_under_mobile(seed: int, sizes: tuple[int, ...], fast: int) -> None:
+    given = cells(seed, sizes, fast)
+    x = filled(given)
+    n_f, n_area = len(given.c), len(sizes)
+    chi = np.ascontiguousarray(x.held @ given.w + x.from_slopes @ given.s)
+    rho, share, known = np.zeros((n_f, ROWS)), np.zeros((n_f, ROWS)), np.zeros((n_area, ROWS))
+    least, first = np.zeros(ROWS), np.searchsorted(given.home, np.arange(n_area + 1))
+    answer_mobile(
+        n_area > 1, x.answer, x.gap, x.leak, x.cross, given.home, first, given.cell, given.u[given.cell].copy(),
+        given.more, given.slope, given.rate, chi, eta_of(x, given), rho, known, share,
+        np.zeros((n_f, n_area + 1, ROWS)), np.zeros((n_f, n_f + 1, ROWS)), least,
+    )  # fmt: skip
+    want, distance = given.solved(mobile=True)
+    np.testing.assert_allclose(currents_of(x, rho), want, rtol=0.0, atol=1e-10 * np.abs(want).max())
+    np.testing.assert_allclose(least, distance, rtol=1e-10)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 9])
+def test_small_symmetric_matrices_are_diagonalised(n: int) -> None:
+    rng = np.random.default_rng(n)
+    x = rng.normal(size=(n, n)) * np.geomspace(1.0, 1e-5, n)
+    matrix = x.T @ x
+    values, vectors = matrix.copy(), np.empty((n, n))
+    diagonalise(values, vectors)
+    np.testing.assert_allclose(vectors @ vectors.T, np.eye(n), atol=1e-14)
+    np.testing.assert_allclose(vectors @ np.diag(np.diag(values)) @ vectors.T, matrix, atol=1e-15)
+    # Small eigenvalues too: by the singular values of the factor, to their own digits.
+    np.testing.assert_allclose(np.sort(np.diag(values)), np.sort(np.linalg.svd(x)[1] ** 2), rtol=1e-9)
