@@ -334,7 +334,9 @@ def test_time_grows_with_the_deck_and_not_faster() -> None:
         return time.process_time() - start
 
     seconds(100)
-    assert seconds(8000) < 8 * seconds(2000)
+    # The least of three: another process may have the processor's caches meanwhile.
+    long, short = (min(seconds(count) for _ in range(3)) for count in (8000, 2000))
+    assert long < 8 * short
 
 
 # Files
