@@ -333,10 +333,9 @@ def test_time_grows_with_the_deck_and_not_faster() -> None:
         parse_deck(f"t\n{text}.param p{count}=1\n")
         return time.process_time() - start
 
-    seconds(100)
-    # The least of three: another process may have the processor's caches meanwhile.
-    long, short = (min(seconds(count) for _ in range(3)) for count in (8000, 2000))
-    assert long < 8 * short
+    # Of decks beyond the processor's caches; the least of two, as another process may be in the way.
+    short, long = (min(seconds(count) for _ in range(2)) for count in (8000, 24000))
+    assert long < 5 * short
 
 
 # Files
