@@ -102,10 +102,13 @@ class _Cache(FunctionCache):
             cast(Any, super()).save_overload(sig, data)
 
 
-_ONCE = "compiling what this needs, about 20 s, only once: later runs find it on the disk"
+_ONCE = (
+    "compiling what this needs, 20 s for a series stack and about a minute for a network, only once: later runs find "
+    "it on the disk"
+)
 _EVERY_TIME = (
-    "compiling, about 20 s, as at every run: no folder for compiled code can be written, neither the package's nor "
-    "the user's; set NUMBA_CACHE_DIR to one that can"
+    "compiling, 20 s to a minute, as at every run: no folder for compiled code can be written, neither the package's "
+    "nor the user's; set NUMBA_CACHE_DIR to one that can"
 )
 
 
