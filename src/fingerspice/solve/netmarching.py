@@ -74,16 +74,14 @@ def reference_at(scene: NetworkScene, levels: tuple[int, ...], decade: int) -> R
     """The reference whose areas are the fixed ones, or LEVEL_RATIO to these powers over those at 0 V."""
     # One for each thread: compiled code writes into its tables, and other threads run meanwhile.
     key = ("reference", levels, decade, threading.get_ident())
-    if key not in scene.prepared:
+    found: Reference | None = scene.prepared.get(key)
+    if found is None:
         kept = [name for name in list(scene.prepared) if name[0] == "reference"]
         for name in kept if len(kept) >= MOST_REFERENCES else ():
             scene.prepared.pop(name, None)
         area = scene.area0 * LEVEL_RATIO ** np.array(levels, float)
-        found = _make_reference(scene, area, area_error(decade))
-        scene.prepared[key] = found
-        return found
-    made: Reference = scene.prepared[key]
-    return made
+        found = scene.prepared[key] = _make_reference(scene, area, area_error(decade))
+    return found
 
 
 def _make_reference(scene: NetworkScene, area: FloatArray, tol: float) -> Reference:

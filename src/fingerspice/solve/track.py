@@ -27,6 +27,8 @@ from fingerspice.waveforms.sampling import SourceTable
 SAFETY = 2.5
 # The smallest error of a step that is more than rounding, over the voltage scale.
 FINEST = 4e-15
+# Systems that stay with a scene: one for each thread and decade of tolerances, of up to 1 MB.
+MOST_SYSTEMS = 64
 # Steps of a period that is kept, at most: 1 MB.
 KEPT_STEPS = 2000
 
@@ -49,23 +51,26 @@ def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
     decade = int(np.floor(np.log10(rtol)))
     # One for each thread: compiled code writes into its tables and its work, and other threads run meanwhile.
     key = ("system", decade, u_top, threading.get_ident())
-    if key not in scene.prepared:
-        model = scene.model
-        if u_top > 0.0:
-            assert scene.stack.contact is not None
-            model = model._replace(curve=scene.stack.contact.curve(u_top))
-        contact = scene.stack.contact
-        stress = 0.0 if contact is None else float(contact.stress(1.0))
-        system = build_system(
-            model, area_error(decade), area_range(model, max(scene.u_peak, u_top)),
-            scene.stack.grouping, stress,
-        )  # fmt: skip
-        n = model.gap.size
-        scene.prepared[key] = Prepared(
-            system, new_tables(n), new_work(n), integral_table(), area_missed(model.curve, decade)
-        )
-    prepared: Prepared = scene.prepared[key]
-    return prepared
+    found: Prepared | None = scene.prepared.get(key)
+    if found is None:
+        kept = [name for name in list(scene.prepared) if name[0] == "system"]
+        for name in kept if len(kept) >= MOST_SYSTEMS else ():
+            scene.prepared.pop(name, None)
+        found = scene.prepared[key] = _prepare(scene, decade, u_top)
+    return found
+
+
+def _prepare(scene: Scene, decade: int, u_top: float) -> Prepared:
+    model = scene.model
+    if u_top > 0.0:
+        assert scene.stack.contact is not None
+        model = model._replace(curve=scene.stack.contact.curve(u_top))
+    contact = scene.stack.contact
+    stress = 0.0 if contact is None else float(contact.stress(1.0))
+    u_max = max(scene.u_peak, u_top)
+    system = build_system(model, area_error(decade), area_range(model, u_max), scene.stack.grouping, stress)
+    n = model.gap.size
+    return Prepared(system, new_tables(n), new_work(n), integral_table(), area_missed(model.curve, decade))
 
 
 @dataclasses.dataclass
