@@ -42,6 +42,7 @@ MENDED = {
     # Radau's Newton met no slope of the area equation from the start of a step that served at its end.
     (0, 2608): "right",
     (0, 3773): "refused: fold",
+    (0, 3964): "refused: fold",  # Radau stepped over the fold, onto a branch half a period later.
     (3, 178): "refused: fold",
     (0, 354): "right",  # Radau's tolerance was one of 1 V, however large the source.
     (0, 5490): "right",

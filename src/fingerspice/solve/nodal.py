@@ -44,6 +44,8 @@ ATTEMPTS = 6
 # Two runs that meet a fold agree on its time to this, relative. Where none do, a fold is believed that two of them meet
 # as near to each other as the second figure.
 FOLD_TIME, FOLD_SPREAD = 1e-10, 1e-5
+# Distance to the fold below which a run is past one: at a fold it is 0, to rounding.
+PAST_FOLD = -0.01
 # Steps taken and refused, to begin with and over the run: what needs more has a cause that smaller steps do not mend.
 FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
 
@@ -176,7 +178,10 @@ def solve_coupled(
         run.nfev = nfev
         worst = _stated(problem, run, _only(run, probed), beside, u_scale, ALIKE * tol) / rtol
         last = tol <= FINEST or attempt == ATTEMPTS - 1
-        if run.status is Status.FOLD and run.t_failed is not None:
+        if problem.scene.net.mobile and problem.record(run).fold_margin.min(initial=1.0) < PAST_FOLD:
+            # A step has gone over a fold, onto a branch that nothing leads to.
+            tol, run.status = max(0.03 * tol, FINEST), Status.ERROR_NOT_MET
+        elif run.status is Status.FOLD and run.t_failed is not None:
             # What the state is off moves the fold: closer, until its time stays.
             moved, folded = abs(run.t_failed - folded) / run.t_failed if run.t_failed > 0.0 else 0.0, run.t_failed
             if nearest is None or moved < nearest[0]:
