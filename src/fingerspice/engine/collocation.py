@@ -15,8 +15,6 @@ from fingerspice.engine.network import (
     at_sources,
     choose_signs,
     gap_voltage,
-    lend,
-    lend_room,
     rates,
 )
 from fingerspice.engine.radau import (
@@ -26,7 +24,6 @@ from fingerspice.engine.radau import (
     dense_polynomial,
     dense_state,
     guess,
-    lend_work,
     linearise,
     step,
 )
@@ -187,12 +184,7 @@ def advance(
     int
         DONE; JUMP: a source jumps at the time reached, take that first; STEP_UNDERFLOW; or PAUSED: call again.
     """
-    net, room, work = lend(net), lend_room(room), lend_work(work)
-    scheme = Scheme(
-        borrow(scheme.a), borrow(scheme.c), borrow(scheme.e), borrow(scheme.dense), borrow(scheme.eigenvalues),
-        borrow(scheme.to), borrow(scheme.back), scheme.h_max,
-    )  # fmt: skip
-    sources = Sources(borrow(sources.first), borrow(sources.edges), borrow(sources.terms), borrow(sources.series))
+    net, room, work, scheme, sources = borrow(net), borrow(room), borrow(work), borrow(scheme), borrow(sources)
     y, sign, s_before, scale = borrow(y), borrow(sign), borrow(s_before), borrow(scale)
     control, counters, peaks = borrow(control), borrow(counters), borrow(peaks)
     t_out, left, rows = borrow(t_out), borrow(left), borrow(rows)

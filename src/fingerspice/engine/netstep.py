@@ -16,17 +16,9 @@ from fingerspice.engine.netcharge import charge_rows
 from fingerspice.engine.netrows import Form, Work, clear, combine, evaluate, mode_rates, wanted
 from fingerspice.engine.network import Sources
 from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
-from fingerspice.physics.contact import inverse_area
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-
-@jit
-def area_at(curve: FloatArray, u: float) -> float:
-    """Area (m^2) at a gap voltage (V)."""
-    inverse, _ = inverse_area(abs(u), curve)
-    return 1.0 / inverse
 
 
 @jit

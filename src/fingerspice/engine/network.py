@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import borrow, jit, jit_inline
+from fingerspice.base.compiled import jit
 from fingerspice.engine.segment import Segment, source
 from fingerspice.physics.contact import inverse_area
 
@@ -102,26 +102,6 @@ class Room(NamedTuple):
     k: FloatArray
     base: FloatArray
     probe: FloatArray
-
-
-@jit_inline
-def lend(net: Net) -> Net:
-    """The same network without a count of its arrays' users; see `compiled.borrow`."""
-    return Net(
-        net.mobile, borrow(net.p), borrow(net.q), borrow(net.c), borrow(net.g_total), borrow(net.g_area),
-        borrow(net.place), borrow(net.k), borrow(net.b), borrow(net.through),
-        borrow(net.delivered), borrow(net.gap), borrow(net.area0),
-        borrow(net.tau), borrow(net.slow), borrow(net.curves),
-    )  # fmt: skip
-
-
-@jit_inline
-def lend_room(room: Room) -> Room:
-    """As `lend`."""
-    return Room(
-        borrow(room.s), borrow(room.ds), borrow(room.u), borrow(room.along), borrow(room.area), borrow(room.slope),
-        borrow(room.rate), borrow(room.matrix), borrow(room.k), borrow(room.base), borrow(room.probe),
-    )  # fmt: skip
 
 
 @jit

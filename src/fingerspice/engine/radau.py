@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import borrow, jit, jit_inline
+from fingerspice.base.compiled import jit
 from fingerspice.engine.network import Net, Room, Sources, at_sources, capacitances, rates, residual
 from fingerspice.numerics.small import invert
 
@@ -77,15 +77,6 @@ def new_work(net: Net, stages: int, n_eigen: int, size: int) -> Work:
         np.zeros((stages, size)), np.zeros((size, stages)), np.zeros((m, m)), np.zeros((m, m)), np.zeros(m),
         np.zeros((n_eigen, m, m), np.complex128), np.zeros(size), np.zeros(size), np.zeros(size),
         np.zeros((stages, m)), np.zeros(n_s, np.int64), np.zeros(1), np.zeros((stages, n_s)), np.zeros((stages, n_s)),
-    )  # fmt: skip
-
-
-@jit_inline
-def lend_work(work: Work) -> Work:
-    return Work(
-        borrow(work.k), borrow(work.poly), borrow(work.slope), borrow(work.mass), borrow(work.weight),
-        borrow(work.newton), borrow(work.rate), borrow(work.stage), borrow(work.y1), borrow(work.residual),
-        borrow(work.place), borrow(work.base), borrow(work.s), borrow(work.ds),
     )  # fmt: skip
 
 

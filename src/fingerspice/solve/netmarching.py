@@ -25,7 +25,7 @@ from fingerspice.results.outcome import Status
 from fingerspice.results.steps import Recorded, Recorder
 from fingerspice.solve.netruns import Integration, NetworkRun, held, integrate, state_error
 from fingerspice.solve.networks import NetworkProblem, NetworkScene
-from fingerspice.solve.runs import Progress
+from fingerspice.solve.runs import Progress, kept_with
 from fingerspice.solve.settling import Settling
 from fingerspice.waveforms.sampling import same_time
 
@@ -74,13 +74,10 @@ def reference_at(scene: NetworkScene, levels: tuple[int, ...], decade: int) -> R
     """The reference whose areas are the fixed ones, or LEVEL_RATIO to these powers over those at 0 V."""
     # One for each thread: compiled code writes into its tables, and other threads run meanwhile.
     key = ("reference", levels, decade, threading.get_ident())
-    found: Reference | None = scene.prepared.get(key)
-    if found is None:
-        kept = [name for name in list(scene.prepared) if name[0] == "reference"]
-        for name in kept if len(kept) >= MOST_REFERENCES else ():
-            scene.prepared.pop(name, None)
-        area = scene.area0 * LEVEL_RATIO ** np.array(levels, float)
-        found = scene.prepared[key] = _make_reference(scene, area, area_error(decade))
+    area = scene.area0 * LEVEL_RATIO ** np.array(levels, float)
+    found: Reference = kept_with(
+        scene.prepared, key, MOST_REFERENCES, lambda: _make_reference(scene, area, area_error(decade))
+    )
     return found
 
 

@@ -33,6 +33,21 @@ BREAKPOINTS_PER_WINDOW = 2000.0
 KEPT_WINDOWS = 4
 
 
+def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: Callable[[], Any]) -> Any:
+    """What stands in a scene's `prepared` under a key, made if need be.
+
+    There are at most `most` entries with the same first part of the key: beyond, all of them give way. Other threads
+    may take them out meanwhile, so that what has been found is looked up once.
+    """
+    found = prepared.get(key)
+    if found is None:
+        kept = [name for name in list(prepared) if name[0] == key[0]]
+        for name in kept if len(kept) >= most else ():
+            prepared.pop(name, None)
+        found = prepared[key] = make()
+    return found
+
+
 @dataclass
 class Run:
     """What one integration gives, and how it went.

@@ -19,7 +19,7 @@ from fingerspice.numerics.lobatto import integral_table
 from fingerspice.results.record import stack_record
 from fingerspice.results.steps import Recorded, Recorder
 from fingerspice.solve.problem import Problem, Scene
-from fingerspice.solve.runs import BoolArray, FloatArray, after_the_end, from_rows, row_width
+from fingerspice.solve.runs import BoolArray, FloatArray, after_the_end, from_rows, kept_with, row_width
 from fingerspice.solve.settling import Settling
 from fingerspice.waveforms.sampling import SourceTable
 
@@ -51,12 +51,7 @@ def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
     decade = int(np.floor(np.log10(rtol)))
     # One for each thread: compiled code writes into its tables and its work, and other threads run meanwhile.
     key = ("system", decade, u_top, threading.get_ident())
-    found: Prepared | None = scene.prepared.get(key)
-    if found is None:
-        kept = [name for name in list(scene.prepared) if name[0] == "system"]
-        for name in kept if len(kept) >= MOST_SYSTEMS else ():
-            scene.prepared.pop(name, None)
-        found = scene.prepared[key] = _prepare(scene, decade, u_top)
+    found: Prepared = kept_with(scene.prepared, key, MOST_SYSTEMS, lambda: _prepare(scene, decade, u_top))
     return found
 
 
