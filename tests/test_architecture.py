@@ -19,8 +19,8 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 400
 # Files that are longer still, with their lines: no other may be, and these may only shrink.
 LONGER = {
-    "engine.march": 442,
-    "engine.netmarch": 437,
+    "engine.march": 433,
+    "engine.netmarch": 434,
     "solve.problem": 445,
 }
 

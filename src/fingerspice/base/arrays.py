@@ -1,6 +1,9 @@
-"""Types of numpy arrays, named once for the whole package."""
+"""Types of numpy arrays, named once for the whole package; and several arrays in one."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,3 +12,13 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+
+def views_of(shapes: Sequence[tuple[int, ...]]) -> tuple[FloatArray, list[FloatArray]]:
+    """One row of zeros, and arrays of these shapes that are views of it, one after the other."""
+    sizes = [math.prod(shape) for shape in shapes]
+    numbers = np.zeros(sum(sizes))
+    ends = np.cumsum(sizes)
+    return numbers, [
+        numbers[end - size : end].reshape(shape) for shape, size, end in zip(shapes, sizes, ends, strict=True)
+    ]

@@ -28,6 +28,7 @@ from fingerspice.engine.radau import (
     step,
 )
 from fingerspice.engine.readout import note
+from fingerspice.numerics.small import copy_to
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -211,8 +212,8 @@ def advance(
             for i in range(n_s):
                 if abs(now[i] - s_before[i]) > ROUNDING * max(abs(now[i]), abs(s_before[i])):
                     return JUMP
-        room.s[:] = now
-        room.ds[:] = slopes
+        copy_to(room.s, now)
+        copy_to(room.ds, slopes)
         for i in range(sign.size):
             if sign[i] == 0.0:
                 choose_signs(net, room, jump, y, sign)
@@ -272,7 +273,7 @@ def advance(
         if which >= 0 and theta <= 1.0:
             sign[which] = -sign[which]
             counters[ZEROS] += 1
-        y[:] = work.y1
+        copy_to(y, work.y1)
         if control[JUMPED] > 0.0:
             control[H_AFTER_JUMP] = h
             control[JUMPED] = 0.0

@@ -29,9 +29,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.arrays import views_of
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.numerics.lobatto import ROWS
-from fingerspice.numerics.small import diagonalise
+from fingerspice.numerics.small import copy_to, diagonalise
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -43,6 +44,8 @@ STIFF = 300.0
 
 # Over the areas, each time the currents are evaluated.
 _SWEEPS = 2
+# Couplings that are kept for when they are needed again, and numbers of them, at most.
+_KEPT, _MOST_NUMBERS = 16, 65_536
 
 
 class Coupling(NamedTuple):
@@ -64,8 +67,14 @@ class Coupling(NamedTuple):
         Rate of the voltage that the area follows is gap (eta - L chi A') / (1 + e L), summed, less leak u.
     cross : ndarray, shape (n_f, n_f)
         eta from rho of other areas.
-    stiff : ndarray of int, shape (1,)
-        Number of stiff modes, which says which they are; -1 where nothing has been filled in.
+    numbers : ndarray, shape (size,)
+        All of the above, which are views of it.
+    key : ndarray of int, shape (2,)
+        Of what this is the coupling, and the number of stiff modes, which says which they are; -1 for nothing yet.
+    kept, keys : ndarray, shape (room, size) and (room, 2)
+        `numbers` and `key` of couplings that were filled in before, the oldest of which give way.
+    used : ndarray of int, shape (1,)
+        How many of them there were.
     """
 
     answer: FloatArray
@@ -80,16 +89,49 @@ class Coupling(NamedTuple):
     gap: FloatArray
     leak: FloatArray
     cross: FloatArray
-    stiff: IntArray
+    numbers: FloatArray
+    key: IntArray
+    kept: FloatArray
+    keys: IntArray
+    used: IntArray
 
 
 def new_coupling(n: int, cells: int, sources: int) -> Coupling:
     """Nothing filled in yet."""
-    return Coupling(
-        np.zeros(cells), np.zeros((cells, cells)), np.zeros((cells, n)), np.zeros((cells, n)), np.zeros((cells, n)),
-        np.zeros((cells, n)), np.zeros((cells, sources)), np.zeros((cells, sources)), np.zeros((n, cells)),
-        np.zeros(cells), np.zeros(cells), np.zeros((cells, cells)), np.full(1, -1),
+    shapes = (
+        (cells,), (cells, cells), (cells, n), (cells, n), (cells, n), (cells, n), (cells, sources), (cells, sources),
+        (n, cells), (cells,), (cells,), (cells, cells),
     )  # fmt: skip
+    numbers, parts = views_of(shapes)
+    room = max(2, min(_KEPT, _MOST_NUMBERS // max(numbers.size, 1)))
+    return Coupling(
+        *parts, numbers, np.full(2, -1), np.zeros((room, numbers.size)), np.full((room, 2), -1), np.zeros(1, np.int64)
+    )
+
+
+@jit
+def take_coupling(
+    out: Coupling, which: int, h: float, rates: FloatArray, feed: FloatArray, tap: FloatArray, tap_s: FloatArray,
+    c: FloatArray, g: FloatArray, home: IntArray, cell: IntArray,
+) -> None:  # fmt: skip
+    """The coupling number `which` for steps of length h (s), made if it is not kept; with h = 0 no mode is stiff."""
+    stiff = 0
+    for k in range(rates.size):
+        if rates[k] * h > STIFF:
+            stiff += 1
+    if out.key[0] == which and out.key[1] == stiff:
+        return
+    out.key[0], out.key[1] = which, stiff
+    room = out.keys.shape[0]
+    for slot in range(room):
+        if out.keys[slot, 0] == which and out.keys[slot, 1] == stiff:
+            copy_to(out.numbers, out.kept[slot])
+            return
+    fill_coupling(out, h, rates, feed, tap, tap_s, c, g, home, cell)
+    slot = out.used[0] % room
+    out.used[0] += 1
+    out.keys[slot, 0], out.keys[slot, 1] = which, stiff
+    copy_to(out.kept[slot], out.numbers)
 
 
 @jit
@@ -97,15 +139,8 @@ def fill_coupling(
     out: Coupling, h: float, rates: FloatArray, feed: FloatArray, tap: FloatArray, tap_s: FloatArray, c: FloatArray,
     g: FloatArray, home: IntArray, cell: IntArray,
 ) -> None:  # fmt: skip
-    """Fill in a coupling for steps of length h (s), unless the same modes are stiff as before; with h = 0 none is."""
+    """Fill in a coupling for steps of length h (s)."""
     n_f, n = tap.shape
-    stiff = 0
-    for k in range(rates.size):
-        if rates[k] * h > STIFF:
-            stiff += 1
-    if out.stiff[0] == stiff:
-        return
-    out.stiff[0] = stiff
     met = np.zeros((n_f, n_f))
     for p in range(n_f):
         for q in range(n_f):

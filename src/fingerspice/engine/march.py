@@ -12,7 +12,18 @@ from fingerspice.engine.charge import charge_step
 from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, weigh
 from fingerspice.engine.growth import carry
 from fingerspice.engine.model import Model, branch_area, dot, gap_voltage, turns_at_zero, write_row_at
-from fingerspice.engine.pace import Pace, change_level, choose_step, enter, nearest_level, rung, take_branch
+from fingerspice.engine.pace import (
+    Pace,
+    accept,
+    allowed_factor,
+    change_level,
+    choose_step,
+    enter,
+    nearest_level,
+    rung,
+    shorten,
+    take_branch,
+)
 from fingerspice.engine.readout import (
     ACCEPTED,
     ALLOWED,
@@ -63,10 +74,6 @@ IntArray = NDArray[np.int64]
 
 # Codes returned by `march`.
 DONE, NO_STEP, OUT_OF_RANGE, TOO_MANY, PAUSED = 0, 1, 2, 3, 4
-# Step over the one before, at most; and what of it may be foreseen growth.
-_MOST_GROWTH, _MOST_TREND = 8.0, 2.5
-# Over a length once found too long: if the error allows this much, what made it so has passed.
-_REFUTED = 1.5
 
 
 @jit
@@ -244,7 +251,7 @@ def march(
         wrong = 0
         below = 0.0
         flip = False
-        wanted = control[H]
+        wanted, tries = control[H], 1
         while True:
             if h != h_slot:
                 slot = make_tables(
@@ -288,26 +295,12 @@ def march(
             note(tried, counters[ACCEPTED] + counters[REJECTED], t, h, step_error / tol)
             if not controlled and closed:
                 break
-            factor = 6.0
-            if step_error > 0.0:
-                factor = 0.9 * (tol / step_error) ** (1.0 / NODES) if step_error < math.inf else 0.5
+            factor = allowed_factor(step_error, tol)
             if step_error <= tol:
-                # A step cut short by a boundary says little about the next one.
-                # After a jump the decays die away one by one, and the length allowed grows from step to step as it did.
-                growth = h * factor / control[ALLOWED] if control[ALLOWED] > 0.0 else 1.0
-                control[ALLOWED] = h * factor
-                proposed = h * min(_MOST_GROWTH, max(0.5, factor * min(max(growth, 1.0), _MOST_TREND)))
-                proposed = max(proposed, wanted if h < wanted else 0.0)
-                if h * factor > _REFUTED * control[TOO_LONG]:
-                    control[TOO_LONG] = 0.0
-                if control[TOO_LONG] > 0.0:
-                    proposed = min(proposed, 0.93 * control[TOO_LONG])
-                    control[TOO_LONG] *= growth if growth > 1.5 else 1.03
-                if fresh >= 0 and h >= wanted:
-                    control[fresh] = h * min(2.0, factor)
+                accept(h, wanted, factor, tries, fresh, True, control)
                 fresh = -1
-                control[H] = proposed
                 break
+            tries += 1
             counters[REJECTED] += 1
             # Near the end of the area's polynomial no step ends beyond it: the kink there would be crept up to.
             if coupled and abs(control[U_GAP]) > 0.9 * u_top and largest_size(u_rows) > u_top:
@@ -323,9 +316,7 @@ def march(
                 # It went far over a zero, where the branch has no meaning: end soon after the zero.
                 h = rung(h * min(0.9, 1.1 * POINTS[wrong]))
             else:
-                control[TOO_LONG] = h
-                control[ALLOWED] = 0.0
-                h = rung(h * min(0.9, max(0.25, factor)))
+                h = shorten(h, factor, control)
                 wanted = h
         if flip:
             if turns_at_zero(model, r[X_GAP, 0], -control[SIGN]):

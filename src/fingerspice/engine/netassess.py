@@ -11,7 +11,7 @@ from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.charge import DERIVATIVE
 from fingerspice.engine.exponential import N_PLACES, between, largest, left_over
 from fingerspice.engine.readout import first_wrong, leaves
-from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import END, MISS, NODES, POINTS, ROWS
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -20,6 +20,9 @@ IntArray = NDArray[np.int64]
 PEAK_U, PEAK_F, ERROR_U, ERROR_F = 0, 1, 2, 3
 # Share of a step in which its polynomials may miss a decay: a third of the way to the first node.
 _EARLY = POINTS[1] / 3.0
+# Rows from which the response to what the polynomials miss is taken, for the points between and the end: what is missed
+# changes its sign at every node, and so its integral is largest at the nodes beside those points, and small at them.
+_WORST = (1, NODES // 2, 9, END)
 
 
 @jit
@@ -112,8 +115,7 @@ def assess(
             for i in range(n):
                 x[i, 4] += shape[i, k] * early[k]
         for p in range(4):
-            row = FIRST + p if p < 3 else END
-            fresh = magnified * miss[k, row] * missed
+            fresh = magnified * miss[k, _WORST[p]] * missed
             places[k, p + 1] = carried[k, p] + magnified * left[p] + fresh
             off = fresh
             if p < 3:

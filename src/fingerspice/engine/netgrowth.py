@@ -16,6 +16,7 @@ from fingerspice.engine.coupling import Coupling
 from fingerspice.engine.exponential import respond
 from fingerspice.engine.netrows import CHI_S, ETA_S, LIN, PULL, RHO, U_S, Form, W, Work, evaluate
 from fingerspice.numerics.lobatto import END, NODES, ROWS
+from fingerspice.numerics.small import copy_to
 
 FloatArray = NDArray[np.float64]
 
@@ -61,8 +62,8 @@ def carry(
     step = _SHIFT * size / largest if largest > 0.0 else 0.0
     if 0.0 < step < math.inf:
         for part in (ETA_S, CHI_S, RHO):
-            cells[part] = work.cells[part]
-        areas[U_S] = work.areas[U_S]
+            copy_to(cells[part], work.cells[part])
+        copy_to(areas[U_S], work.areas[U_S])
         for _ in range(_PASSES):
             before = 0.0
             for k in range(error.size):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine import netrows
-from fingerspice.engine.coupling import fill_coupling
+from fingerspice.engine.coupling import take_coupling
 from fingerspice.engine.exponential import (
     N_PLACES,
     Tables,
@@ -38,7 +38,7 @@ from fingerspice.engine.netstep import (
     step_charges,
 )
 from fingerspice.engine.network import Sources, at_sources
-from fingerspice.engine.pace import Pace, choose_step, rung
+from fingerspice.engine.pace import Pace, accept, allowed_factor, choose_step, rung, shorten
 from fingerspice.engine.readout import (
     ACCEPTED,
     ALLOWED,
@@ -67,8 +67,10 @@ from fingerspice.engine.readout import (
     series_of,
     write_outputs,
 )
+from fingerspice.engine.references import References, far_from, find, go_over, start_at
 from fingerspice.engine.repeat import Kept
 from fingerspice.numerics.lobatto import END, NODES, POINTS
+from fingerspice.numerics.small import copy_to
 from fingerspice.physics.contact import inverse_area
 
 FloatArray = NDArray[np.float64]
@@ -78,10 +80,6 @@ IntArray = NDArray[np.int64]
 DONE, NO_STEP, TOO_MANY, REFERENCE, PAUSED = 0, 1, 2, 3, 4
 # One entry of `control` more than `readout` has: steps taken and refused, at most.
 MOST = N_CONTROL
-# Step over the one before, at most; and what of it may be foreseen growth.
-_MOST_GROWTH, _MOST_TREND = 8.0, 2.5
-# An area this many times another reference's, or a part of it, wants a reference of its own.
-FARTHEST = 1.2
 # A source's change at an edge, relative, that is its rounding and no jump.
 ROUNDING, UNNOTICED = 1e-14, 1e-9
 # Closer to the fold, other methods get there sooner.
@@ -92,8 +90,8 @@ AT_ONCE = 40_000
 
 @jit
 def march(
-    form: Form, pace: Pace, tables: Tables, work: Work, integral: FloatArray, size: FloatArray, sources: Sources,
-    tau: float, t_end: float, y: FloatArray, error: FloatArray, sign: FloatArray, s_before: FloatArray,
+    form: Form, references: References, pace: Pace, tables: Tables, work: Work, integral: FloatArray, sources: Sources,
+    u_scale: float, t_end: float, y: FloatArray, error: FloatArray, sign: FloatArray, s_before: FloatArray,
     branch: FloatArray, control: FloatArray, counters: IntArray, peaks: FloatArray, collected: FloatArray,
     t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray, kept: Kept, steps: Steps,
     tried: FloatArray,
@@ -105,13 +103,12 @@ def march(
 
     Parameters
     ----------
-    form, pace, tables, work, integral
-        What to step, how and where; `integral` is `lobatto.integral_table()`.
-    size : ndarray, shape (m,)
-        Voltage (V) that each mode moves.
+    form, references, pace, tables, work, integral
+        What to step, how and where; `integral` is `lobatto.integral_table()`. The form's numbers are those of one of
+        the references, whose number is in `work.at`: both change with the areas.
     sources : Sources
-    tau : float
-        Shortest time constant, s.
+    u_scale : float
+        Largest voltage, V: a slow area counts as its share of it.
     t_end : float
         s, not past the last edge; if it is the time reached, only a jump that stands there is taken.
     y : ndarray
@@ -137,15 +134,18 @@ def march(
     Returns
     -------
     int
-        DONE; NO_STEP is short enough; TOO_MANY steps; REFERENCE: an area is far from its own; or PAUSED: call again.
+        DONE; NO_STEP is short enough; TOO_MANY steps; REFERENCE: the areas want one that is not known yet; or PAUSED:
+        call again.
     """
     # Without a count of their users: an atomic operation wherever an array is taken out of its tuple.
-    form, tables, work, sources = borrow(form), borrow(tables), borrow(work), borrow(sources)
+    form, references, tables, work, sources = (
+        borrow(form), borrow(references), borrow(tables), borrow(work), borrow(sources)
+    )  # fmt: skip
     kept, steps, time_branch = borrow(kept), borrow(steps), borrow(branch)
     y, error, sign, s_before = borrow(y), borrow(error), borrow(sign), borrow(s_before)
     control, counters, peaks, collected = borrow(control), borrow(counters), borrow(peaks), borrow(collected)
     t_out, left, out, tried = borrow(t_out), borrow(left), borrow(out), borrow(tried)
-    integral, size = borrow(integral), borrow(size)
+    integral = borrow(integral)
     mobile = form.mobile
     shape, follow, home, cell, slow = form.shape, form.follow, form.home, form.cell, form.slow
     s, ds, modes, cells, areas, values = work.s, work.ds, work.modes, work.cells, work.areas, work.values
@@ -170,9 +170,10 @@ def march(
     nothing_lost, nothing_lost_s = np.zeros((n_s, n)), np.zeros((n_s, n_s))
     smooth = all_zero(form.tap_s, form.stored_s, follow, form.gap_s)
     areas[:] = 0.0
-    for a in range(n_area):
-        areas[netrows.AREA, a] = form.area0[a]
-    slot, h_slot, flips, fresh, whole, closing, begun = -1, 0.0, 0, -1, True, False, False
+    start_at(form.area0, areas[netrows.AREA])
+    here, size = np.zeros(n_area), np.full(m, u_scale)
+    copy_to(size[:n], form.size)
+    slot, h_slot, flips, fresh, whole, closing, begun, which_coupling = -1, 0.0, 0, -1, True, False, False, 0
     first_out = counters[OUTPUT]
     next_out = t_out[first_out] if first_out < t_out.size else math.inf
     pause = counters[ACCEPTED] + 1 + AT_ONCE // m
@@ -185,14 +186,14 @@ def march(
         if inside and t >= 1.0:
             inside = False
             aside[ERROR_Q], aside[MAGNIFIED] = control[ERROR_Q], control[MAGNIFIED]
-            control[:] = aside
-            s_before[:] = jump_to
+            copy_to(control, aside)
+            copy_to(s_before, jump_to)
             t = control[T]
             for a in range(n_area):
                 if sign[a] != sign_aside[a]:
                     time_branch[a, 0], time_branch[a, 1] = t, math.inf
             rates, gain, g, area_pace, lost, lost_s = form.rates, form.gain, form.g, form.pace, form.lost, form.lost_s
-            branch, own, h_slot = time_branch, work.own, 0.0
+            branch, h_slot = time_branch, 0.0
         if counters[ACCEPTED] + counters[REJECTED] > control[MOST]:
             code = TOO_MANY
             break
@@ -218,21 +219,21 @@ def march(
             for i in range(n_s):
                 jumps |= abs(now[i] - s_before[i]) > least * max(abs(now[i]), abs(s_before[i]))
             if jumps and smooth:
-                s_before[:] = now
+                copy_to(s_before, now)
             elif jumps:
                 inside = True
-                aside[:] = control
-                sign_aside[:] = sign
-                jump_from[:] = s_before
-                jump_to[:] = now
+                copy_to(aside, control)
+                copy_to(sign_aside, sign)
+                copy_to(jump_from, s_before)
+                copy_to(jump_to, now)
                 jump_branch[:] = 0.0
                 control[:] = 0.0
                 control[ERROR_Q], control[MAGNIFIED], control[MOST] = aside[ERROR_Q], aside[MAGNIFIED], aside[MOST]
                 rates, gain, g, area_pace = no_rates, no_gain, no_leaks, no_rates
                 lost, lost_s = nothing_lost, nothing_lost_s
-                branch, own, h_slot = jump_branch, work.inside, 0.0
+                branch, h_slot = jump_branch, 0.0
                 t, stop, at_edge = 0.0, 1.0, False
-                now[:] = jump_from
+                copy_to(now, jump_from)
             if not inside and t >= t_end:
                 break
         else:
@@ -260,30 +261,40 @@ def march(
                 sign[a] = 1.0 if voltage >= 0.0 else -1.0
                 branch[a, 0], branch[a, 1] = t, math.inf
             if not inside:
-                here = (
+                here[a] = (
                     form.unit[a] * y[slow[a]] if slow[a] >= 0 else 1.0 / inverse_area(abs(voltage), form.curves[a])[0]
                 )
-                if max(here / form.area0[a], form.area0[a] / here) > FARTHEST:
-                    code = REFERENCE
             end = branch[a, 0] + 1.02 * branch[a, 1] - t
             if 0.0 < end < ahead:
                 ahead = end
                 control[BRANCH_START], control[BRANCH_LENGTH] = branch[a, 0], branch[a, 1]
-        if code != DONE:
-            break
+        if not inside and far_from(form, here):
+            found = find(references, form, here)
+            if found < 0:
+                code = REFERENCE
+                break
+            go_over(references, found, form, error)
+            work.at[0], h_slot = found, 0.0
+            copy_to(size[:n], form.size)
+            start_at(form.area0, areas[netrows.AREA])
+            load(form.inverse, follow, y, now, w0)
         longest = Pace(tol, 1.0, True, charge) if inside else pace
-        h = choose_step(longest, math.inf if inside else tau, True, is_series and not inside, t, stop - t, control)
-        wanted_h = control[H]
+        fastest = rates.max()
+        h = choose_step(
+            longest, 1.0 / fastest if fastest > 0.0 else math.inf, True, is_series and not inside, t, stop - t, control
+        )  # fmt: skip
+        wanted_h, tries = control[H], 1
         which, magnified = -1, 1.0
         while True:
             if h != h_slot:
+                level = -1 if inside else work.at[0]
                 slot = make_tables(
-                    rates, 1 if inside else 0, h, tables.h, tables.level, tables.used, tables.decay, tables.phi,
-                    tables.miss,
-                )  # fmt: skip
+                    rates, level, h, tables.h, tables.level, tables.used, tables.decay, tables.phi, tables.miss
+                )
                 h_slot = h
-                fill_coupling(own, h, rates, form.feed, form.tap, form.tap_s, form.c, g, home, cell)
-                whole = own.stiff[0] == 0
+                which_coupling = 2 * work.at[0] + inside
+                take_coupling(own, which_coupling, h, rates, form.feed, form.tap, form.tap_s, form.c, g, home, cell)
+                whole = own.key[1] == 0
                 weigh(rates, size, tables.decay[slot], h, work.weight)
             decay, phi, miss = tables.decay[slot], tables.phi[slot], tables.miss[slot]
             if inside:
@@ -311,25 +322,12 @@ def march(
                 if charge:
                     step_error = max(step_error, charged(cell, u, areas[netrows.AREA]))
             note(tried, counters[ACCEPTED] + counters[REJECTED], t, h, step_error / tol)
-            factor = 6.0
-            if step_error > 0.0:
-                factor = 0.9 * (tol / step_error) ** (1.0 / NODES) if step_error < math.inf else 0.5
+            factor = allowed_factor(step_error, tol)
             if step_error <= tol:
-                # A step cut short by a boundary says little about the next one; after a jump the decays die away one
-                # by one, and the length allowed grows from step to step as it did.
-                growth = h * factor / control[ALLOWED] if control[ALLOWED] > 0.0 else 1.0
-                control[ALLOWED] = h * factor
-                proposed = h * min(_MOST_GROWTH, max(0.5, factor * min(max(growth, 1.0), _MOST_TREND)))
-                proposed = max(proposed, wanted_h if h < wanted_h else 0.0)
-                if control[TOO_LONG] > 0.0:
-                    proposed = min(proposed, 0.93 * control[TOO_LONG])
-                    grows = growth if closing else max(growth, factor)
-                    control[TOO_LONG] *= grows if grows > 1.5 else 1.03
-                if fresh >= 0 and h >= wanted_h:
-                    control[fresh] = h * min(2.0, factor)
+                accept(h, wanted_h, factor, tries, fresh, not closing, control)
                 fresh = -1
-                control[H] = proposed
                 break
+            tries += 1
             counters[REJECTED] += 1
             # Refused at this length: a singularity, of which rounding hides the last bit.
             if h <= 1e-13 * max(abs(t), 1e-3 * (stop - t)) or (whole and lowest < NEAR_FOLD):
@@ -345,10 +343,8 @@ def march(
             if shorter < 1.0:
                 h = rung(h * min(0.9, shorter))
             else:
-                control[TOO_LONG] = h
                 closing = not closed
-                control[ALLOWED] = 0.0
-                h = rung(h * min(0.9, max(0.25, factor)))
+                h = shorten(h, factor, control)
                 wanted_h = h
         if code != DONE:
             break
@@ -365,7 +361,8 @@ def march(
             flips += 1
             continue
         if mobile and not whole:
-            magnified = magnified_whole(form, work, several)
+            magnified = magnified_whole(form, work, which_coupling, several)
+            take_coupling(own, which_coupling, h, rates, form.feed, form.tap, form.tap_s, form.c, g, home, cell)
         if not 0.0 < magnified < math.inf:
             code = NO_STEP
             break
@@ -395,7 +392,7 @@ def march(
                 counters[KEPT] += 1
                 if place < kept_times.shape[0]:
                     kept_times[place, 0], kept_times[place, 1], kept_times[place, 2] = t, h, t_new
-                    kept_series[place] = work.coefficients[: out.shape[0]]
+                    copy_to(kept_series[place], work.coefficients[: out.shape[0]])
             if next_out <= t_new:
                 first_out += write_outputs(
                     t, h, theta, t_new, 0.0, False, work.coefficients, work.outputs, first_out, 0, t_out, left, out
@@ -433,5 +430,5 @@ def march(
     if inside:
         # Left in the middle of a jump: at the time where it stands.
         aside[ERROR_Q], aside[MAGNIFIED] = control[ERROR_Q], control[MAGNIFIED]
-        control[:] = aside
+        copy_to(control, aside)
     return code

@@ -47,8 +47,9 @@ class Form(NamedTuple):
 
     Attributes
     ----------
-    mobile : bool
-        Charge law.
+    numbers : ndarray, shape (size,)
+        All that belongs to the reference areas, of which the arrays in `REFERRED` are views: copying other numbers into
+        it is all that a change of the reference areas takes.
     rates : ndarray, shape (m,)
     gain : ndarray, shape (m, n_s)
     shape, inverse : ndarray, shape (n, n)
@@ -70,6 +71,10 @@ class Form(NamedTuple):
         The mode of each area, -1 where it has none; `pace` (n_area,) is its rate, 1/s.
     gap, gap_s : ndarray, shape (n_area, n) and (n_area, n_s)
         Voltage of each area's GAP from x and s; zero without one.
+    size : ndarray, shape (n,)
+        Voltage (V) that each mode of the live voltages moves.
+    mobile : bool
+        Charge law.
     stress : ndarray, shape (n_area,)
         Force per area and squared gap voltage, Pa/V^2.
     powers, slopes : ndarray, shape (n_area, DEGREE + 1)
@@ -80,7 +85,7 @@ class Form(NamedTuple):
         And what of j comes on top.
     """
 
-    mobile: bool
+    numbers: FloatArray
     rates: FloatArray
     gain: FloatArray
     shape: FloatArray
@@ -89,34 +94,40 @@ class Form(NamedTuple):
     feed: FloatArray
     tap: FloatArray
     tap_s: FloatArray
+    area0: FloatArray
+    gap: FloatArray
+    gap_s: FloatArray
+    size: FloatArray
+    stored: FloatArray
+    stored_s: FloatArray
+    lost: FloatArray
+    lost_s: FloatArray
+    mobile: bool
     c: FloatArray
     g: FloatArray
     home: IntArray
     first: IntArray
     cell: IntArray
-    area0: FloatArray
     unit: FloatArray
     slow: IntArray
     pace: FloatArray
-    gap: FloatArray
-    gap_s: FloatArray
     stress: FloatArray
     powers: FloatArray
     slopes: FloatArray
     lo: FloatArray
     scale: FloatArray
     curves: FloatArray
-    stored: FloatArray
-    stored_s: FloatArray
-    lost: FloatArray
-    lost_s: FloatArray
     through: FloatArray
+
+
+#: The fields of a `Form` that belong to its reference areas, in the order in which they stand in its `numbers`.
+REFERRED = Form._fields[1:17]
 
 
 class Work(NamedTuple):
     """Arrays that steps work in; those with ROWS behind hold one value for each row of a step.
 
-    `own` is the coupling of the step at hand, `whole` that with no mode taken for stiff, and `inside` that of a jump.
+    `own` is the coupling of the step at hand, and `at` (1,) the number of the reference in use.
     """
 
     r: FloatArray
@@ -128,8 +139,7 @@ class Work(NamedTuple):
     matrix: FloatArray
     mixed: FloatArray
     own: Coupling
-    whole: Coupling
-    inside: Coupling
+    at: IntArray
     w0: FloatArray
     places: FloatArray
     weight: FloatArray
@@ -156,8 +166,7 @@ def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: 
         np.zeros((cells, cells + 1, ROWS)),
         np.zeros((cells, areas + 1, ROWS)),
         new_coupling(n, cells, sources),
-        new_coupling(n, cells, sources),
-        new_coupling(n, cells, sources),
+        np.zeros(1, np.int64),
         np.zeros(modes),
         np.zeros((modes, N_PLACES)),
         np.zeros(modes),
@@ -310,7 +319,7 @@ def evaluate(
     """
     mobile = form.mobile
     n = form.gap.shape[1]
-    stiff = coupling.stiff[0] > 0
+    stiff = coupling.key[1] > 0
     u, eta, chi, rho = areas[U], cells[ETA], cells[CHI], cells[RHO]
     area, slope, rate, more = areas[AREA], areas[SLOPE], areas[RATE], areas[MORE]
     combine_from(form.gap, w, areas[U_S], u)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine import netrows, rows
-from fingerspice.engine.coupling import Coupling, answer_mobile, cell_currents, fill_coupling
+from fingerspice.engine.coupling import Coupling, answer_mobile, cell_currents, take_coupling
 from fingerspice.engine.exponential import distance, mix, plain, respond
 from fingerspice.engine.netassess import moved
 from fingerspice.engine.netcharge import charge_rows
@@ -141,10 +141,13 @@ def all_zero(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> bool
 
 
 @jit
-def magnified_whole(form: Form, work: Work, several: bool) -> float:
-    """Inverse distance of a step to the fold, with the modes that follow at once: they take no part in its own."""
-    whole, areas, spare = work.whole, work.areas, work.spare_cells
-    fill_coupling(whole, 0.0, form.rates, form.feed, form.tap, form.tap_s, form.c, form.g, form.home, form.cell)
+def magnified_whole(form: Form, work: Work, which: int, several: bool) -> float:
+    """Inverse distance of a step to the fold, with the modes that follow at once: they take no part in its own.
+
+    `work.own` becomes the coupling number `which` with no mode taken for stiff.
+    """
+    whole, areas, spare = work.own, work.areas, work.spare_cells
+    take_coupling(whole, which, 0.0, form.rates, form.feed, form.tap, form.tap_s, form.c, form.g, form.home, form.cell)
     clear(spare[netrows.CHI])
     clear(spare[netrows.ETA])
     combine(whole.held, work.modes[netrows.W][: form.shape.shape[0]], spare[netrows.CHI])

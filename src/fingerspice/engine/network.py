@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.compiled import jit
 from fingerspice.engine.segment import Segment, source
+from fingerspice.numerics.small import copy_to
 from fingerspice.physics.contact import inverse_area
 
 FloatArray = NDArray[np.float64]
@@ -266,7 +267,7 @@ def capacitances(net: Net, room: Room, y: FloatArray, sign: FloatArray) -> None:
         room.k[j] = 0.0
         for i in range(n):
             room.matrix[i, j] = -room.probe[i]
-    room.ds[:] = ds
+    copy_to(room.ds, ds)
 
 
 @jit
@@ -280,7 +281,7 @@ def rates(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray, out
         return False
     # The charges' rates need the voltages' own.
     residual(net, room, jump, y, sign, out, room.probe)
-    out[y.size - n_s :] = room.probe[y.size - n_s :]
+    copy_to(out[y.size - n_s :], room.probe[y.size - n_s :])
     return True
 
 

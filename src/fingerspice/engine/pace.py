@@ -10,7 +10,19 @@ from numpy.typing import NDArray
 
 from fingerspice.base.compiled import jit
 from fingerspice.engine.model import Model, choose_branch, dot, gap_voltage, jump_charge, ramp
-from fingerspice.engine.readout import BRANCH_LENGTH, BRANCH_START, ERROR_Q, SIGN, U_BEFORE, U_GAP, H, T
+from fingerspice.engine.readout import (
+    ALLOWED,
+    BRANCH_LENGTH,
+    BRANCH_START,
+    ERROR_Q,
+    SIGN,
+    TOO_LONG,
+    U_BEFORE,
+    U_GAP,
+    H,
+    T,
+)
+from fingerspice.numerics.lobatto import NODES
 
 FloatArray = NDArray[np.float64]
 
@@ -18,6 +30,13 @@ FloatArray = NDArray[np.float64]
 _RUNGS = 16.0
 # A step meant to reach a zero of the gap voltage goes this much farther.
 _BEYOND = 1.02
+# Step over the one before, at most; and what of it may be foreseen growth.
+_MOST_GROWTH, _MOST_TREND = 8.0, 2.5
+# Over a length once found too long: if the error allows this much, what made it so has passed.
+_REFUTED = 1.5
+# The first step after an edge or a zero is tried so much longer than the one before at such a place, at most; less
+# where that one was found by trying.
+_MOST_FRESH, _TRIED_FRESH = 2.0, 1.1
 
 
 class Pace(NamedTuple):
@@ -109,6 +128,59 @@ def choose_step(
         return h if h < remaining else remaining
     h = rung(h)
     return h if h <= pace.h_max else rung(0.95 * pace.h_max)
+
+
+@jit
+def allowed_factor(error: float, tol: float) -> float:
+    """Length that the error of a step allows, over its own."""
+    if error == 0.0:
+        return 6.0
+    return 0.9 * (tol / error) ** (1.0 / NODES) if error < math.inf else 0.5
+
+
+@jit
+def accept(h: float, wanted: float, factor: float, tries: int, fresh: int, closed: bool, control: FloatArray) -> None:
+    """Choose the length after that of a step within its error.
+
+    Parameters
+    ----------
+    h, wanted : float
+        Length of the step, and that wanted before a boundary or a zero cut it short, s.
+    factor : float
+        See `allowed_factor`.
+    tries : int
+        Lengths that were tried.
+    fresh : int
+        Where the length of a first step after an edge or a zero is kept; -1 for other steps.
+    closed : bool
+        False where the length last found too long was one on which the iteration did not close: the error of a shorter
+        step says nothing about that.
+    control : ndarray
+        Bookkeeping, updated in place.
+    """
+    # A step cut short by a boundary says little about the next one. After a jump the decays die away one by one, and
+    # the length allowed grows from step to step as it did.
+    growth = h * factor / control[ALLOWED] if control[ALLOWED] > 0.0 else 1.0
+    control[ALLOWED] = h * factor
+    proposed = h * min(_MOST_GROWTH, max(0.5, factor * min(max(growth, 1.0), _MOST_TREND)))
+    proposed = max(proposed, wanted if h < wanted else 0.0)
+    if closed and h * factor > _REFUTED * control[TOO_LONG]:
+        control[TOO_LONG] = 0.0
+    if control[TOO_LONG] > 0.0:
+        proposed = min(proposed, 0.93 * control[TOO_LONG])
+        control[TOO_LONG] *= growth if growth > 1.5 else 1.03
+    if fresh >= 0 and h >= wanted:
+        control[fresh] = h * min(_MOST_FRESH if tries == 1 else _TRIED_FRESH, factor)
+    control[H] = proposed
+
+
+@jit
+def shorten(h: float, factor: float, control: FloatArray) -> float:
+    """The length to try after one that is too long, of which note is taken."""
+    control[TOO_LONG] = h
+    control[ALLOWED] = 0.0
+    shorter: float = rung(h * min(0.9, max(0.25, factor)))
+    return shorter
 
 
 @jit

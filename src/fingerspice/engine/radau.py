@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.compiled import jit
 from fingerspice.engine.network import Net, Room, Sources, at_sources, capacitances, rates, residual
-from fingerspice.numerics.small import invert
+from fingerspice.numerics.small import copy_to, invert
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -100,7 +100,7 @@ def linearise(net: Net, room: Room, work: Work, jump: bool, y: FloatArray, sign:
         if i >= n:
             work.mass[i, i] = 1.0
         work.weight[i] = 1.0 / largest
-    work.stage[:] = y
+    copy_to(work.stage, y)
     residual(net, room, jump, y, sign, work.rate, room.base)
     for j in range(m):
         change = 1e-7 * (abs(y[j]) + scale[j])
@@ -165,8 +165,8 @@ def _residuals(
     stages, m = work.residual.shape
     for i in range(stages):
         _stage(scheme, work, i, h, y)
-        room.s[:] = work.s[i]
-        room.ds[:] = work.ds[i]
+        copy_to(room.s, work.s[i])
+        copy_to(room.ds, work.ds[i])
         residual(net, room, jump, work.stage, sign, work.k[i], room.base)
         for j in range(m):
             work.residual[i, j] = work.weight[j] * room.base[j]
@@ -231,8 +231,8 @@ def step(
         # Past a fold there may be a solution that does not continue this one, and a step may reach it.
         for i in range(stages):
             _stage(scheme, work, i, h, y)
-            room.s[:] = work.s[i]
-            room.ds[:] = work.ds[i]
+            copy_to(room.s, work.s[i])
+            copy_to(room.ds, work.ds[i])
             if not rates(net, room, jump, work.stage, sign, work.rate):
                 return math.inf
     return norm if norm == norm else math.inf

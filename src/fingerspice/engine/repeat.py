@@ -16,6 +16,7 @@ from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine.readout import WRITTEN_AT_ONCE, write_outputs
 from fingerspice.numerics.chebyshev import to_powers
 from fingerspice.numerics.lobatto import NODES, ROWS
+from fingerspice.numerics.small import copy_to
 
 FloatArray = NDArray[np.float64]
 
@@ -149,10 +150,10 @@ def _make_powers(series: FloatArray, by: FloatArray, made: NDArray[np.bool_]) ->
             continue
         for c in range(series.shape[1]):
             to_powers(series[i, c, :NODES], room)
-            series[i, c, :NODES] = room
+            copy_to(series[i, c, :NODES], room)
             for m in range(by.shape[0]):
                 to_powers(by[m, i, c, :NODES], room)
-                by[m, i, c, :NODES] = room
+                copy_to(by[m, i, c, :NODES], room)
 
 
 def approach(
@@ -244,7 +245,7 @@ def _approach(
             moved = max(moved, abs(delta[m] - formed.at[m]))
         # Whether outputs are asked for or not: none of them depends on the others.
         if moved > still:
-            formed.at[:] = delta
+            copy_to(formed.at, delta)
             formed.stale[0] = True
         close = marks[-1] + shift
         if first < t_out.size and t_out[first] <= close + _SLACK * abs(close):
@@ -276,8 +277,8 @@ def _form(
     formed: FloatArray,
 ) -> None:  # fmt: skip
     """Marks and series of the period that starts `delta` (V) off, see `approach`, into `stops` and `formed`."""
-    stops[:] = marks
-    formed[:] = series
+    copy_to(stops, marks)
+    copy_to(formed, series)
     for m in range(delta.size):
         stops += marks_by[:, m] * delta[m]
         for i in range(series.shape[0]):

@@ -1,4 +1,4 @@
-"""Dense algebra on matrices of a few rows, compiled.
+"""Dense algebra on matrices of a few rows, and copies of arrays, compiled.
 
 LAPACK through numba would cost a fifth of a second at start-up to load, for matrices of ten rows.
 """
@@ -12,6 +12,16 @@ from fingerspice.base.compiled import jit
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+
+
+@jit
+def copy_to(out: FloatArray, x: FloatArray) -> None:
+    """out = x, of the same shape.
+
+    For `out[:] = x` numba compiles the text of an error about unlike shapes, which takes as long as a whole loop.
+    """
+    for i in range(x.size):
+        out.flat[i] = x.flat[i]
 
 
 @jit

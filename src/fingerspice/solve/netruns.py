@@ -56,18 +56,24 @@ class NetworkRun:
     gaps: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
 
     def excess(self, u_scale: float) -> float:
-        """Largest stated error over the peak it belongs to, in any gap's voltage or force.
-
-        A gap that takes no more than rounding of `u_scale`, the largest voltage of the circuit (V), is at 0 V.
-        """
-        u_peak, f_peak, u_error, f_error = self.gaps[self.gaps[:, 0] > ROUNDING * u_scale].T
-        over = np.append(u_error / u_peak, f_error / np.where(f_peak > 0.0, f_peak, np.inf))
-        return float(over.max(initial=0.0))
+        """See `excess_of`."""
+        return excess_of(self.gaps, u_scale)
 
     def end_before(self, t: float) -> None:
         """Take back the outputs from a time (s) on."""
         kept = self.t < t
         self.t, self.left, self.rows = self.t[kept], self.left[kept], self.rows[kept]
+
+
+def excess_of(gaps: FloatArray, u_scale: float) -> float:
+    """Largest stated error over the peak it belongs to, in any gap's voltage or force.
+
+    A gap that takes no more than rounding of `u_scale`, the largest voltage of the circuit (V), is at 0 V; `gaps`
+    (n_gap, 4) has peaks of voltage (V) and force (N), and the stated errors of both.
+    """
+    u_peak, f_peak, u_error, f_error = gaps[gaps[:, 0] > ROUNDING * u_scale].T
+    over = np.append(u_error / u_peak, f_error / np.where(f_peak > 0.0, f_peak, np.inf))
+    return float(over.max(initial=0.0))
 
 
 def source_tables(problem: NetworkProblem, tol: float, *, no_chirps: bool = False) -> Iterator[list[SourceTable]]:

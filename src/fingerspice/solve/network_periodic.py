@@ -204,9 +204,9 @@ class _Search:
         one = March(problem, max(tol, FINEST), self.rtol, self.scale, none, none.astype(bool), False)
         if one.through(self.period.sources, self.period.end) is not Status.SUCCESS:
             return None
-        error = np.append(one.reference.form.shape @ one.error[:n], one.error[n:])
+        error = np.append(one.form.shape @ one.error[:n], one.error[n:])
         magnified = max(1.0, float(one.control[readout.MAGNIFIED]))
-        return one.y, one.s_before, error, _Pass(none, none, one.met.copy(), magnified, one.reference.magnified)
+        return one.y, one.s_before, error, _Pass(none, none, one.met.copy(), magnified, one.references.magnified)
 
     def _collocated(self, problem: NetworkProblem, tol: float) -> _Made:
         """The same by an implicit method, its error from a coarser pass."""
@@ -248,7 +248,8 @@ class _Search:
     def _newton(self, tol: float) -> tuple[_Pass, FloatArray, float]:
         """Close the period; returns its last pass, the last step of z, and the largest change over that pass, V."""
         moved = self.scale * (_FIRST / _CRUDE if self.passes == 0 else 0.0)
-        change_before, step, here, smallest, since = None, np.zeros(self.z.size), _FIRST, math.inf, 0
+        change_before, before, step = None, _FIRST, np.zeros(self.z.size)
+        here, smallest, since = _FIRST, math.inf, 0
         for count in range(1, _MOST + 1):
             # What a pass misses the solver makes larger.
             memory = self._memory()
@@ -256,10 +257,13 @@ class _Search:
             last = self.passed(self.z, here)
             change = last.end - self.z
             if change_before is not None:
-                self._update(step, change_before - np.where(self.free, change, 0.0))
+                fell = change_before - np.where(self.free, change, 0.0)
+                # From what two passes miss nothing is to be learnt.
+                if self._largest(fell) > before * self.scale:
+                    self._update(step, fell)
             if count % _PATIENCE == 0:
                 self.solver = self._inverse(self._slope())
-            change_before = np.where(self.free, change, 0.0)
+            change_before, before = np.where(self.free, change, 0.0), here
             step = self.solver @ change_before
             if count == 1 and self._largest(step) > _LONG * self.scale:
                 # A slow mode, whose few decays the areas' ripple may outdo.

@@ -1,0 +1,87 @@
+"""Reference areas of a network: which the areas at hand want, and going over from one to another."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.compiled import jit
+from fingerspice.engine.netrows import Form
+from fingerspice.numerics.small import copy_to
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# Ratio of neighbouring reference areas; an area this many times its reference's, or a part of it, wants another one.
+LEVEL_RATIO, FARTHEST = 1.28, 1.2
+
+
+class References(NamedTuple):
+    """What is known of a network around several reference areas.
+
+    Attributes
+    ----------
+    levels : ndarray of int, shape (room, n_area)
+        Powers of LEVEL_RATIO that the areas of each reference are over those at 0 V.
+    numbers : ndarray, shape (room, size)
+        See `Form`.
+    count, wanted : ndarray of int, shape (1,) and (n_area,)
+        How many references there are; the levels that were looked for last.
+    """
+
+    levels: IntArray
+    numbers: FloatArray
+    count: IntArray
+    wanted: IntArray
+
+
+@jit
+def far_from(form: Form, area: FloatArray) -> bool:
+    """Whether some area that moves (n_area,) wants another reference."""
+    for a in range(area.size):
+        if form.cell[a] >= 0 and max(area[a] / form.area0[a], form.area0[a] / area[a]) > FARTHEST:
+            return True
+    return False
+
+
+@jit
+def find(references: References, form: Form, area: FloatArray) -> int:
+    """The reference nearest to these areas (n_area,), or -1 where it is not known yet; its levels into `wanted`."""
+    wanted = references.wanted
+    for a in range(area.size):
+        wanted[a] = 0
+        if form.cell[a] >= 0:
+            wanted[a] = round(math.log(area[a] / form.unit[a]) / math.log(LEVEL_RATIO))
+    for one in range(references.count[0]):
+        same = True
+        for a in range(area.size):
+            same &= references.levels[one, a] == wanted[a]
+        if same:
+            return one
+    return -1
+
+
+@jit
+def go_over(references: References, one: int, form: Form, error: FloatArray) -> None:
+    """Make a form that of another reference, and carry the error of its modes over."""
+    n = form.shape.shape[0]
+    x = np.zeros(n)
+    for i in range(n):
+        for k in range(n):
+            x[i] += form.shape[i, k] * error[k]
+    copy_to(form.numbers, references.numbers[one])
+    for k in range(n):
+        error[k] = 0.0
+        for i in range(n):
+            error[k] += form.inverse[k, i] * x[i]
+
+
+@jit
+def start_at(area0: FloatArray, area: FloatArray) -> None:
+    """Areas (n_area, ROWS) as at their references."""
+    for a in range(area0.size):
+        for i in range(area.shape[1]):
+            area[a, i] = area0[a]

@@ -1,0 +1,198 @@
+"""A network around reference areas as numbers, made when a run first wants them and kept with the scene."""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray, IntArray, views_of
+from fingerspice.circuit.network import Modes, network_modes
+from fingerspice.engine.exponential import Tables, new_tables
+from fingerspice.engine.netrows import REFERRED, Form
+from fingerspice.engine.references import LEVEL_RATIO, References
+from fingerspice.engine.system import area_error, area_polynomials
+from fingerspice.solve.networks import NetworkScene
+from fingerspice.solve.runs import kept_with
+
+# Sets of references that stay with a scene: one for each thread and decade of tolerances.
+MOST_SETS = 16
+# References of a set, and numbers of all of them (64 MB), at most; beyond, a new set is begun.
+MOST_REFERENCES, MOST_NUMBERS = 256, 8_000_000
+
+
+@dataclass
+class Known:
+    """The references of a scene that one thread has needed so far, and the tables of steps around them.
+
+    Attributes
+    ----------
+    arrays : References
+    tables : Tables
+    magnified : ndarray, shape (n_area,)
+        Rounding of each gap's voltage over that of the largest voltage, the most of all references.
+    fixed : dict
+        The fields of a `Form` that are the same for all references.
+    """
+
+    scene: NetworkScene
+    decade: int
+    arrays: References
+    tables: Tables
+    magnified: FloatArray
+    fixed: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def count(self) -> int:
+        return int(self.arrays.count[0])
+
+    @property
+    def is_full(self) -> bool:
+        return self.count >= max(2, min(MOST_REFERENCES, MOST_NUMBERS // self.arrays.numbers.shape[1]))
+
+    def add(self, levels: tuple[int, ...]) -> None:
+        """Make the reference whose areas are the fixed ones, or LEVEL_RATIO to these powers over those at 0 V."""
+        arrays, one = self.arrays, self.count
+        if one == len(arrays.levels):
+            more = np.zeros_like(arrays.levels), np.zeros_like(arrays.numbers)
+            self.arrays = arrays = arrays._replace(
+                levels=np.vstack([arrays.levels, more[0]]), numbers=np.vstack([arrays.numbers, more[1]])
+            )
+        area = self.scene.area0 * LEVEL_RATIO ** np.array(levels, float)
+        parts, magnified = _referred(self.scene, area)
+        arrays.numbers[one] = np.concatenate([parts[name].ravel() for name in REFERRED])
+        arrays.levels[one] = levels
+        arrays.count[0] += 1
+        np.maximum(self.magnified, magnified, out=self.magnified)
+
+    def form(self) -> Form:
+        """A form around the areas at 0 V, with numbers of its own."""
+        numbers, views = views_of(_shapes(self.scene))
+        numbers[:] = self.arrays.numbers[0]
+        return Form(numbers, *views, **self.fixed)
+
+
+def known_references(scene: NetworkScene, decade: int, *, anew: bool = False) -> Known:
+    """The references of a scene for tolerances of a decade, the first of which has the areas at 0 V."""
+    # One set for each thread: compiled code writes into its tables, and other threads run meanwhile.
+    key = ("references", decade, threading.get_ident())
+    if anew:
+        scene.prepared.pop(key, None)
+    found: Known = kept_with(scene.prepared, key, MOST_SETS, lambda: _make(scene, decade))
+    return found
+
+
+def _make(scene: NetworkScene, decade: int) -> Known:
+    n_area = scene.area0.size
+    shapes = _shapes(scene)
+    room = References(
+        np.zeros((2, n_area), np.int64),
+        np.zeros((2, sum(math.prod(shape) for shape in shapes))),
+        np.zeros(1, np.int64),
+        np.zeros(n_area, np.int64),
+    )
+    n_modes = shapes[0][0]
+    known = Known(scene, decade, room, new_tables(n_modes), np.zeros(n_area), _fixed(scene, decade))
+    known.add((0,) * n_area)
+    return known
+
+
+def _shapes(scene: NetworkScene) -> list[tuple[int, ...]]:
+    """Of the arrays in `REFERRED`."""
+    net = scene.net
+    n, n_s = net.b.shape
+    m = n + int(np.count_nonzero(net.slow >= 0))
+    n_f, n_area = _fed(scene).size, net.gap.size
+    shapes = {
+        "rates": (m,), "gain": (m, n_s), "shape": (n, n), "inverse": (n, n), "follow": (n, n_s), "feed": (m, n_f),
+        "tap": (n_f, n), "tap_s": (n_f, n_s), "area0": (n_area,), "gap": (n_area, n), "gap_s": (n_area, n_s),
+        "size": (n,), "stored": (n_s, n), "stored_s": (n_s, n_s), "lost": (n_s, n), "lost_s": (n_s, n_s),
+    }  # fmt: skip
+    return [shapes[name] for name in REFERRED]
+
+
+def _fed(scene: NetworkScene) -> IntArray:
+    """The cells whose area moves, those of each area together."""
+    net = scene.net
+    fed = np.flatnonzero([i >= 0 and net.gap[i] >= 0 for i in net.place])
+    return fed[np.argsort(net.place[fed], kind="stable")]
+
+
+def _fixed(scene: NetworkScene, decade: int) -> dict[str, Any]:
+    """What of a form is the same for all references."""
+    network, net = scene.network, scene.net
+    n, n_area = net.k.shape[0], net.gap.size
+    slow, fed = net.slow >= 0, _fed(scene)
+    stress = np.zeros(n_area)
+    for i in network.fingers:
+        contact = network.contacts[i]
+        assert contact is not None
+        stress[i] = float(contact.stress(1.0))
+    powers, slopes, lo, scale = area_polynomials(net.curves, net.gap >= 0, area_error(decade))
+    return {
+        "mobile": net.mobile,
+        "c": net.c[fed],
+        "g": net.g_area[fed],
+        "home": net.place[fed],
+        "first": np.searchsorted(net.place[fed], np.arange(n_area + 1)),
+        "cell": np.array([int(np.flatnonzero(fed == i)[0]) if i >= 0 else -1 for i in net.gap], np.int64),
+        "unit": scene.area0.copy(),
+        "slow": np.where(slow, n + net.slow, -1),
+        "pace": np.where(slow, 1.0 / np.where(slow, net.tau, 1.0), 0.0),
+        "stress": stress,
+        "powers": powers,
+        "slopes": slopes,
+        "lo": lo,
+        "scale": scale,
+        "curves": net.curves,
+        "through": np.ascontiguousarray(network.through[:, fed]),
+    }
+
+
+def _referred(scene: NetworkScene, area: FloatArray) -> tuple[dict[str, FloatArray], FloatArray]:
+    """What of a form belongs to reference areas (m^2), and the rounding of each gap's voltage."""
+    network, net = scene.network, scene.net
+    modes = network_modes(network, area)
+    n, n_s = modes.gains.shape
+    slow, fed = net.slow >= 0, _fed(scene)
+    n_slow = int(np.count_nonzero(slow))
+    tap, tap_s = network.p @ modes.shape, network.q - network.p @ modes.follow
+    gap, gap_s = np.zeros((area.size, n)), np.zeros((area.size, n_s))
+    for i in network.fingers:
+        cell = network.gaps[i]
+        assert cell is not None
+        gap[i], gap_s[i] = tap[cell], tap_s[cell]
+    capacitance, leak = network.capacitance(area)[:, None], network.leak(area)[:, None]
+    at_x, at_s = network.delivered[:, :n], network.delivered[:, n:]
+    parts = {
+        "rates": np.append(modes.rates, 1.0 / net.tau[slow]),
+        "gain": np.vstack([modes.gains, np.zeros((n_slow, n_s))]),
+        "shape": modes.shape,
+        "inverse": modes.inverse,
+        "follow": modes.follow,
+        "feed": np.vstack([-modes.take[:, fed], np.zeros((n_slow, fed.size))]),
+        "tap": tap[fed],
+        "tap_s": tap_s[fed],
+        "area0": area,
+        "gap": gap,
+        "gap_s": gap_s,
+        "size": np.linalg.norm(modes.shape, axis=0),
+        "stored": network.through @ (capacitance * tap),
+        "stored_s": network.through @ (capacitance * tap_s),
+        "lost": network.through @ (leak * tap) + at_x @ modes.shape,
+        "lost_s": network.through @ (leak * tap_s) - at_x @ modes.follow + at_s,
+    }
+    return parts, _magnified(modes, gap, gap_s)
+
+
+def _magnified(modes: Modes, gap: FloatArray, gap_s: FloatArray) -> FloatArray:
+    """Rounding of each gap's voltage, a sum over modes and sources, over that of the largest voltage."""
+    live = modes.rates[modes.rates > 0.0]
+    # What the rounding of the fastest mode leaves in the slowest.
+    spread = math.sqrt(float(live.max() / live.min())) if live.size else 0.0
+    every = (np.abs(modes.shape) @ np.abs(modes.inverse)).sum(axis=1).max(initial=1.0)
+    own = (np.abs(gap) @ np.abs(modes.inverse)).sum(axis=1) + np.abs(gap_s).sum(axis=1)
+    return np.asarray((every + spread) * np.minimum(own / every, 1.0))
