@@ -47,11 +47,12 @@ class Known:
 
     @property
     def count(self) -> int:
-        return int(self.arrays.count[0])
+        return int(self.arrays.used[0])
 
     @property
     def is_full(self) -> bool:
-        return self.count >= max(2, min(MOST_REFERENCES, MOST_NUMBERS // self.arrays.numbers.shape[1]))
+        most: int = MOST_NUMBERS // self.arrays.numbers.shape[1]
+        return self.count >= max(2, min(MOST_REFERENCES, most))
 
     def add(self, levels: tuple[int, ...]) -> None:
         """Make the reference whose areas are the fixed ones, or LEVEL_RATIO to these powers over those at 0 V."""
@@ -65,14 +66,15 @@ class Known:
         parts, magnified = _referred(self.scene, area)
         arrays.numbers[one] = np.concatenate([parts[name].ravel() for name in REFERRED])
         arrays.levels[one] = levels
-        arrays.count[0] += 1
+        arrays.used[0] += 1
         np.maximum(self.magnified, magnified, out=self.magnified)
 
     def form(self) -> Form:
         """A form around the areas at 0 V, with numbers of its own."""
         numbers, views = views_of(_shapes(self.scene))
         numbers[:] = self.arrays.numbers[0]
-        return Form(numbers, *views, **self.fixed)
+        parts: dict[str, Any] = dict(zip(REFERRED, views, strict=True))
+        return Form(numbers=numbers, **parts, **self.fixed)
 
 
 def known_references(scene: NetworkScene, decade: int, *, anew: bool = False) -> Known:
