@@ -186,7 +186,7 @@ class _Called:
 
 
 def _cached(*, noalias: bool = False, **options: Any) -> Callable[[Function], Function]:
-    """`njit` with a cache; `noalias`: where compiled code calls it, what it writes shares no memory with what it reads."""
+    """`njit` with a cache; `noalias`: where compiled code calls it, it writes to no memory that it reads."""
 
     def compile_when_called(function: Function) -> Function:
         # What is not said here, numba takes from whichever caller comes first.
