@@ -103,7 +103,7 @@ class _Cache(FunctionCache):
 
 
 _ONCE = (
-    "compiling what this needs, 20 s for a series stack and about a minute for a network, only once: later runs find "
+    "compiling what this needs, 20 s for a series stack and 50 s for a network, only once: later runs find "
     "it on the disk"
 )
 _EVERY_TIME = (
