@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -177,54 +176,26 @@ class ErrorEstimate:
 
 @dataclass(frozen=True, repr=False)
 class State:
-    """Where a run of a series stack stopped; another run may start from it.
+    """Where a run stopped; another run may start from it.
 
     Attributes
     ----------
     t : float
         s.
     y : ndarray, shape (n,)
-        The engine's state.
-    u_before : float
-        Source voltage just before `t`, V.
-    charge_offset : float
-        Subtracted from the charge so that it starts at zero, C.
-    charge_law : str
-    u_gap : float
-        Gap voltage (V), which selects one of several solutions of the mobile law; NaN: the one connected to rest.
-    """
-
-    t: float
-    y: FloatArray
-    u_before: float
-    charge_offset: float
-    charge_law: str
-    u_gap: float = math.nan
-
-    def __repr__(self) -> str:
-        return f"<State at t = {self.t:g} s, {self.y.size} numbers, {self.charge_law} law>"
-
-
-@dataclass(frozen=True, repr=False)
-class NetworkState:
-    """Where the run of a network stopped; another run may start from it.
-
-    Attributes
-    ----------
-    t : float
-        s.
-    y : ndarray, shape (n,)
-        The state as in `engine.network`.
+        Live voltages (V), areas with dynamics of their own over their value at 0 V, and charges delivered (C).
     s_before : ndarray, shape (n_source,)
         Source values just before `t`, V or A.
     sign : ndarray, shape (n_area,)
-        Branch of each area.
+        Branch of each area: the sign of its gap's voltage, 0 where that follows from the voltage.
+    charge_law : str
     """
 
     t: float
     y: FloatArray
     s_before: FloatArray
     sign: FloatArray
+    charge_law: str
 
     def __repr__(self) -> str:
-        return f"<NetworkState at t = {self.t:g} s, {self.y.size} numbers>"
+        return f"<State at t = {self.t:g} s, {self.y.size} numbers, {self.charge_law} law>"

@@ -15,8 +15,8 @@ from fingerspice.engine.exponential import Tables, new_tables
 from fingerspice.engine.netrows import REFERRED, Form
 from fingerspice.engine.references import LEVEL_RATIO, References
 from fingerspice.engine.system import area_error, area_polynomials
-from fingerspice.solve.networks import NetworkScene
 from fingerspice.solve.runs import kept_with
+from fingerspice.solve.scenes import Scene
 
 # Sets of references that stay with a scene: one for each thread and decade of tolerances.
 MOST_SETS = 16
@@ -38,7 +38,7 @@ class Known:
         The fields of a `Form` that are the same for all references.
     """
 
-    scene: NetworkScene
+    scene: Scene
     decade: int
     arrays: References
     tables: Tables
@@ -77,7 +77,7 @@ class Known:
         return Form(numbers=numbers, **parts, **self.fixed)
 
 
-def known_references(scene: NetworkScene, decade: int, *, anew: bool = False) -> Known:
+def known_references(scene: Scene, decade: int, *, anew: bool = False) -> Known:
     """The references of a scene for tolerances of a decade, the first of which has the areas at 0 V."""
     # One set for each thread: compiled code writes into its tables, and other threads run meanwhile.
     key = ("references", decade, threading.get_ident())
@@ -87,7 +87,7 @@ def known_references(scene: NetworkScene, decade: int, *, anew: bool = False) ->
     return found
 
 
-def _make(scene: NetworkScene, decade: int) -> Known:
+def _make(scene: Scene, decade: int) -> Known:
     n_area = scene.area0.size
     shapes = _shapes(scene)
     room = References(
@@ -102,7 +102,7 @@ def _make(scene: NetworkScene, decade: int) -> Known:
     return known
 
 
-def _shapes(scene: NetworkScene) -> list[tuple[int, ...]]:
+def _shapes(scene: Scene) -> list[tuple[int, ...]]:
     """Of the arrays in `REFERRED`."""
     net = scene.net
     n, n_s = net.b.shape
@@ -116,14 +116,14 @@ def _shapes(scene: NetworkScene) -> list[tuple[int, ...]]:
     return [shapes[name] for name in REFERRED]
 
 
-def _fed(scene: NetworkScene) -> IntArray:
+def _fed(scene: Scene) -> IntArray:
     """The cells whose area moves, those of each area together."""
     net = scene.net
     fed = np.flatnonzero([i >= 0 and net.gap[i] >= 0 for i in net.place])
     return fed[np.argsort(net.place[fed], kind="stable")]
 
 
-def _fixed(scene: NetworkScene, decade: int) -> dict[str, Any]:
+def _fixed(scene: Scene, decade: int) -> dict[str, Any]:
     """What of a form is the same for all references."""
     network, net = scene.network, scene.net
     n, n_area = net.k.shape[0], net.gap.size
@@ -154,7 +154,7 @@ def _fixed(scene: NetworkScene, decade: int) -> dict[str, Any]:
     }
 
 
-def _referred(scene: NetworkScene, area: FloatArray) -> tuple[dict[str, FloatArray], FloatArray]:
+def _referred(scene: Scene, area: FloatArray) -> tuple[dict[str, FloatArray], FloatArray]:
     """What of a form belongs to reference areas (m^2), and the rounding of each gap's voltage."""
     network, net = scene.network, scene.net
     modes = network_modes(network, area)
