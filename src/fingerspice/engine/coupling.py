@@ -40,8 +40,6 @@ IntArray = NDArray[np.int64]
 # Steps over the time constant of a mode from which on its rate is taken from its polynomial: -rate w + gain s + feed j
 # would be what is left of large numbers, and j hands that on to every other mode.
 STIFF = 300.0
-
-
 # Over the areas, each time the currents are evaluated.
 _SWEEPS = 2
 # Couplings that are kept for when they are needed again, and numbers of them, at most.

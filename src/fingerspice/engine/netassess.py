@@ -73,8 +73,8 @@ def moved(u: FloatArray, before: FloatArray) -> float:
 
 
 @jit_rows
-def _largest_voltage(shape: FloatArray, follow: FloatArray, off: FloatArray, off_s: FloatArray) -> float:
-    """Largest of what the live voltages are off, V, from what the modes (5, m) and the sources (3, n_s) are."""
+def _largest_voltage(shape: FloatArray, follow: FloatArray, m: int, off: FloatArray) -> float:
+    """Largest of what the live voltages are off, V, from what the m modes and, behind them, the sources are."""
     n = shape.shape[0]
     largest_one = 0.0
     for i in range(n):
@@ -82,9 +82,8 @@ def _largest_voltage(shape: FloatArray, follow: FloatArray, off: FloatArray, off
             total = 0.0
             for k in range(n):
                 total += shape[i, k] * off[p, k]
-            if p < off_s.shape[0]:
-                for e in range(off_s.shape[1]):
-                    total -= follow[i, e] * off_s[p, e]
+            for e in range(follow.shape[1]):
+                total -= follow[i, e] * off[p, m + e]
             # NaN is too large as well.
             if not abs(total) <= largest_one:
                 largest_one = abs(total)
@@ -95,19 +94,19 @@ def _largest_voltage(shape: FloatArray, follow: FloatArray, off: FloatArray, off
 def assess(
     rates: FloatArray, h: float, shape: FloatArray, follow: FloatArray, gap: FloatArray, size: FloatArray,
     phi: FloatArray, miss: FloatArray, error: FloatArray, carried: FloatArray, w: FloatArray, lin: FloatArray,
-    pull: FloatArray, used: FloatArray, s: FloatArray, magnified: float, off: FloatArray, off_s: FloatArray,
-    places: FloatArray, early: FloatArray, run: FloatArray,
+    pull: FloatArray, used: FloatArray, s: FloatArray, magnified: float, off: FloatArray, places: FloatArray,
+    early: FloatArray, run: FloatArray,
 ) -> float:  # fmt: skip
     """Error of a converged step, V, from what its polynomials miss between nodes; see `exponential.assess`.
 
     `places` (m, N_PLACES) takes the error of the modes, `early` (m,) what their polynomials miss of a decay that is
     over before the first node, `run` (n_area,) the largest error of each gap's voltage with what the iteration left and
-    what came before; `off` (5, m) and `off_s` (3, n_s) are for passing use.
+    what came before; `off` (5, m + n_s) is for passing use.
     """
-    n = shape.shape[0]
+    n, m = shape.shape[0], w.shape[0]
     left = np.zeros(4)
     for j in range(s.shape[0]):
-        off_s[0, j], off_s[1, j], off_s[2, j] = between(s[j])
+        off[0, m + j], off[1, m + j], off[2, m + j] = between(s[j])
     for k in range(w.shape[0]):
         lin_first, lin_second, lin_third = between(lin[k])
         pull_first, pull_second, pull_third = between(pull[k])
@@ -134,7 +133,7 @@ def assess(
         places[k, 1] += mode_first
         places[k, 2] += mode_second
         places[k, 3] += mode_third
-    step = _largest_voltage(shape, follow, off, off_s)
+    step = _largest_voltage(shape, follow, m, off)
     for k in range(n, w.shape[0]):
         for p in range(4):
             if not size[k] * abs(off[p, k]) <= step:

@@ -317,8 +317,7 @@ def march(
                 carry(form, work, several, h, rates, area_pace, own, decay, phi, error, sign)
                 step_error = assess(
                     rates, h, shape, follow, form.gap, size, phi, miss, error, work.carried, w, modes[netrows.LIN],
-                    modes[netrows.PULL], modes[netrows.USED], s, magnified, work.off, work.off_s, places,
-                    early, run,
+                    modes[netrows.PULL], modes[netrows.USED], s, magnified, work.off, places, early, run,
                 )  # fmt: skip
                 if charge:
                     step_error = max(step_error, charged(cell, u, areas[netrows.AREA]))

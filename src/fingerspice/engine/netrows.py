@@ -148,7 +148,6 @@ class Work(NamedTuple):
     outputs: FloatArray
     room: FloatArray
     off: FloatArray
-    off_s: FloatArray
     carried: FloatArray
     spare: FloatArray
     spare_cells: FloatArray
@@ -175,8 +174,7 @@ def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: 
         np.zeros((columns, ROWS)),
         np.zeros((2, WRITTEN_AT_ONCE)),
         np.zeros((4, ROWS)),
-        np.zeros((N_PLACES, modes)),
-        np.zeros((N_PLACES - 2, sources)),
+        np.zeros((N_PLACES, modes + sources)),
         np.zeros((modes, N_PLACES - 1)),
         np.zeros((6, modes, ROWS)),
         np.zeros((8, cells, ROWS)),
