@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import zip_longest
 from types import MappingProxyType
 
 import numpy as np
@@ -22,58 +23,59 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
     """
 
     def make() -> Network:
-        return _loop_network(build_stack(circuit, skin_at)) if is_stack(circuit) else build_network(circuit)
+        return loop_network(build_stack(circuit, skin_at)) if is_stack(circuit) else build_network(circuit)
 
     network: Network = circuit.remember(("network", skin_at), make)
     return network
 
 
-def _loop_network(stack: Stack) -> Network:
+def loop_network(stack: Stack) -> Network:
     """The network of a stack, its cells in the order of `Stack.state_order`, with voltages from p to n."""
     ends, order = ("1", "0"), list(stack.state_order)
-    n = len(order) - 1
-    sign = stack.sign[order]
+    n, sign = len(order) - 1, stack.sign.tolist()
     layers = [stack.layers[stack.layer_of(i)] for i in order]
-    constants = np.column_stack([stack.c, stack.g_total, stack.g_area])[order].tolist()
-    p, q, through = np.eye(n + 1, n), np.zeros((n + 1, 1)), np.zeros((1, n + 1))
-    p[n], q[n] = -sign[n] * sign[:n], sign[n]
+    constants = list(zip(stack.c.tolist(), stack.g_total.tolist(), stack.g_area.tolist(), strict=True))
+    # Of the states, then of the loop's voltage.
+    across = [[float(i == j) for j in range(n + 1)] for i in range(n)]
+    last = sign[order[n]]
+    across.append([*(-last * sign[i] for i in order[:n]), last])
     area = stack.area_given if stack.contact is None or stack.area_given else float(stack.contact.area(0.0))
     assert area is not None
     # The charge is that of the cell that leaks least, where it suffers least from cancellation.
-    slowest = order.index(int(np.argmin(stack.leak_rates(area))))
-    through[0, slowest] = sign[slowest]
+    slowest = int(np.argmin(stack.leak_rates(area)))
+    through = [sign[i] * (i == slowest) for i in order]
     several = [e for e, _ in stack.sources] if len(stack.sources) > 1 else []
     gap = None if stack.gap_layer is None else stack.layers[stack.gap_layer]
-    names, nodes = [], np.zeros((len(stack.hops) - 1, n + 1 + len(several)))
-    row = np.zeros(nodes.shape[1])
-    for i, hop in enumerate(stack.hops[:-1]):
+    nodes, row = [], [0.0] * (n + 1 + len(several))
+    for hop in stack.hops[:-1]:
         if hop.element.device != "V":
-            own = [j for j, layer in enumerate(layers) if layer is hop.element]
-            row[: n + 1] -= hop.sign * np.append(p[own].sum(axis=0), q[own].sum())
+            for own, layer in zip(across, layers, strict=True):
+                if layer is hop.element:
+                    row = [x - hop.sign * y for x, y in zip_longest(row, own, fillvalue=0.0)]
         elif several:
             row[n + 1 + several.index(hop.element)] -= hop.sign
         else:
             row[n] += 1.0
-        nodes[i] = row
-        names.append(hop.node)
+        nodes.append(list(row))
+    matrix = np.array(across)
     return Network(
         sources=(Element("loop", "V", ends, ends, MappingProxyType({}), stack.waveform),),
         n_voltage=1,
-        cells=tuple(Cell(e, ends, c, g, g_area, 0) for e, (c, g, g_area) in zip(layers, constants, strict=True)),
+        cells=tuple(Cell(layer, ends, *constants[i], 0) for layer, i in zip(layers, order, strict=True)),
         layers=stack.layers,
         live=tuple(range(n)),
         areas=(Area(layers[0].nodes[2], gap, stack.area_given, None),),
         contacts=(stack.contact,),
         gaps=(None if stack.gap is None else order.index(stack.gap),),
-        p=p,
-        q=q,
+        p=matrix[:, :n].copy(),
+        q=matrix[:, n:].copy(),
         k=np.zeros((n, n)),
         b=np.zeros((n, 1)),
-        through=through,
+        through=np.array([through]),
         delivered=np.zeros((1, n + 1)),
         resistor_factor=np.zeros((0, n)),
         resistor_factor_s=np.zeros((0, 1)),
-        node_names=tuple(names),
-        nodes=nodes,
+        node_names=tuple(hop.node for hop in stack.hops[:-1]),
+        nodes=np.array(nodes).reshape(-1, len(row)),
         stack=stack,
     )

@@ -254,7 +254,7 @@ def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run
     along(np.array([u_end]), np.zeros(1), ended)
     y = np.append(start.y[:-1], ended[0, -1])
     state = from_stack(scene, StackState(end, y, u_end, float(ended[0, 1]), start.offset))
-    shown = from_written(scene, rows[:done], start.offset)
+    shown = from_written(scene, rows[:done], start.offset, by_layer=False)
     run = _finished(problem, tables, t_out[:done], left[:done], shown, state, 0.0, solve_algebraic)
     if problem.charge:
         most = (

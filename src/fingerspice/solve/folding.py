@@ -72,7 +72,7 @@ def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray)
     later = t_out[done:]
     t = np.append(later[later < path.t], path.t)
     written = path.rows(problem, t)
-    rows = from_written(problem.scene, written, state.offset)[:, : run.rows.shape[1]]
+    rows = from_written(problem.scene, written, state.offset, run.by_layer)[:, : run.rows.shape[1]]
     run.t, run.left = np.append(run.t[:done], t), np.append(left[: done + t.size - 1], True)
     run.rows = np.vstack([run.rows[:done], rows])
     run.t_failed, run.margin = path.t, 0.0

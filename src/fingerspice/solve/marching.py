@@ -57,6 +57,7 @@ def solve(
         except OutOfRangeError as error:
             top = 1.5 * error.top
             continue
+        run.by_layer = True
         run.end_where_it_stopped()
         nfev += run.nfev
         run.nfev = nfev

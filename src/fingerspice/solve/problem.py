@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.network import Network
 from fingerspice.results.outcome import State
-from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.initial import initial_state
 from fingerspice.solve.scenes import Scene, scene_of
@@ -22,7 +21,6 @@ from fingerspice.waveforms.sampling import on_breakpoint
 from fingerspice.waveforms.waveform import Waveform
 
 FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Breakpoints (64 kB) that a scene keeps.
 KEPT_BREAKPOINTS = 8192
@@ -82,10 +80,6 @@ class Problem:
             state, inner = self.scene.prepared["inner"] = self.initial, to_stack(self.scene, self.initial)
         assert isinstance(inner, StackState)
         return inner
-
-    def record(self, t: FloatArray, left: BoolArray, rows: FloatArray) -> Record:
-        """Outputs of a run (see `Record`) with what they mean."""
-        return Record(self.scene.network, self.scene.net, t, left, rows, self.charge)
 
     def breakpoints(self) -> FloatArray:
         """The sources' breakpoints in the run, s; those of a short run stay with the scene."""

@@ -74,6 +74,8 @@ class Run:
         The row at the time that a failed run reached.
     continuous : Recorded or ClosedForm or None
         The run between its outputs, where that is known.
+    by_layer : bool
+        Whether the rows are those of `Scene.shown`.
     """
 
     t: FloatArray
@@ -93,6 +95,7 @@ class Run:
     tried: tuple[Attempt, ...] = ()
     here: FloatArray | None = None
     continuous: Recorded | ClosedForm | None = None
+    by_layer: bool = False
 
     @property
     def error(self) -> ErrorEstimate:
@@ -102,7 +105,8 @@ class Run:
 
     def record(self, problem: Problem) -> Record:
         """The outputs with what they mean."""
-        return problem.record(self.t, self.left, self.rows)
+        scene = problem.scene.shown if self.by_layer else problem.scene
+        return Record(scene.network, scene.net, self.t, self.left, self.rows, problem.charge)
 
     def end_before(self, t: float) -> None:
         """Take back the outputs from a time (s) on."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
-from fingerspice.circuit.loop import network_of
+from fingerspice.circuit.loop import loop_network, network_of
 from fingerspice.circuit.network import Modes, Network, network_modes
 from fingerspice.circuit.response import areas_at_rest, mean_areas
 from fingerspice.circuit.spectrum import freezing_error
@@ -122,6 +122,14 @@ class Scene:
         return _net(self)
 
     @cached_property
+    def shown(self) -> Scene:
+        """As a run by exponential steps records it: a stack's layers, however many cells they have."""
+        stack = self.stack
+        if stack is None or stack.by_layer is stack:
+            return self
+        return replace(self, network=loop_network(stack.by_layer), prepared={})
+
+    @cached_property
     def area0(self) -> FloatArray:
         """The areas where they are fixed, else at 0 V, m^2."""
         return np.asarray(self.net.area0)
@@ -154,6 +162,11 @@ class Scene:
         """Of a stack: the sign of every live voltage along the loop, shape (n,)."""
         assert self.stack is not None
         return self.stack.sign[list(self.stack.state_order[:-1])]
+
+    @cached_property
+    def is_turned(self) -> bool:
+        """Whether some live voltage of a stack is written against the loop."""
+        return bool(np.any(self.turn < 0.0))
 
     @cached_property
     def measured(self) -> tuple[int, ...]:

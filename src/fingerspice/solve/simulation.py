@@ -258,21 +258,24 @@ def _stepped(
         from fingerspice.solve.foreign import solve_foreign
 
         return solve_foreign(problem, method, rtol, t_out, left, progress), method
-    from fingerspice.solve.folding import lead_to_fold, run_to_fold
-
     is_stack = problem.scene.stack is not None
     if method != "radau" and (is_stack or problem.scene.coupled):
         run = solve_exponential(problem, rtol, t_out, left, progress, repeat=method == "auto")
         if run.status not in (BEYOND_STACKS if is_stack else BEYOND_NETWORKS) or (is_stack and method == "exponential"):
             return run, "exponential"
         if is_stack and run.status is Status.FOLD:
+            from fingerspice.solve.folding import run_to_fold
+
             folded = run_to_fold(problem, t_out, left)
             if folded is not None:
                 return folded, "exponential"
     # For an implicit method, which no fast mode holds up.
     run = solve_coupled(problem, rtol, t_out, left, progress)
-    led = lead_to_fold(problem, run, t_out, left) if is_stack and run.status is Status.FOLD else None
-    return led or run, "radau"
+    if is_stack and run.status is Status.FOLD:
+        from fingerspice.solve.folding import lead_to_fold
+
+        run = lead_to_fold(problem, run, t_out, left) or run
+    return run, "radau"
 
 
 def _state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:

@@ -100,31 +100,28 @@ def unreachable(scene: Scene, state: StackState, largest: float) -> bool:
     return not abs(found - state.u_gap) <= 1e-9 * abs(state.u_gap) + 1e-13 * largest
 
 
-def as_marched(model: Model, rows: FloatArray) -> FloatArray:
-    """Rows of live voltages along the loop, z and current, as the loop writes them, from those of `write_row`."""
-    scale = model.area0 * rows[:, 2:3] if model.mobile else 1.0
-    return np.column_stack([np.outer(rows[:, 0], model.k[:-1]) + rows[:, 5:-1] * scale, rows[:, -1], rows[:, 3]])
+def as_marched(scene: Scene, rows: FloatArray, by_layer: bool = True) -> FloatArray:
+    """Rows as the loop writes them from those of `write_row`: voltages along the loop, z and the current.
 
-
-def as_outputs(scene: Scene, rows: FloatArray, u: FloatArray, inverse: FloatArray | None, offset: float) -> FloatArray:
-    """Rows as in `Record` made of those that the loop writes, in place.
-
-    `u` (V) is the source's voltage and `inverse` (1/m^2) 1/A at each, where the law is `mobile` and charge is wanted.
+    The voltages are those of the recorded layers (`Scene.shown`), or of all cells.
     """
-    model = model_of(scene)
-    n = model.gap.size
-    if inverse is not None:
-        rows[:, n] += u / inverse / model.s - offset
-    if np.any(scene.turn < 0.0):
-        rows[:, :n] *= scene.turn
-    return rows
+    model, stack = model_of(scene), scene.stack
+    x = rows[:, 5:-1] * (model.area0 * rows[:, 2:3]) if model.mobile else rows[:, 5:-1]
+    live = rows[:, :1] * model.k[:-1] + x
+    if by_layer and stack is not None and stack.by_layer is not stack:
+        live = np.einsum("lk,tk->tl", stack.grouping, live)
+    out = np.empty((len(rows), live.shape[1] + 2))
+    out[:, :-2], out[:, -2], out[:, -1] = live, rows[:, -1], rows[:, 3]
+    return out
 
 
-def from_written(scene: Scene, rows: FloatArray, offset: float) -> FloatArray:
+def from_written(scene: Scene, rows: FloatArray, offset: float, by_layer: bool) -> FloatArray:
     """Rows as in `Record` from those of `engine.model.write_row`."""
-    model = model_of(scene)
-    inverse = rows[:, 2] if model.mobile else None
-    return as_outputs(scene, as_marched(model, rows), rows[:, 0], inverse, offset)
+    model, out = model_of(scene), as_marched(scene, rows, by_layer)
+    out[:, :-2] *= (scene.shown if by_layer else scene).turn
+    if model.mobile:
+        out[:, -2] += rows[:, 0] / rows[:, 2] / model.s - offset
+    return out
 
 
 def row_width(scene: Scene) -> int:

@@ -187,5 +187,6 @@ class Stepping(Integration):
         """The steps taken so far."""
         self.recorder.drain(self.counters)
         problem = self.problem
-        make = partial(bare_record, problem.network, self.net)
+        shown = problem.scene.shown
+        make = partial(bare_record, shown.network, shown.net)
         return self.recorder.finish(problem.first, problem.t_stop, make)

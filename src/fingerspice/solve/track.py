@@ -31,9 +31,7 @@ from fingerspice.solve.settling import Settling
 from fingerspice.solve.sources import Tables, segment_index
 from fingerspice.solve.stackstate import (
     StackState,
-    along_gap,
     as_marched,
-    as_outputs,
     from_stack,
     from_written,
     model_of,
@@ -69,12 +67,13 @@ def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
 
 def _prepare(scene: Scene, decade: int, u_top: float) -> Prepared:
     model, (contact,) = model_of(scene), scene.network.contacts
+    assert scene.stack is not None
     if u_top > 0.0:
         assert contact is not None
         model = model._replace(curve=contact.curve(u_top))
     stress = 0.0 if contact is None else float(contact.stress(1.0))
     u_max, n = max(scene.u_peak, u_top), model.gap.size
-    system = build_system(model, area_error(decade), area_range(model, u_max), np.eye(n), stress)
+    system = build_system(model, area_error(decade), area_range(model, u_max), scene.stack.grouping, stress)
     return Prepared(system, new_tables(n), new_work(n), integral_table(), area_missed(model.curve, decade))
 
 
@@ -91,7 +90,8 @@ class Track(Stepping):
         scene, start = problem.scene, problem.inner
         self.prepared, self.start, n = prepared, start, start.y.size - 1
         self.control = np.zeros(readout.N_CONTROL)
-        super().__init__(problem, tol, t_out, left, n, n + 2 if problem.charge else n, h_fixed)
+        shown = scene.shown.turn.size
+        super().__init__(problem, tol, t_out, left, shown, shown + 2 if problem.charge else shown, h_fixed)
         self.y = start.y.copy()
         self.error = np.zeros(n + 1)
         self.control[readout.T] = problem.t_start
@@ -107,7 +107,7 @@ class Track(Stepping):
     @property
     def shown(self) -> int:
         """Voltages among the columns of outputs."""
-        return self.n
+        return int(self.problem.scene.shown.turn.size)
 
     @property
     def capacitance(self) -> float:
@@ -201,12 +201,16 @@ class Track(Stepping):
         return StackState(self.t, self.y.copy(), u_before, u_gap, self.start.offset)
 
     def written(self) -> FloatArray:
-        scene, model, n_out = self.problem.scene, model_of(self.problem.scene), int(self.counters[readout.OUTPUT])
-        rows, u, inverse = self.out[:, :n_out].T, np.zeros(0), None
+        shown, model, n_out = self.problem.scene.shown, self.prepared.system.model, int(self.counters[readout.OUTPUT])
+        n, rows = self.shown, self.out[:, :n_out].T
+        if shown.is_turned:
+            rows[:, :n] *= shown.turn
         if self.pace.charge and model.mobile:
             u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out])
-            inverse = inverse_areas(along_gap(model, rows, u), model.curve)
-        return as_outputs(scene, rows, u, inverse, self.start.offset)
+            (cell,), network = shown.measured, shown.network
+            u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
+            rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s - self.start.offset
+        return rows
 
     def finish(self, sources: Sources, after: Sources | None) -> None:
         first = int(self.counters[readout.OUTPUT])
@@ -215,7 +219,7 @@ class Track(Stepping):
         model = self.prepared.system.model
         # Copies take the charge of a jump that stands at the end; the state itself stays before it.
         march.end_row(model, segment, tau, self.pace.charge, self.y.copy(), self.control.copy(), row)
-        self.out[:, first:] = as_marched(model, row[None, :])[0][: len(self.out), None]
+        self.out[:, first:] = as_marched(self.problem.scene, row[None, :])[0, : len(self.out), None]
         self.counters[readout.OUTPUT] = self.t_out.size
 
     def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
@@ -227,13 +231,13 @@ class Track(Stepping):
         found = gap_voltage(model, model.k_gap * u, dot(model.gap, self.y), c[readout.SIGN], c[readout.U_GAP])
         # By rounding of the time alone a state at a fold may have none.
         write_row_at(model, u, du, self.y, c[readout.SIGN], found if found == found else c[readout.U_GAP], row)
-        return np.asarray(from_written(self.problem.scene, row[None, :], self.start.offset)[0, : len(self.out)])
+        return from_written(self.problem.scene, row[None, :], self.start.offset, by_layer=True)[0, : len(self.out)]
 
     def recorded(self) -> Recorded | None:
-        recorded, turn = super().recorded(), self.problem.scene.turn
-        if recorded is None or np.all(turn > 0.0):
+        recorded, shown = super().recorded(), self.problem.scene.shown
+        if recorded is None or not shown.is_turned:
             return recorded
-        return dataclasses.replace(recorded, make=partial(_turned, recorded.make, turn))
+        return dataclasses.replace(recorded, make=partial(_turned, recorded.make, shown.turn))
 
     def stated_gaps(self) -> FloatArray:
         control, model = self.control, model_of(self.problem.scene)
