@@ -25,7 +25,7 @@ CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
 _REMEMBERING = threading.Lock()
 #: What a changed circuit may take over from the one that it was made of, by its key in `Circuit.remember`.
-INHERITED = ("loop",)
+INHERITED = ("loop", "network")
 
 
 @dataclass(frozen=True)

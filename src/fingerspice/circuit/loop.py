@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from itertools import zip_longest
 from types import MappingProxyType
 
@@ -23,10 +24,25 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
     """
 
     def make() -> Network:
-        return loop_network(build_stack(circuit, skin_at)) if is_stack(circuit) else build_network(circuit)
+        if is_stack(circuit):
+            return loop_network(build_stack(circuit, skin_at))
+        network: Network = circuit.remember("network", lambda: _network(circuit))[1]
+        return network
 
     network: Network = circuit.remember(("network", skin_at), make)
     return network
+
+
+def _network(circuit: Circuit) -> tuple[tuple[Element, ...], Network]:
+    """The elements of a circuit and its network: that of the circuit it was made of, if only sources have changed."""
+    before: tuple[tuple[Element, ...], Network] | None = circuit.remember("of", dict).get("network")
+    if before is not None:
+        elements, network = before
+        changed = {a.name: b for a, b in zip(elements, circuit.elements, strict=True) if a is not b}
+        if changed.keys() <= {e.name for e in network.sources}:
+            sources = tuple(changed.get(e.name, e) for e in network.sources)
+            return circuit.elements, dataclasses.replace(network, sources=sources)
+    return circuit.elements, build_network(circuit)
 
 
 def loop_network(stack: Stack) -> Network:

@@ -12,8 +12,9 @@ and the same on those of the voltage sources, which gives the currents that thes
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +82,8 @@ class Network:
         Node voltages from x, s and the inner sources.
     stack : Stack or None
         Of which this is the network (see `loop`): then modes and phasors follow from it, to full relative precision.
+    kept : dict
+        What was computed of the network whatever its sources are, for networks that differ in those alone.
     """
 
     sources: tuple[Element, ...]
@@ -102,6 +105,10 @@ class Network:
     node_names: tuple[str, ...]
     nodes: FloatArray
     stack: Stack | None = None
+    kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "kept": {}}
 
     @cached_property
     def inner(self) -> tuple[Element, ...]:

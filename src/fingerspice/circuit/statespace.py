@@ -237,8 +237,11 @@ def _loop(circuit: Circuit) -> Loop | None:
     """The circuit's loop, looked for once; in one that `Circuit.replace` made, where that of the other one was."""
 
     def make() -> Loop | None:
-        before: Loop | None = circuit.remember("of", dict).get("loop")
-        return find_loop(circuit) if before is None else same_loop(circuit, before)
+        of = circuit.remember("of", dict)
+        if "loop" not in of:
+            return find_loop(circuit)
+        before: Loop | None = of["loop"]
+        return None if before is None else same_loop(circuit, before)
 
     loop: Loop | None = circuit.remember("loop", make)
     return loop

@@ -22,6 +22,8 @@ from fingerspice.solve.scenes import Scene
 MOST_SETS = 16
 # References of a set, and numbers of all of them (64 MB), at most; beyond, a new set is begun.
 MOST_REFERENCES, MOST_NUMBERS = 256, 8_000_000
+# References whose numbers stay with the network, whatever its sources are.
+MOST_KEPT = 16
 
 
 @dataclass
@@ -63,8 +65,9 @@ class Known:
                 levels=np.vstack([arrays.levels, more[0]]), numbers=np.vstack([arrays.numbers, more[1]])
             )
         area = self.scene.area0 * LEVEL_RATIO ** np.array(levels, float)
-        parts, magnified = _referred(self.scene, area)
-        arrays.numbers[one] = np.concatenate([parts[name].ravel() for name in REFERRED])
+        key = ("referred", self.scene.fixed, area.tobytes())
+        found = kept_with(self.scene.network.kept, key, MOST_KEPT, lambda: _referred(self.scene, area))
+        arrays.numbers[one], magnified = found
         arrays.levels[one] = levels
         arrays.used[0] += 1
         np.maximum(self.magnified, magnified, out=self.magnified)
@@ -154,7 +157,7 @@ def _fixed(scene: Scene, decade: int) -> dict[str, Any]:
     }
 
 
-def _referred(scene: Scene, area: FloatArray) -> tuple[dict[str, FloatArray], FloatArray]:
+def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray]:
     """What of a form belongs to reference areas (m^2), and the rounding of each gap's voltage."""
     network, net = scene.network, scene.net
     modes = network_modes(network, area)
@@ -187,7 +190,7 @@ def _referred(scene: Scene, area: FloatArray) -> tuple[dict[str, FloatArray], Fl
         "lost": network.through @ (leak * tap) + at_x @ modes.shape,
         "lost_s": network.through @ (leak * tap_s) - at_x @ modes.follow + at_s,
     }
-    return parts, _magnified(modes, gap, gap_s)
+    return np.concatenate([parts[name].ravel() for name in REFERRED]), _magnified(modes, gap, gap_s)
 
 
 def _magnified(modes: Modes, gap: FloatArray, gap_s: FloatArray) -> FloatArray:
