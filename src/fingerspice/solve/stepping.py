@@ -115,7 +115,7 @@ class Stepping(Integration):
     def try_out(self, asked: float) -> None:
         """Look at the stated error after a few periods, where many are left."""
         start = self.settling.start
-        if self.settling.periods_left(start) > 2.0 * TRIAL_PERIODS:
+        if self.settling.periods_left(start) > 10.0 * TRIAL_PERIODS:
             self.trial, self.asked = start + TRIAL_PERIODS * self.settling.period, asked
 
     def through(self, sources: Sources, t_end: float) -> Status:
