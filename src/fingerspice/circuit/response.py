@@ -117,10 +117,11 @@ def mean_areas(network: Network, frequency: float | None = None) -> FloatArray:
     several = len(network.sources) > 1
     fundamental = None if several else network.waveforms[0].fundamental
     if fundamental is None:
-        what = "several sources" if several else "a source without fundamental"
+        what = "at the source's fundamental, and this source has none"
+        if several:
+            what = "of one source at its fundamental, and this circuit has several sources"
         raise InputError(
-            f"area='mean' is the area of the phasor of one source at its fundamental, and this circuit has {what}; "
-            "allowed: 'coupled', 'frozen' or an area in m^2"
+            f"area='mean' is the area of the phasor {what}; allowed: 'coupled', 'frozen' or an area in m^2"
         )
     f = fundamental.frequency if frequency is None else frequency
     return coupled_areas(network, f, fundamental.amplitude)
