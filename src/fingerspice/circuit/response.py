@@ -106,8 +106,8 @@ def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
     return LinearScene(network, contact, network.layers.index(gap), place, note)
 
 
-def mean_areas(network: Network, frequency: float | None = None) -> FloatArray:
-    """Areas of a coupled phasor at one frequency (Hz; its source's by default), m^2, shape (n_area,).
+def mean_areas(network: Network) -> FloatArray:
+    """Areas of a coupled phasor at its source's fundamental, m^2, shape (n_area,).
 
     Raises
     ------
@@ -123,8 +123,7 @@ def mean_areas(network: Network, frequency: float | None = None) -> FloatArray:
         raise InputError(
             f"area='mean' is the area of the phasor {what}; allowed: 'coupled', 'frozen' or an area in m^2"
         )
-    f = fundamental.frequency if frequency is None else frequency
-    return coupled_areas(network, f, fundamental.amplitude)
+    return coupled_areas(network, fundamental.frequency, fundamental.amplitude)
 
 
 def areas_at_rest(network: Network) -> FloatArray:

@@ -19,7 +19,7 @@ from fingerspice.numerics.lobatto import integral_table
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Run, kept_with
+from fingerspice.solve.runs import NetworkIntegration, Run, kept_with
 from fingerspice.solve.scenes import Scene
 from fingerspice.solve.settling import Settling
 from fingerspice.solve.sources import held as held_at
@@ -148,7 +148,7 @@ def _packed(x: FloatArray) -> FloatArray:
     return np.ascontiguousarray(x, float)
 
 
-class March(Stepping):
+class March(Stepping, NetworkIntegration):
     """One integration in progress, with an error of `tol` times `u_scale` (V) in every step."""
 
     def __init__(
