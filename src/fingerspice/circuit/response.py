@@ -106,8 +106,8 @@ def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
     return LinearScene(network, contact, network.layers.index(gap), place, note)
 
 
-def mean_areas(network: Network, frequency: float | None = None) -> FloatArray:
-    """Areas of a coupled phasor at one frequency (Hz; its source's by default), m^2, shape (n_area,).
+def mean_areas(network: Network) -> FloatArray:
+    """Areas of a coupled phasor at its source's fundamental, m^2, shape (n_area,).
 
     Raises
     ------
@@ -117,13 +117,13 @@ def mean_areas(network: Network, frequency: float | None = None) -> FloatArray:
     several = len(network.sources) > 1
     fundamental = None if several else network.waveforms[0].fundamental
     if fundamental is None:
-        what = "several sources" if several else "a source without fundamental"
+        what = "at the source's fundamental, and this source has none"
+        if several:
+            what = "of one source at its fundamental, and this circuit has several sources"
         raise InputError(
-            f"area='mean' is the area of the phasor of one source at its fundamental, and this circuit has {what}; "
-            "allowed: 'coupled', 'frozen' or an area in m^2"
+            f"area='mean' is the area of the phasor {what}; allowed: 'coupled', 'frozen' or an area in m^2"
         )
-    f = fundamental.frequency if frequency is None else frequency
-    return coupled_areas(network, f, fundamental.amplitude)
+    return coupled_areas(network, fundamental.frequency, fundamental.amplitude)
 
 
 def areas_at_rest(network: Network) -> FloatArray:

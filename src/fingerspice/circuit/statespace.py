@@ -74,17 +74,6 @@ class Stack:
         """Voltage sources in the loop, each with the sign it adds to U with."""
         return tuple((h.element, -h.sign) for h in self.hops if h.element.device == "V")
 
-    def node_voltages(self, u_layer: FloatArray, u_sources: dict[str, FloatArray]) -> dict[str, FloatArray]:
-        """Voltage of every node of the loop against ground, from the layers' (n_t, n_layer) and the sources'."""
-        column = {e.name: u_layer[:, i] for i, e in enumerate(self.layers)}
-        out = {}
-        potential = np.zeros(u_layer.shape[0])
-        for hop in self.hops[:-1]:
-            voltage = u_sources[hop.element.name] if hop.element.device == "V" else column[hop.element.name]
-            potential = potential - hop.sign * voltage
-            out[hop.node] = potential
-        return out
-
     @cached_property
     def first_cell(self) -> NDArray[np.intp]:
         """Index of the first cell of each layer."""

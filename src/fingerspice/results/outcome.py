@@ -163,16 +163,6 @@ class ErrorEstimate:
     f_el: float
     q_source: float | None = None
 
-    def at_least(self, u_gap: float, f_el: float) -> ErrorEstimate:
-        """The same with errors of at least these, V and N."""
-        return ErrorEstimate(max(self.u_gap, u_gap), max(self.f_el, f_el), self.q_source)
-
-    def excess(self, rtol: float, peak_u: float, peak_f: float) -> float:
-        """Ratio of the estimated error to `rtol` times the peak (V, N): the larger one of voltage and force."""
-        pairs = ((self.u_gap, peak_u), (self.f_el, peak_f))
-        # Where the product underflows no error can be asked for.
-        return max(error / (rtol * peak) if rtol * peak > 0.0 else 0.0 for error, peak in pairs)
-
 
 @dataclass(frozen=True, repr=False)
 class State:

@@ -79,5 +79,7 @@ def solve(
                 return run
             tries_out = False
             continue
+        finer = tol * min(0.3, 0.5 / worst)
         # Steps that something else than their error kept short are shortened by a tolerance below what they made only.
-        tol = min(tol * min(0.3, 0.5 / worst), 0.5 / worst * run.error.u_gap / u_scale)
+        # A network's would go on to errors that its areas' polynomials, made for `rtol`, do not reach.
+        tol = min(finer, 0.5 / worst * run.error.u_gap / u_scale) if is_stack else finer

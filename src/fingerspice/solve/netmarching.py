@@ -15,7 +15,7 @@ from fingerspice.numerics.lobatto import integral_table
 from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.references import known_references
-from fingerspice.solve.runs import Run
+from fingerspice.solve.runs import NetworkIntegration, Run
 from fingerspice.solve.settling import Settling
 from fingerspice.solve.sources import held as held_at
 from fingerspice.solve.stepping import SAFETY, Stepping
@@ -28,7 +28,7 @@ BoolArray = NDArray[np.bool_]
 MOST_STEPS = 100
 
 
-class March(Stepping):
+class March(Stepping, NetworkIntegration):
     """One integration in progress, with an error of `tol` times `u_scale` (V) in every step."""
 
     def __init__(

@@ -19,7 +19,7 @@ from fingerspice.numerics.radau_tableau import radau
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Integration, Progress, Run, gap_signals, integrate
+from fingerspice.solve.runs import NetworkIntegration, Progress, Run, gap_signals, integrate
 from fingerspice.solve.sources import Tables, ramp, values_at
 
 FloatArray = NDArray[np.float64]
@@ -65,7 +65,7 @@ def radau_scheme(stages: int) -> Scheme:
     )  # fmt: skip
 
 
-class Collocation(Integration):
+class Collocation(NetworkIntegration):
     """One integration in progress; see `engine.collocation.advance`."""
 
     def __init__(

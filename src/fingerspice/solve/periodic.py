@@ -157,7 +157,7 @@ def _close(problem: Problem, table: SourceTable, before: float, half: bool, rtol
             continue
         if code != shooting.CLOSED:
             break
-        error, excess = _error(figures, model.k_gap * scale, rtol)
+        errors, excess = _errors(figures, model.k_gap * scale, rtol)
         if excess <= 1.0 or pace.tol <= FINEST * scale:
             break
         tol = pace.tol * min(0.3, 0.5 / excess)
@@ -171,18 +171,21 @@ def _close(problem: Problem, table: SourceTable, before: float, half: bool, rtol
         raise SolveError(period_failure(problem, status, None, cause))
     # Two halves: the second carries on at most what the first was off, and adds as much.
     parts = 2 if half else 1
-    errors, map_slope = np.array([[error.u_gap, error.f_el]]), slope @ slope if half else slope
+    map_slope = slope @ slope if half else slope
     found = Found(parts * float(defect), map_slope, float(figures[6]), errors, int(counts[1]) / parts)
     return system.live[0] @ w, found
 
 
-def _error(figures: FloatArray, u_scale: float, rtol: float) -> tuple[ErrorEstimate, float]:
-    """Error of the periodic state from the figures of its period, and that error over the one asked for."""
+def _errors(figures: FloatArray, u_scale: float, rtol: float) -> tuple[FloatArray, float]:
+    """Errors of the periodic state (1, 2), V and N, from the figures of its period, and their ratio to those asked for.
+
+    Where the product of a peak with `rtol` underflows no error can be asked for.
+    """
     peak_u, peak_f, error_u, error_f, left, _, memory = map(float, figures)
     # Rounding is an error too, and what Newton moved last was not much more than what it would move next.
     floor = 4e-16 * (peak_u + u_scale)
     steepest = 2.0 * peak_f / (peak_u or 1.0)
-    error = ErrorEstimate(
-        memory * (SAFETY * error_u + floor) + left, memory * (SAFETY * error_f + steepest * floor) + steepest * left
-    )
-    return error, error.excess(rtol, peak_u, peak_f)
+    u_error = memory * (SAFETY * error_u + floor) + left
+    f_error = memory * (SAFETY * error_f + steepest * floor) + steepest * left
+    pairs = ((u_error, rtol * peak_u), (f_error, rtol * peak_f))
+    return np.array([[u_error, f_error]]), max(error / asked if asked > 0.0 else 0.0 for error, asked in pairs)

@@ -26,6 +26,8 @@ Progress = Callable[[float], None]
 
 # An error below this share of the voltages that cancel in the gap's is rounding: finer steps would not reach it.
 ROUNDING = 2e-14
+# N; errors of smaller forces have too few digits.
+LEAST_FORCE = 1e-290
 
 
 def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: Callable[[], Any]) -> Any:
@@ -142,7 +144,7 @@ def excess_of(gaps: FloatArray, u_scale: float) -> float:
     worst = 0.0
     for u_peak, f_peak, u_error, f_error in gaps.tolist():
         if u_peak > ROUNDING * u_scale:
-            worst = max(worst, u_error / u_peak, f_error / f_peak if f_peak > 0.0 else 0.0)
+            worst = max(worst, u_error / u_peak, f_error / f_peak if f_peak > LEAST_FORCE else 0.0)
     return worst
 
 
@@ -153,17 +155,14 @@ class Integration(ABC):
     ----------
     t_out, left : ndarray, shape (n_out,)
         Output times (s) and whether the left-hand value is meant.
-    rows : ndarray, shape (n_out, width)
-        What is written there, as in `Record`.
     y, sign, s_before : ndarray
-        The state reached, as in `State`.
+        The state reached.
     counters : ndarray of int
         As `engine.readout` counts.
     tried : ndarray, shape (TRIED, 4)
     """
 
     counters: IntArray
-    rows: FloatArray
 
     def __init__(self, problem: Problem, t_out: FloatArray, left: BoolArray) -> None:
         self.problem, self.net, self.t_out, self.left = problem, problem.scene.net, t_out, left
@@ -183,10 +182,6 @@ class Integration(ABC):
     def through(self, sources: Sources, t_end: float) -> Status:
         """To `t_end` (s), the jumps on the way taken."""
 
-    @abstractmethod
-    def jump(self, after: FloatArray) -> bool:
-        """Take a jump of the sources to their values `after`; False where that goes past a fold."""
-
     def state(self) -> State:
         return State(self.t, self.y.copy(), self.s_before.copy(), self.sign.copy(), self.problem.scene.charge_law)
 
@@ -194,8 +189,35 @@ class Integration(ABC):
         """Why no step is short enough."""
         return Status.FOLD if self.net.mobile and self.problem.scene.coupled else Status.STEP_UNDERFLOW
 
+    @abstractmethod
     def finish(self, sources: Sources, after: Sources | None) -> None:
         """Write the right-hand outputs at the very end, `after` the jump that may stand there; none past a fold."""
+
+    @abstractmethod
+    def written(self) -> FloatArray:
+        """The rows written."""
+
+    @abstractmethod
+    def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
+        """The row at the time reached, from the segments on one side of it; NaN past a fold."""
+
+
+class NetworkIntegration(Integration):
+    """One whose steps have the state as outputs have it.
+
+    Attributes
+    ----------
+    rows : ndarray, shape (n_out, width)
+        What is written at the outputs, as in `Record`.
+    """
+
+    rows: FloatArray
+
+    @abstractmethod
+    def jump(self, after: FloatArray) -> bool:
+        """Take a jump of the sources to their values `after`; False where that goes past a fold."""
+
+    def finish(self, sources: Sources, after: Sources | None) -> None:
         if after is not None:
             values = values_at(after, self.problem.t_stop)
             if np.any(values != self.s_before) and not self.jump(values):
@@ -204,11 +226,9 @@ class Integration(ABC):
         self.counters[OUTPUT] = self.t_out.size
 
     def written(self) -> FloatArray:
-        """The rows written."""
         return self.rows[: int(self.counters[OUTPUT])]
 
     def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
-        """The row at the time reached, from the segments on one side of it; NaN past a fold."""
         if not self.problem.charge:
             return self.y.copy()
         room, n_s = new_room(self.net, self.y.size), self.s_before.size

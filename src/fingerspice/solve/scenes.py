@@ -209,7 +209,8 @@ def scene_of(
 def _scene(circuit: Circuit, law: str, area: str | float, stop: float, skin: Freezing | None) -> Scene:
     network = network_of(circuit, None if skin is None else skin.frequency)
     fixed, mode = _fixed_areas(network, area)
-    u_peak = sum(_largest_voltage(waveform, stop) for waveform in network.waveforms[: network.n_voltage])
+    whole = network.stack is not None
+    u_peak = sum(_largest_voltage(waveform, stop, whole) for waveform in network.waveforms[: network.n_voltage])
     # Discharging layers add to the gap's share of a jump: the curve covers a little more than U itself.
     top = 1.3 * u_peak + (DRIVEN_BY_CURRENT if len(network.sources) > network.n_voltage else 0.0) or PEAK_UNKNOWN
     model = None if network.stack is None else _model(network.stack, law, fixed[0], top)
@@ -236,10 +237,11 @@ def _freezing(circuit: Circuit, stop: float) -> Freezing | None:
     return found
 
 
-def _largest_voltage(waveform: Waveform, stop: float) -> float:
+def _largest_voltage(waveform: Waveform, stop: float, whole: bool = True) -> float:
+    """Largest |U| (V) up to a time (s), or of `whole` periods; 0 where it is not known."""
     if not (math.isfinite(stop) and stop > 0.0):
         return 0.0
-    if waveform.period is not None:
+    if whole and waveform.period is not None:
         stop = waveform.settled + waveform.period
     peak = waveform.peak(0.0, stop)
     require(not 0.0 < peak < LEAST_PEAK, "the source's peak", f"{peak:g} V", f"0, or {LEAST_PEAK:g} V or more")

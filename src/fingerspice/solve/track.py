@@ -139,9 +139,6 @@ class Track(Stepping):
             self.control[readout.U_BEFORE], _ = source(*_segment(sources, self.t, "left"))
         return Status.TOO_MANY_STEPS if code == march.TOO_MANY else self.stuck()
 
-    def jump(self, after: FloatArray) -> bool:
-        raise NotImplementedError
-
     def _look(self) -> bool:
         c = self.control
         return self.settling.look(
