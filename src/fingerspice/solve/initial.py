@@ -116,6 +116,9 @@ def _cells_of(network: Network, whole: Network, u: FloatArray) -> FloatArray:
 def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) -> State:
     """State just before the start of cells that hold `u` (n_cell,) V, with the sources at `s` or else at what fits."""
     network, net = scene.network, scene.net
+    if s is None and not u.any() and not np.any(net.slow >= 0):
+        y, before = np.zeros(sum(network.b.shape)), np.zeros(len(network.sources))
+        return State(0.0, y, before, np.zeros(len(network.areas)), scene.charge_law)
     slow = (area / net.area0)[net.slow >= 0]
     x, charge = u[list(network.live)], np.zeros(len(network.sources))
     before = _fitting(network, u - network.p @ x) if s is None else s

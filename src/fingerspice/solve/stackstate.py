@@ -54,6 +54,8 @@ def model_of(scene: Scene) -> Model:
 def to_stack(scene: Scene, state: State) -> StackState:
     """A state of a stack in the engine's form."""
     model = model_of(scene)
+    if not state.y.any() and not state.s_before.any():
+        return StackState(state.t, state.y.copy(), 0.0, 0.0, 0.0)
     before, along = float(state.s_before[0]), scene.turn * state.y[:-1]
     u_gap = float(along_gap(model, along[None], state.s_before)[0])
     inverse = inverse_area(abs(u_gap), model.curve)[0] if model.mobile else 0.0
