@@ -20,7 +20,7 @@ MAX_LINES = 400
 # Files that are longer still, with their lines: no other may be, and these may only shrink.
 LONGER = {
     "engine.march": 433,
-    "engine.netmarch": 434,
+    "engine.netmarch": 416,
 }
 
 # Functions outside compiled code: lines of the body without its docstring, and parameters without `self`.

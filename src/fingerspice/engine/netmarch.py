@@ -162,8 +162,7 @@ def march(
     rates, gain, g, area_pace, lost, lost_s = form.rates, form.gain, form.g, form.pace, form.lost, form.lost_s
     branch = time_branch
     own = work.own
-    unclosed, accepted = 0, counters[ACCEPTED]
-    code = DONE
+    code, unclosed, accepted = DONE, 0, counters[ACCEPTED]
     while True:
         t = control[T]
         if inside and t >= 1.0:
@@ -262,10 +261,8 @@ def march(
             start_at(form.area0, areas[netrows.AREA])
             load(form.inverse, follow, y, now, w0)
         longest = Pace(tol, 1.0, True, charge) if inside else pace
-        fastest = rates.max()
-        h = choose_step(
-            longest, 1.0 / fastest if fastest > 0.0 else math.inf, True, is_series and not inside, t, stop - t, control
-        )  # fmt: skip
+        # With no rate at all: infinity.
+        h = choose_step(longest, 1.0 / rates.max(), True, is_series and not inside, t, stop - t, control)
         wanted_h, tries = control[H], 1
         which, magnified = -1, 1.0
         while True:
