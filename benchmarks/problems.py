@@ -19,12 +19,15 @@ from numpy.typing import NDArray
 
 import fingerspice as fs
 from fingerspice.circuit.statespace import build_stack
+from fingerspice.physics.contact import Contact
 
 FloatArray = NDArray[np.float64]
 DECK = Path(__file__).resolve().parent.parent / "circuits" / "fingerpad.cir"
 AMPLITUDE = 200.0
 OUTPUTS_PER_PERIOD = 100
 SERIES_ERROR = 1e-14
+BELOW = 1.1
+"""Minus the series' argument where the continuation below 0 V ends; 0 V is at 1."""
 
 Drive = Callable[[Callable[[Any], Any]], Callable[[Any, Any], Any]]
 """Takes a library's sine and returns U(t, level) in V for it; `level` (V) is what a square holds on a piece."""
@@ -41,7 +44,8 @@ class Piece:
     level : float
         Voltage of a square on it, V.
     sign : float
-        Sign of the gap voltage where the piece ends on its zeros; 0 where it may cross them.
+        Sign of the gap voltage where the piece ends on its zeros; 0 where it may cross them. Of several gaps see
+        `network_rates.code`.
     first, last : int
         Its outputs are t_eval[first:last].
     """
@@ -83,6 +87,8 @@ class Problem:
     stiff : bool
     reach : float
         No gap voltage of the problem is larger, V.
+    exported : tuple
+        What the export calls the nodes around the gap of each finger, and that of its area.
     """
 
     name: str
@@ -98,6 +104,7 @@ class Problem:
     divisible: bool = True
     stiff: bool = False
     reach: float = AMPLITUDE
+    exported: tuple[tuple[str, str, str], ...] = (("top", "skin", "area"),)
 
     def t_stop(self, periods: int) -> float:
         """End of a run of so many periods, s."""
@@ -121,6 +128,11 @@ class Problem:
     def constants(self) -> Constants:
         """What a right-hand side needs to know."""
         return constants(self.circuit(), self.reach)
+
+    @property
+    def stresses(self) -> tuple[float, ...]:
+        """sigma_el / u_gap^2 of each finger, Pa/V^2."""
+        return (self.constants.stress,)
 
     def pieces(self, periods: int, zeros: Sequence[float] = (), signs: Sequence[float] = ()) -> tuple[Piece, ...]:
         """The run, split at the source's jumps and, where they are given, at the zeros of the gap voltage.
@@ -179,18 +191,14 @@ class Constants:
     stress: float
 
 
-def constants(circuit: fs.Circuit, reach: float, error: float = SERIES_ERROR, degrees: int = 24) -> Constants:
-    """Numbers of a circuit's stack, taken from the package; the area's series reaches to `reach` (V) within `error`.
+def area_series(contact: Contact, reach: float, error: float = SERIES_ERROR, degrees: int = 24) -> tuple[float, ...]:
+    """Power series of 1/A_R (1/m^2) in 2 |u_gap| / `reach` - 1, within `error` to `reach` (V).
 
     Raises
     ------
     ValueError
         Where no series up to that degree does.
     """
-    stack = build_stack(circuit)
-    assert stack.contact is not None
-    assert stack.gap == 1
-    contact = stack.contact
     check = np.linspace(-1.0, 1.0, 4001)
     exact = 1.0 / contact.area(0.5 * reach * (check + 1.0))
     for degree in range(8, degrees + 1):
@@ -198,16 +206,24 @@ def constants(circuit: fs.Circuit, reach: float, error: float = SERIES_ERROR, de
         # Powers for Horner's rule, which compilers do best: on [-1, 1], with decaying coefficients, no digit is lost.
         series = chebyshev.cheb2poly(fit)
         if np.abs(polynomial.polyval(check, series) / exact - 1.0).max() <= error:
-            return Constants(
-                k=tuple(stack.k.tolist()),
-                fixed=tuple((stack.g_area / stack.c).tolist()),
-                per_area=tuple((stack.g_total / stack.c).tolist()),
-                series=tuple(series.tolist()),
-                reach=reach,
-                area0=float(contact.area(0.0)),
-                stress=float(contact.stress(1.0)),
-            )
+            return tuple(series.tolist())
     raise ValueError(f"1/A_R has no series of degree {degrees} or less within {error:g} to {reach:g} V")
+
+
+def constants(circuit: fs.Circuit, reach: float, error: float = SERIES_ERROR, degrees: int = 24) -> Constants:
+    """Numbers of a circuit's stack, taken from the package; the area's series reaches to `reach` (V) within `error`."""
+    stack = build_stack(circuit)
+    assert stack.contact is not None
+    assert stack.gap == 1
+    return Constants(
+        k=tuple(stack.k.tolist()),
+        fixed=tuple((stack.g_area / stack.c).tolist()),
+        per_area=tuple((stack.g_total / stack.c).tolist()),
+        series=area_series(stack.contact, reach, error, degrees),
+        reach=reach,
+        area0=float(stack.contact.area(0.0)),
+        stress=float(stack.contact.stress(1.0)),
+    )
 
 
 def tone(amplitude: float, frequency: float, offset: float = 0.0) -> Drive:
@@ -256,7 +272,8 @@ def _chirp(f0: float, f1: float, duration: float) -> Drive:
     return bind
 
 
-def _square_text(frequency: float) -> str:
+def square_text(frequency: float) -> str:
+    """A square as ngspice's source."""
     # Edges of 1 ns centred on the jumps: 1e-9 of the peak away from ideal ones.
     half, edge = 0.5 / frequency, 1e-9
     times = f"{half - 0.5 * edge!r} {edge!r} {edge!r} {half - edge!r} {2.0 * half!r}"
@@ -271,7 +288,7 @@ def _scene(kind: str, frequency: float, law: str = "local") -> Problem:
         title=f"{kind} {label}",
         waveform=fs.Square(AMPLITUDE, frequency) if square else fs.Sine(AMPLITUDE, frequency),
         drive=held if square else tone(AMPLITUDE, frequency),
-        ngspice=_square_text(frequency) if square else f"SIN(0 {AMPLITUDE!r} {frequency!r})",
+        ngspice=square_text(frequency) if square else f"SIN(0 {AMPLITUDE!r} {frequency!r})",
         skin_frequency=frequency,
         period=1.0 / frequency,
         periods=200 if frequency < 1e3 else 500,

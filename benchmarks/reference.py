@@ -1,6 +1,7 @@
 """Reference solutions of the benchmark problems, by two methods that share no formula.
 
-One is the collocation of `tests/analytic.py`, written from the paper's equations. The other integrates the peers'
+One is a collocation from the paper's equations: that of `tests/analytic.py`, or for networks of
+`network_collocation.py`. The other integrates the peers'
 right-hand side, split at jumps and at the zeros of the gap voltage, at the tightest tolerance: DOP853, or Radau where
 the problem is stiff. Where they disagree, both may be wrong by that much: no error below it is claimed.
 """
@@ -10,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,7 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from problems import Problem, split_times
+from network_collocation import Collocation, Network
+from network_problems import NetworkProblem
+from problems import AMPLITUDE, Problem, split_times
 from right_hand_side import compiled
 
 FloatArray = NDArray[np.float64]
@@ -36,12 +40,12 @@ class Reference:
 
     Attributes
     ----------
-    u_gap, f_el : ndarray, shape (n,)
+    u_gap, f_el : ndarray, shape (n,), or (n, 2) of two fingers
         V and N.
     zeros : ndarray
-        Times of the zeros of the gap voltage, s.
+        Times of the zeros of the gap voltages, s.
     signs : ndarray
-        Its sign on each of the pieces between jumps and zeros.
+        Their signs on each of the pieces between jumps and zeros; of several gaps see `network_rates.code`.
     agreement : float
         Largest difference of the two methods over the peak, of voltage or force.
     second : str
@@ -57,11 +61,11 @@ class Reference:
 
     def errors(self, u_gap: FloatArray, f_el: FloatArray) -> tuple[float, float]:
         """Largest errors of voltage and force over their peaks, of a run that may be shorter than this one."""
-        n = u_gap.size
-        return (
-            float(np.abs(u_gap - self.u_gap[:n]).max() / np.abs(self.u_gap).max()),
-            float(np.abs(f_el - self.f_el[:n]).max() / np.abs(self.f_el).max()),
-        )
+        n = len(u_gap)
+        pairs = ((u_gap, self.u_gap), (f_el, self.f_el))
+        # Each finger beside its own peak.
+        off = [np.max(np.abs(found - true[:n]).max(axis=0) / np.abs(true).max(axis=0)) for found, true in pairs]
+        return float(off[0]), float(off[1])
 
 
 @lru_cache(maxsize=1)
@@ -76,15 +80,36 @@ def _analytic() -> ModuleType:
     return module
 
 
-def _collocation(problem: Problem) -> Reference:
-    analytic = _analytic()
+def _segments(problem: Problem) -> list[tuple[float, float, Callable[[FloatArray], FloatArray]]]:
     u = problem.drive(np.sin)
-    segments = [
+    return [
         (piece.t0, piece.t1, lambda t, level=piece.level: u(np.asarray(t), level) + 0.0 * np.asarray(t))
         for piece in problem.pieces(problem.periods)
     ]
+
+
+def _network_collocation(problem: NetworkProblem) -> Reference:
+    network = Network(_analytic(), problem.deck, problem.skin_frequency, problem.law == "mobile")
+    run = Collocation(network, AMPLITUDE, problem.t_eval(problem.periods))
+    x = np.zeros(network.size)
+    for t0, t1, source in _segments(problem):
+        x = run.segment(t0, t1, x, source)
+    u_gap = run.out[:, network.gaps]
+    force = network.forces(u_gap)
+    zeros = np.sort(run.zeros)
+    edges = split_times(problem, problem.periods, zeros)
+    since, codes = np.array(run.branches).T
+    signs = codes[np.searchsorted(since, 0.5 * (edges[1:] + edges[:-1])) - 1]
+    shape = (-1, len(network.gaps)) if len(network.gaps) > 1 else -1
+    return Reference(u_gap.reshape(shape), force.reshape(shape), zeros, signs, np.inf, "")
+
+
+def _collocation(problem: Problem) -> Reference:
+    if isinstance(problem, NetworkProblem):
+        return _network_collocation(problem)
+    analytic = _analytic()
     run = analytic.transient(
-        segments,
+        _segments(problem),
         problem.t_eval(problem.periods),
         law=problem.law,
         freq=problem.skin_frequency,
@@ -98,18 +123,21 @@ def _collocation(problem: Problem) -> Reference:
 
 def _peers_way(problem: Problem, zeros: FloatArray, signs: FloatArray) -> tuple[FloatArray, FloatArray, str]:
     rhs = compiled(problem)
+    # Fast modes make an explicit method's steps many: of networks it solves the first periods alone.
+    network = isinstance(problem, NetworkProblem)
+    periods = min(10, problem.periods) if network else problem.periods
     method = "Radau" if problem.stiff else "DOP853"
     rtol = 1e-13 if problem.stiff else 3e-14
-    t_eval = problem.t_eval(problem.periods)
-    states = np.empty((t_eval.size, 2))
-    x = np.zeros(2)
-    for piece in problem.pieces(problem.periods, zeros, signs):
+    t_eval = problem.t_eval(periods)
+    states = np.empty((t_eval.size, rhs.size))
+    x = np.zeros(rhs.size)
+    for piece in problem.pieces(periods, zeros[zeros < problem.t_stop(periods)], signs):
         times = np.append(t_eval[piece.first : piece.last], piece.t1)
         args = (piece.sign, piece.level)
         extra = {"jac": rhs.jacobian} if problem.stiff else {}
         # Short steps, because outputs come from the interpolant, whose order is lower than the steps'.
         run = solve_ivp(rhs.rates, (piece.t0, piece.t1), x, method, times, args=args, rtol=rtol, atol=1e-14 * 200.0,
-                        max_step=(piece.t1 - piece.t0) / 12.0, **extra)  # fmt: skip
+                        max_step=(piece.t1 - piece.t0) / (300.0 if network else 12.0), **extra)  # fmt: skip
         states[piece.first : piece.last] = run.y.T[:-1]
         x = run.y[:, -1]
     u_source = problem.waveform.value(t_eval)

@@ -1,8 +1,9 @@
-"""Tables and picture of the measured times, from the files in results/ alone.
+"""Tables and pictures of the measured times, from the files in results/ alone.
 
 Run: python benchmarks/report.py [--results FILE] [--page FILE] [--readme FILE]. From work_precision.json come
-results/work_precision.md (every contestant), results/work_precision.png and the table between the `speed` markers of
-docs/speed.md; from run_times.json, baseline.json and throughput.json beside it that between the README's.
+results/work_precision.md (every contestant), the pictures results/work_precision.png and work_precision_networks.png,
+and the tables between the `speed` markers of docs/speed.md; from run_times.json, baseline.json and throughput.json
+beside it that between the README's.
 """
 
 from __future__ import annotations
@@ -13,24 +14,15 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
+from work_pictures import COSTS, OURS, picture
+
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "work_precision.json"
 README, PAGE = HERE.parent / "README.md", HERE.parent / "docs" / "speed.md"
 BEGIN, END = "<!-- speed:begin -->", "<!-- speed:end -->"
 TARGETS = (1e-3, 1e-6, 1e-10)
 NGSPICE_TARGET = 1e-4
-OURS, STEPPED = "fingerspice", "fingerspice, every period"
-# Okabe and Ito's palette, and markers, so that colour is never alone.
-LOOK = {
-    "fingerspice": ("#000000", "o"),
-    "fingerspice, every period": ("#999999", "o"),
-    "numbalsoda": ("#D55E00", "s"),
-    "diffrax": ("#0072B2", "D"),
-    "scipy": ("#009E73", "^"),
-    "CVODE": ("#CC79A7", "v"),
-    "torchdiffeq": ("#E69F00", "P"),
-    "ngspice": ("#56B4E9", "X"),
-}
+STEPPED = "fingerspice, every period"
 Report = dict[str, Any]
 
 
@@ -64,6 +56,12 @@ def libraries(results: Report) -> list[str]:
     return list(dict.fromkeys(p["library"] for p in results["points"]))
 
 
+def problems(results: Report, law: str, kind: str) -> list[str]:
+    """Names of the problems of a charge law, stacks or networks."""
+    found = results["problems"].items()
+    return [name for name, p in found if (p["charge_law"], p["kind"]) == (law, kind)]
+
+
 def lead(results: Report, problem: str) -> str:
     """How many times our time the best of all peers takes, at each error."""
     ours = good(results, problem, library=OURS)
@@ -77,7 +75,7 @@ def lead(results: Report, problem: str) -> str:
 
 def worst(results: Report, ours: str, targets: tuple[float, ...], **wanted: str) -> str:
     """How many times our time a peer takes, the least of the four scenes of Table 1, at each error."""
-    scenes = [n for n, p in results["problems"].items() if p["charge_law"] == "local"][:4]
+    scenes = problems(results, "local", "stack")[:4]
     least = []
     for target in targets:
         pairs = [
@@ -104,9 +102,9 @@ def ratios(results: Report, ours: str) -> str:
     return ", ".join(parts)
 
 
-def short_table(results: Report, law: str) -> list[str]:
-    """Best of each library on each problem of a charge law; empty where there is none."""
-    names = [n for n, p in results["problems"].items() if p["charge_law"] == law]
+def short_table(results: Report, law: str, kind: str) -> list[str]:
+    """Best of each library on each problem of a charge law and kind; empty where there is none."""
+    names = problems(results, law, kind)
     if not names:
         return []
     rows = [["µs per period", *(results["problems"][n]["title"] for n in names)]]
@@ -193,7 +191,7 @@ def waits(folder: Path) -> str:
         f"Medians of 7 at an error of 1e-6 of the peak, after the first use, on {base['machine']}, commit "
         f"{base['revision']} (`benchmarks/run_times.py`, `baseline.py`, `throughput.py`)."
     )
-    return "\n".join([*markdown(rows), "", *textwrap.wrap(text, 118, break_long_words=False, break_on_hyphens=False)])
+    return "\n".join([*markdown(rows), "", *wrapped(text)])
 
 
 def page_text(results: Report) -> str:
@@ -207,7 +205,7 @@ def page_text(results: Report) -> str:
         "where that helps; fingerspice finds these itself, estimates its error and meets the one asked for. It repeats "
         "a period that no longer changes the state (200 periods at 100 Hz, 500 at 5 kHz); *every period* steps them "
         f"all, as its peers do. Two independent references agree to {spread:.0e}. Medians of {results['repeats']} "
-        f"(slow peers: fewer) by `python benchmarks/work_precision.py` on {results['machine']}; versions, every "
+        f"({once(results)}) by `python benchmarks/work_precision.py` on {results['machine']}; versions, every "
         "method, what failed, and the law `mobile`: [`work_precision.md`](../benchmarks/results/work_precision.md)."
     )
     ratio = (
@@ -216,25 +214,58 @@ def page_text(results: Report) -> str:
     )
     return "\n".join(
         [
-            *textwrap.wrap(text, 118, break_long_words=False, break_on_hyphens=False),
+            *wrapped(text),
             "",
-            *short_table(results, "local"),
+            *short_table(results, "local", "stack"),
             "",
-            *textwrap.wrap(ratio, 118, break_long_words=False, break_on_hyphens=False),
+            *wrapped(ratio),
             "",
             "![Error against time and against evaluations](../benchmarks/results/work_precision.png)",
+            *network_text(results),
         ]
     )
+
+
+def network_text(results: Report) -> list[str]:
+    """The part of that page on networks; empty where none was measured."""
+    table = short_table(results, "local", "network")
+    if not table:
+        return []
+    text = (
+        "Networks, in the same units: the shipped decks `amplifier`, `ungrounded_user` and `two_fingers` at 200 V, 100 "
+        "periods. The peers integrate a right-hand side that was written by hand for these three circuits and divides "
+        "the current in closed form; fingerspice is given the netlist. Where the last row is below 1 a peer is faster. "
+        "Each finger's error is over its own peak. Behind the floating body one mode is hundreds of times faster than "
+        "the source, which explicit methods pay for."
+    )
+    picture_line = "![Error against time of networks](../benchmarks/results/work_precision_networks.png)"
+    return ["", *wrapped(text), "", *table, "", picture_line]
+
+
+def once(results: Report) -> str:
+    """How many of the points were not repeated, and why, in words."""
+    solved = [p for p in results["points"] if p["status"] == "ok"]
+    single = sum(p["repeats"] == 1 for p in solved)
+    return (
+        f"long runs: of 3; {single} of {len(solved)} points, over {results['far']:.0f} times the best time at their "
+        "error, were timed once"
+    )
+
+
+def wrapped(text: str) -> list[str]:
+    """Lines of a paragraph."""
+    return textwrap.wrap(text, 118, break_long_words=False, break_on_hyphens=False)
 
 
 def details(results: Report) -> str:
     """The whole of the results as Markdown."""
     lines = ["# Work and precision", "", f"{conditions(results)}. Made by `benchmarks/report.py`.", ""]
     aims = " / ".join(f"{t:.0e}" for t in TARGETS)
-    for law in ("local", "mobile"):
-        table = short_table(results, law)
-        if table:
-            lines += [f"Law `{law}`, the best of each library, µs per period at an error of {aims}:", "", *table, ""]
+    for kind in ("stack", "network"):
+        for law in ("local", "mobile"):
+            table = short_table(results, law, kind)
+            head = f"{kind.capitalize()}s, law `{law}`, the best of each library, µs per period at an error of {aims}:"
+            lines += [head, "", *table, ""] if table else []
     for name, problem in results["problems"].items():
         law = "" if problem["charge_law"] == "local" else ", law `mobile`"
         lines += [
@@ -249,62 +280,6 @@ def details(results: Report) -> str:
     slow = [f"{name} {seconds:.1f} s" for name, seconds in compile_s.items() if seconds >= 0.1]
     lines += ["## Compilation", "", "Longest first call beyond a second one: " + ", ".join(slow) + ".", ""]
     return "\n".join(lines)
-
-
-def front(points: list[Report], cost: str) -> tuple[list[float], list[float]]:
-    """Costs and errors of the points that no other point beats in both."""
-    best: list[tuple[float, float]] = []
-    for p in sorted((p for p in points if p[cost] is not None), key=lambda p: p[cost]):
-        if not best or p["error"] < best[-1][1]:
-            best.append((p[cost], p["error"]))
-    return [x for x, _ in best], [y for _, y in best]
-
-
-def picture(results: Report, path: Path) -> None:
-    """Error against time and against evaluations on the four scenes of Table 1, the front of each library."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    names = [n for n, p in results["problems"].items() if p["charge_law"] == "local"][:4]
-    costs = {"us_per_period": "time per period / µs", "nfev_per_period": "evaluations per period"}
-    style = {"font.size": 8, "axes.titlesize": 8.5, "axes.labelsize": 8, "xtick.labelsize": 7, "ytick.labelsize": 7}
-    with plt.rc_context(style):
-        figure, axes = plt.subplots(
-            2, len(names), figsize=(7.6, 4.8), sharey=True, sharex="row", squeeze=False, layout="constrained"
-        )
-        for column, name in enumerate(names):
-            floor = results["problems"][name]["error_floor"]
-            for row, cost in enumerate(costs):
-                ax = axes[row][column]
-                for library in reversed([x for x in libraries(results) if x in LOOK]):
-                    x, y = front(good(results, name, library=library), cost)
-                    if x:
-                        colour, marker = LOOK[library]
-                        wide = library == OURS
-                        ax.plot(
-                            x, [max(v, floor) for v in y], color=colour, marker=marker, markersize=4 if wide else 3.5,
-                            linewidth=1.8 if wide else 1.0, label=library,
-                            markeredgewidth=0.0, zorder=3 if wide else 2,
-                        )  # fmt: skip
-                ax.set(xscale="log", yscale="log")
-                ax.grid(True, which="major", color="0.88", linewidth=0.5)
-                ax.set_axisbelow(True)
-                ax.spines[["top", "right"]].set_visible(False)
-            axes[0][column].set_title(results["problems"][name]["title"])
-        axes[0][0].set_ylim(1e-13, 1e-1)
-        for row, label in enumerate(costs.values()):
-            axes[row][0].set_ylabel("largest error / peak")
-            for ax in axes[row]:
-                ax.set_xlabel(label)
-        handles, labels = axes[0][0].get_legend_handles_labels()
-        figure.legend(
-            handles[::-1], labels[::-1], loc="outside upper center", ncols=(len(labels) + 1) // 2, frameon=False,
-            columnspacing=1.2, handlelength=1.6,
-        )  # fmt: skip
-        figure.savefig(path, dpi=200)
-        plt.close(figure)
 
 
 def put_into(text: str, readme: Path) -> None:
@@ -332,7 +307,13 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     results = json.loads(options.results.read_text(encoding="utf-8"))
     options.results.with_suffix(".md").write_text(details(results), encoding="utf-8")
-    picture(results, options.results.with_suffix(".png"))
+    stacks = problems(results, "local", "stack")[:4]
+    picture(results, [[(n, cost) for n in stacks] for cost in COSTS], options.results.with_suffix(".png"))
+    networks = [(name, "us_per_period") for name in problems(results, "local", "network")]
+    if networks:
+        # Sines above, squares below.
+        path = options.results.with_name(f"{options.results.stem}_networks.png")
+        picture(results, [networks[::2], networks[1::2]], path)
     put_into(page_text(results), options.page)
     put_into(waits(options.results.parent), options.readme)
 

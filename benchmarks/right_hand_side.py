@@ -1,7 +1,8 @@
 """The right-hand side that peers integrate: written once, for numba and, under `local`, for any array library.
 
-State x (V): coating and gap of the layer voltages over their capacitive share k U of the source; under `mobile` times
-A_R/A_R(0 V), which no jump of the source changes. The skin's is minus their sum.
+That of networks is in `network_rates.py`. State x (V) of a stack: coating and gap of the layer voltages over their
+capacitive share k U of the source; under `mobile` times A_R/A_R(0 V), which no jump of the source changes. The skin's
+is minus their sum.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from problems import Constants, Drive, Problem
+from network_problems import NetworkProblem
+from network_rates import network_rates
+from problems import BELOW, Constants, Drive, Problem
 
 FloatArray = NDArray[np.float64]
-BELOW = 1.1
-"""Minus the series' argument where the continuation below 0 V ends; 0 V is at 1."""
 
 
 def local_rates(
@@ -139,27 +140,45 @@ def _mobile_rates(
     return rates, gap
 
 
+def open_rates(
+    problem: Problem, sin: Callable[[Any], Any], least: Callable[[Any, Any], Any]
+) -> Callable[[Any, Any, Any, Any], Any]:
+    """rates(t, x, sign, level) -> the rates of the state's parts, in an array library's own functions; `local` only."""
+    if isinstance(problem, NetworkProblem):
+        return network_rates(problem.around, False, problem.drive, sin, least, lambda f: f)
+    stack, _ = local_rates(problem.constants, problem.drive, sin, least)
+    return lambda t, x, sign, level: stack(t, x[0], x[1], sign, level)
+
+
+def size_of(problem: Problem) -> int:
+    """Length of the state."""
+    if not isinstance(problem, NetworkProblem):
+        return 2
+    around = problem.around
+    return 1 + int(math.isfinite(around.body)) + 2 * len(around.fingers)
+
+
 @dataclass(frozen=True)
 class Compiled:
     """numba's right-hand side of a problem.
 
     Attributes
     ----------
-    scalar_rates : callable
-        (t, x0, x1, sign, level) -> (x0', x1').
-    rates : callable
-        (t, x, sign, level) -> x', shape (2,).
+    size : int
+        Length n of the state.
     fill : callable
-        (t, x, out, [sign, level]): the same into `out`.
+        (t, x, out, sign, level): x' into `out`, shape (n,).
+    rates : callable
+        (t, x, sign, level) -> x', shape (n,).
     jacobian : callable
-        (t, x, sign, level) -> (2, 2), by differences: two evaluations.
+        (t, x, sign, level) -> (n, n), by differences: n evaluations beside that of the rates.
     observe : callable
-        (U, x) of shapes (n,), (n, 2) -> u_gap in V and F_el in N, shape (n,).
+        (U, x) of shapes (m,), (m, n) -> u_gap in V and F_el in N, shape (m,), or (m, 2) of two fingers.
     """
 
-    scalar_rates: Callable[..., tuple[float, float]]
-    rates: Callable[..., FloatArray]
+    size: int
     fill: Callable[..., None]
+    rates: Callable[..., FloatArray]
     jacobian: Callable[..., FloatArray]
     observe: Callable[..., tuple[FloatArray, FloatArray]]
 
@@ -170,37 +189,45 @@ _COMPILED: dict[str, Compiled] = {}
 def compiled(problem: Problem) -> Compiled:
     """The compiled right-hand side of a problem; compiled once in a process for all problems of that name."""
     if problem.name not in _COMPILED:
-        _COMPILED[problem.name] = _compile(problem)
+        build = _network if isinstance(problem, NetworkProblem) else _stack
+        fill, observe = build(problem)  # type: ignore[arg-type]
+        _COMPILED[problem.name] = _around(size_of(problem), fill, observe)
     return _COMPILED[problem.name]
 
 
-def _compile(problem: Problem) -> Compiled:
+def _around(size: int, fill: Callable[..., None], observe: Callable[..., Any]) -> Compiled:
+    """What libraries call, from what fills in the rates."""
+
+    @njit(error_model="numpy")
+    def rates(t, x, sign, level):  # type: ignore[no-untyped-def]
+        out = np.empty(size)
+        fill(t, x, out, sign, level)
+        return out
+
+    @njit(error_model="numpy")
+    def jacobian(t, x, sign, level):  # type: ignore[no-untyped-def]
+        out = np.empty((size, size))
+        base, moved = rates(t, x, sign, level), x.copy()
+        # About the square root of rounding times the voltages at hand.
+        d = 1e-6 * (1.0 + np.abs(x).sum())
+        for j in range(size):
+            moved[j] = x[j] + d
+            out[:, j] = (rates(t, moved, sign, level) - base) / d
+            moved[j] = x[j]
+        return out
+
+    return Compiled(size, fill, rates, jacobian, observe)
+
+
+def _stack(problem: Problem) -> tuple[Callable[..., None], Callable[..., Any]]:
     constants = problem.constants
     build = _mobile_rates if problem.law == "mobile" else local_rates
     rates, gap = build(constants, problem.drive, math.sin, min, njit(error_model="numpy"))
     stress = constants.stress
 
     @njit(error_model="numpy")
-    def array_rates(t, x, sign, level):  # type: ignore[no-untyped-def]
-        out = np.empty(2)
+    def fill(t, x, out, sign, level):  # type: ignore[no-untyped-def]
         out[0], out[1] = rates(t, x[0], x[1], sign, level)
-        return out
-
-    @njit(error_model="numpy")
-    def fill(t, x, out, piece):  # type: ignore[no-untyped-def]
-        out[0], out[1] = rates(t, x[0], x[1], piece[0], piece[1])
-
-    @njit(error_model="numpy")
-    def jacobian(t, x, sign, level):  # type: ignore[no-untyped-def]
-        out = np.empty((2, 2))
-        base0, base1 = rates(t, x[0], x[1], sign, level)
-        # About the square root of rounding times the voltages at hand.
-        d = 1e-6 * (1.0 + abs(x[0]) + abs(x[1]))
-        right0, right1 = rates(t, x[0] + d, x[1], sign, level)
-        out[0, 0], out[1, 0] = (right0 - base0) / d, (right1 - base1) / d
-        right0, right1 = rates(t, x[0], x[1] + d, sign, level)
-        out[0, 1], out[1, 1] = (right0 - base0) / d, (right1 - base1) / d
-        return out
 
     @njit(error_model="numpy")
     def observe(u_source, x):  # type: ignore[no-untyped-def]
@@ -212,4 +239,42 @@ def _compile(problem: Problem) -> Compiled:
             force[i] = stress * u * u / inverse
         return u_gap, force
 
-    return Compiled(rates, array_rates, fill, jacobian, observe)
+    return fill, observe
+
+
+def _network(problem: NetworkProblem) -> tuple[Callable[..., None], Callable[..., Any]]:
+    around, size = problem.around, size_of(problem)
+    mobile = problem.law == "mobile"
+    rates = network_rates(around, mobile, problem.drive, math.sin, min, njit(error_model="numpy"))
+    longest = max(len(finger.series) for finger in around.fingers)
+    series = np.array([(0.0,) * (longest - len(f.series)) + f.series[::-1] for f in around.fingers])
+    stress = np.array(problem.stresses)
+    # Where the first gap voltage stands in the state.
+    scale, first = 2.0 / around.reach, size - 2 * stress.size + 1
+
+    @njit(error_model="numpy")
+    def fill(t, x, out, sign, level):  # type: ignore[no-untyped-def]
+        found = rates(t, x, sign, level)
+        for i in range(size):
+            out[i] = found[i]
+
+    @njit(error_model="numpy")
+    def gaps_of(x):  # type: ignore[no-untyped-def]
+        u_gap = np.empty((x.shape[0], stress.size))
+        force = np.empty((x.shape[0], stress.size))
+        for i in range(x.shape[0]):
+            for j in range(stress.size):
+                u = x[i, first + 2 * j]
+                s = min(scale * abs(u) - 1.0, 1.0)
+                inverse = 0.0
+                for c in series[j]:
+                    inverse = inverse * s + c
+                u_gap[i, j] = u
+                force[i, j] = stress[j] * u * u / inverse
+        return u_gap, force
+
+    def observe(u_source: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        u_gap, force = gaps_of(x)
+        return (u_gap[:, 0], force[:, 0]) if stress.size == 1 else (u_gap, force)
+
+    return fill, observe

@@ -29,13 +29,11 @@ Report = dict[str, Any]
 
 def modal_gap(area: float) -> tuple[list[float], list[float], float, list[float]]:
     """Rates, gains, direct share and weights of the gap voltage of Table 1's stack at one area (m^2)."""
-    from fingerspice.engine.system import build_system
-    from fingerspice.solve.problem import scene_of
+    from fingerspice.solve.scenes import scene_of
 
     scene = scene_of(fs.read_netlist(DECK), "local", area, 1.0)
-    system = build_system(scene.model, 1e-13, (1.0 / area, 1.0 / area), scene.stack.grouping)
-    gap = scene.stack.state_order.index(scene.probe)
-    return list(system.rates[0]), list(system.gain[0]), float(scene.model.k[gap]), list(system.live[0, gap])
+    modes, (gap,) = scene.modes, scene.measured
+    return list(modes.rates), list(modes.gains[:, 0]), -float(modes.follow[gap, 0]), list(modes.shape[gap])
 
 
 def equivalent_filter(rates: list[float], gains: list[float], direct: float, weights: list[float]) -> tuple[Any, Any]:

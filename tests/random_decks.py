@@ -33,7 +33,7 @@ def _source(rng: random.Random, kind: str, scale: float) -> str:
     }[kind]
 
 
-def _layers(rng: random.Random, slow: bool, top: str, low: str, area: str, number: str = "") -> list[str]:
+def layers(rng: random.Random, slow: bool, top: str, low: str, area: str, number: str = "") -> list[str]:
     """A coating, a gap and a skin between two nodes, each of a random kind; all leak, for the operating point."""
     coat = rng.choice(
         (f"LAYER d={rng.uniform(0.5, 3.0):.3f}u eps_r=3.9 r=0.2meg", "SLAB d=2u eps_r=3 rho=1e9 e_max=inf")
@@ -57,9 +57,9 @@ def _network(rng: random.Random, kind: str, slow: bool, drive: str, second: str,
     # Time constants of many steps, to which ngspice's error is relative.
     r, c = f"{rng.uniform(0.2, 1.0):.3f}meg", f"{rng.uniform(80.0, 300.0):.1f}p"
     state = rng.getstate()
-    finger = _layers(rng, slow, "drive", "0", "area")
+    finger = layers(rng, slow, "drive", "0", "area")
     rng.setstate(state)
-    floating = _layers(rng, slow, "drive", "body", "area")
+    floating = layers(rng, slow, "drive", "body", "area")
     return {
         "stack": [f"Vdrive drive 0 {drive}", *finger],
         "two sources": [f"Vdrive drive m {drive}", f"Vlow 0 m {second}", *finger],
@@ -76,8 +76,8 @@ def _network(rng: random.Random, kind: str, slow: bool, drive: str, second: str,
             *finger,
         ],
         "two fingers": [
-            f"Vdrive drive 0 {drive}", *_layers(rng, slow, "drive", "body", "left", "1"),
-            *_layers(rng, slow, "drive", "body", "right", "2"), f"Rbody body far {r}", f"Cbody far 0 {c}",
+            f"Vdrive drive 0 {drive}", *layers(rng, slow, "drive", "body", "left", "1"),
+            *layers(rng, slow, "drive", "body", "right", "2"), f"Rbody body far {r}", f"Cbody far 0 {c}",
         ],
         "no gap": [
             f"Vdrive drive 0 {drive}", f"R1 drive a {r}", "X1 a b area LAYER d=2u eps_r=4 r=1meg",

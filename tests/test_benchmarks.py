@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import json
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import fingerspice as fs
 from fingerspice.circuit.statespace import build_stack
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
@@ -54,7 +56,9 @@ def test_every_contestant_is_as_right_as_its_setting_promises(work_precision, ca
         # Ours bounds the error of the result. The others bound each step's: what adds up was measured, 1.4e-8 to 2.3e-5
         # at 1e-6; ngspice's error follows its step.
         allowed = {"fingerspice": 1e-6, "ngspice": 2e-4}.get(point["library"], 5e-5)
-        assert point["error"] <= allowed, point
+        # On a stiff network DOP853's steps are as long as is stable, which leaves an error in what it interpolates.
+        stiff = point["contestant"] == "scipy DOP853" and point["problem"].startswith("two_fingers")
+        assert point["error"] <= (5e-4 if stiff else allowed), point
     assert (written.stat().st_mtime_ns if written.exists() else None) == before
 
 
@@ -67,23 +71,63 @@ def test_the_peers_area_series_and_rates_are_the_packages_model(work_precision):
         np.testing.assert_allclose(f_el, stack.contact.stress(u_gap) * stack.contact.area(u_gap), rtol=2e-14)
 
 
+def test_networks_are_solved_alike_by_three_formulations(work_precision):
+    """Collocation from the paper's equations, the peers' rates, and the package from the netlist; both laws."""
+    reference = importlib.import_module("reference")
+    every = importlib.import_module("network_problems").every()
+    for name in ("amplifier_square_100Hz_mobile", "two_fingers_sine_5kHz"):
+        problem = dataclasses.replace(every[name], periods=1)
+        truth = reference.reference(problem, second=False)
+        u_gap, f_el, _ = reference._peers_way(problem, truth.zeros, truth.signs)
+        assert max(truth.errors(u_gap, f_el)) <= 1e-11
+        ours = fs.simulate(
+            problem.circuit(), t_stop=problem.period, t_eval=problem.t_eval(1), rtol=1e-10, charge_law=problem.law
+        )
+        assert max(truth.errors(ours.u_gap, ours.f_el)) <= 1e-10
+
+
+def test_what_is_far_from_the_best_is_timed_once(work_precision):
+    plan = importlib.import_module("peers.contest").Plan
+    problem = importlib.import_module("problems").by_name()["sine_100Hz"]
+    calls = []
+
+    def run(setting):
+        calls.append(setting)
+        return importlib.import_module("peers.contest").Outcome(np.zeros(1), np.zeros(1), None, setting)
+
+    def entry(error, seconds):
+        cost = 1e6 * seconds / plan(problem, 200).periods
+        return {"status": "ok", "error": error, "us_per_period": cost, "periods": 200, "setting": seconds, "repeats": 1}
+
+    # The second is right at a hundred times the first's time, the third at more; the fourth alone is as right as it is.
+    found = [entry(1e-6, 1e-3), entry(1e-5, 0.09), entry(1e-6, 0.11), entry(1e-9, 0.12), entry(1e-9, 2.0)]
+    entries = [(x, run) for x in found] + [({"status": "failed"}, run)]
+    work_precision.repeat(entries, 7)
+    assert [x["repeats"] for x in found] == [7, 7, 1, 7, 3]
+    assert len(calls) == 24
+
+
 def test_the_report_needs_nothing_but_the_results(work_precision, tmp_path):
     report = importlib.import_module("report")
     results = {
         "machine": "a machine",
         "versions": {"fingerspice": "1", "numbalsoda": "absent"},
         "repeats": 7,
+        "far": 100.0,
         "problems": {
-            "sine": {
-                "title": "sine", "charge_law": "local", "periods": 2, "period_s": 0.01, "reference": "two ways",
-                "reference_agreement": 1e-14, "error_floor": 1e-14, "peak_u_gap_V": 100.0,
+            scene: {
+                "title": scene, "charge_law": "local", "kind": kind, "periods": 2, "period_s": 0.01,
+                "reference": "two ways", "reference_agreement": 1e-14, "error_floor": 1e-14, "peak_u_gap_V": 100.0,
             }
+            for scene, kind in (("a sine", "stack"), ("cable, sine", "network"), ("cable, square", "network"))
         },
         "points": [
             {
-                "problem": "sine", "contestant": name, "library": library, "setting": error, "status": "ok",
+                "problem": scene, "contestant": name, "library": library, "setting": error, "status": "ok",
                 "error": error, "us_per_period": cost, "nfev_per_period": 10.0, "compile_s": None,
+                "repeats": 7 if cost < 10.0 else 1,
             }
+            for scene in ("a sine", "cable, sine", "cable, square")
             for name, library, cost in (("fingerspice", "fingerspice", 2.0), ("scipy LSODA", "scipy", 30.0))
             for error in (1e-4, 1e-7, 1e-11)
         ],
@@ -100,8 +144,11 @@ def test_the_report_needs_nothing_but_the_results(work_precision, tmp_path):
         assert text.endswith("\nafter\n")
         assert "stale" not in text
     assert "| best peer over ours, times | 15 / 15 / 15 |" in page.read_text()
+    assert "| best peer over ours, times | 15 / 15 / 15 | 15 / 15 / 15 |" in page.read_text()
+    assert "9 of 18 points" in " ".join(page.read_text().split())
     assert "| `import fingerspice` | " in readme.read_text()
-    assert path.with_suffix(".png").stat().st_size > 0
+    for picture in ("work_precision.png", "work_precision_networks.png"):
+        assert (tmp_path / picture).stat().st_size > 0
 
 
 def test_throughput_compares_the_same_response_and_writes_nothing_when_quick(monkeypatch, capsys):

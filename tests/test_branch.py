@@ -11,7 +11,7 @@ import analytic as ref
 import fingerspice as fs
 import stress
 from fingerspice.engine.model import branch_area, gap_voltage, ramp, turns_at_zero
-from fingerspice.solve.simulation import prepare
+from fingerspice.solve.problem import prepare
 
 
 def model_of(scene, law="mobile"):
@@ -19,7 +19,7 @@ def model_of(scene, law="mobile"):
         scene.circuit, t_stop=1.0 / scene.frequency, t_eval=None, charge_law=law, area="coupled", start="deck",
         charge=False, rtol=1e-6,
     )  # fmt: skip
-    return problem.model
+    return problem.scene.model
 
 
 def reached(scene, b, u, target):

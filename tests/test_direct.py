@@ -13,7 +13,7 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.solve import direct
+from fingerspice.solve import closed_form
 from scenes import deck, table1
 
 AREA = 34.9715871843e-6
@@ -206,13 +206,13 @@ def test_the_charge_is_what_every_layer_stores_and_leaks(name: str, r_coat: str,
 def held(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Lengths of the inputs given to the hold recursion."""
     calls: list[int] = []
-    recursion = direct.hold.first_order_hold
+    recursion = closed_form.hold.first_order_hold
 
     def counted(u: Any, *arguments: Any, **options: Any) -> Any:
         calls.append(len(u))
         return recursion(u, *arguments, **options)
 
-    monkeypatch.setattr(direct.hold, "first_order_hold", counted)
+    monkeypatch.setattr(closed_form.hold, "first_order_hold", counted)
     return calls
 
 
@@ -325,7 +325,7 @@ def test_a_source_that_stops_being_finite_ends_the_run_there(tier: str) -> None:
     assert 0.0041 <= solution.t[-1] <= 0.0041235
     assert solution.state.t == pytest.approx(0.00412345, abs=1e-9)
     assert np.all(np.isfinite(solution.state.y))
-    assert solution.state.u_before == pytest.approx(math.sin(2e3 * 0.00412345), abs=1e-5)
+    assert solution.state.s_before[0] == pytest.approx(math.sin(2e3 * 0.00412345), abs=1e-5)
     assert np.all(np.isfinite(solution.u_layer))
     want = fs.simulate(circuit, sources={"V1": lambda t: np.sin(2e3 * np.asarray(t))})
     np.testing.assert_allclose(solution.u_layer, want.u_layer[: solution.t.size], rtol=0, atol=1e-10)
@@ -361,7 +361,7 @@ def test_a_source_that_is_never_finite_leaves_the_state_as_it_was(tier: str) -> 
     assert solution.status is fs.Status.SOURCE_NOT_FINITE
     assert solution.t.size == 0
     assert solution.state.t == 0.0
-    assert solution.state.u_before == 0.0
+    assert solution.state.s_before[0] == 0.0
     assert not solution.state.y.any()
 
 

@@ -13,10 +13,9 @@ from analytic import sine_segments, transient
 from fingerspice.engine.network import rates
 from fingerspice.engine.radau import dense_polynomial, dense_state, guess, linearise, step
 from fingerspice.numerics.radau_tableau import Tableau, radau
-from fingerspice.solve.netruns import joined, source_tables, values_at
 from fingerspice.solve.nodal import STAGES, STAGES_BESIDE, Collocation, radau_scheme
 from fingerspice.solve.problem import prepare
-from fingerspice.solve.stacked import as_network
+from fingerspice.solve.sources import Tables, joined, values_at
 from scenes import table1
 
 every_number = pytest.mark.parametrize("stages", [3, STAGES_BESIDE, STAGES])
@@ -153,12 +152,10 @@ def expected(law: str, t: tuple[float, ...]) -> np.ndarray:
 def one_step(stages: int, law: str, h: float) -> np.ndarray:
     """Voltages of coating and gap (V) inside the first step and at its end, shape (10, 2)."""
     circuit = table1(f=F).replace({"Vdrive": fs.Sine(U0, F, phase_deg=PHASE)})
-    problem = as_network(
-        prepare(circuit, t_stop=0.25 / F, t_eval=None, charge_law=law, area="coupled", start="uncharged")
-    )
+    problem = prepare(circuit, t_stop=0.25 / F, t_eval=None, charge_law=law, area="coupled", start="uncharged")
     scheme = radau_scheme(stages)
     one = Collocation(problem, scheme, 1e-14, U0, np.empty(0), np.empty(0, bool))
-    (tables,) = source_tables(problem, 1e-14)
+    (tables,) = Tables(problem, 1e-14)
     sources = joined(tables)
     assert one.jump(values_at(sources, 0.0))
     one.room.s[:], one.room.ds[:] = one.s_before, (U0 * 2.0 * math.pi * F * math.cos(math.radians(PHASE)),)

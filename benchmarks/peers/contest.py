@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from network_problems import NetworkProblem
 from problems import Piece, Problem
 
 FloatArray = NDArray[np.float64]
@@ -92,8 +93,10 @@ class Contestant:
         Takes a plan; returns the function of a setting that is timed.
     kinks : bool
         Whether the plan is split at the zeros of the gap voltage.
-    mobile : bool
-        Whether it takes part under the `mobile` law.
+    whole : bool
+        Whether it can be told the zeros only where the source has no jumps.
+    mobile, networks, stacks : bool
+        Whether it takes part under the `mobile` law, on networks, and on stacks.
     slow : bool
         Whether it is given a fifth of the periods where that costs the same per period.
     compile_limit : float
@@ -106,9 +109,19 @@ class Contestant:
     setup: Callable[[Plan], Callable[[float], Outcome]]
     what: str = "rtol"
     kinks: bool = False
+    whole: bool = False
     mobile: bool = False
+    networks: bool = False
+    stacks: bool = True
     slow: bool = False
     compile_limit: float = 0.0
+
+    def takes_part(self, problem: Problem) -> bool:
+        """Whether it is timed on a problem, and there in another way than without the zeros."""
+        if self.kinks and self.whole and len(problem.pieces(1)) > 1:
+            return False
+        kind = self.networks if isinstance(problem, NetworkProblem) else self.stacks
+        return kind and (self.mobile or problem.law == "local")
 
     @property
     def adaptive(self) -> bool:

@@ -37,7 +37,7 @@ def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
 def contestants() -> list[Contestant]:
     """Our methods; `auto` is what a user gets without asking, `exponential` the same without repeating a period."""
     auto, stepped = (
-        Contestant(library, library, tolerances(2, 12), _setup(method), mobile=True, compile_limit=120.0)
+        Contestant(library, library, tolerances(2, 12), _setup(method), mobile=True, networks=True, compile_limit=300.0)
         for library, method in ((LIBRARY, "auto"), (f"{LIBRARY}, every period", "exponential"))
     )
     radau = Contestant(

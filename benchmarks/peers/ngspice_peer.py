@@ -41,9 +41,10 @@ def deck(problem: Problem, t_stop: float, max_step: float) -> str:
     """The problem's exported netlist with its own source and largest step (s)."""
     text = fs.export_netlist(problem.circuit().replace({"Vdrive": fs.DC(0.0)}))
     behavioural = problem.ngspice.startswith("{")
-    source = f"Bdrive drive 0 V={problem.ngspice}" if behavioural else f"Vdrive drive 0 {problem.ngspice}"
-    text, sources = re.subn(r"(?m)^Vdrive .*$", source, text)
-    tran = f".save v(top) v(skin) v(area)\n.tran {max_step!r} {t_stop!r} 0 {max_step!r} uic"
+    source = rf"Bdrive \1 V={problem.ngspice}" if behavioural else rf"Vdrive \1 {problem.ngspice}"
+    text, sources = re.subn(r"(?m)^Vdrive (\S+ \S+) .*$", source, text)
+    saved = " ".join(f"v({node})" for nodes in problem.exported for node in nodes)
+    tran = f".save {saved}\n.tran {max_step!r} {t_stop!r} 0 {max_step!r} uic"
     text, trans = re.subn(r"(?m)^\.tran .*$", tran, text)
     assert sources == trans == 1
     return text
@@ -85,7 +86,7 @@ def _at_outputs(plan: Plan, raw: dict[str, FloatArray], name: str, max_step: flo
 
 
 def _setup(plan: Plan) -> Callable[[float], Outcome]:
-    stress = plan.problem.constants.stress
+    fingers = list(zip(plan.problem.exported, plan.problem.stresses, strict=True))
     text = {}
 
     def run(steps: float) -> Outcome:
@@ -98,9 +99,14 @@ def _setup(plan: Plan) -> Callable[[float], Outcome]:
             _run(text[steps], Path(folder))
             seconds = time.perf_counter() - begin
             raw = read_raw(Path(folder) / "out.raw")
-        u_gap = _at_outputs(plan, raw, "v(top)", max_step) - _at_outputs(plan, raw, "v(skin)", max_step)
-        area = 1e-6 * _at_outputs(plan, raw, "v(area)", max_step)
-        return Outcome(u_gap, stress * u_gap**2 * area, None, seconds - empty)
+        u_gap, force = np.empty((2, plan.t_eval.size, len(fingers)))
+        for i, (nodes, stress) in enumerate(fingers):
+            top, skin, area = (_at_outputs(plan, raw, f"v({node})", max_step) for node in nodes)
+            u_gap[:, i] = top - skin
+            force[:, i] = stress * u_gap[:, i] ** 2 * 1e-6 * area
+        # One finger's signals have one axis, as the package's have.
+        shape = (-1, len(fingers)) if len(fingers) > 1 else -1
+        return Outcome(u_gap.reshape(shape), force.reshape(shape), None, seconds - empty)
 
     return run
 
@@ -119,5 +125,5 @@ def start_up() -> float:
 
 def contestants() -> list[Contestant]:
     """One contestant: its trapezoidal rule, whose largest step sets the error."""
-    steps = (30.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0)
-    return [Contestant("ngspice", LIBRARY, steps, _setup, "steps per period")]
+    steps = (30.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 5000.0)
+    return [Contestant("ngspice", LIBRARY, steps, _setup, "steps per period", networks=True, slow=True)]

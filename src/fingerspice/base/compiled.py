@@ -103,7 +103,7 @@ class _Cache(FunctionCache):
 
 
 _ONCE = (
-    "compiling what this needs, 20 s for a series stack and about a minute for a network, only once: later runs find "
+    "compiling what this needs, 20 s for a series stack and 50 s for a network, only once: later runs find "
     "it on the disk"
 )
 _EVERY_TIME = (
@@ -153,8 +153,8 @@ class _Called:
     numba makes both for every function, and writes them to the disk; but functions are put into those that call them.
     """
 
-    def __init__(self, dispatcher: Any) -> None:
-        self.of = dispatcher
+    def __init__(self, dispatcher: Any, noalias: bool) -> None:
+        self.of, self.noalias = dispatcher, noalias
         self.found: dict[Any, tuple[object, Any]] = {}
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
@@ -177,6 +177,7 @@ class _Called:
         flags = cast(Any, _Flags)()
         of.targetdescr.options.parse_as_flags(flags, of.targetoptions)
         flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        flags.noalias = self.noalias
         library = cast(Any, _Body)(context.codegen(), of.py_func.__qualname__)
         cres = cast(Any, compile_extra)(of.typingctx, context, of.py_func, args, None, flags, {}, library)
         key = object()
@@ -184,8 +185,8 @@ class _Called:
         return key, cres
 
 
-def _cached(**options: Any) -> Callable[[Function], Function]:
-    """`njit` with a cache."""
+def _cached(*, noalias: bool = False, **options: Any) -> Callable[[Function], Function]:
+    """`njit` with a cache; `noalias`: where compiled code calls it, it writes to no memory that it reads."""
 
     def compile_when_called(function: Function) -> Function:
         # What is not said here, numba takes from whichever caller comes first.
@@ -199,7 +200,7 @@ def _cached(**options: Any) -> Callable[[Function], Function]:
 
         compiled.compile = announced
         compiled._compiler._customize_flags = _Flags
-        called = _Called(compiled)
+        called = _Called(compiled, noalias)
         compiled.get_call_template, compiled.get_overload = called.get_call_template, called.get_overload
         return cast(Function, compiled)
 
@@ -211,9 +212,10 @@ if cast(Any, config).DISABLE_JIT:
 _drop_stale_cache()
 # A division by zero is an infinity that the step control refuses, not an exception out of compiled code.
 jit = _cached()
-# For loops over the rows of a step: fused, so that they vectorise; and where sums may be reordered (always alike).
-jit_fused = _cached(fastmath={"contract"})
-jit_rows = _cached(fastmath={"contract", "reassoc"})
+# For loops over the rows of a step: fused, so that they vectorise; and where sums may be reordered (always alike). What
+# they write shares no memory with what they read: else every loop would be compiled twice, with a test before it.
+jit_fused = _cached(fastmath={"contract"}, noalias=True)
+jit_rows = _cached(fastmath={"contract", "reassoc"}, noalias=True)
 # Put into its caller by the compiler of machine code: handing over a tuple of arrays would cost as much as the work.
 jit_within = _cached(forceinline=True)
 # Put into its caller before compilation, for the same reason.

@@ -25,7 +25,7 @@ CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
 _REMEMBERING = threading.Lock()
 #: What a changed circuit may take over from the one that it was made of, by its key in `Circuit.remember`.
-INHERITED = ("loop",)
+INHERITED = ("loop", "network")
 
 
 @dataclass(frozen=True)
@@ -247,10 +247,12 @@ class Circuit(Shown):
         changed, notes = self._replaced(changes)
         # Warnings of values that are no longer there go; those of the reader begin with a place.
         gone = tuple(set(_unusual(self)) - set(_unusual(changed)))
-        kept = [said for said in self.warnings if not said.endswith(gone) and not _concerns(said, changes)]
+        kept = [text for text in self.warnings if not text.endswith(gone) and not _concerns(text, changes)]
         for text in notes:
             warnings.warn(text, FingerspiceWarning, stacklevel=2)
-        return dataclasses.replace(changed, warnings=(*kept, *notes))
+        warned = dataclasses.replace(changed, warnings=(*kept, *notes))
+        warned._memory.update(changed._memory)
+        return warned
 
     def varied(self, changes: Mapping[str, float | str | Waveform | Callable[[float], float]]) -> Circuit:
         """As `replace`, without warnings: for the sweeps of this package, whose values no user has written."""

@@ -12,18 +12,20 @@ and the same on those of the voltage sources, which gives the currents that thes
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.statespace import contact_of, layer_constants
+from fingerspice.circuit.statespace import Stack, contact_of, layer_constants
 from fingerspice.circuit.topology import Area, find_branches
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
+from fingerspice.waveforms.waveform import Waveform
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -76,8 +78,12 @@ class Network:
     resistor_factor, resistor_factor_s : ndarray, shape (n_r, n) and (n_r, n_s)
         k = f^T f, and b = f^T f_s but for the current sources, whose f_s is zero.
     node_names : tuple of str
-    nodes : ndarray, shape (n_node, n + n_s)
-        Node voltages from x and s.
+    nodes : ndarray, shape (n_node, n + n_s + n_inner)
+        Node voltages from x, s and the inner sources.
+    stack : Stack or None
+        Of which this is the network (see `loop`): then modes and phasors follow from it, to full relative precision.
+    kept : dict
+        What was computed of the network whatever its sources are, for networks that differ in those alone.
     """
 
     sources: tuple[Element, ...]
@@ -98,6 +104,22 @@ class Network:
     resistor_factor_s: FloatArray
     node_names: tuple[str, ...]
     nodes: FloatArray
+    stack: Stack | None = None
+    kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "kept": {}}
+
+    @cached_property
+    def inner(self) -> tuple[Element, ...]:
+        """Sources of a series loop of several, whose sum is the network's one source."""
+        sources = () if self.stack is None else self.stack.sources
+        return tuple(e for e, _ in sources) if len(sources) > 1 else ()
+
+    @cached_property
+    def waveforms(self) -> tuple[Waveform, ...]:
+        """Of each source, V or A."""
+        return tuple(e.waveform for e in self.sources if e.waveform is not None)
 
     @cached_property
     def grouping(self) -> FloatArray:

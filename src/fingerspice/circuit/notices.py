@@ -6,9 +6,8 @@ import math
 from collections.abc import Iterator
 
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.spectrum import energy_outside
-from fingerspice.circuit.statespace import build_stack, is_stack
-from fingerspice.circuit.topology import find_branches
 from fingerspice.waveforms.waveform import Waveform
 
 # Half width of a band around a frequency, relative to it, in which the skin's data change by 3 %; and the share of the
@@ -39,18 +38,14 @@ def _skin_warnings(circuit: Circuit) -> Iterator[str]:
     skins = circuit.by_device("SKIN")
     if not skins:
         return
-    if is_stack(circuit):
-        wave: Waveform | None = build_stack(circuit).waveform
-    else:
-        waves = [e.waveform for e in find_branches(circuit)[1] if e.waveform is not None]
-        if len(waves) > 1:
-            # With several sources only the user can know at which frequency the skin should be taken.
-            return
-        wave = waves[0] if waves else None
-    fundamental = None if wave is None else wave.fundamental
+    waves = network_of(circuit).waveforms
+    if len(waves) > 1:
+        # With several sources only the user can know at which frequency the skin should be taken.
+        return
+    (wave,), fundamental = waves, waves[0].fundamental
     for skin in skins:
         f = skin.values["f"]
-        if fundamental is None and wave is not None and _is_near(circuit, wave, f):
+        if fundamental is None and _is_near(circuit, wave, f):
             continue
         if fundamental is None:
             yield (

@@ -4,105 +4,35 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.network import Network, build_network
-from fingerspice.circuit.statespace import Stack, build_stack, is_stack
+from fingerspice.circuit.loop import network_of
+from fingerspice.circuit.network import Network
+from fingerspice.circuit.statespace import Stack
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.phasor import coupled_area, layer_gains
 from fingerspice.waveforms.waveform import Fundamental
 
 
-class LinearScene(Protocol):
-    """A circuit with one contact, as far as its phasors depend on it."""
-
-    @property
-    def contact(self) -> Contact: ...
-    @property
-    def fundamental(self) -> Fundamental | None: ...
-    @property
-    def sources(self) -> tuple[tuple[Element, float], ...]:
-        """Each source with its sign along the loop."""
-        ...
-
-    @property
-    def layers(self) -> tuple[str, ...]: ...
-    @property
-    def gap(self) -> int:
-        """Index of the GAP among the layers."""
-        ...
-
-    @property
-    def finger(self) -> int:
-        """Index of the GAP's area."""
-        ...
-
-    @property
-    def note(self) -> str:
-        """Which of several GAPs it is; empty where there is one."""
-        ...
-
-    @property
-    def fixed(self) -> bool:
-        """Whether the deck fixes that area."""
-        ...
-
-    def areas(self, f: float, area: str | float, amplitude: float) -> FloatArray:
-        """Areas at one frequency (Hz), m^2, shape (n_area,)."""
-        ...
-
-    def layer_gain(self, f: float, areas: FloatArray) -> ComplexArray:
-        """Ratio of each layer's voltage (from p to n) to the source's, shape (n_layer,)."""
-        ...
-
-
 @dataclass(frozen=True)
-class _StackScene:
-    """A series stack."""
+class LinearScene:
+    """A circuit with one contact, as far as its phasors depend on it.
 
-    stack: Stack
-    contact: Contact
-    gap: int
-    finger: int = 0
-    note: str = ""
-
-    @property
-    def fixed(self) -> bool:
-        return self.stack.area_given is not None
-
-    @property
-    def fundamental(self) -> Fundamental | None:
-        return self.stack.waveform.fundamental
-
-    @property
-    def sources(self) -> tuple[tuple[Element, float], ...]:
-        return self.stack.sources
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        return tuple(e.name for e in self.stack.layers)
-
-    def areas(self, f: float, area: str | float, amplitude: float) -> FloatArray:
-        if not isinstance(area, str):
-            return np.array([area])
-        if self.stack.area_given is not None:
-            return np.array([self.stack.area_given])
-        frozen = area == "frozen"
-        return np.array([float(self.contact.area(0.0)) if frozen else mean_area(self.stack, f, amplitude)])
-
-    def layer_gain(self, f: float, areas: FloatArray) -> ComplexArray:
-        sign = self.stack.sign[self.stack.first_cell]
-        return np.asarray(layer_gains(self.stack.admittance(np.array([f]), areas))[0] * sign)
-
-
-@dataclass(frozen=True)
-class _NetworkScene:
-    """Any other circuit."""
+    Attributes
+    ----------
+    network : Network
+    contact : Contact
+    gap : int
+        Index of the GAP among the layers.
+    finger : int
+        Index of the GAP's area.
+    note : str
+        Which of several GAPs it is; empty where there is one.
+    """
 
     network: Network
     contact: Contact
@@ -112,28 +42,36 @@ class _NetworkScene:
 
     @property
     def fixed(self) -> bool:
+        """Whether the deck fixes that area."""
         return self.network.areas[self.finger].given is not None
 
     @property
     def fundamental(self) -> Fundamental | None:
-        waveform = self.network.sources[0].waveform
-        return None if waveform is None else waveform.fundamental
+        """The source's."""
+        return self.network.waveforms[0].fundamental
 
     @property
     def sources(self) -> tuple[tuple[Element, float], ...]:
-        return tuple((e, 1.0) for e in self.network.sources)
+        """Each source with its sign along the loop, where there is one."""
+        stack = self.network.stack
+        return tuple((e, 1.0) for e in self.network.sources) if stack is None else stack.sources
 
     @property
     def layers(self) -> tuple[str, ...]:
         return tuple(e.name for e in self.network.layers)
 
     def areas(self, f: float, area: str | float, amplitude: float) -> FloatArray:
+        """Areas at one frequency (Hz), m^2, shape (n_area,)."""
         if not isinstance(area, str):
             return np.full(len(self.network.areas), area)
-        return _areas_at_rest(self.network) if area == "frozen" else _coupled_areas(self.network, f, amplitude)
+        return areas_at_rest(self.network) if area == "frozen" else coupled_areas(self.network, f, amplitude)
 
     def layer_gain(self, f: float, areas: FloatArray) -> ComplexArray:
-        return np.asarray(self.network.grouping @ self.network.phasors(f, areas, np.ones(1, complex)))
+        """Ratio of each layer's voltage (from p to n) to the source's, shape (n_layer,)."""
+        network, stack = self.network, self.network.stack
+        if stack is None:
+            return np.asarray(network.grouping @ network.phasors(f, areas, np.ones(1, complex)))
+        return np.asarray(_stack_gains(stack, f, areas) * stack.sign[stack.first_cell])
 
 
 def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
@@ -149,12 +87,7 @@ def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
     if finger is not None and finger.lower() not in gaps:
         known = ", ".join(gaps.values()) or "none: this circuit has no GAP"
         raise InputError(f"finger is {finger!r}; allowed: the name of a GAP, {known}")
-    if is_stack(circuit):
-        stack = build_stack(circuit)
-        if stack.gap_layer is None or stack.contact is None:
-            raise InputError("a phasor solution needs a GAP; this circuit has none")
-        return _StackScene(stack, stack.contact, stack.gap_layer)
-    network = build_network(circuit)
+    network = network_of(circuit)
     if not gaps:
         raise InputError("a phasor solution needs a GAP; this circuit has none")
     if len(network.sources) != 1:
@@ -170,52 +103,54 @@ def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
     else:
         raise InputError(f"{name} drives no area; allowed: a GAP with an area of its own")
     note = f"of several GAPs, {name}" if len(gaps) > 1 else ""
-    return _NetworkScene(network, contact, network.layers.index(gap), place, note)
+    return LinearScene(network, contact, network.layers.index(gap), place, note)
 
 
-def mean_area(stack: Stack, frequency: float, amplitude: float) -> float:
-    """Area of the coupled phasor at one frequency (Hz) and source amplitude (V), m^2."""
-    contact, gap = stack.contact, stack.gap_layer
-    assert contact is not None
-    assert gap is not None
-    f = np.array([frequency])
-
-    def gain(area: float) -> float:
-        return float(np.abs(layer_gains(stack.admittance(f, np.array([area])))[0, gap]))
-
-    return coupled_area(lambda u: float(contact.area(u)), gain, amplitude)
-
-
-def mean_network_areas(circuit: Circuit, network: Network, frequency: float | None = None) -> FloatArray:
-    """Areas of a network's coupled phasor at one frequency (Hz; its source's by default), m^2, shape (n_area,).
+def mean_areas(network: Network) -> FloatArray:
+    """Areas of a coupled phasor at its source's fundamental, m^2, shape (n_area,).
 
     Raises
     ------
     InputError
         Where there are several sources, or one without fundamental; where the areas do not settle.
     """
-    source = network.sources[0]
-    fundamental = None if source.waveform is None else source.waveform.fundamental
-    if len(network.sources) > 1 or fundamental is None:
-        what = "several sources" if len(network.sources) > 1 else "a source without fundamental"
+    several = len(network.sources) > 1
+    fundamental = None if several else network.waveforms[0].fundamental
+    if fundamental is None:
+        what = "at the source's fundamental, and this source has none"
+        if several:
+            what = "of one source at its fundamental, and this circuit has several sources"
         raise InputError(
-            f"area='mean' is the area of the phasor of one source at its fundamental, and this circuit has {what}; "
-            "allowed: 'coupled', 'frozen' or an area in m^2"
+            f"area='mean' is the area of the phasor {what}; allowed: 'coupled', 'frozen' or an area in m^2"
         )
-    f = fundamental.frequency if frequency is None else frequency
-    return _coupled_areas(network, f, fundamental.amplitude)
+    return coupled_areas(network, fundamental.frequency, fundamental.amplitude)
 
 
-def _areas_at_rest(network: Network) -> FloatArray:
+def areas_at_rest(network: Network) -> FloatArray:
     """Areas at 0 V, or as the deck gives them, m^2, shape (n_area,)."""
     pairs = zip(network.areas, network.contacts, strict=True)
     return np.array([float(c.area(0.0)) if c is not None and a.given is None else a.given for a, c in pairs])
 
 
-def _coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
-    """Areas under one source's amplitude (V or A) at one frequency (Hz), each at its gap's rms voltage."""
+def _stack_gains(stack: Stack, f: float, areas: FloatArray) -> ComplexArray:
+    """Share of the source's voltage that each layer takes at a frequency (Hz) and an area (m^2), shape (n_layer,)."""
+    return np.asarray(layer_gains(stack.admittance(np.array([f]), areas))[0])
+
+
+def coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
+    """Areas under one source's amplitude (V or A) at one frequency (Hz), each at its gap's rms voltage.
+
+    Raises
+    ------
+    InputError
+        Where they do not settle.
+    """
+    area = areas_at_rest(network)
+    if all(a.given is not None for a in network.areas):
+        return area
+    if network.stack is not None:
+        return np.array([_stack_area(network.stack, f, amplitude)])
     s = np.array([complex(amplitude)])
-    area = _areas_at_rest(network)
     for attempt in range(500):
         u = np.abs(network.phasors(f, area, s))
         new = area.copy()
@@ -229,3 +164,14 @@ def _coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
         # Two areas may oscillate against each other: take the mean.
         area = new if attempt < 50 else 0.5 * (area + new)
     raise InputError("the phasor's areas do not settle; allowed: area='frozen' or an area in m^2")
+
+
+def _stack_area(stack: Stack, f: float, amplitude: float) -> float:
+    """The same of a stack whose area follows its gap, m^2."""
+    contact, gap = stack.contact, stack.gap_layer
+    assert contact is not None
+
+    def gain(area: float) -> float:
+        return float(np.abs(_stack_gains(stack, f, np.array([area]))[gap]))
+
+    return coupled_area(lambda u: float(contact.area(u)), gain, amplitude)

@@ -11,7 +11,7 @@ layers have N - 1 live states,
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -74,17 +74,6 @@ class Stack:
         """Voltage sources in the loop, each with the sign it adds to U with."""
         return tuple((h.element, -h.sign) for h in self.hops if h.element.device == "V")
 
-    def node_voltages(self, u_layer: FloatArray, u_sources: dict[str, FloatArray]) -> dict[str, FloatArray]:
-        """Voltage of every node of the loop against ground, from the layers' (n_t, n_layer) and the sources'."""
-        column = {e.name: u_layer[:, i] for i, e in enumerate(self.layers)}
-        out = {}
-        potential = np.zeros(u_layer.shape[0])
-        for hop in self.hops[:-1]:
-            voltage = u_sources[hop.element.name] if hop.element.device == "V" else column[hop.element.name]
-            potential = potential - hop.sign * voltage
-            out[hop.node] = potential
-        return out
-
     @cached_property
     def first_cell(self) -> NDArray[np.intp]:
         """Index of the first cell of each layer."""
@@ -129,20 +118,27 @@ class Stack:
         return (*(i for i in range(self.c.size) if i != left_out), left_out)
 
     @cached_property
-    def layer_order(self) -> tuple[int, ...]:
-        """Layers in the order they are recorded in, last the one whose voltage is what the others leave."""
-        left_out = self.layer_of(self.state_order[-1])
-        return (*(i for i in range(len(self.layers)) if i != left_out), left_out)
+    def by_layer(self) -> Stack:
+        """The stack's layers as one capacitor each, without their leaks: what a run records."""
+        if len(self.layers) == self.c.size:
+            return self
+        c, none = 1.0 / np.add.reduceat(1.0 / self.c, self.first_cell), np.zeros(len(self.layers))
+        one, sign = (1,) * len(self.layers), self.sign[self.first_cell]
+        return replace(self, cells=one, sign=sign, c=c, g_total=none, g_area=none, gap=self.gap_layer)
 
     @cached_property
     def grouping(self) -> FloatArray:
         """Which live cells make up each recorded layer, shape (n_layer - 1, n_cell - 1)."""
         layers = np.array([self.layer_of(cell) for cell in self.state_order[:-1]], int)
-        return np.asarray(np.array(self.layer_order[:-1], int)[:, None] == layers, float)
+        return np.asarray(np.array(self.by_layer.state_order[:-1], int)[:, None] == layers, float)
 
     def layer_of(self, cell: int) -> int:
         """Index of the layer that a cell is part of."""
-        return int(np.searchsorted(self.first_cell, cell, side="right")) - 1
+        return self._layers_of_cells[cell]
+
+    @cached_property
+    def _layers_of_cells(self) -> tuple[int, ...]:
+        return tuple(i for i, count in enumerate(self.cells) for _ in range(count))
 
     def leak_rates(self, area: float) -> FloatArray:
         """Leak rate of each cell, g/c, at an area (m^2), 1/s, shape (n_cell,)."""
@@ -230,8 +226,11 @@ def _loop(circuit: Circuit) -> Loop | None:
     """The circuit's loop, looked for once; in one that `Circuit.replace` made, where that of the other one was."""
 
     def make() -> Loop | None:
-        before: Loop | None = circuit.remember("of", dict).get("loop")
-        return find_loop(circuit) if before is None else same_loop(circuit, before)
+        of = circuit.remember("of", dict)
+        if "loop" not in of:
+            return find_loop(circuit)
+        before: Loop | None = of["loop"]
+        return None if before is None else same_loop(circuit, before)
 
     loop: Loop | None = circuit.remember("loop", make)
     return loop

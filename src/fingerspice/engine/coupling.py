@@ -24,7 +24,7 @@ count in u0' and not in M.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +40,6 @@ IntArray = NDArray[np.int64]
 # Steps over the time constant of a mode from which on its rate is taken from its polynomial: -rate w + gain s + feed j
 # would be what is left of large numbers, and j hands that on to every other mode.
 STIFF = 300.0
-
-
 # Over the areas, each time the currents are evaluated.
 _SWEEPS = 2
 # Couplings that are kept for when they are needed again, and numbers of them, at most.
@@ -104,8 +102,14 @@ def new_coupling(n: int, cells: int, sources: int) -> Coupling:
     )  # fmt: skip
     numbers, parts = views_of(shapes)
     room = max(2, min(_KEPT, _MOST_NUMBERS // max(numbers.size, 1)))
+    views: dict[str, Any] = dict(zip(Coupling._fields, parts, strict=False))
     return Coupling(
-        *parts, numbers, np.full(2, -1), np.zeros((room, numbers.size)), np.full((room, 2), -1), np.zeros(1, np.int64)
+        numbers=numbers,
+        key=np.full(2, -1),
+        kept=np.zeros((room, numbers.size)),
+        keys=np.full((room, 2), -1),
+        used=np.zeros(1, np.int64),
+        **views,
     )
 
 

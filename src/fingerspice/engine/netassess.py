@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.charge import DERIVATIVE
 from fingerspice.engine.exponential import N_PLACES, between, largest, left_over
+from fingerspice.engine.netrows import combine
 from fingerspice.engine.readout import first_wrong, leaves
 from fingerspice.numerics.lobatto import END, MISS, NODES, POINTS, ROWS
 
@@ -71,31 +72,41 @@ def moved(u: FloatArray, before: FloatArray) -> float:
     return math.sqrt(total)
 
 
+@jit_rows
+def _largest_voltage(shape: FloatArray, follow: FloatArray, m: int, off: FloatArray) -> float:
+    """Largest of what the live voltages are off, V, from what the m modes and, behind them, the sources are."""
+    n = shape.shape[0]
+    largest_one = 0.0
+    for i in range(n):
+        for p in range(off.shape[0]):
+            total = 0.0
+            for k in range(n):
+                total += shape[i, k] * off[p, k]
+            for e in range(follow.shape[1]):
+                total -= follow[i, e] * off[p, m + e]
+            # NaN is too large as well.
+            if not abs(total) <= largest_one:
+                largest_one = abs(total)
+    return largest_one
+
+
 @jit
 def assess(
     rates: FloatArray, h: float, shape: FloatArray, follow: FloatArray, gap: FloatArray, size: FloatArray,
     phi: FloatArray, miss: FloatArray, error: FloatArray, carried: FloatArray, w: FloatArray, lin: FloatArray,
-    pull: FloatArray, used: FloatArray, s: FloatArray, magnified: float, x: FloatArray, places: FloatArray,
+    pull: FloatArray, used: FloatArray, s: FloatArray, magnified: float, off: FloatArray, places: FloatArray,
     early: FloatArray, run: FloatArray,
 ) -> float:  # fmt: skip
     """Error of a converged step, V, from what its polynomials miss between nodes; see `exponential.assess`.
 
     `places` (m, N_PLACES) takes the error of the modes, `early` (m,) what their polynomials miss of a decay that is
     over before the first node, `run` (n_area,) the largest error of each gap's voltage with what the iteration left and
-    what came before; `x` (n, 5) is for passing use.
+    what came before; `off` (5, m + n_s) is for passing use.
     """
-    n = shape.shape[0]
+    n, m = shape.shape[0], w.shape[0]
     left = np.zeros(4)
-    step = 0.0
-    for i in range(n):
-        for p in range(5):
-            x[i, p] = 0.0
     for j in range(s.shape[0]):
-        first, second, third = between(s[j])
-        for i in range(n):
-            x[i, 0] -= follow[i, j] * first
-            x[i, 1] -= follow[i, j] * second
-            x[i, 2] -= follow[i, j] * third
+        off[0, m + j], off[1, m + j], off[2, m + j] = between(s[j])
     for k in range(w.shape[0]):
         lin_first, lin_second, lin_third = between(lin[k])
         pull_first, pull_second, pull_third = between(pull[k])
@@ -111,27 +122,22 @@ def assess(
             fall += DERIVATIVE[0, j] * w[k, j]
         fall = lin[k, 0] + pull[k, 0] - rates[k] * w[k, 0] - fall / h
         early[k] = fall / (rates[k] + 1.0 / (_EARLY * h))
-        if k < n:
-            for i in range(n):
-                x[i, 4] += shape[i, k] * early[k]
+        off[4, k] = early[k]
         for p in range(4):
             fresh = magnified * miss[k, _WORST[p]] * missed
             places[k, p + 1] = carried[k, p] + magnified * left[p] + fresh
-            off = fresh
-            if p < 3:
-                off += mode_first if p == 0 else (mode_second if p == 1 else mode_third)
-            if k < n:
-                for i in range(n):
-                    x[i, p] += shape[i, k] * off
-            else:
-                step = max(step, size[k] * abs(off))
+            off[p, k] = fresh
+        off[0, k] += mode_first
+        off[1, k] += mode_second
+        off[2, k] += mode_third
         places[k, 1] += mode_first
         places[k, 2] += mode_second
         places[k, 3] += mode_third
-    for i in range(n):
-        for p in range(5):
-            if not abs(x[i, p]) <= step:
-                step = abs(x[i, p])
+    step = _largest_voltage(shape, follow, m, off)
+    for k in range(n, w.shape[0]):
+        for p in range(4):
+            if not size[k] * abs(off[p, k]) <= step:
+                step = size[k] * abs(off[p, k])
     for a in range(run.size):
         total = 0.0
         for k in range(n):
@@ -221,12 +227,10 @@ def write_columns(
     for j in range(n):
         for i in range(ROWS):
             values[j, i] = 0.0
-        for k in range(n):
-            for i in range(ROWS):
-                values[j, i] += shape[j, k] * w[k, i]
         for e in range(s.shape[0]):
             for i in range(ROWS):
                 values[j, i] -= follow[j, e] * s[e, i]
+    combine(shape, w[:n], values[:n])
     for k in range(n, first_z):
         for i in range(ROWS):
             values[k, i] = w[k, i]

@@ -147,7 +147,7 @@ class Work(NamedTuple):
     coefficients: FloatArray
     outputs: FloatArray
     room: FloatArray
-    x: FloatArray
+    off: FloatArray
     carried: FloatArray
     spare: FloatArray
     spare_cells: FloatArray
@@ -174,7 +174,7 @@ def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: 
         np.zeros((columns, ROWS)),
         np.zeros((2, WRITTEN_AT_ONCE)),
         np.zeros((4, ROWS)),
-        np.zeros((n, 5)),
+        np.zeros((N_PLACES, modes + sources)),
         np.zeros((modes, N_PLACES - 1)),
         np.zeros((6, modes, ROWS)),
         np.zeros((8, cells, ROWS)),

@@ -72,8 +72,8 @@ def solve_step(
     clear(used)
     clear(guess)
     clear(cells[netrows.RHO])
-    _free(decay, work.w0, base)
-    respond(lin, phi, base, base)
+    _free(decay, work.w0, w)
+    respond(lin, phi, w, base)
     current = base
     slowly = False
     step = 0.0

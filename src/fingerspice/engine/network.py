@@ -254,20 +254,26 @@ def residual(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray, 
 
 @jit
 def capacitances(net: Net, room: Room, y: FloatArray, sign: FloatArray) -> None:
-    """The matrix (n, n) in F that small changes of the live voltages meet, into `room.matrix`."""
+    """The matrix (n, n) in F that small changes of the live voltages meet, into `room.matrix`.
+
+    From the capacitors alone: beside the current of a small resistance, or of what a fast source pushes, that of a
+    capacitor would be lost in rounding, and with it the distance to a fold.
+    """
     n = net.k.shape[0]
-    ds = room.ds.copy()
-    # As in a jump, the sources at rest: beside the current of a small resistance, or of what a fast source pushes, that
-    # of a capacitor would be lost in rounding, and with it the distance to a fold.
-    room.k[:] = 0.0
-    room.ds[:] = 0.0
-    for j in range(n):
-        room.k[j] = 1.0
-        residual(net, room, True, y, sign, room.k, room.probe)
-        room.k[j] = 0.0
-        for i in range(n):
-            room.matrix[i, j] = -room.probe[i]
-    copy_to(room.ds, ds)
+    _voltages(net, room, y, y)
+    _areas(net, room, y, sign, 0.0)
+    room.matrix[:] = 0.0
+    for cell in range(room.u.size):
+        i = net.place[cell]
+        held = net.c[cell] * (1.0 if i < 0 else room.area[i])
+        felt, gap = 0.0, cell
+        if net.mobile and i >= 0 and net.gap[i] >= 0:
+            felt, gap = net.c[cell] * room.u[cell] * room.slope[i], net.gap[i]
+        for j in range(n):
+            share = net.p[cell, j]
+            if share != 0.0:
+                for k in range(n):
+                    room.matrix[j, k] += share * (held * net.p[cell, k] + felt * net.p[gap, k])
 
 
 @jit

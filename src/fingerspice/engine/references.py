@@ -28,13 +28,13 @@ class References(NamedTuple):
         Powers of LEVEL_RATIO that the areas of each reference are over those at 0 V.
     numbers : ndarray, shape (room, size)
         See `Form`.
-    count, wanted : ndarray of int, shape (1,) and (n_area,)
+    used, wanted : ndarray of int, shape (1,) and (n_area,)
         How many references there are; the levels that were looked for last.
     """
 
     levels: IntArray
     numbers: FloatArray
-    count: IntArray
+    used: IntArray
     wanted: IntArray
 
 
@@ -55,7 +55,7 @@ def find(references: References, form: Form, area: FloatArray) -> int:
         wanted[a] = 0
         if form.cell[a] >= 0:
             wanted[a] = round(math.log(area[a] / form.unit[a]) / math.log(LEVEL_RATIO))
-    for one in range(references.count[0]):
+    for one in range(references.used[0]):
         same = True
         for a in range(area.size):
             same &= references.levels[one, a] == wanted[a]

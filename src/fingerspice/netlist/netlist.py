@@ -10,8 +10,7 @@ from pathlib import Path
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element, Tran, check
-from fingerspice.circuit.network import build_network
-from fingerspice.circuit.statespace import build_stack, is_stack
+from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.usual import REST_AREA
 from fingerspice.circuit.values import unusual
 from fingerspice.netlist.deck import Deck, parse_deck, read_deck
@@ -108,10 +107,7 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
         path=deck.path,
     )
     check(circuit)
-    if is_stack(circuit):
-        build_stack(circuit)
-    else:
-        build_network(circuit)
+    network_of(circuit)
     return circuit
 
 

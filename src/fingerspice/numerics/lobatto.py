@@ -20,7 +20,7 @@ import numpy as np
 from numpy.polynomial import chebyshev, legendre
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import jit_fused
+from fingerspice.base.compiled import jit, jit_fused
 
 FloatArray = NDArray[np.float64]
 
@@ -61,66 +61,114 @@ TO_SERIES = np.zeros((NODES, ROWS))
 
 The last columns are zero, for loops over whole vectors."""
 TO_SERIES[:, :NODES] = np.linalg.inv(chebyshev.chebvander(2.0 * _X - 1.0, NODES - 1)).T
-_GAUSS_X, _GAUSS_W = legendre.leggauss(32)
-_GAUSS_X, _GAUSS_W = 0.5 * (_GAUSS_X + 1.0), 0.5 * _GAUSS_W
-# exp(-45) of the largest value is below rounding.
-_REACH = 45.0
-_END_WEIGHT = _GAUSS_W * np.exp(-_REACH * _GAUSS_X)
-_INVERSE_SCALE = 1.0 / _SCALE
-
-
-# Where Gauss's rule over [0, c_i] stands: basis polynomials, shape (ROWS, 32, NODES), and the node polynomial.
-_AT = POINTS[:, None] * (1.0 - _GAUSS_X)
-_OFF = _AT[:, :, None] - _X
-# The node at 0 and 1 is no Gauss point; only the row of c = 0, which has no integral, meets one.
+# For z below this, by Gauss's rule from each node to the next; from it on by integration by parts. Both are right to a
+# few roundings on their sides of it, and far beyond.
+_LATE = 60.0
+_GAUSS = 12
+_GAUSS_X, _GAUSS_W = (0.5 * x for x in legendre.leggauss(_GAUSS))
+_GAUSS_X = _GAUSS_X + 0.5
+# The row from which each row goes on, and how far; the lengths without their repetitions.
+_FROM = np.array([0, *range(NODES - 1), 0, 5, 9])
+_LENGTH = POINTS - POINTS[_FROM]
+_LENGTHS, _KIND = np.unique(_LENGTH.round(14), return_inverse=True)
+_LENGTHS = np.array([_LENGTH[kind == _KIND].mean() for kind in range(_LENGTHS.size)])
+# There, basis polynomials, shape (ROWS, _GAUSS, NODES), and the node polynomial.
+_OFF = (POINTS[:, None] - _LENGTH[:, None] * (1.0 - _GAUSS_X))[:, :, None] - _X
+# The first row has no way behind it, and its point is a node.
 _OFF[_OFF == 0.0] = 1e-300
 _BASIS = BARYCENTRIC / _OFF
 _BASIS = np.ascontiguousarray(_BASIS / _BASIS.sum(axis=2, keepdims=True))
 _PRODUCT = np.prod(_OFF, axis=2) / _SCALE
 
 
+def _derivatives() -> tuple[FloatArray, FloatArray]:
+    """Derivatives of the basis polynomials, shape (NODES, NODES, ROWS), and of the node polynomial, at the rows."""
+    away = POINTS[:, None].astype(np.longdouble) - _X
+    own = np.zeros((ROWS, NODES + 1, NODES + 1), np.longdouble)
+    own[:, :, 0] = 1.0
+    for m in range(NODES):
+        times = own * away[:, m, None, None]
+        times[:, :, 1:] += own[:, :, :-1]
+        # The last of them is the node polynomial, with every factor; each other one lacks its own.
+        times[:, m] = own[:, m]
+        own = times
+    own *= np.cumprod([1, *range(1, NODES + 1)]).astype(np.longdouble)
+    between = [np.prod((x - np.delete(_X, j)).astype(np.longdouble)) for j, x in enumerate(_X)]
+    basis = own[:, :NODES, :NODES] / np.array(between)[None, :, None]
+    return np.ascontiguousarray(basis.T, float), np.ascontiguousarray(own[:, NODES].T / _SCALE, float)
+
+
+# At the rows, by order: shape (NODES, NODES, ROWS) and (NODES + 1, ROWS).
+_SLOPES, _PRODUCT_SLOPES = _derivatives()
+_LARGEST = np.abs(_SLOPES).max(axis=(1, 2))
+
+
 @jit_fused
+def _fill_early(z: float, phi: FloatArray, miss: FloatArray) -> None:
+    """`phi` and `miss` from row to row: what stood at the last one decays, and what came since is added."""
+    fades = np.empty(_LENGTHS.size)
+    weights = np.empty((_LENGTHS.size, _GAUSS))
+    for kind in range(_LENGTHS.size):
+        length = _LENGTHS[kind]
+        fades[kind] = math.exp(-z * length)
+        for g in range(_GAUSS):
+            weights[kind, g] = length * _GAUSS_W[g] * math.exp(-z * length * (1.0 - _GAUSS_X[g]))
+    for i in range(ROWS):
+        kind, last = _KIND[i], _FROM[i]
+        for j in range(NODES):
+            phi[j, i] = fades[kind] * phi[j, last] if i > 0 else 0.0
+        miss[i] = fades[kind] * miss[last] if i > 0 else 0.0
+        if i > 0:
+            for g in range(_GAUSS):
+                weight = weights[kind, g]
+                for j in range(NODES):
+                    phi[j, i] += weight * _BASIS[i, g, j]
+                miss[i] += weight * _PRODUCT[i, g]
+
+
+@jit_fused
+def _fill_late(z: float, decay: FloatArray, phi: FloatArray, miss: FloatArray) -> None:
+    """The same by parts, with l the polynomial: l / z - l' / z^2 + ... at c_i, less as much at 0 that has decayed."""
+    last = NODES - 1
+    while last > 0 and _LARGEST[last] < 1e-18 * z**last:
+        last -= 1
+    q = 1.0 / z
+    for j in range(NODES):
+        for i in range(ROWS):
+            phi[j, i] = _SLOPES[last, j, i] * q
+    for k in range(last - 1, -1, -1):
+        for j in range(NODES):
+            for i in range(ROWS):
+                phi[j, i] = (_SLOPES[k, j, i] - phi[j, i]) * q
+    for i in range(ROWS):
+        miss[i] = _PRODUCT_SLOPES[NODES, i] * q
+    for k in range(NODES - 1, -1, -1):
+        for i in range(ROWS):
+            miss[i] = (_PRODUCT_SLOPES[k, i] - miss[i]) * q
+    for j in range(NODES):
+        start = phi[j, 0]
+        for i in range(ROWS):
+            phi[j, i] -= decay[i] * start
+    start = miss[0]
+    for i in range(ROWS):
+        miss[i] -= decay[i] * start
+
+
+@jit
 def fill_table(z: float, decay: FloatArray, phi: FloatArray, miss: FloatArray) -> None:
     """Tables of one mode for z = rate * h >= 0, in units of h.
 
     Fills `decay` (ROWS,), exp(-z c_i); `phi` (NODES, ROWS); and `miss` (ROWS,), the response to a forcing that is
     the node polynomial, of largest size 1.
     """
-    basis = np.empty(NODES)
-    sums = np.empty(NODES)
     for i in range(ROWS):
         x = z * POINTS[i]
         # Denormal numbers would slow every later product down.
         decay[i] = math.exp(-x) if x < 690.0 else 0.0
-        for j in range(NODES):
-            sums[j] = 0.0
-        missed = 0.0
-        if x > _REACH:
-            # All that counts of exp(-z (c_i - s)) is close to the end.
-            reach = _REACH / z
-            for g in range(_GAUSS_X.size):
-                s = POINTS[i] - reach * _GAUSS_X[g]
-                total = 0.0
-                product = _INVERSE_SCALE
-                for j in range(NODES):
-                    distance = s - POINTS[j]
-                    product *= distance
-                    basis[j] = BARYCENTRIC[j] / distance if distance != 0.0 else 1e300
-                    total += basis[j]
-                weight = reach * _END_WEIGHT[g]
-                share = weight / total
-                for j in range(NODES):
-                    sums[j] += share * basis[j]
-                missed += weight * product
-        elif i > 0:
-            for g in range(_GAUSS_X.size):
-                weight = POINTS[i] * _GAUSS_W[g] * math.exp(-x * _GAUSS_X[g])
-                for j in range(NODES):
-                    sums[j] += weight * _BASIS[i, g, j]
-                missed += weight * _PRODUCT[i, g]
-        miss[i] = missed
-        for j in range(NODES):
-            phi[j, i] = sums[j]
+    if z < _LATE:
+        _fill_early(z, phi, miss)
+    else:
+        _fill_late(z, decay, phi, miss)
 
 
 @lru_cache(maxsize=1)

@@ -18,7 +18,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.netlist.netlist import parse_netlist
 from fingerspice.physics.contact import Contact
 from fingerspice.results.datafiles import FORMAT, GROUP
-from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, NetworkState, State, Status
+from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, State, Status
 from fingerspice.results.plan import Plan
 from fingerspice.results.solution import Solution
 from fingerspice.results.stored_record import StoredRecord
@@ -106,7 +106,7 @@ def _solution(file: Any) -> Solution:
         method=str(run["method"]),
         plan=Plan(**{**plan, "reasons": tuple(plan["reasons"]), "rates": tuple(plan["rates"])}),
         circuit=_circuit(file, run["overrides"]),
-        state=_state(run["state"]),
+        state=_state(run["state"], str(run["charge_law"])),
         fundamental=None if run["fundamental"] is None else Fundamental(**run["fundamental"]),
         period=run["period"],
         fold_margin_min=float(run["fold_margin_min"]),
@@ -158,9 +158,12 @@ def _text(value: Any) -> str:
     return value.decode() if isinstance(value, bytes) else str(value)
 
 
-def _state(kept: dict[str, Any]) -> State | NetworkState:
-    values: dict[str, Any] = {k: np.array(v, float) if isinstance(v, list) else v for k, v in kept.items()}
-    return NetworkState(**values) if "s_before" in values else State(**values)
+def _state(kept: dict[str, Any], law: str) -> State:
+    """The state reached, of files by earlier versions too: a series stack's source was a number there."""
+    y, before, sign = (np.array(kept.get(k, d), float) for k, d in (("y", []), ("s_before", []), ("sign", [0.0])))
+    if "u_before" in kept:
+        before = np.array([kept["u_before"]], float)
+    return State(float(kept["t"]), y, before, sign, law)
 
 
 def _circuit(file: Any, overrides: dict[str, str]) -> Circuit:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -164,67 +163,29 @@ class ErrorEstimate:
     f_el: float
     q_source: float | None = None
 
-    def at_least(self, u_gap: float, f_el: float) -> ErrorEstimate:
-        """The same with errors of at least these, V and N."""
-        return ErrorEstimate(max(self.u_gap, u_gap), max(self.f_el, f_el), self.q_source)
-
-    def excess(self, rtol: float, peak_u: float, peak_f: float) -> float:
-        """Ratio of the estimated error to `rtol` times the peak (V, N): the larger one of voltage and force."""
-        pairs = ((self.u_gap, peak_u), (self.f_el, peak_f))
-        # Where the product underflows no error can be asked for.
-        return max(error / (rtol * peak) if rtol * peak > 0.0 else 0.0 for error, peak in pairs)
-
 
 @dataclass(frozen=True, repr=False)
 class State:
-    """Where a run of a series stack stopped; another run may start from it.
+    """Where a run stopped; another run may start from it.
 
     Attributes
     ----------
     t : float
         s.
     y : ndarray, shape (n,)
-        The engine's state.
-    u_before : float
-        Source voltage just before `t`, V.
-    charge_offset : float
-        Subtracted from the charge so that it starts at zero, C.
-    charge_law : str
-    u_gap : float
-        Gap voltage (V), which selects one of several solutions of the mobile law; NaN: the one connected to rest.
-    """
-
-    t: float
-    y: FloatArray
-    u_before: float
-    charge_offset: float
-    charge_law: str
-    u_gap: float = math.nan
-
-    def __repr__(self) -> str:
-        return f"<State at t = {self.t:g} s, {self.y.size} numbers, {self.charge_law} law>"
-
-
-@dataclass(frozen=True, repr=False)
-class NetworkState:
-    """Where the run of a network stopped; another run may start from it.
-
-    Attributes
-    ----------
-    t : float
-        s.
-    y : ndarray, shape (n,)
-        The state as in `engine.network`.
+        Live voltages (V), areas with dynamics of their own over their value at 0 V, and charges delivered (C).
     s_before : ndarray, shape (n_source,)
         Source values just before `t`, V or A.
     sign : ndarray, shape (n_area,)
-        Branch of each area.
+        Branch of each area: the sign of its gap's voltage, 0 where that follows from the voltage.
+    charge_law : str
     """
 
     t: float
     y: FloatArray
     s_before: FloatArray
     sign: FloatArray
+    charge_law: str
 
     def __repr__(self) -> str:
-        return f"<NetworkState at t = {self.t:g} s, {self.y.size} numbers>"
+        return f"<State at t = {self.t:g} s, {self.y.size} numbers, {self.charge_law} law>"

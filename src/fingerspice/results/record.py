@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.circuit.statespace import Stack
-from fingerspice.engine.model import Model
+from fingerspice.circuit.network import Network
+from fingerspice.engine.network import Net
 from fingerspice.physics.contact import Contact, areas, forces, inverse_area_array
 from fingerspice.waveforms.waveform import Waveform
 
@@ -46,133 +46,199 @@ def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Record(Sealed):
-    """Outputs of a series stack's run as they were computed, and the signals that follow from them.
+    """Outputs of a run as they were computed, and the signals that follow from them.
+
+    Signals of gaps and of sources have the shape (n_t,) where there is one of them, else (n_t, n).
 
     Attributes
     ----------
-    stack : Stack
-    waveform : Waveform
-        Voltage around the loop.
-    model : Model
+    network : Network
+    net : Net
     t : ndarray, shape (n_t,)
         s; at a jump two entries share a time.
     left : ndarray of bool, shape (n_t,)
         Whether an output is the left-hand value at a jump.
-    live : ndarray, shape (n_layer - 1, n_t)
-        Voltages along the loop of all layers except the last of `stack.layer_order`, V.
-    z, current : ndarray, shape (n_t,), or None
-        State of the charge (C), and the source's current without impulses (A); None where they were not asked for.
-    charge_offset : float
-        C, subtracted so that the charge starts at zero.
+    rows : ndarray, shape (n_t, size)
+        The state as in `engine.network`; with `has_charge` the sources' currents follow, else the charges may be
+        missing.
+    has_charge : bool
     """
 
-    stack: Stack
-    waveform: Waveform
-    model: Model
+    network: Network
+    net: Net
     t: FloatArray
     left: BoolArray
-    live: FloatArray
-    z: FloatArray | None
-    current: FloatArray | None
-    charge_offset: float = 0.0
+    rows: FloatArray
+    has_charge: bool
 
     def __post_init__(self) -> None:
-        for array in (self.t, self.left, self.live, self.z, self.current):
-            if array is not None:
-                array.flags.writeable = False
+        for array in (self.t, self.left, self.rows):
+            array.flags.writeable = False
 
     @property
     def layers(self) -> tuple[str, ...]:
         """Names of the layers, in the order of `u_layer`."""
-        return tuple(e.name for e in self.stack.layers)
+        return tuple(e.name for e in self.network.layers)
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Name of the one source: the loop as a whole."""
-        return ("loop",)
+        """Names of the sources, in the order of the columns of what belongs to them."""
+        return tuple(e.name for e in self.network.sources)
 
     @cached_property
     def fingers(self) -> tuple[tuple[str, Contact], ...]:
-        """The GAP's name and contact."""
-        gap, contact = self.stack.gap_layer, self.stack.contact
-        return () if gap is None or contact is None else ((self.stack.layers[gap].name, contact),)
+        """Each GAP's name and contact."""
+        found = []
+        for i in self.network.fingers:
+            contact, gap = self.network.contacts[i], self.network.areas[i].gap
+            assert contact is not None
+            assert gap is not None
+            found.append((gap.name, contact))
+        return tuple(found)
+
+    @cached_property
+    def _x(self) -> FloatArray:
+        # In one order in memory, whichever method wrote it: a sum over a row rounds by that order.
+        return np.ascontiguousarray(self.rows[:, : self.network.k.shape[0]])
+
+    @cached_property
+    def _s(self) -> FloatArray:
+        """Values of the sources, and of those within a loop, V or A, shape (n_t, n_s + n_inner)."""
+        elements = (*self.network.sources, *self.network.inner)
+        return np.column_stack([sided(e.waveform, self.t, self.left) for e in elements if e.waveform is not None])
+
+    def _voltage(self, by_x: FloatArray, by_s: FloatArray) -> FloatArray:
+        """A voltage (V) from its weights of the live voltages and of the sources, shape (n_t,)."""
+        weights = (*by_x.tolist(), *by_s.tolist())
+        some = [i for i, weight in enumerate(weights) if weight != 0.0]
+        n = by_x.size
+        if len(some) >= 8:
+            # Without BLAS, whose threads may round differently.
+            return np.asarray((self._x * by_x).sum(1) + (self._s[:, : by_s.size] * by_s).sum(1))
+        out = np.zeros(self.t.size)
+        for i in reversed(some):
+            out += weights[i] * (self._x[:, i] if i < n else self._s[:, i - n])
+        return out
+
+    def cell_voltage(self, cell: int) -> FloatArray:
+        """Voltage of a cell from p to n, V, shape (n_t,)."""
+        return self._voltage(self.network.p[cell], self.network.q[cell])
+
+    def finger_voltage(self, finger: int) -> FloatArray:
+        """Gap voltage of a finger, V, shape (n_t,)."""
+        gap = self.network.gaps[self.network.fingers[finger]]
+        assert gap is not None
+        return self.cell_voltage(gap)
+
+    def _area_of(self, i: int) -> FloatArray:
+        if self.net.slow[i] >= 0:
+            return np.asarray(self.rows[:, self._x.shape[1] + int(self.net.slow[i])] * self.net.area0[i])
+        if self.net.gap[i] < 0:
+            return np.full(self.t.size, self.net.area0[i])
+        return areas(self.cell_voltage(int(self.net.gap[i])), self.net.curves[i])
+
+    def finger_area(self, finger: int) -> FloatArray:
+        """Contact area of a finger, m^2, shape (n_t,)."""
+        return self._area_of(self.network.fingers[finger])
+
+    def finger_force(self, finger: int) -> FloatArray:
+        """Electroadhesive force (Eq. 2 times A_R) of a finger, N, shape (n_t,)."""
+        _, contact = self.fingers[finger]
+        i, u = self.network.fingers[finger], self.finger_voltage(finger)
+        if self.net.gap[i] >= 0 and self.net.slow[i] < 0:
+            return forces(u, self.net.curves[i], float(contact.stress(1.0)))
+        return np.asarray(contact.stress(u) * self.finger_area(finger))
 
     @cached_property
     def u_source(self) -> FloatArray:
-        """Voltage around the loop, V, shape (n_t,)."""
-        return sided(self.waveform, self.t, self.left)
+        """Voltage of each source, V: from p to n of a V, and from n to p of an I, the direction in which it drives."""
+        n_v = self.network.n_voltage
+        out = self._s[:, : len(self.network.sources)].copy()
+        if n_v < out.shape[1]:
+            for j, element in enumerate(self.network.sources[n_v:]):
+                ends = [self._at_node(node) for node in element.nodes[:2]]
+                out[:, n_v + j] = ends[1] - ends[0]
+        return _columns(out)
+
+    def _at_node(self, node: str) -> FloatArray:
+        n = self._x.shape[1]
+        for name, row in zip(self.network.node_names, self.network.nodes, strict=True):
+            if name.lower() == node:
+                return self._voltage(row[:n], row[n:])
+        return np.zeros(self.t.size)
 
     @cached_property
     def u_layer(self) -> FloatArray:
-        """Layer voltages from p to n (n_t, n_layer), V."""
-        *live, last = self.stack.layer_order
-        out = np.empty((self.t.size, len(live) + 1))
-        out[:, live] = self.live.T
-        # So the voltages of the layers add up to the source's exactly.
-        out[:, last] = self.u_source - self.live.sum(axis=0)
-        out *= self.stack.sign[self.stack.first_cell]
-        return sealed(out)
+        """Layer voltages from p to n, V, shape (n_t, n_layer)."""
+        cells = np.column_stack(
+            [np.zeros((self.t.size, 0)), *(self.cell_voltage(i) for i in range(len(self.network.cells)))]
+        )
+        return sealed(np.einsum("tc,lc->tl", cells, self.network.grouping))
 
     @cached_property
     def u_gap(self) -> FloatArray:
-        """Gap voltage, V, shape (n_t,)."""
-        gap = self.stack.gap_layer
-        assert gap is not None
-        *live, _ = self.stack.layer_order
-        if gap in live:
-            along = self.live[live.index(gap)]
-            return sealed(along if self.stack.sign[self.stack.gap] > 0.0 else -along)
-        # The gap is the last, or only, layer of `layer_order`.
-        return sealed(self.u_layer[:, 0].copy())
+        """Gap voltage, V."""
+        return _columns(np.column_stack([self.finger_voltage(i) for i in range(len(self.fingers))]))
 
     @cached_property
-    def area(self) -> FloatArray:
-        """Ridge contact area, m^2, shape (n_t,)."""
-        if not self.model.coupled:
-            return sealed(np.full(self.t.size, self.model.area0))
-        return sealed(areas(self.u_gap, self.model.curve))
+    def area(self) -> FloatArray | None:
+        """Contact area of each GAP, m^2; without a GAP the circuit's first area; None where there is none."""
+        shown = self.network.fingers or ((0,) if self.network.areas else ())
+        return _columns(np.column_stack([self._area_of(i) for i in shown])) if shown else None
 
     @cached_property
     def force(self) -> FloatArray:
-        """Electroadhesive force (Eq. 2 times A_R), N, shape (n_t,)."""
-        assert self.stack.contact is not None
-        u = self.u_gap
-        stress = float(self.stack.contact.stress(1.0))
-        if self.model.coupled:
-            # Computed without `area`, so that the result does not depend on what was asked for before.
-            return sealed(forces(u, self.model.curve, stress))
-        return sealed(stress * u * self.area * u)
+        """Electroadhesive force, N."""
+        return _columns(np.column_stack([self.finger_force(i) for i in range(len(self.fingers))]))
 
     @cached_property
     def charge(self) -> FloatArray | None:
-        """Charge delivered by the source, C, shape (n_t,)."""
-        if self.z is None:
-            return None
-        held = self.area * self.u_source / self.model.s if self.model.mobile else 0.0
-        return sealed(held + self.z - self.charge_offset)
+        """Charge (C) that each source has delivered at its p node, or at its n node if it is an I."""
+        n_s = len(self.network.sources)
+        end = self.rows.shape[1] - n_s
+        return _columns(self.rows[:, end - n_s : end].copy()) if self.has_charge else None
+
+    @cached_property
+    def current(self) -> FloatArray | None:
+        """Current (A) that each source delivers at that node, without the impulses at jumps."""
+        return _columns(self.rows[:, -len(self.network.sources) :].copy()) if self.has_charge else None
 
     @cached_property
     def fold_margin(self) -> FloatArray:
-        """Distance to the fold of the `mobile` area equation, 1 without stored charge, shape (n_t,)."""
-        if not (self.model.mobile and self.model.coupled):
-            return sealed(np.ones(self.t.size))
-        u = self.u_gap * self.stack.sign[self.stack.gap]
-        q, slope = inverse_area_array(np.abs(u), self.model.curve)
-        return sealed(1.0 - (u - self.model.k_gap * self.u_source) / q * slope * np.sign(u))
+        """Distance to the fold of the `mobile` law, 1 where no area feels a voltage, shape (n_t,).
+
+        Ratio of the determinant of the differential capacitances to that of the capacitances at fixed areas.
+        """
+        net, n = self.net, self._x.shape[1]
+        out = np.ones(self.t.size)
+        if not net.mobile or not np.any((net.gap >= 0) & (net.slow < 0)):
+            return sealed(out)
+        area = np.column_stack([self._area_of(i) for i in range(net.gap.size)])
+        held, met = np.zeros((2, self.t.size, n, n))
+        for cell in range(net.c.size):
+            i, row = int(net.place[cell]), net.p[cell]
+            own = net.c[cell] * (np.ones(self.t.size) if i < 0 else area[:, i])
+            held += own[:, None, None] * np.outer(row, row)
+            if i >= 0 and net.gap[i] >= 0 and net.slow[i] < 0:
+                u = self.cell_voltage(int(net.gap[i]))
+                inverse, slope = inverse_area_array(np.abs(u), net.curves[i])
+                cross = net.c[cell] * self.cell_voltage(cell) * -np.sign(u) * slope / inverse**2
+                met += cross[:, None, None] * np.outer(row, net.p[net.gap[i]])
+        return sealed(np.linalg.det(held + met) / np.linalg.det(held))
 
     @cached_property
     def node_voltages(self) -> dict[str, FloatArray]:
         """Voltage of every node against ground, V, shape (n_t,) each."""
-        sources = {}
-        for element, sign in self.stack.sources:
-            assert element.waveform is not None
-            single = len(self.stack.sources) == 1
-            sources[element.name] = sign * self.u_source if single else sided(element.waveform, self.t, self.left)
-        return {k: sealed(v) for k, v in self.stack.node_voltages(self.u_layer, sources).items()}
+        n = self._x.shape[1]
+        rows = zip(self.network.node_names, self.network.nodes, strict=True)
+        return {name: sealed(self._voltage(row[:n], row[n:])) for name, row in rows}
 
 
-def stack_record(
-    stack: Stack, waveform: Waveform, model: Model, t: FloatArray, left: BoolArray, live: FloatArray
-) -> Record:  # fmt: skip
-    """A record without charge."""
-    return Record(stack, waveform, model, t, left, live, None, None)
+def _columns(x: FloatArray) -> FloatArray:
+    """A table of one column as a one-dimensional array; others as they are."""
+    return sealed(np.ascontiguousarray(x[:, 0]) if x.shape[1] == 1 else x)
+
+
+def bare_record(network: Network, net: Net, t: FloatArray, left: BoolArray, rows: FloatArray) -> Record:
+    """A record without charge, from states as columns, shape (size, n_t)."""
+    return Record(network, net, t, left, rows.T, False)

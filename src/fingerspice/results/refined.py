@@ -12,7 +12,6 @@ from numpy.polynomial import chebyshev
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS, TO_SERIES
 from fingerspice.results.measures import Panels, Read
-from fingerspice.results.network_record import NetworkRecord
 from fingerspice.results.record import Record
 from fingerspice.waveforms.waveform import Waveform
 
@@ -39,7 +38,7 @@ class ClosedForm:
         Start of the run, and the interval for figures, s.
     """
 
-    look: Callable[[FloatArray, BoolArray], Record | NetworkRecord]
+    look: Callable[[FloatArray, BoolArray], Record]
     waveform: Waveform
     t_start: float
     first: float
@@ -115,7 +114,7 @@ class ClosedForm:
 class Refined:
     """Consecutive panels of a run in closed form; see `measures.Run`."""
 
-    look: Callable[[FloatArray, BoolArray], Record | NetworkRecord]
+    look: Callable[[FloatArray, BoolArray], Record]
     begin: FloatArray
     end: FloatArray
 
@@ -128,13 +127,11 @@ class Refined:
         return Panels(some, low[some], high[some], (high - low)[some] * length[some])
 
     @cached_property
-    def _own(self) -> tuple[FloatArray, IntArray, Record | NetworkRecord]:
+    def _own(self) -> tuple[FloatArray, IntArray, Record]:
         """Times at the points of all panels, shape (p, ROWS), their ascending order, and the record in that order."""
         return self._looked_at(slice(None), np.broadcast_to(POINTS, (self.begin.size, POINTS.size)))
 
-    def _looked_at(
-        self, index: IntArray | slice, fraction: FloatArray
-    ) -> tuple[FloatArray, IntArray, Record | NetworkRecord]:
+    def _looked_at(self, index: IntArray | slice, fraction: FloatArray) -> tuple[FloatArray, IntArray, Record]:
         begin, end = self.begin[index, None], self.end[index, None]
         left = fraction >= 1.0
         t = np.where(left, end, begin + fraction * (end - begin))
@@ -156,9 +153,7 @@ class Refined:
         return _in_place(read, *self._looked_at(index, fraction))
 
 
-def _in_place(
-    read: Read, t: FloatArray, order: IntArray, record: Record | NetworkRecord
-) -> tuple[FloatArray, FloatArray]:
+def _in_place(read: Read, t: FloatArray, order: IntArray, record: Record) -> tuple[FloatArray, FloatArray]:
     """Times, and the signal of a record in ascending order of time put into the order of the times."""
     x = np.empty(t.size)
     x[order] = read(record)

@@ -9,11 +9,10 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.physics.contact import Contact
-from fingerspice.results.network_record import NetworkRecord
 from fingerspice.results.record import Record, sealed
 from fingerspice.results.stored_record import StoredRecord
 
-AnyRecord = Record | NetworkRecord | StoredRecord
+AnyRecord = Record | StoredRecord
 
 #: Unit and long name of each signal; layers and nodes are ``u_layer:NAME`` and ``v:NAME``.
 SIGNALS = {

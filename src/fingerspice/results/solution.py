@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.pages import Page, Shown
 from fingerspice.results.datafiles import dataset, to_dataframe, write_csv, write_netcdf
-from fingerspice.results.outcome import ErrorEstimate, Failure, NetworkState, State, Status
+from fingerspice.results.outcome import ErrorEstimate, Failure, State, Status
 from fingerspice.results.record import Sealed, sealed
 from fingerspice.results.signals import SIGNALS, AnyRecord, Signals
 from fingerspice.results.summary import Figured, Figures, KeptFigures
@@ -43,7 +43,7 @@ class Solution(Sealed, Shown, Figured):
     ----------
     t : ndarray, shape (n_t,)
         s.
-    record : Record, NetworkRecord or StoredRecord
+    record : Record or StoredRecord
         Outputs of the run, from which all signals follow.
     status : Status
     failure : Failure or None
@@ -85,7 +85,7 @@ class Solution(Sealed, Shown, Figured):
     method: str
     plan: Plan
     circuit: Circuit
-    state: State | NetworkState
+    state: State
     fundamental: Fundamental | None = None
     period: float | None = None
     fold_margin_min: float = 1.0

@@ -13,11 +13,8 @@ from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.readout import RECORDED, Steps, new_steps
 from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS
 from fingerspice.results.measures import Panels, Read
-from fingerspice.results.network_record import NetworkRecord
 from fingerspice.results.record import Record
 from fingerspice.waveforms.sampling import same_time
-
-AnyRecord = Record | NetworkRecord
 
 #: Largest number of steps recorded before Python collects them, and of numbers at their nodes.
 CAPACITY, _AT_ONCE = 512, 16_384
@@ -128,7 +125,7 @@ class Recorder:
             if isinstance(part, Block) and periods > 0:
                 self.parts.append(Block(part.times, part.values, periods, period, period))
 
-    def finish(self, first: float, stop: float, make: Callable[..., AnyRecord]) -> Recorded | None:
+    def finish(self, first: float, stop: float, make: Callable[..., Record]) -> Recorded | None:
         """The recorded run from `first` to `stop` (s); None where nothing, or too much, was recorded."""
         return None if self.full or not self.parts else Recorded(tuple(self.parts), first, stop, make)
 
@@ -140,7 +137,7 @@ class Recorded:
     parts: tuple[Block | Leap, ...]
     first: float
     stop: float
-    make: Callable[[FloatArray, BoolArray, FloatArray], AnyRecord]
+    make: Callable[[FloatArray, BoolArray, FloatArray], Record]
 
     def run(self, readers: Callable[[], Mapping[str, Read]], since: float, until: float) -> Stretches | None:
         """The steps as one array; None where they are too many."""
@@ -160,7 +157,7 @@ class Recorded:
 class Stretches:
     """Steps of a run, with its signals at any fraction of each step."""
 
-    def __init__(self, blocks: list[Block], make: Callable[[FloatArray, BoolArray, FloatArray], AnyRecord]) -> None:
+    def __init__(self, blocks: list[Block], make: Callable[[FloatArray, BoolArray, FloatArray], Record]) -> None:
         sizes = [len(b.times) for b in blocks]
         self._make = make
         self.start, self.length, self.reached, self.reach = np.concatenate([b.times for b in blocks]).T
@@ -196,7 +193,7 @@ class Stretches:
         return Panels(index[some], low[some], high[some], (weight * (high - low))[some] * self.length[index[some]])
 
     @cached_property
-    def _whole(self) -> tuple[FloatArray, AnyRecord]:
+    def _whole(self) -> tuple[FloatArray, Record]:
         """Times (k, ROWS) and the record at the points of every step, up to the end that it reached."""
         columns = np.concatenate([self.values, self.values @ BETWEEN], axis=2)
         fraction = self.reach[:, None] * POINTS

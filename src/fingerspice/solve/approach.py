@@ -19,12 +19,13 @@ import numpy as np
 
 from fingerspice.engine import march, readout
 from fingerspice.engine import repeat as repetition
+from fingerspice.engine.network import Sources
 from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
 from fingerspice.results.steps import Leap, Recorder
 from fingerspice.solve.runs import FloatArray
 from fingerspice.solve.settling import Settling
-from fingerspice.solve.track import FINEST, KEPT_STEPS, SAFETY, Track
-from fingerspice.waveforms.sampling import SourceTable
+from fingerspice.solve.stepping import FINEST, KEPT_STEPS, SAFETY
+from fingerspice.solve.track import Track
 
 # Tolerance of its steps, over that of others: what it is off is off in every period that is made of it.
 _FINER = 0.01
@@ -85,7 +86,7 @@ class _Period:
         return np.interp(other.marks, its, mine)
 
 
-def _period(track: Track, table: SourceTable, stop: float, x: FloatArray, steps: int = KEPT_STEPS) -> _Period:
+def _period(track: Track, sources: Sources, stop: float, x: FloatArray, steps: int = KEPT_STEPS) -> _Period:
     """A period of so many steps at most from live voltages x on, integrated to `stop` (s) by a copy of the track."""
     probe = copy.copy(track)
     probe.y = np.append(x, 0.0)
@@ -97,7 +98,7 @@ def _period(track: Track, table: SourceTable, stop: float, x: FloatArray, steps:
     probe.recorder = Recorder(track.shown, 0)
     probe.t_out, probe.left, probe.out = np.zeros(0), np.zeros(0, bool), np.empty((track.out.shape[0], 0))
     probe.keep(steps)
-    code = probe.advance(table, stop)
+    code = probe.advance(sources, stop)
     track.counters[: readout.OUTPUT] += probe.counters[: readout.OUTPUT]
     if code != march.DONE or not probe.keeps_all:
         raise _LostError
@@ -111,22 +112,22 @@ def _moved(slope: FloatArray, shift: FloatArray, periods: int) -> FloatArray:
     return np.asarray(np.linalg.matrix_power(np.block([[slope, shift[:, None]], [np.zeros(n), 1.0]]), periods)[:n, n])
 
 
-def leap(track: Track, table: SourceTable, settling: Settling) -> None:
+def leap(track: Track, sources: Sources, settling: Settling) -> None:
     """Let the periods that follow come from one map, if its error allows it; see `Settling.may_leap`."""
-    stop = settling.snapped(table.edges, track.t + settling.period)
-    if stop > table.edges[-1]:
+    stop = settling.snapped(sources.edges, track.t + settling.period)
+    if stop > sources.edges[-1]:
         return
     try:
-        _leap(track, table, settling, stop)
+        _leap(track, sources, settling, stop)
     except _LostError:
         settling.stumbled(_LOST)
 
 
-def _leap(track: Track, table: SourceTable, settling: Settling, stop: float) -> None:
+def _leap(track: Track, sources: Sources, settling: Settling, stop: float) -> None:
     left = settling.periods_left(track.t)
     x0 = track.y[:-1].copy()
     n = x0.size
-    here = _period(track, table, stop, x0)
+    here = _period(track, sources, stop, x0)
     series_here, end = here.series(here.marks), here.track.y
     slope = np.empty((n + 1, n))
     marks_by = np.empty((here.marks.size, n))
@@ -136,14 +137,14 @@ def _leap(track: Track, table: SourceTable, settling: Settling, stop: float) -> 
     for k in range(n):
         x = x0.copy()
         x[k] += settling.probe
-        probe = _period(track, table, stop, x, room)
+        probe = _period(track, sources, stop, x, room)
         offs.append(probe.off)
         marks = probe.marks_like(here)
         slope[:, k] = (probe.track.y - end) / settling.probe
         marks_by[:, k] = (marks - here.marks) / settling.probe
         by[k] = (probe.series(marks) - series_here) / settling.probe
     base_x = x0 + _moved(slope[:n], end[:n] - x0, left)
-    base = _period(track, table, stop, base_x, room)
+    base = _period(track, sources, stop, base_x, room)
     marks = base.marks_like(here)
     series = base.series(marks)
     # What the map misses where the run stands.
@@ -183,5 +184,5 @@ def _leap(track: Track, table: SourceTable, settling: Settling, stop: float) -> 
     for peak in (readout.PEAK_U, readout.PEAK_F, readout.PEAK_Q, readout.ERROR_U, readout.ERROR_F):
         control[peak] = max(control[peak], before[peak])
     control[readout.MARGIN] = min(control[readout.MARGIN], before[readout.MARGIN])
-    track.leap(base.track, state, left, settling, error, owed)
+    track.land(base.track, state, left, error, owed)
     settling.leapt(left, state[:n])

@@ -10,13 +10,10 @@ import numpy as np
 from fingerspice.circuit.circuit import Element
 from fingerspice.circuit.notices import circuit_warnings
 from fingerspice.circuit.spectrum import spectrum_warning
-from fingerspice.circuit.usual import LARGEST_FORCE, beyond_fingers
+from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.physics.contact import inverse_area
-from fingerspice.results.network_record import NetworkRecord
 from fingerspice.results.outcome import Status
 from fingerspice.results.record import Record
-from fingerspice.solve.netruns import NetworkRun
-from fingerspice.solve.networks import NetworkProblem
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run
 from fingerspice.waveforms.waveform import DC
@@ -28,45 +25,33 @@ LEAST_AREA = 0.2
 NEAR_FOLD = 0.2
 
 
-def stack_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
+def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Where a run leaves what its model holds for."""
     yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit))
     yield from _source_warnings(problem)
-    stack = problem.stack
-    if stack.contact is not None:
-        at_rest, follows = problem.model.area0, problem.model.coupled
-        loaded = 1.0 / inverse_area(run.peak_u, problem.model.curve)[0] if follows else at_rest
-        yield from _gap_warnings("", run.peak_u, at_rest, loaded if follows else math.inf)
-        yield from beyond_fingers("", run.peak_f, float(stack.contact.stress(run.peak_u)), max(at_rest, loaded))
-    if run.status is Status.SUCCESS and 0.0 < run.peak_u <= run.error.u_gap:
-        yield (
-            f"the gap takes no more than rounding of the source's voltage: of its {run.peak_u:.2g} V nothing is known "
-            "but that they are as good as 0"
-        )
-    yield from _fold_warning(run)
-    yield from _strength_warnings(stack.layers, record)
-
-
-def network_warnings(problem: NetworkProblem, run: NetworkRun, record: NetworkRecord) -> Iterator[str]:
-    yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit))
-    yield from _source_warnings(problem)
-    several = len(record.fingers) > 1
-    for finger, i in enumerate(problem.network.fingers):
-        area = record.finger_area(finger)
-        least, largest = float(area.min(initial=math.inf)), float(area.max(initial=0.0))
-        where = f" of {record.fingers[finger][0]}" if several else ""
-        follows = problem.scene.fixed[i] is None
-        yield from _gap_warnings(
-            where, float(run.peaks[i]), float(problem.scene.area0[i]), least if follows else math.inf
-        )
-        pressure = float(record.fingers[finger][1].stress(float(run.peaks[i])))
-        force = float(record.finger_force(finger).max(initial=0.0)) if pressure * largest > LARGEST_FORCE else 0.0
-        yield from beyond_fingers(where, force, pressure, largest)
+    net, several = problem.scene.net, len(record.fingers) > 1
+    for finger, (name, contact) in enumerate(record.fingers):
+        i, (u_peak, f_peak, u_error, _) = problem.network.fingers[finger], run.gaps[finger].tolist()
+        where, unloaded = f" of {name}" if several else "", float(net.area0[i])
+        least, largest = math.inf, unloaded
+        if net.slow[i] >= 0:
+            area = record.finger_area(finger)
+            least, largest = float(area.min(initial=math.inf)), float(area.max(initial=0.0))
+        elif net.gap[i] >= 0:
+            least = float(1.0 / inverse_area(u_peak, net.curves[i])[0])
+            largest = max(unloaded, least)
+        yield from _gap_warnings(where, u_peak, unloaded, least)
+        yield from beyond_fingers(where, f_peak, float(contact.stress(u_peak)), largest)
+        if run.status is Status.SUCCESS and 0.0 < u_peak <= u_error and not several:
+            yield (
+                f"the gap takes no more than rounding of the source's voltage: of its {u_peak:.2g} V nothing is "
+                "known but that they are as good as 0"
+            )
     yield from _fold_warning(run)
     yield from _strength_warnings(problem.network.layers, record)
 
 
-def _source_warnings(problem: Problem | NetworkProblem) -> Iterator[str]:
+def _source_warnings(problem: Problem) -> Iterator[str]:
     """Of sources beyond the band of the skin's data, and of those that drive sweeps alone."""
     outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
     if outside is not None:
@@ -95,7 +80,7 @@ def _gap_warnings(where: str, peak: float, unloaded: float, least: float) -> Ite
         )
 
 
-def _fold_warning(run: Run | NetworkRun) -> Iterator[str]:
+def _fold_warning(run: Run) -> Iterator[str]:
     if run.margin < NEAR_FOLD and run.status is Status.SUCCESS:
         yield (
             f"the fold of the mobile charge law is near: the distance to it falls to {run.margin:.2g} (1 far, 0 at the "
@@ -103,7 +88,7 @@ def _fold_warning(run: Run | NetworkRun) -> Iterator[str]:
         )
 
 
-def _strength_warnings(layers: tuple[Element, ...], record: Record | NetworkRecord) -> Iterator[str]:
+def _strength_warnings(layers: tuple[Element, ...], record: Record) -> Iterator[str]:
     for i, layer in enumerate(layers):
         strength = layer.values.get("e_max", math.inf)
         if math.isfinite(strength) and record.t.size:

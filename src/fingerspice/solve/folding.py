@@ -17,10 +17,12 @@ from scipy.integrate import OdeSolution, solve_ivp
 
 from fingerspice.engine.model import branch_area, dot, ramp, voltage_by_time, write_row_at
 from fingerspice.engine.segment import Segment, source
-from fingerspice.results.outcome import Failure, SolveError, State, Status
+from fingerspice.results.outcome import Failure, SolveError, Status
 from fingerspice.solve.marching import solve as solve_marching
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import BoolArray, Run, Tables, from_rows, row_width
+from fingerspice.solve.runs import BoolArray, Run
+from fingerspice.solve.sources import Tables
+from fingerspice.solve.stackstate import StackState, from_stack, from_written, model_of, row_width, to_stack
 
 FloatArray = NDArray[np.float64]
 
@@ -57,10 +59,11 @@ def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | N
 
 def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray) -> Run | None:
     """A run that stopped for a fold, led on until it meets it; None where it meets none."""
-    begun = _start(problem, run.state)
+    state = to_stack(problem.scene, run.state)
+    begun = _start(problem, state)
     if run.margin <= 0.0 or math.isnan(begun.u):
         return run
-    path = _ahead(problem, run.state, begun, run.margin, FINEST_RTOL)
+    path = _ahead(problem, state, begun, run.margin, FINEST_RTOL)
     if path is None:
         return None
     # The row of where the steps stopped is no output.
@@ -68,20 +71,18 @@ def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray)
     done = run.t.size - int(stopped)
     later = t_out[done:]
     t = np.append(later[later < path.t], path.t)
-    rows = path.rows(problem, t)
-    live, z, current = from_rows(problem, rows)
+    written = path.rows(problem, t)
+    rows = from_written(problem.scene, written, state.offset, run.by_layer)[:, : run.rows.shape[1]]
     run.t, run.left = np.append(run.t[:done], t), np.append(left[: done + t.size - 1], True)
-    run.live = np.hstack([run.live[:, :done], live])
-    if run.z is not None and run.current is not None:
-        run.z, run.current = np.append(run.z[:done], z), np.append(run.current[:done], current)
+    run.rows = np.vstack([run.rows[:done], rows])
     run.t_failed, run.margin = path.t, 0.0
-    force = problem.scene.force(rows[:, 1], rows[:, 2])
-    run.peak_u = max(run.peak_u, float(np.abs(rows[:, 1]).max()))
-    run.peak_f = max(run.peak_f, float(force.max()))
-    n = problem.model.gap.size
-    run.state = dataclasses.replace(
-        run.state, t=path.t, y=rows[-1, -n - 1 :].copy(), u_before=float(rows[-1, 0]), u_gap=float(rows[-1, 1])
-    )
+    for _, contact in run.record(problem).fingers:
+        force = contact.stress(written[:, 1]) / written[:, 2]
+        run.gaps[0, :2] = np.maximum(run.gaps[0, :2], (np.abs(written[:, 1]).max(), force.max()))
+    u, u_gap = written[-1, :2].tolist()
+    n = model_of(problem.scene).gap.size
+    end = StackState(path.t, written[-1, -n - 1 :].copy(), u, u_gap, state.offset)
+    run.state = from_stack(problem.scene, end)
     return run
 
 
@@ -99,8 +100,9 @@ def meets_fold(problem: Problem, rtol: float) -> bool:
         return False
     if run.status is not Status.FOLD:
         raise SolveError(Failure(run.status, run.status.cause, run.status.action, run.t_failed, tried=run.tried))
-    begun = _start(problem, run.state)
-    return run.margin <= 0.0 or math.isnan(begun.u) or _ahead(problem, run.state, begun, run.margin, rtol) is not None
+    state = to_stack(problem.scene, run.state)
+    begun = _start(problem, state)
+    return run.margin <= 0.0 or math.isnan(begun.u) or _ahead(problem, state, begun, run.margin, rtol) is not None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,10 +128,10 @@ class _Path:
             middle = 0.5 * (low + high)
             early = self.solution(middle)[-2] * self.scale[-2] < t - self.begin
             low, high = np.where(early, middle, low), np.where(early, high, middle)
-        rows = np.empty((t.size, row_width(problem)))
+        rows = np.empty((t.size, row_width(problem.scene)))
         for row, z, time in zip(rows, (self.solution(high).T * self.scale), t, strict=True):
             u, du = source(self.segment, time - self.segment.start)
-            write_row_at(problem.model, u, du, z[:-2].copy(), self.sign, z[-1], row)
+            write_row_at(model_of(problem.scene), u, du, z[:-2].copy(), self.sign, z[-1], row)
         return rows
 
 
@@ -145,9 +147,9 @@ class _Start(NamedTuple):
     u: float
 
 
-def _start(problem: Problem, state: State) -> _Start:
-    t, model = state.t, problem.model
-    tables = list(Tables(problem, FINEST_RTOL))
+def _start(problem: Problem, state: StackState) -> _Start:
+    t, model = state.t, model_of(problem.scene)
+    tables = [table for (table,) in Tables(problem, FINEST_RTOL)]
     table = next((table for table in tables if table.edges[-1] > t), tables[-1])
     i = min(max(int(np.searchsorted(table.edges, t, side="right")) - 1, 0), table.edges.size - 2)
     start, end = float(table.edges[i]), float(table.edges[i + 1])
@@ -159,7 +161,7 @@ def _start(problem: Problem, state: State) -> _Start:
     return _Start(segment, end, math.copysign(1.0, u), u)
 
 
-def _ahead(problem: Problem, state: State, begun: _Start, margin: float, rtol: float) -> _Path | None:
+def _ahead(problem: Problem, state: StackState, begun: _Start, margin: float, rtol: float) -> _Path | None:
     """The path from a state, so far from a fold, to that in its segment of the source; None where none is found."""
     tries = (rtol, LOOSER_RTOL, LOOSEST_RTOL) if margin < NEAR else (rtol, LOOSER_RTOL)
     for tried in sorted({max(rtol, x) for x in tries}):
@@ -170,8 +172,8 @@ def _ahead(problem: Problem, state: State, begun: _Start, margin: float, rtol: f
     return None
 
 
-def _path(problem: Problem, state: State, begun: _Start, rtol: float) -> _Path | None:
-    t, y, model, n = state.t, state.y, problem.model, state.y.size
+def _path(problem: Problem, state: StackState, begun: _Start, rtol: float) -> _Path | None:
+    t, y, model, n = state.t, state.y, model_of(problem.scene), state.y.size
     segment, end, sign, u = begun
     if u == 0.0:
         return None

@@ -19,10 +19,10 @@ from fingerspice.engine import collocation
 from fingerspice.engine.network import Net, Room, Sources, at_sources, choose_signs, gap_voltage, rates
 from fingerspice.engine.radau import NFEV
 from fingerspice.results.outcome import Status
-from fingerspice.solve.netruns import NetworkRun, gap_signals, integrate, state_error, values_at
-from fingerspice.solve.networks import NetworkProblem
 from fingerspice.solve.nodal import STAGES, Collocation, radau_scheme, solve_coupled
-from fingerspice.solve.runs import Progress
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.runs import Progress, Run, gap_signals, integrate
+from fingerspice.solve.sources import Tables, values_at
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -155,14 +155,14 @@ class Foreign(Collocation):
     """One integration by a library, piece by piece; jumps of the sources are taken as `Collocation` takes them."""
 
     def __init__(
-        self, problem: NetworkProblem, library: str, name: str, tol: float, u_scale: float, t_out: FloatArray,
+        self, problem: Problem, library: str, name: str, tol: float, u_scale: float, t_out: FloatArray,
         left: BoolArray,
     ) -> None:  # fmt: skip
         super().__init__(problem, radau_scheme(STAGES), tol, u_scale, t_out, left)
         self.library, self.name, self.detail = library, name, ""
         # Where no charge was asked for, its error is none beside 1 C.
         self.scale = np.where(np.isfinite(self.scale), self.scale, 1.0)
-        fastest = float(problem.scene.modes.rates.max(initial=0.0))
+        fastest = float(problem.scene.rates.max(initial=0.0))
         self.tau = 1.0 / fastest if fastest > 0.0 else np.inf
 
     def through(self, sources: Sources, t_end: float) -> Status:
@@ -224,9 +224,9 @@ class Foreign(Collocation):
 
 
 def solve_foreign(
-    problem: NetworkProblem, method: str, rtol: float, t_out: FloatArray, left: BoolArray,
+    problem: Problem, method: str, rtol: float, t_out: FloatArray, left: BoolArray,
     progress: Progress | None = None,
-) -> NetworkRun:  # fmt: skip
+) -> Run:  # fmt: skip
     """Integrate with a library's method until the error against our own Radau is within `rtol` of the peaks.
 
     Raises
@@ -245,19 +245,20 @@ def solve_foreign(
         except ImportError:
             raise InputError(f"method '{method}' needs torchdiffeq; pip install 'fingerspice[torch]'") from None
     reference = solve_coupled(problem, max(REFERENCE * rtol, 1e-13), t_out, left)
-    ours = list(gap_signals(problem, reference))
+    ours = list(gap_signals(reference.record(problem)))
     u_scale = float(reference.gaps[:, 0].max(initial=0.0)) or 1.0
     tol, nfev = FIRST * rtol, 0
     for attempt in range(ATTEMPTS):
         one = Foreign(problem, library, name, tol, u_scale, t_out, left)
-        run = integrate(one, progress)
+        run = integrate(one, Tables(problem, tol, t_out=t_out), progress)
         nfev += run.nfev
-        run.nfev, run.peaks, run.margin, run.detail = nfev, reference.peaks, reference.margin, one.detail
+        run.nfev, run.margin, run.detail = nfev, reference.margin, one.detail
         gaps = reference.gaps.copy()
-        for gap, mine, theirs in zip(gaps, ours, gap_signals(problem, run), strict=True):
+        for gap, mine, theirs in zip(gaps, ours, gap_signals(run.record(problem)), strict=True):
             n = min(mine[0].size, theirs[0].size)
             gap[2:] += [np.abs(a[:n] - b[:n]).max(initial=0.0) for a, b in zip(mine, theirs, strict=True)]
-        worst = state_error(run, gaps, max(u_scale, problem.scene.u_peak), None) / rtol
+        run.gaps = gaps
+        worst = run.excess(max(u_scale, problem.scene.u_peak)) / rtol
         if run.status is not Status.SUCCESS:
             if reference.status is Status.FOLD:
                 run.status, run.t_failed = reference.status, reference.t_failed

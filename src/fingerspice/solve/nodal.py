@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator
 from functools import cache
 
 import numpy as np
@@ -19,9 +18,9 @@ from fingerspice.engine.readout import TRIED
 from fingerspice.numerics.radau_tableau import radau
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import Status
-from fingerspice.solve.netruns import Integration, NetworkRun, gap_signals, integrate, ramp, state_error, values_at
-from fingerspice.solve.networks import NetworkProblem
-from fingerspice.solve.runs import Progress
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.runs import NetworkIntegration, Progress, Run, gap_signals, integrate
+from fingerspice.solve.sources import Tables, ramp, values_at
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -66,14 +65,15 @@ def radau_scheme(stages: int) -> Scheme:
     )  # fmt: skip
 
 
-class Collocation(Integration):
+class Collocation(NetworkIntegration):
     """One integration in progress; see `engine.collocation.advance`."""
 
     def __init__(
-        self, problem: NetworkProblem, scheme: Scheme, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray
+        self, problem: Problem, scheme: Scheme, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray
     ) -> None:
-        super().__init__(problem, tol, t_out, left)
-        self.scheme = scheme
+        super().__init__(problem, t_out, left)
+        self.scheme, self.tol = scheme, tol
+        self.rows = np.full((t_out.size, self.width), np.nan)
         n_s = self.s_before.size
         stored = u_scale * float(np.abs(problem.network.capacitance(problem.scene.area0)).sum()) or u_scale
         # A charge's own error is not looked at where nobody asked for it.
@@ -132,7 +132,7 @@ class Collocation(Integration):
 
 
 def pass_through(
-    problem: NetworkProblem, sources: Sources, tol: float, u_scale: float
+    problem: Problem, sources: Sources, tol: float, u_scale: float
 ) -> tuple[Status, Collocation, FloatArray]:
     """A problem's run without outputs: how it ended, the run, and what its end differs by from a coarser run's."""
     longest, none = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step), np.zeros(0)
@@ -148,15 +148,22 @@ def pass_through(
 
 
 def _integrate(
-    problem: NetworkProblem, scheme: Scheme, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray,
+    problem: Problem, scheme: Scheme, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray,
     progress: Progress | None,
-) -> NetworkRun:  # fmt: skip
-    return integrate(Collocation(problem, scheme, tol, u_scale, t_out, left), progress)
+) -> Run:  # fmt: skip
+    one, scene = Collocation(problem, scheme, tol, u_scale, t_out, left), problem.scene
+    run = integrate(one, Tables(problem, tol, t_out=t_out), progress)
+    run.gaps = np.zeros((len(problem.network.fingers), 4))
+    for row, i in zip(run.gaps, problem.network.fingers, strict=True):
+        row[0], contact = one.peaks[i], problem.network.contacts[i]
+        if contact is not None and scene.net.gap[i] >= 0 and scene.net.slow[i] < 0:
+            row[1] = float(contact.stress(row[0])) / inverse_area(row[0], scene.net.curves[i])[0]
+    return run
 
 
 def solve_coupled(
-    problem: NetworkProblem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None = None
-) -> NetworkRun:
+    problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None = None
+) -> Run:
     """Integrate until the stated error is within `rtol` of the peaks of every gap's voltage and force.
 
     The error is stated from a second run with a larger tolerance.
@@ -164,13 +171,12 @@ def solve_coupled(
     longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
     fine, coarse = (radau_scheme(stages)._replace(h_max=longest) for stages in (STAGES, STAGES_BESIDE))
     at, side, probed = _with_probes(problem, t_out, left)
-    n = problem.network.k.shape[0]
-    u_scale = max(problem.scene.u_peak, float(np.abs(problem.initial.y[:n]).max(initial=0.0)))
+    u_scale = problem.largest
     if problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
         u_scale = _voltage_scale(problem, coarse, max(u_scale, 1.0))
     tol, nfev = LOCAL_SHARE * rtol, 0
     folded = math.inf
-    nearest: tuple[float, NetworkRun] | None = None
+    nearest: tuple[float, Run] | None = None
     for attempt in range(ATTEMPTS):
         beside = _integrate(problem, coarse, BESIDE * tol, u_scale, at[probed], side[probed], None)
         run = _integrate(problem, fine, tol, u_scale, at, side, progress)
@@ -178,7 +184,7 @@ def solve_coupled(
         run.nfev = nfev
         worst = _stated(problem, run, _only(run, probed), beside, u_scale, ALIKE * tol) / rtol
         last = tol <= FINEST or attempt == ATTEMPTS - 1
-        if problem.scene.net.mobile and problem.record(run).fold_margin.min(initial=1.0) < PAST_FOLD:
+        if problem.scene.net.mobile and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD:
             # A step has gone over a fold, onto a branch that nothing leads to.
             tol, run.status = max(0.03 * tol, FINEST), Status.ERROR_NOT_MET
         elif run.status is Status.FOLD and run.t_failed is not None:
@@ -203,17 +209,15 @@ def solve_coupled(
         run = nearest[1]
         run.status, run.nfev = Status.FOLD if believed else Status.ERROR_NOT_MET, nfev
     if problem.scene.net.mobile:
-        run.margin = float(problem.record(run).fold_margin.min(initial=1.0))
+        run.margin = float(run.record(problem).fold_margin.min(initial=1.0))
     run = _only(run, ~probed)
-    t_end = run.state.t
-    if run.here is not None and np.all(np.isfinite(run.here)) and (run.t.size == 0 or t_end > run.t[-1]):
-        # A failed run's arrays end at the time it reached.
-        run.t, run.left = np.append(run.t, t_end), np.append(run.left, True)
-        run.rows = np.vstack([run.rows, run.here])
+    run.end_where_it_stopped()
+    if problem.scene.net.mobile and run.t.size:
+        run.margin = min(run.margin, float(run.record(problem).fold_margin[-1]))
     return run
 
 
-def _voltage_scale(problem: NetworkProblem, scheme: Scheme, guess: float) -> float:
+def _voltage_scale(problem: Problem, scheme: Scheme, guess: float) -> float:
     """Largest live voltage, V, from rough runs: that of a current drive is not known beforehand.
 
     From above: what is small beside the guess costs nothing, what is large beside it would be followed far too closely.
@@ -229,7 +233,7 @@ def _voltage_scale(problem: NetworkProblem, scheme: Scheme, guess: float) -> flo
     return guess
 
 
-def _with_probes(problem: NetworkProblem, t: FloatArray, left: BoolArray) -> tuple[FloatArray, BoolArray, BoolArray]:
+def _with_probes(problem: Problem, t: FloatArray, left: BoolArray) -> tuple[FloatArray, BoolArray, BoolArray]:
     """Times asked for together with those that errors are looked for at, and which are the latter.
 
     These are the same whichever outputs are asked for, so that no result depends on that.
@@ -248,24 +252,13 @@ def _with_probes(problem: NetworkProblem, t: FloatArray, left: BoolArray) -> tup
     return every[order], side[order], (np.arange(every.size) >= t.size)[order]
 
 
-def _only(run: NetworkRun, keep: BoolArray) -> NetworkRun:
+def _only(run: Run, keep: BoolArray) -> Run:
     """A run with only some of its outputs."""
     keep = keep[: run.t.size]
     return dataclasses.replace(run, t=run.t[keep], left=run.left[keep], rows=run.rows[keep])
 
 
-def _peaks(problem: NetworkProblem, run: NetworkRun) -> Iterator[tuple[float, float]]:
-    """Of each finger: the largest voltage that its steps met (V), and the force there (N) where its area follows."""
-    net, record = problem.scene.net, problem.record(run)
-    for (_, contact), i in zip(record.fingers, problem.network.fingers, strict=True):
-        u = float(run.peaks[i])
-        follows = net.gap[i] >= 0 and net.slow[i] < 0
-        yield u, float(contact.stress(u)) / inverse_area(u, net.curves[i])[0] if follows else 0.0
-
-
-def _stated(
-    problem: NetworkProblem, run: NetworkRun, probed: NetworkRun, beside: NetworkRun, u_scale: float, alike: float
-) -> float:
+def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float, alike: float) -> float:
     """Write the stated error into a run: the largest difference, what both have alike, and rounding.
 
     Returns it over the peaks of each gap, the larger of voltage and force.
@@ -273,18 +266,19 @@ def _stated(
     count = min(probed.t.size, beside.t.size)
     both = (alike + 4e-15) * u_scale
     gaps = []
-    met = itertools.chain(_peaks(problem, run), itertools.repeat((0.0, 0.0)))
+    # The steps may have met larger voltages, and forces where the area follows at once.
+    met = itertools.chain(run.gaps[:, :2].tolist(), itertools.repeat((0.0, 0.0)))
     for (u, f), (v, g), (u_met, f_met) in zip(
-        gap_signals(problem, probed), gap_signals(problem, beside), met, strict=False
+        gap_signals(probed.record(problem)), gap_signals(beside.record(problem)), met, strict=False
     ):
         peak, force = max(float(np.abs(u).max(initial=0.0)), u_met), max(float(f.max(initial=0.0)), f_met)
         u_error = float(np.abs(u[:count] - v[:count]).max(initial=0.0)) + both
         # F ~ u^2: what moves u by du moves F by 2 F du / u.
         moved = 2.0 * both / peak * force if peak > 0.0 else 0.0
         gaps.append((peak, force, u_error, float(np.abs(f[:count] - g[:count]).max(initial=0.0)) + moved))
-    charge = None
+    run.gaps = np.array(gaps).reshape(-1, 4)
     if problem.charge:
         n_s = problem.initial.s_before.size
         at = slice(problem.initial.y.size - n_s, problem.initial.y.size)
-        charge = float(np.abs(probed.rows[:count, at] - beside.rows[:count, at]).max(initial=0.0))
-    return state_error(run, np.array(gaps).reshape(-1, 4), u_scale, charge)
+        run.charge_error = float(np.abs(probed.rows[:count, at] - beside.rows[:count, at]).max(initial=0.0))
+    return run.excess(u_scale)

@@ -7,7 +7,6 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.solve.networks import NetworkProblem
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.times import check_length, check_outputs
 from fingerspice.waveforms.sampling import misses, same_time
@@ -22,7 +21,7 @@ _RESOLVED = 8.0
 _BREAKPOINTS_AT_ONCE = 65_536
 
 
-def at_breakpoints(problem: Problem | NetworkProblem, t: FloatArray) -> FloatArray:
+def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
     """Times moved onto the breakpoint they miss by rounding, so that 5 ms means the jump at 5 ms."""
     span = problem.t_start, problem.t_stop
     windows = 1 + int((span[1] - span[0]) * problem.waveform.breakpoint_rate() / _BREAKPOINTS_AT_ONCE)
@@ -40,7 +39,7 @@ def at_breakpoints(problem: Problem | NetworkProblem, t: FloatArray) -> FloatArr
 
 
 def asked_for(
-    problem: Problem | NetworkProblem, t_eval: FloatArray | None, jumps: str
+    problem: Problem, t_eval: FloatArray | None, jumps: str
 ) -> tuple[FloatArray, BoolArray]:  # fmt: skip
     """Output times and sides: those given, or the deck's.
 
@@ -59,7 +58,7 @@ def asked_for(
     return t_out, left
 
 
-def output_times(problem: Problem | NetworkProblem, jumps: str = "both") -> tuple[FloatArray, BoolArray]:
+def output_times(problem: Problem, jumps: str = "both") -> tuple[FloatArray, BoolArray]:
     """TSTART:TSTEP:TSTOP and which of them are left-hand; with `jumps` "both" two more at each jump, left and right.
 
     t = 0 stands once, right-hand.
@@ -82,7 +81,7 @@ def output_times(problem: Problem | NetworkProblem, jumps: str = "both") -> tupl
     return np.ascontiguousarray(t[order]), np.ascontiguousarray(left[order])
 
 
-def _jumps(problem: Problem | NetworkProblem) -> FloatArray:
+def _jumps(problem: Problem) -> FloatArray:
     """Times (s, ascending) of the jumps of any source in the run, after its start."""
     stop = problem.t_stop
     rounding = same_time(stop)

@@ -15,13 +15,15 @@ from fingerspice.engine.exponential import Tables, new_tables
 from fingerspice.engine.netrows import REFERRED, Form
 from fingerspice.engine.references import LEVEL_RATIO, References
 from fingerspice.engine.system import area_error, area_polynomials
-from fingerspice.solve.networks import NetworkScene
 from fingerspice.solve.runs import kept_with
+from fingerspice.solve.scenes import Scene
 
 # Sets of references that stay with a scene: one for each thread and decade of tolerances.
 MOST_SETS = 16
 # References of a set, and numbers of all of them (64 MB), at most; beyond, a new set is begun.
 MOST_REFERENCES, MOST_NUMBERS = 256, 8_000_000
+# References whose numbers stay with the network, whatever its sources are.
+MOST_KEPT = 16
 
 
 @dataclass
@@ -38,7 +40,7 @@ class Known:
         The fields of a `Form` that are the same for all references.
     """
 
-    scene: NetworkScene
+    scene: Scene
     decade: int
     arrays: References
     tables: Tables
@@ -47,11 +49,12 @@ class Known:
 
     @property
     def count(self) -> int:
-        return int(self.arrays.count[0])
+        return int(self.arrays.used[0])
 
     @property
     def is_full(self) -> bool:
-        return self.count >= max(2, min(MOST_REFERENCES, MOST_NUMBERS // self.arrays.numbers.shape[1]))
+        most: int = MOST_NUMBERS // self.arrays.numbers.shape[1]
+        return self.count >= max(2, min(MOST_REFERENCES, most))
 
     def add(self, levels: tuple[int, ...]) -> None:
         """Make the reference whose areas are the fixed ones, or LEVEL_RATIO to these powers over those at 0 V."""
@@ -62,20 +65,22 @@ class Known:
                 levels=np.vstack([arrays.levels, more[0]]), numbers=np.vstack([arrays.numbers, more[1]])
             )
         area = self.scene.area0 * LEVEL_RATIO ** np.array(levels, float)
-        parts, magnified = _referred(self.scene, area)
-        arrays.numbers[one] = np.concatenate([parts[name].ravel() for name in REFERRED])
+        key = ("referred", self.scene.fixed, area.tobytes())
+        found = kept_with(self.scene.network.kept, key, MOST_KEPT, lambda: _referred(self.scene, area))
+        arrays.numbers[one], magnified = found
         arrays.levels[one] = levels
-        arrays.count[0] += 1
+        arrays.used[0] += 1
         np.maximum(self.magnified, magnified, out=self.magnified)
 
     def form(self) -> Form:
         """A form around the areas at 0 V, with numbers of its own."""
         numbers, views = views_of(_shapes(self.scene))
         numbers[:] = self.arrays.numbers[0]
-        return Form(numbers, *views, **self.fixed)
+        parts: dict[str, Any] = dict(zip(REFERRED, views, strict=True))
+        return Form(numbers=numbers, **parts, **self.fixed)
 
 
-def known_references(scene: NetworkScene, decade: int, *, anew: bool = False) -> Known:
+def known_references(scene: Scene, decade: int, *, anew: bool = False) -> Known:
     """The references of a scene for tolerances of a decade, the first of which has the areas at 0 V."""
     # One set for each thread: compiled code writes into its tables, and other threads run meanwhile.
     key = ("references", decade, threading.get_ident())
@@ -85,7 +90,7 @@ def known_references(scene: NetworkScene, decade: int, *, anew: bool = False) ->
     return found
 
 
-def _make(scene: NetworkScene, decade: int) -> Known:
+def _make(scene: Scene, decade: int) -> Known:
     n_area = scene.area0.size
     shapes = _shapes(scene)
     room = References(
@@ -100,7 +105,7 @@ def _make(scene: NetworkScene, decade: int) -> Known:
     return known
 
 
-def _shapes(scene: NetworkScene) -> list[tuple[int, ...]]:
+def _shapes(scene: Scene) -> list[tuple[int, ...]]:
     """Of the arrays in `REFERRED`."""
     net = scene.net
     n, n_s = net.b.shape
@@ -114,14 +119,14 @@ def _shapes(scene: NetworkScene) -> list[tuple[int, ...]]:
     return [shapes[name] for name in REFERRED]
 
 
-def _fed(scene: NetworkScene) -> IntArray:
+def _fed(scene: Scene) -> IntArray:
     """The cells whose area moves, those of each area together."""
     net = scene.net
     fed = np.flatnonzero([i >= 0 and net.gap[i] >= 0 for i in net.place])
     return fed[np.argsort(net.place[fed], kind="stable")]
 
 
-def _fixed(scene: NetworkScene, decade: int) -> dict[str, Any]:
+def _fixed(scene: Scene, decade: int) -> dict[str, Any]:
     """What of a form is the same for all references."""
     network, net = scene.network, scene.net
     n, n_area = net.k.shape[0], net.gap.size
@@ -152,7 +157,7 @@ def _fixed(scene: NetworkScene, decade: int) -> dict[str, Any]:
     }
 
 
-def _referred(scene: NetworkScene, area: FloatArray) -> tuple[dict[str, FloatArray], FloatArray]:
+def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray]:
     """What of a form belongs to reference areas (m^2), and the rounding of each gap's voltage."""
     network, net = scene.network, scene.net
     modes = network_modes(network, area)
@@ -185,7 +190,7 @@ def _referred(scene: NetworkScene, area: FloatArray) -> tuple[dict[str, FloatArr
         "lost": network.through @ (leak * tap) + at_x @ modes.shape,
         "lost_s": network.through @ (leak * tap_s) - at_x @ modes.follow + at_s,
     }
-    return parts, _magnified(modes, gap, gap_s)
+    return np.concatenate([parts[name].ravel() for name in REFERRED]), _magnified(modes, gap, gap_s)
 
 
 def _magnified(modes: Modes, gap: FloatArray, gap_s: FloatArray) -> FloatArray:

@@ -1,36 +1,33 @@
-"""What every integrator shares: the source window by window, the end of a run, and what a run gives back."""
+"""What every method of integration shares: the run window by window, its end, and what it gives with its error."""
 
 from __future__ import annotations
 
-import itertools
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.engine.model import Model, dot, gap_voltage, write_row_at
-from fingerspice.engine.segment import Segment, source
-from fingerspice.results.outcome import Attempt, ErrorEstimate, State, Status
+from fingerspice.engine.network import Sources, at_sources, new_room, rates
+from fingerspice.engine.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, ZEROS
+from fingerspice.results.outcome import Attempt, ErrorEstimate, State, Status, last_tried
 from fingerspice.results.record import Record
 from fingerspice.results.refined import ClosedForm
 from fingerspice.results.steps import Recorded
-from fingerspice.solve.networks import NetworkProblem
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.times import check_length
-from fingerspice.waveforms.sampling import SourceTable, breakpoints_at, source_table
+from fingerspice.solve.sources import Tables, after_the_end, joined, segment_index, values_at
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 Progress = Callable[[float], None]
-Continuous = Recorded | ClosedForm
 
 # An error below this share of the voltages that cancel in the gap's is rounding: finer steps would not reach it.
 ROUNDING = 2e-14
-PERIODS_PER_WINDOW = 4096.0
-BREAKPOINTS_PER_WINDOW = 2000.0
-KEPT_WINDOWS = 4
+# N; errors of smaller forces have too few digits.
+LEAST_FORCE = 1e-290
 
 
 def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: Callable[[], Any]) -> Any:
@@ -50,171 +47,235 @@ def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: C
 
 @dataclass
 class Run:
-    """What one integration gives, and how it went.
+    """What one run gives, and how it went.
 
-    `t`, `left`, `live`, `z`, `current` are as in `Record`, up to the time reached; `rough` is the source's (see
-    `SourceTable`), V, and `unseen` the first output (s) at which it is not what was integrated, by how much (V);
-    `margin` is the smallest distance to the fold met, `tried` the last steps tried, and `continuous` the run between
-    its outputs, where that is known.
+    Attributes
+    ----------
+    t, left, rows : ndarray
+        As in `Record`, up to the time reached.
+    status : Status
+    nfev : int
+    stats : dict
+    state : State
+        Where it stopped.
+    gaps : ndarray, shape (n_measured, 4)
+        Of each cell that errors are measured on (`Scene.measured`): peaks of voltage (V) and force (N), and the stated
+        errors of both.
+    charge_error : float or None
+        C.
+    t_failed : float or None
+    unseen, rough
+        See `Tables`.
+    margin : float
+        Smallest distance to the fold met.
+    detail : str
+        What a method says of its failure.
+    tried : tuple of Attempt
+        The last steps tried.
+    here : ndarray, shape (width,), or None
+        The row at the time that a failed run reached.
+    continuous : Recorded or ClosedForm or None
+        The run between its outputs, where that is known.
+    by_layer : bool
+        Whether the rows are those of `Scene.shown`.
     """
 
     t: FloatArray
     left: BoolArray
-    live: FloatArray
-    z: FloatArray | None
-    current: FloatArray | None
+    rows: FloatArray
     status: Status
-    error: ErrorEstimate
-    peak_u: float
-    peak_f: float
     nfev: int
     stats: dict[str, int]
     state: State
+    gaps: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
+    charge_error: float | None = None
     t_failed: float | None = None
-    detail: str = ""
+    unseen: tuple[float, float, int] | None = None
     rough: float = 0.0
-    unseen: tuple[float, float] | None = None
     margin: float = 1.0
+    detail: str = ""
     tried: tuple[Attempt, ...] = ()
-    continuous: Continuous | None = None
+    here: FloatArray | None = None
+    continuous: Recorded | ClosedForm | None = None
+    by_layer: bool = False
+
+    @property
+    def error(self) -> ErrorEstimate:
+        """The largest stated errors."""
+        _, _, u_gap, f_el = self.gaps.max(axis=0, initial=0.0).tolist()
+        return ErrorEstimate(u_gap, f_el, self.charge_error)
 
     def record(self, problem: Problem) -> Record:
         """The outputs with what they mean."""
-        return Record(
-            problem.stack, problem.waveform, problem.model, self.t, self.left, self.live, self.z, self.current,
-            self.state.charge_offset,
-        )  # fmt: skip
+        scene = problem.scene.shown if self.by_layer else problem.scene
+        return Record(scene.network, scene.net, self.t, self.left, self.rows, problem.charge)
 
     def end_before(self, t: float) -> None:
         """Take back the outputs from a time (s) on."""
         kept = self.t < t
-        self.t, self.left, self.live = self.t[kept], self.left[kept], self.live[:, kept]
-        if self.z is not None and self.current is not None:
-            self.z, self.current = self.z[kept], self.current[kept]
+        self.t, self.left, self.rows = self.t[kept], self.left[kept], self.rows[kept]
 
-    def excess(self, rtol: float) -> float:
-        """Estimated error over the one asked for, the larger of voltage and force."""
-        return self.error.excess(rtol, self.peak_u, self.peak_f)
+    def end_where_it_stopped(self) -> None:
+        """Let the outputs of a failed run end at the time it reached, left-hand, if it has none there already."""
+        t, row = self.state.t, self.here
+        if row is not None and np.all(np.isfinite(row)) and (self.t.size == 0 or t > self.t[-1]):
+            self.t, self.left = np.append(self.t, t), np.append(self.left, True)
+            self.rows = np.vstack([self.rows, row])
+
+    def add_error(self, u_gap: FloatArray | float, f_el: FloatArray | None = None) -> None:
+        """Add what the stated errors do not know of, V and N: a force goes with the square of its voltage."""
+        gaps = self.gaps.copy()
+        if f_el is None:
+            f_el = 2.0 * u_gap * gaps[:, 1] / np.where(gaps[:, 0] > 0.0, gaps[:, 0], np.inf)
+        gaps[:, 2] += u_gap
+        gaps[:, 3] += f_el
+        self.gaps = gaps
+
+    def excess(self, u_scale: float) -> float:
+        """See `excess_of`."""
+        return excess_of(self.gaps, u_scale)
 
 
-class Tables:
-    """Tables of a problem's source, window by window.
+def excess_of(gaps: FloatArray, u_scale: float) -> float:
+    """Largest stated error over the peak it belongs to, in any gap's voltage or force; for `gaps` see `Run`.
 
-    A user's function is expensive to look at, so its tables are kept for the run. Those of library waveforms are made
-    anew, which keeps a long run's memory constant, but for a run of few windows: its tables stay with the scene.
+    A gap that takes no more than rounding of `u_scale`, the largest voltage of the circuit (V), is at 0 V.
+    """
+    worst = 0.0
+    for u_peak, f_peak, u_error, f_error in gaps.tolist():
+        if u_peak > ROUNDING * u_scale:
+            worst = max(worst, u_error / u_peak, f_error / f_peak if f_peak > LEAST_FORCE else 0.0)
+    return worst
+
+
+class Integration(ABC):
+    """One integration in progress.
+
+    Attributes
+    ----------
+    t_out, left : ndarray, shape (n_out,)
+        Output times (s) and whether the left-hand value is meant.
+    y, sign, s_before : ndarray
+        The state reached.
+    counters : ndarray of int
+        As `engine.readout` counts.
+    tried : ndarray, shape (TRIED, 4)
     """
 
-    def __init__(
-        self, problem: Problem, tol: float, *, no_chirps: bool = False, t_out: FloatArray | None = None
-    ) -> None:
-        self.no_chirps = no_chirps
-        # Times (s) at which a user's function is compared with its table, and the first that it is not like it.
-        self.t_out = t_out
-        self.unseen: tuple[float, float] | None = None
-        # Time at which the source stopped being finite, once that has been met.
-        self.not_finite: float | None = None
-        self.problem = problem
-        self.tol = min(1e-3, max(0.05 * tol, 1e-14))
-        self.edges = windows(problem)
-        # Windows that end by this time (s) are done with, but for the last.
-        self.done = -np.inf
-        # Largest |U| (V) of the sampled windows so far.
-        self.scale = 0.0
-        self.rough = 0.0
-        self.kept: dict[Any, SourceTable] | None = {} if problem.scene.is_sampled else None
-        if self.kept is None and len(self.edges) <= 1 + KEPT_WINDOWS:
-            self.kept = problem.scene.prepared.setdefault("tables", {})
-            if len(self.kept) > 16:
-                self.kept.clear()
+    counters: IntArray
 
-    def __iter__(self) -> Iterator[SourceTable]:
-        for w0, w1 in itertools.pairwise(self.edges):
-            if w1 <= self.done and w1 < self.edges[-1]:
-                continue
-            key = (w0, w1, self.no_chirps)
-            table = self.kept.get(key) if self.kept is not None else None
-            if table is None:
-                table = source_table(
-                    self.problem.waveform, w0, w1, self.tol, self.problem.step, no_chirps=self.no_chirps,
-                    scale=self.scale,
-                )  # fmt: skip
-                if self.unseen is None and self.t_out is not None and self.problem.scene.is_sampled:
-                    self.unseen = table.unseen(self.problem.waveform, self.t_out, self.tol)
-                if self.kept is not None:
-                    self.kept[key] = table
-            self.scale, self.rough = max(self.scale, table.scale), max(self.rough, table.rough)
-            self.not_finite = table.not_finite
-            yield table
-            if table.not_finite is not None:
+    def __init__(self, problem: Problem, t_out: FloatArray, left: BoolArray) -> None:
+        self.problem, self.net, self.t_out, self.left = problem, problem.scene.net, t_out, left
+        self.n, n_s = map(int, self.net.b.shape)
+        self.y, self.sign = problem.initial.y.copy(), problem.initial.sign.copy()
+        self.s_before = problem.initial.s_before.copy()
+        self.n_slow = self.y.size - self.n - n_s
+        self.width = self.y.size + (n_s if problem.charge else 0)
+        self.tried = np.zeros((TRIED, 4))
+
+    @property
+    @abstractmethod
+    def t(self) -> float:
+        """Time reached, s."""
+
+    @abstractmethod
+    def through(self, sources: Sources, t_end: float) -> Status:
+        """To `t_end` (s), the jumps on the way taken."""
+
+    def state(self) -> State:
+        return State(self.t, self.y.copy(), self.s_before.copy(), self.sign.copy(), self.problem.scene.charge_law)
+
+    def stuck(self) -> Status:
+        """Why no step is short enough."""
+        return Status.FOLD if self.net.mobile and self.problem.scene.coupled else Status.STEP_UNDERFLOW
+
+    @abstractmethod
+    def finish(self, sources: Sources, after: Sources | None) -> None:
+        """Write the right-hand outputs at the very end, `after` the jump that may stand there; none past a fold."""
+
+    @abstractmethod
+    def written(self) -> FloatArray:
+        """The rows written."""
+
+    @abstractmethod
+    def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
+        """The row at the time reached, from the segments on one side of it; NaN past a fold."""
+
+
+class NetworkIntegration(Integration):
+    """One whose steps have the state as outputs have it.
+
+    Attributes
+    ----------
+    rows : ndarray, shape (n_out, width)
+        What is written at the outputs, as in `Record`.
+    """
+
+    rows: FloatArray
+
+    @abstractmethod
+    def jump(self, after: FloatArray) -> bool:
+        """Take a jump of the sources to their values `after`; False where that goes past a fold."""
+
+    def finish(self, sources: Sources, after: Sources | None) -> None:
+        if after is not None:
+            values = values_at(after, self.problem.t_stop)
+            if np.any(values != self.s_before) and not self.jump(values):
                 return
+        self.rows[int(self.counters[OUTPUT]) :] = self.row(after or sources, "right")
+        self.counters[OUTPUT] = self.t_out.size
 
-    def peak(self) -> float:
-        """Largest |U| (V) of the run."""
-        if self.kept is None:
-            return self.problem.waveform.peak(self.problem.t_start, self.problem.t_stop)
-        return max(table.scale for table in self)
+    def written(self) -> FloatArray:
+        return self.rows[: int(self.counters[OUTPUT])]
 
-
-def windows(problem: Problem | NetworkProblem) -> list[float]:
-    """Edges of the windows the source is tabulated on: constant memory, and phases that stay exact."""
-    check_length(problem.waveform, problem.t_start, problem.t_stop)
-    span = problem.t_stop - problem.t_start
-    rate = max(
-        problem.waveform.breakpoint_rate() / BREAKPOINTS_PER_WINDOW,
-        1.0 / (PERIODS_PER_WINDOW * problem.waveform.shortest_time()),
-        # A function is sampled at the output step.
-        1.0 / (4096.0 * problem.step) if problem.scene.is_sampled else 0.0,
-    )
-    count = max(1, int(np.ceil(span * rate)))
-    return [problem.t_start + span * i / count for i in range(count)] + [problem.t_stop]
+    def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
+        if not self.problem.charge:
+            return self.y.copy()
+        room, n_s = new_room(self.net, self.y.size), self.s_before.size
+        at_sources(sources, segment_index(sources, self.t, side), self.t, 0.0, room.s, room.ds)
+        rate = np.full(self.y.size, np.nan)
+        found = rates(self.net, room, False, self.y, self.sign, rate)
+        return np.concatenate([self.y, rate[-n_s:] if found else np.full(n_s, np.nan)])
 
 
-def after_the_end(problem: Problem, table: SourceTable) -> tuple[Segment, float]:
-    """The segment that right-hand outputs at the very end of a run belong to, and how far into it they are, s."""
-    stop = problem.t_stop
-    if breakpoints_at(problem.waveform, stop).size:
-        span = stop, problem.step
-        # One entry with its key: another thread may put its own there at any time.
-        kept, after = problem.scene.prepared.get("after", (None, None))
-        if kept != span:
-            after = source_table(problem.waveform, stop, stop + problem.step, 1e-10, problem.step)
-            problem.scene.prepared["after"] = span, after
-        table = after
-        length = float(table.edges[1] - table.edges[0])
-        return Segment(float(table.edges[0]), length, table.terms[0], table.series[0]), 0.0
-    start = float(table.edges[-2])
-    segment = Segment(start, float(table.edges[-1]) - start, table.terms[-1], table.series[-1])
-    return segment, stop - start
+def integrate(one: Integration, tables: Tables, progress: Progress | None = None) -> Run:
+    """Run an integration to its end, or as far as it goes; the error is not stated yet."""
+    problem, t_out, left = one.problem, one.t_out, one.left
+    status, t_failed = Status.SUCCESS, None
+    sources: Sources | None = None
+    tables.done = -np.inf
+    for window in tables:
+        if all(table.edges.size > 1 for table in window):
+            sources = joined(window)
+            status = one.through(sources, min(float(table.edges[-1]) for table in window))
+            if status is not Status.SUCCESS:
+                t_failed = one.t
+                break
+        tables.done = one.t
+        if progress is not None:
+            progress((one.t - problem.t_start) / (problem.t_stop - problem.t_start))
+        if tables.not_finite is not None:
+            status, t_failed = Status.SOURCE_NOT_FINITE, tables.not_finite
+            break
+    state = one.state()
+    if status is Status.SUCCESS and one.counters[OUTPUT] < t_out.size and sources is not None:
+        one.finish(sources, after_the_end(problem))
+    here = None
+    if t_failed is not None and sources is not None and state.t > problem.t_start:
+        here = one.row(sources, "left")
+    rows = one.written()
+    stats = {name: int(one.counters[i]) for name, i in (("steps", ACCEPTED), ("rejected", REJECTED), ("zeros", ZEROS))}
+    return Run(
+        t_out[: len(rows)], left[: len(rows)], rows, status, int(one.counters[NFEV]), stats, state,
+        t_failed=t_failed, tried=last_tried(one.tried), unseen=tables.unseen, rough=tables.rough, here=here,
+    )  # fmt: skip
 
 
-def last_row(
-    problem: Problem, model: Model, table: SourceTable, t: float, y: FloatArray, sign: float, u_gap: float
-) -> FloatArray | None:  # fmt: skip
-    """Row at the time t (s) that a failed run reached, left-hand; None before the first step, or if it is not finite.
-
-    `model` may cover more of the area's curve than the problem's; `y`, `sign` and `u_gap` (V) are the state there, its
-    branch and its gap voltage.
-    """
-    if t <= problem.t_start:
-        return None
-    i = max(int(np.searchsorted(table.edges, t, side="left")) - 1, 0)
-    start = float(table.edges[i])
-    segment = Segment(start, float(table.edges[i + 1]) - start, table.terms[i], table.series[i])
-    row = np.empty(row_width(problem))
-    u, du = source(segment, t - start)
-    found = gap_voltage(model, model.k_gap * u, dot(model.gap, y), sign, u_gap)
-    # By rounding of the time alone a state at a fold may have none.
-    write_row_at(model, u, du, y, sign, found if found == found else u_gap, row)
-    return row if np.all(np.isfinite(row)) else None
-
-
-def from_rows(problem: Problem, rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Live layer voltages, z and current from rows of `engine.model.write_row`."""
-    # Rows hold y = [x, z] after five columns; z is the last.
-    live = problem.scene.live_voltages(rows[:, 0], rows[:, 2], rows[:, 5:-1])
-    return live, rows[:, -1].copy(), rows[:, 3].copy()
-
-
-def row_width(problem: Problem) -> int:
-    """Columns of a row of `engine.model.write_row`."""
-    return 5 + problem.stack.c.size
+def gap_signals(record: Record) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Voltage (V) and force (N) of every gap; without one, the voltage of the smallest capacitor and no force."""
+    network = record.network
+    for i in range(len(record.fingers)):
+        yield record.finger_voltage(i), record.finger_force(i)
+    if not record.fingers and network.cells:
+        u = record.cell_voltage(int(np.argmin(network.capacitance(record.net.area0))))
+        yield u, np.zeros(u.size)

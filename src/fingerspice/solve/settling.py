@@ -7,7 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.solve.networks import NetworkProblem
 from fingerspice.solve.problem import Problem
 from fingerspice.waveforms.sampling import same_time
 
@@ -33,7 +32,7 @@ class Settling:
 
     Parameters
     ----------
-    problem : Problem or NetworkProblem
+    problem : Problem
     rates : ndarray
         Rates of the stack with its area frozen, 1/s.
     tol : float
@@ -49,7 +48,7 @@ class Settling:
         Distance at which the map of a period may pass for a linear one, V.
     """
 
-    def __init__(self, problem: Problem | NetworkProblem, rates: FloatArray, tol: float) -> None:
+    def __init__(self, problem: Problem, rates: FloatArray, tol: float) -> None:
         self.period = problem.waveform.period or math.inf
         self.start = max(problem.t_start, problem.waveform.settled)
         self.stop = problem.t_stop

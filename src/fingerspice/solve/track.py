@@ -1,36 +1,46 @@
-"""One integration by exponential steps in progress: its state, its bookkeeping, and what it has written."""
+"""A series stack by exponential steps; see `engine.march.march`."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import threading
+from collections.abc import Callable
 from functools import partial
+from typing import Literal
 
 import numpy as np
 
 from fingerspice.engine import march, readout
-from fingerspice.engine import repeat as repetition
 from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
-from fingerspice.engine.pace import Pace
+from fingerspice.engine.model import dot, gap_voltage, write_row_at
+from fingerspice.engine.network import Sources
+from fingerspice.engine.segment import Segment, source
 from fingerspice.engine.system import System, area_error, area_missed, area_range, build_system
 from fingerspice.engine.work import Work, new_work
 from fingerspice.numerics.lobatto import integral_table
-from fingerspice.results.record import stack_record
-from fingerspice.results.steps import Recorded, Recorder
-from fingerspice.solve.problem import Problem, Scene
-from fingerspice.solve.runs import BoolArray, FloatArray, after_the_end, from_rows, kept_with, row_width
+from fingerspice.physics.contact import inverse_areas
+from fingerspice.results.outcome import State, Status
+from fingerspice.results.record import Record, sided
+from fingerspice.results.steps import Recorded
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.runs import BoolArray, FloatArray, Run, kept_with
+from fingerspice.solve.scenes import Scene
 from fingerspice.solve.settling import Settling
-from fingerspice.waveforms.sampling import SourceTable
+from fingerspice.solve.sources import Tables, segment_index
+from fingerspice.solve.stackstate import (
+    StackState,
+    as_marched,
+    from_stack,
+    from_written,
+    model_of,
+    row_width,
+)
+from fingerspice.solve.stepping import SAFETY, OutOfRangeError, Stepping
 
-# The largest error between nodes may stand beside the two points where it is looked for, and signs may cancel there.
-SAFETY = 2.5
-# The smallest error of a step that is more than rounding, over the voltage scale.
-FINEST = 4e-15
 # Systems that stay with a scene: one for each thread and decade of tolerances, of up to 1 MB.
 MOST_SYSTEMS = 64
-# Steps of a period that is kept, at most: 1 MB.
-KEPT_STEPS = 2000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,51 +66,48 @@ def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
 
 
 def _prepare(scene: Scene, decade: int, u_top: float) -> Prepared:
-    model = scene.model
+    model, (contact,) = model_of(scene), scene.network.contacts
+    assert scene.stack is not None
     if u_top > 0.0:
-        assert scene.stack.contact is not None
-        model = model._replace(curve=scene.stack.contact.curve(u_top))
-    contact = scene.stack.contact
+        assert contact is not None
+        model = model._replace(curve=contact.curve(u_top))
     stress = 0.0 if contact is None else float(contact.stress(1.0))
-    u_max = max(scene.u_peak, u_top)
+    u_max, n = max(scene.u_peak, u_top), model.gap.size
     system = build_system(model, area_error(decade), area_range(model, u_max), scene.stack.grouping, stress)
-    n = model.gap.size
     return Prepared(system, new_tables(n), new_work(n), integral_table(), area_missed(model.curve, decade))
 
 
-@dataclasses.dataclass
-class Track:
-    """One integration in progress; see `engine.march.march`."""
+class Track(Stepping):
+    """One integration in progress, with an error of the gap voltage of `tol` (V) in every step.
 
-    problem: Problem
-    prepared: Prepared
-    pace: Pace
-    t_out: FloatArray
-    left: BoolArray
+    Its state is that of `engine.model`; what it gives is that of any circuit.
+    """
 
-    def __post_init__(self) -> None:
-        start = self.problem.initial
-        n = self.problem.model.gap.size
+    def __init__(
+        self, problem: Problem, prepared: Prepared, tol: float, t_out: FloatArray, left: BoolArray,
+        repeat: bool = True, h_fixed: float = 0.0,
+    ) -> None:  # fmt: skip
+        scene, start = problem.scene, problem.inner
+        self.prepared, self.start, n = prepared, start, start.y.size - 1
+        self.control = np.zeros(readout.N_CONTROL)
+        shown = scene.shown.turn.size
+        super().__init__(problem, tol, t_out, left, shown, shown + 2 if problem.charge else shown, h_fixed)
         self.y = start.y.copy()
         self.error = np.zeros(n + 1)
-        self.control = np.zeros(readout.N_CONTROL)
-        self.control[readout.T] = self.problem.t_start
+        self.control[readout.T] = problem.t_start
         self.control[readout.U_BEFORE] = start.u_before
         self.control[readout.BRANCH_LENGTH] = np.inf
         self.control[readout.MARGIN] = 1.0
-        if self.problem.model.mobile and abs(start.u_gap) > 0.0:
-            self.control[readout.U_GAP], self.control[readout.SIGN] = start.u_gap, np.sign(start.u_gap)
-        self.counters = np.zeros(readout.N_COUNTERS, np.int64)
-        self.tried = np.zeros((readout.TRIED, 4))
-        self.shown = self.prepared.system.k_shown.size
-        self.out = np.empty((self.shown + 2 if self.pace.charge else self.shown, self.t_out.size))
-        self.repeated = 0
-        self.recorder = Recorder(self.shown)
-        self.forget()
+        if model_of(scene).mobile and problem.initial.sign[0] != 0.0:
+            self.control[readout.U_GAP], self.control[readout.SIGN] = start.u_gap, math.copysign(1.0, start.u_gap)
+        self.settling = Settling(problem, prepared.system.rates, tol)
+        if h_fixed > 0.0 or not repeat:
+            self.settling.next = math.inf
 
     @property
-    def t(self) -> float:
-        return float(self.control[readout.T])
+    def shown(self) -> int:
+        """Voltages among the columns of outputs."""
+        return int(self.problem.scene.shown.turn.size)
 
     @property
     def capacitance(self) -> float:
@@ -108,114 +115,169 @@ class Track:
         model = self.prepared.system.model
         return float(model.slow[-3]) * model.area0
 
-    def advance(self, table: SourceTable, t_end: float) -> int:
-        """March to `t_end` (s) through a table."""
+    def advance(self, sources: Sources, t_end: float) -> int:
+        """March to `t_end` (s) through the source's table."""
         p = self.prepared
         mine = (self.y, self.error, self.control, self.counters)
         while True:
             code = march.march(
-                p.system, self.pace, p.tables, p.work, p.integral, table.edges, table.terms, table.series, t_end,
+                p.system, self.pace, p.tables, p.work, p.integral, sources.edges, sources.terms, sources.series, t_end,
                 *mine, self.t_out, self.left, self.out, self.kept, self.recorder.room, self.tried,
             )  # fmt: skip
             if code != march.PAUSED:
                 return int(code)
             self.recorder.drain(self.counters)
 
-    def forget(self) -> None:
-        """Keep no steps."""
-        self.kept = repetition.new_kept(0, self.out.shape[0])
+    def _to(self, sources: Sources, t_end: float) -> Status:
+        code = self.advance(sources, t_end)
+        if code == march.OUT_OF_RANGE:
+            raise OutOfRangeError(self.prepared.system.u_top)
+        if code == march.DONE:
+            return Status.SUCCESS
+        if self.t > sources.edges[0]:
+            # The loop knows the source's value at edges and ends only.
+            self.control[readout.U_BEFORE], _ = source(*_segment(sources, self.t, "left"))
+        return Status.TOO_MANY_STEPS if code == march.TOO_MANY else self.stuck()
 
-    def keep(self, steps: int = KEPT_STEPS) -> None:
-        """Keep so many of the steps that follow."""
-        self.kept = repetition.new_kept(steps, self.out.shape[0])
-        self.counters[readout.KEPT] = 0
-        self.recorder.drain(self.counters)
-        self.kept_from = len(self.recorder.parts)
-        self.before = float(self.y[-1]), float(self.control[readout.COLLECTED]), float(self.control[readout.SPREAD])
-
-    @property
-    def keeps_all(self) -> bool:
-        """Whether all steps since `keep` are kept."""
-        return 0 < int(self.counters[readout.KEPT]) <= len(self.kept.times)
-
-    def repeat(self, settling: Settling) -> None:
-        """Let the period that is kept stand for the whole ones that follow."""
-        periods, period = settling.periods_left(self.t), settling.period
-        charge, collected, spread = self.before
-        drift = float(self.y[-1]) - charge
-        drifts = np.zeros(self.out.shape[0])
-        if self.pace.charge:
-            drifts[-2] = drift
-        first, kept = int(self.counters[readout.OUTPUT]), int(self.counters[readout.KEPT])
-        self.counters[readout.OUTPUT] = repetition.repeat(
-            self.kept, kept, period, periods, drifts, first, self.t_out, self.left, self.out
+    def _look(self) -> bool:
+        c = self.control
+        return self.settling.look(
+            self.y[:-1], float(c[readout.MAGNIFIED]), float(c[readout.PEAK_U]), int(self.counters[readout.ACCEPTED])
         )
-        self.y[-1] += periods * drift
-        self.recorder.drain(self.counters)
-        self.recorder.repeat(self.kept_from, periods, period)
-        self._pass(periods, periods, settling, settling.remaining, collected, spread)
-        self.forget()
 
-    def leap(self, base: Track, state: FloatArray, periods: int, settling: Settling, off: float, owed: float) -> None:
+    def leap(self, sources: Sources) -> None:
+        from fingerspice.solve.approach import leap
+
+        leap(self, sources, self.settling)
+
+    def _collected(self) -> tuple[float, float]:
+        return float(self.control[readout.COLLECTED]), float(self.control[readout.SPREAD])
+
+    def land(self, base: Track, state: FloatArray, periods: int, off: float, owed: float) -> None:
         """Stand where a map of the period has led, in place of whole periods from here on.
 
         `base` has gone through the last of them; `state` is that after them, `off` what it may be off as a move of
         the gap voltage (V), and `owed` what the charge may be off for the map (C).
         """
-        t, (collected, spread) = self.t, self.control[[readout.COLLECTED, readout.SPREAD]]
+        t, collected = self.t, self._collected()
         self.y[:] = state
         self.error, self.control = base.error, base.control
-        self.control[readout.T] = t
-        self.control[readout.BRANCH_START] -= settling.period
+        self.control[readout.T] = t + periods * self.settling.period
+        self.control[readout.BRANCH_START] -= self.settling.period
         self.control[readout.ERROR_Q] += owed
-        self._pass(periods, periods - 1, settling, off, collected, spread)
+        self._pass(periods, periods - 1, off, collected)
+        self.repeated += periods
 
-    def _pass(
-        self, periods: int, alike: int, settling: Settling, off: float, collected: float, spread: float
-    ) -> None:  # fmt: skip
-        """Go on by whole periods whose outputs are written, `alike` more than the one that was integrated for them.
-
-        They are `off` by so much (V); `collected` and `spread` are the charge's before that one (see `readout`).
-        """
-        self.control[readout.T] += periods * settling.period
-        self.control[readout.BRANCH_START] += periods * settling.period
+    def _pass(self, periods: int, alike: int, off: float, collected: tuple[float, float]) -> None:
+        self.control[readout.BRANCH_START] += periods * self.settling.period
         self.control[readout.ERROR_U] += off
         if self.control[readout.PEAK_U] > 0.0:
             steepest = 2.0 * self.control[readout.PEAK_F] / self.control[readout.PEAK_U]
             self.control[readout.ERROR_F] += off * steepest
         if self.pace.charge:
             # What the one period is off is off in every one that it stands for.
-            missed = self.control[readout.COLLECTED] - collected
+            missed = self.control[readout.COLLECTED] - collected[0]
             self.control[readout.COLLECTED] += alike * missed
             self.control[readout.ERROR_Q] += (
-                alike * (abs(missed) + np.sqrt(self.control[readout.SPREAD] - spread))
+                alike * (abs(missed) + np.sqrt(self.control[readout.SPREAD] - collected[1]))
                 + self.capacitance * off
             )  # fmt: skip
-        self.repeated += periods
+
+    def state(self) -> State:
+        return from_stack(self.problem.scene, self.inner_state())
+
+    def inner_state(self) -> StackState:
+        """The state reached in the engine's form."""
+        c, model = self.control, self.prepared.system.model
+        u_before, u_gap = float(c[readout.U_BEFORE]), float(c[readout.U_GAP])
+        if model.mobile:
+            x_gap = dot(model.gap, self.y)
+            found = float(gap_voltage(model, model.k_gap * u_before, x_gap, c[readout.SIGN] or 1.0, u_gap))
+            # By rounding of the time alone a state at a fold may have none.
+            u_gap = found if found == found else u_gap
+        return StackState(self.t, self.y.copy(), u_before, u_gap, self.start.offset)
+
+    def written(self) -> FloatArray:
+        shown, model, n_out = self.problem.scene.shown, self.prepared.system.model, int(self.counters[readout.OUTPUT])
+        n, rows = self.shown, self.out[:, :n_out].T
+        if shown.is_turned:
+            rows[:, :n] *= shown.turn
+        if self.pace.charge and model.mobile:
+            u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out])
+            (cell,), network = shown.measured, shown.network
+            u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
+            rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s - self.start.offset
+        return rows
+
+    def finish(self, sources: Sources, after: Sources | None) -> None:
+        first = int(self.counters[readout.OUTPUT])
+        row = np.empty(row_width(self.problem.scene))
+        segment, tau = _segment(after or sources, self.problem.t_stop, "right")
+        model = self.prepared.system.model
+        # Copies take the charge of a jump that stands at the end; the state itself stays before it.
+        march.end_row(model, segment, tau, self.pace.charge, self.y.copy(), self.control.copy(), row)
+        self.out[:, first:] = as_marched(self.problem.scene, row[None, :])[0, : len(self.out), None]
+        self.counters[readout.OUTPUT] = self.t_out.size
+
+    def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
+        # The model may cover more of the area's curve than the scene's.
+        model, c = self.prepared.system.model, self.control
+        segment, tau = _segment(sources, self.t, side)
+        row = np.empty(row_width(self.problem.scene))
+        u, du = source(segment, tau)
+        found = gap_voltage(model, model.k_gap * u, dot(model.gap, self.y), c[readout.SIGN], c[readout.U_GAP])
+        # By rounding of the time alone a state at a fold may have none.
+        write_row_at(model, u, du, self.y, c[readout.SIGN], found if found == found else c[readout.U_GAP], row)
+        return from_written(self.problem.scene, row[None, :], self.start.offset, by_layer=True)[0, : len(self.out)]
 
     def recorded(self) -> Recorded | None:
-        """The steps taken so far."""
-        self.recorder.drain(self.counters)
-        problem = self.problem
-        return self.recorder.finish(
-            problem.first, problem.t_stop, partial(stack_record, problem.stack, problem.waveform, problem.model)
-        )
+        recorded, shown = super().recorded(), self.problem.scene.shown
+        if recorded is None or not shown.is_turned:
+            return recorded
+        return dataclasses.replace(recorded, make=partial(_turned, recorded.make, shown.turn))
 
-    def finish(self, table: SourceTable) -> None:
-        """Write the right-hand outputs at the very end of the run."""
-        first = int(self.counters[readout.OUTPUT])
-        if first == self.t_out.size:
-            return
-        segment, tau = after_the_end(self.problem, table)
-        # Copies take the charge of a jump that stands at the end; the state itself stays before it.
-        row = np.empty(row_width(self.problem))
-        march.end_row(
-            self.prepared.system.model, segment, tau, self.pace.charge, self.y.copy(), self.control.copy(), row
-        )
-        live, z, current = from_rows(self.problem, row[None, :])
-        n = live.shape[0]
-        self.out[:n, first:] = live
-        if self.pace.charge:
-            self.out[n, first:] = z
-            self.out[n + 1, first:] = current
-        self.counters[readout.OUTPUT] = self.t_out.size
+    def stated_gaps(self) -> FloatArray:
+        control, model = self.control, model_of(self.problem.scene)
+        peak_u, peak_f = float(control[readout.PEAK_U]), float(control[readout.PEAK_F])
+        # Rounding is an error too.
+        floor = 4e-16 * (peak_u + model.k_gap * self.problem.scene.u_peak)
+        u_error = SAFETY * float(control[readout.ERROR_U]) + floor
+        f_error = SAFETY * float(control[readout.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f
+        return np.array([[peak_u, peak_f, u_error, f_error]])
+
+    def stated(self, run: Run) -> None:
+        run.gaps, run.margin = self.stated_gaps(), float(self.control[readout.MARGIN])
+        if self.problem.charge:
+            run.charge_error = self._charge_error(float(self.control[readout.PEAK_U]))
+
+    def _charge_error(self, peak_u: float) -> float:
+        """Estimated error of the charge, C; every step adds the rounding of the charge that a layer holds."""
+        held = self.capacitance * (self.problem.scene.u_peak + peak_u)
+        steps = 1.0 + float(self.counters[readout.ACCEPTED])
+        # Whatever the area's polynomial misses, all charge that is moved misses too.
+        moved = held + float(self.control[readout.PEAK_Q])
+        missed = self.prepared.area_error * moved if self.prepared.system.model.coupled else 0.0
+        # Twice as safe: what leaks between nodes is looked for at a few places only, and against the reference 1.7
+        # times as much was met in a stack that leaks fast throughout.
+        return 2.0 * SAFETY * float(self.control[readout.ERROR_Q]) + 4e-16 * held * steps + missed
+
+
+def _turned(
+    make: Callable[..., Record], turn: FloatArray, t: FloatArray, left: BoolArray, columns: FloatArray
+) -> Record:  # fmt: skip
+    """A record of live voltages along the loop."""
+    return make(t, left, turn[:, None] * columns)
+
+
+def _segment(sources: Sources, t: float, side: Literal["left", "right"]) -> tuple[Segment, float]:
+    """The segment of one source that a time (s) is in, and how far into it that is, s."""
+    (i,) = segment_index(sources, t, side).tolist()
+    start = float(sources.edges[i])
+    return Segment(start, float(sources.edges[i + 1]) - start, sources.terms[i], sources.series[i]), t - start
+
+
+def scale_of(problem: Problem, tables: Tables) -> float:
+    """Largest gap voltage to expect, V."""
+    peak, start = problem.scene.u_peak or tables.peak(), problem.inner
+    share = peak * model_of(problem.scene).k_gap if np.isfinite(peak) else 0.0
+    return max(share, float(np.abs(start.y[:-1]).max(initial=0.0))) or 1.0

@@ -10,11 +10,11 @@ import numpy as np
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
+from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.topology import find_branches
 from fingerspice.netlist.library import LIBRARIES, library_text
 from fingerspice.physics.contact import Contact
-from fingerspice.solve.networks import prepare_network
+from fingerspice.solve.problem import prepare
 from fingerspice.solve.starting import start_voltage, starts_uncharged
 from fingerspice.waveforms.ramps import PWL, Pulse
 from fingerspice.waveforms.transients import Exp
@@ -106,10 +106,9 @@ def _refuse_merged_names(circuit: Circuit) -> None:
 
 def _contacts(circuit: Circuit) -> dict[str, Contact]:
     """The contact of each GAP, by area node."""
-    if is_stack(circuit):
-        stack = build_stack(circuit)
-        return {e.nodes[2]: stack.contact for e in stack.layers if stack.contact is not None}
-    return {gap.nodes[2]: contact_of(gap) for gap in circuit.by_device("GAP")}
+    network = network_of(circuit)
+    pairs = zip(network.areas, network.contacts, strict=True)
+    return {area.node: contact for area, contact in pairs if contact is not None}
 
 
 def _start_areas(circuit: Circuit, law: str) -> dict[str, float]:
@@ -132,9 +131,7 @@ def _start_areas(circuit: Circuit, law: str) -> dict[str, float]:
 
 def _slow_areas(circuit: Circuit, law: str) -> dict[str, float]:
     """Start values (mm^2) of areas with dynamics of their own."""
-    problem = prepare_network(
-        circuit, t_stop=None, t_eval=None, charge_law=law, area="coupled", start="deck", charge=False
-    )
+    problem = prepare(circuit, t_stop=None, t_eval=None, charge_law=law, area="coupled", start="deck", charge=False)
     net, n = problem.scene.net, problem.scene.net.k.shape[0]
     slow = problem.initial.y[n:]
     return {

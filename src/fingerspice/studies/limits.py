@@ -15,13 +15,11 @@ from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import heading
-from fingerspice.circuit.statespace import is_stack
 from fingerspice.results.outcome import SolveError, Status
 from fingerspice.solve.folding import meets_fold
-from fingerspice.solve.networks import prepare_network
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.runs import Progress
-from fingerspice.solve.simulation import run_network
+from fingerspice.solve.simulation import run_problem
 from fingerspice.waveforms.combinations import Product
 from fingerspice.waveforms.waveform import Waveform, as_waveform, require
 
@@ -207,18 +205,14 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
             {e.name: Product((factor, e.waveform)) for e in circuit.by_device("V") if e.waveform is not None}
         )
         try:
-            if is_stack(raised):
-                problem = prepare(
-                    raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="deck",
-                    charge=False, rtol=RTOL,
-                )  # fmt: skip
+            problem = prepare(
+                raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="deck", charge=False,
+                rtol=RTOL,
+            )  # fmt: skip
+            if problem.scene.stack is not None:
                 return meets_fold(problem, RTOL)
-            ends = np.array([0.0, t_stop])
-            network = prepare_network(
-                raised, t_stop=t_stop, t_eval=ends, charge_law="mobile", area="coupled", start="deck", charge=False
-            )
             # Not by `simulate`: warnings of voltages that nobody asked for are none.
-            run = run_network(network, ends, RTOL)
+            run = run_problem(problem, np.array([0.0, problem.t_stop]), RTOL)
         except InputError as error:
             # An operating point goes with the source, and may itself stand past the fold; a given start does not.
             if circuit.initial or "past the fold" not in str(error):

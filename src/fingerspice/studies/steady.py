@@ -16,18 +16,15 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_area
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.statespace import build_stack, is_stack
-from fingerspice.circuit.topology import find_branches
+from fingerspice.circuit.loop import network_of
 from fingerspice.results.outcome import ErrorEstimate, SolveError
 from fingerspice.results.solution import Solution
 from fingerspice.results.summary import Figured, Figures, KeptFigures
-from fingerspice.solve.network_periodic import close_network_period
-from fingerspice.solve.networks import NetworkProblem, prepare_network
-from fingerspice.solve.periodic import Closed, close_period
+from fingerspice.solve.periodic import close_period
 from fingerspice.solve.problem import Problem, prepare
-from fingerspice.solve.simulation import RTOL_RANGE, run_network, run_problem
+from fingerspice.solve.simulation import RTOL_RANGE, run_problem
 from fingerspice.waveforms.combinations import Sum
-from fingerspice.waveforms.waveform import Waveform, require
+from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,7 +38,7 @@ class SteadyState(Shown, Figured):
 
     Attributes
     ----------
-    problem : Problem or NetworkProblem
+    problem : Problem
         One period from the periodic state on, at the first whole period after the source has settled.
     rtol : float
     defect : float
@@ -57,7 +54,7 @@ class SteadyState(Shown, Figured):
         Periods integrated to find it.
     """
 
-    problem: Problem | NetworkProblem
+    problem: Problem
     rtol: float
     defect: float
     map_slope: FloatArray
@@ -103,10 +100,7 @@ class SteadyState(Shown, Figured):
         SolveError
             Where that fails.
         """
-        if isinstance(self.problem, NetworkProblem):
-            solution = run_network(self.problem, rtol=self.rtol, start="periodic")
-        else:
-            solution = run_problem(self.problem, rtol=self.rtol, start="periodic", begun=self.error)
+        solution = run_problem(self.problem, rtol=self.rtol, start="periodic")
         if solution.failure is not None:
             raise SolveError(solution.failure, solution)
         for text in solution.warnings:
@@ -114,15 +108,6 @@ class SteadyState(Shown, Figured):
                 # Past functools, to the line that asked.
                 warnings.warn(text, FingerspiceWarning, stacklevel=3)
         return solution
-
-
-def _waveform(circuit: Circuit) -> Waveform:
-    """All sources of a circuit at once."""
-    if is_stack(circuit):
-        return build_stack(circuit).waveform
-    sources = [e.waveform for e in find_branches(circuit)[1] if e.device in "VI"]
-    known = tuple(wave for wave in sources if wave is not None)
-    return known[0] if len(known) == 1 else Sum(known)
 
 
 def steady_state(
@@ -165,20 +150,14 @@ def steady_state(
     require(points >= 1, "points", points, "1 or more")
     require_area(area)
     circuit = overridden(circuit, sources, parameters)
-    period = circuit.remember("waveform", lambda: _waveform(circuit)).period
+    waves = network_of(circuit).waveforms
+    period = (waves[0] if len(waves) == 1 else Sum(waves)).period
     if period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
-    closed: Closed[Problem] | Closed[NetworkProblem]
-    if is_stack(circuit):
-        problem = prepare(
-            circuit, t_stop=period, t_eval=None, charge_law=charge_law, area=area, start="uncharged", charge=charge
-        )
-        closed = close_period(dataclasses.replace(problem, first=0.0, step=period / points), 0.5 * rtol)
-    else:
-        network = prepare_network(
-            circuit, t_stop=period, t_eval=None, charge_law=charge_law, area=area, start="uncharged", charge=charge
-        )
-        closed = close_network_period(dataclasses.replace(network, first=0.0, step=period / points), 0.5 * rtol)
+    problem = prepare(
+        circuit, t_stop=period, t_eval=None, charge_law=charge_law, area=area, start="uncharged", charge=charge
+    )
+    closed = close_period(dataclasses.replace(problem, first=0.0, step=period / points), 0.5 * rtol)
     return SteadyState(
         closed.problem, rtol, closed.defect, closed.map_slope, closed.memory, closed.error, closed.periods
     )

@@ -1,8 +1,9 @@
-"""One period of a network, for its periodic state: the sources' tables, the state as modes, what is linear about it."""
+"""One period of a circuit, for its periodic state: the sources' tables, the state as modes, what is linear about it."""
 
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +11,9 @@ from numpy.typing import NDArray
 from fingerspice.circuit.network import Modes
 from fingerspice.engine.network import Sources
 from fingerspice.numerics import linear
-from fingerspice.results.outcome import NetworkState, Status
-from fingerspice.solve.netruns import joined
-from fingerspice.solve.networks import NetworkProblem
+from fingerspice.results.outcome import State, Status
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.sources import joined
 from fingerspice.waveforms.sampling import SourceTable, source_table
 from fingerspice.waveforms.waveform import DC
 
@@ -27,11 +28,32 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _GAUSS = 0.5 + 0.5 * _NODES, 0.5 * _WEIGHTS
 
 
+CHARGING = "a current source charges, from period to period, what nothing drains"
+
+
+@dataclass(frozen=True)
+class Found:
+    """What `Closed` tells, with the error of every gap's voltage and force (n_gap, 2), V and N."""
+
+    defect: float
+    map_slope: FloatArray
+    memory: float
+    gap_errors: FloatArray
+    periods: float
+
+
 class Stopped(Exception):
     """A period that could not be integrated."""
 
     def __init__(self, status: Status, t: float) -> None:
         self.status, self.t = status, t
+
+
+def first_period(problem: Problem) -> float:
+    """Time (s) of the first whole period after the source has settled, or after the start if that is later."""
+    waveform = problem.waveform
+    assert waveform.period is not None
+    return waveform.period * float(np.ceil(max(waveform.settled, problem.t_start) / waveform.period))
 
 
 class Period:
@@ -56,14 +78,14 @@ class Period:
         What these have when the period begins; 0 elsewhere.
     turned : ndarray, shape (n + n_slow,)
         Sign with which the end of the span is its start.
-    problem : NetworkProblem
+    problem : Problem
         Of the span alone, without charge.
     """
 
-    def __init__(self, problem: NetworkProblem) -> None:
+    def __init__(self, problem: Problem) -> None:
         waveform, scene, net = problem.waveform, problem.scene, problem.scene.net
         assert waveform.period is not None
-        self.begin = waveform.period * float(np.ceil(max(waveform.settled, problem.t_start) / waveform.period))
+        self.begin = first_period(problem)
         self.modes: Modes = scene.modes
         self.before = np.array([float(w.value(self.begin, "left")) for w in scene.waveforms])
         slow = net.slow >= 0
@@ -91,14 +113,14 @@ class Period:
         self.turned = np.where(np.arange(self.rates.size) < self.n, 1.0 if self.parts == 1 else -1.0, 1.0)
         self.problem = dataclasses.replace(
             problem, t_start=self.begin, t_stop=self.end, first=self.begin, charge=False,
-            initial=NetworkState(self.begin, problem.initial.y, self.before, np.zeros(net.gap.size)),
+            initial=State(self.begin, problem.initial.y, self.before, np.zeros(net.gap.size), scene.charge_law),
         )  # fmt: skip
 
-    def _key(self, problem: NetworkProblem) -> tuple[object, ...]:
+    def _key(self, problem: Problem) -> tuple[object, ...]:
         """Of the sources' tables; a function's is as fine as the outputs."""
         return "period", self.begin, self.span, problem.step if problem.scene.is_sampled else 0.0
 
-    def _push(self, problem: NetworkProblem) -> None:
+    def _push(self, problem: Problem) -> None:
         """What currents move onto the capacitors that nothing drains before the period begins."""
         for j, wave in enumerate(problem.scene.waveforms):
             table = source_table(wave, problem.t_start, self.begin, 1e-13, problem.step)
@@ -160,7 +182,7 @@ class Period:
         return np.column_stack([wave.value(t) for wave in self.problem.scene.waveforms])
 
 
-def _turns(problem: NetworkProblem) -> bool:
+def _turns(problem: Problem) -> bool:
     """Whether every source repeats its half periods with the sign turned: then so do all voltages.
 
     The circuit is symmetric: linear but for areas that follow the size of a voltage.

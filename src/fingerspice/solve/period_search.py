@@ -1,4 +1,4 @@
-"""The periodic state of a network, by Newton's method on the map of one period; `periodic` for networks.
+"""The periodic state of any circuit, by Newton's method on the map of one period.
 
 The map is that of z: the modes of the live voltages with the areas as at 0 V, then the areas with dynamics of their own
 over their value at 0 V. Its derivative is at first that of the circuit with its areas held at their means, which
@@ -14,16 +14,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.errors import InputError
 from fingerspice.circuit.network import network_modes
 from fingerspice.engine import netassess, readout
-from fingerspice.results.outcome import ErrorEstimate, Failure, NetworkState, SolveError, Status
-from fingerspice.solve.diagnosis import not_finite_at
-from fingerspice.solve.netmarching import FINEST, GUESS, LOCAL_SHARE, SAFETY, March
-from fingerspice.solve.network_period import Period, Stopped
-from fingerspice.solve.networks import NetworkProblem
+from fingerspice.results.outcome import SolveError, Status
+from fingerspice.solve.diagnosis import period_failure
+from fingerspice.solve.marching import GUESS
+from fingerspice.solve.netmarching import March
 from fingerspice.solve.nodal import pass_through
-from fingerspice.solve.periodic import Closed
+from fingerspice.solve.period import CHARGING, Found, Period, Stopped
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY
 
 FloatArray = NDArray[np.float64]
 
@@ -59,70 +59,11 @@ class _Pass:
     rounding: FloatArray
 
 
-def close_network_period(problem: NetworkProblem, rtol: float) -> Closed[NetworkProblem]:
-    """Start a network from its periodic state, keeping its length; as `periodic.close_period`.
-
-    Raises
-    ------
-    InputError
-        For sources without a common period.
-    SolveError
-        Where a period cannot be integrated, or the iteration does not close it.
-    """
-    if problem.waveform.period is None:
-        raise InputError("the source has no period, so there is no periodic state to find")
-    try:
-        period = Period(problem)
-        closed = _closed_form(period) if not problem.scene.coupled else _Search(period, rtol).close()
-    except Stopped as stopped:
-        raise SolveError(_failure(problem, stopped.status, stopped.t)) from None
-    x, areas, found = closed
-    moved = period.begin - problem.t_start
-    n_s = period.before.size
-    y = np.concatenate([x, areas, np.zeros(n_s)])
-    state = NetworkState(period.begin, y, period.before, np.zeros(problem.scene.net.gap.size))
-    started = dataclasses.replace(
-        problem, t_start=period.begin, t_stop=problem.t_stop + moved, first=problem.first + moved, initial=state,
-        begun=found.gap_errors,
-    )  # fmt: skip
-    u_gap, f_el = map(float, found.gap_errors.max(axis=0, initial=0.0))
-    return Closed(started, found.defect, found.map_slope, found.memory, ErrorEstimate(u_gap, f_el), found.periods)
-
-
-@dataclass(frozen=True)
-class _Found:
-    """As `periodic.Closed`, with the error of every gap's voltage and force (n_gap, 2), V and N."""
-
-    defect: float
-    map_slope: FloatArray
-    memory: float
-    gap_errors: FloatArray
-    periods: float
-
-
-def _closed_form(period: Period) -> tuple[FloatArray, FloatArray, _Found]:
-    """Live voltages (V) of the periodic state of a circuit with fixed areas."""
-    modes = period.modes
-    start, end, _ = period.linear_state(modes)
-    if not np.all(np.isfinite(start)):
-        raise SolveError(_failure(period.problem, Status.NOT_PERIODIC, None, CHARGING))
-    sign = 1.0 if period.parts == 1 else -1.0
-    defect = float(np.abs(modes.shape @ (sign * end - start)).max(initial=0.0))
-    slope = np.diag(np.exp(-period.rates * period.span * period.parts))
-    x = period.voltages(start + period.kept)
-    # In closed form there is rounding only, which a run states itself.
-    none = np.zeros((len(period.problem.network.fingers), 2))
-    return x, np.zeros(0), _Found(period.parts * defect, slope, 1.0, none, 1)
-
-
-CHARGING = "a current source charges, from period to period, what nothing drains"
-
-
 # State and sources at the end of a pass, the error of the state, and what else is known of it.
 _Made = tuple[FloatArray, FloatArray, FloatArray, _Pass]
 
 
-class _Search:
+class Search:
     """Newton's method on the map of a period."""
 
     def __init__(self, period: Period, rtol: float) -> None:
@@ -152,7 +93,7 @@ class _Search:
             modes = network_modes(network, area)
             start, _, along = period.linear_state(modes)
             if not np.all(np.isfinite(start)):
-                raise SolveError(_failure(problem, Status.NOT_PERIODIC, None, CHARGING))
+                raise SolveError(period_failure(problem, Status.NOT_PERIODIC, None, CHARGING))
             x = along @ modes.shape.T - s @ modes.follow.T
             for i in np.flatnonzero(net.gap >= 0):
                 contact = network.contacts[i]
@@ -198,7 +139,7 @@ class _Search:
         error = np.append(period.modes.inverse @ error_x[:n], error_x[n : z.size])
         return dataclasses.replace(figures, end=period.turned * end, error=error)
 
-    def _marched(self, problem: NetworkProblem, tol: float) -> _Made | None:
+    def _marched(self, problem: Problem, tol: float) -> _Made | None:
         """State and sources at the end by exponential steps, the state's error, and the figures; None for no way on."""
         none, n = np.zeros(0), self.period.n
         one = March(problem, max(tol, FINEST), self.rtol, self.scale, none, none.astype(bool), False)
@@ -208,7 +149,7 @@ class _Search:
         magnified = max(1.0, float(one.control[readout.MAGNIFIED]))
         return one.y, one.s_before, error, _Pass(none, none, one.met.copy(), magnified, one.references.magnified)
 
-    def _collocated(self, problem: NetworkProblem, tol: float) -> _Made:
+    def _collocated(self, problem: Problem, tol: float) -> _Made:
         """The same by an implicit method, its error from a coarser pass."""
         none, scene, network = np.zeros(0), problem.scene, problem.network
         status, one, error = pass_through(problem, self.period.sources, tol, self.scale)
@@ -224,7 +165,7 @@ class _Search:
         rounding = (np.abs(gap) @ np.abs(self.period.modes.inverse)).sum(axis=1)
         return one.y, one.s_before, error, _Pass(none, none, met, 1.0, 10.0 + rounding)
 
-    def close(self) -> tuple[FloatArray, FloatArray, _Found]:
+    def close(self) -> tuple[FloatArray, FloatArray, Found]:
         """Live voltages (V) and slow areas that a period leads back to, to the error asked for or as rounding lets."""
         period = self.period
         tol = LOCAL_SHARE * self.rtol
@@ -242,7 +183,7 @@ class _Search:
                 break
         slope = self._slope()
         slope = slope @ slope if period.parts == 2 else slope
-        found = _Found(period.parts * defect, slope, memory, errors, self.passes / period.parts)
+        found = Found(period.parts * defect, slope, memory, errors, self.passes / period.parts)
         return period.voltages(self.z), self.z[period.n :], found
 
     def _newton(self, tol: float) -> tuple[_Pass, FloatArray, float]:
@@ -282,7 +223,7 @@ class _Search:
                 self._mind_wandering(last, change, tol)
                 return last, step, defect
         cause = f"{Status.NOT_PERIODIC.cause}: {defect:.3g} V are left after a period"
-        raise SolveError(_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
+        raise SolveError(period_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
 
     def _memory(self) -> float:
         """Largest factor by which an error of the voltages that is made in every period grows; 1 or more."""
@@ -308,7 +249,7 @@ class _Search:
         moved = self._largest(np.where(held, change, 0.0))
         if moved > allowed:
             cause = f"a charge that nothing drains moves by {moved:.3g} V in every period"
-            raise SolveError(_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
+            raise SolveError(period_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
 
     def _holding(self, z: FloatArray) -> FloatArray:
         """z with the charge that nothing drains as it began: its modes alone tell it only while areas are as at 0 V."""
@@ -373,12 +314,3 @@ class _Search:
             float(over.max(initial=0.0)) / self.rtol,
             rounding / self.rtol,
         )
-
-
-def _failure(problem: NetworkProblem, status: Status, t: float | None, cause: str = "") -> Failure:
-    """Why no periodic state was reached."""
-    names = [gap.name for a in problem.network.areas if (gap := a.gap) is not None]
-    if status is Status.SOURCE_NOT_FINITE and t is not None:
-        names = [not_finite_at(problem, t)]
-    why = cause or f"no periodic state was reached: {status.cause}"
-    return Failure(status, why, status.action, t, ", ".join(names))

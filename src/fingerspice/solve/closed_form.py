@@ -1,0 +1,265 @@
+"""Runs in closed form: of a circuit whose areas are fixed or do not matter, and of a stack that does not leak."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.circuit.network import Modes, Network
+from fingerspice.engine.algebraic import follow, source_at
+from fingerspice.engine.network import at_sources
+from fingerspice.numerics import hold, linear
+from fingerspice.results.outcome import State, Status
+from fingerspice.results.record import Record
+from fingerspice.results.refined import ClosedForm
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.runs import Run, gap_signals, kept_with
+from fingerspice.solve.sources import Tables, after_the_end, joined, segment_index
+from fingerspice.solve.stackstate import StackState, from_stack, from_written, model_of, row_width
+from fingerspice.waveforms.ramps import Samples
+from fingerspice.waveforms.sampling import same_time
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# Of the closed forms, over the largest voltage of the run: where the modes follow from a secular equation, and else.
+ROUNDING, ROUNDING_OF_MATRICES = 1e-13, 1e-12
+# Areas whose modes stay with a scene.
+MOST_MODES = 8
+
+
+def solve_linear(
+    problem: Problem, t_out: FloatArray, left: BoolArray, area: FloatArray | None = None, bound: float = 0.0
+) -> Run:
+    """Outputs of a circuit with its areas fixed: its modes answered source by source, and added up.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its charge is wanted only where the areas are fixed.
+    t_out, left : ndarray, shape (n_out,)
+    area : ndarray, shape (n_area,), optional
+        m^2; those of the scene by default.
+    bound : float
+        Error from taking these areas, relative to the peaks; 0 where they are the areas, or do not matter.
+    """
+    scene, start = problem.scene, problem.initial
+    area = scene.area0 if area is None else area
+    key = ("modes", *area.tolist())
+    modes: Modes = kept_with(scene.prepared, key, MOST_MODES, lambda: scene.modes_at(area))
+    n = modes.rates.size
+    v0 = modes.inverse @ (start.y[:n] + modes.follow @ start.s_before)
+    tables = Tables(problem, 1e-13, no_chirps=True, t_out=t_out)
+    z_end = start.y[n:]
+    if _is_sample_by_sample(problem, t_out):
+        rows, last = _at_samples(problem, modes, v0)
+        t, side, end = t_out, left, problem.t_stop
+    else:
+        answer, last, end = _answer(problem, tables, modes, v0, t_out, left)
+        t, side, rows = t_out[: len(answer.v)], left[: len(answer.v)], answer.x(modes)
+        if problem.charge:
+            flow = _Charge(problem.network, area, modes, v0, start, problem.t_start)
+            rows = np.hstack([rows, *flow.at(t, answer)])
+            z_end = flow.at(np.array([end]), last)[0][0]
+    y = np.concatenate([last.x(modes)[0], z_end])
+    state = State(end, y, last.s[0], np.zeros(area.size), scene.charge_law)
+    return _finished(problem, tables, t, side, rows, state, bound, partial(solve_linear, area=area))
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """Modes (n_t, n), sources, their integrals and their slopes (n_t, n_s) at times."""
+
+    v: FloatArray
+    s: FloatArray
+    integral: FloatArray
+    slope: FloatArray
+
+    def x(self, modes: Modes) -> FloatArray:
+        """Live voltages, V, shape (n_t, n)."""
+        # Not by BLAS, whose threads cost more than the product and may round otherwise.
+        return np.asarray(
+            np.einsum("jk,tk->tj", modes.shape, self.v) - np.einsum("jk,tk->tj", modes.follow, self.s), float
+        )
+
+
+def _answer(
+    problem: Problem, tables: Tables, modes: Modes, v0: FloatArray, t_out: FloatArray, left: BoolArray
+) -> tuple[_Answer, _Answer, float]:
+    """The outputs reached, the same just before the time reached (n_t = 1), and that time, s."""
+    n, n_s = modes.gains.shape
+    # The sources' integrals ride along as modes of rate zero, for the charge.
+    rates, gains = np.append(modes.rates, 0.0), np.vstack([modes.gains, np.ones(n_s)])
+    states = [np.append(v0 if j == 0 else np.zeros(n), 0.0) for j in range(n_s)]
+    size = t_out.size
+    v, s, integral, slope = (np.zeros((size + 1, k)) for k in (n, n_s, n_s, n_s))
+    v[size], s[size], end, first = v0, problem.initial.s_before, problem.t_start, 0
+    sources = None
+    for window in tables:
+        if any(table.edges.size < 2 for table in window):
+            break
+        sources, end = joined(window), min(float(table.edges[-1]) for table in window)
+        # The end is one more of the times: where one source breaks off there, the others' tables go on.
+        at = np.append(np.arange(first, _upto(t_out, left, end)), size)
+        t, side = np.append(t_out[at[:-1]], end), np.append(left[at[:-1]], True)
+        v[size] = 0.0
+        for j, table in enumerate(window):
+            given = table.edges, table.terms, table.series
+            rows, states[j] = linear.respond(rates, gains[:, j], *given, states[j], t, side)
+            v[at] += rows[:, :n]
+            integral[at, j] = rows[:, n]
+            s[at, j], slope[at, j] = source_at(*given, t, side)
+        first = at.size - 1 + first
+    if tables.not_finite is None and first < size and sources is not None:
+        after = after_the_end(problem) or sources
+        v[first:size], integral[first:size] = v[size], integral[size]
+        at_sources(after, segment_index(after, end, "right"), end, 0.0, s[first], slope[first])
+        s[first:size], slope[first:size] = s[first], slope[first]
+        first = size
+    out, last = (_Answer(v[part], s[part], integral[part], slope[part]) for part in (slice(first), slice(size, None)))
+    return out, last, end
+
+
+def _upto(t_out: FloatArray, left: BoolArray, end: float) -> int:
+    """Number of outputs up to the end of a window, left-hand ones on it included."""
+    last = int(np.searchsorted(t_out, end, side="left"))
+    while last < t_out.size and t_out[last] == end and left[last]:
+        last += 1
+    return last
+
+
+def _is_sample_by_sample(problem: Problem, t_out: FloatArray) -> bool:
+    """Whether a recorded source is wanted at its own samples from the first one on: then a recursion serves."""
+    wave = problem.waveform
+    if problem.charge or not isinstance(wave, Samples) or not 1 < t_out.size <= wave.values.size:
+        return False
+    if wave.start != problem.t_start or t_out[-1] < problem.t_stop * (1.0 - 1e-12):
+        return False
+    grid = wave.start + np.arange(t_out.size) / wave.rate
+    return bool(np.all(np.abs(t_out - grid) <= same_time(problem.t_stop)))
+
+
+def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatArray, _Answer]:
+    """Live voltages at the samples of a recorded source (n_t, n), and the answer at the last."""
+    wave = problem.waveform
+    assert isinstance(wave, Samples)
+    count = round((problem.t_stop - wave.start) * wave.rate) + 1
+    u, rates, gains = wave.values[:count], modes.rates, np.ascontiguousarray(modes.gains[:, 0])
+    live, end = np.empty((modes.rates.size, u.size)), v0
+    for i, out in enumerate(live):
+        direct = -float(modes.follow[i, 0])
+        _, end = hold.first_order_hold(u, 1.0 / wave.rate, rates, gains, direct, modes.shape[i], v0, out=out)
+    s = np.array([[float(wave.value(problem.t_stop, "left"))]])
+    return live.T, _Answer(end[None], s, np.zeros((1, 1)), np.zeros((1, 1)))
+
+
+@dataclass(frozen=True)
+class _Charge:
+    """Charge that each source delivers, and its regular current, of a circuit with fixed areas."""
+
+    network: Network
+    area: FloatArray
+    modes: Modes
+    v_start: FloatArray
+    start: State
+    t_start: float
+
+    def at(self, t: FloatArray, answer: _Answer) -> list[FloatArray]:
+        """Charges and currents (n_t, n_s) at times t."""
+        net, modes = self.network, self.modes
+        n, x, s = modes.rates.size, answer.x(modes), answer.s
+        capacitance, leak = net.capacitance(self.area)[:, None], net.leak(self.area)[:, None]
+        stored_x, stored_s = net.through @ (capacitance * net.p), net.through @ (capacitance * net.q)
+        lost_x = net.through @ (leak * net.p) + net.delivered[:, :n]
+        lost_s = net.through @ (leak * net.q) + net.delivered[:, n:]
+        draining = modes.rates > 0.0
+        passed = np.einsum("kj,tj->tk", modes.gains, answer.integral) - (answer.v - self.v_start)
+        held = np.outer(t - self.t_start, self.v_start)
+        # What nothing drains loses nothing either, so that its integral does not count.
+        integral = np.where(draining, passed / np.where(draining, modes.rates, 1.0), held)
+        x_integral = _Answer(integral, answer.integral, s, s).x(modes)
+        rate = np.einsum("kj,tj->tk", modes.gains, s) - modes.rates * answer.v
+        dx = _Answer(rate, answer.slope, s, s).x(modes)
+
+        def along(matrix: FloatArray, values: FloatArray) -> FloatArray:
+            return np.asarray(np.einsum("kj,tj->tk", matrix, values))
+
+        moved = along(stored_x, x - self.start.y[:n]) + along(stored_s, s - self.start.s_before)
+        charge = self.start.y[n:] + moved + along(lost_x, x_integral) + along(lost_s, answer.integral)
+        current = along(stored_x, dx) + along(stored_s, answer.slope) + along(lost_x, x) + along(lost_s, s)
+        return [charge, current]
+
+
+def _finished(
+    problem: Problem, tables: Tables, t: FloatArray, left: BoolArray, rows: FloatArray, state: State, bound: float,
+    solve: Callable[..., Run],
+) -> Run:  # fmt: skip
+    """A run with its peaks and its errors: rounding, and `bound` relative to the peaks."""
+    status = Status.SUCCESS if tables.not_finite is None else Status.SOURCE_NOT_FINITE
+    run = Run(t, left, rows, status, 0, {}, state, t_failed=tables.not_finite)
+    run.unseen, run.rough = tables.unseen, tables.rough
+    largest = problem.largest
+    if problem.network.n_voltage < len(problem.network.sources):
+        largest = max(largest, float(np.abs(rows[:, : problem.network.k.shape[0]]).max(initial=0.0)))
+    rounding = (ROUNDING_OF_MATRICES if problem.scene.stack is None else ROUNDING) * largest
+    gaps = []
+    for u, f in gap_signals(run.record(problem)):
+        peak, force = float(np.abs(u).max(initial=0.0)), float(f.max(initial=0.0))
+        share = rounding / peak if peak > 0.0 else 0.0
+        gaps.append((peak, force, rounding + bound * peak, (2.0 * share + 3.0 * bound) * force))
+    run.gaps = np.array(gaps or [(0.0, 0.0, rounding, 0.0)])
+    if not problem.scene.is_sampled:
+        # A function would cost too much to look at.
+        look = partial(_look, dataclasses.replace(problem, charge=False), solve)
+        run.continuous = ClosedForm(look, problem.waveform, problem.t_start, problem.first, problem.t_stop)
+    return run
+
+
+def _look(problem: Problem, solve: Callable[..., Run], t: FloatArray, left: BoolArray) -> Record:
+    return solve(problem, t, left).record(problem)
+
+
+def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run:
+    """Outputs of a stack without any leak: the layers keep their share of the source's voltage."""
+    scene = problem.scene
+    model, start = model_of(scene), problem.inner
+    tables = Tables(problem, 1e-12, t_out=t_out)
+    rows, ended = np.empty((t_out.size, row_width(scene))), np.empty((1, row_width(scene)))
+    done, end, u_end, sources, charge_error = 0, problem.t_start, start.u_before, None, 0.0
+
+    def along(u: FloatArray, slope: FloatArray, into: FloatArray) -> float:
+        return float(follow(model, u, slope, start.y, start.u_before, into))
+
+    for (table,) in tables:
+        if table.edges.size < 2:
+            break
+        sources, end = joined([table]), float(table.edges[-1])
+        at = slice(done, _upto(t_out, left, end))
+        t, side = np.append(t_out[at], end), np.append(left[at], True)
+        u, slope = source_at(table.edges, table.terms, table.series, t, side)
+        charge_error = max(charge_error, along(u[:-1], slope[:-1], rows[at]))
+        done, u_end = at.stop, float(u[-1])
+    if tables.not_finite is None and done < t_out.size and sources is not None:
+        after, last = after_the_end(problem) or sources, np.empty((2, 1))
+        at_sources(after, segment_index(after, end, "right"), end, 0.0, last[0], last[1])
+        u, slope = np.repeat(last, t_out.size - done, axis=1)
+        charge_error = max(charge_error, along(u, slope, rows[done:]))
+        done = t_out.size
+    # The state is that before a jump at the end.
+    along(np.array([u_end]), np.zeros(1), ended)
+    y = np.append(start.y[:-1], ended[0, -1])
+    state = from_stack(scene, StackState(end, y, u_end, float(ended[0, 1]), start.offset))
+    shown = from_written(scene, rows[:done], start.offset, by_layer=False)
+    run = _finished(problem, tables, t_out[:done], left[:done], shown, state, 0.0, solve_algebraic)
+    if problem.charge:
+        most = (
+            np.abs(rows[:done, -1]).max(initial=0.0)
+            + np.abs(rows[:done, 0] / rows[:done, 2]).max(initial=0.0) / model.s
+        )
+        run.charge_error = charge_error + ROUNDING * float(most)
+    return run

@@ -1,0 +1,190 @@
+"""The state that a run of a circuit starts from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.errors import InputError
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.network import Network, build_network
+from fingerspice.circuit.statespace import Stack
+from fingerspice.engine.model import Model
+from fingerspice.physics.contact import inverse_area
+from fingerspice.results.outcome import State
+from fingerspice.results.solution import Solution
+from fingerspice.solve.scenes import Scene
+from fingerspice.solve.stackstate import to_stack, unreachable
+from fingerspice.solve.starting import (
+    PAST_FOLD,
+    ROUNDING,
+    at_own_area,
+    operating_point,
+    settle,
+    start_voltages,
+    starts_uncharged,
+)
+from fingerspice.waveforms.waveform import require
+
+FloatArray = NDArray[np.float64]
+
+
+def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> State:
+    """State just before the start.
+
+    Raises
+    ------
+    InputError
+        For a start that cannot be.
+    """
+    network = scene.network
+    size = sum(network.b.shape) + int(np.count_nonzero(scene.net.slow >= 0))
+    if isinstance(start, Solution):
+        names = tuple(e.name for e in network.layers)
+        if start.layers != names or start.state.y.size != size or start.charge_law != scene.charge_law:
+            raise InputError(
+                f"the solution to start from has layers {', '.join(start.layers)} and the {start.charge_law} law, or "
+                f"is another circuit's; allowed: one of this circuit, {', '.join(names)} and {scene.charge_law}"
+            )
+        return start.state
+    require(start in ("deck", "uncharged", "dc"), "start", repr(start), "'deck', 'uncharged', 'dc' or a Solution")
+    if ("initial", start) not in scene.prepared:
+        if start == "uncharged" or (start == "deck" and starts_uncharged(circuit)):
+            u, area, s = _given(circuit, scene, start == "deck")
+        else:
+            u, area, s = _at_rest(circuit, scene, circuit.initial if start == "deck" else {})
+        scene.prepared["initial", start] = _state(scene, u, area, s)
+    found: State = scene.prepared["initial", start]
+    return found
+
+
+def _given(circuit: Circuit, scene: Scene, asked: bool) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Cell voltages (V) and areas (m^2) that a start with ``uic`` gives; None for the sources: their own at 0+.
+
+    Areas are NaN where they follow, or start at rest.
+    """
+    network = scene.network
+    area = np.full(len(network.areas), np.nan)
+    if not asked:
+        return np.zeros(len(network.cells)), area, None
+    for i, one in enumerate(network.areas):
+        if scene.net.slow[i] >= 0:
+            area[i] = 1e-6 * circuit.initial.get(one.node, math.nan)
+    cells = network.cells
+    return start_voltages([c.element for c in cells], scene.net.c, circuit.initial), area, None
+
+
+def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Cell voltages (V), areas (m^2) and sources of the operating point, the nodes in `initial` held."""
+    network, net, stack = scene.network, scene.net, scene.stack
+    s = np.array([float(w.value(0.0, "left")) for w in scene.waveforms])
+    if stack is not None and scene.model is not None and not initial:
+        order = list(stack.state_order)
+        return (stack.sign * dc_voltages(stack, float(s[0]), scene.model))[order], scene.area0, s
+    contacts = [c if gap >= 0 else None for c, gap in zip(network.contacts, net.gap, strict=True)]
+    # The network of a loop does not know its nodes.
+    whole = network if stack is None else build_network(replace(circuit, work="gap"))
+    point = operating_point(circuit, whole, scene.area0, contacts, initial)
+    u = point.u.copy() if stack is None else _cells_of(network, whole, u=point.u)
+    if net.mobile:
+        for i in np.flatnonzero(point.held & (net.slow < 0)):
+            # Let go, the area goes its own way, and the charge stays.
+            gap = net.gap[i]
+            own = at_own_area(float(u[gap]), point.area[i], net.curves[i])
+            rest = 1.0 / inverse_area(abs(own), net.curves[i])[0]
+            u[net.place == i] *= point.area[i] / rest
+            u[gap] = own
+    return u, point.area, s
+
+
+def _cells_of(network: Network, whole: Network, u: FloatArray) -> FloatArray:
+    """Voltages (V) of a loop's cells from those of the same circuit's as a network."""
+    of: dict[str, list[float]] = {}
+    for cell, one in zip(whole.cells, u.tolist(), strict=True):
+        of.setdefault(cell.element.name, []).append(one)
+    for layer in network.layers:
+        if sum(cell.element is layer for cell in network.cells) == 1:
+            # A dispersive skin whose data are taken at one frequency is one cell.
+            of[layer.name] = [sum(of[layer.name])]
+    return np.array([of[cell.element.name].pop(0) for cell in network.cells])
+
+
+def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) -> State:
+    """State just before the start of cells that hold `u` (n_cell,) V, with the sources at `s` or else at what fits."""
+    network, net = scene.network, scene.net
+    if s is None and not u.any() and not np.any(net.slow >= 0):
+        y, before = np.zeros(sum(network.b.shape)), np.zeros(len(network.sources))
+        return State(0.0, y, before, np.zeros(len(network.areas)), scene.charge_law)
+    slow = (area / net.area0)[net.slow >= 0]
+    x, charge = u[list(network.live)], np.zeros(len(network.sources))
+    before = _fitting(network, u - network.p @ x) if s is None else s
+    off = float(np.abs(u - network.p @ x - network.q @ before).max(initial=0.0))
+    if off > ROUNDING * float(np.abs(u).max(initial=0.0)):
+        before = _after(scene) if s is None else s
+        settled = settle(net, u, slow, before)
+        x, slow, charge = settled.x, settled.slow, settled.charge
+    elif np.any(np.isnan(slow)):
+        # Areas with dynamics of their own start where they rest after the sources' first jump.
+        slow = settle(net, u, slow, _after(scene)).slow
+    sign = np.zeros(len(network.areas))
+    state = State(0.0, np.concatenate([x, slow, charge]), before, sign, scene.charge_law)
+    if scene.model is not None and np.any(u) and unreachable(scene, to_stack(scene, state), float(np.abs(u).max())):
+        raise InputError(f"the start has {u[scene.measured[0]]:.4g} V across the gap, {PAST_FOLD}")
+    return state
+
+
+def _after(scene: Scene) -> FloatArray:
+    """The sources after their first jump."""
+    after = np.array([float(w.value(0.0)) for w in scene.waveforms])
+    # A run of a source that is not finite says so itself.
+    after[~np.isfinite(after)] = 0.0
+    return after
+
+
+def _fitting(network: Network, u: FloatArray) -> FloatArray:
+    """Values of the sources that leave the cells `u` (n_cell,) V, as nearly as they can."""
+    if not network.q.size or not np.any(u):
+        return np.zeros(network.q.shape[1])
+    return np.asarray(np.linalg.lstsq(network.q, u, rcond=None)[0], float)
+
+
+def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
+    """Cell voltages along the loop (n_cell,) at the DC operating point, the area coupled.
+
+    Raises
+    ------
+    InputError
+        Where two or more layers do not leak: the node between them has no DC voltage.
+    """
+    insulating = stack.layers_of(stack.g_total + stack.g_area == 0.0)
+    if len(insulating) > 1:
+        raise InputError(
+            f"no DC operating point: {' and '.join(insulating)} do not leak, so the nodes between them are reached "
+            "by capacitors only; allowed: a leakage (r=...), or uic in .tran to start uncharged"
+        )
+
+    def split(area: float) -> FloatArray:
+        g = stack.g_total + stack.g_area * area
+        if insulating:
+            return np.asarray(np.where(g == 0.0, u_source, 0.0))
+        r = 1.0 / g
+        return np.asarray(u_source * r / r.sum())
+
+    if stack.gap is None or not model.coupled:
+        return split(model.area0)
+    lo, hi = 0.0, abs(u_source)
+    for _ in range(200):
+        middle = 0.5 * (lo + hi)
+        inverse, _ = inverse_area(middle, model.curve)
+        if abs(split(1.0 / inverse)[stack.gap]) > middle:
+            lo = middle
+        else:
+            hi = middle
+        if not lo < 0.5 * (lo + hi) < hi:
+            break
+    inverse, _ = inverse_area(hi, model.curve)
+    return split(1.0 / inverse)

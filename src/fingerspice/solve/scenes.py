@@ -1,0 +1,350 @@
+"""A circuit under one charge law and area mode as numbers: its equations, its areas, and the peak of its sources."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
+from fingerspice.circuit.loop import loop_network, network_of
+from fingerspice.circuit.network import Modes, Network, network_modes
+from fingerspice.circuit.response import areas_at_rest, mean_areas
+from fingerspice.circuit.spectrum import freezing_error
+from fingerspice.circuit.statespace import Stack, build_stack, is_stack
+from fingerspice.engine.model import Model
+from fingerspice.engine.network import Net
+from fingerspice.engine.system import System, build_system
+from fingerspice.numerics.modes import modes
+from fingerspice.physics.contact import fixed_area_curve
+from fingerspice.waveforms.combinations import Sum
+from fingerspice.waveforms.sampling import is_sampled
+from fingerspice.waveforms.waveform import Fundamental, Waveform, require
+
+FloatArray = NDArray[np.float64]
+
+# What a dispersive skin's data taken at one frequency may cost, over the error asked for.
+FREEZING_SHARE = 0.3
+# V; below, the digits of all that a source causes are lost.
+LEAST_PEAK = 1e-300
+# What the curve of an area covers where nothing is known of the sources, V: over too little it would be a constant.
+PEAK_UNKNOWN = 1.0
+# A current source may put any voltage across a gap; the curves of the areas reach this far (V), then the long way.
+DRIVEN_BY_CURRENT = 300.0
+
+
+@dataclass(frozen=True)
+class Freezing:
+    """A dispersive skin's data taken at one frequency, and what that costs.
+
+    Attributes
+    ----------
+    frequency : float
+        Hz.
+    error : float
+        Of the gap voltage, relative to its peak.
+    """
+
+    frequency: float
+    error: float
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A circuit under one charge law and area mode, as numbers; kept with the circuit from run to run.
+
+    Attributes
+    ----------
+    network : Network
+        Of a series stack that of its loop.
+    charge_law, area_mode : str
+    fixed : tuple of float or None
+        Each area where it is fixed, m^2.
+    u_peak : float
+        Sum of the largest |U| of the voltage sources, V; 0 where it is not known.
+    u_top : float
+        Largest gap voltage that the areas' curves cover, V.
+    model : Model or None
+        That of a series stack, whose modes follow from a secular equation.
+    skin : Freezing or None
+        At what frequency a dispersive skin's data are taken, where that is enough for the error asked for.
+    prepared : dict
+        What integrators made ready for this scene.
+    """
+
+    network: Network
+    charge_law: str
+    area_mode: str
+    fixed: tuple[float | None, ...]
+    u_peak: float
+    u_top: float
+    model: Model | None = None
+    skin: Freezing | None = None
+    prepared: dict[Any, Any] = field(default_factory=dict)
+
+    @property
+    def stack(self) -> Stack | None:
+        """Where the circuit is one."""
+        return self.network.stack
+
+    @property
+    def waveforms(self) -> tuple[Waveform, ...]:
+        """Of each source, V or A."""
+        return self.network.waveforms
+
+    @cached_property
+    def waveform(self) -> Waveform:
+        """All sources at once, for their common period, breakpoints and shortest time."""
+        return self.waveforms[0] if len(self.waveforms) == 1 else Sum(self.waveforms)
+
+    @cached_property
+    def fundamental(self) -> Fundamental | None:
+        """The source's, where there is only one."""
+        return self.waveform.fundamental if len(self.waveforms) == 1 else None
+
+    @cached_property
+    def is_sampled(self) -> bool:
+        """Whether some source is a function that has to be looked at, not a waveform with a formula."""
+        return any(is_sampled(w) for w in self.waveforms)
+
+    @property
+    def coupled(self) -> bool:
+        """Whether some area follows its gap's voltage."""
+        return any(area is None for area in self.fixed)
+
+    @cached_property
+    def net(self) -> Net:
+        """The network with its area curves, for compiled code."""
+        return _net(self)
+
+    @cached_property
+    def shown(self) -> Scene:
+        """As a run by exponential steps records it: a stack's layers, however many cells they have."""
+        stack = self.stack
+        if stack is None or stack.by_layer is stack:
+            return self
+        return replace(self, network=loop_network(stack.by_layer), prepared={})
+
+    @cached_property
+    def area0(self) -> FloatArray:
+        """The areas where they are fixed, else at 0 V, m^2."""
+        return np.asarray(self.net.area0)
+
+    @cached_property
+    def modes(self) -> Modes:
+        """Of the circuit with its areas fixed, or as they are at 0 V."""
+        return self.modes_at(self.area0)
+
+    @cached_property
+    def rates(self) -> FloatArray:
+        """Of these modes, 1/s."""
+        if self.model is None:
+            return self.modes.rates
+        rates, _, _, _ = modes(self.model.rate + self.model.rate0 / self.model.area0, self.model.k)
+        return np.asarray(rates)
+
+    def modes_at(self, area: FloatArray) -> Modes:
+        """Modes of the circuit at areas (n_area,) in m^2."""
+        if self.model is None:
+            return network_modes(self.network, area)
+        system, turn = fixed_system(self.model, float(area[0])), self.turn
+        return Modes(
+            system.rates[0], system.gain[0][:, None], turn[:, None] * system.live[0], system.project[0] * turn,
+            -(turn * self.model.k[:-1])[:, None], np.zeros((turn.size, turn.size + 1)),
+        )  # fmt: skip
+
+    @cached_property
+    def turn(self) -> FloatArray:
+        """Of a stack: the sign of every live voltage along the loop, shape (n,)."""
+        assert self.stack is not None
+        return self.stack.sign[list(self.stack.state_order[:-1])]
+
+    @cached_property
+    def is_turned(self) -> bool:
+        """Whether some live voltage of a stack is written against the loop."""
+        return bool(np.any(self.turn < 0.0))
+
+    @cached_property
+    def measured(self) -> tuple[int, ...]:
+        """Cells whose voltage errors are measured on: the gaps, or else the one with the smallest capacitance."""
+        gaps = tuple(gap for gap in self.network.gaps if gap is not None)
+        if gaps or not self.network.cells:
+            return gaps
+        return (int(np.argmin(self.network.capacitance(self.area0))),)
+
+
+def fixed_system(model: Model, area: float) -> System:
+    """The modal system of a stack with its area fixed, m^2."""
+    model = model._replace(coupled=False, mobile=False, area0=area, curve=fixed_area_curve(area))
+    return build_system(model, 1e-13, (1.0 / area, 1.0 / area), np.eye(model.gap.size))
+
+
+def scene_of(
+    circuit: Circuit, charge_law: str | None, area: str | float, t_stop: float | None, rtol: float = 0.0
+) -> Scene:
+    """The circuit's scene under a charge law and area mode, made on first use.
+
+    `rtol` decides whether a dispersive skin's data may be taken at one frequency.
+
+    Raises
+    ------
+    InputError
+        For anything in the request that cannot be run.
+    """
+    law = charge_law or circuit.charge_law or "local"
+    require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
+    stop = t_stop or (circuit.tran.stop if circuit.tran else 1.0)
+    skin = _freezing(circuit, stop)
+    if skin is not None and skin.error > FREEZING_SHARE * rtol:
+        skin = None
+
+    scene: Scene = circuit.remember(("scene", law, area, stop, skin), lambda: _scene(circuit, law, area, stop, skin))
+    return scene
+
+
+def _scene(circuit: Circuit, law: str, area: str | float, stop: float, skin: Freezing | None) -> Scene:
+    network = network_of(circuit, None if skin is None else skin.frequency)
+    fixed, mode = _fixed_areas(network, area)
+    whole = network.stack is not None
+    u_peak = sum(_largest_voltage(waveform, stop, whole) for waveform in network.waveforms[: network.n_voltage])
+    # Discharging layers add to the gap's share of a jump: the curve covers a little more than U itself.
+    top = 1.3 * u_peak + (DRIVEN_BY_CURRENT if len(network.sources) > network.n_voltage else 0.0) or PEAK_UNKNOWN
+    model = None if network.stack is None else _model(network.stack, law, fixed[0], top)
+    return Scene(network, law, mode, fixed, u_peak, top, model, skin)
+
+
+def _freezing(circuit: Circuit, stop: float) -> Freezing | None:
+    """The best single frequency of a dispersive skin, and its error; None where there is no such skin or frequency."""
+    if not circuit.by_device("SKIN_DISPERSIVE") or not is_stack(circuit):
+        return None
+
+    def make() -> Freezing | None:
+        stack = build_stack(circuit)
+        fundamental = stack.waveform.fundamental
+        if fundamental is None or stack.contact is None or not (math.isfinite(stop) and stop > 0.0):
+            return None
+        f = fundamental.frequency
+        areas = stack.contact.area(np.linspace(0.0, _largest_voltage(stack.waveform, stop), 65))
+        area = stack.area_given or float(np.median(areas))
+        change = 0.0 if stack.area_given else float(np.ptp(areas)) / area
+        return Freezing(f, freezing_error(circuit, f, area, change, stop))
+
+    found: Freezing | None = circuit.remember(("freezing", stop), make)
+    return found
+
+
+def _largest_voltage(waveform: Waveform, stop: float, whole: bool = True) -> float:
+    """Largest |U| (V) up to a time (s), or of `whole` periods; 0 where it is not known."""
+    if not (math.isfinite(stop) and stop > 0.0):
+        return 0.0
+    if whole and waveform.period is not None:
+        stop = waveform.settled + waveform.period
+    peak = waveform.peak(0.0, stop)
+    require(not 0.0 < peak < LEAST_PEAK, "the source's peak", f"{peak:g} V", f"0, or {LEAST_PEAK:g} V or more")
+    return peak if math.isfinite(peak) else 0.0
+
+
+def _fixed_areas(network: Network, area: str | float) -> tuple[tuple[float | None, ...], str]:
+    """Each area (m^2) that does not follow its gap, and the mode's name."""
+    given = [a.given for a in network.areas]
+    if not isinstance(area, str):
+        require(math.isfinite(area) and area > 0.0, "area", f"{area:g} m^2", "a positive area in m^2")
+        return (float(area),) * len(given), f"{area:g} m^2"
+    require(area in ("coupled", "mean", "frozen"), "area", repr(area), "'coupled', 'mean', 'frozen' or m^2")
+    if not given:
+        return (), "none"
+    if all(x is not None for x in given):
+        return tuple(given), f"{given[0]:g} m^2 (from the deck)" if len(given) == 1 else "given by the deck"
+    if area == "coupled":
+        return tuple(given), area
+    if area == "mean":
+        return tuple(map(float, mean_areas(network))), area
+    return tuple(map(float, areas_at_rest(network))), area
+
+
+def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:
+    if fixed is not None:
+        area0 = fixed
+        curve = fixed_area_curve(fixed)
+    else:
+        assert stack.contact is not None
+        area0 = float(stack.contact.area(0.0))
+        curve = stack.contact.curve(u_top)
+    order = list(stack.state_order)
+    probe = int(np.argmin(stack.c)) if stack.gap is None else stack.gap
+    k = stack.k[order]
+    leaks = stack.leak_rates(area0)
+    slow = int(np.argmin(leaks))
+    rates, _, _, _ = modes(np.ascontiguousarray(leaks[order]), np.ascontiguousarray(k))
+    fastest = float(rates.max(initial=0.0))
+    return Model(
+        mobile=law == "mobile",
+        coupled=fixed is None,
+        k=np.ascontiguousarray(k),
+        rate=np.ascontiguousarray((stack.g_area / stack.c)[order]),
+        rate0=np.ascontiguousarray((stack.g_total / stack.c)[order]),
+        k_gap=float(stack.k[probe]),
+        gap=_row(order, probe),
+        s=stack.s,
+        slow=np.append(_row(order, slow), [stack.k[slow], stack.c[slow], stack.g_area[slow], stack.g_total[slow]]),
+        area0=area0,
+        tau=1.0 / fastest if fastest > 0.0 else math.inf,
+        curve=curve,
+    )
+
+
+def _row(order: list[int], layer: int) -> FloatArray:
+    """How a cell's voltage over k U follows from the states, shape (n_cell - 1,)."""
+    place = order.index(layer)
+    n = len(order) - 1
+    return np.full(n, -1.0) if place == n else np.eye(n)[place]
+
+
+def _net(scene: Scene) -> Net:
+    network, model = scene.network, scene.model
+    area0: list[float | None] = []
+    tau, curves, gaps = [], [], []
+    for x, contact, gap, area in zip(scene.fixed, network.contacts, network.gaps, network.areas, strict=True):
+        if x is None and contact is not None and gap is not None and area.gap is not None:
+            gaps.append(gap)
+            area0.append(float(contact.area(0.0)) if model is None else model.area0)
+            tau.append(area.gap.values["tau"])
+            curves.append(contact.curve(scene.u_top) if model is None else model.curve)
+        else:
+            gaps.append(-1)
+            area0.append(x)
+            tau.append(0.0)
+            curves.append(np.zeros(1))
+    width = max((c.size for c in curves), default=1)
+    slow, count = [], 0
+    for t in tau:
+        slow.append(count if t > 0.0 else -1)
+        count += t > 0.0
+    cells = network.cells
+    return Net(
+        mobile=scene.charge_law == "mobile",
+        p=np.ascontiguousarray(network.p),
+        q=np.ascontiguousarray(network.q),
+        c=np.array([c.c for c in cells], float),
+        g_total=np.array([c.g_total for c in cells], float),
+        g_area=np.array([c.g_area for c in cells], float),
+        place=np.array([-1 if c.area is None else c.area for c in cells], np.int64),
+        k=np.ascontiguousarray(network.k),
+        b=np.ascontiguousarray(network.b),
+        through=np.ascontiguousarray(network.through),
+        delivered=np.ascontiguousarray(network.delivered),
+        gap=np.array(gaps, np.int64),
+        area0=np.array(area0, float),
+        tau=np.array(tau, float),
+        slow=np.array(slow, np.int64),
+        curves=np.array([_padded(c, width) for c in curves]).reshape(len(curves), width),
+    )
+
+
+def _padded(curve: FloatArray, width: int) -> FloatArray:
+    """A curve as long as the others'."""
+    return curve if curve.size == width else np.pad(curve, (0, width - curve.size))

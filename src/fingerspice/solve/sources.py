@@ -1,0 +1,166 @@
+"""The sources of a run as tables for compiled code, window by window."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.engine.network import Sources, at_sources
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.times import check_length
+from fingerspice.waveforms.sampling import SourceTable, breakpoints_at, is_sampled, source_table
+from fingerspice.waveforms.waveform import Waveform
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+PERIODS_PER_WINDOW = 4096.0
+BREAKPOINTS_PER_WINDOW = 2000.0
+# Windows of a run whose tables stay with the scene, and tables that stay there.
+KEPT_WINDOWS, MOST_KEPT = 4, 16
+
+
+class Tables:
+    """Tables of a problem's sources, window by window, until one of them stops being finite.
+
+    A user's function is expensive to look at, so its tables are kept for the run. Those of library waveforms are made
+    anew, which keeps a long run's memory constant, but for a run of few windows: its tables stay with the scene.
+
+    Attributes
+    ----------
+    rough : float
+        Largest misfit (V) of a table that no finer one would mend.
+    unseen : tuple of float, float and int, or None
+        The first output at which a user's function is not what its table says, s, by how much, V, and which it is.
+    not_finite : float or None
+        Time (s) at which a source stopped being finite, once that has been met.
+    done : float
+        Windows that end by this time (s) are done with, but for the last.
+    """
+
+    def __init__(
+        self, problem: Problem, tol: float, *, no_chirps: bool = False, t_out: FloatArray | None = None
+    ) -> None:
+        self.problem, self.no_chirps, self.t_out = problem, no_chirps, t_out
+        self.tol = min(1e-3, max(0.05 * tol, 1e-14))
+        self.edges = windows(problem)
+        self.done = -np.inf
+        self.rough = 0.0
+        self.unseen: tuple[float, float, int] | None = None
+        self.not_finite: float | None = None
+        # Largest values (V or A) of the sampled windows so far.
+        self.scales = [0.0] * len(problem.waveforms)
+        self.kept: dict[Any, list[SourceTable]] | None = {} if problem.scene.is_sampled else None
+        if self.kept is None and len(self.edges) <= 1 + KEPT_WINDOWS:
+            self.kept = problem.scene.prepared.setdefault("tables", {})
+            if len(self.kept) > MOST_KEPT:
+                self.kept.clear()
+
+    def __iter__(self) -> Iterator[list[SourceTable]]:
+        for w0, w1 in itertools.pairwise(self.edges):
+            if w1 <= self.done and w1 < self.edges[-1]:
+                continue
+            # Without chirps a series stands for them, to this error.
+            key = (w0, w1, self.tol if self.no_chirps else None)
+            tables = self.kept.get(key) if self.kept is not None else None
+            if tables is None:
+                tables = [self._table(wave, w0, w1, i) for i, wave in enumerate(self.problem.waveforms)]
+                if self.kept is not None:
+                    self.kept[key] = tables
+            self.scales = [max(scale, table.scale) for scale, table in zip(self.scales, tables, strict=True)]
+            self.rough = max(self.rough, *(table.rough for table in tables))
+            self.not_finite = min((t.not_finite for t in tables if t.not_finite is not None), default=None)
+            yield tables
+            if self.not_finite is not None:
+                return
+
+    def _table(self, wave: Waveform, w0: float, w1: float, place: int) -> SourceTable:
+        step, scale = self.problem.step, self.scales[place]
+        table = source_table(wave, w0, w1, self.tol, step, no_chirps=self.no_chirps, scale=scale)
+        if self.t_out is not None and self.problem.scene.is_sampled and is_sampled(wave):
+            off = table.unseen(wave, self.t_out, self.tol)
+            found = [one for one in (self.unseen, off and (*off, place)) if one]
+            self.unseen = min(found, default=None)
+        return table
+
+    def peak(self) -> float:
+        """Largest source voltage (V) of the run."""
+        if self.kept is None:
+            return self.problem.waveform.peak(self.problem.t_start, self.problem.t_stop)
+        return max(table.scale for tables in self for table in tables)
+
+
+def windows(problem: Problem) -> list[float]:
+    """Edges of the windows the source is tabulated on: constant memory, and phases that stay exact."""
+    check_length(problem.waveform, problem.t_start, problem.t_stop)
+    span = problem.t_stop - problem.t_start
+    rate = max(
+        problem.waveform.breakpoint_rate() / BREAKPOINTS_PER_WINDOW,
+        1.0 / (PERIODS_PER_WINDOW * problem.waveform.shortest_time()),
+        # A function is sampled at the output step.
+        1.0 / (4096.0 * problem.step) if problem.scene.is_sampled else 0.0,
+    )
+    count = max(1, int(np.ceil(span * rate)))
+    return [problem.t_start + span * i / count for i in range(count)] + [problem.t_stop]
+
+
+def joined(tables: list[SourceTable]) -> Sources:
+    """Tables of all sources as compiled code takes them."""
+    if len(tables) == 1:
+        (one,) = tables
+        return Sources(np.array([0, one.edges.size]), one.edges, one.terms, one.series)
+    width = max(t.terms.shape[1] for t in tables), max(t.series.shape[1] for t in tables)
+    first = np.concatenate([[0], np.cumsum([t.edges.size for t in tables])]).astype(np.int64)
+    terms = [np.pad(t.terms, ((0, 0), (0, width[0] - t.terms.shape[1]), (0, 0))) for t in tables]
+    series = [np.pad(t.series, ((0, 0), (0, width[1] - t.series.shape[1]))) for t in tables]
+    return Sources(first, np.concatenate([t.edges for t in tables]), np.concatenate(terms), np.concatenate(series))
+
+
+def ramp(before: FloatArray, after: FloatArray) -> Sources:
+    """A jump of every source as a ramp over [0, 1]."""
+    terms = np.zeros((before.size, 2, 6))
+    terms[:, 0, 0], terms[:, 1, 0], terms[:, 1, 1] = before, after - before, 1.0
+    edges = np.tile([0.0, 1.0], before.size)
+    return Sources(2 * np.arange(before.size + 1, dtype=np.int64), edges, terms, np.zeros((before.size, 0)))
+
+
+def held(t: float, values: FloatArray) -> Sources:
+    """Sources that stand at these values from t (s) on."""
+    terms = np.zeros((values.size, 1, 6))
+    terms[:, 0, 0] = values
+    edges = np.tile([t, t + 1.0], values.size)
+    return Sources(2 * np.arange(values.size + 1, dtype=np.int64), edges, terms, np.zeros((values.size, 0)))
+
+
+def values_at(sources: Sources, t: float) -> FloatArray:
+    """Right-hand values of the sources at t (s)."""
+    out, slope = np.empty((2, sources.first.size - 1))
+    at_sources(sources, segment_index(sources, t, "right"), t, 0.0, out, slope)
+    return out
+
+
+def after_the_end(problem: Problem) -> Sources | None:
+    """The sources from the end of a run on, where one of them may jump there; else None."""
+    stop = problem.t_stop
+    if not any(breakpoints_at(wave, stop).size for wave in problem.waveforms):
+        return None
+    span = stop, problem.step
+    # One entry with its key: another thread may put its own there at any time.
+    kept, after = problem.scene.prepared.get("after", (None, None))
+    if kept != span:
+        after = joined([source_table(w, stop, stop + problem.step, 1e-10, problem.step) for w in problem.waveforms])
+        problem.scene.prepared["after"] = span, after
+    assert isinstance(after, Sources)
+    return after
+
+
+def segment_index(sources: Sources, t: float, side: Literal["left", "right"]) -> IntArray:
+    """The segment of every source (n_s,) that a time (s) is in, or at whose end it is on the left side."""
+    return np.array([
+        min(max(int(np.searchsorted(sources.edges[a:b], t, side=side)) - 1, 0), b - a - 2)
+        for a, b in itertools.pairwise(sources.first)
+    ])  # fmt: skip
