@@ -73,7 +73,7 @@ def solve(
         peak = float(run.gaps[:, 0].max(initial=0.0))
         # A peak that is no more than the error may yet turn out to be none.
         hopeless = rtol * peak < ROUNDING * u_scale and run.error.u_gap < peak
-        if hopeless or tol <= FINEST or attempts == ATTEMPTS:
+        if hopeless or tol <= FINEST or attempts >= ATTEMPTS:
             if is_whole:
                 run.status = Status.ERROR_NOT_MET
                 return run

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,8 @@ class Known:
     tables : Tables
     magnified : ndarray, shape (n_area,)
         Rounding of each gap's voltage over that of the largest voltage, the most of all references.
+    shapes : list of tuple
+        Of the arrays in `REFERRED`.
     fixed : dict
         The fields of a `Form` that are the same for all references.
     """
@@ -45,7 +47,8 @@ class Known:
     arrays: References
     tables: Tables
     magnified: FloatArray
-    fixed: dict[str, Any] = field(default_factory=dict)
+    shapes: list[tuple[int, ...]]
+    fixed: dict[str, Any]
 
     @property
     def count(self) -> int:
@@ -74,7 +77,7 @@ class Known:
 
     def form(self) -> Form:
         """A form around the areas at 0 V, with numbers of its own."""
-        numbers, views = views_of(_shapes(self.scene))
+        numbers, views = views_of(self.shapes)
         numbers[:] = self.arrays.numbers[0]
         parts: dict[str, Any] = dict(zip(REFERRED, views, strict=True))
         return Form(numbers=numbers, **parts, **self.fixed)
@@ -100,7 +103,7 @@ def _make(scene: Scene, decade: int) -> Known:
         np.zeros(n_area, np.int64),
     )
     n_modes = shapes[0][0]
-    known = Known(scene, decade, room, new_tables(n_modes), np.zeros(n_area), _fixed(scene, decade))
+    known = Known(scene, decade, room, new_tables(n_modes), np.zeros(n_area), shapes, _fixed(scene, decade))
     known.add((0,) * n_area)
     return known
 
