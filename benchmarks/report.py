@@ -309,7 +309,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     results = json.loads(options.results.read_text(encoding="utf-8"))
     if "far" not in results:
-        parser.error(f"{options.results} is of an earlier program; allowed: what benchmarks/work_precision.py writes now")
+        parser.error(f"{options.results} is of an earlier program; allowed: what work_precision.py writes now")
     options.results.with_suffix(".md").write_text(details(results), encoding="utf-8")
     stacks = problems(results, "local", "stack")[:4]
     picture(results, [[(n, cost) for n in stacks] for cost in COSTS], options.results.with_suffix(".png"))
