@@ -328,7 +328,8 @@ def test_expansion_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_work_grows_with_the_deck_and_not_faster() -> None:
     def calls(count: int, name: str) -> int:
-        text = "".join(f"R{i} n{i} n{i + 1} {{{name}{i}}}\n.param {name}{i}={{{name}{i + 1}+1}}\n" for i in range(count))
+        line = "R{i} n{i} n{j} {{{name}{i}}}\n.param {name}{i}={{{name}{j}+1}}\n"
+        text = "".join(line.format(i=i, j=i + 1, name=name) for i in range(count))
         reader, made = str(Path(flatten.__file__).parent), 0
 
         def count_one(frame: FrameType, event: str, _argument: object) -> None:
