@@ -50,6 +50,8 @@ if TYPE_CHECKING:
     from fingerspice.waveforms.ramps import PWL as PWL
     from fingerspice.waveforms.ramps import Pulse as Pulse
     from fingerspice.waveforms.ramps import Samples as Samples
+    from fingerspice.waveforms.repeated import Burst as Burst
+    from fingerspice.waveforms.repeated import Repeat as Repeat
     from fingerspice.waveforms.sampling import Function as Function
     from fingerspice.waveforms.transients import Chirp as Chirp
     from fingerspice.waveforms.transients import Exp as Exp
@@ -62,6 +64,7 @@ _HOMES = {
     "netlist.netlist": ("parse_netlist", "read_netlist"),
     "waveforms.periodic": ("Sawtooth", "Square", "Triangle"),
     "waveforms.ramps": ("PWL", "Pulse", "Samples"),
+    "waveforms.repeated": ("Burst", "Repeat"),
     "waveforms.transients": ("Chirp", "Exp"),
     "waveforms.sampling": ("Function",),
     "waveforms.combinations": ("AM", "Product", "Sum"),
