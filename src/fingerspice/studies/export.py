@@ -238,12 +238,16 @@ def _source_text(waveform: Waveform, element: Element, circuit: Circuit) -> str:
 
 
 def _own_points(waveform: PWL | Samples, element: Element, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
-    """The points of straight lines up to the first after the end of the run, where its end is known."""
-    t, v = waveform.points
+    """The points of straight lines from 0 s to the first after the end of the run, where its end is known."""
+    v = np.asarray(waveform.values)
+    at = waveform.times if isinstance(waveform, PWL) else waveform.start + np.arange(v.size) / waveform.rate
+    t = np.asarray(at)
     if circuit.tran is not None:
-        # Of two points at one time both are needed, and of the points a run does not reach the next one, for its line.
         count = int(np.searchsorted(t, circuit.tran.stop, side="right")) + 1
         t, v = t[:count], v[:count]
+    if t[0] < 0.0:
+        at_0 = [waveform.value(0.0, "left").item(), waveform.value(0.0).item()]
+        t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append(at_0, v[t > 0.0])
     _refuse_many(t.size, element)
     return t, v
 
