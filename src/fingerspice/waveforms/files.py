@@ -263,8 +263,9 @@ def _npz_columns(path: Path) -> tuple[Columns, float | None]:
         with np.load(path) as file:
             for name in file.files:
                 array = file[name]
-                if array.dtype.kind not in "iuf":
-                    raise InputError(f"'{path}': the array {name!r} is of {array.dtype}; allowed: real numbers")
+                if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf":
+                    kind = getattr(array, "dtype", "another kind")
+                    raise InputError(f"'{path}': the array {name!r} is of {kind}; allowed: real numbers")
                 if array.ndim == 0 and name.lower() in _RATE_NAMES:
                     rate = float(array)
                 elif array.ndim == 1:
