@@ -1,4 +1,4 @@
-"""The decks of signals in `circuits/`: each runs to its end without a warning; their recording is as its script makes it."""
+"""The decks of signals in `circuits/`: each runs to its end without a warning, and their recording is reproducible."""
 
 from __future__ import annotations
 
