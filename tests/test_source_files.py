@@ -258,12 +258,12 @@ def test_what_is_no_table_is_refused_with_its_line(
 def test_rates_that_contradict_the_times_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("a.csv").write_text("t,u\n0,1\n0.001,2\n0.0025,2\n")
-    said = "'a.csv', line 4: this time is 0.0015 s after the one before, and the rate is 1000 Hz; allowed: times or"
+    said = "'a.csv', line 4: the time 0.0025 s is not that of sample 2 at 1000 Hz, 0.002 s; allowed: times or a rate"
     assert said in refusal(lambda: fs.Samples.from_table("a.csv", 1000.0))
     assert "the rate is -1 Hz; allowed: > 0" in refusal(lambda: fs.Samples.from_table("a.csv", -1.0, "u"))
     assert "is a table with times; allowed: one with a rate" in refusal(lambda: fs.Samples.from_table("a.csv"))
-    np.savez("a.npz", u=np.zeros(3), t=np.arange(3) / 44100, rate=48000)
-    assert "row 1: this time is 2.26757e-05 s after the one before, and the rate is 48000 Hz" in refusal(
+    np.savez("a.npz", u=np.zeros(30), t=np.arange(30) / 44100, rate=48000)
+    assert "row 2: the time 4.53515e-05 s is not that of sample 2 at 48000 Hz, 4.16667e-05 s" in refusal(
         lambda: fs.Samples.from_table("a.npz")
     )
     assert "the rate given is 44100 Hz, and its own is 48000 Hz; allowed: one rate" in refusal(
@@ -493,6 +493,19 @@ def test_sources_of_the_command_line_are_named_from_the_working_directory(comman
     # A deck does not reach there.
     Path("decks/out.cir").write_text(deck.replace("SIN(0 200 100)", "WAVEFILE(../far/a.wav 150)"))
     assert "lies outside the netlist's folder" in command("run", "decks/out.cir", "--stop", "20m").err
+
+
+def test_results_tell_recordings_apart_by_their_names(command: Command) -> None:
+    for name in ("a.wav", "b.wav"):
+        Path(name).write_bytes(wav(packed(np.arange(-200, 200) * 50, 16), 16))
+    Path("a.csv").write_text("".join(f"{i}m {i % 7}\n" for i in range(200)))
+    words = ("run", "pad.cir", "--stop", "1m", "--no-plot", "--source")
+    assert command(*words, "WAV(a.wav 150)").code == 0
+    assert command(*words, "WAV(a.wav 150)").code == 0
+    assert "--overwrite" in command(*words, "WAV(b.wav 150)").err
+    assert command(*words, "TABLE(a.csv)", "--name", "table").code == 0
+    with pytest.warns(fs.FingerspiceWarning, match="a source that was a function or samples is not kept"):
+        assert fs.load("out/table.nc").circuit.overrides == {"Vdrive": "TABLE(a.csv)"}
 
 
 def test_start_and_stop_replace_those_of_the_deck(command: Command) -> None:

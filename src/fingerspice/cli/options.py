@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 LARGEST_AREA = 0.01
 """m^2; a larger area was probably given in mm^2."""
 
+LONGEST_SOURCE = 1000
+"""Characters of a source's numbers that are kept with the results."""
+
 
 def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | None) -> Circuit:
     """The deck's circuit with ``--set`` and ``--source``.
@@ -68,11 +71,14 @@ def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
     from fingerspice.circuit.arguments import overridden
     from fingerspice.circuit.topology import find_branches
     from fingerspice.netlist.netlist import source_from_text
+    from fingerspice.waveforms.ramps import Samples
 
     if not texts:
         return circuit
     names = {e.name.lower(): e.name for e in find_branches(circuit)[1] if e.device in "VI"}
     sources: dict[str, Waveform] = {}
+    # What the results call a recording or a long table: the text that names it, and not its numbers.
+    named_by: dict[str, str] = {}
     for text in texts:
         named, equals, spec = (part.strip() for part in text.partition("="))
         # In PWL(...) r=10m what precedes the = is more than a name.
@@ -89,7 +95,10 @@ def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
             sources[name] = source_from_text(spec, circuit)
         except InputError as error:
             raise InputError(f"--source {error.message}") from None
-    return overridden(circuit, sources)
+        if isinstance(sources[name], Samples) or len(repr(sources[name])) > LONGEST_SOURCE:
+            named_by[name] = spec
+    changed = overridden(circuit, sources)
+    return dataclasses.replace(changed, overrides={**changed.overrides, **named_by})
 
 
 def with_times(circuit: Circuit, stop: str | None, start: str = "deck") -> tuple[Circuit, str]:

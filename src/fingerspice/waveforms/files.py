@@ -23,8 +23,8 @@ from fingerspice.waveforms.columns import Columns, read_text_columns
 MAX_BYTES, MAX_TEXT_BYTES = 2**30, 2**26
 #: Largest number of samples: an hour at 48 kHz has 1.7e8, which take 1.4 GB.
 MAX_SAMPLES = 200_000_000
-# How far the distances between times may differ from 1 / rate, relative to it.
-_SAME_RATE = 1e-6
+# How far times that stand beside a rate may be off by their rounding, in samples.
+_JITTER = 0.1
 _RATE_NAMES = ("rate", "fs", "sample_rate")
 _TIME_NAMES = ("t", "time")
 # What scipy 1.17 raises on broken headers, found by 20,000 of them, and what it might.
@@ -181,11 +181,13 @@ def read_table(
     if rate is None:
         return Recording(values, None, t)
     _check_rate(path, rate)
-    steps = np.diff(t) * rate
-    if steps.size and np.abs(steps - 1.0).max() > _SAME_RATE + 4e-16 * np.abs(t).max() * rate:
-        i = int(np.argmax(np.abs(steps - 1.0)))
-        raise InputError(f"{found.place(i + 1)}: this time is {steps[i] / rate:g} s after the one before, and the rate "
-                         f"is {rate:g} Hz; allowed: times or a rate")  # fmt: skip
+    late = np.abs((t - t[0]) * rate - np.arange(t.size)) > _JITTER
+    if late.any():
+        i = int(np.argmax(late))
+        problem = (
+            f"{found.place(i)}: the time {t[i]:g} s is not that of sample {i} at {rate:g} Hz, {t[0] + i / rate:g} s"
+        )
+        raise InputError(f"{problem}; allowed: times or a rate, or both that agree")
     return Recording(values, rate)
 
 
