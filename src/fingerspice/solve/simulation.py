@@ -258,6 +258,12 @@ def _stepped(
         from fingerspice.solve.foreign import solve_foreign
 
         return solve_foreign(problem, method, rtol, t_out, left, progress), method
+    if method == "auto":
+        from fingerspice.solve.recordings import solve as solve_recording
+
+        recorded = solve_recording(problem, rtol, t_out, left, progress)
+        if recorded is not None:
+            return recorded, "relaxation"
     is_stack = problem.scene.stack is not None
     if method != "radau" and (is_stack or problem.scene.coupled):
         run = solve_exponential(problem, rtol, t_out, left, progress, repeat=method == "auto")

@@ -1,0 +1,518 @@
+"""Waveform relaxation over blocks of equal steps: how a recording, whose slope breaks at every sample, is followed.
+
+In modes around a reference q0 of q = 1/A a stack is w' = -rates w + gain U + sum_t feed_t g_t (`engine.system`), and
+what the area moves, g_t = (q - q0) (tap_t w + tap_k U), is a few per cent of what leaks. Between two samples U is a
+straight line, and g so smooth that a parabola through three nodes serves: exponential Simpson, of fourth order, the
+response to U exact. All steps of a block are solved together: from g at all nodes the modes follow by a recursion, from
+these the gap voltage and g anew. Each sweep leaves a few hundredths of the error, and is a loop over rows of hundreds
+of steps, as fast as a processor's vectors.
+
+1/A has a kink where the gap voltage is 0. In a step across it the parabola misses kappa (|u| - its own parabola),
+kappa = dg/d|u|; that is added with u as a straight line.
+
+The error is looked for at 1/4 and 3/4 of every step, where the parabola's misfit tells the quadrature's own error
+(Boole's rule against Simpson's). Where that is too much, a block is taken again with steps half as long.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.compiled import jit, jit_rows, jit_within
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# Steps of a block, and halvings of a sample's length at most.
+BLOCK, LEVELS = 512, 7
+# Degree of the polynomial for 1/A at most.
+MOST_DEGREE = 28
+# Zeros in front of rows that a recursion looks back from.
+_PAD = 8
+# Where a step is looked at besides its ends: its middle, and the two places that tell the error.
+PLACES = (0.5, 0.25, 0.75)
+MIDDLE, FIRST_QUARTER, LAST_QUARTER = 0, 1, 2
+# Of the parabola through 0, 1/2 and 1, at those places; and Simpson's and Boole's weights.
+PARABOLA = np.array([[0.0, 1.0, 0.0], [0.375, 0.75, -0.125], [-0.125, 0.75, 0.375]])
+# Sweeps of a block, after which it is not going to close; and how little of the error allowed they may leave.
+_MOST_SWEEPS, _LEFT = 40, 0.25
+# Sweeps at which what does not depend on the drives is made: at 4 the place of the kinks is known well enough.
+_RENEWED = (0, 2, 4)
+# Under `mobile` the gap voltage is found by Newton: at first, and in every later sweep; and the least distance to the
+# fold at which that is safe.
+FIRST_NEWTON, _NEWTON, LEAST_MARGIN = 6, 2, 0.2
+# An error this far below the one allowed lets the steps of the next block be longer: it rises sixteenfold.
+SPARE = 0.02
+
+
+class Form(NamedTuple):
+    """A stack around reference areas, and the weights of steps of one length and its halves.
+
+    r references, `LEVELS` halvings, m modes, T drives g_t, and P projections at the ends and `PLACES` of a step: the gap
+    voltage (under `mobile` its modes' part alone), the taps, and what the slowest layer stores and leaks by (see
+    `engine.recording`).
+
+    Attributes
+    ----------
+    mobile : bool
+        Charge law. Then the last drive is (1/q - 1/q0) U.
+    q0 : ndarray, shape (r,)
+    decay : ndarray, shape (r, LEVELS, m)
+        Over a step.
+    source : ndarray, shape (r, LEVELS, m, 2)
+        What the source's values at both ends add to a mode.
+    drive : ndarray, shape (r, LEVELS, m, T, 3)
+        And what those of the drives at 0, 1/2 and 1 add.
+    feed : ndarray, shape (r, m, T)
+    taps, tap_s : ndarray, shape (r, P, m) and (P,)
+        Projections of modes and source.
+    within, within_s, within_g : ndarray, shape (r, LEVELS, 3, P, m), (r, LEVELS, 3, P, 2) and (r, LEVELS, 3, P, T, 3)
+        The same at `PLACES`, from the modes at the start of a step, the source at both ends, and the drives.
+    defect : ndarray, shape (r, LEVELS, m, T, 2)
+        What misfits at the quarters add to the error of a mode.
+    early : ndarray, shape (r, LEVELS, T, 2)
+        And to that of the gap voltage in the middle of the step.
+    area : ndarray, shape (4 k + 1,)
+        1/A as a polynomial in `scale` |u| + `shift`.
+    """
+
+    mobile: bool
+    q0: FloatArray
+    rates: FloatArray
+    gain: FloatArray
+    decay: FloatArray
+    source: FloatArray
+    drive: FloatArray
+    feed: FloatArray
+    taps: FloatArray
+    tap_s: FloatArray
+    within: FloatArray
+    within_s: FloatArray
+    within_g: FloatArray
+    defect: FloatArray
+    early: FloatArray
+    area: FloatArray
+    scale: float
+    shift: float
+    k_gap: float
+    area0: float
+
+
+class Room(NamedTuple):
+    """Rows of a block to work in: of the source, modes, increments, projections, drives, and single ones."""
+
+    s: FloatArray
+    s_within: FloatArray
+    w: FloatArray
+    own: FloatArray
+    inc: FloatArray
+    other: FloatArray
+    end: FloatArray
+    within: FloatArray
+    g: FloatArray
+    g_within: FloatArray
+    u: FloatArray
+    u_within: FloatArray
+    z: FloatArray
+    slope: FloatArray
+    before: FloatArray
+    kinked: FloatArray
+    after: FloatArray
+
+
+def new_room(modes: int, drives: int, projections: int) -> Room:
+    """Room for a form of so many."""
+    n = BLOCK + _PAD
+    return Room(
+        np.zeros(n), np.zeros(n), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n),
+        np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)),
+        np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
+    )  # fmt: skip
+
+
+@jit_rows
+def add(n: int, a: float, x: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] += a * x[i]
+
+
+@jit_rows
+def add_two(n: int, a: float, x: FloatArray, b: float, y: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] += a * x[i] + b * y[i]
+
+
+@jit_rows
+def _add_three(
+    n: int, a: float, x: FloatArray, b: float, y: FloatArray, c: float, z: FloatArray, out: FloatArray
+) -> None:  # fmt: skip
+    for i in range(n):
+        out[i] += a * x[i] + b * y[i] + c * z[i]
+
+
+@jit_rows
+def both_ends(n: int, a: float, b: float, x: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = a * x[i] + b * x[i + 1]
+
+
+@jit_rows
+def _add_six(
+    n: int, a: FloatArray, x: FloatArray, x_m: FloatArray, b: FloatArray, y: FloatArray, y_m: FloatArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    a0, a1, a2, b0, b1, b2 = a[0], a[1], a[2], b[0], b[1], b[2]
+    for i in range(n):
+        out[i] += a0 * x[i] + a1 * x_m[i] + a2 * x[i + 1] + b0 * y[i] + b1 * y_m[i] + b2 * y[i + 1]
+
+
+@jit_rows
+def _of_step(
+    n: int, share: FloatArray, s: FloatArray, c: float, w: FloatArray, d: float, v: FloatArray, out: FloatArray
+) -> None:  # fmt: skip
+    a, b = share[0], share[1]
+    for i in range(n):
+        out[i] = a * s[i] + b * s[i + 1] + c * w[i] + d * v[i]
+
+
+@jit_rows
+def _of_end(n: int, a: float, s: FloatArray, c: float, w: FloatArray, d: float, v: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = a * s[i] + c * w[i] + d * v[i]
+
+
+@jit_within
+def _drives_into(n: int, c: FloatArray, g: FloatArray, middle: FloatArray, out: FloatArray) -> None:
+    """Add what the drives (T, n) make with weights (T, 3) of their ends and middles."""
+    t = 0
+    while t + 1 < c.shape[0]:
+        _add_six(n, c[t], g[t], middle[t], c[t + 1], g[t + 1], middle[t + 1], out)
+        t += 2
+    if t < c.shape[0]:
+        _add_three(n, c[t, 0], g[t], c[t, 1], middle[t], c[t, 2], g[t, 1:], out)
+
+
+@jit_within
+def modes_into(n: int, first: int, c: FloatArray, w: FloatArray, out: FloatArray) -> None:
+    """Add the sum of c_k w_k over the modes from `first` on."""
+    k = first
+    while k + 1 < c.size:
+        add_two(n, c[k], w[k], c[k + 1], w[k + 1], out)
+        k += 2
+    if k < c.size:
+        add(n, c[k], w[k], out)
+
+
+@jit_rows
+def scaled(n: int, a: float, x: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = a * x[i]
+
+
+@jit_rows
+def _product(n: int, x: FloatArray, y: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = x[i] * y[i]
+
+
+@jit_rows
+def _doubled(n: int, decay: float, by: int, x: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[_PAD + i] = x[_PAD + i] + decay * x[_PAD + i - by]
+
+
+@jit_rows
+def _by_eight(n: int, decay: float, x: FloatArray, w: FloatArray) -> None:
+    for i in range(min(n, _PAD)):
+        w[i + 1] = x[i + _PAD]
+    for i in range(n - _PAD):
+        w[i + 1 + _PAD] = x[i + 2 * _PAD] + decay * w[i + 1]
+
+
+@jit_within
+def recursion(n: int, decay: float, inc: FloatArray, other: FloatArray, w: FloatArray) -> None:
+    """w[i + 1] = decay w[i] + inc[i], eight at a time: sums over 2, 4 and 8 increments, then over those before.
+
+    `inc` and `other` have `_PAD` zeros in front; `inc` is lost.
+    """
+    inc[_PAD] += decay * w[0]
+    two = decay * decay
+    four = two * two
+    _doubled(n, decay, 1, inc, other)
+    _doubled(n, two, 2, other, inc)
+    _doubled(n, four, 4, inc, other)
+    _by_eight(n, four * four, other, w)
+
+
+@jit_rows
+def area_rows(n: int, area: FloatArray, scale: float, shift: float, q0: float, u: FloatArray, z: FloatArray) -> None:
+    """q - q0 at gap voltages."""
+    d = area.size - 1
+    a, b, c, e, f = area[d], area[d - 1], area[d - 2], area[d - 3], area[d - 4]
+    last = f - q0 if d == 4 else f
+    for i in range(n):
+        x = abs(u[i]) * scale + shift
+        z[i] = (((a * x + b) * x + c) * x + e) * x + last
+    for j in range(d - 4, 0, -4):
+        b, c, e, f = area[j - 1], area[j - 2], area[j - 3], area[j - 4]
+        last = f - q0 if j == 4 else f
+        for i in range(n):
+            x = abs(u[i]) * scale + shift
+            z[i] = (((z[i] * x + b) * x + c) * x + e) * x + last
+
+
+@jit_rows
+def _newton_rows(
+    n: int, area: FloatArray, scale: float, shift: float, k_gap: float, area0: float, s: FloatArray, x_gap: FloatArray,
+    u: FloatArray, z: FloatArray, slope: FloatArray,
+) -> float:  # fmt: skip
+    """One step of Newton for u = k_gap U + A0 x_gap q(|u|) in every place; the least slope of the difference."""
+    d = area.size - 1
+    top = area[d]
+    for i in range(n):
+        z[i], slope[i] = top, 0.0
+    for j in range(d - 1, -1, -1):
+        c = area[j]
+        for i in range(n):
+            x = abs(u[i]) * scale + shift
+            slope[i] = slope[i] * x + z[i]
+            z[i] = z[i] * x + c
+    least = 1.0
+    for i in range(n):
+        b = area0 * x_gap[i]
+        margin = 1.0 - b * slope[i] * scale * (1.0 if u[i] >= 0.0 else -1.0)
+        least = min(least, margin)
+        u[i] -= (u[i] - k_gap * s[i] - b * z[i]) / margin
+    return least
+
+
+@jit_within
+def _drives(
+    form: Form, q0: float, n: int, newton: int, s: FloatArray, x: FloatArray, u: FloatArray, z: FloatArray,
+    slope: FloatArray, g: FloatArray,
+) -> float:  # fmt: skip
+    """Gap voltages and drives from the projections x (P, n); the least distance to the fold."""
+    margin = 1.0
+    drives = g.shape[0]
+    if form.mobile:
+        for _ in range(newton):
+            margin = _newton_rows(
+                n, form.area, form.scale, form.shift, form.k_gap, form.area0, s, x[0], u, z, slope
+            )  # fmt: skip
+        drives -= 1
+    else:
+        for i in range(n):
+            u[i] = x[0, i]
+    area_rows(n, form.area, form.scale, form.shift, q0, u, z)
+    for t in range(drives):
+        _product(n, z, x[1 + t], g[t])
+    if form.mobile:
+        last, share = g[drives], x[1 + drives]
+        for i in range(n):
+            last[i] = -z[i] / (q0 * (q0 + z[i])) * share[i]
+    return margin
+
+
+@jit_rows
+def _change(n: int, u: FloatArray, before: FloatArray) -> float:
+    """The largest |u - before|, or up to twice that: a mean of eighth powers, several of which are added at once.
+
+    `before` becomes u.
+    """
+    total = 0.0
+    for i in range(n):
+        d = u[i] - before[i]
+        before[i] = u[i]
+        d *= d
+        d *= d
+        total += d * d
+    return float(total**0.125)
+
+
+@jit_rows
+def crosses(n: int, u: FloatArray) -> bool:
+    """Whether some step crosses 0 V."""
+    found = False
+    for i in range(n):
+        found |= u[i] * u[i + 1] < 0.0
+    return found
+
+
+@jit_rows
+def _kink_rows(n: int, kink: float, u: FloatArray, x: FloatArray, out: FloatArray, after: FloatArray) -> None:
+    """What the parabola misses of kink |u| x over a step, in units of its length, and what of that comes after 0 V."""
+    for i in range(n):
+        a, b = u[i], u[i + 1]
+        size = abs(a) + abs(b) + 1e-300
+        at = abs(a) / size
+        missed = 0.5 * (a * a + b * b) / size - (abs(a) + 2.0 * abs(a + b) + abs(b)) / 6.0
+        missed = missed if a * b < 0.0 else 0.0
+        out[i] = kink * missed * (x[i] + at * (x[i + 1] - x[i]))
+        after[i] = 1.0 - at
+
+
+@jit_rows
+def _fading(n: int, z: float, feed: float, kinked: FloatArray, after: FloatArray, inc: FloatArray) -> None:
+    """Add what kinks make, decayed from where they are (exp to second order) to the end of the step."""
+    for i in range(n):
+        y = z * after[i]
+        inc[i] += feed * kinked[i] / (1.0 + y * (1.0 + 0.5 * y))
+
+
+@jit_rows
+def _kink_at(
+    n: int, kink: float, place: float, weight: FloatArray, u: FloatArray, x: FloatArray, out: FloatArray
+) -> None:  # fmt: skip
+    """Take from misfits at a place of the steps what the kink is known to make of them."""
+    p, m, r = weight[0], weight[1], weight[2]
+    for i in range(n):
+        a, b = u[i], u[i + 1]
+        at = abs(a) / (abs(a) + abs(b) + 1e-300)
+        known = abs(a + place * (b - a)) - p * abs(a) - 0.5 * m * abs(a + b) - r * abs(b)
+        known = known if a * b < 0.0 else 0.0
+        out[i] -= kink * known * (x[i] + at * (x[i + 1] - x[i]))
+
+
+@jit_within
+def _project(form: Form, room: Room, r: int, level: int, place: int, n: int, p: int) -> None:
+    """Projection p at one place within the steps."""
+    x, c = room.within[place, p], form.within[r, level, place, p]
+    if c.size > 1:
+        _of_step(n, form.within_s[r, level, place, p], room.s, c[0], room.w[0], c[1], room.w[1], x)
+    else:
+        both_ends(n, form.within_s[r, level, place, p, 0], form.within_s[r, level, place, p, 1], room.s, x)
+        add(n, c[0], room.w[0], x)
+    modes_into(n, 2, c, room.w, x)
+    _drives_into(n, form.within_g[r, level, place, p], room.g, room.g_within[MIDDLE], x)
+
+
+@jit_within
+def _look(form: Form, room: Room, r: int, level: int, place: int, n: int, newton: int) -> float:
+    """Gap voltages and drives at one place within the steps; the least distance to the fold."""
+    g = room.g_within[place]
+    for p in range(1 + g.shape[0]):
+        _project(form, room, r, level, place, n, p)
+    if form.mobile:
+        both_ends(n, 1.0 - PLACES[place], PLACES[place], room.s, room.s_within)
+    return _drives(
+        form, form.q0[r], n, newton, room.s_within, room.within[place], room.u_within[place], room.z, room.slope, g
+    )  # fmt: skip
+
+
+@jit_within
+def project_at_ends(form: Form, room: Room, r: int, n: int, p: int) -> None:
+    """Projection p at the ends of the steps."""
+    c, x = form.taps[r, p], room.end[p]
+    if c.size > 1:
+        _of_end(n, form.tap_s[p], room.s, c[0], room.w[0], c[1], room.w[1], x)
+    else:
+        scaled(n, form.tap_s[p], room.s, x)
+        add(n, c[0], room.w[0], x)
+    modes_into(n, 2, c, room.w, x)
+
+
+@jit_within
+def look_at_ends(form: Form, room: Room, r: int, n: int, newton: int) -> float:
+    """Gap voltages and drives at the ends of the steps."""
+    for p in range(1 + room.g.shape[0]):
+        project_at_ends(form, room, r, n, p)
+    return _drives(form, form.q0[r], n, newton, room.s, room.end, room.u, room.z, room.slope, room.g)
+
+
+@jit_within
+def project_for_charge(form: Form, room: Room, r: int, level: int, n: int) -> None:
+    """The projections that only the charge needs, everywhere; those at the quarters along the parabolas."""
+    for p in range(1 + room.g.shape[0], form.tap_s.size):
+        project_at_ends(form, room, r, n + 1, p)
+        for place in range(len(PLACES)):
+            _project(form, room, r, level, place, n, p)
+
+
+@jit_within
+def _kinks(form: Form, room: Room, r: int, h: float, kink: FloatArray, n: int) -> None:
+    """Add to `room.own` what the parabolas miss of the kink."""
+    for t in range(kink.size):
+        _kink_rows(n, h * kink[t], room.u, room.end[1 + t], room.kinked, room.after)
+        for k in range(form.rates.shape[1]):
+            _fading(n, form.rates[r, k] * h, form.feed[r, k, t], room.kinked, room.after, room.own[k])
+
+
+@jit_within
+def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int, tol: float) -> tuple[
+    float, float, int
+]:  # fmt: skip
+    """Solve n steps of length h from `room.w[:, 0]` and `room.g[:, 0]`, for the source in `room.s`.
+
+    Returns what the last sweep leaves (V; inf where sweeps do not close), the least distance to the fold, and the
+    number of sweeps.
+    """
+    modes, drives = form.rates.shape[1], room.g.shape[0]
+    for t in range(drives):
+        start = room.g[t, 0]
+        for i in range(n):
+            room.g[t, i + 1] = start
+            room.g_within[MIDDLE, t, i] = start
+    # As at the start but for the source, from where Newton begins, and the first sweep's change is counted.
+    charged = room.u[0] - form.k_gap * room.s[0]
+    for i in range(n + 1):
+        room.u[i] = room.before[i] = form.k_gap * room.s[i] + charged
+    for i in range(n):
+        room.u_within[MIDDLE, i] = 0.5 * (room.u[i] + room.u[i + 1])
+    last, margin = math.inf, 1.0
+    for sweep in range(_MOST_SWEEPS):
+        if sweep in _RENEWED:
+            for k in range(modes):
+                both_ends(n, form.source[r, level, k, 0], form.source[r, level, k, 1], room.s, room.own[k])
+            if sweep > 0 and crosses(n, room.u):
+                _kinks(form, room, r, h, kink, n)
+        for k in range(modes):
+            scaled(n, 1.0, room.own[k], room.inc[k, _PAD:])
+            _drives_into(n, form.drive[r, level, k], room.g, room.g_within[MIDDLE], room.inc[k, _PAD:])
+            recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.w[k])
+        newton = FIRST_NEWTON if sweep == 0 else _NEWTON
+        margin = _look(form, room, r, level, MIDDLE, n, newton)
+        margin = min(margin, look_at_ends(form, room, r, n + 1, newton))
+        if sweep > 0 and not margin > LEAST_MARGIN:
+            return math.inf, margin, sweep
+        if not abs(room.u[n]) < math.inf:
+            # Whatever is no number any more is carried to the end.
+            return math.inf, margin, sweep
+        change = _change(n + 1, room.u, room.before)
+        if sweep > 0:
+            ratio = change / last if last > 0.0 else 0.0
+            if not ratio < 0.9 and change > tol:
+                return math.inf, margin, sweep
+            # What is left goes on falling by about the same ratio.
+            left = 2.0 * change * ratio
+            if left <= _LEFT * tol:
+                return left, margin, sweep
+        last = change
+    return math.inf, margin, _MOST_SWEEPS
+
+
+@jit_within
+def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
+    """What each step adds to the error of the modes, into `room.inc`: Boole's rule less Simpson's."""
+    crossing = crosses(n, room.u)
+    for k in range(form.rates.shape[1]):
+        for i in range(n):
+            room.inc[k, _PAD + i] = 0.0
+    for place in (FIRST_QUARTER, LAST_QUARTER):
+        if form.mobile:
+            weight = PARABOLA[place]
+            both_ends(n, weight[0], weight[2], room.u, room.u_within[place])
+            add(n, weight[1], room.u_within[MIDDLE], room.u_within[place])
+        _look(form, room, r, level, place, n, _NEWTON)
+        for t in range(room.g.shape[0]):
+            off, weight = room.g_within[place, t], PARABOLA[place]
+            _add_three(
+                n, -weight[0], room.g[t], -weight[1], room.g_within[MIDDLE, t], -weight[2], room.g[t, 1:], off
+            )  # fmt: skip
+            if crossing:
+                _kink_at(n, kink[t], PLACES[place], weight, room.u, room.end[1 + t], off)
+            for k in range(form.rates.shape[1]):
+                add(n, form.defect[r, level, k, t, place - FIRST_QUARTER], off, room.inc[k, _PAD:])
