@@ -133,13 +133,13 @@ def _largest(n: int, x: FloatArray) -> float:
 @jit_rows
 def _charge_rows(
     n: int, h: float, mobile: bool, slow: FloatArray, area0: float, kink: float, s: FloatArray, u: FloatArray,
-    v: FloatArray, v_m: FloatArray, v_a: FloatArray, v_b: FloatArray, l: FloatArray, l_m: FloatArray, l_a: FloatArray,
-    l_b: FloatArray, q: FloatArray, q_m: FloatArray, q_a: FloatArray, q_b: FloatArray, rate: FloatArray,
+    v: FloatArray, v_m: FloatArray, v_a: FloatArray, v_b: FloatArray, by: FloatArray, by_m: FloatArray,
+    by_a: FloatArray, by_b: FloatArray, q: FloatArray, q_m: FloatArray, q_a: FloatArray, q_b: FloatArray, rate: FloatArray,
     rate_m: FloatArray, rate_end: FloatArray, gained: FloatArray, off: FloatArray,
 ) -> None:  # fmt: skip
     """Charge gained in each step but for what follows u, its rates at 0, 1/2 and 1, and Boole's rule less Simpson's.
 
-    `v` is the part of the slowest layer's voltage that does not follow u, `l` that by which it leaks. What is stored
+    `v` is the part of the slowest layer's voltage that does not follow u, `by` that by which it leaks. What is stored
     moves with the area at the start of the step; along the polynomial of v goes what the area moves meanwhile.
     """
     share, c, g_area, g_total = slow[slow.size - 4], slow[slow.size - 3], slow[slow.size - 2], slow[slow.size - 1]
@@ -147,7 +147,7 @@ def _charge_rows(
         s0, s4 = s[i], s[i + 1]
         v0, v1, v2, v3, v4 = v[i], v_a[i], v_m[i], v_b[i], v[i + 1]
         a0, a1, a2, a3, a4 = 1.0 / q[i], 1.0 / q_a[i], 1.0 / q_m[i], 1.0 / q_b[i], 1.0 / q[i + 1]
-        l0, l1, l2, l3, l4 = l[i], l_a[i], l_m[i], l_b[i], l[i + 1]
+        l0, l1, l2, l3, l4 = by[i], by_a[i], by_m[i], by_b[i], by[i + 1]
         turn = c / h
         if mobile:
             turn = 0.0
@@ -289,7 +289,8 @@ def _bent(at: float, a: float, b: float) -> float:
     whole = x * at * (1.0 - 0.5 * at / zero) if at < zero else 0.5 * (x * zero + y * (at - zero) ** 2 / (1.0 - zero))
     square, cube = at * at, at * at * at
     parabola = x * (at - 1.5 * square + 2.0 / 3.0 * cube) + m * (2.0 * square - 4.0 / 3.0 * cube)
-    return whole - parabola - y * (2.0 / 3.0 * cube - 0.5 * square)
+    missed: float = whole - parabola - y * (2.0 / 3.0 * cube - 0.5 * square)
+    return missed
 
 
 @jit

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import jit, jit_rows, jit_within
+from fingerspice.base.compiled import jit_rows, jit_within
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -52,8 +52,8 @@ SPARE = 0.02
 class Form(NamedTuple):
     """A stack around reference areas, and the weights of steps of one length and its halves.
 
-    r references, `LEVELS` halvings, m modes, T drives g_t, and P projections at the ends and `PLACES` of a step: the gap
-    voltage (under `mobile` its modes' part alone), the taps, and what the slowest layer stores and leaks by (see
+    r references, `LEVELS` halvings, m modes, T drives g_t, and P projections at the ends and `PLACES` of a step: the
+    gap voltage (under `mobile` its modes' part alone), the taps, and what the slowest layer stores and leaks by (see
     `engine.recording`).
 
     Attributes

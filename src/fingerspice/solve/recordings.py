@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.polynomial import chebyshev as series_of
@@ -18,7 +20,7 @@ from fingerspice.numerics.moments import weights
 from fingerspice.physics.contact import N_PACKED
 from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Progress, Run
+from fingerspice.solve.runs import Progress, Run, kept_with
 from fingerspice.solve.stackstate import model_of
 from fingerspice.solve.track import Prepared, Track, prepare_system
 from fingerspice.waveforms.ramps import Samples
@@ -30,9 +32,12 @@ LEAST_SAMPLES = 64
 SHARE, SAFETY, ATTEMPTS, AREA_SHARE = 0.2, 1.5, 4, 0.02
 # Samples between two words of progress.
 _AT_ONCE = 1 << 20
-# From values at Chebyshev's points to the coefficients of a series.
-_FIT = np.cos(np.pi * (np.arange(40) + 0.5) / 40)
-_TO_SERIES = np.linalg.inv(series_of.chebvander(_FIT, 39))
+# From values at Chebyshev's points to the coefficients of the antiderivative of their series.
+_POINTS = 40
+_AT = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
+_INTEGRAL = series_of.chebint(np.linalg.inv(series_of.chebvander(_AT, _POINTS - 1)))
+# Forms that stay with a scene, of up to 0.2 MB: one for each tolerance, spacing of samples and thread.
+MOST_FORMS = 16
 
 
 @dataclass(frozen=True)
@@ -84,13 +89,15 @@ def _area(system: System, tol: float) -> FloatArray | None:
 
 def _moved(system: System, area: FloatArray, at_rest: float) -> FloatArray:
     """What follows the gap voltage of the charge, C: a polynomial as that of 1/A, 0 at 0 V."""
-    model, (low, high) = system.model, (at_rest, (system.u_top - system.lo) * system.scale - 1.0)
-    x = 0.5 * (high + low) + 0.5 * (high - low) * _FIT
-    series = series_of.Chebyshev(_TO_SERIES @ (1.0 / polyval(x, area)), (low, high)).integ(lbnd=at_rest)
-    slow, n = model.slow, model.gap.size
-    by = slow[n + 1] * slow[n] / model.k_gap / system.scale
-    kept = np.flatnonzero(np.abs(series.coef) > 1e-16 * np.abs(series.coef).max())[-1] + 1
-    return np.asarray(by * series.truncate(kept).convert(kind=np.polynomial.Polynomial, domain=[-1, 1]).coef)
+    model, slow, n = system.model, system.model.slow, system.model.gap.size
+    if model.mobile:
+        return np.zeros(1)
+    series = slow[n + 1] * slow[n] / model.k_gap / system.scale * (_INTEGRAL @ (1.0 / polyval(_AT, area)))
+    kept = np.ascontiguousarray(series[: np.flatnonzero(np.abs(series) > 1e-16 * np.abs(series).max())[-1] + 1])
+    powers = np.empty(kept.size)
+    chebyshev.to_powers(kept, powers)
+    powers[0] -= polyval(at_rest, powers)
+    return powers
 
 
 def form_of(system: System, area: FloatArray, spacing: float) -> Form:
@@ -99,15 +106,15 @@ def form_of(system: System, area: FloatArray, spacing: float) -> Form:
     h = spacing / 2.0 ** np.arange(LEVELS)[:, None]
     z = system.rates[:, None, :] * h
     n, slow = model.gap.size, model.slow
-    feed, taps, tap_s = system.feed, [system.gap[:, None], system.tap], [[model.k_gap], system.tap_k]
+    feed, taps, tap_s = system.feed, [system.gap[:, None], system.tap], [model.k_gap, *system.tap_k]
     if model.mobile:
         feed = np.concatenate([feed, system.push[:, :, None] / model.area0], axis=2)
         taps.append(np.zeros((system.q0.size, 1, n)))
-        tap_s = [[0.0], system.tap_k, [1.0]]
+        tap_s = [0.0, *system.tap_k, 1.0]
     ratio = 0.0 if model.mobile else slow[n] / model.k_gap
     taps += [(system.slow - ratio * system.gap)[:, None], system.slow[:, None]]
-    tap_s.append([0.0, 0.0 if model.mobile else slow[n]])
-    every, direct = np.concatenate(taps, axis=1), np.concatenate(tap_s)
+    tap_s += [0.0, 0.0 if model.mobile else slow[n]]
+    every, direct = np.concatenate(taps, axis=1), np.array(tap_s)
     gain = system.gain[:, None, :, None] * h[..., None]
     drives = feed[:, None, :, :, None] * h[..., None, None]
 
@@ -118,7 +125,9 @@ def form_of(system: System, area: FloatArray, spacing: float) -> Form:
         of_g = np.einsum("rpk,rsktj->rsptj", every, drives * weights(z, (0.0, 0.5, 1.0), at)[..., None, :])
         return own, of_s, of_g
 
-    inner, inner_s, inner_g = (np.ascontiguousarray(np.stack(x, axis=2)) for x in zip(*map(within, PLACES), strict=True))
+    inner, inner_s, inner_g = (
+        np.ascontiguousarray(np.stack(x, axis=2)) for x in zip(*map(within, PLACES), strict=True)
+    )
     five = (0.0, 0.25, 0.5, 0.75, 1.0)
     quarters, early = (weights(z, five, until)[..., None, [1, 3]] for until in (1.0, 0.5))
     return Form(
@@ -130,22 +139,76 @@ def form_of(system: System, area: FloatArray, spacing: float) -> Form:
     )  # fmt: skip
 
 
-def solve(
-    problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None
-) -> Run | None:
+@dataclass(frozen=True)
+class Followed:
+    """A scene ready to be followed sample by sample, to an error of a decade.
+
+    Attributes
+    ----------
+    prepared : Prepared
+    area : ndarray
+        See `Form.area`.
+    at_rest, q_rest : float
+        Its variable and 1/A (1/m^2) at 0 V.
+    shown : recording.Shown
+    """
+
+    prepared: Prepared
+    area: FloatArray
+    at_rest: float
+    q_rest: float
+    shown: recording.Shown
+
+    @property
+    def system(self) -> System:
+        return self.prepared.system
+
+    def followed(self, u_gap: float) -> float:
+        """The charge that follows a gap voltage (V), C."""
+        return math.copysign(float(polyval(abs(u_gap) * self.system.scale + self.at_rest, self.shown.moved)), u_gap)
+
+
+def _followed(problem: Problem, rtol: float) -> Followed | None:
+    """The scene made ready, where a polynomial for its area is good enough."""
+    prepared = prepare_system(problem.scene, rtol)
+    system = prepared.system
+    area = _area(system, AREA_SHARE * rtol)
+    if area is None:
+        return None
+    at_rest = -system.lo * system.scale - 1.0
+    q_rest = float(polyval(at_rest, area))
+    kink = float(polyval(at_rest, area[1:] * np.arange(1, area.size))) * system.scale
+    kinks = np.full(system.tap_k.size, kink)
+    if system.model.mobile:
+        kinks = np.append(kinks, -kink / q_rest**2)
+    shown = recording.Shown(
+        system.shown, system.k_shown, system.slow, system.live, system.project, system.stress, kinks,
+        -kink / q_rest**2, _moved(system, area, at_rest), problem.charge,
+    )  # fmt: skip
+    return Followed(prepared, area, at_rest, q_rest, shown)
+
+
+def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None) -> Run | None:
     """A run sample by sample, or None where that is not the way: no recording, or one too coarse for it."""
     parts = stretches(problem)
     if parts is None:
         return None
-    prepared = prepare_system(problem.scene, rtol)
-    area = _area(prepared.system, AREA_SHARE * rtol)
-    if area is None:
+    decade = 10.0 ** np.floor(np.log10(rtol))
+    kept, thread = problem.scene.prepared, threading.get_ident()
+    one = kept_with(
+        kept, ("followed", decade, problem.charge, thread), MOST_FORMS, lambda: _followed(problem, decade)
+    )  # fmt: skip
+    if one is None:
         return None
+    forms: list[Form] = []
+    for part in parts:
+        make = partial(form_of, one.system, one.area, part.spacing)
+        forms.append(kept_with(kept, ("form", decade, part.spacing, thread), MOST_FORMS, make))
     peak = max(float(np.abs(part.values).max()) for part in parts)
     scale = max(peak * model_of(problem.scene).k_gap, float(np.abs(problem.initial.y).max(initial=0.0)))
     tol, refused = SHARE * rtol * scale, 0
     for _ in range(ATTEMPTS):
-        run = _follow(problem, prepared, area, parts, tol, rtol, t_out, left, progress)
+        run = _follow(problem, one, list(zip(parts, forms, strict=True)), tol, t_out, left, progress)
         if run is None:
             return None
         refused += run.stats["rejected"]
@@ -158,85 +221,66 @@ def solve(
 
 
 def _follow(
-    problem: Problem, prepared: Prepared, area: FloatArray, parts: list[Stretch], tol: float, rtol: float,
-    t_out: FloatArray, left: BoolArray, progress: Progress | None,
+    problem: Problem, one: Followed, parts: list[tuple[Stretch, Form]], tol: float, t_out: FloatArray, left: BoolArray,
+    progress: Progress | None,
 ) -> Run | None:  # fmt: skip
     """One attempt, with an error of `tol` (V) allowed to come from each block."""
-    one = Track(problem, prepared, tol, t_out, left, repeat=False)
-    system, model = prepared.system, prepared.system.model
-    at_rest = -system.lo * system.scale - 1.0
-    kink = float(polyval(at_rest, area[1:] * np.arange(1, area.size)))
-    kink *= system.scale
-    q_rest = float(polyval(at_rest, area))
-    drives = system.tap_k.size + (1 if model.mobile else 0)
-    kinks = np.full(drives, kink)
-    if model.mobile:
-        kinks[-1] = -kink / q_rest**2
-    moved = _moved(system, area, at_rest)
-    shown = recording.Shown(
-        system.shown, system.k_shown, system.slow, system.live, system.project, system.stress, kinks, -kink / q_rest**2,
-        moved, problem.charge
-    )  # fmt: skip
-    m = system.rates.shape[1]
+    track = Track(problem, one.prepared, tol, t_out, left, repeat=False)
+    system, model, shown = one.system, one.system.model, one.shown
+    m, drives = system.rates.shape[1], shown.kink.size
     room, own = relaxation.new_room(m, drives, drives + 3), recording.new_charges()
     control, counters = np.zeros(recording.N_CONTROL), np.zeros(4, np.int64)
-    control[recording.MARGIN] = 1.0
-    start = problem.inner
-    x = start.u_gap * system.scale
-    followed = 0.0 if model.mobile else math.copysign(polyval(abs(x) + at_rest, moved), x)
-    control[recording.Z], control[recording.U_GAP] = start.y[-1] - followed, start.u_gap
-    r = int(np.argmin(np.abs(np.log(system.q0 / q_rest))))
-    control[recording.REFERENCE] = r
+    start, r = problem.inner, int(np.argmin(np.abs(np.log(system.q0 / one.q_rest))))
+    control[recording.MARGIN], control[recording.REFERENCE], control[recording.U_GAP] = 1.0, r, start.u_gap
+    control[recording.Z] = start.y[-1] - one.followed(start.u_gap)
     w, error, spare = system.project[r] @ start.y[:-1], np.zeros(m), np.zeros((3, max(m, drives, 3)))
-    before = start.u_before
-    for part in parts:
-        form = form_of(system, area, part.spacing)
+    for part, form in parts:
         if not recording.jump(model, form, float(part.values[0]), w, control):
             return None
         for first in range(0, part.values.size - 1, _AT_ONCE):
             last = min(first + _AT_ONCE, part.values.size - 1)
             code = recording.march(
                 model, form, shown, room, own, part.values, first, last, part.start, part.spacing, tol, w, error,
-                control, counters, spare, t_out, one.out,
+                control, counters, spare, t_out, track.out,
             )  # fmt: skip
             if code != recording.DONE or control[recording.PEAK_U] > system.u_top:
                 return None
             if progress is not None:
                 progress((part.start + last * part.spacing - problem.t_start) / (problem.t_stop - problem.t_start))
-        before = float(part.values[-1])
-    slope = _slope_after(problem)
+    ends = float(parts[-1][0].values[-1])
     recording.write_end(
-        model, form, shown, room, own, before, slope, w, control, counters, spare, problem.t_stop, t_out, left, True,
-        one.out,
+        model, form, shown, room, own, ends, _slope_after(problem), w, control, counters, spare, problem.t_stop, t_out,
+        left, True, track.out,
     )  # fmt: skip
-    x = float(control[recording.U_GAP]) * system.scale
-    followed = 0.0 if model.mobile else math.copysign(polyval(abs(x) + at_rest, moved), x)
-    z = float(control[recording.Z]) + followed
-    return _as_run(problem, one, system, w, before, control, counters, z, t_out, left)
+    return _as_run(problem, one, track, w, ends, control, counters)
 
 
 def _slope_after(problem: Problem) -> float:
     """Slope of the source right of the end of a run, V/s."""
     wave, stop = problem.waveform, problem.t_stop
-    _, slope = wave.terms(np.array([stop]), np.array([stop + 1e-3 / wave.rate]))[0, :, 0]  # type: ignore[attr-defined, index]
-    return float(slope)
+    assert isinstance(wave, Samples)
+    after = 1e-3 / wave.rate
+    here, later = wave.value([stop, stop + after]).tolist()
+    return float(later - here) / after
 
 
 def _as_run(
-    problem: Problem, one: Track, system: System, w: FloatArray, u_before: float, control: FloatArray,
-    counters: IntArray, z: float, t_out: FloatArray, left: BoolArray,
+    problem: Problem, one: Followed, track: Track, w: FloatArray, u_before: float, control: FloatArray,
+    counters: IntArray,
 ) -> Run:  # fmt: skip
     """What a march has left, as a run."""
-    r = int(control[recording.REFERENCE])
-    one.y[:-1], one.y[-1] = system.live[r] @ w, z
-    u_gap = float(control[recording.U_GAP])
-    one.control[readout.T], one.control[readout.U_BEFORE], one.control[readout.U_GAP] = problem.t_stop, u_before, u_gap
-    one.control[readout.SIGN] = math.copysign(1.0, u_gap)
-    one.counters[readout.OUTPUT] = counters[recording.OUTPUT]
-    rows = one.written()
+    system, u_gap = one.system, float(control[recording.U_GAP])
+    track.y[:-1] = system.live[int(control[recording.REFERENCE])] @ w
+    track.y[-1] = control[recording.Z] + one.followed(u_gap)
+    given = track.control
+    given[readout.T], given[readout.U_BEFORE], given[readout.U_GAP] = problem.t_stop, u_before, u_gap
+    given[readout.SIGN] = math.copysign(1.0, u_gap)
+    track.counters[readout.OUTPUT] = counters[recording.OUTPUT]
+    rows = track.written()
+    n = len(rows)
     stats = {"steps": int(counters[recording.STEPS]), "rejected": int(counters[recording.REFUSED]), "zeros": 0}
     evaluated = 2 * BLOCK * int(counters[recording.SWEEPS])
-    run = Run(t_out[: len(rows)], left[: len(rows)], rows, Status.SUCCESS, evaluated, stats, one.state())
+    run = Run(track.t_out[:n], track.left[:n], rows, Status.SUCCESS, evaluated, stats, track.state())
     peak_u, peak_f = float(control[recording.PEAK_U]), float(control[recording.PEAK_F])
     # Rounding is an error too, and what the area's polynomial misses.
     floor = 4e-16 * (peak_u + system.model.k_gap * problem.scene.u_peak)
@@ -244,8 +288,7 @@ def _as_run(
     f_error = SAFETY * float(control[recording.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f
     run.gaps = np.array([[peak_u, peak_f, u_error, f_error]])
     if problem.charge:
-        held = one.capacitance * (problem.scene.u_peak + peak_u)
+        held = track.capacitance * (problem.scene.u_peak + peak_u)
         run.charge_error = 2.0 * SAFETY * float(control[recording.ERROR_Q]) + 4e-16 * held * (1.0 + stats["steps"])
-    run.margin = float(control[recording.MARGIN])
-    run.by_layer = True
+    run.margin, run.by_layer = float(control[recording.MARGIN]), True
     return run
