@@ -22,7 +22,27 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import jit_rows, jit_within
+from fingerspice.base.compiled import jit_within
+from fingerspice.engine.blockrows import (
+    PAD,
+    add,
+    add_three,
+    area_rows,
+    both_ends,
+    change_of,
+    crosses,
+    drives_into,
+    fading,
+    kink_at,
+    kink_rows,
+    modes_into,
+    newton_rows,
+    of_end,
+    of_step,
+    product_of,
+    recursion,
+    scaled,
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -31,8 +51,6 @@ IntArray = NDArray[np.int64]
 BLOCK, LEVELS = 512, 7
 # Degree of the polynomial for 1/A at most.
 MOST_DEGREE = 28
-# Zeros in front of rows that a recursion looks back from.
-_PAD = 8
 # Where a step is looked at besides its ends: its middle, and the two places that tell the error.
 PLACES = (0.5, 0.25, 0.75)
 MIDDLE, FIRST_QUARTER, LAST_QUARTER = 0, 1, 2
@@ -47,6 +65,14 @@ _RENEWED = (0, 2, 4)
 FIRST_NEWTON, _NEWTON, LEAST_MARGIN = 6, 2, 0.2
 # An error this far below the one allowed lets the steps of the next block be longer: it rises sixteenfold.
 SPARE = 0.02
+
+
+# Entries of `control`: halvings of a sample, reference, and as in `engine.readout`.
+LEVEL, REFERENCE, PEAK_U, PEAK_F, ERROR_U, ERROR_F, MARGIN, Z, PEAK_Q, ERROR_Q, COLLECTED, U_GAP = range(12)
+N_CONTROL = 12
+# Entries of `counters`.
+OUTPUT, STEPS, REFUSED, SWEEPS = range(4)
+N_COUNTERS = 4
 
 
 class Form(NamedTuple):
@@ -102,6 +128,41 @@ class Form(NamedTuple):
     area0: float
 
 
+class Shown(NamedTuple):
+    """What is written at the outputs.
+
+    Attributes
+    ----------
+    columns : ndarray, shape (r, C, m)
+        Recorded voltages over k U.
+    k : ndarray, shape (C,)
+    slow : ndarray, shape (r, m)
+        The slowest layer's share of each mode (see `Model.slow`).
+    live, project : ndarray, shape (r, m, m)
+        From modes to live voltages and back.
+    stress : float
+        Force per area and squared gap voltage, Pa/V^2.
+    kink : ndarray, shape (T,)
+        Slope of each drive over what it multiplies, by |u_gap| at 0 V.
+    area_kink : float
+        dA/d|u| at 0 V, m^2/V.
+    moved : ndarray
+        c r G(|u|) under `local`, a polynomial as `Form.area`, C.
+    charge : bool
+    """
+
+    columns: FloatArray
+    k: FloatArray
+    slow: FloatArray
+    live: FloatArray
+    project: FloatArray
+    stress: float
+    kink: FloatArray
+    area_kink: float
+    moved: FloatArray
+    charge: bool
+
+
 class Room(NamedTuple):
     """Rows of a block to work in: of the source, modes, increments, projections, drives, and single ones."""
 
@@ -126,168 +187,12 @@ class Room(NamedTuple):
 
 def new_room(modes: int, drives: int, projections: int) -> Room:
     """Room for a form of so many."""
-    n = BLOCK + _PAD
+    n = BLOCK + PAD
     return Room(
         np.zeros(n), np.zeros(n), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n),
         np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)),
         np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
     )  # fmt: skip
-
-
-@jit_rows
-def add(n: int, a: float, x: FloatArray, out: FloatArray) -> None:
-    for i in range(n):
-        out[i] += a * x[i]
-
-
-@jit_rows
-def add_two(n: int, a: float, x: FloatArray, b: float, y: FloatArray, out: FloatArray) -> None:
-    for i in range(n):
-        out[i] += a * x[i] + b * y[i]
-
-
-@jit_rows
-def _add_three(
-    n: int, a: float, x: FloatArray, b: float, y: FloatArray, c: float, z: FloatArray, out: FloatArray
-) -> None:  # fmt: skip
-    for i in range(n):
-        out[i] += a * x[i] + b * y[i] + c * z[i]
-
-
-@jit_rows
-def both_ends(n: int, a: float, b: float, x: FloatArray, out: FloatArray) -> None:
-    for i in range(n):
-        out[i] = a * x[i] + b * x[i + 1]
-
-
-@jit_rows
-def _add_six(
-    n: int, a: FloatArray, x: FloatArray, x_m: FloatArray, b: FloatArray, y: FloatArray, y_m: FloatArray,
-    out: FloatArray,
-) -> None:  # fmt: skip
-    a0, a1, a2, b0, b1, b2 = a[0], a[1], a[2], b[0], b[1], b[2]
-    for i in range(n):
-        out[i] += a0 * x[i] + a1 * x_m[i] + a2 * x[i + 1] + b0 * y[i] + b1 * y_m[i] + b2 * y[i + 1]
-
-
-@jit_rows
-def _of_step(
-    n: int, share: FloatArray, s: FloatArray, c: float, w: FloatArray, d: float, v: FloatArray, out: FloatArray
-) -> None:  # fmt: skip
-    a, b = share[0], share[1]
-    for i in range(n):
-        out[i] = a * s[i] + b * s[i + 1] + c * w[i] + d * v[i]
-
-
-@jit_rows
-def _of_end(n: int, a: float, s: FloatArray, c: float, w: FloatArray, d: float, v: FloatArray, out: FloatArray) -> None:
-    for i in range(n):
-        out[i] = a * s[i] + c * w[i] + d * v[i]
-
-
-@jit_within
-def _drives_into(n: int, c: FloatArray, g: FloatArray, middle: FloatArray, out: FloatArray) -> None:
-    """Add what the drives (T, n) make with weights (T, 3) of their ends and middles."""
-    t = 0
-    while t + 1 < c.shape[0]:
-        _add_six(n, c[t], g[t], middle[t], c[t + 1], g[t + 1], middle[t + 1], out)
-        t += 2
-    if t < c.shape[0]:
-        _add_three(n, c[t, 0], g[t], c[t, 1], middle[t], c[t, 2], g[t, 1:], out)
-
-
-@jit_within
-def modes_into(n: int, first: int, c: FloatArray, w: FloatArray, out: FloatArray) -> None:
-    """Add the sum of c_k w_k over the modes from `first` on."""
-    k = first
-    while k + 1 < c.size:
-        add_two(n, c[k], w[k], c[k + 1], w[k + 1], out)
-        k += 2
-    if k < c.size:
-        add(n, c[k], w[k], out)
-
-
-@jit_rows
-def scaled(n: int, a: float, x: FloatArray, out: FloatArray) -> None:
-    for i in range(n):
-        out[i] = a * x[i]
-
-
-@jit_rows
-def _product(n: int, x: FloatArray, y: FloatArray, out: FloatArray) -> None:
-    for i in range(n):
-        out[i] = x[i] * y[i]
-
-
-@jit_rows
-def _doubled(n: int, decay: float, by: int, x: FloatArray, out: FloatArray) -> None:
-    for i in range(n):
-        out[_PAD + i] = x[_PAD + i] + decay * x[_PAD + i - by]
-
-
-@jit_rows
-def _by_eight(n: int, decay: float, x: FloatArray, w: FloatArray) -> None:
-    for i in range(min(n, _PAD)):
-        w[i + 1] = x[i + _PAD]
-    for i in range(n - _PAD):
-        w[i + 1 + _PAD] = x[i + 2 * _PAD] + decay * w[i + 1]
-
-
-@jit_within
-def recursion(n: int, decay: float, inc: FloatArray, other: FloatArray, w: FloatArray) -> None:
-    """w[i + 1] = decay w[i] + inc[i], eight at a time: sums over 2, 4 and 8 increments, then over those before.
-
-    `inc` and `other` have `_PAD` zeros in front; `inc` is lost.
-    """
-    inc[_PAD] += decay * w[0]
-    two = decay * decay
-    four = two * two
-    _doubled(n, decay, 1, inc, other)
-    _doubled(n, two, 2, other, inc)
-    _doubled(n, four, 4, inc, other)
-    _by_eight(n, four * four, other, w)
-
-
-@jit_rows
-def area_rows(n: int, area: FloatArray, scale: float, shift: float, q0: float, u: FloatArray, z: FloatArray) -> None:
-    """q - q0 at gap voltages."""
-    d = area.size - 1
-    a, b, c, e, f = area[d], area[d - 1], area[d - 2], area[d - 3], area[d - 4]
-    last = f - q0 if d == 4 else f
-    for i in range(n):
-        x = abs(u[i]) * scale + shift
-        z[i] = (((a * x + b) * x + c) * x + e) * x + last
-    for j in range(d - 4, 0, -4):
-        b, c, e, f = area[j - 1], area[j - 2], area[j - 3], area[j - 4]
-        last = f - q0 if j == 4 else f
-        for i in range(n):
-            x = abs(u[i]) * scale + shift
-            z[i] = (((z[i] * x + b) * x + c) * x + e) * x + last
-
-
-@jit_rows
-def _newton_rows(
-    n: int, area: FloatArray, scale: float, shift: float, k_gap: float, area0: float, s: FloatArray, x_gap: FloatArray,
-    u: FloatArray, z: FloatArray, slope: FloatArray,
-) -> float:  # fmt: skip
-    """One step of Newton for u = k_gap U + A0 x_gap q(|u|) in every place; the least slope of the difference."""
-    d = area.size - 1
-    top = area[d]
-    for i in range(n):
-        z[i], slope[i] = top, 0.0
-    for j in range(d - 1, -1, -1):
-        c = area[j]
-        for i in range(n):
-            x = abs(u[i]) * scale + shift
-            slope[i] = slope[i] * x + z[i]
-            z[i] = z[i] * x + c
-    least = 1.0
-    for i in range(n):
-        b = area0 * x_gap[i]
-        margin = 1.0 - b * slope[i] * scale * (1.0 if u[i] >= 0.0 else -1.0)
-        least = min(least, margin)
-        u[i] -= (u[i] - k_gap * s[i] - b * z[i]) / margin
-    return least
 
 
 @jit_within
@@ -300,7 +205,7 @@ def _drives(
     drives = g.shape[0]
     if form.mobile:
         for _ in range(newton):
-            margin = _newton_rows(
+            margin = newton_rows(
                 n, form.area, form.scale, form.shift, form.k_gap, form.area0, s, x[0], u, z, slope
             )  # fmt: skip
         drives -= 1
@@ -309,7 +214,7 @@ def _drives(
             u[i] = x[0, i]
     area_rows(n, form.area, form.scale, form.shift, q0, u, z)
     for t in range(drives):
-        _product(n, z, x[1 + t], g[t])
+        product_of(n, z, x[1 + t], g[t])
     if form.mobile:
         last, share = g[drives], x[1 + drives]
         for i in range(n):
@@ -317,77 +222,17 @@ def _drives(
     return margin
 
 
-@jit_rows
-def _change(n: int, u: FloatArray, before: FloatArray) -> float:
-    """The largest |u - before|, or up to twice that: a mean of eighth powers, several of which are added at once.
-
-    `before` becomes u.
-    """
-    total = 0.0
-    for i in range(n):
-        d = u[i] - before[i]
-        before[i] = u[i]
-        d *= d
-        d *= d
-        total += d * d
-    return float(total**0.125)
-
-
-@jit_rows
-def crosses(n: int, u: FloatArray) -> bool:
-    """Whether some step crosses 0 V."""
-    found = False
-    for i in range(n):
-        found |= u[i] * u[i + 1] < 0.0
-    return found
-
-
-@jit_rows
-def _kink_rows(n: int, kink: float, u: FloatArray, x: FloatArray, out: FloatArray, after: FloatArray) -> None:
-    """What the parabola misses of kink |u| x over a step, in units of its length, and what of that comes after 0 V."""
-    for i in range(n):
-        a, b = u[i], u[i + 1]
-        size = abs(a) + abs(b) + 1e-300
-        at = abs(a) / size
-        missed = 0.5 * (a * a + b * b) / size - (abs(a) + 2.0 * abs(a + b) + abs(b)) / 6.0
-        missed = missed if a * b < 0.0 else 0.0
-        out[i] = kink * missed * (x[i] + at * (x[i + 1] - x[i]))
-        after[i] = 1.0 - at
-
-
-@jit_rows
-def _fading(n: int, z: float, feed: float, kinked: FloatArray, after: FloatArray, inc: FloatArray) -> None:
-    """Add what kinks make, decayed from where they are (exp to second order) to the end of the step."""
-    for i in range(n):
-        y = z * after[i]
-        inc[i] += feed * kinked[i] / (1.0 + y * (1.0 + 0.5 * y))
-
-
-@jit_rows
-def _kink_at(
-    n: int, kink: float, place: float, weight: FloatArray, u: FloatArray, x: FloatArray, out: FloatArray
-) -> None:  # fmt: skip
-    """Take from misfits at a place of the steps what the kink is known to make of them."""
-    p, m, r = weight[0], weight[1], weight[2]
-    for i in range(n):
-        a, b = u[i], u[i + 1]
-        at = abs(a) / (abs(a) + abs(b) + 1e-300)
-        known = abs(a + place * (b - a)) - p * abs(a) - 0.5 * m * abs(a + b) - r * abs(b)
-        known = known if a * b < 0.0 else 0.0
-        out[i] -= kink * known * (x[i] + at * (x[i + 1] - x[i]))
-
-
 @jit_within
 def _project(form: Form, room: Room, r: int, level: int, place: int, n: int, p: int) -> None:
     """Projection p at one place within the steps."""
     x, c = room.within[place, p], form.within[r, level, place, p]
     if c.size > 1:
-        _of_step(n, form.within_s[r, level, place, p], room.s, c[0], room.w[0], c[1], room.w[1], x)
+        of_step(n, form.within_s[r, level, place, p], room.s, c[0], room.w[0], c[1], room.w[1], x)
     else:
         both_ends(n, form.within_s[r, level, place, p, 0], form.within_s[r, level, place, p, 1], room.s, x)
         add(n, c[0], room.w[0], x)
     modes_into(n, 2, c, room.w, x)
-    _drives_into(n, form.within_g[r, level, place, p], room.g, room.g_within[MIDDLE], x)
+    drives_into(n, form.within_g[r, level, place, p], room.g, room.g_within[MIDDLE], x)
 
 
 @jit_within
@@ -408,7 +253,7 @@ def project_at_ends(form: Form, room: Room, r: int, n: int, p: int) -> None:
     """Projection p at the ends of the steps."""
     c, x = form.taps[r, p], room.end[p]
     if c.size > 1:
-        _of_end(n, form.tap_s[p], room.s, c[0], room.w[0], c[1], room.w[1], x)
+        of_end(n, form.tap_s[p], room.s, c[0], room.w[0], c[1], room.w[1], x)
     else:
         scaled(n, form.tap_s[p], room.s, x)
         add(n, c[0], room.w[0], x)
@@ -436,9 +281,9 @@ def project_for_charge(form: Form, room: Room, r: int, level: int, n: int) -> No
 def _kinks(form: Form, room: Room, r: int, h: float, kink: FloatArray, n: int) -> None:
     """Add to `room.own` what the parabolas miss of the kink."""
     for t in range(kink.size):
-        _kink_rows(n, h * kink[t], room.u, room.end[1 + t], room.kinked, room.after)
+        kink_rows(n, h * kink[t], room.u, room.end[1 + t], room.kinked, room.after)
         for k in range(form.rates.shape[1]):
-            _fading(n, form.rates[r, k] * h, form.feed[r, k, t], room.kinked, room.after, room.own[k])
+            fading(n, form.rates[r, k] * h, form.feed[r, k, t], room.kinked, room.after, room.own[k])
 
 
 @jit_within
@@ -470,8 +315,8 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
             if sweep > 0 and crosses(n, room.u):
                 _kinks(form, room, r, h, kink, n)
         for k in range(modes):
-            scaled(n, 1.0, room.own[k], room.inc[k, _PAD:])
-            _drives_into(n, form.drive[r, level, k], room.g, room.g_within[MIDDLE], room.inc[k, _PAD:])
+            scaled(n, 1.0, room.own[k], room.inc[k, PAD:])
+            drives_into(n, form.drive[r, level, k], room.g, room.g_within[MIDDLE], room.inc[k, PAD:])
             recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.w[k])
         newton = FIRST_NEWTON if sweep == 0 else _NEWTON
         margin = _look(form, room, r, level, MIDDLE, n, newton)
@@ -481,7 +326,7 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
         if not abs(room.u[n]) < math.inf:
             # Whatever is no number any more is carried to the end.
             return math.inf, margin, sweep
-        change = _change(n + 1, room.u, room.before)
+        change = change_of(n + 1, room.u, room.before)
         if sweep > 0:
             ratio = change / last if last > 0.0 else 0.0
             if not ratio < 0.9 and change > tol:
@@ -500,7 +345,7 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
     crossing = crosses(n, room.u)
     for k in range(form.rates.shape[1]):
         for i in range(n):
-            room.inc[k, _PAD + i] = 0.0
+            room.inc[k, PAD + i] = 0.0
     for place in (FIRST_QUARTER, LAST_QUARTER):
         if form.mobile:
             weight = PARABOLA[place]
@@ -509,10 +354,10 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
         _look(form, room, r, level, place, n, _NEWTON)
         for t in range(room.g.shape[0]):
             off, weight = room.g_within[place, t], PARABOLA[place]
-            _add_three(
+            add_three(
                 n, -weight[0], room.g[t], -weight[1], room.g_within[MIDDLE, t], -weight[2], room.g[t, 1:], off
             )  # fmt: skip
             if crossing:
-                _kink_at(n, kink[t], PLACES[place], weight, room.u, room.end[1 + t], off)
+                kink_at(n, kink[t], PLACES[place], weight, room.u, room.end[1 + t], off)
             for k in range(form.rates.shape[1]):
-                add(n, form.defect[r, level, k, t, place - FIRST_QUARTER], off, room.inc[k, _PAD:])
+                add(n, form.defect[r, level, k, t, place - FIRST_QUARTER], off, room.inc[k, PAD:])

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.polynomial import chebyshev as series_of
 from numpy.polynomial.polynomial import polyval
 
-from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine import readout, recording, relaxation
+from fingerspice.engine.blockcharge import Course, new_charges
+from fingerspice.engine.blockoutput import write_end
 from fingerspice.engine.relaxation import BLOCK, LEVELS, PLACES, Form
 from fingerspice.engine.system import System
 from fingerspice.numerics import chebyshev
@@ -150,14 +152,14 @@ class Followed:
         See `Form.area`.
     at_rest, q_rest : float
         Its variable and 1/A (1/m^2) at 0 V.
-    shown : recording.Shown
+    shown : relaxation.Shown
     """
 
     prepared: Prepared
     area: FloatArray
     at_rest: float
     q_rest: float
-    shown: recording.Shown
+    shown: relaxation.Shown
 
     @property
     def system(self) -> System:
@@ -181,7 +183,7 @@ def _followed(problem: Problem, rtol: float) -> Followed | None:
     kinks = np.full(system.tap_k.size, kink)
     if system.model.mobile:
         kinks = np.append(kinks, -kink / q_rest**2)
-    shown = recording.Shown(
+    shown = relaxation.Shown(
         system.shown, system.k_shown, system.slow, system.live, system.project, system.stress, kinks,
         -kink / q_rest**2, _moved(system, area, at_rest), problem.charge,
     )  # fmt: skip
@@ -226,33 +228,32 @@ def _follow(
 ) -> Run | None:  # fmt: skip
     """One attempt, with an error of `tol` (V) allowed to come from each block."""
     track = Track(problem, one.prepared, tol, t_out, left, repeat=False)
-    system, model, shown = one.system, one.system.model, one.shown
-    m, drives = system.rates.shape[1], shown.kink.size
-    room, own = relaxation.new_room(m, drives, drives + 3), recording.new_charges()
-    control, counters = np.zeros(recording.N_CONTROL), np.zeros(4, np.int64)
+    system = one.system
+    m, drives = system.rates.shape[1], one.shown.kink.size
     start, r = problem.inner, int(np.argmin(np.abs(np.log(system.q0 / one.q_rest))))
-    control[recording.MARGIN], control[recording.REFERENCE], control[recording.U_GAP] = 1.0, r, start.u_gap
-    control[recording.Z] = start.y[-1] - one.followed(start.u_gap)
-    w, error, spare = system.project[r] @ start.y[:-1], np.zeros(m), np.zeros((3, max(m, drives, 3)))
+    control, counters = np.zeros(relaxation.N_CONTROL), np.zeros(relaxation.N_COUNTERS, np.int64)
+    control[relaxation.MARGIN], control[relaxation.REFERENCE], control[relaxation.U_GAP] = 1.0, r, start.u_gap
+    control[relaxation.Z] = start.y[-1] - one.followed(start.u_gap)
+    course = Course(
+        system.model, parts[0][1], one.shown, relaxation.new_room(m, drives, drives + 3), new_charges(),
+        np.zeros((3, max(m, drives, 3))), system.project[r] @ start.y[:-1], np.zeros(m), control, counters,
+    )  # fmt: skip
     for part, form in parts:
-        if not recording.jump(model, form, float(part.values[0]), w, control):
+        course = course._replace(form=form)
+        if not recording.jump(course, float(part.values[0])):
             return None
         for first in range(0, part.values.size - 1, _AT_ONCE):
             last = min(first + _AT_ONCE, part.values.size - 1)
             code = recording.march(
-                model, form, shown, room, own, part.values, first, last, part.start, part.spacing, tol, w, error,
-                control, counters, spare, t_out, track.out,
+                course, part.values, first, last, part.start, part.spacing, tol, t_out, track.out
             )  # fmt: skip
-            if code != recording.DONE or control[recording.PEAK_U] > system.u_top:
+            if code != recording.DONE or control[relaxation.PEAK_U] > system.u_top:
                 return None
             if progress is not None:
                 progress((part.start + last * part.spacing - problem.t_start) / (problem.t_stop - problem.t_start))
-    ends = float(parts[-1][0].values[-1])
-    recording.write_end(
-        model, form, shown, room, own, ends, _slope_after(problem), w, control, counters, spare, problem.t_stop, t_out,
-        left, True, track.out,
-    )  # fmt: skip
-    return _as_run(problem, one, track, w, ends, control, counters)
+    end = float(parts[-1][0].values[-1])
+    write_end(course, end, _slope_after(problem), t_out, track.out)
+    return _as_run(problem, one, track, course, end)
 
 
 def _slope_after(problem: Problem) -> float:
@@ -264,31 +265,29 @@ def _slope_after(problem: Problem) -> float:
     return float(later - here) / after
 
 
-def _as_run(
-    problem: Problem, one: Followed, track: Track, w: FloatArray, u_before: float, control: FloatArray,
-    counters: IntArray,
-) -> Run:  # fmt: skip
+def _as_run(problem: Problem, one: Followed, track: Track, course: Course, u_before: float) -> Run:
     """What a march has left, as a run."""
-    system, u_gap = one.system, float(control[recording.U_GAP])
-    track.y[:-1] = system.live[int(control[recording.REFERENCE])] @ w
-    track.y[-1] = control[recording.Z] + one.followed(u_gap)
+    control, counters = course.control, course.counters
+    system, u_gap = one.system, float(control[relaxation.U_GAP])
+    track.y[:-1] = system.live[int(control[relaxation.REFERENCE])] @ course.w
+    track.y[-1] = control[relaxation.Z] + one.followed(u_gap)
     given = track.control
     given[readout.T], given[readout.U_BEFORE], given[readout.U_GAP] = problem.t_stop, u_before, u_gap
     given[readout.SIGN] = math.copysign(1.0, u_gap)
-    track.counters[readout.OUTPUT] = counters[recording.OUTPUT]
+    track.counters[readout.OUTPUT] = counters[relaxation.OUTPUT]
     rows = track.written()
     n = len(rows)
-    stats = {"steps": int(counters[recording.STEPS]), "rejected": int(counters[recording.REFUSED]), "zeros": 0}
-    evaluated = 2 * BLOCK * int(counters[recording.SWEEPS])
+    stats = {"steps": int(counters[relaxation.STEPS]), "rejected": int(counters[relaxation.REFUSED]), "zeros": 0}
+    evaluated = 2 * BLOCK * int(counters[relaxation.SWEEPS])
     run = Run(track.t_out[:n], track.left[:n], rows, Status.SUCCESS, evaluated, stats, track.state())
-    peak_u, peak_f = float(control[recording.PEAK_U]), float(control[recording.PEAK_F])
+    peak_u, peak_f = float(control[relaxation.PEAK_U]), float(control[relaxation.PEAK_F])
     # Rounding is an error too, and what the area's polynomial misses.
     floor = 4e-16 * (peak_u + system.model.k_gap * problem.scene.u_peak)
-    u_error = SAFETY * float(control[recording.ERROR_U]) + floor
-    f_error = SAFETY * float(control[recording.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f
+    u_error = SAFETY * float(control[relaxation.ERROR_U]) + floor
+    f_error = SAFETY * float(control[relaxation.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f
     run.gaps = np.array([[peak_u, peak_f, u_error, f_error]])
     if problem.charge:
         held = track.capacitance * (problem.scene.u_peak + peak_u)
-        run.charge_error = 2.0 * SAFETY * float(control[recording.ERROR_Q]) + 4e-16 * held * (1.0 + stats["steps"])
-    run.margin, run.by_layer = float(control[recording.MARGIN]), True
+        run.charge_error = 2.0 * SAFETY * float(control[relaxation.ERROR_Q]) + 4e-16 * held * (1.0 + stats["steps"])
+    run.margin, run.by_layer = float(control[relaxation.MARGIN]), True
     return run
