@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.blockrows import area_rows, modes_into, scaled
+from fingerspice.engine.blockrows import area_rows, crossing, modes_into, scaled
 from fingerspice.engine.model import Model, branch_area
 from fingerspice.engine.relaxation import (
     BLOCK,
     COLLECTED,
     ERROR_Q,
+    MIDDLE,
     PEAK_Q,
     PLACES,
     Form,
@@ -80,7 +81,7 @@ def new_charges() -> Charges:
 @jit_rows
 def _charge_rows(
     n: int, h: float, mobile: bool, slow: FloatArray, area0: float, kink: float, s: FloatArray, u: FloatArray,
-    ends: FloatArray, within: FloatArray, q: FloatArray, steps: FloatArray,
+    middle: FloatArray, ends: FloatArray, within: FloatArray, q: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
     """Charge gained in each step but for what follows u, its rates, and Boole's rule less Simpson's (`Charges.steps`).
 
@@ -123,17 +124,14 @@ def _charge_rows(
             + 7.0 * (r4 + turn * (a4 - a0) * d4)
         ) / 90.0
         # Of the area's kink both rules miss a known part.
-        x, y = u[i], u[i + 1]
-        size = abs(x) + abs(y) + 1e-300
-        at = abs(x) / size
-        by_simpson = (abs(x) + 2.0 * abs(x + y) + abs(y)) / 6.0
-        by_boole = (7.0 * (abs(x) + abs(y)) + 8.0 * (abs(3.0 * x + y) + abs(x + 3.0 * y)) + 6.0 * abs(x + y)) / 90.0
-        bent = kink * (g_area * (l0 + at * (l4 - l0)) + turn * (v4 - v0))
-        bent = bent if x * y < 0.0 else 0.0
+        at, jump = crossing(u[i], middle[i], u[i + 1])
+        rest, early = 1.0 - at, max(0.5 - at, 0.0)
+        by_simpson = (4.0 * early + rest) / 6.0
+        by_boole = (32.0 * (max(0.25 - at, 0.0) + max(0.75 - at, 0.0)) + 12.0 * early + 7.0 * rest) / 90.0
+        bent = kink * jump * (g_area * (l0 + at * (l4 - l0)) + turn * (v4 - v0))
         steps[0, i], steps[1, i], steps[2, i] = r0, m2, m4
-        steps[3, i] = c * (area0 if mobile else a0) * (v4 - v0) + h * (
-            simpson + bent * (0.5 * (x * x + y * y) / size - by_simpson)
-        )
+        kinked = bent * (0.5 * rest * rest - by_simpson)
+        steps[3, i] = c * (area0 if mobile else a0) * (v4 - v0) + h * (simpson + kinked)
         steps[4, i] = h * (boole - simpson - bent * (by_boole - by_simpson))
 
 
@@ -175,8 +173,8 @@ def charge_block(c: Course, r: int, level: int, n: int, h: float, local: float) 
     for place in range(len(PLACES)):
         area_rows(n, form.area, form.scale, form.shift, 0.0, room.u_within[place], own.q[1 + place])
     _charge_rows(
-        n, h, form.mobile, slow, form.area0, c.shown.area_kink, room.s, room.u, room.end[v:], room.within[:, v:],
-        own.q, own.steps,
+        n, h, form.mobile, slow, form.area0, c.shown.area_kink, room.s, room.u, room.u_within[MIDDLE],
+        room.end[v:], room.within[:, v:], own.q, own.steps,
     )  # fmt: skip
     scaled(n + 1, 0.0, room.s, own.error)
     modes_into(n + 1, 0, c.shown.slow[r], room.own, own.error)

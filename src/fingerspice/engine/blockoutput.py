@@ -9,24 +9,12 @@ from numpy.typing import NDArray
 
 from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.blockcharge import Course, current_at, current_block, moved_rows, moved_with
-from fingerspice.engine.blockrows import modes_into, scaled
+from fingerspice.engine.blockrows import crossing, modes_into, scaled
 from fingerspice.engine.model import branch_area
 from fingerspice.engine.relaxation import FIRST_NEWTON, MIDDLE, OUTPUT, REFERENCE, U_GAP, Z, look_at_ends
 from fingerspice.numerics.moments import moments
 
 FloatArray = NDArray[np.float64]
-
-
-@jit
-def _bent(at: float, a: float, b: float) -> float:
-    """Integral over [0, at] of |u|, u from a to b along a straight line across 0, less that of its parabola."""
-    x, y, m = abs(a), abs(b), 0.5 * abs(a + b)
-    zero = x / (x + y)
-    whole = x * at * (1.0 - 0.5 * at / zero) if at < zero else 0.5 * (x * zero + y * (at - zero) ** 2 / (1.0 - zero))
-    square, cube = at * at, at * at * at
-    parabola = x * (at - 1.5 * square + 2.0 / 3.0 * cube) + m * (2.0 * square - 4.0 / 3.0 * cube)
-    missed: float = whole - parabola - y * (2.0 / 3.0 * cube - 0.5 * square)
-    return missed
 
 
 @jit
@@ -45,13 +33,19 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
             linear += form.feed[r, k, t] * (4.0 * g1 - 3.0 * g0 - g2)
             square += form.feed[r, k, t] * 2.0 * (g0 - 2.0 * g1 + g2)
         w[k] = w[k] * math.exp(-z) + h * at * (whole * found[0] + at * (linear * found[1] + at * square * found[2]))
-    if room.u[i] * room.u[i + 1] < 0.0:
-        zero = room.u[i] / (room.u[i] - room.u[i + 1])
-        bent = h * _bent(at, room.u[i], room.u[i + 1])
-        for t in range(drives):
-            x = room.end[1 + t, i] + zero * (room.end[1 + t, i + 1] - room.end[1 + t, i])
-            for k in range(w.size):
-                w[k] += form.feed[r, k, t] * c.shown.kink[t] * x * bent
+    zero, jump = crossing(room.u[i], room.u_within[MIDDLE, i], room.u[i + 1])
+    if jump > 0.0:
+        early, rest, since = max(0.5 - zero, 0.0), 1.0 - zero, max(at - zero, 0.0)
+        for k in range(w.size):
+            # As `add_kinks`, up to here.
+            moments(form.rates[r, k] * h * at, found)
+            one, two = at * at * found[1], at * at * at * found[2]
+            own = -4.0 * (one - two) * early - (2.0 * two - one) * rest
+            moments(form.rates[r, k] * h * since, found)
+            own += since * since * found[1]
+            for t in range(drives):
+                x = room.end[1 + t, i] + zero * (room.end[1 + t, i + 1] - room.end[1 + t, i])
+                w[k] += form.feed[r, k, t] * c.shown.kink[t] * x * h * jump * own
 
 
 @jit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.compiled import jit_rows, jit_within
+from fingerspice.base.compiled import jit_inline, jit_rows, jit_within
 
 FloatArray = NDArray[np.float64]
 
@@ -194,36 +194,50 @@ def crosses(n: int, u: FloatArray) -> bool:
     return found
 
 
-@jit_rows
-def kink_rows(n: int, kink: float, u: FloatArray, x: FloatArray, out: FloatArray, after: FloatArray) -> None:
-    """What the parabola misses of kink |u| x over a step, in units of its length, and what of that comes after 0 V."""
-    for i in range(n):
-        a, b = u[i], u[i + 1]
-        size = abs(a) + abs(b) + 1e-300
-        at = abs(a) / size
-        missed = 0.5 * (a * a + b * b) / size - (abs(a) + 2.0 * abs(a + b) + abs(b)) / 6.0
-        missed = missed if a * b < 0.0 else 0.0
-        out[i] = kink * missed * (x[i] + at * (x[i + 1] - x[i]))
-        after[i] = 1.0 - at
+@jit_inline
+def crossing(a: float, m: float, b: float) -> tuple[float, float]:
+    """Where in a step u crosses 0 V, given at 0, 1/2 and 1, and by how much the slope of |u| jumps there; 0 if not."""
+    early = a * m < 0.0
+    before, after = (a, m) if early else (m, b)
+    size = abs(before) + abs(after) + 1e-300
+    return (0.0 if early else 0.5) + 0.5 * abs(before) / size, 4.0 * size if a * b < 0.0 else 0.0
 
 
 @jit_rows
-def fading(n: int, z: float, feed: float, kinked: FloatArray, after: FloatArray, inc: FloatArray) -> None:
-    """Add what kinks make, decayed from where they are (exp to second order) to the end of the step."""
+def kink_rows(
+    n: int, kink: float, u: FloatArray, middle: FloatArray, x: FloatArray, at: FloatArray, out: FloatArray
+) -> None:  # fmt: skip
+    """Where each step crosses 0 V, and the jump of the slope of kink |u| x there; 0 if it does not."""
     for i in range(n):
-        y = z * after[i]
-        inc[i] += feed * kinked[i] / (1.0 + y * (1.0 + 0.5 * y))
+        place, jump = crossing(u[i], middle[i], u[i + 1])
+        at[i], out[i] = place, kink * jump * (x[i] + place * (x[i + 1] - x[i]))
+
+
+@jit_rows
+def add_kinks(
+    n: int, z: float, weight: FloatArray, feed: float, at: FloatArray, jump: FloatArray, out: FloatArray
+) -> None:
+    """Add what a mode of rate z makes of a jump of the slope, and the parabola through its 0, 1/2 and 1 does not.
+
+    `weight` are those of values at 1/2 and 1. Since the jump the mode has made (y - 1 + exp(-y)) / y^2 of the square of
+    the rest of the step, y = z rest, here to 3e-4: the correction is itself a small one.
+    """
+    by_middle, by_end = weight[0], weight[1]
+    for i in range(n):
+        rest = 1.0 - at[i]
+        y = z * rest
+        ramp = rest * rest * (1.0 + y * (0.32058491 + 0.06524308 * y))
+        ramp /= 2.0 + y * (1.31296923 + y * (0.38813995 + 0.06524308 * y))
+        out[i] += feed * jump[i] * (ramp - by_middle * max(0.5 - at[i], 0.0) - by_end * rest)
 
 
 @jit_rows
 def kink_at(
-    n: int, kink: float, place: float, weight: FloatArray, u: FloatArray, x: FloatArray, out: FloatArray
+    n: int, kink: float, place: float, u: FloatArray, middle: FloatArray, x: FloatArray, out: FloatArray
 ) -> None:  # fmt: skip
     """Take from misfits at a place of the steps what the kink is known to make of them."""
-    p, m, r = weight[0], weight[1], weight[2]
+    m, r = 4.0 * place * (1.0 - place), place * (2.0 * place - 1.0)
     for i in range(n):
-        a, b = u[i], u[i + 1]
-        at = abs(a) / (abs(a) + abs(b) + 1e-300)
-        known = abs(a + place * (b - a)) - p * abs(a) - 0.5 * m * abs(a + b) - r * abs(b)
-        known = known if a * b < 0.0 else 0.0
+        at, jump = crossing(u[i], middle[i], u[i + 1])
+        known = jump * (max(place - at, 0.0) - m * max(0.5 - at, 0.0) - r * (1.0 - at))
         out[i] -= kink * known * (x[i] + at * (x[i + 1] - x[i]))

@@ -8,7 +8,7 @@ these the gap voltage and g anew. Each sweep leaves a few hundredths of the erro
 of steps, as fast as a processor's vectors.
 
 1/A has a kink where the gap voltage is 0. In a step across it the parabola misses kappa (|u| - its own parabola),
-kappa = dg/d|u|; that is added with u as a straight line.
+kappa = dg/d|u|: what the jump of the slope of |u| makes of it is known, and is added.
 
 The error is looked for at 1/4 and 3/4 of every step, where the parabola's misfit tells the quadrature's own error
 (Boole's rule against Simpson's). Where that is too much, a block is taken again with steps half as long.
@@ -26,13 +26,13 @@ from fingerspice.base.compiled import jit_within
 from fingerspice.engine.blockrows import (
     PAD,
     add,
+    add_kinks,
     add_three,
     area_rows,
     both_ends,
     change_of,
     crosses,
     drives_into,
-    fading,
     kink_at,
     kink_rows,
     modes_into,
@@ -58,8 +58,10 @@ MIDDLE, FIRST_QUARTER, LAST_QUARTER = 0, 1, 2
 PARABOLA = np.array([[0.0, 1.0, 0.0], [0.375, 0.75, -0.125], [-0.125, 0.75, 0.375]])
 # Sweeps of a block, after which it is not going to close; and how little of the error allowed they may leave.
 _MOST_SWEEPS, _LEFT = 40, 0.25
-# Sweeps at which what does not depend on the drives is made: at 4 the place of the kinks is known well enough.
-_RENEWED = (0, 2, 4)
+# What the error of a sweep is over that of the one before, at least: the first sweeps may close faster than the rest.
+_SLOWEST = 0.05
+# The sweep from which on the places of the kinks are known well enough, and how fast sweeps close.
+_KINKED = 2
 # Under `mobile` the gap voltage is found by Newton: at first, and in every later sweep; and the least distance to the
 # fold at which that is safe.
 FIRST_NEWTON, _NEWTON, LEAST_MARGIN = 6, 2, 0.2
@@ -98,6 +100,8 @@ class Form(NamedTuple):
         Projections of modes and source.
     within, within_s, within_g : ndarray, shape (r, LEVELS, 3, P, m), (r, LEVELS, 3, P, 2) and (r, LEVELS, 3, P, T, 3)
         The same at `PLACES`, from the modes at the start of a step, the source at both ends, and the drives.
+    share : ndarray, shape (r, LEVELS, m, 2)
+        The weights of 1/2 and 1 in the integral of a parabola over a step, in units of its length.
     defect : ndarray, shape (r, LEVELS, m, T, 2)
         What misfits at the quarters add to the error of a mode.
     early : ndarray, shape (r, LEVELS, T, 2)
@@ -119,6 +123,7 @@ class Form(NamedTuple):
     within: FloatArray
     within_s: FloatArray
     within_g: FloatArray
+    share: FloatArray
     defect: FloatArray
     early: FloatArray
     area: FloatArray
@@ -181,8 +186,8 @@ class Room(NamedTuple):
     z: FloatArray
     slope: FloatArray
     before: FloatArray
-    kinked: FloatArray
-    after: FloatArray
+    crossed: FloatArray
+    jumps: FloatArray
 
 
 def new_room(modes: int, drives: int, projections: int) -> Room:
@@ -278,12 +283,15 @@ def project_for_charge(form: Form, room: Room, r: int, level: int, n: int) -> No
 
 
 @jit_within
-def _kinks(form: Form, room: Room, r: int, h: float, kink: FloatArray, n: int) -> None:
-    """Add to `room.own` what the parabolas miss of the kink."""
+def _kinks(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
+    """Add to `room.inc` what the parabolas miss of the kink."""
     for t in range(kink.size):
-        kink_rows(n, h * kink[t], room.u, room.end[1 + t], room.kinked, room.after)
+        kink_rows(n, h * kink[t], room.u, room.u_within[MIDDLE], room.end[1 + t], room.crossed, room.jumps)
         for k in range(form.rates.shape[1]):
-            fading(n, form.rates[r, k] * h, form.feed[r, k, t], room.kinked, room.after, room.own[k])
+            add_kinks(
+                n, form.rates[r, k] * h, form.share[r, level, k], form.feed[r, k, t], room.crossed, room.jumps,
+                room.inc[k, PAD:],
+            )  # fmt: skip
 
 
 @jit_within
@@ -309,14 +317,13 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
         room.u_within[MIDDLE, i] = 0.5 * (room.u[i] + room.u[i + 1])
     last, margin = math.inf, 1.0
     for sweep in range(_MOST_SWEEPS):
-        if sweep in _RENEWED:
-            for k in range(modes):
-                both_ends(n, form.source[r, level, k, 0], form.source[r, level, k, 1], room.s, room.own[k])
-            if sweep > 0 and crosses(n, room.u):
-                _kinks(form, room, r, h, kink, n)
         for k in range(modes):
-            scaled(n, 1.0, room.own[k], room.inc[k, PAD:])
-            drives_into(n, form.drive[r, level, k], room.g, room.g_within[MIDDLE], room.inc[k, PAD:])
+            own = room.inc[k, PAD:]
+            both_ends(n, form.source[r, level, k, 0], form.source[r, level, k, 1], room.s, own)
+            drives_into(n, form.drive[r, level, k], room.g, room.g_within[MIDDLE], own)
+        if sweep >= _KINKED and crosses(n, room.u):
+            _kinks(form, room, r, level, h, kink, n)
+        for k in range(modes):
             recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.w[k])
         newton = FIRST_NEWTON if sweep == 0 else _NEWTON
         margin = _look(form, room, r, level, MIDDLE, n, newton)
@@ -328,12 +335,12 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
             return math.inf, margin, sweep
         change = change_of(n + 1, room.u, room.before)
         if sweep > 0:
-            ratio = change / last if last > 0.0 else 0.0
+            ratio = max(change / last, _SLOWEST) if last > 0.0 else 0.0
             if not ratio < 0.9 and change > tol:
                 return math.inf, margin, sweep
             # What is left goes on falling by about the same ratio.
             left = 2.0 * change * ratio
-            if left <= _LEFT * tol:
+            if left <= _LEFT * tol and sweep >= _KINKED:
                 return left, margin, sweep
         last = change
     return math.inf, margin, _MOST_SWEEPS
@@ -358,6 +365,6 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
                 n, -weight[0], room.g[t], -weight[1], room.g_within[MIDDLE, t], -weight[2], room.g[t, 1:], off
             )  # fmt: skip
             if crossing:
-                kink_at(n, kink[t], PLACES[place], weight, room.u, room.end[1 + t], off)
+                kink_at(n, kink[t], PLACES[place], room.u, room.u_within[MIDDLE], room.end[1 + t], off)
             for k in range(form.rates.shape[1]):
                 add(n, form.defect[r, level, k, t, place - FIRST_QUARTER], off, room.inc[k, PAD:])

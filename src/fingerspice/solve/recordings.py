@@ -31,7 +31,7 @@ from fingerspice.waveforms.ramps import Samples
 LEAST_SAMPLES = 64
 # The error allowed to come from a block, over the one asked for; what the stated error is over what was seen; runs, and
 # what the area's polynomial may miss, over the error asked for.
-SHARE, SAFETY, ATTEMPTS, AREA_SHARE = 0.2, 1.5, 4, 0.02
+SHARE, SAFETY, ATTEMPTS, AREA_SHARE = 0.2, 2.0, 4, 0.02
 # Samples between two words of progress.
 _AT_ONCE = 1 << 20
 # From values at Chebyshev's points to the coefficients of the antiderivative of their series.
@@ -135,7 +135,7 @@ def form_of(system: System, area: FloatArray, spacing: float) -> Form:
     return Form(
         model.mobile, system.q0, system.rates, system.gain, np.exp(-z), gain * weights(z, (0.0, 1.0)),
         drives * weights(z, (0.0, 0.5, 1.0))[..., None, :], np.ascontiguousarray(feed), np.ascontiguousarray(every),
-        direct, inner, inner_s, inner_g, drives * quarters,
+        direct, inner, inner_s, inner_g, np.ascontiguousarray(weights(z, (0.0, 0.5, 1.0))[..., 1:]), drives * quarters,
         np.einsum("rk,rsktj->rstj", system.gap, drives * early), area, system.scale, -system.lo * system.scale - 1.0,
         model.k_gap, model.area0,
     )  # fmt: skip
