@@ -47,16 +47,20 @@ _FARTHEST = 1.2
 
 
 @jit_rows
-def _peaks(n: int, stress: float, u: FloatArray, q: FloatArray) -> tuple[float, float, float]:
-    """The largest |u|, force, and force by voltage."""
-    peak, force, steepest = 0.0, 0.0, 0.0
+def _peaks(
+    n: int, stress: float, u: FloatArray, q: FloatArray, error: FloatArray
+) -> tuple[float, float, float, float]:  # fmt: skip
+    """The largest |u|, force, force over voltage, and that times the error of the voltage in its place."""
+    peak, force, steepest, worst = 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         x = abs(u[i])
         slope = stress * x / q[i]
         peak = x if x > peak else peak
         steepest = slope if slope > steepest else steepest
         force = slope * x if slope * x > force else force
-    return peak, force, steepest
+        off = slope * abs(error[i])
+        worst = off if off > worst else worst
+    return peak, force, steepest, worst
 
 
 @jit_rows
@@ -135,17 +139,23 @@ def _block_error(c: Course, r: int, level: int, n: int) -> float:
 
 
 @jit_within
-def _accept(c: Course, r: int, level: int, n: int, h: float, local: float, magnified: float) -> None:
-    """Note the peaks and the errors of a block that is good, and go on to its end."""
+def _accept(
+    c: Course, r: int, level: int, n: int, h: float, local: float, left_over: float, magnified: float
+) -> None:  # fmt: skip
+    """Note the peaks and the errors of a block that is good, and go on to its end.
+
+    `local` is what it adds to the gap voltage's error, of which `left_over` is anywhere, V.
+    """
     room, control, decay = c.room, c.control, c.form.decay[r, level]
     carried = 0.0
     for k in range(c.w.size):
         carried += abs(c.form.taps[r, 0, k] * c.error[k])
-    off = local + magnified * carried
-    peak, force, steepest = _peaks(n + 1, c.shown.stress, room.u, c.charges.q[0])
+    peak, force, steepest, worst = _peaks(n + 1, c.shown.stress, room.u, c.charges.q[0], room.before)
     control[PEAK_U], control[PEAK_F] = max(control[PEAK_U], peak), max(control[PEAK_F], force)
     # The force goes with the square of the voltage, and a little with the area.
-    control[ERROR_U], control[ERROR_F] = max(control[ERROR_U], off), max(control[ERROR_F], 2.2 * steepest * off)
+    off = magnified * worst + steepest * (left_over + magnified * carried)
+    control[ERROR_U] = max(control[ERROR_U], local + magnified * carried)
+    control[ERROR_F] = max(control[ERROR_F], 2.2 * off)
     if c.shown.charge:
         charge_block(c, r, level, n, h, local)
     for k in range(c.w.size):
@@ -201,7 +211,7 @@ def march(
             c.counters[REFUSED] += n
             continue
         control[MARGIN] = min(control[MARGIN], margin)
-        _accept(c, r, level, n, h, local, magnified)
+        _accept(c, r, level, n, h, local, left_over, magnified)
         write_block(c, r, sub, count, h, start + at * spacing, t_out, out)
         at += count
         if level > 0 and local < SPARE * tol:

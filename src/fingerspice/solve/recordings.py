@@ -288,6 +288,6 @@ def _as_run(problem: Problem, one: Followed, track: Track, course: Course, u_bef
     run.gaps = np.array([[peak_u, peak_f, u_error, f_error]])
     if problem.charge:
         held = track.capacitance * (problem.scene.u_peak + peak_u)
-        run.charge_error = 2.0 * SAFETY * float(control[relaxation.ERROR_Q]) + 4e-16 * held * (1.0 + stats["steps"])
+        run.charge_error = SAFETY * float(control[relaxation.ERROR_Q]) + 4e-16 * held * (1.0 + stats["steps"])
     run.margin, run.by_layer = float(control[relaxation.MARGIN]), True
     return run
