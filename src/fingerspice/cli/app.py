@@ -139,6 +139,8 @@ def run(
         answer.give(lambda: "\n\n".join([summary_table(solution), *(touch.said if touch else ())]), writes)
         if solution.failure is not None:
             raise SolveError(solution.failure, solution)
+        if touch is not None and touch.failed is not None:
+            raise touch.failed
 
 
 @app.command()

@@ -46,18 +46,18 @@ class Touch:
         self.results = results
         self.picture = None if results is None else results.file("_feel.png")
         self.fingers: list[Feel] = []
+        self.failed: InputError | None = None
 
-    def look(self, solution: Solution) -> list[dict[str, Any]]:
-        """Look at a run, and answer for each finger.
-
-        Raises
-        ------
-        InputError
-            Where its outputs are too few or uneven.
-        """
+    def look(self, solution: Solution) -> list[dict[str, Any]] | None:
+        """Look at a run, and answer for each finger; None where its outputs are too few or uneven, as `failed` says."""
         from fingerspice.studies.feel import feel
 
-        self.fingers = [feel(solution, name) for name in solution.all_signals.names("f_t")]
+        try:
+            self.fingers = [feel(solution, name) for name in solution.all_signals.names("f_t")]
+        except InputError as error:
+            # The files of the run are written before this is said.
+            self.failed = error
+            return None
         return [one.to_dict() for one in self.fingers]
 
     @property
@@ -71,6 +71,6 @@ class Touch:
         from fingerspice.plots.drawing import save
 
         results, picture = self.results, self.picture
-        if results is None or picture is None:
+        if results is None or picture is None or not self.fingers:
             return []
         return [lambda: save(self.fingers[0].plot(self.fingers[1:]), picture, about=results.about)]

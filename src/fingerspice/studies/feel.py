@@ -105,8 +105,9 @@ class Feel(Sealed, Shown):
         return self.highest / DIFFERENCE_DB if self.highest is not None and self.felt else None
 
     def to_dict(self) -> dict[str, Any]:
-        """The keys of ``--json``."""
-        rows = zip(self.frequency, self.force, self.displacement, self.acceleration, self.level, strict=True)
+        """The keys of ``--json``; lines that the threshold does not judge are left out."""
+        every = (self.frequency, self.force, self.displacement, self.acceleration, self.level)
+        rows = zip(*(x[np.isfinite(self.level)] for x in every), strict=True)
         keys = ("frequency", "force", "displacement", "acceleration", "level_db")
         place = self.strongest
         return {

@@ -137,8 +137,8 @@ def android_threshold() -> Threshold:
 
     Source: the Android Open Source Project, Apache License 2.0; the head of `least_perceptible_acceleration.csv` names
     its files. Caveat: it is of a device held in the hand, not of a bare finger that slides. Whether the acceleration is
-    a peak or an rms, and from which experiment it is, Android does not say. It is taken as a peak here; if it is an rms,
-    every level is 3 dB lower.
+    a peak or an rms, and from which experiment it is, Android does not say. It is taken as a peak here; as an rms it
+    would be 3 dB higher, and every level 3 dB lower.
     """
     path = Path(__file__).with_name("least_perceptible_acceleration.csv")
     rows = [row for row in csv.reader(path.read_text(encoding="utf-8").splitlines()) if not row[0].startswith("#")]
