@@ -148,6 +148,18 @@ def test_a_source_without_a_period_is_felt_in_third_octaves() -> None:
     np.testing.assert_allclose(np.diff(np.log2(found.frequency)), 1.0 / 3.0)
 
 
+def test_a_period_with_too_many_lines_is_felt_in_third_octaves() -> None:
+    slow = fs.AM(200, 100, 0.25)
+    circuit = table1(skin={"f": 100.0})
+    solution = fs.simulate(circuit, sources={"Vdrive": slow}, t_stop=8.0, t_eval=np.arange(0.0, 8.0, 5e-4), rtol=1e-5)
+    found = feel(solution)
+    assert found.kind == "bands"
+    assert found.felt
+    place = found.strongest
+    assert place is not None
+    assert found.frequency[place] == pytest.approx(198.4, abs=0.1)
+
+
 def test_bands_add_up_to_the_variance_of_noise() -> None:
     values = 60.0 * np.random.default_rng(3).standard_normal(8000)
     source = fs.Samples(values, rate=2000.0)

@@ -143,6 +143,14 @@ def test_a_period_that_is_not_yet_periodic_is_told() -> None:
     circuit = deck("V1 a 0 SIN(5 1 100)", "R1 a b 1meg", "C1 b 0 100n", ".tran 100u 20m uic")
     with pytest.warns(fs.FingerspiceWarning, match="start='periodic'"):
         fs.simulate(circuit).spectrum("v:b")
+    fs.simulate(circuit, start="periodic").spectrum("v:b")
+
+
+@pytest.mark.parametrize("jumps", ["both", "none"])
+def test_a_signal_that_jumps_at_the_end_of_its_period_is_periodic(jumps: str) -> None:
+    square = fs.simulate(table1("SQUARE(200 100)"), start="periodic", t_stop=0.01, jumps=jumps)
+    found = square.spectrum("u_gap")
+    assert 0.99 < found.shown_variance / found.variance < 1.0
 
 
 @pytest.mark.parametrize(

@@ -190,7 +190,7 @@ def _warn_if_open(solution: Solution, name: str, weighed: Weighed) -> None:
     """Warn where the last period of the source is not yet one of the signal."""
     first, last = int(weighed.t.argmin()), int(weighed.t.argmax())
     x = weighed.x.ravel()
-    if abs(x[last] - x[first]) > _CLOSED * float(np.ptp(x)) and not _jumps(solution):
+    if abs(x[last] - x[first]) > _CLOSED * float(np.ptp(x)) and not _has_edge(solution):
         warnings.warn(
             f"{name} changes over the last period by more than {100 * _CLOSED:g} % of its range, so its lines are not "
             "those of the periodic state; a longer run, or start='periodic', has it",
@@ -199,9 +199,11 @@ def _warn_if_open(solution: Solution, name: str, weighed: Weighed) -> None:
         )
 
 
-def _jumps(solution: Solution) -> bool:
-    """Whether the source jumps at the end of its period, as its signals may then do."""
-    return solution.t.size > 1 and bool(np.any(np.diff(solution.t) == 0.0))
+def _has_edge(solution: Solution) -> bool:
+    """Whether the run ends at a breakpoint of a source, where the signals may jump."""
+    assert solution.period is not None
+    stop, slack = solution.t_stop, 1e-6 * solution.period
+    return any(w.breakpoints(stop - slack, stop + slack).size > 0 for w in network_of(solution.circuit).waveforms)
 
 
 def _density(

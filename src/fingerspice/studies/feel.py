@@ -213,6 +213,9 @@ def feel(
     if not solution.gaps:
         raise InputError("the circuit has no GAP, so there is no friction to feel; allowed: a circuit with a GAP")
     spectrum = solution.spectrum(signal)
+    if spectrum.amplitude is not None and spectrum.frequency[-1] < table.frequency[-1]:
+        # The lines of a long period are too many, and too close to be felt one by one.
+        spectrum = solution.spectrum(signal, method="welch")
     kind = "bands" if spectrum.amplitude is None else "lines"
     f, force = _bands(spectrum) if spectrum.amplitude is None else (spectrum.frequency, spectrum.amplitude)
     size = np.abs(mechanics.acceleration(f)) * force
