@@ -85,6 +85,7 @@ STRANGERS = (
 LENT = {
     "circuit.circuit.Circuit._waveform": "netlist.netlist",
     "results.solution.Solution.plot": "plots.traces",
+    "results.spectrum.Spectrum.plot": "plots.spectra",
     "results.phasor_solution.PhasorSolution.plot": "plots.phasors",
 }
 THIRD_PARTY = {

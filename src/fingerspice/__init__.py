@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
     from fingerspice.studies.export import export_netlist as export_netlist
+    from fingerspice.studies.feel import Feel as Feel
+    from fingerspice.studies.feel import feel as feel
     from fingerspice.studies.fitting import ColeCole as ColeCole
     from fingerspice.studies.fitting import MaterialFit as MaterialFit
     from fingerspice.studies.fitting import fit_material as fit_material
@@ -69,6 +71,7 @@ _HOMES = {
     "studies.comparison": ("Comparison", "compare"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "studies.export": ("export_netlist",),
+    "studies.feel": ("Feel", "feel"),
     "studies.fitting": ("ColeCole", "MaterialFit", "fit_material"),
     "studies.largesignal": ("large_signal",),
     "studies.limits": ("FoldLimits", "fold_limits"),
