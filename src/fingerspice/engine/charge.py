@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.exponential import N_PLACES
+from fingerspice.engine.exponential import N_PLACES, row_of
 from fingerspice.engine.model import Model
 from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, PEAK_Q, SPREAD, at
 from fingerspice.engine.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U
@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 # What a polynomial misses of a rate changes its sign at every node: of its integral over the step's length so much is
 # left. It is 0.03 to 0.14 where what is missed are Chebyshev polynomials of degree 13 to 21; where the area changes
 # tenfold within a step it is no such polynomial, and 0.22 in scene 7391 of tests/stress.py.
-_LOBE, _STEEP_LOBE, _STEEP = 0.15, 0.3, 10.0
+LOBE, _STEEP_LOBE, _STEEP = 0.15, 0.3, 10.0
 # Slope at each node, per step length, of the polynomial through values at the nodes.
 DERIVATIVE = np.zeros((NODES, NODES))
 for _i in range(NODES):
@@ -86,7 +86,7 @@ def _lobe(q: FloatArray) -> float:
     lowest, highest = q[0], q[0]
     for j in range(1, NODES):
         lowest, highest = min(lowest, q[j]), max(highest, q[j])
-    return _STEEP_LOBE if highest > _STEEP * lowest else _LOBE
+    return _STEEP_LOBE if highest > _STEEP * lowest else LOBE
 
 
 @jit_rows
@@ -129,7 +129,7 @@ def _account(
     added = 0.0
     spread = missed
     for p in range(N_PLACES):
-        row = 0 if p == 0 else (END if p == N_PLACES - 1 else FIRST + p - 1)
+        row = row_of(p)
         q = r[Q, row]
         area = 1.0 / q
         v = 0.0

@@ -348,3 +348,53 @@ def assess(
     missed = abs(largest(area_first / MISS[0], area_second / MISS[1], area_third / MISS[2]))
     charged = swing * missed / r[Q, 0]
     return max(step, charged), run, magnified
+
+
+@jit
+def node_error(
+    mobile: bool, area0: float, node: FloatArray, k_node: FloatArray, gap: FloatArray, w: FloatArray, r: FloatArray,
+    places: FloatArray,
+) -> float:  # fmt: skip
+    """Largest error of any node's voltage over a step (V) from that of the modes; see `assess`.
+
+    Under `mobile` the voltages are the modes' over A, and so are off by what A is, and by what the polynomial of that
+    product misses.
+    """
+    own, missed, values = np.zeros((places.shape[0], N_PLACES)), np.zeros(N_PLACES), np.zeros(ROWS)
+    moved = np.zeros(N_PLACES)
+    for p in range(N_PLACES):
+        scale = area0 * r[Q, row_of(p)] if mobile else 1.0
+        for k in range(gap.size):
+            own[k, p] = scale * places[k, p]
+    if mobile:
+        for k in range(gap.size):
+            missed[1], missed[2], missed[3] = between(w[k])
+            for p in range(N_PLACES):
+                own[k, p] -= area0 * r[Q, row_of(p)] * missed[p]
+                moved[p] += gap[k] * own[k, p]
+        for p in range(N_PLACES):
+            row = row_of(p)
+            moved[p] *= area0 * r[DQ, row] / max(1.0 - area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
+    worst = 0.0
+    for i in range(k_node.size):
+        for j in range(ROWS):
+            values[j] = 0.0
+            for k in range(gap.size if mobile else 0):
+                values[j] += node[i, k] * w[k, j]
+            values[j] *= area0 * r[Q, j]
+            values[j] += k_node[i] * r[SOURCE, j]
+        missed[1], missed[2], missed[3] = between(values)
+        for p in range(N_PLACES):
+            total = missed[p]
+            for k in range(gap.size):
+                total += node[i, k] * (own[k, p] + moved[p] * w[k, row_of(p)])
+            worst = max(worst, abs(total))
+    return worst
+
+
+@jit
+def row_of(place: int) -> int:
+    """The row that a place of the error is."""
+    if place == 0:
+        return 0
+    return END if place == N_PLACES - 1 else FIRST + place - 1
