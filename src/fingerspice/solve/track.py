@@ -262,9 +262,7 @@ class Track(Stepping):
         # Whatever the area's polynomial misses, all charge that is moved misses too.
         moved = held + float(self.control[readout.PEAK_Q])
         missed = self.prepared.area_error * moved if self.prepared.system.model.coupled else 0.0
-        # Twice as safe: what leaks between nodes is looked for at a few places only, and against the reference 1.7
-        # times as much was met in a stack that leaks fast throughout.
-        return 2.0 * SAFETY * float(self.control[readout.ERROR_Q]) + 4e-16 * held * steps + missed
+        return SAFETY * float(self.control[readout.ERROR_Q]) + 4e-16 * held * steps + missed
 
 
 def _turned(
