@@ -104,7 +104,9 @@ def test_a_run_whose_nodes_are_off_by_more_than_asked_for_is_not_accepted() -> N
     from fingerspice.solve.runs import Run
 
     nothing = np.zeros(0)
-    run = Run(nothing, nothing.astype(bool), np.zeros((0, 1)), Status.SUCCESS, 0, {}, State(0.0, *[nothing] * 3, "local"))
+    run = Run(
+        nothing, nothing.astype(bool), np.zeros((0, 1)), Status.SUCCESS, 0, {}, State(0.0, *[nothing] * 3, "local")
+    )
     run.gaps = np.array([[50.0, 1.0, 5e-7, 1e-8]])
     assert run.excess(100.0) == pytest.approx(1e-8)
     assert dataclasses.replace(run, node_error=2e-4).excess(100.0) == pytest.approx(2e-6)

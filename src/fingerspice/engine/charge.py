@@ -12,7 +12,7 @@ from fingerspice.engine.exponential import N_PLACES, between, row_of
 from fingerspice.engine.model import Model
 from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, PEAK_Q, SPREAD, at
 from fingerspice.engine.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U
-from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, END, FIRST, NODES, POINTS
+from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, FIRST, NODES, POINTS
 
 FloatArray = NDArray[np.float64]
 

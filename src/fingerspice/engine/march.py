@@ -166,16 +166,13 @@ def march(
     slow_share, live, project, shown = all_slow[0], all_live[0], all_project[0], all_shown[0]
     tap, feed = all_tap[0], all_feed[0]
     decay, phi, miss = all_decay[0], all_phi[0], all_miss[0]
-    h_slot = 0.0
-    flips = 0
+    h_slot, flips = 0.0, 0
     # Where the length of a step is kept that is the first after an edge or a zero; -1 for others.
     fresh = -1
     first_out = int(counters[OUTPUT])
     next_out = t_out[first_out] if first_out < t_out.size else math.inf
     index = -1
-    start = 0.0
-    edge = control[T]
-    since = 0.0
+    start, edge, since = 0.0, control[T], 0.0
     segment_terms, segment_series = terms[0], series[0]
     if edges[0] < control[T]:
         index = segment_at(edges, control[T]) - 1

@@ -12,7 +12,7 @@ from fingerspice.engine.charge import DERIVATIVE, LOBE
 from fingerspice.engine.exponential import N_PLACES, between, row_of
 from fingerspice.engine.netrows import AREA, MORE, SLOPE, Form
 from fingerspice.engine.readout import ERROR_Q
-from fingerspice.numerics.lobatto import END, FIRST, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -130,7 +130,7 @@ def charge_error(
     _cell_errors(form, brief, areas[SLOPE], off[1])
     for source in range(form.stored.shape[0]):
         first, second, third = between(z[source])
-        swing, end, lobe = 0.0, 0.0, 0.0
+        swing, end, lobe, apart = 0.0, 0.0, 0.0, 0.0
         if not form.mobile:
             swing, end = _area_missed(form, source, u, areas[AREA])
         for p in range(1, N_PLACES - 1):
@@ -140,8 +140,10 @@ def charge_error(
             held = _held(form, source, p, brief, off[1], u, areas[MORE])
             own = first if p == 1 else (second if p == 2 else (third if p == 3 else 0.0))
             off_briefly[p] = max(abs(held), abs(own), swing, lobe)
-        # Of a step that is cut short the lobes stay. Their signs are not known.
-        kept = end if theta == 1.0 else math.sqrt(swing * swing + lobe * lobe)
+            apart = max(apart, abs(own - held) if 0 < p < N_PLACES - 1 else 0.0)
+        # Of a step that is cut short the lobes stay, and what its charge and its modes disagree by. Their signs are not
+        # known.
+        kept = end if theta == 1.0 else math.sqrt(swing * swing + lobe * lobe + apart * apart)
         collected[1, source] += kept * kept
         added, last_leak, last_theta = 0.0, 0.0, 0.0
         for p in range(N_PLACES):

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.compiled import borrow, jit
-from fingerspice.engine import netrows
+from fingerspice.engine import netassess, netrows
 from fingerspice.engine.coupling import take_coupling
 from fingerspice.engine.exponential import N_PLACES, Tables, make_tables, weigh
-from fingerspice.engine.netassess import account, account_nodes, assess, charged, first_zero, load, store, turn_at_start, write_columns
+from fingerspice.engine.netassess import account, assess, charged, first_zero, load, store, turn_at_start, write_columns
 from fingerspice.engine.netcharge import charge_error
 from fingerspice.engine.netgrowth import carry
 from fingerspice.engine.netrows import Form, Work, follow_sources
@@ -383,7 +383,7 @@ def march(
         for a in range(n_area):
             if form.stress[a] > 0.0:
                 account(u[a], areas[netrows.AREA, a], form.stress[a], theta, run[a], places, slow[a], peaks[a])
-        account_nodes(form.node, form.node_s, places, work.off, peaks[n_area])
+        netassess.account_nodes(form.node, form.node_s, places, work.off, peaks[n_area])
         for k in range(m):
             w0[k] = at(w[k], theta) if theta < 1.0 else w[k, END]
         if theta < 1.0:

@@ -143,5 +143,5 @@ class March(Stepping, NetworkIntegration):
             # Whatever the areas' polynomials miss, all charge that is moved misses too.
             moved = held + float(np.abs(self.y[-self.s_before.size :]).max(initial=0.0))
             missed = max((area_missed(curve, self.decade) for curve in self.net.curves), default=0.0)
-            error_q = SAFETY * float(self.control[readout.ERROR_Q])
+            error_q = self.charge_error(float(self.collected[1].max(initial=0.0)))
             run.charge_error = error_q + 4e-16 * held * steps + moved * missed

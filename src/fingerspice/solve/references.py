@@ -205,7 +205,7 @@ def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _magnified(
     modes: Modes, gap: FloatArray, gap_s: FloatArray, node: FloatArray, node_s: FloatArray
 ) -> FloatArray:  # fmt: skip
-    """Rounding of each gap's voltage and, last, of the nodes', sums over modes and sources, over the largest voltage's."""
+    """Rounding of each gap's voltage, and last of the nodes', sums over modes and sources, over the largest one."""
     live = modes.rates[modes.rates > 0.0]
     # What the rounding of the fastest mode leaves in the slowest.
     spread = math.sqrt(float(live.max() / live.min())) if live.size else 0.0
