@@ -262,8 +262,8 @@ class Track(Stepping):
         # Whatever the area's polynomial misses, all charge that is moved misses too.
         moved = held + float(self.control[readout.PEAK_Q])
         missed = self.prepared.area_error * moved if self.prepared.system.model.coupled else 0.0
-        # Half as safe again: in a stack that leaks fast throughout, gap voltage and charge were both off by 1.5 times as
-        # much, against the reference, beside the points where errors are looked for.
+        # Half as safe again: in a stack that leaks fast throughout, gap voltage and charge were both off by 1.5 times
+        # as much, against the reference, beside the points where errors are looked for.
         return 1.5 * self.charge_error(float(self.control[readout.SPREAD])) + 4e-16 * held * steps + missed
 
 
