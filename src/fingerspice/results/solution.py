@@ -263,6 +263,7 @@ class Solution(Sealed, Shown, Figured):
             "error_u_gap_V": repr(self.error.u_gap),
             "error_f_el_N": repr(self.error.f_el),
             "error_q_source_C": repr(self.error.q_source),
+            "error_v_nodes_V": repr(self.error.v_nodes),
             "status": self.status.name,
             "message": self.message,
         }

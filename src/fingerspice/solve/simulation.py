@@ -289,8 +289,8 @@ def _state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
     if problem.begun is not None:
         if len(problem.begun) == len(run.gaps):
             run.add_error(*problem.begun.T)
-        # What the charge collects from where it starts is not known.
-        run.charge_error = None
+        # What the charge collects from where it starts is not known, nor what the start is off at other nodes.
+        run.charge_error = run.node_error = None
     if run.unseen is not None and run.status in (Status.SUCCESS, Status.ERROR_NOT_MET):
         # The outputs show the source to be another one than was integrated.
         run.t_failed, off = run.unseen[:2]
@@ -307,5 +307,5 @@ def _state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
             gap[2:] = np.maximum(gap[2:], (share * gap[0], share**2 * gap[1]))
     # The rounding of a closed form is stated, and no reason to refuse it: no other method would do better.
     judged = plan.tier == "coupled" or plan.error_bound > 0.0 or run.rough > 0.0
-    if run.status is Status.SUCCESS and judged and run.excess(problem.scene.u_peak) > rtol:
+    if run.status is Status.SUCCESS and judged and run.excess(problem.largest) > rtol:
         run.status = Status.ERROR_NOT_MET
