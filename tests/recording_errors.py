@@ -2,7 +2,7 @@
 
 A recording is noise of a random band at a random rate, with or without an offset; a circuit is a stack of random
 layers, by either charge law. It is run at each of `RTOLS`, and once at `TIGHT` by the steps that serve every source,
-from which the true error is taken, of gap voltage, force and charge.
+from which the true error is taken, of gap voltage, force, charge and node voltages.
 
 Run: python tests/recording_errors.py [--recordings 100] [--first 0]. A recording is made from its number alone.
 """
@@ -20,7 +20,7 @@ import fingerspice as fs
 from random_decks import layers
 
 RTOLS, TIGHT = (1e-3, 1e-4, 1e-6, 1e-8), 1e-12
-QUANTITIES = ("u_gap", "f_el", "q_source")
+QUANTITIES = ("u_gap", "f_el", "q_source", "v_nodes")
 # What the tight run may be off but for its stated error, over the peak; and the least true error, over what is not
 # known of it, of which a ratio says something.
 ROUNDING, KNOWN = 1e-13, 10.0
@@ -104,9 +104,12 @@ def judge(recording: Recording) -> list[Beside]:
         exact = run(TIGHT, "exponential")
     for rtol, one in runs.items():
         for name in QUANTITIES:
-            truth = getattr(exact, name)
+            truth, values = (
+                np.column_stack(list(run.node_voltages.values())) if name == "v_nodes" else getattr(run, name)
+                for run in (exact, one)
+            )
             peak = float(np.abs(truth).max())
-            off = float(np.abs(getattr(one, name) - truth).max())
+            off = float(np.abs(values - truth).max())
             unknown = getattr(exact.error, name) / peak + ROUNDING
             found.append(Beside(recording, rtol, name, getattr(one.error, name) / peak, off / peak, unknown))
     return found

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockrows import area_rows, crossing, modes_into, scaled
-from fingerspice.engine.model import Model, branch_area
+from fingerspice.engine.model import Model
 from fingerspice.engine.relaxation import (
     BLOCK,
     COLLECTED,
@@ -196,6 +196,17 @@ def charge_block(c: Course, r: int, level: int, n: int, h: float, local: float) 
 
 
 @jit
+def inverse_area_at(form: Form, u: float) -> tuple[float, float]:
+    """1/A and its slope by the gap voltage, from the polynomial that the blocks use."""
+    x = abs(u) * form.scale + form.shift
+    q, slope = 0.0, 0.0
+    for j in range(form.area.size - 1, -1, -1):
+        slope = slope * x + q
+        q = q * x + form.area[j]
+    return q, (slope if u >= 0.0 else -slope) * form.scale
+
+
+@jit
 def current_at(
     c: Course, r: int, w: FloatArray, g: FloatArray, source: float, slope: float, u: float
 ) -> float:  # fmt: skip
@@ -211,7 +222,7 @@ def current_at(
         v += c.shown.slow[r, k] * w[k]
         x_gap += form.taps[r, 0, k] * w[k]
         dx_gap += form.taps[r, 0, k] * dw
-    q, dq = branch_area(model, 1.0 if u >= 0.0 else -1.0, u)
+    q, dq = inverse_area_at(form, u)
     if not form.mobile:
         leak = (slow[n + 2] + q * slow[n + 3]) * (slow[n] * source + v)
         return float((slow[n + 1] * dv + leak + slope / model.s) / q)

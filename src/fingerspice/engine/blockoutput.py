@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.compiled import jit, jit_within
-from fingerspice.engine.blockcharge import Course, current_at, current_block, moved_rows, moved_with
+from fingerspice.engine.blockcharge import Course, current_at, current_block, inverse_area_at, moved_rows, moved_with
 from fingerspice.engine.blockrows import crossing, modes_into, scaled
-from fingerspice.engine.model import branch_area
 from fingerspice.engine.relaxation import FIRST_NEWTON, MIDDLE, OUTPUT, REFERENCE, U_GAP, Z, look_at_ends
 from fingerspice.numerics.moments import moments
 
@@ -93,10 +92,10 @@ def _write_point(
         if at > 0.0:
             u += middle * room.u_within[MIDDLE, i] + last * room.u[i + 1]
         for _ in range(3):
-            q, dq = branch_area(model, 1.0 if u >= 0.0 else -1.0, u)
+            q, dq = inverse_area_at(form, u)
             b = model.area0 * x_gap
             u -= (u - model.k_gap * source - b * q) / (1.0 - b * dq)
-        scale = model.area0 * branch_area(model, 1.0 if u >= 0.0 else -1.0, u)[0]
+        scale = model.area0 * inverse_area_at(form, u)[0]
     n = shown.k.size
     for column in range(n):
         v = 0.0

@@ -16,6 +16,7 @@ from fingerspice.engine.relaxation import (
     BLOCK,
     ERROR_F,
     ERROR_U,
+    ERROR_V,
     FIRST_NEWTON,
     FIRST_QUARTER,
     LAST_QUARTER,
@@ -139,6 +140,20 @@ def _block_error(c: Course, r: int, level: int, n: int) -> float:
 
 
 @jit_within
+def _node_error(c: Course, r: int, n: int, left_over: float, magnified: float) -> float:
+    """The largest error of a node's voltage in a block, V."""
+    room, worst = c.room, 0.0
+    for i in range(c.shown.node.shape[1]):
+        scaled(n + 1, 0.0, room.s, room.before)
+        modes_into(n + 1, 0, c.shown.node[r, i], room.own, room.before)
+        carried = 0.0
+        for k in range(c.w.size):
+            carried += abs(c.shown.node[r, i, k] * c.error[k])
+        worst = max(worst, _largest(n + 1, room.before) + carried)
+    return left_over + magnified * worst
+
+
+@jit_within
 def _accept(
     c: Course, r: int, level: int, n: int, h: float, local: float, left_over: float, magnified: float
 ) -> None:  # fmt: skip
@@ -156,6 +171,9 @@ def _accept(
     off = magnified * worst + steepest * (left_over + magnified * carried)
     control[ERROR_U] = max(control[ERROR_U], local + magnified * carried)
     control[ERROR_F] = max(control[ERROR_F], 2.2 * off)
+    # Under `mobile` what the gap voltage is off moves the area, and with it all other voltages.
+    moved = local + magnified * carried if c.form.mobile else 0.0
+    control[ERROR_V] = max(control[ERROR_V], moved + _node_error(c, r, n, left_over, magnified))
     if c.shown.charge:
         charge_block(c, r, level, n, h, local)
     for k in range(c.w.size):

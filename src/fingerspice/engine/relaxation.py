@@ -70,8 +70,8 @@ SPARE = 0.02
 
 
 # Entries of `control`: halvings of a sample, reference, and as in `engine.readout`.
-LEVEL, REFERENCE, PEAK_U, PEAK_F, ERROR_U, ERROR_F, MARGIN, Z, PEAK_Q, ERROR_Q, COLLECTED, U_GAP = range(12)
-N_CONTROL = 12
+LEVEL, REFERENCE, PEAK_U, PEAK_F, ERROR_U, ERROR_F, MARGIN, Z, PEAK_Q, ERROR_Q, COLLECTED, U_GAP, ERROR_V = range(13)
+N_CONTROL = 13
 # Entries of `counters`.
 OUTPUT, STEPS, REFUSED, SWEEPS = range(4)
 N_COUNTERS = 4
@@ -141,6 +141,8 @@ class Shown(NamedTuple):
     columns : ndarray, shape (r, C, m)
         Recorded voltages over k U.
     k : ndarray, shape (C,)
+    node : ndarray, shape (r, n_node, m)
+        Voltages of the nodes, as `columns`.
     slow : ndarray, shape (r, m)
         The slowest layer's share of each mode (see `Model.slow`).
     live, project : ndarray, shape (r, m, m)
@@ -158,6 +160,7 @@ class Shown(NamedTuple):
 
     columns: FloatArray
     k: FloatArray
+    node: FloatArray
     slow: FloatArray
     live: FloatArray
     project: FloatArray

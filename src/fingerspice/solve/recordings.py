@@ -184,7 +184,7 @@ def _followed(problem: Problem, rtol: float) -> Followed | None:
     if system.model.mobile:
         kinks = np.append(kinks, -kink / q_rest**2)
     shown = relaxation.Shown(
-        system.shown, system.k_shown, system.slow, system.live, system.project, system.stress, kinks,
+        system.shown, system.k_shown, system.node, system.slow, system.live, system.project, system.stress, kinks,
         -kink / q_rest**2, _moved(system, area, at_rest), problem.charge,
     )  # fmt: skip
     return Followed(prepared, area, at_rest, q_rest, shown)
@@ -286,6 +286,7 @@ def _as_run(problem: Problem, one: Followed, track: Track, course: Course, u_bef
     u_error = SAFETY * float(control[relaxation.ERROR_U]) + floor
     f_error = SAFETY * float(control[relaxation.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f
     run.gaps = np.array([[peak_u, peak_f, u_error, f_error]])
+    run.node_error = SAFETY * float(control[relaxation.ERROR_V]) + 4e-16 * (peak_u + problem.scene.u_peak)
     if problem.charge:
         held = track.capacitance * (problem.scene.u_peak + peak_u)
         run.charge_error = SAFETY * float(control[relaxation.ERROR_Q]) + 4e-16 * held * (1.0 + stats["steps"])
