@@ -51,7 +51,6 @@ LARGER = {
     "engine.march.march": (301, 19),
     "engine.netassess.assess": (60, 20),
     "engine.netcharge.charge_rows": (29, 21),
-    "engine.netcharge.charge_error": (67, 22),
     "engine.netmarch.march": (295, 24),
     "engine.netrows.evaluate": (40, 16),
     "engine.radau.step": (52, 13),
@@ -85,6 +84,7 @@ STRANGERS = (
 LENT = {
     "circuit.circuit.Circuit._waveform": "netlist.netlist",
     "results.solution.Solution.plot": "plots.traces",
+    "results.spectrum.Spectrum.plot": "plots.spectra",
     "results.phasor_solution.PhasorSolution.plot": "plots.phasors",
 }
 THIRD_PARTY = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,10 +11,11 @@ import pytest
 from numpy.polynomial import Polynomial
 from scipy.optimize import brentq
 
-from fingerspice.engine import charge, netcharge, readout, rows
+from fingerspice.engine import charge, netcharge, netrows, readout, rows
 from fingerspice.engine.exponential import N_PLACES
 from fingerspice.engine.model import Model
-from fingerspice.numerics.lobatto import END, FIRST, POINTS, ROWS
+from fingerspice.engine.netrows import Form
+from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS
 
 PLACES = np.array([0, FIRST, FIRST + 1, FIRST + 2, END])
 A0, H = 35e-6, 1e-3
@@ -131,7 +133,9 @@ def stack(rng: np.random.Generator, law: str, parts: str) -> Stack:
     )  # fmt: skip
 
 
-def engine_account(step: Stack, collected: float = 0.0, last_area: float | None = None) -> np.ndarray:
+def engine_account(
+    step: Stack, collected: float = 0.0, last_area: float | None = None, kept: float = 0.0
+) -> np.ndarray:
     """`control` after the engine's account of the step, with a jump before it from an area (m^2) if that is given."""
     u, _, area = step.at(POINTS, 0.0)
     w = np.array([m(POINTS) for m in step.modes])
@@ -142,7 +146,7 @@ def engine_account(step: Stack, collected: float = 0.0, last_area: float | None 
     control = np.zeros(readout.N_CONTROL)
     control[readout.COLLECTED] = collected
     control[readout.LAST_Q] = 0.0 if last_area is None else 1.0 / last_area
-    charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, control)
+    charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, kept, control)
     return control
 
 
@@ -161,13 +165,18 @@ def test_what_a_step_of_a_stack_leaves_in_the_charge_is_its_derivative_by_the_vo
     spread = np.cumsum(np.abs(np.diff(stays, prepend=0.0)))
     scale = max(np.abs(stays).max(), np.abs(held).max())
     assert control[readout.COLLECTED] == pytest.approx(stays[-1], abs=ROUGH * spread[-1] + 1e-9 * scale)
-    # Since the start of the run, where nothing was off; and what was collected may have cancelled by chance.
-    want = np.max(np.abs(held + stays) + spread)
-    assert control[readout.ERROR_Q] == pytest.approx(want, rel=2.0 * ROUGH, abs=0.0)
+    # Since the start of the run, where nothing was off.
+    # What the trapezoids miss is a share of all that was added up, whatever is left of it.
+    want = np.max(np.abs(held + stays))
+    assert control[readout.ERROR_Q] == pytest.approx(want, rel=0.0, abs=2.0 * ROUGH * (want + spread[-1]))
     # What was collected before adds to it with its sign.
     for before in (3.0 * scale, -3.0 * scale):
-        want = np.max(np.abs(held + stays + before) + spread)
-        assert engine_account(step, before)[readout.ERROR_Q] == pytest.approx(want, rel=2.0 * ROUGH, abs=0.0)
+        want = np.max(np.abs(held + stays + before))
+        rough = 2.0 * ROUGH * (want + spread[-1])
+        assert engine_account(step, before)[readout.ERROR_Q] == pytest.approx(want, rel=0.0, abs=rough)
+    # What stays with a sign that is not known is as likely to add as to take away.
+    both = engine_account(step, kept=3.0 * scale)[readout.ERROR_Q]
+    assert both == pytest.approx(np.hypot(control[readout.ERROR_Q], 3.0 * scale), rel=1e-12, abs=0.0)
 
 
 def test_both_ends_of_a_jump_s_move_are_off_in_its_charge() -> None:
@@ -179,6 +188,28 @@ def test_both_ends_of_a_jump_s_move_are_off_in_its_charge() -> None:
     # From u1 to u2 the charge is the integral of A du / (k S): moved by d, (A(u2) - A(u1)) d / (k S).
     moved = float(step.gap @ [e(0.0) for e in step.errors])
     assert added == pytest.approx((area - before) * moved / (step.k_gap * step.s), rel=1e-9, abs=0.0)
+
+
+@every_law
+def test_what_a_stack_s_polynomials_miss_between_nodes_does_not_leak(law: str) -> None:
+    # Modes that wriggle about their own by a polynomial that is zero at every node, and an error that is just that.
+    step = stack(np.random.default_rng(5), law, "leaks")
+    nodes = POINTS[:NODES]
+    wriggle = [Polynomial(m(nodes[0])) + 0.0 for m in step.modes]
+    size = 1e-3
+    missed = size * MISS
+    u, _, area = step.at(POINTS, 0.0)
+    w = np.array([m(POINTS) for m in wriggle])
+    w[:, FIRST:] += missed
+    places = np.zeros((2, N_PLACES))
+    places[:, 1 : N_PLACES - 1] = missed
+    r = np.zeros((rows.N_FLAT, ROWS))
+    r[rows.SOURCE], r[rows.U], r[rows.Q] = step.source(POINTS), u, 1.0 / area
+    r[rows.DQ], r[rows.X_GAP] = -slope_at(u) / area**2, step.gap @ w
+    control = np.zeros(readout.N_CONTROL)
+    charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, 0.0, control)
+    leaked = size * H * 3e-7 * np.abs(step.slow).sum()
+    assert abs(control[readout.COLLECTED]) <= 1e-6 * leaked
 
 
 # A network --------------------------------------------------------------------------------------------------
@@ -224,6 +255,18 @@ class Net:
                 )  # fmt: skip
         return total
 
+    def held_by(self, x: float, share: float) -> float:
+        """What an error of `share` of every mode is worth at a fraction of the step, per volt, C/V."""
+        return dataclasses.replace(self, errors=[Polynomial([share])] * len(self.errors)).held(x)
+
+    def leak_by(self, x: float, share: float) -> float:
+        """What of it leaks, A/V."""
+        at, off = np.array([x]), share * self.tap.sum(axis=1)
+        _, u, a = self.at(at, 0.0)
+        moved = slope_at(u[0])[0] * off[0]
+        both = (a[0] - A0) * off + u[:, 0] * moved
+        return float(share * self.lost.sum() + (self.through * self.g * both).sum())
+
     def held(self, x: float) -> float:
         """What the error is worth that is stored at a fraction of the step, C."""
         at = np.array([x])
@@ -236,6 +279,37 @@ class Net:
                 change = (a - A0) * slope_of(lambda e, b=b: self.at(at, e)[1][b])
             value += share * self.c[b] * float(change[0])
         return value
+
+
+def form_of(step: Net) -> Form:
+    """What of a form the charges of a network need."""
+    parts = {name: np.zeros((0, 0)) for name in Form._fields}
+    flat = ("numbers", "rates", "area0", "size", "c", "g", "unit", "pace", "stress", "lo", "scale")
+    parts |= {name: np.zeros(0) for name in flat}
+    own = {
+        "stored": step.stored[None, :], "lost": step.lost[None, :], "through": step.through[None, :], "tap": step.tap,
+        "c": step.c, "g": step.g, "home": np.zeros(2, np.int64), "first": np.array([0, 2]),
+        "cell": np.zeros(1, np.int64), "unit": np.array([A0]), "slow": np.array([2 if step.slow else -1]),
+        "mobile": step.mobile,
+    }  # fmt: skip
+    return Form(**(parts | own))
+
+
+def engine_charge(
+    step: Net, places: np.ndarray, missed: np.ndarray, before: float = 0.0, theta: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """What stayed (2,) and `control` after the engine's account of a step."""
+    _, u, area = step.at(POINTS, 0.0)
+    areas = np.zeros((8, 1, ROWS))
+    areas[netrows.AREA], areas[netrows.MORE] = area, area - A0
+    areas[netrows.SLOPE] = 0.0 if step.slow else slope_at(u[0])
+    z = np.array([[step.charge(x, 0.0) for x in POINTS]])
+    control, collected = np.zeros(readout.N_CONTROL), np.array([[before], [0.0]])
+    netcharge.charge_error(
+        form_of(step), H, step.lost[None, :], step.g, places, missed, theta, np.ascontiguousarray(u), areas, z,
+        collected, control,
+    )  # fmt: skip
+    return collected[:, 0], control
 
 
 def network(rng: np.random.Generator, law: str, parts: str, slow: bool) -> Net:
@@ -261,27 +335,41 @@ def test_what_a_step_of_a_network_leaves_in_the_charge_is_its_derivative_by_the_
     seed: int, parts: str, slow: bool, law: str
 ) -> None:
     step = network(np.random.default_rng([seed, 4]), law, parts, slow)
-    _, u, area = step.at(POINTS, 0.0)
     places = np.array([e(POINTS[PLACES]) for e in step.errors])
-    slope = np.zeros(ROWS) if slow else slope_at(u[0])
     fractions = POINTS[PLACES]
     total = np.array([(step.charge(x, 0.5) - step.charge(x, -0.5)) for x in fractions])
     held = np.array([step.held(x) for x in fractions])
     stays = total - (held - held[0])
     scale = max(np.abs(stays).max(), np.abs(held).max())
     spread = np.cumsum(np.abs(np.diff(stays, prepend=0.0)))
-    z = np.array([[step.charge(x, 0.0) for x in POINTS]])
     for before in (0.0, 3.0 * scale, -3.0 * scale):
-        control, collected = np.zeros(readout.N_CONTROL), np.array([[before], [0.0]])
-        netcharge.charge_error(
-            step.mobile, H, step.stored[None, :], step.lost[None, :], step.through[None, :], step.tap, step.c, step.g,
-            np.zeros(2, np.int64), np.zeros(1, np.int64), np.array([A0]), np.array([2 if slow else -1]),
-            places, np.zeros(3), 1.0, np.ascontiguousarray(u), area[None, :].copy(), slope[None, :].copy(),
-            area[None, :] - A0, z, collected, control,
-        )  # fmt: skip
-        assert collected[0, 0] - before == pytest.approx(stays[-1], abs=ROUGH * spread[-1] + 1e-9 * scale)
-        want = np.max(np.abs(held + stays + before) + spread)
-        assert control[readout.ERROR_Q] == pytest.approx(want, rel=2.0 * ROUGH, abs=0.0)
+        collected, control = engine_charge(step, places, np.zeros((5, len(places))), before)
+        assert collected[0] - before == pytest.approx(stays[-1], abs=ROUGH * spread[-1] + 1e-9 * scale)
+        want = np.max(np.abs(held + stays + before))
+        rough = 2.0 * ROUGH * (want + spread[-1])
+        assert control[readout.ERROR_Q] == pytest.approx(want, rel=0.0, abs=rough)
+
+
+@every_law
+def test_what_polynomials_miss_between_nodes_is_stored_but_stays_only_where_a_step_is_cut_short(law: str) -> None:
+    step = network(np.random.default_rng(6), law, "reference, stores, leaks", False)
+    size = 1e-3
+    places, missed = np.zeros((2, N_PLACES)), np.zeros((5, 2))
+    places[:, 1 : N_PLACES - 1] = size * MISS
+    missed[:3] = size * MISS[:, None]
+    whole, control = engine_charge(step, places, missed)
+    stored = size * max(abs(step.held_by(x, m)) for x, m in zip(POINTS[FIRST:], MISS, strict=True))
+    assert whole[0] == 0.0
+    # The areas' own polynomials are exact here to rounding.
+    assert np.sqrt(whole[1]) <= 1e-9 * stored
+    assert control[readout.ERROR_Q] >= 0.99 * stored
+    cut, _ = engine_charge(step, places, missed, theta=0.6)
+    leak = size * max(abs(step.leak_by(x, m)) for x, m in zip(POINTS[FIRST:], MISS, strict=True))
+    # The largest integral of the node polynomial from the start of the step on, over its own largest value.
+    x = np.linspace(0.0, 1.0, 20_001)
+    product = np.prod(x[:, None] - POINTS[:NODES], axis=1)
+    lobe = np.abs(np.cumsum(product)).max() * x[1] / np.abs(product).max()
+    assert np.sqrt(cut[1]) == pytest.approx(lobe * H * leak, rel=0.02)
 
 
 def test_the_places_of_the_error_are_where_this_file_says() -> None:

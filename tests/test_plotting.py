@@ -403,3 +403,32 @@ def test_from_a_script_a_picture_opens_a_window(tmp_path: Path) -> None:
     code = [sys.executable, "-W", "error", "-c", WINDOW, str(tmp_path / "x.png")]
     subprocess.run(code, check=True, timeout=60, env={**os.environ, "DISPLAY": ":none"})
     assert (tmp_path / "x.png").stat().st_size > 0
+
+
+def test_a_click_in_a_long_run_is_enlarged_beside_it() -> None:
+    click = fs.PWL((0.0, 0.5, 0.5005, 0.5015, 0.5025, 0.503), (0.0, 0.0, 200.0, -200.0, 200.0, 0.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", fs.FingerspiceWarning)
+        solution = simulate(
+            table1(), sources={"Vdrive": click}, t_stop=2.0, t_eval=np.arange(0.0, 2.0, 1e-4), rtol=1e-5
+        )
+    whole, part = traces.plot_solution(solution, "u_source").axes
+    assert (whole.get_xlabel(), part.get_xlabel()) == ("Time [s]: the whole run", "Time [s]: enlarged")
+    start, stop = part.get_xlim()
+    assert 0.49 < start < 0.5005
+    assert 0.5025 < stop < 0.51
+    assert part.lines[0].get_ydata().max() == pytest.approx(200.0)  # type: ignore[union-attr]
+
+
+def test_of_many_oscillations_the_last_ones_that_are_not_small_are_enlarged() -> None:
+    # The envelope of 50 Hz is zero where the run ends, and widest 10 ms before.
+    t = np.arange(0.0, 0.055, 1e-5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", fs.FingerspiceWarning)
+        solution = simulate(table1(), sources={"Vdrive": fs.AM(200, 5000, 50)}, t_stop=0.055, t_eval=t, rtol=1e-5)
+    whole, part = traces.plot_solution(solution, "u_source").axes
+    assert "envelope of 27" in whole.get_xlabel()
+    assert part.get_xlabel() == "Time [ms]: enlarged"
+    x = np.concatenate([line.get_ydata() for line in part.lines])  # type: ignore[misc]
+    assert 0.6 * 200.0 < np.abs(x).max() < 0.8 * 200.0
+    assert part.get_xlim()[1] < 50.0

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
     from fingerspice.studies.export import export_netlist as export_netlist
+    from fingerspice.studies.feel import Feel as Feel
+    from fingerspice.studies.feel import feel as feel
     from fingerspice.studies.fitting import ColeCole as ColeCole
     from fingerspice.studies.fitting import MaterialFit as MaterialFit
     from fingerspice.studies.fitting import fit_material as fit_material
@@ -44,11 +46,11 @@ if TYPE_CHECKING:
     from fingerspice.waveforms.combinations import AM as AM
     from fingerspice.waveforms.combinations import Product as Product
     from fingerspice.waveforms.combinations import Sum as Sum
+    from fingerspice.waveforms.periodic import Pulse as Pulse
     from fingerspice.waveforms.periodic import Sawtooth as Sawtooth
     from fingerspice.waveforms.periodic import Square as Square
     from fingerspice.waveforms.periodic import Triangle as Triangle
     from fingerspice.waveforms.ramps import PWL as PWL
-    from fingerspice.waveforms.ramps import Pulse as Pulse
     from fingerspice.waveforms.ramps import Samples as Samples
     from fingerspice.waveforms.repeated import Burst as Burst
     from fingerspice.waveforms.repeated import Repeat as Repeat
@@ -62,8 +64,8 @@ if TYPE_CHECKING:
 _HOMES = {
     "circuit.circuit": ("Circuit",),
     "netlist.netlist": ("parse_netlist", "read_netlist"),
-    "waveforms.periodic": ("Sawtooth", "Square", "Triangle"),
-    "waveforms.ramps": ("PWL", "Pulse", "Samples"),
+    "waveforms.periodic": ("Pulse", "Sawtooth", "Square", "Triangle"),
+    "waveforms.ramps": ("PWL", "Samples"),
     "waveforms.repeated": ("Burst", "Repeat"),
     "waveforms.transients": ("Chirp", "Exp"),
     "waveforms.sampling": ("Function",),
@@ -72,6 +74,7 @@ _HOMES = {
     "studies.comparison": ("Comparison", "compare"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "studies.export": ("export_netlist",),
+    "studies.feel": ("Feel", "feel"),
     "studies.fitting": ("ColeCole", "MaterialFit", "fit_material"),
     "studies.largesignal": ("large_signal",),
     "studies.limits": ("FoldLimits", "fold_limits"),

@@ -14,6 +14,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.cli import answers, options
 from fingerspice.cli.options import area_from_text, check_output, read_circuit
 from fingerspice.cli.result_files import FOLDER, Results
+from fingerspice.cli.run_files import Touch, written
 from fingerspice.cli.terminal import Answering, answer_usage, listen, plain_errors, progress, say
 from fingerspice.results.outcome import SolveError
 
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from fingerspice.base.arrays import FloatArray
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.results.phasor_solution import PhasorSolution
-    from fingerspice.results.solution import Solution
 
 app = typer.Typer(
     context_settings={"help_option_names": ["--help", "-h"]},
@@ -94,6 +94,7 @@ def run(
         str, typer.Option(help="Rows at jumps of the source: both, or none, so that time rises strictly.")
     ] = "both",
     csv: Annotated[bool, typer.Option("--csv", help="Write CSV instead of NetCDF.")] = False,
+    feel: Annotated[bool, typer.Option("--feel", help="Say, and draw, what the hand feels of the friction.")] = False,
     as_json: AsJson = False,
     no_plot: NoPlot = False,
 ) -> None:
@@ -110,6 +111,8 @@ def run(
       fingerspice run circuits/click.cir --source 'WAV(circuits/texture.wav gain=150)' --start 0.1 --stop 0.5
 
       fingerspice run circuits/fingerpad.cir --charge-law mobile --rtol 1e-6 --json --no-plot
+
+      fingerspice run circuits/am_carrier.cir --feel
     """
     from fingerspice.results.report import summary_table
     from fingerspice.solve.simulation import simulate
@@ -123,6 +126,7 @@ def run(
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         data = results.file(".csv" if csv else ".nc")
         picture = None if no_plot else results.file(".png")
+        touch = Touch(circuit, None if no_plot else results) if feel else None
         with progress() as update:
             solution = simulate(
                 circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method,
@@ -130,22 +134,15 @@ def run(
             )  # fmt: skip
         if as_json:
             answer.update(**answers.of_run(solution))
-        answer.give(lambda: summary_table(solution), _written(solution, data, picture, results))
+        writes = written(solution, data, picture, results)
+        if touch is not None and solution.success:
+            answer.update(feel=touch.look(solution))
+            writes += touch.writes
+        answer.give(lambda: "\n\n".join([summary_table(solution), *(touch.said if touch else ())]), writes)
         if solution.failure is not None:
             raise SolveError(solution.failure, solution)
-
-
-def _written(solution: Solution, data: Path, picture: Path | None, results: Results) -> list[Callable[[], Path]]:
-    """Functions that write the files of a run: the data, then the picture where one is wanted."""
-    from fingerspice.plots.drawing import save
-
-    if not solution.t.size:
-        return []
-    results.open()
-    writes: list[Callable[[], Path]] = [partial(solution.to_csv if data.suffix == ".csv" else solution.to_netcdf, data)]
-    if picture is not None:
-        writes.append(lambda: save(solution.plot(), picture, about=results.about))
-    return writes
+        if touch is not None and touch.failed is not None:
+            raise touch.failed
 
 
 @app.command()

@@ -8,18 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.exponential import N_PLACES
+from fingerspice.engine.exponential import N_PLACES, between, row_of
 from fingerspice.engine.model import Model
 from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, PEAK_Q, SPREAD, at
 from fingerspice.engine.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U
-from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, END, FIRST, NODES, POINTS
+from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, FIRST, NODES, POINTS
 
 FloatArray = NDArray[np.float64]
 
 # What a polynomial misses of a rate changes its sign at every node: of its integral over the step's length so much is
 # left. It is 0.03 to 0.14 where what is missed are Chebyshev polynomials of degree 13 to 21; where the area changes
 # tenfold within a step it is no such polynomial, and 0.22 in scene 7391 of tests/stress.py.
-_LOBE, _STEEP_LOBE, _STEEP = 0.15, 0.3, 10.0
+LOBE, _STEEP_LOBE, _STEEP = 0.15, 0.3, 10.0
 # Slope at each node, per step length, of the polynomial through values at the nodes.
 DERIVATIVE = np.zeros((NODES, NODES))
 for _i in range(NODES):
@@ -73,12 +73,12 @@ def charge_step(
     if not model.mobile and model.coupled:
         # A c du, of which A at the start of the step is taken exactly and the rest along the polynomial.
         _add_moves(slow[n + 1] / h, voltage, r[Q], z)
-    missed = _lobe(r[Q]) * h * _missed(model, slow_share, w, r, h, voltage, z)
+    missed, kept = _missed(model, slow_share, w, r, h, voltage, z)
     _integrate(integral, h, z0, z)
     for j in range(NODES):
         z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
         control[PEAK_Q] = max(control[PEAK_Q], abs(z[j]))
-    _account(model, gap, slow_share, w, r, h, places, theta, missed, control)
+    _account(model, gap, slow_share, w, r, h, places, theta, missed, missed if theta < 1.0 else kept, control)
 
 
 @jit
@@ -86,7 +86,7 @@ def _lobe(q: FloatArray) -> float:
     lowest, highest = q[0], q[0]
     for j in range(1, NODES):
         lowest, highest = min(lowest, q[j]), max(highest, q[j])
-    return _STEEP_LOBE if highest > _STEEP * lowest else _LOBE
+    return _STEEP_LOBE if highest > _STEEP * lowest else LOBE
 
 
 @jit_rows
@@ -113,13 +113,15 @@ def _integrate(integral: FloatArray, h: float, z0: float, z: FloatArray) -> None
 @jit
 def _account(
     model: Model, gap: FloatArray, slow_share: FloatArray, w: FloatArray, r: FloatArray, h: float, places: FloatArray,
-    theta: float, missed: float, control: FloatArray,
+    theta: float, missed: float, kept: float, control: FloatArray,
 ) -> None:  # fmt: skip
     """Largest error of the charge over the part of a step that counts, from the signed error of the modes.
 
     With dv the error of the slow layer's voltage and dA that of the area, the charge is off by c A dv now, and by what
     stays: the leak of dv, and under `local` the integral of c (dA v' - A' dv). Where the slow layer is the gap, whose
-    voltage decides the area, the latter is nothing. `missed` is what the polynomial of its rate misses, C.
+    voltage decides the area, the latter is nothing. What the modes' polynomials miss changes its sign at every node: it
+    is off now, but nothing of it stays. `missed` is what the polynomial of the charge's rate misses of the charge on
+    the way, and `kept` what of that stays, C.
     """
     n = gap.size
     slow = model.slow
@@ -127,9 +129,15 @@ def _account(
     last_area, last_voltage, last_gap, last_error, last_gap_error = 0.0, 0.0, 0.0, 0.0, 0.0
     last_theta = 0.0
     added = 0.0
-    spread = missed
+    control[SPREAD] += kept * kept
+    brief, brief_gap = np.zeros(N_PLACES), np.zeros(N_PLACES)
+    for k in range(n):
+        first, second, third = between(w[k])
+        for p, own in ((1, first), (2, second), (3, third)):
+            brief[p] += slow_share[k] * own
+            brief_gap[p] += gap[k] * own
     for p in range(N_PLACES):
-        row = 0 if p == 0 else (END if p == N_PLACES - 1 else FIRST + p - 1)
+        row = row_of(p)
         q = r[Q, row]
         area = 1.0 / q
         v = 0.0
@@ -140,54 +148,54 @@ def _account(
             error += slow_share[k] * places[k, p]
             gap_error += gap[k] * places[k, p]
         now = capacitance * area * error
+        lasting, lasting_gap = error - brief[p], gap_error - brief_gap[p]
         if model.mobile:
             # Q = A U / S + z, and the fold magnifies the error of u, which is that of A.
             scale = model.area0 * q
-            gap_error *= scale / max(1.0 - model.area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
-            area_error = -r[DQ, row] * area * area * gap_error
-            now = capacitance * model.area0 * error + area_error * r[SOURCE, row] / model.s
-            error = scale * error - v * scale * area_error * q
+            magnified = scale / max(1.0 - model.area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
+            now = capacitance * model.area0 * error - r[DQ, row] * area * area * magnified * gap_error * (
+                r[SOURCE, row] / model.s
+            )
+            lasting_gap *= magnified
+            lasting = scale * lasting + v * scale * r[DQ, row] * area * lasting_gap
             v *= scale
         voltage = slow[n] * r[SOURCE, row] + v
         if p == 0:
             if not model.mobile and control[LAST_Q] > 0.0:
                 # The charge of a jump of the source is the integral of A over the gap's move: both ends of it are off.
-                added += (area - 1.0 / control[LAST_Q]) * gap_error / (model.k_gap * model.s)
+                added += (area - 1.0 / control[LAST_Q]) * lasting_gap / (model.k_gap * model.s)
         else:
             reached = min(POINTS[row], theta)
             part = (reached - last_theta) / (POINTS[row] - last_theta)
-            mean_error = 0.5 * (error + last_error)
+            mean_error = 0.5 * (lasting + last_error)
             move = area - last_area
             slope = move / (r[U, row] - last_gap) if r[U, row] != last_gap else 0.0
-            mean_area_error = 0.5 * slope * (gap_error + last_gap_error)
+            mean_area_error = 0.5 * slope * (lasting_gap + last_gap_error)
             leak = (g_total + g_area * area) * mean_error + g_area * 0.5 * (voltage + last_voltage) * mean_area_error
             stays = h * (POINTS[row] - last_theta) * leak
             if not model.mobile:
                 stays += capacitance * (mean_area_error * (voltage - last_voltage) - move * mean_error)
             added += part * stays
-            spread += abs(part * stays)
             if reached < POINTS[row]:
                 break
             last_theta = reached
-        # What has been collected may have cancelled by chance: its spread is a part of the error too.
-        control[ERROR_Q] = max(
-            control[ERROR_Q],
-            abs(now + control[COLLECTED] + added) + math.sqrt(control[SPREAD] + spread * spread),
-        )
+        known = now + control[COLLECTED] + added
+        # The signs of the rest are not known.
+        control[ERROR_Q] = max(control[ERROR_Q], math.sqrt(known * known + missed * missed + control[SPREAD]))
         last_area, last_voltage, last_gap = area, voltage, r[U, row]
-        last_error, last_gap_error = error, gap_error
+        last_error, last_gap_error = lasting, lasting_gap
     control[COLLECTED] += added
-    control[SPREAD] += spread * spread
     control[LAST_Q] = at(r[Q], theta)
 
 
 @jit
 def _missed(
     model: Model, slow_share: FloatArray, w: FloatArray, r: FloatArray, h: float, voltage: FloatArray, rate: FloatArray
-) -> float:  # fmt: skip
-    """The most that the polynomial through a rate of the charge misses of it at the points between the nodes, C/s.
+) -> tuple[float, float]:  # fmt: skip
+    """What the polynomial through a rate of the charge misses of the charge on the way and at the end of a step, C.
 
     Where the area falls by decades within a step, it does so long before the voltages' own polynomials miss anything.
+    At the end the rule of quadrature is of twice the order: what the polynomial misses, relative, counts squared.
     """
     n = slow_share.size
     slow = model.slow
@@ -206,4 +214,8 @@ def _missed(
         if not model.mobile and model.coupled:
             off += slow[n + 1] / h * (1.0 / q - 1.0 / r[Q, 0]) * slope
         worst = max(worst, abs(off))
-    return worst
+    largest = 0.0
+    for j in range(NODES):
+        largest = max(largest, abs(rate[j]))
+    lobe = _lobe(r[Q]) * h * worst
+    return lobe, lobe * worst / largest if worst < largest else lobe

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine.charge import charge_step
-from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, weigh
+from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, node_error, weigh
 from fingerspice.engine.growth import carry
 from fingerspice.engine.model import Model, branch_area, dot, gap_voltage, turns_at_zero, write_row_at
 from fingerspice.engine.pace import (
@@ -29,6 +29,7 @@ from fingerspice.engine.readout import (
     ALLOWED,
     BRANCH_LENGTH,
     BRANCH_START,
+    ERROR_V,
     FIRST_PASSES,
     H_AFTER_EDGE,
     H_AFTER_ZERO,
@@ -134,7 +135,7 @@ def march(
     model = system.model
     mobile, coupled, k_gap, area0, tau = model.mobile, model.coupled, model.k_gap, model.area0, model.tau
     curve, k_shown, gap_share = borrow(model.curve), borrow(system.k_shown), borrow(model.gap)
-    all_shown = borrow(system.shown)
+    all_shown, all_node, k_node = borrow(system.shown), borrow(system.node), borrow(system.k_node)
     q0, powers, slopes = borrow(system.q0), borrow(system.powers), borrow(system.slopes)
     all_rates, all_gain, all_push, all_gap = (
         borrow(system.rates), borrow(system.gain), borrow(system.push), borrow(system.gap)
@@ -160,22 +161,18 @@ def march(
     room = step_times.shape[0]
     u_rows, q_rows, source_row = r[U], r[Q], r[SOURCE]
     n = model.gap.size
-    columns, n_shown = out.shape[0], all_shown.shape[1]
-    level, slot = -1, -1
+    columns, n_shown, level, slot = out.shape[0], all_shown.shape[1], -1, -1
     rates, gain, push, gap = all_rates[0], all_gain[0], all_push[0], all_gap[0]
     slow_share, live, project, shown = all_slow[0], all_live[0], all_project[0], all_shown[0]
     tap, feed = all_tap[0], all_feed[0]
     decay, phi, miss = all_decay[0], all_phi[0], all_miss[0]
-    h_slot = 0.0
-    flips = 0
+    h_slot, flips = 0.0, 0
     # Where the length of a step is kept that is the first after an edge or a zero; -1 for others.
     fresh = -1
     first_out = int(counters[OUTPUT])
     next_out = t_out[first_out] if first_out < t_out.size else math.inf
     index = -1
-    start = 0.0
-    edge = control[T]
-    since = 0.0
+    start, edge, since = 0.0, control[T], 0.0
     segment_terms, segment_series = terms[0], series[0]
     if edges[0] < control[T]:
         index = segment_at(edges, control[T]) - 1
@@ -372,6 +369,8 @@ def march(
             next_out = t_out[first_out] if first_out < t_out.size else math.inf
         control[MAGNIFIED] = max(control[MAGNIFIED], magnified)
         account(mobile and coupled, area0, stress, u_rows, q_rows, r[X_GAP], r[DQ], theta, run_error, control)
+        v_error = node_error(mobile, area0, all_node[level], k_node, gap, w, r, places)
+        control[ERROR_V] = max(control[ERROR_V], v_error)
         if theta < 1.0:
             for k in range(n):
                 w0[k] = at(w[k], theta)

@@ -17,13 +17,15 @@ from fingerspice.numerics.lobatto import END, MISS, NODES, POINTS, ROWS
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Columns of `peaks`: of each gap the largest voltage (V) and force (N), and the errors of both.
+# Columns of `peaks`: of each gap, and last of the nodes, the largest voltage (V) and force (N), and the errors of both.
 PEAK_U, PEAK_F, ERROR_U, ERROR_F = 0, 1, 2, 3
 # Share of a step in which its polynomials may miss a decay: a third of the way to the first node.
 _EARLY = POINTS[1] / 3.0
 # Rows from which the response to what the polynomials miss is taken, for the points between and the end: what is missed
 # changes its sign at every node, and so its integral is largest at the nodes beside those points, and small at them.
 _WORST = (1, NODES // 2, 9, END)
+# The first and the last node, for each place, between the places beside it.
+_NEAR = ((0, 1), (0, 5), (1, 9), (6, END), (10, END))
 
 
 @jit
@@ -95,13 +97,14 @@ def assess(
     rates: FloatArray, h: float, shape: FloatArray, follow: FloatArray, gap: FloatArray, size: FloatArray,
     phi: FloatArray, miss: FloatArray, error: FloatArray, carried: FloatArray, w: FloatArray, lin: FloatArray,
     pull: FloatArray, used: FloatArray, s: FloatArray, magnified: float, off: FloatArray, places: FloatArray,
-    early: FloatArray, run: FloatArray,
+    run: FloatArray,
 ) -> float:  # fmt: skip
     """Error of a converged step, V, from what its polynomials miss between nodes; see `exponential.assess`.
 
-    `places` (m, N_PLACES) takes the error of the modes, `early` (m,) what their polynomials miss of a decay that is
-    over before the first node, `run` (n_area,) the largest error of each gap's voltage with what the iteration left and
-    what came before; `off` (5, m + n_s) is for passing use.
+    `places` (m, N_PLACES) takes the error of the modes, `run` (n_area, N_PLACES) that of each gap's voltage, with
+    what the iteration left and what came before. `off` (5, m + n_s) takes what of the errors of the modes, and of the
+    sources behind them, the polynomials miss at the points between and the end, and last of a decay that is over before
+    the first node.
     """
     n, m = shape.shape[0], w.shape[0]
     left = np.zeros(4)
@@ -121,8 +124,7 @@ def assess(
         for j in range(NODES):
             fall += DERIVATIVE[0, j] * w[k, j]
         fall = lin[k, 0] + pull[k, 0] - rates[k] * w[k, 0] - fall / h
-        early[k] = fall / (rates[k] + 1.0 / (_EARLY * h))
-        off[4, k] = early[k]
+        off[4, k] = fall / (rates[k] + 1.0 / (_EARLY * h))
         for p in range(4):
             fresh = magnified * miss[k, _WORST[p]] * missed
             places[k, p + 1] = carried[k, p] + magnified * left[p] + fresh
@@ -138,16 +140,12 @@ def assess(
         for p in range(4):
             if not size[k] * abs(off[p, k]) <= step:
                 step = size[k] * abs(off[p, k])
-    for a in range(run.size):
-        total = 0.0
-        for k in range(n):
-            total += gap[a, k] * (places[k, 0] + early[k])
-        run[a] = abs(total)
-        for p in range(4):
+    for a in range(run.shape[0]):
+        for p in range(N_PLACES):
             total = 0.0
             for k in range(n):
-                total += gap[a, k] * places[k, p + 1]
-            run[a] = max(run[a], abs(total))
+                total += gap[a, k] * (places[k, p] + (off[4, k] if p == 0 else 0.0))
+            run[a, p] = abs(total)
     return step
 
 
@@ -192,30 +190,58 @@ def first_zero(
 
 @jit_rows
 def account(
-    u: FloatArray, area: FloatArray, stress: float, theta: float, run: float, places: FloatArray, slow: int,
+    u: FloatArray, area: FloatArray, stress: float, theta: float, run: FloatArray, places: FloatArray, slow: int,
     peaks: FloatArray,
 ) -> None:  # fmt: skip
     """Peaks of a gap's voltage and force over what counts of a step, and the errors of both.
 
-    `places` holds the error of the modes (see `assess`), of which `slow` is the area's, if it is not negative.
+    `run` and `places` hold the errors of the voltage and of the modes (see `assess`), of which `slow` is the area's, if
+    it is not negative.
     """
     area_off = 0.0
     if slow >= 0:
         for p in range(N_PLACES):
             area_off = max(area_off, abs(places[slow, p]))
-    steepest = 0.0
     force = 0.0
     for i in range(NODES):
         if POINTS[i] <= theta:
             size = abs(u[i])
-            pressure = stress * size * area[i]
             peaks[PEAK_U] = max(peaks[PEAK_U], size)
-            force = max(force, pressure * size)
-            # F ~ u^2 A: what moves u by du moves F by at most 2 F du / u, as the area falls with u.
-            steepest = max(steepest, 2.0 * pressure)
+            force = max(force, stress * size * size * area[i])
+    moved = 0.0
+    for p in range(N_PLACES):
+        steepest = 0.0
+        for i in range(_NEAR[p][0], _NEAR[p][1] + 1):
+            if POINTS[i] <= theta:
+                # F ~ u^2 A: what moves u by du moves F by at most 2 F du / u, as the area falls with u.
+                steepest = max(steepest, 2.0 * stress * abs(u[i]) * area[i])
+        moved = max(moved, run[p] * steepest)
+        peaks[ERROR_U] = max(peaks[ERROR_U], run[p])
     peaks[PEAK_F] = max(peaks[PEAK_F], force)
-    peaks[ERROR_U] = max(peaks[ERROR_U], run)
-    peaks[ERROR_F] = max(peaks[ERROR_F], run * steepest + area_off * force)
+    peaks[ERROR_F] = max(peaks[ERROR_F], moved + area_off * force)
+
+
+@jit_rows
+def account_nodes(
+    node: FloatArray, node_s: FloatArray, places: FloatArray, off: FloatArray, peaks: FloatArray
+) -> None:  # fmt: skip
+    """Largest error of any node's voltage over a step, from that of the modes and the sources (see `assess`)."""
+    m, n = places.shape[0], node.shape[1]
+    error = np.empty((N_PLACES, n))
+    for k in range(n):
+        for p in range(N_PLACES):
+            error[p, k] = places[k, p] + (off[4, k] if p == 0 else 0.0)
+    largest_one = peaks[ERROR_U]
+    for i in range(node.shape[0]):
+        for p in range(N_PLACES):
+            total = 0.0
+            for k in range(n):
+                total += node[i, k] * error[p, k]
+            if 0 < p < N_PLACES - 1:
+                for e in range(node_s.shape[1]):
+                    total += node_s[i, e] * off[p - 1, m + e]
+            largest_one = max(largest_one, abs(total))
+    peaks[ERROR_U] = largest_one
 
 
 @jit_rows

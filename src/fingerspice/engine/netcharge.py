@@ -8,13 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.charge import DERIVATIVE
-from fingerspice.engine.exponential import N_PLACES, between
+from fingerspice.engine.charge import DERIVATIVE, LOBE
+from fingerspice.engine.exponential import N_PLACES, between, row_of
+from fingerspice.engine.netrows import AREA, MORE, SLOPE, Form
 from fingerspice.engine.readout import ERROR_Q
-from fingerspice.numerics.lobatto import END, FIRST, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+# What changes its sign at every node, as the node polynomial does, collects so much of itself within a step.
+_HALF_LOBE = 0.041
 
 
 @jit_rows
@@ -91,92 +95,155 @@ def charge_rows(
 
 @jit
 def charge_error(
-    mobile: bool, h: float, stored: FloatArray, lost: FloatArray, through: FloatArray, tap: FloatArray, c: FloatArray,
-    g: FloatArray, home: IntArray, cell: IntArray, unit: FloatArray, slow: IntArray, places: FloatArray,
-    early: FloatArray, theta: float, u: FloatArray, area: FloatArray, slope: FloatArray, more: FloatArray,
-    z: FloatArray, collected: FloatArray, control: FloatArray,
+    form: Form, h: float, lost: FloatArray, g: FloatArray, places: FloatArray, missed: FloatArray, theta: float,
+    u: FloatArray, areas: FloatArray, z: FloatArray, collected: FloatArray, control: FloatArray,
 ) -> None:  # fmt: skip
     """Largest error of the charges over the part of a step that counts, from the signed error of the modes.
 
     With du the error of a cell's voltage and dA that of its area, a charge is off by what is stored of them now, and by
-    what stays: their leak, and under `local` the integral of c (dA u' - A' du). `collected` (2, n_s) holds what stayed
-    so far, and the squares of what each step added: it may have cancelled by chance. `z` is that of `charge_rows`.
+    what stays: their leak, and under `local` the integral of c (dA u' - A' du). What polynomials miss between nodes
+    changes its sign at every node: it is stored, but nothing of it leaks in a whole step. What lobe is left on the way
+    stays where a step is cut short.
+
+    Parameters
+    ----------
+    form, h, lost, g, theta
+        Of the step; `g` (n_f,) are the leaks that count, none in a jump.
+    places, missed : ndarray, shape (m, N_PLACES) and (5, m + n_s)
+        Error of the modes, and what of it the polynomials of this step miss; see `netassess.assess`.
+    u, areas, z : ndarray
+        Rows of the cells' voltages (n_f, ROWS), blocks of the areas', and charges gained (n_s, ROWS).
+    collected : ndarray, shape (2, n_s)
+        What has stayed so far, and the squares of what has with a sign that is not known.
+    control : ndarray
+        See `readout`.
     """
-    n, n_f, n_area = tap.shape[1], c.size, cell.size
-    off = np.zeros((N_PLACES, n_f))
-    area_off = np.zeros((N_PLACES, n_area))
-    for p in range(N_PLACES):
-        row = _row(p)
-        for b in range(n_f):
-            for k in range(n):
-                off[p, b] += tap[b, k] * places[k, p]
-        for a in range(n_area):
-            if cell[a] >= 0:
-                area_off[p, a] = slope[a, row] * off[p, cell[a]]
-                if slow[a] >= 0:
-                    area_off[p, a] = unit[a] * places[slow[a], p]
-    for source in range(stored.shape[0]):
-        # Under `local` what the polynomial misses of an area between nodes counts with all that the voltage moves.
+    n_f, n_area = form.c.size, form.cell.size
+    lasting, brief = places.copy(), np.zeros_like(places)
+    for k in range(places.shape[0]):
+        brief[k, 0] = missed[4, k]
+        for p in range(3):
+            brief[k, p + 1] = missed[p, k]
+            lasting[k, p + 1] -= missed[p, k]
+    off, off_briefly = np.zeros((2, N_PLACES, n_f + n_area)), np.zeros(N_PLACES)
+    _cell_errors(form, lasting, areas[SLOPE], off[0])
+    _cell_errors(form, brief, areas[SLOPE], off[1])
+    for source in range(form.stored.shape[0]):
         first, second, third = between(z[source])
-        missed = max(abs(first), abs(second), abs(third))
-        if not mobile:
-            for b in range(n_f):
-                first, second, third = between(area[home[b]])
-                worst = max(abs(first), abs(second), abs(third))
-                missed += abs(through[source, b]) * c[b] * worst * _way(u[b])
-        added = 0.0
-        spread = missed
-        last_leak = 0.0
-        last_theta = 0.0
+        swing, end, lobe, apart = 0.0, 0.0, 0.0, 0.0
+        if not form.mobile:
+            swing, end = _area_missed(form, source, u, areas[AREA])
+        for p in range(1, N_PLACES - 1):
+            leak = _leak(form, source, p, lost, g, brief, off[1], u, areas[MORE])
+            lobe = max(lobe, _HALF_LOBE * h * abs(leak))
         for p in range(N_PLACES):
-            row = _row(p)
-            now = 0.0
-            leak = 0.0
-            turned = 0.0
-            for k in range(n):
-                now += stored[source, k] * (places[k, p] + (early[k] if p == 0 else 0.0))
-                leak += lost[source, k] * places[k, p]
-            for b in range(n_f):
-                a = home[b]
-                share = through[source, b]
-                both = more[a, row] * off[p, b] + u[b, row] * area_off[p, a]
-                leak += share * g[b] * both
-                now += share * c[b] * (both if mobile else more[a, row] * off[p, b])
-                if p > 0 and not mobile:
-                    last = _row(p - 1)
-                    turned += (
-                        0.5
-                        * share
-                        * c[b]
-                        * (
-                            (area_off[p, a] + area_off[p - 1, a]) * (u[b, row] - u[b, last])
-                            - (area[a, row] - area[a, last]) * (off[p, b] + off[p - 1, b])
-                        )
-                    )
+            held = _held(form, source, p, brief, off[1], u, areas[MORE])
+            own = first if p == 1 else (second if p == 2 else (third if p == 3 else 0.0))
+            off_briefly[p] = max(abs(held), abs(own), swing, lobe)
+            apart = max(apart, abs(own - held) if 0 < p < N_PLACES - 1 else 0.0)
+        # Of a step that is cut short the lobes stay, and what its charge and its modes disagree by. Their signs are not
+        # known.
+        kept = end if theta == 1.0 else math.sqrt(swing * swing + lobe * lobe + apart * apart)
+        collected[1, source] += kept * kept
+        added, last_leak, last_theta = 0.0, 0.0, 0.0
+        for p in range(N_PLACES):
+            row = row_of(p)
+            leak = _leak(form, source, p, lost, g, lasting, off[0], u, areas[MORE])
             if p > 0:
                 reached = min(POINTS[row], theta)
                 part = (reached - last_theta) / (POINTS[row] - last_theta)
-                stays = 0.5 * h * (POINTS[row] - last_theta) * (leak + last_leak) + turned
-                added += part * stays
-                spread += abs(part * stays)
-            control[ERROR_Q] = max(
-                control[ERROR_Q],
-                abs(now + collected[0, source] + added) + math.sqrt(collected[1, source] + spread * spread) + missed,
-            )
-            if p > 0 and reached < POINTS[row]:
-                break
-            last_theta = POINTS[row] if p > 0 else 0.0
+                turned = 0.0 if form.mobile else _turned(form, source, p, off[0], u, areas[AREA])
+                added += part * (0.5 * h * (POINTS[row] - last_theta) * (leak + last_leak) + turned)
+                last_theta = POINTS[row]
             last_leak = leak
+            now = _held(form, source, p, lasting, off[0], u, areas[MORE])
+            known = now + collected[0, source] + added
+            error = math.sqrt(known * known + off_briefly[p] * off_briefly[p] + collected[1, source])
+            control[ERROR_Q] = max(control[ERROR_Q], error)
+            if last_theta > theta:
+                break
         collected[0, source] += added
-        collected[1, source] += spread * spread
 
 
 @jit
-def _row(place: int) -> int:
-    """The row that a place of the error is."""
-    if place == 0:
-        return 0
-    return END if place == N_PLACES - 1 else FIRST + place - 1
+def _cell_errors(form: Form, places: FloatArray, slope: FloatArray, off: FloatArray) -> None:
+    """Errors of the cells' voltages (V) and, behind them, of the areas (m^2) from those of the modes, at the places."""
+    n_f = form.c.size
+    for p in range(N_PLACES):
+        for b in range(n_f):
+            for k in range(form.tap.shape[1]):
+                off[p, b] += form.tap[b, k] * places[k, p]
+        for a in range(form.cell.size):
+            if form.slow[a] >= 0:
+                off[p, n_f + a] = form.unit[a] * places[form.slow[a], p]
+            elif form.cell[a] >= 0:
+                off[p, n_f + a] = slope[a, row_of(p)] * off[p, form.cell[a]]
+
+
+@jit
+def _held(
+    form: Form, source: int, p: int, places: FloatArray, off: FloatArray, u: FloatArray, more: FloatArray
+) -> float:  # fmt: skip
+    """What the error at a place is worth that is stored there, C."""
+    total = 0.0
+    row = row_of(p)
+    for k in range(form.stored.shape[1]):
+        total += form.stored[source, k] * places[k, p]
+    for b in range(form.c.size):
+        a = form.home[b]
+        moved = more[a, row] * off[p, b]
+        if form.mobile:
+            moved += u[b, row] * off[p, form.c.size + a]
+        total += form.through[source, b] * form.c[b] * moved
+    return total
+
+
+@jit
+def _leak(
+    form: Form, source: int, p: int, lost: FloatArray, g: FloatArray, places: FloatArray, off: FloatArray,
+    u: FloatArray, more: FloatArray,
+) -> float:  # fmt: skip
+    """What of the error at a place leaks, A."""
+    total = 0.0
+    row = row_of(p)
+    for k in range(lost.shape[1]):
+        total += lost[source, k] * places[k, p]
+    for b in range(g.size):
+        a = form.home[b]
+        both = more[a, row] * off[p, b] + u[b, row] * off[p, g.size + a]
+        total += form.through[source, b] * g[b] * both
+    return total
+
+
+@jit
+def _turned(form: Form, source: int, p: int, off: FloatArray, u: FloatArray, area: FloatArray) -> float:
+    """Integral of c (dA u' - A' du) from the place before, C."""
+    total = 0.0
+    row, last = row_of(p), row_of(p - 1)
+    for b in range(form.c.size):
+        a = form.home[b]
+        area_off = off[p, form.c.size + a] + off[p - 1, form.c.size + a]
+        both = area_off * (u[b, row] - u[b, last]) - (area[a, row] - area[a, last]) * (off[p, b] + off[p - 1, b])
+        total += 0.5 * form.through[source, b] * form.c[b] * both
+    return total
+
+
+@jit
+def _area_missed(form: Form, source: int, u: FloatArray, area: FloatArray) -> tuple[float, float]:
+    """What the areas' polynomials miss of the integral of c A u' on the way and at the end of a step, C.
+
+    Between two nodes it is a lobe. At the end the rule of quadrature is of twice the order: what the polynomial misses,
+    relative, counts squared.
+    """
+    way, end = 0.0, 0.0
+    for b in range(form.c.size):
+        a = form.home[b]
+        first, second, third = between(area[a])
+        worst = max(abs(first), abs(second), abs(third))
+        lobes = LOBE * abs(form.through[source, b]) * form.c[b] * worst * _way(u[b])
+        way += lobes
+        end += lobes * min(1.0, worst / area[a, 0])
+    return way, end
 
 
 @jit

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.compiled import borrow, jit
-from fingerspice.engine import netrows
+from fingerspice.engine import netassess, netrows
 from fingerspice.engine.coupling import take_coupling
 from fingerspice.engine.exponential import N_PLACES, Tables, make_tables, weigh
 from fingerspice.engine.netassess import account, assess, charged, first_zero, load, store, turn_at_start, write_columns
@@ -140,7 +140,7 @@ def march(
     is_series = sources.series.shape[1] > 0
     index = np.zeros(n_s, np.int64)
     now, slopes_now = np.zeros(n_s), np.zeros(n_s)
-    run, gained, early = np.zeros(n_area), np.zeros(n_s), np.zeros(m)
+    run, gained = np.zeros((n_area, N_PLACES)), np.zeros(n_s)
     several = False
     for b in range(1, home.size):
         several |= home[b] != home[0]
@@ -297,7 +297,7 @@ def march(
                 carry(form, work, several, h, rates, area_pace, own, decay, phi, error, sign)
                 step_error = assess(
                     rates, h, shape, follow, form.gap, size, phi, miss, error, work.carried, w, modes[netrows.LIN],
-                    modes[netrows.PULL], modes[netrows.USED], s, magnified, work.off, places, early, run,
+                    modes[netrows.PULL], modes[netrows.USED], s, magnified, work.off, places, run,
                 )  # fmt: skip
                 if charge:
                     step_error = max(step_error, charged(cell, u, areas[netrows.AREA]))
@@ -355,9 +355,8 @@ def march(
                 form, work, own, h, rates, g, lost, lost_s, integral, sign, values[first_z : y.size], values[y.size :]
             )
             charge_error(
-                mobile, h, form.stored, lost, form.through, form.tap, form.c, g, home, cell, form.unit, slow, places,
-                early, theta, cells[netrows.CELL_U], areas[netrows.AREA], areas[netrows.SLOPE], areas[netrows.MORE],
-                values[first_z:], collected, control,
+                form, h, lost, g, places, work.off, theta, cells[netrows.CELL_U], areas, values[first_z:], collected,
+                control,
             )  # fmt: skip
         for e in range(n_s):
             gained[e] = at(values[first_z + e], theta) if charge else 0.0
@@ -384,6 +383,7 @@ def march(
         for a in range(n_area):
             if form.stress[a] > 0.0:
                 account(u[a], areas[netrows.AREA, a], form.stress[a], theta, run[a], places, slow[a], peaks[a])
+        netassess.account_nodes(form.node, form.node_s, places, work.off, peaks[n_area])
         for k in range(m):
             w0[k] = at(w[k], theta) if theta < 1.0 else w[k, END]
         if theta < 1.0:

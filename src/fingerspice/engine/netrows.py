@@ -71,6 +71,8 @@ class Form(NamedTuple):
         The mode of each area, -1 where it has none; `pace` (n_area,) is its rate, 1/s.
     gap, gap_s : ndarray, shape (n_area, n) and (n_area, n_s)
         Voltage of each area's GAP from x and s; zero without one.
+    node, node_s : ndarray, shape (n_node, n) and (n_node, n_s)
+        Voltage of each node from the same.
     size : ndarray, shape (n,)
         Voltage (V) that each mode of the live voltages moves.
     mobile : bool
@@ -97,6 +99,8 @@ class Form(NamedTuple):
     area0: FloatArray
     gap: FloatArray
     gap_s: FloatArray
+    node: FloatArray
+    node_s: FloatArray
     size: FloatArray
     stored: FloatArray
     stored_s: FloatArray
@@ -121,7 +125,7 @@ class Form(NamedTuple):
 
 
 #: The fields of a `Form` that belong to its reference areas, in the order in which they stand in its `numbers`.
-REFERRED = Form._fields[1:17]
+REFERRED = Form._fields[1:19]
 
 
 class Work(NamedTuple):

@@ -34,7 +34,9 @@ H_AFTER_ZERO = 19
 MARGIN = 20
 # Largest charge met, C.
 PEAK_Q = 21
-N_CONTROL = 22
+# Largest error of a node's voltage, V.
+ERROR_V = 22
+N_CONTROL = 23
 # Entries of `counters`: rows evaluated, steps accepted and refused, zeros met, outputs written, steps kept, recorded.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT, RECORDED = 0, 1, 2, 3, 4, 5, 6
 N_COUNTERS = 7

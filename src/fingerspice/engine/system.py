@@ -60,6 +60,9 @@ class System(NamedTuple):
     shown : ndarray, shape (n_level, n_column, n)
         Recorded voltages over k_shown U, as `live` gives the live ones.
     k_shown : ndarray, shape (n_column,)
+    node : ndarray, shape (n_level, n_node, n)
+        Voltages of the nodes in the same way, over k_node U.
+    k_node : ndarray, shape (n_node,)
     powers, slopes : ndarray, shape (DEGREE + 1,) or longer
         1/A as a polynomial in (u - lo) * scale - 1, and its derivative; longer ones hold coefficients of Chebyshev
         series
@@ -86,6 +89,8 @@ class System(NamedTuple):
     project: FloatArray
     shown: FloatArray
     k_shown: FloatArray
+    node: FloatArray
+    k_node: FloatArray
     powers: FloatArray
     slopes: FloatArray
     lo: float
@@ -95,8 +100,9 @@ class System(NamedTuple):
 
 
 def build_system(
-    model: Model, tol: float, q_range: tuple[float, float], grouping: FloatArray, stress: float = 0.0
-) -> System:
+    model: Model, tol: float, q_range: tuple[float, float], grouping: FloatArray, nodes: FloatArray,
+    stress: float = 0.0,
+) -> System:  # fmt: skip
     """Modal form of a model.
 
     Parameters
@@ -108,6 +114,8 @@ def build_system(
         Smallest and largest 1/A (1/m^2) to expect.
     grouping : ndarray, shape (n_column, n)
         Which live voltages add up to each recorded one.
+    nodes : ndarray, shape (n_node, n + 1)
+        Voltages of the nodes from the live ones and U.
     stress : float
         Force per area and squared gap voltage, Pa/V^2.
     """
@@ -138,6 +146,8 @@ def build_system(
         project,
         np.ascontiguousarray(grouping @ live),
         grouping @ model.k[:n],
+        np.ascontiguousarray(nodes[:, :n] @ live),
+        nodes[:, :n] @ model.k[:n] + nodes[:, n],
         powers,
         slopes,
         lo,

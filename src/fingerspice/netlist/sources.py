@@ -14,8 +14,8 @@ from fingerspice.netlist.files import SourceFiles
 from fingerspice.netlist.slips import is_unit
 from fingerspice.netlist.spelling import nearest
 from fingerspice.waveforms.files import read_table
-from fingerspice.waveforms.periodic import Square
-from fingerspice.waveforms.ramps import PWL, Pulse, Samples
+from fingerspice.waveforms.periodic import Pulse, Square
+from fingerspice.waveforms.ramps import PWL, Samples
 from fingerspice.waveforms.repeated import Burst, Repeat
 from fingerspice.waveforms.transients import Chirp, Exp
 from fingerspice.waveforms.waveform import DC, Sine, Waveform

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from fingerspice.plots.picture import Picture
     from fingerspice.results.solution import Solution
 
-#: Up to this many oscillations are drawn as lines; more are drawn as an envelope, with the last ones beside it.
-MOST_DRAWN, ZOOMED = 30, 4
+#: Up to this many oscillations are drawn as lines; more are drawn as an envelope, with the last ones beside it that
+#: swing by this share of the widest swing or more.
+MOST_DRAWN, ZOOMED, _LOUD = 30, 4, 0.7
 #: Outputs that an oscillation needs for its shape to be seen.
 _FEWEST = 12
 
@@ -37,45 +38,47 @@ def plot_solution(
     runs = _runs(solution, others)
     panels = _panels(runs, signals)
     start, stop = _window(runs, window)
-    marks = _turns(runs, panels, start, stop)
+    marks, heights = _turns(runs, panels, start, stop)
     dense = marks.size > 2 * MOST_DRAWN
-    heights = [1.5 if quantity == lines.VOLTAGE else 1.1 for quantity, _ in panels]
-    options: dict[str, Any] = {"height_ratios": heights, "sharex": "col", "sharey": "row"}
-    if dense:
+    zoomed = _zoom(marks, heights, start, stop)
+    beside = zoomed is not None
+    shares = [1.5 if quantity == lines.VOLTAGE else 1.1 for quantity, _ in panels]
+    options: dict[str, Any] = {"height_ratios": shares, "sharex": "col", "sharey": "row"}
+    if beside:
         options["width_ratios"] = [1.5, 1.0]
-    height = max(3.4, 0.7 + 1.15 * sum(heights))
-    figure, axes = drawing.new_figure(len(panels), 2 if dense else 1, height=height, **options)
-    left, right = (axes[::2], axes[1::2]) if dense else (axes, [])
-    zoomed = _zoom(marks, stop) if dense else (start, stop)
+    tall = max(3.4, 0.7 + 1.15 * sum(shares))
+    figure, axes = drawing.new_figure(len(panels), 2 if beside else 1, height=tall, **options)
+    left, right = (axes[::2], axes[1::2]) if beside else (axes, [])
     for row, (quantity, keys) in enumerate(panels):
         traces = lines.traces_of(runs, keys)
         factor, unit = lines.scale_of(quantity, traces, start, stop)
         for trace in traces:
             lines.draw_line(left[row], trace, factor, start, stop, runs, envelope=marks if dense else None)
-            if dense:
+            if zoomed is not None:
                 lines.draw_line(right[row], replace(trace, label="_"), factor, *zoomed, runs)
         if keys == ["f_el"] and len(traces) == 1:
-            lines.draw_mean(left[row], traces[0], factor, unit, told=not dense)
-            if dense:
+            lines.draw_mean(left[row], traces[0], factor, unit, told=not beside)
+            if beside:
                 lines.draw_mean(right[row], traces[0], factor, unit)
                 drawing.legend_above(right[row], 1)
-        room = lines.HALF if dense else lines.PAGE
+        room = lines.HALF if beside else lines.PAGE
         lines.finish_panel(left[row], quantity, unit, [factor * t.x for t in traces], room)
         if keys == ["f_t"] and len(traces) == 1:
-            lines.coefficient_axis(right[row] if dense else left[row], traces[0].solution, factor)
+            lines.coefficient_axis(right[row] if beside else left[row], traces[0].solution, factor)
     lines.time_axis(left, runs, start, stop)
-    if dense:
+    small = lines.about_all(runs)
+    if zoomed is not None:
         lines.time_axis(right, runs, *zoomed)
         for ax in right:
             # Times have many digits here: there is room for three of them.
             ax.locator_params(axis="x", nbins=3)
-        count = marks.size // 2
-        left[-1].set_xlabel(f"{left[-1].get_xlabel()}: envelope of {count} oscillations", fontsize=drawing.FONT)
-        right[-1].set_xlabel(f"{right[-1].get_xlabel()}: the last {ZOOMED}", fontsize=drawing.FONT)
-    small = lines.about_all(runs)
-    t = solution.t
-    if dense and np.count_nonzero((t >= zoomed[0]) & (t <= zoomed[1])) < _FEWEST * ZOOMED:
-        small += f" · fewer than {_FEWEST} outputs an oscillation: their shape needs a shorter TSTEP"
+        whole = f"envelope of {marks.size // 2} oscillations" if dense else "the whole run"
+        part = f"the last {ZOOMED}" if dense and marks[-1] <= zoomed[1] else "enlarged"
+        left[-1].set_xlabel(f"{left[-1].get_xlabel()}: {whole}", fontsize=drawing.FONT)
+        right[-1].set_xlabel(f"{right[-1].get_xlabel()}: {part}", fontsize=drawing.FONT)
+        t = solution.t
+        if dense and np.count_nonzero((t >= zoomed[0]) & (t <= zoomed[1])) < _FEWEST * ZOOMED:
+            small += f" · fewer than {_FEWEST} outputs an oscillation: their shape needs a shorter TSTEP"
     drawing.caption(figure, small, drawing.GREY if all(run.solution.success for run in runs) else drawing.VERMILION)
     figure.align_ylabels(left)
     return figure
@@ -152,9 +155,11 @@ def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[floa
     return start, stop
 
 
-def _turns(runs: list[Drawn], panels: list[tuple[Quantity, list[str]]], start: float, stop: float) -> FloatArray:
-    """Times (s) of the turning points, two to each oscillation, of the first panel's signal that has most of them."""
-    best = np.zeros(0)
+def _turns(
+    runs: list[Drawn], panels: list[tuple[Quantity, list[str]]], start: float, stop: float
+) -> tuple[FloatArray, FloatArray]:
+    """Times (s) and values of the turning points, two to each oscillation, of the first panel's signal with most."""
+    best = np.zeros(0), np.zeros(0)
     for run in runs:
         t = run.solution.t
         kept = (t >= start) & (t <= stop)
@@ -164,12 +169,25 @@ def _turns(runs: list[Drawn], panels: list[tuple[Quantity, list[str]]], start: f
                 # Rounding errors turn, too, and are not counted.
                 steep = np.flatnonzero(np.abs(step) > 1e-6 * drawing.peak_of(x))
                 turns = steep[1:][np.signbit(step[steep[1:]]) != np.signbit(step[steep[:-1]])]
-                if turns.size > best.size:
-                    best = t[kept][turns]
+                if turns.size > best[0].size:
+                    best = t[kept][turns], x[kept][turns]
     return best
 
 
-def _zoom(marks: FloatArray, stop: float) -> tuple[float, float]:
-    """Start and end (s) of the last oscillations, without a silence that may follow them."""
-    first, last = float(marks[-2 * ZOOMED - 1]), float(marks[-1])
-    return first, min(stop, last + 0.1 * (last - first))
+def _zoom(marks: FloatArray, heights: FloatArray, start: float, stop: float) -> tuple[float, float] | None:
+    """Start and end (s) of what is enlarged beside the whole; None where nothing has to be.
+
+    Of many oscillations these are the last ones that are not small; of a few that take a small part of the time, as a
+    click does, all.
+    """
+    length = 2 * ZOOMED
+    if marks.size > 2 * MOST_DRAWN:
+        swing = np.lib.stride_tricks.sliding_window_view(np.abs(np.diff(heights)), length).max(axis=1)
+        place = int(np.flatnonzero(swing >= _LOUD * swing.max())[-1])
+        first, last = float(marks[place]), float(marks[place + length])
+        # A silence that may follow them is left out.
+        return first, min(stop, last + 0.1 * (last - first))
+    if marks.size < 2 or marks[-1] - marks[0] > (stop - start) / MOST_DRAWN:
+        return None
+    around = float(marks[-1] - marks[0])
+    return max(start, float(marks[0]) - around), min(stop, float(marks[-1]) + around)

@@ -30,7 +30,7 @@ from fingerspice.waveforms.waveform import Fundamental, Waveform
 _WAVEFORMS = {
     kind.__name__: kind
     for kind in (
-        waveforms.DC, waveforms.Sine, transients.Chirp, transients.Exp, ramps.PWL, ramps.Pulse, periodic.Square,
+        waveforms.DC, waveforms.Sine, transients.Chirp, transients.Exp, ramps.PWL, periodic.Pulse, periodic.Square,
         periodic.Triangle, periodic.Sawtooth, combinations.Sum, combinations.Product, combinations.AM,
         repeated.Burst, repeated.Repeat,
     )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -111,11 +112,16 @@ class Stretch:
         s.
     rtol : float
         Error of the run relative to its peaks; means and extremes are computed more exactly.
+    longest : float
+        s: panels are halved until none is longer.
     """
 
-    def __init__(self, run: Run, since: float, until: float, rtol: float) -> None:
-        self.run, self.rtol = run, rtol
+    def __init__(self, run: Run, since: float, until: float, rtol: float, longest: float = math.inf) -> None:
+        self.run, self.span, self.rtol = run, (since, until), rtol
         self.panels = run.panels(since, until)
+        while (long := self.panels.duration > longest).any():
+            short, halves = self.panels.take(np.flatnonzero(~long)), self.panels.take(np.flatnonzero(long)).halved()
+            self.panels = _joined([short, halves])
         self._share, self._shares = _shares(self.panels)
 
     def weigh(self, read: Read) -> Weighed:
@@ -157,9 +163,13 @@ class Stretch:
             panels = panels.take(np.flatnonzero(wrong)).halved()
             most -= panels.step.size
             t, x = self.run.at_points(read, panels)
-        every = Panels(*(np.concatenate(column) for column in zip(*(part[0] for part in parts), strict=True)))
+        every = _joined([part[0] for part in parts])
         t, x = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
         return Weighed(t, _shares(every)[1], x), every
+
+
+def _joined(parts: Sequence[Panels]) -> Panels:
+    return Panels(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _missed(x: FloatArray) -> FloatArray:

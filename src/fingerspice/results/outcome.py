@@ -152,7 +152,11 @@ class SolveError(FingerspiceError, RuntimeError):
 
 @dataclass(frozen=True)
 class ErrorEstimate:
-    """Estimated largest error over the run: of the gap voltage (V), the electroadhesive force (N) and the charge (C).
+    """Estimated largest error over the run: of gap voltage (V), electroadhesive force (N), charge (C) and nodes (V).
+
+    `v_nodes` is that of the voltages of all nodes. A run accepts it as that of a gap voltage, but over the largest
+    voltage of the circuit: a node that hardly moves has no error of its own to meet. It is None in runs that start from
+    the periodic state, which is found to an error at the gaps.
 
     Without a GAP, `u_gap` is the error of the voltage across the layer with the smallest capacitance, and `f_el` is 0.
     `q_source` is None where the charge was left out, or where its error is not estimated: only the coupled tier's own
@@ -162,6 +166,7 @@ class ErrorEstimate:
     u_gap: float
     f_el: float
     q_source: float | None = None
+    v_nodes: float | None = None
 
 
 @dataclass(frozen=True, repr=False)

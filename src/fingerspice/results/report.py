@@ -74,11 +74,13 @@ def summary_table(solution: Solution) -> Page:
                 f"{100.0 * share:.2f} % of the source, leading by {lead:.2f} deg"
             )
     out.append("")
+    nodes = "" if solution.error.v_nodes is None else f", nodes {solution.error.v_nodes:.2g} V"
     if solution.u_gap is None:
         inside = "layer" if solution.layers else "capacitor"
-        out.append(f"no GAP, no forces; estimated error: {inside} voltage {solution.error.u_gap:.2g} V")
+        out.append(f"no GAP, no forces; estimated error: {inside} voltage {solution.error.u_gap:.2g} V{nodes}")
     else:
-        out.append(f"estimated error: gap voltage {solution.error.u_gap:.2g} V, force {solution.error.f_el:.2g} N")
+        force = f"force {solution.error.f_el:.2g} N"
+        out.append(f"estimated error: gap voltage {solution.error.u_gap:.2g} V, {force}{nodes}")
     if s.get("figures_from") == "outputs":
         out.append("figures are those of the outputs: what lies between them is not known")
     if solution.charge_law == "mobile" and "fold_margin_min" in s:

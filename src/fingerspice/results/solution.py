@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.results.plan import Plan
     from fingerspice.results.refined import ClosedForm
+    from fingerspice.results.spectrum import Spectrum
     from fingerspice.results.steps import Recorded
     from fingerspice.waveforms.waveform import Fundamental
 
@@ -262,6 +263,7 @@ class Solution(Sealed, Shown, Figured):
             "error_u_gap_V": repr(self.error.u_gap),
             "error_f_el_N": repr(self.error.f_el),
             "error_q_source_C": repr(self.error.q_source),
+            "error_v_nodes_V": repr(self.error.v_nodes),
             "status": self.status.name,
             "message": self.message,
         }
@@ -322,6 +324,43 @@ class Solution(Sealed, Shown, Figured):
         """
         return write_netcdf(self, Path(path), jumps)
 
+    def spectrum(
+        self,
+        signal: str = "f_t",
+        *,
+        method: str = "auto",
+        highest: float | None = None,
+        resolution: float | None = None,
+        since: float | None = None,
+    ) -> Spectrum:
+        """Spectrum of a signal: lines where the source is periodic, else a density by Welch's method.
+
+        The lines are Fourier integrals over the last period of the source, whatever outputs were asked for; the density
+        is that of the outputs, with Hann windows that overlap by half.
+
+        Parameters
+        ----------
+        signal : str
+            A key of `signals`; the friction force by default.
+        method : str
+            ``"auto"``, ``"lines"`` or ``"welch"``.
+        highest : float, optional
+            Frequency up to which the spectrum goes, Hz; by default 1000 lines, or half the rate of the outputs.
+        resolution : float, optional
+            Width of the density's bins, Hz; by default that of 8 segments.
+        since : float, optional
+            Time from which on outputs are taken into the density, s; the first one by default.
+
+        Raises
+        ------
+        InputError
+            For an unknown signal, one of several elements, or a value out of range; where the run holds no period and
+            `method` is ``"lines"``, or outputs of a density are few or not evenly spaced.
+        """
+        from fingerspice.results.spectrum import spectrum_of
+
+        return spectrum_of(self, signal, method, highest, resolution, since)
+
     def plot(
         self,
         signals: str | Sequence[str] | None = None,
@@ -331,7 +370,7 @@ class Solution(Sealed, Shown, Figured):
     ) -> Figure:
         """Draw signals against time: a notebook shows the figure, and from a script ``plot().show()`` opens a window.
 
-        More than about 30 oscillations are drawn as envelopes, with the last few of them beside.
+        More than about 30 oscillations are drawn as envelopes, with a few of the last beside; so is a short event.
 
         Parameters
         ----------

@@ -156,6 +156,18 @@ class Figures:
             return _Outputs(s.t, self.signals, int(np.searchsorted(s.t, start + tolerance, side="right")) - 1)
         return _Outputs(s.t, self.signals, first, start)
 
+    def last_finely(self, name: str, longest: float) -> tuple[Weighed, bool]:
+        """A signal over the last period, and whether it is known between the outputs.
+
+        Where it is, its pieces are no longer than `longest` (s), so that the weights also integrate its product with an
+        oscillation of that period.
+        """
+        assert self.last is not None
+        if not isinstance(self.last, _Steps):
+            return self.last.weigh(name), False
+        coarse = self.last.stretch
+        return _Steps(Stretch(coarse.run, *coarse.span, coarse.rtol, longest)).weigh(name), True
+
     @cached_property
     def shown(self) -> tuple[str, ...]:
         """Signals in the summary; without a gap those of every layer, and without layers those of every node."""

@@ -181,7 +181,7 @@ def _leap(track: Track, sources: Sources, settling: Settling, stop: float) -> No
         settling.period, left, int(track.counters[readout.OUTPUT]), track.t_out, track.left, track.out,
     )  # fmt: skip
     control, before = base.track.control, here.track.control
-    for peak in (readout.PEAK_U, readout.PEAK_F, readout.PEAK_Q, readout.ERROR_U, readout.ERROR_F):
+    for peak in (readout.PEAK_U, readout.PEAK_F, readout.PEAK_Q, readout.ERROR_U, readout.ERROR_F, readout.ERROR_V):
         control[peak] = max(control[peak], before[peak])
     control[readout.MARGIN] = min(control[readout.MARGIN], before[readout.MARGIN])
     track.land(base.track, state, left, error, owed)

@@ -213,6 +213,7 @@ def _finished(
         share = rounding / peak if peak > 0.0 else 0.0
         gaps.append((peak, force, rounding + bound * peak, (2.0 * share + 3.0 * bound) * force))
     run.gaps = np.array(gaps or [(0.0, 0.0, rounding, 0.0)])
+    run.node_error = rounding + bound * largest
     if not problem.scene.is_sampled:
         # A function would cost too much to look at.
         look = partial(_look, dataclasses.replace(problem, charge=False), solve)

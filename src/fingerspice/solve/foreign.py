@@ -21,7 +21,7 @@ from fingerspice.engine.radau import NFEV
 from fingerspice.results.outcome import Status
 from fingerspice.solve.nodal import STAGES, Collocation, radau_scheme, solve_coupled
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Progress, Run, gap_signals, integrate
+from fingerspice.solve.runs import Progress, Run, gap_signals, integrate, nodes_apart
 from fingerspice.solve.sources import Tables, values_at
 
 FloatArray = NDArray[np.float64]
@@ -258,6 +258,7 @@ def solve_foreign(
             n = min(mine[0].size, theirs[0].size)
             gap[2:] += [np.abs(a[:n] - b[:n]).max(initial=0.0) for a, b in zip(mine, theirs, strict=True)]
         run.gaps = gaps
+        run.node_error = (reference.node_error or 0.0) + nodes_apart(reference.record(problem), run.record(problem))
         worst = run.excess(max(u_scale, problem.scene.u_peak)) / rtol
         if run.status is not Status.SUCCESS:
             if reference.status is Status.FOLD:

@@ -46,7 +46,7 @@ class March(Stepping, NetworkIntegration):
         super().__init__(problem, tol * u_scale, t_out, left, size - n_s, width)
         self.rows = self.out.T
         self.error = np.zeros(self.n + self.n_slow)
-        self.met = np.zeros((n_area, 4))
+        self.met = np.zeros((n_area + 1, 4))
         self.branch = np.tile([problem.t_start, math.inf], (n_area, 1))
         self.shortest = problem.waveform.shortest_time()
         self.integral = integral_table()
@@ -118,6 +118,10 @@ class March(Stepping, NetworkIntegration):
         known.add(wanted)
 
     def stated_gaps(self) -> FloatArray:
+        return self._stated()[list(self.problem.scene.network.fingers)]
+
+    def _stated(self) -> FloatArray:
+        """Peaks and stated errors of all areas' gaps, and last of the nodes."""
         gaps = self.met.copy()
         u_peak = gaps[:, netassess.PEAK_U]
         # Rounding is an error too.
@@ -125,11 +129,12 @@ class March(Stepping, NetworkIntegration):
         steepest = 2.0 * gaps[:, netassess.PEAK_F] / np.where(u_peak > 0.0, u_peak, np.inf)
         gaps[:, netassess.ERROR_U] = SAFETY * gaps[:, netassess.ERROR_U] + floor
         gaps[:, netassess.ERROR_F] = SAFETY * gaps[:, netassess.ERROR_F] + floor * steepest
-        return gaps[list(self.problem.scene.network.fingers)]
+        return gaps
 
     def stated(self, run: Run) -> None:
         scene = self.problem.scene
         run.gaps = self.stated_gaps()
+        run.node_error = float(self._stated()[-1, netassess.ERROR_U])
         run.margin = 1.0 / float(self.control[readout.MAGNIFIED])
         if self.problem.charge:
             steps = 1.0 + float(self.counters[readout.ACCEPTED])
@@ -138,5 +143,5 @@ class March(Stepping, NetworkIntegration):
             # Whatever the areas' polynomials miss, all charge that is moved misses too.
             moved = held + float(np.abs(self.y[-self.s_before.size :]).max(initial=0.0))
             missed = max((area_missed(curve, self.decade) for curve in self.net.curves), default=0.0)
-            error_q = 2.0 * SAFETY * float(self.control[readout.ERROR_Q])
+            error_q = self.charge_error(float(self.collected[1].max(initial=0.0)))
             run.charge_error = error_q + 4e-16 * held * steps + moved * missed

@@ -19,7 +19,7 @@ from fingerspice.numerics.radau_tableau import radau
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import NetworkIntegration, Progress, Run, gap_signals, integrate
+from fingerspice.solve.runs import NetworkIntegration, Progress, Run, gap_signals, integrate, nodes_apart
 from fingerspice.solve.sources import Tables, ramp, values_at
 
 FloatArray = NDArray[np.float64]
@@ -277,6 +277,7 @@ def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float
         moved = 2.0 * both / peak * force if peak > 0.0 else 0.0
         gaps.append((peak, force, u_error, float(np.abs(f[:count] - g[:count]).max(initial=0.0)) + moved))
     run.gaps = np.array(gaps).reshape(-1, 4)
+    run.node_error = nodes_apart(probed.record(problem), beside.record(problem)) + both
     if problem.charge:
         n_s = problem.initial.s_before.size
         at = slice(problem.initial.y.size - n_s, problem.initial.y.size)

@@ -34,8 +34,9 @@ class Known:
     ----------
     arrays : References
     tables : Tables
-    magnified : ndarray, shape (n_area,)
-        Rounding of each gap's voltage over that of the largest voltage, the most of all references.
+    magnified : ndarray, shape (n_area + 1,)
+        Rounding of each gap's voltage, and last of the nodes', over that of the largest voltage, the most of all
+        references.
     shapes : list of tuple
         Of the arrays in `REFERRED`.
     fixed : dict
@@ -103,7 +104,7 @@ def _make(scene: Scene, decade: int) -> Known:
         np.zeros(n_area, np.int64),
     )
     n_modes = shapes[0][0]
-    known = Known(scene, decade, room, new_tables(n_modes), np.zeros(n_area), shapes, _fixed(scene, decade))
+    known = Known(scene, decade, room, new_tables(n_modes), np.zeros(n_area + 1), shapes, _fixed(scene, decade))
     known.add((0,) * n_area)
     return known
 
@@ -117,6 +118,7 @@ def _shapes(scene: Scene) -> list[tuple[int, ...]]:
     shapes = {
         "rates": (m,), "gain": (m, n_s), "shape": (n, n), "inverse": (n, n), "follow": (n, n_s), "feed": (m, n_f),
         "tap": (n_f, n), "tap_s": (n_f, n_s), "area0": (n_area,), "gap": (n_area, n), "gap_s": (n_area, n_s),
+        "node": (len(scene.network.nodes), n), "node_s": (len(scene.network.nodes), n_s),
         "size": (n,), "stored": (n_s, n), "stored_s": (n_s, n_s), "lost": (n_s, n), "lost_s": (n_s, n_s),
     }  # fmt: skip
     return [shapes[name] for name in REFERRED]
@@ -174,6 +176,8 @@ def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray]:
         assert cell is not None
         gap[i], gap_s[i] = tap[cell], tap_s[cell]
     capacitance, leak = network.capacitance(area)[:, None], network.leak(area)[:, None]
+    node = network.nodes[:, :n] @ modes.shape
+    node_s = network.nodes[:, n : n + n_s] - network.nodes[:, :n] @ modes.follow
     at_x, at_s = network.delivered[:, :n], network.delivered[:, n:]
     parts = {
         "rates": np.append(modes.rates, 1.0 / net.tau[slow]),
@@ -187,20 +191,29 @@ def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray]:
         "area0": area,
         "gap": gap,
         "gap_s": gap_s,
+        "node": node,
+        "node_s": node_s,
         "size": np.linalg.norm(modes.shape, axis=0),
         "stored": network.through @ (capacitance * tap),
         "stored_s": network.through @ (capacitance * tap_s),
         "lost": network.through @ (leak * tap) + at_x @ modes.shape,
         "lost_s": network.through @ (leak * tap_s) - at_x @ modes.follow + at_s,
     }
-    return np.concatenate([parts[name].ravel() for name in REFERRED]), _magnified(modes, gap, gap_s)
+    return np.concatenate([parts[name].ravel() for name in REFERRED]), _magnified(modes, gap, gap_s, node, node_s)
 
 
-def _magnified(modes: Modes, gap: FloatArray, gap_s: FloatArray) -> FloatArray:
-    """Rounding of each gap's voltage, a sum over modes and sources, over that of the largest voltage."""
+def _magnified(
+    modes: Modes, gap: FloatArray, gap_s: FloatArray, node: FloatArray, node_s: FloatArray
+) -> FloatArray:  # fmt: skip
+    """Rounding of each gap's voltage, and last of the nodes', sums over modes and sources, over the largest one."""
     live = modes.rates[modes.rates > 0.0]
     # What the rounding of the fastest mode leaves in the slowest.
     spread = math.sqrt(float(live.max() / live.min())) if live.size else 0.0
-    every = (np.abs(modes.shape) @ np.abs(modes.inverse)).sum(axis=1).max(initial=1.0)
-    own = (np.abs(gap) @ np.abs(modes.inverse)).sum(axis=1) + np.abs(gap_s).sum(axis=1)
+    inverse = np.abs(modes.inverse)
+    every = (np.abs(modes.shape) @ inverse).sum(axis=1).max(initial=1.0)
+    of_gaps, of_nodes = (
+        (np.abs(by_mode) @ inverse).sum(axis=1) + np.abs(by_source).sum(axis=1)
+        for by_mode, by_source in ((gap, gap_s), (node, node_s))
+    )
+    own = np.append(of_gaps, of_nodes.max(initial=0.0))
     return np.asarray((every + spread) * np.minimum(own / every, 1.0))

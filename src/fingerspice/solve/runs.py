@@ -63,6 +63,8 @@ class Run:
         errors of both.
     charge_error : float or None
         C.
+    node_error : float or None
+        Stated error of the nodes' voltages, V.
     t_failed : float or None
     unseen, rough
         See `Tables`.
@@ -89,6 +91,7 @@ class Run:
     state: State
     gaps: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
     charge_error: float | None = None
+    node_error: float | None = None
     t_failed: float | None = None
     unseen: tuple[float, float, int] | None = None
     rough: float = 0.0
@@ -103,7 +106,7 @@ class Run:
     def error(self) -> ErrorEstimate:
         """The largest stated errors."""
         _, _, u_gap, f_el = self.gaps.max(axis=0, initial=0.0).tolist()
-        return ErrorEstimate(u_gap, f_el, self.charge_error)
+        return ErrorEstimate(u_gap, f_el, self.charge_error, self.node_error)
 
     def record(self, problem: Problem) -> Record:
         """The outputs with what they mean."""
@@ -125,6 +128,8 @@ class Run:
     def add_error(self, u_gap: FloatArray | float, f_el: FloatArray | None = None) -> None:
         """Add what the stated errors do not know of, V and N: a force goes with the square of its voltage."""
         gaps = self.gaps.copy()
+        if self.node_error is not None:
+            self.node_error += float(np.max(u_gap, initial=0.0))
         if f_el is None:
             f_el = 2.0 * u_gap * gaps[:, 1] / np.where(gaps[:, 0] > 0.0, gaps[:, 0], np.inf)
         gaps[:, 2] += u_gap
@@ -132,8 +137,10 @@ class Run:
         self.gaps = gaps
 
     def excess(self, u_scale: float) -> float:
-        """See `excess_of`."""
-        return excess_of(self.gaps, u_scale)
+        """See `excess_of`; the error of the nodes counts over the largest voltage."""
+        largest = max(u_scale, float(self.gaps[:, 0].max(initial=0.0)))
+        of_nodes = 0.0 if self.node_error is None or largest == 0.0 else self.node_error / largest
+        return max(excess_of(self.gaps, u_scale), of_nodes)
 
 
 def excess_of(gaps: FloatArray, u_scale: float) -> float:
@@ -279,3 +286,10 @@ def gap_signals(record: Record) -> Iterator[tuple[FloatArray, FloatArray]]:
     if not record.fingers and network.cells:
         u = record.cell_voltage(int(np.argmin(network.capacitance(record.net.area0))))
         yield u, np.zeros(u.size)
+
+
+def nodes_apart(one: Record, other: Record) -> float:
+    """Largest difference (V) between the voltages of any node in two records of the same outputs, as far as both go."""
+    count = min(one.t.size, other.t.size)
+    pairs = zip(one.node_voltages.values(), other.node_voltages.values(), strict=True)
+    return max((float(np.abs(a[:count] - b[:count]).max(initial=0.0)) for a, b in pairs), default=0.0)

@@ -180,7 +180,9 @@ class Scene:
 def fixed_system(model: Model, area: float) -> System:
     """The modal system of a stack with its area fixed, m^2."""
     model = model._replace(coupled=False, mobile=False, area0=area, curve=fixed_area_curve(area))
-    return build_system(model, 1e-13, (1.0 / area, 1.0 / area), np.eye(model.gap.size))
+    return build_system(
+        model, 1e-13, (1.0 / area, 1.0 / area), np.eye(model.gap.size), np.zeros((0, model.gap.size + 1))
+    )
 
 
 def scene_of(

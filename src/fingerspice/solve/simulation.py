@@ -258,6 +258,12 @@ def _stepped(
         from fingerspice.solve.foreign import solve_foreign
 
         return solve_foreign(problem, method, rtol, t_out, left, progress), method
+    if method == "auto":
+        from fingerspice.solve.recordings import solve as solve_recording
+
+        recorded = solve_recording(problem, rtol, t_out, left, progress)
+        if recorded is not None:
+            return recorded, "relaxation"
     is_stack = problem.scene.stack is not None
     if method != "radau" and (is_stack or problem.scene.coupled):
         run = solve_exponential(problem, rtol, t_out, left, progress, repeat=method == "auto")
@@ -283,8 +289,8 @@ def _state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
     if problem.begun is not None:
         if len(problem.begun) == len(run.gaps):
             run.add_error(*problem.begun.T)
-        # What the charge collects from where it starts is not known.
-        run.charge_error = None
+        # What the charge collects from where it starts is not known, nor what the start is off at other nodes.
+        run.charge_error = run.node_error = None
     if run.unseen is not None and run.status in (Status.SUCCESS, Status.ERROR_NOT_MET):
         # The outputs show the source to be another one than was integrated.
         run.t_failed, off = run.unseen[:2]
@@ -301,5 +307,5 @@ def _state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
             gap[2:] = np.maximum(gap[2:], (share * gap[0], share**2 * gap[1]))
     # The rounding of a closed form is stated, and no reason to refuse it: no other method would do better.
     judged = plan.tier == "coupled" or plan.error_bound > 0.0 or run.rough > 0.0
-    if run.status is Status.SUCCESS and judged and run.excess(problem.scene.u_peak) > rtol:
+    if run.status is Status.SUCCESS and judged and run.excess(problem.largest) > rtol:
         run.status = Status.ERROR_NOT_MET

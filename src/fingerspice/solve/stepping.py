@@ -183,6 +183,17 @@ class Stepping(Integration):
         self._pass(periods, periods, settling.remaining, collected)
         self.repeated += periods
 
+    def charge_error(self, spread: float) -> float:
+        """Estimated error of the charge, C, with what steps have left with signs that are not known, C^2.
+
+        They are the same in every period, and so do not cancel between periods.
+        """
+        period = self.problem.waveform.period
+        passed = self.t - self.problem.t_start
+        alike = passed / period - self.repeated if period else 0.0
+        known = float(self.control[readout.ERROR_Q])
+        return SAFETY * math.sqrt(known**2 + max(alike - 1.0, 0.0) * spread)
+
     def recorded(self) -> Recorded | None:
         """The steps taken so far."""
         self.recorder.drain(self.counters)

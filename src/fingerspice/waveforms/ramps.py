@@ -1,4 +1,4 @@
-"""Waveforms made of straight pieces: `PWL`, `Pulse`, `Samples`, and the class on which all such waveforms rest.
+"""Waveforms made of straight pieces: `PWL`, `Samples`, and the class on which all such waveforms rest.
 
 A subclass of `Ramps` only lists its knots.
 """
@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
 from fingerspice.waveforms.bounds import check_finite, check_range, in_windows, runs_through
 from fingerspice.waveforms.files import read_table, read_wav
@@ -33,6 +35,19 @@ class Ramps(Waveform):
 
     _first: float = 0.0
 
+    @cached_property
+    def _listed(self) -> tuple[FloatArray, FloatArray]:
+        """`_knots`, made once."""
+        return self._knots()
+
+    @cached_property
+    def _distinct(self) -> FloatArray:
+        """Times of the knots, each once, s."""
+        return _once(np.unique(self._listed[0]))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in ("_listed", "_distinct")}
+
     def _knots(self) -> tuple[FloatArray, FloatArray]:
         """Times (s, ascending) and values (V) of the knots, shape (n,) each."""
         raise NotImplementedError
@@ -45,21 +60,19 @@ class Ramps(Waveform):
         return start, t - start
 
     def _times(self, t0: float, t1: float) -> FloatArray:
-        """Times of the knots (s, ascending) over [t0, t1] and somewhat beyond; a jump appears twice."""
-        times, _ = self._knots()
-        if self.period is None:
-            return times
+        """Times of a periodic waveform's knots (s, ascending) over [t0, t1] and somewhat beyond; jumps appear twice."""
+        assert self.period is not None
+        times, _ = self._listed
         low = max(0.0, np.floor((t0 - self._first) / self.period) - 1.0)
         high = max(low, np.ceil((t1 - self._first) / self.period) + 1.0)
         starts = self._first + runs_through(low, high, times.size, t0, t1) * self.period
         return np.asarray((starts[:, None] + times[None, :]).ravel())
 
     def _edges(self, t0: float, t1: float) -> FloatArray:
-        times = np.unique(self._times(t0, t1))
-        # The last knot of a period and the first of the next are the same time but for rounding.
-        keep = np.ones(times.size, bool)
-        keep[1:] = np.diff(times) > 1e-15 * np.abs(times[1:])
-        return times[keep]
+        if self.period is None:
+            times = self._distinct
+            return times[max(0, times.searchsorted(t0) - 1) : times.searchsorted(t1, "right") + 1]
+        return _once(np.unique(self._times(t0, t1)))
 
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
         times = self._edges(t0, t1)
@@ -75,6 +88,11 @@ class Ramps(Waveform):
 
     def _values(self, flat: FloatArray, side: str) -> FloatArray:
         """As `value`, at times (n_t,) within one window."""
+        if self.period is None:
+            times, values = self._listed
+            return _between(
+                times, values, np.searchsorted(times, flat, side="right" if side == "right" else "left"), flat
+            )
         edges = self._edges(flat.min(), flat.max())
         index = np.searchsorted(edges, flat, side="right" if side == "right" else "left")
         bounds = np.concatenate([[-math.inf], edges, [math.inf]])
@@ -88,7 +106,7 @@ class Ramps(Waveform):
 
         A piece is identified by its midpoint, which rounding cannot move into a neighbour.
         """
-        times, values = self._knots()
+        times, values = self._listed
         middle = 0.5 * (start + stop)
         run, tau = self._phase(np.where(np.isfinite(middle), middle, 0.0))
         index = np.searchsorted(times, tau, side="right")
@@ -110,13 +128,68 @@ class Ramps(Waveform):
         out[:, 1, 1] = 1.0
         return out
 
+    def peak(self, t0: float, t1: float) -> float:
+        if self.period is not None:
+            return super().peak(t0, t1)
+        times, values = self._listed
+        inside = values[times.searchsorted(t0) : times.searchsorted(t1, "right")]
+        ends = np.append(self.value([t0, t1]), self.value([t0, t1], "left"))
+        return float(max(np.abs(ends).max(), inside.max(initial=0.0), -inside.min(initial=0.0)))
+
     def breakpoint_rate(self) -> float:
-        times, _ = self._knots()
+        times, _ = self._listed
         if self.period is None and times.size <= _FEW_KNOTS:
             # No window can contain more breakpoints than these few.
             return 0.0
         span = self.period or (times[-1] - times[0])
         return times.size / span if span > 0.0 else 0.0
+
+
+def _once(times: FloatArray) -> FloatArray:
+    """Ascending times (s) without those that differ from the one before by rounding.
+
+    The last knot of a period and the first of the next are the same time but for that.
+    """
+    keep = np.ones(times.size, bool)
+    keep[1:] = np.diff(times) > 1e-15 * np.abs(times[1:])
+    return times[keep]
+
+
+@jit
+def _between(times: FloatArray, values: FloatArray, index: IntArray, t: FloatArray) -> FloatArray:
+    """Values (V) at times `t` (s), each of which lies before the knot `index`."""
+    out = np.empty(t.size)
+    last = times.size - 1
+    for i in range(t.size):
+        j = index[i]
+        if j == 0:
+            out[i] = values[0]
+        elif j > last:
+            out[i] = values[last]
+        else:
+            slope = (values[j] - values[j - 1]) / (times[j] - times[j - 1])
+            out[i] = values[j - 1] + slope * (t[i] - times[j - 1])
+    return out
+
+
+@jit
+def _along(values: FloatArray, start: float, rate: float, t: FloatArray, left: bool) -> FloatArray:
+    """Values (V) at times `t` (s) of samples at a rate (Hz); the sample at a time exactly, from either side."""
+    out = np.empty(t.size)
+    last = values.size - 1
+    for i in range(t.size):
+        j = int(min(max((t[i] - start) * rate, 0.0), float(last)))
+        # By rounding it may be the neighbour.
+        while j < last and (start + (j + 1) / rate < t[i] or (not left and start + (j + 1) / rate == t[i])):
+            j += 1
+        while j > 0 and (start + j / rate > t[i] or (left and start + j / rate == t[i])):
+            j -= 1
+        here, after = start + j / rate, start + (j + 1) / rate
+        if t[i] <= here or j == last:
+            out[i] = values[j]
+        else:
+            out[i] = values[j] + (values[j + 1] - values[j]) / (after - here) * (t[i] - here)
+    return out
 
 
 @dataclass(frozen=True)
@@ -204,92 +277,14 @@ class PWL(Ramps):
         return k * period, t - k * period
 
     def _times(self, t0: float, t1: float) -> FloatArray:
+        assert self.repeat is not None
         times = np.asarray(self.times)
-        if self.repeat is None:
-            return times
         period = self.times[-1] - self.repeat
         body = times[times >= self.repeat]
         low = max(1.0, np.floor((t0 - self.repeat) / period) - 1.0)
         high = max(low, np.ceil((t1 - self.repeat) / period) + 1.0)
         runs = (runs_through(low, high, body.size, t0, t1) * period)[:, None] + body[None, :]
         return np.concatenate([times, runs.ravel()])
-
-
-@dataclass(frozen=True)
-class Pulse(Ramps):
-    """SPICE's PULSE: v1 until `delay`; then, in every `pulse_period`, a rise to v2, a width, and a fall back to v1.
-
-    Voltages in V, times in s. A rise or fall of 0 is an ideal jump. Without `pulse_period` there is one pulse.
-    """
-
-    v1: float
-    v2: float
-    delay: float = 0.0
-    rise: float = 0.0
-    fall: float = 0.0
-    width: float = math.inf
-    pulse_period: float = math.inf
-    units: ClassVar[dict[str, str]] = {
-        "v1": "V",
-        "v2": "V",
-        "delay": "s",
-        "rise": "s",
-        "fall": "s",
-        "width": "s",
-        "pulse_period": "s",
-    }
-
-    def __post_init__(self) -> None:
-        for name in ("v1", "v2", "delay"):
-            require(math.isfinite(getattr(self, name)), f"pulse {name}", getattr(self, name), "a finite number")
-        for name in ("rise", "fall", "width"):
-            require(getattr(self, name) >= 0.0, f"pulse {name}", f"{getattr(self, name):g} s", ">= 0")
-        require(self.pulse_period > 0.0, "pulse period", f"{self.pulse_period:g} s", "> 0")
-        for name, unit in self.units.items():
-            check_range(f"pulse {name.replace('_', ' ')}", getattr(self, name), unit)
-        require(math.isfinite(self.rise + self.fall), "pulse rise + fall", "infinite", "finite times")
-        busy = self.rise + self.width + self.fall
-        if math.isfinite(self.pulse_period):
-            require(
-                busy <= self.pulse_period * (1.0 + 1e-12),
-                "pulse rise + width + fall",
-                f"{busy:g} s",
-                f"at most the period, {self.pulse_period:g} s",
-            )
-
-    @property
-    def period(self) -> float | None:  # type: ignore[override]
-        return self.pulse_period if math.isfinite(self.pulse_period) else None
-
-    @property
-    def settled(self) -> float:
-        return max(0.0, self.delay)
-
-    @property
-    def half_wave(self) -> bool:
-        return (
-            self.v1 == -self.v2
-            and self.rise == self.fall
-            and abs(2.0 * (self.rise + self.width) - self.pulse_period) <= 4e-16 * self.pulse_period
-        )
-
-    @property
-    def _first(self) -> float:  # type: ignore[override]
-        return self.delay
-
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
-        start = 0.0 if self.period else self.delay
-        up = start + self.rise
-        if not math.isfinite(self.width):
-            return np.array([start, up]), np.array([self.v1, self.v2])
-        t = [start, up, up + self.width, up + self.width + self.fall]
-        v = [self.v1, self.v2, self.v2, self.v1]
-        if self.period:
-            t.append(max(t[-1], self.pulse_period))
-            v.append(self.v1)
-            if t[-2] >= t[-1]:
-                t, v = t[:-1], v[:-1]
-        return np.array(t), np.array(v)
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,3 +386,6 @@ class Samples(Ramps):
 
     def _knots(self) -> tuple[FloatArray, FloatArray]:
         return self.start + np.arange(self.values.size) / self.rate, self.values
+
+    def _values(self, flat: FloatArray, side: str) -> FloatArray:
+        return _along(self.values, self.start, self.rate, np.ascontiguousarray(flat), side == "left")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -26,6 +27,7 @@ class _Shifted(Waveform):
         """Length of a stretch, s."""
         raise NotImplementedError
 
+    @cached_property
     def _marks(self) -> FloatArray:
         """Breakpoints of the other waveform within a stretch, both its ends among them, s."""
         length = self._stretch()
@@ -35,7 +37,7 @@ class _Shifted(Waveform):
     def _inner(self, t: FloatArray, begin: FloatArray | float) -> FloatArray:
         """Times (s) since the stretch began; those that are a breakpoint but for rounding are exactly that."""
         tau = np.asarray(t - begin, float)
-        marks = self._marks()
+        marks = self._marks
         right = np.clip(np.searchsorted(marks, tau), 1, marks.size - 1)
         near = np.where(tau - marks[right - 1] < marks[right] - tau, marks[right - 1], marks[right])
         return np.where(np.abs(tau - near) <= _ROUNDING * np.abs(t), near, tau)
@@ -79,7 +81,7 @@ class Burst(_Shifted):
         return np.where(on, self.waveform.value(np.where(on, tau, 0.0), side), 0.0)
 
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
-        times = self.delay + self._marks()
+        times = self.delay + self._marks
         return times[(times >= t0) & (times <= t1)]
 
     def breakpoint_rate(self) -> float:
@@ -129,14 +131,14 @@ class Repeat(_Shifted):
         return self.waveform.value(tau, side)
 
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
-        marks = self._marks()[:-1]
+        marks = self._marks[:-1]
         low, high = math.floor(t0 / self.period) - 1.0, math.ceil(t1 / self.period) + 1.0
         runs = runs_through(low, high, marks.size, t0, t1)
         times = (runs[:, None] * self.period + marks).ravel()
         return times[(times >= t0) & (times <= t1)]
 
     def breakpoint_rate(self) -> float:
-        return self._marks().size / self.period
+        return self._marks.size / self.period
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
         begin = np.floor(0.5 * (start + stop) / self.period) * self.period

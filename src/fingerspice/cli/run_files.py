@@ -1,0 +1,76 @@
+"""What `run` writes besides its text: the data, the picture, and what the hand feels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fingerspice.base.errors import InputError
+from fingerspice.cli.result_files import Results
+
+if TYPE_CHECKING:
+    from fingerspice.circuit.circuit import Circuit
+    from fingerspice.results.solution import Solution
+    from fingerspice.studies.feel import Feel
+
+
+def written(solution: Solution, data: Path, picture: Path | None, results: Results) -> list[Callable[[], Path]]:
+    """Functions that write the files of a run: the data, then the picture where one is wanted."""
+    from fingerspice.plots.drawing import save
+
+    if not solution.t.size:
+        return []
+    results.open()
+    writes: list[Callable[[], Path]] = [partial(solution.to_csv if data.suffix == ".csv" else solution.to_netcdf, data)]
+    if picture is not None:
+        writes.append(lambda: save(solution.plot(), picture, about=results.about))
+    return writes
+
+
+class Touch:
+    """What the hand feels of a run, for ``--feel``: one picture of all fingers, and a page for each.
+
+    Parameters
+    ----------
+    circuit : Circuit
+        With a GAP, or more.
+    results : Results or None
+        Where the picture goes; None for none.
+    """
+
+    def __init__(self, circuit: Circuit, results: Results | None) -> None:
+        if not circuit.by_device("GAP"):
+            raise InputError("--feel: the circuit has no GAP, so there is no friction to feel")
+        self.results = results
+        self.picture = None if results is None else results.file("_feel.png")
+        self.fingers: list[Feel] = []
+        self.failed: InputError | None = None
+
+    def look(self, solution: Solution) -> list[dict[str, Any]] | None:
+        """Look at a run, and answer for each finger; None where its outputs are too few or uneven, as `failed` says."""
+        from fingerspice.studies.feel import feel
+
+        try:
+            self.fingers = [feel(solution, name) for name in solution.all_signals.names("f_t")]
+        except InputError as error:
+            # The files of the run are written before this is said.
+            self.failed = error
+            return None
+        return [one.to_dict() for one in self.fingers]
+
+    @property
+    def said(self) -> list[str]:
+        """A page for each finger."""
+        return list(map(str, self.fingers))
+
+    @property
+    def writes(self) -> list[Callable[[], Path]]:
+        """The function that writes the picture, where one is wanted."""
+        from fingerspice.plots.drawing import save
+
+        results, picture = self.results, self.picture
+        if results is None or picture is None or not self.fingers:
+            return []
+        return [lambda: save(self.fingers[0].plot(self.fingers[1:]), picture, about=results.about)]

@@ -1,0 +1,274 @@
+"""Charge of the blocks of a recording, and current at the starts of their steps.
+
+The charge goes through the slowest layer, as in `engine.charge`. Under `local` that is the integral of
+A (c V' + g V) + g0 V. A step may take the gap voltage u through most of its range, and A with it: but with
+V = r u + v, r the ratio of both voltages' shares of the source, A c r u' is the derivative of c r G(u), G' = A, and v
+moves as slowly as the layers leak. Quadrature is left with A c v' and the leaks.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.compiled import jit, jit_rows, jit_within
+from fingerspice.engine.blockrows import area_rows, crossing, modes_into, scaled
+from fingerspice.engine.model import Model
+from fingerspice.engine.relaxation import (
+    BLOCK,
+    COLLECTED,
+    ERROR_Q,
+    MIDDLE,
+    PEAK_Q,
+    PLACES,
+    Form,
+    Room,
+    Shown,
+    Z,
+    project_for_charge,
+)
+
+FloatArray = NDArray[np.float64]
+
+
+class Charges(NamedTuple):
+    """Rows of a block for the charge.
+
+    Attributes
+    ----------
+    q : ndarray, shape (4, n)
+        1/A at the ends of the steps and at `PLACES`, 1/m^2.
+    steps : ndarray, shape (5, n)
+        Rates at 0, 1/2 and 1 of each step (A), what it gains, and the error of that (C).
+    z, current, error : ndarray, shape (n,)
+        Charge and current at the starts of the steps, and the error of the slowest layer's voltage.
+    """
+
+    q: FloatArray
+    steps: FloatArray
+    z: FloatArray
+    current: FloatArray
+    error: FloatArray
+
+
+class Course(NamedTuple):
+    """What the march along a recording works on; `w` and `error` (m,) are the modes and their error.
+
+    `spare` (3, n) is room for single outputs; `control` and `counters` as `engine.relaxation` lists them.
+    """
+
+    model: Model
+    form: Form
+    shown: Shown
+    room: Room
+    charges: Charges
+    spare: FloatArray
+    w: FloatArray
+    error: FloatArray
+    control: FloatArray
+    counters: NDArray[np.int64]
+
+
+def new_charges() -> Charges:
+    """Room for one block."""
+    n = BLOCK + 8
+    return Charges(np.zeros((4, n)), np.zeros((5, n)), np.zeros(n), np.zeros(n), np.zeros(n))
+
+
+@jit_rows
+def _charge_rows(
+    n: int, h: float, mobile: bool, slow: FloatArray, area0: float, kink: float, s: FloatArray, u: FloatArray,
+    middle: FloatArray, ends: FloatArray, within: FloatArray, q: FloatArray, steps: FloatArray,
+) -> None:  # fmt: skip
+    """Charge gained in each step but for what follows u, its rates, and Boole's rule less Simpson's (`Charges.steps`).
+
+    `ends` (2, n) and `within` (3, 2, n) are the part v of the slowest layer's voltage that does not follow u, and that
+    by which it leaks. What is stored moves with the area at the start of the step; along the polynomial of v goes what
+    the area moves meanwhile.
+    """
+    share, c, g_area, g_total = slow[slow.size - 4], slow[slow.size - 3], slow[slow.size - 2], slow[slow.size - 1]
+    for i in range(n):
+        s0, s4 = s[i], s[i + 1]
+        v0, v1, v2, v3, v4 = ends[0, i], within[1, 0, i], within[0, 0, i], within[2, 0, i], ends[0, i + 1]
+        a0, a1, a2, a3 = 1.0 / q[0, i], 1.0 / q[2, i], 1.0 / q[1, i], 1.0 / q[3, i]
+        a4 = 1.0 / q[0, i + 1]
+        l0, l1, l2, l3, l4 = ends[1, i], within[1, 1, i], within[0, 1, i], within[2, 1, i], ends[1, i + 1]
+        turn = c / h
+        if mobile:
+            turn = 0.0
+            l0 = share * s0 + area0 * l0 / a0
+            l1 = share * (0.75 * s0 + 0.25 * s4) + area0 * l1 / a1
+            l2 = share * (0.5 * s0 + 0.5 * s4) + area0 * l2 / a2
+            l3 = share * (0.25 * s0 + 0.75 * s4) + area0 * l3 / a3
+            l4 = share * s4 + area0 * l4 / a4
+        r0 = (g_area * a0 + g_total) * l0
+        r1 = (g_area * a1 + g_total) * l1
+        r2 = (g_area * a2 + g_total) * l2
+        r3 = (g_area * a3 + g_total) * l3
+        r4 = (g_area * a4 + g_total) * l4
+        m2, m4 = r2 + turn * (a2 - a0) * (v4 - v0), r4 + turn * (a4 - a0) * (v0 - 4.0 * v2 + 3.0 * v4)
+        simpson = (r0 + 4.0 * m2 + m4) / 6.0
+        # Slopes of the polynomial through all five.
+        d1 = -v0 - (10.0 * v1 - 18.0 * v2 + 6.0 * v3 - v4) / 3.0
+        d2 = (v0 - 8.0 * v1 + 8.0 * v3 - v4) / 3.0
+        d3 = (-v0 + 6.0 * v1 - 18.0 * v2 + 10.0 * v3) / 3.0 + v4
+        d4 = v0 - (16.0 * v1 - 36.0 * v2 + 48.0 * v3 - 25.0 * v4) / 3.0
+        boole = (
+            7.0 * r0
+            + 32.0 * (r1 + turn * (a1 - a0) * d1)
+            + 12.0 * (r2 + turn * (a2 - a0) * d2)
+            + 32.0 * (r3 + turn * (a3 - a0) * d3)
+            + 7.0 * (r4 + turn * (a4 - a0) * d4)
+        ) / 90.0
+        # Of the area's kink both rules miss a known part.
+        at, jump = crossing(u[i], middle[i], u[i + 1])
+        rest, early = 1.0 - at, max(0.5 - at, 0.0)
+        by_simpson = (4.0 * early + rest) / 6.0
+        by_boole = (32.0 * (max(0.25 - at, 0.0) + max(0.75 - at, 0.0)) + 12.0 * early + 7.0 * rest) / 90.0
+        bent = kink * jump * (g_area * (l0 + at * (l4 - l0)) + turn * (v4 - v0))
+        steps[0, i], steps[1, i], steps[2, i] = r0, m2, m4
+        kinked = bent * (0.5 * rest * rest - by_simpson)
+        steps[3, i] = c * (area0 if mobile else a0) * (v4 - v0) + h * (simpson + kinked)
+        steps[4, i] = h * (boole - simpson - bent * (by_boole - by_simpson))
+
+
+@jit_rows
+def _leaked_error(
+    n: int, h: float, slow: FloatArray, q: FloatArray, error: FloatArray, off: FloatArray
+) -> None:  # fmt: skip
+    """Add to a step's error of the charge what the error of the slow layer's voltage leaks in it."""
+    g_area, g_total = slow[slow.size - 2], slow[slow.size - 1]
+    for i in range(n):
+        off[i] += 0.5 * h * (g_area / q[i] + g_total) * (error[i] + error[i + 1])
+
+
+@jit
+def moved_with(moved: FloatArray, scale: float, shift: float, u: float) -> float:
+    """Charge (C) that has followed the gap voltage: odd in it."""
+    x = abs(u) * scale + shift
+    total = 0.0
+    for j in range(moved.size - 1, -1, -1):
+        total = total * x + moved[j]
+    return math.copysign(total, u)
+
+
+@jit
+def moved_rows(n: int, moved: FloatArray, scale: float, shift: float, u: FloatArray, z: FloatArray) -> None:
+    """Add it to charges."""
+    for i in range(n):
+        z[i] += moved_with(moved, scale, shift, u[i])
+
+
+@jit_within
+def charge_block(c: Course, r: int, level: int, n: int, h: float, local: float) -> None:
+    """Charge at the ends of a block's steps, and its error; `Room.own` holds the error of the modes.
+
+    `local` is what the gap voltage is off by this block, V.
+    """
+    form, room, own, slow, v = c.form, c.room, c.charges, c.model.slow, c.form.tap_s.size - 2
+    project_for_charge(form, room, r, level, n)
+    for place in range(len(PLACES)):
+        area_rows(n, form.area, form.scale, form.shift, 0.0, room.u_within[place], own.q[1 + place])
+    _charge_rows(
+        n, h, form.mobile, slow, form.area0, c.shown.area_kink, room.s, room.u, room.u_within[MIDDLE],
+        room.end[v:], room.within[:, v:], own.q, own.steps,
+    )  # fmt: skip
+    scaled(n + 1, 0.0, room.s, own.error)
+    modes_into(n + 1, 0, c.shown.slow[r], room.own, own.error)
+    _leaked_error(n, h, slow, own.q[0], own.error, own.steps[4])
+    control = c.control
+    z, collected, worst, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]
+    stored = slow[slow.size - 3]
+    for i in range(n):
+        own.z[i] = z
+        z += own.steps[3, i]
+        collected += own.steps[4, i]
+        now = abs(collected) + stored * (abs(own.error[i + 1]) + local) / own.q[0, i + 1]
+        worst = now if now > worst else worst
+        peak = abs(z) if abs(z) > peak else peak
+    own.z[n] = z
+    if not form.mobile:
+        moved_rows(n + 1, c.shown.moved, form.scale, form.shift, room.u, own.z)
+    control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q] = z, collected, worst, peak
+
+
+@jit
+def inverse_area_at(form: Form, u: float) -> tuple[float, float]:
+    """1/A and its slope by the gap voltage, from the polynomial that the blocks use."""
+    x = abs(u) * form.scale + form.shift
+    q, slope = 0.0, 0.0
+    for j in range(form.area.size - 1, -1, -1):
+        slope = slope * x + q
+        q = q * x + form.area[j]
+    return q, (slope if u >= 0.0 else -slope) * form.scale
+
+
+@jit
+def current_at(
+    c: Course, r: int, w: FloatArray, g: FloatArray, source: float, slope: float, u: float
+) -> float:  # fmt: skip
+    """Current (A) from modes, drives, the source's value and slope, and the gap voltage."""
+    model, form, slow = c.model, c.form, c.model.slow
+    n = slow.size - 4
+    dv, v, x_gap, dx_gap = 0.0, 0.0, 0.0, 0.0
+    for k in range(w.size):
+        dw = -form.rates[r, k] * w[k] + form.gain[r, k] * source
+        for t in range(g.size):
+            dw += form.feed[r, k, t] * g[t]
+        dv += c.shown.slow[r, k] * dw
+        v += c.shown.slow[r, k] * w[k]
+        x_gap += form.taps[r, 0, k] * w[k]
+        dx_gap += form.taps[r, 0, k] * dw
+    q, dq = inverse_area_at(form, u)
+    if not form.mobile:
+        leak = (slow[n + 2] + q * slow[n + 3]) * (slow[n] * source + v)
+        return float((slow[n + 1] * dv + leak + slope / model.s) / q)
+    scale = model.area0 * q
+    lam = slow[n + 1] * dv * scale + (slow[n + 2] + q * slow[n + 3]) * (slow[n] * source + v * scale)
+    # i = Q' with Q = A U / S + z, and u' from the area equation.
+    du = (model.k_gap * slope + dx_gap * scale) / (1.0 - x_gap * model.area0 * dq)
+    return float(lam / q + (slope / q - dq * du * source / (q * q)) / model.s)
+
+
+@jit_rows
+def _current_rows(
+    n: int, slow: FloatArray, over_s: float, h: float, s: FloatArray, dv: FloatArray, v: FloatArray, q: FloatArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """The current right of the start of each step, under `local`."""
+    c, g_area, g_total = slow[slow.size - 3], slow[slow.size - 2], slow[slow.size - 1]
+    for i in range(n):
+        out[i] = (c * dv[i] + g_area * v[i] + (s[i + 1] - s[i]) / h * over_s) / q[i] + g_total * v[i]
+
+
+@jit_within
+def current_block(c: Course, r: int, n: int, h: float) -> None:
+    """The current right of the start of each step into `Charges.current`."""
+    form, room, shown, own = c.form, c.room, c.shown, c.charges
+    m, drives = form.rates.shape[1], room.g.shape[0]
+    if form.mobile:
+        w, g = c.spare[0, :m], c.spare[1, :drives]
+        for i in range(n):
+            for k in range(m):
+                w[k] = room.w[k, i]
+            for t in range(drives):
+                g[t] = room.g[t, i]
+            own.current[i] = current_at(c, r, w, g, room.s[i], (room.s[i + 1] - room.s[i]) / h, room.u[i])
+        return
+    share, by_g, by_s = c.spare[0, :m], c.spare[1, :drives], 0.0
+    for t in range(drives):
+        by_g[t] = 0.0
+    for k in range(m):
+        share[k] = -form.rates[r, k] * shown.slow[r, k]
+        by_s += form.gain[r, k] * shown.slow[r, k]
+        for t in range(drives):
+            by_g[t] += shown.slow[r, k] * form.feed[r, k, t]
+    scaled(n, by_s, room.s, room.before)
+    modes_into(n, 0, share, room.w, room.before)
+    modes_into(n, 0, by_g, room.g, room.before)
+    _current_rows(
+        n, c.model.slow, 1.0 / c.model.s, h, room.s, room.before, room.end[form.tap_s.size - 1], own.q[0], own.current
+    )  # fmt: skip

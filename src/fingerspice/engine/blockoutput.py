@@ -1,0 +1,185 @@
+"""Outputs of a recording, block by block: at its samples all at once, at other times one by one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.compiled import jit, jit_within
+from fingerspice.engine.blockcharge import Course, current_at, current_block, inverse_area_at, moved_rows, moved_with
+from fingerspice.engine.blockrows import crossing, modes_into, scaled
+from fingerspice.engine.relaxation import FIRST_NEWTON, MIDDLE, OUTPUT, REFERENCE, U_GAP, Z, look_at_ends
+from fingerspice.numerics.moments import moments
+
+FloatArray = NDArray[np.float64]
+
+
+@jit
+def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> None:
+    """Modes at fraction `at` > 0 of step i, along the parabolas through the drives."""
+    form, room, found = c.form, c.room, c.spare[2, :3]
+    drives = room.g.shape[0]
+    for k in range(w.size):
+        z = form.rates[r, k] * h * at
+        moments(z, found)
+        # Constant, linear and square parts of what forces the mode along the step.
+        whole, linear, square = form.gain[r, k] * room.s[i], form.gain[r, k] * (room.s[i + 1] - room.s[i]), 0.0
+        for t in range(drives):
+            g0, g1, g2 = room.g[t, i], room.g_within[MIDDLE, t, i], room.g[t, i + 1]
+            whole += form.feed[r, k, t] * g0
+            linear += form.feed[r, k, t] * (4.0 * g1 - 3.0 * g0 - g2)
+            square += form.feed[r, k, t] * 2.0 * (g0 - 2.0 * g1 + g2)
+        w[k] = w[k] * math.exp(-z) + h * at * (whole * found[0] + at * (linear * found[1] + at * square * found[2]))
+    zero, jump = crossing(room.u[i], room.u_within[MIDDLE, i], room.u[i + 1])
+    if jump > 0.0:
+        early, rest, since = max(0.5 - zero, 0.0), 1.0 - zero, max(at - zero, 0.0)
+        for k in range(w.size):
+            # As `add_kinks`, up to here.
+            moments(form.rates[r, k] * h * at, found)
+            one, two = at * at * found[1], at * at * at * found[2]
+            own = -4.0 * (one - two) * early - (2.0 * two - one) * rest
+            moments(form.rates[r, k] * h * since, found)
+            own += since * since * found[1]
+            for t in range(drives):
+                x = room.end[1 + t, i] + zero * (room.end[1 + t, i + 1] - room.end[1 + t, i])
+                w[k] += form.feed[r, k, t] * c.shown.kink[t] * x * h * jump * own
+
+
+@jit
+def _charge_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, u: float) -> float:
+    """Charge at a fraction of step i, where the modes and the gap voltage (V) are known."""
+    form, room, own, shown = c.form, c.room, c.charges, c.shown
+    p = form.tap_s.size - 2
+    stored, followed, area = 0.0, 0.0, form.area0
+    for k in range(w.size):
+        stored += form.taps[r, p, k] * (w[k] - room.w[k, i])
+    if not form.mobile:
+        followed = moved_with(shown.moved, form.scale, form.shift, u)
+        followed -= moved_with(shown.moved, form.scale, form.shift, room.u[i])
+        area = 1.0 / own.q[0, i]
+    rates = (
+        own.steps[0, i] * (1.0 + at * (2.0 / 3.0 * at - 1.5))
+        + own.steps[1, i] * at * (2.0 - 4.0 / 3.0 * at)
+        + own.steps[2, i] * at * (2.0 / 3.0 * at - 0.5)
+    )
+    charge: float = own.z[i] + followed + c.model.slow[c.model.slow.size - 3] * area * stored + h * at * rates
+    return charge
+
+
+@jit
+def _write_point(
+    c: Course, r: int, h: float, i: int, at: float, slope: float, out: FloatArray, place: int
+) -> None:  # fmt: skip
+    """One output at fraction `at` of step i; `slope` is that of the source there, V/s."""
+    form, room, shown, model = c.form, c.room, c.shown, c.model
+    w, g = c.spare[0, : c.w.size], c.spare[1, : room.g.shape[0]]
+    source = room.s[i] + at * (room.s[i + 1] - room.s[i])
+    first, middle, last = (2.0 * at - 1.0) * (at - 1.0), 4.0 * at * (1.0 - at), at * (2.0 * at - 1.0)
+    for t in range(g.size):
+        g[t] = first * room.g[t, i] + middle * room.g_within[MIDDLE, t, i] + last * room.g[t, i + 1]
+    for k in range(w.size):
+        w[k] = room.w[k, i]
+    if at > 0.0:
+        _modes_at(c, r, h, i, at, w)
+    x_gap = 0.0
+    for k in range(w.size):
+        x_gap += form.taps[r, 0, k] * w[k]
+    u, scale = model.k_gap * source + x_gap, 1.0
+    if form.mobile:
+        u = first * room.u[i]
+        if at > 0.0:
+            u += middle * room.u_within[MIDDLE, i] + last * room.u[i + 1]
+        for _ in range(3):
+            q, dq = inverse_area_at(form, u)
+            b = model.area0 * x_gap
+            u -= (u - model.k_gap * source - b * q) / (1.0 - b * dq)
+        scale = model.area0 * inverse_area_at(form, u)[0]
+    n = shown.k.size
+    for column in range(n):
+        v = 0.0
+        for k in range(w.size):
+            v += shown.columns[r, column, k] * w[k]
+        out[column, place] = shown.k[column] * source + scale * v
+    if shown.charge:
+        out[n, place] = _charge_at(c, r, h, i, at, w, u)
+        out[n + 1, place] = current_at(c, r, w, g, source, slope, u)
+
+
+@jit
+def _write_points(
+    c: Course, r: int, n: int, h: float, start: float, slack: float, t_out: FloatArray, out: FloatArray, last: int
+) -> None:  # fmt: skip
+    """The outputs before number `last`, wherever they are in the block."""
+    s = c.room.s
+    for place in range(c.counters[OUTPUT], last):
+        along = max((t_out[place] - start) / h, 0.0)
+        i = min(int(along), n - 1)
+        at = min(along - i, 1.0)
+        if abs(t_out[place] - (start + (i + 1) * h)) <= slack and i + 1 < n:
+            i, at = i + 1, 0.0
+        elif abs(at * h) <= slack:
+            at = 0.0
+        _write_point(c, r, h, i, at, (s[i + 1] - s[i]) / h, out, place)
+
+
+@jit
+def _every(sub: int, count: int, x: FloatArray, out: FloatArray) -> None:
+    for j in range(count):
+        out[j] = x[j * sub]
+
+
+@jit_within
+def write_block(
+    c: Course, r: int, sub: int, count: int, h: float, start: float, t_out: FloatArray, out: FloatArray
+) -> None:  # fmt: skip
+    """Outputs from the start of a block (s) of `count` samples up to, and without, its end."""
+    form, room, shown, n, first = c.form, c.room, c.shown, count * sub, c.counters[OUTPUT]
+    slack = 8e-16 * (abs(start) + n * h)
+    last, aligned = first, True
+    while last < t_out.size and t_out[last] < start + n * h - slack:
+        j = last - first
+        aligned &= j < count and abs(t_out[last] - (start + j * sub * h)) <= slack
+        last += 1
+    if last == first:
+        return
+    if not aligned or last - first != count:
+        _write_points(c, r, n, h, start, slack, t_out, out, last)
+    else:
+        row = room.before
+        for column in range(shown.k.size):
+            if form.mobile:
+                scaled(n, 0.0, room.s, row)
+                modes_into(n, 0, shown.columns[r, column], room.w, row)
+                for i in range(n):
+                    row[i] = shown.k[column] * room.s[i] + form.area0 * c.charges.q[0, i] * row[i]
+            else:
+                scaled(n, shown.k[column], room.s, row)
+                modes_into(n, 0, shown.columns[r, column], room.w, row)
+            _every(sub, count, row, out[column, first:last])
+        if shown.charge:
+            current_block(c, r, n, h)
+            _every(sub, count, c.charges.z, out[shown.k.size, first:last])
+            _every(sub, count, c.charges.current, out[shown.k.size + 1, first:last])
+    c.counters[OUTPUT] = last
+
+
+@jit
+def write_end(c: Course, value: float, slope: float, t_out: FloatArray, out: FloatArray) -> None:
+    """The outputs at the end of a run, where the source has this value (V) and slope (V/s)."""
+    r = int(c.control[REFERENCE])
+    room, form = c.room, c.form
+    for k in range(c.w.size):
+        room.w[k, 0] = c.w[k]
+    room.s[0] = room.s[1] = value
+    room.u[0] = c.control[U_GAP]
+    look_at_ends(form, room, r, 1, FIRST_NEWTON)
+    c.charges.z[0] = c.control[Z]
+    if not form.mobile:
+        moved_rows(1, c.shown.moved, form.scale, form.shift, room.u, c.charges.z)
+    c.charges.q[0, 0] = 1.0
+    c.charges.steps[:3, 0] = 0.0
+    for place in range(c.counters[OUTPUT], t_out.size):
+        _write_point(c, r, 1.0, 0, 0.0, slope, out, place)
+    c.counters[OUTPUT] = t_out.size

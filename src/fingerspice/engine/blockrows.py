@@ -1,0 +1,243 @@
+"""Loops over the rows of a block of steps, one place a step: what `engine.relaxation` is made of."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.compiled import jit_inline, jit_rows, jit_within
+
+FloatArray = NDArray[np.float64]
+
+# Zeros in front of rows that a recursion looks back from.
+PAD = 8
+
+
+@jit_rows
+def add(n: int, a: float, x: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] += a * x[i]
+
+
+@jit_rows
+def add_two(n: int, a: float, x: FloatArray, b: float, y: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] += a * x[i] + b * y[i]
+
+
+@jit_rows
+def add_three(
+    n: int, a: float, x: FloatArray, b: float, y: FloatArray, c: float, z: FloatArray, out: FloatArray
+) -> None:  # fmt: skip
+    for i in range(n):
+        out[i] += a * x[i] + b * y[i] + c * z[i]
+
+
+@jit_rows
+def both_ends(n: int, a: float, b: float, x: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = a * x[i] + b * x[i + 1]
+
+
+@jit_rows
+def add_six(
+    n: int, a: FloatArray, x: FloatArray, x_m: FloatArray, b: FloatArray, y: FloatArray, y_m: FloatArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    a0, a1, a2, b0, b1, b2 = a[0], a[1], a[2], b[0], b[1], b[2]
+    for i in range(n):
+        out[i] += a0 * x[i] + a1 * x_m[i] + a2 * x[i + 1] + b0 * y[i] + b1 * y_m[i] + b2 * y[i + 1]
+
+
+@jit_rows
+def of_step(
+    n: int, share: FloatArray, s: FloatArray, c: float, w: FloatArray, d: float, v: FloatArray, out: FloatArray
+) -> None:  # fmt: skip
+    a, b = share[0], share[1]
+    for i in range(n):
+        out[i] = a * s[i] + b * s[i + 1] + c * w[i] + d * v[i]
+
+
+@jit_rows
+def of_end(n: int, a: float, s: FloatArray, c: float, w: FloatArray, d: float, v: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = a * s[i] + c * w[i] + d * v[i]
+
+
+@jit_within
+def drives_into(n: int, c: FloatArray, g: FloatArray, middle: FloatArray, out: FloatArray) -> None:
+    """Add what the drives (T, n) make with weights (T, 3) of their ends and middles."""
+    t = 0
+    while t + 1 < c.shape[0]:
+        add_six(n, c[t], g[t], middle[t], c[t + 1], g[t + 1], middle[t + 1], out)
+        t += 2
+    if t < c.shape[0]:
+        add_three(n, c[t, 0], g[t], c[t, 1], middle[t], c[t, 2], g[t, 1:], out)
+
+
+@jit_within
+def modes_into(n: int, first: int, c: FloatArray, w: FloatArray, out: FloatArray) -> None:
+    """Add the sum of c_k w_k over the modes from `first` on."""
+    k = first
+    while k + 1 < c.size:
+        add_two(n, c[k], w[k], c[k + 1], w[k + 1], out)
+        k += 2
+    if k < c.size:
+        add(n, c[k], w[k], out)
+
+
+@jit_rows
+def scaled(n: int, a: float, x: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = a * x[i]
+
+
+@jit_rows
+def product_of(n: int, x: FloatArray, y: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = x[i] * y[i]
+
+
+@jit_rows
+def _doubled(n: int, decay: float, by: int, x: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[PAD + i] = x[PAD + i] + decay * x[PAD + i - by]
+
+
+@jit_rows
+def _by_eight(n: int, decay: float, x: FloatArray, w: FloatArray) -> None:
+    for i in range(min(n, PAD)):
+        w[i + 1] = x[i + PAD]
+    for i in range(n - PAD):
+        w[i + 1 + PAD] = x[i + 2 * PAD] + decay * w[i + 1]
+
+
+@jit_within
+def recursion(n: int, decay: float, inc: FloatArray, other: FloatArray, w: FloatArray) -> None:
+    """w[i + 1] = decay w[i] + inc[i], eight at a time: sums over 2, 4 and 8 increments, then over those before.
+
+    `inc` and `other` have `PAD` zeros in front; `inc` is lost.
+    """
+    inc[PAD] += decay * w[0]
+    two = decay * decay
+    four = two * two
+    _doubled(n, decay, 1, inc, other)
+    _doubled(n, two, 2, other, inc)
+    _doubled(n, four, 4, inc, other)
+    _by_eight(n, four * four, other, w)
+
+
+@jit_rows
+def area_rows(n: int, area: FloatArray, scale: float, shift: float, q0: float, u: FloatArray, z: FloatArray) -> None:
+    """q - q0 at gap voltages."""
+    d = area.size - 1
+    a, b, c, e, f = area[d], area[d - 1], area[d - 2], area[d - 3], area[d - 4]
+    last = f - q0 if d == 4 else f
+    for i in range(n):
+        x = abs(u[i]) * scale + shift
+        z[i] = (((a * x + b) * x + c) * x + e) * x + last
+    for j in range(d - 4, 0, -4):
+        b, c, e, f = area[j - 1], area[j - 2], area[j - 3], area[j - 4]
+        last = f - q0 if j == 4 else f
+        for i in range(n):
+            x = abs(u[i]) * scale + shift
+            z[i] = (((z[i] * x + b) * x + c) * x + e) * x + last
+
+
+@jit_rows
+def newton_rows(
+    n: int, area: FloatArray, scale: float, shift: float, k_gap: float, area0: float, s: FloatArray, x_gap: FloatArray,
+    u: FloatArray, z: FloatArray, slope: FloatArray,
+) -> float:  # fmt: skip
+    """One step of Newton for u = k_gap U + A0 x_gap q(|u|) in every place; the least slope of the difference."""
+    d = area.size - 1
+    top = area[d]
+    for i in range(n):
+        z[i], slope[i] = top, 0.0
+    for j in range(d - 1, -1, -1):
+        c = area[j]
+        for i in range(n):
+            x = abs(u[i]) * scale + shift
+            slope[i] = slope[i] * x + z[i]
+            z[i] = z[i] * x + c
+    least = 1.0
+    for i in range(n):
+        b = area0 * x_gap[i]
+        margin = 1.0 - b * slope[i] * scale * (1.0 if u[i] >= 0.0 else -1.0)
+        least = min(least, margin)
+        u[i] -= (u[i] - k_gap * s[i] - b * z[i]) / margin
+    return least
+
+
+@jit_rows
+def change_of(n: int, u: FloatArray, before: FloatArray) -> float:
+    """The largest |u - before|, or up to twice that: a mean of eighth powers, several of which are added at once.
+
+    `before` becomes u.
+    """
+    total = 0.0
+    for i in range(n):
+        d = u[i] - before[i]
+        before[i] = u[i]
+        d *= d
+        d *= d
+        total += d * d
+    return float(total**0.125)
+
+
+@jit_rows
+def crosses(n: int, u: FloatArray) -> bool:
+    """Whether some step crosses 0 V."""
+    found = False
+    for i in range(n):
+        found |= u[i] * u[i + 1] < 0.0
+    return found
+
+
+@jit_inline
+def crossing(a: float, m: float, b: float) -> tuple[float, float]:
+    """Where in a step u crosses 0 V, given at 0, 1/2 and 1, and by how much the slope of |u| jumps there; 0 if not."""
+    early = a * m < 0.0
+    before, after = (a, m) if early else (m, b)
+    size = abs(before) + abs(after) + 1e-300
+    return (0.0 if early else 0.5) + 0.5 * abs(before) / size, 4.0 * size if a * b < 0.0 else 0.0
+
+
+@jit_rows
+def kink_rows(
+    n: int, kink: float, u: FloatArray, middle: FloatArray, x: FloatArray, at: FloatArray, out: FloatArray
+) -> None:  # fmt: skip
+    """Where each step crosses 0 V, and the jump of the slope of kink |u| x there; 0 if it does not."""
+    for i in range(n):
+        place, jump = crossing(u[i], middle[i], u[i + 1])
+        at[i], out[i] = place, kink * jump * (x[i] + place * (x[i + 1] - x[i]))
+
+
+@jit_rows
+def add_kinks(
+    n: int, z: float, weight: FloatArray, feed: float, at: FloatArray, jump: FloatArray, out: FloatArray
+) -> None:
+    """Add what a mode of rate z makes of a jump of the slope, and the parabola through its 0, 1/2 and 1 does not.
+
+    `weight` are those of values at 1/2 and 1. Since the jump the mode has made (y - 1 + exp(-y)) / y^2 of the square of
+    the rest of the step, y = z rest, here to 3e-4: the correction is itself a small one.
+    """
+    by_middle, by_end = weight[0], weight[1]
+    for i in range(n):
+        rest = 1.0 - at[i]
+        y = z * rest
+        ramp = rest * rest * (1.0 + y * (0.32058491 + 0.06524308 * y))
+        ramp /= 2.0 + y * (1.31296923 + y * (0.38813995 + 0.06524308 * y))
+        out[i] += feed * jump[i] * (ramp - by_middle * max(0.5 - at[i], 0.0) - by_end * rest)
+
+
+@jit_rows
+def kink_at(
+    n: int, kink: float, place: float, u: FloatArray, middle: FloatArray, x: FloatArray, out: FloatArray
+) -> None:  # fmt: skip
+    """Take from misfits at a place of the steps what the kink is known to make of them."""
+    m, r = 4.0 * place * (1.0 - place), place * (2.0 * place - 1.0)
+    for i in range(n):
+        at, jump = crossing(u[i], middle[i], u[i + 1])
+        known = jump * (max(place - at, 0.0) - m * max(0.5 - at, 0.0) - r * (1.0 - at))
+        out[i] -= kink * known * (x[i] + at * (x[i + 1] - x[i]))

@@ -1,0 +1,237 @@
+"""A recorded source followed block by block (`engine.relaxation`): accuracy, error, peaks."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
+from fingerspice.engine.blockcharge import Course, charge_block
+from fingerspice.engine.blockoutput import write_block
+from fingerspice.engine.blockrows import add_two, area_rows, modes_into, recursion, scaled
+from fingerspice.engine.model import ramp
+from fingerspice.engine.relaxation import (
+    BLOCK,
+    ERROR_F,
+    ERROR_U,
+    ERROR_V,
+    FIRST_NEWTON,
+    FIRST_QUARTER,
+    LAST_QUARTER,
+    LEAST_MARGIN,
+    LEVEL,
+    LEVELS,
+    MARGIN,
+    PEAK_F,
+    PEAK_U,
+    REFERENCE,
+    REFUSED,
+    SPARE,
+    STEPS,
+    SWEEPS,
+    U_GAP,
+    Form,
+    look_at_ends,
+    misfit,
+    relax,
+)
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# What a march returns.
+DONE, NOT_CLOSED, TOO_COARSE = range(3)
+# A reference serves up to so many times its own 1/A.
+_FARTHEST = 1.2
+
+
+@jit_rows
+def _peaks(
+    n: int, stress: float, u: FloatArray, q: FloatArray, error: FloatArray
+) -> tuple[float, float, float, float]:  # fmt: skip
+    """The largest |u|, force, force over voltage, and that times the error of the voltage in its place."""
+    peak, force, steepest, worst = 0.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        x = abs(u[i])
+        slope = stress * x / q[i]
+        peak = x if x > peak else peak
+        steepest = slope if slope > steepest else steepest
+        force = slope * x if slope * x > force else force
+        off = slope * abs(error[i])
+        worst = off if off > worst else worst
+    return peak, force, steepest, worst
+
+
+@jit_rows
+def _largest(n: int, x: FloatArray) -> float:
+    largest = 0.0
+    for i in range(n):
+        a = abs(x[i])
+        largest = a if a > largest else largest
+    return largest
+
+
+@jit
+def _nearest(form: Form, q: float, r: int) -> int:
+    """The reference for a value of 1/A: the one at hand, unless that is far off."""
+    if max(q / form.q0[r], form.q0[r] / q) <= _FARTHEST:
+        return r
+    best = r
+    for one in range(form.q0.size):
+        if abs(math.log(q / form.q0[one])) < abs(math.log(q / form.q0[best])):
+            best = one
+    return best
+
+
+@jit
+def _go_over(c: Course, r: int, to: int, w: FloatArray) -> None:
+    """Modes around one reference as those around another."""
+    live, shown = c.spare[0], c.shown
+    for i in range(w.size):
+        live[i] = 0.0
+        for k in range(w.size):
+            live[i] += shown.live[r, i, k] * w[k]
+    for k in range(w.size):
+        w[k] = 0.0
+        for i in range(w.size):
+            w[k] += shown.project[to, k, i] * live[i]
+
+
+@jit
+def jump(c: Course, to: float) -> bool:
+    """Take a jump of the source to `to` (V); False where it meets a fold."""
+    r, model = int(c.control[REFERENCE]), c.model
+    x_gap = 0.0
+    for k in range(c.w.size):
+        x_gap += c.form.taps[r, 0, k] * c.w[k]
+    c.control[U_GAP] = ramp(model, model.k_gap * to, x_gap, c.control[U_GAP])
+    return not math.isnan(c.control[U_GAP])
+
+
+@jit
+def _sources(values: FloatArray, at: int, count: int, sub: int, s: FloatArray) -> None:
+    """The source's values at the ends of steps, `sub` of which make a sample's length."""
+    for j in range(count):
+        here = values[at + j]
+        for i in range(sub):
+            s[j * sub + i] = here + (i / sub) * (values[at + j + 1] - here)
+    s[count * sub] = values[at + count]
+
+
+@jit_within
+def _block_error(c: Course, r: int, level: int, n: int) -> float:
+    """What a block adds to the error of the gap voltage's modes at most, V; that of the modes into `Room.own`."""
+    form, room = c.form, c.room
+    for k in range(c.w.size):
+        room.own[k, 0] = 0.0
+        recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.own[k])
+    scaled(n + 1, 0.0, room.s, room.before)
+    modes_into(n + 1, 0, form.taps[r, 0], room.own, room.before)
+    worst = _largest(n + 1, room.before)
+    # In the middle of the steps what the parabolas miss has not cancelled yet.
+    for t in range(room.g.shape[0]):
+        early = form.early[r, level, t]
+        add_two(
+            n, early[0], room.g_within[FIRST_QUARTER, t], early[1], room.g_within[LAST_QUARTER, t], room.before
+        )  # fmt: skip
+    return max(worst, _largest(n, room.before))
+
+
+@jit_within
+def _node_error(c: Course, r: int, n: int, left_over: float, magnified: float) -> float:
+    """The largest error of a node's voltage in a block, V."""
+    room, worst = c.room, 0.0
+    for i in range(c.shown.node.shape[1]):
+        scaled(n + 1, 0.0, room.s, room.before)
+        modes_into(n + 1, 0, c.shown.node[r, i], room.own, room.before)
+        carried = 0.0
+        for k in range(c.w.size):
+            carried += abs(c.shown.node[r, i, k] * c.error[k])
+        worst = max(worst, _largest(n + 1, room.before) + carried)
+    return left_over + magnified * worst
+
+
+@jit_within
+def _accept(
+    c: Course, r: int, level: int, n: int, h: float, local: float, left_over: float, magnified: float
+) -> None:  # fmt: skip
+    """Note the peaks and the errors of a block that is good, and go on to its end.
+
+    `local` is what it adds to the gap voltage's error, of which `left_over` is anywhere, V.
+    """
+    room, control, decay = c.room, c.control, c.form.decay[r, level]
+    carried = 0.0
+    for k in range(c.w.size):
+        carried += abs(c.form.taps[r, 0, k] * c.error[k])
+    peak, force, steepest, worst = _peaks(n + 1, c.shown.stress, room.u, c.charges.q[0], room.before)
+    control[PEAK_U], control[PEAK_F] = max(control[PEAK_U], peak), max(control[PEAK_F], force)
+    # The force goes with the square of the voltage, and a little with the area.
+    off = magnified * worst + steepest * (left_over + magnified * carried)
+    control[ERROR_U] = max(control[ERROR_U], local + magnified * carried)
+    control[ERROR_F] = max(control[ERROR_F], 2.2 * off)
+    # Under `mobile` what the gap voltage is off moves the area, and with it all other voltages.
+    moved = local + magnified * carried if c.form.mobile else 0.0
+    control[ERROR_V] = max(control[ERROR_V], moved + _node_error(c, r, n, left_over, magnified))
+    if c.shown.charge:
+        charge_block(c, r, level, n, h, local)
+    for k in range(c.w.size):
+        c.w[k] = room.w[k, n]
+        c.error[k] = c.error[k] * decay[k] ** n + room.own[k, n]
+    control[U_GAP] = room.u[n]
+    c.counters[STEPS] += n
+
+
+@jit
+def march(
+    c: Course, values: FloatArray, at: int, stop: int, start: float, spacing: float, tol: float, t_out: FloatArray,
+    out: FloatArray,
+) -> int:  # fmt: skip
+    """Follow samples `values` at `start` + i `spacing` (s) from number `at` to `stop`.
+
+    Outputs are written up to, and without, the end. `tol` is the error of the gap voltage (V) allowed to come from a
+    block.
+    """
+    c, values = borrow(c), borrow(values)
+    form, room, control = c.form, c.room, c.control
+    while at < stop:
+        level, r = int(control[LEVEL]), int(control[REFERENCE])
+        sub = 1 << level
+        h, count = spacing / sub, min(BLOCK >> level, stop - at)
+        n = count * sub
+        _sources(values, at, count, sub, room.s)
+        for k in range(c.w.size):
+            room.w[k, 0] = c.w[k]
+        room.u[0] = control[U_GAP]
+        look_at_ends(form, room, r, 1, FIRST_NEWTON)
+        to = _nearest(form, form.q0[r] + room.z[0], r)
+        if to != r:
+            _go_over(c, r, to, c.w)
+            _go_over(c, r, to, c.error)
+            control[REFERENCE] = to
+            continue
+        left_over, margin, sweeps = relax(form, room, r, level, h, c.shown.kink, n, tol)
+        c.counters[SWEEPS] += sweeps
+        closed, local, magnified = left_over < math.inf, math.inf, 1.0
+        if closed:
+            misfit(form, room, r, level, h, c.shown.kink, n)
+            area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
+            if form.mobile:
+                # Of the state the gap voltage is 1/A times as much, and the fold magnifies it.
+                magnified = form.area0 * _largest(n + 1, c.charges.q[0]) / margin
+            local = left_over + magnified * _block_error(c, r, level, n)
+        if not local <= tol:
+            if level + 1 == LEVELS or margin <= LEAST_MARGIN:
+                return TOO_COARSE if closed else NOT_CLOSED
+            halvings = max(1.0, math.ceil(0.25 * math.log2(local / tol))) if closed else 1.0
+            control[LEVEL] = min(LEVELS - 1.0, level + halvings)
+            c.counters[REFUSED] += n
+            continue
+        control[MARGIN] = min(control[MARGIN], margin)
+        _accept(c, r, level, n, h, local, left_over, magnified)
+        write_block(c, r, sub, count, h, start + at * spacing, t_out, out)
+        at += count
+        if level > 0 and local < SPARE * tol:
+            control[LEVEL] -= 1.0
+    return DONE

@@ -1,0 +1,373 @@
+"""Waveform relaxation over blocks of equal steps: how a recording, whose slope breaks at every sample, is followed.
+
+In modes around a reference q0 of q = 1/A a stack is w' = -rates w + gain U + sum_t feed_t g_t (`engine.system`), and
+what the area moves, g_t = (q - q0) (tap_t w + tap_k U), is a few per cent of what leaks. Between two samples U is a
+straight line, and g so smooth that a parabola through three nodes serves: exponential Simpson, of fourth order, the
+response to U exact. All steps of a block are solved together: from g at all nodes the modes follow by a recursion, from
+these the gap voltage and g anew. Each sweep leaves a few hundredths of the error, and is a loop over rows of hundreds
+of steps, as fast as a processor's vectors.
+
+1/A has a kink where the gap voltage is 0. In a step across it the parabola misses kappa (|u| - its own parabola),
+kappa = dg/d|u|: what the jump of the slope of |u| makes of it is known, and is added.
+
+The error is looked for at 1/4 and 3/4 of every step, where the parabola's misfit tells the quadrature's own error
+(Boole's rule against Simpson's). Where that is too much, a block is taken again with steps half as long.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.compiled import jit_within
+from fingerspice.engine.blockrows import (
+    PAD,
+    add,
+    add_kinks,
+    add_three,
+    area_rows,
+    both_ends,
+    change_of,
+    crosses,
+    drives_into,
+    kink_at,
+    kink_rows,
+    modes_into,
+    newton_rows,
+    of_end,
+    of_step,
+    product_of,
+    recursion,
+    scaled,
+)
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# Steps of a block, and halvings of a sample's length at most.
+BLOCK, LEVELS = 512, 7
+# Degree of the polynomial for 1/A at most.
+MOST_DEGREE = 28
+# Where a step is looked at besides its ends: its middle, and the two places that tell the error.
+PLACES = (0.5, 0.25, 0.75)
+MIDDLE, FIRST_QUARTER, LAST_QUARTER = 0, 1, 2
+# Of the parabola through 0, 1/2 and 1, at those places; and Simpson's and Boole's weights.
+PARABOLA = np.array([[0.0, 1.0, 0.0], [0.375, 0.75, -0.125], [-0.125, 0.75, 0.375]])
+# Sweeps of a block, after which it is not going to close; and how little of the error allowed they may leave.
+_MOST_SWEEPS, _LEFT = 40, 0.25
+# What the error of a sweep is over that of the one before, at least: the first sweeps may close faster than the rest.
+_SLOWEST = 0.05
+# The sweep from which on the places of the kinks are known well enough, and how fast sweeps close.
+_KINKED = 2
+# Under `mobile` the gap voltage is found by Newton: at first, and in every later sweep; and the least distance to the
+# fold at which that is safe.
+FIRST_NEWTON, _NEWTON, LEAST_MARGIN = 6, 2, 0.2
+# An error this far below the one allowed lets the steps of the next block be longer: it rises sixteenfold.
+SPARE = 0.02
+
+
+# Entries of `control`: halvings of a sample, reference, and as in `engine.readout`.
+LEVEL, REFERENCE, PEAK_U, PEAK_F, ERROR_U, ERROR_F, MARGIN, Z, PEAK_Q, ERROR_Q, COLLECTED, U_GAP, ERROR_V = range(13)
+N_CONTROL = 13
+# Entries of `counters`.
+OUTPUT, STEPS, REFUSED, SWEEPS = range(4)
+N_COUNTERS = 4
+
+
+class Form(NamedTuple):
+    """A stack around reference areas, and the weights of steps of one length and its halves.
+
+    r references, `LEVELS` halvings, m modes, T drives g_t, and P projections at the ends and `PLACES` of a step: the
+    gap voltage (under `mobile` its modes' part alone), the taps, and what the slowest layer stores and leaks by (see
+    `engine.recording`).
+
+    Attributes
+    ----------
+    mobile : bool
+        Charge law. Then the last drive is (1/q - 1/q0) U.
+    q0 : ndarray, shape (r,)
+    decay : ndarray, shape (r, LEVELS, m)
+        Over a step.
+    source : ndarray, shape (r, LEVELS, m, 2)
+        What the source's values at both ends add to a mode.
+    drive : ndarray, shape (r, LEVELS, m, T, 3)
+        And what those of the drives at 0, 1/2 and 1 add.
+    feed : ndarray, shape (r, m, T)
+    taps, tap_s : ndarray, shape (r, P, m) and (P,)
+        Projections of modes and source.
+    within, within_s, within_g : ndarray, shape (r, LEVELS, 3, P, m), (r, LEVELS, 3, P, 2) and (r, LEVELS, 3, P, T, 3)
+        The same at `PLACES`, from the modes at the start of a step, the source at both ends, and the drives.
+    share : ndarray, shape (r, LEVELS, m, 2)
+        The weights of 1/2 and 1 in the integral of a parabola over a step, in units of its length.
+    defect : ndarray, shape (r, LEVELS, m, T, 2)
+        What misfits at the quarters add to the error of a mode.
+    early : ndarray, shape (r, LEVELS, T, 2)
+        And to that of the gap voltage in the middle of the step.
+    area : ndarray, shape (4 k + 1,)
+        1/A as a polynomial in `scale` |u| + `shift`.
+    """
+
+    mobile: bool
+    q0: FloatArray
+    rates: FloatArray
+    gain: FloatArray
+    decay: FloatArray
+    source: FloatArray
+    drive: FloatArray
+    feed: FloatArray
+    taps: FloatArray
+    tap_s: FloatArray
+    within: FloatArray
+    within_s: FloatArray
+    within_g: FloatArray
+    share: FloatArray
+    defect: FloatArray
+    early: FloatArray
+    area: FloatArray
+    scale: float
+    shift: float
+    k_gap: float
+    area0: float
+
+
+class Shown(NamedTuple):
+    """What is written at the outputs.
+
+    Attributes
+    ----------
+    columns : ndarray, shape (r, C, m)
+        Recorded voltages over k U.
+    k : ndarray, shape (C,)
+    node : ndarray, shape (r, n_node, m)
+        Voltages of the nodes, as `columns`.
+    slow : ndarray, shape (r, m)
+        The slowest layer's share of each mode (see `Model.slow`).
+    live, project : ndarray, shape (r, m, m)
+        From modes to live voltages and back.
+    stress : float
+        Force per area and squared gap voltage, Pa/V^2.
+    kink : ndarray, shape (T,)
+        Slope of each drive over what it multiplies, by |u_gap| at 0 V.
+    area_kink : float
+        dA/d|u| at 0 V, m^2/V.
+    moved : ndarray
+        c r G(|u|) under `local`, a polynomial as `Form.area`, C.
+    charge : bool
+    """
+
+    columns: FloatArray
+    k: FloatArray
+    node: FloatArray
+    slow: FloatArray
+    live: FloatArray
+    project: FloatArray
+    stress: float
+    kink: FloatArray
+    area_kink: float
+    moved: FloatArray
+    charge: bool
+
+
+class Room(NamedTuple):
+    """Rows of a block to work in: of the source, modes, increments, projections, drives, and single ones."""
+
+    s: FloatArray
+    s_within: FloatArray
+    w: FloatArray
+    own: FloatArray
+    inc: FloatArray
+    other: FloatArray
+    end: FloatArray
+    within: FloatArray
+    g: FloatArray
+    g_within: FloatArray
+    u: FloatArray
+    u_within: FloatArray
+    z: FloatArray
+    slope: FloatArray
+    before: FloatArray
+    crossed: FloatArray
+    jumps: FloatArray
+
+
+def new_room(modes: int, drives: int, projections: int) -> Room:
+    """Room for a form of so many."""
+    n = BLOCK + PAD
+    return Room(
+        np.zeros(n), np.zeros(n), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n),
+        np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)),
+        np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
+    )  # fmt: skip
+
+
+@jit_within
+def _drives(
+    form: Form, q0: float, n: int, newton: int, s: FloatArray, x: FloatArray, u: FloatArray, z: FloatArray,
+    slope: FloatArray, g: FloatArray,
+) -> float:  # fmt: skip
+    """Gap voltages and drives from the projections x (P, n); the least distance to the fold."""
+    margin = 1.0
+    drives = g.shape[0]
+    if form.mobile:
+        for _ in range(newton):
+            margin = newton_rows(
+                n, form.area, form.scale, form.shift, form.k_gap, form.area0, s, x[0], u, z, slope
+            )  # fmt: skip
+        drives -= 1
+    else:
+        for i in range(n):
+            u[i] = x[0, i]
+    area_rows(n, form.area, form.scale, form.shift, q0, u, z)
+    for t in range(drives):
+        product_of(n, z, x[1 + t], g[t])
+    if form.mobile:
+        last, share = g[drives], x[1 + drives]
+        for i in range(n):
+            last[i] = -z[i] / (q0 * (q0 + z[i])) * share[i]
+    return margin
+
+
+@jit_within
+def _project(form: Form, room: Room, r: int, level: int, place: int, n: int, p: int) -> None:
+    """Projection p at one place within the steps."""
+    x, c = room.within[place, p], form.within[r, level, place, p]
+    if c.size > 1:
+        of_step(n, form.within_s[r, level, place, p], room.s, c[0], room.w[0], c[1], room.w[1], x)
+    else:
+        both_ends(n, form.within_s[r, level, place, p, 0], form.within_s[r, level, place, p, 1], room.s, x)
+        add(n, c[0], room.w[0], x)
+    modes_into(n, 2, c, room.w, x)
+    drives_into(n, form.within_g[r, level, place, p], room.g, room.g_within[MIDDLE], x)
+
+
+@jit_within
+def _look(form: Form, room: Room, r: int, level: int, place: int, n: int, newton: int) -> float:
+    """Gap voltages and drives at one place within the steps; the least distance to the fold."""
+    g = room.g_within[place]
+    for p in range(1 + g.shape[0]):
+        _project(form, room, r, level, place, n, p)
+    if form.mobile:
+        both_ends(n, 1.0 - PLACES[place], PLACES[place], room.s, room.s_within)
+    return _drives(
+        form, form.q0[r], n, newton, room.s_within, room.within[place], room.u_within[place], room.z, room.slope, g
+    )  # fmt: skip
+
+
+@jit_within
+def project_at_ends(form: Form, room: Room, r: int, n: int, p: int) -> None:
+    """Projection p at the ends of the steps."""
+    c, x = form.taps[r, p], room.end[p]
+    if c.size > 1:
+        of_end(n, form.tap_s[p], room.s, c[0], room.w[0], c[1], room.w[1], x)
+    else:
+        scaled(n, form.tap_s[p], room.s, x)
+        add(n, c[0], room.w[0], x)
+    modes_into(n, 2, c, room.w, x)
+
+
+@jit_within
+def look_at_ends(form: Form, room: Room, r: int, n: int, newton: int) -> float:
+    """Gap voltages and drives at the ends of the steps."""
+    for p in range(1 + room.g.shape[0]):
+        project_at_ends(form, room, r, n, p)
+    return _drives(form, form.q0[r], n, newton, room.s, room.end, room.u, room.z, room.slope, room.g)
+
+
+@jit_within
+def project_for_charge(form: Form, room: Room, r: int, level: int, n: int) -> None:
+    """The projections that only the charge needs, everywhere; those at the quarters along the parabolas."""
+    for p in range(1 + room.g.shape[0], form.tap_s.size):
+        project_at_ends(form, room, r, n + 1, p)
+        for place in range(len(PLACES)):
+            _project(form, room, r, level, place, n, p)
+
+
+@jit_within
+def _kinks(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
+    """Add to `room.inc` what the parabolas miss of the kink."""
+    for t in range(kink.size):
+        kink_rows(n, h * kink[t], room.u, room.u_within[MIDDLE], room.end[1 + t], room.crossed, room.jumps)
+        for k in range(form.rates.shape[1]):
+            add_kinks(
+                n, form.rates[r, k] * h, form.share[r, level, k], form.feed[r, k, t], room.crossed, room.jumps,
+                room.inc[k, PAD:],
+            )  # fmt: skip
+
+
+@jit_within
+def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int, tol: float) -> tuple[
+    float, float, int
+]:  # fmt: skip
+    """Solve n steps of length h from `room.w[:, 0]` and `room.g[:, 0]`, for the source in `room.s`.
+
+    Returns what the last sweep leaves (V; inf where sweeps do not close), the least distance to the fold, and the
+    number of sweeps.
+    """
+    modes, drives = form.rates.shape[1], room.g.shape[0]
+    for t in range(drives):
+        start = room.g[t, 0]
+        for i in range(n):
+            room.g[t, i + 1] = start
+            room.g_within[MIDDLE, t, i] = start
+    # As at the start but for the source, from where Newton begins, and the first sweep's change is counted.
+    charged = room.u[0] - form.k_gap * room.s[0]
+    for i in range(n + 1):
+        room.u[i] = room.before[i] = form.k_gap * room.s[i] + charged
+    for i in range(n):
+        room.u_within[MIDDLE, i] = 0.5 * (room.u[i] + room.u[i + 1])
+    last, margin = math.inf, 1.0
+    for sweep in range(_MOST_SWEEPS):
+        for k in range(modes):
+            own = room.inc[k, PAD:]
+            both_ends(n, form.source[r, level, k, 0], form.source[r, level, k, 1], room.s, own)
+            drives_into(n, form.drive[r, level, k], room.g, room.g_within[MIDDLE], own)
+        if sweep >= _KINKED and crosses(n, room.u):
+            _kinks(form, room, r, level, h, kink, n)
+        for k in range(modes):
+            recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.w[k])
+        newton = FIRST_NEWTON if sweep == 0 else _NEWTON
+        margin = _look(form, room, r, level, MIDDLE, n, newton)
+        margin = min(margin, look_at_ends(form, room, r, n + 1, newton))
+        if sweep > 0 and not margin > LEAST_MARGIN:
+            return math.inf, margin, sweep
+        if not abs(room.u[n]) < math.inf:
+            # Whatever is no number any more is carried to the end.
+            return math.inf, margin, sweep
+        change = change_of(n + 1, room.u, room.before)
+        if sweep > 0:
+            ratio = max(change / last, _SLOWEST) if last > 0.0 else 0.0
+            if not ratio < 0.9 and change > tol:
+                return math.inf, margin, sweep
+            # What is left goes on falling by about the same ratio.
+            left = 2.0 * change * ratio
+            if left <= _LEFT * tol and sweep >= _KINKED:
+                return left, margin, sweep
+        last = change
+    return math.inf, margin, _MOST_SWEEPS
+
+
+@jit_within
+def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
+    """What each step adds to the error of the modes, into `room.inc`: Boole's rule less Simpson's."""
+    crossing = crosses(n, room.u)
+    for k in range(form.rates.shape[1]):
+        for i in range(n):
+            room.inc[k, PAD + i] = 0.0
+    for place in (FIRST_QUARTER, LAST_QUARTER):
+        if form.mobile:
+            weight = PARABOLA[place]
+            both_ends(n, weight[0], weight[2], room.u, room.u_within[place])
+            add(n, weight[1], room.u_within[MIDDLE], room.u_within[place])
+        _look(form, room, r, level, place, n, _NEWTON)
+        for t in range(room.g.shape[0]):
+            off, weight = room.g_within[place, t], PARABOLA[place]
+            add_three(
+                n, -weight[0], room.g[t], -weight[1], room.g_within[MIDDLE, t], -weight[2], room.g[t, 1:], off
+            )  # fmt: skip
+            if crossing:
+                kink_at(n, kink[t], PLACES[place], room.u, room.u_within[MIDDLE], room.end[1 + t], off)
+            for k in range(form.rates.shape[1]):
+                add(n, form.defect[r, level, k, t, place - FIRST_QUARTER], off, room.inc[k, PAD:])

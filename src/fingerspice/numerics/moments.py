@@ -1,0 +1,68 @@
+"""Moments of a decaying exponential, from which the weights of exponential quadrature follow."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.compiled import jit
+
+FloatArray = NDArray[np.float64]
+
+# Beyond, each moment follows from the one below; before, that would lose digits, and they follow from the highest.
+_LATE = 4.0
+
+
+@jit
+def moments(z: float, out: FloatArray) -> None:
+    """Integrals of exp(-z (1 - x)) x^j over [0, 1] for z >= 0 into `out` (count,), j from 0; to a few roundings."""
+    count = out.size
+    if z > _LATE:
+        out[0] = -math.expm1(-z) / z
+        for j in range(1, count):
+            out[j] = (1.0 - j * out[j - 1]) / z
+        return
+    # exp(-z) sum of z^k / (k! (k + count)): all terms are positive.
+    total, term = 0.0, 1.0
+    for k in range(60):
+        total += term / (k + count)
+        term *= z / (k + 1.0)
+    out[count - 1] = math.exp(-z) * total
+    for j in range(count - 1, 0, -1):
+        out[j - 1] = (1.0 - z * out[j]) / j
+
+
+@jit
+def _fill(z: FloatArray, basis: FloatArray, until: float, out: FloatArray) -> None:
+    count = basis.shape[1]
+    found = np.empty(count)
+    for i in range(z.size):
+        moments(z[i] * until, found)
+        for a in range(basis.shape[0]):
+            out[i, a] = 0.0
+            for j in range(count):
+                out[i, a] += basis[a, j] * until ** (j + 1) * found[j]
+
+
+def weights(z: FloatArray, nodes: tuple[float, ...], until: float = 1.0) -> FloatArray:
+    """Weights of values at `nodes` in the integral of exp(-z (until - x)) f(x) over [0, until], f their polynomial.
+
+    Parameters
+    ----------
+    z : ndarray
+        Not negative.
+    nodes : tuple of float
+        In [0, 1].
+    until : float
+        In (0, 1].
+
+    Returns
+    -------
+    ndarray, shape (*z.shape, n_nodes)
+    """
+    basis = np.ascontiguousarray(np.linalg.inv(np.vander(nodes, increasing=True)).T)
+    out = np.empty((z.size, len(nodes)))
+    _fill(np.ravel(z), basis, until, out)
+    return out.reshape(*z.shape, len(nodes))

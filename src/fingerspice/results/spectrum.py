@@ -1,0 +1,307 @@
+"""Spectrum of a signal: the lines of its last period as Fourier integrals, or a density by Welch's method."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.pages import Page, Shown, Table
+from fingerspice.base.units import format_si
+from fingerspice.circuit.loop import network_of
+from fingerspice.circuit.spectrum import NOTABLE, energy_outside
+from fingerspice.results.record import Sealed, sealed
+from fingerspice.results.signals import SIGNALS
+from fingerspice.results.summary import Figures
+from fingerspice.waveforms.waveform import require
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from fingerspice.results.measures import Weighed
+    from fingerspice.results.solution import Solution
+
+METHODS = ("auto", "lines", "welch")
+#: Number of lines unless a highest frequency is given, and the largest number.
+_LINES, _MOST_LINES = 1000, 10_000
+#: Fewest outputs of a density; half-overlapping segments into which they are divided unless a resolution is given.
+_FEWEST, _SEGMENTS = 64, 8
+#: Largest misfit of an output's time to even ones, in their distance.
+_EVEN = 1e-5
+#: Probability that the interval of a density contains the true one.
+CONFIDENCE = 0.95
+#: Largest change of a signal over its last period, relative to its range, of a periodic state.
+_CLOSED = 0.01
+#: Lines in a report.
+_SHOWN = 12
+
+
+@dataclass(frozen=True, repr=False)
+class Spectrum(Sealed, Shown):
+    """Spectrum of a signal about its mean: lines of a periodic one, or else a density with its uncertainty.
+
+    Attributes
+    ----------
+    signal, unit : str
+    frequency : ndarray, shape (n,)
+        Hz.
+    amplitude : ndarray, shape (n,), or None
+        Peak amplitude of each line, in the signal's unit; half their squares add up to the variance.
+    density : ndarray, shape (n,), or None
+        One-sided power spectral density, in the unit's square per Hz; its integral is the variance.
+    lower, upper : ndarray, shape (n,), or None
+        Ends of the interval that contains the true density with a probability of 95 %, if the signal is Gaussian noise
+        whose density changes little within the resolution.
+    mean, variance : float
+        Of the signal, over the period or over the outputs taken.
+    resolution : float
+        Hz: distance of the lines, or width of the bins.
+    segments : float
+        Independent segments to which the overlapping ones of a density are equivalent; 1 for lines.
+    """
+
+    signal: str
+    unit: str
+    frequency: FloatArray
+    amplitude: FloatArray | None
+    density: FloatArray | None
+    lower: FloatArray | None
+    upper: FloatArray | None
+    mean: float
+    variance: float
+    resolution: float
+    segments: float
+
+    def __post_init__(self) -> None:
+        for x in (self.frequency, self.amplitude, self.density, self.lower, self.upper):
+            if x is not None:
+                sealed(x)
+
+    @property
+    def shown_variance(self) -> float:
+        """Variance of what the spectrum holds: less than `variance` where the signal goes beyond its frequencies."""
+        if self.amplitude is not None:
+            return 0.5 * float((self.amplitude**2).sum())
+        assert self.density is not None
+        return float(self.density.sum()) * self.resolution
+
+    def _page(self) -> Page:
+        name = f"{SIGNALS[self.signal.partition(':')[0]][1]} ({self.signal})"
+        rms = format_si(math.sqrt(self.variance), self.unit)
+        head = f"spectrum of the {name}: mean {format_si(self.mean, self.unit)}, rms about it {rms}"
+        if self.amplitude is not None:
+            strongest = np.sort(np.argsort(self.amplitude)[::-1][:_SHOWN])
+            rows = [
+                (format_si(float(self.frequency[i]), "Hz"), format_si(float(self.amplitude[i]), self.unit))
+                for i in strongest
+            ]
+            share = 100.0 * self.shown_variance / self.variance if self.variance > 0.0 else 100.0
+            last = f"the strongest of {self.frequency.size} lines, which hold {share:.4g} % of the variance"
+            return Page([head, "", Table(("line", "amplitude"), rows), "", last])
+        lines = f"density at {self.frequency.size} frequencies up to {format_si(float(self.frequency[-1]), 'Hz')}"
+        return Page([head, f"{lines}, {self.resolution:.4g} Hz apart, as of {self.segments:.3g} independent segments"])
+
+    def plot(self) -> Figure:
+        """Draw the lines, or the density with its interval, against frequency.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            ``savefig("x.pdf")`` saves it, ``show()`` shows it.
+        """
+        from fingerspice.plots.spectra import plot_spectrum
+
+        return plot_spectrum(self)
+
+
+def spectrum_of(
+    solution: Solution, signal: str, method: str, highest: float | None, resolution: float | None, since: float | None
+) -> Spectrum:
+    """As `Solution.spectrum` says."""
+    require(method in METHODS, "method", repr(method), ", ".join(map(repr, METHODS)))
+    for name, value, unit in (("highest", highest, "Hz"), ("resolution", resolution, "Hz")):
+        require(value is None or 0.0 < value < math.inf, name, value, f"more than 0 {unit}, or None")
+    names = solution.all_signals.names(signal)
+    if len(names) != 1:
+        known = ", ".join(names) or "signals of elements that the circuit has"
+        raise InputError(f"signal {signal!r} has {len(names)} columns and a spectrum is of one; allowed: {known}")
+    welch_only = resolution is not None or since is not None
+    if method == "lines" and welch_only:
+        raise InputError("resolution and since go with method 'welch'; the lines are those of the last period")
+    if method != "welch" and not welch_only:
+        found = _lines(solution, names[0], highest)
+        if found is not None:
+            return found
+        if method == "lines":
+            raise InputError("the run holds no whole period of its source; allowed: a longer run, or method 'welch'")
+    return _density(solution, names[0], highest, resolution, since)
+
+
+def _lines(solution: Solution, name: str, highest: float | None) -> Spectrum | None:
+    """Lines of the source's last period; None where the run holds none."""
+    figures = solution._figures if isinstance(solution._figures, Figures) else Figures(solution)
+    period = solution.period
+    if period is None or figures.last is None:
+        return None
+    count = _LINES if highest is None else int(highest * period * (1.0 + 1e-12))
+    allowed = f"{1.0 / period:g} Hz, the lowest line, to {_MOST_LINES / period:g} Hz"
+    require(1 <= count <= _MOST_LINES, "highest", f"{highest} Hz", allowed)
+    weighed, exact = figures.last_finely(name, period / count)
+    if not exact:
+        # Of outputs alone nothing is known beyond half their rate.
+        count = max(min(count, (weighed.t.size - 1) // 2), 1)
+    _warn_if_open(solution, name, weighed)
+    mean = weighed.mean()
+    about = Centred(weighed.t.ravel(), weighed.weight.ravel(), weighed.x.ravel() - mean)
+    return Spectrum(
+        name, SIGNALS[name.partition(":")[0]][0], np.arange(1, count + 1) / period, about.amplitudes(period, count),
+        None, None, None, mean, about.variance, 1.0 / period, 1.0,
+    )  # fmt: skip
+
+
+class Centred(NamedTuple):
+    """Values of a signal about its mean at times (s) of one period, with quadrature weights; shape (n,) each."""
+
+    t: FloatArray
+    weight: FloatArray
+    x: FloatArray
+
+    @property
+    def variance(self) -> float:
+        return float((self.weight * self.x**2).sum())
+
+    def amplitudes(self, period: float, count: int) -> FloatArray:
+        """Amplitudes of the first `count` harmonics, shape (count,)."""
+        turn = np.exp(-2j * np.pi * np.remainder(self.t / period, 1.0))
+        turning = 2.0 * self.weight * self.x + 0j
+        out = np.empty(count)
+        for k in range(count):
+            turning *= turn
+            out[k] = abs(turning.sum())
+        return out
+
+
+def _warn_if_open(solution: Solution, name: str, weighed: Weighed) -> None:
+    """Warn where the last period of the source is not yet one of the signal."""
+    first, last = int(weighed.t.argmin()), int(weighed.t.argmax())
+    x = weighed.x.ravel()
+    if abs(x[last] - x[first]) > _CLOSED * float(np.ptp(x)) and not _has_edge(solution):
+        warnings.warn(
+            f"{name} changes over the last period by more than {100 * _CLOSED:g} % of its range, so its lines are not "
+            "those of the periodic state; a longer run, or start='periodic', has it",
+            FingerspiceWarning,
+            stacklevel=5,
+        )
+
+
+def _has_edge(solution: Solution) -> bool:
+    """Whether the run ends at a breakpoint of a source, where the signals may jump."""
+    assert solution.period is not None
+    stop, slack = solution.t_stop, 1e-6 * solution.period
+    return any(w.breakpoints(stop - slack, stop + slack).size > 0 for w in network_of(solution.circuit).waveforms)
+
+
+def _density(
+    solution: Solution, name: str, highest: float | None, resolution: float | None, since: float | None
+) -> Spectrum:
+    """Welch's density of the outputs from `since` (s) on."""
+    from scipy.signal import get_window, welch
+
+    t, x = even_outputs(solution, name, since)
+    rate = (t.size - 1) / (t[-1] - t[0])
+    size = 2 * t.size // (_SEGMENTS + 1) if resolution is None else round(rate / resolution)
+    allowed = f"{rate / t.size:.4g} Hz, one over the length of the run, to {rate / 8:.4g} Hz"
+    require(8 <= size <= t.size, "resolution", f"{resolution} Hz", allowed)
+    mean = float(x.mean())
+    window = get_window("hann", size)
+    f, density = welch(x - mean, rate, window=window, noverlap=size // 2, detrend=False)
+    segments = equivalent_segments(window, size - size // 2, 1 + (t.size - size) // (size - size // 2))
+    low, high = interval(segments)
+    variance = float(np.mean((x - mean) ** 2))
+    _warn_if_folded(solution, name, rate)
+    kept = slice(None) if highest is None else f <= highest
+    require(bool(np.any(f[kept])), "highest", f"{highest} Hz", f"{f[1]:.4g} Hz or more")
+    return Spectrum(
+        name, SIGNALS[name.partition(":")[0]][0], f[kept], None, density[kept], low * density[kept],
+        high * density[kept], mean, variance, float(f[1]), segments,
+    )  # fmt: skip
+
+
+def even_outputs(solution: Solution, name: str, since: float | None) -> tuple[FloatArray, FloatArray]:
+    """Times (s) and values of a signal's outputs, without those that the jumps of the source add between them.
+
+    Raises
+    ------
+    InputError
+        Where these are not evenly spaced, or too few.
+    """
+    t, x = solution.t, solution.all_signals.one(name)
+    require(since is None or (t.size > 0 and since < t[-1]), "since", since, "a time before the end of the run, s")
+    # Of the two rows of a jump the right-hand one stays, and none where the jump lies between the other outputs.
+    kept = np.append(np.diff(t) > 0.0, True)[: t.size] & (t >= (-math.inf if since is None else since))
+    jump = np.append(False, np.diff(t) == 0.0)[: t.size][kept]
+    t, x = t[kept], x[kept]
+    if t.size < _FEWEST:
+        raise InputError(
+            f"a density needs {_FEWEST} outputs or more, and there are {t.size}; allowed: a shorter step on the .tran "
+            "line, or more times in t_eval"
+        )
+    place = (t - t[0]) / (t[-1] - t[0])
+    place *= np.rint(1.0 / np.median(np.diff(place)))
+    on = ~jump | (np.abs(place - np.rint(place)) <= _EVEN)
+    if np.any(np.abs(np.diff(place[on]) - 1.0) > _EVEN):
+        raise InputError(
+            "the outputs are not evenly spaced, and a density needs them so; allowed: the even outputs of the .tran "
+            "line's step, or even times in t_eval"
+        )
+    return t[on], x[on]
+
+
+def equivalent_segments(window: FloatArray, step: int, count: int) -> float:
+    """Independent segments with the same variance of the mean density as `count` overlapping ones (Welch 1967).
+
+    Parameters
+    ----------
+    window : ndarray, shape (size,)
+    step : int
+        Samples from the start of a segment to that of the next.
+    count : int
+    """
+    power = float(window @ window)
+    shifts = range(1, min(count, -(-window.size // step)))
+    overlap = [float(window[m * step :] @ window[: window.size - m * step]) / power for m in shifts]
+    return count / (1.0 + 2.0 * sum((1.0 - m / count) * r**2 for m, r in zip(shifts, overlap, strict=True)))
+
+
+def interval(segments: float) -> tuple[float, float]:
+    """Factors from an estimated density to the ends of its interval, by chi-square with two degrees a segment."""
+    from scipy.stats import chi2
+
+    degrees = 2.0 * segments
+    tail = 0.5 * (1.0 - CONFIDENCE)
+    return float(degrees / chi2.ppf(1.0 - tail, degrees)), float(degrees / chi2.ppf(tail, degrees))
+
+
+def _warn_if_folded(solution: Solution, name: str, rate: float) -> None:
+    """Warn where the outputs are too rare for the signal's band: what lies beyond is folded into the spectrum.
+
+    The band of a voltage is that of the sources; areas and forces follow the voltage's square, with twice that band.
+    """
+    wide = 1.0 if name.partition(":")[0] in ("u_source", "u_layer", "u_gap", "v", "i_source", "q_source") else 2.0
+    half = 0.5 * rate / wide
+    waves = network_of(solution.circuit).waveforms
+    # Each look samples the source at four times a frequency: the second one sees what the first would fold, too.
+    share = max((energy_outside(w, solution.t_stop, (0.0, f))[1] for w in waves for f in (half, 8.0 * half)), default=0)
+    if share > NOTABLE:
+        warnings.warn(
+            f"{name} has frequencies beyond half the rate of the outputs, {0.5 * rate:g} Hz, which are folded into its "
+            f"spectrum ({100.0 * share:.0f} % of the source's energy lie above {half:g} Hz); a shorter step of the "
+            "outputs, at most half a period of the highest frequency, keeps them apart",
+            FingerspiceWarning,
+            stacklevel=5,
+        )

@@ -1,0 +1,248 @@
+"""What the hand feels of a run: the friction's spectrum as movement of the skin, and its level above a threshold."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import InputError
+from fingerspice.base.pages import Page, Shown, Table
+from fingerspice.base.units import format_si
+from fingerspice.results.record import Sealed, sealed
+from fingerspice.studies.perception import (
+    DIFFERENCE_DB,
+    FINGERPAD,
+    WEBER_FRICTION,
+    SkinMechanics,
+    Threshold,
+    android_threshold,
+)  # fmt: skip
+from fingerspice.waveforms.waveform import require
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from fingerspice.results.solution import Solution
+    from fingerspice.results.spectrum import Spectrum
+
+#: Edges of a third-octave band, relative to its middle, of which one is at 1 kHz; fewest bins of a density in a band.
+_EDGE, _FEWEST = 2.0 ** (1.0 / 6.0), 2
+#: Lines weaker than the strongest acceleration by this factor are rounding, and are left out.
+_NOTHING = 1e-9
+#: Rows of a report.
+_SHOWN = 10
+
+
+@dataclass(frozen=True, repr=False)
+class Feel(Sealed, Shown):
+    """What a hand may feel of a friction force: lines of a periodic one, else third-octave bands.
+
+    The threshold is that of the device that the hand holds, and the skin is one mass on a spring, so a level is an
+    estimate to compare drives by, and no measurement. Sounds, warmth and edges are not looked at.
+
+    Attributes
+    ----------
+    signal : str
+        The friction force that was looked at: ``f_t``, or ``f_t:GAP`` of one of several fingers.
+    kind : str
+        ``"lines"`` or ``"bands"``; a band has the amplitude of the sine with its rms.
+    frequency : ndarray, shape (n,)
+        Of the lines, or in the middle of the bands, Hz.
+    force, displacement, acceleration : ndarray, shape (n,)
+        Amplitudes of the friction force (N), and of the skin's movement (m, m/s^2).
+    level : ndarray, shape (n,)
+        Of the acceleration above the threshold, dB; NaN at frequencies of which the threshold says nothing.
+    change : float
+        Friction's change relative to its highest value, by what of it lies within the threshold's frequencies: that of
+        a sine of its rms.
+    mechanics : SkinMechanics
+    threshold : Threshold
+    """
+
+    signal: str
+    kind: str
+    frequency: FloatArray
+    force: FloatArray
+    displacement: FloatArray
+    acceleration: FloatArray
+    level: FloatArray
+    change: float
+    mechanics: SkinMechanics
+    threshold: Threshold
+
+    def __post_init__(self) -> None:
+        for x in (self.frequency, self.force, self.displacement, self.acceleration, self.level):
+            sealed(x)
+
+    @property
+    def strongest(self) -> int | None:
+        """Number of the line or band with the highest level; None where the threshold judges none."""
+        return int(np.nanargmax(self.level)) if np.isfinite(self.level).any() else None
+
+    @property
+    def highest(self) -> float | None:
+        """The highest level, dB; None where the threshold judges no line or band."""
+        return None if self.strongest is None else float(self.level[self.strongest])
+
+    @property
+    def felt(self) -> bool:
+        """Whether some line or band reaches the threshold."""
+        return self.highest is not None and self.highest >= 0.0
+
+    @property
+    def change_felt(self) -> bool:
+        """Whether the friction's change reaches Weber's fraction of 0.11 (`perception.WEBER_FRICTION`)."""
+        return self.change >= WEBER_FRICTION
+
+    @property
+    def steps(self) -> float | None:
+        """The highest level in difference thresholds of 1.21 dB (`perception.DIFFERENCE_DB`); None where not felt."""
+        return self.highest / DIFFERENCE_DB if self.highest is not None and self.felt else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The keys of ``--json``; lines that the threshold does not judge are left out."""
+        every = (self.frequency, self.force, self.displacement, self.acceleration, self.level)
+        rows = zip(*(x[np.isfinite(self.level)] for x in every), strict=True)
+        keys = ("frequency", "force", "displacement", "acceleration", "level_db")
+        place = self.strongest
+        return {
+            "element": self.signal.partition(":")[2] or None,
+            "felt": self.felt,
+            "kind": self.kind,
+            "strongest": None if place is None else float(self.frequency[place]),
+            "level_db": self.highest,
+            "difference_steps": self.steps,
+            "friction_change": self.change,
+            "friction_change_felt": self.change_felt,
+            "mechanics": {"name": self.mechanics.name, "mass": self.mechanics.mass, "damping": self.mechanics.damping,
+                          "stiffness": self.mechanics.stiffness, "source": self.mechanics.source},
+            "threshold": {"name": self.threshold.name, "source": self.threshold.source},
+            "lines": [dict(zip(keys, map(float, row), strict=True)) for row in rows],
+        }  # fmt: skip
+
+    def _page(self) -> Page:
+        what = "line" if self.kind == "lines" else "band around"
+        blocks: list[str | Table] = [self.verdict()]
+        judged = np.flatnonzero(np.isfinite(self.level))
+        if judged.size:
+            shown = np.sort(judged[np.argsort(self.level[judged])[::-1][:_SHOWN]])
+            rows = [
+                (
+                    *(format_si(float(x[i]), unit) for x, unit in (
+                        (self.frequency, "Hz"), (self.force, "N"), (self.displacement, "m"),
+                        (self.acceleration, "m/s^2"),
+                    )),
+                    f"{self.level[i]:+.1f} dB",
+                )
+                for i in shown
+            ]  # fmt: skip
+            blocks += ["", Table((what, "friction", "skin moves", "accelerates", "above threshold"), rows), ""]
+        blocks.append(
+            f"friction changes by {100.0 * self.change:.3g} % within these frequencies; "
+            f"{100.0 * WEBER_FRICTION:g} % are noticed as a transient reduction"
+        )
+        m = self.mechanics
+        blocks.append(f"threshold: {self.threshold.name} ({self.threshold.source})")
+        blocks.append(f"skin: {m.name}: {1e3 * m.mass:g} g, {m.damping:g} N s/m, {1e-3 * m.stiffness:g} N/mm")
+        return Page(blocks)
+
+    def verdict(self) -> str:
+        """Felt or not, where, and how far above the threshold, in one sentence."""
+        finger = f"finger {self.signal.partition(':')[2]}: " if ":" in self.signal else ""
+        place = self.strongest
+        low, high = self.threshold.frequency[[0, -1]]
+        if place is None:
+            return f"{finger}not felt: no part of the friction lies between {low:g} and {high:g} Hz"
+        level, at = self.level[place], format_si(float(self.frequency[place]), "Hz")
+        where = f"at {at}" if self.kind == "lines" else f"in the third octave around {at}"
+        if self.steps is None:
+            return f"{finger}not felt: strongest {where}, {-level:.1f} dB below the threshold"
+        return (
+            f"{finger}felt: strongest {where}, {level:.1f} dB above the threshold ({self.steps:.0f} noticeable steps)"
+        )
+
+    def plot(self, others: Sequence[Feel] = ()) -> Figure:
+        """Draw acceleration against the threshold over frequency, with that of other fingers.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            ``savefig("x.pdf")`` saves it, ``show()`` shows it.
+        """
+        from fingerspice.studies.feel_picture import plot_feel
+
+        return plot_feel([self, *others])
+
+
+def feel(
+    solution: Solution,
+    signal: str = "f_t",
+    *,
+    mechanics: SkinMechanics = FINGERPAD,
+    threshold: Threshold | None = None,
+) -> Feel:
+    """What a hand may feel of a run: its friction as movement of the skin, and its level above a threshold.
+
+    The friction's lines, or for a source without a period the third-octave bands of its density (see
+    `Solution.spectrum`), move the skin by its mechanics; the acceleration's amplitude is compared with the threshold.
+
+    Parameters
+    ----------
+    solution : Solution
+    signal : str
+        ``"f_t"``, or ``"f_t:GAP"`` of one of several fingers.
+    mechanics : SkinMechanics
+        `fingerspice.studies.perception.FINGERPAD` by default.
+    threshold : Threshold, optional
+        Android's least perceptible acceleration by default, which is that of a device held in the hand.
+
+    Raises
+    ------
+    InputError
+        For a signal that is no friction force, or a run whose spectrum cannot be computed.
+    """
+    require(signal.partition(":")[0] == "f_t", "signal", repr(signal), "'f_t', the friction force, or 'f_t:GAP'")
+    require(isinstance(mechanics, SkinMechanics), "mechanics", repr(mechanics), "a SkinMechanics")
+    table = android_threshold() if threshold is None else threshold
+    require(isinstance(table, Threshold), "threshold", repr(table), "a Threshold")
+    if not solution.gaps:
+        raise InputError("the circuit has no GAP, so there is no friction to feel; allowed: a circuit with a GAP")
+    spectrum = solution.spectrum(signal)
+    if spectrum.amplitude is not None and spectrum.frequency[-1] < table.frequency[-1]:
+        # The lines of a long period are too many, and too close to be felt one by one.
+        spectrum = solution.spectrum(signal, method="welch")
+    kind = "bands" if spectrum.amplitude is None else "lines"
+    f, force = _bands(spectrum) if spectrum.amplitude is None else (spectrum.frequency, spectrum.amplitude)
+    size = np.abs(mechanics.acceleration(f)) * force
+    kept = size > _NOTHING * size.max(initial=0.0)
+    f, force, size = f[kept], force[kept], size[kept]
+    with np.errstate(divide="ignore"):
+        level = 20.0 * np.log10(size / table.acceleration(f))
+    return Feel(
+        spectrum.signal, kind, f, force, np.abs(mechanics.displacement(f)) * force, size, level,
+        _change(spectrum.mean, force[np.isfinite(level)]), mechanics, table,
+    )  # fmt: skip
+
+
+def _change(mean: float, force: FloatArray) -> float:
+    """Peak to peak of a sine with the rms of these amplitudes (N), relative to its highest value about a mean (N)."""
+    amplitude = math.sqrt(float((force**2).sum()))
+    return 2.0 * amplitude / (mean + amplitude) if amplitude > 0.0 else 0.0
+
+
+def _bands(spectrum: Spectrum) -> tuple[FloatArray, FloatArray]:
+    """Middles (Hz) of the third octaves that the density resolves, and amplitudes of sines with their rms."""
+    assert spectrum.density is not None
+    width = spectrum.resolution
+    # A bin belongs to the band in which its middle lies; the lowest band is as wide as some bins.
+    lowest = math.ceil(3.0 * math.log2(_FEWEST * width / (_EDGE - 1.0 / _EDGE) / 1e3))
+    highest = math.floor(3.0 * math.log2(float(spectrum.frequency[-1]) / _EDGE / 1e3))
+    middle = 1e3 * 2.0 ** (np.arange(lowest, max(highest, lowest) + 1) / 3.0)
+    edges = np.append(middle / _EDGE, middle[-1] * _EDGE)
+    sums = np.append(0.0, np.cumsum(spectrum.density * width))[np.searchsorted(spectrum.frequency, edges)]
+    return middle, np.sqrt(2.0 * np.diff(sums))

@@ -1,0 +1,152 @@
+"""What is known of feeling: the skin's mechanics, and thresholds of perception, each with its source and caveat."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import InputError
+from fingerspice.results.record import Sealed, sealed
+from fingerspice.waveforms.waveform import require
+
+#: Standard gravity, m/s^2.
+GRAVITY = 9.80665
+DIFFERENCE_DB = 1.21
+"""Smallest difference of two electrovibrations that is noticed, dB of the stimulus.
+
+Source: S. Ryu et al., "Mechanical vibration influences the perception of electrovibration", Scientific Reports 8, 4555
+(2018), doi:10.1038/s41598-018-22865-x: an average, where Weber's law holds. Caveat: only the abstract was at hand. It
+does not say whether the decibels are of voltage or of force; force follows the voltage's square, so that the step would
+be twice as many decibels of force if they are of voltage.
+"""
+WEBER_FRICTION = 0.11
+"""Smallest reduction of the friction force that is noticed, relative to the force before it.
+
+Source: D. Gueorguiev et al., "The tactile perception of transient changes in friction", Journal of the Royal Society
+Interface 14, 20170641 (2017), doi:10.1098/rsif.2017.0641: in all conditions. Caveat: transient reductions by ultrasonic
+lubrication of a finger that a robot rubs, so other than an electroadhesive increase.
+"""
+
+
+@dataclass(frozen=True)
+class SkinMechanics:
+    """How far the skin moves sideways under a tangential force: one mass on a spring and a damper.
+
+    Parameters
+    ----------
+    name : str
+    mass, damping, stiffness : float
+        kg, N s/m and N/m.
+    source : str
+        Where the values are from, and what they do not claim.
+    """
+
+    name: str
+    mass: float
+    damping: float
+    stiffness: float
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        for what, unit in (("mass", "kg"), ("damping", "N s/m"), ("stiffness", "N/m")):
+            value = getattr(self, what)
+            require(0.0 <= value < np.inf, what, f"{value} {unit}", f"finite, 0 or more {unit}")
+        require(self.stiffness > 0.0, "stiffness", f"{self.stiffness} N/m", "more than 0 N/m")
+
+    def displacement(self, frequency: FloatArray) -> NDArray[np.complex128]:
+        """Displacement per force at frequencies (Hz), m/N, same shape."""
+        omega = 2.0 * np.pi * np.asarray(frequency)
+        return np.asarray(1.0 / (self.stiffness - self.mass * omega**2 + 1j * self.damping * omega))
+
+    def acceleration(self, frequency: FloatArray) -> NDArray[np.complex128]:
+        """Acceleration per force at frequencies (Hz), 1/kg, same shape."""
+        return np.asarray(-((2.0 * np.pi * np.asarray(frequency)) ** 2) * self.displacement(frequency))
+
+
+FINGERPAD = SkinMechanics(
+    "fingerpad, sideways",
+    mass=1e-4,
+    damping=1.0,
+    stiffness=1e3,
+    source="Table 1 of 'Friction perception resulting from laterally vibrotactile stimuli', ROBOMECH Journal 2017, "
+    "doi:10.1186/s40648-017-0080-8, values of a simulation; those of a person differ, and change with load and speed",
+)
+"""The fingerpad moved sideways: 0.1 g, 1 N s/m, 1 N/mm.
+
+Source: values of a simulation, Table 1 of "Friction perception resulting from laterally vibrotactile stimuli", ROBOMECH
+Journal (2017), doi:10.1186/s40648-017-0080-8. Caveat: one mass stands for a pad whose parts move differently. Stiffness
+and moving mass rise with the sliding speed (Balasubramanian et al. 2025, arXiv:2505.11162: 4 N/m and 0.03 g per mm/s)
+and differ between people. Measurements that are often quoted (Nakazawa, Ikeura and Inooka, "Characteristics of human
+fingertips in the shearing direction", 2000) are said to lie at 1 to 2 N/mm, 1 to 3 N s/m and 0.1 to 0.2 g; these could
+not be checked.
+"""
+
+
+@dataclass(frozen=True)
+class Threshold(Sealed):
+    """Smallest amplitude of a vibration that is felt, against frequency; nothing is said beyond its frequencies.
+
+    Parameters
+    ----------
+    name : str
+    frequency : array_like, shape (n,)
+        Hz, ascending, two or more.
+    level : array_like, shape (n,)
+        dB: 20 log10 of the acceleration's amplitude in `reference`; linear in frequency between the points.
+    reference : float
+        m/s^2; 1 by default.
+    source : str
+        Where the values are from, and what they do not claim.
+    """
+
+    name: str
+    frequency: FloatArray
+    level: FloatArray
+    reference: float = 1.0
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        for what in ("frequency", "level"):
+            object.__setattr__(self, what, sealed(np.array(getattr(self, what), float)))
+        f, level = self.frequency, self.level
+        good = f.ndim == 1 and f.size >= 2 and f.shape == level.shape
+        require(good, "threshold", f"shapes {f.shape} and {level.shape}", "two rows of equal length, two or more")
+        bad = np.flatnonzero(~(np.isfinite(f) & np.isfinite(level)) | (f < 0.0) | np.append(False, np.diff(f) <= 0.0))
+        if bad.size:
+            raise InputError(
+                f"threshold {self.name!r}: point {bad[0] + 1} is {f[bad[0]]} Hz, {level[bad[0]]} dB; allowed: finite "
+                "numbers, with frequencies ascending from 0 or more"
+            )
+        require(0.0 < self.reference < np.inf, "reference", f"{self.reference} m/s^2", "more than 0 m/s^2")
+
+    def acceleration(self, frequency: FloatArray) -> FloatArray:
+        """Amplitude that is just felt at frequencies (Hz), m/s^2, same shape; NaN beyond the table."""
+        level = np.interp(frequency, self.frequency, self.level, left=np.nan, right=np.nan)
+        return np.asarray(self.reference * 10.0 ** (level / 20.0))
+
+
+@cache
+def android_threshold() -> Threshold:
+    """Least perceptible acceleration as published by Android: 41 points, 0.4 to 400 Hz.
+
+    Source: the Android Open Source Project, Apache License 2.0; the head of `least_perceptible_acceleration.csv` names
+    its files. Caveat: it is of a device held in the hand, not of a bare finger that slides. Whether the acceleration is
+    a peak or an rms, and from which experiment it is, Android does not say. It is taken as a peak here; as an rms it
+    would be 3 dB higher, and every level 3 dB lower.
+    """
+    path = Path(__file__).with_name("least_perceptible_acceleration.csv")
+    rows = [row for row in csv.reader(path.read_text(encoding="utf-8").splitlines()) if not row[0].startswith("#")]
+    frequency, level = np.array(rows[1:], float).T
+    return Threshold(
+        "Android's least perceptible acceleration",
+        frequency,
+        level,
+        reference=GRAVITY,
+        source="Android Open Source Project, Apache-2.0: of a device held in the hand, not of a bare, sliding finger",
+    )

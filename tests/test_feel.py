@@ -1,0 +1,275 @@
+"""What the hand feels: the skin's mechanics, the thresholds from their sources, levels, and the command line."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import fingerspice as fs
+from commands import Command
+from fingerspice.studies.feel import feel
+from fingerspice.studies.perception import (
+    DIFFERENCE_DB,
+    FINGERPAD,
+    GRAVITY,
+    WEBER_FRICTION,
+    SkinMechanics,
+    Threshold,
+    android_threshold,
+)
+from scenes import deck, table1
+
+ROOT = Path(__file__).parents[1]
+EPS0, D, MU, LOAD = 8.854e-12, 3.5e-6, 0.3, 0.5
+#: Some points of Android's array, as its source has them.
+ANDROID = {0.4: -97.81, 2.0: -69.86, 10.37: -48.52, 72.0: -31.55, 103.68: -31.77, 200.0: -30.86, 400.0: -19.81}
+FLAT = Threshold("flat", (1.0, 1000.0), (0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def frozen() -> fs.Solution:
+    """A periodic run whose friction is that of a sine: the area does not change."""
+    return fs.simulate(table1(), area="frozen", start="periodic", t_stop=0.01)
+
+
+@pytest.mark.parametrize("frequency", [20.0, 160.0, 700.0])
+def test_the_skin_moves_as_its_equation_of_motion_says(frequency: float) -> None:
+    skin = SkinMechanics("any", 2e-4, 0.4, 1.5e3)
+    omega = 2.0 * math.pi * frequency
+
+    def motion(t: float, y: np.ndarray) -> list[float]:
+        force = math.sin(omega * t)
+        return [y[1], (force - skin.damping * y[1] - skin.stiffness * y[0]) / skin.mass]
+
+    # The free motion dies away with mass / damping, 1 ms at most.
+    period = 1.0 / frequency
+    begin = math.ceil(0.1 / period) * period
+    t = begin + np.linspace(0.0, period, 33)[:-1]
+    found = solve_ivp(motion, (0.0, t[-1]), [0.0, 0.0], t_eval=t, method="DOP853", rtol=1e-10, atol=1e-16)
+    amplitude = 2.0 * np.mean(found.y[0] * np.exp(-1j * omega * t)) * 1j
+    np.testing.assert_allclose(skin.displacement(np.array([frequency]))[0], amplitude, rtol=1e-6)
+    np.testing.assert_allclose(skin.acceleration(np.array([frequency]))[0], -(omega**2) * amplitude, rtol=1e-6)
+
+
+def test_the_fingerpad_is_a_spring_at_low_and_a_mass_at_high_frequencies() -> None:
+    assert (FINGERPAD.mass, FINGERPAD.damping, FINGERPAD.stiffness) == (1e-4, 1.0, 1e3)
+    low, high = np.abs(FINGERPAD.displacement(np.array([0.1]))), np.abs(FINGERPAD.acceleration(np.array([1e6])))
+    np.testing.assert_allclose([low[0], high[0]], [1e-3, 1e4], rtol=1e-5)
+
+
+def test_the_threshold_is_androids() -> None:
+    table = android_threshold()
+    assert table.frequency.size == 41
+    assert (table.frequency[0], table.frequency[-1]) == (0.4, 400.0)
+    for frequency, level in ANDROID.items():
+        found = table.acceleration(np.array([frequency]))[0]
+        assert found == pytest.approx(GRAVITY * 10.0 ** (level / 20.0), rel=1e-12)
+    # Decibels are linear in frequency between two points: 15 Hz has -44.35, 17.92 Hz has -41.96.
+    middle = table.acceleration(np.array([16.46]))[0]
+    assert 20.0 * math.log10(middle / GRAVITY) == pytest.approx(-43.155, abs=1e-9)
+    assert np.isnan(table.acceleration(np.array([0.3, 401.0]))).all()
+
+
+def test_the_tables_head_has_licence_and_origin() -> None:
+    text = (ROOT / "src/fingerspice/studies/least_perceptible_acceleration.csv").read_text()
+    head = "".join(line for line in text.splitlines() if line.startswith("#"))
+    for said in ("Android Open Source Project", "Apache License, Version 2.0", "BasicToPwleSegmentAdapter.java"):
+        assert said in head
+    assert "least_perceptible_acceleration.csv" in (ROOT / "NOTICE").read_text()
+    assert "Apache License" in (ROOT / "LICENSES" / "Apache-2.0.txt").read_text()
+
+
+def test_the_other_thresholds_are_those_of_their_papers() -> None:
+    assert (DIFFERENCE_DB, WEBER_FRICTION) == (1.21, 0.11)
+
+
+def test_the_level_of_a_sines_friction_is_that_of_the_formula(frozen: fs.Solution) -> None:
+    found = feel(frozen, threshold=FLAT)
+    area = float(frozen.area[0])
+    # With a constant area the friction of a sine is one line at twice its frequency.
+    force = MU * EPS0 * area * frozen.u_gap_amplitude**2 / (4.0 * D**2)
+    omega = 2.0 * math.pi * 200.0
+    size = omega**2 * force / abs(1e3 - 1e-4 * omega**2 + 1j * omega)
+    place = found.strongest
+    assert place is not None
+    assert found.frequency[place] == pytest.approx(200.0)
+    assert found.force[place] == pytest.approx(force, rel=1e-7)
+    assert found.displacement[place] == pytest.approx(size / omega**2, rel=1e-7)
+    assert found.acceleration[place] == pytest.approx(size, rel=1e-7)
+    assert found.highest == pytest.approx(20.0 * math.log10(size), abs=1e-6)
+    assert found.steps == pytest.approx(20.0 * math.log10(size) / 1.21, rel=1e-6)
+    mean = MU * LOAD + force
+    assert found.change == pytest.approx(2.0 * force / (mean + force), rel=1e-7)
+    assert found.change_felt
+
+
+def test_a_level_follows_drive_threshold_and_skin_in_decibels(frozen: fs.Solution) -> None:
+    half = fs.simulate(table1("SIN(0 100 100)"), area="frozen", start="periodic", t_stop=0.01)
+    level = feel(frozen, threshold=FLAT).highest
+    assert level is not None
+    # Force goes with the square of the voltage: 20 log10(4).
+    assert feel(half, threshold=FLAT).highest == pytest.approx(level - 40.0 * math.log10(2.0), abs=1e-6)
+    higher = Threshold("higher", FLAT.frequency, FLAT.level + 6.0)
+    assert feel(frozen, threshold=higher).highest == pytest.approx(level - 6.0, abs=1e-9)
+    stiff = SkinMechanics("stiff", 1e-3, 10.0, 1e4)
+    assert feel(frozen, threshold=FLAT, mechanics=stiff).highest == pytest.approx(level - 20.0, abs=1e-9)
+
+
+def test_what_is_weak_or_too_fast_is_not_felt() -> None:
+    weak = feel(fs.simulate(table1("SIN(0 2 100)"), start="periodic", t_stop=0.01))
+    assert not weak.felt
+    assert weak.steps is None
+    assert not weak.change_felt
+    assert "below the threshold" in weak.verdict()
+    fast = feel(fs.simulate(table1("SIN(0 200 5k)", f=5e3), start="periodic", t_stop=2e-4))
+    assert not fast.felt
+    assert fast.highest is None
+    assert "no part of the friction" in fast.verdict()
+
+
+@pytest.mark.parametrize("frequency", [15.0, 30.0, 60.0, 180.0])
+def test_below_60_hz_squares_are_felt_at_lower_voltages_than_sines_by_their_fast_lines(frequency: float) -> None:
+    # Measured by Vardar, Güçlü and Basdogan (2016 and 2017, doi:10.1109/TOH.2017.2704603): at 60 Hz and above squares
+    # have no advantage, and what feels squares is the Pacinian channel, which is best at 200 to 300 Hz.
+    circuit = table1(skin={"f": frequency})
+    waves = fs.Sine(20.0, frequency), fs.Square(20.0, frequency)
+    sine, square = (feel(fs.steady_state(circuit, sources=wave, rtol=1e-5).solution) for wave in waves)
+    assert sine.highest is not None
+    assert square.highest is not None
+    assert square.strongest is not None
+    more = square.highest - sine.highest
+    if frequency < 60.0:
+        assert more > 6.0
+        assert 200.0 <= square.frequency[square.strongest] <= 300.0
+    else:
+        # Here the square loses up to 3.2 dB, a factor of 1.2 of voltage, as every line is judged alone.
+        assert more < 1.0
+
+
+def test_a_source_without_a_period_is_felt_in_third_octaves() -> None:
+    # A tone of 80 Hz without a period of its own, so that the force has 160 Hz.
+    t = np.arange(0.0, 2.0, 2e-4)
+    chirp = fs.Chirp(200.0, 80.0, 80.001, 2.0)
+    found = feel(fs.simulate(table1(), sources={"Vdrive": chirp}, area="frozen", t_stop=2.0, t_eval=t, rtol=1e-6))
+    tone = feel(fs.simulate(table1("SIN(0 200 80)"), area="frozen", start="periodic", t_stop=0.0125))
+    assert (found.kind, tone.kind) == ("bands", "lines")
+    place = found.strongest
+    assert place is not None
+    assert found.frequency[place] == pytest.approx(1e3 * 2.0 ** (-8 / 3))
+    # The band holds all of the tone, whose frequency is not its middle.
+    assert found.force[place] == pytest.approx(tone.force.max(), rel=1e-3)
+    assert "third octave" in found.verdict()
+    np.testing.assert_allclose(np.diff(np.log2(found.frequency)), 1.0 / 3.0)
+
+
+def test_a_period_with_too_many_lines_is_felt_in_third_octaves() -> None:
+    slow = fs.AM(200, 100, 0.25)
+    circuit = table1(skin={"f": 100.0})
+    solution = fs.simulate(circuit, sources={"Vdrive": slow}, t_stop=8.0, t_eval=np.arange(0.0, 8.0, 5e-4), rtol=1e-5)
+    found = feel(solution)
+    assert found.kind == "bands"
+    assert found.felt
+    place = found.strongest
+    assert place is not None
+    assert found.frequency[place] == pytest.approx(198.4, abs=0.1)
+
+
+def test_bands_add_up_to_the_variance_of_noise() -> None:
+    values = 60.0 * np.random.default_rng(3).standard_normal(8000)
+    source = fs.Samples(values, rate=2000.0)
+    solution = fs.simulate(
+        table1(), sources={"Vdrive": source}, area="frozen", t_stop=3.9, t_eval=np.arange(0.0, 3.9, 1e-4), rtol=1e-5
+    )
+    found, spectrum = feel(solution), solution.spectrum()
+    assert spectrum.density is not None
+    low, high = found.frequency[0] / 2.0 ** (1 / 6), found.frequency[-1] * 2.0 ** (1 / 6)
+    inside = (spectrum.frequency >= low) & (spectrum.frequency < high)
+    expected = spectrum.density[inside].sum() * spectrum.resolution
+    assert 0.5 * np.sum(found.force**2) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: SkinMechanics("x", -1.0, 1.0, 1.0), "mass is -1.0 kg; allowed: finite, 0 or more kg"),
+        (lambda: SkinMechanics("x", 1.0, 1.0, 0.0), "more than 0 N/m"),
+        (lambda: SkinMechanics("x", 1.0, math.nan, 1.0), "damping is nan"),
+        (lambda: Threshold("x", (1.0,), (0.0,)), "two rows of equal length"),
+        (lambda: Threshold("x", (1.0, 2.0), (0.0, 1.0, 2.0)), "two rows of equal length"),
+        (lambda: Threshold("x", (2.0, 1.0), (0.0, 0.0)), "point 2 is 1.0 Hz"),
+        (lambda: Threshold("x", (1.0, 2.0), (math.nan, 0.0)), "point 1 is 1.0 Hz, nan dB"),
+        (lambda: Threshold("x", (1.0, 2.0), (0.0, 0.0), reference=0.0), "more than 0 m/s"),
+    ],
+)
+def test_mechanics_and_thresholds_without_sense_are_refused(make: object, said: str) -> None:
+    with pytest.raises(fs.InputError, match=said):
+        make()  # type: ignore[operator]
+
+
+def test_what_cannot_be_felt_is_refused(frozen: fs.Solution) -> None:
+    with pytest.raises(fs.InputError, match="'f_t', the friction force"):
+        feel(frozen, "u_gap")
+    with pytest.raises(fs.InputError, match="a Threshold"):
+        feel(frozen, threshold=3.0)  # type: ignore[arg-type]
+    with pytest.raises(fs.InputError, match="a SkinMechanics"):
+        feel(frozen, mechanics="soft")  # type: ignore[arg-type]
+    with pytest.raises(fs.InputError, match="no GAP"):
+        feel(fs.simulate(deck("V1 a 0 SIN(0 1 100)", "R1 a 0 1k", ".tran 1m 20m")))
+
+
+def test_the_picture_has_the_threshold_and_every_finger() -> None:
+    circuit = fs.read_netlist(ROOT / "circuits" / "two_fingers.cir")
+    solution = fs.simulate(circuit, sources={"Vdrive": fs.Sine(200.0, 50.0)}, t_stop=0.04, rtol=1e-5)
+    firm, light = (feel(solution, f"f_t:{gap}") for gap in solution.gaps)
+    (ax,) = firm.plot([light]).axes
+    legend = ax.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "Android's least perceptible acceleration",
+        "skin, lines Xfirm.Xgap",
+        "skin, lines Xlight.Xgap",
+    ]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Frequency [Hz]", "Acceleration amplitude [m/s²]")
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    caption = firm.plot([light]).get_supxlabel().replace("\n", " ")
+    assert "held in the hand, not of a bare" in caption
+    assert firm.verdict() in caption
+
+
+def test_run_says_what_is_felt_and_draws_it(command: Command) -> None:
+    result = command("run", "pad.cir", "--feel", "--out", "out")
+    assert result.code == 0
+    assert "felt: strongest at 200 Hz" in result.out
+    assert "held in the hand" in result.out
+    assert Path("out/pad_feel.png").is_file()
+    found = json.loads(command("run", "pad.cir", "--feel", "--json", "--no-plot", "--out", "out").out)
+    assert [Path(file).name for file in found["files"]] == ["pad.nc"]
+    (finger,) = found["feel"]
+    assert (finger["felt"], finger["kind"], finger["strongest"]) == (True, "lines", 200.0)
+    assert finger["lines"][1].keys() == {"frequency", "force", "displacement", "acceleration", "level_db"}
+    document = (ROOT / "docs" / "json.md").read_text()
+    for key in (*finger, *finger["lines"][0]):
+        assert f"`{key}`" in document
+    assert json.loads(command("run", "pad.cir", "--json", "--no-plot", "--out", "out").out)["feel"] is None
+
+
+def test_run_refuses_to_feel_without_a_gap_before_it_runs(command: Command) -> None:
+    Path("rc.cir").write_text("t\nV1 a 0 SIN(0 10 100)\nR1 a 0 1k\n.tran 100u 20m uic\n")
+    result = command("run", "rc.cir", "--feel")
+    assert (result.code, result.out) == (2, "")
+    assert result.lines == ["fingerspice: --feel: the circuit has no GAP, so there is no friction to feel"]
+    assert not Path("out").exists()
+
+
+def test_a_run_whose_friction_cannot_be_judged_keeps_its_files(command: Command) -> None:
+    # Ten outputs are too few for a density.
+    words = ("run", "pad.cir", "--feel", "--source", "PWL(0 0 1m 200)", "--stop", "0.4m", "--no-plot", "--out", "out")
+    result = command(*words)
+    assert result.code == 2
+    assert "64 outputs or more" in result.err
+    assert Path("out/pad.nc").is_file()

@@ -1,0 +1,128 @@
+"""Runs along recordings: against the independent reference and the steps that serve every source; stated errors."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+
+import mpmath
+import numpy as np
+import pytest
+
+import analytic
+import fingerspice as fs
+import recording_errors
+from fingerspice.numerics.moments import moments, weights
+from scenes import table1_deck
+
+RATE = 8000.0
+
+
+@pytest.fixture(autouse=True)
+def _without_warnings() -> Iterator[None]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", fs.FingerspiceWarning)
+        yield
+
+
+def recording(count: int = 160, high: float = 1500.0, volts: float = 180.0) -> np.ndarray:
+    return volts * recording_errors.noise(7, count, RATE, 100.0, high)
+
+
+def follow(samples: fs.Waveform, t_stop: float, **options: object) -> fs.Solution:
+    circuit = fs.parse_netlist(table1_deck())
+    given = {"t_stop": t_stop, "start": "uncharged", "jumps": "none"} | options
+    return fs.simulate(circuit, sources=samples, **given)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
+def test_samples_are_followed_as_the_reference_follows_them(law: str, rtol: float) -> None:
+    values = recording()
+    knots = np.arange(values.size) / RATE
+    t = np.sort(np.append(knots[1:-1], np.random.default_rng(1).uniform(0.0, knots[-2], 60)))
+    segments = analytic.pwl_segments(list(zip(knots.tolist(), values.tolist(), strict=True)))
+    exact = analytic.transient(segments, t.tolist(), law=law, freq=100.0)
+    run = follow(fs.Samples(values, RATE), float(knots[-2]), t_eval=t, charge_law=law, rtol=rtol)
+    assert run.method == "relaxation"
+    peaks = {"u_gap": np.abs(exact.u_gap).max(), "f_el": exact.force.max()}
+    off = {"u_gap": np.abs(run.u_gap - exact.u_gap).max(), "f_el": np.abs(run.f_el - exact.force).max()}
+    for name, peak in peaks.items():
+        assert off[name] <= min(rtol * peak, getattr(run.error, name))
+    assert np.abs(run.q_source - exact.q).max() <= run.error.q_source + 1e-12 * np.abs(exact.q).max()
+
+
+def test_stated_errors_cover_the_true_ones_and_what_was_asked_is_met() -> None:
+    found = [x for number in range(100, 118) for x in recording_errors.judge(recording_errors.draw(number, 300))]
+    assert len(found) > 100
+    assert np.mean([x.covered for x in found]) >= 0.95
+    for x in found:
+        if x.quantity in ("u_gap", "f_el"):
+            assert x.true <= x.rtol
+    ratios = [x.ratio for x in found if x.ratio is not None and x.quantity == "u_gap"]
+    assert np.median(ratios) <= 10.0
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_outputs_are_one_solution_wherever_they_are(law: str) -> None:
+    samples = fs.Samples(recording(), RATE, start=0.4 / RATE)
+    stop = 0.01734
+    every = np.sort(np.append(np.linspace(0.0, stop, 37), np.arange(100) / RATE))
+    whole = follow(samples, stop, t_eval=every, charge_law=law, rtol=1e-6)
+    for part in (slice(0, None, 3), slice(30, 60), slice(every.size - 1, None)):
+        some = follow(samples, stop, t_eval=every[part], charge_law=law, rtol=1e-6)
+        for name in ("u_gap", "q_source", "i_source"):
+            # Samples are written by the block and other times one by one: alike but for rounding.
+            given, expected = getattr(some, name), getattr(whole, name)
+            assert np.abs(given - expected[part]).max() <= 1e-11 * np.abs(expected).max()
+    assert whole.method == "relaxation"
+
+
+def test_a_run_goes_on_where_another_has_ended() -> None:
+    samples, stop = fs.Samples(recording(), RATE), 150.0 / RATE
+    t = np.linspace(0.5 * stop, stop, 41)
+    whole = follow(samples, stop, t_eval=t, rtol=1e-8)
+    first = follow(samples, 0.5 * stop, t_eval=[0.0], rtol=1e-8)
+    second = follow(samples, stop, t_eval=t, rtol=1e-8, start=first)
+    assert (first.method, second.method) == ("relaxation", "relaxation")
+    for name in ("u_gap", "q_source"):
+        peak = np.abs(getattr(whole, name)).max()
+        assert np.abs(getattr(whole, name) - getattr(second, name)).max() <= 1e-7 * peak
+
+
+def test_what_is_no_recording_is_stepped_as_ever() -> None:
+    few = follow(fs.Samples(recording(count=40), RATE), 39.0 / RATE, rtol=1e-6)
+    sine = follow(fs.Sine(200.0, 100.0), 0.02, rtol=1e-6)
+    # Beyond the polynomial of the area: the steps that serve every source take over.
+    steep = follow(fs.Samples(recording(volts=900.0), RATE), 0.01, rtol=1e-6)
+    assert {few.method, sine.method, steep.method} == {"exponential"}
+    assert steep.success
+
+
+def test_charge_and_force_belong_to_the_gap_voltage() -> None:
+    run = follow(fs.Samples(recording(), RATE), 0.0195, t_eval=np.arange(150) / RATE, rtol=1e-8)
+    force = analytic.contact(np.abs(run.u_gap))[3]
+    assert np.abs(run.f_el - force).max() <= 1e-12 * force.max()
+    # The current is the charge's slope: between two samples both are smooth.
+    t = 20.3 / RATE + np.array([-1.0, 0.0, 1.0]) * 1e-3 / RATE
+    near = follow(fs.Samples(recording(), RATE), 0.0195, t_eval=t, rtol=1e-10)
+    slope = (near.q_source[2] - near.q_source[0]) / (t[2] - t[0])
+    assert near.i_source[1] == pytest.approx(slope, rel=1e-6)
+
+
+def test_moments_are_integrals() -> None:
+    for z in (0.0, 1e-9, 0.3, 3.9, 4.1, 50.0):
+        found = np.empty(5)
+        moments(z, found)
+        for j in range(5):
+            exact = mpmath.quad(lambda x, j=j, z=z: mpmath.exp(-z * (1 - x)) * x**j, [0, 0.9, 1])
+            assert found[j] == pytest.approx(float(exact), rel=4e-15)
+    # A parabola through its values is itself.
+    z, nodes = np.array([0.0, 0.7, 30.0]), np.array([0.0, 0.5, 1.0])
+    for until in (0.25, 1.0):
+        found = weights(z, (0.0, 0.5, 1.0), until) @ (1.0 - 3.0 * nodes + 2.0 * nodes**2)
+        for i in range(3):
+            exact = mpmath.quad(
+                lambda x, i=i, end=until: mpmath.exp(-z[i] * (end - x)) * (1 - 3 * x + 2 * x * x), [0, until]
+            )
+            assert found[i] == pytest.approx(float(exact), rel=1e-12)

@@ -1,0 +1,209 @@
+"""Spectra: Parseval, known tones, the interval of a density, and what is refused."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+from fingerspice.results.spectrum import equivalent_segments, interval
+from scenes import deck, table1
+
+RATE = 8000.0
+
+
+def resistor(source: fs.Waveform, stop: float, **options: object) -> fs.Solution:
+    """The source alone: a signal that is known exactly."""
+    circuit = deck("V1 a 0 DC 1", "R1 a 0 1k", ".tran 125u 1")
+    return fs.simulate(circuit, sources={"V1": source}, t_stop=stop, **options)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def sine() -> fs.Solution:
+    return fs.simulate(table1())
+
+
+@pytest.fixture(scope="module")
+def noise() -> fs.Solution:
+    values = np.random.default_rng(1).standard_normal(24_001)
+    return resistor(fs.Samples(values, rate=RATE), 3.0, t_eval=np.arange(24_000) / RATE)
+
+
+def test_the_lines_are_the_tones_of_the_source() -> None:
+    tones = fs.Sine(3.0, 100.0) + fs.Sine(0.5, 300.0, phase_deg=40.0) + 2.0
+    found = resistor(tones, 0.05).spectrum("u_source")
+    expected = np.zeros(found.frequency.size)
+    expected[[0, 2]] = 3.0, 0.5
+    np.testing.assert_allclose(found.frequency, 100.0 * np.arange(1, 1001))
+    np.testing.assert_allclose(found.amplitude, expected, rtol=0, atol=1e-11)
+    assert found.mean == pytest.approx(2.0, rel=1e-12)
+    assert found.variance == pytest.approx(0.5 * (3.0**2 + 0.5**2), rel=1e-12)
+
+
+def test_the_lines_of_a_square_are_those_of_its_fourier_series() -> None:
+    found = resistor(fs.Square(2.0, 100.0), 0.05).spectrum("u_source", highest=50e3)
+    n = np.arange(1, 501)
+    assert found.amplitude is not None
+    np.testing.assert_allclose(found.amplitude, np.where(n % 2, 8.0 / (math.pi * n), 0.0), rtol=0, atol=1e-9)
+
+
+def test_half_the_squares_of_the_lines_are_the_variance(sine: fs.Solution) -> None:
+    summary = sine.summary()
+    found = sine.spectrum("u_gap")
+    variance = summary["u_gap_rms_periodic"] ** 2 - summary["u_gap_mean_periodic"] ** 2
+    assert found.shown_variance == pytest.approx(variance, rel=1e-9)
+    assert found.amplitude is not None
+    assert found.amplitude[0] == pytest.approx(summary["u_gap_amplitude"], rel=1e-9)
+    friction = sine.spectrum()
+    assert friction.shown_variance == pytest.approx(friction.variance, rel=1e-9)
+    assert friction.mean == pytest.approx(summary["f_t_mean_periodic"], rel=1e-9)
+
+
+def test_the_lines_do_not_depend_on_the_outputs() -> None:
+    few, many = (fs.steady_state(table1(), points=n).solution.spectrum() for n in (5, 400))
+    assert few.amplitude is not None
+    np.testing.assert_allclose(few.amplitude, many.amplitude, rtol=0, atol=1e-10)
+
+
+def test_a_run_read_from_a_file_has_its_outputs_lines(sine: fs.Solution, tmp_path: Path) -> None:
+    found = fs.load(sine.to_netcdf(tmp_path / "x.nc")).spectrum(highest=1000.0)
+    assert found.amplitude is not None
+    np.testing.assert_allclose(found.amplitude, sine.spectrum(highest=1000.0).amplitude, rtol=0, atol=1e-7)
+
+
+def test_the_integral_of_a_tones_density_is_its_variance() -> None:
+    solution = resistor(fs.Sine(3.0, 500.0), 1.0)
+    found = solution.spectrum("u_source", method="welch", resolution=10.0)
+    assert found.density is not None
+    assert found.resolution == pytest.approx(10.0)
+    assert found.shown_variance == pytest.approx(4.5, rel=1e-4)
+    assert found.frequency[found.density.argmax()] == pytest.approx(500.0)
+
+
+def test_the_interval_covers_the_density_of_white_noise(noise: fs.Solution) -> None:
+    with pytest.warns(fs.FingerspiceWarning, match="folded"):
+        found = noise.spectrum("u_source")
+    assert found.lower is not None
+    assert found.upper is not None
+    inside = slice(2, -2)
+    true = 2.0 / RATE
+    covered = np.mean((found.lower[inside] <= true) & (true <= found.upper[inside]))
+    assert abs(covered - 0.95) < 0.01
+    assert found.shown_variance == pytest.approx(found.variance, rel=0.01)
+
+
+def test_the_interval_narrows_with_the_resolution(noise: fs.Solution) -> None:
+    with pytest.warns(fs.FingerspiceWarning, match="folded"):
+        coarse, fine = (noise.spectrum("u_source", resolution=f) for f in (50.0, 2.0))
+    assert coarse.segments > 20 * fine.segments
+    low, high = interval(1e6)
+    assert (low, high) == pytest.approx((1.0, 1.0), abs=3e-3)
+
+
+def test_overlapping_segments_count_as_fewer() -> None:
+    box, hann = np.ones(100), np.sin(np.pi * np.arange(100) / 100) ** 2
+    assert equivalent_segments(box, 100, 7) == 7.0
+    # Boxes that overlap by half are correlated by 1/2, and Hann windows by 1/6.
+    assert equivalent_segments(box, 50, 9) == pytest.approx(9.0 / (1.0 + 2.0 * (8.0 / 9.0) / 4.0))
+    assert equivalent_segments(hann, 50, 9) == pytest.approx(9.0 / (1.0 + 2.0 * (8.0 / 9.0) / 36.0))
+
+
+def test_the_rows_that_jumps_add_are_left_out() -> None:
+    # The jumps lie between the outputs, and two lie on outputs.
+    solution = resistor(fs.PWL((0.0, 0.1, 0.1, 0.20003, 0.20003, 1.0), (0.0, 0.0, 1.0, 1.0, 0.0, 0.0)), 1.0)
+    assert np.any(np.diff(solution.t) == 0.0)
+    found = solution.spectrum("u_source")
+    assert found.density is not None
+    inside = (np.arange(8001) >= 800) & (np.arange(8001) <= 1600)
+    assert found.variance == pytest.approx(np.var(inside), rel=1e-3)
+
+
+def test_outputs_from_a_time_on() -> None:
+    solution = resistor(fs.PWL((0.0, 0.4, 1.0), (50.0, 1.0, 1.0)), 1.0)
+    assert solution.spectrum("u_source", since=0.5).variance == pytest.approx(0.0, abs=1e-20)
+
+
+@pytest.mark.parametrize("step", [100e-6, 60e-6])
+def test_outputs_too_rare_for_the_force_are_told(step: float) -> None:
+    # The force of a sine of 3 kHz has 6 kHz, which half the rate of the outputs has to reach.
+    t = np.arange(0.0, 0.02, step)
+    solution = fs.simulate(table1(), sources={"Vdrive": fs.Chirp(100.0, 3e3, 3.001e3, 0.02)}, t_eval=t, rtol=1e-6)
+    if step > 1.0 / 12e3:
+        with pytest.warns(fs.FingerspiceWarning, match=r"half the rate of the outputs, 5000 Hz.*shorter step"):
+            solution.spectrum()
+    else:
+        solution.spectrum()
+
+
+def test_a_period_that_is_not_yet_periodic_is_told() -> None:
+    circuit = deck("V1 a 0 SIN(5 1 100)", "R1 a b 1meg", "C1 b 0 100n", ".tran 100u 20m uic")
+    with pytest.warns(fs.FingerspiceWarning, match="start='periodic'"):
+        fs.simulate(circuit).spectrum("v:b")
+    fs.simulate(circuit, start="periodic").spectrum("v:b")
+
+
+@pytest.mark.parametrize("jumps", ["both", "none"])
+def test_a_signal_that_jumps_at_the_end_of_its_period_is_periodic(jumps: str) -> None:
+    square = fs.simulate(table1("SQUARE(200 100)"), start="periodic", t_stop=0.01, jumps=jumps)
+    found = square.spectrum("u_gap")
+    assert 0.99 < found.shown_variance / found.variance < 1.0
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"signal": "force"}, "unknown signal 'force'"),
+        ({"signal": "u_layer"}, "allowed: u_layer:Xcoat, u_layer:Xgap, u_layer:Xskin"),
+        ({"method": "fft"}, "'auto', 'lines', 'welch'"),
+        ({"highest": -1.0}, "more than 0 Hz"),
+        ({"highest": 50.0}, "100 Hz, the lowest line"),
+        ({"highest": 1e9}, "to 1e\\+06 Hz"),
+        ({"resolution": math.nan}, "more than 0 Hz"),
+        ({"resolution": 1e-3}, "one over the length of the run"),
+        ({"resolution": 1e5}, "one over the length of the run"),
+        ({"method": "lines", "since": 0.01}, "go with method 'welch'"),
+        ({"since": 1.0}, "a time before the end of the run"),
+        ({"method": "welch", "since": 0.0499}, "64 outputs or more"),
+    ],
+)
+def test_what_a_spectrum_refuses(sine: fs.Solution, options: dict[str, object], said: str) -> None:
+    with pytest.raises(fs.InputError, match=said):
+        sine.spectrum(**options)  # type: ignore[arg-type]
+
+
+def test_uneven_outputs_are_refused_with_the_remedy() -> None:
+    solution = resistor(fs.PWL((0.0, 1.0), (0.0, 1.0)), 1.0, t_eval=np.linspace(0.0, 1.0, 500) ** 2)
+    with pytest.raises(fs.InputError, match=r"not evenly spaced.*\.tran line's step, or even times in t_eval"):
+        solution.spectrum("u_source")
+    with pytest.raises(fs.InputError, match="holds no whole period"):
+        solution.spectrum("u_source", method="lines")
+
+
+def test_two_fingers_have_a_spectrum_each() -> None:
+    circuit = fs.read_netlist(Path(__file__).parents[1] / "circuits" / "two_fingers.cir")
+    solution = fs.simulate(circuit, rtol=1e-6)
+    with pytest.raises(fs.InputError, match=r"2 columns.*f_t:Xfirm\.Xgap, f_t:Xlight\.Xgap"):
+        solution.spectrum()
+    firm, light = (solution.spectrum(f"f_t:{name}") for name in solution.gaps)
+    assert firm.shown_variance > light.shown_variance > 0.0
+
+
+def test_a_spectrum_is_read_only_and_shown_as_text_and_picture(sine: fs.Solution, noise: fs.Solution) -> None:
+    lines = sine.spectrum()
+    with pytest.warns(fs.FingerspiceWarning, match="folded"):
+        density = noise.spectrum("u_source")
+    for found in (lines, pickle.loads(pickle.dumps(lines))):
+        assert found.amplitude is not None
+        assert not found.amplitude.flags.writeable
+    assert "200 Hz" in str(lines)
+    assert "independent segments" in str(density)
+    assert [f.axes[0].get_ylabel() for f in (lines.plot(), density.plot())] == [
+        "Friction force: amplitude [N]",
+        "Source voltage: density [V²/Hz]",
+    ]
+    flat = resistor(fs.DC(1.0), 0.05).spectrum("u_source")
+    flat.plot().savefig(Path("/dev/null"), format="png")
