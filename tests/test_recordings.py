@@ -110,6 +110,15 @@ def test_charge_and_force_belong_to_the_gap_voltage() -> None:
     assert near.i_source[1] == pytest.approx(slope, rel=1e-6)
 
 
+def test_figures_are_those_of_the_run_and_not_of_its_outputs() -> None:
+    samples, stop = fs.Samples(recording(), RATE), 0.0195
+    rare = follow(samples, stop, t_eval=[0.0, stop], rtol=1e-6)
+    exact = follow(samples, stop, t_eval=[0.0, stop], rtol=1e-11, method="exponential")
+    assert rare.method == "relaxation"
+    assert rare.f_el_mean == pytest.approx(exact.f_el_mean, rel=1e-6)
+    assert rare.summary()["f_el_max"] == pytest.approx(exact.summary()["f_el_max"], rel=1e-5)
+
+
 def test_moments_are_integrals() -> None:
     for z in (0.0, 1e-9, 0.3, 3.9, 4.1, 50.0):
         found = np.empty(5)

@@ -80,15 +80,16 @@ def new_charges() -> Charges:
 
 @jit_rows
 def _charge_rows(
-    n: int, h: float, mobile: bool, slow: FloatArray, area0: float, kink: float, s: FloatArray, u: FloatArray,
+    n: int, h: float, slow: FloatArray, area0: float, kink: float, s: FloatArray, u: FloatArray,
     middle: FloatArray, ends: FloatArray, within: FloatArray, q: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
     """Charge gained in each step but for what follows u, its rates, and Boole's rule less Simpson's (`Charges.steps`).
 
     `ends` (2, n) and `within` (3, 2, n) are the part v of the slowest layer's voltage that does not follow u, and that
     by which it leaks. What is stored moves with the area at the start of the step; along the polynomial of v goes what
-    the area moves meanwhile.
+    the area moves meanwhile. `area0` is that of the state under `mobile`, 0 under `local`.
     """
+    mobile = area0 > 0.0
     share, c, g_area, g_total = slow[slow.size - 4], slow[slow.size - 3], slow[slow.size - 2], slow[slow.size - 1]
     for i in range(n):
         s0, s4 = s[i], s[i + 1]
@@ -173,7 +174,7 @@ def charge_block(c: Course, r: int, level: int, n: int, h: float, local: float) 
     for place in range(len(PLACES)):
         area_rows(n, form.area, form.scale, form.shift, 0.0, room.u_within[place], own.q[1 + place])
     _charge_rows(
-        n, h, form.mobile, slow, form.area0, c.shown.area_kink, room.s, room.u, room.u_within[MIDDLE],
+        n, h, slow, form.area0 if form.mobile else 0.0, c.shown.area_kink, room.s, room.u, room.u_within[MIDDLE],
         room.end[v:], room.within[:, v:], own.q, own.steps,
     )  # fmt: skip
     scaled(n + 1, 0.0, room.s, own.error)

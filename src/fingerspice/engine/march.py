@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine.charge import charge_step
-from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, node_error, weigh
+from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, weigh
 from fingerspice.engine.growth import carry
 from fingerspice.engine.model import Model, branch_area, dot, gap_voltage, turns_at_zero, write_row_at
+from fingerspice.engine.nodes import node_error
 from fingerspice.engine.pace import (
     Pace,
     accept,

@@ -36,6 +36,8 @@ class ClosedForm:
         Waveform with the breakpoints of all sources.
     t_start, first, stop : float
         Start of the run, and the interval for figures, s.
+    error : float
+        Error of what `look` gives, relative to the peaks: polynomials need not be finer.
     """
 
     look: Callable[[FloatArray, BoolArray], Record]
@@ -43,6 +45,7 @@ class ClosedForm:
     t_start: float
     first: float
     stop: float
+    error: float = 0.0
 
     def run(self, readers: Callable[[], Mapping[str, Read]], since: float, until: float) -> Refined | None:
         """Panels between two times (s) on each of which every voltage is a polynomial; None where they are too many.
@@ -90,7 +93,7 @@ class ClosedForm:
             _, values = every.at_own_points(read)
             peaks[name] = max(peaks.get(name, 0.0), float(np.abs(values).max(initial=0.0)))
             missed = np.abs(values[:, :NODES] @ BETWEEN - values[:, NODES:]).max(axis=1)
-            wrong |= missed > _MISSED * peaks[name]
+            wrong |= missed > max(_MISSED, self.error) * peaks[name]
         return wrong & (0.5 * (begin + end) > begin) & (0.5 * (begin + end) < end)
 
     def _cut_at_zeros(self, readers: Mapping[str, Read], run: Refined) -> Refined:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -21,6 +21,8 @@ from fingerspice.numerics import chebyshev
 from fingerspice.numerics.moments import weights
 from fingerspice.physics.contact import N_PACKED
 from fingerspice.results.outcome import Status
+from fingerspice.results.record import Record
+from fingerspice.results.refined import ClosedForm
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Progress, Run, kept_with
 from fingerspice.solve.stackstate import model_of
@@ -217,9 +219,20 @@ def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, pro
         run.stats["rejected"] = refused
         excess = run.excess(problem.largest) / rtol
         if excess <= 1.0:
+            look = partial(_look, replace(problem, charge=False), rtol)
+            run.continuous = ClosedForm(
+                look, problem.waveform, problem.t_start, problem.first, problem.t_stop, rtol
+            )  # fmt: skip
             return run
         tol *= min(0.3, 0.5 / excess)
     return None
+
+
+def _look(problem: Problem, rtol: float, t: FloatArray, left: BoolArray) -> Record:
+    """The run at other times."""
+    run = solve(problem, rtol, t, left, None)
+    assert run is not None
+    return run.record(problem)
 
 
 def _follow(

@@ -82,8 +82,9 @@ def simulate(
     method : str
         ``"auto"``, an own stepper (``"exponential"``, ``"radau"``), ``"scipy:NAME"`` or ``"torchdiffeq:NAME"``.
         ``"auto"`` steps as ``"exponential"`` does, and once a period of the source no longer changes the state it lets
-        that period stand for those that follow; the others step every period. Where a fast mode that the area moves
-        lets only short steps converge, ``"auto"`` goes on as ``"radau"``, an implicit method.
+        that period stand for those that follow; the others step every period. A recording (`Samples`) on a series stack
+        it follows sample by sample (`Solution.method` is ``"relaxation"`` then). Where a fast mode that the area moves
+        lets only short steps converge, it goes on as ``"radau"``, an implicit method.
     tier : str
         ``"auto"``, or the model to take: ``"algebraic"``, ``"linear"`` or ``"coupled"`` (see `Plan`).
     start : str or Solution
