@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from typing import Any
@@ -12,6 +13,7 @@ from scipy.optimize import brentq
 
 import analytic as ref
 import fingerspice as fs
+from fingerspice.circuit.spectrum import energy_outside, skin_error
 from scenes import deck, table1, table1_deck
 
 every_kind = pytest.mark.parametrize("beside", ["", "Rbeside drive 0 1meg"], ids=["stack", "network"])
@@ -117,6 +119,19 @@ def test_a_recording_on_a_skin_of_one_frequency_is_warned_about_with_its_error(
     said = float(match[1]) / 100.0 * (1.0 if match[2] == "large" else -1.0)
     # The warning knows the linear response at rest; coupled the error is a little different.
     assert said == pytest.approx(held.f_el_mean / right.f_el_mean - 1.0, rel=0.1)
+
+
+@pytest.mark.parametrize("seconds", [30.0, 33.7, 1000.0])
+def test_the_error_of_a_long_recording_is_that_of_its_pieces(seconds: float) -> None:
+    short, rate = noise(50.0, 1000.0, 8000.0, 2.0), 8000.0
+    circuit = table1()
+    error = skin_error(circuit, short, 2.0)
+    repeated = fs.Samples(np.tile(short.values, math.ceil(seconds / 2.0)), rate)
+    assert error is not None
+    assert skin_error(circuit, repeated, seconds) == pytest.approx(error, rel=0.05)
+    # Below 10 Hz there is nothing, and above a kilohertz only what straight lines add.
+    assert energy_outside(repeated, seconds)[0] < 1e-3
+    assert sum(energy_outside(repeated, seconds, (40.0, 1100.0))) < 1e-2
 
 
 def test_directives_without_effect_are_warned_about_but_not_those_for_ngspice() -> None:

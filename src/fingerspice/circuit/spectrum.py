@@ -28,9 +28,13 @@ NOTABLE = 0.01
 _COUPLING = 0.05
 
 
-def _samples(waveform: Waveform, t0: float, t1: float, rate: float) -> FloatArray:
-    """The source at the midpoints of equal intervals, `rate` or more per second unless that is too many."""
-    count = int(min(_MOST_SAMPLES, max(1024, 2 ** math.ceil(math.log2((t1 - t0) * rate)))))
+def _enough(span: float, rate: float) -> int:
+    """Number of samples of a span (s), a power of two: `rate` or more per second unless that is too many."""
+    return int(min(_MOST_SAMPLES, max(1024, 2 ** math.ceil(math.log2(span * rate)))))
+
+
+def _samples(waveform: Waveform, t0: float, t1: float, count: int) -> FloatArray:
+    """The source at the midpoints of `count` equal intervals."""
     return np.asarray(waveform.value(t0 + (np.arange(count) + 0.5) * ((t1 - t0) / count)))
 
 
@@ -49,10 +53,11 @@ def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatA
         own = max(2.0 * waveform.breakpoint_rate(), 16.0 / waveform.shortest_time())
         rate = min(rate, own or rate)
         pieces = 1 if span * rate <= _MOST_SAMPLES else _PIECES
-    length = span if pieces == 1 else _MOST_SAMPLES / _PIECES / rate
+    count = _enough(span, rate) // pieces
+    length = span if pieces == 1 else count / rate
     total: FloatArray = np.zeros(1)
     for start in np.linspace(t0, t0 + span - length, pieces).tolist():
-        u = _samples(waveform, start, start + length, rate)
+        u = _samples(waveform, start, start + length, count)
         if not np.all(np.isfinite(u)):
             return np.zeros(1), np.zeros(1)
         total = total + np.abs(np.fft.rfft(u if periodic else u * np.hanning(u.size))) ** 2
@@ -144,7 +149,7 @@ def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity:
     gap = dispersive.gap_layer
     assert gap is not None
     span = min(t_stop, _PERIODS / frequency)
-    u = _samples(dispersive.waveform, 0.0, span, 200.0 * frequency)
+    u = _samples(dispersive.waveform, 0.0, span, _enough(span, 200.0 * frequency))
     # The run is followed by silence of equal length, so that the discrete transform does not wrap its end round.
     lines = np.fft.rfft(u, 2 * u.size)
     f = np.arange(1, lines.size) / (2.0 * span)
