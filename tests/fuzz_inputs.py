@@ -36,8 +36,8 @@ FUNCTIONS = (
     *("min", "max", "pow", "pwr", "atan2", "hypot", "ternary_fcn", "sqr", "eval", "open", "exec", "SIN",
       "sqrtt", "v", "i"),
 )
-SOURCES = ("SIN", "PULSE", "EXP", "PWL", "SQUARE", "AM", "SFFM", "WAVEFILE", "TABLE", "DC", "AC", "SINE",
-      "sin", "Pwl", "FOO")
+SOURCES = ("SIN", "PULSE", "EXP", "PWL", "SQUARE", "AM", "SFFM", "WAVEFILE", "TABLE", "CHIRP", "BURST", "WAV",
+      "DC", "AC", "SINE", "sin", "Pwl", "FOO")
 FILES = (
     *("fingerspice.lib", "fingerspice_mobile.lib", "part.lib", "loop.lib", "ping.lib", "sub/inner.lib", "sub",
       "link.lib"),

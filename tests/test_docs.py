@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import warnings
+import wave
 from pathlib import Path
 
 import numpy as np
@@ -160,10 +161,15 @@ def test_every_device_source_and_directive_is_named() -> None:
 
 
 @pytest.mark.parametrize("row", rows("example"), ids=lambda row: row[0])
-def test_the_sources_are_read(row: list[str]) -> None:
+def test_the_sources_are_read(row: list[str], tmp_path: Path) -> None:
+    with wave.open(str(tmp_path / "a.wav"), "wb") as file:
+        file.setparams((1, 2, 48000, 0, "NONE", ""))
+        file.writeframes(np.arange(100, dtype="<i2").tobytes())
+    (tmp_path / "a.csv").write_text("time (ms), drive [kV]\n0, 0\n1, 0.1\n")
+    (tmp_path / "a.txt").write_text("0 0\n1m 100\n")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        circuit = fs.parse_netlist(FINGER.replace("SIN(0 200 100)", row[0].strip("`")))
+        circuit = fs.parse_netlist(FINGER.replace("SIN(0 200 100)", row[0].strip("`")), tmp_path / "finger.cir")
     assert fs.simulate(circuit, t_stop=2e-3).success
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -81,6 +82,30 @@ def test_every_shipped_deck_runs_in_ngspice_as_exported(name: str, law: str) -> 
 def test_every_source_runs_in_ngspice_as_exported(source: str, law: str) -> None:
     # Constant stretches are the hard part: ngspice's usual options stop there, or never end.
     assert deviation(table1(source, tran="10u 30m uic"), law) <= 5e-5
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("start", [0.0, -1.1e-3, 2.3e-3])
+def test_a_recording_is_exported_as_its_own_points(start: float, law: str) -> None:
+    values = 100.0 * np.sin(np.arange(200) * 0.7) * np.sin(np.arange(200) * 0.031)
+    circuit = table1(tran="10u 30.02m uic").replace({"Vdrive": fs.Samples(values, 4000.0, start)})
+    text = re.search(r"^Vdrive .*?PWL\((.*?)\)", fs.export_netlist(circuit).replace("\n+", ""), re.MULTILINE)
+    assert text is not None
+    t, v = np.array(text[1].split(), float).reshape(-1, 2).T
+    # To the first point after the end.
+    at = start + np.arange(200) / 4000.0
+    inside = (at > 1e-12) & (at < 0.03002 + 1.0 / 4000.0)
+    np.testing.assert_array_equal(t[-inside.sum() :], at[inside])
+    np.testing.assert_array_equal(v[-inside.sum() :], values[inside])
+    assert deviation(circuit, law) <= 5e-5
+
+
+@pytest.mark.parametrize("name", ["click", "burst", "am_bump"])
+def test_decks_of_the_gallery_run_in_ngspice_as_exported(name: str) -> None:
+    circuit = fs.read_netlist(CIRCUITS / f"{name}.cir")
+    if name != "click":
+        circuit = dataclasses.replace(circuit, tran=fs.read_netlist(CIRCUITS / "fingerpad_5khz.cir").tran)
+    assert deviation(circuit) <= 5e-5
 
 
 @pytest.mark.parametrize("law", LAWS)

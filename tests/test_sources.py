@@ -149,9 +149,9 @@ def test_square_is_ours_with_a_duty() -> None:
     [
         ("AM(1 2 3 4)", "AM changed its argument order"),
         ("SFFM(1 2 3 4 5)", "SFFM changed its argument order"),
-        ("WAVEFILE(sound.wav 100)", "WAVEFILE is not supported by this version"),
-        ("TABLE(data.csv)", "TABLE is not supported by this version"),
-        ("PWL(file=data.txt)", "PWL(file=...) is not supported"),
+        ("WAVEFILE(sound.wav 100)", "'sound.wav' cannot be read: a netlist given as text has no folder"),
+        ("TABLE(data.csv)", "'data.csv' cannot be read: a netlist given as text has no folder"),
+        ("PWL(file=data.txt)", "'data.txt' cannot be read: a netlist given as text has no folder"),
         ("SINN(0 200 100)", "did you mean 'sin'?"),
         ("TRNOISE(1 2 3 4)", "unknown source 'TRNOISE'"),
         ("SIN(0)", "SIN needs 2 values, 1 given"),

@@ -46,12 +46,14 @@ if TYPE_CHECKING:
     from fingerspice.waveforms.combinations import AM as AM
     from fingerspice.waveforms.combinations import Product as Product
     from fingerspice.waveforms.combinations import Sum as Sum
+    from fingerspice.waveforms.periodic import Pulse as Pulse
     from fingerspice.waveforms.periodic import Sawtooth as Sawtooth
     from fingerspice.waveforms.periodic import Square as Square
     from fingerspice.waveforms.periodic import Triangle as Triangle
     from fingerspice.waveforms.ramps import PWL as PWL
-    from fingerspice.waveforms.ramps import Pulse as Pulse
     from fingerspice.waveforms.ramps import Samples as Samples
+    from fingerspice.waveforms.repeated import Burst as Burst
+    from fingerspice.waveforms.repeated import Repeat as Repeat
     from fingerspice.waveforms.sampling import Function as Function
     from fingerspice.waveforms.transients import Chirp as Chirp
     from fingerspice.waveforms.transients import Exp as Exp
@@ -62,8 +64,9 @@ if TYPE_CHECKING:
 _HOMES = {
     "circuit.circuit": ("Circuit",),
     "netlist.netlist": ("parse_netlist", "read_netlist"),
-    "waveforms.periodic": ("Sawtooth", "Square", "Triangle"),
-    "waveforms.ramps": ("PWL", "Pulse", "Samples"),
+    "waveforms.periodic": ("Pulse", "Sawtooth", "Square", "Triangle"),
+    "waveforms.ramps": ("PWL", "Samples"),
+    "waveforms.repeated": ("Burst", "Repeat"),
     "waveforms.transients": ("Chirp", "Exp"),
     "waveforms.sampling": ("Function",),
     "waveforms.combinations": ("AM", "Product", "Sum"),

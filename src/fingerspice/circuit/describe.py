@@ -10,6 +10,7 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.waveforms.combinations import Product, Sum
 from fingerspice.waveforms.ramps import PWL, Samples
+from fingerspice.waveforms.repeated import Burst, Repeat
 from fingerspice.waveforms.sampling import Function
 from fingerspice.waveforms.waveform import DC, Waveform
 
@@ -33,6 +34,8 @@ def waveform_text(waveform: Waveform, unit: str = "V") -> str:
         said.append(f"{len(waveform.times)} points")
     if isinstance(waveform, Samples):
         said.append(f"{waveform.values.size} values")
+    if isinstance(waveform, Burst | Repeat):
+        said.append(waveform_text(waveform.waveform, unit))
     for field in dataclasses.fields(waveform):  # type: ignore[arg-type]
         value = getattr(waveform, field.name)
         if field.name not in waveform.units or value == field.default:

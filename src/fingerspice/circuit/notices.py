@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import partial
 
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.loop import network_of
-from fingerspice.circuit.spectrum import energy_outside
+from fingerspice.circuit.spectrum import energy_outside, skin_error
 from fingerspice.waveforms.waveform import Waveform
 
 # Half width of a band around a frequency, relative to it, in which the skin's data change by 3 %; and the share of the
 # source's energy that may lie outside the band.
 _BAND, _OUTSIDE = 0.05, 0.01
+# What is said of the mean force where nothing is known of it, and the smallest error that is told from none.
+_UNKNOWN, _LITTLE = "may be 5 to 10 % off", 0.005
 # Directives that only ngspice needs, of which no warning is given.
 _FOR_NGSPICE = (".nodeset", ".options")
 
 
-def circuit_warnings(circuit: Circuit) -> tuple[str, ...]:
-    """Warnings of what has no effect in a deck, and of a SKIN whose frequency is not the source's fundamental."""
-    return (*directive_warnings(circuit), *_skin_warnings(circuit))
+def circuit_warnings(circuit: Circuit, t_stop: float | None) -> tuple[str, ...]:
+    """Warnings of what has no effect in a deck, and of a SKIN whose one frequency is not right for its source.
+
+    The run is one to `t_stop` (s), or to the deck's own end.
+    """
+    stop = t_stop or (circuit.tran.stop if circuit.tran is not None else math.nan)
+    return (*directive_warnings(circuit), *_skin_warnings(circuit, stop))
 
 
 def directive_warnings(circuit: Circuit) -> tuple[str, ...]:
@@ -27,14 +34,13 @@ def directive_warnings(circuit: Circuit) -> tuple[str, ...]:
     return tuple(f"{name} has no effect here" for name in circuit.unused if not name.startswith(_FOR_NGSPICE))
 
 
-def _is_near(circuit: Circuit, wave: Waveform, f: float) -> bool:
+def _is_near(wave: Waveform, stop: float, f: float) -> bool:
     """Whether nearly all of a source's energy is close to a frequency (Hz), as for a carrier with a slow envelope."""
-    stop = circuit.tran.stop if circuit.tran is not None else math.nan
     band = f * (1.0 - _BAND), f * (1.0 + _BAND)
-    return stop > 0.0 and sum(energy_outside(wave, stop, band)) < _OUTSIDE
+    return sum(energy_outside(wave, stop, band)) < _OUTSIDE
 
 
-def _skin_warnings(circuit: Circuit) -> Iterator[str]:
+def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
     skins = circuit.by_device("SKIN")
     if not skins:
         return
@@ -43,17 +49,28 @@ def _skin_warnings(circuit: Circuit) -> Iterator[str]:
         # With several sources only the user can know at which frequency the skin should be taken.
         return
     (wave,), fundamental = waves, waves[0].fundamental
+    known = 0.0 < stop < math.inf
     for skin in skins:
         f = skin.values["f"]
-        if fundamental is None and _is_near(circuit, wave, f):
-            continue
         if fundamental is None:
-            yield (
-                f"{skin.name} takes its data at f = {f:g} Hz, and the source has no fundamental: the mean force may be "
-                f"5 to 10 % off; SKIN_DISPERSIVE d={1e6 * skin.values['d']:g}u is right for any source"
-            )
+            if not (known and circuit.remember(("near", f, stop), partial(_is_near, wave, stop, f))):
+                yield (
+                    f"{skin.name} takes its data at f = {f:g} Hz, and the source has no fundamental: the mean force "
+                    f"{_how_far(circuit, wave, stop) if known else _UNKNOWN}; SKIN_DISPERSIVE "
+                    f"d={1e6 * skin.values['d']:g}u is right for any source"
+                )
         elif abs(f / fundamental.frequency - 1.0) > 1e-9:
             yield (
                 f"{skin.name} takes its data at f = {f:g} Hz, the source's fundamental is "
                 f"{fundamental.frequency:g} Hz; {skin.name}.f={fundamental.frequency:g} would match"
             )
+
+
+def _how_far(circuit: Circuit, wave: Waveform, stop: float) -> str:
+    """What is known of the mean force of a run to `stop` (s), for a warning."""
+    error = circuit.remember(("skin error", stop), lambda: skin_error(circuit, wave, stop))
+    if error is None:
+        return _UNKNOWN
+    if abs(error) < _LITTLE:
+        return f"may be {100.0 * _LITTLE:g} % off"
+    return f"is about {100.0 * abs(error):.2g} % too {'large' if error > 0.0 else 'small'}"

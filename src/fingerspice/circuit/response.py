@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.network import Network
 from fingerspice.circuit.statespace import Stack
 from fingerspice.physics.contact import Contact
+from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
 from fingerspice.waveforms.waveform import Fundamental
 
@@ -104,6 +106,18 @@ def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
         raise InputError(f"{name} drives no area; allowed: a GAP with an area of its own")
     note = f"of several GAPs, {name}" if len(gaps) > 1 else ""
     return LinearScene(network, contact, network.layers.index(gap), place, note)
+
+
+def with_skin_held(circuit: Circuit) -> Circuit:
+    """The circuit with each SKIN replaced by a slab of its data at its own frequency."""
+
+    def held(skin: Element) -> Element:
+        d, f = skin.values["d"], skin.values["f"]
+        eps_r, rho = float(skin_permittivity(f)), float(skin_resistivity(f))
+        values = MappingProxyType({"d": d, "eps_r": eps_r, "rho": rho, "e_max": math.inf})
+        return replace(skin, device="SLAB", values=values)
+
+    return replace(circuit, elements=tuple(held(e) if e.device == "SKIN" else e for e in circuit.elements))
 
 
 def mean_areas(network: Network) -> FloatArray:

@@ -8,6 +8,8 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.loop import network_of
+from fingerspice.circuit.response import areas_at_rest, with_skin_held
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.physics.phasor import layer_gains
@@ -16,6 +18,8 @@ from fingerspice.waveforms.waveform import Waveform
 # Largest number of samples of a spectrum, and number of periods that represent a longer run of a periodic source.
 _MOST_SAMPLES = 2**19
 _PERIODS = 16
+# Pieces that represent a longer run of another source, and frequencies between which gains are interpolated.
+_PIECES, _GRID = 4, 49
 # Share of the source's energy outside the band of the skin's data from which on a warning is given.
 NOTABLE = 0.01
 # The area's harmonics also meet the skin's data. Taken at the fundamental, these cause a further relative error of at
@@ -30,30 +34,76 @@ def _samples(waveform: Waveform, t0: float, t1: float, rate: float) -> FloatArra
     return np.asarray(waveform.value(t0 + (np.arange(count) + 0.5) * ((t1 - t0) / count)))
 
 
+def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatArray, FloatArray]:
+    """Frequencies (Hz) up to twice the highest of interest (Hz), and the source's energy at each, in any unit.
+
+    They are of one period of a periodic source, and else of the run to `t_stop` (s) with a Hann window, so that its
+    ends are no jumps. Of a run too long for that they are the sum of pieces spread over it. A source that is not finite
+    has no energy.
+    """
+    periodic = waveform.period is not None
+    t0 = waveform.settled if periodic else 0.0
+    span = waveform.period if waveform.period is not None else t_stop
+    rate, pieces = 4.0 * highest, 1
+    if not periodic and span * rate > _MOST_SAMPLES:
+        own = max(2.0 * waveform.breakpoint_rate(), 16.0 / waveform.shortest_time())
+        rate = min(rate, own or rate)
+        pieces = 1 if span * rate <= _MOST_SAMPLES else _PIECES
+    length = span if pieces == 1 else _MOST_SAMPLES / _PIECES / rate
+    total: FloatArray = np.zeros(1)
+    for start in np.linspace(t0, t0 + span - length, pieces).tolist():
+        u = _samples(waveform, start, start + length, rate)
+        if not np.all(np.isfinite(u)):
+            return np.zeros(1), np.zeros(1)
+        total = total + np.abs(np.fft.rfft(u if periodic else u * np.hanning(u.size))) ** 2
+    total[1:] *= 2.0
+    return np.arange(total.size) / length, total
+
+
 def energy_outside(
     waveform: Waveform, t_stop: float, band: tuple[float, float] = SKIN_BAND
 ) -> tuple[float, float]:  # fmt: skip
     """Shares of the source's energy below and above a band (Hz), by default that of the skin's data.
 
-    They are taken over one period of a periodic source, and else over the run to `t_stop` (s) with a Hann window, so
-    that its ends are no jumps. A source that is not finite counts as inside.
+    They are taken over one period of a periodic source, and else over the run to `t_stop` (s). A source that is not
+    finite counts as inside.
     """
     low, high = band
-    periodic = waveform.period is not None
-    t0 = waveform.settled if periodic else 0.0
-    span = waveform.period if waveform.period is not None else t_stop
-    u = _samples(waveform, t0, t0 + span, 4.0 * high)
-    if not np.all(np.isfinite(u)):
-        return 0.0, 0.0
-    if not periodic:
-        u = u * np.hanning(u.size)
-    energy = np.abs(np.fft.rfft(u)) ** 2
-    energy[1:] *= 2.0
-    f = np.arange(energy.size) / span
+    f, energy = _energies(waveform, t_stop, high)
     total = float(energy.sum())
     # The window spreads a line over the neighbouring bins, so one bin below the band counts as inside.
-    below = f < low - (0.0 if periodic else 1.0 / span)
+    below = f < low - (0.0 if waveform.period is not None else f[1] if f.size > 1 else 0.0)
     return (float(energy[below].sum() / total), float(energy[f > high].sum() / total)) if total > 0.0 else (0.0, 0.0)
+
+
+def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | None:
+    """Relative error of the mean force where SKIN has its data at its own frequency, for the only source of a circuit.
+
+    It is that of the mean square of the gap's linear response at the areas at rest, with the source's spectrum over the
+    run to `t_stop` (s); of several fingers that of the worst. Outside the band of the skin's data those at its ends are
+    taken. None where it cannot be told.
+    """
+    networks = network_of(circuit), network_of(with_skin_held(circuit))
+    gaps = [gap for gap in networks[0].gaps if gap is not None]
+    f, energy = _energies(waveform, t_stop, SKIN_BAND[1])
+    grid = np.geomspace(*SKIN_BAND, _GRID)
+    nearest = np.log(np.clip(f, *SKIN_BAND))
+    areas = areas_at_rest(networks[0])
+    try:
+        squares = [
+            np.array([np.abs(n.phasors(x, areas, np.ones(1, complex))[gaps]) ** 2 for x in grid.tolist()])
+            for n in networks
+        ]
+    except np.linalg.LinAlgError:
+        return None
+    right, held = (
+        np.array([float(energy @ np.interp(nearest, np.log(grid), column)) for column in square.T])
+        for square in squares
+    )
+    if not (right.size and np.all(right > 0.0) and np.all(np.isfinite(held / right))):
+        return None
+    errors = held / right - 1.0
+    return float(errors[np.argmax(np.abs(errors))])
 
 
 def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> str | None:

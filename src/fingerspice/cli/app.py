@@ -12,7 +12,7 @@ import typer
 
 from fingerspice.base.errors import InputError
 from fingerspice.cli import answers, options
-from fingerspice.cli.options import area_from_text, check_output, read_circuit, time_from_text
+from fingerspice.cli.options import area_from_text, check_output, read_circuit
 from fingerspice.cli.result_files import FOLDER, Results
 from fingerspice.cli.run_files import Touch, written
 from fingerspice.cli.terminal import Answering, answer_usage, listen, plain_errors, progress, say
@@ -43,9 +43,10 @@ ChargeLaw = Annotated[str | None, typer.Option(help="local or mobile; the includ
 Set = Annotated[
     list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Change a value: Xgap.d=3u. May be repeated.")
 ]
+_SPECS = "'SQUARE(200 100)', 'Vdrive=DC 5', 'WAV(a.wav gain=150)', 'TABLE(a.csv)'"
 Source = Annotated[
     list[str] | None,
-    typer.Option("--source", metavar="[NAME=]SPEC", help="Replace a source: 'SQUARE(200 100)', 'Vdrive=DC 5'."),
+    typer.Option("--source", metavar="[NAME=]SPEC", help=f"Replace a source: {_SPECS}."),
 ]
 Stop = Annotated[str | None, typer.Option(metavar="TIME", help="End of the run, s: 50m; TSTOP by default.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON (docs/json.md), nothing else on stdout.")]
@@ -87,7 +88,7 @@ def run(
     source: Source = None,
     stop: Stop = None,
     start: Annotated[
-        str, typer.Option(help="deck (as its .tran says), uncharged, dc, or periodic (the periodic state).")
+        str, typer.Option(help="deck (as its .tran says), uncharged, dc, periodic; or TIME of the first output: 5m.")
     ] = "deck",
     jumps: Annotated[
         str, typer.Option(help="Rows at jumps of the source: both, or none, so that time rises strictly.")
@@ -107,6 +108,8 @@ def run(
 
       fingerspice run circuits/fingerpad.cir --stop 20m --start periodic
 
+      fingerspice run circuits/click.cir --source 'WAV(circuits/texture.wav gain=150)' --start 0.1 --stop 0.5
+
       fingerspice run circuits/fingerpad.cir --charge-law mobile --rtol 1e-6 --json --no-plot
 
       fingerspice run circuits/am_carrier.cir --feel
@@ -117,17 +120,16 @@ def run(
     with Answering("run", as_json, charge_law=charge_law, method=method, rtol=rtol, area=area) as answer:
         circuit = read_circuit(deck, changes, source)
         answer.update(**answers.of_circuit(circuit, charge_law))
-        t_stop = time_from_text("--stop", stop)
-        if circuit.tran is None and t_stop is None:
+        circuit, start = options.with_times(circuit, stop, start)
+        if circuit.tran is None:
             raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
-        options.check_stop(circuit, t_stop)
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         data = results.file(".csv" if csv else ".nc")
         picture = None if no_plot else results.file(".png")
         touch = Touch(circuit, None if no_plot else results) if feel else None
         with progress() as update:
             solution = simulate(
-                circuit, t_stop=t_stop, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method,
+                circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method,
                 start=start, jumps=jumps, throw=False, progress=update,
             )  # fmt: skip
         if as_json:
@@ -244,10 +246,8 @@ def plan(
     with Answering("plan", as_json, charge_law=charge_law, rtol=rtol, area=area) as answer:
         circuit = read_circuit(deck, changes, source)
         answer.update(**answers.of_circuit(circuit, charge_law))
-        t_stop = time_from_text("--stop", stop)
-        result = make(
-            circuit, t_stop=t_stop, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge
-        )
+        circuit, _ = options.with_times(circuit, stop)
+        result = make(circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge)
         answer.update(**answers.of_plan(result))
         answer.give(lambda: plan_text(result, circuit))
 
@@ -340,6 +340,7 @@ def export(
     charge_law: ChargeLaw = None,
     changes: Set = None,
     source: Source = None,
+    stop: Stop = None,
     as_json: AsJson = False,
 ) -> None:
     """Write DECK as one self-contained ngspice deck: bodies included, parameters folded in.
@@ -354,6 +355,7 @@ def export(
     with Answering("export", as_json, charge_law=charge_law) as answer:
         circuit = read_circuit(deck, changes, source)
         answer.update(**answers.of_circuit(circuit, charge_law))
+        circuit, _ = options.with_times(circuit, stop)
         check_output(output, deck)
         text = export_netlist(circuit, charge_law=charge_law)
         answer.give(str, [lambda: write_aside(output, lambda path: path.write_text(text, encoding="utf-8"))])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import warnings
 from pathlib import Path
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
 
 LARGEST_AREA = 0.01
 """m^2; a larger area was probably given in mm^2."""
+
+LONGEST_SOURCE = 1000
+"""Characters of a source's numbers that are kept with the results."""
 
 
 def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | None) -> Circuit:
@@ -67,11 +71,14 @@ def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
     from fingerspice.circuit.arguments import overridden
     from fingerspice.circuit.topology import find_branches
     from fingerspice.netlist.netlist import source_from_text
+    from fingerspice.waveforms.ramps import Samples
 
     if not texts:
         return circuit
     names = {e.name.lower(): e.name for e in find_branches(circuit)[1] if e.device in "VI"}
     sources: dict[str, Waveform] = {}
+    # What the results call a recording or a long table: the text that names it, and not its numbers.
+    named_by: dict[str, str] = {}
     for text in texts:
         named, equals, spec = (part.strip() for part in text.partition("="))
         # In PWL(...) r=10m what precedes the = is more than a name.
@@ -88,25 +95,47 @@ def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
             sources[name] = source_from_text(spec, circuit)
         except InputError as error:
             raise InputError(f"--source {error.message}") from None
-    return overridden(circuit, sources)
+        if isinstance(sources[name], Samples) or len(repr(sources[name])) > LONGEST_SOURCE:
+            named_by[name] = spec
+    changed = overridden(circuit, sources)
+    return dataclasses.replace(changed, overrides={**changed.overrides, **named_by})
 
 
-def time_from_text(option: str, text: str | None) -> float | None:
+def with_times(circuit: Circuit, stop: str | None, start: str = "deck") -> tuple[Circuit, str]:
+    """The circuit with ``--stop`` and ``--start`` in place of TSTOP and TSTART, and how the run starts.
+
+    Without a .tran line the run starts uncharged and has 1,001 outputs.
+    """
+    from fingerspice.circuit.circuit import Tran
+
+    tran, t_stop = circuit.tran, _time("--stop", stop)
+    t_start = _time("--start", start) if start[:1] in "+-.0123456789" and start else None
+    if t_start is not None:
+        start = "deck"
+    if t_stop is None and (t_start is None or tran is None):
+        return circuit, start
+    first = t_start if t_start is not None else tran.start if tran is not None else 0.0
+    last = t_stop if t_stop is not None or tran is None else tran.stop
+    assert last is not None
+    if last <= 0.0:
+        raise InputError(f"--stop {last:g} s; allowed: more than 0 s")
+    if t_start is not None and not 0.0 <= first < last:
+        raise InputError(f"--start {first:g} s; allowed: from 0 s to less than the end, {last:g} s")
+    step = tran.step if tran is not None else (last - first) / 1000.0
+    if last < first + step * (1.0 - 1e-12):
+        raise InputError(
+            f"--stop {last:g} s is before the second output; allowed: TSTART + TSTEP = {first + step:g} s or more"
+        )
+    old = Tran(step, last, uic=True) if tran is None else tran
+    return dataclasses.replace(circuit, tran=dataclasses.replace(old, stop=last, start=first)), start
+
+
+def _time(option: str, text: str | None) -> float | None:
     """A time in s, such as ``50m``."""
     try:
         return None if text is None else parse_number(text)
     except ValueError as error:
         raise InputError(f"{option} {text!r}: {error}") from None
-
-
-def check_stop(circuit: Circuit, t_stop: float | None) -> None:
-    """Refuse an end (s) before the deck's second output."""
-    tran = circuit.tran
-    if t_stop is not None and tran is not None and 0.0 < t_stop < tran.start + tran.step:
-        raise InputError(
-            f"--stop {t_stop:g} s is before the second output; allowed: TSTART + TSTEP = {tran.start + tran.step:g} s "
-            "or more"
-        )
 
 
 def area_from_text(text: str) -> str | float:

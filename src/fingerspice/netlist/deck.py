@@ -35,7 +35,7 @@ __all__ = [
 #: Characters of a title that are shown; the middle of a longer one is left out.
 LONGEST_TITLE = 200
 
-_VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|wavefile|table)\b)"
+_VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|chirp|burst|wavefile|table)\b)"
 _ELEMENT_TITLE = re.compile(rf"[rcvi]\w*\s+\S+\s+\S+\s+{_VALUE}", re.IGNORECASE)
 _DEVICE_TITLE = re.compile(rf"x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(layer_devices())})(?:\s|$)", re.IGNORECASE)
 

@@ -14,7 +14,7 @@ from fingerspice.circuit.values import is_resistance, mega_note, unit_trap, unus
 from fingerspice.netlist.deck import Call, Number, Statement, Token
 from fingerspice.netlist.directives import start_volts
 from fingerspice.netlist.scope import Value
-from fingerspice.netlist.sources import Source, Timing, read_source
+from fingerspice.netlist.sources import Context, Source, read_source
 from fingerspice.netlist.spelling import nearest
 
 #: LTspice's parasitics, which become elements: ``rser`` in series at the first node, the others in parallel.
@@ -26,13 +26,13 @@ _VALUE_NAMES = {"R": ("r", "resistance"), "C": ("c", "capacitance")}
 _COPIES = "m"
 
 
-def read_elements(statement: Statement, timing: Timing, notes: list[str]) -> list[Element]:
+def read_elements(statement: Statement, context: Context, notes: list[str]) -> list[Element]:
     """The element of a statement, and those that LTspice's ``Rser``, ``Rpar`` and ``Cpar`` stand for.
 
     Parameters
     ----------
     statement : Statement
-    timing : Timing
+    context : Context
     notes : list of str
         Warnings are added to it.
 
@@ -53,7 +53,7 @@ def read_elements(statement: Statement, timing: Timing, notes: list[str]) -> lis
             )
         values = _device_values(own, device, notes)
     elif device in "VI":
-        source = _source(own, timing)
+        source = source_of(own, context)
         notes.extend(source.notes)
     else:
         values, initial = _passive_value(own, notes)
@@ -104,8 +104,17 @@ def _with_parasitics(element: Element, beside: dict[str, Value], notes: list[str
     return out
 
 
-def _source(statement: Statement, timing: Timing) -> Source:
+def source_of(statement: Statement, context: Context) -> Source:
+    """The source that a V or I element's statement describes.
+
+    Raises
+    ------
+    InputError
+        One sentence with the place.
+    """
     body = list(statement.body)
+    if "wavefile" in statement.params and not any(isinstance(word, Call) for word in body):
+        return read_source(statement.name, [*body, _ltspice_wavefile(statement)], context, statement.where)
     last = body[-1] if body else None
     if isinstance(last, Token) and last.text.lower() == "pwl":
         # The brackets of PWL(file=...) may be left out.
@@ -122,7 +131,18 @@ def _source(statement: Statement, timing: Timing) -> Source:
             params={**last.params, **statement.params},
             param_where={**last.param_where, **statement.param_where},
         )
-    return read_source(statement.name, body, timing, statement.where)
+    return read_source(statement.name, body, context, statement.where)
+
+
+def _ltspice_wavefile(statement: Statement) -> Call:
+    """LTspice's ``wavefile=path [chan=n]`` as a call: 1 V at full scale, and the first channel if none is chosen."""
+    where = statement.param_where["wavefile"]
+    for key in statement.params:
+        if key not in ("wavefile", "chan"):
+            raise InputError(f"{statement.name} takes no parameter {key!r} beside wavefile=; allowed: chan=",
+                             statement.param_where[key])  # fmt: skip
+    channel = statement.params.get("chan", Number(0.0, "0", where))
+    return Call("wavefile", (statement.params["wavefile"], Number(1.0, "1", where), channel), {}, {}, where)
 
 
 def _device_values(statement: Statement, device: str, notes: list[str]) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+from dataclasses import dataclass
 from encodings import cp1252
 from pathlib import Path, PurePath
 
@@ -12,6 +13,8 @@ from fingerspice.netlist.library import LIBRARIES, library_text
 from fingerspice.netlist.spelling import closest, nearest
 
 MAX_BYTES = 64 * 2**20
+#: Of all files that a deck's sources name.
+MAX_SOURCE_BYTES = 2**30
 
 #: Libraries with ngspice's bodies of the native devices; the one that is included says which charge law is meant.
 NATIVE_LIBRARIES = tuple(LIBRARIES.values())
@@ -66,6 +69,50 @@ def read_text(path: Path, shown: str, where: Where | None = None, root: Path | N
         number = data[:broken].count(b"\n") + 1
         problem = f"'{shown}' is neither UTF-8 nor Latin-1 text (byte 0x{data[broken]:02x} in line {number})"
         raise InputError(f"{problem}: save it as UTF-8", where) from None
+
+
+@dataclass
+class SourceFiles:
+    """Where sources find recordings and tables: for a deck in its folder or below, for a text of the user's anywhere.
+
+    Attributes
+    ----------
+    folder : Path or None
+        The deck's; None for a deck given as text, which has none.
+    anywhere : bool
+        Whether any file may be read, named from the working directory: so it is for what a user, and no deck, asks for.
+    size : int
+        Bytes of the files named so far, each as often as it is named.
+    """
+
+    folder: Path | None = None
+    anywhere: bool = False
+    size: int = 0
+
+    def find(self, name: str, where: Where) -> Path:
+        """Path of a file, where `where` names it; refused where it lies outside the folder.
+
+        Raises
+        ------
+        InputError
+            One sentence with the place.
+        """
+        path = Path(name).expanduser() if self.anywhere else self._below(name, where)
+        if path.is_file():
+            self.size += path.stat().st_size
+            if self.size > MAX_SOURCE_BYTES:
+                raise InputError(f"the sources' files are larger than {MAX_SOURCE_BYTES >> 20:,} MiB in all", where)
+        return path
+
+    def _below(self, name: str, where: Where) -> Path:
+        if self.folder is None:
+            raise InputError(f"'{name}' cannot be read: a netlist given as text has no folder to look in", where)
+        # The line may stand in an included file, whose name begins with the deck's folder as the user wrote it.
+        folder = Path(where.file).parent
+        path = inside(self.folder.resolve(), folder, name, where)
+        if not path.exists():
+            raise InputError(f"'{name}' does not exist{_similar_file(path, name, self.folder.resolve())}", where)
+        return folder / name.replace("\\", "/")
 
 
 def library_changed(root: Path, folder: Path, name: str) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
@@ -15,10 +16,11 @@ from fingerspice.circuit.usual import REST_AREA
 from fingerspice.circuit.values import unusual
 from fingerspice.netlist.deck import Deck, parse_deck, read_deck
 from fingerspice.netlist.directives import read_ac, read_initial, read_options, read_tran, unused_starts
-from fingerspice.netlist.elements import read_elements
+from fingerspice.netlist.elements import read_elements, source_of
+from fingerspice.netlist.files import SourceFiles
 from fingerspice.netlist.reader import MAX_WARNINGS
 from fingerspice.netlist.slips import decimal_comma, with_comma
-from fingerspice.netlist.sources import Timing, read_source
+from fingerspice.netlist.sources import Context
 from fingerspice.waveforms.waveform import DC, Waveform
 
 
@@ -87,8 +89,9 @@ def _in_deck(error: InputError, deck: Deck) -> InputError:
 
 def _read(deck: Deck, notes: list[str]) -> Circuit:
     tran = read_tran(deck.tran, notes) if deck.tran else None
-    timing = Timing(tran.step if tran else None, tran.stop if tran else None)
-    elements = tuple(e for statement in deck.statements for e in read_elements(statement, timing, notes))
+    files = SourceFiles(None if deck.path is None else deck.path.parent)
+    context = Context(tran.step if tran else None, tran.stop if tran else None, files)
+    elements = tuple(e for statement in deck.statements for e in read_elements(statement, context, notes))
     work, unused = read_options(deck.options)
     initial = read_initial(deck.ic, elements)
     notes.extend(_unusual_areas(elements, initial))
@@ -146,7 +149,9 @@ def _charge_law(includes: tuple[str, ...]) -> str | None:
 
 
 def source_from_text(text: str, circuit: Circuit) -> Waveform:
-    """A waveform from netlist text such as ``SQUARE(200 100)``; SPICE's defaults are taken from the circuit's .tran.
+    """A waveform from netlist text such as ``SQUARE(200 100)`` or ``WAVEFILE(a.wav 150)``.
+
+    SPICE's defaults are taken from the circuit's .tran, and files are named from the working directory.
 
     Raises
     ------
@@ -155,12 +160,13 @@ def source_from_text(text: str, circuit: Circuit) -> Waveform:
     """
     tran = circuit.tran
     line = f".tran {tran.step!r} {tran.stop!r}\n" if tran else ""
-    timing = Timing(tran.step if tran else None, tran.stop if tran else None)
+    files = SourceFiles(anywhere=True)
+    context = Context(tran.step if tran else None, tran.stop if tran else None, files)
     try:
         deck = parse_deck(f"source\nVsource a 0 {text}\n{line}")
-        if len(deck.statements) != 1 or deck.statements[0].params:
+        if len(deck.statements) != 1:
             raise InputError("not one source; allowed: such as SQUARE(200 100)")
-        source = read_source("source", deck.statements[0].body, timing, deck.statements[0].where)
+        source = source_of(replace(deck.statements[0], name="source"), context)
         if source.ac is not None:
             raise InputError("AC belongs into the deck; allowed: the source function alone, whose fundamental drives")
     except InputError as error:

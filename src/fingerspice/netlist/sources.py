@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.circuit import SmallSignal
 from fingerspice.netlist.deck import Call, Number, Token
+from fingerspice.netlist.files import SourceFiles
 from fingerspice.netlist.slips import is_unit
 from fingerspice.netlist.spelling import nearest
-from fingerspice.waveforms.periodic import Square
-from fingerspice.waveforms.ramps import PWL, Pulse
-from fingerspice.waveforms.transients import Exp
+from fingerspice.waveforms.files import read_table
+from fingerspice.waveforms.periodic import Pulse, Square
+from fingerspice.waveforms.ramps import PWL, Samples
+from fingerspice.waveforms.repeated import Burst, Repeat
+from fingerspice.waveforms.transients import Chirp, Exp
 from fingerspice.waveforms.waveform import DC, Sine, Waveform
 
 Word = Number | Token | Call
@@ -22,16 +25,27 @@ _SIN = ("VO", "VA", "FREQ", "TD", "THETA", "PHASE")
 _PULSE = ("V1", "V2", "TD", "TR", "TF", "PW", "PER")
 #: Functions to which LTspice adds a number of periods.
 _COUNTED = (_SIN, _PULSE)
-#: Names in LTspice.
-_ALIASES = {"sine": "sin"}
+#: Names in LTspice, and a short one for the command line.
+_ALIASES = {"sine": "sin", "wav": "wavefile"}
+_CHIRP = ("amplitude", "f0", "f1", "duration")
+_BURST = ("amplitude", "frequency", "cycles", "every")
 
 
 @dataclass(frozen=True)
-class Timing:
-    """TSTEP and TSTOP of the deck (s), on which SPICE's defaults depend; None without a .tran line."""
+class Context:
+    """What a source's text may refer to.
 
-    step: float | None
-    stop: float | None
+    Attributes
+    ----------
+    step, stop : float or None
+        TSTEP and TSTOP of the deck (s), on which SPICE's defaults depend; None without a .tran line.
+    files : SourceFiles
+        Where recordings and tables are read.
+    """
+
+    step: float | None = None
+    stop: float | None = None
+    files: SourceFiles = field(default_factory=SourceFiles)
 
 
 @dataclass(frozen=True)
@@ -41,7 +55,7 @@ class _Arguments:
     call: Call
     names: tuple[str, ...]
     required: int
-    timing: Timing
+    context: Context
 
     def __post_init__(self) -> None:
         given = len(self.call.args)
@@ -53,7 +67,7 @@ class _Arguments:
             )
         if given > len(self.names):
             # LTspice has one more, Ncycles.
-            hint = "; Ncycles is not supported, in Python a burst is a product, fs.Sine(...) * fs.Pulse(...)"
+            hint = "; Ncycles is not supported, a burst is BURST(amplitude frequency cycles), in Python fs.Burst"
             usage += hint if self.names in _COUNTED and given == len(self.names) + 1 else ""
             raise InputError(
                 f"{self.call.name.upper()} takes at most {len(self.names)} values, {given} given; allowed: {usage}",
@@ -71,13 +85,13 @@ class _Arguments:
         """An argument whose SPICE default is TSTEP."""
         if self.names.index(name) < len(self.call.args):
             return self.get(name)
-        if self.timing.step is None:
+        if self.context.step is None:
             raise InputError(
                 f"{self.call.name.upper()} leaves out {name}, which defaults to TSTEP, and there is no .tran line; "
                 f"allowed: give {name}",
                 self.call.where,
             )
-        return self.timing.step
+        return self.context.step
 
 
 def _number(word: Word, what: str) -> float:
@@ -87,16 +101,16 @@ def _number(word: Word, what: str) -> float:
     raise InputError(f"{what} is {text!r}; allowed: a number or {{expression}}", word.where)
 
 
-def _sin(call: Call, timing: Timing) -> Waveform:
-    a = _Arguments(call, _SIN, 2, timing)
-    frequency = a.get("FREQ", 1.0 / timing.stop if timing.stop else math.nan)
+def _sin(call: Call, context: Context) -> Waveform:
+    a = _Arguments(call, _SIN, 2, context)
+    frequency = a.get("FREQ", 1.0 / context.stop if context.stop else math.nan)
     if math.isnan(frequency):
         raise InputError("SIN leaves out FREQ, which defaults to 1/TSTOP, and there is no .tran line", call.where)
     return Sine(a.get("VA"), frequency, a.get("VO"), a.get("PHASE", 0.0), a.get("TD", 0.0), a.get("THETA", 0.0))
 
 
-def _pulse(call: Call, timing: Timing) -> Waveform:
-    a = _Arguments(call, _PULSE, 2, timing)
+def _pulse(call: Call, context: Context) -> Waveform:
+    a = _Arguments(call, _PULSE, 2, context)
     # TR and TF of 0 mean ideal edges here. PW and PER of 0 mean "for ever", as in ngspice.
     return Pulse(
         a.get("V1"),
@@ -109,56 +123,146 @@ def _pulse(call: Call, timing: Timing) -> Waveform:
     )
 
 
-def _exp(call: Call, timing: Timing) -> Waveform:
-    a = _Arguments(call, ("V1", "V2", "TD1", "TAU1", "TD2", "TAU2"), 2, timing)
+def _exp(call: Call, context: Context) -> Waveform:
+    a = _Arguments(call, ("V1", "V2", "TD1", "TAU1", "TD2", "TAU2"), 2, context)
     td1 = a.get("TD1", 0.0)
     td2 = a.get("TD2") if len(call.args) > 4 else td1 + a.step_or("TD2")
     return Exp(a.get("V1"), a.get("V2"), td1, a.step_or("TAU1"), td2, a.step_or("TAU2"))
 
 
-def _pwl(call: Call, timing: Timing) -> Waveform:
+def _pwl(call: Call, context: Context) -> Waveform:
     for key, value in call.params.items():
-        if key not in ("r", "td"):
+        if key not in ("r", "td", "file"):
             place = call.param_where.get(key, call.where)
-            if key == "file":
-                raise InputError(
-                    "PWL(file=...) is not supported (it aborts ngspice 39); write the points, PWL(t1 v1 t2 v2 ...), or "
-                    "give them in Python, fs.PWL(times, values) or fs.Samples(values, rate)",
-                    place,
-                )
-            raise InputError(f"PWL has no parameter {key!r}; allowed: r and td", place)
-        _number(value, f"PWL {key}")
-    values = [_number(arg, "PWL value") for arg in call.args]
-    if len(values) < 2 or len(values) % 2:
-        raise InputError(f"PWL needs pairs of time and value, {len(values)} numbers given", call.where)
+            raise InputError(f"PWL has no parameter {key!r}; allowed: r, td and file", place)
+        if key != "file":
+            _number(value, f"PWL {key}")
+    if "file" in call.params:
+        if call.args:
+            raise InputError("PWL has points and file= too; allowed: one of them", call.where)
+        points = PWL.from_table(context.files.find(*_path(call, call.params["file"])))
+        given, levels = points.times, points.values
+    else:
+        numbers = [_number(arg, "PWL value") for arg in call.args]
+        if len(numbers) < 2 or len(numbers) % 2:
+            raise InputError(f"PWL needs pairs of time and value, {len(numbers)} numbers given", call.where)
+        given, levels = tuple(numbers[0::2]), tuple(numbers[1::2])
     shift = _number(call.params["td"], "PWL td") if "td" in call.params else 0.0
     repeat = _number(call.params["r"], "PWL r") if "r" in call.params else -1.0
-    times = [t + shift for t in values[0::2]]
-    if repeat >= 0.0 and repeat not in values[0::2] and repeat < values[0]:
+    times = tuple(t + shift for t in given)
+    if 0.0 <= repeat < given[0]:
         # Where the repeated part begins before the first point, it begins with the first value.
-        times, values = [repeat + shift, *times], [repeat, values[1], *values]
-    return PWL(tuple(times), tuple(values[1::2]), repeat + shift if repeat >= 0.0 else None)
+        times, levels = (repeat + shift, *times), (levels[0], *levels)
+    return PWL(times, levels, repeat + shift if repeat >= 0.0 else None)
 
 
-def _square(call: Call, timing: Timing) -> Waveform:
-    a = _Arguments(call, ("amplitude", "frequency", "duty"), 2, timing)
+def _path(call: Call, word: Word | None) -> tuple[str, Where]:
+    """The name of a file, and its place."""
+    if word is None:
+        raise InputError(f"{call.name.upper()} names no file; allowed: {_OF_FILES[_kind(call)]}", call.where)
+    return word.name if isinstance(word, Call) else word.text, word.where
+
+
+def _kind(call: Call) -> str:
+    return _ALIASES.get(call.name.lower(), call.name.lower())
+
+
+def _named(call: Call, names: tuple[str, ...], keys: tuple[str, ...]) -> dict[str, Word]:
+    """Words of a call by name: positional ones are those of `names`, and any of `keys` may be given as key=value."""
+    usage = f"allowed: {_OF_FILES[_kind(call)]}"
+    if len(call.args) > len(names):
+        raise InputError(f"{call.name.upper()} takes at most {len(names)} values, {len(call.args)} given; {usage}",
+                         call.where)  # fmt: skip
+    words: dict[str, Word] = dict(zip(names, call.args, strict=False))
+    for key, value in call.params.items():
+        if key not in keys or key in words:
+            problem = f"{key!r} twice" if key in words else f"no parameter {key!r}"
+            raise InputError(f"{call.name.upper()} has {problem}; {usage}", call.param_where.get(key, call.where))
+        words[key] = value
+    return words
+
+
+def _whole(words: dict[str, Word], key: str) -> int | None:
+    """A whole number by its name; None where it is left out."""
+    if key not in words:
+        return None
+    value = _number(words[key], key)
+    if value != int(value):
+        raise InputError(f"{key} is {value:g}; allowed: a whole number", words[key].where)
+    return int(value)
+
+
+def _column(words: dict[str, Word], key: str) -> str | int | None:
+    """A column's name or number; None where it is left out."""
+    word = words.get(key)
+    return word.text if isinstance(word, Token) else _whole(words, key)
+
+
+def _wavefile(call: Call, context: Context) -> Waveform:
+    words = _named(call, ("path", "gain", "channel"), ("gain", "channel", "upsample"))
+    path = context.files.find(*_path(call, words.get("path")))
+    if "gain" not in words:
+        raise InputError(f"{call.name.upper()} has no gain, the V at full scale; allowed: {_OF_FILES['wavefile']}",
+                         call.where)  # fmt: skip
+    recording = Samples.from_wav(path, _number(words["gain"], "gain"), _whole(words, "channel"))
+    factor = _whole(words, "upsample")
+    return recording if factor is None else recording.upsampled(factor)
+
+
+def _table(call: Call, context: Context) -> Waveform:
+    words = _named(call, ("path", "time", "value"), ("time", "value", "rate", "upsample"))
+    path = context.files.find(*_path(call, words.get("path")))
+    rate = _number(words["rate"], "TABLE rate") if "rate" in words else None
+    table = read_table(path, _column(words, "time"), _column(words, "value"), rate)
+    factor = _whole(words, "upsample")
+    if table.rate is not None:
+        recording = Samples(table.values, table.rate)
+        return recording if factor is None else recording.upsampled(factor)
+    if factor is not None:
+        raise InputError("TABLE upsample goes with a rate, and this table has times", call.where)
+    return PWL(table.times, table.values)  # type: ignore[arg-type]
+
+
+def _square(call: Call, context: Context) -> Waveform:
+    a = _Arguments(call, ("amplitude", "frequency", "duty"), 2, context)
     return Square(a.get("amplitude"), a.get("frequency"), a.get("duty", 0.5))
 
 
-SOURCES: dict[str, Callable[[Call, Timing], Waveform]] = {
+def _chirp(call: Call, context: Context) -> Waveform:
+    a = _Arguments(call, _CHIRP, 4, context)
+    return Chirp(*(a.get(name) for name in _CHIRP))
+
+
+def _burst(call: Call, context: Context) -> Waveform:
+    a = _Arguments(call, _BURST, 3, context)
+    frequency, every = a.get("frequency"), a.get("every", 0.0)
+    tone = Sine(a.get("amplitude"), frequency)
+    burst = Burst(tone, a.get("cycles") / frequency)
+    return Repeat(burst, every) if every else burst
+
+
+SOURCES: dict[str, Callable[[Call, Context], Waveform]] = {
     "sin": _sin,
     "pulse": _pulse,
     "exp": _exp,
     "pwl": _pwl,
     "square": _square,
+    "chirp": _chirp,
+    "burst": _burst,
+    "wavefile": _wavefile,
+    "table": _table,
 }
 """Source functions by name: add one here to teach the reader another."""
+
+_OF_FILES = {
+    "wavefile": "WAVEFILE(path gain [channel]) with gain in V at full scale",
+    "table": "TABLE(path [time_column value_column]) or TABLE(path rate=RATE)",
+    "pwl": "PWL FILE=path",
+}
 
 _REFUSED = {
     "am": "AM changed its argument order between ngspice versions; write the waveform as PWL, or give it in Python",
     "sffm": "SFFM changed its argument order between ngspice versions; write the waveform as PWL",
-    "wavefile": "WAVEFILE is not supported by this version; give the samples in Python: fs.Samples(values, rate)",
-    "table": "TABLE is not supported by this version; write the points as PWL(t1 v1 t2 v2 ...)",
 }
 
 
@@ -179,7 +283,7 @@ class Source:
     notes: tuple[str, ...] = ()
 
 
-def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -> Source:
+def read_source(name: str, body: Sequence[Word], context: Context, where: Where) -> Source:
     """Read the words after the nodes of a V or I element.
 
     Parameters
@@ -188,7 +292,7 @@ def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -
         The element.
     body : sequence of words
         ``[DC] value``, ``AC ...`` and at most one source function.
-    timing : Timing
+    context : Context
     where : Where
         Place of the element.
 
@@ -230,7 +334,7 @@ def read_source(name: str, body: Sequence[Word], timing: Timing, where: Where) -
         elif waveform is not None:
             raise InputError(f"{name} has two source functions, the second is {key.upper()}", word.where)
         else:
-            waveform = _read_call(name, key, call, timing)
+            waveform = _read_call(name, key, call, context)
             notes = _differences(name, key, waveform, call)
     if waveform is None and level is None and ac is None:
         raise InputError(f"{name} has no value; allowed: a number or one of {_known()}", where)
@@ -277,7 +381,7 @@ def _leading_numbers(words: deque[Word]) -> list[Number]:
     return out
 
 
-def _read_call(name: str, key: str, call: Call, timing: Timing) -> Waveform:
+def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:
     if key in _REFUSED:
         raise InputError(f"{name}: {_REFUSED[key]}", call.where)
     if key not in SOURCES:
@@ -285,7 +389,7 @@ def _read_call(name: str, key: str, call: Call, timing: Timing) -> Waveform:
             f"{name}: unknown source {key.upper()!r}{nearest(key, SOURCES)}; allowed: {_known()}", call.where
         )
     try:
-        return SOURCES[key](call, timing)
+        return SOURCES[key](call, context)
     except InputError as error:
         raise error if error.where else InputError(f"{name}: {error.message}", call.where) from None
 

@@ -22,7 +22,7 @@ from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, State, 
 from fingerspice.results.plan import Plan
 from fingerspice.results.solution import Solution
 from fingerspice.results.stored_record import StoredRecord
-from fingerspice.waveforms import combinations, periodic, ramps, transients
+from fingerspice.waveforms import combinations, periodic, ramps, repeated, transients
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.waveform import Fundamental, Waveform
 
@@ -30,8 +30,9 @@ from fingerspice.waveforms.waveform import Fundamental, Waveform
 _WAVEFORMS = {
     kind.__name__: kind
     for kind in (
-        waveforms.DC, waveforms.Sine, transients.Chirp, transients.Exp, ramps.PWL, ramps.Pulse, periodic.Square,
+        waveforms.DC, waveforms.Sine, transients.Chirp, transients.Exp, ramps.PWL, periodic.Pulse, periodic.Square,
         periodic.Triangle, periodic.Sawtooth, combinations.Sum, combinations.Product, combinations.AM,
+        repeated.Burst, repeated.Repeat,
     )
 }  # fmt: skip
 # Deepest nesting in that text.
@@ -44,7 +45,7 @@ def load(path: str | Path) -> Solution:
 
     Signals with both rows of each jump, figures, error, status and warnings are those of the run. The circuit is made
     again from the deck's text and the changes; where that is not possible (a source that was a function or samples, a
-    deck that includes files) it has no elements, and a warning says so. No run can start from a loaded one.
+    deck that includes or plays files) it has no elements, and a warning says so. No run can start from a loaded one.
 
     Parameters
     ----------

@@ -185,7 +185,7 @@ def plan(
     circuit = overridden(circuit, sources, parameters)
     if t_stop is None and circuit.tran is None:
         t_stop = 1.0
-    for text in circuit_warnings(circuit):
+    for text in circuit_warnings(circuit, t_stop):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     problem = prepare(
         circuit, t_stop=t_stop, t_eval=None, charge_law=charge_law, area=area, start="deck", charge=charge, rtol=rtol

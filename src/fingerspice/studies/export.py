@@ -16,7 +16,8 @@ from fingerspice.netlist.library import LIBRARIES, library_text
 from fingerspice.physics.contact import Contact
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.starting import start_voltage, starts_uncharged
-from fingerspice.waveforms.ramps import PWL, Pulse
+from fingerspice.waveforms.periodic import Pulse
+from fingerspice.waveforms.ramps import PWL, Samples
 from fingerspice.waveforms.transients import Exp
 from fingerspice.waveforms.waveform import DC, Sine, Waveform
 
@@ -227,14 +228,37 @@ def _source_text(waveform: Waveform, element: Element, circuit: Circuit) -> str:
     if isinstance(waveform, Exp):
         e = waveform
         return f"EXP({' '.join(repr(float(x)) for x in (e.v1, e.v2, e.td1 or NOW, e.tau1, e.td2 or NOW, e.tau2))})"
-    if isinstance(waveform, PWL) and waveform.repeat is None:
-        t, v = np.asarray(waveform.times), np.asarray(waveform.values)
+    if isinstance(waveform, PWL | Samples) and waveform.period is None:
+        t, v = _own_points(waveform, element, circuit)
     else:
         t, v = _sampled(waveform, element, circuit)
     if _starts_empty(circuit):
         # Everything starts at 0 V, and the source jumps from there: ngspice can hardly take its first step otherwise.
         t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append([0.0, waveform.value(0.0)], v[t > 0.0])
     return _pwl_text(t, v, _edge(circuit))
+
+
+def _own_points(waveform: PWL | Samples, element: Element, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
+    """The points of straight lines from 0 s to the first after the end of the run, where its end is known."""
+    v = np.asarray(waveform.values)
+    at = waveform.times if isinstance(waveform, PWL) else waveform.start + np.arange(v.size) / waveform.rate
+    t = np.asarray(at)
+    if circuit.tran is not None:
+        count = int(np.searchsorted(t, circuit.tran.stop, side="right")) + 1
+        t, v = t[:count], v[:count]
+    if t[0] < 0.0:
+        at_0 = [waveform.value(0.0, "left").item(), waveform.value(0.0).item()]
+        t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append(at_0, v[t > 0.0])
+    _refuse_many(t.size, element)
+    return t, v
+
+
+def _refuse_many(points: float, element: Element) -> None:
+    if points > _MAX_POINTS:
+        raise InputError(
+            f"{element.name}: the source would take {points:.0f} PWL points; allowed: at most {_MAX_POINTS}; shorten "
+            "the run (--stop, or .tran)"
+        )
 
 
 def _starts_empty(circuit: Circuit) -> bool:
@@ -282,11 +306,7 @@ def _sampled(waveform: Waveform, element: Element, circuit: Circuit) -> tuple[np
     if points <= 10 * _MAX_POINTS:
         breaks = waveform.breakpoints(0.0, stop)
         points = count + 2 * breaks.size
-    if points > _MAX_POINTS:
-        raise InputError(
-            f"{element.name}: the source would take {points:.0f} PWL points; allowed: at most {_MAX_POINTS}; shorten "
-            "the run (.tran)"
-        )
+    _refuse_many(points, element)
     if circuit.tran.uic:
         # The value before t = 0 only matters to an operating point.
         breaks = breaks[breaks > 0.0]

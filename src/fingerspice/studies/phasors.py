@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import replace
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,10 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_area
-from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.response import linear_scene
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.response import linear_scene, with_skin_held
 from fingerspice.circuit.usual import beyond_fingers
-from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 from fingerspice.results.phasor_solution import PhasorSolution
 from fingerspice.studies.sweeps import sweep_drive, sweep_notes
 from fingerspice.waveforms.waveform import Fundamental, require
@@ -48,18 +45,6 @@ def _check_area(area: str | float, amplitude: float, fixed: bool) -> None:
             "area='mean' needs the amplitude of the source's fundamental, and this source has none; allowed: "
             "'frozen' or an area in m^2"
         )
-
-
-def _with_skin_held(circuit: Circuit) -> Circuit:
-    """The circuit with each SKIN replaced by a slab of its data at its own frequency."""
-
-    def held(skin: Element) -> Element:
-        d, f = skin.values["d"], skin.values["f"]
-        eps_r, rho = float(skin_permittivity(f)), float(skin_resistivity(f))
-        values = MappingProxyType({"d": d, "eps_r": eps_r, "rho": rho, "e_max": math.inf})
-        return replace(skin, device="SLAB", values=values)
-
-    return replace(circuit, elements=tuple(held(e) if e.device == "SKIN" else e for e in circuit.elements))
 
 
 def _refuse_no_number(f: FloatArray, *results: NDArray[np.inexact]) -> None:
@@ -113,7 +98,7 @@ def phasor(
     require(skin in ("swept", "own"), "skin", repr(skin), "'swept' or 'own'")
     require_area(area)
     circuit = overridden(circuit, sources, parameters)
-    scene = linear_scene(circuit if skin == "swept" else _with_skin_held(circuit), finger)
+    scene = linear_scene(circuit if skin == "swept" else with_skin_held(circuit), finger)
     f = _frequencies(frequency, scene.fundamental)
     drive = sweep_drive(scene.sources, scene.fundamental, frequency is not None)
     _check_area(area, drive.amplitude, scene.fixed)

@@ -1,4 +1,4 @@
-"""Periodic waveforms made of straight pieces: square, triangle and sawtooth."""
+"""Periodic waveforms made of straight pieces: square, triangle, sawtooth, and SPICE's pulses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.waveforms.bounds import check_finite, runs_through
+from fingerspice.waveforms.bounds import check_finite, check_range, runs_through
 from fingerspice.waveforms.ramps import Ramps
 from fingerspice.waveforms.waveform import require
 
@@ -124,3 +124,80 @@ class Sawtooth(_Periodic):
         period = 1.0 / self.frequency
         t = np.array([0.0, 0.0, 1.0]) * period
         return t, self.offset + self.amplitude * np.array([1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Pulse(Ramps):
+    """SPICE's PULSE: v1 until `delay`; then, in every `pulse_period`, a rise to v2, a width, and a fall back to v1.
+
+    Voltages in V, times in s. A rise or fall of 0 is an ideal jump. Without `pulse_period` there is one pulse.
+    """
+
+    v1: float
+    v2: float
+    delay: float = 0.0
+    rise: float = 0.0
+    fall: float = 0.0
+    width: float = math.inf
+    pulse_period: float = math.inf
+    units: ClassVar[dict[str, str]] = {
+        "v1": "V",
+        "v2": "V",
+        "delay": "s",
+        "rise": "s",
+        "fall": "s",
+        "width": "s",
+        "pulse_period": "s",
+    }
+
+    def __post_init__(self) -> None:
+        for name in ("v1", "v2", "delay"):
+            require(math.isfinite(getattr(self, name)), f"pulse {name}", getattr(self, name), "a finite number")
+        for name in ("rise", "fall", "width"):
+            require(getattr(self, name) >= 0.0, f"pulse {name}", f"{getattr(self, name):g} s", ">= 0")
+        require(self.pulse_period > 0.0, "pulse period", f"{self.pulse_period:g} s", "> 0")
+        for name, unit in self.units.items():
+            check_range(f"pulse {name.replace('_', ' ')}", getattr(self, name), unit)
+        require(math.isfinite(self.rise + self.fall), "pulse rise + fall", "infinite", "finite times")
+        busy = self.rise + self.width + self.fall
+        if math.isfinite(self.pulse_period):
+            require(
+                busy <= self.pulse_period * (1.0 + 1e-12),
+                "pulse rise + width + fall",
+                f"{busy:g} s",
+                f"at most the period, {self.pulse_period:g} s",
+            )
+
+    @property
+    def period(self) -> float | None:  # type: ignore[override]
+        return self.pulse_period if math.isfinite(self.pulse_period) else None
+
+    @property
+    def settled(self) -> float:
+        return max(0.0, self.delay)
+
+    @property
+    def half_wave(self) -> bool:
+        return (
+            self.v1 == -self.v2
+            and self.rise == self.fall
+            and abs(2.0 * (self.rise + self.width) - self.pulse_period) <= 4e-16 * self.pulse_period
+        )
+
+    @property
+    def _first(self) -> float:  # type: ignore[override]
+        return self.delay
+
+    def _knots(self) -> tuple[FloatArray, FloatArray]:
+        start = 0.0 if self.period else self.delay
+        up = start + self.rise
+        if not math.isfinite(self.width):
+            return np.array([start, up]), np.array([self.v1, self.v2])
+        t = [start, up, up + self.width, up + self.width + self.fall]
+        v = [self.v1, self.v2, self.v2, self.v1]
+        if self.period:
+            t.append(max(t[-1], self.pulse_period))
+            v.append(self.v1)
+            if t[-2] >= t[-1]:
+                t, v = t[:-1], v[:-1]
+        return np.array(t), np.array(v)

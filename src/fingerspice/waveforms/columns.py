@@ -1,0 +1,223 @@
+"""A text with columns of numbers, such as CSV: what its separators, header and units are, and what is wrong in it."""
+
+from __future__ import annotations
+
+import codecs
+import itertools
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import InputError
+from fingerspice.base.units import parse_number
+
+_UNIT = re.compile(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]")
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
+_VOLTS = {"v": 1.0, "mv": 1e-3, "uv": 1e-6, "µv": 1e-6, "μv": 1e-6, "kv": 1e3}
+_AMPERES = {"a": 1.0, "ma": 1e-3, "ua": 1e-6, "µa": 1e-6, "μa": 1e-6, "na": 1e-9}
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
+# Columns whose names are shown.
+_SHOWN = 8
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns of finite numbers with what they are called.
+
+    Attributes
+    ----------
+    file : Path
+    names : tuple of str
+        Without units; empty where the file has no header.
+    data : ndarray, shape (n_row, n_column)
+        As written.
+    units : tuple of str
+        Of every column, empty where none is given; an empty tuple where no column has one.
+    lines : ndarray of int, shape (n_row,), or None
+        Number of each row's line in the file, from 1; None for a file without lines.
+    """
+
+    file: Path
+    names: tuple[str, ...]
+    data: FloatArray
+    units: tuple[str, ...] = ()
+    lines: NDArray[np.int64] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        bad = np.argwhere(~np.isfinite(self.data))
+        if bad.size:
+            row, column = bad[0].tolist()
+            name = repr(self.names[column]) if self.names else str(column)
+            raise InputError(f"{self.place(row)}: column {name} is {self.data[row, column]}; allowed: finite numbers")
+
+    def place(self, row: int) -> str:
+        """Where a row, counted from 0, stands."""
+        return f"'{self.file}', " + (f"row {row}" if self.lines is None else f"line {self.lines[row]}")
+
+    def listed(self) -> str:
+        """How many columns there are, and what they are called."""
+        count = self.data.shape[1]
+        shown = ", ".join(self.names[:_SHOWN]) + (", ..." if len(self.names) > _SHOWN else "")
+        called = f"({shown})" if self.names else f"without a header (0 to {count - 1})"
+        return f"{count} column{'s' if count > 1 else ''} {called}"
+
+    def index(self, column: str | int) -> int:
+        """Index of a column given by its name or number.
+
+        Raises
+        ------
+        InputError
+            For one that is not there.
+        """
+        count = self.data.shape[1]
+        if isinstance(column, str):
+            if not self.names:
+                raise InputError(f"'{self.file}' has no header that names a column {column!r}; allowed: its number, "
+                                 f"0 to {count - 1}")  # fmt: skip
+            exact = [i for i, name in enumerate(self.names) if name == column]
+            found = exact or [i for i, name in enumerate(self.names) if name.lower() == column.lower()]
+            if len(found) != 1:
+                what = "several columns" if found else "no column"
+                raise InputError(f"'{self.file}' has {what} {column!r}; it has {self.listed()}")
+            return found[0]
+        if not (column == int(column) and 0 <= column < count):
+            raise InputError(f"'{self.file}' has no column {column}; it has {self.listed()}")
+        return int(column)
+
+    def seconds(self, column: int) -> FloatArray:
+        """A column in s, shape (n_row,)."""
+        return self._scaled(column, _SECONDS)
+
+    def volts(self, column: int) -> FloatArray:
+        """A column in V, or in A, shape (n_row,)."""
+        return self._scaled(column, _VOLTS | _AMPERES)
+
+    def _scaled(self, column: int, known: dict[str, float]) -> FloatArray:
+        unit = self.units[column] if self.units else ""
+        if unit and unit.lower() not in known:
+            allowed = ", ".join(name for name in known if name.isascii())
+            problem = f"'{self.file}': the unit of column {self.names[column]!r} is {unit!r}"
+            raise InputError(f"{problem}; allowed: {allowed}")
+        return np.asarray(self.data[:, column] * (known[unit.lower()] if unit else 1.0))
+
+
+def read_text_columns(path: Path) -> Columns:
+    """Columns of a text file.
+
+    Raises
+    ------
+    InputError
+        With the line, for anything but rows of as many finite numbers.
+    """
+    data = path.read_bytes()
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    if b"\0" in data and not wide:
+        raise InputError(f"'{path}' is no text; allowed: a table as text, or an NPZ file")
+    lines = data.decode("utf-16" if wide else "utf-8-sig", "replace").splitlines()
+    numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
+    rows = [(number, line) for number, line in numbered if not line.lstrip().startswith("#")]
+    first = next((i for i, (_, line) in enumerate(rows) if _begins_with_number(line)), None)
+    if first is None:
+        raise InputError(f"'{path}' holds no rows of numbers")
+    begin, line = rows[first]
+    _refuse_semicolons(path, begin, line)
+    _refuse_decimal_commas(path, begin, line)
+    separator = "\t" if "\t" in line else "," if "," in line else None
+    count = len(_cells(line, separator))
+    names = _header(path, numbered, begin, separator, count)
+    rows = rows[first:]
+    table = _numbers(path, rows, separator, count)
+    units = tuple(_unit(name)[1] for name in names)
+    return Columns(
+        path, tuple(_unit(name)[0] for name in names), table, units, np.array([number for number, _ in rows])
+    )  # fmt: skip
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    """The cells of a line, without the quotes that spreadsheets put around them; blanks separate where nothing does."""
+    return [cell.strip().strip('"').strip() for cell in line.strip().split(separator)]
+
+
+def _begins_with_number(line: str) -> bool:
+    """Whether the first cell of a line that is not empty is a number, NaN included, so that the line is no header."""
+    cells = (cell.strip('"') for cell in re.split(r"[\s,;]+", line.strip()))
+    return re.match(r"[+-]?\.?\d|[+-]?(?:nan|inf)\b|$", next(filter(None, cells), ""), re.IGNORECASE) is not None
+
+
+def _unit(header: str) -> tuple[str, str]:
+    """Name and unit of a column from ``name (unit)`` or ``name [unit]``."""
+    match = _UNIT.fullmatch(header)
+    return (match[1], match[2]) if match else (header, "")
+
+
+def _refuse_semicolons(path: Path, number: int, line: str) -> None:
+    if ";" in line:
+        also = " and writes decimal commas" if any(map(_DECIMAL_COMMA.search, line.split(";"))) else ""
+        problem = f"'{path}', line {number}: the table separates by semicolons{also}"
+        raise InputError(f"{problem}; allowed: commas, tabs or blanks between numbers with points")
+
+
+def _refuse_decimal_commas(path: Path, number: int, line: str) -> None:
+    """Refuse cells such as ``0,5`` between blanks; where commas separate, the number of cells tells."""
+    cells = line.split()
+    if len(cells) > 1 and any(map(_DECIMAL_COMMA.fullmatch, cells)) and not any(c.endswith(",") for c in cells):
+        cell = next(filter(_DECIMAL_COMMA.fullmatch, cells))
+        raise InputError(f"'{path}', line {number}: {_comma(cell)}")
+
+
+def _comma(cell: str) -> str:
+    return f"{cell} has a decimal comma; allowed: points, {cell.replace(',', '.')}"
+
+
+def _header(
+    path: Path, numbered: list[tuple[int, str]], begin: int, separator: str | None, count: int
+) -> tuple[str, ...]:
+    """Names of the columns from the line before the first numbers, which may be a comment; empty where it has none."""
+    before = [(number, line) for number, line in numbered if number < begin]
+    if not before:
+        return ()
+    number, line = before[-1]
+    text = line.strip()
+    names = tuple(_cells(text.lstrip("#"), separator))
+    if len(names) == count:
+        return names
+    if text.startswith("#"):
+        return ()
+    hint = ", or are its commas decimal commas" if separator == "," and count == 2 * len(names) else ""
+    raise InputError(f"'{path}', line {number}: the header names {len(names)} columns, and the rows have {count}: is "
+                     f"a name missing{hint}?")  # fmt: skip
+
+
+def _numbers(path: Path, rows: list[tuple[int, str]], separator: str | None, count: int) -> FloatArray:
+    """The numbers, shape (n_row, count); refusals with their line."""
+    try:
+        table = np.loadtxt((line for _, line in rows), delimiter=separator, ndmin=2, comments=None)
+    except ValueError:
+        # NumPy does not know SPICE's scales and quotes, and does not say well what is wrong.
+        return np.array([_row(path, number, line, separator, count) for number, line in rows])
+    return np.asarray(table, float)
+
+
+def _row(path: Path, number: int, line: str, separator: str | None, count: int) -> list[float]:
+    _refuse_semicolons(path, number, line)
+    cells = _cells(line, separator)
+    if len(cells) != count:
+        raise InputError(f"'{path}', line {number} has {len(cells)} cells; allowed: {count}, as in the first row")
+    return [_number(path, number, column, cell) for column, cell in zip(itertools.count(), cells, strict=False)]
+
+
+def _number(path: Path, number: int, column: int, cell: str) -> float:
+    try:
+        # Of NaN and inf the caller says where they stand.
+        return float(cell)
+    except ValueError:
+        pass
+    try:
+        return parse_number(cell)
+    except ValueError as error:
+        reason = str(error) if cell else f"the cell in column {column} is empty; allowed: numbers"
+        raise InputError(f"'{path}', line {number}: {reason}") from None

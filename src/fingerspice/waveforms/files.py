@@ -1,0 +1,289 @@
+"""Recordings from files: WAV, tables as text (CSV and the like), and tables as NPZ.
+
+WAV files are read by `scipy.io.wavfile`: it is a dependency already, and reads integers of 8 to 64 bits, floats,
+extensible headers and RF64. What it leaves unsaid about broken files is said here.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import warnings
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import InputError
+from fingerspice.waveforms.columns import Columns, read_text_columns
+
+#: Largest size of a binary file and of a text, bytes.
+MAX_BYTES, MAX_TEXT_BYTES = 2**30, 2**26
+#: Largest number of samples: an hour at 48 kHz has 1.7e8, which take 1.4 GB.
+MAX_SAMPLES = 200_000_000
+# How far times that stand beside a rate may be off by their rounding, in samples.
+_JITTER = 0.1
+_RATE_NAMES = ("rate", "fs", "sample_rate")
+_TIME_NAMES = ("t", "time")
+# What scipy 1.17 raises on broken headers, found by 20,000 of them, and what it might.
+_BROKEN = (ValueError, struct.error, ArithmeticError, NameError, TypeError, LookupError, MemoryError, OSError)
+# What other formats begin with.
+_OTHERS = {
+    b"ID3": "MP3",
+    b"\xff\xfb": "MP3",
+    b"\xff\xf3": "MP3",
+    b"OggS": "Ogg",
+    b"fLaC": "FLAC",
+    b"FORM": "AIFF",
+    b"caff": "CAF",
+    b"PK": "ZIP or NPZ",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Values against time, either at a rate or at times.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n,)
+        V, or for a WAV file shares of full scale.
+    rate : float or None
+        Samples per second.
+    times : ndarray, shape (n,), or None
+        s, not decreasing.
+    """
+
+    values: FloatArray
+    rate: float | None = None
+    times: FloatArray | None = None
+
+
+def read_wav(path: str | Path, channel: int | None = None) -> Recording:
+    """One channel of a WAV file, as shares of full scale.
+
+    An integer is divided by half the range of its type (8-bit ones have their middle, 128, taken off before), so that
+    full scale is -1 to just below 1. A float is taken as it is.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file of at most `MAX_BYTES`.
+    channel : int, optional
+        Counted from 0; needed where there are several.
+
+    Raises
+    ------
+    InputError
+        For a file that is missing, too large, no WAV file, broken, cut short or empty, and for a missing or wrong
+        channel; one sentence each.
+    """
+    path = checked_file(path, MAX_BYTES)
+    rate, data = _wav_data(path)
+    if data.size == 0:
+        raise InputError(f"'{path}' holds no samples")
+    if not rate > 0:
+        raise InputError(f"'{path}' is broken: its header gives a rate of {rate} Hz")
+    data = data.reshape(data.shape[0], -1)
+    channels = data.shape[1]
+    if channel is None and channels > 1:
+        raise InputError(f"'{path}' has {channels} channels and none is chosen; allowed: channel=0 to {channels - 1}")
+    number = 0 if channel is None else channel
+    if isinstance(number, bool) or number != int(number) or not 0 <= number < channels:
+        allowed = "channel=0, its only one" if channels == 1 else f"channel=0 to {channels - 1}"
+        raise InputError(f"'{path}' has no channel {number}; allowed: {allowed}")
+    check_count(str(path), data.shape[0])
+    values = data[:, int(number)].astype(float)
+    if data.dtype.kind == "u":
+        # Only 8-bit samples are unsigned.
+        values -= 128.0
+    if data.dtype.kind in "iu":
+        values /= 2.0 ** (8 * data.dtype.itemsize - 1)
+    return Recording(values, float(rate))
+
+
+def _wav_data(path: Path) -> tuple[int, np.ndarray]:
+    """Rate (Hz) and samples as they are stored, shape (n,) or (n, n_channel)."""
+    from scipy.io import wavfile
+
+    with path.open("rb") as file:
+        start = file.read(12)
+    if start[:4] not in (b"RIFF", b"RIFX", b"RF64") or (len(start) == 12 and start[8:] != b"WAVE"):
+        kind = next((f", it begins as {name} does" for magic, name in _OTHERS.items() if start.startswith(magic)), "")
+        raise InputError(f"'{path}' is no WAV file{kind}; allowed: WAV (convert it), or a table by TABLE")
+    try:
+        with warnings.catch_warnings(record=True) as noticed:
+            warnings.simplefilter("always")
+            rate, data = wavfile.read(path)
+    except _BROKEN as error:
+        if "Unknown wave file format" in str(error):
+            what = str(error).partition(": ")[2].partition(".")[0]
+            raise InputError(f"'{path}' holds samples as {what}; allowed: PCM or float (convert it)") from None
+        raise InputError(f"'{path}' is broken or cut short: it cannot be read as WAV to its end") from None
+    if any("EOF" in str(note.message) for note in noticed):
+        raise InputError(f"'{path}' is cut short: it ends before the samples that its header promises")
+    return rate, data
+
+
+def read_table(
+    path: str | Path, time: str | int | None = None, value: str | int | None = None, rate: float | None = None
+) -> Recording:
+    """Columns of a table: a text with one row a line, or an NPZ file of NumPy.
+
+    Numbers in a text are separated by commas, tabs or blanks, may have SPICE's scales (``1m``), and have points. Lines
+    that begin with ``#`` are comments. The line before the first numbers may name the columns, with units in brackets:
+    ``time (ms), drive [kV]``; without units they are s and V. An NPZ file holds one array a column, and instead of
+    times it may hold a number named ``rate``.
+
+    Parameters
+    ----------
+    path : str or Path
+        A text of at most `MAX_TEXT_BYTES`, or an NPZ file of at most `MAX_BYTES`.
+    time, value : str or int, optional
+        Names of the columns, or their numbers counted from 0; may be left out where nothing else can be meant.
+    rate : float, optional
+        Samples per second, where there is no column of times.
+
+    Raises
+    ------
+    InputError
+        One sentence with the line: for a file that is missing, too large, empty or broken; for semicolons, decimal
+        commas, cells that are no finite numbers, rows of different length and decreasing times; for a column that is
+        not there; where times and a rate contradict each other.
+    """
+    path = checked_file(path, MAX_BYTES)
+    with path.open("rb") as file:
+        packed = file.read(4) == b"PK\x03\x04"
+    if not packed:
+        checked_file(path, MAX_TEXT_BYTES)
+    found, own_rate = _npz_columns(path) if packed else (read_text_columns(path), None)
+    check_count(str(path), found.data.shape[0])
+    if rate is not None and time is not None:
+        raise InputError(f"'{path}': a rate and a column of times are given; allowed: one of them")
+    if rate is not None and own_rate is not None and rate != own_rate:
+        raise InputError(f"'{path}': the rate given is {rate:g} Hz, and its own is {own_rate:g} Hz; allowed: one rate")
+    rate = own_rate if rate is None else rate
+    columns = found.data.shape[1]
+    timed = time is not None or (columns == 2 and value is None) or (rate is None and columns > 1)
+    if not timed:
+        if rate is None:
+            raise InputError(f"'{path}' has one column and no rate; allowed: a column of times too, or rate= in Hz")
+        _check_rate(path, rate)
+        return Recording(found.volts(_only(found, value, "value", 1)), rate)
+    t = found.seconds(_chosen_time(found, time))
+    values = found.volts(_only(found, value, "value", 2, other=_chosen_time(found, time)))
+    back = np.flatnonzero(t[1:] < t[:-1])
+    if back.size:
+        i = int(back[0])
+        raise InputError(f"{found.place(i + 1)}: the time {t[i + 1]:g} s follows {t[i]:g} s; allowed: not decreasing")
+    if rate is None:
+        return Recording(values, None, t)
+    _check_rate(path, rate)
+    late = np.abs((t - t[0]) * rate - np.arange(t.size)) > _JITTER
+    if late.any():
+        i = int(np.argmax(late))
+        problem = (
+            f"{found.place(i)}: the time {t[i]:g} s is not that of sample {i} at {rate:g} Hz, {t[0] + i / rate:g} s"
+        )
+        raise InputError(f"{problem}; allowed: times or a rate, or both that agree")
+    return Recording(values, rate)
+
+
+def checked_file(path: str | Path, most: int) -> Path:
+    """The path of an ordinary file that is not empty and not larger than `most` bytes.
+
+    Raises
+    ------
+    InputError
+        For anything else.
+    """
+    path = Path(path)
+    try:
+        if path.is_dir():
+            raise InputError(f"'{path}' is a folder, not a file")
+        if not path.exists():
+            raise InputError(f"'{path}' does not exist")
+        if not path.is_file():
+            raise InputError(f"'{path}' is not an ordinary file")
+        size = path.stat().st_size
+        with path.open("rb"):
+            pass
+    except (OSError, ValueError) as error:  # InputError is a ValueError
+        if isinstance(error, InputError):
+            raise
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise InputError(f"'{path}' cannot be read: {reason}") from None
+    if size == 0:
+        raise InputError(f"'{path}' is empty")
+    if size > most:
+        raise InputError(f"'{path}' has {size / 2**20:,.0f} MiB; allowed: at most {most >> 20:,} MiB")
+    return path
+
+
+def check_count(what: str, count: int) -> None:
+    """Refuse more samples than are kept in memory."""
+    if count > MAX_SAMPLES:
+        raise InputError(f"'{what}' has {count:,} samples; allowed: at most {MAX_SAMPLES:,}")
+
+
+def _check_rate(path: Path, rate: float) -> None:
+    if not (math.isfinite(rate) and rate > 0.0):
+        raise InputError(f"'{path}': the rate is {rate:g} Hz; allowed: > 0")
+
+
+def _chosen_time(found: Columns, time: str | int | None) -> int:
+    """Index of the column of times; where none is named the one called so, and else the first of two."""
+    if time is None:
+        named = [i for i, name in enumerate(found.names) if name.lower() in _TIME_NAMES]
+        return named[0] if len(named) == 1 else _only(found, None, "time", 2)
+    return _only(found, time, "time", 2)
+
+
+def _only(found: Columns, column: str | int | None, role: str, most: int, other: int | None = None) -> int:
+    """Index of a column; where it is left out the only one (`most` is 1), or of two the first or the `other`'s."""
+    if column is not None:
+        index = found.index(column)
+        if index == other:
+            raise InputError(f"'{found.file}': the column {column!r} is both time and value; allowed: two columns")
+        return index
+    if found.data.shape[1] > most:
+        raise InputError(f"'{found.file}' has {found.listed()}; allowed: name the column of the {role}")
+    return 0 if other is None else 1 - other
+
+
+def _npz_columns(path: Path) -> tuple[Columns, float | None]:
+    """The arrays of an NPZ file as columns, and its rate (Hz) where it has one."""
+    rate: float | None = None
+    arrays: dict[str, FloatArray] = {}
+    try:
+        with zipfile.ZipFile(path) as packed:
+            size = sum(entry.file_size for entry in packed.infolist())
+        if size > 8 * MAX_SAMPLES:
+            raise InputError(f"'{path}' unpacks to {size / 1e9:.3g} GB; allowed: at most {8e-9 * MAX_SAMPLES:g} GB")
+        with np.load(path) as file:
+            for name in file.files:
+                array = file[name]
+                if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf":
+                    kind = getattr(array, "dtype", "another kind")
+                    raise InputError(f"'{path}': the array {name!r} is of {kind}; allowed: real numbers")
+                if array.ndim == 0 and name.lower() in _RATE_NAMES:
+                    rate = float(array)
+                elif array.ndim == 1:
+                    arrays[name] = array.astype(float)
+                else:
+                    problem = f"'{path}': the array {name!r} has shape {array.shape}"
+                    raise InputError(f"{problem}; allowed: one row a column, and one number named rate")
+    except InputError:
+        raise
+    # What zipfile and NumPy raise on broken files, and on arrays of objects, which are not read.
+    except (ValueError, OSError, zipfile.BadZipFile, EOFError, KeyError, MemoryError, NotImplementedError) as error:
+        raise InputError(f"'{path}' cannot be read as NPZ: {str(error).partition('. ')[0]}") from None
+    lengths = {array.size for array in arrays.values()}
+    if len(lengths) > 1:
+        shown = ", ".join(f"{name} {array.size}" for name, array in arrays.items())
+        raise InputError(f"'{path}' has arrays of different length ({shown}); allowed: one length")
+    if not arrays or lengths == {0}:
+        raise InputError(f"'{path}' holds no numbers")
+    return Columns(path, tuple(arrays), np.column_stack(list(arrays.values()))), rate

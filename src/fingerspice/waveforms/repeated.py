@@ -1,0 +1,151 @@
+"""A waveform for a while, and a waveform again and again: `Burst` and `Repeat`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.waveforms.bounds import check_finite, runs_through
+from fingerspice.waveforms.waveform import Waveform, as_waveform, blank_terms, require
+
+# Times closer than this to a breakpoint, relative to themselves, are that breakpoint but for rounding.
+_ROUNDING = 8e-16
+
+
+class _Shifted(Waveform):
+    """Made of stretches of another waveform from its time 0 on, each shifted to where it begins."""
+
+    waveform: Waveform
+
+    def _stretch(self) -> float:
+        """Length of a stretch, s."""
+        raise NotImplementedError
+
+    @cached_property
+    def _marks(self) -> FloatArray:
+        """Breakpoints of the other waveform within a stretch, both its ends among them, s."""
+        length = self._stretch()
+        inner = self.waveform.breakpoints(0.0, length)
+        return np.concatenate([[0.0], inner[(inner > 0.0) & (inner < length * (1.0 - _ROUNDING))], [length]])
+
+    def _inner(self, t: FloatArray, begin: FloatArray | float) -> FloatArray:
+        """Times (s) since the stretch began; those that are a breakpoint but for rounding are exactly that."""
+        tau = np.asarray(t - begin, float)
+        marks = self._marks
+        right = np.clip(np.searchsorted(marks, tau), 1, marks.size - 1)
+        near = np.where(tau - marks[right - 1] < marks[right] - tau, marks[right - 1], marks[right])
+        return np.where(np.abs(tau - near) <= _ROUNDING * np.abs(t), near, tau)
+
+    def shortest_time(self) -> float:
+        return self.waveform.shortest_time()
+
+
+@dataclass(frozen=True)
+class Burst(_Shifted):
+    """A waveform from its beginning, during `duration` from `delay` on; 0 V before and after.
+
+    Parameters
+    ----------
+    waveform : Waveform
+        Its time 0 is the beginning of the burst. A number or a function of time (s) will do, too.
+    duration : float
+        s, positive.
+    delay : float
+        s, not negative.
+    """
+
+    waveform: Waveform
+    duration: float
+    delay: float = 0.0
+    units: ClassVar[dict[str, str]] = {"duration": "s", "delay": "s"}
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "waveform", as_waveform(self.waveform))
+        check_finite(self)
+        require(self.duration > 0.0, "burst duration", f"{self.duration:g} s", "> 0")
+        require(self.delay >= 0.0, "burst delay", f"{self.delay:g} s", ">= 0")
+
+    def _stretch(self) -> float:
+        return self.duration
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        t = np.asarray(t, float)
+        tau = self._inner(t, self.delay)
+        on = (tau >= 0.0) & (tau < self.duration) if side == "right" else (tau > 0.0) & (tau <= self.duration)
+        return np.where(on, self.waveform.value(np.where(on, tau, 0.0), side), 0.0)
+
+    def breakpoints(self, t0: float, t1: float) -> FloatArray:
+        times = self.delay + self._marks
+        return times[(times >= t0) & (times <= t1)]
+
+    def breakpoint_rate(self) -> float:
+        return self.waveform.breakpoint_rate()
+
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
+        middle = 0.5 * (start + stop) - self.delay
+        on = (middle >= 0.0) & (middle < self.duration)
+        block = self.waveform.terms(self._inner(start[on], self.delay), self._inner(stop[on], self.delay))
+        if block is None:
+            return None
+        out = blank_terms(start.size, block.shape[1])
+        out[on] = block
+        return out
+
+
+@dataclass(frozen=True)
+class Repeat(_Shifted):
+    """The first `period` of a waveform, again and again; its fundamental is that of a tone inside, if it fits.
+
+    Parameters
+    ----------
+    waveform : Waveform
+        Used from its time 0 to `period`. A number or a function of time (s) will do, too.
+    period : float
+        s, positive.
+    """
+
+    waveform: Waveform
+    period: float = field()
+    units: ClassVar[dict[str, str]] = {"period": "s"}
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "waveform", as_waveform(self.waveform))
+        check_finite(self)
+        require(self.period > 0.0, "repeat period", f"{self.period:g} s", "> 0")
+
+    def _stretch(self) -> float:
+        return self.period
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        t = np.asarray(t, float)
+        tau = self._inner(t, np.floor(t / self.period) * self.period)
+        # Rounding may put a time that begins a period into the one before it or after it.
+        first, last = (0.0, self.period) if side == "right" else (self.period, 0.0)
+        tau = np.where(tau == last, first, tau)
+        return self.waveform.value(tau, side)
+
+    def breakpoints(self, t0: float, t1: float) -> FloatArray:
+        marks = self._marks[:-1]
+        low, high = math.floor(t0 / self.period) - 1.0, math.ceil(t1 / self.period) + 1.0
+        runs = runs_through(low, high, marks.size, t0, t1)
+        times = (runs[:, None] * self.period + marks).ravel()
+        return times[(times >= t0) & (times <= t1)]
+
+    def breakpoint_rate(self) -> float:
+        return self._marks.size / self.period
+
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
+        begin = np.floor(0.5 * (start + stop) / self.period) * self.period
+        return self.waveform.terms(self._inner(start, begin), self._inner(stop, begin))
+
+    def tone(self) -> float | None:
+        inside = self.waveform.waveform if isinstance(self.waveform, Burst) else self.waveform
+        tone = inside.tone()
+        turns = 0.0 if tone is None else tone * self.period
+        return tone if round(turns) >= 1 and abs(turns - round(turns)) < 1e-9 * turns else 1.0 / self.period

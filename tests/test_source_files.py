@@ -1,0 +1,522 @@
+"""Recordings and tables from files: what is read from decks, the command line and Python, and what is refused."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+from commands import Command
+from deck_edits import edited
+from fingerspice.netlist import files as netlist_files
+from fingerspice.waveforms import files
+from scenes import table1_deck
+
+GUID = bytes.fromhex("000000001000800000aa00389b71")
+
+
+def wav(
+    data: bytes, bits: int, *, kind: int = 1, channels: int = 1, rate: int = 8000, extensible: bool = False
+) -> bytes:
+    """A WAV file written from its specification: `kind` is 1 for integers and 3 for floats."""
+    block = channels * bits // 8
+    head = struct.pack("<HHIIHH", 0xFFFE if extensible else kind, channels, rate, rate * block, block, bits)
+    if extensible:
+        head += struct.pack("<HHIH", 22, bits, 0, kind) + GUID
+    body = b"WAVEfmt " + struct.pack("<I", len(head)) + head + b"data" + struct.pack("<I", len(data)) + data
+    return b"RIFF" + struct.pack("<I", len(body)) + body
+
+
+def packed(values: np.ndarray, bits: int) -> bytes:
+    """Integers as little-endian samples of so many bits; those of 8 bits have 128 added."""
+    if bits == 8:
+        return bytes((values + 128).astype(np.uint8))
+    return b"".join(int(v).to_bytes(bits // 8, "little", signed=True) for v in values)
+
+
+def refusal(call: Callable[[], object]) -> str:
+    with pytest.raises(fs.InputError) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# WAV ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("extensible", [False, True])
+@pytest.mark.parametrize("bits", [8, 16, 24, 32])
+def test_integers_are_scaled_by_their_type_exactly(bits: int, extensible: bool, tmp_path: Path) -> None:
+    full = 2 ** (bits - 1)
+    whole = np.array([-full, full - 1, 0, 1, -1, full // 2, -full // 3])
+    (tmp_path / "a.wav").write_bytes(wav(packed(whole, bits), bits, rate=44100, extensible=extensible))
+    wave = fs.Samples.from_wav(tmp_path / "a.wav", 150.0)
+    np.testing.assert_array_equal(wave.values, 150.0 * (whole / full))
+    assert (wave.rate, wave.start) == (44100.0, 0.0)
+
+
+@pytest.mark.parametrize(("bits", "kind"), [(32, "<f4"), (64, "<f8")])
+def test_floats_are_taken_as_they_are(bits: int, kind: str, tmp_path: Path) -> None:
+    values = np.array([-1.0, 1.0, 0.1, -1.7, 1e-9], kind)
+    (tmp_path / "a.wav").write_bytes(wav(values.tobytes(), bits, kind=3))
+    np.testing.assert_array_equal(fs.Samples.from_wav(str(tmp_path / "a.wav"), 2.0).values, 2.0 * values.astype(float))
+
+
+@pytest.mark.parametrize("channel", [0, 1, 2])
+def test_a_channel_is_chosen_by_its_number(channel: int, tmp_path: Path) -> None:
+    data = np.arange(12).reshape(4, 3)
+    (tmp_path / "a.wav").write_bytes(wav(packed(data.ravel(), 24), 24, channels=3, extensible=True))
+    wave = fs.Samples.from_wav(tmp_path / "a.wav", 2.0**23, channel)
+    np.testing.assert_array_equal(wave.values, data[:, channel])
+
+
+STEREO = wav(packed(np.arange(40), 16), 16, channels=2)
+MONO = wav(packed(np.arange(40), 16), 16)
+BAD_WAV: list[tuple[bytes, str]] = [
+    (b"", "'a.wav' is empty"),
+    (b"RIF", "'a.wav' is no WAV file; allowed: WAV (convert it), or a table by TABLE"),
+    (b"ID3\x04" + bytes(99), "'a.wav' is no WAV file, it begins as MP3 does; allowed: WAV (convert it)"),
+    (b"\xff\xfb\x90" + bytes(99), "it begins as MP3 does"),
+    (b"OggS" + bytes(99), "it begins as Ogg does"),
+    (b"time,u\n0,1\n", "'a.wav' is no WAV file; allowed"),
+    (MONO[:30], "'a.wav' is broken or cut short"),
+    (MONO[:40], "'a.wav' is broken or cut short"),
+    (MONO[:-1], "cut short"),
+    (MONO[:-20], "'a.wav' is cut short: it ends before the samples that its header promises"),
+    (STEREO[:-3], "cut short"),
+    (STEREO, "'a.wav' has 2 channels and none is chosen; allowed: channel=0 to 1"),
+    (MONO[:22] + b"\0\0" + MONO[24:], "'a.wav' is broken"),
+    (wav(bytes(8), 16, rate=0), "'a.wav' is broken: its header gives a rate of 0 Hz"),
+    (wav(b"", 16), "'a.wav' holds no samples"),
+    (wav(bytes(9), 8, kind=6), "'a.wav' holds samples as ALAW; allowed: PCM or float (convert it)"),
+    (wav(np.array([0, np.nan], "<f4").tobytes(), 32, kind=3), "sample number 1 is nan; allowed: finite numbers"),
+    (wav(b"\0\0", 16), "samples is shape (1,); allowed: one row of two or more"),
+]
+
+
+@pytest.mark.parametrize(("data", "said"), BAD_WAV, ids=range(len(BAD_WAV)))
+def test_what_is_no_whole_recording_is_refused(
+    data: bytes, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("a.wav").write_bytes(data)
+    assert said in refusal(lambda: fs.Samples.from_wav("a.wav", 1.0))
+
+
+def test_channels_that_are_not_there_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("a.wav").write_bytes(STEREO)
+    Path("b.wav").write_bytes(MONO)
+    assert refusal(lambda: fs.Samples.from_wav("a.wav", 1.0, 2)) == "'a.wav' has no channel 2; allowed: channel=0 to 1"
+    assert refusal(lambda: fs.Samples.from_wav("b.wav", 1.0, 1)).endswith("allowed: channel=0, its only one")
+    assert "gain is nan" in refusal(lambda: fs.Samples.from_wav("b.wav", float("nan")))
+
+
+def test_broken_headers_are_refused_in_one_sentence(tmp_path: Path) -> None:
+    random = np.random.default_rng(1)
+    path = tmp_path / "a.wav"
+    for _ in range(300):
+        data = bytearray(STEREO if random.random() < 0.5 else wav(packed(np.arange(9), 24), 24, extensible=True))
+        for place in random.integers(0, 60, random.integers(1, 4)):
+            data[place] = random.integers(256)
+        path.write_bytes(data)
+        # Anything but a refusal would end the test.
+        with contextlib.suppress(fs.InputError):
+            fs.Samples.from_wav(path, 1.0, 0)
+
+
+def test_files_beyond_the_limits_are_refused_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with Path("a.wav").open("wb") as file:
+        file.truncate(5 * 10**9)
+    said = "'a.wav' has 4,768 MiB; allowed: at most 1,024 MiB"
+    assert refusal(lambda: fs.Samples.from_wav("a.wav", 1.0)) == said
+    assert refusal(lambda: fs.PWL.from_table("a.wav")) == said
+    with Path("a.csv").open("wb") as file:
+        file.truncate(10**8)
+    assert refusal(lambda: fs.PWL.from_table("a.csv")) == "'a.csv' has 95 MiB; allowed: at most 64 MiB"
+    monkeypatch.setattr(files, "MAX_SAMPLES", 30)
+    Path("b.wav").write_bytes(MONO)
+    assert refusal(lambda: fs.Samples.from_wav("b.wav", 1.0)) == "'b.wav' has 40 samples; allowed: at most 30"
+    assert "640 samples; allowed: at most 30" in refusal(lambda: fs.Samples(np.arange(40), 1.0).upsampled())
+    Path("c.csv").write_text("".join(f"{i} 0\n" for i in range(40)))
+    assert refusal(lambda: fs.PWL.from_table("c.csv")) == "'c.csv' has 40 samples; allowed: at most 30"
+    np.savez_compressed("d.npz", t=np.zeros(400))
+    assert "unpacks to" in refusal(lambda: fs.PWL.from_table("d.npz"))
+
+
+def test_what_is_no_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("folder").mkdir()
+    assert refusal(lambda: fs.Samples.from_wav("folder", 1.0)) == "'folder' is a folder, not a file"
+    assert refusal(lambda: fs.Samples.from_wav("no.wav", 1.0)) == "'no.wav' does not exist"
+    assert refusal(lambda: fs.PWL.from_table("a\0b")) == "'a\\x00b' does not exist"
+    os.mkfifo("pipe")
+    assert refusal(lambda: fs.PWL.from_table("pipe")) == "'pipe' is not an ordinary file"
+
+
+# Tables -------------------------------------------------------------------------------------------------------
+
+
+TABLES: dict[str, str] = {
+    "commas": "0,1\n0.001,-2.5\n0.003,4\n",
+    "commas and blanks": "0, 1\n0.001 , -2.5\n 0.003, 4\n",
+    "blanks": "0 1\n  0.001   -2.5\n0.003 4",
+    "tabs": "0\t1\n0.001\t-2.5\n0.003\t4\n",
+    "header": "time,u\n0,1\n0.001,-2.5\n0.003,4\n",
+    "units": "time (ms), u [kV]\n0,0.001\n1,-0.0025\n3,0.004\n",
+    "header of NumPy": "# taken on a rainy day\n# t (s), u (V)\n0,1\n1e-3,-2.5\n3e-3,4\n",
+    "quoted": '"time (us)","drive (mV)"\r\n"0","1000"\r\n"1000","-2500"\r\n"3000","4000"\r\n',
+    "SPICE": "0 1\n1m -2500m\n3m 4\n",
+    "comments": "# one\n\n0,1\n# two\n0.001,-2.5\n\n0.003,4\n",
+    "utf-8 with a mark": "\ufefft,u\n0,1\n0.001,-2.5\n0.003,4\n",
+}
+
+
+@pytest.mark.parametrize("text", TABLES.values(), ids=TABLES.keys())
+def test_a_table_of_two_columns_is_read_without_more_words(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    wave = fs.PWL.from_table(tmp_path / "a.csv")
+    np.testing.assert_allclose(wave.times, [0.0, 0.001, 0.003], rtol=1e-15)
+    np.testing.assert_allclose(wave.values, [1.0, -2.5, 4.0], rtol=1e-15)
+
+
+def test_columns_are_chosen_by_name_or_number(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("index,t (ms),left (V),Right (V)\n0,0,1,2\n1,2,3,4\n")
+    for time, value in (("t", "Right"), ("T", "right"), (1, 3), (None, "Right")):
+        assert fs.PWL.from_table(path, time, value) == fs.PWL((0.0, 0.002), (2.0, 4.0))  # type: ignore[arg-type]
+    wave = fs.Samples.from_table(path, 500.0, "left")
+    np.testing.assert_array_equal(wave.values, [1.0, 3.0])
+    assert wave.rate == 500.0
+    path.write_text("1\n3\n-2\n")
+    np.testing.assert_array_equal(fs.Samples.from_table(path, 500.0).values, [1.0, 3.0, -2.0])
+
+
+def test_arrays_of_numpy_are_columns(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, u=np.array([1, 3, -2]), time=np.array([0.0, 0.5, 1.0]))
+    assert fs.PWL.from_table(path) == fs.PWL((0.0, 0.5, 1.0), (1.0, 3.0, -2.0))
+    np.savez_compressed(path, u=np.array([1.0, 3.0, -2.0]), rate=48000)
+    wave = fs.Samples.from_table(path)
+    np.testing.assert_array_equal(wave.values, [1.0, 3.0, -2.0])
+    assert wave.rate == 48000.0
+    # Times that agree with the rate say no more than it does.
+    np.savez(path, u=np.array([1.0, 3.0, -2.0]), t=np.arange(3) / 48000, rate=48000)
+    assert fs.Samples.from_table(path).rate == 48000.0
+    assert "is a table with a rate; allowed: one with times" in refusal(lambda: fs.PWL.from_table(path))
+
+
+BAD_TABLES: list[tuple[str, dict[str, object], str]] = [
+    ("", {}, "'a.csv' is empty"),
+    ("\n\n", {}, "'a.csv' holds no rows of numbers"),
+    ("# nothing\nt,u\n", {}, "'a.csv' holds no rows of numbers"),
+    ("t;u\n0;1\n", {}, "'a.csv', line 2: the table separates by semicolons; allowed: commas, tabs or blanks"),
+    ("t;u\n0,5;1,5\n", {}, "'a.csv', line 2: the table separates by semicolons and writes decimal commas; allowed"),
+    ("t\tu\n0,5\t1,5\n", {}, "'a.csv', line 2: 0,5 has a decimal comma; allowed: points, 0.5"),
+    ("0 1,5\n", {}, "'a.csv', line 1: 1,5 has a decimal comma; allowed: points, 1.5"),
+    ('"t","u"\n0,5,1,5\n', {}, "are its commas decimal commas?"),
+    ("t,u\n0,1\n1,nan\n2,3\n", {}, "'a.csv', line 3: column 'u' is nan; allowed: finite numbers"),
+    ("0,1\n\n1,inf\n", {}, "'a.csv', line 3: column 1 is inf"),
+    ("nan,1\n1,2\n", {}, "'a.csv', line 1: column 0 is nan"),
+    ("0,1\n1,\n", {}, "'a.csv', line 2: the cell in column 1 is empty; allowed: numbers"),
+    ("0,1\n,2\n", {}, "'a.csv', line 2: the cell in column 0 is empty"),
+    ("0,1\n1,2k7\n", {}, "'a.csv', line 2: '2k7' differs between simulators: write 2.7k"),
+    ("0,1\n1,2,3\n", {}, "'a.csv', line 2 has 3 cells; allowed: 2, as in the first row"),
+    ("t,u\n0,1,2\n", {}, "'a.csv', line 1: the header names 2 columns, and the rows have 3: is a name missing?"),
+    ("t,u\n0,1\n2,3\n1,3\n", {}, "'a.csv', line 4: the time 1 s follows 2 s; allowed: not decreasing"),
+    ("0,1\n1,2\n", {"time": "t", "value": "u"}, "'a.csv' has no header that names a column 't'; allowed: its number"),
+    ("t,u\n0,1\n1,2\n", {"value": "v"}, "'a.csv' has no column 'v'; it has 2 columns (t, u)"),
+    ("t,u\n0,1\n1,2\n", {"value": 2}, "'a.csv' has no column 2; it has 2 columns (t, u)"),
+    ("t,u\n0,1\n1,2\n", {"time": "t", "value": "t"}, "the column 't' is both time and value; allowed: two columns"),
+    ("t,a,b\n0,1,2\n", {}, "'a.csv' has 3 columns (t, a, b); allowed: name the column of the value"),
+    ("0,1,2\n", {}, "'a.csv' has 3 columns without a header (0 to 2); allowed: name the column of the time"),
+    ("u,u\n0,1\n", {"value": "u"}, "'a.csv' has several columns 'u'"),
+    ("t (h),u\n0,1\n", {}, "the unit of column 't' is 'h'; allowed: s, ms, us, ns"),
+    ("t,u (N)\n0,1\n", {}, "the unit of column 'u' is 'N'; allowed: v, mv"),
+    ("1\n2\n", {}, "'a.csv' has one column and no rate; allowed: a column of times too, or rate= in Hz"),
+    ("a\0b", {}, "'a.csv' is no text; allowed: a table as text, or an NPZ file"),
+]
+
+
+@pytest.mark.parametrize(("text", "given", "said"), BAD_TABLES, ids=[said for *_, said in BAD_TABLES])
+def test_what_is_no_table_is_refused_with_its_line(
+    text: str, given: dict[str, object], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("a.csv").write_text(text)
+    assert said in refusal(lambda: fs.PWL.from_table("a.csv", **given))  # type: ignore[arg-type]
+
+
+def test_rates_that_contradict_the_times_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("a.csv").write_text("t,u\n0,1\n0.001,2\n0.0025,2\n")
+    said = "'a.csv', line 4: the time 0.0025 s is not that of sample 2 at 1000 Hz, 0.002 s; allowed: times or a rate"
+    assert said in refusal(lambda: fs.Samples.from_table("a.csv", 1000.0))
+    assert "the rate is -1 Hz; allowed: > 0" in refusal(lambda: fs.Samples.from_table("a.csv", -1.0, "u"))
+    assert "is a table with times; allowed: one with a rate" in refusal(lambda: fs.Samples.from_table("a.csv"))
+    np.savez("a.npz", u=np.zeros(30), t=np.arange(30) / 44100, rate=48000)
+    assert "row 2: the time 4.53515e-05 s is not that of sample 2 at 48000 Hz, 4.16667e-05 s" in refusal(
+        lambda: fs.Samples.from_table("a.npz")
+    )
+    assert "the rate given is 44100 Hz, and its own is 48000 Hz; allowed: one rate" in refusal(
+        lambda: fs.Samples.from_table("a.npz", 44100.0)
+    )
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"t": np.arange(3), "u": np.arange(4)}, "has arrays of different length (t 3, u 4); allowed: one length"),
+        ({"t": np.arange(3), "u": np.array([0.0, np.nan, 1.0])}, "row 1: column 'u' is nan; allowed: finite numbers"),
+        ({"t": np.array([0.0, 2.0, 1.0]), "u": np.arange(3)}, "row 2: the time 1 s follows 2 s"),
+        ({"t": np.zeros((2, 2))}, "the array 't' has shape (2, 2); allowed: one row a column"),
+        ({"t": np.array(["a", "b"])}, "the array 't' is of <U1; allowed: real numbers"),
+        ({"t": np.array([1j])}, "the array 't' is of complex128; allowed: real numbers"),
+        ({"t": np.array([{}, None])}, "cannot be read as NPZ: Object arrays cannot be loaded"),
+        ({"t": np.zeros(0), "u": np.zeros(0)}, "holds no numbers"),
+        ({"rate": np.array(48000)}, "holds no numbers"),
+    ],
+)
+def test_arrays_that_are_no_columns_are_refused(arrays: dict[str, np.ndarray], said: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", **arrays)  # type: ignore[arg-type]
+    assert said in refusal(lambda: fs.PWL.from_table(tmp_path / "a.npz"))
+
+
+def test_a_broken_npz_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, t=np.arange(300.0), u=np.arange(300.0))
+    path.write_bytes(path.read_bytes()[:900])
+    assert "cannot be read as NPZ" in refusal(lambda: fs.PWL.from_table(path))
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("readme.txt", "no array")
+    assert "the array 'readme.txt' is of another kind; allowed: real numbers" in refusal(
+        lambda: fs.PWL.from_table(path)
+    )
+
+
+# Band-limited -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2, 0.45])
+@pytest.mark.parametrize("factor", [4, 16])
+def test_upsampled_tones_are_as_near_as_is_said(factor: int, share: float) -> None:
+    rate, f = 8000.0, share * 8000.0
+    wave = fs.Samples(np.sin(2.0 * np.pi * share * np.arange(600) + 0.3), rate)
+    dense = wave.upsampled(factor)
+    assert (dense.rate, dense.start) == (factor * rate, 0.0)
+    np.testing.assert_array_equal(dense.values[::factor], wave.values)
+    t = np.linspace(100.0 / rate, 500.0 / rate, 20011)
+    miss = np.abs(dense(t) - np.sin(2.0 * np.pi * f * t + 0.3)).max()
+    lines = (np.pi * share / factor) ** 2 / 2.0
+    assert miss < 1.01 * lines + 2e-4
+    assert miss > 0.9 * lines - 2e-4
+
+
+def test_an_upsampled_recording_is_held_at_its_ends() -> None:
+    wave = fs.Samples(np.full(50, 3.0), 100.0, 0.2).upsampled(8)
+    np.testing.assert_allclose(wave.values, 3.0, rtol=1e-4)
+    assert wave.values.size == 49 * 8 + 1
+    assert wave.start == 0.2
+    for factor in (1, 65, 2.5):
+        assert "allowed: a whole number from 2 to 64" in refusal(lambda f=factor: wave.upsampled(f))  # type: ignore[misc]
+
+
+# In decks -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory with a deck's folder and files in it, and a recording beside it."""
+    inner = tmp_path / "decks" / "data"
+    inner.mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    random = np.random.default_rng(3)
+    data = random.integers(-(2**15), 2**15, 400)
+    Path("outside.wav").write_bytes(MONO)
+    Path("decks/mono.wav").write_bytes(wav(packed(data, 16), 16))
+    Path("decks/data/stereo one.wav").write_bytes(wav(packed(data, 16), 16, channels=2, rate=4000))
+    Path("decks/table.csv").write_text("time (ms),left,right\n0,0,5\n1,100,6\n3,-100,7\n")
+    Path("decks/points.txt").write_text("0 0\n1m 100\n3m -100\n")
+    np.savez("decks/rate.npz", u=data[:100] / 2**15, rate=8000)
+    return tmp_path
+
+
+def source(text: str, before: str = "") -> fs.Waveform:
+    """The waveform of a deck's source, whose deck lies in ``decks/``."""
+    path = Path("decks/pad.cir")
+    path.write_text(table1_deck(text, extra=before))
+    wave = fs.read_netlist(path)["Vdrive"].waveform
+    assert wave is not None
+    return wave
+
+
+def same(a: fs.Waveform, b: fs.Waveform) -> None:
+    t = np.linspace(0.0, 0.06, 997)
+    assert type(a) is type(b)
+    np.testing.assert_array_equal(a(t), b(t))
+
+
+def test_decks_name_files_beside_them(folder: Path) -> None:
+    mono, stereo = Path("decks/mono.wav"), Path("decks/data/stereo one.wav")
+    wave = fs.Samples.from_wav(mono, 150.0)
+    same(source("wav(mono.wav 150)"), wave)
+    for given in ("mono.wav 150", "mono.wav gain=150", "mono.wav,150,0", "mono.wav {3*50} channel=0"):
+        same(source(f"WAVEFILE({given})"), wave)
+    same(source("WAVEFILE(mono.wav 150 upsample=4)"), wave.upsampled(4))
+    same(source('WAVEFILE("data/stereo one.wav" 20 1)'), fs.Samples.from_wav(stereo, 20.0, 1))
+    same(source("wavefile=mono.wav"), fs.Samples.from_wav(mono, 1.0))
+    same(source('wavefile="data\\stereo one.wav" chan=1'), fs.Samples.from_wav(stereo, 1.0, 1))
+    # LTspice takes the first channel where none is chosen.
+    same(source('wavefile="data/stereo one.wav" Rser=1'), fs.Samples.from_wav(stereo, 1.0, 0))
+    points = fs.PWL((0.0, 1e-3, 3e-3), (0.0, 100.0, -100.0))
+    for text in ("PWL FILE=points.txt", "PWL(file=points.txt)", 'PWL file="points.txt"', "TABLE(table.csv time left)"):
+        same(source(text), points)
+    same(source("TABLE(table.csv 0 2)"), fs.PWL(points.times, (5.0, 6.0, 7.0)))
+    same(source("TABLE(table.csv value=right)"), fs.PWL(points.times, (5.0, 6.0, 7.0)))
+    same(source("PWL FILE=points.txt td=2m r=0"), fs.PWL((2e-3, 3e-3, 5e-3), points.values, 2e-3))
+    same(source("TABLE(rate.npz)"), fs.Samples.from_table("decks/rate.npz"))
+    same(source("TABLE(rate.npz upsample=4)"), fs.Samples.from_table("decks/rate.npz").upsampled(4))
+    same(source("TABLE(table.csv rate=500 value=left)"), fs.Samples([0.0, 100.0, -100.0], 500.0))
+    # In an included file names count from its own folder.
+    Path("decks/data/part.inc").write_text('Vpart part 0 WAVEFILE("stereo one.wav" 7 0)\nRpart part 0 1k\n')
+    Path("decks/pad.cir").write_text(table1_deck("DC 1", extra=".include data/part.inc"))
+    part = fs.read_netlist("decks/pad.cir")["Vpart"].waveform
+    assert part is not None
+    same(part, fs.Samples.from_wav(stereo, 7.0, 0))
+
+
+BAD_SOURCES = [
+    ("WAVEFILE(mono.wav)", "3:16: WAVEFILE has no gain, the V at full scale; allowed: WAVEFILE(path gain"),
+    ("WAVEFILE mono.wav 150", "WAVEFILE names no file; allowed: WAVEFILE(path gain [channel])"),
+    ("WAVEFILE(mono.wav 150 1)", "'decks/mono.wav' has no channel 1; allowed: channel=0, its only one"),
+    ("WAVEFILE(mono.wav 150 0.5)", "channel is 0.5; allowed: a whole number"),
+    ("WAVEFILE(mono.wav 150 0 7)", "WAVEFILE takes at most 3 values, 4 given"),
+    ("WAVEFILE(mono.wav 150 gain=3)", "WAVEFILE has 'gain' twice"),
+    ("WAVEFILE(mono.wav 150 volume=3)", "WAVEFILE has no parameter 'volume'"),
+    ("WAVEFILE(mono.wav loud)", "gain is 'loud'; allowed: a number"),
+    ('WAVEFILE("data/stereo one.wav" 150)', "has 2 channels and none is chosen; allowed: channel=0 to 1"),
+    ("WAVEFILE(mno.wav 150)", "3:25: 'mno.wav' does not exist; did you mean 'mono.wav'?"),
+    ("WAVEFILE(data 150)", "'decks/data' is a folder, not a file"),
+    ("WAVEFILE(table.csv 150)", "'decks/table.csv' is no WAV file"),
+    ("WAVEFILE(../outside.wav 150)", "'../outside.wav' lies outside the netlist's folder, where nothing is read"),
+    ("WAVEFILE(data/../../outside.wav 150)", "lies outside the netlist's folder"),
+    ("WAVEFILE(link.wav 150)", "'link.wav' lies outside the netlist's folder"),
+    ("TABLE(/etc/passwd)", "'/etc/passwd' lies outside the netlist's folder"),
+    ("PWL FILE=/etc/passwd", "'/etc/passwd' lies outside the netlist's folder"),
+    ("wavefile=../outside.wav", "'../outside.wav' lies outside the netlist's folder"),
+    ("wavefile=mono.wav gain=3", "Vdrive takes no parameter 'gain' beside wavefile=; allowed: chan="),
+    ("TABLE()", "TABLE names no file; allowed: TABLE(path [time_column value_column])"),
+    ("TABLE(table.csv)", "'decks/table.csv' has 3 columns (time, left, right); allowed: name the column of the value"),
+    ("TABLE(table.csv time up)", "'decks/table.csv' has no column 'up'"),
+    ("TABLE(points.txt upsample=4)", "TABLE upsample goes with a rate, and this table has times"),
+    ("PWL(0 0 1 1 file=points.txt)", "PWL has points and file= too; allowed: one of them"),
+    ("CHIRP(150 20 2k)", "CHIRP needs 4 values, 3 given; allowed: CHIRP(amplitude f0 f1 duration)"),
+    ("BURST(200 5k)", "BURST needs 3 values, 2 given; allowed: BURST(amplitude frequency cycles every)"),
+    ("BURST(200 0 10)", "sine frequency is 0 Hz; allowed: > 0"),
+    ("BURST(200 5k 0)", "burst duration is 0 s; allowed: > 0"),
+]
+
+
+@pytest.mark.parametrize(("text", "said"), BAD_SOURCES, ids=[text for text, _ in BAD_SOURCES])
+def test_files_that_a_deck_may_not_or_cannot_read_are_refused_with_its_line(text: str, said: str, folder: Path) -> None:
+    Path("decks/link.wav").symlink_to(folder / "outside.wav")
+    message = refusal(lambda: source(text))
+    assert message.startswith("decks/pad.cir:3:")
+    assert said in message
+
+
+def test_all_files_of_a_deck_together_have_a_limit(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(netlist_files, "MAX_SOURCE_BYTES", 1000)
+    twice = "Vother other 0 WAVEFILE(mono.wav 1)\nRother other 0 1k"
+    source("WAVEFILE(mono.wav 150)")
+    assert "decks/pad.cir:8:25: the sources' files are larger than" in refusal(
+        lambda: source("WAVEFILE(mono.wav 150)", twice)
+    )
+
+
+def test_chirps_and_bursts_are_those_of_python() -> None:
+    def read(text: str) -> fs.Waveform | None:
+        return fs.parse_netlist(table1_deck(text))["Vdrive"].waveform
+
+    assert read("CHIRP(150 20 2k 0.3)") == fs.Chirp(150.0, 20.0, 2000.0, 0.3)
+    burst = fs.Burst(fs.Sine(200.0, 5000.0), 10.0 / 5000.0)
+    assert read("BURST(200 5k 10)") == burst
+    assert read("BURST(200 5k 10 10m)") == fs.Repeat(burst, 0.01)
+
+
+def test_a_deck_with_a_recording_runs_as_the_samples_do(folder: Path) -> None:
+    Path("decks/pad.cir").write_text(table1_deck("WAVEFILE(mono.wav 100)", tran="50u 30m uic"))
+    circuit = fs.read_netlist("decks/pad.cir")
+    with pytest.warns(fs.FingerspiceWarning, match="has no fundamental"):
+        by_deck = fs.simulate(circuit, rtol=1e-6)
+    samples = fs.Samples.from_wav("decks/mono.wav", 100.0)
+    with pytest.warns(fs.FingerspiceWarning, match="has no fundamental"):
+        by_hand = fs.simulate(circuit.replace({"Vdrive": 0.0}), sources={"Vdrive": samples}, rtol=1e-6)
+    np.testing.assert_array_equal(by_deck.u_gap, by_hand.u_gap)
+    np.testing.assert_array_equal(by_deck.f_el, by_hand.f_el)
+
+
+# On the command line ------------------------------------------------------------------------------------------
+
+
+def test_sources_of_the_command_line_are_named_from_the_working_directory(command: Command, tmp_path: Path) -> None:
+    Path("far").mkdir()
+    Path("decks").mkdir()
+    deck = edited(("SKIN d=350u f=100", "SKIN_DISPERSIVE d=350u"), (".tran 10u 50m uic", "*"))
+    Path("decks/no_end.cir").write_text(deck)
+    Path("far/a.wav").write_bytes(wav(packed(np.arange(-200, 200) * 50, 16), 16))
+    Path("far/a.csv").write_text("0 0\n10m 100\n20m -100\n")
+    recording = "WAV(far/a.wav gain=150)"
+    for spec in (recording, f"WAVEFILE({tmp_path}/far/a.wav 150)", "TABLE(far/a.csv)", "PWL FILE=far/a.csv"):
+        words = ("run", "decks/no_end.cir", "--source", spec, "--stop", "20m", "--no-plot", "--overwrite", "--csv")
+        done = command(*words, "--start", "5m")
+        assert done.code == 0, done.err
+        t = np.loadtxt("out/no_end.csv", delimiter=",", skiprows=1)[:, 0]
+        assert (t[0], t[-1]) == (0.005, 0.02)
+        assert np.unique(t).size >= 1001
+    assert command("export", "decks/no_end.cir", "--source", recording, "--stop", "5m", "-o", "x.cir").code == 0
+    exported = Path("x.cir").read_text()
+    assert ".tran 5e-06 0.005 uic" in exported
+    # 8 samples a millisecond: up to the first beyond the end.
+    assert exported[exported.index("PWL(") : exported.index(")", exported.index("PWL("))].count(" ") < 2 * 46
+    refused = command("run", "decks/no_end.cir", "--source", "WAV(far/b.wav gain=150)", "--stop", "20m")
+    assert refused.code == 2
+    assert refused.err == "fingerspice: --source 'WAV(far/b.wav gain=150)': source: 'far/b.wav' does not exist\n"
+    # A deck does not reach there.
+    Path("decks/out.cir").write_text(deck.replace("SIN(0 200 100)", "WAVEFILE(../far/a.wav 150)"))
+    assert "lies outside the netlist's folder" in command("run", "decks/out.cir", "--stop", "20m").err
+
+
+def test_results_tell_recordings_apart_by_their_names(command: Command) -> None:
+    for name in ("a.wav", "b.wav"):
+        Path(name).write_bytes(wav(packed(np.arange(-200, 200) * 50, 16), 16))
+    Path("a.csv").write_text("".join(f"{i}m {i % 7}\n" for i in range(200)))
+    words = ("run", "pad.cir", "--stop", "1m", "--no-plot", "--source")
+    assert command(*words, "WAV(a.wav 150)").code == 0
+    assert command(*words, "WAV(a.wav 150)").code == 0
+    assert "--overwrite" in command(*words, "WAV(b.wav 150)").err
+    assert command(*words, "TABLE(a.csv)", "--name", "table").code == 0
+    with pytest.warns(fs.FingerspiceWarning, match="a source that was a function or samples is not kept"):
+        assert fs.load("out/table.nc").circuit.overrides == {"Vdrive": "TABLE(a.csv)"}
+
+
+def test_start_and_stop_replace_those_of_the_deck(command: Command) -> None:
+    done = command("run", "pad.cir", "--start", "12m", "--stop", "18m", "--csv", "--no-plot")
+    assert done.code == 0
+    table = np.loadtxt("out/pad.csv", delimiter=",", skiprows=1)
+    assert (table[0, 0], table[-1, 0]) == (0.012, 0.018)
+    np.testing.assert_allclose(np.diff(table[:, 0]), 50e-6, rtol=1e-9)
+    # The run itself begins at 0.
+    whole = fs.simulate(fs.read_netlist("pad.cir"), t_eval=table[:, 0], t_stop=0.018)
+    assert whole.u_gap is not None
+    header = Path("out/pad.csv").read_text().splitlines()[0].split(",")
+    column = next(i for i, name in enumerate(header) if name.startswith("u_gap"))
+    np.testing.assert_allclose(table[:, column], whole.u_gap, atol=1e-5)
