@@ -2,8 +2,8 @@
 
 Run: python benchmarks/report.py [--results FILE] [--page FILE] [--readme FILE]. From work_precision.json come
 results/work_precision.md (every contestant), the pictures results/work_precision.png and work_precision_networks.png,
-and the tables between the `speed` markers of docs/speed.md; from run_times.json, baseline.json and throughput.json
-beside it that between the README's.
+and the tables between the `speed` markers of docs/speed.md; from run_times.json, baseline.json, throughput.json and
+recordings.json beside it that between the README's.
 """
 
 from __future__ import annotations
@@ -153,9 +153,9 @@ def conditions(results: Report) -> str:
 
 def waits(folder: Path) -> str:
     """What a user waits for, as the README's table, from the results in a folder."""
-    run, base, rate = (
+    run, base, rate, recorded = (
         json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-        for name in ("run_times", "baseline", "throughput")
+        for name in ("run_times", "baseline", "throughput", "recordings")
     )
     calls = {what: 1e3 * seconds for what, seconds in base["calls"].items()}
 
@@ -166,6 +166,10 @@ def waits(folder: Path) -> str:
     def period(circuit: str, method: str) -> str:
         found = {row["source"]: row[method]["us_per_period"] for row in base["times"] if row["circuit"] == circuit}
         return " / ".join(number(us) for us in found.values()) + " µs"
+
+    def sample(skin: str) -> str:
+        at = {p["contestant"]: p for p in recorded["points"] if p["skin"] == skin and p["band_Hz"] == 1000.0}
+        return " / ".join(number(at[f"fingerspice {rtol:g}"]["ns_per_sample"]) for rtol in (1e-4, 1e-6)) + " ns"
 
     sources = ", ".join(row["source"] for row in base["times"] if row["circuit"] == "fingerpad")
     rows = [
@@ -184,6 +188,8 @@ def waits(folder: Path) -> str:
         ["every period stepped: Table 1", period("fingerpad", "exponential")],
         ["every period stepped: behind an amplifier and a cable", period("amplifier", "exponential")],
         ["every period stepped: two fingers and a floating body", period("two_fingers", "exponential")],
+        ["a sample of a recording of up to 1 kHz at 48 kHz, at 1e-4 / 1e-6", sample("SKIN")],
+        ["the same with the dispersive skin", sample("SKIN_DISPERSIVE")],
         [
             "a sample of a recording, with the area given",
             f"{rate['samples']['ns_per_sample']['fingerspice']:.1f} ns",
@@ -191,7 +197,7 @@ def waits(folder: Path) -> str:
     ]  # fmt: skip
     text = (
         f"Medians of 7 at an error of 1e-6 of the peak, after the first use, on {base['machine']}, commit "
-        f"{base['revision']} (`benchmarks/run_times.py`, `baseline.py`, `throughput.py`)."
+        f"{base['revision']} (`benchmarks/run_times.py`, `baseline.py`, `throughput.py`, `recordings.py`)."
     )
     return "\n".join([*markdown(rows), "", *wrapped(text)])
 

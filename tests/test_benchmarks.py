@@ -134,7 +134,7 @@ def test_the_report_needs_nothing_but_the_results(work_precision, tmp_path):
     }  # fmt: skip
     path, page, readme = (tmp_path / name for name in ("work_precision.json", "speed.md", "README.md"))
     path.write_text(json.dumps(results))
-    for name in ("run_times", "baseline", "throughput"):
+    for name in ("run_times", "baseline", "throughput", "recordings"):
         (tmp_path / f"{name}.json").write_text((FOLDER / "results" / f"{name}.json").read_text())
     for written in (page, readme):
         written.write_text(f"before\n{report.BEGIN}\nstale\n{report.END}\nafter\n")

@@ -156,11 +156,20 @@ def moved_with(moved: FloatArray, scale: float, shift: float, u: float) -> float
     return math.copysign(total, u)
 
 
-@jit
-def moved_rows(n: int, moved: FloatArray, scale: float, shift: float, u: FloatArray, z: FloatArray) -> None:
-    """Add it to charges."""
+@jit_rows
+def moved_rows(
+    n: int, moved: FloatArray, scale: float, shift: float, u: FloatArray, row: FloatArray, z: FloatArray
+) -> None:  # fmt: skip
+    """Add it to charges, by way of `row`."""
+    last = moved.size - 1
     for i in range(n):
-        z[i] += moved_with(moved, scale, shift, u[i])
+        row[i] = moved[last]
+    for j in range(last - 1, -1, -1):
+        c = moved[j]
+        for i in range(n):
+            row[i] = row[i] * (abs(u[i]) * scale + shift) + c
+    for i in range(n):
+        z[i] += row[i] if u[i] >= 0.0 else -row[i]
 
 
 @jit_within
@@ -192,7 +201,7 @@ def charge_block(c: Course, r: int, level: int, n: int, h: float, local: float) 
         peak = abs(z) if abs(z) > peak else peak
     own.z[n] = z
     if not form.mobile:
-        moved_rows(n + 1, c.shown.moved, form.scale, form.shift, room.u, own.z)
+        moved_rows(n + 1, c.shown.moved, form.scale, form.shift, room.u, own.current, own.z)
     control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q] = z, collected, worst, peak
 
 

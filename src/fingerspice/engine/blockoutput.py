@@ -177,7 +177,7 @@ def write_end(c: Course, value: float, slope: float, t_out: FloatArray, out: Flo
     look_at_ends(form, room, r, 1, FIRST_NEWTON)
     c.charges.z[0] = c.control[Z]
     if not form.mobile:
-        moved_rows(1, c.shown.moved, form.scale, form.shift, room.u, c.charges.z)
+        moved_rows(1, c.shown.moved, form.scale, form.shift, room.u, c.charges.current, c.charges.z)
     c.charges.q[0, 0] = 1.0
     c.charges.steps[:3, 0] = 0.0
     for place in range(c.counters[OUTPUT], t_out.size):

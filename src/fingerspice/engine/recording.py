@@ -113,6 +113,10 @@ def jump(c: Course, to: float) -> bool:
 @jit
 def _sources(values: FloatArray, at: int, count: int, sub: int, s: FloatArray) -> None:
     """The source's values at the ends of steps, `sub` of which make a sample's length."""
+    if sub == 1:
+        for j in range(count + 1):
+            s[j] = values[at + j]
+        return
     for j in range(count):
         here = values[at + j]
         for i in range(sub):
