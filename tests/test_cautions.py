@@ -121,7 +121,7 @@ def test_a_recording_on_a_skin_of_one_frequency_is_warned_about_with_its_error(
     assert said == pytest.approx(held.f_el_mean / right.f_el_mean - 1.0, rel=0.1)
 
 
-@pytest.mark.parametrize("seconds", [30.0, 33.7, 1000.0])
+@pytest.mark.parametrize("seconds", [30.0, 33.7, 200.0])
 def test_the_error_of_a_long_recording_is_that_of_its_pieces(seconds: float) -> None:
     short, rate = noise(50.0, 1000.0, 8000.0, 2.0), 8000.0
     circuit = table1()
