@@ -233,13 +233,13 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="short recordings, few repeats, nothing written")
     quick = parser.parse_args().quick
     warnings.simplefilter("ignore", fs.FingerspiceWarning)
-    seconds, repeats = (0.2, 1) if quick else (10.0, 7)
+    seconds, repeats = (0.2, 1) if quick else (4.0, 7)
     points = [point for high in BANDS for point in band(high, seconds, repeats)]
     for p in points:
         error = "unstable" if p["error"] is None else f"{p['error']:.1e}"
         name = f"{p['band_Hz']:6g} Hz {p['skin']:16} {p['contestant']:40}"
         print(f"{name} {error:8} {p['ns_per_sample']:12,.1f} ns a sample")
-    by_length = lengths((0.1, 0.2) if quick else (1.0, 10.0, 60.0, 600.0), repeats)
+    by_length = lengths((0.1, 0.2) if quick else (1.0, 10.0, 60.0, 300.0), repeats)
     for p in by_length:
         speed = f"{p['ns_per_sample']:.1f} ns a sample, {p['times_real_time']:,.0f} times real time"
         print(f"{p['seconds']:6g} s: {speed}, {p['bytes_per_sample']:.0f} bytes a sample")
