@@ -16,7 +16,7 @@ from fingerspice.physics.phasor import layer_gains
 from fingerspice.waveforms.waveform import Waveform
 
 # Largest number of samples of a spectrum, and number of periods that represent a longer run of a periodic source.
-_MOST_SAMPLES = 2**19
+_MOST_SAMPLES = 2**17
 _PERIODS = 16
 # Pieces that represent a longer run of another source, and frequencies between which gains are interpolated.
 _PIECES, _GRID = 4, 49
