@@ -96,7 +96,8 @@ def charge_rows(
 @jit
 def charge_error(
     form: Form, h: float, lost: FloatArray, g: FloatArray, places: FloatArray, missed: FloatArray, theta: float,
-    u: FloatArray, areas: FloatArray, z: FloatArray, collected: FloatArray, control: FloatArray,
+    u: FloatArray, areas: FloatArray, z: FloatArray, slips: FloatArray, cell_slips: FloatArray, collected: FloatArray,
+    control: FloatArray,
 ) -> None:  # fmt: skip
     """Largest error of the charges over the part of a step that counts, from the signed error of the modes.
 
@@ -113,31 +114,31 @@ def charge_error(
         Error of the modes, and what of it the polynomials of this step miss; see `netassess.assess`.
     u, areas, z : ndarray
         Rows of the cells' voltages (n_f, ROWS), blocks of the areas', and charges gained (n_s, ROWS).
+    slips, cell_slips : ndarray, shape (2, m, N_PLACES) and (2, N_PLACES, n_f + n_area)
+        Room for what of the errors lasts and what does not, of the modes, and of the cells and areas.
     collected : ndarray, shape (2, n_s)
         What has stayed so far, and the squares of what has with a sign that is not known.
     control : ndarray
         See `readout`.
     """
-    n_f, n_area = form.c.size, form.cell.size
-    lasting, brief = places.copy(), np.zeros_like(places)
+    lasting, brief = slips[0], slips[1]
     for k in range(places.shape[0]):
-        brief[k, 0] = missed[4, k]
-        for p in range(3):
-            brief[k, p + 1] = missed[p, k]
-            lasting[k, p + 1] -= missed[p, k]
-    off, off_briefly = np.zeros((2, N_PLACES, n_f + n_area)), np.zeros(N_PLACES)
-    _cell_errors(form, lasting, areas[SLOPE], off[0])
-    _cell_errors(form, brief, areas[SLOPE], off[1])
+        for p in range(N_PLACES):
+            brief[k, p] = missed[p - 1, k] if 0 < p < N_PLACES - 1 else (missed[4, k] if p == 0 else 0.0)
+            lasting[k, p] = places[k, p] - (brief[k, p] if p > 0 else 0.0)
+    _cell_errors(form, lasting, areas[SLOPE], cell_slips[0])
+    _cell_errors(form, brief, areas[SLOPE], cell_slips[1])
+    off_briefly = np.empty(N_PLACES)
     for source in range(form.stored.shape[0]):
         first, second, third = between(z[source])
         swing, end, lobe, apart = 0.0, 0.0, 0.0, 0.0
         if not form.mobile:
             swing, end = _area_missed(form, source, u, areas[AREA])
         for p in range(1, N_PLACES - 1):
-            leak = _leak(form, source, p, lost, g, brief, off[1], u, areas[MORE])
+            leak = _leak(form, source, p, lost, g, brief, cell_slips[1], u, areas[MORE])
             lobe = max(lobe, _HALF_LOBE * h * abs(leak))
         for p in range(N_PLACES):
-            held = _held(form, source, p, brief, off[1], u, areas[MORE])
+            held = _held(form, source, p, brief, cell_slips[1], u, areas[MORE])
             own = first if p == 1 else (second if p == 2 else (third if p == 3 else 0.0))
             off_briefly[p] = max(abs(held), abs(own), swing, lobe)
             apart = max(apart, abs(own - held) if 0 < p < N_PLACES - 1 else 0.0)
@@ -148,15 +149,15 @@ def charge_error(
         added, last_leak, last_theta = 0.0, 0.0, 0.0
         for p in range(N_PLACES):
             row = row_of(p)
-            leak = _leak(form, source, p, lost, g, lasting, off[0], u, areas[MORE])
+            leak = _leak(form, source, p, lost, g, lasting, cell_slips[0], u, areas[MORE])
             if p > 0:
                 reached = min(POINTS[row], theta)
                 part = (reached - last_theta) / (POINTS[row] - last_theta)
-                turned = 0.0 if form.mobile else _turned(form, source, p, off[0], u, areas[AREA])
+                turned = 0.0 if form.mobile else _turned(form, source, p, cell_slips[0], u, areas[AREA])
                 added += part * (0.5 * h * (POINTS[row] - last_theta) * (leak + last_leak) + turned)
                 last_theta = POINTS[row]
             last_leak = leak
-            now = _held(form, source, p, lasting, off[0], u, areas[MORE])
+            now = _held(form, source, p, lasting, cell_slips[0], u, areas[MORE])
             known = now + collected[0, source] + added
             error = math.sqrt(known * known + off_briefly[p] * off_briefly[p] + collected[1, source])
             control[ERROR_Q] = max(control[ERROR_Q], error)

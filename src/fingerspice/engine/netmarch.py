@@ -355,8 +355,8 @@ def march(
                 form, work, own, h, rates, g, lost, lost_s, integral, sign, values[first_z : y.size], values[y.size :]
             )
             charge_error(
-                form, h, lost, g, places, work.off, theta, cells[netrows.CELL_U], areas, values[first_z:], collected,
-                control,
+                form, h, lost, g, places, work.off, theta, cells[netrows.CELL_U], areas, values[first_z:], work.slips,
+                work.cell_slips, collected, control,
             )  # fmt: skip
         for e in range(n_s):
             gained[e] = at(values[first_z + e], theta) if charge else 0.0

@@ -152,6 +152,8 @@ class Work(NamedTuple):
     outputs: FloatArray
     room: FloatArray
     off: FloatArray
+    slips: FloatArray
+    cell_slips: FloatArray
     carried: FloatArray
     spare: FloatArray
     spare_cells: FloatArray
@@ -179,6 +181,8 @@ def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: 
         np.zeros((2, WRITTEN_AT_ONCE)),
         np.zeros((4, ROWS)),
         np.zeros((N_PLACES, modes + sources)),
+        np.zeros((2, modes, N_PLACES)),
+        np.zeros((2, N_PLACES, cells + areas)),
         np.zeros((modes, N_PLACES - 1)),
         np.zeros((6, modes, ROWS)),
         np.zeros((8, cells, ROWS)),
