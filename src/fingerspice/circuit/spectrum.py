@@ -25,7 +25,7 @@ NOTABLE = 0.01
 # The area's harmonics also meet the skin's data. Taken at the fundamental, these cause a further relative error of at
 # most this times the relative change of the area: 0.004 was found where the area changes by a quarter (sine of 200 V
 # and 100 Hz).
-_COUPLING = 0.05
+COUPLING = 0.05
 
 
 def _enough(span: float, rate: float) -> int:
@@ -116,7 +116,12 @@ def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> str
     skins = circuit.by_device("SKIN_DISPERSIVE")
     if not skins or not (math.isfinite(t_stop) and t_stop > 0.0):
         return None
-    below, above = circuit.remember(("outside", t_stop), lambda: energy_outside(waveform, t_stop))
+    # One entry with its key: another thread may put its own there at any time.
+    kept, shares = waveform.kept.get("outside", (None, (0.0, 0.0)))
+    if kept != t_stop:
+        shares = energy_outside(waveform, t_stop)
+        waveform.kept["outside"] = t_stop, shares
+    below, above = shares
     parts = [
         f"{100.0 * share:.{0 if share > 0.1 else 1}f} % {where}"
         for share, where in ((below, f"below {SKIN_BAND[0]:g} Hz"), (above, f"above {SKIN_BAND[1] / 1e3:g} kHz"))
@@ -160,4 +165,4 @@ def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity:
     peak = float(np.abs(right).max())
     if not (peak > 0.0 and math.isfinite(peak)):
         return math.inf
-    return float(np.abs(missed).max()) / peak + _COUPLING * sensitivity
+    return float(np.abs(missed).max()) / peak + COUPLING * sensitivity

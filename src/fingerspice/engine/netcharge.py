@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.charge import DERIVATIVE, LOBE
 from fingerspice.engine.exponential import N_PLACES, between, row_of
-from fingerspice.engine.netrows import AREA, MORE, SLOPE, Form
+from fingerspice.engine.netrows import AREA, MORE, SLOPE, Form, Work
 from fingerspice.engine.readout import ERROR_Q
 from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # What changes its sign at every node, as the node polynomial does, collects so much of itself within a step.
 _HALF_LOBE = 0.041
@@ -95,9 +92,8 @@ def charge_rows(
 
 @jit
 def charge_error(
-    form: Form, h: float, lost: FloatArray, g: FloatArray, places: FloatArray, missed: FloatArray, theta: float,
-    u: FloatArray, areas: FloatArray, z: FloatArray, slips: FloatArray, cell_slips: FloatArray, collected: FloatArray,
-    control: FloatArray,
+    form: Form, work: Work, h: float, lost: FloatArray, g: FloatArray, theta: float, u: FloatArray, areas: FloatArray,
+    z: FloatArray, collected: FloatArray, control: FloatArray,
 ) -> None:  # fmt: skip
     """Largest error of the charges over the part of a step that counts, from the signed error of the modes.
 
@@ -110,18 +106,18 @@ def charge_error(
     ----------
     form, h, lost, g, theta
         Of the step; `g` (n_f,) are the leaks that count, none in a jump.
-    places, missed : ndarray, shape (m, N_PLACES) and (5, m + n_s)
-        Error of the modes, and what of it the polynomials of this step miss; see `netassess.assess`.
+    work : Work
+        Its `places` (m, N_PLACES) are the errors of the modes, and `off` (5, m + n_s) what of these the polynomials of
+        this step miss; see `netassess.assess`.
     u, areas, z : ndarray
         Rows of the cells' voltages (n_f, ROWS), blocks of the areas', and charges gained (n_s, ROWS).
-    slips, cell_slips : ndarray, shape (2, m, N_PLACES) and (2, N_PLACES, n_f + n_area)
-        Room for what of the errors lasts and what does not, of the modes, and of the cells and areas.
     collected : ndarray, shape (2, n_s)
         What has stayed so far, and the squares of what has with a sign that is not known.
     control : ndarray
         See `readout`.
     """
-    lasting, brief = slips[0], slips[1]
+    places, missed, cell_slips = work.places, work.off, work.cell_slips
+    lasting, brief = work.slips[0], work.slips[1]
     for k in range(places.shape[0]):
         for p in range(N_PLACES):
             brief[k, p] = missed[p - 1, k] if 0 < p < N_PLACES - 1 else (missed[4, k] if p == 0 else 0.0)

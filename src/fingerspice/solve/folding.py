@@ -12,19 +12,17 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import OdeSolution, solve_ivp
 
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine.model import branch_area, dot, ramp, voltage_by_time, write_row_at
 from fingerspice.engine.segment import Segment, source
 from fingerspice.results.outcome import Failure, SolveError, Status
 from fingerspice.solve.marching import solve as solve_marching
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import BoolArray, Run
+from fingerspice.solve.runs import Run
 from fingerspice.solve.sources import Tables
 from fingerspice.solve.stackstate import StackState, from_stack, from_written, model_of, row_width, to_stack
-
-FloatArray = NDArray[np.float64]
 
 FINEST_RTOL = 1e-12
 # Where leaks are fast beside a path to a fold, their rounding leaves no tight tolerance to be met: a second try's, and

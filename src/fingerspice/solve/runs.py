@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.network import Sources, at_sources, new_room, rates
 from fingerspice.engine.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, ZEROS
 from fingerspice.results.outcome import Attempt, ErrorEstimate, State, Status, last_tried
@@ -19,9 +19,6 @@ from fingerspice.results.steps import Recorded
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.sources import Tables, after_the_end, joined, segment_index, values_at
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 Progress = Callable[[float], None]
 
 # An error below this share of the voltages that cancel in the gap's is rounding: finer steps would not reach it.
