@@ -1,0 +1,310 @@
+"""What `engine.lockstep` needs to know of its scenes: modes, the source's response, area polynomials, step weights."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit, jit_rows
+from fingerspice.engine.lockstep import (
+    LANES, N_STATE, N_WEIGHTS, PEAK, SCALE, SHAPE, VALUE, WAVE_X, WAVE_Y, Z, Marks, Weights, n_constants, n_state, run,
+)  # fmt: skip
+from fingerspice.numerics.modes import modes as modes_of
+
+# Rows of a table of scenes, after those of each cell: capacitance (F/m^2), leakage in all (S) and per area (S/m^2).
+CELL_ROWS = 3
+XI, REST, STRESS, LOAD, LOSS, AMPLITUDE, OMEGA, PHASE, N_OTHERS = 0, 1, 2, 3, 4, 5, 6, 7, 8
+"""Eq. 4's X at 1 V, A0 at 0 V (m^2), Pa at 1 V, N, c2 mu^2; V, rad/s and rad of the source."""
+LARGEST_X = 1.3
+"""To where the series of the universal curve reaches."""
+# Largest gap voltage that the area's polynomial covers, over the source's amplitude: a jump of both signs adds to what
+# leaked before it.
+COVERED, COVERED_JUMPING = 1.05, 1.6
+# Roots nearer than this to a pole, relative, leave too few digits of the distance.
+NEAR_POLE = 1e-5
+# Periods in which the periodic state has to be found.
+MOST_PERIODS = 16
+
+
+@jit_rows
+def _inverse_areas(
+    n: int, at: float, top: FloatArray, b: FloatArray, series: FloatArray, y: FloatArray, out: FloatArray
+) -> None:  # fmt: skip
+    """1/A at the voltages top (1 + at) / 2 of every lane, by the universal curve and the closed form of Eqs. 1 and 3.
+
+    `b` has the table's other rows of the block, from which X, A0 and the rest are taken.
+    """
+    for i in range(LANES):
+        x = b[XI * LANES + i] * (0.5 * (1.0 + at) * top[i]) * (2.0 / LARGEST_X) - 1.0
+        total = series[0]
+        for d in range(1, n):
+            total = total * x + series[d]
+        y[i] = total
+    for i in range(LANES):
+        u = 0.5 * (1.0 + at) * top[i]
+        a0 = b[REST * LANES + i] * y[i]
+        load, k = b[LOAD * LANES + i], b[LOSS * LANES + i] / a0
+        sigma = b[STRESS * LANES + i] * u * u
+        root = math.sqrt(1.0 + 4.0 * k * sigma * (load + sigma * a0))
+        out[i] = (1.0 + 2.0 * k * load * sigma + root) / (2.0 * (a0 - k * load * load))
+
+
+@jit_rows
+def _add_row(share: float, x: FloatArray, out: FloatArray) -> None:
+    for i in range(LANES):
+        out[i] += share * x[i]
+
+
+@jit
+def _three_modes(r: FloatArray, k: FloatArray, rates: FloatArray) -> bool:
+    """The two rates of three cells from a quadratic; False where they are too near to a cell's own."""
+    b = k[0] * (r[1] + r[2]) + k[1] * (r[0] + r[2]) + k[2] * (r[0] + r[1])
+    c = k[0] * r[1] * r[2] + k[1] * r[0] * r[2] + k[2] * r[0] * r[1]
+    square = b * b - 4.0 * c
+    if not square > 0.0:
+        return False
+    rates[1] = 0.5 * (b + math.sqrt(square))
+    rates[0] = c / rates[1]
+    for m in range(2):
+        for j in range(3):
+            if not abs(r[j] - rates[m]) > NEAR_POLE * max(r[j], rates[m]):
+                return False
+    return True
+
+
+@jit
+def _modes(r: FloatArray, k: FloatArray, rates: FloatArray, gain: FloatArray, feed: FloatArray, shape: FloatArray) -> None:
+    """As `numerics.modes.modes`, into arrays, and without its iteration for three cells that differ."""
+    if r.size == 3 and _three_modes(r, k, rates):
+        for m in range(2):
+            norm = 0.0
+            for j in range(3):
+                shape[j, m] = k[j] / (r[j] - rates[m])
+                norm += shape[j, m] * shape[j, m] / k[j]
+            gain[m] = -1.0 / norm
+            for j in range(3):
+                feed[j, m] = -shape[j, m] / k[j] / norm
+        return
+    found = modes_of(r, k)
+    rates[:], gain[:], feed[:], shape[:] = found[0], found[1], found[2], found[3]
+
+
+@jit
+def moment_integrals(y: float, out: FloatArray) -> None:
+    """Integrals of exp(-y (1 - s)) s^k over [0, 1] for k = 0, 1, 2, y >= 0."""
+    if y < 1.0:
+        # The sum of (-y)^j 2! / (j + 3)!, from the highest; then down, where rounding does not grow.
+        total = 0.0
+        for j in range(14, -1, -1):
+            total = 1.0 - y * total / (j + 4.0)
+        out[2] = total / 3.0
+        out[1] = 0.5 * (1.0 - y * out[2])
+        out[0] = 1.0 - y * out[1]
+        return
+    out[0] = -math.expm1(-y) / y
+    out[1] = (1.0 - out[0]) / y
+    out[2] = (1.0 - 2.0 * out[1]) / y
+
+
+@jit
+def weigh(i: int, h: float, rates: FloatArray, drive: FloatArray, g: Weights, modes: Marks) -> None:
+    """Weights of lane i for no step, a first one and all others of length h (s)."""
+    m_all = len(modes)
+    part = np.empty(3)
+    still, first, rest = g
+    for m in range(m_all):
+        moment_integrals(rates[m] * h, part)
+        i0, i1, i2 = h * part[0], h * part[1], h * part[2]
+        decay, driven, at = math.exp(-rates[m] * h), drive[m] * i0, m * LANES + i
+        _set_row(still, at, m_all * LANES, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        _set_row(first, at, m_all * LANES, (decay, driven, i0, 0.0, i1, i0 - i1, 0.0))
+        later = (decay, driven, i0 + i1, -i1, 0.5 * (i1 + i2), i0 - i2, 0.5 * (i2 - i1))
+        _set_row(rest, at, m_all * LANES, later)
+
+
+@jit
+def _set_row(
+    g: FloatArray, at: int, stride: int, values: tuple[float, float, float, float, float, float, float]
+) -> None:  # fmt: skip
+    """Weights of one mode of one lane, in the order of `lockstep`'s rows."""
+    for row in range(N_WEIGHTS):
+        g[row * stride + at] = values[row]
+
+
+@jit
+def _lane(
+    i: int, gap: int, t: FloatArray, jumping: bool, c: FloatArray, start: FloatArray, rates: FloatArray,
+    drive: FloatArray, modes: Marks, powers: Marks,
+) -> None:  # fmt: skip
+    """Constants and start of lane i from its column of the table; its area's polynomial is there already."""
+    m_all = len(modes)
+    cells = m_all + 1
+    area0 = SHAPE + 3 * m_all + m_all * m_all + len(powers) - 1
+    q0 = c[area0 * LANES + i]
+    others = CELL_ROWS * cells
+    amplitude, omega, phase = t[others + AMPLITUDE], t[others + OMEGA], t[others + PHASE]
+    k, r, moved = np.empty(cells), np.empty(cells), np.empty(cells)
+    gain, feed, shape = np.empty(m_all), np.empty((cells, m_all)), np.empty((cells, m_all))
+    total = 0.0
+    for j in range(cells):
+        total += 1.0 / t[j]
+    for j in range(cells):
+        k[j] = 1.0 / (t[j] * total)
+        moved[j] = t[cells + j] / t[j]
+        r[j] = t[2 * cells + j] / t[j] + q0 * moved[j]
+    _modes(r, k, rates, gain, feed, shape)
+    x, y = np.empty(cells), np.empty(cells)
+    for j in range(cells):
+        x[j] = k[j] * amplitude * (1.0 if jumping else math.cos(phase))
+        y[j] = 0.0 if jumping else k[j] * amplitude * math.sin(phase)
+    for m in range(m_all):
+        start[m * LANES + i], drive[m] = 0.0, 0.0
+        if jumping:
+            drive[m] = gain[m] * amplitude
+            continue
+        # A sine's response is taken out: (rate - i omega) / (rate^2 + omega^2) of it, turned by its phase.
+        size = gain[m] * amplitude / (rates[m] * rates[m] + omega * omega)
+        along = size * (rates[m] * math.cos(phase) + omega * math.sin(phase))
+        across = size * (rates[m] * math.sin(phase) - omega * math.cos(phase))
+        start[m * LANES + i] = -across
+        for j in range(cells):
+            x[j] += shape[j, m] * along
+            y[j] += shape[j, m] * across
+    c[WAVE_X * LANES + i], c[WAVE_Y * LANES + i] = x[gap], y[gap]
+    for m in range(m_all):
+        c[(SHAPE + m) * LANES + i] = shape[gap, m]
+        of_x, of_y = 0.0, 0.0
+        for j in range(cells):
+            of_x += feed[j, m] * moved[j] * x[j]
+            of_y += feed[j, m] * moved[j] * y[j]
+        c[(SHAPE + m_all + m) * LANES + i] = of_x
+        c[(SHAPE + 2 * m_all + m) * LANES + i] = of_y
+        for l in range(m_all):
+            of_z = 0.0
+            for j in range(cells):
+                of_z += feed[j, m] * moved[j] * shape[j, l]
+            c[(SHAPE + 3 * m_all + m * m_all + l) * LANES + i] = of_z
+
+
+@jit
+def _closed(
+    s: FloatArray, start: FloatArray, back: FloatArray, c: FloatArray, closing: FloatArray, tol: float, modes: Marks
+) -> bool:  # fmt: skip
+    """Whether a period leads every lane's start back to itself; else starts move by Newton's method.
+
+    Its slope is that of the stack with its area held. Lanes that have closed keep their start.
+    """
+    m_all, done = len(modes), True
+    for i in range(LANES):
+        off = 0.0
+        for m in range(m_all):
+            change = (s[(Z * m_all + m) * LANES + i] - start[m * LANES + i]) * back[m * LANES + i]
+            off += abs(c[(SHAPE + m) * LANES + i] * change)
+        closing[i] = off / (s[(N_STATE * m_all + PEAK) * LANES + i] + 1e-300)
+        if closing[i] > tol:
+            done = False
+            for m in range(m_all):
+                change = s[(Z * m_all + m) * LANES + i] - start[m * LANES + i]
+                start[m * LANES + i] += change * back[m * LANES + i]
+    return done
+
+
+@jit
+def _results(
+    s: FloatArray, last: FloatArray, closing: FloatArray, steps: tuple[float, float], first: int, out: FloatArray,
+    n_modes: int, count: int,
+) -> None:  # fmt: skip
+    """Means over the run and over its last period, the peak (V), and what the periodic state may be off."""
+    own = N_STATE * n_modes
+    for i in range(min(LANES, out.shape[1] - first)):
+        for j in range(count):
+            out[j, first + i] = s[(own + VALUE + count + j) * LANES + i] / steps[0]
+            out[count + j, first + i] = last[j * LANES + i] / steps[1]
+        out[2 * count, first + i] = s[(own + PEAK) * LANES + i]
+        out[2 * count + 1, first + i] = closing[i]
+
+
+@jit
+def march(
+    table: FloatArray, pending: NDArray[np.int64], gap: int,
+    curves: tuple[FloatArray, FloatArray, FloatArray], waves: tuple[FloatArray, FloatArray],
+    how: tuple[int, bool, bool, float], out: FloatArray, trace: FloatArray, modes: Marks, powers: Marks, moments: Marks,
+) -> None:  # fmt: skip
+    """Scenes of a table in blocks, by the steps of two waves; the first may be empty.
+
+    Parameters
+    ----------
+    table : ndarray, shape (n_row, n_scene)
+        Rows of every cell, then `N_OTHERS`.
+    pending : ndarray, shape (n,)
+        Which scenes.
+    gap : int
+        The gap among the cells.
+    curves : tuple of ndarray
+        Powers of the universal curve over X, highest first; Chebyshev's points; and from values at these to powers
+        (d + 1, d + 1), highest first.
+    waves : tuple of ndarray, each of shape (2, n)
+        As `lockstep.run` takes them: x and y at the steps of a period, or of half a one.
+    how : tuple
+        Half periods; whether the source jumps and turns after each; whether the periodic state is looked for; and how
+        near it has to come.
+    out : ndarray, shape (2, 2 len(moments) + 3, n)
+        Of each wave the means over the run and over its last period, the peak (V), what the periodic state is off, and
+        the last coefficient of the area's series, relative; infinite where the polynomial does not reach.
+    trace : ndarray, shape (n, m)
+        Gap voltage before every step of the second wave, V; (n, 0) for none.
+    """
+    m_all, d_all, count = len(modes), len(powers) - 1, len(moments)
+    halves, jumping, periodic, tol = how
+    cells = m_all + 1
+    c, g = np.zeros(n_constants(m_all, d_all) * LANES), (np.empty(N_WEIGHTS * m_all * LANES), np.empty(N_WEIGHTS * m_all * LANES), np.empty(N_WEIGHTS * m_all * LANES))
+    s, last = np.empty(n_state(m_all, count) * LANES), np.empty(count * LANES)
+    start, back, closing = np.empty(m_all * LANES), np.zeros(m_all * LANES), np.zeros(LANES)
+    rates, drive = np.empty((LANES, m_all)), np.empty((LANES, m_all))
+    b, top, work = np.empty(N_OTHERS * LANES), np.empty(LANES), np.empty((2, LANES))
+    column, tail, area = np.empty(table.shape[0]), np.empty(LANES), SHAPE + 3 * m_all + m_all * m_all
+    voltages = np.empty(LANES * trace.shape[1])
+    for first in range(0, pending.size, LANES):
+        for i in range(LANES):
+            scene = pending[min(first + i, pending.size - 1)]
+            for j in range(N_OTHERS):
+                b[j * LANES + i] = table[CELL_ROWS * cells + j, scene]
+            top[i] = (COVERED_JUMPING if jumping else COVERED) * abs(b[AMPLITUDE * LANES + i]) + 1e-12
+            c[SCALE * LANES + i] = 2.0 / top[i]
+        c[area * LANES :] = 0.0
+        for j in range(d_all + 1):
+            _inverse_areas(curves[0].size, curves[1][j], top, b, curves[0], work[0], work[1])
+            for d in range(d_all + 1):
+                _add_row(curves[2][d, j], work[1], c[(area + d) * LANES : (area + d + 1) * LANES])
+        for i in range(LANES):
+            # The highest power's coefficient is 2^(d - 1) times that of the series.
+            tail[i] = abs(c[area * LANES + i]) / 2.0 ** (d_all - 1) / c[(area + d_all) * LANES + i]
+            if not b[XI * LANES + i] * top[i] <= LARGEST_X:
+                tail[i] = math.inf
+            column[:] = table[:, pending[min(first + i, pending.size - 1)]]
+            _lane(i, gap, column, jumping, c, start, rates[i], drive[i], modes, powers)
+            if periodic:
+                period = 2.0 * math.pi / b[OMEGA * LANES + i]
+                for m in range(m_all):
+                    back[m * LANES + i] = -1.0 / math.expm1(-rates[i, m] * period)
+        for w in range(2):
+            n = waves[w].shape[1] * (2 if jumping else 1)
+            if n == 0:
+                continue
+            for i in range(LANES):
+                weigh(i, 2.0 * math.pi / b[OMEGA * LANES + i] / n, rates[i], drive[i], g, modes)
+            for _ in range(MOST_PERIODS if periodic else 1):
+                s[:] = 0.0
+                s[: m_all * LANES] = start
+                run(c, g, s, waves[w], halves, jumping, last, voltages if w == 1 else voltages[:0], modes, powers, moments)
+                if not periodic or _closed(s, start, back, c, closing, tol, modes):
+                    break
+            _results(s, last, closing, (0.5 * halves * n, float(n)), first, out[w], m_all, count)
+            for i in range(min(LANES, pending.size - first)):
+                out[w, 2 * count + 2, first + i] = tail[i] if out[w, 2 * count, first + i] <= top[i] else math.inf
+        for i in range(min(LANES, pending.size - first)):
+            for k in range(trace.shape[1]):
+                trace[first + i, k] = voltages[i * trace.shape[1] + k]

@@ -1,0 +1,190 @@
+"""Many series stacks at once, in lockstep: the loop of steps of `fs.batch`.
+
+In the modes of a stack with its area held, what the area moves is a few per cent of the whole. An exponential Adams
+method (Hochbruck and Ostermann 2010, section 2.5) takes the rest exactly: z' = -rate z + drive x + dq n(x, y, z), with
+dq = 1/A - 1/A0 a polynomial of the gap voltage's size and n linear. Each step predicts by order 2, evaluates once, and
+corrects by order 3.
+
+A block holds `LANES` scenes, and each of its numbers stands in a row of so many places. The one loop over the lanes has
+a function of its own, whose other loops have constant lengths: `modes` and `powers` are tuples of which only the length
+counts. Then it is compiled into vector instructions without a branch, and a lane's result does not depend on the others.
+"""
+
+from __future__ import annotations
+
+import math
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit, jit_rows
+
+LANES = 16
+"""Scenes of a block."""
+
+Marks = tuple[int, ...]
+"""A tuple of which only the length counts."""
+
+Weights = tuple[FloatArray, FloatArray, FloatArray]
+"""Of no step, of a first one, which knows nothing of before, and of all others."""
+
+# Rows of the constants: u = A x + B y + shape z, and the scale of |u| to [-1, 1]; then those of every mode.
+WAVE_X, WAVE_Y, SCALE, SHAPE = 0, 1, 2, 3
+# Rows of the weights, each for every mode: decay, drive, predictor now and before, corrector next, now and before.
+DECAY, DRIVE, PREDICT, PREDICT_OLD, CORRECT, CORRECT_NOW, CORRECT_OLD, N_WEIGHTS = 0, 1, 2, 3, 4, 5, 6, 7
+# Rows of the state for every mode: z, its rate now and before, and two for the step's own use.
+Z, RATE, OLD, KEPT, GUESS, N_STATE = 0, 1, 2, 3, 4, 5
+# Rows of the state after those: gap voltage, its peak, and what is integrated, as latest value and as sum.
+GAP, PEAK, VALUE = 0, 1, 2
+ALL_MOMENTS = 4
+"""Integrals over time: of u^2 A, its square, u^2, and A."""
+
+
+@jit
+def n_constants(m: int, d: int) -> int:
+    """Rows of the constants of m modes and a polynomial of degree d."""
+    return SHAPE + 3 * m + m * m + d + 1
+
+
+@jit
+def n_state(m: int, moments: int) -> int:
+    """Rows of the state."""
+    return N_STATE * m + VALUE + 2 * moments
+
+
+@jit_rows
+def _step(
+    c: FloatArray, g: FloatArray, s: FloatArray, wave_at: tuple[float, float, float], weight: float, modes: Marks,
+    powers: Marks, moments: Marks,
+) -> None:  # fmt: skip
+    """One step of every lane, adding `weight` times what is integrated at its end.
+
+    The source is at (x, y) there, `wave_at` being x, y and the x before.
+    """
+    x, y, before = wave_at
+    m_all, d_all, count = len(modes), len(powers) - 1, len(moments)
+    of_x, of_y = SHAPE + m_all, SHAPE + 2 * m_all
+    of_z = SHAPE + 3 * m_all
+    area = of_z + m_all * m_all
+    own = N_STATE * m_all
+    value, total = own + VALUE, own + VALUE + count
+    for i in range(LANES):
+        wave = c[WAVE_X * LANES + i] * x + c[WAVE_Y * LANES + i] * y
+        u = wave
+        for m in range(m_all):
+            kept = g[(DECAY * m_all + m) * LANES + i] * s[(Z * m_all + m) * LANES + i]
+            kept += g[(DRIVE * m_all + m) * LANES + i] * before
+            guess = kept + g[(PREDICT * m_all + m) * LANES + i] * s[(RATE * m_all + m) * LANES + i]
+            guess += g[(PREDICT_OLD * m_all + m) * LANES + i] * s[(OLD * m_all + m) * LANES + i]
+            s[(KEPT * m_all + m) * LANES + i] = kept
+            s[(GUESS * m_all + m) * LANES + i] = guess
+            u += c[(SHAPE + m) * LANES + i] * guess
+        v = abs(u) * c[SCALE * LANES + i] - 1.0
+        q = c[area * LANES + i]
+        for d in range(1, d_all):
+            q = q * v + c[(area + d) * LANES + i]
+        q *= v
+        u = wave
+        for m in range(m_all):
+            rate = c[(of_x + m) * LANES + i] * x + c[(of_y + m) * LANES + i] * y
+            for j in range(m_all):
+                rate += c[(of_z + m * m_all + j) * LANES + i] * s[(GUESS * m_all + j) * LANES + i]
+            rate *= q
+            now = s[(RATE * m_all + m) * LANES + i]
+            z = s[(KEPT * m_all + m) * LANES + i] + g[(CORRECT * m_all + m) * LANES + i] * rate
+            z += g[(CORRECT_NOW * m_all + m) * LANES + i] * now
+            z += g[(CORRECT_OLD * m_all + m) * LANES + i] * s[(OLD * m_all + m) * LANES + i]
+            s[(Z * m_all + m) * LANES + i] = z
+            s[(OLD * m_all + m) * LANES + i] = now
+            s[(RATE * m_all + m) * LANES + i] = rate
+            u += c[(SHAPE + m) * LANES + i] * z
+        s[(own + GAP) * LANES + i] = u
+        s[(own + PEAK) * LANES + i] = max(s[(own + PEAK) * LANES + i], abs(u))
+        a = 1.0 / (q + c[(area + d_all) * LANES + i])
+        force = u * u * a
+        s[value * LANES + i] = force
+        s[total * LANES + i] += weight * force
+        if count > 1:
+            s[(value + 1) * LANES + i] = force * force
+            s[(total + 1) * LANES + i] += weight * (force * force)
+            s[(value + 2) * LANES + i] = u * u
+            s[(total + 2) * LANES + i] += weight * (u * u)
+            s[(value + 3) * LANES + i] = a
+            s[(total + 3) * LANES + i] += weight * a
+
+
+@jit_rows
+def _add_latest(first: int, count: int, weight: float, s: FloatArray) -> None:
+    """Add `weight` times the latest values to the sums."""
+    for i in range(count * LANES):
+        s[(first + count) * LANES + i] += weight * s[first * LANES + i]
+
+
+@jit
+def quadrature(k: int, steps: int) -> float:
+    """Weight of value k of `steps` + 1 equidistant ones: Gregory's, of order 4."""
+    end = min(k, steps - k)
+    return 0.375 if end == 0 else 7.0 / 6.0 if end == 1 else 23.0 / 24.0 if end == 2 else 1.0
+
+
+@jit
+def _window(
+    c: FloatArray, g: Weights, s: FloatArray, wave: FloatArray, sign: float, steps: int, restart: bool,
+    trace: FloatArray, at: int, modes: Marks, powers: Marks, moments: Marks,
+) -> None:  # fmt: skip
+    """`steps` steps, which are one stretch of the integrals; the gap voltages go to trace (LANES, n) from `at` on."""
+    count, own = len(moments), N_STATE * len(modes)
+    period, stride = wave.shape[1], trace.shape[0] // LANES
+    if restart:
+        weight = quadrature(0, steps)
+        _step(c, g[0], s, (sign * wave[0, 0], sign * wave[1, 0], 0.0), weight, modes, powers, moments)
+    else:
+        _add_latest(own + VALUE, count, quadrature(0, steps), s)
+    place, before, weights = 0, sign * wave[0, 0], g[1] if restart else g[2]
+    for k in range(steps):
+        if trace.size > 0:
+            for i in range(LANES):
+                trace[i * stride + at + k] = s[(own + GAP) * LANES + i]
+        place = place + 1 if place + 1 < period else 0
+        x, y = sign * wave[0, place], sign * wave[1, place]
+        _step(c, weights, s, (x, y, before), quadrature(k + 1, steps), modes, powers, moments)
+        before, weights = x, g[2]
+
+
+@jit
+def run(
+    c: FloatArray, g: Weights, s: FloatArray, wave: FloatArray, halves: int, turned: bool, last: FloatArray,
+    trace: FloatArray, modes: Marks, powers: Marks, moments: Marks,
+) -> None:  # fmt: skip
+    """A block's scenes over `halves` half periods, from the modes in the state `s` on.
+
+    Parameters
+    ----------
+    c, g, s : ndarray
+        Constants, weights and state, each flat.
+    wave : ndarray, shape (2, n)
+        x and y of the source at the n steps of a period; of half a one where the source is `turned` after it, for then
+        it jumps and the steps begin anew.
+    last : ndarray
+        The sums of the last period, as the state holds those of the whole run; NaN in a shorter one.
+    trace : ndarray, shape (LANES * steps,) or (0,)
+        The gap voltage before each step, V.
+    """
+    count, own = len(moments), N_STATE * len(modes)
+    sums = (own + VALUE + count) * LANES
+    for i in range(count * LANES):
+        s[sums + i] = 0.0
+        last[i] = math.nan
+    for i in range(LANES):
+        s[(own + PEAK) * LANES + i] = 0.0
+    half = wave.shape[1] if turned else wave.shape[1] // 2
+    done = 0
+    while done < halves:
+        if done == halves - 2:
+            last[:] = s[sums : sums + last.size]
+        # What has no jumps is one stretch up to the last period.
+        ahead = 1 if turned or halves < 2 else (halves - 2 if done < halves - 2 else 2)
+        sign = -1.0 if turned and done % 2 == 1 else 1.0
+        restart = turned or done == 0
+        _window(c, g, s, wave, sign, ahead * half, restart, trace, done * half, modes, powers, moments)
+        done += ahead
+    for i in range(last.size):
+        last[i] = s[sums + i] - last[i]
