@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from fingerspice.results.solution import Solution as Solution
     from fingerspice.solve.simulation import plan as plan
     from fingerspice.solve.simulation import simulate as simulate
+    from fingerspice.studies.batch import batch as batch
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
     from fingerspice.studies.export import export_netlist as export_netlist
@@ -71,6 +72,7 @@ _HOMES = {
     "waveforms.sampling": ("Function",),
     "waveforms.combinations": ("AM", "Product", "Sum"),
     "waveforms.waveform": ("DC", "Sine", "Waveform"),
+    "studies.batch": ("batch",),
     "studies.comparison": ("Comparison", "compare"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "studies.export": ("export_netlist",),

@@ -23,6 +23,9 @@ LARGEST_X = 1.3
 # Largest gap voltage that the area's polynomial covers, over the source's amplitude: a jump of both signs adds to what
 # leaked before it.
 COVERED, COVERED_JUMPING = 1.05, 1.6
+Scratch = tuple[
+    FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray
+]  # fmt: skip
 # Roots nearer than this to a pole, relative, leave too few digits of the distance.
 NEAR_POLE = 1e-5
 # Periods in which the periodic state has to be found.
@@ -76,7 +79,9 @@ def _three_modes(r: FloatArray, k: FloatArray, rates: FloatArray) -> bool:
 
 
 @jit
-def _modes(r: FloatArray, k: FloatArray, rates: FloatArray, gain: FloatArray, feed: FloatArray, shape: FloatArray) -> None:
+def _modes(
+    r: FloatArray, k: FloatArray, rates: FloatArray, gain: FloatArray, feed: FloatArray, shape: FloatArray
+) -> None:
     """As `numerics.modes.modes`, into arrays, and without its iteration for three cells that differ."""
     if r.size == 3 and _three_modes(r, k, rates):
         for m in range(2):
@@ -93,36 +98,41 @@ def _modes(r: FloatArray, k: FloatArray, rates: FloatArray, gain: FloatArray, fe
 
 
 @jit
-def moment_integrals(y: float, out: FloatArray) -> None:
+def moment_integrals(y: float) -> tuple[float, float, float]:
     """Integrals of exp(-y (1 - s)) s^k over [0, 1] for k = 0, 1, 2, y >= 0."""
     if y < 1.0:
         # The sum of (-y)^j 2! / (j + 3)!, from the highest; then down, where rounding does not grow.
         total = 0.0
         for j in range(14, -1, -1):
-            total = 1.0 - y * total / (j + 4.0)
-        out[2] = total / 3.0
-        out[1] = 0.5 * (1.0 - y * out[2])
-        out[0] = 1.0 - y * out[1]
-        return
-    out[0] = -math.expm1(-y) / y
-    out[1] = (1.0 - out[0]) / y
-    out[2] = (1.0 - 2.0 * out[1]) / y
+            total = 1.0 - y * total * (1.0 / (j + 4.0))
+        second = total / 3.0
+        first = 0.5 * (1.0 - y * second)
+        return 1.0 - y * first, first, second
+    zeroth = -math.expm1(-y) / y
+    first = (1.0 - zeroth) / y
+    return zeroth, first, (1.0 - 2.0 * first) / y
 
 
 @jit
 def weigh(i: int, h: float, rates: FloatArray, drive: FloatArray, g: Weights, modes: Marks) -> None:
     """Weights of lane i for no step, a first one and all others of length h (s)."""
     m_all = len(modes)
-    part = np.empty(3)
     still, first, rest = g
     for m in range(m_all):
-        moment_integrals(rates[m] * h, part)
-        i0, i1, i2 = h * part[0], h * part[1], h * part[2]
-        decay, driven, at = math.exp(-rates[m] * h), drive[m] * i0, m * LANES + i
+        zeroth, once, twice = moment_integrals(rates[m] * h)
+        i0, i1, i2 = h * zeroth, h * once, h * twice
+        decay, driven, at = 1.0 - rates[m] * i0, drive[m] * i0, m * LANES + i
         _set_row(still, at, m_all * LANES, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
         _set_row(first, at, m_all * LANES, (decay, driven, i0, 0.0, i1, i0 - i1, 0.0))
         later = (decay, driven, i0 + i1, -i1, 0.5 * (i1 + i2), i0 - i2, 0.5 * (i2 - i1))
         _set_row(rest, at, m_all * LANES, later)
+
+
+@jit
+def _scratch(m: int) -> Scratch:
+    """Room for the cells and modes of one lane: allocating it for each would cost as much as the work."""
+    row = np.empty((5, m + 1))
+    return row[0], row[1], row[2], row[3], row[4], np.empty(m), np.empty((m + 1, m)), np.empty((m + 1, m))
 
 
 @jit
@@ -137,7 +147,7 @@ def _set_row(
 @jit
 def _lane(
     i: int, gap: int, t: FloatArray, jumping: bool, c: FloatArray, start: FloatArray, rates: FloatArray,
-    drive: FloatArray, modes: Marks, powers: Marks,
+    drive: FloatArray, scratch: Scratch, modes: Marks, powers: Marks,
 ) -> None:  # fmt: skip
     """Constants and start of lane i from its column of the table; its area's polynomial is there already."""
     m_all = len(modes)
@@ -146,8 +156,7 @@ def _lane(
     q0 = c[area0 * LANES + i]
     others = CELL_ROWS * cells
     amplitude, omega, phase = t[others + AMPLITUDE], t[others + OMEGA], t[others + PHASE]
-    k, r, moved = np.empty(cells), np.empty(cells), np.empty(cells)
-    gain, feed, shape = np.empty(m_all), np.empty((cells, m_all)), np.empty((cells, m_all))
+    k, r, moved, x, y, gain, feed, shape = scratch
     total = 0.0
     for j in range(cells):
         total += 1.0 / t[j]
@@ -156,7 +165,6 @@ def _lane(
         moved[j] = t[cells + j] / t[j]
         r[j] = t[2 * cells + j] / t[j] + q0 * moved[j]
     _modes(r, k, rates, gain, feed, shape)
-    x, y = np.empty(cells), np.empty(cells)
     for j in range(cells):
         x[j] = k[j] * amplitude * (1.0 if jumping else math.cos(phase))
         y[j] = 0.0 if jumping else k[j] * amplitude * math.sin(phase)
@@ -182,11 +190,11 @@ def _lane(
             of_y += feed[j, m] * moved[j] * y[j]
         c[(SHAPE + m_all + m) * LANES + i] = of_x
         c[(SHAPE + 2 * m_all + m) * LANES + i] = of_y
-        for l in range(m_all):
+        for of in range(m_all):
             of_z = 0.0
             for j in range(cells):
-                of_z += feed[j, m] * moved[j] * shape[j, l]
-            c[(SHAPE + 3 * m_all + m * m_all + l) * LANES + i] = of_z
+                of_z += feed[j, m] * moved[j] * shape[j, of]
+            c[(SHAPE + 3 * m_all + m * m_all + of) * LANES + i] = of_z
 
 
 @jit
@@ -231,7 +239,8 @@ def _results(
 def march(
     table: FloatArray, pending: NDArray[np.int64], gap: int,
     curves: tuple[FloatArray, FloatArray, FloatArray], waves: tuple[FloatArray, FloatArray],
-    how: tuple[int, bool, bool, float], out: FloatArray, trace: FloatArray, modes: Marks, powers: Marks, moments: Marks,
+    how: tuple[int, bool, bool, float], out: FloatArray, traces: tuple[FloatArray, FloatArray], modes: Marks,
+    powers: Marks, moments: Marks,
 ) -> None:  # fmt: skip
     """Scenes of a table in blocks, by the steps of two waves; the first may be empty.
 
@@ -254,19 +263,23 @@ def march(
     out : ndarray, shape (2, 2 len(moments) + 3, n)
         Of each wave the means over the run and over its last period, the peak (V), what the periodic state is off, and
         the last coefficient of the area's series, relative; infinite where the polynomial does not reach.
-    trace : ndarray, shape (n, m)
-        Gap voltage before every step of the second wave, V; (n, 0) for none.
+    traces : tuple of ndarray, each of shape (n, steps)
+        Gap voltage before every step of each wave, V; (n, 0) for none.
     """
     m_all, d_all, count = len(modes), len(powers) - 1, len(moments)
     halves, jumping, periodic, tol = how
     cells = m_all + 1
-    c, g = np.zeros(n_constants(m_all, d_all) * LANES), (np.empty(N_WEIGHTS * m_all * LANES), np.empty(N_WEIGHTS * m_all * LANES), np.empty(N_WEIGHTS * m_all * LANES))
+    c, g = (
+        np.zeros(n_constants(m_all, d_all) * LANES),
+        (np.empty(N_WEIGHTS * m_all * LANES), np.empty(N_WEIGHTS * m_all * LANES), np.empty(N_WEIGHTS * m_all * LANES)),
+    )
     s, last = np.empty(n_state(m_all, count) * LANES), np.empty(count * LANES)
     start, back, closing = np.empty(m_all * LANES), np.zeros(m_all * LANES), np.zeros(LANES)
     rates, drive = np.empty((LANES, m_all)), np.empty((LANES, m_all))
+    scratch = _scratch(m_all)
     b, top, work = np.empty(N_OTHERS * LANES), np.empty(LANES), np.empty((2, LANES))
     column, tail, area = np.empty(table.shape[0]), np.empty(LANES), SHAPE + 3 * m_all + m_all * m_all
-    voltages = np.empty(LANES * trace.shape[1])
+    voltages = np.empty(LANES * traces[0].shape[1]), np.empty(LANES * traces[1].shape[1])
     for first in range(0, pending.size, LANES):
         for i in range(LANES):
             scene = pending[min(first + i, pending.size - 1)]
@@ -285,7 +298,7 @@ def march(
             if not b[XI * LANES + i] * top[i] <= LARGEST_X:
                 tail[i] = math.inf
             column[:] = table[:, pending[min(first + i, pending.size - 1)]]
-            _lane(i, gap, column, jumping, c, start, rates[i], drive[i], modes, powers)
+            _lane(i, gap, column, jumping, c, start, rates[i], drive[i], scratch, modes, powers)
             if periodic:
                 period = 2.0 * math.pi / b[OMEGA * LANES + i]
                 for m in range(m_all):
@@ -299,12 +312,11 @@ def march(
             for _ in range(MOST_PERIODS if periodic else 1):
                 s[:] = 0.0
                 s[: m_all * LANES] = start
-                run(c, g, s, waves[w], halves, jumping, last, voltages if w == 1 else voltages[:0], modes, powers, moments)
+                run(c, g, s, waves[w], halves, jumping, last, voltages[w], modes, powers, moments)
                 if not periodic or _closed(s, start, back, c, closing, tol, modes):
                     break
             _results(s, last, closing, (0.5 * halves * n, float(n)), first, out[w], m_all, count)
             for i in range(min(LANES, pending.size - first)):
                 out[w, 2 * count + 2, first + i] = tail[i] if out[w, 2 * count, first + i] <= top[i] else math.inf
-        for i in range(min(LANES, pending.size - first)):
-            for k in range(trace.shape[1]):
-                trace[first + i, k] = voltages[i * trace.shape[1] + k]
+                width = traces[w].shape[1]
+                traces[w][first + i] = voltages[w][i * width : (i + 1) * width]

@@ -7,7 +7,7 @@ corrects by order 3.
 
 A block holds `LANES` scenes, and each of its numbers stands in a row of so many places. The one loop over the lanes has
 a function of its own, whose other loops have constant lengths: `modes` and `powers` are tuples of which only the length
-counts. Then it is compiled into vector instructions without a branch, and a lane's result does not depend on the others.
+counts. Then it is compiled into vector instructions without a branch, and no lane's result depends on the others.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ DECAY, DRIVE, PREDICT, PREDICT_OLD, CORRECT, CORRECT_NOW, CORRECT_OLD, N_WEIGHTS
 Z, RATE, OLD, KEPT, GUESS, N_STATE = 0, 1, 2, 3, 4, 5
 # Rows of the state after those: gap voltage, its peak, and what is integrated, as latest value and as sum.
 GAP, PEAK, VALUE = 0, 1, 2
-ALL_MOMENTS = 4
-"""Integrals over time: of u^2 A, its square, u^2, and A."""
+ALL_MOMENTS = 3
+"""Integrals over time: of u^2 A, its square, and u^2. (A itself has a kink where u is 0: its sum is of order 2.)"""
 
 
 @jit
@@ -107,8 +107,6 @@ def _step(
             s[(total + 1) * LANES + i] += weight * (force * force)
             s[(value + 2) * LANES + i] = u * u
             s[(total + 2) * LANES + i] += weight * (u * u)
-            s[(value + 3) * LANES + i] = a
-            s[(total + 3) * LANES + i] += weight * a
 
 
 @jit_rows

@@ -1,0 +1,333 @@
+"""Many scenes of one circuit: those of the usual kind in lockstep, all others one by one."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import InputError
+from fingerspice.circuit.arguments import require_circuit, require_number
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.topology import driving_sources
+from fingerspice.results.signals import SIGNALS
+from fingerspice.studies.batchladder import climb, in_lockstep
+from fingerspice.studies.batchscenes import lockstep_form
+from fingerspice.studies.batchsingle import SIGNALS_OF_BATCH, Single, run_single
+from fingerspice.studies.batchtask import LOCKSTEP, STATUS_NAMES, Answers, Task
+from fingerspice.waveforms.waveform import require
+
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+_KINDS = ("mean", "rms", "min", "max", "peak", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
+RTOL_RANGE = (1e-12, 0.1)
+# Messages of scenes without a result that a Dataset keeps, and gap voltages (8 GB) that a batch may return.
+MESSAGES, MOST_VOLTAGES = 16, 1e9
+# Scenes of a job; where their gap voltages are wanted, so few that these stay in the cache.
+CHUNK, TRACED = 4096, 256
+# A number of half periods that differs from a whole one by rounding alone, relative.
+WHOLE = 1e-9
+
+
+def batch(
+    circuit: Circuit,
+    parameters: Mapping[str, ArrayLike],
+    *,
+    outputs: Sequence[str] = ("f_el_mean",),
+    rtol: float = 1e-4,
+    t_stop: float | None = None,
+    periods: float | None = None,
+    periodic: bool = False,
+    skin: str = "own",
+    points: int = 200,
+    threads: int | None = None,
+) -> Dataset:
+    """Figures of many scenes, which are one circuit with different values.
+
+    Series stacks of LAYER, SLAB, SKIN and GAP under the local law and a sine or square go in lockstep, two to four
+    layers each. Every other circuit, law or source, and every scene that lockstep does not bring to `rtol`, goes through
+    `simulate` (`steady_state`) by itself.
+
+    Parameters
+    ----------
+    circuit : Circuit
+    parameters : mapping of str to array_like, shape (n_scene,) or ()
+        Path to values in the netlist's unit, as in `Circuit.replace`; ``source.`` stands for the only source.
+    outputs : sequence of str
+        Figures ``SIGNAL_KIND`` as in `Solution.summary`, such as ``f_el_mean``, ``f_t_rms`` and ``u_gap_peak``; and
+        ``u_gap``, the gap voltage at `points` times a period. Means and root mean squares go in lockstep.
+    rtol : float
+        Error of every output, relative to itself; of ``u_gap``, to its peak.
+    t_stop, periods : float, optional
+        Length of every run in s, or in periods of its own source; the deck's TSTOP by default. In lockstep the length is
+        a whole number of half periods.
+    periodic : bool
+        Look for the periodic state; the figures are those of one period of it.
+    skin : str
+        ``"own"`` (a SKIN keeps its `f`) or ``"follow"`` (it is the source's frequency).
+    points : int
+        Gap voltages a period, even.
+    threads : int, optional
+        All processors by default. The result does not depend on it.
+
+    Returns
+    -------
+    xarray.Dataset
+        With dimension ``scene``, the parameters as coordinates, the outputs, ``error`` (stated, relative) and ``status``:
+        0 in lockstep, 1 one by one, 2 refused, 3 failed, where the outputs are NaN. The attribute `n_ordinary` counts
+        those that did not go in lockstep, `ordinary` says why, `failures` has the messages.
+
+    Raises
+    ------
+    InputError
+        For an unknown path, arrays of unequal length, NaN, a value out of range, or an unknown output.
+    """
+    require_circuit(circuit)
+    task = _task(circuit, outputs, rtol, t_stop, periods, periodic, points)
+    require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
+    if threads is not None:
+        require_number("threads", threads, "a whole number")
+        require(threads >= 1, "threads", threads, "1 or more")
+    scenes = _scenes(circuit, parameters)
+    changed = dict(scenes)
+    if skin == "follow":
+        frequency = _frequencies(circuit, scenes)
+        for element in circuit.by_device("SKIN"):
+            if f"{element.name}.f" in scenes:
+                raise InputError(f"skin='follow' and {element.name}.f are both given; allowed: one of them")
+            changed[f"{element.name}.f"] = frequency
+    with ThreadPoolExecutor(threads or _processors()) as pool:
+        found, reason = _lockstep(task, changed, pool)
+        rest = np.flatnonzero(~found.done)
+        _one_by_one(task, changed, rest, found, pool)
+    return _dataset(
+        task, scenes, found, {"skin": skin, "n_ordinary": rest.size, "ordinary": reason if rest.size else ""}
+    )
+
+
+def _processors() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _task(
+    circuit: Circuit, outputs: Sequence[str], rtol: float, t_stop: float | None, periods: float | None, periodic: bool,
+    points: int,
+) -> Task:  # fmt: skip
+    """The checked request."""
+    require_number("rtol", rtol, "1e-12 to 0.1")
+    require(RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-12 to 0.1")
+    require_number("points", points, "an even number")
+    require(points >= 2 and points % 2 == 0, "points", points, "an even number, 2 or more")
+    if isinstance(outputs, str):
+        outputs = (outputs,)
+    known = ["u_gap", *(f"{signal}_{kind}" for signal in SIGNALS_OF_BATCH for kind in _KINDS)]
+    for name in outputs:
+        if name not in known:
+            raise InputError(f"unknown output {name!r}; allowed: u_gap, or one of {', '.join(SIGNALS_OF_BATCH)} with _mean, "
+                             f"_rms, {', '.join(f'_{kind}' for kind in _KINDS[2:])}")  # fmt: skip
+    require(len(outputs) > 0, "outputs", "empty", "one or more names")
+    if periods is not None and t_stop is not None:
+        raise InputError("t_stop and periods are both given; allowed: one of them")
+    for what, value in (("t_stop", t_stop), ("periods", periods)):
+        if value is not None:
+            require_number(what, value, "a number")
+            require(math.isfinite(value) and value > 0.0, what, value, "more than 0")
+    if periodic and (periods is not None or t_stop is not None):
+        raise InputError("periodic=True takes one period, and t_stop or periods is given; allowed: neither")
+    if periods is None and t_stop is None and not periodic:
+        if circuit.tran is None:
+            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s, or periods")
+        t_stop = circuit.tran.stop
+    return Task(circuit, tuple(outputs), float(rtol), t_stop, 1.0 if periodic else periods, periodic, points)
+
+
+def _scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
+    """Values by path, all of one shape (n_scene,).
+
+    Raises
+    ------
+    InputError
+        For an unknown path, unequal lengths, NaN, or a value out of range.
+    """
+    if not isinstance(parameters, Mapping) or not parameters:
+        raise InputError(f"parameters is {parameters!r}; allowed: a mapping such as {{'Xgap.d': [3e-6, 4e-6]}}")
+    given: dict[str, FloatArray] = {}
+    for path, values in parameters.items():
+        name = _path(circuit, path)
+        try:
+            array = np.asarray(values, float)
+        except (TypeError, ValueError):
+            raise InputError(f"{path} is {values!r}; allowed: an array of numbers") from None
+        require(
+            array.ndim <= 1 and array.size > 0, path, f"of shape {array.shape}", "one number, or one row of numbers"
+        )
+        if name in given:
+            raise InputError(f"{name} is given twice; allowed: once")
+        given[name] = array
+    sizes = {path: array.size for path, array in given.items() if array.ndim == 1}
+    if len(set(sizes.values())) > 1:
+        raise InputError(f"the arrays have {', '.join(f'{n} ({p})' for p, n in sizes.items())} values; allowed: equal "
+                         "lengths, or single numbers")  # fmt: skip
+    n = max(sizes.values(), default=1)
+    scenes = {path: np.ascontiguousarray(np.broadcast_to(array, (n,))) for path, array in given.items()}
+    for path, array in scenes.items():
+        _check_values(circuit, path, array)
+    return scenes
+
+
+def _path(circuit: Circuit, path: Any) -> str:
+    """A path as the circuit writes it."""
+    if isinstance(path, str) and path.lower().startswith("source."):
+        on = driving_sources(circuit)
+        if not any(e.name.lower() == "source" for e in circuit.elements) and len(on) == 1:
+            path = f"{on[0].name}.{path.partition('.')[2]}"
+    known = {name.lower(): name for name in circuit.parameters}
+    if not isinstance(path, str) or path.lower() not in known:
+        # The circuit says it, with the nearest name.
+        circuit.varied({path: 1.0})
+        raise InputError(f"{path!r} is no parameter that takes numbers; allowed: a path such as 'Xgap.d'")
+    return known[path.lower()]
+
+
+def _check_values(circuit: Circuit, path: str, array: FloatArray) -> None:
+    """Refuse NaN and what the parameter does not accept, naming the scene."""
+    name, _, parameter = path.rpartition(".")
+    element = circuit[name]
+    bad = np.isnan(array)
+    if not bad.any() and parameter in element.values:
+        spec = element.spec.parameter(parameter)
+        bad = ~((array >= spec.least) & (array <= spec.most))
+        bad &= ~((array == 0.0) & spec.may_be_zero) & ~((array == np.inf) & spec.may_be_infinite)
+        allowed = spec.allowed()
+    elif not bad.any():
+        # A waveform's values are legal between legal ones.
+        for i in (int(np.argmin(array)), int(np.argmax(array))):
+            try:
+                circuit.varied({path: float(array[i])})
+            except InputError as error:
+                raise InputError(f"scene {i}: {error}") from None
+    else:
+        allowed = "numbers"
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise InputError(f"{path} is {array[i]:g} in scene {i}; allowed: {allowed}")
+
+
+def _frequencies(circuit: Circuit, scenes: Mapping[str, FloatArray]) -> FloatArray:
+    """The source's frequency in every scene, Hz.
+
+    Raises
+    ------
+    InputError
+        Where there is not one source with a frequency.
+    """
+    n = next(iter(scenes.values())).size
+    on = [e for e in driving_sources(circuit) if e.waveform is not None and e.waveform.period is not None]
+    if len(on) != 1:
+        raise InputError(f"{len(on)} sources have a period; allowed: one, where periods, u_gap or the skin's frequency "
+                         "follow it")  # fmt: skip
+    given = scenes.get(f"{on[0].name}.frequency")
+    if given is not None:
+        return given
+    assert on[0].waveform is not None
+    assert on[0].waveform.period is not None
+    return np.full(n, 1.0 / on[0].waveform.period)
+
+
+def _lockstep(task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExecutor) -> tuple[Answers, str]:
+    """What lockstep answers, and why it does not answer the rest."""
+    n = next(iter(scenes.values())).size
+    lower = {path.lower(): array for path, array in scenes.items()}
+    traced = "u_gap" in task.outputs
+    form = lockstep_form(task.circuit, lower)
+    others = [name for name in task.outputs if not in_lockstep(name)]
+    by_period = traced or not isinstance(form, str)
+    count = task.count(_frequencies(task.circuit, scenes)) if by_period else np.ones(n)
+    width = math.ceil(float(count.max()) * task.points - 1e-9) if traced else 0
+    require(n * width <= MOST_VOLTAGES, "outputs", f"of {n * width:.3g} gap voltages", f"at most {MOST_VOLTAGES:g}")
+    found = Answers.empty(task, n, width)
+    if isinstance(form, str) or others:
+        return found, form if isinstance(form, str) else f"{', '.join(others)} needs a run of its own"
+    # Runs that end between half periods are left out.
+    halves = np.round(2.0 * count)
+    good = (halves >= 1.0) & (np.abs(2.0 * count - halves) <= WHOLE * halves)
+    if any(name.endswith("_periodic") for name in task.outputs):
+        good &= halves >= 2.0
+    jobs = []
+    for size in np.unique(halves[good]).astype(int).tolist():
+        members, chunk = np.flatnonzero(good & (halves == size)), (TRACED if traced else CHUNK)
+        jobs += [(size, members[i : i + chunk]) for i in range(0, members.size, chunk)]
+
+    def one(job: tuple[int, NDArray[np.int64]]) -> Answers:
+        return climb(task, form, {path: array[job[1]] for path, array in lower.items()}, job[0])
+
+    for (_, members), answer in zip(jobs, pool.map(one, jobs), strict=True):
+        found.put(members[answer.done], {k: v[answer.done] for k, v in answer.values.items()},
+                  answer.error[answer.done], LOCKSTEP)  # fmt: skip
+    return found, "what does not end after half periods, or does not meet its error in lockstep"
+
+
+def _one_by_one(
+    task: Task, scenes: Mapping[str, FloatArray], rest: NDArray[np.int64], found: Answers, pool: ThreadPoolExecutor
+) -> None:  # fmt: skip
+    """Run the scenes `rest`, each by itself."""
+    if not rest.size:
+        return
+    by_period = task.periods is not None and not task.periodic or "u_gap" in task.outputs
+    frequency = _frequencies(task.circuit, scenes) if by_period else np.ones(next(iter(scenes.values())).size)
+
+    def one(i: int) -> Single:
+        return run_single(task, {path: float(array[i]) for path, array in scenes.items()}, float(frequency[i]))
+
+    for i, single in zip(rest.tolist(), pool.map(one, rest.tolist()), strict=True):
+        found.put_single(i, single.values, single.error, single.status)
+        if single.message:
+            found.messages[i] = single.message
+
+
+def _dataset(task: Task, scenes: Mapping[str, FloatArray], found: Answers, attrs: dict[str, Any]) -> Dataset:
+    """The answers with their coordinates and units."""
+    from xarray import Dataset
+
+    units = {path: p.unit for path, p in task.circuit.parameters.items()}
+    data: dict[str, Any] = {}
+    for name, values in found.values.items():
+        signal = next(s for s in SIGNALS_OF_BATCH if name == s or name.startswith(f"{s}_"))
+        unit = "deg" if name.endswith("phase_deg") else SIGNALS[signal][0]
+        dims = ("scene",) if values.ndim == 1 else ("scene", "turn" if name == "u_gap" else "gap")
+        data[name] = (dims, values, {"units": unit, "long_name": f"{SIGNALS[signal][1]}{name[len(signal) :]}"})
+    data["error"] = ("scene", found.error, {"units": "1", "long_name": "stated error, relative"})
+    meanings = {"flag_values": list(range(len(STATUS_NAMES))), "flag_meanings": " ".join(STATUS_NAMES)}
+    data["status"] = ("scene", found.status, meanings)
+    coords: dict[str, Any] = {path: ("scene", array, {"units": units[path]}) for path, array in scenes.items()}
+    if "u_gap" in found.values:
+        turns = np.arange(found.values["u_gap"].shape[1]) / task.points
+        coords["turn"] = ("turn", turns, {"units": "1", "long_name": "time in periods of the source"})
+    length = {"t_stop": task.t_stop} if task.t_stop is not None else {"periods": task.periods}
+    told = [f"scene {i}: {found.messages[i]}" for i in sorted(found.messages)[:MESSAGES]]
+    attrs |= {
+        "rtol": task.rtol,
+        "periodic": int(task.periodic),
+        **length,
+        "failures": told,
+        "skin": _skin(task, scenes, attrs),
+    }
+    return Dataset(data, coords, attrs)
+
+
+def _skin(task: Task, scenes: Mapping[str, FloatArray], attrs: Mapping[str, Any]) -> str:
+    """What a SKIN's frequency is, in words."""
+    skins = task.circuit.by_device("SKIN")
+    if attrs["skin"] == "follow" or not skins:
+        return "the skin's data follow the source's frequency" if skins else "there is no SKIN"
+    held = ", ".join(f"{e.name}.f" for e in skins)
+    varied = any(path.lower().endswith(".frequency") for path in scenes)
+    return f"the skin's data are those at its own {held}{', whatever the source frequency is' if varied else ''}"

@@ -1,0 +1,146 @@
+"""Scenes of a batch in lockstep, with twice the steps wherever the error is not met."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, LOSS, REST, STRESS, march
+from fingerspice.engine.lockstep import ALL_MOMENTS
+from fingerspice.studies.batchscenes import Curves, LockstepForm, curves_of, table_of
+from fingerspice.studies.batchtask import LOCKSTEP, Answers, Task
+
+# Steps a period at first, and degree of the area's polynomial, by the error asked for; then steps double.
+_RUNGS = ((1e-3, 24, 8), (5e-5, 40, 8), (5e-6, 64, 12), (5e-7, 128, 12), (0.0, 160, 16))
+_HIGHEST_DEGREE, _MOST_STEPS = 16, 4096
+# What the periodic state may be off, over the error asked for; and rounding.
+CLOSING, ROUNDING = 0.02, 1e-11
+# What is stated of a change from half the steps: of order 2, at kinks, it would be a third, and of order 3 a seventh.
+_STATED = 0.25
+_Figure = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
+#: Figures of the whole run by the moments (4, n), load, stress at 1 V and friction coefficient, and what they need.
+FIGURES: dict[str, tuple[tuple[int, ...], _Figure]] = {
+    "f_el_mean": ((0,), lambda m, load, stress, mu: stress * m[0]),
+    "f_el_rms": ((1,), lambda m, load, stress, mu: stress * np.sqrt(m[1])),
+    "f_t_mean": ((0,), lambda m, load, stress, mu: mu * (load + stress * m[0])),
+    "f_t_rms": ((0, 1), lambda m, load, stress, mu: mu * _loaded(m, load, stress)),
+    "friction_mean": ((0,), lambda m, load, stress, mu: mu * (load + stress * m[0]) / load),
+    "friction_rms": ((0, 1), lambda m, load, stress, mu: mu * _loaded(m, load, stress) / load),
+    "u_gap_rms": ((2,), lambda m, load, stress, mu: np.sqrt(m[2])),
+}
+
+
+def _loaded(m: FloatArray, load: FloatArray, stress: FloatArray) -> FloatArray:
+    """Root of the mean square of the load and the force together, N."""
+    return np.asarray(np.sqrt(load * load + 2.0 * load * stress * m[0] + stress * stress * m[1]))
+
+
+def in_lockstep(name: str) -> bool:
+    """Whether an output follows from what lockstep integrates."""
+    return name == "u_gap" or name.removesuffix("_periodic") in FIGURES
+
+
+def _wave(n: int, jumping: bool) -> FloatArray:
+    """x and y of the source at n steps of a period, or at the n / 2 of the half period before it turns."""
+    if jumping:
+        return np.concatenate([np.ones((1, n // 2)), np.zeros((1, n // 2))])
+    turn = 2.0 * np.pi * np.arange(n) / n
+    return np.array([np.sin(turn), np.cos(turn)])
+
+
+def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halves: int) -> Answers:
+    """Scenes over so many half periods; those that stay above the error asked for are not done.
+
+    Parameters
+    ----------
+    task : Task
+    form : LockstepForm
+    scenes : mapping of str to ndarray, shape (n,)
+        Values by path in lower case.
+    halves : int
+    """
+    table = table_of(form, scenes)
+    others, gap = CELL_ROWS * len(form.layers), form.layers[form.gap]
+    mu = np.broadcast_to(scenes.get(f"{gap.name.lower()}.mu", np.asarray(gap.values["mu"])), table.shape[1:])
+    found = Answers.empty(task, table.shape[1], halves * task.points // 2)
+    figures = [name for name in task.outputs if name != "u_gap"]
+    needed = sorted({i for name in figures for i in FIGURES[name.removesuffix("_periodic")][0]} or {0})
+    traced = len(figures) < len(task.outputs)
+    steps, degree = next((s, d) for least, s, d in _RUNGS if task.rtol >= least)
+    if traced:
+        steps = task.points * -(-steps // task.points)
+    pending = np.flatnonzero(table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2)
+    before = None
+    while pending.size and steps <= _MOST_STEPS:
+        curves = curves_of(gap.values["m_exp"], gap.values["n_exp"], degree)
+        if curves is None:
+            break
+        level = _Level(task, form, halves, steps, degree, ALL_MOMENTS if needed[-1] else 1, traced)
+        now = level.run(table, pending, curves, before)
+        error = level.error(now, needed)
+        good = error <= task.rtol
+        at = pending[good]
+        for name in figures:
+            part = 1 if name.endswith("_periodic") or task.periodic else 0
+            moments = now.fine[part * level.moments : (part + 1) * level.moments, good]
+            figure = FIGURES[name.removesuffix("_periodic")][1]
+            found.values[name][at] = figure(moments, table[others + LOAD, at], table[others + STRESS, at], mu[at])
+        if traced:
+            found.values["u_gap"][at] = now.trace[good, :: steps // task.points]
+        found.error[at], found.status[at], found.done[at] = error[good], LOCKSTEP, True
+        before = _Run(now.fine[:, ~good], now.fine[:, ~good], now.trace[~good], now.trace[~good])
+        pending, steps, degree = pending[~good], 2 * steps, _HIGHEST_DEGREE
+    return found
+
+
+class _Run(NamedTuple):
+    """What `march` gives with half the steps and with all, and the gap voltages of both."""
+
+    coarse: FloatArray
+    fine: FloatArray
+    trace_coarse: FloatArray
+    trace: FloatArray
+
+
+class _Level(NamedTuple):
+    """A number of steps a period and a degree."""
+
+    task: Task
+    form: LockstepForm
+    halves: int
+    steps: int
+    degree: int
+    moments: int
+    traced: bool
+
+    def run(self, table: FloatArray, pending: NDArray[np.int64], curves: Curves, before: _Run | None) -> _Run:
+        """The scenes `pending`; what half the steps give is known from `before`, or found too."""
+        sizes = (self.steps // 2 if before is None else 0, self.steps)
+        jumping = self.form.jumping
+        out = np.empty((2, 2 * self.moments + 3, pending.size))
+        traces = tuple(np.empty((pending.size, self.halves * n // 2 if self.traced else 0)) for n in sizes)
+        march(
+            table, pending, self.form.gap, curves, (_wave(sizes[0], jumping), _wave(sizes[1], jumping)),
+            (self.halves, jumping, self.task.periodic, CLOSING * self.task.rtol), out, traces,
+            (0,) * (len(self.form.layers) - 1), (0,) * (self.degree + 1), (0,) * self.moments,
+        )  # fmt: skip
+        if before is None:
+            return _Run(out[0], out[1], traces[0], traces[1])
+        return _Run(before.fine, out[1], before.trace, traces[1])
+
+    def error(self, run: _Run, needed: list[int]) -> FloatArray:
+        """Stated error of every output, relative."""
+        peak, closing, tail = run.fine[2 * self.moments :]
+        changes = [np.zeros(peak.size)]
+        parts = (0, 1) if self.halves > 1 else (0,)
+        for row in (part * self.moments + i for part in parts for i in needed):
+            size = np.abs(run.fine[row])
+            changes.append(np.abs(run.fine[row] - run.coarse[row]) / np.where(size > 0.0, size, 1.0))
+        if self.traced:
+            off = np.abs(run.trace[:, ::2] - run.trace_coarse).max(axis=1)
+            changes.append(off / np.where(peak > 0.0, peak, 1.0))
+        return np.asarray(_STATED * np.max(changes, axis=0) + tail + 2.0 * closing + ROUNDING)

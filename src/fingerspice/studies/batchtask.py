@@ -1,0 +1,83 @@
+"""What a batch is asked for, and what it answers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.circuit.circuit import Circuit
+
+LOCKSTEP, ONE_BY_ONE, REFUSED, FAILED = 0, 1, 2, 3
+STATUS_NAMES = ("lockstep", "one_by_one", "refused", "failed")
+
+
+@dataclass(frozen=True)
+class Task:
+    """A checked request; attributes as the arguments of `batch`, with one of `t_stop` and `periods`."""
+
+    circuit: Circuit
+    outputs: tuple[str, ...]
+    rtol: float
+    t_stop: float | None
+    periods: float | None
+    periodic: bool
+    points: int
+
+    def count(self, frequency: FloatArray) -> FloatArray:
+        """Periods that runs with such sources (Hz) last."""
+        if self.t_stop is not None:
+            return np.asarray(frequency * self.t_stop)
+        return np.full(frequency.shape, self.periods)
+
+
+@dataclass
+class Answers:
+    """Outputs of some scenes, their stated errors, and how each was found.
+
+    Attributes
+    ----------
+    values : dict of str to ndarray, shape (n,) or (n, n_t)
+        NaN where there is none.
+    error : ndarray, shape (n,)
+    status : ndarray, shape (n,)
+    done : ndarray, shape (n,)
+    messages : dict of int to str
+        Of scenes without a result.
+    """
+
+    values: dict[str, FloatArray]
+    error: FloatArray
+    status: NDArray[np.int8]
+    done: BoolArray
+    messages: dict[int, str]
+
+    @classmethod
+    def empty(cls, task: Task, n: int, width: int) -> Answers:
+        """Of n scenes, none of them done, with so many gap voltages each."""
+        shapes = {name: (n, width) if name == "u_gap" else (n,) for name in task.outputs}
+        values = {name: np.full(shape, np.nan) for name, shape in shapes.items()}
+        return cls(values, np.full(n, np.nan), np.full(n, ONE_BY_ONE, np.int8), np.zeros(n, bool), {})
+
+    def put(self, at: NDArray[np.int64], values: Mapping[str, FloatArray], error: FloatArray, status: int) -> None:
+        """Enter what was found for the scenes `at`."""
+        for name, found in values.items():
+            if found.ndim == 2:
+                self.values[name][at, : found.shape[1]] = found
+            else:
+                self.values[name][at] = found
+        self.error[at], self.status[at], self.done[at] = error, status, True
+
+    def put_single(self, i: int, values: Mapping[str, FloatArray], error: float, status: int) -> None:
+        """Enter what was found for one scene; several gaps give a column each."""
+        for name, value in values.items():
+            if value.ndim == 1 and self.values[name].ndim == 1:
+                self.values[name] = np.full((self.error.size, value.size), np.nan)
+            if value.ndim == 1:
+                self.values[name][i, : value.size] = value
+            else:
+                self.values[name][i] = value
+        self.error[i], self.status[i], self.done[i] = error, status, True
