@@ -100,10 +100,10 @@ def _modes(
 @jit
 def moment_integrals(y: float) -> tuple[float, float, float]:
     """Integrals of exp(-y (1 - s)) s^k over [0, 1] for k = 0, 1, 2, y >= 0."""
-    if y < 1.0:
+    if y < 0.1:
         # The sum of (-y)^j 2! / (j + 3)!, from the highest; then down, where rounding does not grow.
         total = 0.0
-        for j in range(14, -1, -1):
+        for j in range(8, -1, -1):
             total = 1.0 - y * total * (1.0 / (j + 4.0))
         second = total / 3.0
         first = 0.5 * (1.0 - y * second)
@@ -156,6 +156,8 @@ def _lane(
     q0 = c[area0 * LANES + i]
     others = CELL_ROWS * cells
     amplitude, omega, phase = t[others + AMPLITUDE], t[others + OMEGA], t[others + PHASE]
+    cosine = 1.0 if jumping else math.cos(phase)
+    sine = 0.0 if jumping else math.sin(phase)
     k, r, moved, x, y, gain, feed, shape = scratch
     total = 0.0
     for j in range(cells):
@@ -166,8 +168,8 @@ def _lane(
         r[j] = t[2 * cells + j] / t[j] + q0 * moved[j]
     _modes(r, k, rates, gain, feed, shape)
     for j in range(cells):
-        x[j] = k[j] * amplitude * (1.0 if jumping else math.cos(phase))
-        y[j] = 0.0 if jumping else k[j] * amplitude * math.sin(phase)
+        x[j] = k[j] * amplitude * cosine
+        y[j] = k[j] * amplitude * sine
     for m in range(m_all):
         start[m * LANES + i], drive[m] = 0.0, 0.0
         if jumping:
@@ -175,8 +177,8 @@ def _lane(
             continue
         # A sine's response is taken out: (rate - i omega) / (rate^2 + omega^2) of it, turned by its phase.
         size = gain[m] * amplitude / (rates[m] * rates[m] + omega * omega)
-        along = size * (rates[m] * math.cos(phase) + omega * math.sin(phase))
-        across = size * (rates[m] * math.sin(phase) - omega * math.cos(phase))
+        along = size * (rates[m] * cosine + omega * sine)
+        across = size * (rates[m] * sine - omega * cosine)
         start[m * LANES + i] = -across
         for j in range(cells):
             x[j] += shape[j, m] * along

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
@@ -52,8 +53,8 @@ def batch(
     """Figures of many scenes, which are one circuit with different values.
 
     Series stacks of LAYER, SLAB, SKIN and GAP under the local law and a sine or square go in lockstep, two to four
-    layers each. Every other circuit, law or source, and every scene that lockstep does not bring to `rtol`, goes through
-    `simulate` (`steady_state`) by itself.
+    layers each. Every other circuit, law or source, and every scene that lockstep does not bring to `rtol`, goes
+    through `simulate` (`steady_state`) by itself.
 
     Parameters
     ----------
@@ -66,8 +67,8 @@ def batch(
     rtol : float
         Error of every output, relative to itself; of ``u_gap``, to its peak.
     t_stop, periods : float, optional
-        Length of every run in s, or in periods of its own source; the deck's TSTOP by default. In lockstep the length is
-        a whole number of half periods.
+        Length of every run in s, or in periods of its own source; the deck's TSTOP by default. In lockstep the length
+        is a whole number of half periods.
     periodic : bool
         Look for the periodic state; the figures are those of one period of it.
     skin : str
@@ -80,9 +81,9 @@ def batch(
     Returns
     -------
     xarray.Dataset
-        With dimension ``scene``, the parameters as coordinates, the outputs, ``error`` (stated, relative) and ``status``:
-        0 in lockstep, 1 one by one, 2 refused, 3 failed, where the outputs are NaN. The attribute `n_ordinary` counts
-        those that did not go in lockstep, `ordinary` says why, `failures` has the messages.
+        With dimension ``scene``, the parameters as coordinates, the outputs, ``error`` (stated, relative) and
+        ``status``: 0 in lockstep, 1 one by one; 2 refused and 3 failed, where the outputs are NaN. The attribute
+        `n_ordinary` counts those that did not go in lockstep, `ordinary` says why, `failures` has the messages.
 
     Raises
     ------
@@ -131,8 +132,9 @@ def _task(
     known = ["u_gap", *(f"{signal}_{kind}" for signal in SIGNALS_OF_BATCH for kind in _KINDS)]
     for name in outputs:
         if name not in known:
-            raise InputError(f"unknown output {name!r}; allowed: u_gap, or one of {', '.join(SIGNALS_OF_BATCH)} with _mean, "
-                             f"_rms, {', '.join(f'_{kind}' for kind in _KINDS[2:])}")  # fmt: skip
+            kinds = ", ".join(f"_{kind}" for kind in _KINDS)
+            signals = ", ".join(SIGNALS_OF_BATCH)
+            raise InputError(f"unknown output {name!r}; allowed: u_gap, or one of {signals} with one of {kinds}")
     require(len(outputs) > 0, "outputs", "empty", "one or more names")
     if periods is not None and t_stop is not None:
         raise InputError("t_stop and periods are both given; allowed: one of them")
@@ -281,13 +283,17 @@ def _one_by_one(
     """Run the scenes `rest`, each by itself."""
     if not rest.size:
         return
-    by_period = task.periods is not None and not task.periodic or "u_gap" in task.outputs
+    by_period = (task.periods is not None and not task.periodic) or "u_gap" in task.outputs
     frequency = _frequencies(task.circuit, scenes) if by_period else np.ones(next(iter(scenes.values())).size)
 
     def one(i: int) -> Single:
         return run_single(task, {path: float(array[i]) for path, array in scenes.items()}, float(frequency[i]))
 
-    for i, single in zip(rest.tolist(), pool.map(one, rest.tolist()), strict=True):
+    # What is unusual about values is not said of every scene; the filters are those of all threads.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        singles = list(pool.map(one, rest.tolist()))
+    for i, single in zip(rest.tolist(), singles, strict=True):
         found.put_single(i, single.values, single.error, single.status)
         if single.message:
             found.messages[i] = single.message

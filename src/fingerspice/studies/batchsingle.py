@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -34,10 +33,7 @@ class Single(NamedTuple):
 def run_single(task: Task, changes: Mapping[str, float], frequency: float) -> Single:
     """One scene, with the frequency (Hz) that its periods are counted by; a refusal or failure is an answer too."""
     try:
-        # What is unusual about values is not said of every scene.
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return _run(task, task.circuit.varied(changes), frequency)
+        return _run(task, task.circuit.varied(changes), frequency)
     except InputError as error:
         return Single({}, math.nan, REFUSED, str(error))
     except SolveError as error:

@@ -1,0 +1,297 @@
+"""`fs.batch`: against single runs and the independent reference, and what it does with scenes that differ."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+import analytic as ref
+import fingerspice as fs
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.statespace import build_stack
+from fingerspice.engine.lockscenes import moment_integrals
+from fingerspice.studies.batchscenes import LockstepForm, lockstep_form, table_of
+from scenes import table1
+
+OUTPUTS = ("f_el_mean", "f_el_mean_periodic", "f_t_rms", "u_gap_rms")
+
+
+def square() -> Circuit:
+    return table1().replace({"Vdrive": fs.Square(200.0, 100.0)})
+
+
+def population(n: int, seed: int) -> dict[str, np.ndarray]:
+    """Fingers and drives that differ widely."""
+    rng = np.random.default_rng(seed)
+    return {
+        "Vdrive.frequency": 10.0 ** rng.uniform(np.log10(20.0), 4.0, n),
+        "Vdrive.amplitude": rng.uniform(50.0, 300.0, n),
+        "Xgap.r": 1e6 * 10.0 ** rng.uniform(-1.0, 1.0, n),
+        "Xcoat.r": 2e5 * 10.0 ** rng.uniform(-1.0, 1.0, n),
+        "Xgap.fn": rng.uniform(0.1, 2.0, n),
+        "Xgap.d": rng.uniform(2e-6, 6e-6, n),
+    }
+
+
+def scene(circuit: Circuit, parameters: dict[str, Any], i: int, skin: bool = True) -> Circuit:
+    changes = {path: float(values[i]) for path, values in parameters.items()}
+    if skin:
+        changes["Xskin.f"] = changes["Vdrive.frequency"]
+    return circuit.varied(changes)
+
+
+def singly(circuit: Circuit, parameters: dict[str, Any], outputs: tuple[str, ...], periods: float) -> np.ndarray:
+    """The outputs of single runs at a tolerance far below any here, shape (n_output, n_scene)."""
+    rows = []
+    for i in range(parameters["Vdrive.frequency"].size):
+        stop = periods / parameters["Vdrive.frequency"][i]
+        run = fs.simulate(scene(circuit, parameters, i), t_stop=stop, rtol=1e-11, charge=False)
+        summary = run.summary()
+        rows.append([summary[name] for name in outputs])
+    return np.array(rows).T
+
+
+@pytest.mark.parametrize("circuit", [table1(), square()], ids=["sine", "square"])
+def test_a_wide_population_meets_what_was_asked_and_states_its_error(circuit: Circuit) -> None:
+    parameters = population(60, seed=11)
+    expected = singly(circuit, parameters, OUTPUTS, 5)
+    for rtol in (1e-3, 1e-4, 1e-6):
+        found = fs.batch(circuit, parameters, outputs=OUTPUTS, periods=5, skin="follow", rtol=rtol)
+        off = np.abs(np.array([found[name].values for name in OUTPUTS]) / expected - 1.0)
+        assert off.max() <= rtol
+        assert found.error.max() <= rtol
+        assert np.mean(np.all(off <= found.error.values, axis=0)) >= 0.95
+        assert np.all(np.isin(found.status, (0, 1)))
+        assert found.attrs["n_ordinary"] == np.count_nonzero(found.status == 1) <= 15
+
+
+@pytest.mark.parametrize("jumping", [False, True], ids=["sine", "square"])
+def test_the_mean_force_is_that_of_the_independent_reference(jumping: bool) -> None:
+    volts, f = np.array([80.0, 200.0, 290.0]), 400.0
+    circuit = table1().replace({"Vdrive": fs.Square(200.0, f) if jumping else fs.Sine(200.0, f), "Xskin.f": f})
+    found = fs.batch(circuit, {"Vdrive.amplitude": volts}, periods=3, rtol=1e-7)
+    expected = []
+    for u in volts:
+        segments = ref.square_segments(u, f, 3) if jumping else ref.sine_segments(u, f, 3 / f)
+        run = ref.transient(segments, [3 / f], freq=f)
+        expected.append(run.force_integral(3 / f) * f / 3)
+    assert np.all(found.status == 0)
+    np.testing.assert_allclose(found.f_el_mean, expected, rtol=1e-7)
+
+
+def test_gap_voltages_are_those_of_single_runs() -> None:
+    for circuit in (table1(), square()):
+        parameters = population(6, seed=2)
+        found = fs.batch(circuit, parameters, outputs=("u_gap",), periods=2, points=50, skin="follow", rtol=1e-4)
+        assert found.u_gap.dims == ("scene", "turn")
+        for i in range(6):
+            f = float(parameters["Vdrive.frequency"][i])
+            run = fs.simulate(scene(circuit, parameters, i), t_eval=found.turn.values / f, t_stop=2 / f, rtol=1e-10)
+            peak = np.abs(run.u_gap).max()
+            np.testing.assert_allclose(found.u_gap[i], run.u_gap, rtol=0.0, atol=1e-4 * peak)
+
+
+def test_the_periodic_state_is_that_of_steady_state() -> None:
+    for circuit in (table1(), square()):
+        parameters = population(8, seed=3)
+        found = fs.batch(circuit, parameters, outputs=("f_el_mean",), periodic=True, skin="follow", rtol=1e-5)
+        assert np.count_nonzero(found.status == 0) >= 5
+        for i in range(8):
+            state = fs.steady_state(scene(circuit, parameters, i), rtol=1e-10, charge=False)
+            assert found.f_el_mean[i] == pytest.approx(state.f_el_mean, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    "layers",
+    [
+        "Xgap drive 0 area GAP r=1meg\n",
+        "Xcoat drive top area LAYER d=1u eps_r=3.9 r=0.2meg\nXgap 0 top area GAP r=1meg\n",
+        "X1 drive a area LAYER d=1u eps_r=3.9 r=0.2meg\nX2 a b area SLAB d=5u eps_r=3 rho=1e8\nXgap b c area GAP r=1meg\n"
+        "Xskin c 0 area SKIN d=350u f=100\n",
+        "X1 drive a area LAYER d=1u eps_r=3.9 r=inf\nXgap a c area GAP r=1meg\nX2 c 0 area LAYER d=1u eps_r=3.9 r=inf\n",
+    ],
+    ids=["one", "two, gap turned", "four", "equal rates"],
+)
+def test_stacks_of_other_layers(layers: str) -> None:
+    text = (
+        "stack\n.include fingerspice.lib\nVdrive drive 0 SIN(0 150 100 0 0 40)\n" + layers + ".tran 10u 25m uic\n.end\n"
+    )
+    circuit = fs.parse_netlist(text)
+    found = fs.batch(circuit, {"Xgap.d": [3e-6, 4e-6]}, outputs=("f_el_mean", "u_gap_rms", "u_gap"), rtol=1e-6)
+    assert found.attrs["n_ordinary"] == (2 if layers.count("\n") == 1 else 0)
+    for i, d in enumerate((3e-6, 4e-6)):
+        run = fs.simulate(circuit.replace({"Xgap.d": d}), t_eval=found.turn.values / 100.0, t_stop=0.025, rtol=1e-10)
+        np.testing.assert_allclose(found.f_el_mean[i], run.f_el_mean, rtol=1e-6)
+        np.testing.assert_allclose(found.u_gap_rms[i], run.u_gap_rms, rtol=1e-6)
+        np.testing.assert_allclose(found.u_gap[i], run.u_gap, rtol=0.0, atol=1e-6 * np.abs(run.u_gap).max())
+
+
+def test_neither_threads_nor_the_order_of_scenes_change_a_byte() -> None:
+    parameters = population(300, seed=5)
+    # One of them goes by itself, one is refused.
+    parameters["Vdrive.amplitude"][7] = 3000.0
+    parameters["Xgap.c2"] = np.full(300, 5000.0)
+    parameters["Xgap.c2"][100] = 1e9
+
+    def run(threads: int, order: np.ndarray) -> list[bytes]:
+        some = {path: values[order] for path, values in parameters.items()}
+        found = fs.batch(table1(), some, periods=3, rtol=1e-5, threads=threads, outputs=("f_el_mean", "f_t_rms"))
+        back = np.argsort(order)
+        return [found[name].values[back].tobytes() for name in found.data_vars]
+
+    first = run(1, np.arange(300))
+    assert run(3, np.arange(300)) == first
+    assert run(2, np.random.default_rng(0).permutation(300)) == first
+
+
+def test_one_bad_scene_costs_the_others_nothing() -> None:
+    c2 = np.full(40, 5000.0)
+    good = fs.batch(table1(), {"Xgap.c2": c2}, periods=2)
+    c2[17] = 1e9
+    found = fs.batch(table1(), {"Xgap.c2": c2}, periods=2)
+    assert found.status[17] == 2
+    assert np.isnan(found.f_el_mean[17])
+    assert np.isnan(found.error[17])
+    assert found.attrs["n_ordinary"] == 1
+    assert len(found.attrs["failures"]) == 1
+    assert found.attrs["failures"][0].startswith("scene 17: Xgap has no contact")
+    others = np.arange(40) != 17
+    np.testing.assert_array_equal(found.f_el_mean.values[others], good.f_el_mean.values[others])
+
+
+def test_a_scene_past_its_fold_fails_by_itself() -> None:
+    mobile = table1(library="fingerspice_mobile.lib")
+    found = fs.batch(mobile, {"Xgap.fn": [0.5, 1e-4]}, periods=1)
+    assert found.status.values.tolist() == [1, 3]
+    assert "fold" in found.attrs["failures"][0]
+    run = fs.simulate(mobile, t_stop=0.01, rtol=1e-9)
+    assert found.f_el_mean[0] == pytest.approx(run.f_el_mean, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("circuit", "parameters", "outputs", "why"),
+    [
+        (table1(library="fingerspice_mobile.lib"), {"Xgap.d": [3e-6]}, ("f_el_mean",), "mobile"),
+        (table1(source="SIN(10 200 100)"), {"Xgap.d": [3e-6]}, ("f_el_mean",), "plain sine"),
+        (table1(), {"Xgap.d": [3e-6]}, ("u_gap_peak",), "u_gap_peak"),
+        (table1(), {"Xgap.m_exp": [0.5]}, ("f_el_mean",), "xgap.m_exp"),
+        (table1(), {"Vdrive.offset": [5.0]}, ("f_el_mean",), "vdrive.offset"),
+        (table1(), {"Xgap.fn": [1e-4]}, ("f_el_mean",), "does not"),
+        (table1(tran="10u 23m uic"), {"Xgap.d": [3e-6]}, ("f_el_mean",), "half periods"),
+        (table1(gap={"a_fix": 30}), {"Xgap.d": [3e-6]}, ("f_el_mean",), "no contact"),
+        (table1(extra="Rload drive 0 1k\nCload top 0 1p"), {"Xgap.d": [3e-6]}, ("f_el_mean",), "no series stack"),
+    ],
+)
+def test_what_lockstep_cannot_do_goes_one_by_one(
+    circuit: Circuit, parameters: dict[str, Any], outputs: tuple[str, ...], why: str
+) -> None:
+    found = fs.batch(circuit, parameters, outputs=outputs, rtol=1e-6)
+    assert found.attrs["n_ordinary"] == 1
+    assert why in found.attrs["ordinary"]
+    assert found.status.values.tolist() == [1]
+    single = fs.simulate(circuit.varied({k: v[0] for k, v in parameters.items()}), rtol=1e-9).summary()
+    for name in outputs:
+        assert found[name][0] == pytest.approx(single[name], rel=1e-6)
+
+
+def test_figures_of_several_gaps_have_a_column_each() -> None:
+    circuit = fs.read_netlist("circuits/two_fingers.cir")
+    gap = circuit.by_device("GAP")[0].name
+    found = fs.batch(circuit, {f"{gap}.d": [3e-6, 4e-6]}, rtol=1e-3)
+    assert found.f_el_mean.dims == ("scene", "gap")
+    assert found.f_el_mean.shape == (2, 2)
+
+
+def test_the_skin_follows_the_source_only_on_request() -> None:
+    frequency = [50.0, 1000.0]
+    own = fs.batch(table1(), {"source.frequency": frequency}, periods=5)
+    follow = fs.batch(table1(), {"Vdrive.frequency": frequency}, periods=5, skin="follow")
+    same = fs.batch(table1(), {"vdrive.frequency": frequency, "Xskin.f": frequency}, periods=5)
+    assert "own Xskin.f, whatever" in own.attrs["skin"]
+    assert "follow" in follow.attrs["skin"]
+    np.testing.assert_array_equal(follow.f_el_mean, same.f_el_mean)
+    assert np.all(np.abs(own.f_el_mean / follow.f_el_mean - 1.0) > 1e-3)
+
+
+def test_runs_of_the_deck_s_length_may_have_different_numbers_of_periods() -> None:
+    frequency = np.array([100.0, 200.0, 250.0, 30.0, 33.3])
+    found = fs.batch(table1(), {"Vdrive.frequency": frequency}, rtol=1e-5)
+    # 50 ms hold one and a half periods of 30 Hz, but no whole number of halves of 33.3 Hz.
+    assert found.status.values.tolist() == [0, 0, 0, 0, 1]
+    for i, f in enumerate(frequency):
+        run = fs.simulate(table1().replace({"Vdrive.frequency": f}), rtol=1e-9)
+        assert found.f_el_mean[i] == pytest.approx(run.f_el_mean, rel=1e-5)
+
+
+def test_the_dataset_says_what_it_holds(tmp_path: Any) -> None:
+    found = fs.batch(table1(), {"Xgap.d": [3e-6, 4e-6], "Vdrive.amplitude": 150.0}, periods=1)
+    assert found.f_el_mean.attrs["units"] == "N"
+    assert found["Xgap.d"].attrs["units"] == "m"
+    assert found["Vdrive.amplitude"].values.tolist() == [150.0, 150.0]
+    assert found.status.attrs["flag_meanings"] == "lockstep one_by_one refused failed"
+    found.to_netcdf(tmp_path / "batch.nc", engine="h5netcdf")
+    zero = fs.batch(table1(), {"Vdrive.amplitude": [0.0, 100.0]}, periods=1)
+    assert zero.f_el_mean.values[0] == 0.0
+    assert np.all(zero.error < 1e-4)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "options", "message"),
+    [
+        ({"Xgap.dd": [1e-6]}, {}, "unknown parameter 'Xgap.dd'; nearest: 'Xgap.d'"),
+        ({"Xgpa.d": [1e-6]}, {}, "unknown parameter 'Xgpa.d'; nearest: 'Xgap.d'"),
+        ({"Xgap.d": [3e-6, 4e-6], "Xgap.r": [1e6] * 3}, {}, r"the arrays have 2 \(Xgap.d\), 3 \(Xgap.r\) values"),
+        ({"Xgap.d": [3e-6, np.nan]}, {}, "Xgap.d is nan in scene 1; allowed: numbers"),
+        ({"Xgap.d": [3e-6, -1e-6]}, {}, "Xgap.d is -1e-06 in scene 1; allowed: more than 0"),
+        ({"Vdrive.frequency": [100.0, 0.0]}, {}, "scene 1: sine frequency is 0 Hz; allowed: > 0"),
+        ({"Xgap.d": ["thin"]}, {}, "allowed: an array of numbers"),
+        ({"Xgap.d": [[3e-6]]}, {}, "of shape"),
+        ({"Xgap.d": []}, {}, "of shape"),
+        ({"Xgap.d": [3e-6], "xgap.d": [4e-6]}, {}, "given twice"),
+        ({}, {}, "allowed: a mapping"),
+        ({"Vdrive": [1.0]}, {}, "'Vdrive' is no parameter"),
+        ({"Xgap.d": [3e-6]}, {"outputs": ("f_el_men",)}, "unknown output 'f_el_men'"),
+        ({"Xgap.d": [3e-6]}, {"outputs": ()}, "outputs is empty"),
+        ({"Xgap.d": [3e-6]}, {"rtol": 1.0}, "rtol is 1"),
+        ({"Xgap.d": [3e-6]}, {"points": 3}, "points is 3"),
+        ({"Xgap.d": [3e-6]}, {"threads": 0}, "threads is 0"),
+        ({"Xgap.d": [3e-6]}, {"skin": "both"}, "skin is 'both'"),
+        ({"Xgap.d": [3e-6]}, {"periods": -1.0}, "periods is -1"),
+        ({"Xgap.d": [3e-6]}, {"periods": 1, "t_stop": 0.1}, "both given"),
+        ({"Xgap.d": [3e-6]}, {"periods": 1, "periodic": True}, "periodic=True takes one period"),
+        ({"Xskin.f": [100.0]}, {"skin": "follow"}, "both given"),
+    ],
+)
+def test_bad_input_is_refused_in_one_sentence(parameters: Any, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(fs.InputError, match=message) as caught:
+        fs.batch(table1(), parameters, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_table_s_columns_are_what_a_circuit_has() -> None:
+    parameters = population(5, seed=9)
+    circuit = fs.parse_netlist(
+        "stack\n.include fingerspice.lib\nVdrive drive 0 SIN(0 150 100)\nXcoat drive a area LAYER d=1u eps_r=3.9 r=0.2meg\n"
+        "X2 a b area SLAB d=5u eps_r=3 rho=1e8\nXgap b c area GAP r=1meg\nXskin c 0 area SKIN d=350u f=100\n.tran 1m 5m uic\n"
+    )
+    lower = {path.lower(): values for path, values in parameters.items()}
+    form = lockstep_form(circuit, lower)
+    assert isinstance(form, LockstepForm)
+    table = table_of(form, lower)
+    for i in range(5):
+        stack = build_stack(scene(circuit, parameters, i, skin=False))
+        assert stack.contact is not None
+        packed = stack.contact.packed
+        wave = [parameters["Vdrive.amplitude"][i], 2.0 * np.pi * parameters["Vdrive.frequency"][i], 0.0]
+        rows = [*stack.c, *stack.g_total, *stack.g_area, *packed[[0, 1, 4, 5, 7]], *wave]
+        np.testing.assert_allclose(table[:, i], rows, rtol=1e-13)
+
+
+@pytest.mark.parametrize("y", [0.0, 1e-9, 0.05, 0.0999, 0.1, 0.7, 3.0, 40.0])
+def test_weights_of_a_step_are_integrals_of_the_decay(y: float) -> None:
+    for k, found in enumerate(moment_integrals(y)):
+        expected = quad(lambda s, k=k: np.exp(-y * (1.0 - s)) * s**k, 0.0, 1.0, epsabs=1e-15, epsrel=1e-14)[0]
+        assert found == pytest.approx(expected, rel=2e-13)
