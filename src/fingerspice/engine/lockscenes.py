@@ -10,7 +10,21 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.lockstep import (
-    LANES, N_STATE, N_WEIGHTS, PEAK, SCALE, SHAPE, VALUE, WAVE_X, WAVE_Y, Z, Marks, Weights, n_constants, n_state, run,
+    LANES,
+    N_STATE,
+    N_WEIGHTS,
+    PEAK,
+    SCALE,
+    SHAPE,
+    VALUE,
+    WAVE_X,
+    WAVE_Y,
+    Marks,
+    Weights,
+    Z,
+    n_constants,
+    n_state,
+    run,
 )  # fmt: skip
 from fingerspice.numerics.modes import modes as modes_of
 

@@ -180,7 +180,8 @@ def run(
             last[:] = s[sums : sums + last.size]
         # What has no jumps is one stretch up to the last period.
         ahead = 1 if turned or halves < 2 else (halves - 2 if done < halves - 2 else 2)
-        sign = -1.0 if turned and done % 2 == 1 else 1.0
+        # After half a period a sine, too, is the negative of what it was.
+        sign = -1.0 if done % 2 == 1 else 1.0
         restart = turned or done == 0
         _window(c, g, s, wave, sign, ahead * half, restart, trace, done * half, modes, powers, moments)
         done += ahead

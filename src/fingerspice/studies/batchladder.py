@@ -132,7 +132,8 @@ class _Level(NamedTuple):
         sizes = (self.steps // 2 if before is None else 0, self.steps)
         jumping = self.form.jumping
         out = np.empty((2, 2 * self.moments + 3, pending.size))
-        traces = tuple(np.empty((pending.size, self.halves * n // 2 if self.traced else 0)) for n in sizes)
+        widths = [self.halves * n // 2 if self.traced else 0 for n in sizes]
+        traces = np.empty((pending.size, widths[0])), np.empty((pending.size, widths[1]))
         march(
             table, pending, self.form.gap, curves, (_wave(sizes[0], jumping), _wave(sizes[1], jumping)),
             (self.halves, jumping, self.task.periodic, CLOSING * self.task.rtol), out, traces,
