@@ -198,3 +198,11 @@ def test_a_hard_case_is_right_only_with_the_right_answer_or_the_true_reason(monk
     assert verdict("nan", answer(1.0)) == "wrong silently"
     assert verdict("nan", ("failed", "step size too small")) == "failed with message"
     assert verdict("nan", ("failed", "the source gave NaN at 3 ms")) == "right"
+
+
+def test_the_batch_benchmark_runs_and_meets_its_errors(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    results = importlib.import_module("batch").main(["--quick"])
+    ours = [row for row in results["rows"] if row["who"] == "fs.batch"]
+    assert {row["scenes"] for row in ours} == {"sine, narrow", "sine, wide"}
+    assert all(row["largest_error"] <= row["rtol"] for row in ours)
