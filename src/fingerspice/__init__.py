@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from fingerspice.results.solution import Solution as Solution
     from fingerspice.solve.simulation import plan as plan
     from fingerspice.solve.simulation import simulate as simulate
+    from fingerspice.solve.streaming import stream as stream
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
     from fingerspice.studies.export import export_netlist as export_netlist
@@ -51,9 +52,9 @@ if TYPE_CHECKING:
     from fingerspice.waveforms.periodic import Square as Square
     from fingerspice.waveforms.periodic import Triangle as Triangle
     from fingerspice.waveforms.ramps import PWL as PWL
-    from fingerspice.waveforms.ramps import Samples as Samples
     from fingerspice.waveforms.repeated import Burst as Burst
     from fingerspice.waveforms.repeated import Repeat as Repeat
+    from fingerspice.waveforms.samples import Samples as Samples
     from fingerspice.waveforms.sampling import Function as Function
     from fingerspice.waveforms.transients import Chirp as Chirp
     from fingerspice.waveforms.transients import Exp as Exp
@@ -65,7 +66,8 @@ _HOMES = {
     "circuit.circuit": ("Circuit",),
     "netlist.netlist": ("parse_netlist", "read_netlist"),
     "waveforms.periodic": ("Pulse", "Sawtooth", "Square", "Triangle"),
-    "waveforms.ramps": ("PWL", "Samples"),
+    "waveforms.ramps": ("PWL",),
+    "waveforms.samples": ("Samples",),
     "waveforms.repeated": ("Burst", "Repeat"),
     "waveforms.transients": ("Chirp", "Exp"),
     "waveforms.sampling": ("Function",),
@@ -82,6 +84,7 @@ _HOMES = {
     "studies.phasors": ("phasor",),
     "results.plan": ("Plan",),
     "solve.simulation": ("plan", "simulate"),
+    "solve.streaming": ("stream",),
     "results.outcome": ("SolveError", "Status"),
     "results.solution": ("Solution",),
     "studies.steady": ("SteadyState", "steady_state"),

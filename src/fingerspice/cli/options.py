@@ -71,7 +71,7 @@ def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
     from fingerspice.circuit.arguments import overridden
     from fingerspice.circuit.topology import find_branches
     from fingerspice.netlist.netlist import source_from_text
-    from fingerspice.waveforms.ramps import Samples
+    from fingerspice.waveforms.samples import Samples
 
     if not texts:
         return circuit

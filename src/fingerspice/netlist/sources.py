@@ -15,8 +15,9 @@ from fingerspice.netlist.slips import is_unit
 from fingerspice.netlist.spelling import nearest
 from fingerspice.waveforms.files import read_table
 from fingerspice.waveforms.periodic import Pulse, Square
-from fingerspice.waveforms.ramps import PWL, Samples
+from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.repeated import Burst, Repeat
+from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.transients import Chirp, Exp
 from fingerspice.waveforms.waveform import DC, Sine, Waveform
 
@@ -204,7 +205,8 @@ def _wavefile(call: Call, context: Context) -> Waveform:
     if "gain" not in words:
         raise InputError(f"{call.name.upper()} has no gain, the V at full scale; allowed: {_OF_FILES['wavefile']}",
                          call.where)  # fmt: skip
-    recording = Samples.from_wav(path, _number(words["gain"], "gain"), _whole(words, "channel"))
+    # What is wanted of it decides whether all of it is kept in memory.
+    recording = Samples.from_wav(path, _number(words["gain"], "gain"), _whole(words, "channel"), at_once=False)
     factor = _whole(words, "upsample")
     return recording if factor is None else recording.upsampled(factor)
 
