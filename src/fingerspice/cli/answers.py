@@ -19,7 +19,18 @@ COMMON = (
 )
 #: Further keys of each command.
 OWN: dict[str, tuple[str, ...]] = {
-    "run": ("area", "tier", "t_stop", "figures_from", "error", "fundamental", "fold_margin_min", "signals", "feel"),
+    "run": (
+        "area",
+        "tier",
+        "t_stop",
+        "figures_from",
+        "error",
+        "fundamental",
+        "fold_margin_min",
+        "signals",
+        "feel",
+        "stream",
+    ),
     "ac": ("area", "skin", "sweeps"),
     "plan": ("area", "tier", "reasons", "start", "rates", "stiff", "sensitivity", "error_bound", "plan_area"),
     "compare": ("frequency", "gaps", "phasor", "transient_mean_area", "transient_coupled"),

@@ -6,22 +6,38 @@ import gc
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fingerspice.base.errors import InputError
 from fingerspice.cli import answers, options
+from fingerspice.cli.arguments import (
+    AsJson,
+    ChargeLaw,
+    Chunk,
+    Deck,
+    Name,
+    NetCdf,
+    NoPlot,
+    Out,
+    Overwrite,
+    Rtol,
+    Set,
+    Signals,
+    Source,
+    Stop,
+    Streamed,
+)  # fmt: skip
 from fingerspice.cli.options import area_from_text, check_output, read_circuit
 from fingerspice.cli.result_files import FOLDER, Results
-from fingerspice.cli.run_files import Touch, written
+from fingerspice.cli.run_files import Touch, large_sweep, written
+from fingerspice.cli.streaming import run_streamed
 from fingerspice.cli.terminal import Answering, answer_usage, listen, plain_errors, progress, say
 from fingerspice.results.outcome import SolveError
 
 if TYPE_CHECKING:
-    from fingerspice.base.arrays import FloatArray
-    from fingerspice.circuit.circuit import Circuit
-    from fingerspice.results.phasor_solution import PhasorSolution
+    pass
 
 app = typer.Typer(
     context_settings={"help_option_names": ["--help", "-h"]},
@@ -31,26 +47,6 @@ app = typer.Typer(
     rich_markup_mode="rich",
     help="SPICE for the sliding fingertip: voltages, contact area and friction on an electroadhesive touchscreen.",
 )
-
-Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir).")]
-Out = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder of the files; out by default.")]
-Name = Annotated[
-    str | None, typer.Option("--name", metavar="NAME", help="Name of the files; that of the deck by default.")
-]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of other circuits, and other files.")]
-Rtol = Annotated[float, typer.Option(help="Largest error of gap voltage and force, relative to their peaks.")]
-ChargeLaw = Annotated[str | None, typer.Option(help="local or mobile; the included library's by default.")]
-Set = Annotated[
-    list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Change a value: Xgap.d=3u. May be repeated.")
-]
-_SPECS = "'SQUARE(200 100)', 'Vdrive=DC 5', 'WAV(a.wav gain=150)', 'TABLE(a.csv)'"
-Source = Annotated[
-    list[str] | None,
-    typer.Option("--source", metavar="[NAME=]SPEC", help=f"Replace a source: {_SPECS}."),
-]
-Stop = Annotated[str | None, typer.Option(metavar="TIME", help="End of the run, s: 50m; TSTOP by default.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON (docs/json.md), nothing else on stdout.")]
-NoPlot = Annotated[bool, typer.Option("--no-plot", help="Write no picture.")]
 
 
 def main() -> None:
@@ -94,6 +90,10 @@ def run(
         str, typer.Option(help="Rows at jumps of the source: both, or none, so that time rises strictly.")
     ] = "both",
     csv: Annotated[bool, typer.Option("--csv", help="Write CSV instead of NetCDF.")] = False,
+    stream: Streamed = False,
+    chunk: Chunk = None,
+    signals: Signals = None,
+    netcdf: NetCdf = False,
     feel: Annotated[bool, typer.Option("--feel", help="Say, and draw, what the hand feels of the friction.")] = False,
     as_json: AsJson = False,
     no_plot: NoPlot = False,
@@ -113,6 +113,8 @@ def run(
       fingerspice run circuits/fingerpad.cir --charge-law mobile --rtol 1e-6 --json --no-plot
 
       fingerspice run circuits/am_carrier.cir --feel
+
+      fingerspice run long.cir --stream --rtol 1e-5 --signals u_gap,friction
     """
     from fingerspice.results.report import summary_table
     from fingerspice.solve.simulation import simulate
@@ -124,6 +126,12 @@ def run(
         if circuit.tran is None:
             raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
         results = Results(deck, circuit, out, name, overwrite, charge_law)
+        if stream or chunk or signals or netcdf:
+            options.check_streamed(stream, csv=csv, feel=feel)
+            how = {"charge_law": charge_law, "area": area_from_text(area), "rtol": rtol}
+            how |= {"method": method, "start": start}
+            run_streamed(answer, results, circuit, how, chunk=chunk, signals=signals, netcdf=netcdf)
+            return
         data = results.file(".csv" if csv else ".nc")
         picture = None if no_plot else results.file(".png")
         touch = Touch(circuit, None if no_plot else results) if feel else None
@@ -194,7 +202,7 @@ def ac(
         if area == "coupled":
             if skin != "swept":
                 raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
-            found = _large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger)
+            found = large_sweep(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger)
         elif amplitude:
             raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
         else:
@@ -208,16 +216,6 @@ def ac(
             writes.append(lambda: save(plot_phasor(found, circuit), picture, about=results.about))
         answer.update(sweeps=[phasor_dict(r) for r in found] if as_json else None)
         answer.give(lambda: phasor_tables(found, circuit), writes)
-
-
-def _large_signal(
-    circuit: Circuit, frequencies: FloatArray, amplitude: list[float] | None, **how: Any
-) -> tuple[PhasorSolution, ...]:
-    """The sweep with ``--area coupled``: the periodic state at every frequency (Hz) and amplitude (V)."""
-    from fingerspice.studies.largesignal import large_signal
-
-    with progress("sweeping") as update:
-        return large_signal(circuit, frequencies, amplitude, progress=update, **how)
 
 
 @app.command()

@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine import recording, relaxation
 from fingerspice.engine.blockcharge import Course, new_charges
 from fingerspice.engine.blockoutput import write_end
@@ -177,15 +177,15 @@ class March:
         """Force (N) at a gap voltage (V), the area as at 0 V."""
         return self.one.shown.stress * u_gap**2 / self.one.q_rest
 
-    def _parts(self) -> tuple[FloatArray, ...]:
+    def _parts(self) -> tuple[FloatArray | IntArray, ...]:
         c = self.course
         return c.w, c.error, c.control, c.counters
 
-    def mark(self) -> list[FloatArray]:
+    def mark(self) -> list[FloatArray | IntArray]:
         """All that changes on the way: `recall` leads back here."""
         return [x.copy() for x in self._parts()]
 
-    def recall(self, mark: list[FloatArray]) -> None:
+    def recall(self, mark: list[FloatArray | IntArray]) -> None:
         for x, kept in zip(self._parts(), mark, strict=True):
             x[:] = kept
 

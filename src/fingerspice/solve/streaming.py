@@ -180,7 +180,8 @@ class _Windows:
     def go_to(self, mark: Mark) -> None:
         self.written = mark["written"]
         self.gaps = np.array(mark["gaps"], float).reshape(-1, 4)
-        self.state = State(**{k: np.array(v, float) if isinstance(v, list) else v for k, v in mark["state"].items()})
+        kept: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in mark["state"].items()}
+        self.state = State(**kept)
 
     def advance(self) -> tuple[FloatArray, FloatArray]:
         end = min(self.written + WINDOW, self.outputs.total)
@@ -332,6 +333,9 @@ class Stream:
 
     def _solution(self, t: FloatArray, rows: FloatArray) -> Solution:
         problem, run = self.problem, self._source.run()
+        if self._ready:
+            # What has failed since concerns a later chunk.
+            run.status, run.t_failed = Status.SUCCESS, None
         shown = problem.scene.shown
         span = (float(t[0]), float(t[-1])) if t.size else (problem.t_start, problem.t_start)
         network = within(shown.network, *span)

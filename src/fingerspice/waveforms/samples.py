@@ -220,6 +220,9 @@ def _check_samples(values: FloatArray, first: int) -> None:
 class _WavFile(Samples):
     """Samples in a file: what is asked of all of them at once reads them all, and they stay."""
 
+    layout: WavLayout
+    gain: float
+
     def __init__(self, layout: WavLayout, gain: float) -> None:
         self.__dict__.update(layout=layout, gain=gain, rate=float(layout.rate), start=0.0)
         for first in range(0, self.count, AT_ONCE):
@@ -229,7 +232,7 @@ class _WavFile(Samples):
         return f"Samples.from_wav({str(self.layout.path)!r}, {self.gain!r}, {self.layout.channel}, at_once=False)"
 
     @cached_property
-    def values(self) -> FloatArray:  # type: ignore[override]
+    def values(self) -> FloatArray:
         values = self.between(0, self.count)
         values.flags.writeable = False
         return values
@@ -242,7 +245,7 @@ class _WavFile(Samples):
         if "values" in self.__dict__:
             return super().between(first, last)
         low, high = (min(max(n, 0), self.count - 1) for n in (first, last - 1))
-        values = self.gain * self.layout.read(low, high + 1)
+        values: FloatArray = self.gain * self.layout.read(low, high + 1)
         return values if (low, high) == (first, last - 1) else values[np.clip(np.arange(first, last), low, high) - low]
 
     def _values(self, flat: FloatArray, side: str) -> FloatArray:
