@@ -36,6 +36,7 @@ MANY_PARAMETERS = {
     "cli.app.limits",
     "solve.simulation.simulate",
     "solve.simulation.plan",
+    "solve.streaming.stream",
 }
 # Functions over the limits, with their lines and parameters: no other may be, and these may only shrink.
 LARGER = {

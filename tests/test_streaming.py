@@ -19,7 +19,7 @@ import fingerspice as fs
 import recording_errors
 from commands import Command, tree
 from fingerspice.cli.store import Store
-from fingerspice.solve import recordings, streaming
+from fingerspice.solve import recordings, windows
 from processes import ended, no_room, start
 from scenes import table1_deck
 
@@ -112,7 +112,7 @@ def test_a_quiet_beginning_is_followed_to_its_own_scale() -> None:
 
 @pytest.mark.parametrize("name", ["two_fingers", "amplifier", "fingerpad_square", "texture_recording"])
 def test_any_circuit_is_streamed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(streaming, "WINDOW", 400)
+    monkeypatch.setattr(windows, "WINDOW", 400)
     circuit = fs.read_netlist(Path(__file__).parents[1] / "circuits" / f"{name}.cir")
     how = {"rtol": 1e-6, "t_stop": 0.03}
     one, other = (list(fs.stream(circuit, count=count, **how)) for count in (251, 10**6))

@@ -162,6 +162,8 @@ class Samples(Ramps):
 
     def between(self, first: int, last: int) -> FloatArray:
         """Samples number `first` to `last` - 1, V; beyond the ends those at the ends, shape (last - first,)."""
+        if first >= 0 and last <= self.count:
+            return self.values[first:last].copy()
         return np.asarray(self.values[np.clip(np.arange(first, last), 0, self.count - 1)])
 
     def part(self, t0: float, t1: float) -> Samples:
