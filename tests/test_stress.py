@@ -64,7 +64,7 @@ MENDED = {
     (
         0,
         1596,
-    ): "refused: fold",  # The steps had met the fold, and the path that was to lead them there went back in time.
+    ): "refused: fold",  # The path from where the steps had met the fold went back in time.
 }
 
 
