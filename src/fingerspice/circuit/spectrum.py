@@ -86,8 +86,7 @@ def _shared_out(f: FloatArray, energy: FloatArray, grid: FloatArray) -> FloatArr
     place = np.log(np.clip(f, grid[0], grid[-1]) / grid[0]) / math.log(grid[1] / grid[0])
     low = np.minimum(place.astype(int), grid.size - 2)
     above = energy * (place - low)
-    shared: FloatArray = np.bincount(low, energy - above, grid.size) + np.bincount(low + 1, above, grid.size)
-    return shared
+    return np.asarray(np.bincount(low, energy - above, grid.size) + np.bincount(low + 1, above, grid.size), float)
 
 
 def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | None:
