@@ -80,11 +80,12 @@ def scene(deck: Path, law: str, rtol: float) -> Report:
 
 
 def driven(circuit: fs.Circuit, square: bool, frequency: float) -> fs.Circuit:
-    """The circuit under a sine or square of its own source's strength."""
+    """The circuit under a sine or square of its own source's strength, its other sources switched off."""
     name = next(e.name for e in circuit.elements if e.name[0] in "VI")
     strength = 200.0 if name[0] == "V" else 500e-6 * frequency / 5e3
     source = fs.Square(strength, frequency) if square else fs.Sine(strength, frequency)
-    return circuit.replace({name: source})
+    others = {e.name: 0.0 for e in circuit.elements if e.waveform is not None and e.name != name}
+    return circuit.replace({name: source, **others})
 
 
 def times(deck: str, square: bool, frequency: float, repeats: int) -> Report:

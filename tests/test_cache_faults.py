@@ -23,7 +23,7 @@ AREA = """
 from fingerspice.physics.contact import ridge_area, universal_curve, Contact
 universal_curve(0.0, 1.9, 1.1)
 c = Contact(3.5e-6, 1.0, 0.5, 0.3, 54.4e-6, 0.52, 32e-6 * 1e3**1.41, 1.41, 5e-9)
-print(repr(ridge_area(0.0, c.pack())))
+print(repr(ridge_area(0.0, c.packed)))
 """
 # Each of the two functions that Python calls has two files.
 # numba ends with the N-th file of its cache ready, but for its name.

@@ -305,10 +305,12 @@ def engine_charge(
     areas[netrows.SLOPE] = 0.0 if step.slow else slope_at(u[0])
     z = np.array([[step.charge(x, 0.0) for x in POINTS]])
     control, collected = np.zeros(readout.N_CONTROL), np.array([[before], [0.0]])
+    form = form_of(step)
+    work = netrows.new_work(len(places), len(places), form.c.size, form.cell.size, 1, 1)
+    work.places[:], work.off[:, : len(places)] = places, missed
     netcharge.charge_error(
-        form_of(step), H, step.lost[None, :], step.g, places, missed, theta, np.ascontiguousarray(u), areas, z,
-        collected, control,
-    )  # fmt: skip
+        form, work, H, step.lost[None, :], step.g, theta, np.ascontiguousarray(u), areas, z, collected, control
+    )
     return collected[:, 0], control
 
 

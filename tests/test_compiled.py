@@ -24,7 +24,7 @@ def area_at_zero_volt(folder):
     code = (
         "from fingerspice.physics.contact import ridge_area, Contact\n"
         "c = Contact(3.5e-6, 1.0, 0.5, 0.3, 54.4e-6, 0.52, 32e-6 * 1e3**1.41, 1.41, 5e-9)\n"
-        "print(repr(ridge_area(0.0, c.pack())))"
+        "print(repr(ridge_area(0.0, c.packed)))"
     )
     return printed(code, folder)
 

@@ -234,7 +234,7 @@ def test_the_force_goes_to_zero_with_the_voltage_as_its_square() -> None:
 
 @pytest.mark.parametrize("u_max", [1e-30, 1e-3, 1.0, 43.0, 200.0, 500.0, 1000.0, 3000.0, 1e4])
 def test_the_curve_agrees_with_the_exact_area_over_its_range_and_beyond_its_end(u_max: float) -> None:
-    packed = PAPER.pack()
+    packed = PAPER.packed
     curve = PAPER.curve(u_max)
     for u in np.linspace(0.0, 3.0 * u_max, 601):
         inverse, _ = inverse_area(u, curve)
@@ -269,7 +269,7 @@ def test_what_steps_evaluate_of_the_area_misses_no_more_than_the_run_asks_for(u_
 def test_the_curve_of_any_finger_agrees_with_its_exact_area(p: Parameters, u_max: float) -> None:
     c = from_parameters(p)
     assume(c.exists)
-    curve, packed = c.curve(u_max), c.pack()
+    curve, packed = c.curve(u_max), c.packed
     for u in np.linspace(0.0, 1.3 * u_max, 80):
         assert inverse_area(u, curve)[0] * ridge_area(u, packed) == pytest.approx(1.0, abs=1e-13)
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.topology import find_branches
+from fingerspice.circuit.topology import driving_sources
 from fingerspice.waveforms.waveform import DC, Waveform
 
 #: A waveform, a constant (V, or A of a current source), or a function of time (s).
@@ -53,7 +53,7 @@ def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Par
         circuit = circuit.replace(parameters)
     if sources is None or (isinstance(sources, Mapping) and not sources):
         return circuit
-    driving = [e for e in find_branches(circuit)[1] if e.device in "VI"]
+    driving = driving_sources(circuit)
     if not isinstance(sources, Mapping):
         if len(driving) != 1:
             names = ", ".join(e.name for e in driving)

@@ -18,14 +18,12 @@ from typing import Any
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.devices import DEVICES, DeviceSpec
-from fingerspice.circuit.values import unusual, value_of
+from fingerspice.circuit.values import concerns, unusual, unusual_of_changed, value_of
 from fingerspice.waveforms.waveform import Waveform, as_waveform
 
 CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
 _REMEMBERING = threading.Lock()
-#: What a changed circuit may take over from the one that it was made of, by its key in `Circuit.remember`.
-INHERITED = ("loop", "network")
 
 
 @dataclass(frozen=True)
@@ -157,6 +155,8 @@ class Circuit(Shown):
     path : Path or None
     overrides : mapping of str to str
         What `replace` has changed, from path to value as text.
+    related : dict
+        What follows from the nodes and devices alone, for all circuits that `replace` makes of this one.
     """
 
     title: str
@@ -171,10 +171,11 @@ class Circuit(Shown):
     text: str = ""
     path: Path | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
+    related: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     _memory: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_memory": {}}
+        return {**vars(self), "related": {}, "_memory": {}}
 
     def _page(self) -> Page:
         from fingerspice.circuit.describe import circuit_page
@@ -209,7 +210,16 @@ class Circuit(Shown):
 
     def by_device(self, *devices: str) -> tuple[Element, ...]:
         """Elements of the given devices, in deck order."""
+        if len(devices) == 1:
+            return self._by_device.get(devices[0], ())
         return tuple(e for e in self.elements if e.device in devices)
+
+    @cached_property
+    def _by_device(self) -> dict[str, tuple[Element, ...]]:
+        found: dict[str, tuple[Element, ...]] = {}
+        for e in self.elements:
+            found[e.device] = (*found.get(e.device, ()), e)
+        return found
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
@@ -245,14 +255,15 @@ class Circuit(Shown):
             Of a value outside the usual range, which was probably meant in another unit.
         """
         changed, notes = self._replaced(changes)
+        if not self.warnings and not notes:
+            return changed
         # Warnings of values that are no longer there go; those of the reader begin with a place.
-        gone = tuple(set(_unusual(self)) - set(_unusual(changed)))
-        kept = [text for text in self.warnings if not text.endswith(gone) and not _concerns(text, changes)]
+        before, after = unusual_of_changed(self, changed)
+        gone = tuple(before.keys() - after.keys())
+        kept = [text for text in self.warnings if not text.endswith(gone) and not concerns(text, changes)]
         for text in notes:
             warnings.warn(text, FingerspiceWarning, stacklevel=2)
-        warned = dataclasses.replace(changed, warnings=(*kept, *notes))
-        warned._memory.update(changed._memory)
-        return warned
+        return changed._with(warnings=(*kept, *notes))
 
     def varied(self, changes: Mapping[str, float | str | Waveform | Callable[[float], float]]) -> Circuit:
         """As `replace`, without warnings: for the sweeps of this package, whose values no user has written."""
@@ -278,14 +289,18 @@ class Circuit(Shown):
             else:
                 raise InputError(self._unknown_path(path))
             overrides[path] = value if isinstance(value, str) else getattr(value, "__name__", repr(value))
-        changed = dataclasses.replace(self, elements=tuple(elements.values()), overrides=overrides)
-        # Of the same nodes and devices: what follows from those alone is found in it.
-        changed._memory["of"] = ({k: v[0] for k, v in self._memory.items() if k in INHERITED},)
+        changed = self._with(elements=tuple(elements.values()), overrides=overrides)
         check(changed)
-        before, after = _unusual(self), _unusual(changed)
+        before, after = unusual_of_changed(self, changed)
         # One warning of each value is enough.
         new = [text for text, path in after.items() if text not in before and path not in traps]
         return changed, [*traps.values(), *new]
+
+    def _with(self, **changes: Any) -> Circuit:
+        """This circuit, changed in what leaves its nodes and devices as they are."""
+        changed = dataclasses.replace(self, **changes)
+        vars(changed)["related"] = self.related
+        return changed
 
     def _unknown_path(self, path: str) -> str:
         """Why `replace` does not know a path."""
@@ -306,27 +321,6 @@ class Circuit(Shown):
         from fingerspice.netlist.netlist import source_from_text
 
         return source_from_text(given, self)
-
-
-def _unusual(circuit: Circuit) -> dict[str, str]:
-    """Warnings of unusual values in a circuit, each with the path (in lower case) that it is about."""
-    found: dict[str, str] = {}
-    for e in circuit.elements:
-        if "unusual" not in e.kept:
-            e.kept["unusual"] = {text: f"{e.name}.{name}".lower() for name, text in unusual(e)}
-        found |= e.kept["unusual"]
-    return found
-
-
-def _concerns(warning: str, changes: Mapping[str, Any]) -> bool:
-    """Whether a warning of the reader is about how something was written that is replaced now."""
-    for path in changes:
-        name, _, parameter = path.lower().rpartition(".")
-        # A warning of a source as a whole may be about its frequency.
-        subjects = [path.lower(), f"{name} {parameter}", *([name] if parameter == "frequency" else [])]
-        if any(f": {subject}: " in warning.lower() for subject in subjects):
-            return True
-    return False
 
 
 def _changed(element: Element, parameter: str, given: Any, path: str) -> tuple[Element, str | None]:

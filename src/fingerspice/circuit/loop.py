@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from itertools import zip_longest
+from functools import lru_cache
 from types import MappingProxyType
 
 import numpy as np
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.network import Cell, Network, build_network
 from fingerspice.circuit.statespace import Stack, build_stack, is_stack
 from fingerspice.circuit.topology import Area
+
+_NOTHING: MappingProxyType[str, float] = MappingProxyType({})
 
 
 def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
@@ -26,56 +29,42 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
     def make() -> Network:
         if is_stack(circuit):
             return loop_network(build_stack(circuit, skin_at))
-        network: Network = circuit.remember("network", lambda: _network(circuit))[1]
+        network: Network = circuit.remember("network", lambda: _network(circuit))
         return network
 
     network: Network = circuit.remember(("network", skin_at), make)
     return network
 
 
-def _network(circuit: Circuit) -> tuple[tuple[Element, ...], Network]:
-    """The elements of a circuit and its network: that of the circuit it was made of, if only sources have changed."""
-    before: tuple[tuple[Element, ...], Network] | None = circuit.remember("of", dict).get("network")
+def _network(circuit: Circuit) -> Network:
+    """The network of a circuit, made of that of a related one where only sources differ."""
+    before: tuple[tuple[Element, ...], Network] | None = circuit.related.get("network")
     if before is not None:
         elements, network = before
         changed = {a.name: b for a, b in zip(elements, circuit.elements, strict=True) if a is not b}
         if changed.keys() <= {e.name for e in network.sources}:
             sources = tuple(changed.get(e.name, e) for e in network.sources)
-            return circuit.elements, dataclasses.replace(network, sources=sources)
-    return circuit.elements, build_network(circuit)
+            return dataclasses.replace(network, sources=sources)
+    found = build_network(circuit)
+    circuit.related["network"] = circuit.elements, found
+    return found
 
 
 def loop_network(stack: Stack) -> Network:
     """The network of a stack, its cells in the order of `Stack.state_order`, with voltages from p to n."""
-    ends, order = ("1", "0"), list(stack.state_order)
-    n, sign = len(order) - 1, stack.sign.tolist()
+    ends, order = ("1", "0"), stack.state_order
+    n, sign = len(order) - 1, tuple(stack.sign.tolist())
     layers = [stack.layers[stack.layer_of(i)] for i in order]
     constants = list(zip(stack.c.tolist(), stack.g_total.tolist(), stack.g_area.tolist(), strict=True))
-    # Of the states, then of the loop's voltage.
-    across = [[float(i == j) for j in range(n + 1)] for i in range(n)]
-    last = sign[order[n]]
-    across.append([*(-last * sign[i] for i in order[:n]), last])
-    area = stack.area_given if stack.contact is None or stack.area_given else float(stack.contact.area(0.0))
+    area = stack.area_given if stack.contact is None or stack.area_given else stack.contact.area_at_rest
     assert area is not None
     # The charge is that of the cell that leaks least, where it suffers least from cancellation.
     slowest = int(np.argmin(stack.leak_rates(area)))
-    through = [sign[i] * (i == slowest) for i in order]
-    several = [e for e, _ in stack.sources] if len(stack.sources) > 1 else []
+    hops = tuple((hop.element.device == "V", hop.sign) for hop in stack.hops)
+    p, q, nodes = _voltages(hops, tuple(stack.layer_of(i) for i in order), tuple(sign[i] for i in order))
     gap = None if stack.gap_layer is None else stack.layers[stack.gap_layer]
-    nodes, row = [], [0.0] * (n + 1 + len(several))
-    for hop in stack.hops[:-1]:
-        if hop.element.device != "V":
-            for own, layer in zip(across, layers, strict=True):
-                if layer is hop.element:
-                    row = [x - hop.sign * y for x, y in zip_longest(row, own, fillvalue=0.0)]
-        elif several:
-            row[n + 1 + several.index(hop.element)] -= hop.sign
-        else:
-            row[n] += 1.0
-        nodes.append(list(row))
-    matrix = np.array(across)
     return Network(
-        sources=(Element("loop", "V", ends, ends, MappingProxyType({}), stack.waveform),),
+        sources=(Element("loop", "V", ends, ends, _NOTHING, stack.waveform),),
         n_voltage=1,
         cells=tuple(Cell(layer, ends, *constants[i], 0) for layer, i in zip(layers, order, strict=True)),
         layers=stack.layers,
@@ -83,15 +72,48 @@ def loop_network(stack: Stack) -> Network:
         areas=(Area(layers[0].nodes[2], gap, stack.area_given, None),),
         contacts=(stack.contact,),
         gaps=(None if stack.gap is None else order.index(stack.gap),),
-        p=matrix[:, :n].copy(),
-        q=matrix[:, n:].copy(),
+        p=p,
+        q=q,
         k=np.zeros((n, n)),
         b=np.zeros((n, 1)),
-        through=np.array([through]),
+        through=np.array([[sign[i] * (i == slowest) for i in order]]),
         delivered=np.zeros((1, n + 1)),
         resistor_factor=np.zeros((0, n)),
         resistor_factor_s=np.zeros((0, 1)),
         node_names=tuple(hop.node for hop in stack.hops[:-1]),
-        nodes=np.array(nodes).reshape(-1, len(row)),
+        nodes=nodes,
         stack=stack,
     )
+
+
+@lru_cache(maxsize=64)
+def _voltages(
+    hops: tuple[tuple[bool, float], ...], layers: tuple[int, ...], sign: tuple[float, ...]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Voltages of a loop's cells (n_cell, n) and (n_cell, 1) from the states and the loop's voltage, and of its nodes.
+
+    Those are (n_node, n + 1), or from the sources one by one as well, where there are several.
+
+    Parameters
+    ----------
+    hops : tuple of (bool, float)
+        Of each hop whether it is a source, and its sign.
+    layers, sign : tuple
+        The layer that each cell is part of, counted along the loop, and the cell's sign; in the order of the states.
+    """
+    n, several = len(sign) - 1, sum(is_source for is_source, _ in hops)
+    across = np.zeros((n + 1, n + 1 + (several if several > 1 else 0)))
+    across[:n, :n] = np.eye(n)
+    across[n, :n], across[n, n] = -sign[n] * np.array(sign[:n]), sign[n]
+    nodes, row, source, layer = [], np.zeros(across.shape[1]), 0, 0
+    for is_source, turn in hops[:-1]:
+        if not is_source:
+            row = row - turn * across[[i == layer for i in layers]].sum(axis=0)
+            layer += 1
+        elif several > 1:
+            row[n + 1 + source] -= turn
+            source += 1
+        else:
+            row[n] += 1.0
+        nodes.append(row.copy())
+    return across[:, :n].copy(), across[:, n : n + 1].copy(), np.array(nodes).reshape(-1, row.size)

@@ -25,7 +25,7 @@ NOTABLE = 0.01
 # The area's harmonics also meet the skin's data. Taken at the fundamental, these cause a further relative error of at
 # most this times the relative change of the area: 0.004 was found where the area changes by a quarter (sine of 200 V
 # and 100 Hz).
-_COUPLING = 0.05
+COUPLING = 0.05
 
 
 def _enough(span: float, rate: float) -> int:
@@ -81,6 +81,14 @@ def energy_outside(
     return (float(energy[below].sum() / total), float(energy[f > high].sum() / total)) if total > 0.0 else (0.0, 0.0)
 
 
+def _shared_out(f: FloatArray, energy: FloatArray, grid: FloatArray) -> FloatArray:
+    """Energy at frequencies (Hz) shared between the two nearest of a geometric grid, as linear interpolation does."""
+    place = np.log(np.clip(f, grid[0], grid[-1]) / grid[0]) / math.log(grid[1] / grid[0])
+    low = np.minimum(place.astype(int), grid.size - 2)
+    above = energy * (place - low)
+    return np.asarray(np.bincount(low, energy - above, grid.size) + np.bincount(low + 1, above, grid.size), float)
+
+
 def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | None:
     """Relative error of the mean force where SKIN has its data at its own frequency, for the only source of a circuit.
 
@@ -92,19 +100,13 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
     gaps = [gap for gap in networks[0].gaps if gap is not None]
     f, energy = _energies(waveform, t_stop, SKIN_BAND[1])
     grid = np.geomspace(*SKIN_BAND, _GRID)
-    nearest = np.log(np.clip(f, *SKIN_BAND))
     areas = areas_at_rest(networks[0])
     try:
-        squares = [
-            np.array([np.abs(n.phasors(x, areas, np.ones(1, complex))[gaps]) ** 2 for x in grid.tolist()])
-            for n in networks
-        ]
+        squares = [np.abs(n.phasors(grid, areas, np.ones(1, complex))[:, gaps]) ** 2 for n in networks]
     except np.linalg.LinAlgError:
         return None
-    right, held = (
-        np.array([float(energy @ np.interp(nearest, np.log(grid), column)) for column in square.T])
-        for square in squares
-    )
+    near = _shared_out(f, energy, grid)
+    right, held = (near @ square for square in squares)
     if not (right.size and np.all(right > 0.0) and np.all(np.isfinite(held / right))):
         return None
     errors = held / right - 1.0
@@ -116,7 +118,12 @@ def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> str
     skins = circuit.by_device("SKIN_DISPERSIVE")
     if not skins or not (math.isfinite(t_stop) and t_stop > 0.0):
         return None
-    below, above = circuit.remember(("outside", t_stop), lambda: energy_outside(waveform, t_stop))
+    # One entry with its key: another thread may put its own there at any time.
+    kept, shares = waveform.kept.get("outside", (None, (0.0, 0.0)))
+    if kept != t_stop:
+        shares = energy_outside(waveform, t_stop)
+        waveform.kept["outside"] = t_stop, shares
+    below, above = shares
     parts = [
         f"{100.0 * share:.{0 if share > 0.1 else 1}f} % {where}"
         for share, where in ((below, f"below {SKIN_BAND[0]:g} Hz"), (above, f"above {SKIN_BAND[1] / 1e3:g} kHz"))
@@ -160,4 +167,4 @@ def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity:
     peak = float(np.abs(right).max())
     if not (peak > 0.0 and math.isfinite(peak)):
         return math.inf
-    return float(np.abs(missed).max()) / peak + _COUPLING * sensitivity
+    return float(np.abs(missed).max()) / peak + COUPLING * sensitivity

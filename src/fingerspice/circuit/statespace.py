@@ -17,6 +17,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.topology import Hop, Loop, find_loop, same_loop
@@ -24,9 +25,6 @@ from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 from fingerspice.waveforms.combinations import Product, Sum
 from fingerspice.waveforms.waveform import DC, Waveform
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
@@ -105,8 +103,10 @@ class Stack:
         parts: list[Waveform] = []
         for element, sign in self.sources:
             assert element.waveform is not None
-            parts.append(element.waveform if sign > 0 else Product((DC(-1.0), element.waveform)))
-        return parts[0] if len(parts) == 1 else Sum(tuple(parts))
+            # One at 0 V only measures a current.
+            if element.waveform != DC(0.0):
+                parts.append(element.waveform if sign > 0 else Product((DC(-1.0), element.waveform)))
+        return Sum(tuple(parts)) if len(parts) > 1 else parts[0] if parts else DC(0.0)
 
     @property
     def state_order(self) -> tuple[int, ...]:
@@ -199,7 +199,7 @@ def _contact_of(gap: Element) -> Contact:
             n=v["n_exp"],
             c2=v["c2"] * 1e-12,
         )
-        possible = bool(np.all(np.isfinite(contact.pack())))
+        possible = bool(np.all(np.isfinite(contact.packed)))
     except (ArithmeticError, ValueError):  # a product overflows, or a logarithm is taken of one that underflows
         possible = False
     if not possible:
@@ -223,14 +223,13 @@ def is_stack(circuit: Circuit) -> bool:
 
 
 def _loop(circuit: Circuit) -> Loop | None:
-    """The circuit's loop, looked for once; in one that `Circuit.replace` made, where that of the other one was."""
+    """The circuit's loop, looked for once for all circuits that `Circuit.replace` makes of one another."""
 
     def make() -> Loop | None:
-        of = circuit.remember("of", dict)
-        if "loop" not in of:
-            return find_loop(circuit)
-        before: Loop | None = of["loop"]
-        return None if before is None else same_loop(circuit, before)
+        if "loop" not in circuit.related:
+            circuit.related["loop"] = find_loop(circuit)
+        walked: Loop | None = circuit.related["loop"]
+        return None if walked is None else same_loop(circuit, walked)
 
     loop: Loop | None = circuit.remember("loop", make)
     return loop

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from difflib import get_close_matches
 
 from fingerspice.base.errors import InputError
@@ -82,8 +82,21 @@ def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
     return areas, branches
 
 
+def driving_sources(circuit: Circuit) -> list[Element]:
+    """The sources of a circuit that carry current.
+
+    Raises
+    ------
+    InputError
+        As `find_branches`.
+    """
+    if "driving" not in circuit.related:
+        circuit.related["driving"] = {e.name for e in find_branches(circuit)[1] if e.device in "VI"}
+    return [e for e in circuit.elements if e.name in circuit.related["driving"]]
+
+
 def find_loop(circuit: Circuit) -> Loop | None:
-    """The loop of a circuit that is one series loop with one area following at once; None for any other network.
+    """The loop of a circuit that is one series loop with one area; None for any other network.
 
     Raises
     ------
@@ -95,25 +108,25 @@ def find_loop(circuit: Circuit) -> Loop | None:
         return None
     if any(len(elements) > 2 for elements in _incidence(branches).values()):
         return None
-    gap = areas[0].gap
-    if gap is not None and gap.values["tau"] > 0.0 and areas[0].given is None:
-        return None
-    return Loop(_walk(branches), gap, areas[0].given)
+    return Loop(_walk(branches), areas[0].gap, areas[0].given)
 
 
 def same_loop(circuit: Circuit, before: Loop) -> Loop | None:
-    """The loop of a circuit with the elements of another one on the same nodes, whose loop is known; or None.
+    """The loop of a circuit with the same devices on the same nodes as one whose loop is known.
+
+    None where the area has dynamics of its own.
 
     Raises
     ------
     InputError
         For areas, as `find_branches`.
     """
-    (area,) = _areas(circuit)
-    if area.gap is not None and area.gap.values["tau"] > 0.0 and area.given is None:
-        return None
     now = {e.name: e for e in circuit.elements}
-    return Loop(tuple(replace(hop, element=now[hop.element.name]) for hop in before.hops), area.gap, area.given)
+    gap = None if before.gap is None else now[before.gap.name]
+    given = _areas(circuit)[0].given if gap is None else _area_fixed(gap)
+    if gap is not None and gap.values["tau"] > 0.0 and given is None:
+        return None
+    return Loop(tuple(Hop(now[hop.element.name], hop.sign, hop.node) for hop in before.hops), gap, given)
 
 
 def _refuse_large(circuit: Circuit) -> None:
@@ -151,9 +164,14 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
                 f"signal; allowed: a_fix= on {owner.name} for a given area, another node for what carries current",
                 on_node[0].where,
             )
-        a_fix = owner.values["a_fix"]
-        out.append(Area(node, owner, a_fix * 1e-6 if a_fix > 0.0 else None))
+        out.append(Area(node, owner, _area_fixed(owner)))
     return tuple(reversed(out))
+
+
+def _area_fixed(gap: Element) -> float | None:
+    """The area that a GAP is given (m^2), if it is."""
+    a_fix = gap.values["a_fix"]
+    return a_fix * 1e-6 if a_fix > 0.0 else None
 
 
 def _given_by_source(layer: Element, sources: list[Element], gaps: list[Element]) -> tuple[float, Element]:

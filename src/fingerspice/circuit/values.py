@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from fingerspice.circuit.devices import ParameterSpec
 from fingerspice.circuit.usual import REST_AREA, SOURCES
 
 if TYPE_CHECKING:
-    from fingerspice.circuit.circuit import Element
+    from fingerspice.circuit.circuit import Circuit, Element
 
 _UNIT_TRAPS = {"F": "farad", "N": "newton"}
 
@@ -95,3 +95,29 @@ def unusual(element: Element) -> Iterator[tuple[str, str]]:
             at_rest = area / (v["alpha"] * v["fn"] ** v["m_exp"])
             found.append(("", REST_AREA.warning(f"{element.name} area at 0 V", at_rest, "mm^2")))
     yield from ((name, text) for name, text in found if text is not None)
+
+
+def unusual_of_changed(before: Circuit, after: Circuit) -> tuple[dict[str, str], dict[str, str]]:
+    """Warnings of unusual values in those elements of two circuits that differ, with the path (in lower case) of each.
+
+    The paths tell what a warning is about.
+    """
+    found: tuple[dict[str, str], dict[str, str]] = {}, {}
+    for pair in zip(before.elements, after.elements, strict=True):
+        if pair[0] is not pair[1]:
+            for texts, e in zip(found, pair, strict=True):
+                if "unusual" not in e.kept:
+                    e.kept["unusual"] = {text: f"{e.name}.{name}".lower() for name, text in unusual(e)}
+                texts |= e.kept["unusual"]
+    return found
+
+
+def concerns(warning: str, changes: Mapping[str, Any]) -> bool:
+    """Whether a warning of the reader is about how something was written that is replaced now."""
+    for path in changes:
+        name, _, parameter = path.lower().rpartition(".")
+        # A warning of a source as a whole may be about its frequency.
+        subjects = [path.lower(), f"{name} {parameter}", *([name] if parameter == "frequency" else [])]
+        if any(f": {subject}: " in warning.lower() for subject in subjects):
+            return True
+    return False

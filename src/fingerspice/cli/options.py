@@ -69,13 +69,13 @@ def _with_changes(circuit: Circuit, changes: list[str]) -> Circuit:
 def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
     """The circuit with every ``--source``; its name may be left out where the circuit has one source."""
     from fingerspice.circuit.arguments import overridden
-    from fingerspice.circuit.topology import find_branches
+    from fingerspice.circuit.topology import driving_sources
     from fingerspice.netlist.netlist import source_from_text
     from fingerspice.waveforms.samples import Samples
 
     if not texts:
         return circuit
-    names = {e.name.lower(): e.name for e in find_branches(circuit)[1] if e.device in "VI"}
+    names = {e.name.lower(): e.name for e in driving_sources(circuit)}
     sources: dict[str, Waveform] = {}
     # What the results call a recording or a long table: the text that names it, and not its numbers.
     named_by: dict[str, str] = {}

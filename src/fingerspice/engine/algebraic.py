@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
 from fingerspice.engine.model import Model, choose_branch, dot, jump_charge, write_row
 from fingerspice.engine.segment import Segment, source
-
-FloatArray = NDArray[np.float64]
 
 
 @jit

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockrows import area_rows, crossing, modes_into, scaled
 from fingerspice.engine.model import Model
@@ -30,8 +31,6 @@ from fingerspice.engine.relaxation import (
     Z,
     project_for_charge,
 )
-
-FloatArray = NDArray[np.float64]
 
 
 class Charges(NamedTuple):

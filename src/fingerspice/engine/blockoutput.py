@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.blockcharge import Course, current_at, current_block, inverse_area_at, moved_rows, moved_with
 from fingerspice.engine.blockrows import crossing, modes_into, scaled
 from fingerspice.engine.relaxation import FIRST_NEWTON, MIDDLE, OUTPUT, REFERENCE, U_GAP, Z, look_at_ends
 from fingerspice.numerics.moments import moments
-
-FloatArray = NDArray[np.float64]
 
 
 @jit

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_inline, jit_rows, jit_within
-
-FloatArray = NDArray[np.float64]
 
 # Zeros in front of rows that a recursion looks back from.
 PAD = 8

@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.exponential import N_PLACES, between, row_of
 from fingerspice.engine.model import Model
 from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, PEAK_Q, SPREAD, at
 from fingerspice.engine.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U
 from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, FIRST, NODES, POINTS
-
-FloatArray = NDArray[np.float64]
 
 # What a polynomial misses of a rate changes its sign at every node: of its integral over the step's length so much is
 # left. It is 0.03 to 0.14 where what is missed are Chebyshev polynomials of degree 13 to 21; where the area changes

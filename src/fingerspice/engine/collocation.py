@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine.network import (
     Net,
@@ -29,9 +30,6 @@ from fingerspice.engine.radau import (
 )
 from fingerspice.engine.readout import note
 from fingerspice.numerics.small import copy_to
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Codes returned by `advance`.
 DONE, JUMP, STEP_UNDERFLOW, PAUSED = 0, 1, 2, 3

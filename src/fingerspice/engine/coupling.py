@@ -27,15 +27,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fingerspice.base.arrays import views_of
+from fingerspice.base.arrays import FloatArray, IntArray, views_of
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.numerics.lobatto import ROWS
 from fingerspice.numerics.small import copy_to, diagonalise
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Steps over the time constant of a mode from which on its rate is taken from its polynomial: -rate w + gain s + feed j
 # would be what is left of large numbers, and j hands that on to every other mode.

@@ -6,14 +6,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_inline, jit_rows
 from fingerspice.engine.rows import DQ, GUESS, SOURCE, X_GAP, Q, U, evaluate, moved
 from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Step lengths with tables of their own; fewer where there are many modes, each of which takes 2 kB a slot.
 N_SLOTS, FEWEST_SLOTS, MOST_ENTRIES = 192, 8, 8_192

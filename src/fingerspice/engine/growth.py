@@ -10,15 +10,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
 from fingerspice.engine.model import Model, branch_area
 from fingerspice.engine.rows import DQ, SOURCE, X_GAP, Q, U
 from fingerspice.numerics.lobatto import END, NODES, POINTS
-
-FloatArray = NDArray[np.float64]
 
 # Loop gain of the area, over a step, up to which the modes' own decay is taken for all; and up to which two halves of
 # the step are short enough.

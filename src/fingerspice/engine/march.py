@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine.charge import charge_step
 from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, weigh
@@ -70,9 +71,6 @@ from fingerspice.engine.segment import Segment, segment_at, source
 from fingerspice.engine.system import System
 from fingerspice.engine.work import Work
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Codes returned by `march`.
 DONE, NO_STEP, OUT_OF_RANGE, TOO_MANY, PAUSED = 0, 1, 2, 3, 4

@@ -16,12 +16,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
 from fingerspice.physics.contact import inverse_area
-
-FloatArray = NDArray[np.float64]
 
 
 class Model(NamedTuple):

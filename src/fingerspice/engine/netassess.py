@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.charge import DERIVATIVE
 from fingerspice.engine.exponential import N_PLACES, between, largest, left_over
 from fingerspice.engine.netrows import combine
 from fingerspice.engine.readout import first_wrong, leaves
 from fingerspice.numerics.lobatto import END, MISS, NODES, POINTS, ROWS
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Columns of `peaks`: of each gap, and last of the nodes, the largest voltage (V) and force (N), and the errors of both.
 PEAK_U, PEAK_F, ERROR_U, ERROR_F = 0, 1, 2, 3

@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.charge import DERIVATIVE, LOBE
 from fingerspice.engine.exponential import N_PLACES, between, row_of
-from fingerspice.engine.netrows import AREA, MORE, SLOPE, Form
+from fingerspice.engine.netrows import AREA, MORE, SLOPE, Form, Work
 from fingerspice.engine.readout import ERROR_Q
 from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # What changes its sign at every node, as the node polynomial does, collects so much of itself within a step.
 _HALF_LOBE = 0.041
@@ -95,8 +92,8 @@ def charge_rows(
 
 @jit
 def charge_error(
-    form: Form, h: float, lost: FloatArray, g: FloatArray, places: FloatArray, missed: FloatArray, theta: float,
-    u: FloatArray, areas: FloatArray, z: FloatArray, collected: FloatArray, control: FloatArray,
+    form: Form, work: Work, h: float, lost: FloatArray, g: FloatArray, theta: float, u: FloatArray, areas: FloatArray,
+    z: FloatArray, collected: FloatArray, control: FloatArray,
 ) -> None:  # fmt: skip
     """Largest error of the charges over the part of a step that counts, from the signed error of the modes.
 
@@ -109,8 +106,9 @@ def charge_error(
     ----------
     form, h, lost, g, theta
         Of the step; `g` (n_f,) are the leaks that count, none in a jump.
-    places, missed : ndarray, shape (m, N_PLACES) and (5, m + n_s)
-        Error of the modes, and what of it the polynomials of this step miss; see `netassess.assess`.
+    work : Work
+        Its `places` (m, N_PLACES) are the errors of the modes, and `off` (5, m + n_s) what of these the polynomials of
+        this step miss; see `netassess.assess`.
     u, areas, z : ndarray
         Rows of the cells' voltages (n_f, ROWS), blocks of the areas', and charges gained (n_s, ROWS).
     collected : ndarray, shape (2, n_s)
@@ -118,26 +116,25 @@ def charge_error(
     control : ndarray
         See `readout`.
     """
-    n_f, n_area = form.c.size, form.cell.size
-    lasting, brief = places.copy(), np.zeros_like(places)
+    places, missed, cell_slips = work.places, work.off, work.cell_slips
+    lasting, brief = work.slips[0], work.slips[1]
     for k in range(places.shape[0]):
-        brief[k, 0] = missed[4, k]
-        for p in range(3):
-            brief[k, p + 1] = missed[p, k]
-            lasting[k, p + 1] -= missed[p, k]
-    off, off_briefly = np.zeros((2, N_PLACES, n_f + n_area)), np.zeros(N_PLACES)
-    _cell_errors(form, lasting, areas[SLOPE], off[0])
-    _cell_errors(form, brief, areas[SLOPE], off[1])
+        for p in range(N_PLACES):
+            brief[k, p] = missed[p - 1, k] if 0 < p < N_PLACES - 1 else (missed[4, k] if p == 0 else 0.0)
+            lasting[k, p] = places[k, p] - (brief[k, p] if p > 0 else 0.0)
+    _cell_errors(form, lasting, areas[SLOPE], cell_slips[0])
+    _cell_errors(form, brief, areas[SLOPE], cell_slips[1])
+    off_briefly = np.empty(N_PLACES)
     for source in range(form.stored.shape[0]):
         first, second, third = between(z[source])
         swing, end, lobe, apart = 0.0, 0.0, 0.0, 0.0
         if not form.mobile:
             swing, end = _area_missed(form, source, u, areas[AREA])
         for p in range(1, N_PLACES - 1):
-            leak = _leak(form, source, p, lost, g, brief, off[1], u, areas[MORE])
+            leak = _leak(form, source, p, lost, g, brief, cell_slips[1], u, areas[MORE])
             lobe = max(lobe, _HALF_LOBE * h * abs(leak))
         for p in range(N_PLACES):
-            held = _held(form, source, p, brief, off[1], u, areas[MORE])
+            held = _held(form, source, p, brief, cell_slips[1], u, areas[MORE])
             own = first if p == 1 else (second if p == 2 else (third if p == 3 else 0.0))
             off_briefly[p] = max(abs(held), abs(own), swing, lobe)
             apart = max(apart, abs(own - held) if 0 < p < N_PLACES - 1 else 0.0)
@@ -148,15 +145,15 @@ def charge_error(
         added, last_leak, last_theta = 0.0, 0.0, 0.0
         for p in range(N_PLACES):
             row = row_of(p)
-            leak = _leak(form, source, p, lost, g, lasting, off[0], u, areas[MORE])
+            leak = _leak(form, source, p, lost, g, lasting, cell_slips[0], u, areas[MORE])
             if p > 0:
                 reached = min(POINTS[row], theta)
                 part = (reached - last_theta) / (POINTS[row] - last_theta)
-                turned = 0.0 if form.mobile else _turned(form, source, p, off[0], u, areas[AREA])
+                turned = 0.0 if form.mobile else _turned(form, source, p, cell_slips[0], u, areas[AREA])
                 added += part * (0.5 * h * (POINTS[row] - last_theta) * (leak + last_leak) + turned)
                 last_theta = POINTS[row]
             last_leak = leak
-            now = _held(form, source, p, lasting, off[0], u, areas[MORE])
+            now = _held(form, source, p, lasting, cell_slips[0], u, areas[MORE])
             known = now + collected[0, source] + added
             error = math.sqrt(known * known + off_briefly[p] * off_briefly[p] + collected[1, source])
             control[ERROR_Q] = max(control[ERROR_Q], error)

@@ -8,17 +8,13 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
 from fingerspice.engine.coupling import Coupling
 from fingerspice.engine.exponential import respond
 from fingerspice.engine.netrows import CHI_S, ETA_S, LIN, PULL, RHO, U_S, Form, W, Work, evaluate
 from fingerspice.numerics.lobatto import END, NODES, ROWS
 from fingerspice.numerics.small import copy_to
-
-FloatArray = NDArray[np.float64]
 
 # What the modes are moved by, over the largest; half of the digits for the difference.
 _SHIFT = 1e-7

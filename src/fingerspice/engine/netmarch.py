@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine import netassess, netrows
 from fingerspice.engine.coupling import take_coupling
@@ -51,9 +52,6 @@ from fingerspice.engine.repeat import Kept
 from fingerspice.numerics.lobatto import END, NODES, POINTS
 from fingerspice.numerics.small import copy_to
 from fingerspice.physics.contact import inverse_area
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Codes returned by `march`.
 DONE, NO_STEP, TOO_MANY, REFERENCE, PAUSED = 0, 1, 2, 3, 4
@@ -355,8 +353,7 @@ def march(
                 form, work, own, h, rates, g, lost, lost_s, integral, sign, values[first_z : y.size], values[y.size :]
             )
             charge_error(
-                form, h, lost, g, places, work.off, theta, cells[netrows.CELL_U], areas, values[first_z:], collected,
-                control,
+                form, work, h, lost, g, theta, cells[netrows.CELL_U], areas, values[first_z:], collected, control
             )  # fmt: skip
         for e in range(n_s):
             gained[e] = at(values[first_z + e], theta) if charge else 0.0

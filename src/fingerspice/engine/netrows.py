@@ -17,8 +17,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.charge import DERIVATIVE
 from fingerspice.engine.coupling import STIFF, Coupling, answer_alone, answer_mobile, answer_together, new_coupling
@@ -27,9 +27,6 @@ from fingerspice.engine.readout import WRITTEN_AT_ONCE
 from fingerspice.engine.rows import N_FLAT, polynomial_rows
 from fingerspice.numerics.lobatto import BETWEEN, NODES, ROWS
 from fingerspice.physics.contact import inverse_area
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Blocks of the modes' rows.
 W, BASE, LIN, D, PULL, USED, PULL_BEFORE, LEFT_BEFORE = range(8)
@@ -152,6 +149,8 @@ class Work(NamedTuple):
     outputs: FloatArray
     room: FloatArray
     off: FloatArray
+    slips: FloatArray
+    cell_slips: FloatArray
     carried: FloatArray
     spare: FloatArray
     spare_cells: FloatArray
@@ -179,6 +178,8 @@ def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: 
         np.zeros((2, WRITTEN_AT_ONCE)),
         np.zeros((4, ROWS)),
         np.zeros((N_PLACES, modes + sources)),
+        np.zeros((2, modes, N_PLACES)),
+        np.zeros((2, N_PLACES, cells + areas)),
         np.zeros((modes, N_PLACES - 1)),
         np.zeros((6, modes, ROWS)),
         np.zeros((8, cells, ROWS)),

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine import netrows, rows
 from fingerspice.engine.coupling import Coupling, answer_mobile, cell_currents, take_coupling
@@ -16,9 +14,6 @@ from fingerspice.engine.netcharge import charge_rows
 from fingerspice.engine.netrows import Form, Work, clear, combine, evaluate, mode_rates, wanted
 from fingerspice.engine.network import Sources
 from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 @jit

@@ -17,15 +17,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
 from fingerspice.engine.segment import Segment, source
 from fingerspice.numerics.small import copy_to
 from fingerspice.physics.contact import inverse_area
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 class Net(NamedTuple):

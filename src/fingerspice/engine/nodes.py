@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.exponential import N_PLACES, between, row_of
 from fingerspice.engine.rows import DQ, SOURCE, X_GAP, Q
 from fingerspice.numerics.lobatto import ROWS
-
-FloatArray = NDArray[np.float64]
 
 
 @jit

@@ -6,8 +6,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
 from fingerspice.engine.model import Model, choose_branch, dot, gap_voltage, jump_charge, ramp
 from fingerspice.engine.readout import (
@@ -23,8 +23,6 @@ from fingerspice.engine.readout import (
     T,
 )
 from fingerspice.numerics.lobatto import NODES
-
-FloatArray = NDArray[np.float64]
 
 # Neighbouring step lengths of the ladder, as a power of two: fine enough to waste little, coarse enough to recur.
 _RUNGS = 16.0

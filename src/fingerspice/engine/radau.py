@@ -6,15 +6,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import ComplexArray, FloatArray, IntArray
 from fingerspice.base.compiled import jit
 from fingerspice.engine.network import Net, Room, Sources, at_sources, capacitances, rates, residual
 from fingerspice.numerics.small import copy_to, invert
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-IntArray = NDArray[np.int64]
 
 # Entry of `counters`: evaluations of the right-hand side.
 NFEV = 0

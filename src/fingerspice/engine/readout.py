@@ -7,11 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_fused, jit_rows
 from fingerspice.numerics.lobatto import BARYCENTRIC, FIRST, NODES, POINTS, ROWS, SECOND, THIRD, TO_SERIES
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Entries of `control`.
 T, H, SIGN, U_BEFORE, U_GAP = 0, 1, 2, 3, 4

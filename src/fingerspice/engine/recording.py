@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
 from fingerspice.engine.blockcharge import Course, charge_block
 from fingerspice.engine.blockoutput import write_block
@@ -37,9 +35,6 @@ from fingerspice.engine.relaxation import (
     misfit,
     relax,
 )
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # What a march returns.
 DONE, NOT_CLOSED, TOO_COARSE = range(3)

@@ -6,14 +6,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
 from fingerspice.engine.netrows import Form
 from fingerspice.numerics.small import copy_to
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Ratio of neighbouring reference areas; an area this many times its reference's, or a part of it, wants another one.
 LEVEL_RATIO, FARTHEST = 1.28, 1.2

@@ -20,8 +20,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_within
 from fingerspice.engine.blockrows import (
     PAD,
@@ -43,9 +43,6 @@ from fingerspice.engine.blockrows import (
     recursion,
     scaled,
 )
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Steps of a block, and halvings of a sample's length at most.
 BLOCK, LEVELS = 512, 7

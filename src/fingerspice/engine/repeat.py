@@ -12,13 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine.readout import WRITTEN_AT_ONCE, write_outputs
 from fingerspice.numerics.chebyshev import to_powers
 from fingerspice.numerics.lobatto import NODES, ROWS
 from fingerspice.numerics.small import copy_to
-
-FloatArray = NDArray[np.float64]
 
 # A boundary of a step, moved by whole periods, is one of the times asked for if it is this near, relative.
 _SLACK = 8e-16

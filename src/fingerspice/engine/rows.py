@@ -8,15 +8,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_fused, jit_inline, jit_rows
 from fingerspice.engine.system import DEGREE
 from fingerspice.numerics import chebyshev
 from fingerspice.numerics.lobatto import POINTS, ROWS
 from fingerspice.physics.contact import inverse_area
-
-FloatArray = NDArray[np.float64]
 
 # Rows of the work array `r` (N_FLAT, ROWS): source (V) and its slope (V/s), k_gap U, gap voltage and its guess (V),
 # gap w, 1/A (1/m^2), its slope by the gap voltage, two for passing use.

@@ -5,13 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
 from fingerspice.numerics import chebyshev
-
-FloatArray = NDArray[np.float64]
 
 
 class Segment(NamedTuple):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
 from fingerspice.engine.exponential import Tables
 from fingerspice.engine.march import DONE, march
@@ -29,9 +29,6 @@ from fingerspice.engine.system import System
 from fingerspice.engine.work import Work
 from fingerspice.numerics.lobatto import NODES, ROWS
 from fingerspice.numerics.small import inverse
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 CLOSED, NOT_CLOSED = 100, 101
 """Codes of `close_period` beside those of `march`."""

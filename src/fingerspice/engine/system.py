@@ -19,13 +19,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
 from fingerspice.engine.model import Model
 from fingerspice.numerics.chebyshev import evaluate, fit, to_powers
 from fingerspice.numerics.modes import modes
-from fingerspice.physics.contact import N_PACKED, inverse_area, ridge_area, ridge_area_array
-
-FloatArray = NDArray[np.float64]
+from fingerspice.physics.contact import N_PACKED, inverse_area_range, ridge_area, ridge_area_array
 
 DEGREE = 27
 """Of the polynomial for 1/A; where it does not reach the error asked for, a longer Chebyshev series serves."""
@@ -119,42 +118,63 @@ def build_system(
     stress : float
         Force per area and squared gap voltage, Pa/V^2.
     """
-    lowest, highest = q_range
-    count = max(1, math.ceil(math.log(highest / lowest) / math.log(_LEVEL_RATIO)))
-    q0 = lowest * (highest / lowest) ** ((np.arange(count) + 0.5) / count)
-    forms = [modes(model.rate + q * model.rate0, model.k) for q in q0]
-    rates, gain, feed, shape = (np.ascontiguousarray(np.stack(x)) for x in zip(*forms, strict=True))
-    n = model.gap.size
-    share = 1.0 / (model.area0 * q0) if model.mobile else np.ones(count)
-    live = np.ascontiguousarray(shape[:, :n])
-    # `feed` takes -p + k sum(p) to modes; x is that of p = -x, as it sums to zero.
-    project = np.ascontiguousarray(np.swapaxes(feed[:, n:] - feed[:, :n], 1, 2))
-    leaking = np.flatnonzero(model.rate0 > 0.0)
-    powers, slopes, lo, scale = _polynomial(model, tol)
-    return System(
-        model,
-        q0,
-        rates,
-        gain * share[:, None],
-        np.einsum("lik,i->lk", feed, model.rate * model.k),
-        np.einsum("lik,i->lk", live, model.gap),
-        np.einsum("lik,i->lk", live, model.slow[:n]),
-        np.ascontiguousarray(shape[:, leaking]),
-        np.zeros(leaking.size) if model.mobile else model.k[leaking],
-        np.ascontiguousarray(np.swapaxes(feed[:, leaking] * model.rate0[leaking, None], 1, 2)),
-        live,
-        project,
-        np.ascontiguousarray(grouping @ live),
-        grouping @ model.k[:n],
-        np.ascontiguousarray(nodes[:, :n] @ live),
-        nodes[:, :n] @ model.k[:n] + nodes[:, n],
-        powers,
-        slopes,
-        lo,
-        scale,
-        float(model.curve[1]),
-        stress,
-    )
+    forms = _forms(
+        model.mobile, model.area0, q_range[0], q_range[1], model.rate, model.rate0, model.k, model.gap, model.slow,
+        grouping, nodes,
+    )  # fmt: skip
+    return System(model, *forms, *_polynomial(model, tol), float(model.curve[1]), stress)
+
+
+@jit
+def _forms(
+    mobile: bool, area0: float, lowest: float, highest: float, rate: FloatArray, rate0: FloatArray, k: FloatArray,
+    gap: FloatArray, slow: FloatArray, grouping: FloatArray, nodes: FloatArray,
+) -> tuple[
+    FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray,
+    FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray,
+]:  # fmt: skip
+    """The arrays of a `System` from `q0` to `k_node`, for reference areas whose 1/A is from `lowest` to `highest`."""
+    n = gap.size
+    levels = max(1, math.ceil(math.log(highest / lowest) / math.log(_LEVEL_RATIO)))
+    leaking = np.flatnonzero(rate0 > 0.0)
+    tap_k = np.zeros(leaking.size)
+    q0, rates, gain, push, own, slowest = (
+        np.empty(levels), np.empty((levels, n)), np.empty((levels, n)), np.zeros((levels, n)), np.zeros((levels, n)),
+        np.zeros((levels, n)),
+    )  # fmt: skip
+    tap, feed = np.empty((levels, leaking.size, n)), np.empty((levels, n, leaking.size))
+    live, project = np.empty((levels, n, n)), np.empty((levels, n, n))
+    shown, node = np.zeros((levels, grouping.shape[0], n)), np.zeros((levels, nodes.shape[0], n))
+    for level in range(levels):
+        q = lowest * (highest / lowest) ** ((level + 0.5) / levels)
+        q0[level] = q
+        its_rates, its_gain, its_feed, shape = modes(rate + q * rate0, k)
+        share = 1.0 / (area0 * q) if mobile else 1.0
+        for m in range(n):
+            rates[level, m], gain[level, m] = its_rates[m], its_gain[m] * share
+            for i in range(n + 1):
+                push[level, m] += its_feed[i, m] * rate[i] * k[i]
+            for i in range(n):
+                own[level, m] += gap[i] * shape[i, m]
+                slowest[level, m] += slow[i] * shape[i, m]
+                live[level, i, m] = shape[i, m]
+                # `feed` takes -p + k sum(p) to modes; x is that of p = -x, as it sums to zero.
+                project[level, m, i] = its_feed[n, m] - its_feed[i, m]
+                for c in range(grouping.shape[0]):
+                    shown[level, c, m] += grouping[c, i] * shape[i, m]
+                for v in range(nodes.shape[0]):
+                    node[level, v, m] += nodes[v, i] * shape[i, m]
+            for j in range(leaking.size):
+                tap[level, j, m] = shape[leaking[j], m]
+                feed[level, m, j] = its_feed[leaking[j], m] * rate0[leaking[j]]
+    k_shown, k_node = np.zeros(grouping.shape[0]), nodes[:, n].copy()
+    for i in range(n):
+        k_shown += grouping[:, i] * k[i]
+        k_node += nodes[:, i] * k[i]
+    if not mobile:
+        for j in range(leaking.size):
+            tap_k[j] = k[leaking[j]]
+    return q0, rates, gain, push, own, slowest, tap, tap_k, feed, live, project, shown, k_shown, node, k_node
 
 
 def _polynomial(model: Model, tol: float) -> tuple[FloatArray, FloatArray, float, float]:
@@ -278,5 +298,5 @@ def area_range(model: Model, u_max: float) -> tuple[float, float]:
     """Smallest and largest 1/A (1/m^2) for gap voltages up to `u_max` (V)."""
     if not model.coupled:
         return 1.0 / model.area0, 1.0 / model.area0
-    values = [inverse_area(u, model.curve)[0] for u in np.linspace(0.0, u_max, 17)]
-    return min(values), max(values)
+    least, largest = inverse_area_range(u_max, 17, model.curve)
+    return least, largest

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.engine.exponential import N_PLACES
 from fingerspice.engine.readout import WRITTEN_AT_ONCE
 from fingerspice.engine.rows import N_FLAT
 from fingerspice.numerics.lobatto import ROWS
-
-FloatArray = NDArray[np.float64]
 
 
 class Work(NamedTuple):

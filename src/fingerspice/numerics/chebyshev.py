@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import borrow, jit, jit_rows
-
-FloatArray = NDArray[np.float64]
 
 
 def nodes(n: int, lo: float, hi: float) -> FloatArray:
@@ -65,6 +64,36 @@ def fit(
             keep = np.flatnonzero(magnitude > 2.0 * tol * magnitude.max())
             return np.ascontiguousarray(c[: (keep[-1] + 1 if keep.size else 1)])
     return None
+
+
+@jit
+def series_through(values: FloatArray, tol: float, c: FloatArray) -> int:
+    """Coefficients `c` (n,) of the interpolant through values at Chebyshev's points, in descending order of these.
+
+    Returns how many of them count, or 0 where the last two are above `tol` of the largest, or one is not finite.
+    """
+    n = values.size
+    largest = 0.0
+    # All the cosines that there are, of 4 n equal parts of a turn.
+    cosine = np.empty(4 * n)
+    for j in range(4 * n):
+        cosine[j] = math.cos(j * (0.5 * math.pi / n))
+    for k in range(n):
+        total = 0.0
+        for i in range(n):
+            total += values[i] * cosine[(2 * i + 1) * k % (4 * n)]
+        c[k] = total * (1.0 if k == 0 else 2.0) / n
+        if not abs(c[k]) < math.inf:
+            return 0
+        largest = max(largest, abs(c[k]))
+    if max(abs(c[n - 1]), abs(c[n - 2])) > tol * largest:
+        return 0
+    kept = 1
+    for k in range(n):
+        # Below twice that the function's own rounding stands, not the series.
+        if abs(c[k]) > 2.0 * tol * largest:
+            kept = k + 1
+    return kept
 
 
 @jit

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
 from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
-
-FloatArray = NDArray[np.float64]
 
 
 @jit

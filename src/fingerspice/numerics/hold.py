@@ -11,11 +11,11 @@ import math
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
 
-FloatArray = NDArray[np.float64]
 Lanes: TypeAlias = tuple[float, float, float, float, float, float, float, float]
 
 # Not a power of two: eight stretches that far apart would meet in the same sets of the cache.

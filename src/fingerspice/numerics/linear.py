@@ -15,10 +15,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # exp(-690) = 2e-300: beyond, an exponential is zero, before any product with it can become a (slow) denormal number.
 _LAST_EXPONENT = 690.0

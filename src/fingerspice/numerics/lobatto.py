@@ -18,11 +18,9 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import chebyshev, legendre
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_fused
-
-FloatArray = NDArray[np.float64]
 
 NODES = 13
 ROWS = 16

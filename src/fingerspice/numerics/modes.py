@@ -15,9 +15,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
-
-FloatArray = NDArray[np.float64]
 
 
 @jit

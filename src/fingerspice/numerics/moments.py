@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
-
-FloatArray = NDArray[np.float64]
 
 # Beyond, each moment follows from the one below; before, that would lose digits, and they follow from the highest.
 _LATE = 4.0

@@ -11,9 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from fingerspice.base.arrays import FloatArray
 
 
 class Tableau(NamedTuple):

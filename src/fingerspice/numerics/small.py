@@ -6,12 +6,9 @@ LAPACK through numba would cost a fifth of a second at start-up to load, for mat
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.compiled import jit
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 @jit

@@ -12,18 +12,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.materials import EPS0
 
-FloatArray = NDArray[np.float64]
-
 N_PACKED = 8
 """Length of the parameter vector that the compiled functions take."""
+# Terms that a curve may have, and its error, relative.
+_SIZES, _ERROR = (16, 24, 32, 48), 2e-15
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,13 @@ class Contact:
         """Whether friction leaves an area at 0 V: A0^2 > c2 mu^2 F_N^2."""
         return self.area_unloaded**2 > self.c2 * (self.mu * self.f_n) ** 2
 
-    def pack(self) -> FloatArray:
+    @cached_property
+    def area_at_rest(self) -> float:
+        """Ridge contact area without voltage, m^2."""
+        return float(ridge_area(0.0, self.packed))
+
+    @cached_property
+    def packed(self) -> FloatArray:
         """Parameters as the compiled functions take them, shape (8,), SI."""
         p = 0.5 * (1.0 + 1.0 / self.m - 1.0 / self.n)
         area = self.area_unloaded
@@ -93,11 +101,11 @@ class Contact:
     def area(self, u_gap: ArrayLike) -> FloatArray:
         """Ridge contact area in full slip, A_R (Eqs. 1 to 4), m^2, at gap voltage `u_gap` (V)."""
         u = np.abs(np.asarray(u_gap, float))
-        return np.asarray(ridge_area_array(u.ravel(), self.pack())).reshape(u.shape)
+        return np.asarray(ridge_area_array(u.ravel(), self.packed)).reshape(u.shape)
 
     def area_adhesive(self, u_gap: ArrayLike) -> FloatArray:
         """Ridge contact area under normal load alone, A_R0 (Eq. 4), m^2, at gap voltage `u_gap` (V)."""
-        packed = self.pack()
+        packed = self.packed
         x = packed[0] * np.abs(np.asarray(u_gap, float))
         return packed[1] * universal_curve_array(x.ravel(), packed[2], packed[3]).reshape(x.shape)  # type: ignore[no-any-return]
 
@@ -116,11 +124,29 @@ class Contact:
         The series reaches a little past the kink at 0 V on its analytic continuation, so that a step across
         the kink stays smooth. Where no short series reaches rounding, the exact solution is used instead.
         """
-        packed = self.pack()
         # The continuation exists while 1 + x y^p > 0; x = -0.2 is well inside for every legal exponent pair.
-        lo, hi = -min(0.3 * u_max, 0.2 / packed[0]), u_max
-        series = chebyshev.fit(lambda u: 1.0 / np.asarray(ridge_area_array(u, packed)), lo, hi, 2e-15, (16, 24, 32, 48))
-        return np.concatenate([[lo, hi], packed, [] if series is None else series])
+        return np.asarray(_curve(-min(0.3 * u_max, 0.2 / float(self.packed[0])), u_max, self.packed))
+
+
+@jit
+def _curve(lo: float, hi: float, packed: FloatArray) -> FloatArray:
+    """The ends of a range (V), a contact's constants, and the series of 1/A_R over that range, if there is one."""
+    head = 2 + packed.size
+    for size in _SIZES:
+        out = np.empty(head + size)
+        values = np.empty(size)
+        for i in range(size):
+            x = math.cos((i + 0.5) * math.pi / size)
+            values[i] = 1.0 / ridge_area(0.5 * (lo + hi) + 0.5 * (hi - lo) * x, packed)
+        kept = chebyshev.series_through(values, _ERROR, out[head:])
+        if kept > 0:
+            break
+        out = out[:head]
+    out[0] = lo
+    out[1] = hi
+    for i in range(packed.size):
+        out[2 + i] = packed[i]
+    return out[: head + max(kept, 0)].copy()
 
 
 def fixed_area_curve(area: float) -> FloatArray:
@@ -235,6 +261,16 @@ def areas(u: FloatArray, curve: FloatArray) -> FloatArray:
     """A_R (m^2) at gap voltages |u| (V), shape (n,), from a `Contact.curve`."""
     q = inverse_areas(u, curve)
     return np.divide(1.0, q, out=q)
+
+
+@jit
+def inverse_area_range(u_max: float, points: int, curve: FloatArray) -> tuple[float, float]:
+    """Smallest and largest 1/A_R (1/m^2) at so many gap voltages from 0 to `u_max` (V)."""
+    least, largest = math.inf, 0.0
+    for i in range(points):
+        q = inverse_area(u_max * i / (points - 1), curve)[0]
+        least, largest = min(least, q), max(largest, q)
+    return least, largest
 
 
 @jit

@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+from fingerspice.base.arrays import ComplexArray
 
 
 def layer_gains(admittance: ArrayLike) -> ComplexArray:

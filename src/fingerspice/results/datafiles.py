@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 from collections.abc import Collection
@@ -142,6 +143,6 @@ def _run(solution: Solution) -> dict[str, Any]:
         "fold_margin_min": solution.fold_margin_min, "warnings": list(solution.warnings), "first": solution.first,
         "t_stop": solution.t_stop, "sources": list(solution.sources),
         "signals": list(solution.signals),
-        "contacts": [[name, vars(contact)] for name, contact in solution.record.fingers],
+        "contacts": [[name, dataclasses.asdict(contact)] for name, contact in solution.record.fingers],
         "overrides": dict(solution.circuit.overrides), "state": state, "summary": solution.summary(),
     }  # fmt: skip

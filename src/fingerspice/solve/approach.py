@@ -17,12 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.engine import march, readout
 from fingerspice.engine import repeat as repetition
 from fingerspice.engine.network import Sources
 from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
 from fingerspice.results.steps import Leap, Recorder
-from fingerspice.solve.runs import FloatArray
 from fingerspice.solve.settling import Settling
 from fingerspice.solve.stepping import FINEST, KEPT_STEPS, SAFETY
 from fingerspice.solve.track import Track

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.circuit.network import Modes, Network
 from fingerspice.engine.algebraic import follow, source_at
 from fingerspice.engine.network import at_sources
@@ -23,9 +23,6 @@ from fingerspice.solve.sources import Tables, after_the_end, joined, segment_ind
 from fingerspice.solve.stackstate import StackState, from_stack, from_written, model_of, row_width
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import same_time
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Of the closed forms, over the largest voltage of the run: where the modes follow from a secular equation, and else.
 ROUNDING, ROUNDING_OF_MATRICES = 1e-13, 1e-12

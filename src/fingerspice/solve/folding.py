@@ -12,19 +12,17 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import OdeSolution, solve_ivp
 
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine.model import branch_area, dot, ramp, voltage_by_time, write_row_at
 from fingerspice.engine.segment import Segment, source
 from fingerspice.results.outcome import Failure, SolveError, Status
 from fingerspice.solve.marching import solve as solve_marching
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import BoolArray, Run
+from fingerspice.solve.runs import Run
 from fingerspice.solve.sources import Tables
 from fingerspice.solve.stackstate import StackState, from_stack, from_written, model_of, row_width, to_stack
-
-FloatArray = NDArray[np.float64]
 
 FINEST_RTOL = 1e-12
 # Where leaks are fast beside a path to a fold, their rounding leaves no tight tolerance to be met: a second try's, and
@@ -138,7 +136,7 @@ class _Path:
 class _Start(NamedTuple):
     """Where a path starts: the segment of the source, its end (s), the area's branch, and the gap voltage (V).
 
-    The voltage is NaN where a jump of the source has gone past the fold.
+    The voltage is NaN where the start is at the fold or past it, as after a jump of the source.
     """
 
     segment: Segment
@@ -158,7 +156,12 @@ def _start(problem: Problem, state: StackState) -> _Start:
     if t == start:
         u_source, _ = source(segment, 0.0)
         u = float(ramp(model, model.k_gap * u_source, dot(model.gap, state.y), u))
-    return _Start(segment, end, math.copysign(1.0, u), u)
+    sign = math.copysign(1.0, u)
+    if u != 0.0 and not math.isnan(u):
+        u_source, slope = source(segment, t - start)
+        margin, _ = voltage_by_time(model, u_source, slope, state.y, sign, u, np.empty(state.y.size))
+        u = u if margin > 0.0 else math.nan
+    return _Start(segment, end, sign, u)
 
 
 def _ahead(problem: Problem, state: StackState, begun: _Start, margin: float, rtol: float) -> _Path | None:

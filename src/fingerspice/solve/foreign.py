@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
 from fingerspice.engine import collocation
@@ -23,10 +23,6 @@ from fingerspice.solve.nodal import STAGES, Collocation, radau_scheme, solve_cou
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Progress, Run, gap_signals, integrate, nodes_apart
 from fingerspice.solve.sources import Tables, values_at
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 _QUIET = threading.Lock()
 SCIPY_METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.network import Network, build_network
@@ -29,8 +29,6 @@ from fingerspice.solve.starting import (
     starts_uncharged,
 )
 from fingerspice.waveforms.waveform import require
-
-FloatArray = NDArray[np.float64]
 
 
 def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> State:
@@ -69,12 +67,12 @@ def _given(circuit: Circuit, scene: Scene, asked: bool) -> tuple[FloatArray, Flo
     """
     network = scene.network
     area = np.full(len(network.areas), np.nan)
-    if not asked:
-        return np.zeros(len(network.cells)), area, None
+    cells = network.cells
+    if not asked or not (circuit.initial or any(cell.element.initial is not None for cell in cells)):
+        return np.zeros(len(cells)), area, None
     for i, one in enumerate(network.areas):
         if scene.net.slow[i] >= 0:
             area[i] = 1e-6 * circuit.initial.get(one.node, math.nan)
-    cells = network.cells
     return start_voltages([c.element for c in cells], scene.net.c, circuit.initial), area, None
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.results.outcome import Status
 from fingerspice.solve.netmarching import March
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import ROUNDING, BoolArray, FloatArray, Progress, Run, integrate
+from fingerspice.solve.runs import ROUNDING, Progress, Run, integrate
 from fingerspice.solve.sources import Tables
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, OutOfRangeError, Stepping
 from fingerspice.solve.track import Track, prepare_system, scale_of

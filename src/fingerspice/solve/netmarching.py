@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine import netassess, netmarch, readout
 from fingerspice.engine.netrows import new_work
 from fingerspice.engine.network import Sources
@@ -19,9 +19,6 @@ from fingerspice.solve.runs import NetworkIntegration, Run
 from fingerspice.solve.settling import Settling
 from fingerspice.solve.sources import held as held_at
 from fingerspice.solve.stepping import SAFETY, Stepping
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Steps for each of the sources' edges and shortest times: what needs more is for another method. Where a mode follows
 # at once and the area moves its charge strongly, the iteration closes on steps as short as the mode's own time only.

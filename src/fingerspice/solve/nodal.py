@@ -8,8 +8,8 @@ import math
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine import collocation
 from fingerspice.engine.collocation import advance
 from fingerspice.engine.network import Sources, new_room
@@ -21,9 +21,6 @@ from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import NetworkIntegration, Progress, Run, gap_signals, integrate, nodes_apart
 from fingerspice.solve.sources import Tables, ramp, values_at
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Of a run, and of the coarser one beside it, with its tolerance over the run's. Their difference is the error stated:
 # where a step is cut short by an edge or a zero, the order alone keeps them apart.

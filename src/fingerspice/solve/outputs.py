@@ -5,15 +5,12 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.times import check_length, check_outputs
 from fingerspice.waveforms.sampling import misses, same_time
 from fingerspice.waveforms.waveform import Waveform
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # A time is resolved to so many of its roundings; what a source does within them is no jump.
 _RESOLVED = 8.0

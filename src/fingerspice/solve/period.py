@@ -6,8 +6,8 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.circuit.network import Modes
 from fingerspice.engine.network import Sources
 from fingerspice.numerics import linear
@@ -16,10 +16,6 @@ from fingerspice.solve.problem import Problem
 from fingerspice.solve.sources import joined
 from fingerspice.waveforms.sampling import SourceTable, source_table
 from fingerspice.waveforms.waveform import DC
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 # Times of a period at which the areas are averaged.
 SAMPLES = 64

@@ -12,8 +12,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.network import network_modes
 from fingerspice.engine import netassess, readout
 from fingerspice.results.outcome import SolveError, Status
@@ -24,8 +24,6 @@ from fingerspice.solve.nodal import pass_through
 from fingerspice.solve.period import CHARGING, Found, Period, Stopped
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY
-
-FloatArray = NDArray[np.float64]
 
 # Of the passes before the last ones: what they may be off, over what the state moved last.
 _CRUDE, _FIRST = 1e-3, 1e-4

@@ -6,8 +6,8 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.engine import march, shooting
 from fingerspice.engine.model import choose_branch, gap_voltage
@@ -22,8 +22,6 @@ from fingerspice.solve.stackstate import StackState, from_stack, model_of
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, LONGEST_STEP, SAFETY
 from fingerspice.solve.track import prepare_system
 from fingerspice.waveforms.sampling import SourceTable, source_table
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,17 +6,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.engine.model import Model
-from fingerspice.physics.contact import areas
+from fingerspice.physics.contact import inverse_area_range
 from fingerspice.results.plan import Plan
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import kept_with
 from fingerspice.solve.settling import FEWEST_PERIODS
-
-FloatArray = NDArray[np.float64]
 
 # Plans that stay with a scene.
 MOST_PLANS = 16
@@ -157,7 +155,6 @@ def _of_stack(problem: Problem, model: Model, rtol: float) -> _Choice:
 def _change(curve: FloatArray, u_peak: float) -> tuple[float, float]:
     """Largest relative change of 1/A under sources of that peak (V), from the area in the middle, and that (m^2)."""
     # A gap may take all of the voltage, and as much again where charge is stored when the source turns.
-    u = np.linspace(0.0, 2.0 * u_peak, 65)
-    a = areas(u, curve)
-    middle = 2.0 / (1.0 / a.min() + 1.0 / a.max())
-    return float(max(a.max() / middle, middle / a.min()) - 1.0), float(middle)
+    least, largest = inverse_area_range(2.0 * u_peak, 65, curve)
+    middle = 0.5 * (least + largest)
+    return max(middle / least, largest / middle) - 1.0, 1.0 / middle

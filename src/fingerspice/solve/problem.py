@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.network import Network
 from fingerspice.results.outcome import State
@@ -19,8 +19,6 @@ from fingerspice.solve.stackstate import StackState, to_stack
 from fingerspice.solve.times import run_times
 from fingerspice.waveforms.sampling import on_breakpoint
 from fingerspice.waveforms.waveform import Waveform
-
-FloatArray = NDArray[np.float64]
 
 # Breakpoints (64 kB) that a scene keeps.
 KEPT_BREAKPOINTS = 8192
@@ -82,14 +80,14 @@ class Problem:
         return inner
 
     def breakpoints(self) -> FloatArray:
-        """The sources' breakpoints in the run, s; those of a short run stay with the scene."""
+        """The sources' breakpoints in the run, s; those of a short run stay with the waveform."""
         span = self.t_start, self.t_stop
         # One entry with its key: another thread may put its own there at any time.
-        kept, edges = self.scene.prepared.get("breakpoints", (None, np.empty(0)))
+        kept, edges = self.waveform.kept.get("breakpoints", (None, np.empty(0)))
         if kept != span:
             edges = self.waveform.breakpoints(*span)
             if edges.size <= KEPT_BREAKPOINTS:
-                self.scene.prepared["breakpoints"] = span, edges
+                self.waveform.kept["breakpoints"] = span, edges
         return np.asarray(edges)
 
     @property
@@ -121,8 +119,9 @@ def prepare(
     scene = scene_of(circuit, charge_law, area, t_stop, rtol)
     stop, step = run_times(circuit, t_start, t_stop, t_eval)
     # One entry with its key: another thread may put its own there at any time.
-    asked, ends = scene.prepared.get("end", (math.nan, math.nan))
+    kept = scene.waveform.kept
+    asked, ends = kept.get("end", (math.nan, math.nan))
     if asked != stop:
-        asked, ends = scene.prepared["end"] = stop, on_breakpoint(scene.waveform, stop)
+        asked, ends = kept["end"] = stop, on_breakpoint(scene.waveform, stop)
     first = t_start + (circuit.tran.start if circuit.tran else 0.0)
     return Problem(circuit, scene, t_start, ends, first, step, initial_state(circuit, scene, start), charge)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.network import Sources, at_sources, new_room, rates
 from fingerspice.engine.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, ZEROS
 from fingerspice.results.outcome import Attempt, ErrorEstimate, State, Status, last_tried
@@ -19,9 +19,6 @@ from fingerspice.results.steps import Recorded
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.sources import Tables, after_the_end, joined, segment_index, values_at
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 Progress = Callable[[float], None]
 
 # An error below this share of the voltages that cancel in the gap's is rounding: finer steps would not reach it.
@@ -137,10 +134,8 @@ class Run:
         self.gaps = gaps
 
     def excess(self, u_scale: float) -> float:
-        """See `excess_of`; the error of the nodes counts over the largest voltage."""
-        largest = max(u_scale, float(self.gaps[:, 0].max(initial=0.0)))
-        of_nodes = 0.0 if self.node_error is None or largest == 0.0 else self.node_error / largest
-        return max(excess_of(self.gaps, u_scale), of_nodes)
+        """See `excess_of`."""
+        return excess_of(self.gaps, u_scale)
 
 
 def excess_of(gaps: FloatArray, u_scale: float) -> float:

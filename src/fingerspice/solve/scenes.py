@@ -8,13 +8,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.loop import loop_network, network_of
 from fingerspice.circuit.network import Modes, Network, network_modes
 from fingerspice.circuit.response import areas_at_rest, mean_areas
-from fingerspice.circuit.spectrum import freezing_error
+from fingerspice.circuit.spectrum import COUPLING, freezing_error
 from fingerspice.circuit.statespace import Stack, build_stack, is_stack
 from fingerspice.engine.model import Model
 from fingerspice.engine.network import Net
@@ -24,8 +24,6 @@ from fingerspice.physics.contact import fixed_area_curve
 from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.sampling import is_sampled
 from fingerspice.waveforms.waveform import Fundamental, Waveform, require
-
-FloatArray = NDArray[np.float64]
 
 # What a dispersive skin's data taken at one frequency may cost, over the error asked for.
 FREEZING_SHARE = 0.3
@@ -200,10 +198,7 @@ def scene_of(
     law = charge_law or circuit.charge_law or "local"
     require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
     stop = t_stop or (circuit.tran.stop if circuit.tran else 1.0)
-    skin = _freezing(circuit, stop)
-    if skin is not None and skin.error > FREEZING_SHARE * rtol:
-        skin = None
-
+    skin = _freezing(circuit, stop, rtol)
     scene: Scene = circuit.remember(("scene", law, area, stop, skin), lambda: _scene(circuit, law, area, stop, skin))
     return scene
 
@@ -219,24 +214,29 @@ def _scene(circuit: Circuit, law: str, area: str | float, stop: float, skin: Fre
     return Scene(network, law, mode, fixed, u_peak, top, model, skin)
 
 
-def _freezing(circuit: Circuit, stop: float) -> Freezing | None:
-    """The best single frequency of a dispersive skin, and its error; None where there is no such skin or frequency."""
+def _freezing(circuit: Circuit, stop: float, rtol: float) -> Freezing | None:
+    """The best single frequency of a dispersive skin, where there is one that serves to `rtol`."""
     if not circuit.by_device("SKIN_DISPERSIVE") or not is_stack(circuit):
+        return None
+    stack, allowed = build_stack(circuit), FREEZING_SHARE * rtol
+    if stack.contact is None or not (math.isfinite(stop) and stop > 0.0):
+        return None
+    areas = stack.contact.area(np.linspace(0.0, _largest_voltage(stack.waveform, stop), 65))
+    area = stack.area_given or float(np.median(areas))
+    change = 0.0 if stack.area_given else float(np.ptp(areas)) / area
+    if COUPLING * change > allowed:
+        # A part of the error is too much already.
         return None
 
     def make() -> Freezing | None:
-        stack = build_stack(circuit)
         fundamental = stack.waveform.fundamental
-        if fundamental is None or stack.contact is None or not (math.isfinite(stop) and stop > 0.0):
+        if fundamental is None:
             return None
         f = fundamental.frequency
-        areas = stack.contact.area(np.linspace(0.0, _largest_voltage(stack.waveform, stop), 65))
-        area = stack.area_given or float(np.median(areas))
-        change = 0.0 if stack.area_given else float(np.ptp(areas)) / area
         return Freezing(f, freezing_error(circuit, f, area, change, stop))
 
     found: Freezing | None = circuit.remember(("freezing", stop), make)
-    return found
+    return found if found is not None and found.error <= allowed else None
 
 
 def _largest_voltage(waveform: Waveform, stop: float, whole: bool = True) -> float:
@@ -245,7 +245,11 @@ def _largest_voltage(waveform: Waveform, stop: float, whole: bool = True) -> flo
         return 0.0
     if whole and waveform.period is not None:
         stop = waveform.settled + waveform.period
-    peak = waveform.peak(0.0, stop)
+    # One entry with its key: another thread may put its own there at any time.
+    kept, peak = waveform.kept.get("peak", (None, 0.0))
+    if kept != stop:
+        peak = waveform.peak(0.0, stop)
+        waveform.kept["peak"] = stop, peak
     require(not 0.0 < peak < LEAST_PEAK, "the source's peak", f"{peak:g} V", f"0, or {LEAST_PEAK:g} V or more")
     return peak if math.isfinite(peak) else 0.0
 
@@ -274,7 +278,7 @@ def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:
         curve = fixed_area_curve(fixed)
     else:
         assert stack.contact is not None
-        area0 = float(stack.contact.area(0.0))
+        area0 = stack.contact.area_at_rest
         curve = stack.contact.curve(u_top)
     order = list(stack.state_order)
     probe = int(np.argmin(stack.c)) if stack.gap is None else stack.gap
@@ -313,7 +317,7 @@ def _net(scene: Scene) -> Net:
     for x, contact, gap, area in zip(scene.fixed, network.contacts, network.gaps, network.areas, strict=True):
         if x is None and contact is not None and gap is not None and area.gap is not None:
             gaps.append(gap)
-            area0.append(float(contact.area(0.0)) if model is None else model.area0)
+            area0.append(contact.area_at_rest if model is None else model.area0)
             tau.append(area.gap.values["tau"])
             curves.append(contact.curve(scene.u_top) if model is None else model.curve)
         else:

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from fingerspice.base.arrays import FloatArray
 from fingerspice.solve.problem import Problem
 from fingerspice.waveforms.sampling import same_time
-
-FloatArray = NDArray[np.float64]
 
 # Shorter runs are stepped as they are: nothing would be saved.
 FEWEST_PERIODS = 6.0

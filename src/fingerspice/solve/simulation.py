@@ -8,8 +8,9 @@ import warnings
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_area, require_number, times_given
 from fingerspice.circuit.circuit import Circuit
@@ -29,9 +30,6 @@ from fingerspice.solve.planning import make_plan
 from fingerspice.solve.problem import Problem, prepare
 from fingerspice.solve.runs import ROUNDING, Progress, Run
 from fingerspice.waveforms.waveform import require
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 RTOL_RANGE = (1e-13, 0.1)
 METHODS, LIBRARIES = ("auto", "exponential", "radau"), ("scipy", "torchdiffeq")

@@ -7,20 +7,17 @@ from collections.abc import Iterator
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.engine.network import Sources, at_sources
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.times import check_length
 from fingerspice.waveforms.sampling import SourceTable, breakpoints_at, is_sampled, source_table
 from fingerspice.waveforms.waveform import Waveform
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 PERIODS_PER_WINDOW = 4096.0
 BREAKPOINTS_PER_WINDOW = 2000.0
-# Windows of a run whose tables stay with the scene, and tables that stay there.
+# Windows of a run whose tables stay with the waveform, and tables that stay there.
 KEPT_WINDOWS, MOST_KEPT = 4, 16
 
 
@@ -28,7 +25,7 @@ class Tables:
     """Tables of a problem's sources, window by window, until one of them stops being finite.
 
     A user's function is expensive to look at, so its tables are kept for the run. Those of library waveforms are made
-    anew, which keeps a long run's memory constant, but for a run of few windows: its tables stay with the scene.
+    anew, which keeps a long run's memory constant, but for a run of few windows: its tables stay with the waveform.
 
     Attributes
     ----------
@@ -56,7 +53,7 @@ class Tables:
         self.scales = [0.0] * len(problem.waveforms)
         self.kept: dict[Any, list[SourceTable]] | None = {} if problem.scene.is_sampled else None
         if self.kept is None and len(self.edges) <= 1 + KEPT_WINDOWS:
-            self.kept = problem.scene.prepared.setdefault("tables", {})
+            self.kept = problem.waveform.kept.setdefault("tables", {})
             if len(self.kept) > MOST_KEPT:
                 self.kept.clear()
 
@@ -150,10 +147,10 @@ def after_the_end(problem: Problem) -> Sources | None:
         return None
     span = stop, problem.step
     # One entry with its key: another thread may put its own there at any time.
-    kept, after = problem.scene.prepared.get("after", (None, None))
+    kept, after = problem.waveform.kept.get("after", (None, None))
     if kept != span:
         after = joined([source_table(w, stop, stop + problem.step, 1e-10, problem.step) for w in problem.waveforms])
-        problem.scene.prepared["after"] = span, after
+        problem.waveform.kept["after"] = span, after
     assert isinstance(after, Sources)
     return after
 

@@ -10,14 +10,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.engine.model import Model, choose_branch, gap_voltage
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
 from fingerspice.solve.scenes import Scene
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -24,14 +24,13 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.network import Network, build_network
 from fingerspice.engine.network import Net
 from fingerspice.physics.contact import Contact, inverse_area
 from fingerspice.waveforms.waveform import DC
-
-FloatArray = NDArray[np.float64]
 
 # What start voltages may miss Kirchhoff's law by, over the largest of them: the rounding of a deck's decimals.
 ROUNDING = 1e-12

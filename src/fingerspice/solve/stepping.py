@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine import readout
 from fingerspice.engine import repeat as repetition
 from fingerspice.engine.network import Sources
@@ -17,7 +18,7 @@ from fingerspice.results.outcome import Status
 from fingerspice.results.record import bare_record
 from fingerspice.results.steps import Recorded, Recorder
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import BoolArray, FloatArray, Integration, Run, excess_of
+from fingerspice.solve.runs import Integration, Run, excess_of
 from fingerspice.solve.settling import Settling
 from fingerspice.waveforms.sampling import same_time
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.waveforms.waveform import Waveform, require
-
-FloatArray = NDArray[np.float64]
 
 #: Periods (or shortest time scales) of the source in a run, and its breakpoints: hours of work, and a gigabyte.
 MOST_PERIODS, MOST_BREAKPOINTS = 1e10, 4e9

@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine import march, readout
 from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
@@ -25,7 +26,7 @@ from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record, sided
 from fingerspice.results.steps import Recorded
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import BoolArray, FloatArray, Run, kept_with
+from fingerspice.solve.runs import Run, kept_with
 from fingerspice.solve.scenes import Scene
 from fingerspice.solve.settling import Settling
 from fingerspice.solve.sources import Tables, segment_index

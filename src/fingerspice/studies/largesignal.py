@@ -8,8 +8,9 @@ import warnings
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
@@ -22,7 +23,6 @@ from fingerspice.studies.steady import steady_state
 from fingerspice.studies.sweeps import Drive, sweep_drive, sweep_notes
 from fingerspice.waveforms.waveform import Sine, Waveform, require
 
-FloatArray = NDArray[np.float64]
 # Outputs in a period: cubics through them are good to 1e-9 of a sine.
 POINTS = 400
 

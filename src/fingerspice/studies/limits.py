@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import require_circuit
@@ -26,7 +26,6 @@ from fingerspice.waveforms.waveform import Waveform, as_waveform, require
 if TYPE_CHECKING:
     from fingerspice.plots.picture import Picture
 
-FloatArray = NDArray[np.float64]
 
 # Voltages looked at, V, how exactly the fold's is found, relative, and the error of each run.
 LOWEST, HIGHEST = 1e-3, 1e5

@@ -10,8 +10,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_area
@@ -28,8 +28,6 @@ from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, repr=False)

@@ -194,7 +194,10 @@ def on_breakpoint(waveform: Waveform, t: float) -> float:
 
 def is_sampled(waveform: Waveform) -> bool:
     """Whether a waveform has no terms, so that it is represented by series."""
-    return waveform.terms(np.zeros(1), np.ones(1)) is None
+    found = waveform.kept.get("sampled")
+    if found is None:
+        found = waveform.kept["sampled"] = waveform.terms(np.zeros(1), np.ones(1)) is None
+    return bool(found)
 
 
 def source_table(

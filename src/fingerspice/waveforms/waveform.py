@@ -14,6 +14,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -57,6 +58,14 @@ class Waveform:
 
     period: float | None = None
     """Period in s after any delay, or None."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in vars(self).items() if key != "kept"}
+
+    @cached_property
+    def kept(self) -> dict[Any, Any]:
+        """What was computed of this waveform, for every circuit that has it."""
+        return {}
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         """Voltage (V) at times `t` (s); at a jump the limit from the right or from the left, as `side` says."""
@@ -111,6 +120,12 @@ class Waveform:
     @property
     def fundamental(self) -> Fundamental | None:
         """Fundamental of the periodic part, from the Fourier integral over one period; None where there is none."""
+        if "fundamental" not in self.kept:
+            self.kept["fundamental"] = self._fundamental()
+        found: Fundamental | None = self.kept["fundamental"]
+        return found
+
+    def _fundamental(self) -> Fundamental | None:
         frequency = self.tone()
         if frequency is None:
             return None
@@ -279,6 +294,11 @@ class Sine(Waveform):
     @property
     def half_wave(self) -> bool:
         return self.offset == 0.0 and self.damping == 0.0
+
+    def peak(self, t0: float, t1: float) -> float:
+        if self.damping or t1 - max(t0, self.delay) < (1.0 - 1e-9) / self.frequency:
+            return super().peak(t0, t1)
+        return abs(self.offset) + abs(self.amplitude)
 
     def _turns(self, t: FloatArray) -> FloatArray:
         turns = np.asarray(self.frequency * (t - self.delay))
