@@ -26,8 +26,7 @@ _SIN = ("VO", "VA", "FREQ", "TD", "THETA", "PHASE")
 _PULSE = ("V1", "V2", "TD", "TR", "TF", "PW", "PER")
 #: Functions to which LTspice adds a number of periods.
 _COUNTED = (_SIN, _PULSE)
-# A larger WAV file is not kept in memory, but read as it is needed: 32 MiB are six minutes of 16 bits at 48 kHz.
-_KEPT_BYTES = 2**25
+_KEPT_BYTES = 2**25  # A larger WAV file is read as it is needed: 32 MiB are six minutes of 16 bits at 48 kHz.
 #: Names in LTspice, and a short one for the command line.
 _ALIASES = {"sine": "sin", "wav": "wavefile"}
 _CHIRP = ("amplitude", "f0", "f1", "duration")
@@ -208,8 +207,8 @@ def _wavefile(call: Call, context: Context) -> Waveform:
         raise InputError(f"{call.name.upper()} has no gain, the V at full scale; allowed: {_OF_FILES['wavefile']}",
                          call.where)  # fmt: skip
     factor, small = _whole(words, "upsample"), not path.is_file() or path.stat().st_size <= _KEPT_BYTES
-    recording = Samples.from_wav(path, _number(words["gain"], "gain"), _whole(words, "channel"), at_once=small)
-    return recording if factor is None else recording.upsampled(factor)
+    read = Samples.from_wav(path, _number(words["gain"], "gain"), _whole(words, "channel"), at_once=small)
+    return read if factor is None else read.upsampled(factor)
 
 
 def _table(call: Call, context: Context) -> Waveform:

@@ -160,10 +160,9 @@ class March:
             )  # fmt: skip
             if code != recording.DONE or control[relaxation.PEAK_U] > one.system.u_top:
                 return Outcome.LOST
-            gaps, node_error, _ = self.stated()
+            gaps, _, _ = self.stated()
             gaps[0, 0], gaps[0, 1] = max(gaps[0, 0], self.least), max(gaps[0, 1], self._force(self.least))
-            largest = max(self.problem.largest, float(gaps[0, 0]))
-            excess = max(excess_of(gaps, largest), node_error / largest if largest > 0.0 else 0.0) / self.rtol
+            excess = excess_of(gaps, self.problem.largest) / self.rtol
             if excess <= 1.0:
                 self.t, self.u_last = piece.stop, float(values[-1])
                 return Outcome.MET

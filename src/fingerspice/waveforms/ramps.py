@@ -45,7 +45,7 @@ class Ramps(Waveform):
         return _once(np.unique(self._listed[0]))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in ("_listed", "_distinct")}
+        return {name: value for name, value in super().__getstate__().items() if name not in ("_listed", "_distinct")}
 
     def _knots(self) -> tuple[FloatArray, FloatArray]:
         """Times (s, ascending) and values (V) of the knots, shape (n,) each."""

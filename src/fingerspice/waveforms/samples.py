@@ -260,6 +260,9 @@ class _WavFile(Samples):
             out[here] = self.part(float(flat[here].min()), float(flat[here].max()))._values(flat[here], side)
         return out
 
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
+        return self.part(float(start.min()), float(stop.max())).terms(start, stop)
+
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in super().__getstate__().items() if name != "values"}
 
