@@ -45,8 +45,10 @@ def case(path: str, seconds: float, rtol: float) -> Report:
     """One stream, and the memory that this process took."""
     warnings.simplefilter("ignore", fs.FingerspiceWarning)
     samples = fs.Samples.from_wav(path, 200.0, at_once=False)
-    begin = time.perf_counter()
     count, circuit = 0, stack("SKIN")
+    # Loads the compiled code.
+    next(fs.stream(circuit, sources=samples, t_stop=1.0, rtol=rtol, charge=False, start="uncharged")).f_el  # noqa: B018
+    begin = time.perf_counter()
     stream = fs.stream(circuit, sources=samples, t_stop=seconds, rtol=rtol, charge=False, start="uncharged")
     for chunk in stream:
         assert chunk.u_gap is not None

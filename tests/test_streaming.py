@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import pickle
 import random
 import re
 import signal
+import struct
 import time
 import tracemalloc
 import warnings
@@ -20,8 +22,10 @@ import recording_errors
 from commands import Command, tree
 from fingerspice.cli.store import Store
 from fingerspice.solve import recordings, windows
+from fingerspice.waveforms import samples
 from processes import ended, no_room, start
 from scenes import table1_deck
+from test_source_files import wav as wav_bytes
 
 RATE = 48_000.0
 NAMES = ("t", "u_gap", "f_el", "q_source", "i_source", "u_source", "u_layer", "friction")
@@ -68,10 +72,10 @@ def test_chunks_are_the_whole_to_the_last_bit(law: str, skin: str, tmp_path: Pat
         re.sub(r"SKIN (d=\S+) f=\S+", r"SKIN_DISPERSIVE \1", text) if skin == "dispersive" else text
     )
     assert bool(circuit.by_device("SKIN_DISPERSIVE")) == (skin == "dispersive")
-    samples, stop = fs.Samples.from_wav(path, 150.0), (count - 1.4) / RATE
+    drive, stop = fs.Samples.from_wav(path, 150.0), (count - 1.4) / RATE
     how = {"t_stop": stop, "rtol": 1e-4, "charge_law": law, "start": "uncharged"}
     t = np.arange(count - 1) / RATE
-    whole = fs.simulate(circuit, sources=samples, t_eval=t, **how)
+    whole = fs.simulate(circuit, sources=drive, t_eval=t, **how)
     assert whole.method == "relaxation"
     for length in (977, recordings.PIECE, 10**6):
         lazy = fs.Samples.from_wav(path, 150.0, at_once=False)
@@ -197,6 +201,70 @@ def test_a_run_that_fails_gives_what_came_before() -> None:
     assert caught.value.solution.t[-1] == pytest.approx(0.12345, abs=1e-4)
 
 
+# Recordings in files --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+@pytest.mark.parametrize(("bits", "kind"), [(8, 1), (16, 1), (24, 1), (32, 1), (32, 3), (64, 3)])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_parts_of_a_file_are_those_of_the_whole(
+    bits: int, kind: int, channels: int, order: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(samples, "AT_ONCE", 50)
+    rng = np.random.default_rng(bits)
+    if kind == 3:
+        floats = rng.uniform(-1.0, 1.0, 301 * channels).astype(f"{'<' if order == 'little' else '>'}f{bits // 8}")
+        data = floats.tobytes()
+    else:
+        data = rng.integers(0, 256, 301 * channels * bits // 8, dtype=np.uint8).tobytes()
+    file = wav_bytes(data, bits, kind=kind, channels=channels)
+    if order == "big":
+        head, (tag, lanes, rate, flow, block, depth) = b"RIFX", struct.unpack("<HHIIHH", file[20:36])
+        size = struct.pack(">I", len(file) - 8)
+        form = struct.pack(">IHHIIHH", 16, tag, lanes, rate, flow, block, depth)
+        file = head + size + b"WAVEfmt " + form + b"data" + struct.pack(">I", len(data)) + data
+    path = tmp_path / "a.wav"
+    path.write_bytes(file)
+    channel = channels - 1
+    whole = fs.Samples.from_wav(path, 150.0, channel)
+    parts = fs.Samples.from_wav(path, 150.0, channel, at_once=False)
+    assert (parts.rate, parts.count) == (whole.rate, whole.count) == (8000.0, 301)
+    t = np.append(rng.uniform(-0.01, 0.05, 200), np.arange(301) / 8000.0)
+    np.testing.assert_array_equal(parts.value(t), whole.value(t))
+    np.testing.assert_array_equal(parts.breakpoints(0.001, 0.02), whole.breakpoints(0.001, 0.02))
+    np.testing.assert_array_equal(parts.between(-3, 305), whole.between(-3, 305))
+    assert parts.peak(0.0, 0.03) == whole.peak(0.0, 0.03)
+    edges = np.arange(20, 31) / 8000.0
+    np.testing.assert_array_equal(parts.terms(edges[:-1], edges[1:]), whole.terms(edges[:-1], edges[1:]))
+    assert "values" not in vars(parts)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(parts)).values, whole.values)
+    np.testing.assert_array_equal(parts.values, whole.values)
+    np.testing.assert_array_equal(parts.value(t), whole.value(t))
+
+
+def test_a_file_that_is_not_sound_is_refused_as_ever(tmp_path: Path) -> None:
+    good, path = wav_bytes(bytes(400), 16), tmp_path / "a.wav"
+    nan = wav_bytes(np.array([0.0] * 99 + [np.nan], "<f4").tobytes(), 32, kind=3)
+    for content in (good[:-3], good[:30], b"RIFF", good[:20] + b"\x55" + good[21:], nan):
+        path.write_bytes(content)
+        said = []
+        for at_once in (True, False):
+            with pytest.raises(fs.InputError) as caught:
+                fs.Samples.from_wav(path, 150.0, at_once=at_once)
+            said.append(str(caught.value))
+        assert said[0] == said[1]
+
+
+def test_a_file_that_becomes_shorter_ends_a_stream_in_one_sentence(tmp_path: Path) -> None:
+    path = wav(tmp_path / "a.wav", 3 * recordings.PIECE)
+    drive = fs.Samples.from_wav(path, 150.0, at_once=False)
+    stream = fs.stream(fs.parse_netlist(table1_deck()), sources=drive, t_stop=4.0, rtol=1e-3, count=recordings.PIECE)
+    next(stream)
+    path.write_bytes(path.read_bytes()[: 3 * recordings.PIECE])
+    with pytest.raises(fs.InputError, match="has become shorter while it was read"):
+        list(stream)
+
+
 # The store ------------------------------------------------------------------------------------------------------------
 
 
@@ -257,13 +325,18 @@ def test_a_killed_run_goes_on_to_the_same_bytes(scene: Path) -> None:
 
 
 def test_a_full_disk_loses_nothing(scene: Path) -> None:
-    # A piece of u_layer has 115 kB; the description of the store has to be small enough.
+    # A piece of u_layer has 115 kB, and one of u_gap 38 kB.
     code, lines, _ = ended(start(scene, *STREAM, preexec_fn=no_room(60_000)))
     assert code == 2
     (line,) = lines
     assert line.startswith("fingerspice: cannot write out/long.zarr: ")
     assert line.endswith("0 of 41 pieces are written, and the same command goes on from there")
-    assert ended(start(scene, *STREAM))[0] == 0
+    # There is room for the pieces, and not for the whole in one file.
+    code, lines, _ = ended(start(scene, *STREAM, "--netcdf", preexec_fn=no_room(1_000_000)))
+    assert code == 2
+    assert lines == ["fingerspice: cannot write out/long.nc: the library HDF5 could not write it; the disk may be full"]
+    assert not (scene / "out" / "long.nc").exists()
+    assert ended(start(scene, *STREAM, "--netcdf"))[0] == 0
 
 
 def test_a_store_of_another_run_is_refused(scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -196,26 +196,33 @@ class Store:
         group = self.zarr.open_group(self.path, mode="r")
         arrays = dict(group.arrays())
         size = sum(array.nbytes for array in arrays.values()) + 2**20
-        room = shutil.disk_usage(path.parent).free
-        if room < size:
-            # HDF5 would end the process on a full disk.
-            raise InputError(f"cannot write {path}: it takes {size / 1e9:.3g} GB, and the disk has {room / 1e9:.3g} GB")
 
         def write(target: Path) -> None:
+            # HDF5 would end the process on a full disk: room for it is taken, and given back.
+            with target.open("wb") as room:
+                if hasattr(os, "posix_fallocate"):
+                    os.posix_fallocate(room.fileno(), 0, size)
+                elif shutil.disk_usage(target.parent).free < size:
+                    raise OSError(f"it takes {size / 1e9:.3g} GB, which the disk has not")
             with h5netcdf.File(target, "w") as file:
-                file.dimensions["time"] = self.total
-                for name, array in arrays.items():
-                    for dimension, length in zip(array.metadata.dimension_names[1:], array.shape[1:], strict=True):
-                        if dimension not in file.dimensions:
-                            file.dimensions[dimension] = length
-                    variable = file.create_variable(name, array.metadata.dimension_names, dtype="f8")
-                    for key, value in array.attrs.asdict().items():
-                        variable.attrs[key] = value if isinstance(value, str) else json.dumps(value)
-                    rows = max(1, _PIECE // (8 * max(1, int(np.prod(array.shape[1:])))))
-                    for at in range(0, self.total, rows):
-                        variable[at : at + rows] = array[at : at + rows]
-                for key, value in group.attrs.asdict().items():
-                    if isinstance(value, str):
-                        file.attrs[key] = value
+                self._copy(group, arrays, file)
 
         return write_aside(path, write)
+
+    def _copy(self, group: Any, arrays: dict[str, Any], file: Any) -> None:
+        """Copy all arrays and texts into a NetCDF file."""
+        file.dimensions["time"] = self.total
+        for name, array in arrays.items():
+            names = array.metadata.dimension_names
+            for dimension, length in zip(names[1:], array.shape[1:], strict=True):
+                if dimension not in file.dimensions:
+                    file.dimensions[dimension] = length
+            variable = file.create_variable(name, names, dtype="f8")
+            for key, value in array.attrs.asdict().items():
+                variable.attrs[key] = value if isinstance(value, str) else json.dumps(value)
+            rows = max(1, _PIECE // (8 * max(1, int(np.prod(array.shape[1:])))))
+            for at in range(0, self.total, rows):
+                variable[at : at + rows] = array[at : at + rows]
+        for key, value in group.attrs.asdict().items():
+            if isinstance(value, str):
+                file.attrs[key] = value

@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from fingerspice.cli.store import Store
     from fingerspice.solve.streaming import Stream
 
-# Samples that are hashed at once.
-_AT_ONCE = 1 << 20
-
 
 def run_streamed(
     answer: Answering, results: Results, circuit: Circuit, how: dict[str, Any], *, chunk: str | None,
@@ -99,9 +96,7 @@ def _identity(run: Stream, circuit: Circuit, how: dict[str, Any], names: list[st
         wave = element.waveform
         elements.update(repr((element.name, element.device, element.nodes, dict(element.values))).encode())
         if isinstance(wave, Samples):
-            for at in range(0, wave.count, _AT_ONCE):
-                sources.update(wave.between(at, min(at + _AT_ONCE, wave.count)).tobytes())
-            sources.update(repr((element.name, wave.rate, wave.start)).encode())
+            sources.update(repr((element.name, wave.digest())).encode())
         else:
             sources.update(repr((element.name, wave)).encode())
     tran = circuit.tran

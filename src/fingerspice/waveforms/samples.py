@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -98,8 +99,8 @@ class Samples(Ramps):
         channel : int, optional
             Counted from 0; needed where there are several.
         at_once : bool
-            Whether all samples are kept in memory, 8 bytes each. Otherwise they are looked through once, and read from
-            the file piece by piece as they are needed, which must stay as it is meanwhile; `stream` then takes the same
+            Whether all samples are kept in memory, 8 bytes each. Otherwise they are read from the file
+            piece by piece as they are needed, and it must stay as it is meanwhile; `stream` then takes the same
             memory for an hour as for a second.
 
         Raises
@@ -159,6 +160,10 @@ class Samples(Ramps):
     def count(self) -> int:
         """Number of samples."""
         return self.values.size
+
+    def digest(self) -> str:
+        """A text that differs from that of other samples."""
+        return hashlib.sha256(repr((self.rate, self.start)).encode() + self.values.tobytes()).hexdigest()
 
     def between(self, first: int, last: int) -> FloatArray:
         """Samples number `first` to `last` - 1, V; beyond the ends those at the ends, shape (last - first,)."""
@@ -227,7 +232,9 @@ class _WavFile(Samples):
 
     def __init__(self, layout: WavLayout, gain: float) -> None:
         self.__dict__.update(layout=layout, gain=gain, rate=float(layout.rate), start=0.0)
-        for first in range(0, self.count, AT_ONCE):
+        check_range("a sample", [gain], "V")
+        # Integers are finite, and within full scale.
+        for first in range(0, self.count if layout.kind[1] == "f" else 0, AT_ONCE):
             _check_samples(self.between(first, min(first + AT_ONCE, self.count)), first)
 
     def __repr__(self) -> str:
@@ -242,6 +249,12 @@ class _WavFile(Samples):
     @property
     def count(self) -> int:
         return int(self.layout.count)
+
+    def digest(self) -> str:
+        with self.layout.path.open("rb") as file:
+            found = hashlib.file_digest(file, "sha256")
+        found.update(repr((self.gain, self.layout.channel)).encode())
+        return found.hexdigest()
 
     def between(self, first: int, last: int) -> FloatArray:
         if "values" in self.__dict__:
