@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -38,6 +39,12 @@ def _samples(waveform: Waveform, t0: float, t1: float, count: int) -> FloatArray
     return np.asarray(waveform.value(t0 + (np.arange(count) + 0.5) * ((t1 - t0) / count)))
 
 
+@lru_cache(maxsize=4)
+def _window(count: int) -> FloatArray:
+    """Hann's window; its cosines would cost as much as the transform."""
+    return np.hanning(count)
+
+
 def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatArray, FloatArray]:
     """Frequencies (Hz) up to twice the highest of interest (Hz), and the source's energy at each, in any unit.
 
@@ -60,7 +67,7 @@ def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatA
         u = _samples(waveform, start, start + length, count)
         if not np.all(np.isfinite(u)):
             return np.zeros(1), np.zeros(1)
-        total = total + np.abs(np.fft.rfft(u if periodic else u * np.hanning(u.size))) ** 2
+        total = total + np.abs(np.fft.rfft(u if periodic else u * _window(u.size))) ** 2
     total[1:] *= 2.0
     return np.arange(total.size) / length, total
 
