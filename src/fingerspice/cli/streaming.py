@@ -61,7 +61,7 @@ def run_streamed(
     span = run.problem.t_stop - run.problem.t_start
     said = [f"{run.outputs.total:,} outputs of {span:g} s in {store.chunks:,} pieces: {path}"]
     if made > 0.0:
-        said.append(f"{made * span / took:,.0f} times real time")
+        said.append(f"{made * span / took:,.3g} times real time")
     error = store.so_far["error"]
     said.append(f"stated error {error['u_gap']:.2g} V of the gap voltage, {error['f_el']:.2g} N of the force")
     if first:
@@ -149,5 +149,5 @@ class _Pace:
         took, made = time.perf_counter() - self.begun, t - self.first
         if took > 1.0 and made > 0.0 and sys.stderr.isatty():
             left = time.strftime("%H:%M:%S", time.gmtime((self.stop - t) * took / made))
-            note = f", {made / took:,.0f} times real time, {left} left"
+            note = f", {made / took:,.3g} times real time, {left} left"
             self.bar.show((t - self.start) / (self.stop - self.start), note)
