@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.fitting import ColeCole as ColeCole
     from fingerspice.studies.fitting import MaterialFit as MaterialFit
     from fingerspice.studies.fitting import fit_material as fit_material
+    from fingerspice.studies.inverse import InverseDrive as InverseDrive
+    from fingerspice.studies.inverse import inverse_drive as inverse_drive
     from fingerspice.studies.largesignal import large_signal as large_signal
     from fingerspice.studies.limits import FoldLimits as FoldLimits
     from fingerspice.studies.limits import fold_limits as fold_limits
@@ -76,6 +78,7 @@ _HOMES = {
     "studies.export": ("export_netlist",),
     "studies.feel": ("Feel", "feel"),
     "studies.fitting": ("ColeCole", "MaterialFit", "fit_material"),
+    "studies.inverse": ("InverseDrive", "inverse_drive"),
     "studies.largesignal": ("large_signal",),
     "studies.limits": ("FoldLimits", "fold_limits"),
     "results.loading": ("load",),
