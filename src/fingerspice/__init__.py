@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from fingerspice.results.solution import Solution as Solution
     from fingerspice.solve.simulation import plan as plan
     from fingerspice.solve.simulation import simulate as simulate
+    from fingerspice.studies.capability import Capability as Capability
+    from fingerspice.studies.capability import capability as capability
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
     from fingerspice.studies.export import export_netlist as export_netlist
@@ -73,6 +75,7 @@ _HOMES = {
     "waveforms.sampling": ("Function",),
     "waveforms.combinations": ("AM", "Product", "Sum"),
     "waveforms.waveform": ("DC", "Sine", "Waveform"),
+    "studies.capability": ("Capability", "capability"),
     "studies.comparison": ("Comparison", "compare"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "studies.export": ("export_netlist",),

@@ -301,6 +301,9 @@ def limits(
     overwrite: Overwrite = False,
     points: Annotated[int, typer.Option(help="Values of each parameter.")] = 9,
     span: Annotated[float, typer.Option(help="Each goes from its value over this to its value times this.")] = 10.0,
+    capability: Annotated[bool, typer.Option("--capability", help="Map the friction it can make instead.")] = False,
+    limit: Annotated[str | None, typer.Option(metavar="V", help="--capability: largest voltage of the source.")] = None,
+    carrier: Annotated[str | None, typer.Option(metavar="HZ", help="--capability: of the drive; none.")] = None,
     changes: Set = None,
     source: Source = None,
     as_json: AsJson = False,
@@ -308,15 +311,29 @@ def limits(
 ) -> None:
     """Map where DECK folds under the mobile charge law: source voltage against load, gap and frequency.
 
-    Example:
+    Examples:
 
       fingerspice limits circuits/fingerpad.cir --set Xgap.d=100n --points 7 --out out
+
+      fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
+    from fingerspice.cli import design as designs
     from fingerspice.studies.limits import fold_limits, plot_limits
     from fingerspice.studies.reports import limits_csv, limits_text
 
-    with Answering("limits", as_json, charge_law="mobile") as answer:
+    law = None if capability else "mobile"
+    with Answering("limits", as_json, charge_law=law) as answer:
         circuit = read_circuit(deck, changes, source)
+        if capability:
+            answer.update(**answers.of_circuit(circuit, None))
+            numbers = designs.number("--limit", limit), designs.number("--carrier", carrier)
+            results = Results(deck, circuit, out, name, overwrite, None)
+            found, writes = designs.capability(circuit, results, not no_plot, *numbers)
+            answer.update(capability=found.to_dict())
+            answer.give(lambda: str(found), writes)
+            return
+        if limit is not None or carrier is not None:
+            raise InputError("--limit and --carrier belong to --capability")
         answer.update(**answers.of_circuit(circuit, "mobile"))
         results = Results(deck, circuit, out, name, overwrite, "mobile")
         table = results.file("_limits.csv")
@@ -331,6 +348,41 @@ def limits(
             writes.append(lambda: save(plot_limits(result), picture, about=results.about))
         answer.update(**result.to_dict())
         answer.give(lambda: limits_text(result), writes)
+
+
+@app.command()
+def design(
+    table: Annotated[Path, typer.Argument(metavar="FRICTION.csv", help="Columns time and friction, or force (N).")],
+    deck: Deck,
+    out: Out = None,
+    name: Name = None,
+    overwrite: Overwrite = False,
+    carrier: Annotated[str | None, typer.Option(metavar="HZ", help="Carrier of the drive; none by default.")] = None,
+    limit: Annotated[str | None, typer.Option(metavar="V", help="Largest voltage of the source.")] = None,
+    slew: Annotated[str | None, typer.Option(metavar="V/S", help="Its largest change.")] = None,
+    rate: Annotated[str | None, typer.Option(metavar="HZ", help="Samples per second of the table and drive.")] = None,
+    charge_law: ChargeLaw = None,
+    changes: Set = None,
+    as_json: AsJson = False,
+    no_plot: NoPlot = False,
+) -> None:
+    """Find the drive of DECK that makes the friction (or force) of a table: WAV, CSV, prediction and picture.
+
+    Example:
+
+      fingerspice design wanted.csv circuits/fingerpad_5khz.cir --carrier 5k --limit 200
+    """
+    from fingerspice.cli import design as designs
+
+    with Answering("design", as_json, charge_law=charge_law) as answer:
+        circuit = read_circuit(deck, changes, None)
+        answer.update(**answers.of_circuit(circuit, charge_law))
+        given = {"carrier": carrier, "limit": limit, "slew": slew, "rate": rate}
+        numbers = {key: designs.number(f"--{key}", text) for key, text in given.items()}
+        results = Results(deck, circuit, out, name, overwrite, charge_law)
+        found, writes = designs.design(table, circuit, results, not no_plot, {**numbers, "charge_law": charge_law})
+        answer.update(**found.to_dict())
+        answer.give(lambda: str(found), writes)
 
 
 @app.command()

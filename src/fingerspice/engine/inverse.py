@@ -3,8 +3,8 @@
 With the gap voltage u given the area A is, and so is what flows through every layer. Per unit area (`local` law) or in
 all (`mobile`) the gap holds the charge q = c u a, with a = 1 or A, and leaks j = (g_total / A + g_area) u a. Each other
 cell has the charge s with s' = q' + j - r s, r = (g_total / A + g_area) / c, and the voltage s / (c a). The source's
-voltage is the sum. With p = s - q there is no derivative left: p' = (j - r q) - r p, stepped by an exponential with r at
-its mean and the rest a straight line.
+voltage is the sum. With p = s - q there is no derivative left: p' = (j - r q) - r p, stepped by an exponential with r
+at its mean and the rest a straight line.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ def drive_stack(
     """Fill `drive` (n,) with the source's voltages (V) for the gap voltages `target` (n,), V, at steps of `h` (s).
 
     It starts uncharged. `cells` are c, total and areal leakage of each cell, shape (n_cell, 3). Where the source would
-    pass `limit` (V) or change by more than `change` (V) in a step, it is held there, marked in `held` (n,), and the layers
-    go on from the state that this makes.
+    pass `limit` (V) or change by more than `change` (V) in a step, it is held there, marked in `held` (n,), and the
+    layers go on from the state that this makes.
     """
     before = np.zeros((2, cells.shape[0]))
     after = np.zeros((2, cells.shape[0]))

@@ -49,7 +49,9 @@ def _verdict(found: InverseDrive) -> str:
         return f"met to {100.0 * found.worst_share:.2g} % of its largest value"
     limits = [format_si(found.limit, "V")] if math.isfinite(found.limit) else []
     limits += [format_si(found.slew, "V/s")] if math.isfinite(found.slew) else []
-    return f"the limits ({', '.join(limits)}) cost {format_si(found.worst, 'N')} at worst, {format_si(found.rms, 'N')} rms"
+    return (
+        f"the limits ({', '.join(limits)}) cost {format_si(found.worst, 'N')} at worst, {format_si(found.rms, 'N')} rms"
+    )
 
 
 def plot_drive(found: InverseDrive) -> Picture:
@@ -74,7 +76,9 @@ def plot_drive(found: InverseDrive) -> Picture:
     at = scale * np.arange(found.drive.values.size) / found.drive.rate
     bottom.plot(*drawing.thin(at, found.drive.values), color=drawing.BLUE, linewidth=0.9)
     if math.isfinite(found.limit):
-        for level in {math.copysign(found.limit, side) for side in (found.drive.values.min(), found.drive.values.max())}:
+        for level in {
+            math.copysign(found.limit, side) for side in (found.drive.values.min(), found.drive.values.max())
+        }:
             bottom.axhline(level, color=drawing.GREY, linewidth=0.9, linestyle="--")
     drawing.dress(bottom, "Drive [V]", f"Time [{unit}]")
     mean = "" if found.carrier is None else f" · means over periods of the carrier, {format_si(found.carrier, 'Hz')}"

@@ -299,19 +299,24 @@ class _Task:
         """The drive, corrected by what forward runs miss of the gap's voltage."""
         peak = float(np.abs(self.target).max())
         inverter = inverter_of(self.circuit, peak, self.law)
-        wish, best, least, done = self.target.copy(), None, math.inf, -1
+        target, best, least, done = self.target, None, math.inf, -1
+        wish, levelled = target.copy(), self.carrier is None
         while best is None or done < CORRECTIONS:
             drive, held = inverter.drive(wish, 1.0 / self.rate, limits)
             u, force = self._forward(drive, inverter)
-            miss = np.where(held, 0.0, self.target - u)
+            miss = np.where(held, 0.0, target - u)
             size = float(np.abs(miss[self.lead :]).max()) / max(peak, 1e-300)
             done += 1
             stalled = size > STALLED * least
             if size < least:
                 best, least = (drive, held, force, done), size
-            if size <= CLOSE or stalled:
+            if (size <= CLOSE or stalled) and levelled:
                 break
             wish = wish + miss
+            if size <= CLOSE or stalled:
+                # Between samples the voltage of the gap is no sine: what that makes of the mean force is known now.
+                factor, levelled, least = np.where(held, 1.0, self._level(force)), True, math.inf
+                target, wish = target * factor, wish * factor
         assert best is not None
         return self._result(limits, *best)
 
@@ -328,7 +333,22 @@ class _Task:
         return inverter.sign * run.u_gap[:: self.fine], run.f_el
 
     def _driven(self, drive: FloatArray) -> Circuit:
-        return self.circuit.replace({self.finger.source.name: Samples(drive, self.rate)})
+        return self.circuit.varied({self.finger.source.name: Samples(drive, self.rate)})
+
+    def _edges(self) -> FloatArray:
+        """Ends of the carrier's whole periods after the lead, s."""
+        assert self.carrier is not None
+        count = math.floor((self.wanted.size - 1) / (2.0 * self.rate) * self.carrier * (1.0 + 1e-12))
+        return np.arange(count + 1) / self.carrier
+
+    def _level(self, force: FloatArray) -> FloatArray:
+        """Factors for the gap voltage, at the samples, that lift the mean force of each period to the wanted one."""
+        edges = self._edges()
+        reached, wanted = (_means(x, self.rate, edges) for x in (force[2 * self.lead :], self.wanted))
+        some = (reached > 0.5 * wanted) & (wanted > 1e-3 * wanted.max())
+        factor = np.sqrt(np.divide(wanted, reached, out=np.ones_like(wanted), where=some))
+        t = (np.arange(self.target.size) - self.lead) / self.rate
+        return np.interp(t, 0.5 * (edges[1:] + edges[:-1]), factor)
 
     def _result(
         self, limits: Limits, drive: FloatArray, held: BoolArray, force: FloatArray, corrections: int
@@ -338,8 +358,7 @@ class _Task:
         if self.carrier is None:
             times = lead + np.arange(wanted.size) / self.rate
         else:
-            edges = np.arange(math.floor((wanted.size - 1) / (2.0 * self.rate) * self.carrier * (1 + 1e-12)) + 1)
-            edges = edges / self.carrier
+            edges = self._edges()
             reached, wanted = (_means(x, self.rate, edges) for x in (reached, wanted))
             times = lead + 0.5 * (edges[1:] + edges[:-1])
         contact = self.finger.contact

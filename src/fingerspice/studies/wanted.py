@@ -211,8 +211,7 @@ def check_forces(force: FloatArray, times: FloatArray, what: str, contact: Conta
         least = "0 N" if what == "force" else f"{contact.mu * contact.f_n:g} N, the friction without a voltage"
         value = force[i] if what == "force" else contact.mu * (force[i] + contact.f_n)
         raise InputError(
-            f"{what}: {value:g} N at {times[i]:g} s is reached by no voltage, which only attracts; allowed: from {least}"
+            f"{what}: {value:g} N at {times[i]:g} s is reached by no voltage, which only attracts; allowed: from "
+            f"{least}"
         )
     return np.asarray(np.maximum(force, 0.0))
-
-
