@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -216,7 +217,7 @@ class _Search:
         return _largest(lambda x: self.holds(mean, x, frequency), mean)
 
 
-def _largest(holds: Any, most: float) -> float:
+def _largest(holds: Callable[[float], bool], most: float) -> float:
     """Largest number up to `most` that holds, to `_EXACT` of itself or a thousandth of that of `most`."""
     if holds(most):
         return most
@@ -229,7 +230,7 @@ def _largest(holds: Any, most: float) -> float:
 
 def plot_capability(found: Capability) -> Picture:
     """The map of amplitudes, and the largest over frequency."""
-    from fingerspice.plots.drawing import BLUE, VERMILION, caption, dress, engineering, legend_above, new_figure
+    from fingerspice.plots.drawing import BLUE, caption, dress, engineering, new_figure
 
     figure, (left, right) = new_figure(1, 2, height=3.4, width_ratios=(1.25, 1))
     factor, unit = engineering(found.largest_mean, "N")
@@ -241,15 +242,10 @@ def plot_capability(found: Capability) -> Picture:
     bar = figure.colorbar(mesh, ax=left, pad=0.02)
     bar.set_label(f"Largest amplitude [{unit}]", fontsize=8)
     bar.ax.tick_params(labelsize=8)
-    right.plot(found.frequency, factor * found.largest, color=BLUE, marker="o", markersize=3, label="largest amplitude")
-    right.plot(
-        found.frequency, factor * found.best_mean, color=VERMILION, marker="s", markersize=3, linestyle="--",
-        label="at this mean",
-    )  # fmt: skip
+    right.plot(found.frequency, factor * found.largest, color=BLUE, marker="o", markersize=3)
     right.set_xscale("log")
     right.set_ylim(bottom=0.0)
-    dress(right, f"Friction [{unit}]", "Modulation frequency [Hz]")
-    legend_above(right, 2)
+    dress(right, f"Largest amplitude, best mean [{unit}]", "Modulation frequency [Hz]")
     wave = "unipolar drive" if found.carrier is None else f"carrier {format_si(found.carrier, 'Hz')}"
     caption(
         figure,

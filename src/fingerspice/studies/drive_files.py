@@ -107,10 +107,10 @@ def drive_wav(found: InverseDrive, path: Path, gain: float | None) -> Path:
 
 
 def write_columns(path: Path, names: tuple[str, ...], columns: tuple[FloatArray, ...]) -> Path:
-    """Write columns as CSV under their names; every number to its last bit but one."""
+    """Write columns as CSV under their names; every number to its last bit."""
 
     def write(target: Path) -> None:
         with target.open("w", newline="", encoding="utf-8") as stream:
-            np.savetxt(stream, np.column_stack(columns), "%.16g", ",", header=",".join(names), comments="")
+            np.savetxt(stream, np.column_stack(columns), "%.17g", ",", header=",".join(names), comments="")
 
     return write_aside(path, write)
