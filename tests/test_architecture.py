@@ -34,7 +34,7 @@ MANY_PARAMETERS = {
     "cli.app.plan",
     "cli.app.compare",
     "cli.app.limits",
-    "cli.app.design",
+    "cli.design.design",
     "studies.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",

@@ -12,6 +12,8 @@ import typer
 
 from fingerspice.base.errors import InputError
 from fingerspice.cli import answers, options
+from fingerspice.cli import design as designs
+from fingerspice.cli.kinds import AsJson, ChargeLaw, Deck, Name, NoPlot, Out, Overwrite, Rtol, Set, Source, Stop
 from fingerspice.cli.options import area_from_text, check_output, read_circuit
 from fingerspice.cli.result_files import FOLDER, Results
 from fingerspice.cli.run_files import Touch, written
@@ -31,26 +33,6 @@ app = typer.Typer(
     rich_markup_mode="rich",
     help="SPICE for the sliding fingertip: voltages, contact area and friction on an electroadhesive touchscreen.",
 )
-
-Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir).")]
-Out = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder of the files; out by default.")]
-Name = Annotated[
-    str | None, typer.Option("--name", metavar="NAME", help="Name of the files; that of the deck by default.")
-]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of other circuits, and other files.")]
-Rtol = Annotated[float, typer.Option(help="Largest error of gap voltage and force, relative to their peaks.")]
-ChargeLaw = Annotated[str | None, typer.Option(help="local or mobile; the included library's by default.")]
-Set = Annotated[
-    list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Change a value: Xgap.d=3u. May be repeated.")
-]
-_SPECS = "'SQUARE(200 100)', 'Vdrive=DC 5', 'WAV(a.wav gain=150)', 'TABLE(a.csv)'"
-Source = Annotated[
-    list[str] | None,
-    typer.Option("--source", metavar="[NAME=]SPEC", help=f"Replace a source: {_SPECS}."),
-]
-Stop = Annotated[str | None, typer.Option(metavar="TIME", help="End of the run, s: 50m; TSTOP by default.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON (docs/json.md), nothing else on stdout.")]
-NoPlot = Annotated[bool, typer.Option("--no-plot", help="Write no picture.")]
 
 
 def main() -> None:
@@ -317,7 +299,6 @@ def limits(
 
       fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
-    from fingerspice.cli import design as designs
     from fingerspice.studies.limits import fold_limits, plot_limits
     from fingerspice.studies.reports import limits_csv, limits_text
 
@@ -350,39 +331,7 @@ def limits(
         answer.give(lambda: limits_text(result), writes)
 
 
-@app.command()
-def design(
-    table: Annotated[Path, typer.Argument(metavar="FRICTION.csv", help="Columns time and friction, or force (N).")],
-    deck: Deck,
-    out: Out = None,
-    name: Name = None,
-    overwrite: Overwrite = False,
-    carrier: Annotated[str | None, typer.Option(metavar="HZ", help="Carrier of the drive; none by default.")] = None,
-    limit: Annotated[str | None, typer.Option(metavar="V", help="Largest voltage of the source.")] = None,
-    slew: Annotated[str | None, typer.Option(metavar="V/S", help="Its largest change.")] = None,
-    rate: Annotated[str | None, typer.Option(metavar="HZ", help="Samples per second of the table and drive.")] = None,
-    charge_law: ChargeLaw = None,
-    changes: Set = None,
-    as_json: AsJson = False,
-    no_plot: NoPlot = False,
-) -> None:
-    """Find the drive of DECK that makes the friction (or force) of a table: WAV, CSV, prediction and picture.
-
-    Example:
-
-      fingerspice design wanted.csv circuits/fingerpad_5khz.cir --carrier 5k --limit 200
-    """
-    from fingerspice.cli import design as designs
-
-    with Answering("design", as_json, charge_law=charge_law) as answer:
-        circuit = read_circuit(deck, changes, None)
-        answer.update(**answers.of_circuit(circuit, charge_law))
-        given = {"carrier": carrier, "limit": limit, "slew": slew, "rate": rate}
-        numbers = {key: designs.number(f"--{key}", text) for key, text in given.items()}
-        results = Results(deck, circuit, out, name, overwrite, charge_law)
-        found, writes = designs.design(table, circuit, results, not no_plot, {**numbers, "charge_law": charge_law})
-        answer.update(**found.to_dict())
-        answer.give(lambda: str(found), writes)
+app.command()(designs.design)
 
 
 @app.command()

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import parse_number
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.cli import answers
+from fingerspice.cli.kinds import AsJson, ChargeLaw, Deck, Name, NoPlot, Out, Overwrite, Set
+from fingerspice.cli.options import read_circuit
 from fingerspice.cli.result_files import Results
-from fingerspice.cli.terminal import progress
+from fingerspice.cli.terminal import Answering, progress
 
 Writes = list[Callable[[], Path]]
 
@@ -31,7 +36,7 @@ def number(option: str, text: str | None) -> float | None:
         raise InputError(f"{option}: {error}") from None
 
 
-def design(
+def find_drive(
     table: Path, circuit: Circuit, results: Results, picture: bool, options: dict[str, Any]
 ) -> tuple[Any, Writes]:
     """The drive for the friction or force of a table, and the functions that write its files."""
@@ -72,3 +77,35 @@ def capability(
     if image is not None:
         writes.append(lambda: save(found.plot(), image, about=results.about))
     return found, writes
+
+
+def design(
+    table: Annotated[Path, typer.Argument(metavar="FRICTION.csv", help="Columns time and friction, or force (N).")],
+    deck: Deck,
+    out: Out = None,
+    name: Name = None,
+    overwrite: Overwrite = False,
+    carrier: Annotated[str | None, typer.Option(metavar="HZ", help="Carrier of the drive; none by default.")] = None,
+    limit: Annotated[str | None, typer.Option(metavar="V", help="Largest voltage of the source.")] = None,
+    slew: Annotated[str | None, typer.Option(metavar="V/S", help="Its largest change.")] = None,
+    rate: Annotated[str | None, typer.Option(metavar="HZ", help="Samples per second of the table and drive.")] = None,
+    charge_law: ChargeLaw = None,
+    changes: Set = None,
+    as_json: AsJson = False,
+    no_plot: NoPlot = False,
+) -> None:
+    """Find the drive of DECK that makes the friction (or force) of a table: WAV, CSV, prediction and picture.
+
+    Example:
+
+      fingerspice design wanted.csv circuits/fingerpad_5khz.cir --carrier 5k --limit 200
+    """
+    with Answering("design", as_json, charge_law=charge_law) as answer:
+        circuit = read_circuit(deck, changes, None)
+        answer.update(**answers.of_circuit(circuit, charge_law))
+        given = {"carrier": carrier, "limit": limit, "slew": slew, "rate": rate}
+        numbers = {key: number(f"--{key}", text) for key, text in given.items()}
+        results = Results(deck, circuit, out, name, overwrite, charge_law)
+        found, writes = find_drive(table, circuit, results, not no_plot, {**numbers, "charge_law": charge_law})
+        answer.update(**found.to_dict())
+        answer.give(lambda: str(found), writes)

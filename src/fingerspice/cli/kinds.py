@@ -1,0 +1,28 @@
+"""The arguments and options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir).")]
+Out = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder of the files; out by default.")]
+Name = Annotated[
+    str | None, typer.Option("--name", metavar="NAME", help="Name of the files; that of the deck by default.")
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of other circuits, and other files.")]
+Rtol = Annotated[float, typer.Option(help="Largest error of gap voltage and force, relative to their peaks.")]
+ChargeLaw = Annotated[str | None, typer.Option(help="local or mobile; the included library's by default.")]
+Set = Annotated[
+    list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Change a value: Xgap.d=3u. May be repeated.")
+]
+_SPECS = "'SQUARE(200 100)', 'Vdrive=DC 5', 'WAV(a.wav gain=150)', 'TABLE(a.csv)'"
+Source = Annotated[
+    list[str] | None,
+    typer.Option("--source", metavar="[NAME=]SPEC", help=f"Replace a source: {_SPECS}."),
+]
+Stop = Annotated[str | None, typer.Option(metavar="TIME", help="End of the run, s: 50m; TSTOP by default.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON (docs/json.md), nothing else on stdout.")]
+NoPlot = Annotated[bool, typer.Option("--no-plot", help="Write no picture.")]
