@@ -47,7 +47,7 @@ def find_drive(
     kind, profile = read_wanted(table, options["rate"])
     files = [results.file(end) for end in ("_drive.wav", "_drive.csv", "_friction.csv")]
     image = results.file("_design.png") if picture else None
-    found = inverse_drive(circuit, **{kind: profile.wave}, duration=profile.duration, **options)
+    found = inverse_drive(circuit, duration=profile.duration, **{**options, kind: profile.wave})
     results.open()
     writes: Writes = [
         lambda: found.to_wav(files[0]), lambda: found.to_csv(files[1]), lambda: found.friction_to_csv(files[2])

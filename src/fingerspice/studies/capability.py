@@ -17,10 +17,9 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
-from fingerspice.circuit.describe import heading
+from fingerspice.circuit.describe import head_lines, heading
 from fingerspice.solve.runs import Progress
 from fingerspice.studies.inversion import Inverter, Limits, inverter_of, the_finger
-from fingerspice.studies.reports import head_lines
 from fingerspice.studies.wanted import ForceCurve
 from fingerspice.waveforms.waveform import require
 
@@ -154,7 +153,7 @@ def capability(
     require(3 <= means <= 1000, "means", means, "3 to 1000")
     top = 1000.0 if carrier is None else min(1000.0, carrier / 8.0)
     f = np.geomspace(min(5.0, 0.1 * top), top, 13) if frequency is None else np.atleast_1d(np.asarray(frequency, float))
-    require(bool(np.all(np.isfinite(f) & (f > 0.0))) and f.ndim == 1, "frequency", f"{frequency} Hz", "> 0")
+    require(bool(np.all(np.isfinite(f) & (f > 0.0))) and f.ndim == 1, "frequency", f"{f.tolist()} Hz", "> 0")
     if carrier is not None and f.max() > carrier / 4.0:
         raise InputError(
             f"frequency reaches {f.max():g} Hz; allowed: at most a quarter of the carrier's {carrier:g} Hz"

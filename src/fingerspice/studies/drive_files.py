@@ -13,9 +13,8 @@ from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
-from fingerspice.circuit.describe import heading
+from fingerspice.circuit.describe import head_lines, heading
 from fingerspice.plots import drawing
-from fingerspice.studies.reports import head_lines
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -71,7 +70,7 @@ def plot_drive(found: InverseDrive) -> Picture:
     drawing.dress(top, f"{found.kind.capitalize()} [{newton}]")
     drawing.legend_above(top, 2)
     small, milli = drawing.engineering(max(found.worst, 1e-12), "N")
-    middle.plot(*drawing.thin(t, small * (reached - wanted)), color=drawing.VERMILION, linewidth=1.0)
+    middle.plot(*drawing.thin(t, np.asarray(small * (reached - wanted), float)), color=drawing.VERMILION, linewidth=1.0)
     drawing.dress(middle, f"Miss [{milli}]")
     at = scale * np.arange(found.drive.values.size) / found.drive.rate
     bottom.plot(*drawing.thin(at, found.drive.values), color=drawing.BLUE, linewidth=0.9)

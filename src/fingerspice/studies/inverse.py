@@ -330,7 +330,10 @@ class _Task:
                 self._driven(drive), t_stop=float(t[-1]), t_eval=t, charge_law=self.law, rtol=RTOL, start="uncharged",
                 charge=False,
             )  # fmt: skip
-        return inverter.sign * run.u_gap[:: self.fine], run.f_el
+        u, force = run.u_gap, run.f_el
+        assert u is not None
+        assert force is not None
+        return inverter.sign * u[:: self.fine], force
 
     def _driven(self, drive: FloatArray) -> Circuit:
         return self.circuit.varied({self.finger.source.name: Samples(drive, self.rate)})
