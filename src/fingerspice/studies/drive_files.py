@@ -56,7 +56,8 @@ def _verdict(found: InverseDrive) -> str:
 def plot_drive(found: InverseDrive) -> Picture:
     """Wanted against reached, the miss, and the drive, over time."""
     figure, (top, middle, bottom) = drawing.new_figure(3, height=5.2, sharex=True, height_ratios=(3, 1.4, 2))
-    wanted, reached = found.wanted, found.force
+    wanted: FloatArray = found.wanted
+    reached: FloatArray = found.force
     if found.kind == "friction":
         wanted, reached = found.wanted_friction, found.friction
     end = float(found.drive.values.size - 1) / found.drive.rate
@@ -70,10 +71,12 @@ def plot_drive(found: InverseDrive) -> Picture:
     drawing.dress(top, f"{found.kind.capitalize()} [{newton}]")
     drawing.legend_above(top, 2)
     small, milli = drawing.engineering(max(found.worst, 1e-12), "N")
-    middle.plot(*drawing.thin(t, np.asarray(small * (reached - wanted), float)), color=drawing.VERMILION, linewidth=1.0)
+    middle.plot(
+        *drawing.thin(t, np.asarray(small * (reached - wanted), np.float64)), color=drawing.VERMILION, linewidth=1.0
+    )
     drawing.dress(middle, f"Miss [{milli}]")
     at = scale * np.arange(found.drive.values.size) / found.drive.rate
-    bottom.plot(*drawing.thin(at, found.drive.values), color=drawing.BLUE, linewidth=0.9)
+    bottom.plot(*drawing.thin(np.asarray(at, np.float64), found.drive.values), color=drawing.BLUE, linewidth=0.9)
     if math.isfinite(found.limit):
         for level in {
             math.copysign(found.limit, side) for side in (found.drive.values.min(), found.drive.values.max())
