@@ -34,6 +34,8 @@ MANY_PARAMETERS = {
     "cli.app.plan",
     "cli.app.compare",
     "cli.app.limits",
+    "cli.design.design",
+    "studies.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",
     "solve.streaming.stream",

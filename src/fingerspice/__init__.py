@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from fingerspice.solve.simulation import plan as plan
     from fingerspice.solve.simulation import simulate as simulate
     from fingerspice.solve.streaming import stream as stream
+    from fingerspice.studies.capability import Capability as Capability
+    from fingerspice.studies.capability import capability as capability
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
     from fingerspice.studies.export import export_netlist as export_netlist
@@ -38,6 +40,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.fitting import ColeCole as ColeCole
     from fingerspice.studies.fitting import MaterialFit as MaterialFit
     from fingerspice.studies.fitting import fit_material as fit_material
+    from fingerspice.studies.inverse import InverseDrive as InverseDrive
+    from fingerspice.studies.inverse import inverse_drive as inverse_drive
     from fingerspice.studies.largesignal import large_signal as large_signal
     from fingerspice.studies.limits import FoldLimits as FoldLimits
     from fingerspice.studies.limits import fold_limits as fold_limits
@@ -73,11 +77,13 @@ _HOMES = {
     "waveforms.sampling": ("Function",),
     "waveforms.combinations": ("AM", "Product", "Sum"),
     "waveforms.waveform": ("DC", "Sine", "Waveform"),
+    "studies.capability": ("Capability", "capability"),
     "studies.comparison": ("Comparison", "compare"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "studies.export": ("export_netlist",),
     "studies.feel": ("Feel", "feel"),
     "studies.fitting": ("ColeCole", "MaterialFit", "fit_material"),
+    "studies.inverse": ("InverseDrive", "inverse_drive"),
     "studies.largesignal": ("large_signal",),
     "studies.limits": ("FoldLimits", "fold_limits"),
     "results.loading": ("load",),

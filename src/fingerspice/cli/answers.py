@@ -34,7 +34,11 @@ OWN: dict[str, tuple[str, ...]] = {
     "ac": ("area", "skin", "sweeps"),
     "plan": ("area", "tier", "reasons", "start", "rates", "stiff", "sensitivity", "error_bound", "plan_area"),
     "compare": ("frequency", "gaps", "phasor", "transient_mean_area", "transient_coupled"),
-    "limits": ("peak", "voltage", "sweeps"),
+    "limits": ("peak", "voltage", "sweeps", "capability"),
+    "design": (
+        *("kind", "rate", "samples", "carrier", "limit", "slew", "lead", "peak", "at_limit", "worst", "rms"),
+        *("worst_share", "rms_share", "largest_wanted", "largest_reached", "corrections"),
+    ),
     "export": (),
     "figures": (),
 }

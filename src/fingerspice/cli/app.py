@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from fingerspice.base.errors import InputError
 from fingerspice.cli import answers, options
+from fingerspice.cli import design as designs
 from fingerspice.cli.arguments import (
     AsJson,
     ChargeLaw,
@@ -29,15 +29,13 @@ from fingerspice.cli.arguments import (
     Stop,
     Streamed,
 )  # fmt: skip
+from fingerspice.cli.figures import figures
 from fingerspice.cli.options import area_from_text, check_output, read_circuit
-from fingerspice.cli.result_files import FOLDER, Results
+from fingerspice.cli.result_files import Results
 from fingerspice.cli.run_files import Touch, large_sweep, written
 from fingerspice.cli.streaming import run_streamed
 from fingerspice.cli.terminal import Answering, answer_usage, listen, plain_errors, progress, say
 from fingerspice.results.outcome import SolveError
-
-if TYPE_CHECKING:
-    pass
 
 app = typer.Typer(
     context_settings={"help_option_names": ["--help", "-h"]},
@@ -299,6 +297,9 @@ def limits(
     overwrite: Overwrite = False,
     points: Annotated[int, typer.Option(help="Values of each parameter.")] = 9,
     span: Annotated[float, typer.Option(help="Each goes from its value over this to its value times this.")] = 10.0,
+    capability: Annotated[bool, typer.Option("--capability", help="Map the friction it can make instead.")] = False,
+    limit: Annotated[str | None, typer.Option(metavar="V", help="--capability: largest voltage of the source.")] = None,
+    carrier: Annotated[str | None, typer.Option(metavar="HZ", help="--capability: of the drive; none.")] = None,
     changes: Set = None,
     source: Source = None,
     as_json: AsJson = False,
@@ -306,15 +307,28 @@ def limits(
 ) -> None:
     """Map where DECK folds under the mobile charge law: source voltage against load, gap and frequency.
 
-    Example:
+    Examples:
 
       fingerspice limits circuits/fingerpad.cir --set Xgap.d=100n --points 7 --out out
+
+      fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
     from fingerspice.studies.limits import fold_limits, plot_limits
     from fingerspice.studies.reports import limits_csv, limits_text
 
-    with Answering("limits", as_json, charge_law="mobile") as answer:
+    law = None if capability else "mobile"
+    with Answering("limits", as_json, charge_law=law) as answer:
         circuit = read_circuit(deck, changes, source)
+        if capability:
+            answer.update(**answers.of_circuit(circuit, None))
+            numbers = designs.number("--limit", limit), designs.number("--carrier", carrier)
+            results = Results(deck, circuit, out, name, overwrite, None)
+            found, writes = designs.capability(circuit, results, not no_plot, *numbers)
+            answer.update(capability=found.to_dict())
+            answer.give(lambda: str(found), writes)
+            return
+        if limit is not None or carrier is not None:
+            raise InputError("--limit and --carrier belong to --capability")
         answer.update(**answers.of_circuit(circuit, "mobile"))
         results = Results(deck, circuit, out, name, overwrite, "mobile")
         table = results.file("_limits.csv")
@@ -329,6 +343,9 @@ def limits(
             writes.append(lambda: save(plot_limits(result), picture, about=results.about))
         answer.update(**result.to_dict())
         answer.give(lambda: limits_text(result), writes)
+
+
+app.command()(designs.design)
 
 
 @app.command()
@@ -359,28 +376,7 @@ def export(
         answer.give(str, [lambda: write_aside(output, lambda path: path.write_text(text, encoding="utf-8"))])
 
 
-@app.command()
-def figures(
-    out: Out = None,
-    only: Annotated[list[int] | None, typer.Option(help="Only these of the paper's figures 2 to 5.")] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Draw the paper's Figs. 2 to 5 from scratch, each as PNG with its data as CSV.
-
-    Example:
-
-      fingerspice figures --out out --only 4 --only 5
-    """
-    from fingerspice.studies.figures import FIGURES, make_figures
-
-    folder = out or FOLDER
-    with Answering("figures", as_json) as answer:
-        for number in only or FIGURES:
-            for kind in ("png", "csv"):
-                check_output(folder / f"fig{number}.{kind}")
-        with progress("drawing") as update:
-            files = make_figures(folder, only=only, progress=update)
-        answer.give(str, [partial(Path, file) for file in files])
+app.command()(figures)
 
 
 @app.callback(invoke_without_command=True)
