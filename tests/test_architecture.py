@@ -34,9 +34,12 @@ MANY_PARAMETERS = {
     "cli.app.plan",
     "cli.app.compare",
     "cli.app.limits",
+    "cli.design.design",
+    "studies.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",
     "studies.batch.batch",
+    "solve.streaming.stream",
 }
 # Functions over the limits, with their lines and parameters: no other may be, and these may only shrink.
 LARGER = {

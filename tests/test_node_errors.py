@@ -83,7 +83,7 @@ def test_a_node_that_has_the_gap_s_voltage_has_no_smaller_error(deck: str, law: 
     assert run.error.v_nodes is not None
     assert np.array_equal(run.node_voltages["t0"], run.u_gap) or np.allclose(run.node_voltages["t0"], run.u_gap)
     assert run.error.v_nodes >= 0.99 * run.error.u_gap > 0.0
-    # It is held to the error asked for, over the largest voltage.
+    # No gap of these decks is slower than a node: the step that serves the one serves the other.
     assert run.error.v_nodes <= 1e-6 * 120.0 * 1.01
 
 
@@ -99,7 +99,7 @@ def test_nodes_of_a_run_from_the_periodic_state_have_none() -> None:
     assert fs.simulate(fs.parse_netlist(STACK), start="periodic").error.v_nodes is None
 
 
-def test_a_run_whose_nodes_are_off_by_more_than_asked_for_is_not_accepted() -> None:
+def test_the_nodes_error_is_stated_and_does_not_refuse_a_run() -> None:
     from fingerspice.results.outcome import State, Status
     from fingerspice.solve.runs import Run
 
@@ -109,9 +109,7 @@ def test_a_run_whose_nodes_are_off_by_more_than_asked_for_is_not_accepted() -> N
     )
     run.gaps = np.array([[50.0, 1.0, 5e-7, 1e-8]])
     assert run.excess(100.0) == pytest.approx(1e-8)
-    assert dataclasses.replace(run, node_error=2e-4).excess(100.0) == pytest.approx(2e-6)
-    # Over the largest voltage that is known.
-    assert dataclasses.replace(run, node_error=2e-4).excess(0.0) == pytest.approx(4e-6)
+    assert dataclasses.replace(run, node_error=2e-4).excess(100.0) == run.excess(100.0)
     run.node_error = 1e-5
     run.add_error(2e-5)
     assert run.error.v_nodes == pytest.approx(3e-5)

@@ -57,6 +57,14 @@ MENDED = {
     (0, 2529): "right",  # The charge's stated error left out what the polynomial of its rate misses.
     (0, 3978): "right",  # The force's peak was looked for on polynomials that missed it by 1e-6.
     (0, 4495): "right",  # The force's peak stood between the last two nodes of a panel.
+    (0, 1304): "right",  # Runs were refused for the error of a node whose fast decay no gap feels; likewise:
+    (0, 1380): "right",
+    (0, 1731): "right",
+    (0, 1887): "right",
+    (
+        0,
+        1596,
+    ): "refused: fold",  # The path from where the steps had met the fold went back in time.
 }
 
 

@@ -29,7 +29,10 @@ if TYPE_CHECKING:
     from fingerspice.results.solution import Solution as Solution
     from fingerspice.solve.simulation import plan as plan
     from fingerspice.solve.simulation import simulate as simulate
+    from fingerspice.solve.streaming import stream as stream
     from fingerspice.studies.batch import batch as batch
+    from fingerspice.studies.capability import Capability as Capability
+    from fingerspice.studies.capability import capability as capability
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
     from fingerspice.studies.export import export_netlist as export_netlist
@@ -38,6 +41,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.fitting import ColeCole as ColeCole
     from fingerspice.studies.fitting import MaterialFit as MaterialFit
     from fingerspice.studies.fitting import fit_material as fit_material
+    from fingerspice.studies.inverse import InverseDrive as InverseDrive
+    from fingerspice.studies.inverse import inverse_drive as inverse_drive
     from fingerspice.studies.largesignal import large_signal as large_signal
     from fingerspice.studies.limits import FoldLimits as FoldLimits
     from fingerspice.studies.limits import fold_limits as fold_limits
@@ -52,9 +57,9 @@ if TYPE_CHECKING:
     from fingerspice.waveforms.periodic import Square as Square
     from fingerspice.waveforms.periodic import Triangle as Triangle
     from fingerspice.waveforms.ramps import PWL as PWL
-    from fingerspice.waveforms.ramps import Samples as Samples
     from fingerspice.waveforms.repeated import Burst as Burst
     from fingerspice.waveforms.repeated import Repeat as Repeat
+    from fingerspice.waveforms.samples import Samples as Samples
     from fingerspice.waveforms.sampling import Function as Function
     from fingerspice.waveforms.transients import Chirp as Chirp
     from fingerspice.waveforms.transients import Exp as Exp
@@ -66,24 +71,28 @@ _HOMES = {
     "circuit.circuit": ("Circuit",),
     "netlist.netlist": ("parse_netlist", "read_netlist"),
     "waveforms.periodic": ("Pulse", "Sawtooth", "Square", "Triangle"),
-    "waveforms.ramps": ("PWL", "Samples"),
+    "waveforms.ramps": ("PWL",),
+    "waveforms.samples": ("Samples",),
     "waveforms.repeated": ("Burst", "Repeat"),
     "waveforms.transients": ("Chirp", "Exp"),
     "waveforms.sampling": ("Function",),
     "waveforms.combinations": ("AM", "Product", "Sum"),
     "waveforms.waveform": ("DC", "Sine", "Waveform"),
     "studies.batch": ("batch",),
+    "studies.capability": ("Capability", "capability"),
     "studies.comparison": ("Comparison", "compare"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "studies.export": ("export_netlist",),
     "studies.feel": ("Feel", "feel"),
     "studies.fitting": ("ColeCole", "MaterialFit", "fit_material"),
+    "studies.inverse": ("InverseDrive", "inverse_drive"),
     "studies.largesignal": ("large_signal",),
     "studies.limits": ("FoldLimits", "fold_limits"),
     "results.loading": ("load",),
     "studies.phasors": ("phasor",),
     "results.plan": ("Plan",),
     "solve.simulation": ("plan", "simulate"),
+    "solve.streaming": ("stream",),
     "results.outcome": ("SolveError", "Status"),
     "results.solution": ("Solution",),
     "studies.steady": ("SteadyState", "steady_state"),

@@ -28,8 +28,8 @@ class Bar:
         self._what, self._endless = what, endless
         self._bar: Any = None
 
-    def show(self, done: float = 0.0) -> None:
-        """Show the bar with this fraction done."""
+    def show(self, done: float = 0.0, note: str = "") -> None:
+        """Show the bar with this fraction done, and a note behind it."""
         if self._bar is None:
             if Bar._standing is not None or not sys.stderr.isatty():
                 return
@@ -37,12 +37,14 @@ class Bar:
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
             columns = [TextColumn("{task.description}"), BarColumn()]
-            columns += [TimeElapsedColumn()] if self._endless else [TextColumn("{task.percentage:3.0f} %")]
+            columns += (
+                [TimeElapsedColumn()] if self._endless else [TextColumn("{task.percentage:3.0f} %{task.fields[note]}")]
+            )
             self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
-            self._bar.add_task(self._what, total=None if self._endless else 1.0)
+            self._bar.add_task(self._what, total=None if self._endless else 1.0, note="")
             self._bar.start()
             Bar._standing = self
-        self._bar.update(self._bar.task_ids[0], completed=done)
+        self._bar.update(self._bar.task_ids[0], completed=done, note=note)
 
     def stop(self) -> None:
         """Remove the bar."""

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from fingerspice.base.errors import InputError
 
+#: The beginning of temporary names.
+UNFINISHED = ".fingerspice-"
 _UNFINISHED: set[Path] = set()
 _PIECE = 64 * 2**20
 
@@ -29,7 +31,7 @@ def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
             raise InputError(f"cannot write {path}: {error.strerror or error}") from None
         return path
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".fingerspice-{os.urandom(6).hex()}")
+    temporary = target.with_name(f"{UNFINISHED}{os.urandom(6).hex()}")
     # Entered before the file exists, so that `discard_unfinished` finds it whenever a signal comes.
     _UNFINISHED.add(temporary)
     try:
@@ -53,6 +55,28 @@ def write_pieces(path: Path, data: memoryview) -> None:
     with path.open("wb") as stream:
         for begin in range(0, data.nbytes, _PIECE):
             stream.write(data[begin : begin + _PIECE])
+
+
+def write_durably(path: Path, content: bytes) -> None:
+    """Replace a file as a whole: after a crash of the machine there is the old one or the new one."""
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+
+    write_aside(path, write)
+    settle_on_disk(path.parent)
+
+
+def settle_on_disk(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk."""
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
 
 
 def discard_unfinished() -> None:

@@ -9,8 +9,9 @@ from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.waveforms.combinations import Product, Sum
-from fingerspice.waveforms.ramps import PWL, Samples
+from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.repeated import Burst, Repeat
+from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import Function
 from fingerspice.waveforms.waveform import DC, Waveform
 
@@ -33,7 +34,7 @@ def waveform_text(waveform: Waveform, unit: str = "V") -> str:
     if isinstance(waveform, PWL):
         said.append(f"{len(waveform.times)} points")
     if isinstance(waveform, Samples):
-        said.append(f"{waveform.values.size} values")
+        said.append(f"{waveform.count} values")
     if isinstance(waveform, Burst | Repeat):
         said.append(waveform_text(waveform.waveform, unit))
     for field in dataclasses.fields(waveform):  # type: ignore[arg-type]

@@ -17,6 +17,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
@@ -146,21 +147,22 @@ class Network:
         leak = self.leak(area)[:, None]
         return self.k + self.p.T @ (leak * self.p), self.b + self.p.T @ (leak * self.q)
 
-    def admittances(self, frequency: float, area: FloatArray) -> ComplexArray:
-        """Complex admittance of every cell at a frequency (Hz), SKIN's data taken there, S, shape (n_cell,)."""
-        y = self.leak(area) + 2j * np.pi * frequency * self.capacitance(area)
+    def admittances(self, frequency: ArrayLike, area: FloatArray) -> ComplexArray:
+        """Complex admittance of every cell at frequencies (Hz), SKIN's data taken there, S, shape (..., n_cell)."""
+        f = np.asarray(frequency, float)
+        y = self.leak(area) + 2j * np.pi * f[..., None] * self.capacitance(area)
         for i, cell in enumerate(self.cells):
             if cell.element.device == "SKIN" and cell.area is not None:
-                f = np.array([frequency])
                 per_area = 1.0 / skin_resistivity(f) + 2j * np.pi * f * EPS0 * skin_permittivity(f)
-                y[i] = per_area[0] * area[cell.area] / cell.element.values["d"]
+                y[..., i] = per_area * area[cell.area] / cell.element.values["d"]
         return np.asarray(y)
 
-    def phasors(self, frequency: float, area: FloatArray, s: ComplexArray) -> ComplexArray:
-        """Cell voltages (n_cell,) at a frequency (Hz) and areas (n_area,) in m^2 for source phasors s (n_s,)."""
-        y = self.admittances(frequency, area)[:, None]
-        x = np.linalg.solve(self.k + self.p.T @ (y * self.p), -(self.b + self.p.T @ (y * self.q)) @ s)
-        return np.asarray(self.p @ x + self.q @ s)
+    def phasors(self, frequency: ArrayLike, area: FloatArray, s: ComplexArray) -> ComplexArray:
+        """Cell voltages (..., n_cell) at frequencies (Hz) and areas (n_area,) in m^2 for source phasors s (n_s,)."""
+        y = self.admittances(frequency, area)[..., None]
+        driven = (self.b + self.p.T @ (y * self.q)) @ s
+        x = np.linalg.solve(self.k + self.p.T @ (y * self.p), -driven[..., None])[..., 0]
+        return np.asarray(x @ self.p.T + self.q @ s)
 
 
 def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -38,6 +39,12 @@ def _samples(waveform: Waveform, t0: float, t1: float, count: int) -> FloatArray
     return np.asarray(waveform.value(t0 + (np.arange(count) + 0.5) * ((t1 - t0) / count)))
 
 
+@lru_cache(maxsize=4)
+def _window(count: int) -> FloatArray:
+    """Hann's window; its cosines would cost as much as the transform."""
+    return np.hanning(count)
+
+
 def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatArray, FloatArray]:
     """Frequencies (Hz) up to twice the highest of interest (Hz), and the source's energy at each, in any unit.
 
@@ -60,7 +67,7 @@ def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatA
         u = _samples(waveform, start, start + length, count)
         if not np.all(np.isfinite(u)):
             return np.zeros(1), np.zeros(1)
-        total = total + np.abs(np.fft.rfft(u if periodic else u * np.hanning(u.size))) ** 2
+        total = total + np.abs(np.fft.rfft(u if periodic else u * _window(u.size))) ** 2
     total[1:] *= 2.0
     return np.arange(total.size) / length, total
 
@@ -81,6 +88,14 @@ def energy_outside(
     return (float(energy[below].sum() / total), float(energy[f > high].sum() / total)) if total > 0.0 else (0.0, 0.0)
 
 
+def _shared_out(f: FloatArray, energy: FloatArray, grid: FloatArray) -> FloatArray:
+    """Energy at frequencies (Hz) shared between the two nearest of a geometric grid, as linear interpolation does."""
+    place = np.log(np.clip(f, grid[0], grid[-1]) / grid[0]) / math.log(grid[1] / grid[0])
+    low = np.minimum(place.astype(int), grid.size - 2)
+    above = energy * (place - low)
+    return np.asarray(np.bincount(low, energy - above, grid.size) + np.bincount(low + 1, above, grid.size), float)
+
+
 def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | None:
     """Relative error of the mean force where SKIN has its data at its own frequency, for the only source of a circuit.
 
@@ -92,19 +107,13 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
     gaps = [gap for gap in networks[0].gaps if gap is not None]
     f, energy = _energies(waveform, t_stop, SKIN_BAND[1])
     grid = np.geomspace(*SKIN_BAND, _GRID)
-    nearest = np.log(np.clip(f, *SKIN_BAND))
     areas = areas_at_rest(networks[0])
     try:
-        squares = [
-            np.array([np.abs(n.phasors(x, areas, np.ones(1, complex))[gaps]) ** 2 for x in grid.tolist()])
-            for n in networks
-        ]
+        squares = [np.abs(n.phasors(grid, areas, np.ones(1, complex))[:, gaps]) ** 2 for n in networks]
     except np.linalg.LinAlgError:
         return None
-    right, held = (
-        np.array([float(energy @ np.interp(nearest, np.log(grid), column)) for column in square.T])
-        for square in squares
-    )
+    near = _shared_out(f, energy, grid)
+    right, held = (near @ square for square in squares)
     if not (right.size and np.all(right > 0.0) and np.all(np.isfinite(held / right))):
         return None
     errors = held / right - 1.0

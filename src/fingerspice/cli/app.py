@@ -4,24 +4,38 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from fingerspice.base.errors import InputError
 from fingerspice.cli import answers, options
+from fingerspice.cli import design as designs
+from fingerspice.cli.arguments import (
+    AsJson,
+    ChargeLaw,
+    Chunk,
+    Deck,
+    Name,
+    NetCdf,
+    NoPlot,
+    Out,
+    Overwrite,
+    Rtol,
+    Set,
+    Signals,
+    Source,
+    Stop,
+    Streamed,
+)  # fmt: skip
+from fingerspice.cli.figures import figures
 from fingerspice.cli.options import area_from_text, check_output, read_circuit
-from fingerspice.cli.result_files import FOLDER, Results
-from fingerspice.cli.run_files import Touch, written
+from fingerspice.cli.result_files import Results
+from fingerspice.cli.run_files import Touch, large_sweep, written
+from fingerspice.cli.streaming import run_streamed
 from fingerspice.cli.terminal import Answering, answer_usage, listen, plain_errors, progress, say
 from fingerspice.results.outcome import SolveError
-
-if TYPE_CHECKING:
-    from fingerspice.base.arrays import FloatArray
-    from fingerspice.circuit.circuit import Circuit
-    from fingerspice.results.phasor_solution import PhasorSolution
 
 app = typer.Typer(
     context_settings={"help_option_names": ["--help", "-h"]},
@@ -31,26 +45,6 @@ app = typer.Typer(
     rich_markup_mode="rich",
     help="SPICE for the sliding fingertip: voltages, contact area and friction on an electroadhesive touchscreen.",
 )
-
-Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir).")]
-Out = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder of the files; out by default.")]
-Name = Annotated[
-    str | None, typer.Option("--name", metavar="NAME", help="Name of the files; that of the deck by default.")
-]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of other circuits, and other files.")]
-Rtol = Annotated[float, typer.Option(help="Largest error of gap voltage and force, relative to their peaks.")]
-ChargeLaw = Annotated[str | None, typer.Option(help="local or mobile; the included library's by default.")]
-Set = Annotated[
-    list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Change a value: Xgap.d=3u. May be repeated.")
-]
-_SPECS = "'SQUARE(200 100)', 'Vdrive=DC 5', 'WAV(a.wav gain=150)', 'TABLE(a.csv)'"
-Source = Annotated[
-    list[str] | None,
-    typer.Option("--source", metavar="[NAME=]SPEC", help=f"Replace a source: {_SPECS}."),
-]
-Stop = Annotated[str | None, typer.Option(metavar="TIME", help="End of the run, s: 50m; TSTOP by default.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON (docs/json.md), nothing else on stdout.")]
-NoPlot = Annotated[bool, typer.Option("--no-plot", help="Write no picture.")]
 
 
 def main() -> None:
@@ -94,6 +88,10 @@ def run(
         str, typer.Option(help="Rows at jumps of the source: both, or none, so that time rises strictly.")
     ] = "both",
     csv: Annotated[bool, typer.Option("--csv", help="Write CSV instead of NetCDF.")] = False,
+    stream: Streamed = False,
+    chunk: Chunk = None,
+    signals: Signals = None,
+    netcdf: NetCdf = False,
     feel: Annotated[bool, typer.Option("--feel", help="Say, and draw, what the hand feels of the friction.")] = False,
     as_json: AsJson = False,
     no_plot: NoPlot = False,
@@ -113,6 +111,8 @@ def run(
       fingerspice run circuits/fingerpad.cir --charge-law mobile --rtol 1e-6 --json --no-plot
 
       fingerspice run circuits/am_carrier.cir --feel
+
+      fingerspice run long.cir --stream --rtol 1e-5 --signals u_gap,friction
     """
     from fingerspice.results.report import summary_table
     from fingerspice.solve.simulation import simulate
@@ -124,6 +124,12 @@ def run(
         if circuit.tran is None:
             raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
         results = Results(deck, circuit, out, name, overwrite, charge_law)
+        if stream or chunk or signals or netcdf:
+            options.check_streamed(stream, csv=csv, feel=feel)
+            how = {"charge_law": charge_law, "area": area_from_text(area), "rtol": rtol}
+            how |= {"method": method, "start": start}
+            run_streamed(answer, results, circuit, how, chunk=chunk, signals=signals, netcdf=netcdf)
+            return
         data = results.file(".csv" if csv else ".nc")
         picture = None if no_plot else results.file(".png")
         touch = Touch(circuit, None if no_plot else results) if feel else None
@@ -194,7 +200,7 @@ def ac(
         if area == "coupled":
             if skin != "swept":
                 raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
-            found = _large_signal(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger)
+            found = large_sweep(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger)
         elif amplitude:
             raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
         else:
@@ -208,16 +214,6 @@ def ac(
             writes.append(lambda: save(plot_phasor(found, circuit), picture, about=results.about))
         answer.update(sweeps=[phasor_dict(r) for r in found] if as_json else None)
         answer.give(lambda: phasor_tables(found, circuit), writes)
-
-
-def _large_signal(
-    circuit: Circuit, frequencies: FloatArray, amplitude: list[float] | None, **how: Any
-) -> tuple[PhasorSolution, ...]:
-    """The sweep with ``--area coupled``: the periodic state at every frequency (Hz) and amplitude (V)."""
-    from fingerspice.studies.largesignal import large_signal
-
-    with progress("sweeping") as update:
-        return large_signal(circuit, frequencies, amplitude, progress=update, **how)
 
 
 @app.command()
@@ -301,6 +297,9 @@ def limits(
     overwrite: Overwrite = False,
     points: Annotated[int, typer.Option(help="Values of each parameter.")] = 9,
     span: Annotated[float, typer.Option(help="Each goes from its value over this to its value times this.")] = 10.0,
+    capability: Annotated[bool, typer.Option("--capability", help="Map the friction it can make instead.")] = False,
+    limit: Annotated[str | None, typer.Option(metavar="V", help="--capability: largest voltage of the source.")] = None,
+    carrier: Annotated[str | None, typer.Option(metavar="HZ", help="--capability: of the drive; none.")] = None,
     changes: Set = None,
     source: Source = None,
     as_json: AsJson = False,
@@ -308,15 +307,28 @@ def limits(
 ) -> None:
     """Map where DECK folds under the mobile charge law: source voltage against load, gap and frequency.
 
-    Example:
+    Examples:
 
       fingerspice limits circuits/fingerpad.cir --set Xgap.d=100n --points 7 --out out
+
+      fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
     from fingerspice.studies.limits import fold_limits, plot_limits
     from fingerspice.studies.reports import limits_csv, limits_text
 
-    with Answering("limits", as_json, charge_law="mobile") as answer:
+    law = None if capability else "mobile"
+    with Answering("limits", as_json, charge_law=law) as answer:
         circuit = read_circuit(deck, changes, source)
+        if capability:
+            answer.update(**answers.of_circuit(circuit, None))
+            numbers = designs.number("--limit", limit), designs.number("--carrier", carrier)
+            results = Results(deck, circuit, out, name, overwrite, None)
+            found, writes = designs.capability(circuit, results, not no_plot, *numbers)
+            answer.update(capability=found.to_dict())
+            answer.give(lambda: str(found), writes)
+            return
+        if limit is not None or carrier is not None:
+            raise InputError("--limit and --carrier belong to --capability")
         answer.update(**answers.of_circuit(circuit, "mobile"))
         results = Results(deck, circuit, out, name, overwrite, "mobile")
         table = results.file("_limits.csv")
@@ -331,6 +343,9 @@ def limits(
             writes.append(lambda: save(plot_limits(result), picture, about=results.about))
         answer.update(**result.to_dict())
         answer.give(lambda: limits_text(result), writes)
+
+
+app.command()(designs.design)
 
 
 @app.command()
@@ -361,28 +376,7 @@ def export(
         answer.give(str, [lambda: write_aside(output, lambda path: path.write_text(text, encoding="utf-8"))])
 
 
-@app.command()
-def figures(
-    out: Out = None,
-    only: Annotated[list[int] | None, typer.Option(help="Only these of the paper's figures 2 to 5.")] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Draw the paper's Figs. 2 to 5 from scratch, each as PNG with its data as CSV.
-
-    Example:
-
-      fingerspice figures --out out --only 4 --only 5
-    """
-    from fingerspice.studies.figures import FIGURES, make_figures
-
-    folder = out or FOLDER
-    with Answering("figures", as_json) as answer:
-        for number in only or FIGURES:
-            for kind in ("png", "csv"):
-                check_output(folder / f"fig{number}.{kind}")
-        with progress("drawing") as update:
-            files = make_figures(folder, only=only, progress=update)
-        answer.give(str, [partial(Path, file) for file in files])
+app.command()(figures)
 
 
 @app.callback(invoke_without_command=True)

@@ -71,7 +71,7 @@ def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
     from fingerspice.circuit.arguments import overridden
     from fingerspice.circuit.topology import driving_sources
     from fingerspice.netlist.netlist import source_from_text
-    from fingerspice.waveforms.ramps import Samples
+    from fingerspice.waveforms.samples import Samples
 
     if not texts:
         return circuit
@@ -108,8 +108,8 @@ def with_times(circuit: Circuit, stop: str | None, start: str = "deck") -> tuple
     """
     from fingerspice.circuit.circuit import Tran
 
-    tran, t_stop = circuit.tran, _time("--stop", stop)
-    t_start = _time("--start", start) if start[:1] in "+-.0123456789" and start else None
+    tran, t_stop = circuit.tran, time_from_text("--stop", stop)
+    t_start = time_from_text("--start", start) if start[:1] in "+-.0123456789" and start else None
     if t_start is not None:
         start = "deck"
     if t_stop is None and (t_start is None or tran is None):
@@ -130,7 +130,16 @@ def with_times(circuit: Circuit, stop: str | None, start: str = "deck") -> tuple
     return dataclasses.replace(circuit, tran=dataclasses.replace(old, stop=last, start=first)), start
 
 
-def _time(option: str, text: str | None) -> float | None:
+def check_streamed(stream: bool, **others: bool) -> None:
+    """Refuse options that do not go together with ``--stream``, and those of it without it."""
+    if not stream:
+        raise InputError("--chunk, --signals and --netcdf go with --stream")
+    for name, given in others.items():
+        if given:
+            raise InputError(f"--{name} does not go with --stream, which writes Zarr; allowed: --netcdf beside it")
+
+
+def time_from_text(option: str, text: str | None) -> float | None:
     """A time in s, such as ``50m``."""
     try:
         return None if text is None else parse_number(text)

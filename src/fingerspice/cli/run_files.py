@@ -1,4 +1,4 @@
-"""What `run` writes besides its text: the data, the picture, and what the hand feels."""
+"""What `run` writes besides its text: the data, the picture, and what the hand feels; and the sweep of `ac`."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from fingerspice.base.errors import InputError
 from fingerspice.cli.result_files import Results
+from fingerspice.cli.terminal import progress
 
 if TYPE_CHECKING:
+    from fingerspice.base.arrays import FloatArray
     from fingerspice.circuit.circuit import Circuit
+    from fingerspice.results.phasor_solution import PhasorSolution
     from fingerspice.results.solution import Solution
     from fingerspice.studies.feel import Feel
 
@@ -27,6 +30,16 @@ def written(solution: Solution, data: Path, picture: Path | None, results: Resul
     if picture is not None:
         writes.append(lambda: save(solution.plot(), picture, about=results.about))
     return writes
+
+
+def large_sweep(
+    circuit: Circuit, frequencies: FloatArray, amplitude: list[float] | None, **how: Any
+) -> tuple[PhasorSolution, ...]:
+    """The sweep with ``--area coupled``: the periodic state at every frequency (Hz) and amplitude (V)."""
+    from fingerspice.studies.largesignal import large_signal
+
+    with progress("sweeping") as update:
+        return large_signal(circuit, frequencies, amplitude, progress=update, **how)
 
 
 class Touch:

@@ -15,8 +15,9 @@ from fingerspice.netlist.slips import is_unit
 from fingerspice.netlist.spelling import nearest
 from fingerspice.waveforms.files import read_table
 from fingerspice.waveforms.periodic import Pulse, Square
-from fingerspice.waveforms.ramps import PWL, Samples
+from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.repeated import Burst, Repeat
+from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.transients import Chirp, Exp
 from fingerspice.waveforms.waveform import DC, Sine, Waveform
 
@@ -25,6 +26,7 @@ _SIN = ("VO", "VA", "FREQ", "TD", "THETA", "PHASE")
 _PULSE = ("V1", "V2", "TD", "TR", "TF", "PW", "PER")
 #: Functions to which LTspice adds a number of periods.
 _COUNTED = (_SIN, _PULSE)
+_KEPT_BYTES = 2**25  # A larger WAV file is read as it is needed: 32 MiB are six minutes of 16 bits at 48 kHz.
 #: Names in LTspice, and a short one for the command line.
 _ALIASES = {"sine": "sin", "wav": "wavefile"}
 _CHIRP = ("amplitude", "f0", "f1", "duration")
@@ -204,9 +206,9 @@ def _wavefile(call: Call, context: Context) -> Waveform:
     if "gain" not in words:
         raise InputError(f"{call.name.upper()} has no gain, the V at full scale; allowed: {_OF_FILES['wavefile']}",
                          call.where)  # fmt: skip
-    recording = Samples.from_wav(path, _number(words["gain"], "gain"), _whole(words, "channel"))
-    factor = _whole(words, "upsample")
-    return recording if factor is None else recording.upsampled(factor)
+    factor, small = _whole(words, "upsample"), not path.is_file() or path.stat().st_size <= _KEPT_BYTES
+    read = Samples.from_wav(path, _number(words["gain"], "gain"), _whole(words, "channel"), at_once=small)
+    return read if factor is None else read.upsampled(factor)
 
 
 def _table(call: Call, context: Context) -> Waveform:

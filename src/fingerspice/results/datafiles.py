@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import io
 import json
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,15 +54,17 @@ def _kept(solution: Solution, jumps: str) -> BoolArray:
     return keep
 
 
-def variables(solution: Solution, keep: BoolArray) -> tuple[dict[str, Variable], dict[str, Variable]]:
-    """Variables and coordinates of the data files, with the rows in `keep`."""
+def variables(
+    solution: Solution, keep: BoolArray, wanted: Collection[str] = SIGNALS
+) -> tuple[dict[str, Variable], dict[str, Variable]]:  # fmt: skip
+    """Variables and coordinates of the data files, with the rows in `keep` and those signals that are wanted."""
     signals = solution.all_signals
     data: dict[str, Variable] = {}
     coords: dict[str, Variable] = {"time": (("time",), solution.t[keep], {"units": "s", "long_name": "time"})}
     for key, (unit, text) in SIGNALS.items():
         names = signals.names(key)
         several = key in ("u_layer", "v")
-        if not names and not several:
+        if key not in wanted or (not names and not several):
             continue
         columns = [signals.one(name)[keep] for name in names]
         if several or len(names) > 1:

@@ -154,8 +154,8 @@ class SolveError(FingerspiceError, RuntimeError):
 class ErrorEstimate:
     """Estimated largest error over the run: of gap voltage (V), electroadhesive force (N), charge (C) and nodes (V).
 
-    `v_nodes` is that of the voltages of all nodes. A run accepts it as that of a gap voltage, but over the largest
-    voltage of the circuit: a node that hardly moves has no error of its own to meet. It is None in runs that start from
+    `v_nodes` is that of the voltages of all nodes. It is stated, but no run is refined for it: the error asked for is
+    that of gap voltage and force, and a node may follow a decay that no gap feels. It is None in runs that start from
     the periodic state, which is found to an error at the gaps.
 
     Without a GAP, `u_gap` is the error of the voltage across the layer with the smallest capacitance, and `f_el` is 0.

@@ -21,7 +21,7 @@ from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run, gap_signals, kept_with
 from fingerspice.solve.sources import Tables, after_the_end, joined, segment_index
 from fingerspice.solve.stackstate import StackState, from_stack, from_written, model_of, row_width
-from fingerspice.waveforms.ramps import Samples
+from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import same_time
 
 # Of the closed forms, over the largest voltage of the run: where the modes follow from a secular equation, and else.
@@ -133,7 +133,7 @@ def _upto(t_out: FloatArray, left: BoolArray, end: float) -> int:
 def _is_sample_by_sample(problem: Problem, t_out: FloatArray) -> bool:
     """Whether a recorded source is wanted at its own samples from the first one on: then a recursion serves."""
     wave = problem.waveform
-    if problem.charge or not isinstance(wave, Samples) or not 1 < t_out.size <= wave.values.size:
+    if problem.charge or not isinstance(wave, Samples) or not 1 < t_out.size <= wave.count:
         return False
     if wave.start != problem.t_start or t_out[-1] < problem.t_stop * (1.0 - 1e-12):
         return False

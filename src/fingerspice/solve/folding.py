@@ -136,7 +136,7 @@ class _Path:
 class _Start(NamedTuple):
     """Where a path starts: the segment of the source, its end (s), the area's branch, and the gap voltage (V).
 
-    The voltage is NaN where a jump of the source has gone past the fold.
+    The voltage is NaN where the start is at the fold or past it, as after a jump of the source.
     """
 
     segment: Segment
@@ -156,7 +156,12 @@ def _start(problem: Problem, state: StackState) -> _Start:
     if t == start:
         u_source, _ = source(segment, 0.0)
         u = float(ramp(model, model.k_gap * u_source, dot(model.gap, state.y), u))
-    return _Start(segment, end, math.copysign(1.0, u), u)
+    sign = math.copysign(1.0, u)
+    if u != 0.0 and not math.isnan(u):
+        u_source, slope = source(segment, t - start)
+        margin, _ = voltage_by_time(model, u_source, slope, state.y, sign, u, np.empty(state.y.size))
+        u = u if margin > 0.0 else math.nan
+    return _Start(segment, end, sign, u)
 
 
 def _ahead(problem: Problem, state: StackState, begun: _Start, margin: float, rtol: float) -> _Path | None:

@@ -134,10 +134,8 @@ class Run:
         self.gaps = gaps
 
     def excess(self, u_scale: float) -> float:
-        """See `excess_of`; the error of the nodes counts over the largest voltage."""
-        largest = max(u_scale, float(self.gaps[:, 0].max(initial=0.0)))
-        of_nodes = 0.0 if self.node_error is None or largest == 0.0 else self.node_error / largest
-        return max(excess_of(self.gaps, u_scale), of_nodes)
+        """See `excess_of`."""
+        return excess_of(self.gaps, u_scale)
 
 
 def excess_of(gaps: FloatArray, u_scale: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +17,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.notices import circuit_warnings
 from fingerspice.results.outcome import SolveError, Status
 from fingerspice.results.plan import Plan
+from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.cautions import run_warnings
 from fingerspice.solve.closed_form import solve_algebraic, solve_linear
@@ -109,31 +111,46 @@ def simulate(
     SolveError
         Where the run failed and `throw` is set; its `solution` holds what came before.
     """
-    _check_rtol(rtol)
     require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
+    check_method(method)
+    times = times_given("t_eval", t_eval)
+    circuit = overridden(circuit, sources, parameters)
+    problem = asked(
+        circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=start, charge=charge, rtol=rtol
+    )  # fmt: skip
+    how = start if isinstance(start, str) else "given"
+    return _given_back(run_problem(problem, times, rtol, method, progress, tier, how, jumps), throw)
+
+
+def asked(
+    circuit: Circuit, *, t_stop: float | None, t_eval: FloatArray | None, start: str | Solution, rtol: float,
+    area: str | float, **how: Any,
+) -> Problem:  # fmt: skip
+    """The problem that a call of `simulate` asks for, its arguments checked.
+
+    Raises
+    ------
+    InputError
+        For a request that cannot be run.
+    """
+    _check_rtol(rtol)
     if t_stop is not None:
         require_number("t_stop", t_stop, "a number in s")
     require_area(area)
-    _check_method(method)
     known = isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)
     require(known, "start", repr(start), f"{', '.join(map(repr, STARTS))} or a Solution")
     if isinstance(start, Solution) and start.stored is not None:
         raise InputError("start is a solution read from a file, which a run cannot go on from; allowed: one just made")
-    circuit = overridden(circuit, sources, parameters)
-    times = times_given("t_eval", t_eval)
     first = "uncharged" if start == "periodic" else start
-    problem = prepare(
-        circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=first, charge=charge, rtol=rtol
-    )  # fmt: skip
+    problem = prepare(circuit, t_stop=t_stop, t_eval=t_eval, start=first, rtol=rtol, area=area, **how)
     if start == "periodic":
         problem = close_period(problem, 0.5 * rtol).problem
-        if times is not None and times[0] < problem.t_start:
+        if t_eval is not None and t_eval[0] < problem.t_start:
             raise InputError(
-                f"t_eval starts at {times[0]:g} s; allowed: from {problem.t_start:g} s on, where the source has "
+                f"t_eval starts at {t_eval[0]:g} s; allowed: from {problem.t_start:g} s on, where the source has "
                 "settled and its periodic state exists"
             )
-    how = start if isinstance(start, str) else "given"
-    return _given_back(run_problem(problem, times, rtol, method, progress, tier, how, jumps), throw)
+    return problem
 
 
 def _check_rtol(rtol: float) -> None:
@@ -141,7 +158,7 @@ def _check_rtol(rtol: float) -> None:
     require(good, "rtol", rtol, "1e-13 to 0.1")
 
 
-def _check_method(method: str) -> None:
+def check_method(method: str) -> None:
     require(isinstance(method, str), "method", repr(method), "a name, such as 'auto'")
     library, _, name = method.partition(":")
     if method not in METHODS and not (library in LIBRARIES and name):
@@ -202,27 +219,50 @@ def run_problem(
     jumps: str = "both",
 ) -> Solution:
     """Integrate a problem made ready; arguments as in `simulate`. Never raises for a failed run."""
-    # A method steps, and what is stepped is the coupled model.
-    plan = make_plan(problem, rtol, "coupled" if tier == "auto" and method != "auto" else tier, start)
+    plan = planned(problem, rtol, method, tier, start)
     t_out, left = asked_for(problem, t_eval, jumps)
     run_at = t_out if t_eval is None else at_breakpoints(problem, t_eval)
     begin = time.perf_counter()
-    if plan.tier == "algebraic":
-        run, name = solve_algebraic(problem, run_at, left), plan.tier
-    elif plan.tier == "linear":
-        area = np.array([plan.area]) if problem.scene.stack is not None else None
-        run, name = solve_linear(problem, run_at, left, area, plan.error_bound), plan.tier
-    else:
-        # What the start and the plan give away is part of the error asked for.
-        own = max((1.0 if problem.begun is None else 0.5) * rtol - 2.0 * plan.error_bound, RTOL_RANGE[0])
-        run, name = _stepped(problem, method, own, run_at, left, progress)
-        if plan.error_bound > 0.0:
-            run.add_error(plan.error_bound * run.gaps[:, 0])
-    _state_error(problem, run, plan, rtol)
-    wall = time.perf_counter() - begin
+    run, name = integrated(problem, plan, run_at, left, rtol, method, progress)
+    run.stats["wall_s"] = time.perf_counter() - begin  # type: ignore[assignment]
     record = run.record(problem)
     # The times asked for, not those that rounding moved onto a breakpoint.
     t = np.concatenate([t_out[: run.t.size], run.t[t_out.size :]]) if run.status is Status.SUCCESS else run.t.copy()
+    return solution_of(problem, plan, run, record, t, rtol, name)
+
+
+def planned(problem: Problem, rtol: float, method: str, tier: str, start: str) -> Plan:
+    """The plan of a run by a method: a method steps, and what is stepped is the coupled model."""
+    return make_plan(problem, rtol, "coupled" if tier == "auto" and method != "auto" else tier, start)
+
+
+def integrated(
+    problem: Problem, plan: Plan, t_out: FloatArray, left: BoolArray, rtol: float, method: str,
+    progress: Progress | None = None,
+) -> tuple[Run, str]:  # fmt: skip
+    """A run as planned, its error stated and judged, and the name of the method that made it."""
+    if plan.tier == "algebraic":
+        run, name = solve_algebraic(problem, t_out, left), plan.tier
+    elif plan.tier == "linear":
+        area = np.array([plan.area]) if problem.scene.stack is not None else None
+        run, name = solve_linear(problem, t_out, left, area, plan.error_bound), plan.tier
+    else:
+        run, name = _stepped(problem, method, own_rtol(problem, plan, rtol), t_out, left, progress)
+        if plan.error_bound > 0.0:
+            run.add_error(plan.error_bound * run.gaps[:, 0])
+    state_error(problem, run, plan, rtol)
+    return run, name
+
+
+def own_rtol(problem: Problem, plan: Plan, rtol: float) -> float:
+    """What the start and the plan leave of the error asked for."""
+    return max((1.0 if problem.begun is None else 0.5) * rtol - 2.0 * plan.error_bound, RTOL_RANGE[0])
+
+
+def solution_of(
+    problem: Problem, plan: Plan, run: Run, record: Record, t: FloatArray, rtol: float, name: str
+) -> Solution:  # fmt: skip
+    """A run, by the method of this name, as a solution with its outputs at times `t` (s)."""
     scene = problem.scene
     return Solution(
         t=t,
@@ -230,7 +270,7 @@ def run_problem(
         status=run.status,
         failure=None if run.status is Status.SUCCESS else run_failure(problem, run, record),
         nfev=run.nfev,
-        stats={**run.stats, "wall_s": wall},
+        stats=dict(run.stats),
         error=run.error,
         rtol=rtol,
         charge_law=scene.charge_law,
@@ -283,7 +323,7 @@ def _stepped(
     return run, "radau"
 
 
-def _state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
+def state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
     """Add to a run's error what its method does not know of, and judge it by the error asked for."""
     if problem.begun is not None:
         if len(problem.begun) == len(run.gaps):

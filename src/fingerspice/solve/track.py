@@ -15,7 +15,7 @@ from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine import march, readout
 from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
-from fingerspice.engine.model import dot, gap_voltage, write_row_at
+from fingerspice.engine.model import Model, dot, gap_voltage, write_row_at
 from fingerspice.engine.network import Sources
 from fingerspice.engine.segment import Segment, source
 from fingerspice.engine.system import System, area_error, area_missed, area_range, build_system
@@ -192,26 +192,15 @@ class Track(Stepping):
 
     def inner_state(self) -> StackState:
         """The state reached in the engine's form."""
-        c, model = self.control, self.prepared.system.model
-        u_before, u_gap = float(c[readout.U_BEFORE]), float(c[readout.U_GAP])
-        if model.mobile:
-            x_gap = dot(model.gap, self.y)
-            found = float(gap_voltage(model, model.k_gap * u_before, x_gap, c[readout.SIGN] or 1.0, u_gap))
-            # By rounding of the time alone a state at a fold may have none.
-            u_gap = found if found == found else u_gap
-        return StackState(self.t, self.y.copy(), u_before, u_gap, self.start.offset)
+        c = self.control
+        sign, u_gap = float(c[readout.SIGN]), float(c[readout.U_GAP])
+        state = StackState(self.t, self.y.copy(), float(c[readout.U_BEFORE]), u_gap, self.start.offset)
+        return on_branch(self.prepared.system.model, state, sign)
 
     def written(self) -> FloatArray:
-        shown, model, n_out = self.problem.scene.shown, self.prepared.system.model, int(self.counters[readout.OUTPUT])
-        n, rows = self.shown, self.out[:, :n_out].T
-        if shown.is_turned:
-            rows[:, :n] *= shown.turn
-        if self.pace.charge and model.mobile:
-            u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out])
-            (cell,), network = shown.measured, shown.network
-            u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
-            rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s - self.start.offset
-        return rows
+        n_out = int(self.counters[readout.OUTPUT])
+        u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out]) if self.pace.charge else np.empty(0)
+        return as_recorded(self.problem, self.prepared.system.model, self.out[:, :n_out].T, u)
 
     def finish(self, sources: Sources, after: Sources | None) -> None:
         first = int(self.counters[readout.OUTPUT])
@@ -266,6 +255,29 @@ class Track(Stepping):
         # Half as safe again: in a stack that leaks fast throughout, gap voltage and charge were both off by 1.5 times
         # as much, against the reference, beside the points where errors are looked for.
         return 1.5 * self.charge_error(float(self.control[readout.SPREAD])) + 4e-16 * held * steps + missed
+
+
+def on_branch(model: Model, state: StackState, sign: float) -> StackState:
+    """A state whose gap voltage is that of its own other voltages, on the branch of this sign."""
+    if not model.mobile:
+        return state
+    x_gap = dot(model.gap, state.y)
+    found = float(gap_voltage(model, model.k_gap * state.u_before, x_gap, sign or 1.0, state.u_gap))
+    # By rounding of the time alone a state at a fold may have none.
+    return state if found != found else dataclasses.replace(state, u_gap=found)
+
+
+def as_recorded(problem: Problem, model: Model, rows: FloatArray, u: FloatArray) -> FloatArray:
+    """Rows as in `Record` from those that loops write, in their place; `u` (V) is the source where charge is wanted."""
+    shown = problem.scene.shown
+    n = int(shown.turn.size)
+    if shown.is_turned:
+        rows[:, :n] *= shown.turn
+    if problem.charge and model.mobile:
+        (cell,), network = shown.measured, shown.network
+        u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
+        rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s - problem.inner.offset
+    return rows
 
 
 def _turned(

@@ -19,6 +19,7 @@ _UNIT = re.compile(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
 _VOLTS = {"v": 1.0, "mv": 1e-3, "uv": 1e-6, "µv": 1e-6, "μv": 1e-6, "kv": 1e3}
 _AMPERES = {"a": 1.0, "ma": 1e-3, "ua": 1e-6, "µa": 1e-6, "μa": 1e-6, "na": 1e-9}
+_NEWTONS = {"n": 1.0, "mn": 1e-3, "un": 1e-6, "µn": 1e-6, "μn": 1e-6, "kn": 1e3}
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 # Columns whose names are shown.
 _SHOWN = 8
@@ -95,6 +96,10 @@ class Columns:
     def volts(self, column: int) -> FloatArray:
         """A column in V, or in A, shape (n_row,)."""
         return self._scaled(column, _VOLTS | _AMPERES)
+
+    def newtons(self, column: int) -> FloatArray:
+        """A column in N, shape (n_row,)."""
+        return self._scaled(column, _NEWTONS)
 
     def _scaled(self, column: int, known: dict[str, float]) -> FloatArray:
         unit = self.units[column] if self.units else ""

@@ -12,6 +12,7 @@ import warnings
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -23,6 +24,8 @@ from fingerspice.waveforms.columns import Columns, read_text_columns
 MAX_BYTES, MAX_TEXT_BYTES = 2**30, 2**26
 #: Largest number of samples: an hour at 48 kHz has 1.7e8, which take 1.4 GB.
 MAX_SAMPLES = 200_000_000
+#: Bytes of a WAV file that is read piece by piece, and of a part of its header.
+LARGEST_STREAMED, MAX_HEADER = 2**40, 2**16
 # How far times that stand beside a rate may be off by their rounding, in samples.
 _JITTER = 0.1
 _RATE_NAMES = ("rate", "fs", "sample_rate")
@@ -95,13 +98,120 @@ def read_wav(path: str | Path, channel: int | None = None) -> Recording:
         allowed = "channel=0, its only one" if channels == 1 else f"channel=0 to {channels - 1}"
         raise InputError(f"'{path}' has no channel {number}; allowed: {allowed}")
     check_count(str(path), data.shape[0])
-    values = data[:, int(number)].astype(float)
+    return Recording(_shares(data[:, int(number)]), float(rate))
+
+
+def _shares(data: np.ndarray) -> FloatArray:
+    """Samples as they are stored as shares of full scale."""
+    values = data.astype(float)
     if data.dtype.kind == "u":
         # Only 8-bit samples are unsigned.
         values -= 128.0
     if data.dtype.kind in "iu":
         values /= 2.0 ** (8 * data.dtype.itemsize - 1)
-    return Recording(values, float(rate))
+    return values
+
+
+@dataclass(frozen=True)
+class WavLayout:
+    """Where a WAV file has its samples, so that some of them can be read.
+
+    Attributes
+    ----------
+    path : Path
+    rate, channels, channel, count : int
+        Hz; of these channels, this one is read; samples of each.
+    kind : str
+        Of a number as NumPy names it, such as ``<i2``; ``<i3`` and ``>i3`` have three bytes.
+    offset : int
+        Where the first one begins, bytes.
+    """
+
+    path: Path
+    rate: int
+    channels: int
+    channel: int
+    count: int
+    kind: str
+    offset: int
+
+    def read(self, first: int, last: int) -> FloatArray:
+        """Samples number `first` to `last` - 1 as shares of full scale.
+
+        Raises
+        ------
+        InputError
+            Where they cannot be read any more.
+        """
+        width = int(self.kind[2])
+        block = self.channels * width
+        try:
+            with self.path.open("rb") as file:
+                file.seek(self.offset + first * block)
+                raw = file.read((last - first) * block)
+        except OSError as error:
+            raise InputError(f"'{self.path}' cannot be read: {error.strerror}") from None
+        if len(raw) < (last - first) * block:
+            raise InputError(f"'{self.path}' has become shorter while it was read")
+        if width != 3:
+            return _shares(np.frombuffer(raw, self.kind).reshape(-1, self.channels)[:, self.channel])
+        # As `scipy.io.wavfile` has them: the fourth byte is the lowest.
+        wide = np.zeros((last - first, 4), np.uint8)
+        low = 1 if self.kind[0] == "<" else 0
+        wide[:, low : low + 3] = np.frombuffer(raw, np.uint8).reshape(-1, self.channels, 3)[:, self.channel]
+        return _shares(wide.view(self.kind[0] + "i4")[:, 0])
+
+
+def wav_layout(path: str | Path, channel: int | None) -> WavLayout | None:
+    """Where a WAV file has the samples of a channel; None where the file, or the channel, is not beyond all doubt.
+
+    Raises
+    ------
+    InputError
+        For a file that is missing, none, or empty.
+    """
+    path = checked_file(path, LARGEST_STREAMED)
+    with path.open("rb") as file:
+        found = _wav_header(file)
+        if found is None:
+            return None
+        order, form, length = found
+        offset, size = file.tell(), file.seek(0, 2)
+    tag, channels, rate, _, block, bits = struct.unpack(order + "HHIIHH", form[:16])
+    if tag == 0xFFFE and len(form) >= 26:
+        (tag,) = struct.unpack(order + "H", form[24:26])
+    width = block // max(channels, 1)
+    known = {1: (1, 2, 3, 4, 8), 3: (4, 8)}.get(tag, ())
+    whole = width in known and block == channels * width and (bits + 7) // 8 == width and length % block == 0
+    number = 0 if channel is None and channels == 1 else channel
+    if not whole or offset + length > size or length < 2 * block or rate == 0:
+        return None
+    if number is None or isinstance(number, bool) or number != int(number) or not 0 <= number < channels:
+        return None
+    kind = f"{order}{'f' if tag == 3 else 'u' if width == 1 else 'i'}{width}"
+    return WavLayout(path, rate, channels, int(number), length // block, kind, offset)
+
+
+def _wav_header(file: BinaryIO) -> tuple[str, bytes, int] | None:
+    """Byte order, format, and length of the samples (bytes), at the first of which the file stands then."""
+    start = file.read(12)
+    order = {b"RIFF": "<", b"RIFX": ">", b"RF64": "<"}.get(start[:4])
+    form, long = b"", 0
+    while order is not None and start[8:12] == b"WAVE":
+        entry = file.read(8)
+        if len(entry) < 8:
+            break
+        (length,) = struct.unpack(order + "I", entry[4:])
+        if entry[:4] == b"data":
+            return (order, form, long or length) if len(form) >= 16 else None
+        if entry[:4] in (b"fmt ", b"ds64") and length < MAX_HEADER:
+            body = file.read(length)
+            form = body if entry[:4] == b"fmt " else form
+            long = struct.unpack("<Q", body[8:16])[0] if entry[:4] == b"ds64" and len(body) >= 16 else long
+        else:
+            file.seek(length, 1)
+        file.seek(length & 1, 1)
+    return None
 
 
 def _wav_data(path: Path) -> tuple[int, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Waveforms made of straight pieces: `PWL`, `Samples`, and the class on which all such waveforms rest.
+"""Waveforms made of straight pieces: `PWL`, and the class on which all such waveforms rest.
 
 A subclass of `Ramps` only lists its knots.
 """
@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,13 +17,12 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.bounds import check_finite, check_range, in_windows, runs_through
-from fingerspice.waveforms.files import read_table, read_wav
-from fingerspice.waveforms.upsampling import upsample
+from fingerspice.waveforms.bounds import check_range, in_windows, runs_through
+from fingerspice.waveforms.files import read_table
 from fingerspice.waveforms.waveform import Waveform, blank_terms, require
 
 # So few knots need not be divided into windows, however close together they are.
-_FEW_KNOTS = 1000
+FEW_KNOTS = 1000
 
 
 class Ramps(Waveform):
@@ -46,7 +45,7 @@ class Ramps(Waveform):
         return _once(np.unique(self._listed[0]))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in ("_listed", "_distinct")}
+        return {name: value for name, value in super().__getstate__().items() if name not in ("_listed", "_distinct")}
 
     def _knots(self) -> tuple[FloatArray, FloatArray]:
         """Times (s, ascending) and values (V) of the knots, shape (n,) each."""
@@ -138,7 +137,7 @@ class Ramps(Waveform):
 
     def breakpoint_rate(self) -> float:
         times, _ = self._listed
-        if self.period is None and times.size <= _FEW_KNOTS:
+        if self.period is None and times.size <= FEW_KNOTS:
             # No window can contain more breakpoints than these few.
             return 0.0
         span = self.period or (times[-1] - times[0])
@@ -169,26 +168,6 @@ def _between(times: FloatArray, values: FloatArray, index: IntArray, t: FloatArr
         else:
             slope = (values[j] - values[j - 1]) / (times[j] - times[j - 1])
             out[i] = values[j - 1] + slope * (t[i] - times[j - 1])
-    return out
-
-
-@jit
-def _along(values: FloatArray, start: float, rate: float, t: FloatArray, left: bool) -> FloatArray:
-    """Values (V) at times `t` (s) of samples at a rate (Hz); the sample at a time exactly, from either side."""
-    out = np.empty(t.size)
-    last = values.size - 1
-    for i in range(t.size):
-        j = int(min(max((t[i] - start) * rate, 0.0), float(last)))
-        # By rounding it may be the neighbour.
-        while j < last and (start + (j + 1) / rate < t[i] or (not left and start + (j + 1) / rate == t[i])):
-            j += 1
-        while j > 0 and (start + j / rate > t[i] or (left and start + j / rate == t[i])):
-            j -= 1
-        here, after = start + j / rate, start + (j + 1) / rate
-        if t[i] <= here or j == last:
-            out[i] = values[j]
-        else:
-            out[i] = values[j] + (values[j + 1] - values[j]) / (after - here) * (t[i] - here)
     return out
 
 
@@ -285,107 +264,3 @@ class PWL(Ramps):
         high = max(low, np.ceil((t1 - self.repeat) / period) + 1.0)
         runs = (runs_through(low, high, body.size, t0, t1) * period)[:, None] + body[None, :]
         return np.concatenate([times, runs.ravel()])
-
-
-@dataclass(frozen=True, eq=False)
-class Samples(Ramps):
-    """Samples at a constant rate, linear between them, constant before the first and after the last.
-
-    Parameters
-    ----------
-    values : array_like, shape (n,)
-        V, n >= 2.
-    rate : float
-        Samples per second.
-    start : float
-        Time of the first sample, s.
-    """
-
-    values: FloatArray
-    rate: float
-    start: float = 0.0
-    units: ClassVar[dict[str, str]] = {"rate": "Hz", "start": "s"}
-
-    def __post_init__(self) -> None:
-        values = np.array(self.values, float)
-        values.flags.writeable = False
-        object.__setattr__(self, "values", values)
-        require(
-            values.ndim == 1 and values.size >= 2,
-            "samples",
-            f"shape {values.shape}",
-            "one row of two or more",
-        )
-        bad = np.flatnonzero(~np.isfinite(values))
-        if bad.size:
-            raise InputError(f"sample number {bad[0]} is {values[bad[0]]}; allowed: finite numbers")
-        check_range("a sample", values, "V")
-        check_finite(self)
-        require(self.rate > 0.0, "sample rate", f"{self.rate:g} Hz", "> 0")
-
-    @classmethod
-    def from_wav(cls, path: str | Path, gain: float, channel: int | None = None) -> Samples:
-        """One channel of a WAV file of integers (8 to 32 bits) or floats, at any rate.
-
-        Parameters
-        ----------
-        path : str or Path
-        gain : float
-            V at full scale, which is half the range of the file's integers, and 1 of floats.
-        channel : int, optional
-            Counted from 0; needed where there are several.
-
-        Raises
-        ------
-        InputError
-            For a file that cannot be read or is broken, and for a channel that is missing or not there.
-        """
-        require(math.isfinite(gain), "gain", gain, "a finite number of V at full scale")
-        recording = read_wav(path, channel)
-        return cls(gain * recording.values, recording.rate)  # type: ignore[arg-type]
-
-    @classmethod
-    def from_table(cls, path: str | Path, rate: float | None = None, value: str | int | None = None) -> Samples:
-        """A column of a table at a rate (see `waveforms.files.read_table`).
-
-        Parameters
-        ----------
-        path : str or Path
-        rate : float, optional
-            Samples per second; needed where the file does not give it.
-        value : str or int, optional
-            Name of the column, or its number counted from 0; needed where there are several.
-
-        Raises
-        ------
-        InputError
-            For a file that cannot be read, with the line, and for one that has times and no rate.
-        """
-        table = read_table(path, None, value, rate)
-        require(table.rate is not None, f"'{path}'", "a table with times", "one with a rate; fs.PWL.from_table")
-        return cls(table.values, table.rate)  # type: ignore[arg-type]
-
-    def upsampled(self, factor: int = 16) -> Samples:
-        """The same recording at `factor` (2 to 64) times the rate, by band-limited interpolation.
-
-        Of a tone at f the straight lines between the new samples miss up to (pi f / (factor rate))^2 / 2 of the
-        amplitude: with a factor of 16 it is 0.08 % at 0.2 of the old rate and 0.4 % at 0.45 of it. The filter adds
-        0.02 % up to 0.46 of that rate, and attenuates what lies above. Beyond its ends the recording counts as held.
-
-        Raises
-        ------
-        InputError
-            For another factor, or too many samples.
-        """
-        return Samples(upsample(self.values, factor), factor * self.rate, self.start)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        # An unpickled array would be writable.
-        self.values.flags.writeable = False
-
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
-        return self.start + np.arange(self.values.size) / self.rate, self.values
-
-    def _values(self, flat: FloatArray, side: str) -> FloatArray:
-        return _along(self.values, self.start, self.rate, np.ascontiguousarray(flat), side == "left")

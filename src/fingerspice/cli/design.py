@@ -1,0 +1,111 @@
+"""What `design` and `limits --capability` do: they find a drive, or a map, and write its files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from fingerspice.base.errors import InputError
+from fingerspice.base.units import parse_number
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.cli import answers
+from fingerspice.cli.arguments import AsJson, ChargeLaw, Deck, Name, NoPlot, Out, Overwrite, Set
+from fingerspice.cli.options import read_circuit
+from fingerspice.cli.result_files import Results
+from fingerspice.cli.terminal import Answering, progress
+
+Writes = list[Callable[[], Path]]
+
+
+def number(option: str, text: str | None) -> float | None:
+    """The number of an option, with SPICE's scales; None where it is not given.
+
+    Raises
+    ------
+    InputError
+        For anything but a number.
+    """
+    if text is None:
+        return None
+    try:
+        return parse_number(text)
+    except ValueError as error:
+        raise InputError(f"{option}: {error}") from None
+
+
+def find_drive(
+    table: Path, circuit: Circuit, results: Results, picture: bool, options: dict[str, Any]
+) -> tuple[Any, Writes]:
+    """The drive for the friction or force of a table, and the functions that write its files."""
+    from fingerspice.plots.drawing import save
+    from fingerspice.studies.inverse import inverse_drive
+    from fingerspice.studies.wanted import read_wanted
+
+    kind, profile = read_wanted(table, options["rate"])
+    files = [results.file(end) for end in ("_drive.wav", "_drive.csv", "_friction.csv")]
+    image = results.file("_design.png") if picture else None
+    found = inverse_drive(circuit, duration=profile.duration, **{**options, kind: profile.wave})
+    results.open()
+    writes: Writes = [
+        lambda: found.to_wav(files[0]), lambda: found.to_csv(files[1]), lambda: found.friction_to_csv(files[2])
+    ]  # fmt: skip
+    if image is not None:
+        writes.append(lambda: save(found.plot(), image, about=results.about))
+    return found, writes
+
+
+def capability(
+    circuit: Circuit, results: Results, picture: bool, limit: float | None, carrier: float | None
+) -> tuple[Any, Writes]:
+    """The map of what the screen can do, and the functions that write its files."""
+    from fingerspice.plots.drawing import save
+    from fingerspice.studies.capability import capability as find
+
+    if limit is None:
+        peaks = [e.waveform.peak(0.0, circuit.tran.stop if circuit.tran else 1.0)
+                 for e in circuit.by_device("V") if e.waveform is not None]  # fmt: skip
+        limit = max(peaks, default=0.0)
+    table = results.file("_capability.csv")
+    image = results.file("_capability.png") if picture else None
+    with progress("looking for the largest amplitudes") as update:
+        found = find(circuit, limit, carrier=carrier, progress=update)
+    results.open()
+    writes: Writes = [lambda: found.to_csv(table)]
+    if image is not None:
+        writes.append(lambda: save(found.plot(), image, about=results.about))
+    return found, writes
+
+
+def design(
+    table: Annotated[Path, typer.Argument(metavar="FRICTION.csv", help="Columns time and friction, or force (N).")],
+    deck: Deck,
+    out: Out = None,
+    name: Name = None,
+    overwrite: Overwrite = False,
+    carrier: Annotated[str | None, typer.Option(metavar="HZ", help="Carrier of the drive; none by default.")] = None,
+    limit: Annotated[str | None, typer.Option(metavar="V", help="Largest voltage of the source.")] = None,
+    slew: Annotated[str | None, typer.Option(metavar="V/S", help="Its largest change.")] = None,
+    rate: Annotated[str | None, typer.Option(metavar="HZ", help="Samples per second of the table and drive.")] = None,
+    charge_law: ChargeLaw = None,
+    changes: Set = None,
+    as_json: AsJson = False,
+    no_plot: NoPlot = False,
+) -> None:
+    """Find the drive of DECK that makes the friction (or force) of a table: WAV, CSV, prediction and picture.
+
+    Example:
+
+      fingerspice design wanted.csv circuits/fingerpad_5khz.cir --carrier 5k --limit 200
+    """
+    with Answering("design", as_json, charge_law=charge_law) as answer:
+        circuit = read_circuit(deck, changes, None)
+        answer.update(**answers.of_circuit(circuit, charge_law))
+        given = {"carrier": carrier, "limit": limit, "slew": slew, "rate": rate}
+        numbers = {key: number(f"--{key}", text) for key, text in given.items()}
+        results = Results(deck, circuit, out, name, overwrite, charge_law)
+        found, writes = find_drive(table, circuit, results, not no_plot, {**numbers, "charge_law": charge_law})
+        answer.update(**found.to_dict())
+        answer.give(lambda: str(found), writes)

@@ -1,0 +1,153 @@
+"""`fingerspice run --stream`: a long run chunk by chunk into a Zarr store, going on where an earlier call has ended."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+import time
+import warnings
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fingerspice import __version__
+from fingerspice.base.announcing import Bar
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.cli.options import check_output, time_from_text
+from fingerspice.cli.result_files import Results
+from fingerspice.cli.terminal import Answering
+
+if TYPE_CHECKING:
+    from fingerspice.circuit.circuit import Circuit
+    from fingerspice.cli.store import Store
+    from fingerspice.solve.streaming import Stream
+
+
+def run_streamed(
+    answer: Answering, results: Results, circuit: Circuit, how: dict[str, Any], *, chunk: str | None,
+    signals: str | None, netcdf: bool,
+) -> None:  # fmt: skip
+    """Run a circuit into a store of its own, and answer.
+
+    Raises
+    ------
+    InputError
+        For a request that cannot be run, a store of another run or a damaged one, and a full disk.
+    SolveError
+        Where the run fails; what came before is in the store.
+    """
+    from fingerspice.cli.store import Store
+    from fingerspice.solve.streaming import stream
+
+    path = results.folder / f"{results.name}.zarr"
+    # The store is a folder; that files can be written beside it is what has to be known.
+    check_output(path.with_suffix(".zarr.part"), results.deck)
+    data = results.file(".nc") if netcdf else None
+    names = _names(signals, circuit)
+    charge = any(name in ("q_source", "i_source") for name in names)
+    run = stream(circuit, chunk=time_from_text("--chunk", chunk), charge=charge, **how)
+    store = Store(path, _identity(run, circuit, how, names), run.outputs.total, run.count)
+    store.open(results.overwrite)
+    if store.done and store.done < store.chunks:
+        run.go_to(store.mark, store.done * store.count)
+    results.open()
+    begun, first = time.perf_counter(), store.done
+    answer.data["files"].append(str(path))
+    if first < store.chunks:
+        _fill(run, store, names, results)
+    answer.update(**store.so_far)
+    took, made = time.perf_counter() - begun, (store.chunks - first) / store.chunks
+    span = run.problem.t_stop - run.problem.t_start
+    said = [f"{run.outputs.total:,} outputs of {span:g} s in {store.chunks:,} pieces: {path}"]
+    if made > 0.0:
+        said.append(f"{made * span / took:,.3g} times real time")
+    error = store.so_far["error"]
+    said.append(f"stated error {error['u_gap']:.2g} V of the gap voltage, {error['f_el']:.2g} N of the force")
+    if first:
+        said.append(f"the first {first:,} were there already")
+    answer.update(stream={"chunks": store.chunks, "found": first, "outputs": run.outputs.total, "seconds": took})
+    answer.give(lambda: "; ".join(said), [] if data is None else [lambda: store.to_netcdf(data)])
+
+
+def _names(signals: str | None, circuit: Circuit) -> list[str]:
+    """Keys of the signals that are written."""
+    from fingerspice.results.signals import SIGNALS
+
+    if signals is None:
+        return ["u_gap", "f_el"] if circuit.by_device("GAP") else ["u_layer"] if _layers(circuit) else ["v"]
+    names = [name.strip() for name in signals.split(",")]
+    for name in names:
+        if name not in SIGNALS:
+            raise InputError(f"--signals names {name!r}; allowed: {', '.join(SIGNALS)}")
+    return sorted(set(names), key=list(SIGNALS).index)
+
+
+def _layers(circuit: Circuit) -> bool:
+    return any(element.spec.is_layer for element in circuit.elements)
+
+
+def _identity(run: Stream, circuit: Circuit, how: dict[str, Any], names: list[str]) -> dict[str, Any]:
+    """What decides over the bytes of a store."""
+    from fingerspice.waveforms.samples import Samples
+
+    elements, sources = hashlib.sha256(), hashlib.sha256()
+    for element in circuit.elements:
+        wave = element.waveform
+        elements.update(repr((element.name, element.device, element.nodes, dict(element.values))).encode())
+        if isinstance(wave, Samples):
+            sources.update(repr((element.name, wave.digest())).encode())
+        else:
+            sources.update(repr((element.name, wave)).encode())
+    tran = circuit.tran
+    elements.update(repr((dict(circuit.initial), tran and (tran.max_step, tran.uic))).encode())
+    o = run.outputs
+    return {
+        "circuit": elements.hexdigest(), "source": sources.hexdigest(), "rtol": how["rtol"],
+        "charge_law": run.problem.scene.charge_law, "area": run.problem.scene.area_mode, "method": how["method"],
+        "start": str(how["start"]), "chunk": run.count, "signals": names, "end": run.problem.t_stop,
+        "output_times": [o.start, o.over, o.low, o.total],
+        "program": f"fingerspice {__version__}, NumPy {np.__version__}",
+    }  # fmt: skip
+
+
+def _fill(run: Stream, store: Store, names: list[str], results: Results) -> None:
+    """Compute and write all chunks that are missing, a chunk being written while the next one is computed."""
+    about = {key: text for key, text in results.about.items() if key != "files"}
+    known: set[str] = set()
+    writing: Future[None] | None = None
+    with ThreadPoolExecutor(1) as writer, _Pace(run) as pace:
+        for number, solution in enumerate(run, store.done):
+            for text in solution.warnings:
+                if text not in known:
+                    known.add(text)
+                    warnings.warn(text, FingerspiceWarning, stacklevel=2)
+            if writing is not None:
+                writing.result()
+            writing = writer.submit(store.write, number, solution, names, about, run.mark())
+            pace.show(solution.t_stop)
+        if writing is not None:
+            writing.result()
+
+
+class _Pace:
+    """A bar with the rate, over real time, and the time left."""
+
+    def __init__(self, run: Stream) -> None:
+        self.bar, self.begun = Bar("simulating"), time.perf_counter()
+        self.start, self.stop = run.problem.t_start, run.problem.t_stop
+        self.first = float(run.outputs.times(run.done, run.done + 1)[0])
+
+    def __enter__(self) -> _Pace:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.stop()
+
+    def show(self, t: float) -> None:
+        """Show that the run has come to a time, s."""
+        took, made = time.perf_counter() - self.begun, t - self.first
+        if took > 1.0 and made > 0.0 and sys.stderr.isatty():
+            left = time.strftime("%H:%M:%S", time.gmtime((self.stop - t) * took / made))
+            note = f", {made / took:,.3g} times real time, {left} left"
+            self.bar.show((t - self.start) / (self.stop - self.start), note)

@@ -1,0 +1,226 @@
+"""Long runs chunk by chunk, in constant memory.
+
+A run is integrated in pieces of a fixed length, whatever the chunks are: a recording on a series stack in those of
+`solve.recordings`, anything else in windows of so many outputs, each a run that starts where the one before has ended.
+Chunks are cut from what the pieces give, so that no bit depends on their length.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_number
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.results.outcome import SolveError, Status
+from fingerspice.results.plan import Plan
+from fingerspice.results.record import Record
+from fingerspice.results.solution import Solution
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.simulation import (
+    asked,
+    check_method,
+    planned,
+    solution_of,
+)
+from fingerspice.solve.times import check_length, check_outputs
+from fingerspice.solve.windows import BySamples, ByWindows, Mark, Outputs, outputs_of, within
+from fingerspice.waveforms.waveform import require
+
+# Length of a chunk where none is given, s.
+CHUNK = 10.0
+
+
+class Stream:
+    """A run chunk by chunk: an iterator of `Solution`; `fs.stream` makes it.
+
+    Attributes
+    ----------
+    problem : Problem
+    outputs : Outputs
+        All output times.
+    count : int
+        Outputs of a chunk; the last one has the rest.
+    done : int
+        Outputs given so far.
+    """
+
+    def __init__(
+        self, problem: Problem, plan: Plan, outputs: Outputs, count: int, rtol: float, method: str
+    ) -> None:  # fmt: skip
+        self.problem, self.plan, self.outputs, self.count, self.rtol, self.asked = (
+            problem, plan, outputs, count, rtol, method,
+        )  # fmt: skip
+        self.done = 0
+        self._source: BySamples | ByWindows = (
+            BySamples(problem, outputs, plan, rtol)
+            if method == "auto" and BySamples.serve(problem, plan, rtol)
+            else ByWindows(problem, outputs, plan, rtol, method)
+        )
+        # What the pieces have given and no chunk has yet; and where the run stood before each of these pieces.
+        self._ready: list[tuple[FloatArray, FloatArray]] = []
+        self._marks: list[Mark] = []
+
+    def __iter__(self) -> Iterator[Solution]:
+        return self
+
+    def __len__(self) -> int:
+        """Number of all chunks."""
+        return -(-self.outputs.total // self.count)
+
+    def __next__(self) -> Solution:
+        if self.done == self.outputs.total:
+            raise StopIteration
+        wanted = min(self.count, self.outputs.total - self.done)
+        while sum(t.size for t, _ in self._ready) < wanted and not self._source.over:
+            self._advance()
+        given = self._take(wanted)
+        solution = self._solution(*given)
+        if solution.failure is not None:
+            self.done = self.outputs.total
+            raise SolveError(solution.failure, solution)
+        self.done += wanted
+        return solution
+
+    def mark(self) -> Mark:
+        """Where to go on for the chunk that is next, as plain data."""
+        found = [m for m in [*self._marks, self._mark()] if m["written"] <= self.done]
+        return found[-1]
+
+    def go_to(self, mark: Mark, done: int) -> None:
+        """Go on from a mark, where so many outputs have been given; before the first chunk only."""
+        if "state" in mark and isinstance(self._source, BySamples):
+            self._source = self._stepped(self._source.problem)
+        self._source.go_to(mark)
+        self.done = done
+        while self._source.written <= done and not self._source.over:
+            self._advance()
+        first = self._marks[0]["written"] if self._marks else done
+        self._take(done - first)
+
+    def _mark(self) -> Mark:
+        return self._source.mark()
+
+    def _stepped(self, problem: Problem) -> ByWindows:
+        return ByWindows(problem, self.outputs, self.plan, self.rtol, "exponential")
+
+    def _advance(self) -> None:
+        """Integrate the next piece."""
+        mark = self._mark()
+        found = self._source.advance()
+        if found is None:
+            # From here on by the steps that serve every source.
+            assert isinstance(self._source, BySamples)
+            self._source.go_to(mark)
+            other = self._stepped(self.problem)
+            other.written, other.state = mark["written"], self._source.march.state()
+            self._source = other
+            self._advance()
+            return
+        self._marks.append(mark)
+        self._ready.append(found)
+
+    def _take(self, count: int) -> tuple[FloatArray, FloatArray]:
+        """The next outputs: times (s) and rows."""
+        times, rows, left = [np.empty(0)], [], count
+        while left > 0 and self._ready:
+            t, r = self._ready[0]
+            times.append(t[:left])
+            rows.append(r[:left])
+            if t.size <= left:
+                self._ready.pop(0)
+                self._marks.pop(0)
+            else:
+                self._ready[0] = t[left:], r[left:]
+            left -= times[-1].size
+        width = max(self.problem.initial.y.size, 1)
+        return np.concatenate(times), np.concatenate(rows) if rows else np.empty((0, width))
+
+    def _solution(self, t: FloatArray, rows: FloatArray) -> Solution:
+        problem, run = self.problem, self._source.run()
+        if self._ready:
+            # What has failed since concerns a later chunk.
+            run.status, run.t_failed = Status.SUCCESS, None
+        shown = problem.scene.shown
+        span = (float(t[0]), float(t[-1])) if t.size else (problem.t_start, problem.t_start)
+        network = within(shown.network, *span)
+        record = Record(network, shown.net, t, np.zeros(t.size, bool), np.ascontiguousarray(rows), problem.charge)
+        found = solution_of(problem, self.plan, run, record, t, self.rtol, self._source.method)
+        return replace(found, first=span[0], t_stop=span[1])
+
+
+def stream(
+    circuit: Circuit,
+    *,
+    chunk: float | None = None,
+    count: int | None = None,
+    step: float | None = None,
+    t_stop: float | None = None,
+    sources: Sources | None = None,
+    parameters: Parameters | None = None,
+    charge_law: str | None = None,
+    area: str | float = "coupled",
+    rtol: float = 1e-8,
+    method: str = "auto",
+    tier: str = "auto",
+    start: str | Solution = "deck",
+    charge: bool = True,
+) -> Stream:
+    """Simulate a circuit in time chunk by chunk, in memory that does not grow with the length of the run.
+
+    The chunks of a run are the same to the last bit whatever their length is. Of a recording on a series stack they are
+    also those of `simulate` with the same times as `t_eval`. Of other runs they are not: there each window of 16,384
+    outputs is a run of its own, which starts where the one before ended.
+
+    Parameters
+    ----------
+    circuit : Circuit
+    chunk : float, optional
+        Length of a chunk, s; 10 s by default.
+    count : int, optional
+        Outputs of a chunk, instead of `chunk`.
+    step : float, optional
+        Time between outputs, s, from TSTART on. By default outputs are at the samples of the recording that drives the
+        circuit; where there is none, or several sources, TSTEP apart.
+    t_stop, sources, parameters, charge_law, area, rtol, method, tier, start, charge
+        As in `simulate`. A long recording is `Samples.from_wav(path, gain, at_once=False)`, or a deck's WAVEFILE.
+
+    Returns
+    -------
+    Stream
+        An iterator of `Solution`. At a jump of a source there is one row, the right-hand one. The stated errors of a
+        chunk are the largest since the start (beyond recordings without what the state at the start of the last window
+        was off), its figures those of its outputs, and its `state` is that at the end of the last piece integrated.
+
+    Raises
+    ------
+    InputError
+        For a request that cannot be run.
+    SolveError
+        While iterating, where the run fails; its `solution` holds what came after the last chunk.
+    """
+    check_method(method)
+    for name, value in (("chunk", chunk), ("step", step)):
+        if value is not None:
+            require_number(name, value, "a number in s")
+            require(0.0 < value < math.inf, name, f"{value:g} s", "> 0 s")
+    if count is not None:
+        require(isinstance(count, int) and count >= 1, "count", repr(count), "a whole number from 1 on")
+        require(chunk is None, "count", "given beside chunk", "one of them")
+    circuit = overridden(circuit, sources, parameters)
+    problem = asked(
+        circuit, t_stop=t_stop, t_eval=None, charge_law=charge_law, area=area, start=start, charge=charge, rtol=rtol
+    )  # fmt: skip
+    check_length(problem.waveform, problem.t_start, problem.t_stop)
+    outputs = outputs_of(problem, step)
+    if count is None:
+        spacing = 1.0 / outputs.over if outputs.rated else outputs.over
+        count = max(1, round((CHUNK if chunk is None else chunk) / spacing))
+    count = min(count, outputs.total)
+    check_outputs(circuit, count)
+    plan = planned(problem, rtol, method, tier, start if isinstance(start, str) else "given")
+    return Stream(problem, plan, outputs, count, rtol, method)

@@ -1,0 +1,206 @@
+"""The pieces of a long run, one after another, whatever chunks are made of them; see `solve.streaming`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.circuit.network import Network
+from fingerspice.results.outcome import State, Status
+from fingerspice.results.plan import Plan
+from fingerspice.results.record import Record
+from fingerspice.solve.outputs import at_breakpoints
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.recordings import March, Outcome, pieces_of, ready
+from fingerspice.solve.runs import Run
+from fingerspice.solve.simulation import integrated, own_rtol, state_error
+from fingerspice.waveforms.samples import Samples
+from fingerspice.waveforms.sampling import on_breakpoint
+from fingerspice.waveforms.waveform import require
+
+# Outputs of a window of runs that are not followed sample by sample.
+WINDOW = 1 << 14
+
+#: Where a stream stands before a piece, as plain data: with it another one goes on there, to the same bytes.
+Mark = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Output times, evenly spaced.
+
+    Attributes
+    ----------
+    start, over : float
+        Time of number 0 and spacing, s; or with `rate` set the rate of a recording, Hz, from its start on.
+    low, total : int
+        Number of the first, and how many there are.
+    stop : float
+        End of the run, s.
+    """
+
+    start: float
+    over: float
+    rated: bool
+    low: int
+    total: int
+    stop: float
+
+    def times(self, i: int, j: int) -> FloatArray:
+        """Times of outputs i to j - 1, s, as the arrays ``start + arange / rate`` or ``start + step * arange`` have."""
+        number = np.arange(self.low + i, self.low + min(j, self.total))
+        t = self.start + (number / self.over if self.rated else self.over * number)
+        return np.asarray(np.minimum(t, self.stop))
+
+
+def outputs_of(problem: Problem, step: float | None) -> Outputs:
+    """The outputs at the samples of a recording, or every `step` (s); the deck's TSTEP where there is no recording."""
+    wave, first, stop = problem.waveform, max(problem.first, problem.t_start), problem.t_stop
+    if step is None and isinstance(wave, Samples):
+        low = math.ceil((first - wave.start) * wave.rate - 1e-6)
+        total = math.floor((stop - wave.start) * wave.rate + 1e-6) - low + 1
+        found = Outputs(wave.start, wave.rate, True, low, total, stop)
+    else:
+        step = problem.step if step is None else step
+        total = math.floor((stop - first) / step * (1.0 + 1e-12) + 1e-9) + 1
+        found = Outputs(first, step, False, 0, total, stop)
+    require(found.total >= 1, "the run", f"one of {stop - first:g} s without any output", "a longer one")
+    return found
+
+
+class BySamples:
+    """A recording followed sample by sample."""
+
+    method = "relaxation"
+
+    def __init__(self, problem: Problem, outputs: Outputs, plan: Plan, rtol: float) -> None:
+        self.problem, self.outputs, self.plan, self.rtol = problem, outputs, plan, rtol
+        own = own_rtol(problem, plan, rtol)
+        pieces, one = pieces_of(problem), ready(problem, own)
+        assert pieces is not None
+        assert one is not None
+        self.pieces, self.march, self.place, self.written = pieces, March(problem, one, own), 0, 0
+
+    @staticmethod
+    def serve(problem: Problem, plan: Plan, rtol: float) -> bool:
+        """Whether a run can be followed so."""
+        if plan.tier != "coupled" or pieces_of(problem) is None:
+            return False
+        return ready(problem, own_rtol(problem, plan, rtol)) is not None
+
+    @property
+    def over(self) -> bool:
+        return self.place == len(self.pieces)
+
+    def mark(self) -> Mark:
+        m = self.march
+        numbers = {"t": m.t, "share": m.share, "loudest": m.loudest, "u_last": m.u_last, "spacing": m.spacing}
+        arrays = [x.tolist() for x in m.mark()]
+        return {"written": self.written, "place": self.place, "numbers": numbers, "arrays": arrays}
+
+    def go_to(self, mark: Mark) -> None:
+        self.written, self.place = mark["written"], mark["place"]
+        self.march.stand(mark["numbers"], mark["arrays"])
+
+    def advance(self) -> tuple[FloatArray, FloatArray] | None:
+        """Times (s) and rows of the next piece; None where there is no way on sample by sample."""
+        piece, march, last = self.pieces[self.place], self.march, self.place + 1 == len(self.pieces)
+        end = self.outputs.total if last else self._until(piece.stop)
+        t = self.outputs.times(self.written, end)
+        run_at = t if self.outputs.rated else at_breakpoints(_between(self.problem, piece.start, piece.stop), t)
+        out = np.empty((march.width, t.size))
+        march.begin_outputs()
+        if march.follow(piece, piece.values(march.wave), run_at, out) is not Outcome.MET:
+            return None
+        if last:
+            march.finish(run_at, out)
+        count = march.outputs
+        t, self.written, self.place = t[:count], self.written + count, self.place + 1
+        return t, march.rows(run_at[:count], np.zeros(count, bool), out)
+
+    def _until(self, t: float) -> int:
+        """A number of outputs that includes all up to a time (s), and few others."""
+        o = self.outputs
+        number = (t - o.start) * o.over if o.rated else (t - o.start) / o.over
+        return min(max(math.ceil(number) - o.low + 2, self.written), o.total)
+
+    def run(self) -> Run:
+        """How the run stands, without outputs."""
+        run = self.march.run(np.empty(0), np.empty(0, bool), np.empty((0, 0)))
+        if self.plan.error_bound > 0.0:
+            run.add_error(self.plan.error_bound * run.gaps[:, 0])
+        if self.over:
+            state_error(self.problem, run, self.plan, self.rtol)
+        return run
+
+
+class ByWindows:
+    """Any run, in windows of outputs."""
+
+    def __init__(
+        self, problem: Problem, outputs: Outputs, plan: Plan, rtol: float, method: str,
+    ) -> None:  # fmt: skip
+        self.problem, self.outputs, self.plan, self.rtol, self.asked = problem, outputs, plan, rtol, method
+        self.written, self.state, self.method = 0, problem.initial, method
+        self.last: Run | None = None
+        self.gaps = np.zeros((0, 4))
+
+    @property
+    def over(self) -> bool:
+        return self.written == self.outputs.total or (self.last is not None and self.last.status is not Status.SUCCESS)
+
+    def mark(self) -> Mark:
+        state = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self.state).items()}
+        return {"written": self.written, "state": state, "gaps": self.gaps.tolist()}
+
+    def go_to(self, mark: Mark) -> None:
+        self.written = mark["written"]
+        self.gaps = np.array(mark["gaps"], float).reshape(-1, 4)
+        kept: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in mark["state"].items()}
+        self.state = State(**kept)
+
+    def advance(self) -> tuple[FloatArray, FloatArray]:
+        end = min(self.written + WINDOW, self.outputs.total)
+        t, whole = self.outputs.times(self.written, end), self.problem
+        stop = whole.t_stop if end == self.outputs.total else on_breakpoint(whole.waveform, float(t[-1]))
+        problem = _between(whole, self.state.t, stop)
+        scene = replace(whole.scene, network=within(whole.network, self.state.t, stop + whole.step))
+        problem = replace(problem, scene=scene, initial=self.state)
+        run_at = at_breakpoints(problem, t)
+        run, self.method = integrated(problem, self.plan, run_at, np.zeros(t.size, bool), self.rtol, self.asked)
+        if run.gaps.shape == self.gaps.shape:
+            run.gaps = np.maximum(run.gaps, self.gaps)
+        self.last, self.gaps, self.state = run, run.gaps, run.state
+        self.written += run.t.size
+        return t[: run.t.size], _as_shown(run.record(problem), whole)
+
+    def run(self) -> Run:
+        assert self.last is not None
+        empty = np.empty(0)
+        return replace(self.last, t=empty, left=np.empty(0, bool), rows=np.empty((0, 0)), continuous=None)
+
+
+def _between(problem: Problem, t0: float, t1: float) -> Problem:
+    """A part of a run's time, s."""
+    return replace(problem, t_start=t0, t_stop=t1, first=t0)
+
+
+def within(network: Network, t0: float, t1: float) -> Network:
+    """A network whose recordings are those parts of them that a time (s) needs."""
+    cut = [
+        replace(e, waveform=e.waveform.part(t0, t1)) if isinstance(e.waveform, Samples) else e for e in network.sources
+    ]
+    return replace(network, sources=tuple(cut))
+
+
+def _as_shown(record: Record, problem: Problem) -> FloatArray:
+    """Rows as exponential steps record them, whichever method has made them (see `Scene.shown`)."""
+    shown, n = problem.scene.shown.network, record.network.k.shape[0]
+    if len(shown.cells) == len(record.network.cells):
+        return record.rows
+    place = [shown.layers.index(shown.cells[i].element) for i in shown.live]
+    return np.column_stack([record.u_layer[:, place], record.rows[:, n:]])

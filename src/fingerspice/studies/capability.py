@@ -1,0 +1,254 @@
+"""What a screen can make a finger feel: the friction's modulation and mean that a largest voltage allows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import InputError
+from fingerspice.base.pages import Page, Shown, Table
+from fingerspice.base.units import format_si
+from fingerspice.circuit.arguments import require_circuit
+from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
+from fingerspice.circuit.describe import head_lines, heading
+from fingerspice.solve.runs import Progress
+from fingerspice.studies.inversion import Inverter, Limits, inverter_of, the_finger
+from fingerspice.studies.wanted import ForceCurve
+from fingerspice.waveforms.waveform import require
+
+if TYPE_CHECKING:
+    from fingerspice.plots.picture import Picture
+
+# Samples of a modulation's and of a carrier's period, and the lowest rate, Hz.
+_PER_PERIOD, _PER_CARRIER, _LEAST_RATE = 64, 32, 8000.0
+# How long a force lasts: so many periods of the modulation, and so many seconds at least.
+_PERIODS, _LASTS = 3.0, 0.05
+# Exactness of an amplitude, of the largest possible.
+_EXACT = 1e-3
+
+
+@dataclass(frozen=True, repr=False)
+class Capability(Shown):
+    """Largest amplitudes of the friction that a voltage allows.
+
+    The friction is mean + amplitude sin(2 pi f t), made by the inverse drive from an uncharged stack for 3 periods, and
+    50 ms at least, with |U| <= limit all the time; the amplitude is at most the mean less the friction without voltage.
+
+    Attributes
+    ----------
+    circuit : Circuit
+    limit : float
+        V.
+    carrier : float or None
+        Hz.
+    frequency : ndarray, shape (n_f,)
+        Of the modulation, Hz.
+    mean : ndarray, shape (n_m,)
+        Of the friction, N.
+    amplitude : ndarray, shape (n_m, n_f)
+        Largest amplitude of the friction, N.
+    smallest_mean, largest_mean : float
+        Of a friction that does not change, N.
+    """
+
+    circuit: Circuit
+    limit: float
+    carrier: float | None
+    frequency: FloatArray
+    mean: FloatArray
+    amplitude: FloatArray
+    smallest_mean: float
+    largest_mean: float
+
+    @property
+    def largest(self) -> FloatArray:
+        """Largest amplitude at each frequency, at whichever mean allows it, N, shape (n_f,)."""
+        return np.asarray(self.amplitude.max(axis=0))
+
+    @property
+    def best_mean(self) -> FloatArray:
+        """The mean at which that is, N, shape (n_f,)."""
+        return np.asarray(self.mean[self.amplitude.argmax(axis=0)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, SI units."""
+        return {
+            "limit": self.limit, "carrier": self.carrier, "frequency": self.frequency.tolist(),
+            "mean": self.mean.tolist(), "amplitude": self.amplitude.tolist(), "largest": self.largest.tolist(),
+            "best_mean": self.best_mean.tolist(), "smallest_mean": self.smallest_mean,
+            "largest_mean": self.largest_mean,
+        }  # fmt: skip
+
+    def _page(self) -> Page:
+        wave = "without a carrier" if self.carrier is None else f"on a carrier of {format_si(self.carrier, 'Hz')}"
+        rows = [
+            (format_si(f, "Hz"), format_si(a, "N"), format_si(m, "N"))
+            for f, a, m in zip(*(x.tolist() for x in (self.frequency, self.largest, self.best_mean)), strict=True)
+        ]
+        said = (
+            f"up to {format_si(self.limit, 'V')} {wave} the friction's mean is from "
+            f"{format_si(self.smallest_mean, 'N')} to {format_si(self.largest_mean, 'N')}"
+        )
+        return Page([*head_lines(self.circuit), said, "", Table(("modulation", "largest amplitude", "at mean"), rows)])
+
+    def plot(self) -> Picture:
+        """The amplitude over frequency and mean as a map, and the largest over frequency."""
+        return plot_capability(self)
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write the map as CSV: one row for each frequency and mean."""
+        from fingerspice.studies.drive_files import write_columns
+
+        mean, f = np.meshgrid(self.mean, self.frequency, indexing="ij")
+        return write_columns(
+            Path(path), ("frequency (Hz)", "mean friction (N)", "largest amplitude (N)"),
+            (f.ravel(), mean.ravel(), self.amplitude.ravel()),
+        )  # fmt: skip
+
+
+def capability(
+    circuit: Circuit,
+    limit: float,
+    *,
+    carrier: float | None = None,
+    frequency: ArrayLike | None = None,
+    means: int = 13,
+    charge_law: str | None = None,
+    progress: Progress | None = None,
+) -> Capability:
+    """Map the friction that a series stack can make with a source of at most `limit` (V).
+
+    Parameters
+    ----------
+    circuit : Circuit
+        A series stack with one GAP and one V source.
+    limit : float
+        Largest voltage of the source, V.
+    carrier : float, optional
+        Hz; without it the drive is unipolar.
+    frequency : array_like, optional
+        Of the modulation, Hz; by default 13 from 5 Hz to 1 kHz, with a carrier to an eighth of it at most.
+    means : int
+        Means of the friction, from the smallest to the largest, 3 or more.
+    charge_law : str, optional
+        As in `simulate`.
+    progress : callable, optional
+        Called with the fraction done.
+
+    Raises
+    ------
+    InputError
+        For another circuit, and numbers out of range.
+    """
+    require_circuit(circuit)
+    require(math.isfinite(limit) and limit > 0.0, "limit", f"{limit:g} V", "> 0")
+    require(carrier is None or (math.isfinite(carrier) and carrier > 0.0), "carrier", f"{carrier} Hz", "> 0")
+    require(3 <= means <= 1000, "means", means, "3 to 1000")
+    top = 1000.0 if carrier is None else min(1000.0, carrier / 8.0)
+    f = np.geomspace(min(5.0, 0.1 * top), top, 13) if frequency is None else np.atleast_1d(np.asarray(frequency, float))
+    require(bool(np.all(np.isfinite(f) & (f > 0.0))) and f.ndim == 1, "frequency", f"{f.tolist()} Hz", "> 0")
+    if carrier is not None and f.max() > carrier / 4.0:
+        raise InputError(
+            f"frequency reaches {f.max():g} Hz; allowed: at most a quarter of the carrier's {carrier:g} Hz"
+        )
+    law = charge_law or circuit.charge_law or "local"
+    require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
+    finger = the_finger(circuit)
+    if not finger.direct:
+        raise InputError(
+            "a map of the friction needs a series stack driven by its source at once; allowed for any network with one "
+            "finger: inverse_drive (design)"
+        )
+    contact = finger.contact
+    if contact.mu == 0.0:
+        raise InputError(f"{finger.gap.name} has mu=0 and no friction; allowed: mu > 0")
+    # A gap voltage of ten times the limit is beyond what the layers' charges may add.
+    points = None if carrier is None else float(_PER_CARRIER)
+    area = finger.area
+    most = float(contact.stress(10.0 * limit)) * (float(contact.area(10.0 * limit)) if area is None else area)
+    curve = ForceCurve(contact, area, points, 0.4 * most)
+    search = _Search(curve, inverter_of(circuit, 10.0 * limit, law), limit, carrier)
+    largest = search.largest_mean(0.4 * most)
+    force = np.linspace(0.0, largest, means)
+    amplitude = np.zeros((means, f.size))
+    for i in range(1, means - 1):
+        for k, x in enumerate(f.tolist()):
+            amplitude[i, k] = search.amplitude(float(force[i]), x)
+        if progress is not None:
+            progress(i / (means - 2))
+    friction = contact.mu * (contact.f_n + force)
+    return Capability(
+        circuit, limit, carrier, f, friction, contact.mu * amplitude, float(friction[0]), float(friction[-1])
+    )
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Whether forces are within the limit, by the inverse drive."""
+
+    curve: ForceCurve
+    inverter: Inverter
+    limit: float
+    carrier: float | None
+
+    def holds(self, mean: float, amplitude: float, frequency: float) -> bool:
+        """Whether a force (N) of this modulation (N, Hz) takes no more than the limit."""
+        rate = max(_PER_PERIOD * frequency, _LEAST_RATE) if self.carrier is None else _PER_CARRIER * self.carrier
+        t = np.arange(math.ceil(max(_PERIODS / frequency, _LASTS) * rate)) / rate
+        u = self.curve.amplitude(np.maximum(mean + amplitude * np.sin(2.0 * np.pi * frequency * t), 0.0))
+        if self.carrier is not None:
+            u *= np.sin(2.0 * np.pi * self.carrier * t)
+        return not self.inverter.drive(u, 1.0 / rate, Limits(self.limit))[1].any()
+
+    def largest_mean(self, most: float) -> float:
+        """Largest force that lasts, N, to `_EXACT`."""
+        return _largest(lambda x: self.holds(x, 0.0, 1.0 / _LASTS), most)
+
+    def amplitude(self, mean: float, frequency: float) -> float:
+        """Largest amplitude (N) around a mean force (N)."""
+        return _largest(lambda x: self.holds(mean, x, frequency), mean)
+
+
+def _largest(holds: Callable[[float], bool], most: float) -> float:
+    """Largest number up to `most` that holds, to `_EXACT` of itself or a thousandth of that of `most`."""
+    if holds(most):
+        return most
+    low, high = 0.0, most
+    while high - low > _EXACT * max(low, 1e-3 * most):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low
+
+
+def plot_capability(found: Capability) -> Picture:
+    """The map of amplitudes, and the largest over frequency."""
+    from fingerspice.plots.drawing import BLUE, caption, dress, engineering, new_figure
+
+    figure, (left, right) = new_figure(1, 2, height=3.4, width_ratios=(1.25, 1))
+    factor, unit = engineering(found.largest_mean, "N")
+    mesh = left.contourf(
+        found.frequency, factor * found.mean, factor * found.amplitude, levels=12, cmap="viridis"
+    )  # fmt: skip
+    left.set_xscale("log")
+    dress(left, f"Mean friction [{unit}]", "Modulation frequency [Hz]")
+    bar = figure.colorbar(mesh, ax=left, pad=0.02)
+    bar.set_label(f"Largest amplitude [{unit}]", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    right.plot(found.frequency, factor * found.largest, color=BLUE, marker="o", markersize=3)
+    right.set_xscale("log")
+    right.set_ylim(bottom=0.0)
+    dress(right, f"Largest amplitude, best mean [{unit}]", "Modulation frequency [Hz]")
+    wave = "unipolar drive" if found.carrier is None else f"carrier {format_si(found.carrier, 'Hz')}"
+    caption(
+        figure,
+        f"{heading(found.circuit)} · at most {format_si(found.limit, 'V')}, {wave} · mean friction "
+        f"{format_si(found.smallest_mean, 'N')} to {format_si(found.largest_mean, 'N')}",
+    )
+    return figure

@@ -1,0 +1,390 @@
+"""The drive that makes a wanted electroadhesive force or friction, and a run that shows what it makes."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.pages import Page, Shown
+from fingerspice.circuit.arguments import require_circuit, require_number
+from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
+from fingerspice.solve.simulation import simulate
+from fingerspice.studies.inversion import Finger, Inverter, Limits, inverter_of, the_finger
+from fingerspice.studies.wanted import ForceCurve, Profile, Wanted, as_profile, check_forces, force_of_friction
+from fingerspice.waveforms.samples import Samples
+from fingerspice.waveforms.waveform import require
+
+if TYPE_CHECKING:
+    from fingerspice.plots.picture import Picture
+
+BoolArray = NDArray[np.bool_]
+
+# Rate of a drive where nothing gives one, Hz; of a carrier's period so many samples, and the fewest.
+RATE, PER_PERIOD, FEWEST = 48_000.0, 128, 20
+# Most samples of a drive: its transform and its run stay within a gigabyte.
+MOST_SAMPLES = 5_000_000
+# Error of the forward run; the miss of the gap voltage at which the correction ends, and corrections at most. A
+# correction that leaves more than this share of the miss is the last.
+RTOL, CLOSE, CORRECTIONS, STALLED = 1e-6, 1e-5, 25, 0.7
+# Time in which the force rises to its first value where something stands before the stack, s.
+LEAD = 2e-3
+
+
+@dataclass(frozen=True, repr=False)
+class InverseDrive(Shown):
+    """A drive, what it was to make and what a forward run says that it makes.
+
+    Attributes
+    ----------
+    circuit : Circuit
+        With the drive as its source.
+    drive : Samples
+        Of the source, V.
+    times : ndarray, shape (n,)
+        Where wanted and reached are compared, s: the samples, or with a carrier the middles of its periods.
+    wanted, force : ndarray, shape (n,)
+        Electroadhesive force wanted, and of the forward run, N; with a carrier means over its periods.
+    wanted_friction, friction : ndarray, shape (n,)
+        Friction, F_T = mu (F_N + F_el), N.
+    kind : str
+        ``"force"`` or ``"friction"``: what was asked for.
+    carrier : float or None
+        Hz.
+    limit, slew : float
+        V and V/s; inf for none.
+    lead : float
+        Time in which the drive rises to the first wanted value, s; it is no part of the comparison.
+    at_limit : float
+        Share of the samples at which a limit holds the drive.
+    corrections : int
+        Forward runs after the first.
+    """
+
+    circuit: Circuit
+    drive: Samples
+    times: FloatArray
+    wanted: FloatArray
+    force: FloatArray
+    wanted_friction: FloatArray
+    friction: FloatArray
+    kind: str
+    carrier: float | None
+    limit: float
+    slew: float
+    lead: float
+    at_limit: float
+    corrections: int
+
+    @property
+    def _miss(self) -> FloatArray:
+        return self.force - self.wanted if self.kind == "force" else self.friction - self.wanted_friction
+
+    @property
+    def _scale(self) -> float:
+        return float((self.wanted if self.kind == "force" else self.wanted_friction).max())
+
+    @property
+    def worst(self) -> float:
+        """Largest miss of what was asked for, N."""
+        return float(np.abs(self._miss).max())
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean square of the miss, N."""
+        return float(np.sqrt(np.mean(self._miss**2)))
+
+    @property
+    def worst_share(self) -> float:
+        """Largest miss over the largest wanted value."""
+        return self.worst / self._scale if self._scale > 0.0 else 0.0
+
+    @property
+    def rms_share(self) -> float:
+        """Rms miss over the largest wanted value."""
+        return self.rms / self._scale if self._scale > 0.0 else 0.0
+
+    @property
+    def peak(self) -> float:
+        """Largest voltage of the drive, V."""
+        return float(np.abs(self.drive.values).max())
+
+    def to_dict(self) -> dict[str, Any]:
+        """The figures as plain data, SI."""
+        return {
+            "kind": self.kind, "rate": self.drive.rate, "samples": self.drive.values.size, "carrier": self.carrier,
+            "limit": self.limit, "slew": self.slew, "lead": self.lead, "peak": self.peak, "at_limit": self.at_limit,
+            "worst": self.worst, "rms": self.rms, "worst_share": self.worst_share, "rms_share": self.rms_share,
+            "largest_wanted": self._scale,
+            "largest_reached": float((self.force if self.kind == "force" else self.friction).max()),
+            "corrections": self.corrections,
+        }  # fmt: skip
+
+    def _page(self) -> Page:
+        from fingerspice.studies.drive_files import drive_page
+
+        return drive_page(self)
+
+    def plot(self) -> Picture:
+        """Wanted against reached, the miss, and the drive."""
+        from fingerspice.studies.drive_files import plot_drive
+
+        return plot_drive(self)
+
+    def to_wav(self, path: str | Path, gain: float | None = None) -> Path:
+        """Write the drive as a WAV file of 32-bit integers.
+
+        Parameters
+        ----------
+        path : str or Path
+        gain : float, optional
+            V at full scale; the drive's own peak by default. ``WAV(path gain=...)`` reads it back.
+
+        Raises
+        ------
+        InputError
+            For a rate that is no whole number of Hz, a gain below the peak, or a path that cannot be written.
+        """
+        from fingerspice.studies.drive_files import drive_wav
+
+        return drive_wav(self, Path(path), gain)
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write the drive as CSV: time (s) and voltage (V)."""
+        from fingerspice.studies.drive_files import write_columns
+
+        t = np.arange(self.drive.values.size) / self.drive.rate
+        return write_columns(Path(path), ("time (s)", "drive (V)"), (t, self.drive.values))
+
+    def friction_to_csv(self, path: str | Path) -> Path:
+        """Write wanted and predicted force and friction as CSV."""
+        from fingerspice.studies.drive_files import write_columns
+
+        names = ("time (s)", "wanted force (N)", "force (N)", "wanted friction (N)", "friction (N)")
+        return write_columns(
+            Path(path), names, (self.times, self.wanted, self.force, self.wanted_friction, self.friction)
+        )
+
+
+def inverse_drive(
+    circuit: Circuit,
+    *,
+    force: Wanted | None = None,
+    friction: Wanted | None = None,
+    rate: float | None = None,
+    carrier: float | None = None,
+    limit: float | None = None,
+    slew: float | None = None,
+    duration: float | None = None,
+    lead: float | None = None,
+    charge_law: str | None = None,
+) -> InverseDrive:
+    """Find the source's voltage that makes a wanted electroadhesive force or friction, from an uncharged circuit on.
+
+    Parameters
+    ----------
+    circuit : Circuit
+        With one GAP and one V source, whose own waveform does not matter.
+    force, friction : array_like, waveform or function of time (s)
+        What is wanted, N, one of the two; an array is at `rate`. The force is that of Eq. 2 times the area, and the
+        friction mu (F_N + force).
+    rate : float, optional
+        Samples per second of the drive, linear between them; by default that of the wanted samples, else 48 kHz, and
+        with a carrier 128 times that.
+    carrier : float, optional
+        Hz: the gap's voltage is then an envelope times a sine, such that the mean force over a period of it is the
+        wanted one. Without a carrier the gap's voltage does not change its sign.
+    limit : float, optional
+        Largest voltage of the source, V.
+    slew : float, optional
+        Its largest change, V/s.
+    duration : float, optional
+        Length of a waveform or function without an end, s.
+    lead : float, optional
+        Time, s, in which the gap's voltage rises to its first value; by default 0 for a series stack, whose gap follows
+        the source at once, and 2 ms for another network.
+    charge_law : str, optional
+        As in `simulate`.
+
+    Returns
+    -------
+    InverseDrive
+
+    Raises
+    ------
+    InputError
+        For a force that no voltage makes, a circuit with several fingers or sources, and arguments that contradict
+        each other.
+    SolveError
+        Where the forward run fails.
+
+    Notes
+    -----
+    Where a limit holds the drive it stays at it and the layers go on from there; the force is the wanted one again as
+    soon as the limits allow. It does not prepare beforehand for what it cannot follow later.
+    """
+    require_circuit(circuit)
+    if (force is None) == (friction is None):
+        given = "neither" if force is None else "both"
+        raise InputError(f"of force and friction {given} is given; allowed: one of them")
+    for name, number in (("rate", rate), ("carrier", carrier), ("limit", limit), ("slew", slew)):
+        if number is not None:
+            require_number(name, number, "a number")
+            require(math.isfinite(number) and number > 0.0, name, f"{number:g}", "> 0")
+    law = charge_law or circuit.charge_law or "local"
+    require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
+    finger = the_finger(circuit)
+    kind, given_profile = ("force", force) if force is not None else ("friction", friction)
+    assert given_profile is not None
+    profile = as_profile(given_profile, kind, rate, duration)
+    rate = _rate(rate, carrier, profile)
+    rise = (0.0 if finger.direct else LEAD) if lead is None else lead
+    require(0.0 <= rise < 1e3, "lead", f"{rise:g} s", "0 or more, less than 1000")
+    task = _Task(circuit, finger, kind, profile, rate, carrier, round(rise * rate), law)
+    return task.solve(Limits(limit or math.inf, slew or math.inf))
+
+
+def _rate(rate: float | None, carrier: float | None, profile: Profile) -> float:
+    """The drive's rate, Hz."""
+    if carrier is not None:
+        if rate is not None and rate < FEWEST * carrier:
+            raise InputError(
+                f"a carrier of {carrier:g} Hz is too fast for a rate of {rate:g} Hz; allowed: at most a {FEWEST}th of "
+                f"it, {rate / FEWEST:g} Hz, or a higher rate"
+            )
+        rate = PER_PERIOD * carrier if rate is None else rate
+        if profile.duration * carrier < 1.0:
+            raise InputError(f"{profile.duration:g} s hold no period of the carrier; allowed: 1 or more")
+    rate = (profile.rate or RATE) if rate is None else rate
+    count = profile.duration * rate
+    allowed = f"2 to {MOST_SAMPLES:,} samples"
+    require(2.0 <= count + 1.0 <= MOST_SAMPLES, "the drive", f"{count:,.0f} samples long", allowed)
+    return rate
+
+
+class _Task:
+    """What is wanted of one circuit: at the drive's samples, and as it is compared."""
+
+    def __init__(
+        self, circuit: Circuit, finger: Finger, kind: str, profile: Profile, rate: float, carrier: float | None,
+        lead: int, law: str,
+    ) -> None:  # fmt: skip
+        self.circuit, self.finger, self.kind, self.law = circuit, finger, kind, law
+        self.rate, self.carrier, self.lead = rate, carrier, lead
+        # With a carrier the middles between the samples too: Simpson's rule needs them.
+        self.fine = 1 if carrier is None else 2
+        count = math.floor(profile.duration * rate * (1.0 + 1e-12)) + 1
+        t = np.arange(self.fine * (count - 1) + 1) / (self.fine * rate)
+        values = profile.wave.value(t)
+        if kind == "friction":
+            values = force_of_friction(values, finger.contact)
+        self.wanted = check_forces(values, t, kind, finger.contact)
+        self.curve = ForceCurve(
+            finger.contact, finger.area, None if carrier is None else rate / carrier, float(self.wanted.max())
+        )
+        u = self.curve.amplitude(self.wanted[:: self.fine])
+        u = np.append(u[0] * _rise(lead), u)
+        if carrier is not None:
+            u *= np.sin(2.0 * np.pi * carrier / rate * (np.arange(u.size) - lead))
+        self.target = u
+
+    def solve(self, limits: Limits) -> InverseDrive:
+        """The drive, corrected by what forward runs miss of the gap's voltage."""
+        peak = float(np.abs(self.target).max())
+        inverter = inverter_of(self.circuit, peak, self.law)
+        target, best, least, done = self.target, None, math.inf, -1
+        wish, levelled = target.copy(), self.carrier is None
+        while best is None or done < CORRECTIONS:
+            drive, held = inverter.drive(wish, 1.0 / self.rate, limits)
+            u, force = self._forward(drive, inverter)
+            miss = np.where(held, 0.0, target - u)
+            size = float(np.abs(miss[self.lead :]).max()) / max(peak, 1e-300)
+            done += 1
+            stalled = size > STALLED * least
+            if size < least:
+                best, least = (drive, held, force, done), size
+            if (size <= CLOSE or stalled) and levelled:
+                break
+            wish = wish + miss
+            if size <= CLOSE or stalled:
+                # Between samples the voltage of the gap is no sine: what that makes of the mean force is known now.
+                factor, levelled, least = np.where(held, 1.0, self._level(force)), True, math.inf
+                target, wish = target * factor, wish * factor
+        assert best is not None
+        return self._result(limits, *best)
+
+    def _forward(self, drive: FloatArray, inverter: Inverter) -> tuple[FloatArray, FloatArray]:
+        """Gap voltage at the samples (V), along the inverter's direction, and force at the fine times (N)."""
+        t = np.arange(self.fine * (drive.size - 1) + 1) / (self.fine * self.rate)
+        with warnings.catch_warnings():
+            # Those of the deck are said where it is read, and those of the last run are not of a drive on its way.
+            warnings.simplefilter("ignore", FingerspiceWarning)
+            run = simulate(
+                self._driven(drive), t_stop=float(t[-1]), t_eval=t, charge_law=self.law, rtol=RTOL, start="uncharged",
+                charge=False,
+            )  # fmt: skip
+        u, force = run.u_gap, run.f_el
+        assert u is not None
+        assert force is not None
+        return inverter.sign * u[:: self.fine], force
+
+    def _driven(self, drive: FloatArray) -> Circuit:
+        return self.circuit.varied({self.finger.source.name: Samples(drive, self.rate)})
+
+    def _edges(self) -> FloatArray:
+        """Ends of the carrier's whole periods after the lead, s."""
+        assert self.carrier is not None
+        count = math.floor((self.wanted.size - 1) / (2.0 * self.rate) * self.carrier * (1.0 + 1e-12))
+        return np.arange(count + 1) / self.carrier
+
+    def _level(self, force: FloatArray) -> FloatArray:
+        """Factors for the gap voltage, at the samples, that lift the mean force of each period to the wanted one."""
+        edges = self._edges()
+        reached, wanted = (_means(x, self.rate, edges) for x in (force[2 * self.lead :], self.wanted))
+        some = (reached > 0.5 * wanted) & (wanted > 1e-3 * wanted.max())
+        factor = np.sqrt(np.divide(wanted, reached, out=np.ones_like(wanted), where=some))
+        t = (np.arange(self.target.size) - self.lead) / self.rate
+        return np.interp(t, 0.5 * (edges[1:] + edges[:-1]), factor)
+
+    def _result(
+        self, limits: Limits, drive: FloatArray, held: BoolArray, force: FloatArray, corrections: int
+    ) -> InverseDrive:
+        lead, begin = self.lead / self.rate, self.lead * self.fine
+        reached, wanted = force[begin:], self.wanted
+        if self.carrier is None:
+            times = lead + np.arange(wanted.size) / self.rate
+        else:
+            edges = self._edges()
+            reached, wanted = (_means(x, self.rate, edges) for x in (reached, wanted))
+            times = lead + 0.5 * (edges[1:] + edges[:-1])
+        contact = self.finger.contact
+        wanted_friction, friction = (contact.mu * (contact.f_n + x) for x in (wanted, reached))
+        driven = self._driven(drive)
+        wave = driven[self.finger.source.name].waveform
+        assert isinstance(wave, Samples)
+        for array in (times, wanted, reached, wanted_friction, friction):
+            array.flags.writeable = False
+        return InverseDrive(
+            driven, wave, times, wanted, reached, wanted_friction, friction, self.kind, self.carrier, limits.voltage,
+            limits.slew, lead, float(held.mean()), corrections,
+        )  # fmt: skip
+
+
+def _rise(count: int) -> FloatArray:
+    """From 0 to 1 in `count` steps, 1 left out, with two smooth derivatives."""
+    x = np.arange(count) / max(count, 1)
+    return np.asarray(x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
+
+
+def _means(fine: FloatArray, rate: float, edges: FloatArray) -> FloatArray:
+    """Means between `edges` (s) of values at a rate (Hz) and in the middles between, by Simpson's rule."""
+    parts = (fine[:-2:2] + 4.0 * fine[1::2] + fine[2::2]) / (6.0 * rate)
+    total = np.append(0.0, np.cumsum(parts))
+    return np.asarray(np.diff(np.interp(edges, np.arange(total.size) / rate, total)) / np.diff(edges))

@@ -1,0 +1,178 @@
+"""The source's voltage for a wanted gap voltage: exact for a stack, by the linear response for another network."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import InputError
+from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.loop import network_of
+from fingerspice.circuit.network import Network
+from fingerspice.circuit.response import areas_at_rest
+from fingerspice.circuit.statespace import Stack, build_stack, contact_of, is_stack
+from fingerspice.circuit.topology import find_branches
+from fingerspice.engine.inverse import drive_stack, hold
+from fingerspice.physics.contact import Contact, fixed_area_curve
+
+BoolArray = NDArray[np.bool_]
+
+# Factor by which a signal is damped over the time of its transform, as exponent, so that its end does not reach its
+# begin: of what is damped the rounding grows by half of it.
+_DAMPING = 14.0
+# A source that moves the gap by less than this share of its largest response at some frequency does not drive it there.
+_DEAF = 1e-9
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the source may do: at most `voltage` (V), and changes of `slew` (V/s)."""
+
+    voltage: float = math.inf
+    slew: float = math.inf
+
+
+class Inverter(Protocol):
+    """What makes a source's voltage of the gap's."""
+
+    sign: float
+
+    def drive(self, u: FloatArray, h: float, limits: Limits) -> tuple[FloatArray, BoolArray]:
+        """Voltages of the source for gap voltages `u` (V, shape (n,)) every `h` (s), and where the limits hold it."""
+        ...
+
+
+@dataclass(frozen=True)
+class Finger:
+    """The one finger of a circuit.
+
+    Attributes
+    ----------
+    gap, source : Element
+    contact : Contact
+    area : float or None
+        Where the deck fixes it, m^2.
+    direct : bool
+        Whether nothing stands between the source and the stack.
+    """
+
+    gap: Element
+    source: Element
+    contact: Contact
+    area: float | None
+    direct: bool
+
+
+def the_finger(circuit: Circuit) -> Finger:
+    """The finger and the source of a circuit that has one of each.
+
+    Raises
+    ------
+    InputError
+        For several fingers or none, several sources or none, a current source, or an area that follows with a delay.
+    """
+    gaps = circuit.by_device("GAP")
+    if len(gaps) != 1:
+        found = ", ".join(g.name for g in gaps) or "none"
+        raise InputError(f"an inverse drive is that of one finger; this circuit has the GAPs {found}; allowed: one GAP")
+    sources = [e for e in find_branches(circuit)[1] if e.device in "VI"]
+    if len(sources) != 1 or sources[0].device != "V":
+        found = ", ".join(e.name for e in sources) or "none"
+        raise InputError(f"an inverse drive is that of one V source; this circuit has {found}; allowed: one V element")
+    if gaps[0].values["tau"] > 0.0:
+        tau = gaps[0].values["tau"]
+        raise InputError(f"{gaps[0].name} has tau={tau:g} s: its area follows with a delay; allowed here: tau=0")
+    if is_stack(circuit):
+        stack = build_stack(circuit)
+        assert stack.contact is not None
+        return Finger(gaps[0], sources[0], stack.contact, stack.area_given, True)
+    network = network_of(circuit)
+    area = next(a for a in network.areas if a.gap is not None and a.gap.name == gaps[0].name)
+    return Finger(gaps[0], sources[0], contact_of(gaps[0]), area.given, False)
+
+
+def inverter_of(circuit: Circuit, u_max: float, law: str) -> Inverter:
+    """What inverts the circuit up to gap voltages of `u_max` (V) under a charge law."""
+    if not is_stack(circuit):
+        return NetworkInverter(network_of(circuit))
+    return StackInverter(build_stack(circuit), u_max, law == "mobile")
+
+
+class StackInverter:
+    """Inverts a stack step by step; where a limit holds the source it goes on from the state of the layers."""
+
+    def __init__(self, stack: Stack, u_max: float, mobile: bool) -> None:
+        assert stack.contact is not None
+        assert stack.gap is not None
+        area = stack.area_given
+        self._curve = stack.contact.curve(1.2 * max(u_max, 1.0)) if area is None else fixed_area_curve(area)
+        self._cells = np.column_stack([stack.c, stack.g_total, stack.g_area])
+        self._gap, self._mobile = stack.gap, mobile
+        self._source = stack.sources[0][1]
+        #: Of a voltage along the loop that of the GAP, from p to n.
+        self.sign = float(stack.sign[stack.gap]) * self._source
+
+    def drive(self, u: FloatArray, h: float, limits: Limits) -> tuple[FloatArray, BoolArray]:
+        """As `Inverter.drive`; `u` counts along the source."""
+        out, held = np.empty(u.size), np.empty(u.size, np.bool_)
+        drive_stack(
+            u, h, self._curve, self._cells, self._gap, self._mobile, limits.voltage, limits.slew * h, out, held
+        )  # fmt: skip
+        return out, held
+
+
+class NetworkInverter:
+    """Inverts the linear response of a network at its areas at rest.
+
+    The signals are damped, exp(-a t): then the response has no zero on the way (a body that floats passes no direct
+    voltage), and the end of the signal does not reach round to its begin.
+    """
+
+    sign = 1.0
+
+    def __init__(self, network: Network) -> None:
+        areas = areas_at_rest(network)
+        self._leak, self._c = network.leak(areas), network.capacitance(areas)
+        self._network = network
+        self._gap = next(g for g in network.gaps if g is not None)
+
+    def response(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Gap voltage over the source's at complex frequencies (1/s), shape (n,).
+
+        Raises
+        ------
+        InputError
+            Where the source does not reach the gap.
+        """
+        net = self._network
+        y = self._leak + s[:, None] * self._c
+        kernel = net.k + np.einsum("ci,fc,cj->fij", net.p, y, net.p, optimize=True)
+        right = net.b[:, 0] + np.einsum("ci,fc,c->fi", net.p, y, net.q[:, 0], optimize=True)
+        x = np.linalg.solve(kernel, -right[:, :, None])[:, :, 0]
+        gain = x @ net.p[self._gap] + net.q[self._gap, 0]
+        if not np.all(np.abs(gain) > _DEAF * np.abs(gain).max(initial=0.0)):
+            raise InputError(
+                f"{net.sources[0].name} does not drive the gap at every frequency of the drive; allowed: a source with "
+                "a path to the GAP, and a lower rate"
+            )
+        return np.asarray(gain)
+
+    def drive(self, u: FloatArray, h: float, limits: Limits) -> tuple[FloatArray, BoolArray]:
+        """As `Inverter.drive`."""
+        from scipy.fft import irfft, next_fast_len, rfft
+
+        n = u.size
+        m = next_fast_len(2 * n, real=True)
+        damp = np.exp(-_DAMPING / (m * h) * h * np.arange(m))
+        spectrum = rfft(np.append(u, np.full(m - n, u[-1])) * damp)
+        s = _DAMPING / (m * h) + 2j * np.pi * np.arange(spectrum.size) / (m * h)
+        gain = self.response(s)
+        wish = irfft(spectrum / gain, m)[:n] / damp[:n]
+        out, held = np.empty(n), np.empty(n, np.bool_)
+        hold(wish, limits.voltage, limits.slew * h, out, held)
+        return out, held

@@ -1,0 +1,242 @@
+"""The inverse drive: what it asks of the source makes what was wanted, and what cannot be made is said."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import analytic as ref
+import fingerspice as fs
+from commands import Command
+from fingerspice.waveforms.files import read_wav
+from scenes import table1
+
+CIRCUITS = Path(__file__).parents[1] / "circuits"
+DISPERSIVE = """Table 1, dispersive skin
+.include fingerspice.lib
+Vdrive drive 0 SIN(0 200 100)
+Xcoat drive top area LAYER d=1u eps_r=3.9 r=0.2meg
+Xgap top skin area GAP d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000
+Xskin skin 0 area SKIN_DISPERSIVE d=350u
+.tran 10u 50m uic
+.end
+"""
+pytestmark = pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
+
+
+def profile(seed: int, duration: float = 0.03, rate: float = 48e3, band: float = 150.0) -> fs.Samples:
+    """A friction of some random tones up to `band` (Hz), from 0.16 to 0.22 N."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(duration * rate) + 1) / rate
+    tones = sum(
+        rng.normal() * np.sin(2 * np.pi * f * t + rng.uniform(0, 2 * np.pi)) for f in rng.uniform(10.0, band, 5)
+    )
+    assert isinstance(tones, np.ndarray)
+    low, high = np.sort(rng.uniform(0.16, 0.22, 2))
+    return fs.Samples(low + (high - low) * (tones - tones.min()) / np.ptp(tones), rate)
+
+
+def amplifier() -> fs.Circuit:
+    return fs.read_netlist(CIRCUITS / "amplifier.cir")
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("carrier", [None, 2000.0])
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_a_stack_makes_the_wanted_friction(seed: int, carrier: float | None, law: str) -> None:
+    found = fs.inverse_drive(table1(), friction=profile(seed), carrier=carrier, charge_law=law)
+    assert found.worst_share < 1e-4
+    assert found.at_limit == 0.0
+
+
+@pytest.mark.parametrize("carrier", [None, 2000.0])
+def test_a_dispersive_skin_is_inverted(carrier: float | None) -> None:
+    assert fs.inverse_drive(fs.parse_netlist(DISPERSIVE), friction=profile(7), carrier=carrier).worst_share < 1e-4
+
+
+@pytest.mark.parametrize("deck", ["amplifier", "ungrounded_user"])
+def test_what_stands_around_the_stack_is_corrected(deck: str) -> None:
+    circuit = fs.read_netlist(CIRCUITS / f"{deck}.cir")
+    found = fs.inverse_drive(circuit, friction=profile(3, 0.01))
+    assert found.worst_share < 1e-4
+    assert found.lead == 2e-3
+    assert found.times[0] == pytest.approx(2e-3)
+
+
+def test_a_carrier_behind_an_amplifier() -> None:
+    assert fs.inverse_drive(amplifier(), friction=profile(4, 0.005), carrier=2000.0).worst_share < 1e-4
+
+
+def test_a_run_of_its_own_finds_the_same_force() -> None:
+    found = fs.inverse_drive(table1(), force=fs.Sum((fs.DC(0.2), fs.Sine(0.1, 60.0))), duration=0.02)
+    t = np.linspace(0.0, 0.02, 301)
+    run = fs.simulate(found.circuit, t_stop=0.02, t_eval=t, rtol=1e-9)
+    # Between the samples too, where right after the start the layers' fast part shows (8e-5).
+    np.testing.assert_allclose(run.f_el, 0.2 + 0.1 * np.sin(2 * np.pi * 60.0 * t), rtol=0.0, atol=1e-4 * 0.3)
+
+
+def test_the_independent_transient_makes_the_wanted_force() -> None:
+    """Forward by tests/analytic.py, which shares nothing with the package: a force that rises and falls."""
+    rate, n = 20e3, 41
+    wanted = 0.15 + 0.1 * np.sin(2 * np.pi * 250.0 * np.arange(n) / rate)
+    found = fs.inverse_drive(table1(), force=wanted, rate=rate)
+    points = list(zip((np.arange(n) / rate).tolist(), found.drive.values.tolist(), strict=True))
+    force = forward_of_reference(points)
+    np.testing.assert_allclose(force, wanted, atol=1e-4 * wanted.max())
+
+
+def forward_of_reference(points: list[tuple[float, float]]) -> np.ndarray:
+    """F_el (N) at the points, by the reference's own transient."""
+    t = np.array([x for x, _ in points])
+    run = ref.transient(ref.pwl_segments(points), t.tolist(), freq=100.0)
+    return np.asarray(run.force)
+
+
+def test_a_limit_holds_the_drive_and_its_cost_is_said() -> None:
+    free = fs.inverse_drive(table1(), friction=profile(1))
+    limit = 0.9 * free.peak
+    held = fs.inverse_drive(table1(), friction=profile(1), limit=limit)
+    assert held.peak == pytest.approx(limit)
+    assert 0.0 < held.at_limit < 1.0
+    assert held.worst > 100.0 * free.worst
+    assert held.rms <= held.worst
+    assert "cost" in str(held)
+    # Where the drive is below its limit the friction is the wanted one again.
+    away = np.abs(held.drive.values) < 0.999 * limit
+    assert np.abs(held.friction - held.wanted_friction)[away].max() < 1e-4 * 0.22
+
+
+def test_a_slew_rate_is_kept() -> None:
+    found = fs.inverse_drive(table1(), friction=profile(1), slew=2e4)
+    assert np.abs(np.diff(found.drive.values)).max() <= 2e4 / 48e3 * (1.0 + 1e-9)
+    assert found.at_limit > 0.0
+
+
+def test_no_other_drive_within_the_limit_does_much_better() -> None:
+    """A search over all samples of a small case, started at the clipped drive."""
+    rate, n = 2000.0, 10
+    wanted = 0.25 + 0.15 * np.sin(2 * np.pi * 200.0 * np.arange(n) / rate)
+    free = fs.inverse_drive(table1(), force=wanted, rate=rate)
+    limit = 0.9 * free.peak
+    held = fs.inverse_drive(table1(), force=wanted, rate=rate, limit=limit)
+    t = np.arange(n) / rate
+
+    def cost(values: np.ndarray) -> float:
+        drive = fs.Samples(values, rate)
+        run = fs.simulate(table1(), sources=drive, t_stop=t[-1], t_eval=t, rtol=1e-8, start="uncharged", charge=False)
+        return 1e4 * float(np.mean((run.f_el - wanted) ** 2))
+
+    start = held.drive.values.copy()
+    best = minimize(cost, start, bounds=[(-limit, limit)] * n, method="L-BFGS-B", options={"maxiter": 60})
+    assert math.sqrt(cost(start) / 1e4) == pytest.approx(held.rms, rel=1e-3)
+    assert held.rms <= OPTIMAL * math.sqrt(best.fun / 1e4)
+
+
+#: Rms miss of the clipped drive over that of the best one found by search.
+OPTIMAL = 1.05
+
+
+BAD = [
+    ({"friction": [0.2, math.nan, 0.2], "rate": 1e3}, "friction: row 1 is nan"),
+    ({"friction": [0.2, 0.1, 0.2], "rate": 1e3}, "friction: 0.1 N at 0.001 s is reached by no voltage"),
+    ({"force": [0.2, -0.1], "rate": 1e3}, "force: -0.1 N at 0.001 s is reached by no voltage"),
+    ({"force": [0.2, 0.1]}, "force is an array without a rate"),
+    ({"force": [0.1, 0.2], "friction": [0.2, 0.3], "rate": 1e3}, "both is given"),
+    ({}, "neither is given"),
+    ({"force": fs.Sine(0.1, 60.0)}, "duration="),
+    ({"force": [0.1] * 100, "rate": 1e3, "carrier": 100.0}, "too fast for a rate of 1000 Hz"),
+    ({"force": [0.1] * 3, "rate": 1e3, "limit": -5.0}, "limit is -5"),
+    ({"force": [1e9] * 3, "rate": 1e3}, "reached by no voltage"),
+    ({"force": [0.1] * 3, "rate": 1e3, "charge_law": "no"}, "charge_law is 'no'"),
+]
+
+
+@pytest.mark.parametrize(("given", "said"), BAD, ids=lambda x: x if isinstance(x, str) else "")
+def test_what_cannot_be_is_refused(given: dict[str, object], said: str) -> None:
+    with pytest.raises(fs.InputError) as caught:
+        fs.inverse_drive(table1(), **given)  # type: ignore[arg-type]
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_circuits_without_one_finger_and_one_source_are_refused() -> None:
+    for deck, said in (("two_fingers", "one finger"), ("current_drive", "one V"), ("fingerpad_dispersive", "one V")):
+        with pytest.raises(fs.InputError, match=said):
+            fs.inverse_drive(fs.read_netlist(CIRCUITS / f"{deck}.cir"), force=[0.1, 0.1], rate=1e3)
+    with pytest.raises(fs.InputError, match="tau"):
+        fs.inverse_drive(table1(gap={"tau": 1e-3}), force=[0.1, 0.1], rate=1e3)
+    with pytest.raises(fs.InputError, match="mu=0"):
+        fs.inverse_drive(table1(gap={"mu": 0}), friction=[0.1, 0.1], rate=1e3)
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    found = fs.inverse_drive(table1(), friction=profile(2, 0.005))
+    found.to_wav(tmp_path / "a.wav")
+    read = read_wav(tmp_path / "a.wav")
+    assert read.rate == 48e3
+    np.testing.assert_allclose(found.peak * read.values, found.drive.values, atol=1e-9 * found.peak)
+    found.to_csv(tmp_path / "a.csv")
+    again = fs.PWL.from_table(tmp_path / "a.csv")
+    np.testing.assert_array_equal(again.values, found.drive.values)
+    with pytest.raises(fs.InputError, match="gain"):
+        found.to_wav(tmp_path / "b.wav", gain=1.0)
+
+
+def test_the_picture_shows_wanted_and_reached() -> None:
+    figure = fs.inverse_drive(table1(), friction=profile(2, 0.005), limit=150.0).plot()
+    top, middle, bottom = figure.axes
+    assert [x.get_label() for x in top.get_lines()] == ["wanted", "reached"]
+    assert (top.get_ylabel(), bottom.get_ylabel()) == ("Friction [mN]", "Drive [V]")
+    assert middle.get_ylabel().startswith("Miss [")
+    assert bottom.get_xlabel() == "Time [ms]"
+
+
+def table(rows: str) -> None:
+    Path("wanted.csv").write_text(rows)
+
+
+ROWS = "time (ms), friction (mN)\n" + "".join(f"{0.1 * i:.1f}, {170 + i % 7}\n" for i in range(60))
+
+
+def test_design_writes_drive_prediction_and_picture(command: Command) -> None:
+    table(ROWS)
+    result = command("design", "wanted.csv", "pad.cir", "--out", "got", "--rate", "10k", "--json")
+    answer = json.loads(result.out)
+    assert result.code == 0, result.err
+    assert answer["kind"] == "friction"
+    assert answer["worst_share"] < 1e-4
+    assert {Path(x).name for x in answer["files"]} == {
+        "pad_drive.wav", "pad_drive.csv", "pad_friction.csv", "pad_design.png"
+    }  # fmt: skip
+    head = Path("got/pad_friction.csv").read_text().splitlines()[0]
+    assert head == "time (s),wanted force (N),force (N),wanted friction (N),friction (N)"
+    drive = f"WAV(got/pad_drive.wav gain={answer['peak']!r})"
+    assert command("run", "pad.cir", "--source", drive, "--stop", "5m", "--no-plot", "--out", "again").code == 0
+
+
+@pytest.mark.parametrize(
+    ("rows", "words", "said"),
+    [
+        ("0, 0.2\n0.1, 0.2\n", [], "no header"),
+        ("time; friction\n0; 0.2\n1; 0.2\n", [], "semicolons"),
+        ("time friction\n0 0,2\n1 0,2\n", [], "decimal comma"),
+        ("time,friction\n0,0.2\n1,nan\n", [], "line 3: column 'friction' is nan"),
+        ("time,friction\n1,0.2\n0,0.2\n", [], "line 3: the time 0 s follows 1 s"),
+        ("time,volts\n1,0.2\n2,0.2\n", [], "one column named force or friction"),
+        ("time,friction (V)\n1,0.2\n2,0.2\n", [], "the unit of column 'friction' is 'V'"),
+        ("time,friction\n0,0.2\n0.1,0.2\n0.2,0.2\n", ["--rate", "1k"], "its times are at 10 Hz"),
+        ("friction\n0.2\n0.2\n", [], "no column of times and no rate"),
+        ("time,friction\n0,0.1\n0.1,0.2\n", [], "reached by no voltage"),
+    ],
+)
+def test_bad_tables_are_refused_in_one_sentence(command: Command, rows: str, words: list[str], said: str) -> None:
+    table(rows)
+    result = command("design", "wanted.csv", "pad.cir", *words)
+    assert result.code == 2
+    assert said in result.err
+    assert len(result.err.strip().splitlines()) == 1

@@ -1,0 +1,405 @@
+"""Runs chunk by chunk: the same bits as the whole, in constant memory, into a store that a crash does not harm."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import random
+import re
+import signal
+import struct
+import time
+import tracemalloc
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+import recording_errors
+from commands import Command, tree
+from fingerspice.cli.store import Store
+from fingerspice.solve import recordings, windows
+from fingerspice.waveforms import samples
+from processes import ended, no_room, start
+from scenes import table1_deck
+from test_source_files import wav as wav_bytes
+
+RATE = 48_000.0
+NAMES = ("t", "u_gap", "f_el", "q_source", "i_source", "u_source", "u_layer", "friction")
+
+
+@pytest.fixture(autouse=True)
+def _without_warnings() -> Iterator[None]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", fs.FingerspiceWarning)
+        yield
+
+
+def wav(path: Path, count: int, high: float = 4000.0) -> Path:
+    """A WAV file of noise, 16 bits, its first half ten times more quiet."""
+    from scipy.io import wavfile
+
+    values = recording_errors.noise(3, count, RATE, 50.0, high)
+    values[: count // 2] *= 0.1
+    wavfile.write(path, int(RATE), np.round(32767.0 * values).astype(np.int16))
+    return path
+
+
+def deck(path: Path, recording: Path, seconds: float) -> Path:
+    """Table 1 under a recording at 150 V."""
+    text = table1_deck()
+    (source,) = (line for line in text.splitlines() if line.startswith("Vdrive"))
+    (tran,) = (line for line in text.splitlines() if line.startswith(".tran"))
+    text = text.replace(source, f"Vdrive drive 0 WAVEFILE({recording.name} 150)")
+    path.write_text(text.replace(tran, f".tran 50u {seconds!r} uic"))
+    return path
+
+
+def joined(chunks: list[fs.Solution], name: str) -> np.ndarray:
+    return np.concatenate([getattr(chunk, name) for chunk in chunks])
+
+
+@pytest.mark.parametrize("skin", ["frozen", "dispersive"])
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_chunks_are_the_whole_to_the_last_bit(law: str, skin: str, tmp_path: Path) -> None:
+    count = 2 * recordings.PIECE + 1234
+    path = wav(tmp_path / "a.wav", count)
+    text = table1_deck()
+    circuit = fs.parse_netlist(
+        re.sub(r"SKIN (d=\S+) f=\S+", r"SKIN_DISPERSIVE \1", text) if skin == "dispersive" else text
+    )
+    assert bool(circuit.by_device("SKIN_DISPERSIVE")) == (skin == "dispersive")
+    drive, stop = fs.Samples.from_wav(path, 150.0), (count - 1.4) / RATE
+    how = {"t_stop": stop, "rtol": 1e-4, "charge_law": law, "start": "uncharged"}
+    t = np.arange(count - 1) / RATE
+    whole = fs.simulate(circuit, sources=drive, t_eval=t, **how)
+    assert whole.method == "relaxation"
+    for length in (977, recordings.PIECE, 10**6):
+        lazy = fs.Samples.from_wav(path, 150.0, at_once=False)
+        stream = fs.stream(circuit, sources=lazy, count=length, **how)
+        chunks = list(stream)
+        assert len(chunks) == len(stream) == -(-t.size // length)
+        for name in NAMES:
+            np.testing.assert_array_equal(joined(chunks, name), getattr(whole, name))
+        assert chunks[-1].error == whole.error
+        # The samples were never in memory at once.
+        assert "values" not in vars(lazy)
+
+
+@pytest.mark.parametrize("step", [1e-3, 1.7e-5])
+def test_outputs_between_samples_are_those_of_the_whole_too(step: float) -> None:
+    values = 150.0 * recording_errors.noise(5, recordings.PIECE + 500, RATE, 50.0, 4000.0)
+    samples, circuit = fs.Samples(values, RATE, start=0.3 / RATE), fs.parse_netlist(table1_deck())
+    how = {"sources": samples, "t_stop": (values.size - 3) / RATE, "rtol": 1e-5, "start": "uncharged"}
+    chunks = list(fs.stream(circuit, chunk=0.31, step=step, **how))
+    t = joined(chunks, "t")
+    np.testing.assert_array_equal(t, step * np.arange(t.size))
+    whole = fs.simulate(circuit, t_eval=t, **how)
+    for name in ("u_gap", "f_el", "q_source"):
+        np.testing.assert_array_equal(joined(chunks, name), getattr(whole, name))
+
+
+def test_a_quiet_beginning_is_followed_to_its_own_scale() -> None:
+    values = 150.0 * recording_errors.noise(5, 2 * recordings.PIECE, RATE, 50.0, 4000.0)
+    values[: recordings.PIECE] *= 0.05
+    samples, circuit = fs.Samples(values, RATE), fs.parse_netlist(table1_deck())
+    how = {"sources": samples, "t_stop": (values.size - 1) / RATE, "rtol": 1e-4, "start": "uncharged", "charge": False}
+    first = next(fs.stream(circuit, count=recordings.PIECE, **how))
+    exact = fs.simulate(circuit, t_eval=first.t[:4000], **how | {"t_stop": 0.1, "rtol": 1e-10})
+    peak = np.abs(first.u_gap).max()
+    assert peak < 10.0
+    assert np.abs(first.u_gap[:4000] - exact.u_gap).max() <= first.error.u_gap <= 1e-4 * peak
+
+
+@pytest.mark.parametrize("name", ["two_fingers", "amplifier", "fingerpad_square", "texture_recording"])
+def test_any_circuit_is_streamed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(windows, "WINDOW", 400)
+    circuit = fs.read_netlist(Path(__file__).parents[1] / "circuits" / f"{name}.cir")
+    how = {"rtol": 1e-6, "t_stop": 0.03}
+    one, other = (list(fs.stream(circuit, count=count, **how)) for count in (251, 10**6))
+    for signal_name in ("t", "u_gap", "q_source"):
+        np.testing.assert_array_equal(joined(one, signal_name), joined(other, signal_name))
+    whole = fs.simulate(circuit, t_eval=np.minimum(joined(one, "t"), 0.03), **how)
+    # Each window states its own error, and what one leaves dies away in the next.
+    assert np.abs(joined(one, "u_gap") - whole.u_gap).max() <= 4e-6 * np.abs(whole.u_gap).max()
+
+
+def test_what_cannot_be_followed_by_samples_goes_on_by_other_steps() -> None:
+    values = 100.0 * recording_errors.noise(5, recordings.PIECE + 600, RATE, 50.0, 2000.0)
+    # Beyond the range of the area's polynomial, in the second piece only.
+    values[recordings.PIECE + 300 :] *= 40.0
+    samples, circuit = fs.Samples(values, RATE), fs.parse_netlist(table1_deck())
+    how = {"sources": samples, "t_stop": (values.size - 1) / RATE, "rtol": 1e-4, "start": "uncharged"}
+    chunks = list(fs.stream(circuit, count=recordings.PIECE // 2, **how))
+    assert chunks[-1].success
+    tail = fs.simulate(circuit, t_eval=chunks[-1].t, **how)
+    assert np.abs(chunks[-1].u_gap - tail.u_gap).max() <= 3e-4 * np.abs(tail.u_gap).max()
+
+
+def test_a_stream_goes_on_from_a_mark() -> None:
+    values = 150.0 * recording_errors.noise(5, 2 * recordings.PIECE, RATE, 50.0, 4000.0)
+    circuit = fs.parse_netlist(table1_deck())
+    for sources in (fs.Samples(values, RATE), fs.Square(200.0, 100.0)):
+        how = {"sources": sources, "t_stop": 2.7, "rtol": 1e-4, "step": 3e-5, "count": 20_011, "start": "uncharged"}
+        whole = list(fs.stream(circuit, **how))
+        stream = fs.stream(circuit, **how)
+        for number in range(1, len(whole)):
+            next(stream)
+            # As a file keeps it.
+            mark = json.loads(json.dumps(stream.mark()))
+            other = fs.stream(circuit, **how)
+            other.go_to(mark, number * 20_011)
+            chunk = next(other)
+            for name in ("t", "u_gap", "q_source"):
+                np.testing.assert_array_equal(getattr(chunk, name), getattr(whole[number], name))
+
+
+def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
+    circuit, most = fs.parse_netlist(table1_deck()), []
+    for seconds in (25, 25, 75):
+        path = wav(tmp_path / f"{seconds}.wav", 48_000 * seconds)
+        tracemalloc.start()
+        samples = fs.Samples.from_wav(path, 150.0, at_once=False)
+        for chunk in fs.stream(circuit, sources=samples, t_stop=seconds - 0.1, rtol=1e-3, chunk=2.0, start="uncharged"):
+            assert chunk.f_el is not None
+        most.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert most[2] < 1.1 * most[1] + 1e6
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"chunk": 0.0}, "chunk is 0 s; allowed: > 0 s"),
+        ({"chunk": "1"}, "chunk is '1', a str; allowed: a number in s"),
+        ({"count": 0}, "count is 0; allowed: a whole number from 1 on"),
+        ({"count": 3, "chunk": 1.0}, "count is given beside chunk; allowed: one of them"),
+        ({"step": -1.0}, "step is -1 s; allowed: > 0 s"),
+        ({"method": "euler"}, "unknown method 'euler'"),
+        ({"rtol": 1.0}, "rtol is 1.0; allowed"),
+        ({"count": 10**10, "step": 1e-12, "t_stop": 1.0}, "outputs with"),
+    ],
+)
+def test_a_stream_that_cannot_be_is_refused_at_once(given: dict[str, object], said: str) -> None:
+    with pytest.raises(fs.InputError, match=said.replace("(", r"\(")):
+        fs.stream(fs.parse_netlist(table1_deck()), **given)
+
+
+def test_a_run_that_fails_gives_what_came_before() -> None:
+    circuit = fs.parse_netlist(table1_deck())
+    source = fs.Function(lambda t: np.where(t < 0.12345, 100.0 * np.sin(700.0 * t), np.nan))
+    found = []
+    with pytest.raises(fs.SolveError) as caught:
+        found.extend(fs.stream(circuit, sources=source, t_stop=0.3, step=1e-4, count=500, start="uncharged", rtol=1e-5))
+    assert caught.value.failure.status is fs.Status.SOURCE_NOT_FINITE
+    assert len(found) == 2
+    assert all(chunk.success for chunk in found)
+    assert caught.value.solution.t[0] == pytest.approx(0.1)
+    assert caught.value.solution.t[-1] == pytest.approx(0.12345, abs=1e-4)
+
+
+# Recordings in files --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+@pytest.mark.parametrize(("bits", "kind"), [(8, 1), (16, 1), (24, 1), (32, 1), (32, 3), (64, 3)])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_parts_of_a_file_are_those_of_the_whole(
+    bits: int, kind: int, channels: int, order: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(samples, "AT_ONCE", 50)
+    rng = np.random.default_rng(bits)
+    if kind == 3:
+        floats = rng.uniform(-1.0, 1.0, 301 * channels).astype(f"{'<' if order == 'little' else '>'}f{bits // 8}")
+        data = floats.tobytes()
+    else:
+        data = rng.integers(0, 256, 301 * channels * bits // 8, dtype=np.uint8).tobytes()
+    file = wav_bytes(data, bits, kind=kind, channels=channels)
+    if order == "big":
+        head, (tag, lanes, rate, flow, block, depth) = b"RIFX", struct.unpack("<HHIIHH", file[20:36])
+        size = struct.pack(">I", len(file) - 8)
+        form = struct.pack(">IHHIIHH", 16, tag, lanes, rate, flow, block, depth)
+        file = head + size + b"WAVEfmt " + form + b"data" + struct.pack(">I", len(data)) + data
+    path = tmp_path / "a.wav"
+    path.write_bytes(file)
+    channel = channels - 1
+    whole = fs.Samples.from_wav(path, 150.0, channel)
+    parts = fs.Samples.from_wav(path, 150.0, channel, at_once=False)
+    assert (parts.rate, parts.count) == (whole.rate, whole.count) == (8000.0, 301)
+    t = np.append(rng.uniform(-0.01, 0.05, 200), np.arange(301) / 8000.0)
+    np.testing.assert_array_equal(parts.value(t), whole.value(t))
+    np.testing.assert_array_equal(parts.breakpoints(0.001, 0.02), whole.breakpoints(0.001, 0.02))
+    np.testing.assert_array_equal(parts.between(-3, 305), whole.between(-3, 305))
+    assert parts.peak(0.0, 0.03) == whole.peak(0.0, 0.03)
+    edges = np.arange(20, 31) / 8000.0
+    np.testing.assert_array_equal(parts.terms(edges[:-1], edges[1:]), whole.terms(edges[:-1], edges[1:]))
+    assert "values" not in vars(parts)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(parts)).values, whole.values)
+    np.testing.assert_array_equal(parts.values, whole.values)
+    np.testing.assert_array_equal(parts.value(t), whole.value(t))
+
+
+def test_a_file_that_is_not_sound_is_refused_as_ever(tmp_path: Path) -> None:
+    good, path = wav_bytes(bytes(400), 16), tmp_path / "a.wav"
+    nan = wav_bytes(np.array([0.0] * 99 + [np.nan], "<f4").tobytes(), 32, kind=3)
+    for content in (good[:-3], good[:30], b"RIFF", good[:20] + b"\x55" + good[21:], nan):
+        path.write_bytes(content)
+        said = []
+        for at_once in (True, False):
+            with pytest.raises(fs.InputError) as caught:
+                fs.Samples.from_wav(path, 150.0, at_once=at_once)
+            said.append(str(caught.value))
+        assert said[0] == said[1]
+
+
+def test_a_file_that_becomes_shorter_ends_a_stream_in_one_sentence(tmp_path: Path) -> None:
+    path = wav(tmp_path / "a.wav", 3 * recordings.PIECE)
+    drive = fs.Samples.from_wav(path, 150.0, at_once=False)
+    stream = fs.stream(fs.parse_netlist(table1_deck()), sources=drive, t_stop=4.0, rtol=1e-3, count=recordings.PIECE)
+    next(stream)
+    path.write_bytes(path.read_bytes()[: 3 * recordings.PIECE])
+    with pytest.raises(fs.InputError, match="has become shorter while it was read"):
+        list(stream)
+
+
+# The store ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """A folder with a deck of 4 s, streamed in 40 pieces."""
+    pytest.importorskip("zarr")
+    deck(tmp_path / "long.cir", wav(tmp_path / "a.wav", 200_000), 4.0)
+    return tmp_path
+
+
+STREAM = ("run", "long.cir", "--stream", "--rtol", "1e-4", "--chunk", "0.1", "--signals", "u_gap,f_el,u_layer")
+
+
+def test_a_store_holds_the_run(scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    import xarray
+
+    monkeypatch.chdir(scene)
+    result = command(*STREAM, "--netcdf", "--json")
+    assert result.code == 0
+    answer = json.loads(result.out)
+    assert answer["stream"]["chunks"] == 41
+    assert (answer["method"], answer["files"]) == ("relaxation", ["out/long.zarr", "out/long.nc"])
+    circuit = fs.read_netlist("long.cir")
+    whole = fs.simulate(circuit, t_eval=np.arange(192_001) / RATE, rtol=1e-4, charge=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for given in (
+            xarray.open_dataset("out/long.zarr", engine="zarr", consolidated=False),
+            xarray.open_dataset("out/long.nc"),
+        ):
+            np.testing.assert_array_equal(given["time"], whole.t)
+            np.testing.assert_array_equal(given["f_el"], whole.f_el)
+            np.testing.assert_array_equal(given["u_layer"], whole.u_layer)
+            assert given["u_gap"].attrs["units"] == "V"
+            given.close()
+    # Once more: everything is there.
+    again = json.loads(command(*STREAM, "--json").out)
+    assert again["stream"]["found"] == 41
+    assert again["error"] == answer["error"]
+
+
+def test_a_killed_run_goes_on_to_the_same_bytes(scene: Path) -> None:
+    whole = start(scene, *STREAM, "--out", "whole")
+    begun = time.perf_counter()
+    assert ended(whole)[0] == 0
+    took, rng = time.perf_counter() - begun, random.Random(17)
+    killed = 0
+    for _ in range(6):
+        process = start(scene, *STREAM, "--out", "parts")
+        time.sleep(rng.uniform(0.3, 1.0) * took)
+        process.send_signal(signal.SIGKILL)
+        killed += process.wait() == -signal.SIGKILL
+        process.communicate()
+    assert killed > 0
+    assert ended(start(scene, *STREAM, "--out", "parts"))[0] == 0
+    assert tree(scene / "parts" / "long.zarr") == tree(scene / "whole" / "long.zarr")
+
+
+def test_a_full_disk_loses_nothing(scene: Path) -> None:
+    # A piece of u_layer has 115 kB, and one of u_gap 38 kB.
+    code, lines, _ = ended(start(scene, *STREAM, preexec_fn=no_room(60_000)))
+    assert code == 2
+    (line,) = lines
+    assert line.startswith("fingerspice: cannot write out/long.zarr: ")
+    assert line.endswith("0 of 41 pieces are written, and the same command goes on from there")
+    # There is room for the pieces, and not for the whole in one file.
+    code, lines, _ = ended(start(scene, *STREAM, "--netcdf", preexec_fn=no_room(1_000_000)))
+    assert code == 2
+    assert lines == ["fingerspice: cannot write out/long.nc: File too large"]
+    assert not (scene / "out" / "long.nc").exists()
+    assert ended(start(scene, *STREAM, "--netcdf"))[0] == 0
+
+
+def test_a_store_of_another_run_is_refused(scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(scene)
+    few = ("run", "long.cir", "--stream", "--stop", "0.3", "--rtol", "1e-4", "--chunk", "0.1")
+    assert command(*few).code == 0
+    before = tree(scene / "out")
+    others = {
+        "rtol": (*few[:5], "--rtol", "1e-5", "--chunk", "0.1"),
+        "chunk": (*few[:-1], "0.2"),
+        "end": (*few[:4], "0.25", *few[5:]),
+        "charge law": (*few, "--charge-law", "mobile"),
+        "circuit": (*few, "--set", "Xgap.d=3u"),
+        "signals": (*few, "--signals", "u_gap"),
+        "source": (*few, "--source", "WAV(a.wav gain=100)"),
+    }
+    for what, arguments in others.items():
+        result = command(*arguments)
+        (line,) = [line for line in result.lines if not line.startswith("fingerspice: warning")]
+        assert result.code == 2
+        assert f"out/long.zarr holds a run of another {what}" in line
+        assert tree(scene / "out") == before
+    assert command(*others["rtol"], "--overwrite").code == 0
+
+
+def test_a_damaged_store_is_refused(scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(scene)
+    few = ("run", "long.cir", "--stream", "--stop", "0.3", "--rtol", "1e-4", "--chunk", "0.1")
+    assert command(*few).code == 0
+    piece, head = scene / "out/long.zarr/f_el/c/1", scene / "out/long.zarr/zarr.json"
+    piece.write_bytes(piece.read_bytes()[:-8])
+    said = command(*few)
+    assert said.code == 2
+    assert (
+        "out/long.zarr is damaged: out/long.zarr/f_el/c/1 is missing or cut short; allowed: --overw" in said.lines[-1]
+    )
+    head.write_bytes(head.read_bytes()[:200])
+    said = command(*few, "--overwrite")
+    assert said.code == 2
+    assert "out/long.zarr is there already and is no whole store of a run" in said.lines[-1]
+    assert piece.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--chunk", "1"), "--chunk, --signals and --netcdf go with --stream"),
+        (("--stream", "--csv"), "--csv does not go with --stream"),
+        (("--stream", "--chunk", "soon"), "--chunk 'soon'"),
+        (("--stream", "--signals", "u_gap,loudness"), "--signals names 'loudness'; allowed: "),
+    ],
+)
+def test_options_of_streams_are_checked(
+    arguments: tuple[str, ...], said: str, scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(scene)
+    result = command("run", "long.cir", *arguments)
+    assert result.code == 2
+    assert said in result.lines[-1]
+    assert not (scene / "out").exists()
+
+
+def test_without_zarr_a_store_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "zarr", None)
+    with pytest.raises(fs.InputError, match=r"pip install 'fingerspice\[stream\]'"):
+        Store(tmp_path / "a.zarr", {}, 10, 3)
