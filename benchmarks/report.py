@@ -153,9 +153,9 @@ def conditions(results: Report) -> str:
 
 def waits(folder: Path) -> str:
     """What a user waits for, as the README's table, from the results in a folder."""
-    run, base, rate, recorded = (
+    run, base, recorded = (
         json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-        for name in ("run_times", "baseline", "throughput", "recordings")
+        for name in ("run_times", "baseline", "recordings")
     )
     calls = {what: 1e3 * seconds for what, seconds in base["calls"].items()}
 
@@ -185,19 +185,12 @@ def waits(folder: Path) -> str:
         [f"a period, outputs included, of 100: {sources}", period("fingerpad", "auto")],
         ["the same behind an amplifier and a cable", period("amplifier", "auto")],
         ["the same with two fingers and a floating body", period("two_fingers", "auto")],
-        ["every period stepped: Table 1", period("fingerpad", "exponential")],
-        ["every period stepped: behind an amplifier and a cable", period("amplifier", "exponential")],
-        ["every period stepped: two fingers and a floating body", period("two_fingers", "exponential")],
         ["a sample of a recording of up to 1 kHz at 48 kHz, at 1e-4 / 1e-6", sample("SKIN")],
         ["the same with the dispersive skin", sample("SKIN_DISPERSIVE")],
-        [
-            "a sample of a recording, with the area given",
-            f"{rate['samples']['ns_per_sample']['fingerspice']:.1f} ns",
-        ],
     ]  # fmt: skip
     text = (
         f"Medians of 7 at an error of 1e-6 of the peak, after the first use, on {base['machine']}, commit "
-        f"{base['revision']} (`benchmarks/run_times.py`, `baseline.py`, `throughput.py`, `recordings.py`)."
+        f"{base['revision']} (`benchmarks/run_times.py`, `baseline.py`, `recordings.py`)."
     )
     return "\n".join([*markdown(rows), "", *wrapped(text)])
 

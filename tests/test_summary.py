@@ -85,3 +85,11 @@ def test_a_period_that_ends_with_a_jump_is_looked_at_a_few_times(
     run = fs.simulate(table1(), sources={"Vdrive": source}, t_stop=0.05, rtol=1e-8)
     assert run.summary()["figures_from"] == "steps"
     assert len(looks) < 100
+
+
+def test_a_gap_alone_has_them_too() -> None:
+    """A stack of one layer has no state: its voltage is the source's."""
+    gap = "Xgap a 0 area GAP d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
+    run = fs.simulate(fs.parse_netlist(f"gap\nV1 a 0 SIN(0 100 100)\n{gap}\n.tran 10u 20m uic\n.end"))
+    assert run.f_el_mean == pytest.approx(np.trapezoid(run.f_el, run.t) / 0.02, rel=1e-6)
+    assert run.u_gap_amplitude == pytest.approx(100.0, rel=1e-9)

@@ -201,7 +201,7 @@ class Stretches:
         if short.size:
             columns[short] = np.einsum("pcn,pqn->pcq", self.values[short], _basis(fraction[short]))
         t, left = self._times(slice(None), fraction)
-        return t, self._make(t.ravel(), left.ravel(), columns.transpose(1, 0, 2).reshape(columns.shape[1], -1))
+        return t, self._make(t.ravel(), left.ravel(), columns.transpose(1, 0, 2).reshape(columns.shape[1], t.size))
 
     def _times(self, index: IntArray | slice, fraction: FloatArray) -> tuple[FloatArray, BoolArray]:
         t = self.start[index, None] + fraction * self.length[index, None]
@@ -226,7 +226,7 @@ class Stretches:
         """As `measures.Run` says, from the polynomials of the steps."""
         columns = np.einsum("pcn,pqn->cpq", self.values[index], _basis(fraction))
         t, left = self._times(index, fraction)
-        record = self._make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], -1))
+        record = self._make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], t.size))
         return t, read(record).reshape(t.shape)
 
 
