@@ -5,6 +5,7 @@ Written from the impedances, in their own order, and sharing nothing with the st
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -48,16 +49,15 @@ def coupled_area(area_of: Callable[[float], float], gain_of: Callable[[float], f
 
     Notes
     -----
-    The gain lies between 0 and 1, so the root of u - U_0 |gain(g(u / sqrt 2))| is bracketed by 0 and U_0.
+    The gain lies between 0 and 1, so the root of u - U_0 |gain(g(u / sqrt 2))| is bracketed by 0 and U_0. Where the
+    area answers strongly, iterating on it would swing between two values for ever.
     """
-    lo, hi = 0.0, abs(amplitude)
-    u = hi
-    for _ in range(200):
-        new = abs(amplitude) * gain_of(area_of(u / np.sqrt(2.0)))
-        lo, hi = (u, hi) if new > u else (lo, u)
-        # The map contracts strongly; bisection guards the scenes where it does not.
-        nearer = new if lo <= new <= hi else 0.5 * (lo + hi)
-        if abs(nearer - u) <= 2e-16 * abs(u):
-            break
-        u = nearer
-    return float(area_of(u / np.sqrt(2.0)))
+    from scipy.optimize import brentq
+
+    def excess(u: float) -> float:
+        return u - abs(amplitude) * gain_of(area_of(u / math.sqrt(2.0)))
+
+    u = abs(amplitude)
+    if excess(u) > 0.0:
+        u = float(brentq(excess, 0.0, u, xtol=1e-300, rtol=1e-15))
+    return float(area_of(u / math.sqrt(2.0)))
