@@ -164,7 +164,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
         warnings.simplefilter("ignore")
         rows = measure("sine, narrow", sine, n, False, repeats) + measure("sine, wide", sine, n, True, repeats)
         rows += measure("square, narrow", square, n // 4, False, repeats) if not options.quick else []
-    results = {"python": platform.python_version(), "machine": "shared with other work", "rows": rows}
+    results = {"python": platform.python_version(), "machine": platform.machine(), "rows": rows}
     for row in rows:
         row["scenes_per_processor_s"] = row["n"] / row["processor_s"]
         shown = ", ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items())
