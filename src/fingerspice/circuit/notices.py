@@ -67,7 +67,7 @@ def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
 
 
 def _how_far(circuit: Circuit, wave: Waveform, stop: float) -> str:
-    """What is known of the mean force of a run to `stop` (s), for a warning."""
+    """Text for a warning: the error of the mean force of a run to `stop` (s)."""
     error = circuit.remember(("skin error", stop), lambda: skin_error(circuit, wave, stop))
     if error is None:
         return _UNKNOWN

@@ -100,8 +100,8 @@ def _shared_out(f: FloatArray, energy: FloatArray, grid: FloatArray) -> FloatArr
 def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | None:
     """Relative error of the mean force due to SKIN's data held at one frequency, for a circuit with one source.
 
-    It is estimated by the relative error of the mean square of the gap voltage, from the linear response at the areas at
-    rest and the source's spectrum over the run to `t_stop` (s); of several fingers the largest error counts. Outside
+    It is estimated by the relative error of the mean square of the gap voltage, from the linear response at the areas
+    at rest and the source's spectrum over the run to `t_stop` (s); of several fingers the largest error counts. Outside
     the band of the skin's data the response at the band's ends is used. None if the response cannot be computed.
     """
     networks = network_of(circuit), network_of(with_skin_held(circuit))

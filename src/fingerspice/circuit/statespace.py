@@ -145,7 +145,7 @@ class Stack:
         return np.asarray((self.g_total / area + self.g_area) / self.c)
 
     def admittance(self, frequency: FloatArray, area: FloatArray) -> ComplexArray:
-        """Complex layer admittances (n_frequency, n_layer), S, with SKIN's data at each frequency (Eqs. 9, 16 to 19)."""
+        """Complex layer admittances (n_frequency, n_layer), S; SKIN has data at each frequency (Eqs. 9, 16 to 19)."""
         f = np.atleast_1d(np.asarray(frequency, float))[:, None]
         a = np.broadcast_to(np.asarray(area, float), (f.shape[0],))[:, None]
         y = self.g_total + self.g_area * a + 2j * math.pi * f * self.c * a
