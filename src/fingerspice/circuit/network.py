@@ -201,7 +201,7 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     potential = tree.potentials()
 
     def rows(pairs: list[tuple[str, ...]]) -> FloatArray:
-        """Matrix from the voltages of the tree's branches, in the tree's order, to the voltages between pairs of nodes."""
+        """Matrix from the voltages of the tree's branches, in the tree's order, to the voltages between node pairs."""
         out = [potential[a] - potential[b] for a, b, *_ in pairs]
         return np.array(out).reshape(len(pairs), n_v + n + n_r)
 
