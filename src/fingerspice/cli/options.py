@@ -1,4 +1,4 @@
-"""Meaning of the command line's options, and checks before a run; nothing here writes a file."""
+"""Interpretation of the command line's options, and checks before a run; no function here writes a file."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ class SourceFiles:
     folder : Path or None
         Folder of the deck; None for a deck given as text.
     anywhere : bool
-        Whether any file may be read, relative to the working directory: True for a source given by the user, not a deck.
+        Whether any file may be read, relative to the working directory: for sources given by the user, not by a deck.
     size : int
         Total size of the files named so far, bytes; a file counts each time that it is named.
     """

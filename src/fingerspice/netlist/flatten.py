@@ -216,7 +216,7 @@ class Flattener:
 
 
 def _bind(inner: _Instance, line: Line, words: Group, caller: Scope) -> None:
-    """Evaluate the parameters of a call: those given on the call with the caller's names, the others with its own."""
+    """Evaluate a call's parameters: a value on the X line in the caller's scope, a default in the subcircuit's scope."""
     definition = inner.definition
     for formula in (*definition.defaults, *definition.params):
         inner.scope.define(formula)
@@ -232,7 +232,7 @@ def _bind(inner: _Instance, line: Line, words: Group, caller: Scope) -> None:
 
 
 def _refuse_captured(device: str, own: dict[str, float], line: Line, words: Group, caller: Scope) -> None:
-    """Refuse a value on an X line that names a parameter of the caller where ngspice would take the device's own."""
+    """Refuse a value on an X line with a name that is the caller's parameter here, and the device's own in ngspice."""
     for key, pair in words.params.items():
         for name, value in caller.references(line, pair.value).items():
             if name != key and own.get(name, value) != value:

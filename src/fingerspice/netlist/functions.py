@@ -17,7 +17,7 @@ class Problem(Exception):
 
 
 def power(base: float, exponent: float) -> float:
-    """`base ** exponent`; a negative base needs an even exponent, since ngspice takes the absolute value of the base."""
+    """`base ** exponent`; a negative base needs an even exponent, as ngspice takes the base's absolute value."""
     if base < 0.0 and not (exponent % 2.0 == 0.0):
         raise Problem(
             f"({base:g})^({exponent:g}) has a negative base, whose absolute value ngspice takes: "

@@ -78,7 +78,7 @@ def is_unit(word: str) -> bool:
 
 
 def stray_word(word: str, before: str) -> str:
-    """A hint for a word after ``key=value`` that is a unit, separated by a blank from its number; else an empty text."""
+    """A hint if a word after ``key=value`` is a unit, separated from its number by a blank; else an empty text."""
     number = before.rpartition("=")[2].strip()
     return f"; a unit joins its number, {number}{word}" if _NUMBER.fullmatch(number) and is_unit(word) else ""
 

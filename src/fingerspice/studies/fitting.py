@@ -250,7 +250,7 @@ def _admittivity(table: FloatArray) -> tuple[FloatArray, ComplexArray]:
 
 
 def _doubt(table: FloatArray, found: Consistency) -> str:
-    """Warn about data that no material can have, or refuse them, with likely slips; return the warning or an empty text."""
+    """Warn about data that no material can have, or refuse them, with likely slips; returns the warning, else ''."""
     if found.rms <= NOTABLE:
         return ""
     slips = likely_slips(table, lambda other: _consistency(*_admittivity(other)).rms, found.rms)
