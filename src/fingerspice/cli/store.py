@@ -154,7 +154,7 @@ class Store:
         self.done = chunk + 1
 
     def _create(self, data: dict[str, Variable], coords: dict[str, Variable], about: dict[str, Any]) -> None:
-        """Create the store with its arrays, still without values, under a temporary name, and rename it when complete."""
+        """Create the store with its arrays, still without values, under a temporary name, then rename it."""
         aside = self.path.with_name(f"{UNFINISHED}{self.path.name}")
         shutil.rmtree(aside, ignore_errors=True)
         self.path.parent.mkdir(parents=True, exist_ok=True)

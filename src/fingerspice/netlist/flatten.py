@@ -216,7 +216,7 @@ class Flattener:
 
 
 def _bind(inner: _Instance, line: Line, words: Group, caller: Scope) -> None:
-    """Evaluate a call's parameters: a value on the X line in the caller's scope, a default in the subcircuit's scope."""
+    """Evaluate a call's parameters: values on the X line in the caller's scope, defaults in the subcircuit's."""
     definition = inner.definition
     for formula in (*definition.defaults, *definition.params):
         inner.scope.define(formula)

@@ -129,7 +129,7 @@ def _unusual_areas(elements: tuple[Element, ...], initial: Mapping[str, float]) 
 
 
 def _coarse_outputs(deck: Deck, elements: tuple[Element, ...], tran: Tran | None) -> Iterator[str]:
-    """A warning about each source with a period shorter than TSTEP, unless one about its frequency was given already."""
+    """A warning about each source with a period shorter than TSTEP, unless there is one about its frequency."""
     if deck.tran is None or tran is None:
         return
     for e in elements:

@@ -103,7 +103,7 @@ def legend_within(ax: Axes, room: int) -> None:
 
 
 def _columns(names: list[str], columns: int) -> list[int]:
-    """Widths (letters) of a legend's columns; entries fill column by column, and the first columns may have one more."""
+    """Widths (letters) of a legend's columns; entries fill column by column, and the first ones may hold one more."""
     rows, longer = divmod(len(names), columns)
     begins = [place * rows + min(place, longer) for place in range(columns + 1)]
     return [max(map(len, names[a:b])) + 6 for a, b in itertools.pairwise(begins)]
