@@ -115,9 +115,12 @@ class Record(Sealed):
         if len(some) >= 8:
             # Without BLAS, whose threads may round differently.
             return np.asarray((self._x * by_x).sum(1) + (self._s[:, : by_s.size] * by_s).sum(1))
-        out = np.zeros(self.t.size)
-        for i in reversed(some):
-            out += weights[i] * (self._x[:, i] if i < n else self._s[:, i - n])
+        columns = [self.rows[:, i] if i < n else self._s[:, i - n] for i in reversed(some)]
+        if len(some) == 1 and weights[some[0]] == 1.0:
+            return np.ascontiguousarray(columns[0])
+        out = weights[some[-1]] * columns[0] if some else np.zeros(self.t.size)
+        for i, column in zip(some[-2::-1], columns[1:], strict=True):
+            out += weights[i] * column
         return out
 
     def cell_voltage(self, cell: int) -> FloatArray:
@@ -178,18 +181,18 @@ class Record(Sealed):
     @cached_property
     def u_gap(self) -> FloatArray:
         """Gap voltage, V."""
-        return _columns(np.column_stack([self.finger_voltage(i) for i in range(len(self.fingers))]))
+        return _side_by_side([self.finger_voltage(i) for i in range(len(self.fingers))])
 
     @cached_property
     def area(self) -> FloatArray | None:
         """Contact area of each GAP, m^2; without a GAP the circuit's first area; None where there is none."""
         shown = self.network.fingers or ((0,) if self.network.areas else ())
-        return _columns(np.column_stack([self._area_of(i) for i in shown])) if shown else None
+        return _side_by_side([self._area_of(i) for i in shown]) if shown else None
 
     @cached_property
     def force(self) -> FloatArray:
         """Electroadhesive force, N."""
-        return _columns(np.column_stack([self.finger_force(i) for i in range(len(self.fingers))]))
+        return _side_by_side([self.finger_force(i) for i in range(len(self.fingers))])
 
     @cached_property
     def charge(self) -> FloatArray | None:
@@ -232,6 +235,11 @@ class Record(Sealed):
         n = self._x.shape[1]
         rows = zip(self.network.node_names, self.network.nodes, strict=True)
         return {name: sealed(self._voltage(row[:n], row[n:])) for name, row in rows}
+
+
+def _side_by_side(columns: list[FloatArray]) -> FloatArray:
+    """Signals of several elements as a table, that of one as it is."""
+    return sealed(columns[0] if len(columns) == 1 else np.column_stack(columns))
 
 
 def _columns(x: FloatArray) -> FloatArray:

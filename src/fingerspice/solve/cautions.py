@@ -28,7 +28,7 @@ NEAR_FOLD = 0.2
 def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Where a run leaves what its model holds for."""
     yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit, problem.t_stop))
-    yield from _source_warnings(problem)
+    yield from problem.circuit.remember(("source", problem.t_stop), lambda: tuple(_source_warnings(problem)))
     net, several = problem.scene.net, len(record.fingers) > 1
     for finger, (name, contact) in enumerate(record.fingers):
         i, (u_peak, f_peak, u_error, _) = problem.network.fingers[finger], run.gaps[finger].tolist()

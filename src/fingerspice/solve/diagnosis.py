@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fingerspice.results.outcome import Failure, Status
+from fingerspice.results.outcome import Failure, Status, last_tried
 from fingerspice.results.record import Record
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run
@@ -43,7 +43,7 @@ def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
         element = names[worst] if names else element
         cause += f" (estimate {run.gaps[worst, 2]:.3g} V of {peaks[worst]:.3g} V peak"
         cause += _little(peaks[worst], max(problem.scene.u_peak, float(peaks.max()))) + ")"
-    return Failure(status, cause, status.action, run.t_failed, element, u_gap, area, margin, run.tried)
+    return Failure(status, cause, status.action, run.t_failed, element, u_gap, area, margin, last_tried(run.tried))
 
 
 def period_failure(problem: Problem, status: Status, t: float | None = None, cause: str = "") -> Failure:

@@ -17,7 +17,7 @@ from scipy.integrate import OdeSolution, solve_ivp
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine.model import branch_area, dot, ramp, voltage_by_time, write_row_at
 from fingerspice.engine.segment import Segment, source
-from fingerspice.results.outcome import Failure, SolveError, Status
+from fingerspice.results.outcome import Failure, SolveError, Status, last_tried
 from fingerspice.solve.marching import solve as solve_marching
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run
@@ -97,7 +97,8 @@ def meets_fold(problem: Problem, rtol: float) -> bool:
     if run.status is Status.SUCCESS:
         return False
     if run.status is not Status.FOLD:
-        raise SolveError(Failure(run.status, run.status.cause, run.status.action, run.t_failed, tried=run.tried))
+        tried = last_tried(run.tried)
+        raise SolveError(Failure(run.status, run.status.cause, run.status.action, run.t_failed, tried=tried))
     state = to_stack(problem.scene, run.state)
     begun = _start(problem, state)
     return run.margin <= 0.0 or math.isnan(begun.u) or _ahead(problem, state, begun, run.margin, rtol) is not None

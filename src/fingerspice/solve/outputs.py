@@ -16,6 +16,9 @@ from fingerspice.waveforms.waveform import Waveform
 _RESOLVED = 8.0
 # Of a long run, so that its memory does not grow with its length.
 _BREAKPOINTS_AT_ONCE = 65_536
+# Output times (0.3 MB) that a waveform keeps.
+KEPT_OUTPUTS = 32_768
+_NONE = np.empty(0)
 
 
 def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
@@ -49,7 +52,14 @@ def asked_for(
     if t_eval is not None:
         return t_eval, np.zeros(t_eval.size, bool)
     check_outputs(problem.circuit, (problem.t_stop - problem.first) / problem.step)
-    t_out, left = output_times(problem, jumps)
+    key, kept = (problem.t_start, problem.t_stop, problem.first, problem.step, jumps), problem.waveform.kept
+    # One entry with its key: another thread may put its own there at any time.
+    known, t_out, left = kept.get("outputs", (None, _NONE, _NONE))
+    if known != key:
+        t_out, left = output_times(problem, jumps)
+        t_out.flags.writeable = left.flags.writeable = False
+        if t_out.size <= KEPT_OUTPUTS:
+            kept["outputs"] = key, t_out, left
     # Jumps have two each.
     check_outputs(problem.circuit, t_out.size)
     return t_out, left

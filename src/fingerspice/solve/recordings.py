@@ -212,8 +212,9 @@ class March:
 
     def rows(self, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
         """Outputs at times `t` (s) as rows of a record."""
-        u = sided(self.wave, t, left) if self.problem.charge else np.empty(0)
-        return as_recorded(self.problem, self.one.system.model, out[:, : t.size].T, u)
+        model = self.one.system.model
+        u = sided(self.wave, t, left) if self.problem.charge and model.mobile else np.empty(0)
+        return as_recorded(self.problem, model, out[:, : t.size].T, u)
 
     def state(self) -> State:
         """Where the run is."""

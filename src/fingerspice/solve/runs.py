@@ -12,7 +12,7 @@ import numpy as np
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.network import Sources, at_sources, new_room, rates
 from fingerspice.engine.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, ZEROS
-from fingerspice.results.outcome import Attempt, ErrorEstimate, State, Status, last_tried
+from fingerspice.results.outcome import ErrorEstimate, State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.refined import ClosedForm
 from fingerspice.results.steps import Recorded
@@ -69,8 +69,8 @@ class Run:
         Smallest distance to the fold met.
     detail : str
         What a method says of its failure.
-    tried : tuple of Attempt
-        The last steps tried.
+    tried : ndarray, shape (n, 4)
+        The last steps tried, as `results.outcome.last_tried` takes them.
     here : ndarray, shape (width,), or None
         The row at the time that a failed run reached.
     continuous : Recorded or ClosedForm or None
@@ -94,7 +94,7 @@ class Run:
     rough: float = 0.0
     margin: float = 1.0
     detail: str = ""
-    tried: tuple[Attempt, ...] = ()
+    tried: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
     here: FloatArray | None = None
     continuous: Recorded | ClosedForm | None = None
     by_layer: bool = False
@@ -269,7 +269,7 @@ def integrate(one: Integration, tables: Tables, progress: Progress | None = None
     stats = {name: int(one.counters[i]) for name, i in (("steps", ACCEPTED), ("rejected", REJECTED), ("zeros", ZEROS))}
     return Run(
         t_out[: len(rows)], left[: len(rows)], rows, status, int(one.counters[NFEV]), stats, state,
-        t_failed=t_failed, tried=last_tried(one.tried), unseen=tables.unseen, rough=tables.rough, here=here,
+        t_failed=t_failed, tried=one.tried, unseen=tables.unseen, rough=tables.rough, here=here,
     )  # fmt: skip
 
 

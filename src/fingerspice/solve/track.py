@@ -199,8 +199,10 @@ class Track(Stepping):
 
     def written(self) -> FloatArray:
         n_out = int(self.counters[readout.OUTPUT])
-        u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out]) if self.pace.charge else np.empty(0)
-        return as_recorded(self.problem, self.prepared.system.model, self.out[:, :n_out].T, u)
+        model = self.prepared.system.model
+        wanted = self.pace.charge and model.mobile
+        u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out]) if wanted else np.empty(0)
+        return as_recorded(self.problem, model, self.out[:, :n_out].T, u)
 
     def finish(self, sources: Sources, after: Sources | None) -> None:
         first = int(self.counters[readout.OUTPUT])
@@ -268,7 +270,7 @@ def on_branch(model: Model, state: StackState, sign: float) -> StackState:
 
 
 def as_recorded(problem: Problem, model: Model, rows: FloatArray, u: FloatArray) -> FloatArray:
-    """Rows as in `Record` from those that loops write, in their place; `u` (V) is the source where charge is wanted."""
+    """Rows as in `Record` from those that loops write, in their place; `mobile` takes the source `u` (V) for charge."""
     shown = problem.scene.shown
     n = int(shown.turn.size)
     if shown.is_turned:
