@@ -26,7 +26,7 @@ from fingerspice.waveforms import combinations, periodic, ramps, repeated, trans
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.waveform import Fundamental, Waveform
 
-# The waveforms that may appear in the text of a changed source.
+# Waveform classes that `_literal` accepts in the stored text of a changed source.
 _WAVEFORMS = {
     kind.__name__: kind
     for kind in (
@@ -35,7 +35,7 @@ _WAVEFORMS = {
         repeated.Burst, repeated.Repeat,
     )
 }  # fmt: skip
-# Deepest nesting in that text.
+# Deepest nesting of expressions in that text, so that a malicious file cannot exhaust the stack.
 _DEEPEST = 20
 _NOT_KEPT = "a source that was a function or samples is not kept in a file"
 
@@ -160,7 +160,7 @@ def _text(value: Any) -> str:
 
 
 def _state(kept: dict[str, Any], law: str) -> State:
-    """The state reached, of files by earlier versions too: a series stack's source was a number there."""
+    """The state reached; files of earlier versions store the source of a series stack as one number, `u_before`."""
     y, before, sign = (np.array(kept.get(k, d), float) for k, d in (("y", []), ("s_before", []), ("sign", [0.0])))
     if "u_before" in kept:
         before = np.array([kept["u_before"]], float)
