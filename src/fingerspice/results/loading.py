@@ -43,9 +43,9 @@ _NOT_KEPT = "a source that was a function or samples is not kept in a file"
 def load(path: str | Path) -> Solution:
     """Read a run back from a file of `Solution.to_netcdf` or of ``fingerspice run``.
 
-    Signals with both rows of each jump, figures, error, status and warnings are those of the run. The circuit is made
+    Signals with both rows of each jump, figures, error, status and warnings are those of the run. The circuit is built
     again from the deck's text and the changes; where that is not possible (a source that was a function or samples, a
-    deck that includes or plays files) it has no elements, and a warning says so. No run can start from a loaded one.
+    deck that includes or plays files), it has no elements, and a warning is issued. No run can start from a loaded one.
 
     Parameters
     ----------

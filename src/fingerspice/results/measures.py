@@ -20,9 +20,9 @@ Read = Callable[[Any], FloatArray]
 _NODES = POINTS[:NODES]
 #: Smallest tolerance of the interpolation error of a panel, relative to the signal's peak.
 _FINEST = 1e-12
-#: Number of halves of panels that may be evaluated, besides four for each panel.
+#: Most halves of panels that are evaluated, in addition to four for each panel.
 _MOST_CUT = 4096
-#: Number of halvings of one panel.
+#: Most times that one panel is halved.
 _MOST_ROUNDS = 60
 #: Gauss-Lobatto weights on [0, 1]: exact for polynomials of degree 23.
 _WEIGHTS = 1.0 / (NODES * (NODES - 1) * legendre.Legendre.basis(NODES - 1)(2.0 * _NODES - 1.0) ** 2)
@@ -37,7 +37,7 @@ class Panels(NamedTuple):
     low, high : ndarray, shape (p,)
         The part of that step that the panel covers, as fractions of its length.
     duration : ndarray, shape (p,)
-        s; longer than the panel itself where that represents several equal periods.
+        Duration, s; longer than the panel itself if the panel represents several equal periods.
     """
 
     step: IntArray

@@ -178,7 +178,7 @@ class State:
     t : float
         s.
     y : ndarray, shape (n,)
-        Live voltages (V), areas with a time constant relative to their values at 0 V, and charges delivered (C).
+        Live voltages (V), areas with a time constant (relative to their values at 0 V), and charges delivered (C).
     s_before : ndarray, shape (n_source,)
         Source values just before `t`, V or A.
     sign : ndarray, shape (n_area,)

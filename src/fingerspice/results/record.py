@@ -59,8 +59,8 @@ class Record(Sealed):
     left : ndarray of bool, shape (n_t,)
         Whether an output is the left-hand value at a jump.
     rows : ndarray, shape (n_t, size)
-        The state as in `engine.network`; with `has_charge` the sources' currents follow, else the charges may be
-        missing.
+        The state as in `engine.network`; with `has_charge` the sources' currents follow in the last columns, and
+        without it the columns of the charges may be missing.
     has_charge : bool
     """
 

@@ -52,7 +52,7 @@ class Solution(Sealed, Shown, Figured):
     nfev : int
         Evaluations of the right-hand side.
     stats : dict
-        Numbers of steps, of rejected steps and of zeros of the gap voltage; the wall time.
+        Numbers of steps, rejected steps, zeros of the gap voltage and repeated periods; the wall time (s).
     error : ErrorEstimate
     rtol : float
         Error asked for, relative to the peaks.

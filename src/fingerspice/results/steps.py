@@ -120,7 +120,7 @@ class Recorder:
         return block
 
     def repeat(self, since: int, periods: int, period: float) -> None:
-        """Let the blocks from number `since` on represent a number of further periods."""
+        """Let the blocks from number `since` on also represent the `periods` periods that follow them."""
         for part in self.parts[since:]:
             if isinstance(part, Block) and periods > 0:
                 self.parts.append(Block(part.times, part.values, periods, period, period))

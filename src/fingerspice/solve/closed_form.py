@@ -225,7 +225,7 @@ def _look(problem: Problem, solve: Callable[..., Run], t: FloatArray, left: Bool
 
 
 def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run:
-    """Outputs of a stack without leakage: each layer has a fixed share of the source's voltage, whatever the area."""
+    """Outputs of a stack without leakage: the layers share each change of the source's voltage in fixed ratios."""
     scene = problem.scene
     model, start = model_of(scene), problem.inner
     tables = Tables(problem, 1e-12, t_out=t_out)

@@ -32,7 +32,7 @@ FINEST_RTOL = 1e-12
 LOOSER_RTOL, LOOSEST_RTOL, NEAR = 1e-9, 1e-6, 3e-3
 # Largest residual of the area equation at the end of a path, relative to the gap voltage.
 STRAYED = 1e-3
-# Distance at which the fold counts as reached, and largest value of the variable s.
+# Distance at which the fold counts as reached, and largest value of s in units of the shortest time constant.
 NOTHING_LEFT, LONGEST = 1e-10, 1e12
 # Limit of the evaluations of a path; most paths to a fold take a few thousand.
 MOST_EVALUATIONS = 10_000
@@ -224,8 +224,7 @@ def _path(problem: Problem, state: StackState, begun: _Start, rtol: float) -> _P
         event.terminal = True
 
     def jacobian(s: float, z: FloatArray) -> FloatArray:
-        # Plain differences: scipy enlarges its increment without limit for entries, such as the charge, on which
-        # nothing depends.
+        # Plain differences: scipy enlarges its own without limit for entries on which nothing depends (the charge).
         here, columns = slope(s, z), []
         for i in range(z.size):
             moved = z.copy()

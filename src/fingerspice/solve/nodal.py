@@ -220,8 +220,8 @@ def solve_coupled(
 def _voltage_scale(problem: Problem, scheme: Scheme, guess: float) -> float:
     """Largest live voltage, V, from coarse runs: under a current drive it is not known beforehand.
 
-    The guess starts high and comes down: a coarse run of a voltage much smaller than the guess is cheap, whereas one
-    much larger than the guess would be integrated far too accurately.
+    A high guess is better than a low one: a coarse run whose voltages are much smaller than the guess is cheap, whereas
+    much larger voltages would be integrated far too accurately.
     """
     at = np.linspace(problem.t_start, problem.t_stop, PROBES)
     for _ in range(20):

@@ -12,7 +12,8 @@ from fingerspice.solve.times import check_length, check_outputs
 from fingerspice.waveforms.sampling import misses, same_time
 from fingerspice.waveforms.waveform import Waveform
 
-# Resolution of a time in units of its rounding error; a change of a source that takes longer than this is no jump.
+# Resolution of a time in units of its rounding error; a difference of a source's two limits at an edge is no jump if
+# the source changes as much within this resolution beside the edge.
 _RESOLVED = 8.0
 # Breakpoints held in memory at a time, so that memory does not grow with the length of the run.
 _BREAKPOINTS_AT_ONCE = 65_536

@@ -33,7 +33,7 @@ CHARGING = "a current source charges, from period to period, what nothing drains
 
 @dataclass(frozen=True)
 class Found:
-    """Figures of a periodic state that `Closed` passes on; `gap_errors` (n_gap, 2): of gap voltage (V), force (N)."""
+    """Figures of a periodic state for `Closed`; `gap_errors` (n_gap, 2): errors of gap voltage (V) and force (N)."""
 
     defect: float
     map_slope: FloatArray

@@ -173,8 +173,8 @@ def stream(
     """Simulate a circuit in time chunk by chunk, in memory that does not grow with the length of the run.
 
     The outputs are the same to the last bit whatever the length of the chunks. For a recording on a series stack they
-    also equal those of `simulate` with the same times as `t_eval`. For other runs they differ within the error, because
-    each window of 16,384 outputs is a run of its own, which starts from the final state of the window before.
+    also equal those of `simulate` with the same times as `t_eval`. For other runs they do not, because each window of
+    16,384 outputs is a run of its own, which starts from the final state of the window before.
 
     Parameters
     ----------
