@@ -26,7 +26,12 @@ def circuit_warnings(circuit: Circuit, t_stop: float | None) -> tuple[str, ...]:
     The run is taken to end at `t_stop` (s), or at the deck's own end where that is None.
     """
     stop = t_stop or (circuit.tran.stop if circuit.tran is not None else math.nan)
-    return (*directive_warnings(circuit), *_skin_warnings(circuit, stop))
+
+    def make() -> tuple[str, ...]:
+        return (*directive_warnings(circuit), *_skin_warnings(circuit, stop))
+
+    found: tuple[str, ...] = circuit.remember(("notices", stop), make)
+    return found
 
 
 def directive_warnings(circuit: Circuit) -> tuple[str, ...]:

@@ -1,1 +1,1 @@
-"""Results of runs: signals, figures, errors, failures and files."""
+"""Results of runs: signals, figures, stated errors, failures and files."""

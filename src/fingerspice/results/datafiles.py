@@ -1,4 +1,4 @@
-"""A solution as a file or a table: CSV, NetCDF, xarray, pandas."""
+"""Export of a solution as a file or a table: CSV, NetCDF, xarray, pandas."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def write_csv(solution: Solution, path: Path) -> Path:
 
 
 def _kept(solution: Solution, jumps: str) -> BoolArray:
-    """Which rows are written, shape (n_t,): all, or without the left-hand rows of jumps."""
+    """Mask of the rows that are written, shape (n_t,): all rows, or all but the left-hand rows of jumps."""
     require(jumps in ("right", "both"), "jumps", repr(jumps), "'right' or 'both'")
     keep = np.ones(solution.t.size, bool)
     if jumps == "right" and solution.t.size:
@@ -92,13 +92,13 @@ def to_dataframe(solution: Solution, jumps: str) -> pandas.DataFrame:
 
 
 def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
-    """Write the variables as a NetCDF file, with a group that has what else `load` needs."""
+    """Write the variables as a NetCDF file, with a group of further data that `load` needs."""
     import h5netcdf
 
     keep = _kept(solution, jumps)
 
     def write(target: Path) -> None:
-        # HDF5 would end the process on a full disk, so it writes into memory.
+        # HDF5 would end the process on a full disk, so let it write into memory.
         content = io.BytesIO()
         with h5netcdf.File(content, "w") as file:
             _fill(file, *variables(solution, keep))
@@ -107,7 +107,7 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
             group = file.create_group(GROUP)
             group.attrs["run"] = json.dumps(_run(solution))
             if not keep.all():
-                # The left-hand rows of jumps, of which only `load` has a use, form one table: each variable takes time.
+                # Only `load` uses the left-hand rows of jumps; they form one table, because each variable takes time.
                 group.dimensions["jump"] = int(np.count_nonzero(~keep))
                 group.dimensions["signal"] = 1 + len(solution.signals)
                 rows = [np.flatnonzero(~keep), *(x[~keep] for x, _, _ in solution.signals.values())]
@@ -134,7 +134,7 @@ def _run(solution: Solution) -> dict[str, Any]:
     fundamental = solution.fundamental
     return {
         "format": FORMAT, "nfev": int(solution.nfev), "error": vars(solution.error), "rtol": solution.rtol,
-        # Without the time that it took, so that the same run gives the same file.
+        # Without the wall time, so that the same run gives the same file.
         "stats": {k: v for k, v in solution.stats.items() if isinstance(v, (int, float, str)) and k != "wall_s"},
         "charge_law": solution.charge_law, "area_mode": solution.area_mode, "method": solution.method,
         "plan": solution.plan.to_dict(), "status": solution.status.name,

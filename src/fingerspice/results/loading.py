@@ -26,7 +26,7 @@ from fingerspice.waveforms import combinations, periodic, ramps, repeated, trans
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.waveform import Fundamental, Waveform
 
-# The waveforms that may appear in the text of a changed source.
+# Waveform classes that `_literal` accepts in the stored text of a changed source.
 _WAVEFORMS = {
     kind.__name__: kind
     for kind in (
@@ -35,7 +35,7 @@ _WAVEFORMS = {
         repeated.Burst, repeated.Repeat,
     )
 }  # fmt: skip
-# Deepest nesting in that text.
+# Deepest nesting of expressions in that text, so that a malicious file cannot exhaust the stack.
 _DEEPEST = 20
 _NOT_KEPT = "a source that was a function or samples is not kept in a file"
 
@@ -43,9 +43,9 @@ _NOT_KEPT = "a source that was a function or samples is not kept in a file"
 def load(path: str | Path) -> Solution:
     """Read a run back from a file of `Solution.to_netcdf` or of ``fingerspice run``.
 
-    Signals with both rows of each jump, figures, error, status and warnings are those of the run. The circuit is made
+    Signals with both rows of each jump, figures, error, status and warnings are those of the run. The circuit is built
     again from the deck's text and the changes; where that is not possible (a source that was a function or samples, a
-    deck that includes or plays files) it has no elements, and a warning says so. No run can start from a loaded one.
+    deck that includes or plays files), it has no elements, and a warning is issued. No run can start from a loaded one.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def _text(value: Any) -> str:
 
 
 def _state(kept: dict[str, Any], law: str) -> State:
-    """The state reached, of files by earlier versions too: a series stack's source was a number there."""
+    """The state reached; files of earlier versions store the source of a series stack as one number, `u_before`."""
     y, before, sign = (np.array(kept.get(k, d), float) for k, d in (("y", []), ("s_before", []), ("sign", [0.0])))
     if "u_before" in kept:
         before = np.array([kept["u_before"]], float)

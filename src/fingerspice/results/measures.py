@@ -18,11 +18,11 @@ from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS
 Read = Callable[[Any], FloatArray]
 
 _NODES = POINTS[:NODES]
-#: Smallest tolerance of a polynomial's misfit, relative to the signal's peak.
+#: Smallest tolerance of the interpolation error of a panel, relative to the signal's peak.
 _FINEST = 1e-12
-#: Number of halves of panels that may be evaluated, besides four for each panel.
+#: Most halves of panels that are evaluated, in addition to four for each panel.
 _MOST_CUT = 4096
-#: Number of halvings of one panel.
+#: Most times that one panel is halved.
 _MOST_ROUNDS = 60
 #: Gauss-Lobatto weights on [0, 1]: exact for polynomials of degree 23.
 _WEIGHTS = 1.0 / (NODES * (NODES - 1) * legendre.Legendre.basis(NODES - 1)(2.0 * _NODES - 1.0) ** 2)
@@ -37,7 +37,7 @@ class Panels(NamedTuple):
     low, high : ndarray, shape (p,)
         The part of that step that the panel covers, as fractions of its length.
     duration : ndarray, shape (p,)
-        s; longer than the panel itself where that represents several equal periods.
+        Duration, s; longer than the panel itself if the panel represents several equal periods.
     """
 
     step: IntArray
@@ -102,8 +102,8 @@ class Weighed:
 class Stretch:
     """A run between two times (s), with weights and extremes of every signal.
 
-    A panel is halved where the polynomial through its nodes misses the signal between them: steps are chosen to resolve
-    the gap voltage, and the area may change within a small part of its range.
+    A panel is halved where the polynomial through its nodes differs from the signal between them: steps are chosen to
+    resolve the gap voltage, and the area may change within a small part of the voltage's range.
 
     Parameters
     ----------
@@ -129,16 +129,16 @@ class Stretch:
         t, x = self.run.at_points(read, self.panels)
         peak = float(np.abs(x).max(initial=0.0)) or 1.0
         missed = _missed(x) / peak
-        # Gauss-Lobatto weights integrate polynomials up to twice the degree of the interpolant exactly. If the series'
-        # terms fall geometrically, the error of the integral is about the misfit to the power 1.85; 1.5 is on the safe
-        # side.
+        # Gauss-Lobatto weights integrate polynomials up to twice the degree of the interpolant exactly. If the terms of
+        # the series fall geometrically, the quadrature error is about the interpolation error to the power 1.85; 1.5 is
+        # on the safe side.
         if float((self._share * missed**1.5).sum()) <= max(_FINEST, 1e-3 * self.rtol):
             return Weighed(t[:, :NODES], self._shares, x[:, :NODES])
         return self._cut(read, t, x, _FINEST)[0]
 
     def extremes(self, read: Read) -> tuple[float, float]:
         """Smallest and largest value of a signal, evaluated where its polynomials have their extremes."""
-        # A misfit shifts the place of an extreme, and changes the value there by its square only.
+        # An interpolation error shifts the place of an extreme, which changes the signal there by its square only.
         weighed, panels = self._cut(read, *self.run.at_points(read, self.panels), max(_FINEST, 1e-3 * self.rtol))
         found = [largest(weighed.x, sign) for sign in (-1.0, 1.0)]
         panel, place = np.array([p for p, _, _ in found]), np.array([x for _, x, _ in found])
@@ -148,14 +148,14 @@ class Stretch:
         return min(low, float(weighed.x.min())), max(high, float(weighed.x.max()))
 
     def _cut(self, read: Read, t: FloatArray, x: FloatArray, tol: float) -> tuple[Weighed, Panels]:
-        """A signal, and panels on which its polynomials miss it by at most `tol` times its peak."""
+        """A signal, and panels on which its interpolation error is at most `tol` times its peak."""
         smooth = tol * float(np.abs(x).max(initial=0.0))
         panels, parts = self.panels, []
         most = _MOST_CUT + 4 * panels.step.size
         for left in range(_MOST_ROUNDS, 0, -1):
             wrong = _missed(x) > smooth
             if most <= 0 or left == 1:
-                # What is not smooth by now is rounding, or a jump that rounding has shifted across an end.
+                # Panels that are still not smooth hold round-off, or a jump that round-off has shifted across an end.
                 wrong[:] = False
             parts.append((panels.take(np.flatnonzero(~wrong)), t[~wrong, :NODES], x[~wrong, :NODES]))
             if not wrong.any():
@@ -173,7 +173,7 @@ def _joined(parts: Sequence[Panels]) -> Panels:
 
 
 def _missed(x: FloatArray) -> FloatArray:
-    """Largest misfit between the nodes of each panel's polynomial, from values (p, ROWS), shape (p,)."""
+    """Largest interpolation error found between the nodes of each panel, from values (p, ROWS), shape (p,)."""
     return np.asarray(np.abs(x[:, :NODES] @ BETWEEN - x[:, NODES:]).max(axis=1, initial=0.0))
 
 
@@ -192,7 +192,7 @@ def weigh_outputs(t: FloatArray, x: FloatArray) -> Weighed:
 def output_weights(t: FloatArray) -> FloatArray:
     """Weights (n,) of values at times t (s, ascending) in the integral over them, exact for cubics between jumps.
 
-    Where fewer than four values lie between two jumps the trapezoidal rule is taken.
+    Where fewer than four values lie between two jumps, the trapezoidal rule is used.
     """
     weight = np.zeros(t.size)
     begins = np.flatnonzero(np.append(True, np.diff(t) == 0.0))

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Status(Enum):
-    """How a run ended: why, and what to do about it."""
+    """How a run ended: the cause in words, and the action that the user is advised to take."""
 
     SUCCESS = ("success", "")
     FOLD = (
@@ -154,13 +154,13 @@ class SolveError(FingerspiceError, RuntimeError):
 class ErrorEstimate:
     """Estimated largest error over the run: of gap voltage (V), electroadhesive force (N), charge (C) and nodes (V).
 
-    `v_nodes` is that of the voltages of all nodes. It is stated, but no run is refined for it: the error asked for is
-    that of gap voltage and force, and a node may follow a decay that no gap feels. It is None in runs that start from
-    the periodic state, which is found to an error at the gaps.
+    `v_nodes` is the largest error of the voltages of all nodes. It is stated, but no run is refined for it: `rtol`
+    applies to gap voltage and force only, and a node may have a transient that no gap feels. It is None in runs that
+    start from the periodic state, because the error of that state is estimated at the gaps only.
 
     Without a GAP, `u_gap` is the error of the voltage across the layer with the smallest capacitance, and `f_el` is 0.
     `q_source` is None where the charge was left out, or where its error is not estimated: only the coupled tier's own
-    steps and the algebraic tier estimate it, and not in runs that start from the periodic state.
+    steps and the algebraic tier estimate it, and they do not in runs that start from the periodic state.
     """
 
     u_gap: float
@@ -178,11 +178,11 @@ class State:
     t : float
         s.
     y : ndarray, shape (n,)
-        Live voltages (V), areas with dynamics of their own over their value at 0 V, and charges delivered (C).
+        Live voltages (V), areas with a time constant (relative to their values at 0 V), and charges delivered (C).
     s_before : ndarray, shape (n_source,)
         Source values just before `t`, V or A.
     sign : ndarray, shape (n_area,)
-        Branch of each area: the sign of its gap's voltage, 0 where that follows from the voltage.
+        Branch of each area: the sign of its gap's voltage, or 0 if the branch is to be chosen from the voltage.
     charge_law : str
     """
 

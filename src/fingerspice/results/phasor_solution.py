@@ -33,7 +33,7 @@ class PhasorSolution(Shown):
     f_el_mean : ndarray
         Mean electroadhesive force, N.
     amplitude : float
-        Source amplitude, V (A of a current source).
+        Source amplitude, V (A for a current source).
     layers : tuple of str
     phase : float
         Phase of the source, rad.

@@ -19,16 +19,16 @@ class Plan(Shown):
     reasons : tuple of str
         Reasons for the tier, one sentence each.
     start : str
-        How the run starts; ``periodic`` means from the periodic state, which is found directly.
+        Start of the run; ``periodic`` means the periodic state, which is solved for directly.
     rates : tuple of float
-        Relaxation rates of the circuit at a fixed area, 1/s, ascending.
+        Decay rates of the circuit's modes with its areas fixed, 1/s, ascending.
     stiff : bool
         Whether stability would limit the steps of an explicit method.
     sensitivity : float
-        Largest relative change of 1/A over the run, and with it of the leak rates: of the area that changes most, with
-        gap voltages up to twice the sources' peak. NaN where a current source sets them no bound.
+        Largest relative change of 1/A, and thus of the leak rates, for gap voltages up to twice the sources' peak; the
+        maximum over all areas. NaN with current sources, which do not bound the gap voltage.
     error_bound : float
-        Bound of the error (relative to the peaks) from taking one area, or a dispersive skin at one frequency.
+        Bound of the error (relative to the peaks) from fixing the area, or from a dispersive skin at one frequency.
     area : float
         Area of the `linear` tier, m^2.
     """

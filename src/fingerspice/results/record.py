@@ -22,7 +22,7 @@ def sealed(x: FloatArray) -> FloatArray:
 
 
 class Sealed:
-    """A result whose arrays are read-only, also after it was copied or unpickled, which makes arrays writable."""
+    """A result whose arrays stay read-only after copying or unpickling, which both make writable arrays."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -33,13 +33,13 @@ class Sealed:
 
 
 def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
-    """Values of a waveform at times t (s), from the left where `left` says so, shape (n_t,)."""
+    """Values of a waveform at times t (s), shape (n_t,); left-hand limits where `left` is true."""
     out = np.array(waveform.value(t), float)
     if left.any():
         out[left] = waveform.value(t[left], "left")
     lost = ~np.isfinite(out)
     if lost.any():
-        # A run ends where the source stops being finite, a time known to 1e-12; just before, the source was finite.
+        # A run ends where the source stops being finite, at a time known to 1e-12: use the finite value just before.
         out[lost] = waveform.value(t[lost] * (1.0 - 4e-12))
     return sealed(out)
 
@@ -59,8 +59,8 @@ class Record(Sealed):
     left : ndarray of bool, shape (n_t,)
         Whether an output is the left-hand value at a jump.
     rows : ndarray, shape (n_t, size)
-        The state as in `engine.network`; with `has_charge` the sources' currents follow, else the charges may be
-        missing.
+        The state as in `engine.network`; with `has_charge` the sources' currents follow in the last columns, and
+        without it the columns of the charges may be missing.
     has_charge : bool
     """
 
@@ -82,7 +82,7 @@ class Record(Sealed):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Names of the sources, in the order of the columns of what belongs to them."""
+        """Names of the sources, in the order of the columns of their signals."""
         return tuple(e.name for e in self.network.sources)
 
     @cached_property
@@ -98,7 +98,7 @@ class Record(Sealed):
 
     @cached_property
     def _x(self) -> FloatArray:
-        # In one order in memory, whichever method wrote it: a sum over a row rounds by that order.
+        # Methods store rows in different memory orders, on which the rounding of a sum over a row depends.
         return np.ascontiguousarray(self.rows[:, : self.network.k.shape[0]])
 
     @cached_property
@@ -108,16 +108,19 @@ class Record(Sealed):
         return np.column_stack([sided(e.waveform, self.t, self.left) for e in elements if e.waveform is not None])
 
     def _voltage(self, by_x: FloatArray, by_s: FloatArray) -> FloatArray:
-        """A voltage (V) from its weights of the live voltages and of the sources, shape (n_t,)."""
+        """A voltage (V), shape (n_t,), as a weighted sum of the live voltages and the sources."""
         weights = (*by_x.tolist(), *by_s.tolist())
         some = [i for i, weight in enumerate(weights) if weight != 0.0]
         n = by_x.size
         if len(some) >= 8:
             # Without BLAS, whose threads may round differently.
             return np.asarray((self._x * by_x).sum(1) + (self._s[:, : by_s.size] * by_s).sum(1))
-        out = np.zeros(self.t.size)
-        for i in reversed(some):
-            out += weights[i] * (self._x[:, i] if i < n else self._s[:, i - n])
+        columns = [self.rows[:, i] if i < n else self._s[:, i - n] for i in reversed(some)]
+        if len(some) == 1 and weights[some[0]] == 1.0:
+            return np.ascontiguousarray(columns[0])
+        out = weights[some[-1]] * columns[0] if some else np.zeros(self.t.size)
+        for i, column in zip(some[-2::-1], columns[1:], strict=True):
+            out += weights[i] * column
         return out
 
     def cell_voltage(self, cell: int) -> FloatArray:
@@ -178,18 +181,18 @@ class Record(Sealed):
     @cached_property
     def u_gap(self) -> FloatArray:
         """Gap voltage, V."""
-        return _columns(np.column_stack([self.finger_voltage(i) for i in range(len(self.fingers))]))
+        return _side_by_side([self.finger_voltage(i) for i in range(len(self.fingers))])
 
     @cached_property
     def area(self) -> FloatArray | None:
         """Contact area of each GAP, m^2; without a GAP the circuit's first area; None where there is none."""
         shown = self.network.fingers or ((0,) if self.network.areas else ())
-        return _columns(np.column_stack([self._area_of(i) for i in shown])) if shown else None
+        return _side_by_side([self._area_of(i) for i in shown]) if shown else None
 
     @cached_property
     def force(self) -> FloatArray:
         """Electroadhesive force, N."""
-        return _columns(np.column_stack([self.finger_force(i) for i in range(len(self.fingers))]))
+        return _side_by_side([self.finger_force(i) for i in range(len(self.fingers))])
 
     @cached_property
     def charge(self) -> FloatArray | None:
@@ -232,6 +235,11 @@ class Record(Sealed):
         n = self._x.shape[1]
         rows = zip(self.network.node_names, self.network.nodes, strict=True)
         return {name: sealed(self._voltage(row[:n], row[n:])) for name, row in rows}
+
+
+def _side_by_side(columns: list[FloatArray]) -> FloatArray:
+    """Signals of several elements as a table, that of one as it is."""
+    return sealed(columns[0] if len(columns) == 1 else np.column_stack(columns))
 
 
 def _columns(x: FloatArray) -> FloatArray:

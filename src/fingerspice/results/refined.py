@@ -15,7 +15,7 @@ from fingerspice.results.measures import Panels, Read
 from fingerspice.results.record import Record
 from fingerspice.waveforms.waveform import Waveform
 
-#: Largest misfit of a panel's polynomial between its nodes, relative to the signal's peak.
+#: Largest interpolation error of a panel between its nodes, relative to the signal's peak.
 _MISSED = 1e-11
 #: Largest number of panels, beyond which figures are computed from the outputs; and of halvings of one panel.
 MOST_PANELS, _MOST_ROUNDS = 20_000, 60
@@ -31,13 +31,13 @@ class ClosedForm:
     Attributes
     ----------
     look : callable
-        From times (s, ascending), and whether each means a left-hand value, to a record.
+        Function of times (s, ascending), and of whether the left-hand limit is wanted at each, that returns a record.
     waveform : Waveform
         Waveform with the breakpoints of all sources.
     t_start, first, stop : float
         Start of the run, and the interval for figures, s.
     error : float
-        Error of what `look` gives, relative to the peaks: polynomials need not be finer.
+        Error of the records of `look`, relative to the peaks; the panels' polynomials need not be more accurate.
     """
 
     look: Callable[[FloatArray, BoolArray], Record]
@@ -48,14 +48,14 @@ class ClosedForm:
     error: float = 0.0
 
     def run(self, readers: Callable[[], Mapping[str, Read]], since: float, until: float) -> Refined | None:
-        """Panels between two times (s) on each of which every voltage is a polynomial; None where they are too many.
+        """Panels between two times (s), on each of which a polynomial represents every voltage; None if too many.
 
         `readers` gives, by name, the functions that read signals from a record.
         """
         every = readers()
         longest = _LONGEST * self.waveform.shortest_time()
         rate = self.waveform.breakpoint_rate() + 1.0 / longest
-        # Each evaluation goes through the run from its start.
+        # Each evaluation computes the run from its start, so that the segments before `since` count too.
         if (until - since) * rate > MOST_PANELS or (until - self.t_start) * rate > _MOST_PASSED:
             return None
         inner = self.waveform.breakpoints(since, until)
@@ -83,7 +83,7 @@ class ClosedForm:
     def _is_rough(
         self, readers: Mapping[str, Read], begin: FloatArray, end: FloatArray, peaks: dict[str, float]
     ) -> BoolArray:
-        """Whether the polynomial through a panel's nodes misses some voltage between them, shape (p,)."""
+        """Whether some voltage's interpolation error on a panel is too large, shape (p,)."""
         every = Refined(self.look, begin, end)
         wrong = np.zeros(begin.size, bool)
         for name, read in readers.items():
@@ -122,7 +122,7 @@ class Refined:
     end: FloatArray
 
     def panels(self, since: float, until: float) -> Panels:
-        """The panels between two times, s, cut at them."""
+        """The panels between two times (s); the first and last are cut off at these times."""
         length = self.end - self.begin
         low = np.maximum((since - self.begin) / length, 0.0)
         high = np.minimum((until - self.begin) / length, 1.0)
@@ -146,18 +146,18 @@ class Refined:
         return _in_place(read, *self._own)
 
     def at_points(self, read: Read, panels: Panels) -> tuple[FloatArray, FloatArray]:
-        """As `measures.Run` says."""
+        """See `measures.Run`; the record at the points of all panels is computed only once."""
         if panels.step.size == self.begin.size and not panels.low.any() and (panels.high == 1.0).all():
             return self.at_own_points(read)
         return self.values_at(read, panels.step, panels.fractions(POINTS))
 
     def values_at(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As `measures.Run` says, by evaluating the closed form."""
+        """See `measures.Run`; evaluates the closed form."""
         return _in_place(read, *self._looked_at(index, fraction))
 
 
 def _in_place(read: Read, t: FloatArray, order: IntArray, record: Record) -> tuple[FloatArray, FloatArray]:
-    """Times, and the signal of a record in ascending order of time put into the order of the times."""
+    """Times, and a signal of a record, whose times ascend, rearranged to the order of these times."""
     x = np.empty(t.size)
     x[order] = read(record)
     return t, x.reshape(t.shape)

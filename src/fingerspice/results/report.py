@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def _value(value: float | None, unit: str, factor: float = 1.0, peak: float = 0.0) -> str:
     if value is None:
         return "-"
-    # A mean that is zero but for rounding is written as 0.
+    # A mean that is 0 to round-off is written as 0.
     value = 0.0 if abs(value) <= 1e-12 * peak else value
     if unit in ("mm^2", "", "deg"):
         return f"{value * factor:.4g} {unit}".rstrip()
@@ -48,7 +48,7 @@ def summary_table(solution: Solution) -> Page:
             ("friction", "friction coefficient", "", 1.0),
             ("area", "ridge contact area", "mm^2", 1e6),
         ):
-            # Each of several gaps or sources has a row.
+            # If there are several gaps or sources, each has its own row.
             for name in [
                 n for n in (key, *(f"{key}:{e}" for e in (*solution.gaps, *solution.sources))) if f"{n}_max" in s
             ]:
@@ -100,7 +100,7 @@ def _scene(solution: Solution) -> str:
 
 
 def plan_text(plan: Plan, circuit: Circuit | None = None) -> Page:
-    """A plan in words, with the heading of its circuit where that is given."""
+    """A plan in words, below the heading of its circuit if that is given."""
     rates = ", ".join(f"{r:.4g}" for r in plan.rates) or "none"
     head = [] if circuit is None else [*head_lines(circuit), ""]
     lines: list[str | Table] = [*head, f"model: {plan.tier}", *(f"  because {r}" for r in plan.reasons)]
@@ -133,7 +133,7 @@ def phasor_tables(results: Sequence[PhasorSolution], circuit: Circuit) -> str:
 
 
 def phasor_table(result: PhasorSolution, most: int = 40) -> Page:
-    """A sweep as a table, of which rows are left out so that about `most` remain."""
+    """A sweep as a table; of a long one, only every n-th row, so that at most `most` rows remain."""
     data = phasor_dict(result)
     keep = range(0, result.frequency.size, max(1, -(-result.frequency.size // most)))
     rows = [

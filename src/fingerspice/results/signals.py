@@ -1,4 +1,4 @@
-"""The signals of a run by name: those of its record, and those that follow from them for each gap."""
+"""The signals of a run by name: the signals of its record, and further ones computed from them for each gap."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SIGNALS = {
 }
 #: Signals that every gap has.
 _OF_A_GAP = ("u_gap", "sigma_el", "f_el", "f_t", "friction")
-#: Signals whose name in the record is another one.
+#: Attribute names in the record of signals that are named differently there.
 _IN_RECORD = {"f_el": "force", "q_source": "charge", "i_source": "current"}
 #: Signals that are computed from another one, with the contact of the gap.
 _DERIVED: dict[str, tuple[str, Callable[[Contact, FloatArray], FloatArray]]] = {
@@ -99,7 +99,7 @@ class Signals:
         several = self.columns(key)
         if key in ("u_layer", "v"):
             return tuple(f"{key}:{name}" for name in several)
-        # Whether a signal exists is told, where possible, without computing it.
+        # Decide without computing the signal, where possible.
         missing = not several if key in _OF_A_GAP else False
         if key in ("q_source", "i_source") or (key == "area" and not several):
             missing = self.value(key) is None

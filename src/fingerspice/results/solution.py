@@ -52,7 +52,7 @@ class Solution(Sealed, Shown, Figured):
     nfev : int
         Evaluations of the right-hand side.
     stats : dict
-        Numbers of steps, of rejected steps and of zeros of the gap voltage; the method and the wall time.
+        Numbers of steps, rejected steps, zeros of the gap voltage and repeated periods; the wall time (s).
     error : ErrorEstimate
     rtol : float
         Error asked for, relative to the peaks.
@@ -64,11 +64,11 @@ class Solution(Sealed, Shown, Figured):
     first, t_stop : float
         TSTART and the end of the run, s.
     continuous : Recorded or ClosedForm or None
-        The run between its outputs, where that is known.
+        The run between its outputs; None where only its outputs are known.
     fundamental, period : Fundamental or None, float or None
         Fundamental and period (s) of the source; None where it has none.
     fold_margin_min : float
-        Smallest distance to the fold that the steps met.
+        Smallest distance to the fold in the run's steps.
     stored : mapping or None
         The summary of a run that was read from a file.
     """
@@ -126,7 +126,7 @@ class Solution(Sealed, Shown, Figured):
 
     @property
     def u_source(self) -> FloatArray:
-        """Voltage around the loop, V, shape (n_t,)."""
+        """Voltage of each source, V; for a series stack the voltage around the loop, shape (n_t,)."""
         return self.record.u_source
 
     @property
@@ -233,12 +233,12 @@ class Solution(Sealed, Shown, Figured):
     def summary(self) -> dict[str, Any]:
         """Figures of the run: peak, rms, mean, ripple, amplitude and phase at the fundamental; SI units.
 
-        They are figures of the run itself, from TSTART to its end, whatever outputs were asked for; ``figures_from`` is
-        then ``"steps"``. It is ``"outputs"`` where the run between its outputs is not known, because another method
-        made them, the run failed, or it is too long: means are then integrals of cubics through the outputs, and
-        extremes those of the outputs. `f_el_mean` is the mean over the whole run, and `f_el_mean_periodic` that over
-        the last period of the source; figures of a period are None where the run is shorter. A circuit without GAP has
-        figures of its layer voltages (``u_layer:Xcoat_max``) instead of those of gap voltage and forces.
+        Figures are computed from the run itself, from TSTART to its end, whatever outputs were asked for;
+        ``figures_from`` is then ``"steps"``. It is ``"outputs"`` where the run between its outputs is not known,
+        because a method does not record it, the run failed, or it is too long: means are then integrals of cubics
+        through the outputs, and extremes are those of the outputs. `f_el_mean` is the mean over the whole run, and
+        `f_el_mean_periodic` the mean over the last period of the source; figures of a period are None where the run is
+        shorter. A circuit without GAP has figures of its layer voltages (``u_layer:Xcoat_max``) instead.
         """
         return dict(self._summary)
 
@@ -247,7 +247,7 @@ class Solution(Sealed, Shown, Figured):
         return self._figures.summary()
 
     def provenance(self) -> dict[str, str]:
-        """All that is needed to repeat the run, as text."""
+        """The data needed to repeat the run, as text."""
         from fingerspice import __version__
 
         return {
@@ -349,13 +349,13 @@ class Solution(Sealed, Shown, Figured):
         resolution : float, optional
             Width of the density's bins, Hz; by default that of 8 segments.
         since : float, optional
-            Time from which on outputs are taken into the density, s; the first one by default.
+            Start of the outputs used for a density, s; the first output by default.
 
         Raises
         ------
         InputError
-            For an unknown signal, one of several elements, or a value out of range; where the run holds no period and
-            `method` is ``"lines"``, or outputs of a density are few or not evenly spaced.
+            For an unknown signal, a signal of several elements, or a value out of range; for ``"lines"`` of a run
+            without a whole period, and for a density of outputs that are too few or not evenly spaced.
         """
         from fingerspice.results.spectrum import spectrum_of
 
@@ -370,13 +370,14 @@ class Solution(Sealed, Shown, Figured):
     ) -> Figure:
         """Draw signals against time: a notebook shows the figure, and from a script ``plot().show()`` opens a window.
 
-        More than about 30 oscillations are drawn as envelopes, with a few of the last beside; so is a short event.
+        More than about 30 oscillations are drawn as envelopes, and a second column shows the last few of them enlarged;
+        it also shows a short event enlarged.
 
         Parameters
         ----------
         signals : str or sequence of str, optional
-            Keys of `signals`, such as ``"f_el"``, ``"u_layer:Xcoat"``, or ``"u_layer"`` for all layers; those of one
-            quantity share a panel. The default is source and gap voltage, force, area and friction.
+            Keys of `signals`, such as ``"f_el"``, ``"u_layer:Xcoat"``, or ``"u_layer"`` for all layers; signals of the
+            same quantity share a panel. The default is source and gap voltage, force, area and friction.
         window : tuple of float, optional
             Start and end, s; the whole run by default.
         others : Solution, sequence or mapping of str to Solution, optional

@@ -31,19 +31,19 @@ METHODS = ("auto", "lines", "welch")
 _LINES, _MOST_LINES = 1000, 10_000
 #: Fewest outputs of a density; half-overlapping segments into which they are divided unless a resolution is given.
 _FEWEST, _SEGMENTS = 64, 8
-#: Largest misfit of an output's time to even ones, in their distance.
+#: Largest deviation of output times from evenly spaced ones, relative to their distance.
 _EVEN = 1e-5
-#: Probability that the interval of a density contains the true one.
+#: Probability that the interval of a density contains the true density.
 CONFIDENCE = 0.95
-#: Largest change of a signal over its last period, relative to its range, of a periodic state.
+#: Largest change of a signal over its last period, relative to its range, without a warning that it is not periodic.
 _CLOSED = 0.01
-#: Lines in a report.
+#: Number of lines in a report.
 _SHOWN = 12
 
 
 @dataclass(frozen=True, repr=False)
 class Spectrum(Sealed, Shown):
-    """Spectrum of a signal about its mean: lines of a periodic one, or else a density with its uncertainty.
+    """Spectrum of a signal about its mean: lines of a periodic signal, or a density with its uncertainty.
 
     Attributes
     ----------
@@ -58,11 +58,11 @@ class Spectrum(Sealed, Shown):
         Ends of the interval that contains the true density with a probability of 95 %, if the signal is Gaussian noise
         whose density changes little within the resolution.
     mean, variance : float
-        Of the signal, over the period or over the outputs taken.
+        Mean and variance of the signal, over the period or over the outputs used.
     resolution : float
-        Hz: distance of the lines, or width of the bins.
+        Distance of the lines, or width of the bins, Hz.
     segments : float
-        Independent segments to which the overlapping ones of a density are equivalent; 1 for lines.
+        Number of independent segments equivalent to the overlapping segments of a density; 1 for lines.
     """
 
     signal: str
@@ -84,7 +84,7 @@ class Spectrum(Sealed, Shown):
 
     @property
     def shown_variance(self) -> float:
-        """Variance of what the spectrum holds: less than `variance` where the signal goes beyond its frequencies."""
+        """Variance in the spectrum: less than `variance` where the signal has frequencies beyond the highest one."""
         if self.amplitude is not None:
             return 0.5 * float((self.amplitude**2).sum())
         assert self.density is not None
@@ -122,7 +122,7 @@ class Spectrum(Sealed, Shown):
 def spectrum_of(
     solution: Solution, signal: str, method: str, highest: float | None, resolution: float | None, since: float | None
 ) -> Spectrum:
-    """As `Solution.spectrum` says."""
+    """See `Solution.spectrum`."""
     require(method in METHODS, "method", repr(method), ", ".join(map(repr, METHODS)))
     for name, value, unit in (("highest", highest, "Hz"), ("resolution", resolution, "Hz")):
         require(value is None or 0.0 < value < math.inf, name, value, f"more than 0 {unit}, or None")
@@ -153,7 +153,7 @@ def _lines(solution: Solution, name: str, highest: float | None) -> Spectrum | N
     require(1 <= count <= _MOST_LINES, "highest", f"{highest} Hz", allowed)
     weighed, exact = figures.last_finely(name, period / count)
     if not exact:
-        # Of outputs alone nothing is known beyond half their rate.
+        # The outputs alone determine no frequency beyond half their rate.
         count = max(min(count, (weighed.t.size - 1) // 2), 1)
     _warn_if_open(solution, name, weighed)
     mean = weighed.mean()
@@ -187,7 +187,7 @@ class Centred(NamedTuple):
 
 
 def _warn_if_open(solution: Solution, name: str, weighed: Weighed) -> None:
-    """Warn where the last period of the source is not yet one of the signal."""
+    """Warn if the signal is not periodic yet: its values at both ends of the source's last period differ."""
     first, last = int(weighed.t.argmin()), int(weighed.t.argmax())
     x = weighed.x.ravel()
     if abs(x[last] - x[first]) > _CLOSED * float(np.ptp(x)) and not _has_edge(solution):
@@ -233,16 +233,16 @@ def _density(
 
 
 def even_outputs(solution: Solution, name: str, since: float | None) -> tuple[FloatArray, FloatArray]:
-    """Times (s) and values of a signal's outputs, without those that the jumps of the source add between them.
+    """Times (s) and values of a signal's outputs, without the additional outputs at jumps of the source.
 
     Raises
     ------
     InputError
-        Where these are not evenly spaced, or too few.
+        Where these outputs are not evenly spaced, or too few.
     """
     t, x = solution.t, solution.all_signals.one(name)
     require(since is None or (t.size > 0 and since < t[-1]), "since", since, "a time before the end of the run, s")
-    # Of the two rows of a jump the right-hand one stays, and none where the jump lies between the other outputs.
+    # Of the two rows of a jump keep the right-hand one if the jump is at an even output time, else none.
     kept = np.append(np.diff(t) > 0.0, True)[: t.size] & (t >= (-math.inf if since is None else since))
     jump = np.append(False, np.diff(t) == 0.0)[: t.size][kept]
     t, x = t[kept], x[kept]
@@ -263,14 +263,15 @@ def even_outputs(solution: Solution, name: str, since: float | None) -> tuple[Fl
 
 
 def equivalent_segments(window: FloatArray, step: int, count: int) -> float:
-    """Independent segments with the same variance of the mean density as `count` overlapping ones (Welch 1967).
+    """Number of independent segments whose mean density has the same variance as `count` overlapping ones (Welch 1967).
 
     Parameters
     ----------
     window : ndarray, shape (size,)
     step : int
-        Samples from the start of a segment to that of the next.
+        Samples from the start of a segment to the start of the next.
     count : int
+        Number of overlapping segments.
     """
     power = float(window @ window)
     shifts = range(1, min(count, -(-window.size // step)))
@@ -279,7 +280,7 @@ def equivalent_segments(window: FloatArray, step: int, count: int) -> float:
 
 
 def interval(segments: float) -> tuple[float, float]:
-    """Factors from an estimated density to the ends of its interval, by chi-square with two degrees a segment."""
+    """Factors from an estimated density to the ends of its interval: chi-square, two degrees of freedom per segment."""
     from scipy.stats import chi2
 
     degrees = 2.0 * segments
@@ -288,14 +289,15 @@ def interval(segments: float) -> tuple[float, float]:
 
 
 def _warn_if_folded(solution: Solution, name: str, rate: float) -> None:
-    """Warn where the outputs are too rare for the signal's band: what lies beyond is folded into the spectrum.
+    """Warn if the outputs undersample the signal, so that higher frequencies are aliased into the spectrum.
 
     The band of a voltage is that of the sources; areas and forces follow the voltage's square, with twice that band.
     """
     wide = 1.0 if name.partition(":")[0] in ("u_source", "u_layer", "u_gap", "v", "i_source", "q_source") else 2.0
     half = 0.5 * rate / wide
     waves = network_of(solution.circuit).waveforms
-    # Each look samples the source at four times a frequency: the second one sees what the first would fold, too.
+    # `energy_outside` samples the source at four times the given frequency. The second call, at a higher frequency,
+    # finds energy that the first one's own sampling would alias.
     share = max((energy_outside(w, solution.t_stop, (0.0, f))[1] for w in waves for f in (half, 8.0 * half)), default=0)
     if share > NOTABLE:
         warnings.warn(

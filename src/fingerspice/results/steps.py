@@ -1,4 +1,4 @@
-"""A run between its outputs: the steps that were taken, and the number of periods that each represents."""
+"""A run between its outputs: the recorded steps, and the number of equal periods that each represents."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from fingerspice.results.measures import Panels, Read
 from fingerspice.results.record import Record
 from fingerspice.waveforms.sampling import same_time
 
-#: Largest number of steps recorded before Python collects them, and of numbers at their nodes.
+#: Most steps recorded by the compiled loop before Python collects them, and most numbers at their nodes.
 CAPACITY, _AT_ONCE = 512, 16_384
 #: Largest number of values kept of a run's steps (64 MB); figures of a longer run are computed from its outputs.
 MOST_NUMBERS = 8_000_000
-#: Largest number of different periods in a leap.
+#: Largest number of different periods in an extrapolation (`Leap`).
 _MOST_PERIODS = 20_000
 _NODES = POINTS[:NODES]
-#: From Chebyshev coefficients to values at the nodes.
+#: Matrix from Chebyshev coefficients to values at the nodes.
 _FROM_SERIES = chebyshev.chebvander(2.0 * _NODES - 1.0, NODES - 1).T
 
 
@@ -34,9 +34,9 @@ class Block:
     Attributes
     ----------
     times : ndarray, shape (k, 4)
-        Start and length of each step, the end reached (s), and the fraction of the length at which that is.
+        Start and length of each step and the end reached, s, and the part of the length that was reached.
     values : ndarray, shape (k, n_column, NODES)
-        Values at the nodes of the whole length.
+        Values at the nodes of the whole step, which may extend beyond the end reached.
     count : int
         Number of equal periods.
     shift, period : float
@@ -120,7 +120,7 @@ class Recorder:
         return block
 
     def repeat(self, since: int, periods: int, period: float) -> None:
-        """Let the blocks from number `since` on represent a number of further periods."""
+        """Let the blocks from number `since` on also represent the `periods` periods that follow them."""
         for part in self.parts[since:]:
             if isinstance(part, Block) and periods > 0:
                 self.parts.append(Block(part.times, part.values, periods, period, period))
@@ -132,7 +132,7 @@ class Recorder:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Recorded steps; `make` makes a record of times, of which are left-hand values, and of columns of states."""
+    """Recorded steps; `make` builds a record from times, a mask of left-hand values, and states as columns."""
 
     parts: tuple[Block | Leap, ...]
     first: float
@@ -183,7 +183,7 @@ class Stretches:
         for k, once in ((first - 1.0, True), (last + 1.0, last + 1.0 != first - 1.0)):
             cut = once & (k >= 0) & (k < self.count)
             low = np.maximum((since - begin - k * period) / self.length, 0.0)
-            # A part that ends with the interval, but for rounding, ends as its step does: before a jump.
+            # A part that ends with the interval, to rounding, ends where its step does: on the left of a possible jump.
             whole = end + k * period <= until + slack
             high = np.where(whole, self.reach, np.minimum((until - begin - k * period) / self.length, self.reach))
             found.append((low, high, np.where(cut & (high - low > slack / self.length), 1.0, 0.0)))
@@ -209,7 +209,7 @@ class Stretches:
         return np.where(left, self.reached[index, None], t), left
 
     def at_points(self, read: Read, panels: Panels) -> tuple[FloatArray, FloatArray]:
-        """As `measures.Run` says; panels that are whole steps share one record for all signals."""
+        """See `measures.Run`; panels that are whole steps share one record for all signals."""
         own = (panels.low == 0.0) & (panels.high == self.reach[panels.step])
         if not own.any():
             return self.values_at(read, panels.step, panels.fractions(POINTS))
@@ -223,7 +223,7 @@ class Stretches:
         return t, x
 
     def values_at(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As `measures.Run` says, from the polynomials of the steps."""
+        """See `measures.Run`; evaluates the polynomials of the steps."""
         columns = np.einsum("pcn,pqn->cpq", self.values[index], _basis(fraction))
         t, left = self._times(index, fraction)
         record = self._make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], t.size))
@@ -231,7 +231,7 @@ class Stretches:
 
 
 def _basis(fraction: FloatArray) -> FloatArray:
-    """Weights (p, q, NODES) by which values at the nodes give those at fractions (p, q) of a step."""
+    """Weights (p, q, NODES) for interpolating values at the nodes to fractions (p, q) of a step."""
     distance = fraction[:, :, None] - _NODES
     hit = distance == 0.0
     weight = np.where(hit.any(axis=2, keepdims=True), hit, BARYCENTRIC / np.where(hit, 1.0, distance))

@@ -1,4 +1,4 @@
-"""Outputs of a run that was read from a file; `Record` has those of a run just made."""
+"""Outputs of a run that was read from a file; its signals are stored, whereas `Record` computes them from states."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class StoredRecord(Sealed):
     u_layer : ndarray, shape (n_t, n_layer)
         V.
     u_gap, area, force : ndarray, shape (n_t,) or (n_t, n_gap)
-        V, m^2 and N; an area is None where nothing has one.
+        V, m^2 and N; `area` is None for a circuit without any area.
     fold_margin : ndarray, shape (n_t,)
     node_voltages : dict of str to ndarray, shape (n_t,)
         V.

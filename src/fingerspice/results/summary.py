@@ -1,4 +1,4 @@
-"""Figures of a run: means, peaks and amplitudes of its signals, each computed when it is first asked for."""
+"""Figures of a run: means, peaks and amplitudes of its signals, each computed on first use and cached."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class _Steps:
 
 
 class _Outputs:
-    """Outputs from number `first` on, after interpolated values at the time `start` (s) where that is given."""
+    """Outputs from number `first` on; if a time `start` (s) is given, interpolated values there come first."""
 
     def __init__(self, t: FloatArray, signals: Signals, first: int = 0, start: float | None = None) -> None:
         self.t, self.signals, self.first, self.start = t, signals, first, start
@@ -72,7 +72,7 @@ class _Outputs:
 
 
 class Figures:
-    """Figures of a solution, each computed when it is first asked for and then kept."""
+    """Figures of a solution, each computed on first use and cached."""
 
     def __init__(self, solution: Solution) -> None:
         self.solution = solution
@@ -128,7 +128,7 @@ class Figures:
 
     @cached_property
     def whole(self) -> Span | None:
-        """From TSTART to the end; None where there are no outputs."""
+        """The run from TSTART to its end; None where there are no outputs."""
         s = self.solution
         found = self._between(s.first, s.t_stop)
         return found if found is not None or s.t.size < 2 else _Outputs(s.t, self.signals)
@@ -152,15 +152,15 @@ class Figures:
             return None
         first = int(np.searchsorted(s.t, start - tolerance, side="right"))
         if abs(s.t[first] - start) <= tolerance:
-            # At a jump the period starts with the right-hand value.
+            # Of two outputs at a jump, the period starts with the right-hand one.
             return _Outputs(s.t, self.signals, int(np.searchsorted(s.t, start + tolerance, side="right")) - 1)
         return _Outputs(s.t, self.signals, first, start)
 
     def last_finely(self, name: str, longest: float) -> tuple[Weighed, bool]:
-        """A signal over the last period, and whether it is known between the outputs.
+        """A signal with weights over the last period, and whether it is known between the outputs.
 
-        Where it is, its pieces are no longer than `longest` (s), so that the weights also integrate its product with an
-        oscillation of that period.
+        If it is known, its panels are no longer than `longest` (s), so that the weights also integrate the product of
+        the signal with an oscillation of that period.
         """
         assert self.last is not None
         if not isinstance(self.last, _Steps):
@@ -170,7 +170,7 @@ class Figures:
 
     @cached_property
     def shown(self) -> tuple[str, ...]:
-        """Signals in the summary; without a gap those of every layer, and without layers those of every node."""
+        """Names of the signals in the summary: of gaps, or else of all layers, or else of all nodes."""
         names = self.signals.names
         if self.signals.gaps:
             keys = ("u_source", "u_gap", "area", "f_el", "f_t", "friction")
@@ -208,7 +208,7 @@ def _together(values: list[float | None]) -> Value:
 
 
 class KeptFigures:
-    """Figures that were stored with a run."""
+    """Figures that were stored in a run's file, from which they cannot be computed again."""
 
     def __init__(self, signals: Signals, summary: Mapping[str, Any]) -> None:
         self.signals, self._summary = signals, summary
@@ -223,7 +223,7 @@ class KeptFigures:
 
 
 class Figured:
-    """A result with figures: each is a number, or an array (n_gap,) with several gaps, or None where there is none.
+    """A result with figures: each is a number, an array (n_gap,) with several gaps, or None where it does not exist.
 
     Figures are integrals and extremes of the run itself, not of its outputs.
     """
@@ -269,7 +269,7 @@ class Figured:
 
     @property
     def u_gap_peak(self) -> Value:
-        """Largest size of the gap voltage, V."""
+        """Largest modulus of the gap voltage, V."""
         return self._figures.value("u_gap", "peak")
 
     @property
@@ -284,5 +284,5 @@ class Figured:
 
     @property
     def u_gap_phase_deg(self) -> Value:
-        """Phase of the gap voltage at the source's fundamental, as that of a sine, degrees."""
+        """Phase of the gap voltage at the source's fundamental, relative to a sine, degrees."""
         return self._figures.value("u_gap", "phase_deg")

@@ -1,1 +1,1 @@
-"""From a circuit to its solution in time."""
+"""Solution of a circuit in time: choice of the model, integrators, periodic states, streams."""

@@ -1,13 +1,13 @@
-"""Periods on the way to the periodic state: near it, one affine map gives them all, and they need no steps.
+"""Extrapolation of the period map: near the periodic state one affine map gives all later periods without steps.
 
 With x the live voltages at the start of a period, x' those at its end and y(t) its outputs,
 
     x' = x_b' + S (x - x_b),    y(s) = y_b(s) + D(s) (x - x_b)
 
-up to the square of the distance between x and x_b, where s counts from one zero of the gap voltage or edge of the
-source to the next: a zero moves with x, and what is not smooth there moves with it. Period x_b is where the run will be
-at its end; S and D are differences of neighbouring periods, and what the map misses where the run stands now is its
-error at worst.
+with an error of second order in x - x_b. The variable s counts from one zero of the gap voltage or edge of the source
+to the next: a zero moves with x, and so does the kink of y(t) there. The base period x_b is the last period of the run,
+predicted by the map itself; S and D are finite differences of neighbouring periods. The run starts farthest from x_b,
+so that the map's defect at the present state bounds its error in all later periods.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from fingerspice.solve.settling import Settling
 from fingerspice.solve.stepping import FINEST, KEPT_STEPS, SAFETY
 from fingerspice.solve.track import Track
 
-# Tolerance of its steps, over that of others: what it is off is off in every period that is made of it.
+# Step tolerance within the integrated periods, relative to the run's: their error recurs in every extrapolated period.
 _FINER = 0.01
-# Steps of a period over those of another.
+# Most steps of a perturbed period, relative to the number of steps of the unperturbed one.
 _ROOM = 4
-# What a leap is taken to be off, over what is allowed, if a period on its way could not be integrated.
+# Ratio of error to tolerance assumed for an extrapolation that failed because a period could not be integrated.
 _LOST = 10.0
-# Periods that start nearer to one another than that, over what is allowed, are the same.
+# Periods whose start states differ by less than this fraction of the allowed error are treated as equal.
 _STILL = 1e-3
 
 
 class _LostError(Exception):
-    """A period could not be integrated, or is not like the others."""
+    """A period could not be integrated, or its zeros and edges are not those of the other periods."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class _Period:
     Attributes
     ----------
     track : Track
-        As the period has left it; its charge is what the period has added.
+        The integration at the end of the period; its charge is the charge delivered within the period.
     marks : ndarray, shape (n_step + 1,)
-        Where its steps begin and end, s.
+        Limits of the steps, s.
     fixed : ndarray of float, shape (n_step + 1,)
-        What stands there: AT_ZERO, AT_EDGE or 0.
+        AT_ZERO or AT_EDGE for a limit at a zero of the gap voltage or at an edge of the source, 0 for any other.
     """
 
     track: Track
@@ -61,7 +61,7 @@ class _Period:
 
     @property
     def off(self) -> FloatArray:
-        """Estimated error of the live voltages at its end, by its own steps, V."""
+        """Error of the live voltages at the end of the period, estimated from the period's own steps, V."""
         error = self.track.error
         return np.asarray(self.track.prepared.system.live[int(error[-1])] @ error[:-1])
 
@@ -73,13 +73,13 @@ class _Period:
         left[:, -1] = True
         out = np.empty((self.track.out.shape[0], t.size))
         kept, count = self.track.kept, self.marks.size - 1
-        # Its steps' series are used up by that.
+        # `repeat` overwrites the steps' series, so that this method can be called only once.
         if repetition.repeat(kept, count, 0.0, 1, np.zeros(len(out)), 0, t.ravel(), left.ravel(), out) < t.size:
             raise _LostError
         return np.ascontiguousarray(out.reshape(-1, *t.shape).swapaxes(0, 1) @ TO_SERIES)
 
     def marks_like(self, other: _Period) -> FloatArray:
-        """Marks of this period that stand to its zeros and edges as those of another stand to its own, s."""
+        """Marks of another period, mapped piecewise linearly from its zeros and edges to those of this period, s."""
         mine, its = self.marks[self.fixed > 0.0], other.marks[other.fixed > 0.0]
         if not np.array_equal(self.fixed[self.fixed > 0.0], other.fixed[other.fixed > 0.0]):
             raise _LostError
@@ -87,7 +87,7 @@ class _Period:
 
 
 def _period(track: Track, sources: Sources, stop: float, x: FloatArray, steps: int = KEPT_STEPS) -> _Period:
-    """A period of so many steps at most from live voltages x on, integrated to `stop` (s) by a copy of the track."""
+    """Integrate one period from live voltages x to `stop` (s) in at most `steps` steps, with a copy of the track."""
     probe = copy.copy(track)
     probe.y = np.append(x, 0.0)
     probe.error, probe.control, probe.tried = np.zeros_like(track.error), track.control.copy(), track.tried.copy()
@@ -107,13 +107,13 @@ def _period(track: Track, sources: Sources, stop: float, x: FloatArray, steps: i
 
 
 def _moved(slope: FloatArray, shift: FloatArray, periods: int) -> FloatArray:
-    """Sum over i < periods of slope^i shift."""
+    """Sum of slope^i shift for i = 0 ... periods - 1."""
     n = shift.size
     return np.asarray(np.linalg.matrix_power(np.block([[slope, shift[:, None]], [np.zeros(n), 1.0]]), periods)[:n, n])
 
 
 def leap(track: Track, sources: Sources, settling: Settling) -> None:
-    """Let the periods that follow come from one map, if its error allows it; see `Settling.may_leap`."""
+    """Extrapolate all following periods with one affine map, if its error allows it; see `Settling.may_leap`."""
     stop = settling.snapped(sources.edges, track.t + settling.period)
     if stop > sources.edges[-1]:
         return
@@ -147,21 +147,21 @@ def _leap(track: Track, sources: Sources, settling: Settling, stop: float) -> No
     base = _period(track, sources, stop, base_x, room)
     marks = base.marks_like(here)
     series = base.series(marks)
-    # What the map misses where the run stands.
+    # Defect of the map at the present state: the integrated period minus the period that the map predicts.
     delta = x0 - base_x
     missed = end - base.track.y - slope @ delta
     marks_missed = here.marks - marks - marks_by @ delta
     missed_series = series_here - series - np.tensordot(delta, by, 1)
-    # A polynomial is nowhere larger than the sum of its coefficients.
+    # The sum of the moduli of its Chebyshev coefficients bounds a polynomial.
     off = float(np.abs(missed_series[:, : track.shown]).sum(axis=-1).max(initial=0.0))
     steepest = np.abs(series[:, : track.shown]) @ np.arange(series.shape[-1]) * 2.0 / np.diff(marks)[:, None]
     late = float((steepest.max(axis=1) * np.maximum(abs(marks_missed[1:]), abs(marks_missed[:-1]))).max())
     later = max(float(np.abs(missed[:n]).max()), float(np.abs(_moved(slope[:n], missed[:n], left)).max()))
     slowest = np.abs(np.linalg.eigvals(slope[:n]))
     slowest = float(slowest[slowest < 1.0 - 1e-9].max(initial=0.0))
-    # What the map misses of a period's charge goes with the square of the distance.
+    # The charge defect of a period falls with the square of the distance to the periodic state: a geometric series.
     owed = abs(float(missed[n])) * min(left, 1.0 / (1.0 - slowest**2))
-    # What steps are off goes into the map, and is collected for as long as it is remembered.
+    # The truncation errors of the steps perturb the map itself; their effect accumulates over the circuit's memory.
     noise = base.off + (np.array(offs) - here.off).T @ (delta / settling.probe)
     later += SAFETY * max(float(np.abs(noise).max()), float(np.abs(_moved(slope[:n], noise, left)).max()))
     still = _STILL * settling.allowed

@@ -1,4 +1,4 @@
-"""What a user should be warned of in a run that ended well: beyond what the models, or the materials, are made for."""
+"""Warnings about a run that succeeded but left the range in which its models, or its materials, are valid."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from fingerspice.solve.runs import Run
 from fingerspice.waveforms.waveform import DC
 
 BREAKDOWN_VOLTAGE = 300.0
-# Contact area over that at 0 V.
+# Smallest contact area without a warning, relative to the area at 0 V.
 LEAST_AREA = 0.2
-# Distance to the fold of the mobile law: the voltage that would reach it is a few percent larger.
+# Smallest distance to the fold of the mobile law without a warning: a voltage a few percent larger reaches the fold.
 NEAR_FOLD = 0.2
 
 
 def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
-    """Where a run leaves what its model holds for."""
+    """Warnings for every limit of the model that the run exceeds."""
     yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit, problem.t_stop))
-    yield from _source_warnings(problem)
+    yield from problem.circuit.remember(("source", problem.t_stop), lambda: tuple(_source_warnings(problem)))
     net, several = problem.scene.net, len(record.fingers) > 1
     for finger, (name, contact) in enumerate(record.fingers):
         i, (u_peak, f_peak, u_error, _) = problem.network.fingers[finger], run.gaps[finger].tolist()
@@ -52,7 +52,7 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
 
 
 def _source_warnings(problem: Problem) -> Iterator[str]:
-    """Of sources beyond the band of the skin's data, and of those that drive sweeps alone."""
+    """Warnings about sources beyond the band of the skin's data, and about sources that drive sweeps only."""
     outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
     if outside is not None:
         yield outside
@@ -67,7 +67,7 @@ def _source_warnings(problem: Problem) -> Iterator[str]:
 
 
 def _gap_warnings(where: str, peak: float, unloaded: float, least: float) -> Iterator[str]:
-    """Of a gap with its largest voltage (V), its area at 0 V and its smallest one (m^2)."""
+    """Warnings about a gap, given its largest voltage (V), its area at 0 V and its smallest area (m^2)."""
     if peak > BREAKDOWN_VOLTAGE:
         yield (
             f"the gap voltage{where} reaches {peak:.4g} V; air breaks down above about {BREAKDOWN_VOLTAGE:g} V "

@@ -1,4 +1,4 @@
-"""Runs in closed form: of a circuit whose areas are fixed or do not matter, and of a stack that does not leak."""
+"""Runs in closed form: circuits whose areas are fixed or have negligible effect, and stacks without leakage."""
 
 from __future__ import annotations
 
@@ -24,26 +24,28 @@ from fingerspice.solve.stackstate import StackState, from_stack, from_written, m
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import same_time
 
-# Of the closed forms, over the largest voltage of the run: where the modes follow from a secular equation, and else.
+# Round-off of the closed forms relative to the run's largest voltage: for a stack, whose modes follow from a secular
+# equation, and for a network, whose modes follow from matrices.
 ROUNDING, ROUNDING_OF_MATRICES = 1e-13, 1e-12
-# Areas whose modes stay with a scene.
+# Number of sets of areas whose modes are cached with a scene.
 MOST_MODES = 8
 
 
 def solve_linear(
     problem: Problem, t_out: FloatArray, left: BoolArray, area: FloatArray | None = None, bound: float = 0.0
 ) -> Run:
-    """Outputs of a circuit with its areas fixed: its modes answered source by source, and added up.
+    """Outputs of a circuit with its areas fixed: the modes' responses to the single sources, superposed.
 
     Parameters
     ----------
     problem : Problem
-        Its charge is wanted only where the areas are fixed.
+        It may ask for charge only if the areas are fixed by the circuit.
     t_out, left : ndarray, shape (n_out,)
+        Output times (s, ascending), and whether the left-hand limit is wanted there.
     area : ndarray, shape (n_area,), optional
-        m^2; those of the scene by default.
+        Areas, m^2; the scene's areas by default.
     bound : float
-        Error from taking these areas, relative to the peaks; 0 where they are the areas, or do not matter.
+        Error from holding the areas at these values, relative to the peaks; 0 where they are exact or have no effect.
     """
     scene, start = problem.scene, problem.initial
     area = scene.area0 if area is None else area
@@ -70,7 +72,7 @@ def solve_linear(
 
 @dataclass(frozen=True)
 class _Answer:
-    """Modes (n_t, n), sources, their integrals and their slopes (n_t, n_s) at times."""
+    """Response at n_t times: modes (n_t, n), and the sources, their integrals and their slopes (n_t, n_s)."""
 
     v: FloatArray
     s: FloatArray
@@ -79,7 +81,7 @@ class _Answer:
 
     def x(self, modes: Modes) -> FloatArray:
         """Live voltages, V, shape (n_t, n)."""
-        # Not by BLAS, whose threads cost more than the product and may round otherwise.
+        # Not by BLAS: its threads cost more than the product, and their number changes the rounding.
         return np.asarray(
             np.einsum("jk,tk->tj", modes.shape, self.v) - np.einsum("jk,tk->tj", modes.follow, self.s), float
         )
@@ -88,9 +90,9 @@ class _Answer:
 def _answer(
     problem: Problem, tables: Tables, modes: Modes, v0: FloatArray, t_out: FloatArray, left: BoolArray
 ) -> tuple[_Answer, _Answer, float]:
-    """The outputs reached, the same just before the time reached (n_t = 1), and that time, s."""
+    """Response at the outputs reached, left-hand response at the end of the windows (n_t = 1), and that end, s."""
     n, n_s = modes.gains.shape
-    # The sources' integrals ride along as modes of rate zero, for the charge.
+    # The charge needs the integrals of the sources: each is one more mode, with rate 0 and gain 1.
     rates, gains = np.append(modes.rates, 0.0), np.vstack([modes.gains, np.ones(n_s)])
     states = [np.append(v0 if j == 0 else np.zeros(n), 0.0) for j in range(n_s)]
     size = t_out.size
@@ -101,7 +103,7 @@ def _answer(
         if any(table.edges.size < 2 for table in window):
             break
         sources, end = joined(window), min(float(table.edges[-1]) for table in window)
-        # The end is one more of the times: where one source breaks off there, the others' tables go on.
+        # Evaluate at the window's end too: where one source's table ends there, the other tables continue past it.
         at = np.append(np.arange(first, _upto(t_out, left, end)), size)
         t, side = np.append(t_out[at[:-1]], end), np.append(left[at[:-1]], True)
         v[size] = 0.0
@@ -123,7 +125,7 @@ def _answer(
 
 
 def _upto(t_out: FloatArray, left: BoolArray, end: float) -> int:
-    """Number of outputs up to the end of a window, left-hand ones on it included."""
+    """Number of outputs up to the end of a window, including left-hand outputs at the end itself."""
     last = int(np.searchsorted(t_out, end, side="left"))
     while last < t_out.size and t_out[last] == end and left[last]:
         last += 1
@@ -131,7 +133,7 @@ def _upto(t_out: FloatArray, left: BoolArray, end: float) -> int:
 
 
 def _is_sample_by_sample(problem: Problem, t_out: FloatArray) -> bool:
-    """Whether a recorded source is wanted at its own samples from the first one on: then a recursion serves."""
+    """Whether the outputs are a recorded source's own sample times from the first one on: then a recursion serves."""
     wave = problem.waveform
     if problem.charge or not isinstance(wave, Samples) or not 1 < t_out.size <= wave.count:
         return False
@@ -142,7 +144,7 @@ def _is_sample_by_sample(problem: Problem, t_out: FloatArray) -> bool:
 
 
 def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatArray, _Answer]:
-    """Live voltages at the samples of a recorded source (n_t, n), and the answer at the last."""
+    """Live voltages at the samples of a recorded source (n_t, n), V, and the response at the last sample."""
     wave = problem.waveform
     assert isinstance(wave, Samples)
     count = round((problem.t_stop - wave.start) * wave.rate) + 1
@@ -157,7 +159,7 @@ def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatAr
 
 @dataclass(frozen=True)
 class _Charge:
-    """Charge that each source delivers, and its regular current, of a circuit with fixed areas."""
+    """Charge (C) and regular current (A) that each source delivers to a circuit with fixed areas."""
 
     network: Network
     area: FloatArray
@@ -177,7 +179,7 @@ class _Charge:
         draining = modes.rates > 0.0
         passed = np.einsum("kj,tj->tk", modes.gains, answer.integral) - (answer.v - self.v_start)
         held = np.outer(t - self.t_start, self.v_start)
-        # What nothing drains loses nothing either, so that its integral does not count.
+        # A mode with rate 0 has no leakage current, so that any value of its integral will do.
         integral = np.where(draining, passed / np.where(draining, modes.rates, 1.0), held)
         x_integral = _Answer(integral, answer.integral, s, s).x(modes)
         rate = np.einsum("kj,tj->tk", modes.gains, s) - modes.rates * answer.v
@@ -196,7 +198,7 @@ def _finished(
     problem: Problem, tables: Tables, t: FloatArray, left: BoolArray, rows: FloatArray, state: State, bound: float,
     solve: Callable[..., Run],
 ) -> Run:  # fmt: skip
-    """A run with its peaks and its errors: rounding, and `bound` relative to the peaks."""
+    """A run with its peaks and its stated errors: round-off, and `bound` relative to the peaks."""
     status = Status.SUCCESS if tables.not_finite is None else Status.SOURCE_NOT_FINITE
     run = Run(t, left, rows, status, 0, {}, state, t_failed=tables.not_finite)
     run.unseen, run.rough = tables.unseen, tables.rough
@@ -212,7 +214,7 @@ def _finished(
     run.gaps = np.array(gaps or [(0.0, 0.0, rounding, 0.0)])
     run.node_error = rounding + bound * largest
     if not problem.scene.is_sampled:
-        # A function would cost too much to look at.
+        # Not for a source given as a user's function: evaluating it between the outputs would cost too much.
         look = partial(_look, dataclasses.replace(problem, charge=False), solve)
         run.continuous = ClosedForm(look, problem.waveform, problem.t_start, problem.first, problem.t_stop)
     return run
@@ -223,7 +225,7 @@ def _look(problem: Problem, solve: Callable[..., Run], t: FloatArray, left: Bool
 
 
 def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run:
-    """Outputs of a stack without any leak: the layers keep their share of the source's voltage."""
+    """Outputs of a stack without leakage: the layers share each change of the source's voltage in fixed ratios."""
     scene = problem.scene
     model, start = model_of(scene), problem.inner
     tables = Tables(problem, 1e-12, t_out=t_out)
@@ -248,7 +250,7 @@ def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run
         u, slope = np.repeat(last, t_out.size - done, axis=1)
         charge_error = max(charge_error, along(u, slope, rows[done:]))
         done = t_out.size
-    # The state is that before a jump at the end.
+    # The final state is the left-hand one: it does not include a jump at the end.
     along(np.array([u_end]), np.zeros(1), ended)
     y = np.append(start.y[:-1], ended[0, -1])
     state = from_stack(scene, StackState(end, y, u_end, float(ended[0, 1]), start.offset))

@@ -1,10 +1,10 @@
-"""What is said of a run that failed: where it was, why, and what to change."""
+"""Messages about a run that failed: the place and the time of the failure, its cause, and what to change."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from fingerspice.results.outcome import Failure, Status
+from fingerspice.results.outcome import Failure, Status, last_tried
 from fingerspice.results.record import Record
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run
@@ -14,7 +14,7 @@ ROUGH = "the source function itself is rough by {:.2g} V"
 
 
 def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
-    """Of a run that did not succeed; what folds is the gap with the least area left of its own."""
+    """The failure of a run. At a fold, the gap with the smallest area relative to its area at 0 V is named."""
     status, cause = run.status, run.status.cause
     names = _measured(problem)
     element = ", ".join(names)
@@ -43,11 +43,11 @@ def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
         element = names[worst] if names else element
         cause += f" (estimate {run.gaps[worst, 2]:.3g} V of {peaks[worst]:.3g} V peak"
         cause += _little(peaks[worst], max(problem.scene.u_peak, float(peaks.max()))) + ")"
-    return Failure(status, cause, status.action, run.t_failed, element, u_gap, area, margin, run.tried)
+    return Failure(status, cause, status.action, run.t_failed, element, u_gap, area, margin, last_tried(run.tried))
 
 
 def period_failure(problem: Problem, status: Status, t: float | None = None, cause: str = "") -> Failure:
-    """Of a periodic state that was not reached."""
+    """The failure of a search for the periodic state."""
     element = ", ".join(_measured(problem))
     if status is Status.SOURCE_NOT_FINITE and t is not None:
         element = _not_finite_at(problem, t)
@@ -56,24 +56,24 @@ def period_failure(problem: Problem, status: Status, t: float | None = None, cau
 
 
 def _measured(problem: Problem) -> list[str]:
-    """Names of the elements whose voltages errors are measured on."""
+    """Names of the elements for whose voltages an error is stated."""
     return [problem.network.cells[i].element.name for i in problem.scene.measured]
 
 
 def _written(problem: Problem, place: int) -> list[str]:
-    """Names of the sources that make up one of the network's."""
+    """Names of the deck's sources that are combined in source number `place` of the network."""
     stack = problem.scene.stack
     return [problem.network.sources[place].name] if stack is None else [e.name for e, _ in stack.sources]
 
 
 def _not_finite_at(problem: Problem, t: float) -> str:
-    """Names of the sources that have no finite value at a time, s."""
+    """Names of the sources without a finite value at time t, s."""
     broken = [i for i, wave in enumerate(problem.waveforms) if not np.isfinite(wave.value(t))]
     return ", ".join(name for i in broken for name in _written(problem, i))
 
 
 def _little(peak: float, largest: float) -> str:
-    """Why the error of a gap at so little of the circuit's largest voltage (V) cannot be met."""
+    """Reason why `rtol` cannot be met for a gap with a tiny share of the circuit's largest voltage (V), or ""."""
     if not peak < 1e-4 * largest:
         return ""
     return f"; the gap takes almost nothing of the {largest:.3g} V of the source, and rounding of these limits it"

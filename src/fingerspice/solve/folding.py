@@ -1,8 +1,9 @@
-"""Where a run under the `mobile` law meets its fold.
+"""The fold of a run under the `mobile` law: its time and the outputs up to it.
 
-With m the distance to the fold, m u' = v for a gap voltage u and a v that stays finite. In time u runs into the fold
-with a square root, or creeps up to it as its own mode turns infinitely fast: no step length suits either. In the
-variable s with dt/ds = m, du/ds = v both are smooth: the path crosses m = 0, or comes to rest there.
+Let m be the distance to the fold. The gap voltage u obeys m u' = v, where v stays finite. As a function of time, u
+either has a square-root singularity at the fold, or approaches it slowly while its time constant tends to 0; no step
+length suits either case. With the variable s defined by dt/ds = m and du/ds = v, both are smooth: the path crosses
+m = 0, or comes to rest there.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from scipy.integrate import OdeSolution, solve_ivp
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine.model import branch_area, dot, ramp, voltage_by_time, write_row_at
 from fingerspice.engine.segment import Segment, source
-from fingerspice.results.outcome import Failure, SolveError, Status
+from fingerspice.results.outcome import Failure, SolveError, Status, last_tried
 from fingerspice.solve.marching import solve as solve_marching
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run
@@ -25,29 +26,30 @@ from fingerspice.solve.sources import Tables
 from fingerspice.solve.stackstate import StackState, from_stack, from_written, model_of, row_width, to_stack
 
 FINEST_RTOL = 1e-12
-# Where leaks are fast beside a path to a fold, their rounding leaves no tight tolerance to be met: a second try's, and
-# a third one's that starts as near as this to the fold, so that it has no way to stray.
+# Where leaks are much faster than the path to the fold, their round-off makes a tight tolerance unattainable. The
+# second attempt uses LOOSER_RTOL. The third, with LOOSEST_RTOL, is made only within the distance NEAR of the fold,
+# where the path is too short to drift from the solution of the area equation.
 LOOSER_RTOL, LOOSEST_RTOL, NEAR = 1e-9, 1e-6, 3e-3
-# What a path may leave of the area equation, over the gap voltage.
+# Largest residual of the area equation at the end of a path, relative to the gap voltage.
 STRAYED = 1e-3
-# A fold is met at this distance, and looked for over so many of the shortest time constants.
+# Distance at which the fold counts as reached, and largest value of s in units of the shortest time constant.
 NOTHING_LEFT, LONGEST = 1e-10, 1e12
-# A path to a fold takes a few thousand evaluations.
+# Limit of the evaluations of a path; most paths to a fold take a few thousand.
 MOST_EVALUATIONS = 10_000
 
 
 class _LostError(Exception):
-    """A path took too many evaluations, found no step small enough, or strayed."""
+    """A path took too many evaluations, found no step small enough, or no longer fulfils the area equation."""
 
 
 def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | None:
-    """A run under the `mobile` law that meets a fold, or jumps past one, up to that; None where it meets none.
+    """A run under the `mobile` law up to the fold that it reaches or jumps past; None where it reaches no fold.
 
     Parameters
     ----------
     problem : Problem
     t_out, left : ndarray, shape (n_out,)
-        Output times (s, ascending) and whether the left-hand value is meant.
+        Output times (s, ascending), and whether the left-hand limit is wanted there.
     """
     run = solve_marching(problem, FINEST_RTOL, t_out, left, repeat=False)
     if run.status is Status.FOLD:
@@ -56,7 +58,7 @@ def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | N
 
 
 def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray) -> Run | None:
-    """A run that stopped for a fold, led on until it meets it; None where it meets none."""
+    """Continue a run that stopped near a fold until it reaches the fold; None where it does not reach it."""
     state = to_stack(problem.scene, run.state)
     begun = _start(problem, state)
     if run.margin <= 0.0 or math.isnan(begun.u):
@@ -64,7 +66,7 @@ def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray)
     path = _ahead(problem, state, begun, run.margin, FINEST_RTOL)
     if path is None:
         return None
-    # The row of where the steps stopped is no output.
+    # The last row of the run may be the point where the steps stopped, which is not an output time.
     stopped = run.t.size > 0 and (run.t.size > t_out.size or run.t[-1] != t_out[run.t.size - 1])
     done = run.t.size - int(stopped)
     later = t_out[done:]
@@ -85,19 +87,22 @@ def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray)
 
 
 def meets_fold(problem: Problem, rtol: float) -> bool:
-    """Whether a problem meets a fold, or a jump of its source goes past one; what follows a near miss is not looked at.
+    """Whether a problem reaches a fold, or a jump of its source goes past one.
+
+    A run that stops near a fold and does not reach it counts as a run without a fold: its later course is not examined.
 
     Raises
     ------
     SolveError
-        Where the run fails otherwise.
+        Where the run fails for another reason than a fold.
     """
     nothing = np.empty(0)
     run = solve_marching(problem, rtol, nothing, nothing.astype(bool))
     if run.status is Status.SUCCESS:
         return False
     if run.status is not Status.FOLD:
-        raise SolveError(Failure(run.status, run.status.cause, run.status.action, run.t_failed, tried=run.tried))
+        tried = last_tried(run.tried)
+        raise SolveError(Failure(run.status, run.status.cause, run.status.action, run.t_failed, tried=tried))
     state = to_stack(problem.scene, run.state)
     begun = _start(problem, state)
     return run.margin <= 0.0 or math.isnan(begun.u) or _ahead(problem, state, begun, run.margin, rtol) is not None
@@ -105,7 +110,7 @@ def meets_fold(problem: Problem, rtol: float) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class _Path:
-    """State (n + 1,), time since `begin` (s) and gap voltage (V) over the variable s, up to the fold."""
+    """State (n + 1,), time since `begin` (s) and gap voltage (V) as functions of the variable s, up to the fold."""
 
     begin: float
     segment: Segment
@@ -121,7 +126,7 @@ class _Path:
     def rows(self, problem: Problem, t: FloatArray) -> FloatArray:
         """Rows of `engine.model.write_row` at times (s) on the path."""
         low, high = np.zeros(t.size), np.full(t.size, self.solution.t_max)
-        # Time rises along the path, ever slower: halving has no trouble with that.
+        # Time rises monotonically in s, but dt/ds tends to 0 at the fold: bisection is safe there, Newton is not.
         for _ in range(64):
             middle = 0.5 * (low + high)
             early = self.solution(middle)[-2] * self.scale[-2] < t - self.begin
@@ -134,7 +139,7 @@ class _Path:
 
 
 class _Start(NamedTuple):
-    """Where a path starts: the segment of the source, its end (s), the area's branch, and the gap voltage (V).
+    """Start of a path: the segment of the source, the segment's end (s), the area's branch, and the gap voltage (V).
 
     The voltage is NaN where the start is at the fold or past it, as after a jump of the source.
     """
@@ -165,7 +170,7 @@ def _start(problem: Problem, state: StackState) -> _Start:
 
 
 def _ahead(problem: Problem, state: StackState, begun: _Start, margin: float, rtol: float) -> _Path | None:
-    """The path from a state, so far from a fold, to that in its segment of the source; None where none is found."""
+    """The path from a state at distance `margin` to a fold in the same segment of the source; None if not found."""
     tries = (rtol, LOOSER_RTOL, LOOSEST_RTOL) if margin < NEAR else (rtol, LOOSER_RTOL)
     for tried in sorted({max(rtol, x) for x in tries}):
         try:
@@ -220,7 +225,7 @@ def _path(problem: Problem, state: StackState, begun: _Start, rtol: float) -> _P
         event.terminal = True
 
     def jacobian(s: float, z: FloatArray) -> FloatArray:
-        # By plain differences: scipy's widen theirs for ever where nothing depends on an entry, as on the charge.
+        # Plain differences: scipy enlarges its own without limit for entries on which nothing depends (the charge).
         here, columns = slope(s, z), []
         for i in range(z.size):
             moved = z.copy()
@@ -228,7 +233,7 @@ def _path(problem: Problem, state: StackState, begun: _Start, rtol: float) -> _P
             columns.append((slope(s, moved) - here) / (moved[i] - z[i]))
         return np.array(columns).T
 
-    # The mode that is to fold may be faster than all else and follow it: an explicit method would not get there.
+    # Near the fold the mode that folds may be the stiffest of all: an explicit method would need too many steps.
     found = solve_ivp(
         slope, (0.0, LONGEST), begin, "Radau",
         rtol=rtol, atol=rtol, jac=jacobian, events=events, dense_output=True,
@@ -237,7 +242,7 @@ def _path(problem: Problem, state: StackState, begun: _Start, rtol: float) -> _P
         raise _LostError
     if not found.t_events[0].size:
         return None
-    # The voltage is carried along by its rate: it has to be a solution still.
+    # The gap voltage was integrated from its rate, so check that it still solves the area equation.
     last = found.y[:, -1] * scale
     q, _ = branch_area(model, sign, last[n + 1])
     k_u = model.k_gap * source(segment, t - segment.start + last[n])[0]

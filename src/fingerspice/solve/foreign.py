@@ -1,6 +1,7 @@
-"""Integrators of scipy and torchdiffeq on the right-hand side of any circuit, split where its sources have edges.
+"""Integrators of scipy and torchdiffeq on the right-hand side of any circuit, restarted at the edges of its sources.
 
-Their error is measured against our own Radau collocation at a tighter tolerance, and met by tightening theirs.
+Their error is measured against our own Radau collocation at a tighter tolerance. Where it is too large, the library's
+tolerance is reduced and the run is repeated, because the libraries control a local error only.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ _QUIET = threading.Lock()
 SCIPY_METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 TORCH_METHODS = ("dopri5", "dopri8", "bosh3", "adaptive_heun", "rk4", "midpoint", "euler")
 _TORCH_FIXED = {"rk4": 4, "midpoint": 2, "euler": 1}
-# The tolerance of the run that the error is measured against, and the first one of the library's, over the error asked
-# for; how often that is tightened.
+# Tolerances of our reference run and of the library's first run, relative to the error asked for; and the number of
+# runs with the library's tolerance reduced each time.
 REFERENCE, FIRST, ATTEMPTS = 0.03, 0.1, 6
 
 
 class _FailedError(Exception):
-    """A library's integrator gave up; `t` (s, since the piece began) is how far it got."""
+    """A library's integrator gave up at time `t` (s, from the start of the piece)."""
 
     def __init__(self, t: float, text: str) -> None:
         self.t = t
@@ -47,7 +48,7 @@ def _rate(
     net: Net, room: Room, sources: Sources, index: IntArray, base: float, t: float, y: FloatArray, sign: FloatArray,
     chooses: bool,
 ) -> FloatArray:  # fmt: skip
-    """y' at t (s) after `base`, NaN past a fold; where it `chooses`, the areas' branches are those of the voltages."""
+    """y' at t (s) after `base`, NaN past a fold; with `chooses`, the branches of the areas follow from the voltages."""
     at_sources(sources, index, base, t, room.s, room.ds)
     if chooses:
         choose_signs(net, room, False, y, sign)
@@ -61,16 +62,17 @@ def _rate(
 def _gap(
     net: Net, room: Room, sources: Sources, index: IntArray, base: float, t: float, y: FloatArray, area: int
 ) -> float:  # fmt: skip
-    """Voltage (V) that an area follows at t (s) after `base`."""
+    """Gap voltage (V) on which an area depends, at t (s) after `base`."""
     at_sources(sources, index, base, t, room.s, room.ds)
     return gap_voltage(net, room, area, y)
 
 
 @dataclass
 class _Piece:
-    """A smooth stretch of a run, `length` s from its state `y` on, handed to a library; outputs are at `times`.
+    """A smooth part of a run for a library to integrate: `length` seconds from state `y`, with outputs at `times`.
 
-    `rate` is y'(t, y), `gaps` are the gap voltages times the signs of their branches, which end the piece at 0 V.
+    `rate` is y'(t, y). `gaps` are the gap voltages times the signs of their branches; the piece ends where one becomes
+    0 V, because the area has a kink there.
     """
 
     rate: Callable[[float, FloatArray], FloatArray]
@@ -83,7 +85,7 @@ class _Piece:
     tau: float
 
 
-# What a library gives back: end of the time and of the state, states at the times reached, evaluations.
+# Result of a library: time reached (s) and state there, states at the output times reached, number of evaluations.
 _Result = tuple[float, FloatArray, FloatArray, int]
 
 
@@ -92,7 +94,7 @@ def _scipy_piece(piece: _Piece, name: str) -> _Result:
 
     for gap in piece.gaps:
         gap.terminal, gap.direction = True, -1.0  # type: ignore[attr-defined]
-    # Filters are of the whole process: one thread at a time changes them, and only for scipy's own.
+    # Warning filters belong to the whole process: change them in one thread at a time, for scipy's warnings only.
     with _QUIET, warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"scipy\.")
         try:
@@ -101,10 +103,10 @@ def _scipy_piece(piece: _Piece, name: str) -> _Result:
                 rtol=max(piece.tol, 3e-14), atol=piece.tol * piece.scale,
             )  # fmt: skip
         except ValueError as error:
-            # Past a fold there is no slope, and the implicit methods factor a matrix of NaN.
+            # Past a fold y' is NaN, and scipy's implicit methods refuse to factor a matrix with NaN.
             raise _FailedError(0.0, f"scipy: {error}") from None
     end = result.y[:, -1]
-    # LSODA calls NaN a success.
+    # LSODA reports success even if the state is NaN.
     if result.status < 0 or not np.all(np.isfinite(end)):
         raise _FailedError(float(result.t[-1]), str(result.message))
     t_end = float(result.t[-1]) if result.status == 1 else piece.length
@@ -120,15 +122,15 @@ def _torch_piece(piece: _Piece, name: str) -> _Result:
 
     def slope(t: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         counts[0] += 1
-        # The state is in units of its scale: torchdiffeq takes one atol for all.
+        # torchdiffeq takes one atol for all entries, so each entry is integrated in units of its scale.
         rate = piece.rate(float(t), y.numpy() * piece.scale) / piece.scale
-        # Past a fold there is no slope, and torchdiffeq turns a NaN into a step of NaN; a huge slope is refused.
+        # Past a fold y' is NaN, which would make torchdiffeq's step length NaN; it rejects the step if y' is huge.
         return torch.from_numpy(np.where(np.isfinite(rate), rate, 1e9 / piece.length))
 
     times = np.unique(np.concatenate([[0.0], piece.times, [piece.length]]))
     options = {}
     if name in _TORCH_FIXED:
-        # A fixed step from the tolerance: local error ~ (h / tau)^order.
+        # A fixed step h from the tolerance, with the error model (h / tau)^order.
         longest = min(piece.tau, piece.length / 4.0)
         options = {"step_size": float(min(longest, 2.0 * longest * piece.tol ** (1.0 / _TORCH_FIXED[name])))}
     try:
@@ -148,7 +150,7 @@ def _torch_piece(piece: _Piece, name: str) -> _Result:
 
 
 class Foreign(Collocation):
-    """One integration by a library, piece by piece; jumps of the sources are taken as `Collocation` takes them."""
+    """One integration by a library, piece by piece; jumps of the sources are integrated as in `Collocation`."""
 
     def __init__(
         self, problem: Problem, library: str, name: str, tol: float, u_scale: float, t_out: FloatArray,
@@ -156,7 +158,7 @@ class Foreign(Collocation):
     ) -> None:  # fmt: skip
         super().__init__(problem, radau_scheme(STAGES), tol, u_scale, t_out, left)
         self.library, self.name, self.detail = library, name, ""
-        # Where no charge was asked for, its error is none beside 1 C.
+        # Without a request for charge its scale is infinite, which libraries cannot take: 1 C is as good as infinite.
         self.scale = np.where(np.isfinite(self.scale), self.scale, 1.0)
         fastest = float(problem.scene.rates.max(initial=0.0))
         self.tau = 1.0 / fastest if fastest > 0.0 else np.inf
@@ -176,14 +178,15 @@ class Foreign(Collocation):
                 except _FailedError as error:
                     self.detail = error.text
                     return Status.METHOD_FAILED
-                # An area whose branch ends at 0 V on either side of it leads nowhere.
+                # Give up if every branch has changed sign without progress: on either side of 0 V the area's branch
+                # leads back to 0 V at once.
                 stuck = stuck + 1 if self.t == before else 0
                 if stuck > 2 * self.sign.size:
                     return self.stuck()
         return Status.SUCCESS
 
     def _piece(self, sources: Sources, stop: float) -> None:
-        """To the next zero of a gap voltage, or to `stop` (s)."""
+        """Integrate to the next zero of a gap voltage, at most to `stop` (s)."""
         net, room, base, sign, n_s = self.net, self.room, self.t, self.sign, self.s_before.size
         first = sources.first
         index = np.array([
@@ -228,7 +231,7 @@ def solve_foreign(
     Raises
     ------
     InputError
-        For an unknown method, or torchdiffeq where it is not installed.
+        For an unknown method, or for torchdiffeq if it is not installed.
     """
     library, _, name = method.partition(":")
     known = SCIPY_METHODS if library == "scipy" else TORCH_METHODS

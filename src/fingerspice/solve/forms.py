@@ -1,4 +1,7 @@
-"""What a series stack needs to be followed sample by sample: weights of the steps, and the area as a polynomial."""
+"""Tables for recordings on a series stack: weights of the exponential Simpson steps, and 1/A as a polynomial.
+
+They depend on the scene, the sample spacing and the error asked for only, so that they are made once for all blocks.
+"""
 
 from __future__ import annotations
 
@@ -19,16 +22,19 @@ from fingerspice.physics.contact import N_PACKED
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.track import Prepared, prepare_system
 
-# What the area's polynomial may miss, over the error asked for.
+# Truncation error allowed for the polynomial of 1/A, relative to the error asked for.
 AREA_SHARE = 0.02
-# From values at Chebyshev's points to the coefficients of the antiderivative of their series.
+# Matrix from values at Chebyshev nodes to the Chebyshev coefficients of the antiderivative of their interpolant.
 _POINTS = 40
 _AT = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
 _INTEGRAL = series_of.chebint(np.linalg.inv(series_of.chebvander(_AT, _POINTS - 1)))
 
 
 def _area(system: System, tol: float) -> FloatArray | None:
-    """1/A as a polynomial of degree 4 k in System's variable, to an error of `tol` (relative), where one is enough."""
+    """Coefficients of 1/A as a polynomial in the variable of `System`, with a relative error of at most `tol`.
+
+    The degree is a multiple of 4, for the compiled evaluation; None if no degree up to MOST_DEGREE is enough.
+    """
     series = np.asarray(system.model.curve[2 + N_PACKED :])
     if not system.scale > 0.0 or series.size < 2:
         return None
@@ -43,7 +49,7 @@ def _area(system: System, tol: float) -> FloatArray | None:
 
 
 def _moved(system: System, area: FloatArray, at_rest: float) -> FloatArray:
-    """What follows the gap voltage of the charge, C: a polynomial as that of 1/A, 0 at 0 V."""
+    """Part of the charge (C) that is a function of the gap voltage: a polynomial in the variable of 1/A, 0 at 0 V."""
     model, slow, n = system.model, system.model.slow, system.model.gap.size
     if model.mobile:
         return np.zeros(1)
@@ -56,7 +62,7 @@ def _moved(system: System, area: FloatArray, at_rest: float) -> FloatArray:
 
 
 def form_of(system: System, area: FloatArray, spacing: float) -> Form:
-    """A stack around its reference areas with the weights of steps of a sample's length and its halves."""
+    """The stack's modes at its reference areas, with weights for steps of one sample spacing and its halvings."""
     model = system.model
     h = spacing / 2.0 ** np.arange(LEVELS)[:, None]
     z = system.rates[:, None, :] * h
@@ -96,15 +102,15 @@ def form_of(system: System, area: FloatArray, spacing: float) -> Form:
 
 @dataclass(frozen=True)
 class Followed:
-    """A scene ready to be followed sample by sample, to an error of a decade.
+    """A scene prepared for recordings, for all tolerances of one decade.
 
     Attributes
     ----------
     prepared : Prepared
     area : ndarray
-        See `Form.area`.
+        Polynomial of 1/A, see `Form.area`.
     at_rest, q_rest : float
-        Its variable and 1/A (1/m^2) at 0 V.
+        Variable of that polynomial, and 1/A (1/m^2), at 0 V.
     shown : relaxation.Shown
     """
 
@@ -119,12 +125,12 @@ class Followed:
         return self.prepared.system
 
     def charge_with(self, u_gap: float) -> float:
-        """The charge that follows a gap voltage (V), C."""
+        """Part of the charge (C) that is a function of the gap voltage (V)."""
         return math.copysign(float(polyval(abs(u_gap) * self.system.scale + self.at_rest, self.shown.moved)), u_gap)
 
 
 def followed(problem: Problem, rtol: float) -> Followed | None:
-    """The scene made ready, where a polynomial for its area is good enough."""
+    """The scene prepared for recordings; None where no polynomial represents 1/A well enough."""
     prepared = prepare_system(problem.scene, rtol)
     system = prepared.system
     area = _area(system, AREA_SHARE * rtol)

@@ -1,4 +1,4 @@
-"""The state that a run of a circuit starts from."""
+"""The initial state of a run, from the deck's ``uic`` and ``.ic``, the operating point, or an earlier solution."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
     Raises
     ------
     InputError
-        For a start that cannot be.
+        For an unknown start, a solution of another circuit, or a start that no charge of the circuit allows.
     """
     network = scene.network
     size = sum(network.b.shape) + int(np.count_nonzero(scene.net.slow >= 0))
@@ -61,9 +61,9 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
 
 
 def _given(circuit: Circuit, scene: Scene, asked: bool) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Cell voltages (V) and areas (m^2) that a start with ``uic`` gives; None for the sources: their own at 0+.
+    """Cell voltages (V) and areas (m^2) of a start with ``uic``, and None: the sources start with their values at 0+.
 
-    Areas are NaN where they follow, or start at rest.
+    An area is NaN if it follows its voltage without delay, or if it starts in equilibrium with it.
     """
     network = scene.network
     area = np.full(len(network.areas), np.nan)
@@ -77,20 +77,20 @@ def _given(circuit: Circuit, scene: Scene, asked: bool) -> tuple[FloatArray, Flo
 
 
 def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Cell voltages (V), areas (m^2) and sources of the operating point, the nodes in `initial` held."""
+    """Cell voltages (V), areas (m^2) and sources at the operating point, with the nodes in `initial` held."""
     network, net, stack = scene.network, scene.net, scene.stack
     s = np.array([float(w.value(0.0, "left")) for w in scene.waveforms])
     if stack is not None and scene.model is not None and not initial:
         order = list(stack.state_order)
         return (stack.sign * dc_voltages(stack, float(s[0]), scene.model))[order], scene.area0, s
     contacts = [c if gap >= 0 else None for c, gap in zip(network.contacts, net.gap, strict=True)]
-    # The network of a loop does not know its nodes.
+    # The reduced network of a series loop has no nodes, so the operating point needs the unreduced network.
     whole = network if stack is None else build_network(replace(circuit, work="gap"))
     point = operating_point(circuit, whole, scene.area0, contacts, initial)
     u = point.u.copy() if stack is None else _cells_of(network, whole, u=point.u)
     if net.mobile:
         for i in np.flatnonzero(point.held & (net.slow < 0)):
-            # Let go, the area goes its own way, and the charge stays.
+            # A held area is released at the start: it becomes that of its gap voltage, and the charge is conserved.
             gap = net.gap[i]
             own = at_own_area(float(u[gap]), point.area[i], net.curves[i])
             rest = 1.0 / inverse_area(abs(own), net.curves[i])[0]
@@ -100,19 +100,19 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
 
 
 def _cells_of(network: Network, whole: Network, u: FloatArray) -> FloatArray:
-    """Voltages (V) of a loop's cells from those of the same circuit's as a network."""
+    """Voltages (V) of a loop's cells from the cell voltages of the same circuit built as a network."""
     of: dict[str, list[float]] = {}
     for cell, one in zip(whole.cells, u.tolist(), strict=True):
         of.setdefault(cell.element.name, []).append(one)
     for layer in network.layers:
         if sum(cell.element is layer for cell in network.cells) == 1:
-            # A dispersive skin whose data are taken at one frequency is one cell.
+            # A dispersive skin evaluated at one frequency is one cell of the loop, but several of the network.
             of[layer.name] = [sum(of[layer.name])]
     return np.array([of[cell.element.name].pop(0) for cell in network.cells])
 
 
 def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) -> State:
-    """State just before the start of cells that hold `u` (n_cell,) V, with the sources at `s` or else at what fits."""
+    """State just before the start from cell voltages u (n_cell,) V; without `s`, the sources are fitted to them."""
     network, net = scene.network, scene.net
     if s is None and not u.any() and not np.any(net.slow >= 0):
         y, before = np.zeros(sum(network.b.shape)), np.zeros(len(network.sources))
@@ -126,7 +126,7 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
         settled = settle(net, u, slow, before)
         x, slow, charge = settled.x, settled.slow, settled.charge
     elif np.any(np.isnan(slow)):
-        # Areas with dynamics of their own start where they rest after the sources' first jump.
+        # Areas with a time constant start in equilibrium with the voltages after the sources' first jump.
         slow = settle(net, u, slow, _after(scene)).slow
     sign = np.zeros(len(network.areas))
     state = State(0.0, np.concatenate([x, slow, charge]), before, sign, scene.charge_law)
@@ -136,22 +136,22 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
 
 
 def _after(scene: Scene) -> FloatArray:
-    """The sources after their first jump."""
+    """Values of the sources at 0+, after a jump at the start (V or A)."""
     after = np.array([float(w.value(0.0)) for w in scene.waveforms])
-    # A run of a source that is not finite says so itself.
+    # The run itself reports a source that is not finite.
     after[~np.isfinite(after)] = 0.0
     return after
 
 
 def _fitting(network: Network, u: FloatArray) -> FloatArray:
-    """Values of the sources that leave the cells `u` (n_cell,) V, as nearly as they can."""
+    """Values of the sources that agree with the cell voltages u (n_cell,) V, in the least-squares sense."""
     if not network.q.size or not np.any(u):
         return np.zeros(network.q.shape[1])
     return np.asarray(np.linalg.lstsq(network.q, u, rcond=None)[0], float)
 
 
 def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
-    """Cell voltages along the loop (n_cell,) at the DC operating point, the area coupled.
+    """Cell voltages (V) along the loop (n_cell,) at the DC operating point, with the area coupled.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Own integration by exponential steps, again until the error asked for is met."""
+"""Integration by our own exponential steps, repeated with smaller tolerances until the stated error is met."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, OutOfRangeError, Ste
 from fingerspice.solve.track import Track, prepare_system, scale_of
 
 ATTEMPTS = 6
-# A gap's voltage over the largest one of its sources' before it is known, V.
+# Voltage scale of a circuit whose sources give none, before any voltage has been computed, V.
 GUESS = 1.0
 
 
@@ -27,18 +27,18 @@ def solve(
 ) -> Run:
     """Integrate until the stated error is within `rtol` of the peaks of every gap's voltage and force.
 
-    The first attempt's tolerance is a guess; each further one follows from the error estimated.
+    The tolerance of the first attempt is a guess; each further one follows from the previous attempt's stated error.
 
     Parameters
     ----------
     problem : Problem
     rtol : float
     t_out, left : ndarray, shape (n_out,)
-        Output times (s, ascending) and whether the left-hand value is meant.
+        Output times (s, ascending), and whether the left-hand limit is wanted there.
     progress : callable, optional
         Called with the fraction of the run that is done.
     repeat : bool
-        Whether one period may stand for those after it, once the state no longer changes from one to the next.
+        Whether later periods may repeat one period, once the state no longer changes from one to the next.
     """
     tables = Tables(problem, LOCAL_SHARE * rtol, t_out=t_out)
     is_stack = problem.scene.stack is not None
@@ -67,12 +67,12 @@ def solve(
         one.stated(run)
         attempts += 1
         worst = run.excess(problem.largest) / rtol
-        # Else it has ended after its trial.
+        # A trial (`try_out`) that predicts too large an error stops the run early, with ERROR_NOT_MET.
         is_whole = run.status is not Status.ERROR_NOT_MET
         if is_whole and (run.status is not Status.SUCCESS or worst <= 1.0):
             return run
         peak = float(run.gaps[:, 0].max(initial=0.0))
-        # A peak that is no more than the error may yet turn out to be none.
+        # A peak smaller than its own error may still vanish with a finer tolerance, so that case is not hopeless.
         hopeless = rtol * peak < ROUNDING * u_scale and run.error.u_gap < peak
         if hopeless or tol <= FINEST or attempts >= ATTEMPTS:
             if is_whole:
@@ -81,6 +81,6 @@ def solve(
             tries_out = False
             continue
         finer = tol * min(0.3, 0.5 / worst)
-        # Steps that something else than their error kept short are shortened by a tolerance below what they made only.
-        # A network's would go on to errors that its areas' polynomials, made for `rtol`, do not reach.
+        # If edges or zeros kept the steps short, their error is below `tol`, and only a tolerance below that error
+        # shortens them. Not for a network: this could lead below the error of its areas' polynomials, made for `rtol`.
         tol = min(finer, 0.5 / worst * run.error.u_gap / u_scale) if is_stack else finer

@@ -1,4 +1,4 @@
-"""A network by exponential steps; see `engine.netmarch.march`."""
+"""One integration of a network by exponential steps: the driver of `engine.netmarch.march`."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ from fingerspice.solve.settling import Settling
 from fingerspice.solve.sources import held as held_at
 from fingerspice.solve.stepping import SAFETY, Stepping
 
-# Steps for each of the sources' edges and shortest times: what needs more is for another method. Where a mode follows
-# at once and the area moves its charge strongly, the iteration closes on steps as short as the mode's own time only.
+# Most steps for each edge and each shortest time of the sources; a run that needs more is left to another method. Where
+# an area strongly affects the charge of a stiff mode, the fixed-point iteration converges only with steps of the
+# mode's own time constant.
 MOST_STEPS = 100
 
 
 class March(Stepping, NetworkIntegration):
-    """One integration in progress, with an error of `tol` times `u_scale` (V) in every step."""
+    """One integration in progress, with an error of at most `tol` times `u_scale` (V) in every step."""
 
     def __init__(
         self, problem: Problem, tol: float, rtol: float, u_scale: float, t_out: FloatArray, left: BoolArray,
@@ -85,7 +86,7 @@ class March(Stepping, NetworkIntegration):
         met[:, netassess.ERROR_U] += off
         steepest = 2.0 * met[:, netassess.PEAK_F] / np.maximum(met[:, netassess.PEAK_U], 1e-300)
         met[:, netassess.ERROR_F] += off * steepest
-        # What the kept period is off is off in every one that it stands for.
+        # The charge error of the repeated period recurs in each of the `alike` periods that repeat it.
         missed, spread = self.collected - collected
         self.collected[0] += alike * missed
         held = float(self.problem.network.capacitance(self.problem.scene.area0).sum())
@@ -101,11 +102,11 @@ class March(Stepping, NetworkIntegration):
         return self._march(held_at(self.t, after), self.t) == netmarch.DONE
 
     def _add_reference(self) -> None:
-        """Make the reference that the loop has looked for."""
+        """Add the reference areas that the compiled loop needs next, and that it has written to `wanted`."""
         known, at = self.references, self.work.at
         wanted = tuple(map(int, known.arrays.wanted))
         if known.is_full:
-            # The one in use comes along: tables and couplings of others are made again.
+            # Start a new set of references with the one in use; the tables and couplings of all others are dropped.
             levels = tuple(map(int, known.arrays.levels[at[0]]))
             self.references = known = known_references(self.problem.scene, self.decade, anew=True)
             if levels != (0,) * len(levels):
@@ -118,10 +119,10 @@ class March(Stepping, NetworkIntegration):
         return self._stated()[list(self.problem.scene.network.fingers)]
 
     def _stated(self) -> FloatArray:
-        """Peaks and stated errors of all areas' gaps, and last of the nodes."""
+        """Peaks and stated errors of the gaps of all areas; the last row is that of the nodes."""
         gaps = self.met.copy()
         u_peak = gaps[:, netassess.PEAK_U]
-        # Rounding is an error too.
+        # Round-off, enlarged by the condition of the modes, adds to the truncation error.
         floor = 4e-16 * (self.references.magnified * (float(u_peak.max(initial=0.0)) + self.u_scale) + u_peak)
         steepest = 2.0 * gaps[:, netassess.PEAK_F] / np.where(u_peak > 0.0, u_peak, np.inf)
         gaps[:, netassess.ERROR_U] = SAFETY * gaps[:, netassess.ERROR_U] + floor
@@ -137,7 +138,7 @@ class March(Stepping, NetworkIntegration):
             steps = 1.0 + float(self.counters[readout.ACCEPTED])
             largest = self.u_scale + float(self.met[:, netassess.PEAK_U].max(initial=0.0))
             held = float(scene.network.capacitance(scene.area0).sum()) * largest
-            # Whatever the areas' polynomials miss, all charge that is moved misses too.
+            # The relative error of the areas' polynomials is also a relative error of all charge moved.
             moved = held + float(np.abs(self.y[-self.s_before.size :]).max(initial=0.0))
             missed = max((area_missed(curve, self.decade) for curve in self.net.curves), default=0.0)
             error_q = self.charge_error(float(self.collected[1].max(initial=0.0)))

@@ -1,4 +1,4 @@
-"""Runs of a network by Radau collocation, with a coarser run beside each for the error."""
+"""Runs of a network by Radau collocation, each with a second, coarser run from which its error is estimated."""
 
 from __future__ import annotations
 
@@ -22,38 +22,41 @@ from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import NetworkIntegration, Progress, Run, gap_signals, integrate, nodes_apart
 from fingerspice.solve.sources import Tables, ramp, values_at
 
-# Of a run, and of the coarser one beside it, with its tolerance over the run's. Their difference is the error stated:
-# where a step is cut short by an edge or a zero, the order alone keeps them apart.
+# Stages of a run and of the coarser run, and the ratio of the coarser run's tolerance to the run's. The stated error is
+# the difference of the two runs. They need different orders as well: where edges or zeros cut the steps short, both
+# runs take the same steps, whatever their tolerances.
 STAGES, STAGES_BESIDE, BESIDE = 7, 5, 10.0
-# What Newton's method may leave in both alike, over the error allowed in a step.
+# Residual of Newton's method that both runs may have in common, and their difference does not show, as a fraction of
+# the step tolerance.
 ALIKE = 0.05
-# The error allowed in a step, over the one asked for.
+# Error allowed in a step, relative to the error asked for.
 LOCAL_SHARE = 0.2
 FINEST = 1e-14
-# Steps per shortest time scale of the sources: the stages of a step must not alias it.
+# Longest step, relative to the shortest time scale of the sources: its stages must not alias the sources.
 LONGEST_STEP = 0.5
-# Times that errors are looked for at.
+# Number of equidistant times at which the two runs are compared: least, per period, and most.
 PROBES, PROBES_PER_PERIOD, MOST_PROBES = 512, 32, 20_000
-# And after so many edges of the sources, in parts of the time to the next one.
+# They are also compared after at most so many edges of the sources, at these fractions of the time to the next edge.
 MOST_EDGES, AFTER_EDGE = 256, np.geomspace(1e-15, 0.3, 30)
 ATTEMPTS = 6
-# Two runs that meet a fold agree on its time to this, relative. Where none do, a fold is believed that two of them meet
-# as near to each other as the second figure.
+# Relative difference of a fold's times in two successive runs at which the fold is accepted at once; and the one at
+# which it is accepted after the last attempt.
 FOLD_TIME, FOLD_SPREAD = 1e-10, 1e-5
-# Distance to the fold below which a run is past one: at a fold it is 0, to rounding.
+# A distance to the fold below this means that the run has stepped over a fold: at the fold it is 0 to rounding.
 PAST_FOLD = -0.01
-# Steps taken and refused, to begin with and over the run: what needs more has a cause that smaller steps do not mend.
+# Limit of accepted and rejected steps: at the start, and over the whole run. A run that needs more has a cause that
+# smaller steps do not remove.
 FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
 
 
 @cache
 def radau_scheme(stages: int) -> Scheme:
-    """Radau IIA with its matrix diagonalised."""
+    """The Radau IIA method with its matrix diagonalised, so that each eigenvalue needs a linear system of n only."""
     tableau = radau(stages)
     values, vectors = np.linalg.eig(tableau.a)
     back = np.linalg.inv(vectors)
     upper = np.flatnonzero(values.imag > -1e-12)
-    # A conjugate pair gives twice the real part of one.
+    # Of a conjugate pair keep one eigenvalue: the pair's contribution is twice its real part.
     twice = np.where(values.imag[upper] > 1e-12, 2.0, 1.0)
     return Scheme(
         tableau.a, tableau.c, tableau.e, np.ascontiguousarray(tableau.dense), values[upper].astype(complex),
@@ -73,7 +76,7 @@ class Collocation(NetworkIntegration):
         self.rows = np.full((t_out.size, self.width), np.nan)
         n_s = self.s_before.size
         stored = u_scale * float(np.abs(problem.network.capacitance(problem.scene.area0)).sum()) or u_scale
-        # A charge's own error is not looked at where nobody asked for it.
+        # With an infinite scale the error of the charge does not control the steps, unless charge was asked for.
         charge = stored if problem.charge else np.inf
         self.scale = np.concatenate([np.full(self.n, u_scale), np.ones(self.n_slow), np.full(n_s, charge)])
         self.control = np.zeros(collocation.N_CONTROL)
@@ -89,7 +92,7 @@ class Collocation(NetworkIntegration):
 
     @property
     def steps(self) -> int:
-        """Steps taken and refused."""
+        """Number of accepted and rejected steps."""
         return int(self.counters[collocation.ACCEPTED] + self.counters[collocation.REJECTED])
 
     @property
@@ -131,7 +134,7 @@ class Collocation(NetworkIntegration):
 def pass_through(
     problem: Problem, sources: Sources, tol: float, u_scale: float
 ) -> tuple[Status, Collocation, FloatArray]:
-    """A problem's run without outputs: how it ended, the run, and what its end differs by from a coarser run's."""
+    """Integrate a problem without outputs: its status, the run, and its final error, estimated by a coarser run."""
     longest, none = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step), np.zeros(0)
     ends = []
     for stages, share in ((STAGES_BESIDE, BESIDE), (STAGES, 1.0)):
@@ -163,7 +166,7 @@ def solve_coupled(
 ) -> Run:
     """Integrate until the stated error is within `rtol` of the peaks of every gap's voltage and force.
 
-    The error is stated from a second run with a larger tolerance.
+    The stated error is the difference from a second run of lower order with a larger tolerance.
     """
     longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
     fine, coarse = (radau_scheme(stages)._replace(h_max=longest) for stages in (STAGES, STAGES_BESIDE))
@@ -182,10 +185,10 @@ def solve_coupled(
         worst = _stated(problem, run, _only(run, probed), beside, u_scale, ALIKE * tol) / rtol
         last = tol <= FINEST or attempt == ATTEMPTS - 1
         if problem.scene.net.mobile and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD:
-            # A step has gone over a fold, onto a branch that nothing leads to.
+            # A step has crossed a fold onto a branch of the area equation that no continuous path reaches.
             tol, run.status = max(0.03 * tol, FINEST), Status.ERROR_NOT_MET
         elif run.status is Status.FOLD and run.t_failed is not None:
-            # What the state is off moves the fold: closer, until its time stays.
+            # The error of the state shifts the fold: reduce the tolerance until the fold's time no longer moves.
             moved, folded = abs(run.t_failed - folded) / run.t_failed if run.t_failed > 0.0 else 0.0, run.t_failed
             if nearest is None or moved < nearest[0]:
                 nearest = moved, run
@@ -195,14 +198,14 @@ def solve_coupled(
         elif run.status is not Status.SUCCESS or (worst <= 1.0 and beside.status is not Status.FOLD):
             break
         else:
-            # The coarser run may meet a fold that this one has passed.
+            # This branch is also taken where the coarser run has met a fold that this run passed without one.
             run.status = Status.ERROR_NOT_MET if last else run.status
             tol = max(tol * min(0.3, 0.5 / worst if worst > 0.0 else 0.3), FINEST)
         if last:
             break
     believed = nearest is not None and nearest[0] <= FOLD_SPREAD
     if nearest is not None and (run.status is Status.FOLD or (believed and run.status is not Status.SUCCESS)):
-        # The finest tolerances may be those of rounding: the fold is where two runs came nearest to each other.
+        # Round-off may dominate at the finest tolerances: take the run whose fold differs least from its predecessor's.
         run = nearest[1]
         run.status, run.nfev = Status.FOLD if believed else Status.ERROR_NOT_MET, nfev
     if problem.scene.net.mobile:
@@ -215,9 +218,10 @@ def solve_coupled(
 
 
 def _voltage_scale(problem: Problem, scheme: Scheme, guess: float) -> float:
-    """Largest live voltage, V, from rough runs: that of a current drive is not known beforehand.
+    """Largest live voltage, V, from coarse runs: under a current drive it is not known beforehand.
 
-    From above: what is small beside the guess costs nothing, what is large beside it would be followed far too closely.
+    A high guess is better than a low one: a coarse run whose voltages are much smaller than the guess is cheap, whereas
+    much larger voltages would be integrated far too accurately.
     """
     at = np.linspace(problem.t_start, problem.t_stop, PROBES)
     for _ in range(20):
@@ -231,14 +235,14 @@ def _voltage_scale(problem: Problem, scheme: Scheme, guess: float) -> float:
 
 
 def _with_probes(problem: Problem, t: FloatArray, left: BoolArray) -> tuple[FloatArray, BoolArray, BoolArray]:
-    """Times asked for together with those that errors are looked for at, and which are the latter.
+    """Output times merged with the times at which the error is estimated, their sides, and a mask of the latter.
 
-    These are the same whichever outputs are asked for, so that no result depends on that.
+    The added times do not depend on the output times, so that neither the error nor the tolerance depends on them.
     """
     span = problem.t_stop - problem.t_start
     count = int(min(max(PROBES, PROBES_PER_PERIOD * span / problem.waveform.shortest_time()), MOST_PROBES))
     probes = np.linspace(problem.t_start, problem.t_stop, count + 2)[1:-1]
-    # What decays right after an edge is over before the next of these.
+    # Transients right after an edge may decay between two equidistant times, so look at them on a logarithmic grid.
     edges = np.unique(np.append(problem.breakpoints(), [problem.t_start, problem.t_stop]))
     some = np.arange(0, edges.size - 1, math.ceil(edges.size / MOST_EDGES))
     after = (edges[some, None] + np.diff(edges)[some, None] * AFTER_EDGE).ravel()
@@ -250,27 +254,27 @@ def _with_probes(problem: Problem, t: FloatArray, left: BoolArray) -> tuple[Floa
 
 
 def _only(run: Run, keep: BoolArray) -> Run:
-    """A run with only some of its outputs."""
+    """A copy of a run that has only the outputs with `keep`."""
     keep = keep[: run.t.size]
     return dataclasses.replace(run, t=run.t[keep], left=run.left[keep], rows=run.rows[keep])
 
 
 def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float, alike: float) -> float:
-    """Write the stated error into a run: the largest difference, what both have alike, and rounding.
+    """Write the stated error into a run: the largest difference of both runs, their common error `alike`, and rounding.
 
-    Returns it over the peaks of each gap, the larger of voltage and force.
+    Returns the largest stated error relative to the peak of its gap, of voltages and forces.
     """
     count = min(probed.t.size, beside.t.size)
     both = (alike + 4e-15) * u_scale
     gaps = []
-    # The steps may have met larger voltages, and forces where the area follows at once.
+    # Between the times compared, the steps may have seen larger voltages, and forces if the area has no time constant.
     met = itertools.chain(run.gaps[:, :2].tolist(), itertools.repeat((0.0, 0.0)))
     for (u, f), (v, g), (u_met, f_met) in zip(
         gap_signals(probed.record(problem)), gap_signals(beside.record(problem)), met, strict=False
     ):
         peak, force = max(float(np.abs(u).max(initial=0.0)), u_met), max(float(f.max(initial=0.0)), f_met)
         u_error = float(np.abs(u[:count] - v[:count]).max(initial=0.0)) + both
-        # F ~ u^2: what moves u by du moves F by 2 F du / u.
+        # F ~ u^2: an error du of u is an error 2 F du / u of F.
         moved = 2.0 * both / peak * force if peak > 0.0 else 0.0
         gaps.append((peak, force, u_error, float(np.abs(f[:count] - g[:count]).max(initial=0.0)) + moved))
     run.gaps = np.array(gaps).reshape(-1, 4)

@@ -1,4 +1,4 @@
-"""When a run writes: its output times, both sides of the jumps of its sources, and times that mean a jump."""
+"""Output times of a run: the deck's grid, both sides of the jumps of its sources, and times rounded to a breakpoint."""
 
 from __future__ import annotations
 
@@ -12,14 +12,18 @@ from fingerspice.solve.times import check_length, check_outputs
 from fingerspice.waveforms.sampling import misses, same_time
 from fingerspice.waveforms.waveform import Waveform
 
-# A time is resolved to so many of its roundings; what a source does within them is no jump.
+# Resolution of a time in units of its rounding error; a difference of a source's two limits at an edge is no jump if
+# the source changes as much within this resolution beside the edge.
 _RESOLVED = 8.0
-# Of a long run, so that its memory does not grow with its length.
+# Breakpoints held in memory at a time, so that memory does not grow with the length of the run.
 _BREAKPOINTS_AT_ONCE = 65_536
+# Output times (0.3 MB) that a waveform keeps.
+KEPT_OUTPUTS = 32_768
+_NONE = np.empty(0)
 
 
 def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
-    """Times moved onto the breakpoint they miss by rounding, so that 5 ms means the jump at 5 ms."""
+    """Times (s), each set to the breakpoint from which it differs by rounding only: 5 ms means the jump at 5 ms."""
     span = problem.t_start, problem.t_stop
     windows = 1 + int((span[1] - span[0]) * problem.waveform.breakpoint_rate() / _BREAKPOINTS_AT_ONCE)
     moved = t
@@ -38,27 +42,34 @@ def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
 def asked_for(
     problem: Problem, t_eval: FloatArray | None, jumps: str
 ) -> tuple[FloatArray, BoolArray]:  # fmt: skip
-    """Output times and sides: those given, or the deck's.
+    """Output times (s) and whether each is left-hand: the given times, all right-hand, or the deck's.
 
     Raises
     ------
     InputError
-        For a run that is too long, or one of too many outputs.
+        For a run that is too long or has too many outputs.
     """
     check_length(problem.waveform, problem.t_start, problem.t_stop)
     if t_eval is not None:
         return t_eval, np.zeros(t_eval.size, bool)
     check_outputs(problem.circuit, (problem.t_stop - problem.first) / problem.step)
-    t_out, left = output_times(problem, jumps)
-    # Jumps have two each.
+    key, kept = (problem.t_start, problem.t_stop, problem.first, problem.step, jumps), problem.waveform.kept
+    # One entry with its key: another thread may put its own there at any time.
+    known, t_out, left = kept.get("outputs", (None, _NONE, _NONE))
+    if known != key:
+        t_out, left = output_times(problem, jumps)
+        t_out.flags.writeable = left.flags.writeable = False
+        if t_out.size <= KEPT_OUTPUTS:
+            kept["outputs"] = key, t_out, left
+    # Check again, because each jump adds two outputs.
     check_outputs(problem.circuit, t_out.size)
     return t_out, left
 
 
 def output_times(problem: Problem, jumps: str = "both") -> tuple[FloatArray, BoolArray]:
-    """TSTART:TSTEP:TSTOP and which of them are left-hand; with `jumps` "both" two more at each jump, left and right.
+    """Times TSTART:TSTEP:TSTOP (s) and whether each is left-hand; unless `jumps` is "none", two more at each jump.
 
-    t = 0 stands once, right-hand.
+    A jump at t = 0 has no left-hand output.
     """
     step, first = problem.step, problem.first
     count = int(np.floor((problem.t_stop - first) / step * (1.0 + 1e-12) + 1e-9))
@@ -93,7 +104,10 @@ def _jumps(problem: Problem) -> FloatArray:
 
 
 def _is_jump(wave: Waveform, edges: FloatArray) -> BoolArray:
-    """Whether a waveform's two values at its edges (s) differ by more than it moves within the resolution of time."""
+    """Whether a waveform jumps at its edges (s): its limits differ by more than it changes beside the edge.
+
+    That change is taken over the resolution of time, so that a steep but continuous flank is no jump.
+    """
     right, left = wave.value(edges), wave.value(edges, "left")
     late = _RESOLVED * same_time(1.0) * np.abs(edges)
     moved = np.abs(wave.value(edges + late) - right) + np.abs(left - wave.value(edges - late, "left"))

@@ -1,4 +1,8 @@
-"""One period of a circuit, for its periodic state: the sources' tables, the state as modes, what is linear about it."""
+"""One period of a circuit for the search of its periodic state: tables of the sources, and the linear circuit's state.
+
+The search solves for the modes' amplitudes at the start of the period, so this module converts between them and the
+voltages of the tree capacitors, and gives the periodic state of the circuit with fixed areas as a first guess.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +21,9 @@ from fingerspice.solve.sources import joined
 from fingerspice.waveforms.sampling import SourceTable, source_table
 from fingerspice.waveforms.waveform import DC
 
-# Times of a period at which the areas are averaged.
+# Number of equidistant times of a period from which mean areas are computed.
 SAMPLES = 64
-# Shares of a voltage and their weights, for integrals from 0 V to it.
+# Nodes and weights of Gauss-Legendre quadrature on [0, 1], for integrals over a voltage from 0 V to its value.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _GAUSS = 0.5 + 0.5 * _NODES, 0.5 * _WEIGHTS
 
@@ -29,7 +33,7 @@ CHARGING = "a current source charges, from period to period, what nothing drains
 
 @dataclass(frozen=True)
 class Found:
-    """What `Closed` tells, with the error of every gap's voltage and force (n_gap, 2), V and N."""
+    """Figures of a periodic state for `Closed`; `gap_errors` (n_gap, 2): errors of gap voltage (V) and force (N)."""
 
     defect: float
     map_slope: FloatArray
@@ -46,36 +50,37 @@ class Stopped(Exception):
 
 
 def first_period(problem: Problem) -> float:
-    """Time (s) of the first whole period after the source has settled, or after the start if that is later."""
+    """Start (s) of the first whole period after the source has become periodic, and not before the run's start."""
     waveform = problem.waveform
     assert waveform.period is not None
     return waveform.period * float(np.ceil(max(waveform.settled, problem.t_start) / waveform.period))
 
 
 class Period:
-    """One period of a problem, or the half that the other one repeats with its sign turned.
+    """One period of a problem, or only its first half if the second half is the first with opposite sign.
 
     Attributes
     ----------
     begin, end, span : float
-        s; `parts` such spans are a period.
+        Limits and length of the integrated span, s; the period consists of `parts` such spans.
     parts : int
+        1, or 2 where half a period is enough.
     modes : Modes
-        With the areas as at 0 V.
+        Modes of the circuit with its areas at 0 V.
     before : ndarray, shape (n_s,)
         Sources just before the period, V or A.
     rates : ndarray, shape (n + n_slow,)
-        Of the modes, and of the areas with dynamics of their own, 1/s.
+        Decay rates of the modes and of the areas with a time constant, 1/s.
     n : int
-        Modes.
+        Number of modes.
     neutral : ndarray of bool, shape (n + n_slow,)
-        Modes that do not decay: charges that nothing drains.
+        True for modes that do not decay: charges that nothing drains.
     kept : ndarray, shape (n,)
-        What these have when the period begins; 0 elsewhere.
+        Amplitudes of the neutral modes when the period begins; 0 for all other modes.
     turned : ndarray, shape (n + n_slow,)
-        Sign with which the end of the span is its start.
+        Sign of each entry of a periodic state at the end of the span, relative to its start.
     problem : Problem
-        Of the span alone, without charge.
+        The problem restricted to the span, without charge.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -113,11 +118,11 @@ class Period:
         )  # fmt: skip
 
     def _key(self, problem: Problem) -> tuple[object, ...]:
-        """Of the sources' tables; a function's is as fine as the outputs."""
+        """Key of the sources' tables in the scene's cache; a function's table depends on the output step as well."""
         return "period", self.begin, self.span, problem.step if problem.scene.is_sampled else 0.0
 
     def _push(self, problem: Problem) -> None:
-        """What currents move onto the capacitors that nothing drains before the period begins."""
+        """Add to `kept` the charge that sources drive into the neutral modes between the run's start and the period."""
         for j, wave in enumerate(problem.scene.waveforms):
             table = source_table(wave, problem.t_start, self.begin, 1e-13, problem.step)
             gains = np.where(self.neutral[: self.n], self.modes.gains[:, j], 0.0)
@@ -134,9 +139,9 @@ class Period:
         return np.asarray(self.modes.inverse @ (x + self.modes.follow @ self.before))
 
     def charges(self, z: FloatArray, held: IntArray) -> FloatArray:
-        """Charges that nothing drains, on the scale of their modes `held`, of the state z.
+        """Conserved charges of the state z, projected on the neutral modes with the indices `held`.
 
-        Under `local` a capacitor has taken the integral of C dU from 0 V on; under `mobile` it has C U.
+        Under `local` a capacitor holds the integral of C dU from 0 V to its voltage U; under `mobile` it holds C U.
         """
         scene = self.problem.scene
         network, net = scene.network, scene.net
@@ -153,9 +158,9 @@ class Period:
         return np.asarray(self.modes.shape[:, held].T @ (net.p.T @ charge))
 
     def linear_state(self, modes: Modes) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Periodic state of a circuit with fixed areas: its modes, at the end of the pass too, and at SAMPLES times.
+        """Periodic state of a circuit with fixed areas: its modes at the start, the end and SAMPLES times of the span.
 
-        A mode that does not decay starts from what it keeps; NaN where a current charges it from period to period.
+        A neutral mode starts from the amplitude that it keeps; NaN where a current charges it from period to period.
         """
         rates = modes.rates
         t = self.begin + (self.end - self.begin) * (np.arange(SAMPLES) + 0.5) / SAMPLES
@@ -173,15 +178,15 @@ class Period:
         return start, end, along
 
     def sampled(self) -> FloatArray:
-        """Sources (V or A) at the same times, shape (SAMPLES, n_s)."""
+        """Sources (V or A) at the times of `linear_state`, shape (SAMPLES, n_s)."""
         t = self.begin + (self.end - self.begin) * (np.arange(SAMPLES) + 0.5) / SAMPLES
         return np.column_stack([wave.value(t) for wave in self.problem.scene.waveforms])
 
 
 def _turns(problem: Problem) -> bool:
-    """Whether every source repeats its half periods with the sign turned: then so do all voltages.
+    """Whether the second half period of every source is the first with opposite sign; then so are all voltages.
 
-    The circuit is symmetric: linear but for areas that follow the size of a voltage.
+    The circuit itself has this symmetry: it is linear except for the areas, which depend on the modulus of a voltage.
     """
     period = problem.waveform.period
     for wave in problem.scene.waveforms:

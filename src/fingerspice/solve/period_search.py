@@ -1,8 +1,9 @@
 """The periodic state of any circuit, by Newton's method on the map of one period.
 
-The map is that of z: the modes of the live voltages with the areas as at 0 V, then the areas with dynamics of their own
-over their value at 0 V. Its derivative is at first that of the circuit with its areas held at their means, which
-Broyden's updates better from period to period; only where these do not close the period is it measured.
+The unknown z consists of the modes of the live voltages, for the areas at 0 V, and of the areas with a time constant,
+relative to their values at 0 V. The first derivative of the map is that of the linear circuit with its areas held at
+their means. Broyden's updates improve it from period to period; finite differences, which cost a period for each slow
+mode, replace it only where these updates do not lead to convergence.
 """
 
 from __future__ import annotations
@@ -25,29 +26,32 @@ from fingerspice.solve.period import CHARGING, Found, Period, Stopped
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY
 
-# Of the passes before the last ones: what they may be off, over what the state moved last.
+# Tolerance of the early passes: relative to the last Newton step, and at most, relative to the voltage scale.
 _CRUDE, _FIRST = 1e-3, 1e-4
-# What a measured derivative is moved by, over the voltage scale, and the error allowed in its periods.
+# Finite differences of the map: perturbation relative to the voltage scale, and the tolerance of their passes, usual
+# and least.
 _SHIFT, _SLOPE_TOL, _LEAST_SLOPE_TOL = 5e-4, 1e-9, 1e-11
-# A mode that decays by so many powers of e in a period leaves nothing to measure.
+# A mode that decays by more powers of e than this in a period is not measured: its column is exp(-40) at most.
 _FORGOTTEN = 40.0
-# Passes until the derivative is measured, and until the search is given up.
+# Passes after which the derivative is measured by finite differences, and after which the search fails.
 _PATIENCE, _MOST = 14, 60
-# Passes without a step of less than half of the smallest before, and what such steps may be over the voltage scale.
+# The search has stagnated after so many passes in which no step was less than half of the smallest one before.
+# Round-off is accepted as the cause if the steps are below _NOISE times the voltage scale.
 _HELD_UP, _NOISE = 5, 1e-8
-# A first step this many times the voltage scale is not trusted to the linear circuit's derivative.
+# If the first step is longer than this times the voltage scale, the linear circuit's derivative is not good enough.
 _LONG = 0.1
-# A step of the search this many times the voltage scale leads nowhere.
+# A step longer than this times the voltage scale means that the search diverges.
 _ASTRAY = 1e3
-# How often the areas are averaged over the period of the linear circuit.
+# Fixed-point iterations for the mean areas of the linear circuit's period.
 _AVERAGES = 3
 
 
 @dataclass(frozen=True)
 class _Pass:
-    """What a period made of z: its end, the error of that (signed), and its figures.
+    """Result of one pass over the period: the image of z, its signed error, and the figures of the pass.
 
-    `met` is (n_area, 4) as `netassess` has it, `rounding` (n_area,) that of the gap voltages over the largest voltage.
+    `met` (n_area, 4) has the columns of `netassess`; `rounding` (n_area,) is the round-off of the gap voltages in units
+    of the machine precision times the largest voltage.
     """
 
     end: FloatArray
@@ -57,7 +61,7 @@ class _Pass:
     rounding: FloatArray
 
 
-# State and sources at the end of a pass, the error of the state, and what else is known of it.
+# State and sources at the end of a pass, the error of the state, and the figures of the pass.
 _Made = tuple[FloatArray, FloatArray, FloatArray, _Pass]
 
 
@@ -67,7 +71,7 @@ class Search:
     def __init__(self, period: Period, rtol: float) -> None:
         self.period, self.rtol, self.passes = period, rtol, 0
         self.implicit = False
-        # A charge that nothing drains stays as it is; that half a period turns its sign says that there is none.
+        # A conserved charge is no unknown. If half a period is used, all voltages change sign: such a charge is 0.
         self.free = ~period.neutral if period.parts == 1 else np.ones(period.rates.size, bool)
         self.slow = np.arange(period.rates.size) >= period.n
         problem = period.problem
@@ -79,7 +83,7 @@ class Search:
         self.z = self._holding(self.z)
         cells = [problem.network.gaps[i] for i in self.fingers]
         gap = problem.network.p[np.array(cells, int)] @ period.modes.shape
-        # Voltage of every gap by z: a slow area is no voltage.
+        # Derivative of every gap's voltage by z; its columns for areas with a time constant are 0.
         self.gap = np.hstack([gap, np.zeros((gap.shape[0], int(self.slow.sum())))])
 
     def _guess(self) -> tuple[FloatArray, FloatArray]:
@@ -100,7 +104,7 @@ class Search:
                 area[i] = float(np.mean(contact.area(np.abs(u))))
         v = period.modes_of(modes.shape @ start - modes.follow @ period.before)
         v = np.where(period.neutral[: period.n], period.kept, v)
-        # The same decay seen in the modes of the areas at 0 V.
+        # Transform this decay from the modes at the mean areas to the modes at 0 V.
         turn = period.modes.inverse @ modes.shape
         decay = np.exp(-modes.rates * period.span)
         slope = np.diag(np.exp(-period.rates * period.span))
@@ -109,19 +113,19 @@ class Search:
         return np.append(v, (area / problem.scene.area0)[slow]), period.turned[:, None] * slope
 
     def _inverse(self, slope: FloatArray) -> FloatArray:
-        """Inverse of 1 - slope on what decays, zero on the rest."""
+        """Inverse of 1 - slope for the entries of z that decay, and zero for the neutral modes."""
         out = np.zeros_like(slope)
         free = np.ix_(self.free, self.free)
         out[free] = np.linalg.inv(np.eye(int(self.free.sum())) - slope[free])
         return out
 
     def _largest(self, z: FloatArray) -> float:
-        """Largest voltage that a change of z makes, V; an area counts as its share of the scale."""
+        """Largest voltage in a change of z, V; the relative change of an area counts as that share of the scale."""
         x = float(np.abs(self.period.modes.shape @ z[~self.slow]).max(initial=0.0))
         return max(x, self.scale * float(np.abs(z[self.slow]).max(initial=0.0)))
 
     def passed(self, z: FloatArray, tol: float) -> _Pass:
-        """One pass over the period at an error of `tol` of the scale in every step."""
+        """One pass over the period from z, with an error of `tol` times the voltage scale in every step."""
         period, n = self.period, self.period.n
         y = np.concatenate([period.voltages(z), z[n:], np.zeros(period.before.size)])
         initial = dataclasses.replace(period.problem.initial, y=y)
@@ -129,16 +133,16 @@ class Search:
         self.passes += 1
         made = None if self.implicit else self._marched(problem, tol)
         if made is None:
-            # Whether exponentials find no way on or there is none, the implicit method tells.
+            # The exponential steps failed: the implicit method either succeeds or tells that no solution exists.
             self.implicit, made = True, self._collocated(problem, tol)
         x, s, error_x, figures = made
-        # The sources end as they began, but for the sign and rounding.
+        # Use the sources at the end of the pass: they equal those at the start only up to the sign and round-off.
         end = np.append(period.modes.inverse @ (x[:n] + period.modes.follow @ s), x[n : z.size])
         error = np.append(period.modes.inverse @ error_x[:n], error_x[n : z.size])
         return dataclasses.replace(figures, end=period.turned * end, error=error)
 
     def _marched(self, problem: Problem, tol: float) -> _Made | None:
-        """State and sources at the end by exponential steps, the state's error, and the figures; None for no way on."""
+        """One pass by exponential steps; None where they fail before the end."""
         none, n = np.zeros(0), self.period.n
         one = March(problem, max(tol, FINEST), self.rtol, self.scale, none, none.astype(bool), False)
         if one.through(self.period.sources, self.period.end) is not Status.SUCCESS:
@@ -148,7 +152,7 @@ class Search:
         return one.y, one.s_before, error, _Pass(none, none, one.met.copy(), magnified, one.references.magnified)
 
     def _collocated(self, problem: Problem, tol: float) -> _Made:
-        """The same by an implicit method, its error from a coarser pass."""
+        """One pass by the implicit method, with its error from a coarser pass."""
         none, scene, network = np.zeros(0), problem.scene, problem.network
         status, one, error = pass_through(problem, self.period.sources, tol, self.scale)
         if status is not Status.SUCCESS:
@@ -164,7 +168,7 @@ class Search:
         return one.y, one.s_before, error, _Pass(none, none, met, 1.0, 10.0 + rounding)
 
     def close(self) -> tuple[FloatArray, FloatArray, Found]:
-        """Live voltages (V) and slow areas that a period leads back to, to the error asked for or as rounding lets."""
+        """The periodic state's live voltages (V) and relative areas, to `rtol` or as far as round-off permits."""
         period = self.period
         tol = LOCAL_SHARE * self.rtol
         while True:
@@ -175,7 +179,7 @@ class Search:
             if excess > 2.0 * rounding and tol > FINEST:
                 tol = max(tol * min(0.3, 0.5 / excess), FINEST)
             elif not self.implicit:
-                # The modes' rounding is in the way, which an implicit method has less of.
+                # The round-off of the modes dominates; the implicit method works without them and has less.
                 self.implicit, tol = True, LOCAL_SHARE * self.rtol
             else:
                 break
@@ -185,19 +189,19 @@ class Search:
         return period.voltages(self.z), self.z[period.n :], found
 
     def _newton(self, tol: float) -> tuple[_Pass, FloatArray, float]:
-        """Close the period; returns its last pass, the last step of z, and the largest change over that pass, V."""
+        """Solve for the periodic z; returns the last pass, the last step of z, and the defect of that pass, V."""
         moved = self.scale * (_FIRST / _CRUDE if self.passes == 0 else 0.0)
         change_before, before, step = None, _FIRST, np.zeros(self.z.size)
         here, smallest, since = _FIRST, math.inf, 0
         for count in range(1, _MOST + 1):
-            # What a pass misses the solver makes larger.
+            # The solver enlarges the error of a pass by up to `memory`, so the pass needs a tolerance smaller by that.
             memory = self._memory()
             here = max(tol, min(here, _CRUDE * moved / self.scale / memory, _FIRST / memory))
             last = self.passed(self.z, here)
             change = last.end - self.z
             if change_before is not None:
                 fell = change_before - np.where(self.free, change, 0.0)
-                # From what two passes miss nothing is to be learnt.
+                # Skip the update if the change is within the errors of the two passes.
                 if self._largest(fell) > before * self.scale:
                     self._update(step, fell)
             if count % _PATIENCE == 0:
@@ -205,7 +209,8 @@ class Search:
             change_before, before = np.where(self.free, change, 0.0), here
             step = self.solver @ change_before
             if count == 1 and self._largest(step) > _LONG * self.scale:
-                # A slow mode, whose few decays the areas' ripple may outdo.
+                # For a mode that hardly decays in a period, the effect of the areas' ripple may exceed the decay, and
+                # the derivative of the linear circuit is wrong: measure it.
                 self.solver = self._inverse(self._slope())
                 step = self.solver @ change_before
             self.z = self._holding(self.z + step)
@@ -213,7 +218,7 @@ class Search:
             defect = self._largest(change)
             if not moved < _ASTRAY * self.scale:
                 break
-            # Rounding may hold the steps up before: what they are then is part of the error.
+            # Round-off may prevent smaller steps; the size of the last step is then part of the stated error.
             smallest, since = (moved, 0) if moved < 0.5 * smallest or here > tol else (smallest, since + 1)
             held_up = since >= _HELD_UP and moved <= _NOISE * self.scale
             closed = moved <= tol * self.scale or self._largest(change_before) <= 1e-15 * self.scale
@@ -224,23 +229,23 @@ class Search:
         raise SolveError(period_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
 
     def _memory(self) -> float:
-        """Largest factor by which an error of the voltages that is made in every period grows; 1 or more."""
+        """Largest ratio of the periodic state's error to an error of the voltages made in every period; 1 or more."""
         n, modes = self.period.n, self.period.modes
         grown = modes.shape @ self.solver[:n, :n] @ modes.inverse
         return max(1.0, float(np.abs(grown).sum(axis=1).max(initial=0.0)))
 
     def _update(self, step: FloatArray, fell: FloatArray) -> None:
-        """Broyden's update of the solver: the last step made the change over a period fall by so much."""
+        """Broyden's update of the solver from the last step and the reduction `fell` of the map's defect by it."""
         answered = self.solver @ fell
         along = float(step @ answered)
-        # Without this nothing would be learnt from a step that was all rounding.
+        # A tiny denominator means that round-off dominates the step: such an update would spoil the solver.
         if abs(along) > 1e-3 * float(step @ step) > 0.0:
             self.solver = self.solver + np.outer((step - answered) / along, step @ self.solver)
 
     def _mind_wandering(self, last: _Pass, change: FloatArray, tol: float) -> None:
-        """Refuse a state whose charges that nothing drains move in the period: an area's ripple pumps them, for ever.
+        """Refuse a state whose conserved charges change over the period: an area's ripple would pump them for ever.
 
-        Under `local` it does so where an insulating layer has another voltage over the area than the gap.
+        Under `local` this happens where an insulating layer has the area of the gap but another voltage waveform.
         """
         held = ~self.free
         allowed = SAFETY * self._largest(np.where(held, np.abs(last.error), 0.0)) + 10.0 * tol * self.scale
@@ -250,7 +255,10 @@ class Search:
             raise SolveError(period_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
 
     def _holding(self, z: FloatArray) -> FloatArray:
-        """z with the charge that nothing drains as it began: its modes alone tell it only while areas are as at 0 V."""
+        """z with its neutral modes adjusted so that the conserved charges have their initial values.
+
+        These modes are the conserved charges themselves only with the areas at 0 V, hence the iteration.
+        """
         held = np.flatnonzero(~self.free)
         if not held.size:
             return z
@@ -263,10 +271,10 @@ class Search:
         return z
 
     def _slope(self) -> FloatArray:
-        """Derivative of the pass's end by z, to about 1e-5, from one pass for every mode that outlasts the period."""
+        """Derivative of the map by z, to about 1e-5, from one pass for every mode that does not decay in a period."""
         period = self.period
         decaying = period.rates[~period.neutral]
-        # What a mode forgets in a period must show in its slope.
+        # A slow mode's 1 - slope is about its rate times the period: the passes' errors must be smaller than that.
         forgets = min(1.0, float(decaying.min(initial=math.inf)) * period.span)
         tol = max(_SLOPE_TOL * forgets, _LEAST_SLOPE_TOL)
         base = self.passed(self.z, tol).end
@@ -281,9 +289,10 @@ class Search:
         return slope
 
     def _errors(self, last: _Pass, step: FloatArray) -> tuple[FloatArray, float, float, float]:
-        """Error of every gap's voltage and force (n_gap, 2), the memory, and the largest error over that asked for.
+        """Errors of the gaps' voltages and forces (n_gap, 2), the memory, and the largest error relative to `rtol`.
 
-        The last figure is that of rounding alone. An error made in every period grows to what the solver makes of it.
+        The last figure is the same ratio for round-off alone. An error made in every period leads to an error of the
+        periodic state equal to the solver times it.
         """
         period, solver = self.period, np.abs(self.solver)
         memory = self._memory()
@@ -292,7 +301,7 @@ class Search:
         peak, force = met[:, netassess.PEAK_U], met[:, netassess.PEAK_F]
         largest = float(peak.max(initial=0.0))
         gap = np.abs(self.gap)
-        # Rounding is an error too; what was moved last is more than what would be moved next.
+        # Add round-off, and the last Newton step as a bound of the error that remains after it.
         once = np.abs(period.modes.inverse).sum(axis=1)
         often = solver[: period.n, : period.n] @ once
         grows = np.maximum(1.0, (gap[:, : period.n] @ often) / (gap[:, : period.n] @ once))

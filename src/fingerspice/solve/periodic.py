@@ -1,4 +1,4 @@
-"""The state that one period of a source leads back to, by Newton's method on the map of one period."""
+"""The periodic state, which one period of the source maps to itself, by Newton's method on the map of one period."""
 
 from __future__ import annotations
 
@@ -26,23 +26,24 @@ from fingerspice.waveforms.sampling import SourceTable, source_table
 
 @dataclass(frozen=True)
 class Closed:
-    """A problem that starts from its periodic state, and what vouches for it.
+    """A problem that starts from its periodic state, with the error of that state.
 
     Attributes
     ----------
     problem : Problem
-        From the first whole period after the source has settled, or from where it started if that is later.
+        It starts with the first whole period after the source has become periodic, not before its original start.
     defect : float
         Largest change of a live voltage over a further period, V.
     map_slope : ndarray, shape (n, n)
-        Derivative of the modes after a period by those before it, to about 1e-5; of areas with dynamics of their own
-        too.
+        Jacobian matrix of the period map, to about 1e-5; its variables are the modes and the areas with a time
+        constant.
     memory : float
-        Error of the periodic state over that of one period: what a slow mode collects over the periods it remembers.
+        Error of the periodic state relative to the error of one period: a slow mode accumulates the errors of the
+        periods within its memory.
     error : ErrorEstimate
-        What the state may be off, as its effect on the gap voltage and the force of the period.
+        Error of the state, as its effect on the gap voltage and the force of the period.
     periods : float
-        Periods integrated.
+        Number of periods integrated.
     """
 
     problem: Problem
@@ -56,15 +57,15 @@ class Closed:
 def close_period(problem: Problem, rtol: float) -> Closed:
     """Start a problem from its periodic state, keeping its length.
 
-    The error asked for is that of the state alone, relative to the peaks over the period. Where rounding does not let
-    it be met, the error stated says so.
+    `rtol` bounds the error of the state alone, relative to the peaks over the period. Where round-off exceeds it, the
+    stated error is larger than `rtol`, and no error is raised.
 
     Raises
     ------
     InputError
         For sources without a common period.
     SolveError
-        Where a period cannot be integrated, or the iteration does not close it.
+        Where a period cannot be integrated, or Newton's method does not converge.
     """
     if problem.waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
@@ -82,7 +83,7 @@ def close_period(problem: Problem, rtol: float) -> Closed:
 
 
 def _search(problem: Problem, rtol: float) -> tuple[State, Found]:
-    """The periodic state in closed form, or by one integration for every period tried."""
+    """The periodic state of any circuit: in closed form, or by a Newton search with one integration per iterate."""
     try:
         period = Period(problem)
         x, areas, found = Search(period, rtol).close() if problem.scene.coupled else _closed_form(period)
@@ -103,16 +104,16 @@ def _closed_form(period: Period) -> tuple[FloatArray, FloatArray, Found]:
     defect = float(np.abs(modes.shape @ (sign * end - start)).max(initial=0.0))
     slope = np.diag(np.exp(-period.rates * period.span * period.parts))
     x = period.voltages(start + period.kept)
-    # In closed form there is rounding only, which a run states itself.
+    # The only error of the closed form is round-off, which the run adds to its stated error itself.
     none = np.zeros((len(period.problem.network.fingers), 2))
     return x, np.zeros(0), Found(period.parts * defect, slope, 1.0, none, 1)
 
 
 def _shoot(problem: Problem, rtol: float) -> tuple[State, Found]:
-    """The periodic state of a stack, by compiled periods."""
+    """The periodic state of a stack, by a Newton search that is compiled as a whole."""
     scene, waveform, model = problem.scene, problem.waveform, model_of(problem.scene)
     begin, half = first_period(problem), waveform.half_wave
-    # A function's table is as fine as the outputs.
+    # The table of a user's function is as fine as the outputs, so it is cached by the output step.
     key = ("period", begin, problem.step if scene.is_sampled else 0.0)
     if key not in scene.prepared:
         assert waveform.period is not None
@@ -129,7 +130,7 @@ def _shoot(problem: Problem, rtol: float) -> tuple[State, Found]:
 
 
 def _close(problem: Problem, table: SourceTable, before: float, half: bool, rtol: float) -> tuple[FloatArray, Found]:
-    """Live voltages (V) that a period leads back to, and what else is found; by half a period where that will do."""
+    """Live voltages (V) of the periodic state, and its figures; with `half`, the map is that of half a period."""
     scene = problem.scene
     model, n = model_of(scene), model_of(scene).gap.size
     w, slope, counts, figures = np.zeros(n), np.zeros((n, n)), np.zeros(2, np.int64), np.zeros(shooting.N_FIGURES)
@@ -137,7 +138,7 @@ def _close(problem: Problem, table: SourceTable, before: float, half: bool, rtol
     scale = scene.u_peak or 1.0
     longest = min(LONGEST_STEP * problem.waveform.shortest_time(), float(table.edges[-1] - table.edges[0]))
     prepared = prepare_system(scene, rtol)
-    # A first guess: how much of the source's voltage the gap takes is known once a period has been closed.
+    # The first tolerance assumes the gap's capacitive share of the source's voltage; its peak is known only later.
     tol = LOCAL_SHARE * rtol * scale * model.k_gap
     known = False
     while True:
@@ -167,7 +168,7 @@ def _close(problem: Problem, table: SourceTable, before: float, half: bool, rtol
             status = Status.NOT_PERIODIC
             cause = f"{status.cause}: {defect:.3g} V are left after a period"
         raise SolveError(period_failure(problem, status, None, cause))
-    # Two halves: the second carries on at most what the first was off, and adds as much.
+    # The defect of two half periods is at most twice that of one: the map does not enlarge the first half's defect.
     parts = 2 if half else 1
     map_slope = slope @ slope if half else slope
     found = Found(parts * float(defect), map_slope, float(figures[6]), errors, int(counts[1]) / parts)
@@ -175,12 +176,12 @@ def _close(problem: Problem, table: SourceTable, before: float, half: bool, rtol
 
 
 def _errors(figures: FloatArray, u_scale: float, rtol: float) -> tuple[FloatArray, float]:
-    """Errors of the periodic state (1, 2), V and N, from the figures of its period, and their ratio to those asked for.
+    """Errors of the periodic state (1, 2), V and N, and the largest ratio of an error to the error asked for.
 
-    Where the product of a peak with `rtol` underflows no error can be asked for.
+    The ratio counts as 0 where the error asked for, a peak times `rtol`, underflows to 0.
     """
     peak_u, peak_f, error_u, error_f, left, _, memory = map(float, figures)
-    # Rounding is an error too, and what Newton moved last was not much more than what it would move next.
+    # Add round-off, and `left`, the last step of Newton's method, as an estimate of the error that remains after it.
     floor = 4e-16 * (peak_u + u_scale)
     steepest = 2.0 * peak_f / (peak_u or 1.0)
     u_error = memory * (SAFETY * error_u + floor) + left

@@ -1,4 +1,4 @@
-"""Which model a scene needs, and why: the lightest that is right for what is asked."""
+"""Choice of the model for a scene: the lightest tier whose error is below the error asked for, and the reasons."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import kept_with
 from fingerspice.solve.settling import FEWEST_PERIODS
 
-# Plans that stay with a scene.
+# Number of plans cached with a scene.
 MOST_PLANS = 16
 TIERS = ("algebraic", "linear", "coupled")
-# A frozen stack this many times faster than its source would hold an explicit method back by stability alone.
+# A scene is called stiff if its fastest rate times the source's shortest time exceeds this: stability alone would then
+# limit the steps of an explicit method.
 STIFF = 300.0
 REPEATS = "periodic: once a period no longer changes the state, later ones repeat it"
 
@@ -35,12 +36,12 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", start: str = "d
     tier : str
         ``"auto"``, or the tier to force.
     start : str
-        How the run starts.
+        Start of the run, as given to `simulate`; it is copied into the plan.
 
     Raises
     ------
     InputError
-        For an unknown tier, or one that cannot describe the circuit at all.
+        For an unknown tier, or a tier that cannot describe the circuit.
     """
     if tier not in ("auto", *TIERS):
         raise InputError(f"unknown tier {tier!r}; allowed: auto, {', '.join(TIERS)}")
@@ -51,7 +52,7 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", start: str = "d
 
 @dataclass(frozen=True)
 class _Choice:
-    """The lightest tier that is right, and why; the largest relative change of 1/A, and the area meant by it (m^2)."""
+    """The lightest valid tier and its reason; the largest relative change of 1/A, and the area it refers to (m^2)."""
 
     tier: str
     reason: str
@@ -110,10 +111,10 @@ def _stores(problem: Problem) -> bool:
 
 
 def _of_network(problem: Problem) -> _Choice:
-    """For a network: closed form where its areas are fixed, else stepped.
+    """The tier of a network: linear where its areas are fixed, else coupled.
 
-    Beside other capacitors an area that changes by little may still do much to the voltages, over many periods; of that
-    no bound is known beforehand that is any use, so it is stepped however little the area changes.
+    With capacitors outside the layers, a small change of an area may have a large effect on the voltages over many
+    periods. No useful bound of that effect is known beforehand: a network is coupled however little its areas change.
     """
     scene, network = problem.scene, problem.network
     area = float(scene.area0[0]) if network.areas else math.nan
@@ -131,7 +132,7 @@ def _of_network(problem: Problem) -> _Choice:
 
 
 def _of_stack(problem: Problem, model: Model, rtol: float) -> _Choice:
-    """For a stack: the lightest of all tiers."""
+    """The tier of a stack: the lightest of all three that is valid."""
     scene = problem.scene
     changed, area = _change(model.curve, scene.u_peak) if model.coupled else (0.0, model.area0)
     if not np.any((model.rate > 0.0) | (model.rate0 > 0.0)) and not (
@@ -153,8 +154,8 @@ def _of_stack(problem: Problem, model: Model, rtol: float) -> _Choice:
 
 
 def _change(curve: FloatArray, u_peak: float) -> tuple[float, float]:
-    """Largest relative change of 1/A under sources of that peak (V), from the area in the middle, and that (m^2)."""
-    # A gap may take all of the voltage, and as much again where charge is stored when the source turns.
+    """Largest relative change of 1/A under sources with peak `u_peak` (V) from its middle value, and its area (m^2)."""
+    # The gap may hold the whole source voltage, and up to twice that if stored charge adds to a reversed source.
     least, largest = inverse_area_range(2.0 * u_peak, 65, curve)
     middle = 0.5 * (least + largest)
     return max(middle / least, largest / middle) - 1.0, 1.0 / middle

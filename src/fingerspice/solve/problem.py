@@ -1,4 +1,4 @@
-"""A run made ready: a scene, when it starts and stops, where its outputs are, and the state that it starts from."""
+"""A run prepared for integration: its scene, start and end, output spacing and initial state."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from fingerspice.solve.times import run_times
 from fingerspice.waveforms.sampling import on_breakpoint
 from fingerspice.waveforms.waveform import Waveform
 
-# Breakpoints (64 kB) that a scene keeps.
+# Largest number of breakpoints cached with a waveform (64 kB).
 KEPT_BREAKPOINTS = 8192
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What an integrator needs.
+    """All data that an integrator needs.
 
     Attributes
     ----------
     circuit : Circuit
     scene : Scene
     t_start, t_stop, first, step : float
-        s; outputs are spaced by `step` from `first` on.
+        Start and end of the run, first output and spacing of the outputs, s.
     initial : State
     charge : bool
         Whether charge and current are wanted.
     begun : ndarray, shape (n_gap, 2), or None
-        What the start is off, as its effect on every gap's voltage and force, V and N: of a periodic state that was
-        found to half of the error asked for. The run has the other half.
+        Error of a periodic start, as its effect on every gap's voltage and force, V and N. The start was computed with
+        half of the error asked for; the other half is left to the run.
     """
 
     circuit: Circuit
@@ -66,13 +66,13 @@ class Problem:
 
     @cached_property
     def largest(self) -> float:
-        """Largest voltage (V) of the sources, or of the start."""
+        """Larger one of the sources' peak and the largest live voltage of the start, V."""
         n = self.scene.network.k.shape[0]
         return max(self.scene.u_peak, float(np.abs(self.initial.y[:n]).max(initial=0.0)))
 
     @cached_property
     def inner(self) -> StackState:
-        """The start of a stack in the form of its own equations; the last one stays with the scene."""
+        """The start of a stack in the form of its own equations; the scene caches the last one."""
         state, inner = self.scene.prepared.get("inner", (None, None))
         if state is not self.initial:
             state, inner = self.scene.prepared["inner"] = self.initial, to_stack(self.scene, self.initial)
@@ -80,9 +80,9 @@ class Problem:
         return inner
 
     def breakpoints(self) -> FloatArray:
-        """The sources' breakpoints in the run, s; those of a short run stay with the waveform."""
+        """The sources' breakpoints in the run, s; the waveform caches them if they are few."""
         span = self.t_start, self.t_stop
-        # One entry with its key: another thread may put its own there at any time.
+        # Key and value are one entry, because another thread may replace it at any time.
         kept, edges = self.waveform.kept.get("breakpoints", (None, np.empty(0)))
         if kept != span:
             edges = self.waveform.breakpoints(*span)
@@ -108,7 +108,7 @@ def prepare(
     charge: bool = True,
     rtol: float = 0.0,
 ) -> Problem:
-    """Make a run ready, or refuse it; `rtol` decides whether a dispersive skin's data may be taken at one frequency.
+    """Prepare a run, or refuse it; `rtol` decides whether a dispersive skin's data may be taken at one frequency.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def prepare(
     t_start = start.state.t if isinstance(start, Solution) else 0.0
     scene = scene_of(circuit, charge_law, area, t_stop, rtol)
     stop, step = run_times(circuit, t_start, t_stop, t_eval)
-    # One entry with its key: another thread may put its own there at any time.
+    # Key and value are one entry, because another thread may replace it at any time.
     kept = scene.waveform.kept
     asked, ends = kept.get("end", (math.nan, math.nan))
     if asked != stop:

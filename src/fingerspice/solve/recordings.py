@@ -1,7 +1,7 @@
-"""A series stack under a recorded source, sample by sample, in pieces of fixed length; see `engine.recording`.
+"""Runs of a series stack under a recorded source, sample by sample, in pieces of fixed length; see `engine.recording`.
 
-Every piece is accepted by itself, so that its outputs are the same however many follow, and whether they are kept in
-one array or given out one by one.
+The error of each piece is judged at its end, independently of later pieces. Its outputs are therefore the same however
+long the run is, and whether all outputs are held in one array or streamed in chunks.
 """
 
 from __future__ import annotations
@@ -30,31 +30,30 @@ from fingerspice.solve.stackstate import StackState, from_stack, model_of
 from fingerspice.solve.track import as_recorded, on_branch
 from fingerspice.waveforms.samples import Samples
 
-# The fewest samples that are worth it, and those of a piece: pieces begin at multiples of this number.
+# Fewest samples for which this method pays, and the samples of a piece; pieces begin at multiples of that number.
 LEAST_SAMPLES, PIECE = 64, 1 << 16
-# The error allowed to come from a block, over the one asked for; what the stated error is over what was seen; and tries
-# of a piece.
+# Error allowed in a block, relative to the error asked for; ratio of stated to estimated error; attempts at a piece.
 SHARE, SAFETY, ATTEMPTS = 0.2, 2.0, 4
-# A piece is judged by the peaks up to its end, or by this share of what the source may cause in all: what is quieter
-# than that before the first sound need not be as exact relative to itself.
+# The error of a piece is related to the peaks up to its end, or to this share of the largest gap voltage that the
+# source may cause: noise before the first loud sound need not be exact relative to itself.
 LEAST_PEAK = 1e-3
-# What the whole run's blocks begin with, over the error allowed them: where errors stay for long and add up, a later
-# piece cannot mend what earlier ones have used up.
+# Share of the blocks' allowed error in the first and in the second attempt at the whole run: where errors decay slowly
+# and add up, a later piece cannot make up for errors of the earlier ones.
 BEGINNINGS = (1.0, 0.03)
-# Forms that stay with a scene, of up to 0.2 MB: one for each tolerance, spacing of samples and thread.
+# Number of forms cached with a scene, of up to 0.2 MB each: one for each tolerance, sample spacing and thread.
 MOST_FORMS = 16
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A part of a run over which samples are evenly spaced.
+    """A part of a run with evenly spaced samples.
 
     Attributes
     ----------
     start, spacing : float
-        s.
+        Time of the first sample and distance of the samples, s.
     first, last : int
-        Numbers of the first and the last sample; both 0 where two values of the source between samples stand for them.
+        Numbers of the first and the last sample; both 0 for a single step between two times that are no samples.
     """
 
     start: float
@@ -67,14 +66,14 @@ class Piece:
         return self.start + max(self.last - self.first, 1) * self.spacing
 
     def values(self, wave: Samples) -> FloatArray:
-        """The source at the ends of the steps, V."""
+        """The source at the limits of the steps, V."""
         if self.first == self.last:
             return wave.value([self.start, self.start + self.spacing])
         return wave.between(self.first, self.last + 1)
 
 
 def pieces_of(problem: Problem) -> list[Piece] | None:
-    """The run in pieces, where its source is a recording; else None."""
+    """The pieces of a run if it is a coupled stack driven by a recording of enough samples; else None."""
     wave = problem.waveform
     if problem.scene.stack is None or not problem.scene.coupled or not isinstance(wave, Samples):
         return None
@@ -93,7 +92,7 @@ def pieces_of(problem: Problem) -> list[Piece] | None:
 
 
 class Outcome(Enum):
-    """How following a piece ended: the error is met, or not, or there is no way on by equal steps."""
+    """Outcome of a piece: its error is met, or not met, or this method cannot integrate it (LOST)."""
 
     MET, NOT_MET, LOST = range(3)
 
@@ -106,9 +105,9 @@ class March:
     t : float
         Time reached, s.
     share : float
-        What is left of the error that blocks are allowed, after pieces have been refused.
+        Factor of the error allowed in a block, reduced each time that a piece is rejected.
     loudest : float
-        Largest |U| so far, V.
+        Largest |U| of the source so far, V.
     """
 
     def __init__(self, problem: Problem, one: Followed, rtol: float, share: float = 1.0) -> None:
@@ -143,10 +142,10 @@ class March:
         return form
 
     def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
-        """Go through a piece with its source's `values` (V), and write the outputs before its end, as rows of `out`."""
+        """Integrate a piece with the source's `values` (V), and write the outputs before its end as rows of `out`."""
         one, control, k_gap = self.one, self.course.control, self.one.system.model.k_gap
         if piece.spacing != self.spacing:
-            # Where the spacing changes, the source may jump: always at the start.
+            # The source may jump where the spacing changes, and does so at the start of the run.
             self.course, self.spacing = self.course._replace(form=self._form(piece.spacing)), piece.spacing
             if not recording.jump(self.course, float(values[0])):
                 return Outcome.LOST
@@ -173,7 +172,7 @@ class March:
         return Outcome.NOT_MET
 
     def _force(self, u_gap: float) -> float:
-        """Force (N) at a gap voltage (V), the area as at 0 V."""
+        """Force (N) at a gap voltage (V), with the area at 0 V."""
         return self.one.shown.stress * u_gap**2 / self.one.q_rest
 
     def _parts(self) -> tuple[FloatArray | IntArray, ...]:
@@ -181,7 +180,7 @@ class March:
         return c.w, c.error, c.control, c.counters
 
     def mark(self) -> list[FloatArray | IntArray]:
-        """All that changes on the way: `recall` leads back here."""
+        """A copy of the state of the integration, which `recall` restores."""
         return [x.copy() for x in self._parts()]
 
     def recall(self, mark: list[FloatArray | IntArray]) -> None:
@@ -189,7 +188,7 @@ class March:
             x[:] = kept
 
     def stand(self, numbers: dict[str, float], arrays: list[list[float]]) -> None:
-        """Stand where another march of the same run stood: its attributes and its `mark`."""
+        """Restore the state of another march through the same run, from its attributes and its `mark`."""
         for name, value in numbers.items():
             setattr(self, name, value)
         self.recall([np.array(x) for x in arrays])
@@ -197,11 +196,11 @@ class March:
 
     @property
     def outputs(self) -> int:
-        """Outputs written since `begin_outputs`."""
+        """Number of outputs written since `begin_outputs`."""
         return int(self.course.counters[relaxation.OUTPUT])
 
     def begin_outputs(self) -> None:
-        """Begin with another array of outputs."""
+        """Start counting outputs from 0, for a new array of outputs."""
         self.course.counters[relaxation.OUTPUT] = 0
 
     def finish(self, t_out: FloatArray, out: FloatArray) -> None:
@@ -212,11 +211,12 @@ class March:
 
     def rows(self, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
         """Outputs at times `t` (s) as rows of a record."""
-        u = sided(self.wave, t, left) if self.problem.charge else np.empty(0)
-        return as_recorded(self.problem, self.one.system.model, out[:, : t.size].T, u)
+        model = self.one.system.model
+        u = sided(self.wave, t, left) if self.problem.charge and model.mobile else np.empty(0)
+        return as_recorded(self.problem, model, out[:, : t.size].T, u)
 
     def state(self) -> State:
-        """Where the run is."""
+        """The state reached."""
         control, system, offset = self.course.control, self.one.system, self.problem.inner.offset
         u_gap = float(control[relaxation.U_GAP])
         live = system.live[int(control[relaxation.REFERENCE])] @ self.course.w
@@ -225,10 +225,10 @@ class March:
         return from_stack(self.problem.scene, on_branch(system.model, state, math.copysign(1.0, u_gap)))
 
     def stated(self) -> tuple[FloatArray, float, float | None]:
-        """Peaks and errors as in `Run.gaps`, and the errors of the nodes (V) and the charge (C), so far."""
+        """Peaks and stated errors as in `Run.gaps`, and stated errors of the nodes (V) and the charge (C), so far."""
         control, model, u_peak = self.course.control, self.one.system.model, self.problem.scene.u_peak
         peak_u, peak_f = float(control[relaxation.PEAK_U]), float(control[relaxation.PEAK_F])
-        # Rounding is an error too, and what the area's polynomial misses.
+        # Round-off adds to the errors estimated in the blocks.
         floor = 4e-16 * (peak_u + model.k_gap * u_peak)
         u_error = SAFETY * float(control[relaxation.ERROR_U]) + floor
         f_error = SAFETY * float(control[relaxation.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f
@@ -241,7 +241,7 @@ class March:
         return np.array([[peak_u, peak_f, u_error, f_error]]), node_error, charge_error
 
     def run(self, t: FloatArray, left: BoolArray, rows: FloatArray) -> Run:
-        """The run so far, with some of its outputs."""
+        """The run so far, with the given outputs."""
         counters = self.course.counters
         stats = {"steps": int(counters[relaxation.STEPS]), "rejected": int(counters[relaxation.REFUSED]), "zeros": 0}
         evaluated = 2 * BLOCK * int(counters[relaxation.SWEEPS])
@@ -256,7 +256,7 @@ def _decade(rtol: float) -> float:
 
 
 def ready(problem: Problem, rtol: float) -> Followed | None:
-    """The scene ready to be followed, where a polynomial for its area is good enough."""
+    """The scene prepared for this method, cached by decade; None where no polynomial represents 1/A well enough."""
     decade, kept = _decade(rtol), problem.scene.prepared
     key = ("followed", decade, problem.charge, threading.get_ident())
     one: Followed | None = kept_with(kept, key, MOST_FORMS, lambda: followed(problem, decade))
@@ -264,7 +264,7 @@ def ready(problem: Problem, rtol: float) -> Followed | None:
 
 
 def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None) -> Run | None:
-    """A run sample by sample, or None where that is not the way: no recording, or one too coarse for it."""
+    """A run sample by sample; None where this method does not apply (no recording) or does not meet the error."""
     pieces = pieces_of(problem)
     one = None if pieces is None else ready(problem, rtol)
     if pieces is None or one is None:
@@ -281,7 +281,7 @@ def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, pro
             run = march.run(t_out, left, march.rows(t_out, left, out))
             run.stats["rejected"] += refused
             if run.excess(problem.largest) > rtol:
-                # The run has become less loud than its source lets one expect.
+                # The peaks of the run stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
                 continue
             look = partial(_look, replace(problem, charge=False), rtol)
             run.continuous = ClosedForm(
@@ -295,7 +295,7 @@ def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, pro
 def _through(
     march: March, pieces: list[Piece], t_out: FloatArray, out: FloatArray, progress: Progress | None
 ) -> Outcome:  # fmt: skip
-    """Follow all pieces."""
+    """Integrate all pieces, up to the first that is not MET."""
     problem = march.problem
     for piece in pieces:
         outcome = march.follow(piece, piece.values(march.wave), t_out, out)
@@ -307,7 +307,7 @@ def _through(
 
 
 def _look(problem: Problem, rtol: float, t: FloatArray, left: BoolArray) -> Record:
-    """The run at other times."""
+    """A record of the same run at other output times."""
     run = solve(problem, rtol, t, left, None)
     assert run is not None
     return run.record(problem)

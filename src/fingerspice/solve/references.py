@@ -1,4 +1,7 @@
-"""A network around reference areas as numbers, made when a run first wants them and kept with the scene."""
+"""Modes and matrices of a network at its reference areas, computed when a run first needs them, cached with the scene.
+
+A run whose areas change by much goes from one reference to another, so that the areas stay near those of the modes.
+"""
 
 from __future__ import annotations
 
@@ -18,27 +21,27 @@ from fingerspice.engine.system import area_error, area_polynomials
 from fingerspice.solve.runs import kept_with
 from fingerspice.solve.scenes import Scene
 
-# Sets of references that stay with a scene: one for each thread and decade of tolerances.
+# Number of sets of references cached with a scene: one for each thread and decade of tolerances.
 MOST_SETS = 16
-# References of a set, and numbers of all of them (64 MB), at most; beyond, a new set is begun.
+# Most references in a set, and most numbers in all of them (64 MB); a full set is replaced by a new one.
 MOST_REFERENCES, MOST_NUMBERS = 256, 8_000_000
-# References whose numbers stay with the network, whatever its sources are.
+# Number of references cached with the network, for runs with other sources.
 MOST_KEPT = 16
 
 
 @dataclass
 class Known:
-    """The references of a scene that one thread has needed so far, and the tables of steps around them.
+    """The references of a scene that one thread has needed so far, and the step tables for them.
 
     Attributes
     ----------
     arrays : References
     tables : Tables
     magnified : ndarray, shape (n_area + 1,)
-        Rounding of each gap's voltage, and last of the nodes', over that of the largest voltage, the most of all
-        references.
+        Round-off of each gap's voltage, and last of the nodes' voltages, relative to the rounding of the largest
+        voltage; the maximum over all references.
     shapes : list of tuple
-        Of the arrays in `REFERRED`.
+        Shapes of the arrays in `REFERRED`.
     fixed : dict
         The fields of a `Form` that are the same for all references.
     """
@@ -61,7 +64,7 @@ class Known:
         return self.count >= max(2, min(MOST_REFERENCES, most))
 
     def add(self, levels: tuple[int, ...]) -> None:
-        """Make the reference whose areas are the fixed ones, or LEVEL_RATIO to these powers over those at 0 V."""
+        """Add the reference whose areas are the scene's areas (fixed, or at 0 V) times LEVEL_RATIO to these powers."""
         arrays, one = self.arrays, self.count
         if one == len(arrays.levels):
             more = np.zeros_like(arrays.levels), np.zeros_like(arrays.numbers)
@@ -77,7 +80,7 @@ class Known:
         np.maximum(self.magnified, magnified, out=self.magnified)
 
     def form(self) -> Form:
-        """A form around the areas at 0 V, with numbers of its own."""
+        """A form for the areas at 0 V, with its own copy of the numbers: compiled code overwrites them."""
         numbers, views = views_of(self.shapes)
         numbers[:] = self.arrays.numbers[0]
         parts: dict[str, Any] = dict(zip(REFERRED, views, strict=True))
@@ -86,7 +89,7 @@ class Known:
 
 def known_references(scene: Scene, decade: int, *, anew: bool = False) -> Known:
     """The references of a scene for tolerances of a decade, the first of which has the areas at 0 V."""
-    # One set for each thread: compiled code writes into its tables, and other threads run meanwhile.
+    # Each thread has its own set, because compiled code writes into the tables.
     key = ("references", decade, threading.get_ident())
     if anew:
         scene.prepared.pop(key, None)
@@ -110,7 +113,7 @@ def _make(scene: Scene, decade: int) -> Known:
 
 
 def _shapes(scene: Scene) -> list[tuple[int, ...]]:
-    """Of the arrays in `REFERRED`."""
+    """Shapes of the arrays in `REFERRED`."""
     net = scene.net
     n, n_s = net.b.shape
     m = n + int(np.count_nonzero(net.slow >= 0))
@@ -125,14 +128,14 @@ def _shapes(scene: Scene) -> list[tuple[int, ...]]:
 
 
 def _fed(scene: Scene) -> IntArray:
-    """The cells whose area moves, those of each area together."""
+    """Indices of the cells whose area follows a gap, sorted by area."""
     net = scene.net
     fed = np.flatnonzero([i >= 0 and net.gap[i] >= 0 for i in net.place])
     return fed[np.argsort(net.place[fed], kind="stable")]
 
 
 def _fixed(scene: Scene, decade: int) -> dict[str, Any]:
-    """What of a form is the same for all references."""
+    """The fields of a form that are the same for all references."""
     network, net = scene.network, scene.net
     n, n_area = net.k.shape[0], net.gap.size
     slow, fed = net.slow >= 0, _fed(scene)
@@ -163,7 +166,7 @@ def _fixed(scene: Scene, decade: int) -> dict[str, Any]:
 
 
 def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What of a form belongs to reference areas (m^2), and the rounding of each gap's voltage."""
+    """The arrays in `REFERRED` for reference areas (m^2), in one row, and the round-off as in `Known.magnified`."""
     network, net = scene.network, scene.net
     modes = network_modes(network, area)
     n, n_s = modes.gains.shape
@@ -205,9 +208,12 @@ def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _magnified(
     modes: Modes, gap: FloatArray, gap_s: FloatArray, node: FloatArray, node_s: FloatArray
 ) -> FloatArray:  # fmt: skip
-    """Rounding of each gap's voltage, and last of the nodes', sums over modes and sources, over the largest one."""
+    """Round-off of each gap's voltage, and last of the nodes', relative to the rounding of the largest voltage.
+
+    A voltage is a sum over modes and sources: the sum of the moduli of its terms measures the cancellation.
+    """
     live = modes.rates[modes.rates > 0.0]
-    # What the rounding of the fastest mode leaves in the slowest.
+    # The eigenvectors of the slowest mode contain the round-off of the fastest one.
     spread = math.sqrt(float(live.max() / live.min())) if live.size else 0.0
     inverse = np.abs(modes.inverse)
     every = (np.abs(modes.shape) @ inverse).sum(axis=1).max(initial=1.0)

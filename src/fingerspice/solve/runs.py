@@ -1,4 +1,4 @@
-"""What every method of integration shares: the run window by window, its end, and what it gives with its error."""
+"""The common part of all integrators: the loop over windows, the end of a run, and its result with stated errors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.network import Sources, at_sources, new_room, rates
 from fingerspice.engine.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, ZEROS
-from fingerspice.results.outcome import Attempt, ErrorEstimate, State, Status, last_tried
+from fingerspice.results.outcome import ErrorEstimate, State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.refined import ClosedForm
 from fingerspice.results.steps import Recorded
@@ -21,17 +21,17 @@ from fingerspice.solve.sources import Tables, after_the_end, joined, segment_ind
 
 Progress = Callable[[float], None]
 
-# An error below this share of the voltages that cancel in the gap's is rounding: finer steps would not reach it.
+# Round-off of a gap voltage relative to the voltages that cancel in it; finer steps cannot reduce the error below that.
 ROUNDING = 2e-14
-# N; errors of smaller forces have too few digits.
+# Smallest force (N) whose error is judged; the error of a smaller one may be a denormal number with too few digits.
 LEAST_FORCE = 1e-290
 
 
 def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: Callable[[], Any]) -> Any:
-    """What stands in a scene's `prepared` under a key, made if need be.
+    """The entry of a scene's cache `prepared` under a key; `make` computes it if it is missing.
 
-    There are at most `most` entries with the same first part of the key: beyond, all of them give way. Other threads
-    may take them out meanwhile, so that what has been found is looked up once.
+    At most `most` entries share the first part of the key; when there would be more, all of them are removed first.
+    Other threads may remove entries at any time, so that the entry is looked up only once.
     """
     found = prepared.get(key)
     if found is None:
@@ -44,7 +44,7 @@ def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: C
 
 @dataclass
 class Run:
-    """What one run gives, and how it went.
+    """Result of one run, with its statistics and stated errors.
 
     Attributes
     ----------
@@ -52,31 +52,32 @@ class Run:
         As in `Record`, up to the time reached.
     status : Status
     nfev : int
+        Evaluations of the right-hand side.
     stats : dict
     state : State
-        Where it stopped.
+        State at the time reached.
     gaps : ndarray, shape (n_measured, 4)
-        Of each cell that errors are measured on (`Scene.measured`): peaks of voltage (V) and force (N), and the stated
-        errors of both.
+        Peaks of voltage (V) and force (N), and the stated errors of both, for each cell in `Scene.measured`.
     charge_error : float or None
-        C.
+        Stated error of the charge, C.
     node_error : float or None
         Stated error of the nodes' voltages, V.
     t_failed : float or None
+        Time at which the run failed, s.
     unseen, rough
         See `Tables`.
     margin : float
-        Smallest distance to the fold met.
+        Smallest distance to the fold in the run.
     detail : str
-        What a method says of its failure.
-    tried : tuple of Attempt
-        The last steps tried.
+        Message of a method about its failure.
+    tried : ndarray, shape (n, 4)
+        The last steps tried, as rows of `results.outcome.last_tried`.
     here : ndarray, shape (width,), or None
         The row at the time that a failed run reached.
     continuous : Recorded or ClosedForm or None
         The run between its outputs, where that is known.
     by_layer : bool
-        Whether the rows are those of `Scene.shown`.
+        Whether the rows refer to the network of `Scene.shown`.
     """
 
     t: FloatArray
@@ -94,7 +95,7 @@ class Run:
     rough: float = 0.0
     margin: float = 1.0
     detail: str = ""
-    tried: tuple[Attempt, ...] = ()
+    tried: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
     here: FloatArray | None = None
     continuous: Recorded | ClosedForm | None = None
     by_layer: bool = False
@@ -106,24 +107,24 @@ class Run:
         return ErrorEstimate(u_gap, f_el, self.charge_error, self.node_error)
 
     def record(self, problem: Problem) -> Record:
-        """The outputs with what they mean."""
+        """The outputs as a record, from which all signals follow."""
         scene = problem.scene.shown if self.by_layer else problem.scene
         return Record(scene.network, scene.net, self.t, self.left, self.rows, problem.charge)
 
     def end_before(self, t: float) -> None:
-        """Take back the outputs from a time (s) on."""
+        """Remove the outputs at time t (s) and later."""
         kept = self.t < t
         self.t, self.left, self.rows = self.t[kept], self.left[kept], self.rows[kept]
 
     def end_where_it_stopped(self) -> None:
-        """Let the outputs of a failed run end at the time it reached, left-hand, if it has none there already."""
+        """Append a left-hand output at the time that a failed run reached, unless it has one there already."""
         t, row = self.state.t, self.here
         if row is not None and np.all(np.isfinite(row)) and (self.t.size == 0 or t > self.t[-1]):
             self.t, self.left = np.append(self.t, t), np.append(self.left, True)
             self.rows = np.vstack([self.rows, row])
 
     def add_error(self, u_gap: FloatArray | float, f_el: FloatArray | None = None) -> None:
-        """Add what the stated errors do not know of, V and N: a force goes with the square of its voltage."""
+        """Add errors that the method does not estimate, V and N; by default f_el follows from u_gap, as F ~ u^2."""
         gaps = self.gaps.copy()
         if self.node_error is not None:
             self.node_error += float(np.max(u_gap, initial=0.0))
@@ -139,9 +140,9 @@ class Run:
 
 
 def excess_of(gaps: FloatArray, u_scale: float) -> float:
-    """Largest stated error over the peak it belongs to, in any gap's voltage or force; for `gaps` see `Run`.
+    """Largest ratio of a stated error to its peak, over the voltages and forces of all gaps; for `gaps` see `Run`.
 
-    A gap that takes no more than rounding of `u_scale`, the largest voltage of the circuit (V), is at 0 V.
+    A gap whose peak is below the round-off of `u_scale`, the circuit's largest voltage (V), is at 0 V and not judged.
     """
     worst = 0.0
     for u_peak, f_peak, u_error, f_error in gaps.tolist():
@@ -156,12 +157,13 @@ class Integration(ABC):
     Attributes
     ----------
     t_out, left : ndarray, shape (n_out,)
-        Output times (s) and whether the left-hand value is meant.
+        Output times (s), and whether the left-hand limit is wanted there.
     y, sign, s_before : ndarray
-        The state reached.
+        The state reached, as in `State`.
     counters : ndarray of int
-        As `engine.readout` counts.
+        Counters with the indices of `engine.readout`.
     tried : ndarray, shape (TRIED, 4)
+        The last attempted steps, see `last_tried`.
     """
 
     counters: IntArray
@@ -182,42 +184,45 @@ class Integration(ABC):
 
     @abstractmethod
     def through(self, sources: Sources, t_end: float) -> Status:
-        """To `t_end` (s), the jumps on the way taken."""
+        """Integrate to `t_end` (s), including the jumps of the sources before it."""
 
     def state(self) -> State:
         return State(self.t, self.y.copy(), self.s_before.copy(), self.sign.copy(), self.problem.scene.charge_law)
 
     def stuck(self) -> Status:
-        """Why no step is short enough."""
+        """Status of a run in which no step is short enough; a coupled `mobile` scene is then taken to be at a fold."""
         return Status.FOLD if self.net.mobile and self.problem.scene.coupled else Status.STEP_UNDERFLOW
 
     @abstractmethod
     def finish(self, sources: Sources, after: Sources | None) -> None:
-        """Write the right-hand outputs at the very end, `after` the jump that may stand there; none past a fold."""
+        """Write the right-hand outputs at the end of the run, which `after` (the sources there) may begin with a jump.
+
+        Nothing is written if that jump goes past a fold.
+        """
 
     @abstractmethod
     def written(self) -> FloatArray:
-        """The rows written."""
+        """The rows written so far."""
 
     @abstractmethod
     def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
-        """The row at the time reached, from the segments on one side of it; NaN past a fold."""
+        """The row at the time reached, with left- or right-hand values of the sources; NaN past a fold."""
 
 
 class NetworkIntegration(Integration):
-    """One whose steps have the state as outputs have it.
+    """An integration whose steps use the same state as the outputs.
 
     Attributes
     ----------
     rows : ndarray, shape (n_out, width)
-        What is written at the outputs, as in `Record`.
+        Rows of the outputs, as in `Record`.
     """
 
     rows: FloatArray
 
     @abstractmethod
     def jump(self, after: FloatArray) -> bool:
-        """Take a jump of the sources to their values `after`; False where that goes past a fold."""
+        """Apply a jump of the sources to their values `after`; False where the jump goes past a fold."""
 
     def finish(self, sources: Sources, after: Sources | None) -> None:
         if after is not None:
@@ -241,7 +246,7 @@ class NetworkIntegration(Integration):
 
 
 def integrate(one: Integration, tables: Tables, progress: Progress | None = None) -> Run:
-    """Run an integration to its end, or as far as it goes; the error is not stated yet."""
+    """Run an integration to its end or to its failure; the caller adds the stated error."""
     problem, t_out, left = one.problem, one.t_out, one.left
     status, t_failed = Status.SUCCESS, None
     sources: Sources | None = None
@@ -269,7 +274,7 @@ def integrate(one: Integration, tables: Tables, progress: Progress | None = None
     stats = {name: int(one.counters[i]) for name, i in (("steps", ACCEPTED), ("rejected", REJECTED), ("zeros", ZEROS))}
     return Run(
         t_out[: len(rows)], left[: len(rows)], rows, status, int(one.counters[NFEV]), stats, state,
-        t_failed=t_failed, tried=last_tried(one.tried), unseen=tables.unseen, rough=tables.rough, here=here,
+        t_failed=t_failed, tried=one.tried, unseen=tables.unseen, rough=tables.rough, here=here,
     )  # fmt: skip
 
 
@@ -284,7 +289,7 @@ def gap_signals(record: Record) -> Iterator[tuple[FloatArray, FloatArray]]:
 
 
 def nodes_apart(one: Record, other: Record) -> float:
-    """Largest difference (V) between the voltages of any node in two records of the same outputs, as far as both go."""
+    """Largest difference (V) of a node's voltage between two records of the same outputs, over their common times."""
     count = min(one.t.size, other.t.size)
     pairs = zip(one.node_voltages.values(), other.node_voltages.values(), strict=True)
     return max((float(np.abs(a[:count] - b[:count]).max(initial=0.0)) for a, b in pairs), default=0.0)

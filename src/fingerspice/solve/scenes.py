@@ -1,4 +1,4 @@
-"""A circuit under one charge law and area mode as numbers: its equations, its areas, and the peak of its sources."""
+"""Scenes: a circuit under one charge law and area mode, as arrays for its equations, areas and sources' peak."""
 
 from __future__ import annotations
 
@@ -25,26 +25,27 @@ from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.sampling import is_sampled
 from fingerspice.waveforms.waveform import Fundamental, Waveform, require
 
-# What a dispersive skin's data taken at one frequency may cost, over the error asked for.
+# Error allowed for taking a dispersive skin's data at one frequency, relative to the error asked for.
 FREEZING_SHARE = 0.3
-# V; below, the digits of all that a source causes are lost.
+# Smallest peak of a source other than 0, V; below it, forces and errors are denormal numbers with too few digits.
 LEAST_PEAK = 1e-300
-# What the curve of an area covers where nothing is known of the sources, V: over too little it would be a constant.
+# Gap voltage (V) that an area's curve covers if the sources' peak is unknown; over a tiny range it would be constant.
 PEAK_UNKNOWN = 1.0
-# A current source may put any voltage across a gap; the curves of the areas reach this far (V), then the long way.
+# Gap voltage (V) that an area's curve covers under current sources, which do not bound it; beyond the curve, the
+# contact equations are solved at each evaluation.
 DRIVEN_BY_CURRENT = 300.0
 
 
 @dataclass(frozen=True)
 class Freezing:
-    """A dispersive skin's data taken at one frequency, and what that costs.
+    """The single frequency at which a dispersive skin's data are taken, and the error of doing so.
 
     Attributes
     ----------
     frequency : float
         Hz.
     error : float
-        Of the gap voltage, relative to its peak.
+        Error of the gap voltage, relative to its peak.
     """
 
     frequency: float
@@ -53,25 +54,25 @@ class Freezing:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A circuit under one charge law and area mode, as numbers; kept with the circuit from run to run.
+    """A circuit under one charge law and area mode, as arrays; the circuit caches it from run to run.
 
     Attributes
     ----------
     network : Network
-        Of a series stack that of its loop.
+        The circuit's network; for a series stack that of its loop.
     charge_law, area_mode : str
     fixed : tuple of float or None
-        Each area where it is fixed, m^2.
+        Each area if it is fixed, m^2; None if it follows its gap.
     u_peak : float
         Sum of the largest |U| of the voltage sources, V; 0 where it is not known.
     u_top : float
         Largest gap voltage that the areas' curves cover, V.
     model : Model or None
-        That of a series stack, whose modes follow from a secular equation.
+        Model of a series stack, whose modes follow from a secular equation.
     skin : Freezing or None
-        At what frequency a dispersive skin's data are taken, where that is enough for the error asked for.
+        Frequency at which a dispersive skin's data are taken, if one is accurate enough for the error asked for.
     prepared : dict
-        What integrators made ready for this scene.
+        Cache of the tables and systems that integrators have made for this scene.
     """
 
     network: Network
@@ -86,12 +87,12 @@ class Scene:
 
     @property
     def stack(self) -> Stack | None:
-        """Where the circuit is one."""
+        """The series stack, if the circuit is one."""
         return self.network.stack
 
     @property
     def waveforms(self) -> tuple[Waveform, ...]:
-        """Of each source, V or A."""
+        """Waveform of each source, V or A."""
         return self.network.waveforms
 
     @cached_property
@@ -101,12 +102,12 @@ class Scene:
 
     @cached_property
     def fundamental(self) -> Fundamental | None:
-        """The source's, where there is only one."""
+        """Fundamental of the source, if there is only one."""
         return self.waveform.fundamental if len(self.waveforms) == 1 else None
 
     @cached_property
     def is_sampled(self) -> bool:
-        """Whether some source is a function that has to be looked at, not a waveform with a formula."""
+        """Whether some source is a user's function, which has to be sampled, not a waveform with a formula."""
         return any(is_sampled(w) for w in self.waveforms)
 
     @property
@@ -121,7 +122,7 @@ class Scene:
 
     @cached_property
     def shown(self) -> Scene:
-        """As a run by exponential steps records it: a stack's layers, however many cells they have."""
+        """The scene in whose form exponential steps record a stack: a voltage for each layer, not for each cell."""
         stack = self.stack
         if stack is None or stack.by_layer is stack:
             return self
@@ -129,17 +130,17 @@ class Scene:
 
     @cached_property
     def area0(self) -> FloatArray:
-        """The areas where they are fixed, else at 0 V, m^2."""
+        """The areas, m^2: fixed ones, and those at 0 V of areas that follow their gap."""
         return np.asarray(self.net.area0)
 
     @cached_property
     def modes(self) -> Modes:
-        """Of the circuit with its areas fixed, or as they are at 0 V."""
+        """Modes of the circuit with the areas `area0`."""
         return self.modes_at(self.area0)
 
     @cached_property
     def rates(self) -> FloatArray:
-        """Of these modes, 1/s."""
+        """Decay rates of these modes, 1/s."""
         if self.model is None:
             return self.modes.rates
         rates, _, _, _ = modes(self.model.rate + self.model.rate0 / self.model.area0, self.model.k)
@@ -157,18 +158,18 @@ class Scene:
 
     @cached_property
     def turn(self) -> FloatArray:
-        """Of a stack: the sign of every live voltage along the loop, shape (n,)."""
+        """For a stack: sign of every live voltage relative to the direction of the loop, shape (n,)."""
         assert self.stack is not None
         return self.stack.sign[list(self.stack.state_order[:-1])]
 
     @cached_property
     def is_turned(self) -> bool:
-        """Whether some live voltage of a stack is written against the loop."""
+        """Whether some live voltage of a stack counts against the direction of the loop."""
         return bool(np.any(self.turn < 0.0))
 
     @cached_property
     def measured(self) -> tuple[int, ...]:
-        """Cells whose voltage errors are measured on: the gaps, or else the one with the smallest capacitance."""
+        """Cells for whose voltages errors are stated: the gaps, or without gaps the cell of smallest capacitance."""
         gaps = tuple(gap for gap in self.network.gaps if gap is not None)
         if gaps or not self.network.cells:
             return gaps
@@ -208,14 +209,14 @@ def _scene(circuit: Circuit, law: str, area: str | float, stop: float, skin: Fre
     fixed, mode = _fixed_areas(network, area)
     whole = network.stack is not None
     u_peak = sum(_largest_voltage(waveform, stop, whole) for waveform in network.waveforms[: network.n_voltage])
-    # Discharging layers add to the gap's share of a jump: the curve covers a little more than U itself.
+    # The voltage of discharging layers adds to the gap's share of a jump, so the curve covers more than the peak.
     top = 1.3 * u_peak + (DRIVEN_BY_CURRENT if len(network.sources) > network.n_voltage else 0.0) or PEAK_UNKNOWN
     model = None if network.stack is None else _model(network.stack, law, fixed[0], top)
     return Scene(network, law, mode, fixed, u_peak, top, model, skin)
 
 
 def _freezing(circuit: Circuit, stop: float, rtol: float) -> Freezing | None:
-    """The best single frequency of a dispersive skin, where there is one that serves to `rtol`."""
+    """The single frequency for a dispersive skin's data, if the error of using it is small compared with `rtol`."""
     if not circuit.by_device("SKIN_DISPERSIVE") or not is_stack(circuit):
         return None
     stack, allowed = build_stack(circuit), FREEZING_SHARE * rtol
@@ -225,7 +226,7 @@ def _freezing(circuit: Circuit, stop: float, rtol: float) -> Freezing | None:
     area = stack.area_given or float(np.median(areas))
     change = 0.0 if stack.area_given else float(np.ptp(areas)) / area
     if COUPLING * change > allowed:
-        # A part of the error is too much already.
+        # This part of the error alone is too large, so the expensive part need not be computed.
         return None
 
     def make() -> Freezing | None:
@@ -240,12 +241,12 @@ def _freezing(circuit: Circuit, stop: float, rtol: float) -> Freezing | None:
 
 
 def _largest_voltage(waveform: Waveform, stop: float, whole: bool = True) -> float:
-    """Largest |U| (V) up to a time (s), or of `whole` periods; 0 where it is not known."""
+    """Largest |U| (V) up to time `stop` (s), or with `whole` over a whole period; 0 where it is not finite."""
     if not (math.isfinite(stop) and stop > 0.0):
         return 0.0
     if whole and waveform.period is not None:
         stop = waveform.settled + waveform.period
-    # One entry with its key: another thread may put its own there at any time.
+    # Key and value are one entry, because another thread may replace it at any time.
     kept, peak = waveform.kept.get("peak", (None, 0.0))
     if kept != stop:
         peak = waveform.peak(0.0, stop)
@@ -255,7 +256,7 @@ def _largest_voltage(waveform: Waveform, stop: float, whole: bool = True) -> flo
 
 
 def _fixed_areas(network: Network, area: str | float) -> tuple[tuple[float | None, ...], str]:
-    """Each area (m^2) that does not follow its gap, and the mode's name."""
+    """Each area (m^2), None for one that follows its gap, and the name of the area mode."""
     given = [a.given for a in network.areas]
     if not isinstance(area, str):
         require(math.isfinite(area) and area > 0.0, "area", f"{area:g} m^2", "a positive area in m^2")
@@ -304,7 +305,7 @@ def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:
 
 
 def _row(order: list[int], layer: int) -> FloatArray:
-    """How a cell's voltage over k U follows from the states, shape (n_cell - 1,)."""
+    """Weights of the states in a cell's voltage beyond its share k U, shape (n_cell - 1,)."""
     place = order.index(layer)
     n = len(order) - 1
     return np.full(n, -1.0) if place == n else np.eye(n)[place]
@@ -352,5 +353,5 @@ def _net(scene: Scene) -> Net:
 
 
 def _padded(curve: FloatArray, width: int) -> FloatArray:
-    """A curve as long as the others'."""
+    """A curve padded with zeros to a common length."""
     return curve if curve.size == width else np.pad(curve, (0, width - curve.size))

@@ -33,7 +33,7 @@ from fingerspice.waveforms.waveform import require
 
 RTOL_RANGE = (1e-13, 0.1)
 METHODS, LIBRARIES = ("auto", "exponential", "radau"), ("scipy", "torchdiffeq")
-# Where exponential steps find no way on, which another method may: of a stack, and of a network.
+# Statuses of a run by exponential steps after which another method is tried: for a stack, and for a network.
 BEYOND_STACKS = (Status.FOLD, Status.TOO_MANY_STEPS)
 BEYOND_NETWORKS = (*BEYOND_STACKS, Status.STEP_UNDERFLOW, Status.ERROR_NOT_MET)
 STARTS = ("deck", "uncharged", "dc", "periodic")
@@ -81,24 +81,24 @@ def simulate(
         Largest error of the gap voltage relative to its peak over the run, and of the force likewise.
     method : str
         ``"auto"``, an own stepper (``"exponential"``, ``"radau"``), ``"scipy:NAME"`` or ``"torchdiffeq:NAME"``.
-        ``"auto"`` steps as ``"exponential"`` does, and once a period of the source no longer changes the state it lets
-        that period stand for those that follow; the others step every period. A recording (`Samples`) on a series stack
-        it follows sample by sample (`Solution.method` is ``"relaxation"`` then). Where a fast mode that the area moves
-        lets only short steps converge, it goes on as ``"radau"``, an implicit method.
+        ``"auto"`` uses exponential steps, and once a period of the source no longer changes the state, it repeats that
+        period to the end; the other methods step every period. ``"auto"`` integrates a recording (`Samples`) on a
+        series stack sample by sample (`Solution.method` is then ``"relaxation"``). Where a fast mode that depends on
+        the area makes only short exponential steps converge, the run is repeated with ``"radau"``, an implicit method.
     tier : str
         ``"auto"``, or the model to take: ``"algebraic"``, ``"linear"`` or ``"coupled"`` (see `Plan`).
     start : str or Solution
         ``"deck"`` (as its .tran says), ``"uncharged"``, ``"dc"``, ``"periodic"`` (the periodic state, solved for
-        directly), or a Solution to go on from.
+        directly), or a Solution whose final state is the start.
     charge : bool
         Whether `q_source` and `i_source` are wanted; leaving them out saves a fifth of the time.
     jumps : str
-        ``"both"``: without `t_eval`, both one-sided values at each jump of a source; ``"none"``: no rows but those at
-        TSTART:TSTEP:TSTOP, right-hand values, so that `Solution.t` rises strictly.
+        ``"both"``: without `t_eval`, both one-sided values at each jump of a source; ``"none"``: only right-hand values
+        at TSTART:TSTEP:TSTOP, so that `Solution.t` rises strictly.
     throw : bool
-        Raise where the run fails; otherwise return what came before, with its status.
+        Raise an error if the run fails; otherwise return the outputs before the failure, with its status.
     progress : callable, optional
-        Called with the fraction done.
+        Called with the fraction of the run that is done.
 
     Returns
     -------
@@ -109,7 +109,7 @@ def simulate(
     InputError
         For a request that cannot be run.
     SolveError
-        Where the run failed and `throw` is set; its `solution` holds what came before.
+        Where the run failed and `throw` is set; its `solution` holds the outputs before the failure.
     """
     require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
     check_method(method)
@@ -167,7 +167,10 @@ def check_method(method: str) -> None:
 
 
 def _given_back(solution: Solution, throw: bool) -> Solution:
-    """A solution with its warnings said, but for those of the circuit, which came first; or a failed run's error."""
+    """Issue a solution's warnings and return it, or raise a failed run's error.
+
+    The warnings of the circuit itself are left out, because they were issued when it was read.
+    """
     if solution.failure is not None and throw:
         raise SolveError(solution.failure, solution)
     for text in solution.warnings:
@@ -188,7 +191,7 @@ def plan(
     tier: str = "auto",
     charge: bool = True,
 ) -> Plan:
-    """Which model a run would take, and why; arguments as in `simulate`.
+    """The model that a run would use, and the reasons; arguments as in `simulate`.
 
     Raises
     ------
@@ -218,7 +221,7 @@ def run_problem(
     start: str = "deck",
     jumps: str = "both",
 ) -> Solution:
-    """Integrate a problem made ready; arguments as in `simulate`. Never raises for a failed run."""
+    """Integrate a prepared problem; arguments as in `simulate`. A failed run raises no error."""
     plan = planned(problem, rtol, method, tier, start)
     t_out, left = asked_for(problem, t_eval, jumps)
     run_at = t_out if t_eval is None else at_breakpoints(problem, t_eval)
@@ -226,13 +229,13 @@ def run_problem(
     run, name = integrated(problem, plan, run_at, left, rtol, method, progress)
     run.stats["wall_s"] = time.perf_counter() - begin  # type: ignore[assignment]
     record = run.record(problem)
-    # The times asked for, not those that rounding moved onto a breakpoint.
+    # Report the times asked for, not the breakpoints to which `at_breakpoints` has moved some of them.
     t = np.concatenate([t_out[: run.t.size], run.t[t_out.size :]]) if run.status is Status.SUCCESS else run.t.copy()
     return solution_of(problem, plan, run, record, t, rtol, name)
 
 
 def planned(problem: Problem, rtol: float, method: str, tier: str, start: str) -> Plan:
-    """The plan of a run by a method: a method steps, and what is stepped is the coupled model."""
+    """The plan of a run; a method named explicitly integrates by steps, which only the coupled tier does."""
     return make_plan(problem, rtol, "coupled" if tier == "auto" and method != "auto" else tier, start)
 
 
@@ -240,7 +243,7 @@ def integrated(
     problem: Problem, plan: Plan, t_out: FloatArray, left: BoolArray, rtol: float, method: str,
     progress: Progress | None = None,
 ) -> tuple[Run, str]:  # fmt: skip
-    """A run as planned, its error stated and judged, and the name of the method that made it."""
+    """A run as planned, with its stated error compared with `rtol`, and the name of its method."""
     if plan.tier == "algebraic":
         run, name = solve_algebraic(problem, t_out, left), plan.tier
     elif plan.tier == "linear":
@@ -255,14 +258,14 @@ def integrated(
 
 
 def own_rtol(problem: Problem, plan: Plan, rtol: float) -> float:
-    """What the start and the plan leave of the error asked for."""
+    """The part of the error asked for that is left to the integrator, after the errors of start and plan."""
     return max((1.0 if problem.begun is None else 0.5) * rtol - 2.0 * plan.error_bound, RTOL_RANGE[0])
 
 
 def solution_of(
     problem: Problem, plan: Plan, run: Run, record: Record, t: FloatArray, rtol: float, name: str
 ) -> Solution:  # fmt: skip
-    """A run, by the method of this name, as a solution with its outputs at times `t` (s)."""
+    """The solution made of a run and its record, with output times `t` (s); `name` is the method."""
     scene = problem.scene
     return Solution(
         t=t,
@@ -292,7 +295,7 @@ def solution_of(
 def _stepped(
     problem: Problem, method: str, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None
 ) -> tuple[Run, str]:
-    """A run by steps, and the name of the method that made it."""
+    """A run of the coupled tier, and the name of its method."""
     if ":" in method:
         from fingerspice.solve.foreign import solve_foreign
 
@@ -314,7 +317,7 @@ def _stepped(
             folded = run_to_fold(problem, t_out, left)
             if folded is not None:
                 return folded, "exponential"
-    # For an implicit method, which no fast mode holds up.
+    # The implicit method is the last resort: its step length does not depend on fast modes.
     run = solve_coupled(problem, rtol, t_out, left, progress)
     if is_stack and run.status is Status.FOLD:
         from fingerspice.solve.folding import lead_to_fold
@@ -324,14 +327,14 @@ def _stepped(
 
 
 def state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
-    """Add to a run's error what its method does not know of, and judge it by the error asked for."""
+    """Add the errors that a run's method does not estimate to its stated error, and compare that with `rtol`."""
     if problem.begun is not None:
         if len(problem.begun) == len(run.gaps):
             run.add_error(*problem.begun.T)
-        # What the charge collects from where it starts is not known, nor what the start is off at other nodes.
+        # The start's error is known at the gaps only, not its effect on the charge or at other nodes.
         run.charge_error = run.node_error = None
     if run.unseen is not None and run.status in (Status.SUCCESS, Status.ERROR_NOT_MET):
-        # The outputs show the source to be another one than was integrated.
+        # At this output the user's function differs from the table that was integrated.
         run.t_failed, off = run.unseen[:2]
         run.status = Status.SOURCE_UNSEEN if math.isfinite(off) else Status.SOURCE_NOT_FINITE
         run.end_before(run.t_failed)
@@ -341,10 +344,10 @@ def state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
     rounding = ROUNDING * problem.scene.u_peak
     for gap in run.gaps:
         if gap[0] <= rounding:
-            # It is at 0 V, as far as numbers can tell; the force goes with the square.
+            # To round-off the gap is at 0 V: state at least that round-off as its error, and its square for the force.
             share = rounding / gap[0] if gap[0] > 0.0 else 0.0
             gap[2:] = np.maximum(gap[2:], (share * gap[0], share**2 * gap[1]))
-    # The rounding of a closed form is stated, and no reason to refuse it: no other method would do better.
+    # A closed form is not refused for its round-off, however small `rtol` is: no other method has a smaller error.
     judged = plan.tier == "coupled" or plan.error_bound > 0.0 or run.rough > 0.0
     if run.status is Status.SUCCESS and judged and run.excess(problem.largest) > rtol:
         run.status = Status.ERROR_NOT_MET

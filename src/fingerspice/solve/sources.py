@@ -1,4 +1,4 @@
-"""The sources of a run as tables for compiled code, window by window."""
+"""The sources of a run as tables for compiled code, window by window so that memory does not grow with its length."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from fingerspice.waveforms.waveform import Waveform
 
 PERIODS_PER_WINDOW = 4096.0
 BREAKPOINTS_PER_WINDOW = 2000.0
-# Windows of a run whose tables stay with the waveform, and tables that stay there.
+# A run of at most KEPT_WINDOWS windows leaves its tables in the waveform's cache, which holds about MOST_KEPT of them.
 KEPT_WINDOWS, MOST_KEPT = 4, 16
 
 
 class Tables:
     """Tables of a problem's sources, window by window, until one of them stops being finite.
 
-    A user's function is expensive to look at, so its tables are kept for the run. Those of library waveforms are made
-    anew, which keeps a long run's memory constant, but for a run of few windows: its tables stay with the waveform.
+    A user's function is expensive to evaluate, so its tables are cached for the run. The tables of library waveforms
+    are cached with the waveform if the run has few windows; in a longer run they are computed anew, in constant memory.
 
     Attributes
     ----------
     rough : float
-        Largest misfit (V) of a table that no finer one would mend.
+        Largest interpolation error (V) of a table that a finer table would not reduce.
     unseen : tuple of float, float and int, or None
-        The first output at which a user's function is not what its table says, s, by how much, V, and which it is.
+        First output time (s) at which a user's function differs from its table, the difference (V), and its number.
     not_finite : float or None
-        Time (s) at which a source stopped being finite, once that has been met.
+        Time (s) at which a source stops being finite, once the iteration has reached it.
     done : float
-        Windows that end by this time (s) are done with, but for the last.
+        An iteration skips windows that end by this time (s), except the last window.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Tables:
         self.rough = 0.0
         self.unseen: tuple[float, float, int] | None = None
         self.not_finite: float | None = None
-        # Largest values (V or A) of the sampled windows so far.
+        # Largest value (V or A) of each source in the windows so far.
         self.scales = [0.0] * len(problem.waveforms)
         self.kept: dict[Any, list[SourceTable]] | None = {} if problem.scene.is_sampled else None
         if self.kept is None and len(self.edges) <= 1 + KEPT_WINDOWS:
@@ -61,7 +61,7 @@ class Tables:
         for w0, w1 in itertools.pairwise(self.edges):
             if w1 <= self.done and w1 < self.edges[-1]:
                 continue
-            # Without chirps a series stands for them, to this error.
+            # With `no_chirps`, chirps are approximated by series, so that these tables depend on the tolerance.
             key = (w0, w1, self.tol if self.no_chirps else None)
             tables = self.kept.get(key) if self.kept is not None else None
             if tables is None:
@@ -92,7 +92,7 @@ class Tables:
 
 
 def windows(problem: Problem) -> list[float]:
-    """Edges of the windows the source is tabulated on: constant memory, and phases that stay exact."""
+    """Limits (s) of the windows for the sources' tables: short windows bound memory and the phases' round-off."""
     check_length(problem.waveform, problem.t_start, problem.t_stop)
     span = problem.t_stop - problem.t_start
     rate = max(
@@ -106,7 +106,7 @@ def windows(problem: Problem) -> list[float]:
 
 
 def joined(tables: list[SourceTable]) -> Sources:
-    """Tables of all sources as compiled code takes them."""
+    """Tables of all sources, concatenated for compiled code."""
     if len(tables) == 1:
         (one,) = tables
         return Sources(np.array([0, one.edges.size]), one.edges, one.terms, one.series)
@@ -126,7 +126,7 @@ def ramp(before: FloatArray, after: FloatArray) -> Sources:
 
 
 def held(t: float, values: FloatArray) -> Sources:
-    """Sources that stand at these values from t (s) on."""
+    """Sources that are constant at these values (V or A) from time t (s) on."""
     terms = np.zeros((values.size, 1, 6))
     terms[:, 0, 0] = values
     edges = np.tile([t, t + 1.0], values.size)
@@ -146,7 +146,7 @@ def after_the_end(problem: Problem) -> Sources | None:
     if not any(breakpoints_at(wave, stop).size for wave in problem.waveforms):
         return None
     span = stop, problem.step
-    # One entry with its key: another thread may put its own there at any time.
+    # Key and value are one entry, because another thread may replace it at any time.
     kept, after = problem.waveform.kept.get("after", (None, None))
     if kept != span:
         after = joined([source_table(w, stop, stop + problem.step, 1e-10, problem.step) for w in problem.waveforms])
@@ -156,7 +156,7 @@ def after_the_end(problem: Problem) -> Sources | None:
 
 
 def segment_index(sources: Sources, t: float, side: Literal["left", "right"]) -> IntArray:
-    """The segment of every source (n_s,) that a time (s) is in, or at whose end it is on the left side."""
+    """Index of every source's segment (n_s,) that contains t (s); at an edge, the segment on the given side."""
     return np.array([
         min(max(int(np.searchsorted(sources.edges[a:b], t, side=side)) - 1, 0), b - a - 2)
         for a, b in itertools.pairwise(sources.first)

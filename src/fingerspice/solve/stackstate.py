@@ -1,7 +1,7 @@
-"""The state of a series stack as its own equations have it, from that of any circuit, and back.
+"""Conversion between the state used for all circuits and the state in a series stack's own equations.
 
-There x = v along the loop under `local` and v = x A_0 / A under `mobile`, for live voltages k U + v (see
-`engine.model`). The charge that the source has delivered is z under `local`, and z + A U / S - offset under `mobile`.
+The live voltages along the loop are k U + v. The stack's own state x is v under `local`, and v A / A_0 under `mobile`
+(see `engine.model`). The charge delivered by the source is z under `local`, and z + A U / S - offset under `mobile`.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ class StackState:
     t : float
         s.
     y : ndarray, shape (n + 1,)
-        x (V) and z (C).
+        State x (V), and z (C) last.
     u_before : float
         Voltage around the loop just before `t`, V.
     u_gap : float
         Gap voltage along the loop, V.
     offset : float
-        Subtracted from the charge so that it starts with what has been delivered, C.
+        Value of A U / S at the start of the run, subtracted so that the charge counts from there, C.
     """
 
     t: float
@@ -61,7 +61,7 @@ def to_stack(scene: Scene, state: State) -> StackState:
     offset = before / inverse / model.s if model.mobile else 0.0
     share = model.k[:-1] * before
     x = along - share
-    # Of what follows the source at once, no charge is stored: what is left is rounding.
+    # A remainder within the rounding of the capacitive share is no stored charge: an uncharged start gives exactly 0.
     x[np.abs(x) <= 4e-16 * np.abs(share)] = 0.0
     return StackState(state.t, np.append(x / scale, state.y[-1]), before, u_gap, offset)
 
@@ -69,12 +69,12 @@ def to_stack(scene: Scene, state: State) -> StackState:
 def along_gap(model: Model, along: FloatArray, u_source: FloatArray) -> FloatArray:
     """Gap voltages (n_t,) from rows of live voltages along the loop (n_t, n) and the source's, V."""
     x = np.einsum("tk,k->t", along[:, : model.gap.size], model.gap)
-    # Without states, or where the gap is not one of them, it takes what the others leave.
+    # If the gap's voltage is no state, it is the source's voltage less the states, whose weights are -1.
     return np.asarray(x if model.gap.size and model.gap.max() > 0.0 else u_source + x)
 
 
 def from_stack(scene: Scene, state: StackState) -> State:
-    """A state in the engine's form as that of any circuit."""
+    """The state used for all circuits from a state in the engine's form."""
     model = model_of(scene)
     stack, sign, scale, y = scene.stack, 0.0, 1.0, state.y.copy()
     assert stack is not None
@@ -89,21 +89,21 @@ def from_stack(scene: Scene, state: StackState) -> State:
 
 
 def unreachable(scene: Scene, state: StackState, largest: float) -> bool:
-    """Whether no rise of the source from 0 V leads to a state's gap voltage; `largest` is that of all layers, V."""
+    """Whether the source, raised from 0 V, cannot reach a state's gap voltage; `largest`: largest cell voltage, V."""
     model = model_of(scene)
     if scene.network.gaps[0] is None:
         return False
     k_u = model.k_gap * state.u_before
     sign = choose_branch(model, state.u_before, state.y)
     found = float(gap_voltage(model, k_u, float(model.gap @ state.y[:-1]), sign, k_u))
-    # Behind an insulating coating the gap's 0 V are the difference of others.
+    # Behind an insulating coating, a gap voltage of 0 V is a difference of other voltages: allow for their round-off.
     return not abs(found - state.u_gap) <= 1e-9 * abs(state.u_gap) + 1e-13 * largest
 
 
 def as_marched(scene: Scene, rows: FloatArray, by_layer: bool = True) -> FloatArray:
-    """Rows as the loop writes them from those of `write_row`: voltages along the loop, z and the current.
+    """Rows in the form of the compiled loop from rows of `write_row`: voltages along the loop, z and the current.
 
-    The voltages are those of the recorded layers (`Scene.shown`), or of all cells.
+    The voltages are those of the recorded layers (`Scene.shown`), or without `by_layer` those of all cells.
     """
     model, stack = model_of(scene), scene.stack
     x = rows[:, 5:-1] * (model.area0 * rows[:, 2:3]) if model.mobile else rows[:, 5:-1]
@@ -116,7 +116,7 @@ def as_marched(scene: Scene, rows: FloatArray, by_layer: bool = True) -> FloatAr
 
 
 def from_written(scene: Scene, rows: FloatArray, offset: float, by_layer: bool) -> FloatArray:
-    """Rows as in `Record` from those of `engine.model.write_row`."""
+    """Rows as in `Record` from rows of `engine.model.write_row`."""
     model, out = model_of(scene), as_marched(scene, rows, by_layer)
     out[:, :-2] *= (scene.shown if by_layer else scene).turn
     if model.mobile:
@@ -125,5 +125,5 @@ def from_written(scene: Scene, rows: FloatArray, offset: float, by_layer: bool) 
 
 
 def row_width(scene: Scene) -> int:
-    """Columns of a row of `engine.model.write_row`."""
+    """Number of columns in a row of `engine.model.write_row`."""
     return 6 + model_of(scene).gap.size

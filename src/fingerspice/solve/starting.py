@@ -1,16 +1,16 @@
-"""How a circuit starts: what its capacitors hold at t = 0 by its deck, and what that settles to at once.
+"""Start of a circuit: the capacitors' voltages at t = 0 by the deck, made consistent with Kirchhoff's voltage law.
 
-As SPICE does it, tried on ngspice 39:
+The rules are those of SPICE, compared with ngspice 39:
 
-- With ``uic`` each capacitor holds its own ``IC=``, else the difference of its nodes' ``.ic``, 0 V where there is none.
-- Without ``uic`` the start is the DC operating point with the nodes of ``.ic`` held, which are then let go; ``IC=`` has
-  no effect. A voltage source is stronger than ``.ic``, and of nodes that voltage sources tie together the mean counts.
-- ``.ic`` of an area node (mm^2) holds the area in the operating point, and starts an area with dynamics of its own.
+- With ``uic`` each capacitor has the voltage of its ``IC=``, else the difference of its nodes' ``.ic``, else 0 V.
+- Without ``uic`` the start is the DC operating point with the nodes of ``.ic`` held, which are then released; ``IC=``
+  has no effect. A voltage source overrides ``.ic``; for nodes tied together by voltage sources, the mean is used.
+- ``.ic`` of an area node (mm^2) holds the area in the operating point, and starts an area with a time constant.
 
-Voltages that Kirchhoff's law does not allow beside each other settle at once: charge flows round the loops of
-capacitors and sources as through vanishing resistances, and on every island of nodes it is conserved. With fixed areas
-that is the least sum of C (u - u_start)^2. Where areas follow the voltage, what the loops miss is taken away at a
-steady pace, as a jump of the sources is the limit of a ramp.
+Start voltages that contradict Kirchhoff's voltage law settle at once: charge flows round the loops of capacitors and
+sources as if through vanishing resistances, and is conserved on every island of nodes. With fixed areas the result
+minimises the sum of C (u - u_start)^2. Where areas follow the voltage, the residual of Kirchhoff's law in the loops is
+reduced linearly to 0, because a jump of the sources is the limit of a ramp.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ from fingerspice.engine.network import Net
 from fingerspice.physics.contact import Contact, inverse_area
 from fingerspice.waveforms.waveform import DC
 
-# What start voltages may miss Kirchhoff's law by, over the largest of them: the rounding of a deck's decimals.
+# Residual of Kirchhoff's law, relative to the largest start voltage, that rounded decimals of a deck may cause.
 ROUNDING = 1e-12
-# The error of a step on the way to where start voltages settle, over the largest of them and over themselves.
+# Tolerances of a step towards consistent start voltages, relative to the largest voltage and to each voltage itself.
 STEP_ERROR, STEP_RTOL = 1e-14, 2.3e-14
 PAST_FOLD = "past the fold of the mobile law; allowed: less voltage, more load, or the local law"
 
 
 def starts_uncharged(circuit: Circuit) -> bool:
-    """Whether capacitors start with what ``IC=`` and ``.ic`` say, else 0 V, and not from the operating point."""
+    """Whether capacitors start with the voltages of ``IC=`` and ``.ic`` (else 0 V), not with the operating point."""
     return circuit.tran is None or circuit.tran.uic
 
 
 def start_voltage(element: Element, initial: Mapping[str, float]) -> float:
-    """Voltage (V) from p to n that a capacitor or layer holds at the start with ``uic``."""
+    """Voltage (V) from p to n of a capacitor or layer at a start with ``uic``."""
     if element.initial is not None:
         return element.initial
     return initial.get(element.nodes[0], 0.0) - initial.get(element.nodes[1], 0.0)
 
 
 def start_voltages(elements: Sequence[Element], c: FloatArray, initial: Mapping[str, float]) -> FloatArray:
-    """The same of every cell (n_cell,), given the element that it is part of and its capacitance.
+    """Start voltage of every cell (n_cell,), V, from the cells' elements and capacitances.
 
-    The slabs of a dispersive layer share its voltage as in a jump.
+    The slabs of a dispersive layer share its voltage in proportion to their elastances, as in a jump.
     """
     total: dict[str, float] = {}
     for element, one in zip(elements, c, strict=True):
@@ -66,7 +66,7 @@ def held_sources(circuit: Circuit, initial: Mapping[str, float]) -> tuple[Elemen
     """Voltage sources that hold the nodes of ``.ic`` (V) while the operating point is found."""
     tied: dict[str, dict[str, float]] = {}
     for element in circuit.by_device("V"):
-        # Nodes that sources tie together, and how far each stands above one of them.
+        # Groups of nodes tied together by sources, with the voltage of each node above one of its group.
         p, n = (tied.setdefault(node, {node: 0.0}) for node in element.nodes)
         assert element.waveform is not None
         shift = n[element.nodes[1]] + float(element.waveform.value(0.0, "left")) - p[element.nodes[0]]
@@ -80,16 +80,16 @@ def held_sources(circuit: Circuit, initial: Mapping[str, float]) -> tuple[Elemen
             continue
         done |= group.keys()
         value = float(np.mean([initial[x] - group[x] for x in group if x in initial])) + group[node]
-        # No netlist can write such a name.
+        # This name contains characters that no netlist can contain, so that it cannot clash with an element's.
         out.append(Element(f"v({node}) held", "V", (node, "0"), (node, "0"), MappingProxyType({}), DC(value)))
     return tuple(out)
 
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Voltages of all cells (n_cell,) in V and areas (n_area,) in m^2 at rest.
+    """Voltages of all cells (n_cell,) in V and areas (n_area,) in m^2 at the operating point.
 
-    `held` tells the areas that ``.ic`` holds.
+    `held` marks the areas that ``.ic`` holds.
     """
 
     u: FloatArray
@@ -104,14 +104,14 @@ def operating_point(
     contacts: Sequence[Contact | None],
     initial: Mapping[str, float],
 ) -> OperatingPoint:
-    """The DC operating point of U(0-), the nodes in `initial` held.
+    """The DC operating point with the sources at 0-, and with the nodes in `initial` held.
 
-    Areas follow their gaps by `contacts`; where that is None they are `area0` (m^2).
+    Areas follow their gaps by `contacts`; an area without contact is fixed at `area0` (m^2).
 
     Raises
     ------
     InputError
-        Where a node has no path for direct current, or the areas find no rest.
+        Where a node has no path for direct current, or the iteration for the areas does not converge.
     """
     conductors = {node for e in circuit.elements for node in e.nodes[:2]} - {a.node for a in network.areas}
     held = held_sources(circuit, {node: v for node, v in initial.items() if node in conductors})
@@ -134,21 +134,21 @@ def operating_point(
             if contact is not None and gap is not None and not asked[i]:
                 new[i] = float(contact.area(abs(float(u[gap]))))
         off = float(np.max(np.abs(new / area - 1.0), initial=0.0))
-        # Or as near as rounding lets it come.
+        # The iteration has converged, or round-off lets it come no nearer.
         if off <= 4e-16 or 0.8 * before < off <= 1e-13:
             return OperatingPoint(u, area, asked)
-        # A part of the way: a leak that scales with the area may make it swing.
+        # Damping, because leaks that scale with the area may make the iteration oscillate.
         part *= 0.7 if off > 0.8 * before else 1.0
         area, before = area + part * (new - area), off
     raise InputError("the areas find no DC operating point; allowed: uic in .tran, to start uncharged")
 
 
 def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
-    """Voltages that only capacitors hold have no DC value."""
+    """Refuse a network in which some voltage is determined by capacitors only, so that it has no DC value."""
     factor = np.vstack([network.resistor_factor, np.sqrt(network.leak(area))[:, None] * network.p])
     if not factor.shape[1]:
         return
-    # Columns of like size: conductances range over many decades.
+    # Scale the columns before the rank is determined, because conductances range over many decades.
     size = np.linalg.norm(factor, axis=0)
     _, sigma, turned = np.linalg.svd(factor / np.where(size > 0.0, size, 1.0))
     rank = int(np.count_nonzero(sigma > 1e-12 * max(1.0, sigma.max(initial=0.0))))
@@ -163,19 +163,20 @@ def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
 
 
 def at_own_area(u: float, area: float, curve: FloatArray) -> float:
-    """The gap voltage (V) with the charge that `u` has on `area` (m^2), the area following it, under ``mobile``.
+    """The gap voltage (V) on its own area that has the same charge as `u` (V) on `area` (m^2), under ``mobile``.
 
     Raises
     ------
     InputError
-        Past the fold: no voltage has that charge.
+        Where no voltage has that charge, which is then past the fold.
     """
 
     def charge(v: float) -> float:
         return v / inverse_area(v, curve)[0]
 
     wanted, low, high = area * abs(u), 0.0, 1e-3 * abs(u)
-    # The charge grows up to the fold: the first interval that holds it holds the root on the branch of 0 V.
+    # The charge grows with the voltage up to the fold, so the first interval found contains the root on the branch
+    # that starts at 0 V.
     while charge(high) < wanted:
         low, high = high, 1.05 * high
         if high > 100.0 * abs(u):
@@ -188,16 +189,16 @@ def at_own_area(u: float, area: float, curve: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Settled:
-    """What start voltages settle to.
+    """Consistent start voltages, and the charges that have flowed to make them so.
 
     Attributes
     ----------
     x : ndarray, shape (n,)
         Live voltages, V.
     slow : ndarray, shape (n_slow,)
-        Areas with dynamics of their own over their value at 0 V.
+        Areas with a time constant, relative to their values at 0 V.
     charge : ndarray, shape (n_s,)
-        What each source delivered, C.
+        Charge that each source delivered, C.
     """
 
     x: FloatArray
@@ -206,14 +207,14 @@ class Settled:
 
 
 def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> Settled:
-    """What cells that hold `u` (n_cell,) V settle to, the sources at `s` (n_s,).
+    """Make the cells' start voltages u (n_cell,) V consistent with Kirchhoff's law, with the sources at `s` (n_s,).
 
-    Areas with dynamics of their own that are NaN in `slow` are where they rest at the voltages settled to.
+    Areas with a time constant that are NaN in `slow` are set to their equilibrium at the consistent voltages.
 
     Raises
     ------
     InputError
-        Where that goes past a fold.
+        Where this leads past a fold.
     """
     n = net.k.shape[0]
     free = np.isnan(slow)
@@ -235,7 +236,7 @@ def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> Settled:
 
 @dataclass(frozen=True)
 class _Loops:
-    """Live voltages and delivered charges on the way to u = P x + Q s, as `off` (n_cell,) V beyond it goes to 0."""
+    """The homotopy to u = P x + Q s: the residual of Kirchhoff's law falls from `off` (n_cell,) V linearly to 0."""
 
     net: Net
     off: FloatArray
@@ -244,11 +245,11 @@ class _Loops:
 
     @property
     def follows(self) -> list[int]:
-        """Areas that change on the way."""
+        """Indices of the areas that change during the homotopy: those that follow their gaps without delay."""
         return [int(i) for i in np.flatnonzero((self.net.gap >= 0) & (self.net.slow < 0))]
 
     def rate(self, theta: float, y: FloatArray) -> FloatArray:
-        """Derivative of (x, charges) by the part `theta` of the way; NaN past a fold."""
+        """Derivative of (x, charges) by the homotopy's parameter `theta` in [0, 1]; NaN past a fold."""
         net, n = self.net, self.net.k.shape[0]
         u = net.p @ y[:n] + net.q @ self.s + (1.0 - theta) * self.off
         area, slope = self._areas(u)
@@ -260,12 +261,12 @@ class _Loops:
         along = net.p @ x - self.off
         current = held * along
         if net.mobile and self.follows:
-            # What the areas add to the capacitances, by the gap that they follow.
+            # The derivatives of the areas add to the capacitance matrix, in the columns of the gaps that they follow.
             more = np.zeros((net.c.size, area.size))
             gaps = net.gap[self.follows]
             for i, gap in zip(self.follows, gaps, strict=True):
                 at = net.place == i
-                # At 0 V the branch is that of where it goes.
+                # At 0 V the direction of the change decides on the branch.
                 more[at, i] = (net.c * u)[at] * slope[i] * (np.sign(u[gap]) or np.sign(along[gap]))
             more = more[:, self.follows]
             met += net.p.T @ more @ net.p[gaps]
@@ -277,7 +278,7 @@ class _Loops:
         return np.concatenate([x, net.through @ current])
 
     def _areas(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Areas (m^2) at cell voltages `u`, and what their change by |u_gap| is (m^2/V)."""
+        """Areas (m^2) at cell voltages `u` (V), and their derivatives by |u_gap| (m^2/V)."""
         net = self.net
         area, slope = net.area0.copy(), np.zeros(net.area0.size)
         for i in range(area.size):
@@ -290,7 +291,7 @@ class _Loops:
 
 
 def _along(loops: _Loops) -> FloatArray:
-    """(x, charges) at the end of the way."""
+    """Live voltages (V) and delivered charges (C) at the end of the homotopy."""
     net = loops.net
     y = np.zeros(net.k.shape[0] + net.q.shape[1])
     if not np.any(loops.off):
@@ -301,7 +302,7 @@ def _along(loops: _Loops) -> FloatArray:
 
     scale = np.concatenate([np.ones(net.k.shape[0]), np.full(net.q.shape[1], math.inf)]) * np.abs(loops.off).max()
     with warnings.catch_warnings():
-        # Past a fold there is no rate, and steps towards one turn to NaN.
+        # Past a fold the derivative is NaN, of which numpy and scipy would warn; `status` tells of it.
         warnings.simplefilter("ignore")
         found = solve_ivp(
             loops.rate, (0.0, 1.0), y, "DOP853", first_step=0.1, rtol=STEP_RTOL, atol=STEP_ERROR * scale, t_eval=[1.0]

@@ -1,4 +1,4 @@
-"""An integration by exponential steps in progress, of a stack or a network: settling, repeating, recorded steps."""
+"""The common part of exponential integrators of stacks and networks: periodicity test, repetition, recorded steps."""
 
 from __future__ import annotations
 
@@ -22,43 +22,45 @@ from fingerspice.solve.runs import Integration, Run, excess_of
 from fingerspice.solve.settling import Settling
 from fingerspice.waveforms.sampling import same_time
 
-# The largest error between nodes may stand beside the two points where it is looked for, and signs may cancel there.
+# Ratio of stated to estimated error: the largest error of a step may lie beside the points at which it is estimated,
+# and contributions of opposite sign may cancel at these points.
 SAFETY = 2.5
-# The error allowed in a step, over the one asked for: the force doubles it, and steps add up.
+# Error allowed in a step, relative to the error asked for: a relative error of the voltage counts twice in the force,
+# and the errors of the steps add up.
 LOCAL_SHARE = 0.15
-# The smallest error of a step that is more than rounding, over the voltage scale.
+# Smallest error of a step above round-off, relative to the voltage scale.
 FINEST = 4e-15
-# Steps per shortest time scale of the source: the points of a step must not alias it.
+# Longest step, relative to the source's shortest time scale: the collocation nodes must not alias the source.
 LONGEST_STEP = 0.6
-# Steps of a period that is kept, at most: 1 MB.
+# Most steps of a period that is kept for repetition: 1 MB.
 KEPT_STEPS = 2000
-# Periods of the source after which a run's error is compared with its peaks for the first time.
+# Number of the source's periods after which a run's error is first compared with its peaks.
 TRIAL_PERIODS = 2.0
 
 
 class OutOfRangeError(Exception):
-    """A gap voltage left the range of its area's curve; `top` (V) is that range."""
+    """A gap voltage left the range of its area's curve, which ends at `top` (V)."""
 
     def __init__(self, top: float) -> None:
         self.top = top
 
 
 class Stepping(Integration):
-    """Exponential steps; `tol` is the error allowed in each of them, V.
+    """One integration by exponential steps; `tol` is the error allowed in each step, V.
 
     Attributes
     ----------
     pace : Pace
     settling : Settling
     control : ndarray
-        As `engine.readout` has it.
+        State of the compiled loop, with the indices of `engine.readout`.
     out : ndarray, shape (width, n_out)
-        Takes the outputs.
+        Output rows as columns.
     repeated : int
-        Periods that others stand for.
+        Number of periods that were not integrated but repeat or extrapolate another.
     trial : float
-        When the stated error is compared with `asked`, relative to the peaks, s: it goes by the gaps' own, which are
-        not known before. A run that is not within it is to begin anew then, not at its end.
+        Time (s) at which the stated error is first compared with `asked`. The tolerance was chosen before the peaks of
+        the gaps were known; if it proves too large, the run ends here and not at its end before it is repeated.
     """
 
     settling: Settling
@@ -85,36 +87,37 @@ class Stepping(Integration):
 
     @abstractmethod
     def _to(self, sources: Sources, t_end: float) -> Status:
-        """March to `t_end` (s)."""
+        """Integrate to `t_end` (s) without looking for a periodic state."""
 
     @abstractmethod
     def _look(self) -> bool:
-        """Whether the state has settled; see `Settling.look`."""
+        """Whether the run has reached its periodic state; see `Settling.look`."""
 
     @abstractmethod
     def _collected(self) -> Any:
-        """What the charge's error has collected so far."""
+        """Accumulated error of the charge so far."""
 
     @abstractmethod
     def _pass(self, periods: int, alike: int, off: float, collected: Any) -> None:
-        """Go on by whole periods whose outputs are written, `alike` more than the one that was integrated for them.
+        """Advance the error by `periods` whole periods, of which `alike` repeat the charge error of the integrated one.
 
-        They are `off` by so much (V); `collected` is what the charge's error was before that one.
+        `off` (V) is the error of the voltages of these periods, and `collected` the accumulated error of the charge
+        before the integrated period.
         """
 
     @abstractmethod
     def stated_gaps(self) -> FloatArray:
-        """See `Run.gaps`, so far."""
+        """Peaks and stated errors so far, as in `Run.gaps`."""
 
     @abstractmethod
     def stated(self, run: Run) -> None:
         """Write the stated errors and the margin into a run."""
 
     def leap(self, sources: Sources) -> None:
-        """Let the periods that follow come from one map, if its error allows it."""
+        """Extrapolate the following periods with one affine map, if its error allows it; a network does not."""
 
     def try_out(self, asked: float) -> None:
-        """Look at the stated error after a few periods, where many are left."""
+        """Compare the stated error with `asked` after a few periods, if many are left."""
         start = self.settling.start
         if self.settling.periods_left(start) > 10.0 * TRIAL_PERIODS:
             self.trial, self.asked = start + TRIAL_PERIODS * self.settling.period, asked
@@ -136,7 +139,7 @@ class Stepping(Integration):
                 return status
 
     def _settle(self, sources: Sources) -> None:
-        """See whether the run has settled: then the next period is kept, and stands for those after it."""
+        """Test for the periodic state; once it is reached, keep the next period and then repeat it to the end."""
         if not self._look():
             self.keep(0)
             if self.settling.may_leap:
@@ -144,14 +147,14 @@ class Stepping(Integration):
         elif not len(self.kept.times):
             self.keep(KEPT_STEPS)
         else:
-            # Where there were too many steps to keep, it goes on as it is.
+            # A period of too many steps to keep is not repeated: all later periods are integrated.
             if self.keeps_all:
                 self._repeat()
             self.keep(0)
             self.settling.next = np.inf
 
     def keep(self, steps: int) -> None:
-        """Keep so many of the steps that follow."""
+        """Keep the steps from now on, at most `steps` of them."""
         self.kept = repetition.new_kept(steps, len(self.out))
         if steps:
             self.counters[readout.KEPT] = 0
@@ -161,11 +164,11 @@ class Stepping(Integration):
 
     @property
     def keeps_all(self) -> bool:
-        """Whether all steps since `keep` are kept."""
+        """Whether all steps since `keep` fitted into its array."""
         return 0 < int(self.counters[readout.KEPT]) <= len(self.kept.times)
 
     def _repeat(self) -> None:
-        """Let the period that is kept stand for the whole ones that follow."""
+        """Repeat the kept period in place of all whole periods that follow."""
         settling, n_s = self.settling, self.s_before.size
         periods, period = settling.periods_left(self.t), settling.period
         charge, collected = self.before
@@ -185,9 +188,9 @@ class Stepping(Integration):
         self.repeated += periods
 
     def charge_error(self, spread: float) -> float:
-        """Estimated error of the charge, C, with what steps have left with signs that are not known, C^2.
+        """Estimated error of the charge, C; `spread` (C^2) is the sum of squares of the errors of unknown sign.
 
-        They are the same in every period, and so do not cancel between periods.
+        These errors are the same in every period: they add up from period to period, instead of cancelling at random.
         """
         period = self.problem.waveform.period
         passed = self.t - self.problem.t_start
@@ -196,7 +199,7 @@ class Stepping(Integration):
         return SAFETY * math.sqrt(known**2 + max(alike - 1.0, 0.0) * spread)
 
     def recorded(self) -> Recorded | None:
-        """The steps taken so far."""
+        """The recorded steps of the run so far."""
         self.recorder.drain(self.counters)
         problem = self.problem
         shown = problem.scene.shown

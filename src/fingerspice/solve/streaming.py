@@ -1,8 +1,8 @@
-"""Long runs chunk by chunk, in constant memory.
+"""Streams: long runs chunk by chunk, in constant memory.
 
-A run is integrated in pieces of a fixed length, whatever the chunks are: a recording on a series stack in those of
-`solve.recordings`, anything else in windows of so many outputs, each a run that starts where the one before has ended.
-Chunks are cut from what the pieces give, so that no bit depends on their length.
+A run is integrated in pieces whose length does not depend on the chunks: a recording on a series stack in the pieces of
+`solve.recordings`, any other run in windows of a fixed number of outputs, each starting from the final state of the
+window before. Chunks are cut from the outputs of the pieces, so that no bit depends on their length.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from fingerspice.solve.times import check_length, check_outputs
 from fingerspice.solve.windows import BySamples, ByWindows, Mark, Outputs, outputs_of, within
 from fingerspice.waveforms.waveform import require
 
-# Length of a chunk where none is given, s.
+# Default length of a chunk, s.
 CHUNK = 10.0
 
 
 class Stream:
-    """A run chunk by chunk: an iterator of `Solution`; `fs.stream` makes it.
+    """A run chunk by chunk: an iterator over `Solution` objects, made by `fs.stream`.
 
     Attributes
     ----------
@@ -44,9 +44,9 @@ class Stream:
     outputs : Outputs
         All output times.
     count : int
-        Outputs of a chunk; the last one has the rest.
+        Number of outputs in a chunk; the last chunk may have fewer.
     done : int
-        Outputs given so far.
+        Number of outputs in the chunks returned so far.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Stream:
             if method == "auto" and BySamples.serve(problem, plan, rtol)
             else ByWindows(problem, outputs, plan, rtol, method)
         )
-        # What the pieces have given and no chunk has yet; and where the run stood before each of these pieces.
+        # Outputs of integrated pieces that no chunk has contained yet, and the mark before each of these pieces.
         self._ready: list[tuple[FloatArray, FloatArray]] = []
         self._marks: list[Mark] = []
 
@@ -69,7 +69,7 @@ class Stream:
         return self
 
     def __len__(self) -> int:
-        """Number of all chunks."""
+        """Total number of chunks."""
         return -(-self.outputs.total // self.count)
 
     def __next__(self) -> Solution:
@@ -87,12 +87,12 @@ class Stream:
         return solution
 
     def mark(self) -> Mark:
-        """Where to go on for the chunk that is next, as plain data."""
+        """The state before the piece that contains the next chunk's first output, as plain data; see `go_to`."""
         found = [m for m in [*self._marks, self._mark()] if m["written"] <= self.done]
         return found[-1]
 
     def go_to(self, mark: Mark, done: int) -> None:
-        """Go on from a mark, where so many outputs have been given; before the first chunk only."""
+        """Continue a stream from its mark, after `done` outputs; allowed before this stream's first chunk only."""
         if "state" in mark and isinstance(self._source, BySamples):
             self._source = self._stepped(self._source.problem)
         self._source.go_to(mark)
@@ -113,7 +113,7 @@ class Stream:
         mark = self._mark()
         found = self._source.advance()
         if found is None:
-            # From here on by the steps that serve every source.
+            # The method for recordings has failed on this piece: integrate the rest by exponential steps.
             assert isinstance(self._source, BySamples)
             self._source.go_to(mark)
             other = self._stepped(self.problem)
@@ -125,7 +125,7 @@ class Stream:
         self._ready.append(found)
 
     def _take(self, count: int) -> tuple[FloatArray, FloatArray]:
-        """The next outputs: times (s) and rows."""
+        """Take the next `count` outputs, or all if there are fewer: times (s) and rows."""
         times, rows, left = [np.empty(0)], [], count
         while left > 0 and self._ready:
             t, r = self._ready[0]
@@ -143,7 +143,7 @@ class Stream:
     def _solution(self, t: FloatArray, rows: FloatArray) -> Solution:
         problem, run = self.problem, self._source.run()
         if self._ready:
-            # What has failed since concerns a later chunk.
+            # A failure concerns a later chunk if outputs before it are still waiting for their chunk.
             run.status, run.t_failed = Status.SUCCESS, None
         shown = problem.scene.shown
         span = (float(t[0]), float(t[-1])) if t.size else (problem.t_start, problem.t_start)
@@ -172,9 +172,9 @@ def stream(
 ) -> Stream:
     """Simulate a circuit in time chunk by chunk, in memory that does not grow with the length of the run.
 
-    The chunks of a run are the same to the last bit whatever their length is. Of a recording on a series stack they are
-    also those of `simulate` with the same times as `t_eval`. Of other runs they are not: there each window of 16,384
-    outputs is a run of its own, which starts where the one before ended.
+    The outputs are the same to the last bit whatever the length of the chunks. For a recording on a series stack they
+    also equal those of `simulate` with the same times as `t_eval`. For other runs they do not, because each window of
+    16,384 outputs is a run of its own, which starts from the final state of the window before.
 
     Parameters
     ----------
@@ -182,26 +182,27 @@ def stream(
     chunk : float, optional
         Length of a chunk, s; 10 s by default.
     count : int, optional
-        Outputs of a chunk, instead of `chunk`.
+        Number of outputs in a chunk, instead of `chunk`.
     step : float, optional
-        Time between outputs, s, from TSTART on. By default outputs are at the samples of the recording that drives the
-        circuit; where there is none, or several sources, TSTEP apart.
+        Time between outputs, s, from TSTART on. By default the outputs are at the samples of the recording that drives
+        the circuit; without a recording, or with several sources, they are TSTEP apart.
     t_stop, sources, parameters, charge_law, area, rtol, method, tier, start, charge
         As in `simulate`. A long recording is `Samples.from_wav(path, gain, at_once=False)`, or a deck's WAVEFILE.
 
     Returns
     -------
     Stream
-        An iterator of `Solution`. At a jump of a source there is one row, the right-hand one. The stated errors of a
-        chunk are the largest since the start (beyond recordings without what the state at the start of the last window
-        was off), its figures those of its outputs, and its `state` is that at the end of the last piece integrated.
+        An iterator over `Solution` objects. At a jump of a source there is one row, the right-hand one. The stated
+        errors of a chunk are the largest since the start (except for recordings, they do not include the error of the
+        state at the start of the last window). Its figures are computed from its outputs, and its `state` is the state
+        at the end of the last piece integrated.
 
     Raises
     ------
     InputError
         For a request that cannot be run.
     SolveError
-        While iterating, where the run fails; its `solution` holds what came after the last chunk.
+        While iterating, where the run fails; its `solution` holds the outputs after the last chunk.
     """
     check_method(method)
     for name, value in (("chunk", chunk), ("step", step)):

@@ -1,4 +1,4 @@
-"""How long a run is, how far apart its outputs are, and how much of either is too much."""
+"""Length of a run and spacing of its outputs, and the limits of both: a run beyond them would never finish."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.waveforms.waveform import Waveform, require
 
-#: Periods (or shortest time scales) of the source in a run, and its breakpoints: hours of work, and a gigabyte.
+#: Most periods (or shortest time scales) of the source in a run, and most breakpoints: they take hours and a gigabyte.
 MOST_PERIODS, MOST_BREAKPOINTS = 1e10, 4e9
-#: Bytes of the signals at the deck's own output times; writing a file takes three times as much.
+#: Most bytes of the signals at the deck's own output times; writing a file needs three times as much memory.
 MOST_BYTES = 2e9
 
 
@@ -41,17 +41,17 @@ def run_times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: Fl
     return t_stop, step
 
 
-# Signals that an element brings along: at most those of a GAP, with its two nodes and its area.
+# Most signals that one element adds to the outputs: a GAP adds most, with its two nodes and its area.
 _MOST_COLUMNS = 12
 
 
 def check_length(waveform: Waveform, t_start: float, t_stop: float) -> None:
-    """Refuse a run of more periods or breakpoints than one can come to the end of.
+    """Refuse a run with more periods or breakpoints than can be computed.
 
     Raises
     ------
     InputError
-        With how many there are.
+        Its message tells their number.
     """
     span = t_stop - t_start
     periods = span / waveform.shortest_time()
@@ -71,12 +71,12 @@ def check_length(waveform: Waveform, t_start: float, t_stop: float) -> None:
 
 
 def check_outputs(circuit: Circuit, count: float) -> None:
-    """Refuse more output times than the memory holds the signals of.
+    """Refuse a number of output times for whose signals memory is too small.
 
     Raises
     ------
     InputError
-        With the memory they would take.
+        Its message tells the memory needed.
     """
     if 8.0 * count * _MOST_COLUMNS * len(circuit.elements) <= MOST_BYTES:
         return

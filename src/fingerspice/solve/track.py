@@ -1,4 +1,4 @@
-"""A series stack by exponential steps; see `engine.march.march`."""
+"""One integration of a series stack by exponential steps: the driver of `engine.march.march`."""
 
 from __future__ import annotations
 
@@ -40,27 +40,27 @@ from fingerspice.solve.stackstate import (
 )
 from fingerspice.solve.stepping import SAFETY, OutOfRangeError, Stepping
 
-# Systems that stay with a scene: one for each thread and decade of tolerances, of up to 1 MB.
+# Number of modal systems cached with a scene: one for each thread and decade of tolerances, of up to 1 MB each.
 MOST_SYSTEMS = 64
 
 
 @dataclasses.dataclass(frozen=True)
 class Prepared:
-    """A scene's system with the tables it has needed so far, and arrays to work in, for one thread."""
+    """A scene's modal system with its step tables and scratch arrays, for one thread."""
 
     system: System
     tables: StepTables
     work: Work
     integral: FloatArray
-    # What the area's polynomial misses, relative.
+    # Relative truncation error of the area's polynomial.
     area_error: float
 
 
 def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
-    """The modal system of a scene, made on first use; with the area's curve up to `u_top` (V) if that is given."""
-    # One system serves a decade of tolerances.
+    """The modal system of a scene, made on first use; its area curve reaches `u_top` (V) if that is above 0."""
+    # The cache distinguishes tolerances by their decade, so that similar runs share a system.
     decade = int(np.floor(np.log10(rtol)))
-    # One for each thread: compiled code writes into its tables and its work, and other threads run meanwhile.
+    # It also distinguishes threads, because compiled code writes into the tables and scratch arrays.
     key = ("system", decade, u_top, threading.get_ident())
     found: Prepared = kept_with(scene.prepared, key, MOST_SYSTEMS, lambda: _prepare(scene, decade, u_top))
     return found
@@ -81,9 +81,9 @@ def _prepare(scene: Scene, decade: int, u_top: float) -> Prepared:
 
 
 class Track(Stepping):
-    """One integration in progress, with an error of the gap voltage of `tol` (V) in every step.
+    """One integration in progress, with an error of the gap voltage of at most `tol` (V) in every step.
 
-    Its state is that of `engine.model`; what it gives is that of any circuit.
+    The loop's state is that of `engine.model`; `state` and the outputs have the form used for all circuits.
     """
 
     def __init__(
@@ -109,12 +109,12 @@ class Track(Stepping):
 
     @property
     def shown(self) -> int:
-        """Voltages among the columns of outputs."""
+        """Number of voltages among the columns of the outputs."""
         return int(self.problem.scene.shown.turn.size)
 
     @property
     def capacitance(self) -> float:
-        """Of the layer whose charge is followed, F."""
+        """Capacitance of the layer through which the charge is computed, at the area at 0 V, F."""
         model = self.prepared.system.model
         return float(model.slow[-3]) * model.area0
 
@@ -138,7 +138,7 @@ class Track(Stepping):
         if code == march.DONE:
             return Status.SUCCESS
         if self.t > sources.edges[0]:
-            # The loop knows the source's value at edges and ends only.
+            # The loop updates the source's value at edges and at `t_end` only: a failed call leaves an old value.
             self.control[readout.U_BEFORE], _ = source(*_segment(sources, self.t, "left"))
         return Status.TOO_MANY_STEPS if code == march.TOO_MANY else self.stuck()
 
@@ -157,10 +157,10 @@ class Track(Stepping):
         return float(self.control[readout.COLLECTED]), float(self.control[readout.SPREAD])
 
     def land(self, base: Track, state: FloatArray, periods: int, off: float, owed: float) -> None:
-        """Stand where a map of the period has led, in place of whole periods from here on.
+        """Take the result of the extrapolation by the period map over `periods` whole periods.
 
-        `base` has gone through the last of them; `state` is that after them, `off` what it may be off as a move of
-        the gap voltage (V), and `owed` what the charge may be off for the map (C).
+        `base` is the integration of the last of them and `state` the state after it. `off` bounds the error of the map
+        as an error of the gap voltage (V), and `owed` as an error of the charge (C).
         """
         t, collected = self.t, self._collected()
         self.y[:] = state
@@ -179,7 +179,7 @@ class Track(Stepping):
             steepest = 2.0 * self.control[readout.PEAK_F] / self.control[readout.PEAK_U]
             self.control[readout.ERROR_F] += off * steepest
         if self.pace.charge:
-            # What the one period is off is off in every one that it stands for.
+            # The charge error of the integrated period recurs in each of the `alike` periods that repeat it.
             missed = self.control[readout.COLLECTED] - collected[0]
             self.control[readout.COLLECTED] += alike * missed
             self.control[readout.ERROR_Q] += (
@@ -199,27 +199,29 @@ class Track(Stepping):
 
     def written(self) -> FloatArray:
         n_out = int(self.counters[readout.OUTPUT])
-        u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out]) if self.pace.charge else np.empty(0)
-        return as_recorded(self.problem, self.prepared.system.model, self.out[:, :n_out].T, u)
+        model = self.prepared.system.model
+        wanted = self.pace.charge and model.mobile
+        u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out]) if wanted else np.empty(0)
+        return as_recorded(self.problem, model, self.out[:, :n_out].T, u)
 
     def finish(self, sources: Sources, after: Sources | None) -> None:
         first = int(self.counters[readout.OUTPUT])
         row = np.empty(row_width(self.problem.scene))
         segment, tau = _segment(after or sources, self.problem.t_stop, "right")
         model = self.prepared.system.model
-        # Copies take the charge of a jump that stands at the end; the state itself stays before it.
+        # `end_row` applies a jump at the end to these copies, so that the final state remains the left-hand one.
         march.end_row(model, segment, tau, self.pace.charge, self.y.copy(), self.control.copy(), row)
         self.out[:, first:] = as_marched(self.problem.scene, row[None, :])[0, : len(self.out), None]
         self.counters[readout.OUTPUT] = self.t_out.size
 
     def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
-        # The model may cover more of the area's curve than the scene's.
+        # This model's area curve may reach higher voltages than the curve of the scene's model.
         model, c = self.prepared.system.model, self.control
         segment, tau = _segment(sources, self.t, side)
         row = np.empty(row_width(self.problem.scene))
         u, du = source(segment, tau)
         found = gap_voltage(model, model.k_gap * u, dot(model.gap, self.y), c[readout.SIGN], c[readout.U_GAP])
-        # By rounding of the time alone a state at a fold may have none.
+        # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
         write_row_at(model, u, du, self.y, c[readout.SIGN], found if found == found else c[readout.U_GAP], row)
         return from_written(self.problem.scene, row[None, :], self.start.offset, by_layer=True)[0, : len(self.out)]
 
@@ -232,7 +234,7 @@ class Track(Stepping):
     def stated_gaps(self) -> FloatArray:
         control, model = self.control, model_of(self.problem.scene)
         peak_u, peak_f = float(control[readout.PEAK_U]), float(control[readout.PEAK_F])
-        # Rounding is an error too.
+        # Round-off adds to the truncation error.
         floor = 4e-16 * (peak_u + model.k_gap * self.problem.scene.u_peak)
         u_error = SAFETY * float(control[readout.ERROR_U]) + floor
         f_error = SAFETY * float(control[readout.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f
@@ -246,29 +248,29 @@ class Track(Stepping):
             run.charge_error = self._charge_error(float(self.control[readout.PEAK_U]))
 
     def _charge_error(self, peak_u: float) -> float:
-        """Estimated error of the charge, C; every step adds the rounding of the charge that a layer holds."""
+        """Estimated error of the charge, C; every step adds the round-off of the charge that a layer holds."""
         held = self.capacitance * (self.problem.scene.u_peak + peak_u)
         steps = 1.0 + float(self.counters[readout.ACCEPTED])
-        # Whatever the area's polynomial misses, all charge that is moved misses too.
+        # The relative error of the area's polynomial is also a relative error of all charge moved.
         moved = held + float(self.control[readout.PEAK_Q])
         missed = self.prepared.area_error * moved if self.prepared.system.model.coupled else 0.0
-        # Half as safe again: in a stack that leaks fast throughout, gap voltage and charge were both off by 1.5 times
-        # as much, against the reference, beside the points where errors are looked for.
+        # The factor 1.5 comes from a stack whose layers all leak fast: compared with a reference, the errors of gap
+        # voltage and charge were 1.5 times the estimates, because they peak between the points of the estimate.
         return 1.5 * self.charge_error(float(self.control[readout.SPREAD])) + 4e-16 * held * steps + missed
 
 
 def on_branch(model: Model, state: StackState, sign: float) -> StackState:
-    """A state whose gap voltage is that of its own other voltages, on the branch of this sign."""
+    """The state with its gap voltage computed anew from the area equation, on the branch with this sign."""
     if not model.mobile:
         return state
     x_gap = dot(model.gap, state.y)
     found = float(gap_voltage(model, model.k_gap * state.u_before, x_gap, sign or 1.0, state.u_gap))
-    # By rounding of the time alone a state at a fold may have none.
+    # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
     return state if found != found else dataclasses.replace(state, u_gap=found)
 
 
 def as_recorded(problem: Problem, model: Model, rows: FloatArray, u: FloatArray) -> FloatArray:
-    """Rows as in `Record` from those that loops write, in their place; `u` (V) is the source where charge is wanted."""
+    """Convert rows of the compiled loops to rows of `Record`, in place; `mobile` needs the source u (V) for charge."""
     shown = problem.scene.shown
     n = int(shown.turn.size)
     if shown.is_turned:
@@ -283,12 +285,12 @@ def as_recorded(problem: Problem, model: Model, rows: FloatArray, u: FloatArray)
 def _turned(
     make: Callable[..., Record], turn: FloatArray, t: FloatArray, left: BoolArray, columns: FloatArray
 ) -> Record:  # fmt: skip
-    """A record of live voltages along the loop."""
+    """A record from live voltages counted along the loop."""
     return make(t, left, turn[:, None] * columns)
 
 
 def _segment(sources: Sources, t: float, side: Literal["left", "right"]) -> tuple[Segment, float]:
-    """The segment of one source that a time (s) is in, and how far into it that is, s."""
+    """The segment of a single source that contains time t (s), and the time since the segment's start, s."""
     (i,) = segment_index(sources, t, side).tolist()
     start = float(sources.edges[i])
     return Segment(start, float(sources.edges[i + 1]) - start, sources.terms[i], sources.series[i]), t - start

@@ -1,4 +1,4 @@
-"""The pieces of a long run, one after another, whatever chunks are made of them; see `solve.streaming`."""
+"""Integration of a long run piece by piece, independently of the chunks of a stream; see `solve.streaming`."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import on_breakpoint
 from fingerspice.waveforms.waveform import require
 
-# Outputs of a window of runs that are not followed sample by sample.
+# Number of outputs in a window of a run that is not integrated sample by sample.
 WINDOW = 1 << 14
 
-#: Where a stream stands before a piece, as plain data: with it another one goes on there, to the same bytes.
+#: State of a stream before a piece, as plain data: another stream continues from it with the same bytes.
 Mark = dict[str, Any]
 
 
@@ -36,9 +36,11 @@ class Outputs:
     Attributes
     ----------
     start, over : float
-        Time of number 0 and spacing, s; or with `rate` set the rate of a recording, Hz, from its start on.
+        Time of output number 0, s, and spacing, s; if `rated`, `over` is the rate of a recording, Hz.
+    rated : bool
+        Whether the outputs are at the samples of a recording.
     low, total : int
-        Number of the first, and how many there are.
+        Number of the first output, and how many outputs there are.
     stop : float
         End of the run, s.
     """
@@ -51,7 +53,7 @@ class Outputs:
     stop: float
 
     def times(self, i: int, j: int) -> FloatArray:
-        """Times of outputs i to j - 1, s, as the arrays ``start + arange / rate`` or ``start + step * arange`` have."""
+        """Times of outputs i to j - 1, s, rounded as ``start + arange / rate`` or ``start + step * arange`` are."""
         number = np.arange(self.low + i, self.low + min(j, self.total))
         t = self.start + (number / self.over if self.rated else self.over * number)
         return np.asarray(np.minimum(t, self.stop))
@@ -73,7 +75,7 @@ def outputs_of(problem: Problem, step: float | None) -> Outputs:
 
 
 class BySamples:
-    """A recording followed sample by sample."""
+    """A recording integrated sample by sample, in the pieces of `solve.recordings`."""
 
     method = "relaxation"
 
@@ -87,7 +89,7 @@ class BySamples:
 
     @staticmethod
     def serve(problem: Problem, plan: Plan, rtol: float) -> bool:
-        """Whether a run can be followed so."""
+        """Whether a run can be integrated this way."""
         if plan.tier != "coupled" or pieces_of(problem) is None:
             return False
         return ready(problem, own_rtol(problem, plan, rtol)) is not None
@@ -107,7 +109,7 @@ class BySamples:
         self.march.stand(mark["numbers"], mark["arrays"])
 
     def advance(self) -> tuple[FloatArray, FloatArray] | None:
-        """Times (s) and rows of the next piece; None where there is no way on sample by sample."""
+        """Times (s) and rows of the next piece; None where the method for recordings fails on it."""
         piece, march, last = self.pieces[self.place], self.march, self.place + 1 == len(self.pieces)
         end = self.outputs.total if last else self._until(piece.stop)
         t = self.outputs.times(self.written, end)
@@ -123,13 +125,13 @@ class BySamples:
         return t, march.rows(run_at[:count], np.zeros(count, bool), out)
 
     def _until(self, t: float) -> int:
-        """A number of outputs that includes all up to a time (s), and few others."""
+        """A number of outputs that includes all outputs up to time t (s), and a few more."""
         o = self.outputs
         number = (t - o.start) * o.over if o.rated else (t - o.start) / o.over
         return min(max(math.ceil(number) - o.low + 2, self.written), o.total)
 
     def run(self) -> Run:
-        """How the run stands, without outputs."""
+        """The run so far, without outputs."""
         run = self.march.run(np.empty(0), np.empty(0, bool), np.empty((0, 0)))
         if self.plan.error_bound > 0.0:
             run.add_error(self.plan.error_bound * run.gaps[:, 0])
@@ -139,7 +141,7 @@ class BySamples:
 
 
 class ByWindows:
-    """Any run, in windows of outputs."""
+    """Any run, in windows of a fixed number of outputs."""
 
     def __init__(
         self, problem: Problem, outputs: Outputs, plan: Plan, rtol: float, method: str,
@@ -185,12 +187,12 @@ class ByWindows:
 
 
 def _between(problem: Problem, t0: float, t1: float) -> Problem:
-    """A part of a run's time, s."""
+    """The problem restricted to the times from t0 to t1, s."""
     return replace(problem, t_start=t0, t_stop=t1, first=t0)
 
 
 def within(network: Network, t0: float, t1: float) -> Network:
-    """A network whose recordings are those parts of them that a time (s) needs."""
+    """The network with its recordings cut to the samples needed from t0 to t1, s."""
     cut = [
         replace(e, waveform=e.waveform.part(t0, t1)) if isinstance(e.waveform, Samples) else e for e in network.sources
     ]
@@ -198,7 +200,7 @@ def within(network: Network, t0: float, t1: float) -> Network:
 
 
 def _as_shown(record: Record, problem: Problem) -> FloatArray:
-    """Rows as exponential steps record them, whichever method has made them (see `Scene.shown`)."""
+    """Rows in the form of exponential steps (see `Scene.shown`), whichever method has computed them."""
     shown, n = problem.scene.shown.network, record.network.k.shape[0]
     if len(shown.cells) == len(record.network.cells):
         return record.rows

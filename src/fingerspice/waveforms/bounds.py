@@ -34,7 +34,10 @@ def check_finite(waveform: Waveform) -> None:
             what = f"{type(waveform).__name__} {field.name}"
             if not math.isfinite(value):
                 raise InputError(f"{what} is {value}; allowed: a finite number")
-            check_range(what, value, waveform.units.get(field.name, ""))
+            unit = waveform.units.get(field.name, "")
+            largest, smallest = RANGES.get(unit, ANY_RANGE)
+            if value != 0.0 and not smallest <= abs(value) <= largest:
+                check_range(what, value, unit)
 
 
 def check_range(what: str, values: ArrayLike, unit: str) -> None:

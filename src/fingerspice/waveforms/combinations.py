@@ -153,7 +153,7 @@ class AM(_Combination):
         check_finite(self)
         require(0.0 <= self.depth <= 1.0, "AM depth", f"{self.depth:g}", "0 to 1")
 
-    @property
+    @cached_property
     def parts(self) -> tuple[Waveform, ...]:  # type: ignore[override]
         share = self.amplitude / (1.0 + self.depth)
         envelope = Sine(share * self.depth, self.modulation, offset=share, phase_deg=self.phase_deg)
