@@ -222,9 +222,8 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     into_i = over_resistors[:, e].T @ (conductance[:, None] * by_i) + over_currents[:, e].T
     s, x = slice(0, n_v), slice(n_v, n_v + n)
     n_i = len(currents)
-    # The current of a small resistance comes from a small difference of large voltages, with cancellation. To a
-    # source's cut a combination of the capacitors' cuts is added, chosen by least squares so that the resistors
-    # contribute least: the source's current then comes mostly from the currents of the cells.
+    # The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
+    # capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
     factor = weight * by_e
     together = -np.linalg.lstsq(factor[:, x], factor[:, s], rcond=None)[0].T if factor.size else np.zeros((n_v, n))
     delivered = np.zeros((n_v + n_i, n + n_v + n_i))

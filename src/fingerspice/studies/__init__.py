@@ -1,1 +1,1 @@
-"""Studies: questions that take many runs, or other equations than those of a run."""
+"""Studies, which need many runs, or equations other than those of a run."""

@@ -225,12 +225,12 @@ class PWL(Ramps):
         ----------
         path : str or Path
         time, value : str or int, optional
-            Names of the columns, or their numbers counted from 0; needed where there are more than two.
+            Names of the columns, or their numbers counted from 0; needed if there are more than two.
 
         Raises
         ------
         InputError
-            For a file that cannot be read, with the line, and for one that has a rate and no times.
+            If the file cannot be read (the message names the line), or has a rate and no times.
         """
         table = read_table(path, time, value)
         require(table.times is not None, f"'{path}'", "a table with a rate", "one with times; fs.Samples.from_table")
