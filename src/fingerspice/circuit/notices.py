@@ -35,7 +35,7 @@ def circuit_warnings(circuit: Circuit, t_stop: float | None) -> tuple[str, ...]:
 
 
 def directive_warnings(circuit: Circuit) -> tuple[str, ...]:
-    """Warnings of directives without effect."""
+    """Warnings about directives without effect."""
     return tuple(f"{name} has no effect here" for name in circuit.unused if not name.startswith(_FOR_NGSPICE))
 
 

@@ -47,7 +47,7 @@ def _window(count: int) -> FloatArray:
 
 
 def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatArray, FloatArray]:
-    """Frequencies (Hz) up to at least twice `highest` (Hz), and the source's energy at each, in arbitrary units.
+    """Frequencies (Hz) up to about twice `highest` (Hz), and the source's energy at each, in arbitrary units.
 
     For a periodic source the spectrum is taken over one period, and else over the run to `t_stop` (s) with a Hann
     window, because the ends of the run would count as jumps. For a run of too many samples the spectra of several

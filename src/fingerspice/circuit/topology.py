@@ -206,7 +206,7 @@ def _as_written(node: str, element: Element) -> str:
 
 
 def _reached(at: dict[str, list[Element]]) -> set[str]:
-    """Nodes that elements connect to ground."""
+    """Nodes with a path of elements to ground."""
     reached, todo = {"0"}, ["0"]
     while todo:
         for element in at.get(todo.pop(), ()):

@@ -42,7 +42,7 @@ def read_netlist(path: str | Path) -> Circuit:
 
 
 def parse_netlist(text: str, path: str | Path | None = None) -> Circuit:
-    """Read a circuit from a netlist's text.
+    """Read a circuit from the text of a netlist.
 
     Parameters
     ----------
