@@ -284,6 +284,49 @@ def inverse_area_array(u: FloatArray, curve: FloatArray) -> tuple[FloatArray, Fl
 
 
 @jit
+def area_slopes(u: float, contact: FloatArray, out: FloatArray) -> float:
+    """A_R (m^2) at gap voltage u >= 0 (V), or a little below; its derivatives by u and by every constant into `out`.
+
+    Parameters
+    ----------
+    u : float
+        V.
+    contact : ndarray, shape (N_PACKED,)
+        See `Contact.packed`.
+    out : ndarray, shape (1 + N_PACKED,)
+        Receives dA/du (m^2/V), then the derivatives of A at fixed u by the entries of `contact`.
+    """
+    f_n = contact[5]
+    x = contact[0] * u
+    y = universal_curve(x, contact[2], contact[3])
+    log_y, a0 = math.log(y), contact[1] * y
+    # From ln y / m = log(1 + x y^p), with b = y^p / (1 + x y^p):
+    # (1/m - p x b) d ln y = b dx + x b ln y dp - ln y d(1/m).
+    b = y ** contact[3]
+    b /= 1.0 + x * b
+    sigma = contact[4] * u * u
+    area = ridge_area(u, contact)
+    load = f_n + sigma * area
+    k = contact[7] / a0
+    # A = A0 - (c2 mu^2 / A0) (F + sigma A)^2, differentiated and solved for dA.
+    rest = 1.0 + 2.0 * k * sigma * load
+    by_log = a0 * (1.0 + contact[7] * (load / a0) ** 2) / rest
+    by_load = -2.0 * k * load / rest
+    by_sigma = by_load * area
+    by_log_y = by_log / (contact[2] - contact[3] * x * b)
+    out[0] = by_log_y * b * contact[0] + 2.0 * by_sigma * contact[4] * u
+    out[1] = by_log_y * b * u
+    out[2] = by_log / contact[1]
+    out[3] = -by_log_y * log_y
+    out[4] = by_log_y * x * b * log_y
+    out[5] = by_sigma * u * u
+    out[6] = by_load
+    out[7] = 0.0
+    out[8] = -load * load / a0 / rest
+    return area
+
+
+@jit
 def _ridge_area_slope(u: float, contact: FloatArray) -> tuple[float, float]:
     """A_R (m^2) and dA_R/du (m^2/V): `ridge_area` differentiated."""
     x = contact[0] * u
