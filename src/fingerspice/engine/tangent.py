@@ -1,15 +1,15 @@
 """Tangents of a series stack: how its voltages change with parameters, along the steps of a run that has been made.
 
-With the leaked charges taken out (`engine.model`) a stack is x' = F(q) (k U* + x), where q = 1/A, the leak of layer i is
-h_i = (rate_i + q rate0_i) (k_i U* + x_i), F takes leaks to k sum(h) - h, and U* is the source's voltage U under `local`
+With the leaked charges taken out (`engine.model`) a stack is x' = F(q) (k U* + x) with q = 1/A: layer i leaks
+h_i = (rate_i + q rate0_i) (k_i U* + x_i), and F takes leaks to k sum(h) - h. U* is the source's voltage U under `local`
 and U / q under `mobile`, whose state here is x A_0. A parameter moves k, the rates, the area's constants or U, so that
 its tangent dx obeys
 
     dx' = F(q) dx + F(q) (dk U* + k dU*) + dF (k U* + x) + F_1 (k U* + x) dq,
 
-a linear equation with the state's own fast part. The area in the run's steps is known, so the equation is solved in the
-modes of the nearest reference area by the same exponential collocation, and what the area moves by the same iteration as
-in `engine.exponential`. The zeros of the gap voltage add nothing, since q is continuous there.
+a linear equation with the state's own fast part. The area in the run's steps is known. So the equation is solved in
+the modes of the nearest reference area by the same exponential collocation, with the same iteration for the forcing by
+the area as in `engine.exponential`. The zeros of the gap voltage add nothing, since q is continuous there.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import borrow, jit, jit_rows
 from fingerspice.engine.exponential import Tables, distance, make_tables, mix, plain, respond, weigh
 from fingerspice.engine.system import System
-from fingerspice.numerics.lobatto import END, NODES, ROWS
-from fingerspice.physics.contact import N_PACKED, area_slopes
+from fingerspice.numerics.lobatto import BARYCENTRIC, END, NODES, POINTS, ROWS
+from fingerspice.physics.contact import N_PACKED, area_slopes, inverse_area
 
 # Sweeps of a step at most, and how fast they have to close not to be mixed.
 _MOST_SWEEPS, _SLOW = 80, 0.15
@@ -72,14 +72,14 @@ class Course(NamedTuple):
 
 
 @jit
-def inverse_area_slopes(u: FloatArray, contact: FloatArray, sign: float, q: FloatArray, slopes: FloatArray) -> None:
-    """1/A at gap voltages `u` (n,) and its derivatives (n, 1 + N_PACKED): by u, and by the contact's constants.
+def _area_rows(u: FloatArray, curve: FloatArray, sign: float, q: FloatArray, slopes: FloatArray) -> None:
+    """1/A at the rows of a step, and its derivatives (ROWS, 1 + N_PACKED): by u, and by the contact's constants.
 
-    `sign` is the branch A(sign u), continued a little past 0 V.
+    `sign` is the branch A(sign u), continued a little past 0 V; `curve` is a `Contact.curve`.
     """
-    for i in range(u.size):
-        area = area_slopes(sign * u[i], contact, slopes[i])
-        q[i] = 1.0 / area
+    for i in range(ROWS):
+        q[i], _ = inverse_area(sign * u[i], curve)
+        area_slopes(sign * u[i], 1.0 / q[i], curve[2 : 2 + N_PACKED], slopes[i])
         for j in range(slopes.shape[1]):
             slopes[i, j] *= -q[i] * q[i]
         slopes[i, 0] *= sign
@@ -137,19 +137,19 @@ def _forcing(
 @jit_rows
 def _moves(
     mobile: bool, k_gap: float, by_k_gap: float, s: FloatArray, ds: FloatArray, q: FloatArray, slope: FloatArray,
-    by_contact: FloatArray, x_gap: FloatArray, own: FloatArray, dq: FloatArray, moved: FloatArray,
+    by_contact: FloatArray, x_gap: FloatArray, own: FloatArray, du: FloatArray, dq: FloatArray, moved: FloatArray,
 ) -> None:  # fmt: skip
-    """Changes of q and of U* from that of the source and of the gap's part of the state, `x_gap`.
+    """Changes of u, q and U* from that of the source and of the gap's part of the state, `x_gap`.
 
     `own` is that part in the run itself, V; `slope` and `by_contact` are the changes of q with u and with the contact.
     """
     for i in range(ROWS):
-        du = by_k_gap * s[i] + k_gap * ds[i]
+        at_once = by_k_gap * s[i] + k_gap * ds[i]
         if mobile:
-            du = (du + q[i] * x_gap[i] + own[i] * by_contact[i]) / (1.0 - own[i] * slope[i])
+            du[i] = (at_once + q[i] * x_gap[i] + own[i] * by_contact[i]) / (1.0 - own[i] * slope[i])
         else:
-            du += x_gap[i]
-        dq[i] = slope[i] * du + by_contact[i]
+            du[i] = at_once + x_gap[i]
+        dq[i] = slope[i] * du[i] + by_contact[i]
         moved[i] = (ds[i] - s[i] * dq[i] / q[i]) / q[i] if mobile else ds[i]
 
 
@@ -167,8 +167,8 @@ def _nearest(q0: FloatArray, q: FloatArray) -> int:
 
 @jit
 def follow(
-    system: System, tables: Tables, contact: FloatArray, course: Course, changes: Changes, start: FloatArray,
-    tol: float, out: FloatArray, ends: FloatArray,
+    system: System, tables: Tables, course: Course, changes: Changes, start: FloatArray, tol: float, out: FloatArray,
+    ends: FloatArray,
 ) -> int:  # fmt: skip
     """Solve the state and its tangents along the steps of a run.
 
@@ -177,15 +177,14 @@ def follow(
     system : System
     tables : Tables
         Exponentials, kept from call to call.
-    contact : ndarray, shape (N_PACKED,)
     course : Course
     changes : Changes
     start : ndarray, shape (1 + n_parameter, n)
         The state x at the start (times A_0 under `mobile`), and its tangents.
     tol : float
         Error of every sweep, relative to what the forcing moves the gap voltage in the step.
-    out : ndarray, shape (n_parameter, n, NODES)
-        Takes the tangents of the gap's part of the state.
+    out : ndarray, shape (n_parameter, 2, n, NODES)
+        Takes the changes of the gap voltage (V) and of 1/A (1/m^2) per unit of each parameter.
     ends : ndarray, shape (1 + n_parameter, n)
         Takes the state and its tangents at the end.
 
@@ -195,7 +194,7 @@ def follow(
         The number of the step whose iteration did not close, or -1.
     """
     system, tables, course, changes = borrow(system), borrow(tables), borrow(course), borrow(changes)
-    start, out, ends, contact = borrow(start), borrow(out), borrow(ends), borrow(contact)
+    start, out, ends = borrow(start), borrow(out), borrow(ends)
     model = system.model
     n, columns = model.gap.size, start.shape[0]
     x_at = start.copy()
@@ -207,13 +206,13 @@ def follow(
     x, v, none = np.zeros((n + 1, ROWS)), np.zeros((n + 1, ROWS)), np.zeros(n + 1)
     q, slopes, quiet = np.zeros(ROWS), np.zeros((ROWS, 1 + N_PACKED)), np.zeros(ROWS)
     slope, source, own, by_contact = np.zeros(ROWS), np.zeros(ROWS), np.zeros(ROWS), np.zeros(ROWS)
-    x_gap, dq, moved = np.zeros(ROWS), np.zeros(ROWS), np.zeros(ROWS)
+    x_gap, du, dq, moved = np.zeros(ROWS), np.zeros(ROWS), np.zeros(ROWS), np.zeros(ROWS)
     for at in range(course.order.size):
         i = course.order[at]
         u, s, h = course.u[i], course.s[i], course.h[i]
         # A step lies on one side of 0 V: the branch of its middle.
         sign = 1.0 if u[NODES // 2] >= 0.0 else -1.0
-        inverse_area_slopes(u, contact, sign, q, slopes)
+        _area_rows(u, model.curve, sign, q, slopes)
         for j in range(ROWS):
             slope[j] = slopes[j, 0]
             source[j] = s[j] / q[j] if model.mobile else s[j]
@@ -260,8 +259,8 @@ def follow(
                         for k in range(n):
                             x_gap[j] += gap[k] * w[k, j]
                     _moves(
-                        model.mobile, model.k_gap, changes.k_gap[c - 1], s, ds, q, slope, by_contact, x_gap, own, dq,
-                        moved,
+                        model.mobile, model.k_gap, changes.k_gap[c - 1], s, ds, q, slope, by_contact, x_gap, own, du,
+                        dq, moved,
                     )  # fmt: skip
                     _forcing(
                         system.q0[level], model.rate, model.rate0, model.k, changes.rate[c - 1], changes.rate0[c - 1],
@@ -282,12 +281,30 @@ def follow(
                         v[j, m] = model.k[j] * source[m] + x[j, m]
             else:
                 for j in range(NODES):
-                    out[c - 1, at, j] = 0.0
-                    for k in range(n):
-                        out[c - 1, at, j] += gap[k] * w[k, j]
+                    out[c - 1, 0, at, j] = du[j]
+                    out[c - 1, 1, at, j] = dq[j]
             for j in range(n):
                 x_at[c, j] = x[j, END]
     for c in range(columns):
         for j in range(n):
             ends[c, j] = x_at[c, j]
     return -1
+
+
+@jit
+def between_nodes(step: IntArray, fraction: FloatArray, at_nodes: FloatArray, out: FloatArray) -> None:
+    """Polynomials through values at the nodes of steps (m, n, NODES), at fractions of steps, into `out` (m, n_t)."""
+    weight = np.zeros(NODES)
+    for i in range(step.size):
+        total, hit = 0.0, -1
+        for j in range(NODES):
+            distance = fraction[i] - POINTS[j]
+            if distance == 0.0:
+                hit = j
+            weight[j] = BARYCENTRIC[j] / distance if distance != 0.0 else 0.0
+            total += weight[j]
+        for c in range(out.shape[0]):
+            values, value = at_nodes[c, step[i]], 0.0
+            for j in range(NODES):
+                value += weight[j] * values[j]
+            out[c, i] = values[hit] if hit >= 0 else value / total

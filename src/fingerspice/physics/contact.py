@@ -284,31 +284,28 @@ def inverse_area_array(u: FloatArray, curve: FloatArray) -> tuple[FloatArray, Fl
 
 
 @jit
-def area_slopes(u: float, contact: FloatArray, out: FloatArray) -> float:
-    """A_R (m^2) at gap voltage u >= 0 (V), or a little below; its derivatives by u and by every constant into `out`.
+def area_slopes(u: float, area: float, contact: FloatArray, out: FloatArray) -> None:
+    """Derivatives of A_R by the gap voltage and by every constant of a contact.
 
     Parameters
     ----------
-    u : float
-        V.
+    u, area : float
+        Gap voltage u >= 0 (V), or a little below, and A_R there, m^2.
     contact : ndarray, shape (N_PACKED,)
         See `Contact.packed`.
     out : ndarray, shape (1 + N_PACKED,)
         Receives dA/du (m^2/V), then the derivatives of A at fixed u by the entries of `contact`.
     """
-    f_n = contact[5]
-    x = contact[0] * u
-    y = universal_curve(x, contact[2], contact[3])
-    log_y, a0 = math.log(y), contact[1] * y
+    sigma = contact[4] * u * u
+    load = contact[5] + sigma * area
+    # A = A0 - (c2 mu^2 / A0) load^2 is a quadratic equation for A0 = area_unloaded y.
+    a0 = 0.5 * (area + math.sqrt(area * area + 4.0 * contact[7] * load * load))
+    log_y, x = math.log(a0 / contact[1]), contact[0] * u
     # From ln y / m = log(1 + x y^p), with b = y^p / (1 + x y^p):
     # (1/m - p x b) d ln y = b dx + x b ln y dp - ln y d(1/m).
-    b = y ** contact[3]
+    b = math.exp(contact[3] * log_y)
     b /= 1.0 + x * b
-    sigma = contact[4] * u * u
-    area = ridge_area(u, contact)
-    load = f_n + sigma * area
     k = contact[7] / a0
-    # A = A0 - (c2 mu^2 / A0) (F + sigma A)^2, differentiated and solved for dA.
     rest = 1.0 + 2.0 * k * sigma * load
     by_log = a0 * (1.0 + contact[7] * (load / a0) ** 2) / rest
     by_load = -2.0 * k * load / rest
@@ -323,7 +320,6 @@ def area_slopes(u: float, contact: FloatArray, out: FloatArray) -> float:
     out[6] = by_load
     out[7] = 0.0
     out[8] = -load * load / a0 / rest
-    return area
 
 
 @jit

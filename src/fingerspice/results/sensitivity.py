@@ -5,12 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-
 from fingerspice.base.arrays import FloatArray
-from fingerspice.engine.model import Model
-from fingerspice.engine.tangent import Changes, inverse_area_slopes
-from fingerspice.physics.contact import N_PACKED
 from fingerspice.results.record import Sealed, sealed
 
 
@@ -53,18 +48,6 @@ class Sensitivity(Sealed):
         return f"Sensitivity({self.path} = {self.value:g}{unit}: mean force {relative})"
 
 
-class Places(NamedTuple):
-    """Places of a run along the loop, shape (n,) each: gap and source voltage (V), and what a parameter moves there.
-
-    `moved` is the change of the source, `x_gap` that of the gap's part of the state (`engine.tangent`), V per unit.
-    """
-
-    u: FloatArray
-    s: FloatArray
-    moved: FloatArray
-    x_gap: FloatArray
-
-
 class Tangents(NamedTuple):
     """Changes of the signals with a parameter, shape (n,) each; the gap voltage along the loop."""
 
@@ -75,26 +58,21 @@ class Tangents(NamedTuple):
     friction: FloatArray
 
 
-def tangents_at(model: Model, packed: FloatArray, changes: Changes, i: int, at: Places) -> Tangents:
-    """Changes of the signals at places of a run by parameter number `i`; `packed` as in `Contact.packed`."""
-    q, slopes = np.empty(at.u.size), np.empty((at.u.size, 1 + N_PACKED))
-    inverse_area_slopes(np.abs(at.u), packed, 1.0, q, slopes)
-    slope, by_contact = np.sign(at.u) * slopes[:, 0], slopes[:, 1:] @ changes.contact[i]
-    du = changes.k_gap[i] * at.s + model.k_gap * at.moved
-    if model.mobile:
-        own = (at.u - model.k_gap * at.s) / q
-        du = (du + q * at.x_gap + own * by_contact) / (1.0 - own * slope)
-    else:
-        du = du + at.x_gap
-    area = 1.0 / q
-    by_area = -(area**2) * (slope * du + by_contact)
+def tangents_at(
+    packed: FloatArray, by_packed: FloatArray, u: FloatArray, area: FloatArray, du: FloatArray, dq: FloatArray
+) -> Tangents:
+    """Changes of the signals from those of the gap voltage (V) and of 1/A (1/m^2), each per unit of a parameter.
+
+    Gap voltage `u` (V) and `area` (m^2) are the run's own; `packed` is `Contact.packed`, `by_packed` its change.
+    """
     stress, f_n, mu = packed[4:7]
-    by_stress, by_load, by_mu = changes.contact[i, 4:7]
-    f_el = stress * at.u**2 * area
-    by_force = by_stress * at.u**2 * area + stress * at.u * (2.0 * area * du + at.u * by_area)
-    f_t = mu * (f_n + f_el)
+    by_stress, by_load, by_mu = by_packed[4:7]
+    by_area = -(area**2) * dq
+    f_el = stress * u**2 * area
+    by_force = by_stress * u**2 * area + stress * u * (2.0 * area * du + u * by_area)
     by_friction = by_mu * (f_n + f_el) + mu * (by_load + by_force)
-    return Tangents(du, by_area, by_force, by_friction, by_friction / f_n - f_t * by_load / f_n**2)
+    coefficient = by_friction / f_n - mu * (f_n + f_el) * by_load / f_n**2
+    return Tangents(du, by_area, by_force, by_friction, coefficient)
 
 
 def sensitivity_of(
@@ -104,9 +82,8 @@ def sensitivity_of(
 
     `turn` is -1 where the gap is written against the loop.
     """
-    f_el, f_t, friction, area = (
-        float((weight * x).sum()) for x in (inside.f_el, inside.f_t, inside.friction, inside.area)
-    )
+    means = (inside.f_el, inside.f_t, inside.friction, inside.area)
+    f_el, f_t, friction, area = (float((weight * x).sum()) for x in means)
     return Sensitivity(
         path, unit, value, turn * outputs.u_gap, *outputs[1:],
         f_el_mean=f_el, f_t_mean=f_t, friction_mean=friction, area_mean=area,

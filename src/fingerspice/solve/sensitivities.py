@@ -17,19 +17,20 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import Stack, build_stack
-from fingerspice.engine.tangent import Changes, Course, follow
+from fingerspice.engine.tangent import Changes, Course, between_nodes, follow
 from fingerspice.numerics.lobatto import NODES, POINTS, integral_table
-from fingerspice.physics.contact import N_PACKED
+from fingerspice.physics.contact import N_PACKED, areas
 from fingerspice.results.outcome import Failure, SolveError, Status
 from fingerspice.results.record import Record, sided
-from fingerspice.results.sensitivity import Places, Sensitivity, sensitivity_of, tangents_at
+from fingerspice.results.sensitivity import Sensitivity, sensitivity_of, tangents_at
+from fingerspice.results.solution import Solution
 from fingerspice.results.steps import Recorded, Stretches, basis
 from fingerspice.solve.initial import initial_state
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Run
 from fingerspice.solve.scenes import Scene, scene_of
 from fingerspice.solve.stackstate import model_of, to_stack
 from fingerspice.solve.track import prepare_system
+from fingerspice.waveforms.samples import Samples
 
 # Relative changes of a parameter at which formulas are evaluated, and the weights of a fourth-order difference.
 _STEP = 3e-4
@@ -46,15 +47,17 @@ class _Varied:
     path: str
     unit: str
     value: float
+    step: float
     circuits: tuple[Circuit, ...]
 
     def by(self, of: Sequence[FloatArray | float]) -> FloatArray:
         """Derivative by the parameter of what has these values for the circuits."""
         total = sum(weight * np.asarray(one, float) for weight, one in zip(_WEIGHTS, of, strict=True))
-        return np.asarray(total / (_STEP * self.value))
+        return np.asarray(total / (self.step * self.value))
 
 
-def _varied(circuit: Circuit, path: str) -> _Varied:
+def _varied(problem: Problem, path: str) -> _Varied:
+    circuit = problem.circuit
     known = {name.lower(): (name, one) for name, one in circuit.parameters.items()}
     if path.lower() not in known:
         # Refused with the nearest name.
@@ -62,15 +65,19 @@ def _varied(circuit: Circuit, path: str) -> _Varied:
     name, parameter = known[path.lower()]
     if not (math.isfinite(parameter.value) and parameter.value != 0.0):
         raise InputError(
-            f"sensitivities names {name}, which is {parameter.value:g}; allowed: parameters with a finite value that is "
+            f"sensitivities names {name}, which is {parameter.value:g}; allowed: parameters whose value is finite and "
             "not 0, as steps are relative to it"
         )
-    circuits = tuple(circuit.varied({name: parameter.value * (1.0 + _STEP * at)}) for at in _AT)
-    return _Varied(name, parameter.unit, parameter.value, circuits)
+    step, (element, _, _) = _STEP, name.rpartition(".")
+    if circuit[element].waveform is not None:
+        # A phase is a frequency times all the time since the start.
+        step /= max(1.0, 2.0 * math.pi * problem.t_stop / problem.waveform.shortest_time())
+    circuits = tuple(circuit.varied({name: parameter.value * (1.0 + step * at)}) for at in _AT)
+    return _Varied(name, parameter.unit, parameter.value, step, circuits)
 
 
-def check_request(problem: Problem, paths: Sequence[str], started_from_solution: bool) -> None:
-    """Refuse what has no sensitivities here.
+def check_request(problem: Problem, paths: Sequence[str], method: str, start: str) -> str:
+    """Refuse a run that has no sensitivities here; the method that steps it.
 
     Raises
     ------
@@ -78,18 +85,23 @@ def check_request(problem: Problem, paths: Sequence[str], started_from_solution:
         With what is allowed.
     """
     if isinstance(paths, str) or not all(isinstance(path, str) for path in paths):
-        raise InputError(f"sensitivities is {paths!r}; allowed: a tuple of paths such as ('Xgap.d',)")
-    scene = problem.scene
-    stack = scene.stack
-    what = ""
-    if stack is None or stack.contact is None:
+        raise InputError(f"sensitivities is {paths!r}; allowed: a sequence of paths such as ('Xgap.d',)")
+    scene, what = problem.scene, ""
+    if scene.stack is None or scene.stack.contact is None:
         what = "the circuit is no series stack with a GAP"
     elif not scene.coupled:
         what = f"the area is {scene.area_mode}"
-    elif started_from_solution:
-        what = "the run goes on from another, whose own sensitivities are not known"
+    elif start == "given":
+        what = "the run goes on from another one"
+    elif method not in ("auto", "exponential"):
+        what = f"the method is {method!r}"
     if what:
-        raise InputError(f"sensitivities are not computed here, as {what}; allowed: a series stack, area='coupled'")
+        raise InputError(
+            f"sensitivities are asked for, and {what}; allowed: a series stack with area='coupled', one of the other "
+            "starts, and the methods 'auto' and 'exponential'"
+        )
+    # A recording is otherwise followed sample by sample, without steps that are kept.
+    return "exponential" if isinstance(problem.waveform, Samples) else method
 
 
 def _layers(one: _Varied, stack: Stack, scene: Scene) -> tuple[FloatArray, FloatArray]:
@@ -191,26 +203,35 @@ def _starts(varied: Sequence[_Varied], problem: Problem, start: str) -> FloatArr
 def _followed(
     problem: Problem, rtol: float, course: Course, changes: Changes, start: FloatArray, steps: _Steps
 ) -> tuple[FloatArray, FloatArray]:
-    """Tangents of the gap's part of the state at the nodes of all steps, and state and tangents at the end.
+    """Changes of gap voltage and 1/A at the nodes of all steps (see `follow`), and state and tangents at the end.
 
     Raises
     ------
     SolveError
         Where a step's iteration does not close.
     """
-    prepared, stack = prepare_system(problem.scene, rtol), problem.scene.stack
-    assert stack is not None
-    assert stack.contact is not None
-    x_gap, ends = np.empty((len(start) - 1, course.order.size, NODES)), np.empty(start.shape)
+    prepared = prepare_system(problem.scene, rtol)
+    out, ends = np.empty((len(start) - 1, 2, course.order.size, NODES)), np.empty(start.shape)
     tol = max(_SHARE * rtol, _FINEST)
-    stuck = follow(
-        prepared.system, prepared.tables, stack.contact.packed, course, changes, start, tol, x_gap, ends
-    )  # fmt: skip
+    stuck = follow(prepared.system, prepared.tables, course, changes, start, tol, out, ends)
     if stuck >= 0:
         at = float(steps.begin[stuck])
         cause = f"the iteration for the sensitivities did not close in the step at {at:.6g} s"
         raise SolveError(Failure(Status.STEP_UNDERFLOW, cause, "a smaller rtol takes shorter steps", at))
-    return x_gap, ends
+    return out, ends
+
+
+def _one_period(course: Course, steps: _Steps, end: float) -> Course:
+    """The steps up to a time (s); the one that goes beyond it is cut there."""
+    last = min(int(np.searchsorted(steps.end, end)), steps.end.size - 1)
+    share = min((end - steps.begin[last]) / (steps.end[last] - steps.begin[last]), 1.0)
+    by, step = basis(share * POINTS[None])[0], steps.order[last]
+    u, s = (np.vstack([x, by @ x[step, :NODES]]) for x in (course.u, course.s))
+    moved = course.moved[:, : last + 1].copy()
+    if moved.shape[1]:
+        moved[:, last] = moved[:, last, :NODES] @ by.T
+    order = np.append(course.order[:last], len(course.h))
+    return Course(np.append(course.h, share * course.h[step]), order, u, s, moved)
 
 
 def _closed(
@@ -218,67 +239,49 @@ def _closed(
 ) -> FloatArray:
     """The tangents at the start of a periodic state: those that a period leads back to."""
     period, n, count = problem.waveform.period or math.inf, start.shape[1], len(start) - 1
-    whole = np.flatnonzero(np.abs(steps.end - problem.t_start - period) <= 1e-9 * period)
-    if not whole.size:
+    if problem.t_stop - problem.t_start < period * (1.0 - 1e-9):
         raise InputError(
             f"sensitivities of a periodic state need a run over a whole period, {period:g} s; allowed: a longer t_stop"
         )
-    last = int(whole[0]) + 1
-    # Besides the parameters' own tangents, those of each mode alone: the derivative of the map of the period.
+    course = _one_period(course, steps, problem.t_start + period)
+    # Besides the parameters' own tangents, that of each live voltage alone: the derivative of the map of the period.
     more = Changes(*(np.concatenate([x, np.zeros((n, *x.shape[1:]))]) for x in changes))
-    moved = np.concatenate([course.moved[:, :last], np.zeros((n, *course.moved[:, :last].shape[1:]))])
+    moved = np.concatenate([course.moved, np.zeros((n, *course.moved.shape[1:]))])
     first = np.concatenate([start, np.eye(n)])
-    _, ends = _followed(problem, rtol, course._replace(order=course.order[:last], moved=moved), more, first, steps)
+    _, ends = _followed(problem, rtol, course._replace(moved=moved), more, first, steps)
     out = start.copy()
     out[1:] = np.linalg.solve(np.eye(n) - ends[1 + count :].T, ends[1 : 1 + count].T).T
     return out
 
 
-def _at_outputs(
-    problem: Problem, one: _Varied, record: Record, turn: float, steps: _Steps, x_gap: FloatArray, is_moved: bool
-) -> Places:
-    """The outputs; the tangents of the state are continuous, so that the step on either side of an edge serves."""
-    t = record.t
-    at = np.minimum(np.searchsorted(steps.end, t), steps.end.size - 1)
+def _at_outputs(steps: _Steps, record: Record, at_nodes: FloatArray) -> FloatArray:
+    """What is known at the nodes of all steps (m, n, NODES) at the outputs, shape (m, n_t)."""
+    t, last = record.t, steps.end.size - 1
+    # A left-hand value is that at the end of the step before.
+    at = np.where(record.left, np.searchsorted(steps.end, t), np.searchsorted(steps.begin, t, "right") - 1)
+    at = np.clip(at, 0, last)
     fraction = np.clip((t - steps.begin[at]) / (steps.end - steps.begin)[at], 0.0, 1.0)
-    x = np.einsum("pn,pn->p", basis(fraction[:, None])[:, 0], x_gap[at])
-    moved = np.zeros(t.size)
-    if is_moved:
-        moved = one.by([sided(build_stack(c).waveform, t, record.left) for c in one.circuits])
-    return Places(turn * record.u_gap, record.u_source, moved, x)
+    out = np.empty((len(at_nodes), t.size))
+    between_nodes(at, fraction, at_nodes, out)
+    return out
 
 
-def _at_nodes(problem: Problem, steps: _Steps, course: Course, x_gap: FloatArray, i: int) -> tuple[Places, FloatArray]:
-    """The nodes of all steps after TSTART, and their weights in a mean."""
+def _weights(problem: Problem, steps: _Steps) -> tuple[FloatArray, FloatArray]:
+    """Where each step is evaluated for means from TSTART on, as fractions of it (n, NODES), and with what weights."""
     length = steps.end - steps.begin
-    low = np.clip((problem.first - steps.begin) / length, 0.0, 1.0)
-    moved = course.moved[i] if course.moved.shape[1] else np.zeros((steps.order.size, POINTS.size))
-    rows = [course.u[steps.order], course.s[steps.order], moved, x_gap]
-    rows = [row[:, :NODES] for row in rows]
-    cut = np.flatnonzero((low > 0.0) & (low < 1.0))
-    if cut.size:
-        by = basis(low[cut, None] + (1.0 - low[cut, None]) * POINTS[:NODES])
-        for j, row in enumerate(rows):
-            rows[j] = row.copy()
-            rows[j][cut] = np.einsum("pqn,pn->pq", by, row[cut])
-    weight = ((1.0 - low) * length)[:, None] * _END
-    return Places(*(np.ascontiguousarray(row).ravel() for row in rows)), (weight / weight.sum()).ravel()
+    low = np.clip((problem.first - steps.begin) / length, 0.0, 1.0)[:, None]
+    weight = (1.0 - low) * length[:, None] * _END
+    return low + (1.0 - low) * POINTS[:NODES], weight / weight.sum()
 
 
-def sensitivities(
-    problem: Problem, run: Run, record: Record, rtol: float, paths: Sequence[str], start: str
-) -> dict[str, Sensitivity]:
+def sensitivities_of(problem: Problem, solution: Solution, paths: Sequence[str], start: str) -> dict[str, Sensitivity]:
     """Derivatives of a run's signals by parameters.
 
     Parameters
     ----------
     problem : Problem
-    run : Run
-        Made by exponential steps.
-    record : Record
-        Its outputs.
-    rtol : float
-        Error asked of the run.
+    solution : Solution
+        Its run by exponential steps.
     paths : sequence of str
         As in `Circuit.replace`.
     start : str
@@ -291,10 +294,11 @@ def sensitivities(
     SolveError
         Where a step's iteration does not close.
     """
-    varied, stack = [_varied(problem.circuit, path) for path in paths], problem.scene.stack
-    stretches = None
-    if isinstance(run.continuous, Recorded):
-        stretches = run.continuous.run(dict, problem.t_start, problem.t_stop)
+    varied, stack = [_varied(problem, path) for path in paths], problem.scene.stack
+    stretches, record, rtol = None, solution.record, solution.rtol
+    assert isinstance(record, Record)
+    if isinstance(solution.continuous, Recorded):
+        stretches = solution.continuous.run(dict, problem.t_start, problem.t_stop)
     if stretches is None:
         raise InputError(
             "sensitivities need the steps of the run, and it has too many of them to be kept; allowed: a shorter run"
@@ -309,14 +313,19 @@ def sensitivities(
     begun = _starts(varied, problem, start)
     if start == "periodic":
         begun = _closed(problem, rtol, course, changes, begun, steps)
-    x_gap, _ = _followed(problem, rtol, course, changes, begun, steps)
-    model, packed, found = model_of(problem.scene), stack.contact.packed, {}
+    nodes, _ = _followed(problem, rtol, course, changes, begun, steps)
+    outputs = _at_outputs(steps, record, nodes.reshape(-1, *nodes.shape[2:])).reshape(len(varied), 2, -1)
+    fraction, weight = _weights(problem, steps)
+    inside = np.concatenate([u[None, steps.order, :NODES], nodes.reshape(-1, *nodes.shape[2:])])
+    cut = np.flatnonzero(fraction[:, 0] > 0.0)
+    inside[:, cut] = np.einsum("pqn,cpn->cpq", basis(fraction[cut]), inside[:, cut])
+    flat, packed, found = inside.reshape(len(inside), -1), stack.contact.packed, {}
+    area, curve = record.area, model_of(problem.scene).curve
+    assert area is not None
+    area_inside = areas(flat[0], curve)
     for i, one in enumerate(varied):
-        is_moved = bool(moved.shape[1]) and bool(moved[i].any())
-        outputs = tangents_at(
-            model, packed, changes, i, _at_outputs(problem, one, record, turn, steps, x_gap[i], is_moved)
-        )
-        places, weight = _at_nodes(problem, steps, course, x_gap[i], i)
-        inside = tangents_at(model, packed, changes, i, places)
-        found[one.path] = sensitivity_of(one.path, one.unit, one.value, outputs, inside, weight, turn)
+        by_packed = changes.contact[i]
+        at_outputs = tangents_at(packed, by_packed, turn * record.u_gap, area, *outputs[i])
+        at_nodes = tangents_at(packed, by_packed, flat[0], area_inside, *flat[1 + 2 * i : 3 + 2 * i])
+        found[one.path] = sensitivity_of(one.path, one.unit, one.value, at_outputs, at_nodes, weight.ravel(), turn)
     return found
