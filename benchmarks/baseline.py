@@ -1,7 +1,7 @@
-"""What must not get worse while the engine is rebuilt: digests and figures of scenes, times, steps, compiled calls.
+"""Baseline for changes of the engine: digests and figures of scenes, times, steps, calls of compiled loops.
 
 Run: python benchmarks/baseline.py [--quick] [--output FILE] [--against FILE]. Writes results/baseline.json; with
-`--against` prints what differs from an earlier file: digests that changed, by how much their figures moved beside the
+`--against` prints the differences from an earlier file: changed digests, changes of their figures relative to the
 stated errors, and times and calls as ratios.
 """
 
@@ -30,7 +30,7 @@ HERE = Path(__file__).resolve().parent
 CIRCUITS = HERE.parent / "circuits"
 RESULTS = HERE / "results" / "baseline.json"
 LAWS, TOLERANCES = ("local", "mobile"), (1e-4, 1e-8)
-#: What stands around one finger, or a second finger: decks, and the source they are driven by.
+#: Decks that are timed: one finger alone or in a network, and two fingers.
 CIRCUITS_TIMED = ("fingerpad", "fingerpad_dispersive", "amplifier", "ungrounded_user", "current_drive", "two_fingers")
 PERIODS, OUTPUTS = 100, 100
 Report = dict[str, Any]
@@ -38,7 +38,7 @@ Report = dict[str, Any]
 
 @contextmanager
 def counted() -> Iterator[list[int]]:
-    """Count the calls of the compiled loops from Python in the block."""
+    """Count the calls from Python to the compiled loops in the block."""
     calls = [0]
     originals = {module: module.march for module in (march, netmarch)}
 
@@ -80,7 +80,7 @@ def scene(deck: Path, law: str, rtol: float) -> Report:
 
 
 def driven(circuit: fs.Circuit, square: bool, frequency: float) -> fs.Circuit:
-    """The circuit under a sine or square of its own source's strength, its other sources switched off."""
+    """The circuit with its first source replaced by a sine or square, and all other sources switched off."""
     name = next(e.name for e in circuit.elements if e.name[0] in "VI")
     strength = 200.0 if name[0] == "V" else 500e-6 * frequency / 5e3
     source = fs.Square(strength, frequency) if square else fs.Sine(strength, frequency)
@@ -89,7 +89,7 @@ def driven(circuit: fs.Circuit, square: bool, frequency: float) -> fs.Circuit:
 
 
 def times(deck: str, square: bool, frequency: float, repeats: int) -> Report:
-    """Times per period of a circuit at 1e-6, every period stepped and as usual, and the calls of compiled loops."""
+    """Times per period of a circuit at 1e-6, with every period stepped and by default, and calls of compiled loops."""
     circuit = driven(fs.read_netlist(CIRCUITS / f"{deck}.cir"), square, frequency)
     t = np.linspace(0.0, PERIODS / frequency, PERIODS * OUTPUTS + 1)
     found: Report = {"circuit": deck, "source": f"{'square' if square else 'sine'} {frequency:g} Hz"}
@@ -115,7 +115,7 @@ def times(deck: str, square: bool, frequency: float, repeats: int) -> Report:
 
 
 def line(pieces: int) -> str:
-    """A resistive line with capacitance to ground, and a finger at its end."""
+    """A deck of an RC line with a finger at its end."""
     finger = (CIRCUITS / "fingerpad_5khz.cir").read_text(encoding="utf-8")
     nodes = ["drive", *(f"n{i}" for i in range(1, pieces)), "end"]
     rungs = "\n".join(f"R{i} {a} {b} 10\nC{i} {b} 0 1p" for i, (a, b) in enumerate(itertools.pairwise(nodes)))
@@ -123,7 +123,7 @@ def line(pieces: int) -> str:
 
 
 def calls_of_a_user(repeats: int) -> Report:
-    """Whole calls of five periods with 100 outputs, s: the same circuit, another source, another parameter, a line."""
+    """Times (s) of whole calls: five periods with the same circuit, another source or parameter; and a long line."""
     found: Report = {}
     t = np.linspace(0.0, 0.05, 101)
     for deck in ("fingerpad", "fingerpad_dispersive", "amplifier"):
@@ -150,7 +150,7 @@ def calls_of_a_user(repeats: int) -> Report:
 
 
 def revision() -> str:
-    """The commit that is measured, with a + where files differ from it; empty without git."""
+    """The measured commit, with a + if files differ from it; empty without git."""
     try:
         said = subprocess.run(
             ["git", "describe", "--always", "--dirty=+"], cwd=HERE, capture_output=True, text=True, check=True
@@ -161,7 +161,7 @@ def revision() -> str:
 
 
 def compare(now: Report, before: Report) -> Iterator[str]:
-    """What differs, a line each."""
+    """A line of text for each difference."""
     for name, scene_now in now["scenes"].items():
         was = before["scenes"].get(name)
         if was is None or was["digest"] == scene_now["digest"]:

@@ -1,6 +1,6 @@
-"""Scenes a second of `fs.batch`, whole calls, beside a loop over `simulate` and a numba loop of RK4 across scenes.
+"""Scenes per second of whole calls of `fs.batch`, of a loop over `simulate`, and of a numba loop of RK4 over scenes.
 
-A scene is Table 1's stack with another gap, leak and amplitude; wanted is the mean force of 5 periods. Usage:
+A scene is Table 1's stack with another gap, leak and amplitude; its output is the mean force of 5 periods. Usage:
 ``python benchmarks/batch.py [--quick] [--scenes N]``; writes ``benchmarks/results/batch.json`` unless quick.
 """
 
@@ -27,7 +27,7 @@ REFERENCES = 24
 
 
 def population(n: int, wide: bool) -> dict[str, np.ndarray]:
-    """Fingers that differ: by gap, leak and amplitude, or in all that matters over wide ranges."""
+    """Random parameters: gap, leak and amplitude, or with `wide` six parameters over wide ranges."""
     rng = np.random.default_rng(1)
     if not wide:
         return {
@@ -46,7 +46,7 @@ def population(n: int, wide: bool) -> dict[str, np.ndarray]:
 
 
 def seconds(action: Callable[[], object], repeats: int) -> dict[str, float]:
-    """Least and median wall time, and least processor time of all threads, s, after a run that is not counted."""
+    """Smallest and median wall time, and smallest processor time of all threads, s, after a run that is not counted."""
     action()
     times, busy = [], []
     for _ in range(repeats):
@@ -61,7 +61,7 @@ def seconds(action: Callable[[], object], repeats: int) -> dict[str, float]:
 def rk4(
     c: np.ndarray, g: np.ndarray, g_area: np.ndarray, wave: np.ndarray, areas: np.ndarray, steps: int
 ) -> np.ndarray:
-    """Mean of u_gap^2 A by classical Runge-Kutta, scene by scene; the area from a table of each scene, linear."""
+    """Mean of u_gap^2 A by the classical Runge-Kutta method, scene by scene, with linear tables of the areas."""
     n, m = c.shape
     out = np.empty(n)
     u, v, k, total = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
@@ -97,7 +97,7 @@ def rk4(
 
 
 def by_rk4(circuit: fs.Circuit, parameters: dict[str, np.ndarray], n: int, steps: int) -> Callable[[], np.ndarray]:
-    """The loop of RK4 over the first n scenes, with its set-up outside, which favours it."""
+    """The loop of RK4 over the first n scenes; its set-up is not timed, which favours it."""
     rows = []
     for i in range(n):
         stack = build_stack(circuit.varied({p: float(x[i]) for p, x in parameters.items()}))
@@ -122,7 +122,7 @@ def single(circuit: fs.Circuit, parameters: dict[str, np.ndarray], i: int, rtol:
 
 
 def measure(name: str, circuit: fs.Circuit, n: int, wide: bool, repeats: int) -> list[dict[str, Any]]:
-    """Scenes a second and errors at two tolerances, and of the contestants."""
+    """Scenes per second and errors of `fs.batch` at two tolerances, and of the other contestants."""
     parameters, skin = population(n, wide), "follow" if wide else "own"
     few = min(n, REFERENCES)
     expected = np.array([single(circuit, parameters, i, 1e-11, wide) for i in range(few)])

@@ -1,14 +1,14 @@
-"""The hard cases through this package and everything else that could solve them: right, wrong, refused, or hung.
+"""The hard cases with this package and all other libraries that could solve them: right, wrong, refused, or hung.
 
 Run: python benchmarks/hard_cases.py [--quick] [--cases NAME ... [--update]] [--tools WORD ...]. A full run takes about
 20 minutes and writes results/hard_cases.json and hard_cases.md; --update renews the cases named in them.
 
-1e-6 of the peak of gap voltage and force is asked. Peers control the error of a step, not of the result: they are run
-at 1e-8, split at the jumps that are declared, on the compiled right-hand side of `right_hand_side.py` (an equation
-without a solution is NaN there), with an absolute tolerance that goes with the source; ngspice with 1000 steps a
-period and 100 in every piece longer than 10 ns, 1e-4 being asked of it. An answer is right within ten times what is
-asked, and where there is no answer, if the message names the true reason. Every run is a process of its own, given 10 s
-from the start of the solve; what compiles does so before, once for each case.
+The requested error is 1e-6 of the peak of gap voltage and force. Peers control the error of a step, not of the result:
+they are run at 1e-8, split at the declared jumps, on the compiled right-hand side of `right_hand_side.py` (which is NaN
+if its equation has no solution), with an absolute tolerance proportional to the source. ngspice is run with 1000 steps
+per period and at least 100 in every piece longer than 10 ns, and its requested error is 1e-4. An answer is right if its
+error is at most ten times the requested one; a refusal is right if the case has no answer and the message names the
+true reason. Every run is a process of its own with a limit of 10 s for the solve; compilation comes before it.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ Case = HardProblem | Deck
 
 
 def solver(case: Case, tool: str) -> Callable[[], tuple[FloatArray, FloatArray] | str]:
-    """What is run: gap voltage and force at the outputs; of a deck that was run to its end, what was said of it."""
+    """The function that runs a case: it returns gap voltage and force at the outputs, or a deck's messages."""
     if isinstance(case, Deck):
         return lambda: run_deck(case, tool)
     plan = Plan(case, case.periods)
@@ -71,7 +71,7 @@ def solver(case: Case, tool: str) -> Callable[[], tuple[FloatArray, FloatArray] 
     for name in MODULES:
         module = import_module(f"peers.{name}")
         if hasattr(module, "AMPLITUDE"):
-            # The scale of absolute tolerances.
+            # The peers' absolute tolerances are proportional to AMPLITUDE.
             module.AMPLITUDE = case.peak
         if hasattr(module, "MAX_STEPS"):
             module.MAX_STEPS = MAX_STEPS
@@ -79,11 +79,11 @@ def solver(case: Case, tool: str) -> Callable[[], tuple[FloatArray, FloatArray] 
     run = next(c for c in field if c.name == tool).setup(plan)
     rtol = ASKED if tool == "fingerspice" else PEERS_RTOL
     if tool == "fingerspice":
-        # Another scene of the same law, so that what is compiled is loaded.
+        # Run another scene of the same law first, so that the compiled code is loaded.
         scene = by_name()["sine_100Hz" if case.law == "local" else "sine_100Hz_mobile"]
         fs.simulate(scene.circuit(), t_stop=0.01, rtol=rtol, charge_law=case.law, charge=False)
     if tool.startswith("diffrax"):
-        # Compiles the whole run; how it ends is seen when it counts.
+        # This run only compiles; its result is ignored.
         with contextlib.suppress(NotSolvedError):
             run(0.1)
 
@@ -95,21 +95,22 @@ def solver(case: Case, tool: str) -> Callable[[], tuple[FloatArray, FloatArray] 
 
 
 def run_ngspice(plan: Plan) -> tuple[FloatArray, FloatArray]:
-    """ngspice's own points, their voltages joined by straight lines."""
+    """Run ngspice; outputs are interpolated linearly between its own points."""
     lengths = [p.t1 - p.t0 for p in plan.pieces if p.t1 - p.t0 > 1e-8]
     text = ngspice_peer.deck(plan.problem, plan.t_stop, min(plan.problem.period / STEPS, min(lengths) / 100.0))
     with tempfile.TemporaryDirectory() as folder:
         ngspice_peer._run(text, Path(folder))
         raw = ngspice_peer.read_raw(Path(folder) / "out.raw")
     u_gap = np.interp(plan.t_eval, raw["time"], raw["v(top)"] - raw["v(skin)"])
-    # The area is no state but a function of the gap voltage, and bent where that runs straight.
+    # The area is a nonlinear function of the gap voltage: compute it from the interpolated voltage, not by
+    # interpolation.
     known = plan.problem.constants
     inverse = polynomial.polyval(np.minimum(2.0 * np.abs(u_gap) / known.reach, 2.0) - 1.0, known.series)
     return u_gap, known.stress * u_gap**2 / inverse
 
 
 def run_deck(case: Deck, tool: str) -> str:
-    """Run a netlist to its end, or fail; what was said of it."""
+    """Run a netlist to its end, or fail; returns the tool's messages."""
     if tool == "fingerspice":
         return fs.simulate(fs.parse_netlist(case.text)).message
     with tempfile.TemporaryDirectory() as name:
@@ -128,7 +129,7 @@ def run_deck(case: Deck, tool: str) -> str:
 
 
 def can(case: Case, tool: str) -> bool:
-    """Whether a tool can be given a case."""
+    """Whether a case can be expressed for a tool."""
     if isinstance(case, Deck):
         return tool in ("fingerspice", "ngspice")
     # The mobile law's equation is solved in a loop written for numba only; ngspice's sources declare their edges.
@@ -155,12 +156,12 @@ def worker(case: Case, tool: str, pipe: Any) -> None:
 
 
 def attempt(case: Case, tool: str) -> tuple[str, Any]:
-    """How a run ended: ("done", (answer, s)), ("failed", message) or ("hung", None)."""
+    """Outcome of a run: ("done", (answer, s)), ("failed", message) or ("hung", None)."""
     context = multiprocessing.get_context("fork")
     mine, other = context.Pipe()
     process = context.Process(target=worker, args=(case, tool, other))
     with warnings.catch_warnings():
-        # Of threads that others of this process may hold: what is forked here takes no lock of theirs.
+        # Python warns about a fork with other threads running, whose locks might be held; the child uses none of them.
         warnings.simplefilter("ignore", DeprecationWarning)
         process.start()
     other.close()
@@ -172,14 +173,14 @@ def attempt(case: Case, tool: str) -> tuple[str, Any]:
         found = ("failed", "the process died")
     if process.is_alive():
         if found[0] == "hung" and process.pid is not None:
-            # Its session holds what it started; both are ours.
+            # The process and all processes that it started form one process group of their own: end the group.
             os.killpg(process.pid, signal.SIGKILL)
         process.join()
     return found
 
 
 def judge(case: Case, tool: str, found: tuple[str, Any], truth: tuple[FloatArray, FloatArray] | None) -> Report:
-    """Verdict on how a run ended, with error, time or message."""
+    """Verdict on the outcome of a run, with error, time or message."""
     kind, what = found
     if kind == "hung":
         return {"verdict": "hung"}
@@ -195,7 +196,7 @@ def judge(case: Case, tool: str, found: tuple[str, Any], truth: tuple[FloatArray
         return report
     if not all(np.all(np.isfinite(x)) for x in answer):
         return report | {"error": None}
-    # An error of nothing is measured in volts of nothing.
+    # If the reference is zero, the error is absolute (V or N) instead of relative to the peak.
     errors = [float(np.abs(a - b).max() / (np.abs(b).max() or 1.0)) for a, b in zip(answer, truth, strict=True)]
     allowed = 10.0 * (ASKED_OF_NGSPICE if tool == "ngspice" else ASKED)
     report["error"] = float(f"{max(errors):.3g}")
@@ -203,12 +204,12 @@ def judge(case: Case, tool: str, found: tuple[str, Any], truth: tuple[FloatArray
 
 
 def contest(cases: list[Case], tools: list[str], versions: dict[str, str], path: Path | None, kept: Report) -> Report:
-    """All tools on all cases, a line printed for each; what there is by then is written after every case."""
+    """Run all tools on all cases, and print a line for each; writes the results after every case."""
     results: Report = {"machine": machine(), "versions": versions, "limit_s": LIMIT, "asked": ASKED, "cases": kept}
     for case in cases:
         truth = None
         if isinstance(case, HardProblem):
-            # Before the workers are forked, so that none of them compiles it again.
+            # Compile before the workers are forked, so that none of them compiles again.
             warm(case)
             truth = None if case.refusal else case.truth()
         row = dict(kept[case.name]["tools"]) if case.name in kept else {}

@@ -19,28 +19,28 @@ from problems import Constants, Drive, FloatArray, Piece, Problem, constants, he
 from reference import _analytic
 
 SERIES = 1e-7
-"""Error allowed of the area's series here: 1e-6 is asked of the results, and 2 kV reach far along the area's curve."""
+"""Error allowed of the area's series: results are asked to 1e-6, and at 2 kV a smaller error needs a high degree."""
 NAMES = {"Xcoat.r": "r_i", "Xgap.r": "r_a", "Xgap.d": "d_a", "Xgap.fn": "force_normal"}
 
 
 @dataclass(frozen=True)
 class HardProblem(Problem):
-    """A problem with changes of its deck, a source that may be gated, and as many outputs on every piece.
+    """A problem with changes of its deck, a source that may be gated, and the same number of outputs on every piece.
 
     Attributes
     ----------
     changes : mapping
-        Parameter of the deck to its value.
+        From a parameter of the deck to its value.
     gate : Waveform or None
-        What `level` is on a piece, where that is not the source's own voltage.
+        Waveform that gives the `level` of each piece; None for the source's own voltage.
     outputs : int
-        On every piece between jumps.
+        Number of outputs on every piece between jumps.
     spacing : str
         ``"even"``, ``"geometric"``, or ``"last period"``.
     peak : float
-        Largest |U|, V: peers' absolute tolerances go with it.
+        Largest |U|, V; peers' absolute tolerances are proportional to it.
     refusal : str
-        What a message must hold that refuses this scene for the true reason; "" where it has a solution.
+        Pattern that a message with the true reason of a refusal matches; "" for a scene that has a solution.
     """
 
     changes: Mapping[str, float] = field(default_factory=dict)
@@ -58,7 +58,7 @@ class HardProblem(Problem):
         return constants(self.circuit(), self.reach, SERIES, 50)
 
     def edges(self) -> FloatArray:
-        """Start, the source's breakpoints inside, end, s."""
+        """Start of the run, the source's breakpoints inside, and end, s."""
         stop = self.t_stop(self.periods)
         inner = self.waveform.breakpoints(0.0, stop)
         return np.concatenate([[0.0], inner[(inner > 0.0) & (inner < stop)], [stop]])
@@ -79,7 +79,7 @@ class HardProblem(Problem):
         return tuple(replace(p, level=float(self.gate.value(0.5 * (p.t0 + p.t1)))) for p in found)
 
     def segments(self) -> list[tuple[float, float, Callable[[FloatArray], FloatArray]]]:
-        """The source as `analytic.transient` takes it."""
+        """The source in the form of `analytic.transient`."""
         u = self.drive(np.sin)
         return [
             (p.t0, p.t1, lambda t, level=p.level: u(np.asarray(t), level) + 0.0 * np.asarray(t))
@@ -102,7 +102,7 @@ class HardProblem(Problem):
                 [(0.0, self.period, first[2])], t_out=t - (t[-1] // self.period) * self.period, **options
             )
         elif self.spacing == "last period":
-            # What was more than 6 ms ago is felt by less than 1e-9.
+            # The state 6 ms earlier changes the result by less than 1e-9: start there, uncharged.
             _, stop, u = self.segments()[-1]
             run = analytic.transient([(stop - 6e-3, stop, u)], t, **options)
         else:
@@ -110,7 +110,7 @@ class HardProblem(Problem):
         return run.u_gap, run.force
 
     def exact_segments(self) -> list[tuple[float, float, Callable[[FloatArray], FloatArray]]]:
-        """`segments`, split also where an undeclared source has its corners."""
+        """`segments`, also split at the corners of an undeclared source."""
         (whole, *rest), corners = self.segments(), UNDECLARED.get(self.name, ())
         if rest or not corners:
             return [whole, *rest]
@@ -137,7 +137,7 @@ def _trapezoid(start: float, width: float, edge: float) -> Drive:
 
     def bind(sin: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
         def u(t: Any, level: Any) -> Any:
-            # min(max(x, 0), 1) is (|x| - |x - 1| + 1) / 2, in every library.
+            # Written with absolute values, which every library has: min(max(x, 0), 1) = (|x| - |x - 1| + 1) / 2.
             x, y = (t - start) / edge, (t - after) / edge
             return 100.0 * (abs(x) - abs(x - 1.0) - abs(y) + abs(y - 1.0))
 
@@ -253,7 +253,7 @@ _DRIVE, _TRAN = "Vdrive drive 0 SIN(0 200 100)", ".tran 10u 10m uic"
 
 @dataclass(frozen=True)
 class Deck:
-    """A netlist to be refused, and what a message must hold that refuses it for the true reason."""
+    """A netlist that must be refused, and the pattern that a message with the true reason matches."""
 
     name: str
     title: str

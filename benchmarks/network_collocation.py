@@ -1,8 +1,8 @@
-"""The network scenes by Radau collocation, from the paper's equations as `tests/analytic.py` has them.
+"""The network scenes by Radau collocation, from the paper's equations in `tests/analytic.py`.
 
-Nothing of the package takes part: areas come from Eqs. 1 to 4 at every point, and the circuits' values are written here
-once more, so that a deck that is read wrongly shows too. State x (V): across all fingers; the body's; of each finger,
-coating and gap. See `network_rates.py` for the equations.
+Nothing of the package is used: areas come from Eqs. 1 to 4 at every point, and the circuits' values are repeated here,
+so that errors in reading a deck show as well. State x (V): the voltage across all fingers, the body's voltage, and the
+voltages of each finger's coating and gap. See `network_rates.py` for the equations.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ DECKS = {
 
 
 class Network:
-    """Rates of a deck's state, of many states at once."""
+    """The time derivatives of a deck's state, for many states at once."""
 
     def __init__(self, analytic: ModuleType, deck: str, skin_frequency: float, mobile: bool) -> None:
         self.resistance, self.cable, self.body, loads = DECKS[deck]
@@ -45,13 +45,13 @@ class Network:
         self.gaps = [3 + 2 * j for j in range(len(loads))]
 
     def rates(self, source: FloatArray, x: FloatArray, signs: Sequence[float]) -> FloatArray:
-        """x' (m, n) in V/s for sources (m,) and states (m, n), on the branches of the gap voltages' signs."""
+        """x' (m, n) in V/s for sources (m,) and states (m, n); `signs` selects the branch of each gap's area."""
         fingers = []
         meets, pull = np.full(len(x), self.cable), np.zeros(len(x))
         for j, sign in enumerate(signs):
             u = np.column_stack([x[:, 2 + 2 * j], x[:, 3 + 2 * j], x[:, 0] - x[:, 2 + 2 * j] - x[:, 3 + 2 * j]])
             _, area, slope, _ = self.analytic.contact(sign * u[:, 1], self.fingers[j])
-            # u' = a i - b for the finger's current i.
+            # The layer voltages change by u' = a i - b, with the finger's current i.
             a = 1.0 / (self.c * area[:, None])
             b = (self.g_total + self.g_area * area[:, None]) * u * a
             if self.mobile:
@@ -72,30 +72,30 @@ class Network:
         return np.column_stack(columns)
 
     def forces(self, u_gap: FloatArray) -> FloatArray:
-        """Electroadhesive forces (N) of gap voltages (m, fingers)."""
+        """Electroadhesive forces (N) at gap voltages (V), shape (m, n_finger)."""
         return np.column_stack(
             [self.analytic.contact(np.abs(u), p)[3] for u, p in zip(u_gap.T, self.fingers, strict=True)]
         )
 
 
 class Collocation:
-    """A run of a network; steps end on zeros of the gap voltages, where their areas have kinks."""
+    """A run of a network; steps end on zeros of the gap voltages, where the areas have kinks."""
 
     def __init__(self, network: Network, scale: float, t_eval: FloatArray) -> None:
         self.network, self.scale, self.t_eval = network, scale, t_eval
         self.nodes = network.analytic._nodes("radau", STAGES)
         self.out = np.empty((t_eval.size, network.size))
         self.zeros: list[float] = []
-        # From which time on the gap voltages have which signs, as one `code`.
+        # Start times of the branches, each with the `code` of the gap voltages' signs.
         self.branches: list[tuple[float, float]] = []
         self.steps = 0
 
     def attempt(self, t: float, h: float, x: FloatArray, source: Source, signs: list[float]) -> FloatArray | None:
-        """States at the start and the stages of a step, (stages + 1, n); None where the iteration does not close."""
+        """States at the start and the stages of a step, (stages + 1, n); None if the iteration does not converge."""
         network, nodes, n = self.network, self.nodes, x.size
         m = STAGES
         u = source(t + h * nodes.tau)
-        # The slope where the step begins serves at all its stages: what is left is made smaller at every turn.
+        # Simplified Newton iteration: the Jacobian at the start of the step is used at all stages and iterations.
         d = 1e-5 * self.scale
         around = np.vstack([x + d * np.eye(n), x - d * np.eye(n)])
         f = network.rates(np.full(2 * n, u[0]), around, signs)
@@ -115,13 +115,13 @@ class Collocation:
         return None
 
     def zero(self, w: FloatArray, signs: list[float]) -> tuple[float, int] | None:
-        """Fraction of a step at which the first gap voltage leaves its sign, and which; None where none does."""
+        """Fraction of a step at which a gap voltage first changes its sign, and its number; None if none does."""
         found = []
         grid = np.linspace(-1.0, 1.0, 4 * STAGES + 1)
         rows = self.nodes.interpolation(grid)
         for j, place in enumerate(self.network.gaps):
             values = signs[j] * (rows @ w[:, place])
-            # What began at a zero may be rounding on its wrong side.
+            # A voltage that starts at a zero may have the wrong sign by round-off.
             below = np.flatnonzero(values[1:] < -1e-13 * self.scale)
             if below.size:
                 low, high = grid[below[0]], grid[below[0] + 1]
@@ -136,11 +136,11 @@ class Collocation:
     def shortened(
         self, t: float, h: float, x: FloatArray, source: Source, signs: list[float], cut: tuple[float, int]
     ) -> tuple[float, FloatArray]:
-        """A step that ends on a zero of a gap voltage, from the fraction where a longer one has it."""
+        """Length and states of a step that ends on a zero of a gap voltage, which `cut` locates in a longer step."""
         fraction, j = cut
         place = self.network.gaps[j]
         before = self.nodes.interpolation(np.array([1.0 - 2e-3]))
-        # A shorter step is another polynomial, with its zero within rounding after two corrections.
+        # The polynomial of a shorter step has a slightly different zero: two corrections reach round-off.
         for _ in range(3):
             h *= fraction
             w = self.attempt(t, h, x, source, signs)
@@ -150,7 +150,7 @@ class Collocation:
         return h, w
 
     def signs(self, t: float, length: float, x: FloatArray, source: Source) -> list[float]:
-        """Signs of the gap voltages where a smooth stretch begins; of one at 0 V, that of where it goes."""
+        """Signs of the gap voltages at the start of a smooth stretch; at 0 V the sign just after the start."""
         signs = [math.copysign(1.0, x[place]) for place in self.network.gaps]
         if min(abs(x[place]) for place in self.network.gaps) <= 1e-12 * self.scale:
             w = self.attempt(t, 1e-6 * length, x, source, signs)
@@ -159,7 +159,7 @@ class Collocation:
         return signs
 
     def segment(self, t0: float, t1: float, x: FloatArray, source: Source) -> FloatArray:
-        """Through a smooth stretch of the source; the state at its end."""
+        """Integrate over a smooth stretch of the source, and return the state at its end."""
         t, h = t0, 1e-3 * (t1 - t0)
         signs = self.signs(t0, t1 - t0, x, source)
         self.branches.append((t0, code(signs)))

@@ -1,8 +1,8 @@
 """The network scenes of the benchmarks: shipped decks with an amplifier, a floating user, or two fingers.
 
-All have one form, from which the right-hand side of `network_rates.py` is written: the source drives fingers and, where
-there is one, a cable's capacitance side by side through one resistance, and the current returns through the body's
-capacitance, where the user floats. No jump of the source is felt at once behind the resistance.
+All have the form for which the right-hand side of `network_rates.py` is written: the source drives, through one
+resistance, the fingers and in parallel the capacitance of a cable, if there is one; if the user floats, the current
+returns through the body's capacitance. Behind the resistance no voltage jumps with the source.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class Finger:
     c : tuple of float
         Capacitances per area, F/m^2.
     g_total, g_area : tuple of float
-        Leaks: of the whole layer (S), and per area (S/m^2).
+        Leakage conductances, independent of the area (S) and per area (S/m^2).
     series : tuple of float
-        See `problems.area_series`.
+        Series of 1/A_R; see `problems.area_series`.
     stress : float
         sigma_el / u_gap^2, Pa/V^2.
     """
@@ -41,19 +41,19 @@ class Finger:
 
 @dataclass(frozen=True)
 class Around:
-    """What stands around the fingers, with the fingers.
+    """The circuit around the fingers, and the fingers.
 
     Attributes
     ----------
     resistance : float
-        In the way of the whole current, ohm.
+        Resistance in series with the source, ohm.
     cable : float
-        Capacitance beside the fingers, F.
+        Capacitance parallel to the fingers, F.
     body : float
-        Capacitance through which the current returns, F; inf where the user is grounded.
+        Capacitance through which the current returns, F; inf for a grounded user.
     fingers : tuple of Finger
     reach : float
-        No gap voltage is larger, V.
+        Upper bound of the gap voltages, V.
     """
 
     resistance: float
@@ -63,7 +63,7 @@ class Around:
     reach: float
 
 
-#: The elements that are resistance, cable and body of each deck.
+#: For each deck, the names of the elements that are the resistance, the cable and the body.
 ELEMENTS = {
     "amplifier": ("Rout", "Ccable", None),
     "ungrounded_user": ("Rbody", None, "Cbody"),
@@ -87,7 +87,7 @@ class NetworkProblem(Problem):
 
     @cached_property
     def around(self) -> Around:
-        """What a right-hand side needs to know."""
+        """Constants of the right-hand side."""
         circuit = self.circuit()
         values = {e.name: e.values["value"] for e in circuit.by_device("R", "C")}
         resistance, cable, body = ELEMENTS[self.deck]
@@ -128,7 +128,7 @@ def _scene(
         period=1.0 / frequency,
         periods=100,
         law=law,
-        # After a jump the gap holds what it was charged to, and more.
+        # After a jump the gap voltage exceeds the source voltage by the stored charge.
         reach=1.3 * AMPLITUDE if square else AMPLITUDE,
         exported=exported,
         deck=deck,
@@ -140,7 +140,8 @@ AMPLIFIER, FLOATING, TWO = (
     ("ungrounded_user", "floating user", Problem.exported),
     ("two_fingers", "two fingers", tuple((f"x{x}_top", f"x{x}_skin", x) for x in ("firm", "light"))),
 )
-#: At 100 Hz the layers leak, and the amplifier's resistance counts at the jumps; what floats passes high frequencies.
+#: The amplifier also runs a square of 100 Hz, where the layers leak and its resistance matters at the jumps; a floating
+#: body only passes high frequencies.
 NETWORKS = (
     _scene(*AMPLIFIER, False, 5000.0),
     _scene(*AMPLIFIER, True, 100.0),

@@ -1,12 +1,13 @@
 """The right-hand side of the network scenes that peers integrate, written by hand for numba and for any array library.
 
-It is what someone would write who knows the circuit. No matrix is formed: the layers of a finger are in series and
-the fingers side by side, so that the current divides in closed form. `fingerspice.engine.network.rates`, which serves
-any circuit, fills and eliminates a matrix at every evaluation and is several times dearer: it would handicap the peers.
-The package itself is given the netlist and profits from none of this.
+Someone who knows the circuit would write it in this form. No matrix is needed: the layers of a finger are in series
+and the fingers in parallel, so that the current divides in closed form. `fingerspice.engine.network.rates`, which
+serves any circuit, fills and eliminates a matrix at every evaluation and takes several times longer, which would be
+unfair to the peers. The package itself is given the netlist and uses none of this.
 
-State x (V): across all fingers; the body's, where it floats; of each finger, coating and gap. The skin's voltage is
-what is left of a finger's. A current i through a finger makes each of its voltages u change by u' = a i - b:
+State x (V): the voltage across all fingers; the body's voltage, if the body floats; the voltages of each finger's
+coating and gap. The skin's voltage is the finger's less these two. With the current i through a finger, each of its
+voltages u changes by u' = a i - b:
 
     local:   c A u' = i - G u               G = g_total + g_area A
     mobile:  c A u' + c u A' = i - G u      A' = dA/du_gap u_gap'
@@ -26,15 +27,15 @@ Least = Callable[[Any, Any], Any]
 
 
 def code(signs: Sequence[float]) -> float:
-    """The signs of one or two gap voltages as one number: the first, and three times the second."""
+    """The signs of one or two gap voltages as one number: the first sign plus three times the second."""
     return sum(3.0**i * sign for i, sign in enumerate(signs))
 
 
 def _answer(finger: Finger, reach: float, mobile: bool, least: Least, compile_part: Part) -> Any:
-    """(coating, gap, all layers in V, sign) -> (a, b) of coating, gap, and all layers together.
+    """Function from (coating, gap, all layers in V, sign) to a and b of the coating, the gap, and all layers together.
 
-    sign 0 takes |u_gap|; +-1 the branch of that sign and its continuation through zero. Past both ends of the series
-    the area stands still, so that no wild trial step overflows.
+    A sign of 0 uses |u_gap|; +-1 uses the branch of that sign and its continuation through zero. Beyond both ends of
+    the series the area is constant, so that a trial step far outside does not overflow.
     """
     series, scale = finger.series[::-1], 2.0 / reach
     (c0, c1, c2), (t0, t1, t2), (g0, g1, g2) = finger.c, finger.g_total, finger.g_area
@@ -56,7 +57,7 @@ def _answer(finger: Finger, reach: float, mobile: bool, least: Least, compile_pa
         b2 = (t2 * inverse + g2) * skin / c2
         if mobile:
             side = sign if sign != 0.0 else (1.0 if gap >= 0.0 else -1.0)
-            # Minus the part of the area that a volt across the gap adds.
+            # shrink = -A'/A, the relative decrease of the area per volt across the gap.
             shrink = side * scale * slope / inverse if -BELOW < s < 1.0 else 0.0
             a1 /= 1.0 - gap * shrink
             b1 /= 1.0 - gap * shrink
@@ -70,9 +71,9 @@ def _answer(finger: Finger, reach: float, mobile: bool, least: Least, compile_pa
 def network_rates(
     around: Around, mobile: bool, drive: Drive, sin: Callable[[Any], Any], least: Least, compile_part: Part
 ) -> Any:
-    """rates(t, x, sign, level) -> x' as a tuple; `sin` and `least` are the library's, several signs are one `code`.
+    """Function rates(t, x, sign, level) -> x' as a tuple, for the library's functions `sin` and `least`.
 
-    What the circuit has not is left out when this is compiled.
+    Several signs are one number (see `code`). Elements that the circuit lacks are omitted at compile time.
     """
     assert len(around.fingers) == 1 or math.isfinite(around.body)
     source = compile_part(drive(sin))
@@ -93,7 +94,7 @@ def network_rates(
             left = sign - 3.0 * right
         a0, b0, a1, b1, a, b = first(x[place], x[place + 1], across, left)
         current = conductance * (source(t, level) - across - far)
-        # What the current meets: cable and fingers side by side.
+        # The current charges the cable and the fingers, which are in parallel.
         capacitance, pull = cable + 1.0 / a, b / a
         if two:
             d0, e0, d1, e1, d, e = second(x[place + 2], x[place + 3], across, right)

@@ -1,7 +1,7 @@
-"""The problems of the benchmarks, each defined once: scene, source, outputs, and where to split.
+"""The problems of the benchmarks, each defined once: scene, source, outputs, and times at which runs are split.
 
 All start uncharged at t = 0 with Table 1's finger and the skin frozen at one frequency. Squares have ideal jumps.
-Outputs stand half an output spacing beside the jumps, so that no contestant is asked which side it means.
+Outputs are half an output spacing away from the jumps, so that no contestant has to choose a side of a jump.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ AMPLITUDE = 200.0
 OUTPUTS_PER_PERIOD = 100
 SERIES_ERROR = 1e-14
 BELOW = 1.1
-"""Minus the series' argument where the continuation below 0 V ends; 0 V is at 1."""
+"""Negative of the series' argument at which the continuation below 0 V ends; 0 V is at 1."""
 
 Drive = Callable[[Callable[[Any], Any]], Callable[[Any, Any], Any]]
-"""Takes a library's sine and returns U(t, level) in V for it; `level` (V) is what a square holds on a piece."""
+"""Function from a library's sine to U(t, level) in V; `level` (V) is the value of a square on a piece."""
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A smooth stretch of a run, as peers are given it.
+    """A smooth stretch of a run, in the form that peers are given.
 
     Attributes
     ----------
     t0, t1 : float
         s.
     level : float
-        Voltage of a square on it, V.
+        Voltage of a square on the piece, V.
     sign : float
-        Sign of the gap voltage where the piece ends on its zeros; 0 where it may cross them. Of several gaps see
-        `network_rates.code`.
+        Sign of the gap voltage, if pieces end on its zeros; 0 if the gap voltage may cross zero in the piece. For
+        several gaps see `network_rates.code`.
     first, last : int
-        Its outputs are t_eval[first:last].
+        The outputs in the piece are t_eval[first:last].
     """
 
     t0: float
@@ -65,30 +65,31 @@ class Problem:
     Attributes
     ----------
     name, title : str
-        Key in the results, and what it is called in tables.
+        Key in the results, and name in tables.
     waveform : fs.Waveform
-        Of the source, V.
+        Waveform of the source, V.
     drive : Drive
-        The same for peers.
+        The same waveform for peers.
     ngspice : str
-        The same as ngspice's source.
+        The same waveform as ngspice's source.
     skin_frequency : float
-        Where the skin is evaluated, Hz.
+        Frequency at which the skin is evaluated, Hz.
     period : float
-        What one period is in "per period", s.
+        Length of one period in results "per period", s.
     periods : int
-        Length of the run.
+        Length of the run in periods.
     law : str
         Charge law.
     r_coat : float
         Resistance of the coating, ohm.
     divisible : bool
-        Whether a shorter run costs the same per period, so that slow peers may be given one.
+        Whether a shorter run costs the same per period, so that slow peers may be given a shorter one.
     stiff : bool
+        Whether the second reference uses an implicit method.
     reach : float
-        No gap voltage of the problem is larger, V.
+        Upper bound of the gap voltages of the problem, V.
     exported : tuple
-        What the export calls the nodes around the gap of each finger, and that of its area.
+        For each finger, the exported deck's names of the two nodes of the gap and of the area node.
     """
 
     name: str
@@ -107,7 +108,7 @@ class Problem:
     exported: tuple[tuple[str, str, str], ...] = (("top", "skin", "area"),)
 
     def t_stop(self, periods: int) -> float:
-        """End of a run of so many periods, s."""
+        """End time of a run of this many periods, s."""
         return periods * self.period
 
     def t_eval(self, periods: int) -> FloatArray:
@@ -126,7 +127,7 @@ class Problem:
 
     @cached_property
     def constants(self) -> Constants:
-        """What a right-hand side needs to know."""
+        """Constants of the right-hand side."""
         return constants(self.circuit(), self.reach)
 
     @property
@@ -135,7 +136,7 @@ class Problem:
         return (self.constants.stress,)
 
     def pieces(self, periods: int, zeros: Sequence[float] = (), signs: Sequence[float] = ()) -> tuple[Piece, ...]:
-        """The run, split at the source's jumps and, where they are given, at the zeros of the gap voltage.
+        """The run, split at the source's jumps and, if they are given, at the zeros of the gap voltage.
 
         `signs` holds the sign of the gap voltage on every piece of the whole run.
         """
@@ -156,7 +157,7 @@ def split_times(problem: Problem, periods: int, zeros: Sequence[float] = ()) -> 
     stop = problem.t_stop(periods)
     jumps = problem.waveform.breakpoints(0.0, stop)
     inner = np.unique(np.concatenate([jumps, np.asarray(zeros, float)]))
-    # A zero within rounding of a jump or an end is that jump or end.
+    # A zero that differs from a jump or an end only by rounding counts as that jump or end.
     inner = inner[(inner > 1e-12 * stop) & (inner < stop * (1.0 - 1e-12))]
     keep = np.concatenate([[True], np.diff(inner) > 1e-12 * stop]) if inner.size else np.empty(0, bool)
     return np.concatenate([[0.0], inner[keep], [stop]])
@@ -169,13 +170,13 @@ class Constants:
     Attributes
     ----------
     k : tuple of float
-        Share of a jump of the source that each layer takes.
+        Fraction of a jump of the source that each layer takes.
     fixed, per_area : tuple of float
-        Rates at which each layer leaks: fixed + per_area / A_R, 1/s and m^2/s.
+        Leakage rate of each layer, fixed + per_area / A_R, 1/s and m^2/s.
     series : tuple of float
-        Power series of 1/A_R (1/m^2) in 2 |u_gap| / `reach` - 1, within `SERIES_ERROR` to `reach`.
+        Power series of 1/A_R (1/m^2) in 2 |u_gap| / `reach` - 1, with relative error below `SERIES_ERROR`.
     reach : float
-        V.
+        Largest |u_gap| of the series, V.
     area0 : float
         A_R at 0 V, m^2.
     stress : float
@@ -192,18 +193,18 @@ class Constants:
 
 
 def area_series(contact: Contact, reach: float, error: float = SERIES_ERROR, degrees: int = 24) -> tuple[float, ...]:
-    """Power series of 1/A_R (1/m^2) in 2 |u_gap| / `reach` - 1, within `error` to `reach` (V).
+    """Power series of 1/A_R (1/m^2) in 2 |u_gap| / `reach` - 1, with a relative error of at most `error`.
 
     Raises
     ------
     ValueError
-        Where no series up to that degree does.
+        If no series of up to `degrees` has that error.
     """
     check = np.linspace(-1.0, 1.0, 4001)
     exact = 1.0 / contact.area(0.5 * reach * (check + 1.0))
     for degree in range(8, degrees + 1):
         fit = chebyshev.chebinterpolate(lambda x: 1.0 / contact.area(0.5 * reach * (x + 1.0)), degree)
-        # Powers for Horner's rule, which compilers do best: on [-1, 1], with decaying coefficients, no digit is lost.
+        # Powers allow Horner's rule, which compiles best; on [-1, 1], with decaying coefficients, no digits are lost.
         series = chebyshev.cheb2poly(fit)
         if np.abs(polynomial.polyval(check, series) / exact - 1.0).max() <= error:
             return tuple(series.tolist())
@@ -211,7 +212,7 @@ def area_series(contact: Contact, reach: float, error: float = SERIES_ERROR, deg
 
 
 def constants(circuit: fs.Circuit, reach: float, error: float = SERIES_ERROR, degrees: int = 24) -> Constants:
-    """Numbers of a circuit's stack, taken from the package; the area's series reaches to `reach` (V) within `error`."""
+    """Constants of a circuit's stack, from the package; the area's series reaches to `reach` (V) within `error`."""
     stack = build_stack(circuit)
     assert stack.contact is not None
     assert stack.gap == 1
@@ -227,7 +228,7 @@ def constants(circuit: fs.Circuit, reach: float, error: float = SERIES_ERROR, de
 
 
 def tone(amplitude: float, frequency: float, offset: float = 0.0) -> Drive:
-    """A sine about an offset, V."""
+    """A sine with an offset, V."""
     omega = 2.0 * math.pi * frequency
 
     def bind(sin: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
@@ -240,7 +241,7 @@ def tone(amplitude: float, frequency: float, offset: float = 0.0) -> Drive:
 
 
 def held(sin: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
-    """The level of each piece, V."""
+    """A source that is constant on each piece, at the piece's level (V)."""
 
     def u(t: Any, level: Any) -> Any:
         return level
@@ -274,7 +275,7 @@ def _chirp(f0: float, f1: float, duration: float) -> Drive:
 
 def square_text(frequency: float) -> str:
     """A square as ngspice's source."""
-    # Edges of 1 ns centred on the jumps: 1e-9 of the peak away from ideal ones.
+    # Edges of 1 ns centred on the jumps change the result by 1e-9 of the peak.
     half, edge = 0.5 / frequency, 1e-9
     times = f"{half - 0.5 * edge!r} {edge!r} {edge!r} {half - edge!r} {2.0 * half!r}"
     return f"PULSE({AMPLITUDE!r} {-AMPLITUDE!r} {times})"
@@ -293,7 +294,7 @@ def _scene(kind: str, frequency: float, law: str = "local") -> Problem:
         period=1.0 / frequency,
         periods=200 if frequency < 1e3 else 500,
         law=law,
-        # After a jump the gap holds what it was charged to, and more.
+        # After a jump the gap voltage exceeds the source voltage by the stored charge.
         reach=1.3 * AMPLITUDE if square else AMPLITUDE,
     )
 

@@ -1,12 +1,12 @@
-"""Recordings: time and error a sample, coupled and in closed form, beside what users would write themselves.
+"""Recordings: time and error per sample, for the coupled model and the closed form, compared with a user's own code.
 
 Noise of three bands, sampled at 48 kHz, drives Table 1's stack. Every contestant gives the gap voltage at every sample;
-its error is taken against fingerspice's steps for any source at 1e-11, over the first tenth of a second, relative to
-the peak. Contestants: `fs.simulate`, whole call, at four tolerances, with and without charge and current, and with the
-dispersive skin; a loop in numba (classical Runge-Kutta, one step a sample, the area from a table); scipy's LSODA,
-started anew at every sample; and for the area given scipy's lfilter beside the whole call.
+its error over the first tenth of a second, relative to the peak, is taken against fingerspice's `exponential` method at
+1e-11. Contestants: whole calls of `fs.simulate` at four tolerances, with and without charge and current, and with the
+dispersive skin; a loop in numba (classical Runge-Kutta, one step per sample, the area from a table); scipy's LSODA,
+restarted at every sample; and, for a given area, scipy's lfilter.
 
-Run: python benchmarks/recordings.py [--quick]. Medians of 7, compile time apart; writes results/recordings.json.
+Run: python benchmarks/recordings.py [--quick]. Medians of 7, without compile time; writes results/recordings.json.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ CIRCUITS = HERE.parent / "circuits"
 RATE = 48_000.0
 BANDS = (1_000.0, 8_000.0, 20_000.0)
 RTOLS = (1e-3, 1e-4, 1e-6, 1e-8)
-# Samples from which errors are taken.
+# Number of samples, from the start, over which errors are taken.
 CHECKED = 4_801
 Report = dict[str, Any]
 
 
 def noise(count: int, high: float) -> np.ndarray:
-    """200 V of Gaussian noise from 50 Hz to `high` (Hz), its start independent of the length, shape (count,)."""
+    """Gaussian noise from 50 Hz to `high` (Hz), clipped at 200 V; its start does not depend on the length (count,)."""
     taps = signal.firwin(2047, [50.0, high], fs=RATE, pass_zero=False)
     white = np.random.default_rng(0).standard_normal(count + taps.size - 1)
     values = signal.oaconvolve(white, taps, "valid")
@@ -50,7 +50,7 @@ def noise(count: int, high: float) -> np.ndarray:
 
 
 def stack(skin: str) -> fs.Circuit:
-    """Table 1 with a skin of this device."""
+    """Table 1's stack with the skin device `skin`."""
     text = (CIRCUITS / "fingerpad.cir").read_text()
     frozen = "SKIN  d=350u f=100"
     assert frozen in text
@@ -58,7 +58,7 @@ def stack(skin: str) -> fs.Circuit:
 
 
 def run(circuit: fs.Circuit, values: np.ndarray, rtol: float, **options: Any) -> fs.Solution:
-    """The gap voltage at every sample."""
+    """A run driven by samples (V), with outputs at every sample."""
     count = values.size
     given = {"t_eval": np.arange(count) / RATE, "jumps": "none", "start": "uncharged"} | options
     return fs.simulate(circuit, sources=fs.Samples(values, RATE), t_stop=(count - 1) / RATE, rtol=rtol, **given)
@@ -105,7 +105,7 @@ def _runge_kutta(
 
 
 class Loop:
-    """What a user would write: Runge-Kutta in numba with a table for the area."""
+    """Code that a user might write: a Runge-Kutta method in numba with a table for the area."""
 
     def __init__(self, circuit: fs.Circuit) -> None:
         scene = scene_of(circuit, "local", "coupled", 1.0)
@@ -120,7 +120,7 @@ class Loop:
         return out
 
     def lsoda(self, values: np.ndarray, rtol: float) -> np.ndarray:
-        """The same equations by LSODA, a piece for every sample."""
+        """The same equations by LSODA, with one call per sample."""
         x, m, out = np.zeros(self.model.k.size - 1), self.model, np.empty(values.size)
         out[0] = m.k[self.gap] * values[0]
         slopes = np.empty(x.size)
@@ -187,7 +187,7 @@ def band(high: float, seconds: float, repeats: int) -> list[Report]:
 
 
 def lengths(all_seconds: tuple[float, ...], repeats: int) -> list[Report]:
-    """Time and memory of the whole call against the length, at 1e-6 with gap voltage and force at every sample."""
+    """Time and memory of whole calls against the recording's length, at 1e-6, with force and voltage at each sample."""
     circuit, out = stack("SKIN"), []
     for seconds in all_seconds:
         values = noise(int(seconds * RATE) + 1, 8_000.0)
@@ -213,7 +213,7 @@ def lengths(all_seconds: tuple[float, ...], repeats: int) -> list[Report]:
 
 
 def linear(seconds: float, repeats: int) -> Report:
-    """The whole call with the area given, beside lfilter on the equivalent filter."""
+    """Time of the whole call with a given area, and of lfilter with the equivalent filter."""
     values, area = noise(int(seconds * RATE) + 1, 8_000.0), 35e-6
     rates, gains, direct, weights = modal_gap(area)
     b, a = equivalent_filter(rates, gains, direct, weights)

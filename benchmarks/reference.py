@@ -1,9 +1,8 @@
 """Reference solutions of the benchmark problems, by two methods that share no formula.
 
-One is a collocation from the paper's equations: that of `tests/analytic.py`, or for networks of
-`network_collocation.py`. The other integrates the peers'
-right-hand side, split at jumps and at the zeros of the gap voltage, at the tightest tolerance: DOP853, or Radau where
-the problem is stiff. Where they disagree, both may be wrong by that much: no error below it is claimed.
+One method is collocation of the paper's equations, by `tests/analytic.py` or, for networks, `network_collocation.py`.
+The other method integrates the peers' right-hand side at the tightest tolerance, split at jumps and at the zeros of the
+gap voltage: by DOP853, or by Radau if the problem is stiff. No error below the difference of the two is claimed.
 """
 
 from __future__ import annotations
@@ -31,25 +30,25 @@ HERE = Path(__file__).resolve().parent
 ANALYTIC = HERE.parent / "tests" / "analytic.py"
 CACHE = HERE / ".cache"
 AGREEMENT = 1e-12
-"""Relative to the peak: what two methods are asked to agree to."""
+"""Agreement asked of the two methods, relative to the peak."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What is right, at the outputs of a problem's whole run.
+    """The reference solution at the outputs of a problem's whole run.
 
     Attributes
     ----------
-    u_gap, f_el : ndarray, shape (n,), or (n, 2) of two fingers
-        V and N.
+    u_gap, f_el : ndarray, shape (n,), or (n, 2) for two fingers
+        Gap voltage (V) and electroadhesive force (N).
     zeros : ndarray
         Times of the zeros of the gap voltages, s.
     signs : ndarray
-        Their signs on each of the pieces between jumps and zeros; of several gaps see `network_rates.code`.
+        Signs of the gap voltages on each piece between jumps and zeros; for several gaps see `network_rates.code`.
     agreement : float
-        Largest difference of the two methods over the peak, of voltage or force.
+        Largest difference of the two methods, of voltage or force, relative to the peak.
     second : str
-        The method beside the collocation.
+        The second method, besides the collocation.
     """
 
     u_gap: FloatArray
@@ -60,10 +59,10 @@ class Reference:
     second: str
 
     def errors(self, u_gap: FloatArray, f_el: FloatArray) -> tuple[float, float]:
-        """Largest errors of voltage and force over their peaks, of a run that may be shorter than this one."""
+        """Largest errors of voltage and force, relative to their peaks; the run may be shorter than this one."""
         n = len(u_gap)
         pairs = ((u_gap, self.u_gap), (f_el, self.f_el))
-        # Each finger beside its own peak.
+        # The errors of each finger are relative to its own peak.
         off = [np.max(np.abs(found - true[:n]).max(axis=0) / np.abs(true).max(axis=0)) for found, true in pairs]
         return float(off[0]), float(off[1])
 
@@ -74,7 +73,7 @@ def _analytic() -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    # Its dataclasses look their module up by name.
+    # Dataclasses look up their module by name in `sys.modules`.
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
@@ -123,7 +122,7 @@ def _collocation(problem: Problem) -> Reference:
 
 def _peers_way(problem: Problem, zeros: FloatArray, signs: FloatArray) -> tuple[FloatArray, FloatArray, str]:
     rhs = compiled(problem)
-    # Fast modes make an explicit method's steps many: of networks it solves the first periods alone.
+    # The fast modes of networks force an explicit method to short steps: it only solves the first ten periods.
     network = isinstance(problem, NetworkProblem)
     periods = min(10, problem.periods) if network else problem.periods
     method = "Radau" if problem.stiff else "DOP853"
@@ -135,7 +134,7 @@ def _peers_way(problem: Problem, zeros: FloatArray, signs: FloatArray) -> tuple[
         times = np.append(t_eval[piece.first : piece.last], piece.t1)
         args = (piece.sign, piece.level)
         extra = {"jac": rhs.jacobian} if problem.stiff else {}
-        # Short steps, because outputs come from the interpolant, whose order is lower than the steps'.
+        # Limit the steps, because outputs come from the interpolant, whose order is lower than that of the method.
         run = solve_ivp(rhs.rates, (piece.t0, piece.t1), x, method, times, args=args, rtol=rtol, atol=1e-14 * 200.0,
                         max_step=(piece.t1 - piece.t0) / (300.0 if network else 12.0), **extra)  # fmt: skip
         states[piece.first : piece.last] = run.y.T[:-1]
@@ -145,9 +144,9 @@ def _peers_way(problem: Problem, zeros: FloatArray, signs: FloatArray) -> tuple[
 
 
 def reference(problem: Problem, second: bool = True) -> Reference:
-    """The reference of a problem, from the cache where nothing that decides it has changed.
+    """The reference of a problem, from the cache unless the problem or the references' sources have changed.
 
-    `second` False leaves the second method out (for short checks); nothing is kept then.
+    `second` False leaves out the second method, for short checks; the result is then not cached.
     """
     if not second:
         return _collocation(problem)

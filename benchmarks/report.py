@@ -2,8 +2,8 @@
 
 Run: python benchmarks/report.py [--results FILE] [--page FILE] [--readme FILE]. From work_precision.json come
 results/work_precision.md (every contestant), the pictures results/work_precision.png and work_precision_networks.png,
-and the tables between the `speed` markers of docs/speed.md; from run_times.json, baseline.json, throughput.json and
-recordings.json beside it that between the README's.
+and the tables between the `speed` markers of docs/speed.md; from run_times.json, baseline.json and recordings.json in
+the same folder comes the table between the markers of the README.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Report = dict[str, Any]
 
 
 def good(results: Report, problem: str, **wanted: str) -> list[Report]:
-    """Points of a problem that gave a solution, of a library or contestant."""
+    """Points of a problem that gave a solution, filtered by the keys `wanted`, such as a library or contestant."""
     return [
         p for p in results["points"]
         if p["problem"] == problem and p["status"] == "ok" and all(p[k] == v for k, v in wanted.items())
@@ -35,35 +35,35 @@ def good(results: Report, problem: str, **wanted: str) -> list[Report]:
 
 
 def cheapest(points: list[Report], error: float) -> Report | None:
-    """The point of least time among those that meet an error."""
+    """The fastest point among the points whose error is at most `error`."""
     met = [p for p in points if p["error"] <= error]
     return min(met, key=lambda p: p["us_per_period"]) if met else None
 
 
 def number(value: float) -> str:
-    """Three digits, or whole thousands."""
+    """A number as text: with two digits below 10, and rounded to an integer above."""
     return f"{value:,.0f}" if value >= 100.0 else f"{value:.2g}" if value < 10.0 else f"{value:.0f}"
 
 
 def cell(points: list[Report], targets: tuple[float, ...]) -> str:
-    """Times of the cheapest settings that meet the errors, us per period."""
+    """Times of the fastest settings that meet each error, us per period."""
     found = [cheapest(points, target) for target in targets]
     return " / ".join("-" if p is None else number(p["us_per_period"]) for p in found)
 
 
 def libraries(results: Report) -> list[str]:
-    """Libraries in the results, ours first."""
+    """Libraries in the results, fingerspice first."""
     return list(dict.fromkeys(p["library"] for p in results["points"]))
 
 
 def problems(results: Report, law: str, kind: str) -> list[str]:
-    """Names of the problems of a charge law, stacks or networks."""
+    """Names of the problems of a charge law and kind (stack or network)."""
     found = results["problems"].items()
     return [name for name, p in found if (p["charge_law"], p["kind"]) == (law, kind)]
 
 
 def lead(results: Report, problem: str) -> str:
-    """How many times our time the best of all peers takes, at each error."""
+    """Ratio of the best peer's time to ours, at each error."""
     ours = good(results, problem, library=OURS)
     theirs = [p for p in good(results, problem) if not p["library"].startswith(OURS)]
     ratios = []
@@ -74,7 +74,7 @@ def lead(results: Report, problem: str) -> str:
 
 
 def worst(results: Report, ours: str, targets: tuple[float, ...], **wanted: str) -> str:
-    """How many times our time a peer takes, the least of the four scenes of Table 1, at each error."""
+    """Ratio of a peer's time to ours at each error, the smallest over the four scenes of Table 1."""
     scenes = problems(results, "local", "stack")[:4]
     least = []
     for target in targets:
@@ -88,7 +88,7 @@ def worst(results: Report, ours: str, targets: tuple[float, ...], **wanted: str)
 
 
 def ratios(results: Report, ours: str) -> str:
-    """The same for every peer, in words."""
+    """The ratios of `worst` for every peer, in words."""
     parts = []
     for library in libraries(results):
         if library.startswith(OURS):
@@ -103,7 +103,7 @@ def ratios(results: Report, ours: str) -> str:
 
 
 def short_table(results: Report, law: str, kind: str) -> list[str]:
-    """Best of each library on each problem of a charge law and kind; empty where there is none."""
+    """Best times of each library on each problem of a charge law and kind; empty if there is no such problem."""
     names = problems(results, law, kind)
     if not names:
         return []
@@ -119,13 +119,13 @@ def short_table(results: Report, law: str, kind: str) -> list[str]:
 
 
 def markdown(rows: list[list[str]]) -> list[str]:
-    """A table from rows of cells, the first its head."""
+    """A Markdown table from rows of cells; the first row is the head."""
     lines = ["| " + " | ".join(row) + " |" for row in rows]
     return [lines[0], "|" + "---|" * len(rows[0]), *lines[1:]]
 
 
 def long_table(results: Report, problem: str) -> list[str]:
-    """Every contestant on a problem: time, and how many times ours, at each error; and what failed."""
+    """Table of every contestant on a problem: time, and its ratio to ours, at each error; and the failures."""
     targets = (TARGETS[0], NGSPICE_TARGET, *TARGETS[1:])
     ours = good(results, problem, library=OURS)
     rows = [["contestant", *(f"{t:.0e}: µs (times ours)" for t in targets), "did not run"]]
@@ -144,7 +144,7 @@ def long_table(results: Report, problem: str) -> list[str]:
 def conditions(results: Report) -> str:
     """Machine and versions in one sentence."""
     present = {k: v for k, v in results["versions"].items() if v != "absent"}
-    # Some give the name of the package before its version.
+    # Some version texts already contain the name of the package.
     versions = [f"{k} {v}" if v[0].isdigit() else v for k, v in present.items()]
     absent = [k for k, v in results["versions"].items() if v == "absent"]
     text = f"{results['machine']}; {', '.join(versions)}"
@@ -152,7 +152,7 @@ def conditions(results: Report) -> str:
 
 
 def waits(folder: Path) -> str:
-    """What a user waits for, as the README's table, from the results in a folder."""
+    """The README's table of waiting times, from the results in a folder."""
     run, base, recorded = (
         json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
         for name in ("run_times", "baseline", "recordings")
@@ -196,7 +196,7 @@ def waits(folder: Path) -> str:
 
 
 def page_text(results: Report) -> str:
-    """What stands between the markers of the page on speed."""
+    """The text between the markers of the page on speed."""
     aims = " / ".join(f"{t:.0e}".replace("e-0", "e-") for t in TARGETS)
     spread = max(p["reference_agreement"] for p in results["problems"].values())
     text = (
@@ -228,7 +228,7 @@ def page_text(results: Report) -> str:
 
 
 def network_text(results: Report) -> list[str]:
-    """The part of that page on networks; empty where none was measured."""
+    """The part of the page on speed about networks; empty if none was measured."""
     table = short_table(results, "local", "network")
     if not table:
         return []
@@ -244,7 +244,7 @@ def network_text(results: Report) -> list[str]:
 
 
 def once(results: Report) -> str:
-    """How many of the points were not repeated, and why, in words."""
+    """Number of points that were timed only once, and the reason, in words."""
     solved = [p for p in results["points"] if p["status"] == "ok"]
     single = sum(p["repeats"] == 1 for p in solved)
     return (
@@ -259,7 +259,7 @@ def wrapped(text: str) -> list[str]:
 
 
 def details(results: Report) -> str:
-    """The whole of the results as Markdown."""
+    """All results as Markdown."""
     lines = ["# Work and precision", "", f"{conditions(results)}. Made by `benchmarks/report.py`.", ""]
     aims = " / ".join(f"{t:.0e}" for t in TARGETS)
     for kind in ("stack", "network"):
@@ -289,7 +289,7 @@ def put_into(text: str, readme: Path) -> None:
     Raises
     ------
     ValueError
-        Where it has no markers.
+        If the page has no markers.
     """
     page = readme.read_text(encoding="utf-8")
     before, begin, rest = page.partition(BEGIN)
@@ -314,7 +314,7 @@ def main(arguments: list[str] | None = None) -> None:
     picture(results, [[(n, cost) for n in stacks] for cost in COSTS], options.results.with_suffix(".png"))
     networks = [(name, "us_per_period") for name in problems(results, "local", "network")]
     if networks:
-        # Sines above, squares below.
+        # The upper row has the sines, the lower row the squares.
         path = options.results.with_name(f"{options.results.stem}_networks.png")
         picture(results, [networks[::2], networks[1::2]], path)
     put_into(page_text(results), options.page)

@@ -1,8 +1,8 @@
 """The right-hand side that peers integrate: written once, for numba and, under `local`, for any array library.
 
-That of networks is in `network_rates.py`. State x (V) of a stack: coating and gap of the layer voltages over their
-capacitive share k U of the source; under `mobile` times A_R/A_R(0 V), which no jump of the source changes. The skin's
-is minus their sum.
+The right-hand side of networks is in `network_rates.py`. State x (V) of a stack: the voltages of coating and gap less
+their capacitive fraction k U of the source; under `mobile` multiplied by A_R/A_R(0 V), so that no jump of the source
+changes the state. The skin's part is minus the sum of the two.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ def local_rates(
     least: Callable[[Any, Any], Any],
     compile_part: Callable[[Any], Any] = lambda f: f,
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """rates(t, x0, x1, sign, level) -> (x0', x1') and gap(U, x0, x1, sign) -> (u_gap, 1/A_R) of the `local` law.
+    """Functions rates(t, x0, x1, sign, level) -> (x0', x1') and gap(U, x0, x1, sign) -> (u_gap, 1/A_R) for `local`.
 
-    `sin` and `least` are the library's. sign 0 takes |u_gap|; +-1 the branch of that sign and its continuation through
-    zero. Past both ends of the series the area stands still, so that no wild trial step overflows.
+    `sin` and `least` are the library's functions. A sign of 0 uses |u_gap|; +-1 uses the branch of that sign and its
+    continuation through zero. Beyond both ends of the series the area is constant, so that a trial step far outside
+    does not overflow.
     """
     (k0, k1, k2), (f0, f1, f2), (p0, p1, p2) = constants.k, constants.fixed, constants.per_area
     series, scale = constants.series[::-1], 2.0 / constants.reach
@@ -68,9 +69,10 @@ def _mobile_rates(
     least: Callable[[Any, Any], Any],
     compile_part: Callable[[Any], Any],
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """The same under `mobile`: u_gap = k U + x1 A(0)/A(|u_gap|) is solved by Newton's method at every evaluation.
+    """The functions of `local_rates` for `mobile`: every evaluation solves u_gap = k U + x1 A(0)/A(|u_gap|) by Newton.
 
-    Where that does not converge the first root is searched for from 0 V on and bisected; NaN where there is none.
+    If Newton's method does not converge, the first root from 0 V on is found by search and bisection; NaN if there is
+    none.
     """
     (k0, k1, k2), (f0, f1, f2), (p0, p1, p2) = constants.k, constants.fixed, constants.per_area
     series, scale, area0 = constants.series[::-1], 2.0 / constants.reach, constants.area0
@@ -107,7 +109,7 @@ def _mobile_rates(
         u = share + x1
         step = 0.0
         inverse = 1.0 / area0
-        # From the root at A(0) Newton converges on every scene of the races, all of them off the fold.
+        # From the root at A(0) Newton's method converges on every scene of work_precision.py, as none is near the fold.
         for _ in range(30):
             side = sign if sign != 0.0 else (1.0 if u >= 0.0 else -1.0)
             s = -least(-least(scale * side * u - 1.0, 1.0), BELOW)
@@ -122,7 +124,7 @@ def _mobile_rates(
             u -= step
             if abs(step) <= 4e-16 * (abs(share) + abs(x1)):
                 break
-        # A last step above rounding, or a root of another branch, which lies beyond where the area is known.
+        # The last step is above round-off, or the root is on another branch, beyond the range of the area's series.
         if not abs(step) <= 1e-12 * (abs(share) + abs(x1)) or abs(u) > reach:
             return search(share, x1)
         return u, inverse
@@ -143,7 +145,7 @@ def _mobile_rates(
 def open_rates(
     problem: Problem, sin: Callable[[Any], Any], least: Callable[[Any, Any], Any]
 ) -> Callable[[Any, Any, Any, Any], Any]:
-    """rates(t, x, sign, level) -> the rates of the state's parts, in an array library's own functions; `local` only."""
+    """Function rates(t, x, sign, level) -> x' as a tuple, with an array library's own functions; `local` only."""
     if isinstance(problem, NetworkProblem):
         return network_rates(problem.around, False, problem.drive, sin, least, lambda f: f)
     stack, _ = local_rates(problem.constants, problem.drive, sin, least)
@@ -171,9 +173,9 @@ class Compiled:
     rates : callable
         (t, x, sign, level) -> x', shape (n,).
     jacobian : callable
-        (t, x, sign, level) -> (n, n), by differences: n evaluations beside that of the rates.
+        (t, x, sign, level) -> (n, n), by finite differences: n evaluations and one at x.
     observe : callable
-        (U, x) of shapes (m,), (m, n) -> u_gap in V and F_el in N, shape (m,), or (m, 2) of two fingers.
+        (U, x) of shapes (m,), (m, n) -> u_gap in V and F_el in N, shape (m,), or (m, 2) for two fingers.
     """
 
     size: int
@@ -187,7 +189,7 @@ _COMPILED: dict[str, Compiled] = {}
 
 
 def compiled(problem: Problem) -> Compiled:
-    """The compiled right-hand side of a problem; compiled once in a process for all problems of that name."""
+    """The compiled right-hand side of a problem, compiled once per process for all problems of the same name."""
     if problem.name not in _COMPILED:
         build = _network if isinstance(problem, NetworkProblem) else _stack
         fill, observe = build(problem)  # type: ignore[arg-type]
@@ -196,7 +198,7 @@ def compiled(problem: Problem) -> Compiled:
 
 
 def _around(size: int, fill: Callable[..., None], observe: Callable[..., Any]) -> Compiled:
-    """What libraries call, from what fills in the rates."""
+    """The functions that libraries call, from the function that fills in the rates."""
 
     @njit(error_model="numpy")
     def rates(t, x, sign, level):  # type: ignore[no-untyped-def]
@@ -208,7 +210,7 @@ def _around(size: int, fill: Callable[..., None], observe: Callable[..., Any]) -
     def jacobian(t, x, sign, level):  # type: ignore[no-untyped-def]
         out = np.empty((size, size))
         base, moved = rates(t, x, sign, level), x.copy()
-        # About the square root of rounding times the voltages at hand.
+        # The increment is about the square root of the machine precision times the size of the state.
         d = 1e-6 * (1.0 + np.abs(x).sum())
         for j in range(size):
             moved[j] = x[j] + d
@@ -249,7 +251,7 @@ def _network(problem: NetworkProblem) -> tuple[Callable[..., None], Callable[...
     longest = max(len(finger.series) for finger in around.fingers)
     series = np.array([(0.0,) * (longest - len(f.series)) + f.series[::-1] for f in around.fingers])
     stress = np.array(problem.stresses)
-    # Where the first gap voltage stands in the state.
+    # `first` is the index of the first gap voltage in the state.
     scale, first = 2.0 / around.reach, size - 2 * stress.size + 1
 
     @njit(error_model="numpy")

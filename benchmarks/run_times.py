@@ -1,6 +1,6 @@
-"""What a user waits for: import, `fingerspice run`, ten periods of every shipped deck, periodic states, dispersion.
+"""Waiting times of a user: import, `fingerspice run`, every shipped deck, periodic states, dispersive skins.
 
-Run: python benchmarks/run_times.py [--quick]. Medians of 7, compile time apart; writes results/run_times.json.
+Run: python benchmarks/run_times.py [--quick]. Medians of 7, without compile time; writes results/run_times.json.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CIRCUITS = HERE.parent / "circuits"
 
 
 def as_shipped(path: Path, rtol: float, repeats: int) -> dict[str, Any]:
-    """Time of a deck over its own .tran, with the error that the run states."""
+    """Time of a deck over its own .tran, with the stated error of the run."""
     circuit = fs.read_netlist(path)
     solution = fs.simulate(circuit, rtol=rtol)
     seconds = median_seconds(lambda: fs.simulate(circuit, rtol=rtol), repeats)
@@ -48,7 +48,7 @@ SCENES = (fs.Sine(200.0, 100.0), fs.Square(200.0, 100.0), fs.Sine(200.0, 5000.0)
 
 
 def steady_seconds(source: fs.Sine | fs.Square, repeats: int) -> dict[str, Any]:
-    """Time of the periodic state of Table 1 at 1e-10, without its signals."""
+    """Time of the periodic state of Table 1 at rtol 1e-10, without its signals."""
     circuit = fs.read_netlist(CIRCUITS / "fingerpad.cir").replace({"Vdrive": source, "Xskin.f": source.frequency})
     state = fs.steady_state(circuit, rtol=1e-10, charge=False)
     seconds = median_seconds(lambda: fs.steady_state(circuit, rtol=1e-10, charge=False), 20 * repeats)
@@ -58,14 +58,14 @@ def steady_seconds(source: fs.Sine | fs.Square, repeats: int) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def eight_poles() -> str:
-    """The skin's data on eight poles, as a subcircuit."""
+    """A ladder of eight poles fitted to the skin's data, as a subcircuit."""
     f = np.geomspace(10.0, 1e5, 161)
     rows = np.column_stack([f, skin_resistivity(f), skin_permittivity(f)])
     return fs.fit_material(rows, poles=8).to_netlist("EIGHT")
 
 
 def dispersion_cost(source: fs.Sine | fs.Square, rtol: float, method: str, repeats: int) -> dict[str, Any]:
-    """Time per period with the skin at one frequency, as shipped, and with eight poles."""
+    """Time per period with the skin frozen at one frequency, with the shipped ladder, and with eight poles."""
     frozen = (CIRCUITS / "fingerpad.cir").read_text(encoding="utf-8")
     skin = f"SKIN  d=350u f={source.frequency:g}"
     texts = {

@@ -1,8 +1,8 @@
-"""Streams of long recordings: time a sample, memory, and what writing costs.
+"""Streams of long recordings: time per sample, memory, and the time for writing a store.
 
 Noise at 48 kHz in a WAV file of 16 bits drives Table 1's stack. `fs.stream` reads the file piece by piece and gives gap
-voltage and force at every sample, in chunks of 10 s; each case runs in a process of its own, which says how much memory
-it took. The same is then written to a Zarr store by `fingerspice run --stream`, where the package zarr is installed.
+voltage and force at every sample, in chunks of 10 s; each case runs in a process of its own, which reports its peak
+memory. The same run is then written to a Zarr store by `fingerspice run --stream`, if the package zarr is installed.
 
 Run: python benchmarks/streaming.py [--quick]. Minima of 3, compile time apart; writes results/streaming.json.
 """
@@ -35,18 +35,18 @@ Report = dict[str, Any]
 
 
 def recording(path: Path, seconds: float, high: float) -> Path:
-    """Noise up to `high` (Hz) in a WAV file, a minute of it repeated."""
+    """A WAV file with a minute of noise up to `high` (Hz), repeated."""
     minute = np.round(32767.0 / 200.0 * noise(int(min(seconds, 60.0) * RATE), high)).astype(np.int16)
     wavfile.write(path, int(RATE), np.resize(minute, int(seconds * RATE) + 1))
     return path
 
 
 def case(path: str, seconds: float, rtol: float) -> Report:
-    """One stream, and the memory that this process took."""
+    """Time of one stream, and the peak memory of this process."""
     warnings.simplefilter("ignore", fs.FingerspiceWarning)
     samples = fs.Samples.from_wav(path, 200.0, at_once=False)
     count, circuit = 0, stack("SKIN")
-    # Loads the compiled code.
+    # A first short stream loads the compiled code.
     next(fs.stream(circuit, sources=samples, t_stop=1.0, rtol=rtol, charge=False, start="uncharged")).f_el  # noqa: B018
     begin = time.perf_counter()
     stream = fs.stream(circuit, sources=samples, t_stop=seconds, rtol=rtol, charge=False, start="uncharged")
@@ -55,7 +55,7 @@ def case(path: str, seconds: float, rtol: float) -> Report:
         assert chunk.f_el is not None
         count += chunk.t.size
     took = time.perf_counter() - begin
-    # Of this process alone: what its parent took before counts as its own in `ru_maxrss`.
+    # VmHWM is the peak of this process alone, while `ru_maxrss` includes memory of the parent before the fork.
     own = Path("/proc/self/status")
     line = next((x for x in own.read_text().splitlines() if x.startswith("VmHWM")), "") if own.exists() else ""
     most = 1024 * int(line.split()[1]) if line else 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -63,14 +63,14 @@ def case(path: str, seconds: float, rtol: float) -> Report:
 
 
 def apart(path: Path, seconds: float, rtol: float) -> Report:
-    """`case` in a process of its own."""
+    """Run `case` in a process of its own."""
     command = [sys.executable, str(Path(__file__).resolve()), "--case", str(path), repr(seconds), repr(rtol)]
     found: Report = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     return found
 
 
 def stored(path: Path, seconds: float, rtol: float) -> Report:
-    """The command that writes a store: seconds of the whole call, and bytes written."""
+    """Run the command that writes a store: its total time (s), and the bytes written."""
     deck, folder = str(CIRCUITS / "fingerpad.cir"), path.parent / "out"
     begin = time.perf_counter()
     command = [sys.executable, "-m", "fingerspice", "run", deck, "--source", f"WAV({path} gain=200)", "--stream"]

@@ -1,8 +1,8 @@
-"""How fast the tiers are where they scale: samples, run length, layers, tolerance.
+"""Speed of the tiers against number of samples, run length, number of layers, and tolerance.
 
-Run: python benchmarks/throughput.py [--quick]. Medians of 9 in one process, compile time apart; writes
-results/throughput.json. A sampled source through the linear tier is set beside scipy's lfilter on the equivalent filter
-(the same two poles), dlsim, and a plain copy.
+Run: python benchmarks/throughput.py [--quick]. Medians of 9 in one process, without compile time; writes
+results/throughput.json. The linear tier with a sampled source is compared with scipy's lfilter on the equivalent filter
+(the same two poles), with dlsim, and with a plain copy.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Report = dict[str, Any]
 
 
 def modal_gap(area: float) -> tuple[list[float], list[float], float, list[float]]:
-    """Rates, gains, direct share and weights of the gap voltage of Table 1's stack at one area (m^2)."""
+    """Rates, gains, direct feedthrough and weights of the gap voltage of Table 1's stack at one area (m^2)."""
     from fingerspice.solve.scenes import scene_of
 
     scene = scene_of(fs.read_netlist(DECK), "local", area, 1.0)
@@ -37,7 +37,7 @@ def modal_gap(area: float) -> tuple[list[float], list[float], float, list[float]
 
 
 def equivalent_filter(rates: list[float], gains: list[float], direct: float, weights: list[float]) -> tuple[Any, Any]:
-    """Numerator and denominator of the same first-order-hold response, for lfilter."""
+    """Numerator and denominator of the filter with the same first-order-hold response, for lfilter."""
     b, a = np.array([direct]), np.array([1.0])
     for rate, gain, weight in zip(rates, gains, weights, strict=True):
         before, here = hold_weights(rate * DT)
@@ -49,14 +49,14 @@ def equivalent_filter(rates: list[float], gains: list[float], direct: float, wei
 
 
 def samples(count: int, repeats: int) -> Report:
-    """ns per sample of the recursion, its peers and a copy, and how far the first two differ."""
+    """ns per sample of the recursion, its peers and a copy, and the difference between recursion and lfilter."""
     rng = np.random.default_rng(1)
     u = np.cumsum(rng.standard_normal(count)) / np.sqrt(count)
     rates, gains, direct, weights = modal_gap(35e-6)
     b, a = equivalent_filter(rates, gains, direct, weights)
     out = np.empty_like(u)
     rest = np.zeros(len(rates))
-    # Both from a source that was zero one sample before the first.
+    # lfilter starts from a source that is zero one sample before the first, so start the recursion likewise.
     ours = first_order_hold(u, DT, rates, gains, direct, weights, rest, u_before=0.0)[0]
     theirs = signal.lfilter(b, a, u)
     figures = {
@@ -105,7 +105,7 @@ def chain(layers: int) -> fs.Circuit:
 
 
 def layers(numbers: list[int], repeats: int) -> list[Report]:
-    """us per period against the number of layers, closed form and coupled, at 1e-6."""
+    """us per period against the number of layers, in closed form and coupled, at 1e-6."""
     out = []
     for number in numbers:
         circuit = chain(number)
@@ -125,7 +125,7 @@ def layers(numbers: list[int], repeats: int) -> list[Report]:
 
 
 def tolerances(exponents: range, repeats: int) -> list[Report]:
-    """us per period of Table 1's 100 Hz sine against the error asked for."""
+    """us per period of Table 1's 100 Hz sine against the requested error."""
     circuit = fs.read_netlist(DECK)
     t = (np.arange(10_000) + 0.5) * 1e-4
     out = []

@@ -1,4 +1,4 @@
-"""How the benchmarks time what they compare."""
+"""The timer of the benchmarks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of error against time: of stacks beside the evaluations, of networks a panel for each scene."""
+"""Pictures of error against time: for stacks also against evaluations, for networks with a panel for each scene."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 OURS = "fingerspice"
-# Okabe and Ito's palette, and markers, so that colour is never alone.
+# Okabe and Ito's palette, and markers, so that no line is identified by colour alone.
 LOOK = {
     "fingerspice": ("#000000", "o"),
     "fingerspice, every period": ("#999999", "o"),
@@ -23,7 +23,7 @@ Report = dict[str, Any]
 
 
 def front(points: list[Report], cost: str) -> tuple[list[float], list[float]]:
-    """Costs and errors of the points that no other point beats in both."""
+    """Costs and errors of the points on the Pareto front: no other point has both less cost and less error."""
     best: list[tuple[float, float]] = []
     for p in sorted((p for p in points if p[cost] is not None), key=lambda p: p[cost]):
         if not best or p["error"] < best[-1][1]:
@@ -32,7 +32,7 @@ def front(points: list[Report], cost: str) -> tuple[list[float], list[float]]:
 
 
 def _panel(ax: Any, results: Report, name: str, cost: str) -> None:
-    """The front of each library on a problem, no error below what the references agree to."""
+    """Draw the front of each library on a problem; errors below the agreement of the references are raised to it."""
     points = [p for p in results["points"] if p["problem"] == name and p["status"] == "ok"]
     floor = results["problems"][name]["error_floor"]
     for library, (colour, marker) in reversed(LOOK.items()):
@@ -50,7 +50,7 @@ def _panel(ax: Any, results: Report, name: str, cost: str) -> None:
 
 
 def picture(results: Report, panels: list[list[tuple[str, str]]], path: Path) -> None:
-    """Panels in rows, each a problem's name and a cost; written as PNG."""
+    """Write rows of panels as PNG; each panel is given by a problem's name and a cost."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -65,7 +65,7 @@ def picture(results: Report, panels: list[list[tuple[str, str]]], path: Path) ->
             for ax, (name, cost) in zip(axes[i], row, strict=True):
                 _panel(ax, results, name, cost)
                 ax.set_xlabel(COSTS[cost])
-                # A row of other scenes has titles of its own.
+                # Titles are repeated only in a row with other scenes than the first row.
                 if i == 0 or [n for n, _ in row] != [n for n, _ in panels[0]]:
                     ax.set_title(results["problems"][name]["title"])
             axes[i][0].set_ylabel("largest error / peak")

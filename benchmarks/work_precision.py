@@ -1,16 +1,17 @@
-"""Error against time of this package and of everything else that could solve the same scenes.
+"""Error against time of this package and of all other libraries that can solve the same scenes.
 
 Run: python benchmarks/work_precision.py [--quick] [--repeats 7] [--limit 6] [--problems NAME ...]
 [--contestants WORD ...] [--output FILE], then python benchmarks/report.py. A full run takes about half an hour and
 writes results/work_precision.json; a selection is only printed, unless --output says where to keep it.
 
-What is compared: the stacks of `problems.py` and the networks of `network_problems.py`, 100 outputs a period, every
-contestant given the compiled right-hand side of `right_hand_side.py` and of `network_rates.py`, splits at the source's
-jumps, and, as `+kinks`, the exact times of the gap voltages' zeros for nothing. An error is the larger of those of gap
-voltage and force over all outputs, each finger's over its own peak.
+The problems are the stacks of `problems.py` and the networks of `network_problems.py`, with 100 outputs per period.
+Every contestant gets the compiled right-hand side of `right_hand_side.py` and `network_rates.py`, pieces split at the
+source's jumps, and, as `+kinks`, the exact times of the gap voltages' zeros at no cost. The error is the larger of the
+errors of gap voltage and force over all outputs, each finger's relative to its own peak.
 
-Everything is timed once. Seven times is timed what took no more than `FAR` times the best of all that is at least as
-right (three times what takes longer than `LONG` s); of the rest the one time is kept, and `repeats` says so.
+Every point is timed once. A point that took at most `FAR` times the time of the fastest point of at most its error is
+timed seven times (three times if it takes longer than `LONG` s); all other points keep their single time, with
+`repeats` = 1.
 """
 
 from __future__ import annotations
@@ -46,18 +47,18 @@ QUICK_RTOL, QUICK_STEPS = 1e-6, 200.0
 QUICK_PROBLEMS = (("sine_100Hz", 2), ("square_5kHz", 5), ("two_fingers_sine_5kHz", 2))
 TOO_LONG, FAILED_TWICE = "took too long", "not tried after two failures"
 FAILURES = (NotSolvedError, ArithmeticError, AssertionError, RuntimeError, ValueError)
-"""How libraries fail; SolveError of this package is a RuntimeError."""
+"""Exceptions that count as failures of a library; SolveError of this package is a RuntimeError."""
 Report = dict[str, Any]
 Run = Callable[[float], Outcome]
 
 
 class TooLongError(Exception):
-    """A run took more than it was given."""
+    """A run took longer than its time limit."""
 
 
 @contextmanager
 def at_most(seconds: float) -> Iterator[None]:
-    """Raise TooLongError in the block after so many seconds; a library's compiled loop is not interrupted."""
+    """Raise TooLongError in the block after `seconds`; a library's compiled loop is not interrupted."""
 
     def stop(*_: object) -> None:
         raise TooLongError
@@ -72,7 +73,7 @@ def at_most(seconds: float) -> Iterator[None]:
 
 
 def timed(run: Run, setting: float) -> tuple[float, Outcome]:
-    """Wall time (s) of a run and what it gave."""
+    """Wall time (s) of a run, and its outcome."""
     begin = time.perf_counter()
     outcome = run(setting)
     seconds = time.perf_counter() - begin
@@ -80,7 +81,7 @@ def timed(run: Run, setting: float) -> tuple[float, Outcome]:
 
 
 def in_time(run: Run, setting: float, limit: float) -> tuple[float, Outcome]:
-    """`timed`, within a limit (s); once more where it took longer, for a shared machine may pause."""
+    """`timed`, within a limit (s); a run that took longer is repeated once, because a shared machine may pause."""
     try:
         with at_most(limit):
             return timed(run, setting)
@@ -90,7 +91,7 @@ def in_time(run: Run, setting: float, limit: float) -> tuple[float, Outcome]:
 
 
 def point(run: Run, setting: float, plan: Plan, truth: Reference, limit: float) -> Report:
-    """One setting of a contestant, run once: errors, time, evaluations; or, in `status`, why there are none."""
+    """One setting of a contestant, run once: errors, time and evaluations, or the reason for none in `status`."""
     found: Report = {"setting": setting, "status": "ok"}
     try:
         seconds, outcome = in_time(run, setting, limit)
@@ -116,7 +117,7 @@ def point(run: Run, setting: float, plan: Plan, truth: Reference, limit: float) 
 def race(
     contestant: Contestant, problem: Problem, truth: Reference, settings: tuple[float, ...], limit: float
 ) -> Iterator[tuple[Report, Run]]:
-    """All settings of a contestant on a problem, loose to tight, each run once; with what runs them again."""
+    """All settings of a contestant on a problem, loose to tight, each run once; with the function to repeat the run."""
     periods = problem.periods
     if contestant.slow and problem.divisible:
         periods = max(1, periods // 5)
@@ -140,7 +141,7 @@ def race(
 
 
 def repeat(entries: list[tuple[Report, Run]], repeats: int) -> None:
-    """Time again what is within reach of the best that is as right, and put in the medians; long runs three times."""
+    """Repeat the points that are not much slower than the fastest point of at most their error, and enter medians."""
     solved = [(found, run) for found, run in entries if found["status"] == "ok"]
     once = [(found["error"], found["us_per_period"]) for found, _ in solved]
     for found, run in solved:
@@ -154,19 +155,19 @@ def repeat(entries: list[tuple[Report, Run]], repeats: int) -> None:
 
 
 def warm_up(run: Run, setting: float, limit: float, compile_limit: float) -> tuple[float | None, bool]:
-    """What the first run takes longer than the second, s: compilation (None where unknown); and whether to give up."""
+    """Compilation time (s), the first run's time less the second's (None if unknown); and whether to give up."""
     try:
         first = in_time(run, setting, limit + compile_limit)[0]
         return max(0.0, first - in_time(run, setting, limit)[0]), False
     except TooLongError:
         return None, True
     except FAILURES:
-        # The measured run meets the same and says so.
+        # The measured run fails in the same way, and records it.
         return None, False
 
 
 def describe(problem: Problem, truth: Reference) -> Report:
-    """A problem as the results state it."""
+    """The description of a problem in the results."""
     return {
         "title": problem.title,
         "charge_law": problem.law,
@@ -195,7 +196,7 @@ def machine() -> str:
 
 
 def warm(problem: Problem) -> float:
-    """Compile the shared right-hand side of a problem; s."""
+    """Compile the shared right-hand side of a problem; returns the time, s."""
     begin = time.perf_counter()
     rhs = compiled(problem)
     x, one = np.zeros(rhs.size), np.ones(1)
@@ -213,7 +214,7 @@ def measure(
     limit: float,
     path: Path | None,
 ) -> Report:
-    """Run everything, printing a line a point; what there is by then is written after every problem."""
+    """Run all contestants on all problems, and print a line per point; writes the results after every problem."""
     import fingerspice
 
     begin = time.perf_counter()
@@ -243,7 +244,7 @@ def measure(
 
 
 def write(results: Report, path: Path) -> None:
-    """Results as JSON, a point a line, numbers to five digits."""
+    """Write the results as JSON, with a line per point and numbers of five digits."""
     points = [
         json.dumps({k: float(f"{v:.5g}") if isinstance(v, float) else v for k, v in p.items()})
         for p in results["points"]
@@ -254,7 +255,7 @@ def write(results: Report, path: Path) -> None:
 
 
 def line(found: Report) -> str:
-    """A point as printed."""
+    """A point as a line of text."""
     head = f"  {found['contestant']:28s} {found['setting']:8.1e}"
     if found["status"] != "ok":
         return f"{head}  {found['status']}"
@@ -264,7 +265,7 @@ def line(found: Report) -> str:
 
 
 def quick(seconds: float = 5.0) -> list[Report]:
-    """Every contestant that needs no compiler of its own, on three short problems at one setting; nothing is kept."""
+    """Every contestant without a compiler of its own, on three short problems at one setting; writes nothing."""
     field, _ = contestants(without=("diffrax", "torchdiffeq"))
     points = []
     for name, periods in QUICK_PROBLEMS:
@@ -289,7 +290,7 @@ def main(arguments: list[str] | None = None) -> list[Report]:
     parser.add_argument("--output", type=Path, help="file for the results")
     options = parser.parse_args(arguments)
     with warnings.catch_warnings():
-        # Libraries warn of steps that they then repair or report; what they report is recorded.
+        # Libraries warn about steps that they then repeat; failures are recorded from their exceptions.
         warnings.simplefilter("ignore")
         if options.quick:
             return quick()

@@ -1,4 +1,4 @@
-"""`fingerspice ARGUMENTS` in this process, for the tests of the command line."""
+"""Runs `fingerspice ARGUMENTS` in this process, for the tests of the command line."""
 
 from __future__ import annotations
 

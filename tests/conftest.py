@@ -1,4 +1,4 @@
-"""Fixtures that more than one file uses."""
+"""Fixtures that more than one test file uses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Table 1's deck with one thing changed, for tests that name its lines."""
+"""Table 1's deck with one line changed, for tests that refer to its lines."""
 
 from __future__ import annotations
 

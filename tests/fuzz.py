@@ -1,6 +1,6 @@
-"""Fuzzing of everything that reads text: every input is taken, or refused in one sentence, and touches nothing else.
+"""Fuzzing of all readers of text: every input is accepted, or refused in one sentence, without other effects.
 
-`python tests/fuzz.py --inputs 1000000 --seed 0`; a failure's own line says how to repeat it alone.
+`python tests/fuzz.py --inputs 1000000 --seed 0`; the line of a failure gives the command that repeats it alone.
 """
 
 from __future__ import annotations

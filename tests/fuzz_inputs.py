@@ -1,4 +1,4 @@
-"""Inputs for the fuzzer: mutated decks, arithmetic, sources and tables, each made from its own random numbers."""
+"""Inputs for the fuzzer: mutated decks, arithmetic, sources and tables, each from its own random generator."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""References of the hard cases that `analytic.py` does not hold: written from the equations, never imports the package.
+"""References of the hard cases that `analytic.py` lacks: written from the equations, without importing the package.
 
-`stack_fold` finds where the `mobile` law ends without dividing by what vanishes there. With A = g(|u_a|) and
-q_x = A c_x u_x the stack obeys D u_a' = N, where, S being the sum of all 1/c_x,
+`stack_fold` finds the fold of the `mobile` law without a division by D, which vanishes there. With A = g(|u_a|) and
+q_x = A c_x u_x the stack obeys D u_a' = N, where, with S = sum of all 1/c_x,
 
     D = S c_a d(A u_a)/du_a - U dA/du_a        N = A U' + sum u_x g_x / c_x - S u_a g_a        g_x = 1/R_x + A/r_x
 

@@ -1,11 +1,10 @@
-"""How often the stated error of a random network covers the true one, and by how much it exceeds it.
+"""Statistics on random networks: fraction of runs whose stated error covers the true error, and their ratio.
 
-A network is one to three fingers, side by side or one behind the other, grounded or on a floating body, behind an
-amplifier with a cable or beside a load, under a sine, a square, a chirp or straight lines and by either charge law. It
-is run at each of `RTOLS` and once at `TIGHT`, from which the true error is taken, of gap voltage, force, charge and
-node voltages.
+A network has one to three fingers, in parallel or in series, grounded or on a floating body, behind an amplifier with a
+cable or parallel to a load, under a sine, a square, a chirp or straight lines, with either charge law. It is run at
+each of `RTOLS` and once at `TIGHT`, which gives the true errors of gap voltage, force, charge and node voltages.
 
-Run: python tests/network_errors.py [--networks 100] [--first 0]. A network is made from its number alone.
+Run: python tests/network_errors.py [--networks 100] [--first 0]. A network is determined by its number alone.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Networks solved another way: nodal equations by dense matrix exponentials, fingers by an ODE written out by hand.
+"""Independent solutions of networks: nodal equations by dense matrix exponentials, fingers by a hand-written ODE.
 
-Never imports the package.
+It never imports the package.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Run a netlist of `circuits/` in ngspice and read the transient back.
 
-Used by the tests that compare with ngspice. Nothing here knows the model.
+Used by the tests that compare with ngspice; independent of the model.
 """
 
 from __future__ import annotations

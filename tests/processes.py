@@ -1,4 +1,4 @@
-"""The command in a process of its own, and what a system may refuse it."""
+"""Runs the command in a process of its own, also with limits such as a full disk or too little memory."""
 
 from __future__ import annotations
 

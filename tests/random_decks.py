@@ -1,4 +1,4 @@
-"""Random decks over every device, source and directive, and both charge laws: what is exported and run in ngspice."""
+"""Random decks with every device, source and directive, and both charge laws, for the export to ngspice."""
 
 from __future__ import annotations
 

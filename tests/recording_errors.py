@@ -1,10 +1,10 @@
-"""How often the stated error of a run along a random recording covers the true one, and by how much it exceeds it.
+"""Statistics on random recordings: fraction of runs whose stated error covers the true error, and their ratio.
 
 A recording is noise of a random band at a random rate, with or without an offset; a circuit is a stack of random
-layers, by either charge law. It is run at each of `RTOLS`, and once at `TIGHT` by the steps that serve every source,
-from which the true error is taken, of gap voltage, force, charge and node voltages.
+layers, with either charge law. It is run at each of `RTOLS`, and once at `TIGHT` by the `exponential` method, which
+gives the true errors of gap voltage, force, charge and node voltages.
 
-Run: python tests/recording_errors.py [--recordings 100] [--first 0]. A recording is made from its number alone.
+Run: python tests/recording_errors.py [--recordings 100] [--first 0]. A recording is determined by its number alone.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Circuits for the tests: Table 1's deck, with what a test wants to be different."""
+"""Circuits for the tests: Table 1's deck with the changes that a test needs."""
 
 from __future__ import annotations
 

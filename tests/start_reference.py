@@ -1,7 +1,7 @@
-"""How random networks with initial conditions start and go on, by dense linear algebra in node voltages.
+"""Start and transient of random networks with initial conditions, by dense linear algebra in node voltages.
 
-Never imports the package: what counts at a start is a list of quadratic forms, each minimised where the ones before
-it leave a choice.
+It never imports the package. The start minimises a list of quadratic forms one after the other, each over the states
+that the minima of the earlier forms leave free.
 """
 
 from __future__ import annotations

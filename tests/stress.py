@@ -1,7 +1,7 @@
-"""Random scenes over twelve decades: each is right against an independent reference, or refused for a true reason.
+"""Random scenes over twelve decades: each agrees with an independent reference, or is refused for the true reason.
 
-Right are gap voltage, force, area, charge and the figures of the summary, and the stated errors have to cover the true
-ones: how often one does not is counted. A scene is made from seed and number alone.
+Compared are gap voltage, force, area, charge and the figures of the summary. The stated errors must cover the true
+errors, and the exceptions are counted. A scene is determined by seed and number alone.
 
 Run: python tests/stress.py [--scenes 10000] [--seed 0] [--first 0] [--workers N] [--json PATH].
 """

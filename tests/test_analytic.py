@@ -1,6 +1,6 @@
 """The reference of analytic.py reproduces the figures of the physics pages, and agrees with itself.
 
-Nothing of the package is imported: these tests check the checker.
+Nothing of the package is imported: these tests check the reference that checks the package.
 """
 
 from __future__ import annotations

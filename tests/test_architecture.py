@@ -1,4 +1,4 @@
-"""What may import what, and what no source file does: read from the source, not from running it."""
+"""Allowed imports between modules, and limits of every source file, checked on the source text without running it."""
 
 from __future__ import annotations
 

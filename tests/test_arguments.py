@@ -1,4 +1,4 @@
-"""What a call takes in place of the circuit's own, and the one sentence for what is none of it."""
+"""Arguments of a call that replace the circuit's own data, and the one-sentence error for a wrong argument."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every way to write a deck wrongly gets one clear sentence: place, what was given, what is allowed."""
+"""Wrong decks: every error is one clear sentence with the place, the given text and the allowed alternatives."""
 
 from __future__ import annotations
 

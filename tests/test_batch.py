@@ -1,4 +1,4 @@
-"""`fs.batch`: against single runs and the independent reference, and what it does with scenes that differ."""
+"""`fs.batch`, against single runs and the independent reference, also for scenes that cannot run in lockstep."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every benchmark is run, so that none rots."""
+"""Every benchmark is run, so that it keeps working."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Memory and time are bounded before they are spent: a request without an end is one sentence with the figure."""
+"""Limits of memory and time, checked before a run: a request that is too large gets one sentence with the number."""
 
 from __future__ import annotations
 

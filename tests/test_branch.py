@@ -1,4 +1,4 @@
-"""The gap voltage under `mobile` after a jump of the source: the branch is followed, and no fold is stepped over."""
+"""The gap voltage under `mobile` after a jump of the source: the run stays on its branch and never skips a fold."""
 
 from __future__ import annotations
 

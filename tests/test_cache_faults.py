@@ -1,4 +1,4 @@
-"""The cache of compiled code: no room for it, or killed while it is written."""
+"""The cache of compiled code with a full disk, or with a process killed while it writes the cache."""
 
 from __future__ import annotations
 

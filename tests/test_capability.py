@@ -1,4 +1,4 @@
-"""The map of the friction a screen can make: its edges by other means, and the command."""
+"""The map of the friction that a screen can produce: its limits against other methods, and the command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When a run that ended well is warned about: at the voltage, and at the area, that is said."""
+"""Warnings about successful runs: they appear from the stated limits of voltage and area on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The error that a step adds to the charge, against the derivative of the charge by the voltages, written out here."""
+"""The error that a step adds to the charge, against derivatives of the charge by the voltages, derived here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command: what it writes, prints and exits with; bad input gets one sentence and leaves nothing behind."""
+"""The command line: files, printed text and exit codes; bad input gets one sentence and leaves no file behind."""
 
 from __future__ import annotations
 

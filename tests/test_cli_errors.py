@@ -1,4 +1,4 @@
-"""Bad input on the command line: one sentence on stderr, exit 2, nothing written, nothing left."""
+"""Bad input on the command line: one sentence on stderr, exit code 2, and no file written or left behind."""
 
 from __future__ import annotations
 

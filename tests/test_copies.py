@@ -1,4 +1,4 @@
-"""A Solution that was copied or pickled is as read-only as the one it came from."""
+"""A copied or unpickled Solution is as read-only as the original."""
 
 from __future__ import annotations
 

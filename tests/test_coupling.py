@@ -1,4 +1,4 @@
-"""What the cells of moving areas answer one another: against a dense solution of the same equations, row by row."""
+"""The coupling between the cells of variable areas, against a dense solution of the same equations, row by row."""
 
 from __future__ import annotations
 

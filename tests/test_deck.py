@@ -1,4 +1,4 @@
-"""Netlist text to flat, evaluated statements."""
+"""Conversion of netlist text to flat, evaluated statements."""
 
 from __future__ import annotations
 

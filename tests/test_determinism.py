@@ -1,4 +1,4 @@
-"""The same scene gives the same bytes: whatever ran before or runs beside it, whichever outputs are asked for.
+"""The same scene gives the same bytes, independent of earlier or parallel runs and of the requested outputs.
 
 Run as a program, this file prints a digest of every scene, for processes with other settings.
 """

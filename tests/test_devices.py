@@ -1,4 +1,4 @@
-"""Every device of the registry: its body in both ngspice libraries, and the same circuit here as there."""
+"""Every device of the registry: its subcircuit in both ngspice libraries describes the same circuit as the entry."""
 
 from __future__ import annotations
 

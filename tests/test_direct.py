@@ -1,4 +1,4 @@
-"""Tiers without steps, linear and algebraic, against closed forms and the independent reference."""
+"""The tiers without time steps, linear and algebraic, against closed forms and the independent reference."""
 
 from __future__ import annotations
 

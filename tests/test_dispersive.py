@@ -1,4 +1,4 @@
-"""The dispersive stratum corneum: its ladder, its fit, and what it does in every tier."""
+"""The dispersive stratum corneum: its ladder, its fit, and its effect in every tier."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`docs/netlist.md`: its decks and commands run, its figures are right, and nothing that a deck may hold is missing."""
+"""`docs/netlist.md`: its decks and commands run, its numbers are right, and it lists all that a deck may contain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Decks that were written for LTspice, ngspice or by another hand: what loads, and what is said of the rest."""
+"""Decks written for LTspice, ngspice or by other authors: the supported ones load, the others get clear messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The error that comes with a result: at least the true one, and at most 10 times it, on 95 % of random scenes."""
+"""The stated error: between the true error and 10 times the true error, on 95 % of random scenes."""
 
 from __future__ import annotations
 

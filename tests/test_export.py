@@ -1,4 +1,4 @@
-"""Exported decks: ngspice 39 runs them by themselves, and finds the voltages that we find."""
+"""Exported decks: ngspice 39 runs them without other files, and its voltages agree with this package's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every shipped deck and fifty random ones, exported and run in ngspice 39, find every node's voltage that we find."""
+"""Every shipped deck and fifty random ones, exported and run in ngspice 39, give the same node voltages as here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run that fails says when, where, why and what to do, in one structure, with the last steps it tried."""
+"""The failure record of a run: time, place, cause, remedy, and the last attempted steps."""
 
 import json
 import math

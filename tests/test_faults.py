@@ -1,6 +1,6 @@
-"""Killed, interrupted, no room, nobody who reads: outputs are whole or absent, the exit code is right, a rerun works.
+"""Kills, interrupts, full disks and closed pipes: files are complete or absent, exit codes are right, reruns work.
 
-`python tests/test_faults.py --kills 200` strikes more often, at moments spread over the whole command.
+`python tests/test_faults.py --kills 200` kills more often, at times spread over the whole command.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the hand feels: the skin's mechanics, the thresholds from their sources, levels, and the command line."""
+"""Estimated perception: the skin's mechanics, the thresholds against their sources, levels, and the command line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's figures from scratch, and what its text says about them."""
+"""The paper's figures, computed by the package, and the numbers that the paper's text gives about them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever is typed is taken or refused in one sentence; and the fuzzer that says so can fail."""
+"""Any text input is accepted or refused in one sentence; and the fuzzer finds faults that are put in on purpose."""
 
 from __future__ import annotations
 

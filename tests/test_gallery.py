@@ -1,4 +1,4 @@
-"""The decks of signals in `circuits/`: each runs to its end without a warning, and their recording is reproducible."""
+"""The decks of example signals in `circuits/`: each runs without a warning, and their recording is reproducible."""
 
 from __future__ import annotations
 

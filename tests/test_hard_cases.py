@@ -1,6 +1,6 @@
-"""The hard cases that have an answer: solved to the error asked for, in a bounded number of steps, without a warning.
+"""The hard cases that have a solution: solved to the requested error, in a bounded number of steps, without a warning.
 
-Long runs are in test_hard_runs.py, those that have no answer in test_hard_refusals.py. References are
+Long runs are in test_hard_runs.py, and cases without a solution in test_hard_refusals.py. References are
 independent of the package.
 """
 

@@ -1,4 +1,4 @@
-"""The hard cases that have no answer: refused with time, place, cause and what to change; nothing wrong is returned."""
+"""The hard cases without a solution: each is refused with time, place, cause and remedy, without wrong values."""
 
 from __future__ import annotations
 

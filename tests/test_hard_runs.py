@@ -1,4 +1,4 @@
-"""Hard cases that are long, or next to nothing: no drift, no pile of steps, no memory, no underflow."""
+"""Hard cases of long runs and tiny signals: no drift, no excess of steps, no growth of memory, no underflow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sampled input of linear modes, against extended precision, mpmath, expm and the closed form of ramps."""
+"""Response of linear modes to sampled input, against extended precision, mpmath, expm and closed forms of ramps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a run starts: IC=, .ic and the operating point, against ngspice 39, closed forms and the charge conserved."""
+"""Start of a run: IC=, .ic and the operating point, against ngspice 39, closed forms and conservation of charge."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The inverse drive: what it asks of the source makes what was wanted, and what cannot be made is said."""
+"""The inverse drive: its source voltage produces the wanted force, and impossible requests get a clear message."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`--json`: the same keys whatever the circuit and however a command ends, and nothing else on stdout."""
+"""`--json`: the same keys for every circuit and every outcome of a command, and nothing else on stdout."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Decks beyond all measure are read in time that grows with their length, or refused by the limit they pass.
+"""Very large decks are read in time proportional to their length, or refused by the limit that they exceed.
 
-Nothing is timed: at these sizes an algorithm that looks at every pair would not come to its end.
+Nothing is timed: at these sizes an algorithm of quadratic cost would not finish.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Laws every result obeys, whatever its numbers."""
+"""Laws that every result obeys, such as symmetry and conservation, independent of its numbers."""
 
 from __future__ import annotations
 

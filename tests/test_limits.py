@@ -1,4 +1,4 @@
-"""The map of the mobile law's fold: where it lies, and that it is the fold that runs meet."""
+"""The map of the mobile law's fold: its voltages, which are those at which runs reach the fold."""
 
 import dataclasses
 import json

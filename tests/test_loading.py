@@ -1,4 +1,4 @@
-"""A NetCDF file is a run again, to the last bit; what is none is refused in one sentence."""
+"""Loading a NetCDF file restores the run to the last bit; another file is refused in one sentence."""
 
 from __future__ import annotations
 

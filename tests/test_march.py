@@ -1,4 +1,4 @@
-"""The exponential method's marching: its orders, what its results depend on, and where it has to go."""
+"""The loop of the exponential method on stacks: its orders of convergence, and events at which steps must end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables of measured materials: what their headers say, and the slip that is named where data are none."""
+"""Tables of measured materials: units in headers, and the likely slip that is named if the data fit no material."""
 
 from __future__ import annotations
 

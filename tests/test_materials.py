@@ -1,4 +1,4 @@
-"""Stratum corneum: Eqs. 18 and 19, and why the damaged Eq. 18 is read as a cubic."""
+"""Stratum corneum: Eqs. 18 and 19, and the reason for reading the damaged Eq. 18 as a cubic."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of a run come from the run itself, not from the outputs that happen to be asked for."""
+"""Figures of a run are integrals over the run's steps, and do not depend on the requested outputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every method on every circuit: own steppers, and scipy's and torchdiffeq's on one right-hand side."""
+"""Every method on every circuit: the package's own steppers, and scipy's and torchdiffeq's on one right-hand side."""
 
 from __future__ import annotations
 

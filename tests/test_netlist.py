@@ -1,4 +1,4 @@
-"""Decks to circuits: what devices, parameters and directives mean, the unit traps, and warnings."""
+"""From decks to circuits: the meaning of devices, parameters and directives, ambiguous units, and warnings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Networks by exponential collocation against Radau: any circuit, both laws, stated errors, settled periods."""
+"""Networks by exponential collocation against Radau: any circuit, both laws, stated errors, repeated periods."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stated errors of random networks: they cover the true ones. `python tests/network_errors.py` judges a hundred."""
+"""Stated errors of random networks cover the true errors. `python tests/network_errors.py` tests a hundred networks."""
 
 from __future__ import annotations
 

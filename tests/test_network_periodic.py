@@ -1,4 +1,4 @@
-"""Periodic states of networks: against long runs, another integration, closed forms and the same circuit as a stack."""
+"""Periodic states of networks, against long runs, another integrator, closed forms and the same circuit as a stack."""
 
 from __future__ import annotations
 

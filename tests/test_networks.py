@@ -1,4 +1,4 @@
-"""Any circuit: networks of R, C, V, I and layers against dense exponentials, hand-written ODEs, laws and phasors."""
+"""Networks of R, C, V, I and layers, against dense matrix exponentials, hand-written ODEs, laws and phasors."""
 
 from __future__ import annotations
 

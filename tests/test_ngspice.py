@@ -1,4 +1,4 @@
-"""The shipped decks in ngspice 39, unchanged, against our own run of the same files."""
+"""The shipped decks, unchanged, in ngspice 39 against this package's runs of the same files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stated error of the nodes' voltages: against the linear map that makes it, and what a run does with it."""
+"""The stated error of the node voltages, against the linear map that gives it, and its use in a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A notebook, executed: results show themselves as tables and pictures without a magic line."""
+"""An executed notebook: results appear as tables and pictures without a magic line."""
 
 from __future__ import annotations
 

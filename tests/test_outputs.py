@@ -1,4 +1,4 @@
-"""Which rows a run writes: both sides of a jump, and nothing at the corners of an edge that takes time."""
+"""Output rows of a run: two at a jump, left and right, and no additional rows at the corners of a finite edge."""
 
 from __future__ import annotations
 

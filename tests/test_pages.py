@@ -1,4 +1,4 @@
-"""What results show of themselves: on Python's prompt, to print, and in a notebook."""
+"""Display of results at Python's prompt, by print, and in a notebook."""
 
 from __future__ import annotations
 

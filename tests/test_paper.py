@@ -1,4 +1,4 @@
-"""The paper's claims (its section 4), computed; what is not reproduced is a strict xfail with its reason."""
+"""The claims of the paper's section 4, computed; a claim that is not reproduced is a strict xfail with its reason."""
 
 from __future__ import annotations
 

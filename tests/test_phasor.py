@@ -1,4 +1,4 @@
-"""Phasors: gains against Eqs. 11 to 15 written out, the coupled figures, sweeps, and what is refused."""
+"""Phasors: gains against Eqs. 11 to 15 written out, the coupled figures, sweeps, and refused arguments."""
 
 from __future__ import annotations
 

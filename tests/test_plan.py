@@ -1,4 +1,4 @@
-"""Which model is run: chosen where it should be, with its reason, and as right as the next heavier one."""
+"""The choice of the model: the right tier with its reason, and as accurate as the next heavier tier."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures: they show what the results hold, in any state a result can be in, and touch nothing global."""
+"""Pictures show the data of the results, for every status of a run, and change no global state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs along recordings: against the independent reference and the steps that serve every source; stated errors."""
+"""Runs along recordings, against the independent reference and the `exponential` method; and their stated errors."""
 
 from __future__ import annotations
 

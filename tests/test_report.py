@@ -1,4 +1,4 @@
-"""What a run prints, read back as numbers, against closed forms and the independent reference."""
+"""The printed numbers of a run, against closed forms and the independent reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a command's results go, what they are called, and what is never replaced without a word."""
+"""Folder and names of a command's results, and files that are never replaced without a message."""
 
 from __future__ import annotations
 

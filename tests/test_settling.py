@@ -1,4 +1,4 @@
-"""A settled run repeats its period: the same answer as stepping every one, at any output, for either law."""
+"""A settled run repeats its period: the result equals that of stepping every period, at any output, for both laws."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `make test` does where ngspice is missing."""
+"""`make test` without an installed ngspice."""
 
 from __future__ import annotations
 

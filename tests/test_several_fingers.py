@@ -1,4 +1,4 @@
-"""Two fingers on one circuit: the error asked for is each finger's own, however little of the voltage it takes."""
+"""Two fingers in one circuit: the requested error holds for each finger relative to its own peak, however small."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings and tables from files: what is read from decks, the command line and Python, and what is refused."""
+"""Recordings and tables from files: reading by decks, the command line and Python, and refused files."""
 
 from __future__ import annotations
 

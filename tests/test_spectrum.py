@@ -1,4 +1,4 @@
-"""Spectra: Parseval, known tones, the interval of a density, and what is refused."""
+"""Spectra: Parseval's theorem, known tones, the confidence interval of a density, and refused arguments."""
 
 from __future__ import annotations
 

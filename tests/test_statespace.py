@@ -1,4 +1,4 @@
-"""From nodes to matrices: any series stack, written in any order and direction, against a dense formulation."""
+"""State space of series stacks, written in any order and direction, against a dense formulation."""
 
 from __future__ import annotations
 

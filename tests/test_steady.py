@@ -1,4 +1,4 @@
-"""Periodic states found directly: the state, its certificate and its stability."""
+"""Periodic states by Newton's method: the state, its defect and its stability."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Radau IIA: order conditions of its coefficients, and the orders met by the compiled step on a stack and a network."""
+"""Radau IIA: order conditions of its coefficients, and orders of the compiled step on a stack and a network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs chunk by chunk: the same bits as the whole, in constant memory, into a store that a crash does not harm."""
+"""Runs chunk by chunk: bitwise equal to the whole run, in constant memory, in a store that survives a crash."""
 
 from __future__ import annotations
 

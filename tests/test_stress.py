@@ -1,4 +1,4 @@
-"""Sixty of the random scenes of `stress.py`; `make stress` judges ten thousand."""
+"""Sixty of the random scenes of `stress.py`; `make stress` tests ten thousand."""
 
 import dataclasses
 import json

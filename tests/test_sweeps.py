@@ -1,4 +1,4 @@
-"""Sweeps: what drives them, where a skin's data are taken, networks' against impedances by hand, exports in ngspice."""
+"""Sweeps: their drive, the frequency of the skin's data, networks against hand-computed impedances, ngspice exports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is not a series stack is refused with the names of the elements at fault; circuits as data."""
+"""Invalid circuits are refused with the names of the elements at fault; circuits as data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values that are legal and not usual: what is said, from Python as from the command line, and what is not."""
+"""Values that are legal but unusual: warnings from Python and from the command line, and values without a warning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Waveforms: value, either side of a jump, breakpoints, fundamental, and the table that compiled code steps on."""
+"""Waveforms: value, both sides of a jump, breakpoints, fundamental, and the table for compiled code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every waveform class beside an independent formula: the registry that tests iterate."""
+"""Every waveform class with an independent formula: the registry over which tests iterate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contestants: each file here is one library on the same problems, and says itself whether it is installed."""
+"""The contestants: each file in this folder runs one library on the same problems, if the library is installed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MODULES = (
 
 
 def contestants(without: Collection[str] = ()) -> tuple[list[Contestant], dict[str, str]]:
-    """All contestants of the libraries present, less those named; and all versions, 'absent' for the missing ones."""
+    """All contestants of the installed libraries, without those in `without`; and all versions, or 'absent'."""
     present: list[Contestant] = []
     versions: dict[str, str] = {}
     for name in MODULES:

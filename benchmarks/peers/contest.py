@@ -1,4 +1,4 @@
-"""What a contestant is, and what it is given."""
+"""The data of a contestant, of the run that it is given, and of its outcome."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Plan:
-    """A run to be made: a problem, how long, and where it is split.
+    """A run to be made: a problem, its number of periods, and the times at which it is split.
 
     Attributes
     ----------
     problem : Problem
     periods : int
     zeros, signs : tuple of float
-        Times of the gap voltage's zeros (s) and its sign on each piece, for contestants that restart there.
+        Times of the gap voltage's zeros (s) and its sign on each piece, for contestants that restart at the zeros.
     """
 
     problem: Problem
@@ -35,7 +35,7 @@ class Plan:
 
     @cached_property
     def pieces(self) -> tuple[Piece, ...]:
-        """Smooth stretches in order."""
+        """Smooth stretches of the run, in order."""
         return self.problem.pieces(self.periods, self.zeros, self.signs)
 
     @cached_property
@@ -45,27 +45,27 @@ class Plan:
 
     @cached_property
     def u_source(self) -> FloatArray:
-        """Source at the outputs, V."""
+        """Source voltage at the outputs, V."""
         return self.problem.waveform.value(self.t_eval)
 
     @property
     def t_stop(self) -> float:
-        """End, s."""
+        """End of the run, s."""
         return self.problem.t_stop(self.periods)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run gave.
+    """The results of a run.
 
     Attributes
     ----------
     u_gap, f_el : ndarray
-        V and N, at the outputs.
+        Gap voltage (V) and force (N) at the outputs.
     nfev : int or None
-        Evaluations of the right-hand side; None where the library does not count them.
+        Number of evaluations of the right-hand side; None if the library does not count them.
     seconds : float or None
-        Wall time, where the contestant measures it itself.
+        Wall time, if the contestant measures it itself.
     """
 
     u_gap: FloatArray
@@ -75,7 +75,7 @@ class Outcome:
 
 
 class NotSolvedError(RuntimeError):
-    """The library says that it failed, or did."""
+    """The library reported a failure, or failed without a report."""
 
 
 @dataclass(frozen=True)
@@ -86,21 +86,21 @@ class Contestant:
     ----------
     name, library : str
     settings : tuple of float
-        From loose to tight.
+        Settings from loose to tight.
     what : str
-        What a setting is: ``"rtol"``, or steps per period.
+        Meaning of a setting: ``"rtol"``, or ``"steps per period"``.
     setup : callable
-        Takes a plan; returns the function of a setting that is timed.
+        Function from a plan to the timed function of a setting.
     kinks : bool
         Whether the plan is split at the zeros of the gap voltage.
     whole : bool
-        Whether it can be told the zeros only where the source has no jumps.
+        Whether the zeros can only be given for a source without jumps.
     mobile, networks, stacks : bool
         Whether it takes part under the `mobile` law, on networks, and on stacks.
     slow : bool
-        Whether it is given a fifth of the periods where that costs the same per period.
+        Whether it only runs a fifth of the periods, if a shorter run costs the same per period.
     compile_limit : float
-        What its first run may take longer than others because it compiles, s.
+        Additional time limit of the first run, which compiles, s.
     """
 
     name: str
@@ -117,7 +117,7 @@ class Contestant:
     compile_limit: float = 0.0
 
     def takes_part(self, problem: Problem) -> bool:
-        """Whether it is timed on a problem, and there in another way than without the zeros."""
+        """Whether it is timed on a problem; a contestant that cannot use the zeros there is left out."""
         if self.kinks and self.whole and len(problem.pieces(1)) > 1:
             return False
         kind = self.networks if isinstance(problem, NetworkProblem) else self.stacks
@@ -125,12 +125,12 @@ class Contestant:
 
     @property
     def adaptive(self) -> bool:
-        """Whether a setting is a tolerance."""
+        """Whether its settings are tolerances."""
         return self.what == "rtol"
 
 
 def tolerances(loose: float, tight: float, per_decade: float = 1.0) -> tuple[float, ...]:
-    """Tolerances 10^-loose to 10^-tight, evenly spread."""
+    """Tolerances from 10^-loose to 10^-tight, evenly spaced in the exponent."""
     count = round((tight - loose) * per_decade)
     return tuple(float(10.0 ** -(loose + i / per_decade)) for i in range(count + 1))
 

@@ -45,7 +45,7 @@ def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
                 result = solver.solve(t, x)
                 if not result.success:
                     raise NotSolvedError(result.message)
-                # Where there is no output between start and end it gives its own steps instead.
+                # With only two times CVODE returns its own steps instead, so a piece without outputs is skipped here.
                 if piece.last > piece.first:
                     states[piece.first : piece.last] = result.y[1:-1]
                 x = result.y[-1].copy()
@@ -58,7 +58,7 @@ def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
 
 
 def contestants() -> list[Contestant]:
-    """Both multistep families, each also restarted at the zeros of the gap voltage; for networks, stiff, BDF alone."""
+    """BDF and Adams, each also restarted at the zeros of the gap voltage; only BDF on networks, which are stiff."""
     return [
         Contestant(
             f"CVODE {method}" + (" +kinks" if kinks else ""),

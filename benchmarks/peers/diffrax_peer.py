@@ -1,6 +1,7 @@
-"""diffrax on JAX in double precision: the whole run in one compiled function, its compilation timed apart.
+"""diffrax on JAX in double precision: the whole run is one compiled function, whose compilation is timed separately.
 
-Source jumps are segments of a scan; zeros of the gap voltage are `jump_ts` of the step controller.
+The pieces between the source's jumps are the iterations of a scan; the zeros of the gap voltage are `jump_ts` of the
+step controller.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from right_hand_side import compiled, open_rates, size_of
 
 LIBRARY = "diffrax"
 MAX_STEPS = 500_000
-"""Of a run: at most, a method that is not for stiff problems then gives up within the time limit."""
+"""Largest number of steps per piece; a method for non-stiff problems then gives up within the time limit."""
 
 
 def version() -> str | None:
@@ -33,7 +34,8 @@ def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
         jax.config.update("jax_enable_x64", True)
         rates, size = open_rates(plan.problem, jnp.sin, jnp.minimum), size_of(plan.problem)
         solver = getattr(diffrax, method)()
-        # Where the source jumps the gap voltage does, and passes no zero in between.
+        # The zeros are only given if the source has no jumps: of a square, the gap voltage changes its sign at the
+        # jumps.
         segments = plan.problem.pieces(plan.periods)
         zeros = jnp.asarray(plan.zeros) if plan.zeros and len(segments) == 1 else None
 
@@ -65,8 +67,8 @@ def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
             plan.t_eval.reshape(len(segments), -1),
         )
         observe = compiled(plan.problem).observe
-        # Evaluations of a step: stages, less the one that first-same-as-last methods keep. Those of Newton's
-        # iterations are not counted by diffrax.
+        # Evaluations per step: the number of stages, less one for a first-same-as-last method. diffrax does not count
+        # the evaluations of Newton's iterations.
         per_step = {"Tsit5": 6, "Dopri8": 13}.get(method)
 
         def run(rtol: float) -> Outcome:
@@ -84,7 +86,8 @@ def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
 def contestants() -> list[Contestant]:
     """Two explicit methods and a stiff one, each also restarted at the zeros of the gap voltage.
 
-    On networks Dopri8 was slower than Tsit5 at every error, and the stiff one with the zeros than without.
+    Dopri8 is left out on networks because it was slower than Tsit5 at every error; so is the stiff method with the
+    zeros, because it was slower than without them.
     """
     settings = {
         "Tsit5": tolerances(2, 12.5, 2 / 3), "Dopri8": tolerances(2, 12.5, 2 / 3), "Kvaerno5": (1e-2, 1e-4, 1e-6)

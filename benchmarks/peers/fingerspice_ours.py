@@ -1,4 +1,4 @@
-"""This package, as a user calls it: preparation, error estimate and every output array included."""
+"""This package, as called by a user: the time includes preparation, error estimate and every output array."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def version() -> str | None:
 
 
 def ours(problem: Problem, rtol: float, method: str, plan: Plan, circuit: fs.Circuit) -> Outcome:
-    """One run of a problem; the charge, which no peer computes, is left out."""
+    """One run of a problem, without the charge, which no peer computes."""
     run = fs.simulate(
         circuit, t_stop=plan.t_stop, t_eval=plan.t_eval, rtol=rtol, method=method, charge_law=problem.law, charge=False
     )
@@ -35,7 +35,7 @@ def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
 
 
 def contestants() -> list[Contestant]:
-    """Our methods; `auto` is what a user gets without asking, `exponential` the same without repeating a period."""
+    """Methods of this package: `auto`, the default; `exponential`, which steps every period; and `radau`."""
     auto, stepped = (
         Contestant(library, library, tolerances(2, 12), _setup(method), mobile=True, networks=True, compile_limit=300.0)
         for library, method in ((LIBRARY, "auto"), (f"{LIBRARY}, every period", "exponential"))

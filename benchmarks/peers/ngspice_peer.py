@@ -1,7 +1,7 @@
-"""ngspice on the exported netlist, largest step set; its outputs are its own time points, splined between jumps.
+"""ngspice on the exported netlist with a given largest step; cubic splines through its time points give the outputs.
 
-A run is a process, and its time that of the process less the start: that of a deck with one resistor. Reading and
-splining is not counted.
+A run is a process; its time is the time of the process less the start-up time, measured with a deck of one resistor.
+Reading the file and the splines are not timed.
 """
 
 from __future__ import annotations
@@ -74,11 +74,12 @@ def read_raw(path: Path) -> dict[str, FloatArray]:
 
 
 def _at_outputs(plan: Plan, raw: dict[str, FloatArray], name: str, max_step: float) -> FloatArray:
-    """A signal at the outputs: a cubic spline through ngspice's points of each piece."""
+    """A signal at the outputs, from a cubic spline through ngspice's points of each piece."""
     out = np.empty(plan.t_eval.size)
     t, y = raw["time"], raw[name]
     for piece in plan.pieces:
-        # Edges of 1 ns stand across the jumps; points a thousandth of a step apart are rounding to a spline.
+        # Leave out the 1 ns edges at the jumps, and points less than a thousandth of a step apart, where the
+        # differences of a spline would be round-off.
         inside = np.flatnonzero((t > piece.t0 + 1e-9) & (t < piece.t1 - 1e-9))
         kept = inside[np.concatenate([[True], np.diff(t[inside]) > 1e-3 * max_step])]
         out[piece.first : piece.last] = CubicSpline(t[kept], y[kept])(plan.t_eval[piece.first : piece.last])
@@ -104,7 +105,7 @@ def _setup(plan: Plan) -> Callable[[float], Outcome]:
             top, skin, area = (_at_outputs(plan, raw, f"v({node})", max_step) for node in nodes)
             u_gap[:, i] = top - skin
             force[:, i] = stress * u_gap[:, i] ** 2 * 1e-6 * area
-        # One finger's signals have one axis, as the package's have.
+        # The signals of a single finger have one axis, as in the package.
         shape = (-1, len(fingers)) if len(fingers) > 1 else -1
         return Outcome(u_gap.reshape(shape), force.reshape(shape), None, seconds - empty)
 
@@ -113,7 +114,7 @@ def _setup(plan: Plan) -> Callable[[float], Outcome]:
 
 @lru_cache(maxsize=1)
 def start_up() -> float:
-    """Median wall time of ngspice for almost nothing, s."""
+    """Median wall time of ngspice for a deck of one resistor, s."""
     times = []
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(7):
@@ -124,6 +125,6 @@ def start_up() -> float:
 
 
 def contestants() -> list[Contestant]:
-    """One contestant: its trapezoidal rule, whose largest step sets the error."""
+    """One contestant: ngspice's trapezoidal rule, whose largest step determines the error."""
     steps = (30.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 5000.0)
     return [Contestant("ngspice", LIBRARY, steps, _setup, "steps per period", networks=True, slow=True)]

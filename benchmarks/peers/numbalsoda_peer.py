@@ -25,7 +25,7 @@ def version() -> str | None:
 
 @lru_cache(maxsize=1)
 def _solver() -> Callable[..., tuple[FloatArray, float, bool]]:
-    """The loop over the pieces: (address of the rates, length of the state, rtol, output times, pieces (n, 6))."""
+    """The compiled loop over the pieces; arguments: address of the rates, state length, rtol, times, pieces (n, 6)."""
     from numba import njit
     from numbalsoda import lsoda
 
@@ -52,7 +52,7 @@ def _solver() -> Callable[..., tuple[FloatArray, float, bool]]:
 
 @lru_cache(maxsize=1)
 def _rates(problem: Problem) -> Any:
-    """The rates as a function of C, which counts its calls."""
+    """The rates as a C function that counts its calls."""
     from numba import carray, cfunc
     from numbalsoda import lsoda_sig
 

@@ -1,4 +1,4 @@
-"""scipy: solve_ivp on the compiled right-hand side, one call a piece, and odeint, the faster way to LSODA."""
+"""scipy: solve_ivp on the compiled right-hand side, one call per piece, and odeint, a faster interface to LSODA."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
             states = np.empty((plan.t_eval.size, rhs.size))
             x, nfev = np.zeros(rhs.size), 0
             for piece, t in zip(plan.pieces, times, strict=True):
-                # A trial step far too long may overflow; its step control shortens it.
+                # A trial step that is far too long may overflow; scipy's step control then shortens it.
                 with np.errstate(all="ignore"):
                     result = solve_ivp(
                         rhs.rates, (piece.t0, piece.t1), x, method, t, args=(piece.sign, piece.level),
@@ -41,7 +41,7 @@ def _setup(method: str) -> Callable[[Plan], Callable[[float], Outcome]]:
                     raise NotSolvedError(result.message)
                 states[piece.first : piece.last] = result.y.T[:-1]
                 x = result.y[:, -1]
-                # The differences of a Jacobian beside the rate itself.
+                # Each Jacobian by finite differences takes 1 + size evaluations.
                 nfev += result.nfev + (1 + rhs.size) * result.njev
             return Outcome(*rhs.observe(plan.u_source, states), nfev)
 
@@ -75,10 +75,10 @@ def _setup_odeint(plan: Plan) -> Callable[[float], Outcome]:
 
 
 def contestants() -> list[Contestant]:
-    """Four methods and odeint; the three that are ever best are also restarted at the zeros of the gap voltage.
+    """Four methods and odeint; the three that are best at some error are also restarted at the gap voltage's zeros.
 
-    On networks LSODA runs by odeint alone, the faster way to it; DOP853, far too explicit for them, runs without the
-    zeros only, and BDF, slower than LSODA, not at all.
+    On networks LSODA runs by odeint only, its faster interface; DOP853, an explicit method that needs very short steps
+    there, runs without the zeros only, and BDF, which is slower than LSODA, does not run.
     """
     fine, coarse = tolerances(2, 12.5, 2 / 3), tolerances(2, 8, 1 / 2)
     best = ("odeint", "LSODA", "DOP853")

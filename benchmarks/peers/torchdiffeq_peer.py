@@ -1,7 +1,7 @@
 """torchdiffeq in double precision.
 
-Its right-hand side is the compiled one behind `torch.from_numpy`, some forty times cheaper than the same in eager
-torch; `eager` is what a torch user would write.
+The right-hand side is the compiled one, called through `torch.from_numpy`, which is some forty times faster than the
+same in eager torch; the contestant `eager` has the right-hand side that a torch user would write.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def _setup(method: str, eager: bool = False) -> Callable[[Plan], Callable[[float
                     return torch.from_numpy(rhs.rates(t.item(), x.numpy(), piece.sign, piece.level))
 
                 if fixed:
-                    # A fixed step that divides the piece; the run's setting is steps per period.
+                    # The fixed step divides the piece evenly; the setting is the number of steps per period.
                     length = piece.t1 - piece.t0
                     steps = max(1, round(setting * length / plan.problem.period))
                     keywords = {"options": {"step_size": length / steps, "interp": "cubic"}}
@@ -68,10 +68,10 @@ def _setup(method: str, eager: bool = False) -> Callable[[Plan], Callable[[float
 
 
 def contestants() -> list[Contestant]:
-    """Two adaptive methods, one also restarted at the zeros of the gap voltage, one in eager torch, and fixed steps.
+    """Two adaptive methods, one restarted at the zeros of the gap voltage, one also in eager torch, and fixed steps.
 
-    Its methods are all explicit, and its best takes thousands of times the best's time: few settings are tried, and
-    networks, which are stiff, are left out.
+    All methods of torchdiffeq are explicit, and its best takes thousands of times the time of the fastest library: few
+    settings are tried, and networks, which are stiff, are left out.
     """
     return [
         Contestant("torchdiffeq dopri5", LIBRARY, (1e-3, 1e-5, 1e-7), _setup("dopri5"), slow=True),

@@ -1,4 +1,4 @@
-"""Checks of a call's arguments: the circuit, the sources and parameters changed for the call, numbers and times."""
+"""Checks of a call's arguments: the circuit, its changed sources and parameters, numbers and times."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ Parameters = Mapping[str, float]
 
 
 def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Parameters | None = None) -> Circuit:
-    """The circuit with the sources and parameters of a call.
+    """The circuit with the sources and parameters given in a call.
 
     Parameters
     ----------
     circuit : Circuit
     sources : mapping or waveform, optional
-        From the name of a source to a waveform, a constant (V) or a function of time (s); or one of these alone, where
-        the circuit has one source.
+        From the name of a source to a waveform, a constant (V, or A) or a function of time (s); for a circuit with one
+        source, the waveform, constant or function alone is enough.
     parameters : mapping, optional
         From path to value, as in `Circuit.replace`.
 
     Raises
     ------
     InputError
-        For anything but a circuit, an unknown name, or a source without its name where the circuit has several.
+        If `circuit` is not a circuit, a name is unknown, or a source is given without a name and there are several.
 
     Warns
     -----
     FingerspiceWarning
-        Where other sources than those named in `sources` remain switched on.
+        If sources that `sources` does not name remain switched on.
     """
     require_circuit(circuit)
     if parameters:
@@ -84,7 +84,7 @@ def require_circuit(circuit: Any) -> None:
     Raises
     ------
     InputError
-        With what was given, and how a circuit is made.
+        If it is not; the message names the given type, and says how a circuit is made.
     """
     if not isinstance(circuit, Circuit):
         raise InputError(
@@ -98,19 +98,19 @@ def require_number(what: str, given: Any, allowed: str) -> None:
     Raises
     ------
     InputError
-        With what was given.
+        If it is not; the message names the given value.
     """
     if isinstance(given, bool) or not isinstance(given, (int, float, np.integer, np.floating)):
         raise InputError(f"{what} is {given!r}, a {type(given).__name__}; allowed: {allowed}")
 
 
 def require_area(area: Any) -> None:
-    """Refuse anything but a text or a number; which names of modes there are is checked by the model.
+    """Refuse an area that is neither a text nor a number; the model checks whether a text names one of its modes.
 
     Raises
     ------
     InputError
-        With what was given.
+        If it is neither; the message names the given value.
     """
     if not isinstance(area, str):
         require_number("area", area, "'coupled', 'mean', 'frozen' or a number in m^2")
@@ -122,7 +122,7 @@ def times_given(what: str, given: ArrayLike | None) -> FloatArray | None:
     Raises
     ------
     InputError
-        For anything but numbers.
+        If they are not numbers.
     """
     try:
         return None if given is None else np.asarray(given, float)

@@ -1,4 +1,4 @@
-"""A circuit as data: elements with values in the netlist's units, and the analyses for which its deck asks."""
+"""A circuit as data: elements with values in the netlist's units, and the analyses that its deck asks for."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Element:
     Attributes
     ----------
     name : str
-        As written; inside a subcircuit with its path, as in ``Xfinger.Xgap``.
+        Name as written; for an element of a subcircuit with its path, as in ``Xfinger.Xgap``.
     device : str
         Entry of `DEVICES`.
     nodes, node_names : tuple of str
@@ -61,7 +61,7 @@ class Element:
     waveform : Waveform or None
         Waveform of a source.
     ac : SmallSignal or None
-        ``AC`` of a source that has it.
+        ``AC`` magnitude and phase of a source; None without them.
     initial : float or None
         ``IC=`` of a capacitor, V.
     where : Where or None
@@ -96,7 +96,7 @@ class Element:
 
     @cached_property
     def kept(self) -> dict[Any, Any]:
-        """What follows from this element alone, for every circuit that has it unchanged."""
+        """Cache of results that depend on this element alone, shared by all circuits that contain it."""
         return {}
 
 
@@ -142,7 +142,7 @@ class Circuit(Shown):
     initial : mapping of str to float
         ``.ic``: from canonical node to V, or to mm^2 of an area node.
     charge_law : str or None
-        ``local`` or ``mobile``, as the included library says; None without one.
+        ``local`` or ``mobile``, as set by the included library; None if the deck includes no library.
     work : str
         Reading of Eq. 7: ``gap`` (the gap voltage is held) or ``total`` (the voltage of the whole stack is held, where
         a dispersive skin has its permittivity above all poles).
@@ -151,12 +151,12 @@ class Circuit(Shown):
     unused : tuple of str
         Directives that are accepted and have no effect here.
     text : str
-        The deck.
+        Text of the deck.
     path : Path or None
     overrides : mapping of str to str
-        What `replace` has changed, from path to value as text.
+        Changes made by `replace`, from path to value as text.
     related : dict
-        What follows from the nodes and devices alone, for all circuits that `replace` makes of this one.
+        Cache of results that depend on nodes and devices alone, shared by all circuits that `replace` derives.
     """
 
     title: str
@@ -183,13 +183,13 @@ class Circuit(Shown):
         return circuit_page(self)
 
     def remember(self, key: Any, make: Callable[[], Any]) -> Any:
-        """The result of `make`, kept for later calls with the same key, as circuits do not change."""
+        """The result of `make`, cached by the key; this is safe because circuits do not change."""
         kept = self._memory.get(key)
         if kept is None:
             # Two threads may both call `make`, with the same result.
             kept = (make(),)
             with _REMEMBERING:
-                # The oldest entry goes, so that a sweep over stop times cannot fill the memory.
+                # Drop the oldest entry, so that a sweep over stop times cannot fill the memory.
                 if len(self._memory) >= 16:
                     self._memory.pop(next(iter(self._memory)))
                 self._memory[key] = kept
@@ -201,7 +201,7 @@ class Circuit(Shown):
         Raises
         ------
         InputError
-            With the nearest name.
+            If there is none; the message gives the nearest name.
         """
         for element in self.elements:
             if element.name.lower() == name.lower():
@@ -223,7 +223,7 @@ class Circuit(Shown):
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
-        """Every parameter by path (``Xgap.d``, ``Vdrive.amplitude``), with value and unit of the netlist."""
+        """Every parameter by path (``Xgap.d``, ``Vdrive.amplitude``), with its value and unit as in the netlist."""
         return MappingProxyType(dict(self._parameters()))
 
     def _parameters(self) -> Iterator[tuple[str, Parameter]]:
@@ -247,17 +247,17 @@ class Circuit(Shown):
         Raises
         ------
         InputError
-            For an unknown path (with the nearest one), a text that is no number, or a value out of range.
+            If a path is unknown (the message gives the nearest one), a text is no number, or a value is out of range.
 
         Warns
         -----
         FingerspiceWarning
-            Of a value outside the usual range, which was probably meant in another unit.
+            About a value outside the usual range, which was probably meant in another unit.
         """
         changed, notes = self._replaced(changes)
         if not self.warnings and not notes:
             return changed
-        # Warnings of values that are no longer there go; those of the reader begin with a place.
+        # Drop warnings about replaced values; as the reader's begin with a place in the deck, compare their ends.
         before, after = unusual_of_changed(self, changed)
         gone = tuple(before.keys() - after.keys())
         kept = [text for text in self.warnings if not text.endswith(gone) and not concerns(text, changes)]
@@ -266,7 +266,7 @@ class Circuit(Shown):
         return changed._with(warnings=(*kept, *notes))
 
     def varied(self, changes: Mapping[str, float | str | Waveform | Callable[[float], float]]) -> Circuit:
-        """As `replace`, without warnings: for the sweeps of this package, whose values no user has written."""
+        """As `replace`, without warnings: for values that this package's sweeps choose, and not the user."""
         return self._replaced(changes)[0]
 
     def _replaced(
@@ -292,18 +292,18 @@ class Circuit(Shown):
         changed = self._with(elements=tuple(elements.values()), overrides=overrides)
         check(changed)
         before, after = unusual_of_changed(self, changed)
-        # One warning of each value is enough.
+        # One warning per value is enough: none about its size where there is one about its notation.
         new = [text for text, path in after.items() if text not in before and path not in traps]
         return changed, [*traps.values(), *new]
 
     def _with(self, **changes: Any) -> Circuit:
-        """This circuit, changed in what leaves its nodes and devices as they are."""
+        """This circuit with changes that affect neither nodes nor devices, so that the cache `related` stays valid."""
         changed = dataclasses.replace(self, **changes)
         vars(changed)["related"] = self.related
         return changed
 
     def _unknown_path(self, path: str) -> str:
-        """Why `replace` does not know a path."""
+        """The message about a path that `replace` does not know."""
         name = path.rpartition(".")[0] or path
         inside = [e.name for e in self.elements if e.name.lower().startswith(f"{name.lower()}.")]
         if inside:
@@ -324,7 +324,7 @@ class Circuit(Shown):
 
 
 def _changed(element: Element, parameter: str, given: Any, path: str) -> tuple[Element, str | None]:
-    """An element with another value, and a warning about how that is written, or None."""
+    """An element with a new value, and a warning about the value's notation, or None."""
     if parameter in element.values:
         spec = element.spec.parameter(parameter)
         value, note = value_of(path, given, spec, spec.unit)
@@ -351,7 +351,7 @@ def check(circuit: Circuit) -> None:
     Raises
     ------
     InputError
-        One sentence: which parameter, what was given with its unit, what is allowed, where.
+        If there is such a value; the message names the parameter, its value and unit, the allowed range, and the line.
     """
     for element in circuit.elements:
         if "checked" in element.kept:

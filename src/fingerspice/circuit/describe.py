@@ -1,4 +1,4 @@
-"""A circuit in words: its elements, its sources, and what was changed in it after its deck was read."""
+"""A circuit in words: its elements, its sources, and the changes made after its deck was read."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import Function
 from fingerspice.waveforms.waveform import DC, Waveform
 
-#: Number of changes, or of sources, that are named in one line; of more their number is told.
+#: Largest number of changes, or of sources, that one line names; the number of the others is added.
 _MOST = 8
-#: Elements of a circuit that its page lists.
+#: Largest number of elements that a circuit's page lists.
 MOST_ELEMENTS = 25
 
 
@@ -43,7 +43,7 @@ def waveform_text(waveform: Waveform, unit: str = "V") -> str:
             continue
         own = waveform.units[field.name].replace("V", unit)
         text = _quantity(value, own)
-        # Figures that are always there need no name; those with a default do.
+        # A required figure is known by its position; one that has a default needs its name.
         said.append(text if field.default is dataclasses.MISSING else f"{field.name} {text}")
     return f"{type(waveform).__name__}({', '.join(said)})"
 
@@ -51,7 +51,7 @@ def waveform_text(waveform: Waveform, unit: str = "V") -> str:
 def drive_text(circuit: Circuit) -> str:
     """Every source that is not 0 with its waveform: ``Vdrive: Sine(200 V, 100 Hz)``.
 
-    Sources that were replaced are left out, as `changes_text` has them.
+    Sources that were replaced are left out, since `changes_text` lists them.
     """
     said = []
     replaced = {path.lower() for path in circuit.overrides}
@@ -66,7 +66,7 @@ def drive_text(circuit: Circuit) -> str:
 
 
 def changes_text(circuit: Circuit) -> str:
-    """What was changed after the deck was read, with its present value: ``Xgap.d = 5 um``; empty without changes."""
+    """Changes made after the deck was read, with the present values: ``Xgap.d = 5 um``; empty without changes."""
     known = {path.lower(): (path, parameter) for path, parameter in circuit.parameters.items()}
     said = []
     # A path may have been changed twice, in two spellings.
@@ -84,19 +84,19 @@ def changes_text(circuit: Circuit) -> str:
 
 
 def _as_given(text: str) -> str:
-    """The text to which a parameter was set, shortened where it is long."""
+    """The text to which a parameter was set, shortened if it is long."""
     kind = text.partition("(")[0]
     return text if len(text) <= 40 else f"{kind}(...)" if kind.isidentifier() else f"{text[:36]} ..."
 
 
 def heading(circuit: Circuit) -> str:
-    """The deck's title, and what was changed in it."""
+    """The deck's title, and the changes made after it was read."""
     changed = changes_text(circuit)
     return f"{circuit.title} (changed: {changed})" if changed else circuit.title
 
 
 def head_lines(circuit: Circuit) -> list[str]:
-    """Lines at the top of a report: the heading, and the sources where any of them drives the circuit."""
+    """Lines at the top of a report: the heading, and the sources that are not 0, if there are any."""
     drive = drive_text(circuit)
     return [heading(circuit), *([drive] if drive else [])]
 
@@ -131,7 +131,7 @@ def values_text(element: Element) -> str:
 
 
 def _deck_value(value: float) -> str:
-    """A number as a deck has it: ``3.5u``, ``0.2meg``, ``0.3``."""
+    """A number as written in decks: ``3.5u``, ``0.2meg``, ``0.3``."""
     if 0.01 <= abs(value) < 1e4:
         return f"{value:.4g}"
     text = format_si(value, "").replace(" ", "")

@@ -1,8 +1,8 @@
-"""The devices of netlists: an entry for each, with its nodes, its parameters, and the cells of a layer.
+"""The devices of netlists: one entry per device, with its nodes, its parameters, and for a layer its cells.
 
-The reader, runs, phasors and the export need nothing but the entry. For ngspice a layer also needs a body of the same
+The reader, runs, phasors and the export use the entry alone. For ngspice a layer also needs a subcircuit of the same
 name, nodes, parameters and defaults in `fingerspice.lib` and `fingerspice_mobile.lib`; `tests/test_devices.py` compares
-the two.
+the entry with the subcircuits.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from fingerspice.circuit.usual import REST_AREA, Usual
 from fingerspice.physics.ladder import SKIN_LADDER
 from fingerspice.physics.materials import EPS0, SKIN_BAND, skin_permittivity, skin_resistivity
 
-#: From the values of an element (in the netlist's units) to its cells in series, shape (n_cell, 3): capacitance per
-#: area (F/m^2), total leakage (S) and leakage per area (S/m^2). The second argument is a frequency (Hz) at which a
-#: dispersive material is taken as one cell; None means all its cells.
+#: Function from an element's values (in the netlist's units) to its cells in series, shape (n_cell, 3): capacitance per
+#: area (F/m^2), total leakage (S) and leakage per area (S/m^2). At a frequency (Hz), the second argument, a dispersive
+#: material becomes one cell with its data there; None gives all cells of its ladder.
 Cells = Callable[[Mapping[str, float], float | None], FloatArray]
 
 
@@ -32,13 +32,14 @@ class ParameterSpec:
     ----------
     name, unit : str
     default : float or None
-        None where it has to be given.
+        None for a parameter that the netlist must give.
     usual : Usual or None
         Range outside which a warning is given.
     may_be_zero, may_be_infinite : bool
         Whether 0, or infinity, is allowed besides positive numbers.
     least, most : float
-        Range of the other numbers: far beyond any device, and such that products and quotients do not overflow.
+        Range of all other numbers: wide enough for any device, and so narrow that products and quotients do not
+        overflow.
     """
 
     name: str
@@ -80,12 +81,12 @@ class DeviceSpec:
             raise TypeError(f"device {self.name}: an area node and cells belong together; give both, or neither")
 
     def parameter(self, name: str) -> ParameterSpec:
-        """The parameter of that name; KeyError where there is none."""
+        """The parameter of that name; raises KeyError if there is none."""
         return {p.name: p for p in self.parameters}[name]
 
     @property
     def is_layer(self) -> bool:
-        """Whether its capacitance scales with the ridge contact area; in a netlist it is then an X."""
+        """Whether the capacitance scales with the ridge contact area; a netlist calls such a device by an X line."""
         return "area" in self.nodes
 
 
@@ -120,8 +121,8 @@ _LAYER_NODES = ("p", "n", "area")
 _COATING = Usual(10e-9, 1e-2, "from a sputtered film to a thick glass")
 # The horny layer has 10 to 20 um on most of the body and some 0.2 to 0.6 mm at the fingertip; callus has over 1 mm.
 _SKIN = Usual(1e-6, 2e-3, "skin has 10 um, a fingertip 0.2 to 0.6 mm, callus over 1 mm")
-# The air between rough skin and a screen: 3.5 um in Table 1; below 10 nm surfaces attract each other, above 100 um the
-# ridges (some 60 um high) are off the screen.
+# The air between rough skin and a screen: 3.5 um in Table 1; below 10 nm surfaces attract each other, and above 100 um
+# the ridges (some 60 um high) do not touch the screen.
 _AIR = Usual(10e-9, 100e-6, "from van der Waals contact to ridges off the screen; 3.5 um in Table 1")
 # Air has 1, polymers 2 to 10, ceramics up to some thousand.
 _EPS_R = Usual(1.0, 1e4, "air has 1, polymers 2 to 10, ceramics up to some thousand")
@@ -134,23 +135,23 @@ _LEAK = Usual(1.0, 1e15, "0.2 to 1 megohm in Table 1, an ohm for sweat, 1e14 ohm
 _RHO = Usual(0.1, 1e17, "sweat has 1 ohm m, skin 1e4, good polymers 1e14 to 1e16")
 # Air has 3 MV/m, glass 10 to 40, thin polymer and oxide films 100 to 1000.
 _STRENGTH = Usual(1e5, 1e10, "air has 3 MV/m, thin oxides 1 GV/m", "V/m, not V/um")
-# Fingers touch with 0.1 to 5 N and press with less than 50 N, so that 50 itself is more likely millinewton.
+# Fingers touch with 0.1 to 5 N and press with less than 50 N; a value of 50 is probably meant in millinewton.
 _LOAD = Usual(1e-3, 49.9, "a finger touches with 0.1 to 5 N", "newton, not millinewton")
 # Dry skin on glass has 0.1 to 1, moist skin up to 3 and more.
 _FRICTION = Usual(0.01, 5.0, "dry skin on glass has 0.1 to 1, moist skin up to 3")
-# Table 1 has 54.4; at 1 N this is the area (Eq. 5), which may be that of a pencil's tip or of a palm.
+# The ridge area at 1 N (Eq. 5), from a pencil's tip to a palm; Table 1 has 54.4.
 _ALPHA = Usual(1.0, 2000.0, "the ridge area at 1 N; 54.4 in Table 1", "mm^2 and N")
 # A smooth ball has 2/3 (Hertz), a rough plane up to 1; measured fingers have 0.2 to 0.8, Table 1 has 0.52.
 _M_EXP = Usual(0.1, 1.0, "2/3 for a ball, 1 for a rough plane, 0.52 in Table 1")
 # Table 1 has 32 and 1.41; a disc that is wholly in contact has pi and 2.
 _BETA = Usual(0.3, 1e4, "pi for a full disc, 32 in Table 1", "mm")
 _N_EXP = Usual(0.5, 3.0, "2 for a full disc, 1.41 in Table 1")
-# Table 1 has 5000: with 0.15 N of friction that is a tenth of the square of a fingertip's area.
+# Table 1 has 5000: at a friction force of 0.15 N, c2 F_T^2 is then a tenth of the square of a fingertip's area.
 _C2 = Usual(1.0, 1e6, "5000 in Table 1", "mm^4/N^2")
 # Skin creeps within 1 ms to some seconds.
 _TAU = Usual(1e-5, 60.0, "skin creeps within 1 ms to some seconds")
 _BAND = Usual(*SKIN_BAND, "where the data of Eqs. 18 and 19 were measured")
-# Resistances of leads to insulators; capacitances of a fraction of a picofarad between leads to that of a supply.
+# Resistances from leads to insulators; capacitances from a fraction of a picofarad between leads to a power supply's.
 _OHM = Usual(1e-3, 1e15, "a lead has milliohms, an insulator up to 1e15 ohm")
 _FARAD = Usual(1e-16, 1e-2, "a body has 150 pF to ground, a supply's capacitor some mF")
 
@@ -183,7 +184,7 @@ DEVICES: dict[str, DeviceSpec] = {
         DeviceSpec(
             "GAP",
             _LAYER_NODES,
-            # The defaults are those of the ngspice libraries: Table 1.
+            # The defaults are Table 1's, and equal those of the ngspice libraries.
             (
                 _P("d", "m", 3.5e-6, _AIR),
                 _P("eps_r", "", 1.0, _EPS_R),
@@ -210,5 +211,5 @@ DEVICES: dict[str, DeviceSpec] = {
 
 
 def layer_devices() -> tuple[str, ...]:
-    """Names of the layers, which X lines call without a definition in the netlist."""
+    """Names of the layer devices, which X lines may call without a definition in the netlist."""
     return tuple(name for name, spec in DEVICES.items() if spec.is_layer)

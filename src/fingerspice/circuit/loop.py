@@ -1,4 +1,4 @@
-"""The network of any circuit. In that of a series stack the voltage around its loop is the one source."""
+"""The network of any circuit; the network of a series stack has one source, the voltage around the loop."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
 
 
 def _network(circuit: Circuit) -> Network:
-    """The network of a circuit, made of that of a related one where only sources differ."""
+    """The network of a circuit, taken from a related circuit's network if the two differ in their sources only."""
     before: tuple[tuple[Element, ...], Network] | None = circuit.related.get("network")
     if before is not None:
         elements, network = before
@@ -58,7 +58,7 @@ def loop_network(stack: Stack) -> Network:
     constants = list(zip(stack.c.tolist(), stack.g_total.tolist(), stack.g_area.tolist(), strict=True))
     area = stack.area_given if stack.contact is None or stack.area_given else stack.contact.area_at_rest
     assert area is not None
-    # The charge is that of the cell that leaks least, where it suffers least from cancellation.
+    # The delivered charge is computed at the cell that leaks most slowly, where cancellation costs fewest digits.
     slowest = int(np.argmin(stack.leak_rates(area)))
     hops = tuple((hop.element.device == "V", hop.sign) for hop in stack.hops)
     p, q, nodes = _voltages(hops, tuple(stack.layer_of(i) for i in order), tuple(sign[i] for i in order))
@@ -90,16 +90,21 @@ def loop_network(stack: Stack) -> Network:
 def _voltages(
     hops: tuple[tuple[bool, float], ...], layers: tuple[int, ...], sign: tuple[float, ...]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Voltages of a loop's cells (n_cell, n) and (n_cell, 1) from the states and the loop's voltage, and of its nodes.
-
-    Those are (n_node, n + 1), or from the sources one by one as well, where there are several.
+    """Matrices that give the cell voltages and the node voltages of a loop.
 
     Parameters
     ----------
     hops : tuple of (bool, float)
-        Of each hop whether it is a source, and its sign.
+        For each hop whether it is a source, and its sign.
     layers, sign : tuple
-        The layer that each cell is part of, counted along the loop, and the cell's sign; in the order of the states.
+        Layer of each cell, counted along the loop, and sign of each cell; in the order of the states.
+
+    Returns
+    -------
+    p, q : ndarray, shape (n_cell, n) and (n_cell, 1)
+        Cell voltages from the states and from the loop's voltage.
+    nodes : ndarray, shape (n_node, n + 1 + n_source)
+        Node voltages from the states, the loop's voltage and each source; n_source is 0 for a single source.
     """
     n, several = len(sign) - 1, sum(is_source for is_source, _ in hops)
     across = np.zeros((n + 1, n + 1 + (several if several > 1 else 0)))

@@ -1,12 +1,12 @@
-"""From any connected netlist to its reduced state space: modified nodal analysis on a normal tree.
+"""Reduced state space of any connected netlist, by modified nodal analysis on a normal tree.
 
 The tree takes voltage sources first, then capacitors, then resistors. The voltages x of its capacitors are the live
 states; with the sources' voltages s every capacitor has u = P x + Q s, and the voltages of the tree's resistors, which
-follow at once, are taken out. What is left is Kirchhoff's current law on the cuts of the tree's capacitors,
+depend algebraically on x and s, are eliminated. Kirchhoff's current law on the cuts of the tree's capacitors remains,
 
-    P^T i + K x + B s = 0,    i the currents of all capacitors with their leaks, s with the current sources' currents,
+    P^T i + K x + B s = 0,    i the currents of all capacitors with their leaks, s with the current sources' currents.
 
-and the same on those of the voltage sources, which gives the currents that these deliver.
+The same law on the cuts of the voltage sources gives the currents that these deliver.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ from fingerspice.waveforms.waveform import Waveform
 
 @dataclass(frozen=True)
 class Cell:
-    """A capacitor with the leak beside it: a C, a layer, or one of the slabs of a dispersive layer.
+    """A capacitor with its parallel leak: a C, a layer, or one of the slabs of a dispersive layer.
 
-    Capacitance and leak are `c` and `g_area` times the area, plus `g_total`; without an area, `c` alone.
+    The capacitance is `c` times the area, and the leak is `g_area` times the area plus `g_total`; a cell without an
+    area has the capacitance `c`.
     """
 
     element: Element
@@ -54,34 +55,36 @@ class Network:
     ----------
     sources : tuple of Element
     n_voltage : int
-        How many of them are voltage sources.
+        Number of voltage sources among them.
     cells : tuple of Cell
     layers : tuple of Element
-        Those whose capacitance scales with an area, in deck order.
+        Elements whose capacitance scales with an area, in deck order.
     live : tuple of int
-        The cell whose voltage each live state is.
+        Index of the cell whose voltage is the live state, for each live state.
     areas : tuple of Area
     contacts : tuple of Contact or None
-        Of each area; None where no GAP drives it.
+        Contact of each area; None for an area without GAP.
     gaps : tuple of int or None
-        The cell of each area's GAP.
+        Index of the cell of each area's GAP.
     p, q : ndarray, shape (n_cell, n) and (n_cell, n_s)
         u = p x + q s.
     k, b : ndarray, shape (n, n) and (n, n_s)
         Currents of the resistors and the current sources into the cuts of the live capacitors, S.
     through : ndarray, shape (n_s, n_cell)
     delivered : ndarray, shape (n_s, n + n_s)
-        Current that each source delivers, a V out of its p node and an I out of its n node: through @ i, i the cells'
-        currents, and this of (x, s).
+        The current that each source delivers (a V out of its p node, an I out of its n node) is
+        through @ i + delivered @ (x, s), with the currents i of the cells.
     resistor_factor, resistor_factor_s : ndarray, shape (n_r, n) and (n_r, n_s)
-        k = f^T f, and b = f^T f_s but for the current sources, whose f_s is zero.
+        Factors f and f_s with k = f^T f and, in the columns of the voltage sources, b = f^T f_s; f_s is zero in the
+        columns of the current sources.
     node_names : tuple of str
     nodes : ndarray, shape (n_node, n + n_s + n_inner)
         Node voltages from x, s and the inner sources.
     stack : Stack or None
-        Of which this is the network (see `loop`): then modes and phasors follow from it, to full relative precision.
+        The series stack if this is its network (see `loop`): modes and phasors are then computed from the stack, to
+        full relative precision.
     kept : dict
-        What was computed of the network whatever its sources are, for networks that differ in those alone.
+        Cache of results that do not depend on the sources, shared by networks that differ in their sources only.
     """
 
     sources: tuple[Element, ...]
@@ -110,24 +113,24 @@ class Network:
 
     @cached_property
     def inner(self) -> tuple[Element, ...]:
-        """Sources of a series loop of several, whose sum is the network's one source."""
+        """Sources of a series loop that has several; their sum is the network's one source."""
         sources = () if self.stack is None else self.stack.sources
         return tuple(e for e, _ in sources) if len(sources) > 1 else ()
 
     @cached_property
     def waveforms(self) -> tuple[Waveform, ...]:
-        """Of each source, V or A."""
+        """Waveform of each source, V or A."""
         return tuple(e.waveform for e in self.sources if e.waveform is not None)
 
     @cached_property
     def grouping(self) -> FloatArray:
-        """Which cells make up each layer, shape (n_layer, n_cell)."""
+        """Matrix of 0 and 1 from cells to layers, shape (n_layer, n_cell)."""
         rows = [[float(cell.element is layer) for cell in self.cells] for layer in self.layers]
         return np.array(rows).reshape(len(self.layers), len(self.cells))
 
     @property
     def fingers(self) -> tuple[int, ...]:
-        """Areas that a GAP drives."""
+        """Indices of the areas that a GAP drives."""
         return tuple(i for i, gap in enumerate(self.gaps) if gap is not None)
 
     def capacitance(self, area: FloatArray) -> FloatArray:
@@ -135,20 +138,20 @@ class Network:
         return np.array([c.c if c.area is None else c.c * area[c.area] for c in self.cells])
 
     def leak(self, area: FloatArray) -> FloatArray:
-        """Conductance beside every cell at areas (n_area,) in m^2, S, shape (n_cell,)."""
+        """Leakage conductance of every cell at areas (n_area,) in m^2, S, shape (n_cell,)."""
         return np.array([c.g_total + (0.0 if c.area is None else c.g_area * area[c.area]) for c in self.cells])
 
     def mass(self, area: FloatArray) -> FloatArray:
-        """p^T C p, F, shape (n, n): positive definite."""
+        """Mass matrix p^T C p, F, shape (n, n), positive definite."""
         return np.asarray(self.p.T @ (self.capacitance(area)[:, None] * self.p))
 
     def stiffness(self, area: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Currents into the cuts from x (n, n) and from s (n, n_s), leaks included, S."""
+        """Matrices of the currents into the cuts from x (n, n) and from s (n, n_s), S, the leaks included."""
         leak = self.leak(area)[:, None]
         return self.k + self.p.T @ (leak * self.p), self.b + self.p.T @ (leak * self.q)
 
     def admittances(self, frequency: ArrayLike, area: FloatArray) -> ComplexArray:
-        """Complex admittance of every cell at frequencies (Hz), SKIN's data taken there, S, shape (..., n_cell)."""
+        """Complex admittance of every cell at frequencies (Hz), with SKIN's data there, S, shape (..., n_cell)."""
         f = np.asarray(frequency, float)
         y = self.leak(area) + 2j * np.pi * f[..., None] * self.capacitance(area)
         for i, cell in enumerate(self.cells):
@@ -166,13 +169,14 @@ class Network:
 
 
 def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
-    """The network of a circuit; voltage sources in `held` hold nodes of it, no two of which other sources tie together.
+    """The network of a circuit.
+
+    The voltage sources in `held` are added, to hold the voltages of nodes; they may close no loop of voltage sources.
 
     Raises
     ------
     InputError
-        As `topology.find_branches`; for the reading of Eq. 7 with the total voltage held, which a series stack alone
-        has.
+        As `topology.find_branches`, and if Eq. 7 holds the total voltage, which only a series stack has.
     """
     areas, branches = find_branches(circuit)
     branches = [*branches, *held]
@@ -182,7 +186,7 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
         )
     place = {area.node: i for i, area in enumerate(areas)}
     cells = [cell for e in branches for cell in _cells(e, place)]
-    # The gaps first: their voltages are then states of their own.
+    # The gaps come first, so that the tree contains them and their voltages are states.
     cells.sort(key=lambda cell: cell.element.device != "GAP")
     voltages = [e for e in branches if e.device == "V"]
     currents = [e for e in branches if e.device == "I"]
@@ -197,14 +201,14 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     potential = tree.potentials()
 
     def rows(pairs: list[tuple[str, ...]]) -> FloatArray:
-        """Voltages between pairs of nodes from those of the tree's branches, in the order they were added."""
+        """Matrix from the voltages of the tree's branches, in the tree's order, to the voltages between node pairs."""
         out = [potential[a] - potential[b] for a, b, *_ in pairs]
         return np.array(out).reshape(len(pairs), n_v + n + n_r)
 
     across = rows([cell.nodes for cell in cells])
     over_resistors, over_currents = rows([e.nodes for e in resistors]), rows([e.nodes for e in currents])
     conductance = np.array([1.0 / e.values["value"] for e in resistors])
-    # Voltages e = (s, x) of the tree are given; those of its resistors make the power least.
+    # Given the tree's voltages e = (s, x), the voltages of its resistors minimise the dissipated power.
     e, r = slice(0, n_v + n), slice(n_v + n, None)
     weight = np.sqrt(conductance)[:, None]
     orthogonal, upper = np.linalg.qr(weight * over_resistors[:, r])
@@ -213,13 +217,14 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     from_i = -np.linalg.solve(upper, back) if n_r else back
     by_e = over_resistors[:, e] + over_resistors[:, r] @ from_e
     by_i = over_resistors[:, r] @ from_i
-    # Currents out of the p nodes of the tree's branches: e^T-power, with the current sources' own.
+    # Currents into the cuts of the tree's sources and capacitors, from the resistors (by e) and the current sources.
     into_e = by_e.T @ (conductance[:, None] * by_e)
     into_i = over_resistors[:, e].T @ (conductance[:, None] * by_i) + over_currents[:, e].T
     s, x = slice(0, n_v), slice(n_v, n_v + n)
     n_i = len(currents)
-    # The current of a small resistor is a small difference of large voltages. Taking the sources' cuts together with
-    # those of the capacitors so that as little of it as possible counts leaves what flows through the cells.
+    # The current of a small resistance comes from a small difference of large voltages, with cancellation. To a
+    # source's cut a combination of the capacitors' cuts is added, chosen by least squares so that the resistors
+    # contribute least: the source's current then comes mostly from the currents of the cells.
     factor = weight * by_e
     together = -np.linalg.lstsq(factor[:, x], factor[:, s], rcond=None)[0].T if factor.size else np.zeros((n_v, n))
     delivered = np.zeros((n_v + n_i, n + n_v + n_i))
@@ -296,7 +301,7 @@ class _Tree:
         return node
 
     def add(self, p: str, n: str) -> bool:
-        """Take a branch in where it closes no loop; whether it did."""
+        """Add a branch if it closes no loop, and return whether it was added."""
         a, b = self._root(p), self._root(n)
         if a == b:
             return False
@@ -307,7 +312,7 @@ class _Tree:
         return True
 
     def potentials(self) -> dict[str, FloatArray]:
-        """Voltage of every node against ground as a row over the branches."""
+        """Voltage of every node against ground, as a row of coefficients of the branch voltages."""
         out = {"0": np.zeros(self._count)}
         todo = ["0"]
         while todo:
@@ -322,19 +327,19 @@ class _Tree:
 
 @dataclass(frozen=True)
 class Modes:
-    """A network with fixed areas, x = shape v - follow s with v_k' = -rates_k v_k + gains_k s.
+    """Modes v of a network with fixed areas: x = shape v - follow s, with v_k' = -rates_k v_k + gains_k s.
 
     Attributes
     ----------
     rates : ndarray, shape (n,)
-        1/s; zero for a charge that nothing drains.
+        1/s; zero for a charge that no conductance drains.
     gains : ndarray, shape (n, n_s)
     shape, inverse : ndarray, shape (n, n)
         v = inverse (x + follow s).
     follow : ndarray, shape (n, n_s)
-        What a jump of the sources moves at once.
+        A jump ds of the sources changes x by -follow ds, and v not at all.
     take : ndarray, shape (n, n_cell)
-        v_k' = -take j for currents j (A) that cells take beside their own.
+        Currents j (A) through the cells in addition to their linear ones contribute -take j to v'.
     """
 
     rates: FloatArray
@@ -348,8 +353,8 @@ class Modes:
 def network_modes(network: Network, area: FloatArray) -> Modes:
     """Modes at areas (n_area,) in m^2.
 
-    From the singular values of the conductances' factor rather than the eigenvalues of their matrix: a slow rate beside
-    a fast one keeps twice the digits, and so does what the sources push it.
+    The rates are squares of the singular values of the conductance matrix's factor, not eigenvalues of the matrix: so a
+    slow mode beside a fast one has its rate, and its drive by the sources, with twice as many digits.
     """
     capacitance, leak = network.capacitance(area), network.leak(area)
     n, n_v = network.k.shape[0], network.n_voltage
@@ -362,7 +367,7 @@ def network_modes(network: Network, area: FloatArray) -> Modes:
         left, sigma, turned = np.linalg.svd(np.linalg.solve(lower, factor.T).T)
     rates = np.zeros(n)
     rates[: sigma.size] = sigma**2
-    # What is left of a charge that nothing drains is rounding.
+    # The computed rate of a charge that no conductance drains is round-off.
     rates[rates < 1e-28 * rates.max(initial=0.0)] = 0.0
     inverse = turned @ lower.T
     take = turned @ (np.linalg.solve(lower, network.p.T) if n else network.p.T)

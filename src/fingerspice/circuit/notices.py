@@ -1,4 +1,4 @@
-"""Warnings of a circuit before it runs: directives without effect, and a skin taken at another frequency."""
+"""Warnings about a circuit before it runs: directives without effect, and skin data at an unsuitable frequency."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.spectrum import energy_outside, skin_error
 from fingerspice.waveforms.waveform import Waveform
 
-# Half width of a band around a frequency, relative to it, in which the skin's data change by 3 %; and the share of the
-# source's energy that may lie outside the band.
+# Half-width of a band around a frequency, relative to the frequency, in which the skin's data change by 3 %; and the
+# fraction of the source's energy that may lie outside the band.
 _BAND, _OUTSIDE = 0.05, 0.01
-# What is said of the mean force where nothing is known of it, and the smallest error that is told from none.
+# Text about the mean force if its error cannot be computed, and the smallest relative error that is given as a number.
 _UNKNOWN, _LITTLE = "may be 5 to 10 % off", 0.005
-# Directives that only ngspice needs, of which no warning is given.
+# Directives that only ngspice needs, so that no warning is given about them.
 _FOR_NGSPICE = (".nodeset", ".options")
 
 
 def circuit_warnings(circuit: Circuit, t_stop: float | None) -> tuple[str, ...]:
-    """Warnings of what has no effect in a deck, and of a SKIN whose one frequency is not right for its source.
+    """Warnings about directives without effect, and about a SKIN whose single frequency does not suit its source.
 
-    The run is one to `t_stop` (s), or to the deck's own end.
+    The run is taken to end at `t_stop` (s), or at the deck's own end where that is None.
     """
     stop = t_stop or (circuit.tran.stop if circuit.tran is not None else math.nan)
 
@@ -51,7 +51,7 @@ def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
         return
     waves = network_of(circuit).waveforms
     if len(waves) > 1:
-        # With several sources only the user can know at which frequency the skin should be taken.
+        # With several sources only the user can know at which frequency the skin data should be taken.
         return
     (wave,), fundamental = waves, waves[0].fundamental
     known = 0.0 < stop < math.inf
@@ -72,7 +72,7 @@ def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
 
 
 def _how_far(circuit: Circuit, wave: Waveform, stop: float) -> str:
-    """What is known of the mean force of a run to `stop` (s), for a warning."""
+    """Text for a warning: the error of the mean force of a run to `stop` (s)."""
     error = circuit.remember(("skin error", stop), lambda: skin_error(circuit, wave, stop))
     if error is None:
         return _UNKNOWN

@@ -1,4 +1,4 @@
-"""Linear response of a circuit at one frequency: the voltages of its layers and the areas that belong to them."""
+"""Linear response of a circuit at one frequency: its layer voltages, and the contact areas at these voltages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from fingerspice.waveforms.waveform import Fundamental
 
 @dataclass(frozen=True)
 class LinearScene:
-    """A circuit with one contact, as far as its phasors depend on it.
+    """The data of a circuit that the phasors of one of its contacts depend on.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class LinearScene:
     finger : int
         Index of the GAP's area.
     note : str
-        Which of several GAPs it is; empty where there is one.
+        Text that names the GAP if there are several; empty for one GAP.
     """
 
     network: Network
@@ -44,17 +44,17 @@ class LinearScene:
 
     @property
     def fixed(self) -> bool:
-        """Whether the deck fixes that area."""
+        """Whether the deck fixes the contact's area."""
         return self.network.areas[self.finger].given is not None
 
     @property
     def fundamental(self) -> Fundamental | None:
-        """The source's."""
+        """Fundamental of the source, or None."""
         return self.network.waveforms[0].fundamental
 
     @property
     def sources(self) -> tuple[tuple[Element, float], ...]:
-        """Each source with its sign along the loop, where there is one."""
+        """Each source with its sign along the loop of a series stack; the sign is 1 for other networks."""
         stack = self.network.stack
         return tuple((e, 1.0) for e in self.network.sources) if stack is None else stack.sources
 
@@ -77,13 +77,13 @@ class LinearScene:
 
 
 def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
-    """The contact of a circuit's GAP, which has to be named where there are several, and what drives it.
+    """The linear scene of a circuit's GAP, which has to be named if there are several.
 
     Raises
     ------
     InputError
-        For a circuit without GAP, for a name that no GAP has, or none where there are several, and for several sources
-        of a network, which have no one amplitude and frequency.
+        If the circuit has no GAP, if no GAP has the given name, if several GAPs exist and none is named, or if a
+        network has several sources, which have no common amplitude and frequency.
     """
     gaps = {e.name.lower(): e.name for e in circuit.by_device("GAP")}
     if finger is not None and finger.lower() not in gaps:
@@ -109,7 +109,7 @@ def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
 
 
 def with_skin_held(circuit: Circuit) -> Circuit:
-    """The circuit with each SKIN replaced by a slab of its data at its own frequency."""
+    """The circuit with each SKIN replaced by a SLAB that has the skin's data at the SKIN's own frequency."""
 
     def held(skin: Element) -> Element:
         d, f = skin.values["d"], skin.values["f"]
@@ -126,7 +126,7 @@ def mean_areas(network: Network) -> FloatArray:
     Raises
     ------
     InputError
-        Where there are several sources, or one without fundamental; where the areas do not settle.
+        If there are several sources, if the source has no fundamental, or if the areas do not converge.
     """
     several = len(network.sources) > 1
     fundamental = None if several else network.waveforms[0].fundamental
@@ -147,7 +147,7 @@ def areas_at_rest(network: Network) -> FloatArray:
 
 
 def _stack_gains(stack: Stack, f: float, areas: FloatArray) -> ComplexArray:
-    """Share of the source's voltage that each layer takes at a frequency (Hz) and an area (m^2), shape (n_layer,)."""
+    """Complex ratio of each layer's voltage to the source's at a frequency (Hz) and an area (m^2), shape (n_layer,)."""
     return np.asarray(layer_gains(stack.admittance(np.array([f]), areas))[0])
 
 
@@ -157,7 +157,7 @@ def coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
     Raises
     ------
     InputError
-        Where they do not settle.
+        If the areas do not converge.
     """
     area = areas_at_rest(network)
     if all(a.given is not None for a in network.areas):
@@ -172,16 +172,16 @@ def coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
             contact, gap = network.contacts[i], network.gaps[i]
             if network.areas[i].given is None and contact is not None and gap is not None:
                 new[i] = float(contact.area(float(u[gap]) / math.sqrt(2.0)))
-        # Areas that are no numbers do not converge; the caller refuses them.
+        # NaN and inf cannot converge: return them, for the caller to refuse.
         if np.all(np.abs(new - area) <= 4e-16 * area) or not np.all(np.isfinite(new)):
             return new
-        # Two areas may oscillate against each other: take the mean.
+        # The fixed-point iteration may oscillate between two values: after 50 iterations, damp it by taking the mean.
         area = new if attempt < 50 else 0.5 * (area + new)
     raise InputError("the phasor's areas do not settle; allowed: area='frozen' or an area in m^2")
 
 
 def _stack_area(stack: Stack, f: float, amplitude: float) -> float:
-    """The same of a stack whose area follows its gap, m^2."""
+    """Coupled area (m^2) of a stack at a source amplitude (V) and frequency (Hz), as in `coupled_areas`."""
     contact, gap = stack.contact, stack.gap_layer
     assert contact is not None
 

@@ -1,4 +1,4 @@
-"""A source's spectrum and the skin: the energy outside the skin's data, and the error of data at one frequency."""
+"""A source's spectrum and the skin's data: energy outside their band, and the error of data held at one frequency."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.physics.phasor import layer_gains
 from fingerspice.waveforms.waveform import Waveform
 
-# Largest number of samples of a spectrum, and number of periods that represent a longer run of a periodic source.
+# Largest number of samples of a spectrum, and largest number of periods over which a periodic source is evaluated.
 _MOST_SAMPLES = 2**17
 _PERIODS = 16
-# Pieces that represent a longer run of another source, and frequencies between which gains are interpolated.
+# Number of pieces that represent a long run of a source without period, and number of frequencies at which gains are
+# computed.
 _PIECES, _GRID = 4, 49
-# Share of the source's energy outside the band of the skin's data from which on a warning is given.
+# A warning is given if more than this fraction of the source's energy is outside the band of the skin's data.
 NOTABLE = 0.01
-# The area's harmonics also meet the skin's data. Taken at the fundamental, these cause a further relative error of at
-# most this times the relative change of the area: 0.004 was found where the area changes by a quarter (sine of 200 V
-# and 100 Hz).
+# The area's harmonics also drive currents through the skin. Skin data held at the fundamental cause an additional
+# relative error of at most COUPLING times the relative change of the area: 0.004 was found where the area changes by a
+# quarter (sine of 200 V and 100 Hz).
 COUPLING = 0.05
 
 
 def _enough(span: float, rate: float) -> int:
-    """Number of samples of a span (s), a power of two: `rate` or more per second unless that is too many."""
+    """Number of samples of a span (s), a power of two: at least `rate` per second, but at most `_MOST_SAMPLES`."""
     return int(min(_MOST_SAMPLES, max(1024, 2 ** math.ceil(math.log2(span * rate)))))
 
 
@@ -41,16 +42,16 @@ def _samples(waveform: Waveform, t0: float, t1: float, count: int) -> FloatArray
 
 @lru_cache(maxsize=4)
 def _window(count: int) -> FloatArray:
-    """Hann's window; its cosines would cost as much as the transform."""
+    """Hann's window, cached because its cosines cost as much as the Fourier transform."""
     return np.hanning(count)
 
 
 def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatArray, FloatArray]:
-    """Frequencies (Hz) up to twice the highest of interest (Hz), and the source's energy at each, in any unit.
+    """Frequencies (Hz) up to at least twice `highest` (Hz), and the source's energy at each, in arbitrary units.
 
-    They are of one period of a periodic source, and else of the run to `t_stop` (s) with a Hann window, so that its
-    ends are no jumps. Of a run too long for that they are the sum of pieces spread over it. A source that is not finite
-    has no energy.
+    For a periodic source the spectrum is taken over one period, and else over the run to `t_stop` (s) with a Hann
+    window, because the ends of the run would count as jumps. For a run of too many samples the spectra of several
+    pieces spread over the run are added. A source with values that are not finite has energy 0.
     """
     periodic = waveform.period is not None
     t0 = waveform.settled if periodic else 0.0
@@ -75,10 +76,10 @@ def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatA
 def energy_outside(
     waveform: Waveform, t_stop: float, band: tuple[float, float] = SKIN_BAND
 ) -> tuple[float, float]:  # fmt: skip
-    """Shares of the source's energy below and above a band (Hz), by default that of the skin's data.
+    """Fractions of the source's energy below and above a band (Hz), by default the band of the skin's data.
 
-    They are taken over one period of a periodic source, and else over the run to `t_stop` (s). A source that is not
-    finite counts as inside.
+    The energy is that of one period of a periodic source, and else that of the run to `t_stop` (s). For a source with
+    values that are not finite both fractions are 0.
     """
     low, high = band
     f, energy = _energies(waveform, t_stop, high)
@@ -89,7 +90,7 @@ def energy_outside(
 
 
 def _shared_out(f: FloatArray, energy: FloatArray, grid: FloatArray) -> FloatArray:
-    """Energy at frequencies (Hz) shared between the two nearest of a geometric grid, as linear interpolation does."""
+    """Energy on a geometric grid (Hz): each line is divided between its two neighbours by linear weights in log f."""
     place = np.log(np.clip(f, grid[0], grid[-1]) / grid[0]) / math.log(grid[1] / grid[0])
     low = np.minimum(place.astype(int), grid.size - 2)
     above = energy * (place - low)
@@ -97,11 +98,11 @@ def _shared_out(f: FloatArray, energy: FloatArray, grid: FloatArray) -> FloatArr
 
 
 def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | None:
-    """Relative error of the mean force where SKIN has its data at its own frequency, for the only source of a circuit.
+    """Relative error of the mean force due to SKIN's data held at one frequency, for a circuit with one source.
 
-    It is that of the mean square of the gap's linear response at the areas at rest, with the source's spectrum over the
-    run to `t_stop` (s); of several fingers that of the worst. Outside the band of the skin's data those at its ends are
-    taken. None where it cannot be told.
+    It is estimated by the relative error of the mean square of the gap voltage, from the linear response at the areas
+    at rest and the source's spectrum over the run to `t_stop` (s); of several fingers the largest error counts. Outside
+    the band of the skin's data the response at the band's ends is used. None if the response cannot be computed.
     """
     networks = network_of(circuit), network_of(with_skin_held(circuit))
     gaps = [gap for gap in networks[0].gaps if gap is not None]
@@ -125,7 +126,7 @@ def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> str
     skins = circuit.by_device("SKIN_DISPERSIVE")
     if not skins or not (math.isfinite(t_stop) and t_stop > 0.0):
         return None
-    # One entry with its key: another thread may put its own there at any time.
+    # Key and result are one entry, so that they stay consistent when another thread replaces it.
     kept, shares = waveform.kept.get("outside", (None, (0.0, 0.0)))
     if kept != t_stop:
         shares = energy_outside(waveform, t_stop)
@@ -142,10 +143,10 @@ def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> str
 
 
 def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity: float, t_stop: float) -> float:
-    """Error of the gap voltage, relative to its peak, with a dispersive skin's data taken at one frequency.
+    """Error of the gap voltage, relative to its peak, if a dispersive skin's data are taken at one frequency.
 
-    It is that of the linear response at one area from the uncharged start, by superposition of phasors, plus an
-    estimate of what the change of the area adds.
+    It is the error of the linear response at one area from the uncharged start, by superposition of phasors, plus an
+    estimate of the error due to the change of the area.
 
     Parameters
     ----------
@@ -164,7 +165,7 @@ def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity:
     assert gap is not None
     span = min(t_stop, _PERIODS / frequency)
     u = _samples(dispersive.waveform, 0.0, span, _enough(span, 200.0 * frequency))
-    # The run is followed by silence of equal length, so that the discrete transform does not wrap its end round.
+    # The run is padded with zeros to twice its length, because the discrete transform is cyclic.
     lines = np.fft.rfft(u, 2 * u.size)
     f = np.arange(1, lines.size) / (2.0 * span)
     gains = [layer_gains(stack.admittance(f, np.array([area])))[:, gap] for stack in (dispersive, frozen)]

@@ -1,9 +1,9 @@
-"""From a circuit to its reduced state space, by node incidence.
+"""Reduced state space of a series stack.
 
-Per unit area, layer x has capacitance c_x, leak g_x = 1/(R_x A) (a total resistance) or 1/(rho d) (a material),
-and S = sum 1/c_x. With the leaked charges taken out, u_x = k_x U + v_x with k_x = 1/(c_x S): a jump of U splits in
-the ratio of 1/c_x, no derivative of U appears, and sum v_x = 0 fixes the neutral gauge of the leaked charges. So N
-layers have N - 1 live states,
+Per unit area, layer x has the capacitance c_x and the leakage conductance g_x = 1/(R_x A) (a total resistance) or
+1/(rho d) (a material), and S = sum 1/c_x. With v_x, the part of the voltage due to the leaked charges,
+u_x = k_x U + v_x, k_x = 1/(c_x S): a jump of U splits in the ratio of 1/c_x, no derivative of U appears, and
+sum v_x = 0 fixes the neutral gauge of the leaked charges. So N layers have N - 1 live states,
 
     v' = (k 1^T - I) diag(g/c) u.
 """
@@ -31,20 +31,20 @@ from fingerspice.waveforms.waveform import DC, Waveform
 class Stack:
     """Layers in one series loop with an ideal source, sharing one area. SI throughout.
 
-    A layer is one cell, a capacitor beside a resistor, or, where its material is dispersive, several in series.
+    A layer is one cell, which is a capacitor parallel to a resistor, or, for a dispersive material, several in series.
 
     Attributes
     ----------
     layers : tuple of Element
         In loop order, from the source's positive side.
     cells : tuple of int
-        How many cells each layer has; theirs follow each other in what follows.
+        Number of cells of each layer; the arrays below list the cells of a layer one after the other.
     sign : ndarray, shape (n_cell,)
-        +1 where a layer is written p to n along the loop, -1 where it is turned.
+        +1 for a layer whose p node comes first along the loop, -1 for a layer whose n node does.
     c : ndarray, shape (n_cell,)
         Capacitance per area, F/m^2.
     g_total : ndarray, shape (n_cell,)
-        Leakage conductance of fixed total, S.
+        Leakage conductance independent of the area, S.
     g_area : ndarray, shape (n_cell,)
         Leakage conductance per area, S/m^2.
     gap : int or None
@@ -53,7 +53,7 @@ class Stack:
     area_given : float or None
         Area fixed by the deck, m^2.
     hops : tuple of Hop
-        The loop as walked from ground.
+        The elements of the loop in order, from ground to ground.
     """
 
     layers: tuple[Element, ...]
@@ -69,7 +69,7 @@ class Stack:
 
     @property
     def sources(self) -> tuple[tuple[Element, float], ...]:
-        """Voltage sources in the loop, each with the sign it adds to U with."""
+        """Voltage sources in the loop, each with the sign of its voltage in the sum U."""
         return tuple((h.element, -h.sign) for h in self.hops if h.element.device == "V")
 
     @cached_property
@@ -83,7 +83,7 @@ class Stack:
         return None if self.gap is None else self.layer_of(self.gap)
 
     def layers_of(self, cells: NDArray[np.bool_]) -> list[str]:
-        """Names of the layers of which some cell is marked."""
+        """Names of the layers that have at least one marked cell."""
         marked = np.logical_or.reduceat(cells, self.first_cell)
         return [e.name for e, mark in zip(self.layers, marked, strict=True) if mark]
 
@@ -94,32 +94,32 @@ class Stack:
 
     @cached_property
     def k(self) -> FloatArray:
-        """Share of a jump of U that each cell takes, shape (n_cell,)."""
+        """Fraction of a jump of U that each cell takes, shape (n_cell,)."""
         return np.asarray(1.0 / (self.c * self.s))
 
     @cached_property
     def waveform(self) -> Waveform:
-        """Voltage around the loop: the sources with their signs."""
+        """Voltage around the loop: the sum of the sources with their signs."""
         parts: list[Waveform] = []
         for element, sign in self.sources:
             assert element.waveform is not None
-            # One at 0 V only measures a current.
+            # A source of 0 V only serves to measure a current.
             if element.waveform != DC(0.0):
                 parts.append(element.waveform if sign > 0 else Product((DC(-1.0), element.waveform)))
         return Sum(tuple(parts)) if len(parts) > 1 else parts[0] if parts else DC(0.0)
 
     @property
     def state_order(self) -> tuple[int, ...]:
-        """Cells in the order of the states; the last one's voltage is what the others leave of the source's.
+        """Cells in the order of the states; the last cell has no state, as its voltage is the source's less all others.
 
-        The cell left out is never the gap, so that the gap's voltage is a state of its own.
+        The last cell is never the gap (unless the gap is the only cell), so that the gap voltage is a state of its own.
         """
         left_out = next((i for i in reversed(range(self.c.size)) if i != self.gap), 0)
         return (*(i for i in range(self.c.size) if i != left_out), left_out)
 
     @cached_property
     def by_layer(self) -> Stack:
-        """The stack's layers as one capacitor each, without their leaks: what a run records."""
+        """The stack with each layer as one capacitor without leak: its voltages are those that a run records."""
         if len(self.layers) == self.c.size:
             return self
         c, none = 1.0 / np.add.reduceat(1.0 / self.c, self.first_cell), np.zeros(len(self.layers))
@@ -128,7 +128,7 @@ class Stack:
 
     @cached_property
     def grouping(self) -> FloatArray:
-        """Which live cells make up each recorded layer, shape (n_layer - 1, n_cell - 1)."""
+        """Matrix of 0 and 1 from live cells to recorded layers, shape (n_layer - 1, n_cell - 1)."""
         layers = np.array([self.layer_of(cell) for cell in self.state_order[:-1]], int)
         return np.asarray(np.array(self.by_layer.state_order[:-1], int)[:, None] == layers, float)
 
@@ -145,7 +145,7 @@ class Stack:
         return np.asarray((self.g_total / area + self.g_area) / self.c)
 
     def admittance(self, frequency: FloatArray, area: FloatArray) -> ComplexArray:
-        """Complex layer admittances (n_frequency, n_layer) in S, SKIN at each frequency (Eqs. 9, 16 to 19)."""
+        """Complex layer admittances (n_frequency, n_layer), S; SKIN has data at each frequency (Eqs. 9, 16 to 19)."""
         f = np.atleast_1d(np.asarray(frequency, float))[:, None]
         a = np.broadcast_to(np.asarray(area, float), (f.shape[0],))[:, None]
         y = self.g_total + self.g_area * a + 2j * math.pi * f * self.c * a
@@ -161,7 +161,7 @@ class Stack:
 def layer_constants(layer: Element, skin_at: float | None = None) -> FloatArray:
     """c (F/m^2), total leakage (S) and leakage per area (S/m^2) of a layer's cells, shape (n_cell, 3).
 
-    With `skin_at` a dispersive skin's data are those at that frequency (Hz).
+    With `skin_at` (Hz) a dispersive skin is one cell with its data at that frequency.
     """
     assert layer.spec.cells is not None
     key = ("cells", skin_at)
@@ -172,12 +172,12 @@ def layer_constants(layer: Element, skin_at: float | None = None) -> FloatArray:
 
 
 def contact_of(gap: Element) -> Contact:
-    """The contact of a GAP: the one place where the paper's mm become m.
+    """The contact of a GAP; here, and nowhere else, the paper's mm are converted to m.
 
     Raises
     ------
     InputError
-        Where its constants are beyond the range of numbers.
+        If its constants overflow or underflow.
     """
     if "contact" not in gap.kept:
         gap.kept["contact"] = _contact_of(gap)
@@ -212,7 +212,7 @@ def _contact_of(gap: Element) -> Contact:
 
 
 def is_stack(circuit: Circuit) -> bool:
-    """Whether a circuit is one series loop of sources and layers with one area that follows at once.
+    """Whether a circuit is one series loop of sources and layers, with one area that follows the voltage without delay.
 
     Raises
     ------
@@ -223,7 +223,7 @@ def is_stack(circuit: Circuit) -> bool:
 
 
 def _loop(circuit: Circuit) -> Loop | None:
-    """The circuit's loop, looked for once for all circuits that `Circuit.replace` makes of one another."""
+    """The circuit's loop; the search is done once for all circuits that `Circuit.replace` derives from one another."""
 
     def make() -> Loop | None:
         if "loop" not in circuit.related:
@@ -238,13 +238,13 @@ def _loop(circuit: Circuit) -> Loop | None:
 def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
     """The series stack of a circuit; with `skin_at`, dispersive skins have their data at that frequency (Hz).
 
-    Where the deck holds the total voltage in Eq. 7, the stack is the capacitive one: a dispersive skin counts with its
-    permittivity above all poles, eps_inf, and with the one at `skin_at` where that is given.
+    If the deck holds the total voltage in Eq. 7, the contact uses the stack's capacitances alone: a dispersive skin
+    enters with eps_inf, its permittivity above all poles, or with its permittivity at `skin_at`.
 
     Raises
     ------
     InputError
-        As `topology.find_branches`, and for a network that is no such stack.
+        As `topology.find_branches`, and if the circuit is not a series stack.
     """
     stack: Stack = circuit.remember(("stack", skin_at), lambda: _build(circuit, skin_at))
     return stack

@@ -1,4 +1,4 @@
-"""What a circuit is: its areas, its series loop if it is one, and the refusals of what no network is."""
+"""Topology of a circuit: its areas, its series loop if it is one, and checks that it is a solvable network."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.physics.ladder import SKIN_LADDER
 from fingerspice.waveforms.waveform import DC
 
-#: Elements of a circuit: every matrix of a network is dense.
+#: Largest number of elements of a circuit, because every matrix of a network is dense.
 MAX_ELEMENTS = 2000
 _GROUNDS = ("gnd", "ground", "earth", "vss")
 
 
 @dataclass(frozen=True)
 class Hop:
-    """One element of the loop as walked from ground: `sign` is +1 where it is met p first."""
+    """One element on the way round the loop from ground; `sign` is +1 if its p node comes first."""
 
     element: Element
     sign: float
     node: str
-    """Node reached, as written."""
+    """Name, as written, of the node after the element."""
 
 
 @dataclass(frozen=True)
 class Area:
-    """A contact area of a circuit, and what gives it.
+    """A contact area of a circuit, with the GAP or the value that determines it.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Area:
     given : float or None
         m^2, from a DC source on the node or the gap's a_fix.
     source : Element or None
-        That source.
+        The DC source that gives the area, or None.
     """
 
     node: str
@@ -51,7 +51,7 @@ class Area:
 
 @dataclass(frozen=True)
 class Loop:
-    """A series loop of sources and layers from ground back to ground, and what gives its area."""
+    """A series loop of sources and layers from ground back to ground, with the GAP or the value that gives its area."""
 
     hops: tuple[Hop, ...]
     gap: Element | None
@@ -65,8 +65,8 @@ def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
     Raises
     ------
     InputError
-        Naming the elements or nodes at fault: no source, a floating node, a loop of voltage sources, a current source
-        without a path, an area that nothing or too much drives; for a circuit of too many elements.
+        If there is no source, a floating node, a loop of voltage sources, a current source without a path, an area that
+        no element or several elements drive, or too many elements; the message names the elements or nodes at fault.
     """
     _refuse_large(circuit)
     areas = _areas(circuit)
@@ -96,7 +96,7 @@ def driving_sources(circuit: Circuit) -> list[Element]:
 
 
 def find_loop(circuit: Circuit) -> Loop | None:
-    """The loop of a circuit that is one series loop with one area; None for any other network.
+    """The loop of a circuit that consists of one series loop with one area; None for any other network.
 
     Raises
     ------
@@ -112,14 +112,14 @@ def find_loop(circuit: Circuit) -> Loop | None:
 
 
 def same_loop(circuit: Circuit, before: Loop) -> Loop | None:
-    """The loop of a circuit with the same devices on the same nodes as one whose loop is known.
+    """The loop of a circuit whose devices and nodes are those of a related circuit with a known loop.
 
-    None where the area has dynamics of its own.
+    None if the area follows with a delay (tau > 0): such a circuit is not solved as a stack.
 
     Raises
     ------
     InputError
-        For areas, as `find_branches`.
+        If an area has no valid drive, as in `find_branches`.
     """
     now = {e.name: e for e in circuit.elements}
     gap = None if before.gap is None else now[before.gap.name]
@@ -169,7 +169,7 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
 
 
 def _area_fixed(gap: Element) -> float | None:
-    """The area that a GAP is given (m^2), if it is."""
+    """The fixed area of a GAP, a_fix in m^2, or None."""
     a_fix = gap.values["a_fix"]
     return a_fix * 1e-6 if a_fix > 0.0 else None
 
@@ -221,7 +221,7 @@ def _refuse_floating(branches: list[Element]) -> None:
     for element in branches:
         if element.nodes[0] == element.nodes[1]:
             raise InputError(f"{element.name} has both ends on node {element.node_names[0]!r}", element.where)
-    # Ground last: a chain that misses it dangles at its own end too, and that is the node to name.
+    # Ground comes last: a chain not connected to ground also has a free end elsewhere, which is the node to name.
     for node, elements in sorted(at.items(), key=lambda item: item[0] == "0"):
         if len(elements) == 1:
             e = elements[0]
@@ -243,7 +243,7 @@ def _refuse_floating(branches: list[Element]) -> None:
 
 
 def _lookalike(node: str, at: Mapping[str, list[Element]]) -> str:
-    """Another node that may be the same, misspelt; ground by one of its other names."""
+    """Hint for the message: ground under another name, or a node of which this one may be a misspelling."""
     if node.startswith(_GROUNDS):
         return "; ground is 0 or gnd"
     near = get_close_matches(node, [other for other in at if other not in (node, "0")], 1, 0.7)
@@ -256,7 +256,7 @@ def _refuse_source_conflicts(branches: list[Element]) -> None:
 
     def root(node: str) -> str:
         while parent.setdefault(node, node) != node:
-            parent[node] = parent[parent[node]]  # halves the path: a long one is walked once
+            parent[node] = parent[parent[node]]  # path halving, so that a long path is walked only once
             node = parent[node]
         return node
 
@@ -275,7 +275,7 @@ def _refuse_source_conflicts(branches: list[Element]) -> None:
 
 
 def _path(branches: list[Element], start: str, end: str) -> list[Element]:
-    """The branches, which form no loop, that lead from one node to another."""
+    """The branches on the path from one node to another; the given branches form no loop, so the path is unique."""
     at = _incidence(branches)
     came: dict[str, Element | None] = {start: None}
     ahead = [start]
@@ -295,7 +295,7 @@ def _path(branches: list[Element], start: str, end: str) -> list[Element]:
 
 
 def _refuse_current_without_path(branches: list[Element]) -> None:
-    """Every node must be reached from ground without going through a current source."""
+    """Refuse a current source at a node that is connected to ground through current sources only."""
     reached = _reached(_incidence([e for e in branches if e.device != "I"]))
     for element in branches:
         for node in element.nodes[:2]:
@@ -308,19 +308,20 @@ def _refuse_current_without_path(branches: list[Element]) -> None:
 
 
 def _walk(branches: list[Element]) -> tuple[Hop, ...]:
-    """Walk the loop from ground, in the direction that meets the first source n first."""
+    """The loop from ground, in the direction in which the n node of the first source comes before its p node."""
     at = _incidence(branches)
     walks = [_walk_from(start, at) for start in at["0"]]
     for hops in walks:
         if next(h for h in hops if h.element.device == "V").sign < 0.0:
             return hops
-    # Sources against each other, met p first either way: the deck's first one decides.
+    # With opposed sources, the p node of the first source may come first in both directions: the deck's first source
+    # then decides.
     deciding = next(e for e in branches if e.device == "V")
     return next(hops for hops in walks if any(h.element is deciding and h.sign < 0.0 for h in hops))
 
 
 def _walk_from(start: Element, at: dict[str, list[Element]]) -> tuple[Hop, ...]:
-    """The loop from ground, beginning with one of the two elements there."""
+    """The loop from ground, beginning with the given one of the two elements at ground."""
     hops: list[Hop] = []
     node, element = "0", start
     while True:

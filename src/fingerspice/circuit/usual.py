@@ -1,4 +1,4 @@
-"""Usual ranges of values: values outside are allowed and computed, with a warning."""
+"""Usual ranges of values: a value outside its range is allowed, and causes a warning."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from fingerspice.base.units import format_si, spice_text
 
-# Units that take a prefix, in which slips are powers of 1000; in the other units m^2 is written for mm^2.
+# Units that take a prefix, where a slip of the user is a power of 1000; in the other units the slip is m^2 for mm^2.
 _PREFIXED = ("m", "N", "Pa", "ohm", "ohm m", "V", "V/m", "F", "Hz", "s")
 _THOUSANDS = tuple(sign * 3 * k for k in (1, 2, 3, 4, 5) for sign in (-1, 1))
 _MILLIONS = {"mm^2": (6, -6), "mm^2/N^m": (6, -6), "mm^4/N^2": (12, -12)}
@@ -23,9 +23,9 @@ class Usual:
     least, most : float
         Smallest and largest usual size of the quantity, in its unit. 0 and inf mean "none" and cause no warning.
     source : str
-        Where the range comes from, in words for brackets.
+        Origin of the range, as words to stand in brackets.
     slip : str
-        The unit and the one for which it is often taken, such as ``newton, not millinewton``.
+        The unit, and the other unit for which it is often taken, such as ``newton, not millinewton``.
     """
 
     least: float
@@ -34,14 +34,14 @@ class Usual:
     slip: str = ""
 
     def warning(self, what: str, value: float, unit: str) -> str | None:
-        """The warning of a value outside the range; None for one inside.
+        """The warning about a value outside the range; None for a value inside.
 
         Parameters
         ----------
         what : str
-            Such as ``Xgap d``.
+            Name of the quantity, such as ``Xgap d``.
         value : float
-            In the unit.
+            Value in `unit`.
         unit : str
         """
         size = abs(value)
@@ -55,7 +55,7 @@ class Usual:
         return f"{said}; was {meant} meant?" if meant else said
 
     def _meant(self, value: float, unit: str) -> str:
-        """The same digits with other prefixes that would be usual: at most three, the nearest first."""
+        """Usual values with the same digits and another prefix: at most three, the nearest first."""
         powers = _THOUSANDS if unit in _PREFIXED else _MILLIONS.get(unit, ())
         found = [float(f"{value:.12g}") * 10.0**power for power in powers]
         texts = [spice_text(x) for x in found if self.least <= abs(x) <= self.most][:3]
@@ -84,12 +84,12 @@ LARGEST_AREA = 1e-3
 
 
 def beyond_fingers(where: str, force: float, pressure: float, area: float) -> Iterator[str]:
-    """Warnings of results that no finger can have.
+    """Warnings about results that no finger can have.
 
     Parameters
     ----------
     where : str
-        Empty, or such as `` of Xgap``.
+        Empty, or a text such as `` of Xgap``.
     force, pressure, area : float
         Largest values of the run, N, Pa and m^2.
     """

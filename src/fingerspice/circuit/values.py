@@ -1,4 +1,4 @@
-"""Values of parameters: numbers in SPICE's notation, units that SPICE takes for scales, and unusual values."""
+"""Values of parameters: numbers in SPICE's notation, units that SPICE reads as scale factors, and unusual values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _UNIT_TRAPS = {"F": "farad", "N": "newton"}
 
 
 def unit_trap(spec: ParameterSpec, text: str) -> str | None:
-    """Why a number is refused whose unit SPICE would take for a scale; None where it is not."""
+    """Reason to refuse a number whose unit SPICE would read as a scale factor; None if SPICE would not."""
     word = _UNIT_TRAPS.get(spec.unit)
     if not word or not unit_read_as_scale(text, spec.unit, word):
         return None
@@ -33,7 +33,7 @@ def is_resistance(spec: ParameterSpec) -> bool:
 
 
 def mega_note(text: str, value: float, spec: ParameterSpec) -> str:
-    """The warning of a capital M in a resistance."""
+    """The warning about a capital M in a resistance, which SPICE reads as milli."""
     return (
         f"{text!r} is milli ({value:g} {spec.unit}), as everywhere in SPICE; for mega{spec.unit.partition(' ')[0]} "
         f"write {suggest_mega(text)}"
@@ -48,7 +48,7 @@ def value_of(path: str, given: Any, spec: ParameterSpec | None, unit: str) -> tu
     path : str
         Such as ``Xgap.d``.
     given : float or str
-        In the netlist's unit; a text such as ``3.5u``.
+        Value in the netlist's unit, as a number or as a text such as ``3.5u``.
     spec : ParameterSpec or None
         None for a parameter of a waveform.
     unit : str
@@ -56,7 +56,7 @@ def value_of(path: str, given: Any, spec: ParameterSpec | None, unit: str) -> tu
     Raises
     ------
     InputError
-        When it is no number, or has a unit that SPICE takes for a scale.
+        If the value is not a number, or has a unit that SPICE reads as a scale factor.
     """
     if isinstance(given, Real) or (hasattr(given, "__float__") and getattr(given, "ndim", 1) == 0):
         return float(given), None
@@ -80,7 +80,7 @@ def value_of(path: str, given: Any, spec: ParameterSpec | None, unit: str) -> tu
 
 
 def unusual(element: Element) -> Iterator[tuple[str, str]]:
-    """Warnings of unusual values in an element, each with the parameter's name, empty for the element as a whole."""
+    """Warnings about an element's unusual values, each with the parameter's name (empty for the area at 0 V)."""
     found = [(p.name, p.unusual(element.name, element.values[p.name])) for p in element.spec.parameters]
     if element.waveform is not None:
         found = [
@@ -98,9 +98,9 @@ def unusual(element: Element) -> Iterator[tuple[str, str]]:
 
 
 def unusual_of_changed(before: Circuit, after: Circuit) -> tuple[dict[str, str], dict[str, str]]:
-    """Warnings of unusual values in those elements of two circuits that differ, with the path (in lower case) of each.
+    """Warnings about unusual values in the elements that differ between two circuits, one mapping for each circuit.
 
-    The paths tell what a warning is about.
+    Each maps a warning to the path of its parameter, in lower case.
     """
     found: tuple[dict[str, str], dict[str, str]] = {}, {}
     for pair in zip(before.elements, after.elements, strict=True):
@@ -113,10 +113,10 @@ def unusual_of_changed(before: Circuit, after: Circuit) -> tuple[dict[str, str],
 
 
 def concerns(warning: str, changes: Mapping[str, Any]) -> bool:
-    """Whether a warning of the reader is about how something was written that is replaced now."""
+    """Whether a warning of the reader is about the notation of a value that `changes` now replaces."""
     for path in changes:
         name, _, parameter = path.lower().rpartition(".")
-        # A warning of a source as a whole may be about its frequency.
+        # A warning that names only the source may be about its frequency.
         subjects = [path.lower(), f"{name} {parameter}", *([name] if parameter == "frequency" else [])]
         if any(f": {subject}: " in warning.lower() for subject in subjects):
             return True

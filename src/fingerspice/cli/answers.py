@@ -42,13 +42,13 @@ OWN: dict[str, tuple[str, ...]] = {
     "export": (),
     "figures": (),
 }
-#: Figures of a signal; those that a signal lacks are null.
+#: Figures of a signal; a figure that a signal lacks is null.
 FIGURES = ("min", "max", "peak", "mean", "rms", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
 _UNITS = {"u_source": "V", "u_gap": "V", "u_layer": "V", "v": "V", "area": "m^2", "f_el": "N", "f_t": "N"}
 
 
 def blank(command: str | None) -> Answer:
-    """An answer in which nothing is known yet."""
+    """An answer with all its keys, before any result is known."""
     keys = (*COMMON, *OWN.get(command or "", ()))
     known = {"version": __version__, "command": command, "success": False}
     return {**dict.fromkeys(keys), "warnings": [], "files": [], "overrides": {}, **known}
@@ -60,7 +60,7 @@ def of_circuit(circuit: Circuit, charge_law: str | None) -> Answer:
     Raises
     ------
     InputError
-        For an unknown charge law.
+        If the charge law is unknown.
     """
     from fingerspice.circuit.circuit import CHARGE_LAWS
     from fingerspice.waveforms.waveform import require
@@ -71,7 +71,7 @@ def of_circuit(circuit: Circuit, charge_law: str | None) -> Answer:
 
 
 def of_run(solution: Solution) -> Answer:
-    """The part of an answer that describes a run: how it was made, and figures of every signal in SI units."""
+    """The part of an answer that describes a run: its method and error, and figures of every signal in SI units."""
     s = solution.summary()
     names = [key.removesuffix("_peak") for key in s if key.endswith("_peak")]
     return {

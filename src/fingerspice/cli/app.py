@@ -1,4 +1,4 @@
-"""The command line. Exit codes: 0 for success, 1 for a solve that failed, 2 for bad input or a full disk."""
+"""The command line. Exit codes: 0 for success, 1 for a failed solve, 2 for bad input or a full disk."""
 
 from __future__ import annotations
 
@@ -49,20 +49,21 @@ app = typer.Typer(
 
 def main() -> None:
     """Entry point of the `fingerspice` command."""
-    # Loading libraries creates a million objects and no garbage; collecting so often would take a fifth of a run.
+    # Loading libraries creates a million objects and no garbage; with the default threshold, garbage collection takes a
+    # fifth of a run.
     gc.set_threshold(500_000)
     listen()
     with plain_errors():
         try:
             app(standalone_mode=True)
         except SystemExit as exit_:
-            # typer has refused the usage and has said so on stderr; with --json there has to be an answer as well.
+            # typer has refused the usage with a message on stderr; with --json print an answer as well.
             refused = getattr(exit_.__context__, "format_message", None)
             if refused is not None:
                 answer_usage(refused())
             raise
         finally:
-            # Flush what typer has printed.
+            # Flush the text that typer has printed.
             say(end="")
 
 

@@ -1,4 +1,4 @@
-"""Arguments and options that several commands of the command line share, and those of streaming."""
+"""Arguments and options that several commands share, and the options of streaming."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `design` and `limits --capability` do: they find a drive, or a map, and write its files."""
+"""The commands `design` and `limits --capability`, which find a drive or a map of the friction, and write its files."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ Writes = list[Callable[[], Path]]
 
 
 def number(option: str, text: str | None) -> float | None:
-    """The number of an option, with SPICE's scales; None where it is not given.
+    """The number of an option, with SPICE's scales; None if the option is not given.
 
     Raises
     ------
     InputError
-        For anything but a number.
+        If the text is not a number.
     """
     if text is None:
         return None
@@ -60,7 +60,7 @@ def find_drive(
 def capability(
     circuit: Circuit, results: Results, picture: bool, limit: float | None, carrier: float | None
 ) -> tuple[Any, Writes]:
-    """The map of what the screen can do, and the functions that write its files."""
+    """The map of the friction that the screen can produce, and the functions that write its files."""
     from fingerspice.plots.drawing import save
     from fingerspice.studies.capability import capability as find
 

@@ -1,4 +1,4 @@
-"""Meaning of the command line's options, and checks before a run; nothing here writes a file."""
+"""Interpretation of the command line's options, and checks before a run; no function here writes a file."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from fingerspice.waveforms.waveform import Waveform
 
 LARGEST_AREA = 0.01
-"""m^2; a larger area was probably given in mm^2."""
+"""Largest area that causes no warning, m^2; a larger one was probably given in mm^2."""
 
 LONGEST_SOURCE = 1000
-"""Characters of a source's numbers that are kept with the results."""
+"""Largest number of characters of a source's numbers that are stored with the results."""
 
 
 def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | None) -> Circuit:
     """The deck's circuit with ``--set`` and ``--source``.
 
-    Warns as the reader does, except of values of the deck that are replaced, and of directives without effect.
+    Gives the reader's warnings, without those about replaced values, and warnings about directives without effect.
     """
     from fingerspice.circuit.notices import directive_warnings
     from fingerspice.netlist.netlist import read_netlist
@@ -39,18 +39,18 @@ def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | Non
         circuit = _with_sources(circuit, sources or [])
         given = circuit.warnings
     finally:
-        # Where a change is refused, every warning of the deck may explain why.
+        # If a change is refused, show all warnings of the deck, since any of them may explain the refusal.
         for warning in noticed:
             if str(warning.message) in map(printable, given):
                 warnings.warn(str(warning.message), FingerspiceWarning, stacklevel=2)
-    # Commands that do not run the circuit as it is would not say this otherwise.
+    # `simulate` gives these warnings itself, but commands that do not call it with this circuit would not.
     for text in directive_warnings(circuit):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     return circuit
 
 
 def _with_changes(circuit: Circuit, changes: list[str]) -> Circuit:
-    """The circuit with all ``--set`` at once, as exponents may have to change together."""
+    """The circuit with all ``--set`` changes applied together, as two exponents may only be legal together."""
     values: dict[str, str] = {}
     for change in changes:
         path, equals, text = (part.strip() for part in change.partition("="))
@@ -62,12 +62,12 @@ def _with_changes(circuit: Circuit, changes: list[str]) -> Circuit:
     try:
         return circuit.replace(values)
     except InputError as error:
-        # The place in the deck is left out, as the fault is not there.
+        # Leave out the place in the deck, because the error is in the option.
         raise InputError(f"--set {' '.join(map(repr, changes))}: {error.message}") from None
 
 
 def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
-    """The circuit with every ``--source``; its name may be left out where the circuit has one source."""
+    """The circuit with every ``--source``; the source's name may be left out if the circuit has only one."""
     from fingerspice.circuit.arguments import overridden
     from fingerspice.circuit.topology import driving_sources
     from fingerspice.netlist.netlist import source_from_text
@@ -77,11 +77,11 @@ def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
         return circuit
     names = {e.name.lower(): e.name for e in driving_sources(circuit)}
     sources: dict[str, Waveform] = {}
-    # What the results call a recording or a long table: the text that names it, and not its numbers.
+    # The results describe a recording or a long table by the option's text, instead of by its numbers.
     named_by: dict[str, str] = {}
     for text in texts:
         named, equals, spec = (part.strip() for part in text.partition("="))
-        # In PWL(...) r=10m what precedes the = is more than a name.
+        # In PWL(...) r=10m the text before the = is not a source's name.
         if not (equals and named.replace(".", "").isidentifier()):
             named, spec = "", text
         known = ", ".join(names.values())
@@ -102,7 +102,7 @@ def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
 
 
 def with_times(circuit: Circuit, stop: str | None, start: str = "deck") -> tuple[Circuit, str]:
-    """The circuit with ``--stop`` and ``--start`` in place of TSTOP and TSTART, and how the run starts.
+    """The circuit with ``--stop`` and ``--start`` in place of TSTOP and TSTART, and the mode of the run's start.
 
     Without a .tran line the run starts uncharged and has 1,001 outputs.
     """
@@ -131,7 +131,7 @@ def with_times(circuit: Circuit, stop: str | None, start: str = "deck") -> tuple
 
 
 def check_streamed(stream: bool, **others: bool) -> None:
-    """Refuse options that do not go together with ``--stream``, and those of it without it."""
+    """Refuse options that do not go together with ``--stream``, and its own options without it."""
     if not stream:
         raise InputError("--chunk, --signals and --netcdf go with --stream")
     for name, given in others.items():
@@ -163,7 +163,7 @@ def area_from_text(text: str) -> str | float:
 
 
 def check_output(file: Path, deck: Path | None = None) -> None:
-    """Refuse an output that cannot be written, or is the deck, before time is spent on the run; writes nothing."""
+    """Before a run, refuse an output file that cannot be written or is the deck itself; writes nothing."""
     try:
         _check_output(file, deck)
     except OSError as error:
@@ -174,7 +174,7 @@ def _check_output(file: Path, deck: Path | None) -> None:
     folder = file.parent
     while not folder.exists() and folder != folder.parent and not folder.is_symlink():
         folder = folder.parent
-    # Only looking for the file in a folder that exists shows whether its name is too long.
+    # This raises OSError if the file's name is too long; the check needs a folder that exists.
     (folder / file.name).exists()
     if not folder.is_dir():
         raise InputError(f"cannot write {file}: {folder} is not a folder; allowed: a folder that can be written")
@@ -187,7 +187,7 @@ def _check_output(file: Path, deck: Path | None) -> None:
 
 
 def sweep(text: str | None, circuit: Circuit) -> AcSweep:
-    """The sweep of ``--sweep``, else the deck's, and else the band of the skin's data."""
+    """The sweep given by ``--sweep``, else the deck's, and else a sweep over the band of the skin's data."""
     from fingerspice.circuit.circuit import AcSweep
     from fingerspice.netlist.directives import sweep_from_text
 

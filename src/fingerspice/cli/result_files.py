@@ -1,4 +1,4 @@
-"""Files of a command's results: named after the deck, and never written over the results of another circuit."""
+"""Files of a command's results, which are named after the deck and never replace results of another circuit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 #: Folder of the results unless another one is named.
 FOLDER = Path("out")
-#: The beginnings of the commands' tables.
+#: First bytes of the tables that the commands write.
 _HEADS = (b"t [s],u_source", b"frequency [Hz],gain [1],", b"parameter,value [SI],unit,")
 #: Attributes by which a file identifies its circuit.
 _KNOWN = ("deck_sha256", "overrides", "charge_law")
@@ -36,11 +36,11 @@ class Results:
     folder : Path or None
         `FOLDER` by default.
     name : str or None
-        Name of the files without their endings; that of the deck by default.
+        Name of the files without their endings; the deck's name by default.
     overwrite : bool
-        Whether files of other circuits, or of an unknown one, may be replaced.
+        Whether files of other or unknown circuits may be replaced.
     charge_law : str or None
-        The charge law asked for.
+        The requested charge law.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Results:
         Raises
         ------
         InputError
-            Where it cannot be written, or must not be replaced.
+            If the file cannot be written, or must not be replaced.
         """
         file = self.folder / f"{self.name}{end}"
         check_output(file, self.deck)
@@ -88,9 +88,9 @@ class Results:
         return {**self._own, "files": json.dumps(self.names)}
 
     def open(self) -> None:
-        """Put a .gitignore into the default folder when it is made, which keeps results out of version control."""
+        """When the default folder is created, put a .gitignore into it, to keep results out of version control."""
         if not self.named and not self.folder.exists():
-            # Where this fails writing the results will fail, too, with a message.
+            # Ignore an error: writing the results will then fail as well, with a message.
             with suppress(InputError):
                 write_aside(self.folder / ".gitignore", lambda path: path.write_text("*\n"))
 
@@ -130,7 +130,7 @@ def _hash(text: str) -> str:
 
 
 def _held(file: Path) -> dict[str, str] | None:
-    """From what a file was made, by its own attributes; None where it has none."""
+    """Attributes of a file that name its deck, changes and charge law; None if it has none."""
     try:
         found = _of_data(file) if file.suffix == ".nc" else _of_picture(file)
         if found is None or not all(isinstance(found.get(key), str) for key in _KNOWN):
@@ -157,7 +157,7 @@ def _of_data(file: Path) -> dict[str, str]:
 
 
 def _of_picture(file: Path) -> dict[str, str] | None:
-    """Attributes of a picture, or for a table those of the picture beside it, which names the files made with it."""
+    """Attributes of a picture; for a table, those of the picture of the same name, if it lists the table's file."""
     from PIL import Image
 
     picture = file.with_suffix(".png")
@@ -168,6 +168,6 @@ def _of_picture(file: Path) -> dict[str, str] | None:
         text: dict[str, Any] = dict(getattr(image, "text", {}))
     data = file.with_suffix(".nc")
     if not text.get("files") and file.suffix == ".png" and data.is_file():
-        # Pictures of earlier versions have no list of files; the data beside them have the attributes.
+        # A picture of an earlier version has no list of files; the NetCDF file of the same name has the attributes.
         return _of_data(data)
     return text if file.name in json.loads(text.get("files", "[]")) else None

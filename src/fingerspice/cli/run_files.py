@@ -1,4 +1,4 @@
-"""What `run` writes besides its text: the data, the picture, and what the hand feels; and the sweep of `ac`."""
+"""Files of the command `run`: data, picture and the picture of ``--feel``; and the large-signal sweep of `ac`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def written(solution: Solution, data: Path, picture: Path | None, results: Results) -> list[Callable[[], Path]]:
-    """Functions that write the files of a run: the data, then the picture where one is wanted."""
+    """Functions that write the files of a run: the data, then the picture if `picture` is not None."""
     from fingerspice.plots.drawing import save
 
     if not solution.t.size:
@@ -43,14 +43,14 @@ def large_sweep(
 
 
 class Touch:
-    """What the hand feels of a run, for ``--feel``: one picture of all fingers, and a page for each.
+    """Estimated perception of a run, for ``--feel``: one picture of all fingers, and a page for each.
 
     Parameters
     ----------
     circuit : Circuit
-        With a GAP, or more.
+        A circuit with at least one GAP.
     results : Results or None
-        Where the picture goes; None for none.
+        Files of the command, which get the picture; None for no picture.
     """
 
     def __init__(self, circuit: Circuit, results: Results | None) -> None:
@@ -62,13 +62,13 @@ class Touch:
         self.failed: InputError | None = None
 
     def look(self, solution: Solution) -> list[dict[str, Any]] | None:
-        """Look at a run, and answer for each finger; None where its outputs are too few or uneven, as `failed` says."""
+        """The answer for each finger of a run; None, with the reason in `failed`, if outputs are too few or uneven."""
         from fingerspice.studies.feel import feel
 
         try:
             self.fingers = [feel(solution, name) for name in solution.all_signals.names("f_t")]
         except InputError as error:
-            # The files of the run are written before this is said.
+            # The error is raised later, after the files of the run have been written.
             self.failed = error
             return None
         return [one.to_dict() for one in self.fingers]
@@ -80,7 +80,7 @@ class Touch:
 
     @property
     def writes(self) -> list[Callable[[], Path]]:
-        """The function that writes the picture, where one is wanted."""
+        """The function that writes the picture; empty if no picture is wanted."""
         from fingerspice.plots.drawing import save
 
         results, picture = self.results, self.picture

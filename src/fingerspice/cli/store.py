@@ -1,7 +1,7 @@
-"""A run on the disk as a Zarr store that grows chunk by chunk, and goes on after a crash.
+"""A run on the disk as a Zarr store that grows chunk by chunk, and can be continued after a crash.
 
-Every chunk of the run is one chunk of each array. What says how far the run has come stands in the attributes of the
-store's group, and is replaced as a whole after the chunk's data have reached the disk.
+Every chunk of the run is one chunk of each array. The number of finished chunks is an attribute of the store's group,
+whose file is replaced atomically after the chunk's data have reached the disk.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from fingerspice.base.files import UNFINISHED, settle_on_disk, write_aside, writ
 from fingerspice.results.datafiles import Variable, variables
 from fingerspice.results.solution import Solution
 
-#: Attributes of the group: what the run is, how far it has come, where it goes on, and how it went so far.
+#: Attributes of the group: identity of the run, number of finished chunks, state to continue from, and results so far.
 RUN, DONE, MARK, SO_FAR = "run", "chunks_done", "goes_on", "so_far"
-# Bytes of the store that are copied at once.
+# Number of bytes of the store that are copied at once.
 _PIECE = 1 << 25
 
 
@@ -31,7 +31,7 @@ def zarr_library() -> Any:
     Raises
     ------
     InputError
-        Where it is not installed.
+        If it is not installed.
     """
     try:
         import zarr
@@ -48,11 +48,11 @@ class Store:
     Parameters
     ----------
     path : Path
-        Its folder.
+        Folder of the store.
     run : mapping
-        What the run is, as plain data.
+        Identity of the run: all inputs that determine its results, as plain data.
     total, count : int
-        Outputs of the run, and of a chunk.
+        Number of outputs of the run, and of a chunk.
     """
 
     def __init__(self, path: Path, run: dict[str, Any], total: int, count: int) -> None:
@@ -64,16 +64,16 @@ class Store:
 
     @property
     def chunks(self) -> int:
-        """Chunks of the whole run."""
+        """Number of chunks of the whole run."""
         return -(-self.total // self.count)
 
     def open(self, overwrite: bool) -> None:
-        """Take up what is there of the same run.
+        """Open an existing store of the same run, to continue it; with `overwrite` remove any store.
 
         Raises
         ------
         InputError
-            For a folder that is no store, the store of another run, or one that is damaged.
+            If the folder is not a store, or the store is damaged or holds another run.
         """
         if not os.path.lexists(self.path):
             return
@@ -96,7 +96,7 @@ class Store:
         self._tidy(attributes)
 
     def _tidy(self, attributes: dict[str, Any]) -> None:
-        """Remove what a call that was killed had begun to write."""
+        """Remove unfinished files of a call that was killed."""
         whole = {file for file, _ in self._files(attributes)}
         begun = [file for name in attributes["arrays"] for file in (self.path / name / "c").rglob("*")]
         for file in [*self.path.glob(f"{UNFINISHED}*"), *begun]:
@@ -104,7 +104,7 @@ class Store:
                 file.unlink()
 
     def _attributes(self) -> dict[str, Any] | None:
-        """Attributes of the group, if it is one of this program."""
+        """Attributes of the group; None if it is not a store of this program."""
         try:
             found = json.loads((self.path / "zarr.json").read_text())["attributes"]
             whole = all(isinstance(found[key], dict) for key in (RUN, MARK, SO_FAR, "arrays"))
@@ -113,7 +113,7 @@ class Store:
             return None
 
     def _files(self, attributes: dict[str, Any]) -> list[tuple[Path, int]]:
-        """Files of the chunks that are done, and their sizes, bytes."""
+        """Files of the finished chunks, and their sizes, bytes."""
         return [
             (self._file(name, k, columns), 8 * self.count * max(columns, 1))
             for name, columns in attributes["arrays"].items()
@@ -125,12 +125,12 @@ class Store:
         return folder / "0" if columns else folder
 
     def write(self, chunk: int, solution: Solution, signals: list[str], about: dict[str, Any], mark: Any) -> None:
-        """Write a chunk, and that it is written; `mark` is where the run goes on.
+        """Write a chunk, then record it as finished; `mark` is the state from which the run continues.
 
         Raises
         ------
         InputError
-            Where it cannot be written; what was written before stays.
+            If it cannot be written; the earlier chunks stay.
         """
         data, coords = variables(solution, np.ones(solution.t.size, bool), signals)
         data = {"time": coords["time"], **data}
@@ -154,7 +154,7 @@ class Store:
         self.done = chunk + 1
 
     def _create(self, data: dict[str, Variable], coords: dict[str, Variable], about: dict[str, Any]) -> None:
-        """Make the store with all its arrays, which have no values yet, under another name first."""
+        """Create the store with its arrays, still without values, under a temporary name, then rename it."""
         aside = self.path.with_name(f"{UNFINISHED}{self.path.name}")
         shutil.rmtree(aside, ignore_errors=True)
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -184,12 +184,12 @@ class Store:
         write_durably(file, json.dumps(about, indent=1).encode())
 
     def to_netcdf(self, path: Path) -> Path:
-        """Write the whole as NetCDF, piece by piece.
+        """Write the whole run as NetCDF, piece by piece.
 
         Raises
         ------
         InputError
-            Where it cannot be written, or the disk has not the room for it.
+            If the file cannot be written, or the disk has too little room.
         """
         import h5netcdf
 
@@ -198,7 +198,7 @@ class Store:
         size = sum(array.nbytes for array in arrays.values()) + 2**20
 
         def write(target: Path) -> None:
-            # HDF5 would end the process on a full disk: room for it is taken, and given back.
+            # HDF5 ends the process on a full disk: reserve the room first, so that a full disk raises an error here.
             with target.open("wb") as room:
                 if hasattr(os, "posix_fallocate"):
                     os.posix_fallocate(room.fileno(), 0, size)

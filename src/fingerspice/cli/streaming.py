@@ -1,4 +1,4 @@
-"""`fingerspice run --stream`: a long run chunk by chunk into a Zarr store, going on where an earlier call has ended."""
+"""`fingerspice run --stream`: writes a long run chunk by chunk to a Zarr store, and continues an interrupted one."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ def run_streamed(
     answer: Answering, results: Results, circuit: Circuit, how: dict[str, Any], *, chunk: str | None,
     signals: str | None, netcdf: bool,
 ) -> None:  # fmt: skip
-    """Run a circuit into a store of its own, and answer.
+    """Run a circuit, write its chunks to a store, and fill the answer.
 
     Raises
     ------
     InputError
-        For a request that cannot be run, a store of another run or a damaged one, and a full disk.
+        If the request cannot be run, the store is damaged or holds another run, or the disk is full.
     SolveError
-        Where the run fails; what came before is in the store.
+        If the run fails; the chunks before the failure are in the store.
     """
     from fingerspice.cli.store import Store
     from fingerspice.solve.streaming import stream
 
     path = results.folder / f"{results.name}.zarr"
-    # The store is a folder; that files can be written beside it is what has to be known.
+    # The store is a folder, so check that a file can be written next to it.
     check_output(path.with_suffix(".zarr.part"), results.deck)
     data = results.file(".nc") if netcdf else None
     names = _names(signals, circuit)
@@ -88,7 +88,7 @@ def _layers(circuit: Circuit) -> bool:
 
 
 def _identity(run: Stream, circuit: Circuit, how: dict[str, Any], names: list[str]) -> dict[str, Any]:
-    """What decides over the bytes of a store."""
+    """All inputs that determine the bytes of a store, by which a later call recognises its own store."""
     from fingerspice.waveforms.samples import Samples
 
     elements, sources = hashlib.sha256(), hashlib.sha256()
@@ -112,7 +112,7 @@ def _identity(run: Stream, circuit: Circuit, how: dict[str, Any], names: list[st
 
 
 def _fill(run: Stream, store: Store, names: list[str], results: Results) -> None:
-    """Compute and write all chunks that are missing, a chunk being written while the next one is computed."""
+    """Compute and write all missing chunks; a chunk is written while the next one is computed."""
     about = {key: text for key, text in results.about.items() if key != "files"}
     known: set[str] = set()
     writing: Future[None] | None = None
@@ -131,7 +131,7 @@ def _fill(run: Stream, store: Store, names: list[str], results: Results) -> None
 
 
 class _Pace:
-    """A bar with the rate, over real time, and the time left."""
+    """A progress bar with the speed relative to real time, and the time left."""
 
     def __init__(self, run: Stream) -> None:
         self.bar, self.begun = Bar("simulating"), time.perf_counter()
@@ -145,7 +145,7 @@ class _Pace:
         self.bar.stop()
 
     def show(self, t: float) -> None:
-        """Show that the run has come to a time, s."""
+        """Show that the run has reached a time (s)."""
         took, made = time.perf_counter() - self.begun, t - self.first
         if took > 1.0 and made > 0.0 and sys.stderr.isatty():
             left = time.strftime("%H:%M:%S", time.gmtime((self.stop - t) * took / made))

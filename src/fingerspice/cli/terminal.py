@@ -1,4 +1,4 @@
-"""Output of the command line: without control characters of a deck, and without tracebacks."""
+"""Output of the command line, which removes control characters of a deck and hides tracebacks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError, printable
 from fingerspice.cli.answers import OWN, blank
 from fingerspice.results.outcome import SolveError
 
-#: Characters of a printed line; the middle of a longer one is left out.
+#: Largest number of characters of a printed line; the middle of a longer line is left out.
 LONGEST_LINE = 2000
 Report = dict[str, Any]
 Write = Callable[[], Path]
@@ -40,7 +40,7 @@ def json_text(data: Report) -> str:
 
 
 def say(text: str = "", end: str = "\n") -> None:
-    """Print lines of text that may come from a deck."""
+    """Print lines of text, which may come from a deck, in printable characters."""
     _print("\n".join(printable(line, LONGEST_LINE) for line in text.split("\n")), end)
 
 
@@ -50,18 +50,18 @@ def say_json(data: Report) -> None:
 
 
 def _print(text: str, end: str) -> None:
-    """Print and flush: a full disk is an `InputError`, a reader that has gone away (head, less) is no error."""
+    """Print and flush; a full disk is an `InputError`, and a closed pipe (head, less) is not an error."""
     try:
         print(text, end=end, flush=True)
     except OSError as error:
-        # Python would flush again at its end, and report the error.
+        # Redirect stdout, since Python flushes it again at exit and would report the error a second time.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(error, BrokenPipeError):
             raise InputError(f"cannot write to the standard output: {error.strerror}") from None
 
 
 def complain(text: str) -> None:
-    """Write a line to stderr; that nobody reads it is no error."""
+    """Write a line to stderr; a closed stderr is not an error."""
     try:
         print(f"fingerspice: {printable(text, LONGEST_LINE)}", file=sys.stderr, flush=True)
     except OSError:
@@ -69,7 +69,7 @@ def complain(text: str) -> None:
 
 
 class _Notes(logging.Handler):
-    """Writes what the package logs, such as that it compiles, as lines to stderr."""
+    """Writes the package's log messages, such as a note that it compiles, as lines to stderr."""
 
     def emit(self, record: logging.LogRecord) -> None:
         complain(f"note: {record.getMessage()}")
@@ -79,7 +79,7 @@ _NOTES = _Notes()
 
 
 def listen() -> None:
-    """Show what the package logs as lines on stderr."""
+    """Show the package's log messages as lines on stderr."""
     logger = logging.getLogger("fingerspice")
     logger.setLevel(logging.INFO)
     logger.addHandler(_NOTES)
@@ -87,7 +87,7 @@ def listen() -> None:
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """End with one sentence instead of a traceback, and with the exit code of its kind."""
+    """End with one sentence instead of a traceback: exit code 2 for wrong input, 1 for any other error."""
     try:
         yield
     except Exception as error:
@@ -95,7 +95,7 @@ def plain_errors() -> Iterator[None]:
 
 
 def is_input(error: Exception) -> bool:
-    """Whether the input, or what it asks for, has to change."""
+    """Whether the user has to change the input or the request."""
     return isinstance(error, (InputError, MemoryError))
 
 
@@ -118,15 +118,15 @@ def _fail(message: str, code: int) -> NoReturn:
 class Answering:
     """The answer of one command, collected while it runs and printed at its end as text or JSON.
 
-    It is used as a context. Each warning becomes one line on stderr and a part of the answer. JSON, where it is wanted,
-    is printed in whichever way the command ends.
+    It is used as a context. Each warning becomes one line on stderr and a part of the answer. If JSON is wanted, it is
+    printed even when the command ends with an error.
 
     Parameters
     ----------
     command : str
     as_json : bool
     known : any
-        Values of keys that are known from the start.
+        Values of keys that are known at the start.
     """
 
     def __init__(self, command: str, as_json: bool, **known: Any) -> None:
@@ -166,19 +166,19 @@ class Answering:
     def give(self, text: Callable[[], str], writes: Sequence[Write] = ()) -> None:
         """Write files, then print the result as text unless JSON is wanted.
 
-        Where a file cannot be written the text is printed all the same, before the error is raised.
+        If a file cannot be written, the text is still printed before the error is raised.
 
         Parameters
         ----------
         text : callable
-            Gives the result as text.
+            Function that returns the result as text.
         writes : sequence of callable
-            Each writes a file and returns its path.
+            Functions that each write a file and return its path.
 
         Raises
         ------
         InputError
-            Where a file cannot be written.
+            If a file cannot be written.
         """
         files: list[str] = self.data["files"]
         failed = None
@@ -195,7 +195,7 @@ class Answering:
 
 
 def answer_usage(message: str) -> None:
-    """Answer a command line that typer refused, where it asks for JSON."""
+    """Print the JSON answer to a command line that typer refused, if it asks for JSON."""
     words = sys.argv[1:]
     if "--json" in words:
         command = next((word for word in words if word in OWN), None)

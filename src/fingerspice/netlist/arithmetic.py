@@ -1,6 +1,6 @@
-"""Arithmetic of netlists as Python text: lexemes, a check of their order and nesting, and the translation.
+"""Translation of a netlist's arithmetic to Python text: lexemes, a check of their order and nesting, the translation.
 
-The check finds every syntax error, so that Python's parser is given correct and shallow text only.
+The check finds every syntax error, so that Python's parser only gets correct text of limited nesting.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from fingerspice.base.units import parse_number
 from fingerspice.netlist.functions import FUNCTIONS, Problem
 from fingerspice.netlist.spelling import nearest
 
-#: Nesting of brackets (and number of `?`), and signs in a row.
+#: Largest nesting of brackets (and number of `?`), and largest number of signs in a row.
 MAX_DEPTH, MAX_SIGNS = 25, 3
 _COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
 _SPELLING = {"^": "**", "&&": "and", "||": "or"}
@@ -56,7 +56,7 @@ def lexemes_of(text: str) -> list[Lexeme]:
 
 def check_order(lexemes: list[Lexeme], end: int) -> None:
     """Refuse every sequence of lexemes that is not an expression, or is nested too deeply to be parsed."""
-    open_brackets: list[tuple[Lexeme, bool]] = []  # and whether each holds a function's arguments
+    open_brackets: list[tuple[Lexeme, bool]] = []  # each with whether it encloses a function's arguments
     wants_value, previous, signs, questions = True, "", 0, 0
     for index, (kind, text, position) in enumerate(lexemes):
         if wants_value and kind in ("number", "name", "call"):
@@ -99,7 +99,7 @@ class _Level:
         self.pieces: list[tuple[str, int]] = []
 
     def close(self) -> str:
-        """Text of the pieces, of which inner brackets are one each; the next argument begins without pieces."""
+        """Text of the pieces, where an inner bracket is one piece; clears the pieces for the next argument."""
         _refuse_chains(self.pieces)
         text = _conditional(self.pieces)
         self.pieces = []
@@ -107,9 +107,9 @@ class _Level:
 
 
 def to_python(lexemes: list[Lexeme], order: Mapping[str, int]) -> str:
-    """Python text of checked lexemes: numbers in full, names by their number in `order`, functions with a prefix.
+    """Python text of checked lexemes: numbers in full, names as n and their number in `order`, functions as f_name.
 
-    A name written by its number can be no keyword of Python, and the parser cannot change it by normalising Unicode.
+    A numbered name cannot be a keyword of Python, and the parser cannot change it by normalising Unicode.
     """
     levels = [_Level("")]
     for lexeme in lexemes:

@@ -1,8 +1,8 @@
 """A netlist file as a flat list of evaluated statements.
 
-Statements have names, nodes and values here; what they mean is decided in `elements`, `sources` and `directives`. The
-work is done by `lexer` (from text to words), `reader` (lines by kind, included files), `scope` (parameters and values)
-and `flatten` (subcircuit calls). Every refusal has its place in the file.
+A statement has a name, nodes and values; `elements`, `sources` and `directives` give it a meaning. The steps are those
+of `lexer` (from text to words), `reader` (lines by kind, included files), `scope` (parameters and values) and `flatten`
+(subcircuit calls). Every error has its place in the file.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = [
     "read_deck",
 ]
 
-#: Characters of a title that are shown; the middle of a longer one is left out.
+#: Largest number of characters of a title that are shown; the middle of a longer title is left out.
 LONGEST_TITLE = 200
 
 _VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|chirp|burst|wavefile|table)\b)"
@@ -47,9 +47,9 @@ class Directive:
     Attributes
     ----------
     name : str
-        With its dot, lower case.
+        Name in lower case, with its dot.
     args : tuple of Number, Token or Call
-        Words; numbers are evaluated.
+        Words of the line, numbers evaluated.
     params : dict
         Values of `key=value` pairs by key in lower case; `.ic v(area)=1` has the key ``v(area)``.
     param_where : dict
@@ -75,7 +75,7 @@ class Deck:
     Attributes
     ----------
     title : str
-        The first line in printable characters (see `errors.printable`); `text` has it as written.
+        The first line in printable characters (see `errors.printable`); `text` has the line as written.
     statements : tuple of Statement
         Elements in the order of the file, subcircuit calls expanded.
     tran, ac : Directive or None
@@ -89,13 +89,13 @@ class Deck:
     unused : tuple of str
         Names of the directives that are accepted and have no effect here.
     warnings : tuple of str
-        Sentences about what is legal and probably not meant, each with its place.
+        Warnings about text that is legal but probably not meant, each with its place.
     params : dict
         Values of the deck's own `.param` definitions by lower-case name.
     text : str
         The netlist as read.
     path : Path or None
-        Where it was read from.
+        Path of the file; None for a text.
     """
 
     title: str
@@ -124,7 +124,7 @@ def read_deck(path: str | Path) -> Deck:
     Raises
     ------
     InputError
-        When the file cannot be read (missing, a folder, empty, too large, not UTF-8 text) or is wrong.
+        If the file cannot be read (missing, a folder, empty, too large, not text) or has an error.
     """
     return parse_deck(read_text(Path(path), str(path)), Path(path))
 
@@ -137,12 +137,12 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
     text : str
         The whole netlist; its first line is the title.
     path : Path, optional
-        Where it came from; without it only the libraries of native devices can be included.
+        Path of the file with this text; without it only the libraries of native devices can be included.
 
     Raises
     ------
     InputError
-        When anything in it is wrong or unknown; the message says where and what is allowed.
+        If the text has an error; the message gives its place and the allowed alternatives.
     """
     file = str(path) if path is not None else "<netlist>"
     if not text.strip("\ufeff \t\r\n"):
@@ -206,7 +206,7 @@ def _only(directives: list[Directive], name: str) -> Directive | None:
 
 
 def _warn_uncalled(reader: Reader, root: Subcircuit) -> None:
-    """Warn of subcircuits that the deck itself defines and never calls; of a library usually some are not called."""
+    """Warn about subcircuits that the deck itself defines and never calls; in a library that is usual."""
     for defined in root.inner.values():
         where = defined.line.where(defined.line.start) if defined.line is not None else None
         if where is not None and where.file == reader.file and not (defined.called or defined.skipped):

@@ -13,7 +13,7 @@ from fingerspice.netlist.slips import is_unit
 from fingerspice.netlist.spelling import nearest
 from fingerspice.waveforms.bounds import check_range
 
-#: Number of outputs where .tran has no TSTEP.
+#: Number of outputs of a run whose .tran has no TSTEP.
 LTSPICE_OUTPUTS = 10_000
 _LTSPICE_START = {
     "startup": "sources are not ramped up here; allowed: a source that rises by itself, such as PWL(0 0 20u 5)",
@@ -54,7 +54,7 @@ def _numbers(directive: Directive, usage: str) -> tuple[list[Number], list[str]]
 def read_tran(directive: Directive, notes: list[str]) -> Tran:
     """``.tran TSTEP TSTOP [TSTART [TMAX]] [uic]``, and LTspice's ``.tran TSTOP`` and ``.tran 0 TSTOP [TSTART [TMAX]]``.
 
-    Where no TSTEP is given, a sentence about the one that is taken is added to `notes`.
+    If no TSTEP is given, a warning with the TSTEP that is used is added to `notes`.
     """
     usage = ".tran TSTEP TSTOP [TSTART [TMAX]] [uic]"
     numbers, words = _numbers(directive, usage)
@@ -140,7 +140,7 @@ def read_initial(directives: tuple[Directive, ...], elements: tuple[Element, ...
 
 
 def start_volts(what: str, number: Number) -> float:
-    """A start voltage (V), which has to be within the range allowed for sources."""
+    """A start voltage (V), which must be within the range allowed for sources."""
     try:
         check_range(what, number.value, "V")
     except InputError as error:
@@ -149,7 +149,7 @@ def start_volts(what: str, number: Number) -> float:
 
 
 def unused_starts(initial: Mapping[str, float], elements: tuple[Element, ...], uic: bool) -> tuple[str, ...]:
-    """Start values without effect: with ``uic`` those of nodes without capacitor or layer; without it every ``IC=``."""
+    """Start values without effect: with ``uic`` at nodes without capacitor or layer; without ``uic`` every ``IC=``."""
     layers = [e for e in elements if e.spec.is_layer]
     gaps = {e.nodes[2]: e.values for e in layers if e.device == "GAP" and e.values["a_fix"] == 0.0}
     taken = {node for e in elements if e.device == "C" or e.spec.is_layer for node in e.nodes[:2]}
@@ -165,7 +165,7 @@ def unused_starts(initial: Mapping[str, float], elements: tuple[Element, ...], u
 
 
 def read_options(directives: tuple[Directive, ...]) -> tuple[str, tuple[str, ...]]:
-    """The reading of Eq. 7 that ``work`` selects, and the options of ngspice and LTspice, which have no effect."""
+    """The reading of Eq. 7 that ``work`` selects, and the names of ngspice's and LTspice's options, without effect."""
     work, unused = None, []
     for directive in directives:
         names: list[tuple[str, Number | Token | None, Where]] = [
@@ -199,7 +199,7 @@ def sweep_from_text(text: str) -> AcSweep:
     Raises
     ------
     InputError
-        When the text is not a sweep.
+        If the text is not a sweep.
     """
     try:
         deck = parse_deck(f"sweep\n.ac {text}\n")

@@ -1,4 +1,4 @@
-"""From a statement of a deck to the element that it describes, and those that LTspice's parasitics stand for."""
+"""Conversion of a deck's statement to its element, and to the further elements for LTspice's parasitics."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from fingerspice.netlist.scope import Value
 from fingerspice.netlist.sources import Context, Source, read_source
 from fingerspice.netlist.spelling import nearest
 
-#: LTspice's parasitics, which become elements: ``rser`` in series at the first node, the others in parallel.
+#: LTspice's parasitics, which become elements: ``rser`` in series at the first node, all others in parallel.
 _PARASITICS = {"V": ("rser", "cpar"), "C": ("rser", "rpar", "cpar")}
-#: Data of a part that LTspice writes and no calculation needs.
+#: Data of a part that LTspice writes and no calculation uses.
 _PART_DATA = {"R": ("tol", "pwr"), "C": ("tol", "v", "irms", "mfg", "pn", "type")}
-#: Other names of the value; and the name of the number of equal parts in parallel.
+#: Other names of the value; and the parameter that gives the number of equal parts in parallel.
 _VALUE_NAMES = {"R": ("r", "resistance"), "C": ("c", "capacitance")}
 _COPIES = "m"
 
 
 def read_elements(statement: Statement, context: Context, notes: list[str]) -> list[Element]:
-    """The element of a statement, and those that LTspice's ``Rser``, ``Rpar`` and ``Cpar`` stand for.
+    """The element of a statement, and the elements for LTspice's ``Rser``, ``Rpar`` and ``Cpar``.
 
     Parameters
     ----------
     statement : Statement
     context : Context
     notes : list of str
-        Warnings are added to it.
+        List to which warnings are added.
 
     Raises
     ------
     InputError
-        One sentence with the place.
+        If the statement is wrong; the message has the place.
     """
     device = statement.device or statement.letter
     values: dict[str, float] = {}
@@ -82,7 +82,7 @@ def _given(statement: Statement, parameter: str) -> Value | Call | None:
 
 
 def _is_noted(given: Number, spec: ParameterSpec) -> bool:
-    """Whether `_value` warns of a number already: one warning of each number is enough."""
+    """Whether `_value` already warns about the notation of a number: one warning per number is enough."""
     return (given.mega is not None and is_resistance(spec)) or exponent_and_scale(given.text)
 
 
@@ -110,7 +110,7 @@ def source_of(statement: Statement, context: Context) -> Source:
     Raises
     ------
     InputError
-        One sentence with the place.
+        If the words do not describe a source; the message has the place.
     """
     body = list(statement.body)
     if "wavefile" in statement.params and not any(isinstance(word, Call) for word in body):
@@ -168,7 +168,7 @@ def _device_values(statement: Statement, device: str, notes: list[str]) -> dict[
 
 
 def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> float:
-    """The number of one parameter; units that SPICE takes for scales are refused or warned of."""
+    """Value of one parameter; refuses or warns about units that SPICE reads as scale factors."""
     unit = f" {spec.unit}" if spec.unit else ""
     if isinstance(given, Token):
         if spec.may_be_infinite and given.text.lower() in ("inf", "none"):
@@ -192,7 +192,7 @@ def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> fl
 
 
 def _passive_value(statement: Statement, notes: list[str]) -> tuple[dict[str, float], float | None]:
-    """Value of an R or C, and the voltage (V) with which a C starts, where it is given."""
+    """Value of an R or C, and the start voltage (V) of a C, or None."""
     name, letter = statement.name, statement.letter
     spec = DEVICES[letter].parameter("value")
     own = (*_VALUE_NAMES[letter], _COPIES, *(("ic",) if letter == "C" else ()), *_PART_DATA[letter])

@@ -1,10 +1,10 @@
-"""Arithmetic of netlists: `{2*d + 1u}` to a float, through a whitelist over `ast`, never `eval`.
+"""Evaluation of netlist arithmetic such as `{2*d + 1u}`, by a whitelist of `ast` nodes, never by `eval`.
 
 There are three steps. `arithmetic` divides the text into SPICE numbers, names and operators, and checks their order and
-nesting, which finds every syntax error. Python's own parser then makes a tree of it. Here the tree is evaluated: it may
-hold only the kinds of nodes in the tables below.
+nesting, which finds every syntax error. Python's own parser then builds a tree. This module evaluates the tree, which
+may contain only the kinds of nodes in the tables below.
 
-Functions mean what they mean in ngspice's `.param`; `log` is the natural logarithm. An expression that ngspice and
+Functions have the same meaning as in ngspice's `.param`; `log` is the natural logarithm. An expression that ngspice and
 mathematics read differently (`2^3^2`, a negative base) is refused. ngspice 39 does not know `pi`, `e`, `atan2` and
 `hypot`.
 """
@@ -25,7 +25,7 @@ from fingerspice.netlist.arithmetic import Lexeme, check_order, lexemes_of, numb
 from fingerspice.netlist.functions import CONSTANTS, FUNCTIONS, Problem, power
 from fingerspice.netlist.spelling import nearest
 
-#: Characters of an expression.
+#: Largest number of characters of an expression.
 MAX_LENGTH = 2000
 
 _BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
@@ -43,8 +43,8 @@ _COMPARE: Mapping[type[ast.cmpop], Callable[[float, float], bool]] = {
     ast.Eq: operator.eq,
     ast.NotEq: operator.ne,
 }
-#: The place of an expression in its file: of its first character, or a function that gives that of each character, for
-#: expressions that go over several lines.
+#: The place of an expression in its file: the place of its first character or, for an expression over several lines, a
+#: function from a character's position to its place.
 Place: TypeAlias = Where | Callable[[int], Where]
 
 
@@ -56,14 +56,14 @@ class Expression:
     ----------
     text : str
     names : tuple of str
-        The names that it refers to, in lower case, each once; constants are among them.
+        The names in the expression, constants included, in lower case, each once.
     positions : mapping of str to int
         Position of the first use of each name.
     mega, mega_position : str, int
-        Its first number written with a capital M, or an empty text, and where that stands.
+        The first number written with a capital M, or an empty text, and its position.
     tree : ast.expr
     value : float or None
-        Its value where it is a single number.
+        Value of an expression that is a single number; None for all others.
     """
 
     text: str
@@ -99,19 +99,19 @@ def evaluate(text: str, names: Mapping[str, float], where: Where) -> float:
     Raises
     ------
     InputError
-        When the text is not arithmetic, a name or function is unknown, or the result is not finite.
+        If the text is not arithmetic, a name or function is unknown, or the result is not finite.
     """
     lower = {name.lower(): value for name, value in names.items()}
     return compile_expression(text, where).evaluate(lower, where)
 
 
 def compile_expression(text: str, where: Place) -> Expression:
-    """Check an expression, which may then be evaluated many times.
+    """Check an expression, so that it can be evaluated many times.
 
     Raises
     ------
     InputError
-        When the text is not arithmetic.
+        If the text is not arithmetic.
     """
     try:
         return _compile(text)
@@ -143,16 +143,16 @@ def _compile(text: str) -> Expression:
     python = to_python(lexemes, {name: number for number, name in enumerate(positions)})
     try:
         tree = ast.parse(python, mode="eval").body
-    except (SyntaxError, RecursionError, MemoryError) as error:  # the checks above find all of them
+    except (SyntaxError, RecursionError, MemoryError) as error:  # never expected, as the checks above find all errors
         raise Problem(f"'{text}' is not arithmetic ({type(error).__name__})") from None
     return Expression(text, tuple(positions), positions, mega.text, mega.position, tree, None)
 
 
 def _finite(expression: Expression, names: Mapping[str, float]) -> float:
-    """Value of an expression; anything but a finite number is refused."""
+    """Value of an expression; refuses a value that is not a finite number."""
     try:
         value = float(_walk(expression.tree, names, expression))
-    except RecursionError:  # the limits of nesting prevent it
+    except RecursionError:  # never expected, because of the limits of nesting
         raise Problem(f"'{expression.text}' is nested too deeply") from None
     except ZeroDivisionError:
         raise Problem(f"'{expression.text}' divides by zero") from None
@@ -166,7 +166,7 @@ def _finite(expression: Expression, names: Mapping[str, float]) -> float:
 
 
 def _walk(node: ast.expr, names: Mapping[str, float], expression: Expression) -> float:
-    """Value of one node; only the kinds of nodes handled here are allowed, and their depth is that of the brackets."""
+    """Value of one node of an allowed kind; the recursion is only as deep as the nesting of brackets."""
     if isinstance(node, ast.Constant) and type(node.value) is float:
         return node.value
     if isinstance(node, ast.Name):
@@ -191,7 +191,7 @@ def _walk(node: ast.expr, names: Mapping[str, float], expression: Expression) ->
 
 
 def _walk_chain(node: ast.BinOp, names: Mapping[str, float], expression: Expression) -> float:
-    """Value of a chain `a + b - c ...`, whose tree is as deep as the chain is long: evaluated without recursion."""
+    """Value of a chain `a + b - c ...` by a loop, because its tree is as deep as the chain is long."""
     spine: list[ast.BinOp] = []
     left: ast.expr = node
     while isinstance(left, ast.BinOp):

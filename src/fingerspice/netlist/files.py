@@ -1,4 +1,4 @@
-"""The files of a netlist on the disk: their text, their folder, and the libraries of native devices."""
+"""Access to the files of a netlist: their text, the folder they may be in, and the libraries of native devices."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from fingerspice.netlist.library import LIBRARIES, library_text
 from fingerspice.netlist.spelling import closest, nearest
 
 MAX_BYTES = 64 * 2**20
-#: Of all files that a deck's sources name.
+#: Largest total size of the files that a deck's sources name, bytes.
 MAX_SOURCE_BYTES = 2**30
 
-#: Libraries with ngspice's bodies of the native devices; the one that is included says which charge law is meant.
+#: Libraries with ngspice's subcircuits of the native devices; the included library determines the charge law.
 NATIVE_LIBRARIES = tuple(LIBRARIES.values())
 
 
@@ -31,12 +31,12 @@ def read_text(path: Path, shown: str, where: Where | None = None, root: Path | N
     where : Where, optional
         Place of the line that names the file.
     root : Path, optional
-        Folder outside which no file's name may be told.
+        Folder outside of which no file's name may appear in a message.
 
     Raises
     ------
     InputError
-        When the file is missing, no ordinary file, too large, or not text in UTF-8, Latin-1 or marked UTF-16.
+        If the file is missing, not an ordinary file, too large, or not text in UTF-8, Latin-1 or UTF-16 with a mark.
     """
     try:
         if path.is_dir():
@@ -54,7 +54,7 @@ def read_text(path: Path, shown: str, where: Where | None = None, root: Path | N
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise InputError(f"'{shown}' cannot be read: {reason}", where) from None
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        # LTspice writes UTF-16 where a name has letters that Latin-1 lacks.
+        # LTspice writes UTF-16 if a name has letters that Latin-1 lacks.
         return data.decode("utf-16", "replace")
     if b"\0" in data:
         raise InputError(f"'{shown}' is not a text file (it holds NUL bytes): save it as UTF-8", where)
@@ -73,16 +73,16 @@ def read_text(path: Path, shown: str, where: Where | None = None, root: Path | N
 
 @dataclass
 class SourceFiles:
-    """Where sources find recordings and tables: for a deck in its folder or below, for a text of the user's anywhere.
+    """Finds the recordings and tables of sources: a deck's in its folder or below, a user's own anywhere.
 
     Attributes
     ----------
     folder : Path or None
-        The deck's; None for a deck given as text, which has none.
+        Folder of the deck; None for a deck given as text.
     anywhere : bool
-        Whether any file may be read, named from the working directory: so it is for what a user, and no deck, asks for.
+        Whether any file may be read, relative to the working directory: for sources given by the user, not by a deck.
     size : int
-        Bytes of the files named so far, each as often as it is named.
+        Total size of the files named so far, bytes; a file counts each time that it is named.
     """
 
     folder: Path | None = None
@@ -90,12 +90,12 @@ class SourceFiles:
     size: int = 0
 
     def find(self, name: str, where: Where) -> Path:
-        """Path of a file, where `where` names it; refused where it lies outside the folder.
+        """Path of a file named at the place `where`.
 
         Raises
         ------
         InputError
-            One sentence with the place.
+            If the file is outside the folder, or the files are too large in all; the message has the place.
         """
         path = Path(name).expanduser() if self.anywhere else self._below(name, where)
         if path.is_file():
@@ -116,13 +116,13 @@ class SourceFiles:
 
 
 def library_changed(root: Path, folder: Path, name: str) -> bool:
-    """Whether there is a library of that name in the netlist's folder that differs from this version's."""
+    """Whether the netlist's folder has a library of that name that differs from this version's."""
     try:
         path = (folder / name.replace("\\", "/")).resolve()
         if not path.is_relative_to(root) or not path.is_file():
             return False
         own = library_text(next(law for law, file in LIBRARIES.items() if file == path.name.lower()))
-        # A character has up to four bytes.
+        # A file of more than four bytes per character cannot be equal, and need not be read.
         if path.stat().st_size > 4 * len(own):
             return True
         text = read_text(path, name)
@@ -139,20 +139,20 @@ def _lines(text: str) -> list[str]:
 def _similar_file(path: Path, shown: str, root: Path | None) -> str:
     """The clause ``; did you mean 'folder/file'?`` for a missing file, or an empty text.
 
-    Looked at are the file's folder; where that is missing, the folder with the nearest name in its place; and then the
-    folder that should contain it. What is proposed is written as the missing file is, with its folder.
+    The search goes through the file's folder or, if that is missing, the folder with the nearest name, and then through
+    the parent folder. The proposal is written relative to the same folder as the missing file's name.
     """
     folder, below = path.parent, [path.name]
     while not folder.is_dir() and folder != folder.parent:
         folder, below = folder.parent, [folder.name, *below]
     if root is not None and not folder.is_relative_to(root):
         return ""
-    # As in `shown`, which may begin elsewhere than `path`.
+    # Use the beginning of `shown`, because `path` may be relative to another folder.
     written = PurePath(shown.replace("\\", "/")).parts[: -len(below)]
     found = _nearest_path(folder, below)
     if found is None and len(below) > 1:
         found = _nearest_path(folder, below[-1:])
-    # A library of native devices is not read, and need not be there.
+    # A library of native devices is built in and need not exist in the folder: propose it, too.
     names = [*([found[-1]] if found else []), *(NATIVE_LIBRARIES if root is not None else ())]
     name = closest(path.name, names)
     if found is not None and name in (found[-1], None):
@@ -161,7 +161,7 @@ def _similar_file(path: Path, shown: str, root: Path | None) -> str:
 
 
 def _nearest_path(folder: Path, parts: list[str]) -> list[str] | None:
-    """A file below a folder, found by the nearest name for each of the parts; None where there is none."""
+    """A file below a folder, found by the nearest name for each part of its path; None if there is none."""
     found: list[str] = []
     for number, part in enumerate(parts, 1):
         try:

@@ -1,4 +1,4 @@
-"""Element lines to flat statements: subcircuit calls expanded, nodes renamed, values evaluated."""
+"""Conversion of element lines to flat statements: expands subcircuit calls, renames nodes, evaluates values."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fingerspice.netlist.scope import Bare, Call, Number, Scope, Token, Value
 from fingerspice.netlist.slips import stray_word
 from fingerspice.netlist.spelling import nearest
 
-#: Limits of subcircuit calls: lines and characters in all of them together, nesting, and characters of a flat name.
+#: Limits of subcircuit calls: total number of expanded lines and characters, nesting, and characters of a flat name.
 MAX_EXPANDED = 100_000
 MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
@@ -49,17 +49,17 @@ class Statement:
     Attributes
     ----------
     name : str
-        As written, after the names of the calls around it: ``Xfinger.Xgap``.
+        Name as written, with the names of the enclosing calls in front: ``Xfinger.Xgap``.
     letter : str
         R, C, V, I, or X for a native device.
     nodes : tuple of str
-        In lower case, ground as ``0``; a node inside a subcircuit follows the names of the calls around it.
+        Nodes in lower case, ground as ``0``; a node inside a subcircuit has the names of the enclosing calls in front.
     node_names : tuple of str
         The same nodes as written.
     device : str or None
         A native device's name in upper case.
     body : tuple of Number, Token or Call
-        The words after the nodes; none of an X.
+        The words after the nodes; empty for an X.
     params : dict
         Values of `key=value` pairs by key in lower case.
     param_where : dict
@@ -81,7 +81,7 @@ class Statement:
 
 @dataclass(slots=True)
 class _Instance:
-    """A subcircuit call that is being expanded, or the deck."""
+    """A subcircuit call that is being expanded, or the deck itself."""
 
     definition: Subcircuit
     scope: Scope
@@ -98,7 +98,7 @@ class _Instance:
         return self.ports.get(lower) or (f"{self.prefix}{lower}".lower(), f"{self.prefix}{name}")
 
     def find(self, name: str) -> tuple[Subcircuit, _Instance] | None:
-        """The definition of that name visible here, and the instance that contains it; None where there is none."""
+        """The definition of that name visible here, and the instance that contains it; None if there is none."""
         instance: _Instance | None = self
         while instance is not None:
             if name in instance.definition.inner:
@@ -107,7 +107,7 @@ class _Instance:
         return None
 
     def visible(self) -> list[str]:
-        """Names an X line may call from here."""
+        """Names that an X line may call from here."""
         names = list(layer_devices())
         instance: _Instance | None = self
         while instance is not None:
@@ -122,7 +122,7 @@ class Flattener:
     Attributes
     ----------
     statements : list of Statement
-        In the order of the deck; those of a call stand in place of the call.
+        Statements in the order of the deck; a call is replaced by the statements of its subcircuit.
     """
 
     def __init__(self) -> None:
@@ -216,7 +216,7 @@ class Flattener:
 
 
 def _bind(inner: _Instance, line: Line, words: Group, caller: Scope) -> None:
-    """Evaluate the parameters of a call: those given on the call with the caller's names, the others with its own."""
+    """Evaluate a call's parameters: values on the X line in the caller's scope, defaults in the subcircuit's."""
     definition = inner.definition
     for formula in (*definition.defaults, *definition.params):
         inner.scope.define(formula)
@@ -232,7 +232,7 @@ def _bind(inner: _Instance, line: Line, words: Group, caller: Scope) -> None:
 
 
 def _refuse_captured(device: str, own: dict[str, float], line: Line, words: Group, caller: Scope) -> None:
-    """Refuse a value on an X line that names a parameter of the caller where ngspice would take the device's own."""
+    """Refuse a value on an X line with a name that is the caller's parameter here, and the device's own in ngspice."""
     for key, pair in words.params.items():
         for name, value in caller.references(line, pair.value).items():
             if name != key and own.get(name, value) != value:
@@ -279,12 +279,12 @@ def _check_nodes(name: str, device: str, given: int, wanted: tuple[str, ...], wh
 
 
 def _unknown_device(line: Line, words: list[Lexeme], instance: _Instance) -> str:
-    """Why the last word of an X line is no device."""
+    """The message that the last word of an X line is not a device, with a hint."""
     last = line.written(words[-1])
     visible = instance.visible()
     known = {name.lower() for name in visible}
     for word in words[:-1]:
-        # A device's name after two words or more is the device, and what follows it lacks its `key=`.
+        # A device's name after two words or more is probably the device, and the words after it lack their `key=`.
         if word.text.lower() in known and word is not words[0] and words.index(word) >= 2:
             return f"{last} follows the device {word.text}: its parameters are written key=value"
     hint = nearest(words[-1].text, visible) or f"; devices are {' '.join(visible[:40])}"
@@ -292,7 +292,7 @@ def _unknown_device(line: Line, words: list[Lexeme], instance: _Instance) -> str
 
 
 def _unknown_element(lexemes: list[Lexeme]) -> str:
-    """Why a line with these words is no element."""
+    """The message that a line with these words is not an element, with a hint."""
     name = lexemes[0].text
     if any(lexeme.text.upper() in layer_devices() for lexeme in lexemes[3:]):
         return f"'{name}': a device's name begins with X, as in X{name}"

@@ -1,4 +1,4 @@
-"""Functions and constants of the netlist's arithmetic, with the meaning that they have in ngspice's `.param`."""
+"""Functions and constants of the netlist's arithmetic; they mean the same as in ngspice's `.param`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ CONSTANTS: Mapping[str, float] = {"pi": math.pi, "e": math.e}
 
 
 class Problem(Exception):
-    """Something wrong in an expression, and at which of its characters."""
+    """An error in an expression, with the position of the character at fault."""
 
     def __init__(self, message: str, position: int = 0) -> None:
         self.message = message
@@ -17,7 +17,7 @@ class Problem(Exception):
 
 
 def power(base: float, exponent: float) -> float:
-    """`base ** exponent`; a negative base is refused unless the exponent is even, since ngspice takes its size."""
+    """`base ** exponent`; a negative base needs an even exponent, as ngspice takes the base's absolute value."""
     if base < 0.0 and not (exponent % 2.0 == 0.0):
         raise Problem(
             f"({base:g})^({exponent:g}) has a negative base, whose absolute value ngspice takes: "
@@ -40,7 +40,7 @@ _AS_IN_MATH = (
     *("sqrt", "exp", "log10", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
     *("asinh", "acosh", "atanh", "floor", "ceil"),
 )
-#: By name: the function, its smallest and its largest number of arguments.
+#: From a name to the function, and its smallest and largest number of arguments.
 FUNCTIONS: Mapping[str, tuple[Callable[..., float], int, int]] = {
     **{name: (getattr(math, name), 1, 1) for name in _AS_IN_MATH},
     "ln": (math.log, 1, 1),

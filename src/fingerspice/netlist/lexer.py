@@ -1,6 +1,6 @@
-"""From netlist text to logical lines, lexemes and groups, each with its line and column in the file.
+"""Division of netlist text into logical lines, lexemes and groups, each with its line and column in the file.
 
-Nothing here depends on what a word means: the callers distinguish names, values and directives.
+Nothing here depends on the meaning of a word: the callers distinguish names, values and directives.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fingerspice.base.errors import InputError, Where
 #: As in ngspice a `;`, a `//` after a blank, or a `$` between blanks starts a comment, except in double quotes.
 _COMMENT = re.compile(r'"[^"]*"|(;|(?<!\S)//|(?<!\S)\$(?!\S))')
 _LEX = re.compile(r"""[\s,]+|([()=])|("[^"]*")|('[^']*')|([^\s,()={}'"]+)""")
-#: What separates words, or is one: their number bounds the number of words.
+#: Pattern of a separator or a mark; their number is an upper bound of the number of words.
 _SPLIT = re.compile(r"""[\s,]+|[()={}'"]""")
 _BRACE = re.compile(r"[{}]")
 _MARKS = ("(", ")", "=")
@@ -116,7 +116,7 @@ def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]
     Raises
     ------
     InputError
-        When a continuation has nothing before it.
+        If a continuation has no line before it.
     """
     pending: list[tuple[int, int, str]] = []
     for number, raw in enumerate(lines, first):
@@ -156,7 +156,7 @@ def lex(line: Line, start: int = 0) -> list[Lexeme]:
     Raises
     ------
     InputError
-        When a brace or quote is not closed.
+        If a brace or quote is not closed.
     """
     text, position = line.text, start
     lexemes: list[Lexeme] = []
@@ -205,16 +205,16 @@ def group(line: Line, lexemes: list[Lexeme], plain: int = 0, *, probes: bool = F
     line : Line
         The line, for places.
     lexemes : list of Lexeme
-        Those after the line's first word.
+        The lexemes after the line's first word.
     plain : int
-        Number of words at the beginning that are no calls, because they are nodes, which may stand in brackets.
+        Number of words at the beginning that are nodes, which may stand in brackets without being calls.
     probes : bool
         Whether `v(node)=value` is a pair with the key ``v(node)``.
 
     Raises
     ------
     InputError
-        For brackets without a partner, a pair without its name or value, or one given twice.
+        If a bracket has no partner, or a pair has no name or value, or is given twice.
     """
     top = Group()
     inside, brackets = top, list[tuple[Lexeme, Group]]()

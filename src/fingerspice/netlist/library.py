@@ -1,4 +1,4 @@
-"""The libraries with which ngspice knows the layers, one for each charge law, as shipped with this version."""
+"""The libraries that define the layers for ngspice, one for each charge law, as shipped with this version."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading a netlist: from a file or a text to a `Circuit`."""
+"""Reading of a netlist, from a file or a text, into a `Circuit`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def read_netlist(path: str | Path) -> Circuit:
     Raises
     ------
     InputError
-        When the file cannot be read or anything in it is wrong; the message says where and what is allowed.
+        If the file cannot be read or has an error; the message gives its place and the allowed alternatives.
     """
     if not isinstance(path, str | os.PathLike):
         raise InputError(f"read_netlist is given {path!r}; allowed: the path of a netlist, such as 'deck.cir'")
@@ -48,12 +48,12 @@ def parse_netlist(text: str, path: str | Path | None = None) -> Circuit:
     ----------
     text : str
     path : str or Path, optional
-        Where the text came from; it may include files from that folder.
+        Path of the file with this text; the text may include files from its folder.
 
     Raises
     ------
     InputError
-        When anything in it is wrong; the message says where and what is allowed.
+        If the text has an error; the message gives its place and the allowed alternatives.
     """
     if not isinstance(text, str):
         raise InputError(f"parse_netlist is given {text!r}; allowed: a netlist's text, whose first line is the title")
@@ -74,13 +74,13 @@ def _circuit(deck: Deck) -> Circuit:
 
 
 def _first(notes: list[str]) -> tuple[str, ...]:
-    """The first `MAX_WARNINGS` warnings, and how many more there are."""
+    """The first `MAX_WARNINGS` warnings, and the number of the others."""
     more = len(notes) - MAX_WARNINGS
     return (*notes[:MAX_WARNINGS], f"{more} more warnings are not shown") if more > 1 else tuple(notes)
 
 
 def _in_deck(error: InputError, deck: Deck) -> InputError:
-    """A refusal with the deck's name where it has no place, and with a note where the title reads like a statement."""
+    """The error with the deck's name if it has no place, and with a note if the title reads like a statement."""
     error = with_comma(error, deck.warnings)
     text = error.message if error.where else f"{deck.path or '<netlist>'}: {error.message}"
     title = [note for note in deck.warnings if "the first line is the title" in note]
@@ -115,7 +115,7 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
 
 
 def _unusual_areas(elements: tuple[Element, ...], initial: Mapping[str, float]) -> Iterator[str]:
-    """Warnings of unusual areas among those that sources and start values give."""
+    """Warnings about unusual areas given by sources or start values."""
     nodes = {e.nodes[2] for e in elements if e.spec.is_layer}
     given: list[tuple[str, float, Where | None]]
     given = [(f".ic v({node})", value, None) for node, value in initial.items() if node in nodes]
@@ -129,7 +129,7 @@ def _unusual_areas(elements: tuple[Element, ...], initial: Mapping[str, float]) 
 
 
 def _coarse_outputs(deck: Deck, elements: tuple[Element, ...], tran: Tran | None) -> Iterator[str]:
-    """A warning of each source whose period is shorter than TSTEP; not where its frequency is warned of already."""
+    """A warning about each source with a period shorter than TSTEP, unless there is one about its frequency."""
     if deck.tran is None or tran is None:
         return
     for e in elements:
@@ -151,12 +151,12 @@ def _charge_law(includes: tuple[str, ...]) -> str | None:
 def source_from_text(text: str, circuit: Circuit) -> Waveform:
     """A waveform from netlist text such as ``SQUARE(200 100)`` or ``WAVEFILE(a.wav 150)``.
 
-    SPICE's defaults are taken from the circuit's .tran, and files are named from the working directory.
+    SPICE's defaults come from the circuit's .tran, and file names are relative to the working directory.
 
     Raises
     ------
     InputError
-        When the text is not a source.
+        If the text is not a source.
     """
     tran = circuit.tran
     line = f".tran {tran.step!r} {tran.stop!r}\n" if tran else ""
@@ -173,6 +173,6 @@ def source_from_text(text: str, circuit: Circuit) -> Waveform:
         comma = decimal_comma(f"V1 a 0 {text}")
         raise InputError(f"{text!r}: {error.message}" + (f"; note {comma}" if comma else "")) from None
     for note in (*deck.warnings, *source.notes):
-        # The place that the note begins with is one in this text, not in the deck.
+        # A note begins with a place in the one-source deck made here, which the user does not know: cut it off.
         warnings.warn(f"{text!r}: {note.partition(': ')[2]}", FingerspiceWarning, stacklevel=2)
     return source.waveform

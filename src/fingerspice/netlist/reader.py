@@ -1,6 +1,6 @@
-"""From netlist files to lines by kind: elements, parameters, subcircuits and directives.
+"""Reader of netlist files: sorts lines into elements, parameters, subcircuits and directives.
 
-Included files have to lie in the netlist's own folder.
+Included files must be in the netlist's own folder.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from fingerspice.netlist.scope import Formula, param_formulas
 from fingerspice.netlist.slips import ELSEWHERE, decimal_comma
 from fingerspice.netlist.spelling import nearest
 
-#: Limits of a netlist with its included files; a word takes up to 500 bytes of memory and a line 200.
+#: Limits of a netlist with its included files: a word takes up to 500 bytes of memory, and a line 200.
 MAX_WORDS, MAX_LINES = 1_000_000, 2_000_000
-#: Number of warnings that are shown.
+#: Largest number of warnings that are shown.
 MAX_WARNINGS = 100
 MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 32
 
-#: Directives without effect here: of those in UNUSED a note says so; those in SILENT matter to another simulator only.
+#: Directives without effect here: those in UNUSED cause a warning; those in SILENT only matter to other simulators.
 UNUSED = (".print", ".plot", ".save", ".probe", ".meas", ".measure", ".title")
 SILENT = (".nodeset", ".backanno")
 ANALYSES = (".tran", ".ac", ".ic", ".options", ".option")
@@ -42,9 +42,9 @@ class Subcircuit:
     elements: list[Line] = field(default_factory=list)
     params: list[Formula] = field(default_factory=list)
     inner: dict[str, Subcircuit] = field(default_factory=dict)
-    skipped: bool = False  # a native device's name, or inside one: its body is not read
+    skipped: bool = False  # has a native device's name, or is inside such a definition: its body is not read
     called: bool = False
-    characters: int = 0  # of its lines
+    characters: int = 0  # number of characters of its lines
 
 
 class Reader:
@@ -63,7 +63,7 @@ class Reader:
         self.folder = path.parent.resolve() if path is not None else None
         self._top = path.resolve() if path is not None else None
         self.root = Subcircuit("")
-        self.analyses: list[tuple[str, Line, int]] = []  # and where the arguments start
+        self.analyses: list[tuple[str, Line, int]] = []  # name, line, and position of the arguments
         self.libraries: list[str] = []
         self.files: list[Path] = []
         self.unused: dict[str, None] = {}  # an ordered set
@@ -76,7 +76,7 @@ class Reader:
         self._words = 0
 
     def split(self, text: str, where: Where | None = None) -> list[str]:
-        """Physical lines of the deck or of a file it includes; refused where there are too many in all."""
+        """Physical lines of the deck or of an included file; refuses more than `MAX_LINES` lines in all."""
         self._lines += 1 + text.count("\n") + text.count("\r")
         if self._lines > MAX_LINES:
             problem = f"the netlist has {self._lines:,} lines; allowed: {MAX_LINES:,}, included files counted"
@@ -108,7 +108,7 @@ class Reader:
             self.warn("text after .end is not read", line.where(line.start))
 
     def _take(self, line: Line, folder: Path | None) -> bool:
-        """Enter one line where it belongs; True where it ends the deck."""
+        """Enter one line in its list; returns whether the line ends the deck."""
         start = line.start
         word = line.text[start:].split(None, 1)[0].lower()
         if self._control is not None:
@@ -132,7 +132,7 @@ class Reader:
         return self._directive(word, line, start + len(word), folder)
 
     def _directive(self, word: str, line: Line, rest: int, folder: Path | None) -> bool:
-        """Enter a line that begins with a dot and whose arguments start at `rest`; True where it ends the deck."""
+        """Enter a directive whose arguments start at position `rest`; returns whether the line ends the deck."""
         here = self._open[-1]
         if word == ".subckt":
             self._open_subcircuit(line, rest)

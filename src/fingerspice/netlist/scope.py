@@ -1,4 +1,4 @@
-"""Values of a netlist's words: numbers, keywords, and the parameters to which expressions refer."""
+"""Evaluation of a netlist's words: numbers, keywords, and expressions of parameters."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PAIR = re.compile(r"[({]|[)}]|'[^']*'|(?<![\w.])([A-Za-z_]\w*)\s*=(?!=)|[<>!=]=
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """A word that is no number, such as a keyword, a file name or `inf`; `quoted` where it stood in double quotes."""
+    """A word that is not a number, such as a keyword, a file name or `inf`; `quoted` if it was in double quotes."""
 
     text: str
     where: Where
@@ -44,7 +44,7 @@ class Number:
     where : Where
         The place of its first character.
     mega : Token, optional
-        The number with a capital M, which is milli and perhaps meant as mega, from which this value was computed.
+        The number with a capital M from which the value was computed: M is milli, and perhaps meant as mega.
     """
 
     value: float
@@ -54,8 +54,8 @@ class Number:
 
 
 Value: TypeAlias = Number | Token
-#: What is evaluated without braces: nothing, the name of a parameter, or arithmetic, too. This is as in ngspice, which
-#: takes `R1 a b rho` and `X1 a b sub w=2*rho`, but not `R1 a b 2*rho`.
+#: Kinds of text that are evaluated without braces: nothing, a parameter's name, or also arithmetic. As in ngspice,
+#: `R1 a b rho` and `X1 a b sub w=2*rho` are allowed, but not `R1 a b 2*rho`.
 Bare: TypeAlias = Literal["nothing", "name", "arithmetic"]
 Pairs: TypeAlias = tuple[dict[str, Value], dict[str, Where]]
 
@@ -73,7 +73,7 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Formula:
-    """A parameter's definition, not yet evaluated: its name, the text of its right side, and where both stand."""
+    """A parameter's definition, not yet evaluated: its name, the text of its right side, and the positions of both."""
 
     name: str  # as written
     text: str
@@ -94,8 +94,8 @@ class Formula:
 class Scope:
     """The parameters of the deck or of one subcircuit call, which also sees those of its callers.
 
-    As in ngspice a name that a subcircuit does not define is looked up in its caller, then in the caller of that, and
-    at last in the deck, wherever the subcircuit's definition stands.
+    As in ngspice, a name that a subcircuit does not define is looked up in its caller, then in that caller's caller,
+    and at last in the deck; the place of the subcircuit's definition does not matter.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class Scope:
         self._mega: dict[str, Token] = {}
 
     def define(self, formula: Formula) -> None:
-        """Enter a definition. It is evaluated by `solve`, so that the order of definitions does not matter."""
+        """Enter a definition. `solve` evaluates it later, so that the order of definitions does not matter."""
         name = formula.name.lower()
         if name in self._formulas:
             first = self._formulas[name].where
@@ -121,18 +121,18 @@ class Scope:
         self._formulas[name] = formula
 
     def preset(self, name: str, number: Number) -> None:
-        """Give a parameter the value that the call has for it, instead of its default."""
+        """Set a parameter to its value in the call, instead of its default."""
         self.values[name] = number.value
         if number.mega is not None:
             self._mega[name] = number.mega
 
     def solve(self) -> None:
-        """Evaluate every definition, after those to which it refers.
+        """Evaluate every definition, after the definitions of the parameters in it.
 
         Raises
         ------
         InputError
-            When parameters refer to each other in a circle, to an unknown name, or have no finite value.
+            If parameters refer to each other in a circle or to an unknown name, or have no finite value.
         """
         compiled: dict[str, Expression] = {}
         for root in self._formulas:
@@ -149,11 +149,11 @@ class Scope:
                 if not waiting:
                     self.preset(name, self._evaluate(compiled[name], formula.text, formula.place))
                 elif any(n in compiled for n in waiting):
-                    raise self._circle(compiled, name)  # it is compiled and waits on the stack
+                    raise self._circle(compiled, name)  # a compiled formula without a value is on the stack: a circle
                 stack.extend(waiting)
 
     def _circle(self, compiled: dict[str, Expression], start: str) -> InputError:
-        """The error that names the parameters of a circle, into which every definition without a value leads."""
+        """The error that names the parameters of a circle; following undefined names from `start` leads into it."""
         order = {start: 0}
         name = start
         while True:
@@ -186,7 +186,7 @@ class Scope:
         return Number(expression.evaluate(self._visible, place), written, place(0), mega)
 
     def number(self, line: Line, lexeme: Lexeme) -> Number:
-        """Value of a lexeme that has to be arithmetic, with or without braces."""
+        """Value of a lexeme that must be arithmetic, with or without braces."""
         inner = lexeme.position + (lexeme.kind != "word")
         if lexeme.kind == "string":
             problem = f"a number is needed, not the text {line.written(lexeme)}"
@@ -199,7 +199,7 @@ class Scope:
         return Number(number.value, number.text, line.where(lexeme.position), number.mega)
 
     def references(self, line: Line, lexeme: Lexeme) -> dict[str, float]:
-        """Values in this scope of the parameters to which a lexeme refers; empty where it is no arithmetic."""
+        """Values in this scope of the parameters in a lexeme; empty if the lexeme is not arithmetic."""
         try:
             names = compile_expression(lexeme.text, lambda _: line.where(lexeme.position)).names
         except InputError:
@@ -216,7 +216,7 @@ class Scope:
         lexeme : Lexeme
             A word, string or expression.
         bare : Bare
-            What is evaluated without braces.
+            Kind of text that is evaluated without braces.
         """
         where = line.where(lexeme.position)
         if lexeme.kind == "string":
@@ -286,7 +286,7 @@ def param_formulas(line: Line, start: int) -> list[Formula]:
     Raises
     ------
     InputError
-        When the line is not a row of `name=value`.
+        If the line is not a row of `name=value`.
     """
     keys: list[tuple[int, int, str]] = []  # start of the name, start of the value, the name
     depth = 0

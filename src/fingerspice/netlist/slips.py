@@ -1,4 +1,4 @@
-"""Common slips in netlists, and directives of other simulators, each with a sentence that says what to write."""
+"""Common slips in netlists, and directives of other simulators, each with a sentence about what to write instead."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 from fingerspice.base.errors import InputError
 
-#: Directives that only other simulators know, with what to do instead.
+#: Directives that only other simulators know, each with the alternative here.
 ELSEWHERE = {
     ".step": "give one value a run by --set PATH=VALUE, or loop over circuit.replace({path: value}) in Python",
     ".four": "mean, peaks and amplitude are in the summary of a run, and any harmonic in the data that it writes",
@@ -45,10 +45,10 @@ _UNIT = re.compile(r"(?:[tgkmunpfµμ]|meg|mil)?(?:m|v|a|s|n|f|hz|ohm|ω)?", re.
 
 
 def decimal_comma(text: str) -> str | None:
-    """A warning of a comma that is probably meant as a decimal point; None where there is none.
+    """A warning about a comma that is probably meant as a decimal point; None if there is none.
 
-    Commas separate numbers, as in ``SIN(0,200,100)``. A comma is doubtful where blanks separate the other numbers, as
-    in ``SIN(0 200 0,1)``, and in ``d=3,5u``.
+    Commas separate numbers, as in ``SIN(0,200,100)``. A comma is doubtful if blanks separate the other numbers, as in
+    ``SIN(0 200 0,1)``, and in ``d=3,5u``.
     """
     bare = _LISTS.sub("x", text)
     for found in (_ASSIGNED.search(bare), *_among_blanks(bare)):
@@ -78,13 +78,13 @@ def is_unit(word: str) -> bool:
 
 
 def stray_word(word: str, before: str) -> str:
-    """A hint for a word that stands after ``key=value``, where it is a unit that a blank separates from its number."""
+    """A hint if a word after ``key=value`` is a unit, separated from its number by a blank; else an empty text."""
     number = before.rpartition("=")[2].strip()
     return f"; a unit joins its number, {number}{word}" if _NUMBER.fullmatch(number) and is_unit(word) else ""
 
 
 def with_comma(error: InputError, warnings: Iterable[str]) -> InputError:
-    """The error, with the warning of a decimal comma where there is one of the same line."""
+    """The error, with the warning about a decimal comma in the same line, if there is one."""
     place = f"{error.where.file}:{error.where.line}:" if error.where else "none"
     found = [text.partition(": ")[2] for text in warnings if text.startswith(place) and "decimal comma" in text]
     return InputError("; note ".join([error.message, *found]), error.where) if found else error

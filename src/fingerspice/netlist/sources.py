@@ -1,4 +1,4 @@
-"""Source functions of a netlist as waveforms: those that all SPICEs share, and SQUARE; and ``AC``."""
+"""Source functions of a netlist as waveforms: SPICE's own, SQUARE, CHIRP, BURST and recordings; and ``AC``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SIN = ("VO", "VA", "FREQ", "TD", "THETA", "PHASE")
 _PULSE = ("V1", "V2", "TD", "TR", "TF", "PW", "PER")
 #: Functions to which LTspice adds a number of periods.
 _COUNTED = (_SIN, _PULSE)
-_KEPT_BYTES = 2**25  # A larger WAV file is read as it is needed: 32 MiB are six minutes of 16 bits at 48 kHz.
+_KEPT_BYTES = 2**25  # A larger WAV file is read in parts when needed: 32 MiB are six minutes of 16 bits at 48 kHz.
 #: Names in LTspice, and a short one for the command line.
 _ALIASES = {"sine": "sin", "wav": "wavefile"}
 _CHIRP = ("amplitude", "f0", "f1", "duration")
@@ -35,14 +35,14 @@ _BURST = ("amplitude", "frequency", "cycles", "every")
 
 @dataclass(frozen=True)
 class Context:
-    """What a source's text may refer to.
+    """Data that the text of a source may refer to.
 
     Attributes
     ----------
     step, stop : float or None
         TSTEP and TSTOP of the deck (s), on which SPICE's defaults depend; None without a .tran line.
     files : SourceFiles
-        Where recordings and tables are read.
+        Finds recordings and tables.
     """
 
     step: float | None = None
@@ -68,7 +68,7 @@ class _Arguments:
                 self.call.where,
             )
         if given > len(self.names):
-            # LTspice has one more, Ncycles.
+            # LTspice has one more argument, Ncycles.
             hint = "; Ncycles is not supported, a burst is BURST(amplitude frequency cycles), in Python fs.Burst"
             usage += hint if self.names in _COUNTED and given == len(self.names) + 1 else ""
             raise InputError(
@@ -153,7 +153,7 @@ def _pwl(call: Call, context: Context) -> Waveform:
     repeat = _number(call.params["r"], "PWL r") if "r" in call.params else -1.0
     times = tuple(t + shift for t in given)
     if 0.0 <= repeat < given[0]:
-        # Where the repeated part begins before the first point, it begins with the first value.
+        # If the repeated part begins before the first point, its first value is that of the first point.
         times, levels = (repeat + shift, *times), (levels[0], *levels)
     return PWL(times, levels, repeat + shift if repeat >= 0.0 else None)
 
@@ -170,7 +170,7 @@ def _kind(call: Call) -> str:
 
 
 def _named(call: Call, names: tuple[str, ...], keys: tuple[str, ...]) -> dict[str, Word]:
-    """Words of a call by name: positional ones are those of `names`, and any of `keys` may be given as key=value."""
+    """Words of a call by name: positional words take the `names` in order; `keys` may be given as key=value."""
     usage = f"allowed: {_OF_FILES[_kind(call)]}"
     if len(call.args) > len(names):
         raise InputError(f"{call.name.upper()} takes at most {len(names)} values, {len(call.args)} given; {usage}",
@@ -185,7 +185,7 @@ def _named(call: Call, names: tuple[str, ...], keys: tuple[str, ...]) -> dict[st
 
 
 def _whole(words: dict[str, Word], key: str) -> int | None:
-    """A whole number by its name; None where it is left out."""
+    """A whole number by its name; None if it is left out."""
     if key not in words:
         return None
     value = _number(words[key], key)
@@ -195,7 +195,7 @@ def _whole(words: dict[str, Word], key: str) -> int | None:
 
 
 def _column(words: dict[str, Word], key: str) -> str | int | None:
-    """A column's name or number; None where it is left out."""
+    """A column's name or number; None if it is left out."""
     word = words.get(key)
     return word.text if isinstance(word, Token) else _whole(words, key)
 
@@ -254,7 +254,7 @@ SOURCES: dict[str, Callable[[Call, Context], Waveform]] = {
     "wavefile": _wavefile,
     "table": _table,
 }
-"""Source functions by name: add one here to teach the reader another."""
+"""Source functions by name; an entry is all that a new source function needs."""
 
 _OF_FILES = {
     "wavefile": "WAVEFILE(path gain [channel]) with gain in V at full scale",
@@ -270,14 +270,14 @@ _REFUSED = {
 
 @dataclass(frozen=True)
 class Source:
-    """A V or I element as the words after its nodes describe it.
+    """Waveform and small signal of a V or I element, from the words after its nodes.
 
     Attributes
     ----------
     waveform : Waveform
     ac : SmallSignal or None
     notes : tuple of str
-        Warnings of words that ngspice reads differently.
+        Warnings about words that ngspice reads differently.
     """
 
     waveform: Waveform
@@ -291,7 +291,7 @@ def read_source(name: str, body: Sequence[Word], context: Context, where: Where)
     Parameters
     ----------
     name : str
-        The element.
+        Name of the element.
     body : sequence of words
         ``[DC] value``, ``AC ...`` and at most one source function.
     context : Context
@@ -301,7 +301,7 @@ def read_source(name: str, body: Sequence[Word], context: Context, where: Where)
     Raises
     ------
     InputError
-        One sentence with the place.
+        If the words do not describe a source; the message has the place.
     """
     level: float | None = None
     ac: SmallSignal | None = None
@@ -353,7 +353,7 @@ def _small_signal(name: str, call: Call) -> SmallSignal:
 
 
 def _differences(name: str, key: str, waveform: Waveform, call: Call) -> tuple[str, ...]:
-    """Warnings of numbers that ngspice 39 or LTspice reads differently, or that were left out."""
+    """Warnings about numbers that ngspice 39 or LTspice reads differently, or that were left out."""
     if isinstance(waveform, Exp) and 0.0 in (waveform.td1, waveform.td2):
         which = " and ".join(n for n, x in (("TD1", waveform.td1), ("TD2", waveform.td2)) if x == 0.0)
         return (

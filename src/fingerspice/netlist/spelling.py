@@ -1,4 +1,4 @@
-"""The nearest known spelling of a word that is not known."""
+"""Search for the known word nearest to an unknown one, for the hints of messages."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import difflib
 import itertools
 from collections.abc import Iterable
 
-#: Comparing two words takes the product of their lengths: only so many known words of so many characters are compared.
+#: Largest number and length of the known words that are compared: a comparison takes the product of the two lengths.
 MAX_KNOWN, MAX_COMPARED = 1000, 60
 
 
 def closest(word: str, known: Iterable[str]) -> str | None:
-    """The known word that is spelt most like `word`, whatever their case; None where none is similar."""
+    """The known word whose spelling is nearest to `word`, regardless of case; None if none is similar."""
     if len(word) > MAX_COMPARED:
         return None
     lower = {name.lower(): name for name in itertools.islice(known, MAX_KNOWN) if len(name) <= MAX_COMPARED}

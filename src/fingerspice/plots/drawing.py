@@ -1,7 +1,7 @@
 """Tools of every picture: figure, axes, legend, caption, colours, units and file.
 
-Figures are made with matplotlib's object API, without pyplot and its global state, and matplotlib is imported when the
-first one is made.
+Figures are made with matplotlib's object API, without pyplot and its global state; matplotlib is imported when the
+first figure is made.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FONT, SMALL = 8.5, 7.0
 WIDTH = 7.0
 """Font sizes (points) and width (inches) of a figure across a page."""
 
-#: Bins into which long curves are divided: more than there are dots across the page.
+#: Number of bins into which long curves are divided: larger than the number of dots across the page.
 MAX_BINS = 4000
 #: Largest number of characters of a name in a legend.
 LONGEST_LABEL = 60
@@ -55,9 +55,9 @@ def new_figure(rows: int, columns: int = 1, height: float = 3.0, **options: Any)
     Returns
     -------
     figure : Picture
-        With an Agg canvas, so that it saves without a display.
+        Figure with an Agg canvas, so that it can be saved without a display.
     axes : list of Axes
-        Row by row.
+        Panels, row by row.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -86,7 +86,7 @@ def dress(ax: Axes, ylabel: str = "", xlabel: str = "") -> None:
 
 
 def legend_above(ax: Axes, columns: int = 4, *, right: bool = False, math: bool = False) -> None:
-    """Put a legend above the panel, where it hides no data; names keep their ``$`` unless `math` is set."""
+    """Put a legend above the panel, where it hides no data; a ``$`` is a plain character unless `math` is set."""
     place: dict[str, Any] = {"loc": "lower right" if right else "lower left", "bbox_to_anchor": (right, 1.0)}
     place |= {"borderaxespad": 0.1, "borderpad": 0.2, "handlelength": 1.8, "columnspacing": 1.2}
     legend = ax.legend(ncols=columns, fontsize=FONT - 0.5, frameon=False, **place)
@@ -96,21 +96,21 @@ def legend_above(ax: Axes, columns: int = 4, *, right: bool = False, math: bool 
 
 
 def legend_within(ax: Axes, room: int) -> None:
-    """Put a legend above the panel, in as many columns as fit into a width of `room` letters."""
+    """Put a legend above the panel, with as many columns as fit into a width of `room` letters."""
     names = ax.get_legend_handles_labels()[1]
     columns = next(n for n in range(len(names), 0, -1) if n == 1 or sum(_columns(names, n)) <= room)
     legend_above(ax, columns)
 
 
 def _columns(names: list[str], columns: int) -> list[int]:
-    """Widths (letters) of a legend's columns, which are filled one after the other, the first ones with one more."""
+    """Widths (letters) of a legend's columns; entries fill column by column, and the first ones may hold one more."""
     rows, longer = divmod(len(names), columns)
     begins = [place * rows + min(place, longer) for place in range(columns + 1)]
     return [max(map(len, names[a:b])) + 6 for a, b in itertools.pairwise(begins)]
 
 
 def drawable(text: str, longest: int = 1000) -> str:
-    """Text of a deck for a picture: printable, shortened, and with a box for characters that the font lacks."""
+    """Text of a deck for a picture: printable, shortened, and with a box for each character that the font lacks."""
     text = printable(text, longest)
     if text.isascii():
         return text
@@ -135,21 +135,21 @@ def save(figure: Figure, path: str | Path, *, about: Mapping[str, str] | None = 
     figure : Figure
     path : str or Path
     about : mapping, optional
-        Texts kept in the file, such as what the figure was made from.
+        Texts that are stored in the file, such as the origin of the figure.
     dpi : float
         Dots per inch.
 
     Raises
     ------
     InputError
-        Where the folder cannot be written.
+        If the folder cannot be written.
     """
     options: dict[str, Any] = {"format": "png", "dpi": dpi, "pil_kwargs": {"compress_level": 3}}
     return write_aside(Path(path), lambda target: figure.savefig(target, metadata=dict(about or {}), **options))
 
 
 def engineering(peak: float, unit: str, least: float = 1.0) -> tuple[float, str]:
-    """Factor and prefixed unit by which `peak` is from `least` to 1000 times that: (1e3, "ms") for 0.05 s."""
+    """Factor and prefixed unit that scale `peak` to between `least` and 1000 `least`: (1e3, "ms") for 0.05 s."""
     size = abs(peak) / least
     if not np.isfinite(size) or size == 0.0:
         return 1.0, unit
@@ -158,13 +158,13 @@ def engineering(peak: float, unit: str, least: float = 1.0) -> tuple[float, str]
 
 
 def thin(t: FloatArray, x: FloatArray, bins: int = MAX_BINS) -> tuple[FloatArray, FloatArray]:
-    """A curve that looks the same with about 4 points per bin: the first, last, least and largest of each.
+    """A curve with about 4 points per bin that looks the same: the first, last, smallest and largest of each bin.
 
     Parameters
     ----------
     t, x : ndarray, shape (n,)
     bins : int
-        More than there are dots across the page.
+        Number of bins, larger than the number of dots across the page.
     """
     width = t.size // bins
     if width < 8:
@@ -183,12 +183,12 @@ def peak_of(values: FloatArray) -> float:
 
 
 def from_zero(ax: Axes) -> None:
-    """Let the scale begin at 0, so that ripple is seen in proportion."""
+    """Let the scale begin at 0, so that ripple is shown in proportion to the value."""
     top = ax.get_ylim()[1]
     ax.set_ylim(0.0, top if top > 0.0 else 1.0)
 
 
 def flat(ax: Axes, values: FloatArray) -> None:
-    """Widen the scale of a constant, which would otherwise show its rounding."""
+    """Widen the scale of a constant signal, which would otherwise show round-off."""
     if values.any() and np.ptp(values) <= 1e-6 * peak_of(values):
         ax.set_ylim(0.95 * values.flat[0], 1.05 * values.flat[0])

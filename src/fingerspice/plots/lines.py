@@ -1,4 +1,4 @@
-"""Pictures against time: their panels, lines, time axis and caption."""
+"""Parts of the pictures against time: panels, lines, time axis and caption."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _PALE: dict[str, Any] = {"linewidth": 3.2, "alpha": 0.45, "linestyle": "-", "sol
 
 
 class Quantity(NamedTuple):
-    """What a panel shows.
+    """The physical quantity of a panel, with its label, unit and colour.
 
     Attributes
     ----------
@@ -84,22 +84,22 @@ class Trace:
 
 
 def end_of(solution: Solution) -> float:
-    """Where the run stopped, s."""
+    """Time at which the run stopped, s."""
     return float(max(solution.state.t, solution.t[-1])) if solution.t.size else float(solution.state.t)
 
 
 def signal_of(solution: Solution, key: str) -> dict[str, FloatArray]:
-    """A signal by name; empty where this run has no such element, although another run of the picture has it."""
+    """A signal by name; empty if this run lacks the element, which another run of the picture may have."""
     kind, colon, _ = key.partition(":")
     return solution.by_name(key) if not colon or key in solution.all_signals.names(kind) else {}
 
 
 def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
-    """The lines of one panel. A finger has the same colour in every panel; so has each of several runs."""
+    """The lines of one panel; the colour of a finger, or of a run among several, is the same in every panel."""
     out: list[Trace] = []
     gaps = list(dict.fromkeys(gap for run in runs for gap in run.solution.gaps))
     above = 0
-    # A source that drives all runs alike is drawn once, without the name of a run.
+    # If the source is the same in all runs, it is drawn once, without the name of a run.
     shared = len({run.solution.u_source.tobytes() for run in runs}) == 1
     for number, run in enumerate(runs):
         for key in keys:
@@ -156,12 +156,12 @@ def draw_line(
     ax : Axes
     trace : Trace
     factor : float
-        From the signal's SI unit to the panel's.
+        Factor from the signal's SI unit to the panel's unit.
     start, stop : float
     runs : sequence of Drawn
         All runs of the picture, which determine the unit of the time axis.
     envelope : ndarray, optional
-        Times (s) of the turning points, two to each oscillation; given where an envelope is wanted.
+        Times (s) of the turning points, two per oscillation; with them an envelope is drawn.
     """
     t = trace.solution.t
     first, last = max(int(np.searchsorted(t, start)) - 1, 0), int(np.searchsorted(t, stop, side="right")) + 1
@@ -187,7 +187,7 @@ def draw_line(
 
 
 def draw_mean(ax: Axes, trace: Trace, factor: float, unit: str, *, told: bool = True) -> None:
-    """Draw the mean force as a horizontal line, named in the legend where `told`."""
+    """Draw the mean force as a horizontal line; with `told` the legend names it."""
     summary = trace.solution.summary()
     periodic = summary.get("f_el_mean_periodic")
     mean = periodic if periodic is not None else summary.get("f_el_mean")
@@ -229,7 +229,7 @@ def time_axis(axes: Sequence[Axes], runs: Sequence[Drawn], start: float, stop: f
     span = (stop - start) or 1.0
     stopped = [r.solution for r in runs if r.solution.status not in (Status.SUCCESS, Status.ERROR_NOT_MET)]
     early = [s for s in stopped if start <= end_of(s) <= stop]
-    # Room on the right shows that the run goes no further.
+    # Extend the axis to the right of the end, to show that the run stopped early.
     wide = 1.08 if early else 1.0
     for ax in axes:
         ax.set_xlim(factor * start, factor * (start + span * wide))
@@ -247,13 +247,13 @@ def time_axis(axes: Sequence[Axes], runs: Sequence[Drawn], start: float, stop: f
 
 
 def about(solution: Solution) -> str:
-    """How a run was made, in one line."""
+    """Circuit, method and error of a run, in one line."""
     text = " · ".join(fact for fact in _facts(solution) if fact)
     return text if solution.success else f"{text} · {solution.message}"
 
 
 def _facts(solution: Solution) -> list[str]:
-    """Facts of a run for its caption, each always at the same index; an empty text where a fact does not apply."""
+    """Facts of a run for its caption, each always at the same index; an empty text if a fact does not apply."""
     error = f"error estimate {solution.error.u_gap:.2g} V"
     if solution.gaps:
         error += f", {solution.error.f_el:.2g} N"
@@ -268,14 +268,14 @@ def _facts(solution: Solution) -> list[str]:
 
 
 def about_all(runs: list[Drawn]) -> str:
-    """How the runs were made: first the facts that all share, then the own facts of each."""
+    """Circuit, method and error of several runs: first the facts that all runs share, then each run's own facts."""
     if len(runs) == 1:
         return about(runs[0].solution)
     facts = [_facts(run.solution) for run in runs]
     shared = [f for i, f in enumerate(facts[0]) if f and all(other[i] == f for other in facts)]
     own = []
     for run, fact in zip(runs, facts, strict=True):
-        # The first fact, title and changed parameters, is left out: the run's label has the changes.
+        # Leave out the first fact (title and changed parameters), because the run's label has the changes.
         differs = [f for i, f in enumerate(fact[1:], 1) if f and any(other[i] != f for other in facts)]
         own.append(f"{run.label}: {', '.join(differs)}" if differs else run.label)
     title = runs[0].solution.circuit.title

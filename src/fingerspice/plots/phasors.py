@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
-    """Gain, phase, mean force and area against frequency, a line per amplitude.
+    """Gain, phase, mean force and area against frequency, with a line per amplitude.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
 
 
 def _mark_extrapolation(axes: Sequence[Axes], f: FloatArray, circuit: Circuit) -> str:
-    """Shade the frequencies outside the data of SKIN; returns what the shade means, for the caption."""
+    """Shade the frequencies outside the data of SKIN; returns the caption's explanation of the shade."""
     low, high = f[0], f[-1]
     spans = [(low, min(high, SKIN_BAND[0])), (max(low, SKIN_BAND[1]), high)]
     spans = [s for s in spans if s[1] > s[0]]

@@ -1,4 +1,4 @@
-"""The class of this package's figures, which show themselves in notebooks and open windows."""
+"""The class of this package's figures, which appear in notebooks and can be shown in a window."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from fingerspice.base.errors import InputError
 
-#: Resolution (dots per inch) of the picture in a notebook, and the factor by which the notebook reduces its size.
+#: Resolution (dots per inch) of the picture in a notebook, and the factor by which the notebook scales it down.
 _DPI, _SHARPER = 200, 2
 
 
@@ -25,15 +25,15 @@ class Picture(Figure):
         return content.getvalue(), {"width": width, "height": height}
 
     def show(self, warn: bool = True) -> None:
-        """Show the picture: in a notebook under the cell, and from a script in a window, until that is closed.
+        """Show the picture: in a notebook under the cell; from a script in a window, until the window is closed.
 
         Raises
         ------
         InputError
-            Where there is neither.
+            If there is no notebook and no window can be opened.
         """
         if _in_notebook():
-            # A notebook has imported IPython, which need not be installed otherwise.
+            # IPython is not a dependency: take it from `sys.modules`, as a notebook has imported it.
             sys.modules["IPython"].display.display(self)
             return
         import matplotlib
@@ -48,7 +48,7 @@ class Picture(Figure):
             raise InputError(
                 f"no window can be opened here (matplotlib's backend is {backend}); allowed: savefig('picture.png')"
             )
-        # As in pyplot: matplotlib has no public way from a figure to a window.
+        # These are the steps of pyplot: matplotlib has no public function that opens a window for a given figure.
         manager = canvas.new_manager(self, max(pyplot.get_fignums(), default=0) + 1)
         Gcf._set_new_active_manager(manager)
         pyplot.show()

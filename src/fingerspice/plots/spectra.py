@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from fingerspice.plots.picture import Picture
     from fingerspice.results.spectrum import Spectrum
 
-#: Amplitudes smaller than the largest by this factor are not drawn: they are mostly errors of the run.
+#: Amplitudes below this fraction of the largest are not drawn: they are mostly numerical errors of the run.
 _DRAWN = 1e-6
 
 
 def plot_spectrum(spectrum: Spectrum) -> Picture:
-    """Amplitudes of the lines, or the density with its interval, against frequency, both axes logarithmic."""
+    """Amplitudes of the lines, or the density with its confidence interval, against frequency, on logarithmic axes."""
     figure, (ax,) = drawing.new_figure(1, height=3.4)
     name = spectrum.signal.partition(":")[0]
     color, unit = lines.QUANTITIES[name].color, spectrum.unit.replace("^2", "²")
@@ -44,7 +44,7 @@ def plot_spectrum(spectrum: Spectrum) -> Picture:
 
 
 def _band(ax: Axes, spectrum: Spectrum, color: str) -> None:
-    """A density and its interval, where it is not zero."""
+    """Draw a density and its confidence interval at frequencies above 0 where the density is not zero."""
     assert spectrum.density is not None
     assert spectrum.lower is not None
     assert spectrum.upper is not None
@@ -58,7 +58,7 @@ def _band(ax: Axes, spectrum: Spectrum, color: str) -> None:
 def stems(
     ax: Axes, f: FloatArray, size: FloatArray, least: float, *, color: str, marker: str = "o", label: str = "_"
 ) -> None:
-    """Lines of a spectrum from the bottom of a logarithmic panel, without those smaller than `least`."""
+    """Draw the lines of a spectrum that are larger than `least`, from the bottom of a logarithmic panel."""
     some = size > least
     if not some.any():
         return

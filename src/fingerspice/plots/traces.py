@@ -1,4 +1,4 @@
-"""Pictures of signals against time: of one run or several, of a window, or as envelopes of many oscillations."""
+"""Pictures of signals against time: for one run or several, in a window, or as envelopes of many oscillations."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from fingerspice.plots.picture import Picture
     from fingerspice.results.solution import Solution
 
-#: Up to this many oscillations are drawn as lines; more are drawn as an envelope, with the last ones beside it that
-#: swing by this share of the widest swing or more.
+#: Up to MOST_DRAWN oscillations are drawn as lines. More are drawn as an envelope, with an enlargement of the last
+#: ZOOMED oscillations whose swing is at least the fraction _LOUD of the largest swing.
 MOST_DRAWN, ZOOMED, _LOUD = 30, 4, 0.7
-#: Outputs that an oscillation needs for its shape to be seen.
+#: Smallest number of outputs in an oscillation for which its shape is visible.
 _FEWEST = 12
 
 
@@ -70,7 +70,7 @@ def plot_solution(
     if zoomed is not None:
         lines.time_axis(right, runs, *zoomed)
         for ax in right:
-            # Times have many digits here: there is room for three of them.
+            # Times in an enlargement have many digits, so that only three tick labels have room.
             ax.locator_params(axis="x", nbins=3)
         whole = f"envelope of {marks.size // 2} oscillations" if dense else "the whole run"
         part = f"the last {ZOOMED}" if dense and marks[-1] <= zoomed[1] else "enlarged"
@@ -85,7 +85,7 @@ def plot_solution(
 
 
 def _runs(solution: Solution, others: Any) -> list[Drawn]:
-    """Every run with its name: the one given, or the facts in which it differs from the other runs."""
+    """Every run with its name: the given name, or the facts in which the run differs from the other runs."""
     from fingerspice.results.solution import Solution
 
     if isinstance(others, Solution):
@@ -140,7 +140,7 @@ def _short(names: Mapping[str, None]) -> list[str]:
 
 
 def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[float, float]:
-    """Start and end of what is drawn, s."""
+    """Start and end of the drawn interval, s."""
     times = [run.solution.t for run in runs if run.solution.t.size]
     first, last = min((float(t[0]) for t in times), default=0.0), max(lines.end_of(run.solution) for run in runs)
     if window is None:
@@ -158,7 +158,7 @@ def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[floa
 def _turns(
     runs: list[Drawn], panels: list[tuple[Quantity, list[str]]], start: float, stop: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Times (s) and values of the turning points, two to each oscillation, of the first panel's signal with most."""
+    """Times (s) and values of the turning points, two per oscillation, of the first panel's most oscillating signal."""
     best = np.zeros(0), np.zeros(0)
     for run in runs:
         t = run.solution.t
@@ -166,7 +166,7 @@ def _turns(
         for key in panels[0][1]:
             for x in lines.signal_of(run.solution, key).values():
                 step = np.diff(x[kept])
-                # Rounding errors turn, too, and are not counted.
+                # Turning points of round-off are not counted.
                 steep = np.flatnonzero(np.abs(step) > 1e-6 * drawing.peak_of(x))
                 turns = steep[1:][np.signbit(step[steep[1:]]) != np.signbit(step[steep[:-1]])]
                 if turns.size > best[0].size:
@@ -175,17 +175,17 @@ def _turns(
 
 
 def _zoom(marks: FloatArray, heights: FloatArray, start: float, stop: float) -> tuple[float, float] | None:
-    """Start and end (s) of what is enlarged beside the whole; None where nothing has to be.
+    """Start and end (s) of the interval that is enlarged in a second column; None if no enlargement is needed.
 
-    Of many oscillations these are the last ones that are not small; of a few that take a small part of the time, as a
-    click does, all.
+    With many oscillations, the interval holds the last ones that are not small. With few oscillations in a small part
+    of the time, such as a click, it holds all of them.
     """
     length = 2 * ZOOMED
     if marks.size > 2 * MOST_DRAWN:
         swing = np.lib.stride_tricks.sliding_window_view(np.abs(np.diff(heights)), length).max(axis=1)
         place = int(np.flatnonzero(swing >= _LOUD * swing.max())[-1])
         first, last = float(marks[place]), float(marks[place + length])
-        # A silence that may follow them is left out.
+        # Leave out a constant part that may follow the oscillations.
         return first, min(stop, last + 0.1 * (last - first))
     if marks.size < 2 or marks[-1] - marks[0] > (stop - start) / MOST_DRAWN:
         return None

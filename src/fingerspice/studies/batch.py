@@ -1,4 +1,4 @@
-"""Many scenes of one circuit: those of the usual kind in lockstep, all others one by one."""
+"""Many scenes of one circuit: scenes of a suitable form in lockstep, all others one by one."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 _KINDS = ("mean", "rms", "min", "max", "peak", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
 RTOL_RANGE = (1e-12, 0.1)
-# Messages of scenes without a result that a Dataset keeps, and gap voltages (8 GB) that a batch may return.
+# Largest number of failure messages that a Dataset keeps, and of gap voltages (8 GB) that a batch may return.
 MESSAGES, MOST_VOLTAGES = 16, 1e9
-# Scenes of a job; where their gap voltages are wanted, so few that these stay in the cache.
+# Number of scenes in a job; fewer if gap voltages are wanted, so that these stay in the processor's cache.
 CHUNK, TRACED = 4096, 256
-# A number of half periods that differs from a whole one by rounding alone, relative.
+# Relative distance from a whole number within which a number of half periods counts as whole.
 WHOLE = 1e-9
 
 
@@ -50,11 +50,11 @@ def batch(
     points: int = 200,
     threads: int | None = None,
 ) -> Dataset:
-    """Figures of many scenes, which are one circuit with different values.
+    """Figures of many scenes, which are one circuit with different values of its parameters.
 
-    Series stacks of LAYER, SLAB, SKIN and GAP under the local law and a sine or square go in lockstep, two to four
-    layers each. Every other circuit, law or source, and every scene that lockstep does not bring to `rtol`, goes
-    through `simulate` (`steady_state`) by itself.
+    Series stacks of two to four LAYER, SLAB, SKIN and GAP under the local law, driven by a sine or square, are
+    integrated in lockstep. Every other scene, and every scene that does not reach `rtol` in lockstep, is run by itself
+    through `simulate` (`steady_state`).
 
     Parameters
     ----------
@@ -63,32 +63,32 @@ def batch(
         Path to values in the netlist's unit, as in `Circuit.replace`; ``source.`` stands for the only source.
     outputs : sequence of str
         Figures ``SIGNAL_KIND`` as in `Solution.summary`, such as ``f_el_mean``, ``f_t_rms`` and ``u_gap_peak``; and
-        ``u_gap``, the gap voltage at `points` times a period. Means and root mean squares go in lockstep.
+        ``u_gap``, the gap voltage at `points` times per period. Lockstep gives means, root mean squares and ``u_gap``.
     rtol : float
-        Error of every output, relative to itself; of ``u_gap``, to its peak.
+        Error of every output, relative to itself; error of ``u_gap``, relative to its peak.
     t_stop, periods : float, optional
-        Length of every run in s, or in periods of its own source; the deck's TSTOP by default. In lockstep the length
-        is a whole number of half periods.
+        Length of every run in s, or in periods of its own source; the deck's TSTOP by default. Lockstep is possible if
+        the length is a whole number of half periods.
     periodic : bool
-        Look for the periodic state; the figures are those of one period of it.
+        Find the periodic state; the figures are then those of one period of it.
     skin : str
-        ``"own"`` (a SKIN keeps its `f`) or ``"follow"`` (it is the source's frequency).
+        ``"own"`` (a SKIN keeps its `f`) or ``"follow"`` (its `f` is the source's frequency).
     points : int
-        Gap voltages a period, even.
+        Number of gap voltages per period, even.
     threads : int, optional
-        All processors by default. The result does not depend on it.
+        Number of threads; all processors by default. The result does not depend on it.
 
     Returns
     -------
     xarray.Dataset
         With dimension ``scene``, the parameters as coordinates, the outputs, ``error`` (stated, relative) and
-        ``status``: 0 in lockstep, 1 one by one; 2 refused and 3 failed, where the outputs are NaN. The attribute
-        `n_ordinary` counts those that did not go in lockstep, `ordinary` says why, `failures` has the messages.
+        ``status``: 0 in lockstep, 1 one by one, 2 refused, 3 failed; the outputs of the last two are NaN. The attribute
+        `n_ordinary` counts the scenes not in lockstep, `ordinary` gives the reason, `failures` has the messages.
 
     Raises
     ------
     InputError
-        For an unknown path, arrays of unequal length, NaN, a value out of range, or an unknown output.
+        If a path or output is unknown, arrays have unequal lengths, or a value is NaN or out of range.
     """
     require_circuit(circuit)
     task = _task(circuit, outputs, rtol, t_stop, periods, periodic, points)
@@ -157,7 +157,7 @@ def _scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, 
     Raises
     ------
     InputError
-        For an unknown path, unequal lengths, NaN, or a value out of range.
+        If a path is unknown, lengths are unequal, or a value is NaN or out of range.
     """
     if not isinstance(parameters, Mapping) or not parameters:
         raise InputError(f"parameters is {parameters!r}; allowed: a mapping such as {{'Xgap.d': [3e-6, 4e-6]}}")
@@ -186,21 +186,21 @@ def _scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, 
 
 
 def _path(circuit: Circuit, path: Any) -> str:
-    """A path as the circuit writes it."""
+    """A path in the circuit's own spelling."""
     if isinstance(path, str) and path.lower().startswith("source."):
         on = driving_sources(circuit)
         if not any(e.name.lower() == "source" for e in circuit.elements) and len(on) == 1:
             path = f"{on[0].name}.{path.partition('.')[2]}"
     known = {name.lower(): name for name in circuit.parameters}
     if not isinstance(path, str) or path.lower() not in known:
-        # The circuit says it, with the nearest name.
+        # The circuit raises the error about an unknown path, which gives the nearest name.
         circuit.varied({path: 1.0})
         raise InputError(f"{path!r} is no parameter that takes numbers; allowed: a path such as 'Xgap.d'")
     return known[path.lower()]
 
 
 def _check_values(circuit: Circuit, path: str, array: FloatArray) -> None:
-    """Refuse NaN and what the parameter does not accept, naming the scene."""
+    """Refuse NaN and values that the parameter does not accept; the message names the scene."""
     name, _, parameter = path.rpartition(".")
     element = circuit[name]
     bad = np.isnan(array)
@@ -210,7 +210,7 @@ def _check_values(circuit: Circuit, path: str, array: FloatArray) -> None:
         bad &= ~((array == 0.0) & spec.may_be_zero) & ~((array == np.inf) & spec.may_be_infinite)
         allowed = spec.allowed()
     elif not bad.any():
-        # A waveform's values are legal between legal ones.
+        # The legal values of a waveform's parameter form an interval: testing the smallest and the largest is enough.
         for i in (int(np.argmin(array)), int(np.argmax(array))):
             try:
                 circuit.varied({path: float(array[i])})
@@ -229,7 +229,7 @@ def _frequencies(circuit: Circuit, scenes: Mapping[str, FloatArray]) -> FloatArr
     Raises
     ------
     InputError
-        Where there is not one source with a frequency.
+        If the number of sources with a period is not one.
     """
     n = next(iter(scenes.values())).size
     on = [e for e in driving_sources(circuit) if e.waveform is not None and e.waveform.period is not None]
@@ -245,7 +245,7 @@ def _frequencies(circuit: Circuit, scenes: Mapping[str, FloatArray]) -> FloatArr
 
 
 def _lockstep(task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExecutor) -> tuple[Answers, str]:
-    """What lockstep answers, and why it does not answer the rest."""
+    """The results of lockstep, and the reason why the other scenes have none."""
     n = next(iter(scenes.values())).size
     lower = {path.lower(): array for path, array in scenes.items()}
     traced = "u_gap" in task.outputs
@@ -258,7 +258,7 @@ def _lockstep(task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExec
     found = Answers.empty(task, n, width)
     if isinstance(form, str) or others:
         return found, form if isinstance(form, str) else f"{', '.join(others)} needs a run of its own"
-    # Runs that end between half periods are left out.
+    # Runs whose length is not a whole number of half periods are left out.
     halves = np.round(2.0 * count)
     good = (halves >= 1.0) & (np.abs(2.0 * count - halves) <= WHOLE * halves)
     if any(name.endswith("_periodic") for name in task.outputs):
@@ -289,7 +289,7 @@ def _one_by_one(
     def one(i: int) -> Single:
         return run_single(task, {path: float(array[i]) for path, array in scenes.items()}, float(frequency[i]))
 
-    # What is unusual about values is not said of every scene; the filters are those of all threads.
+    # Warnings about unusual values are not repeated for every scene. Filters apply to all threads, so set them here.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         singles = list(pool.map(one, rest.tolist()))
@@ -330,7 +330,7 @@ def _dataset(task: Task, scenes: Mapping[str, FloatArray], found: Answers, attrs
 
 
 def _skin(task: Task, scenes: Mapping[str, FloatArray], attrs: Mapping[str, Any]) -> str:
-    """What a SKIN's frequency is, in words."""
+    """Text about the frequency at which the skin's data are taken."""
     skins = task.circuit.by_device("SKIN")
     if attrs["skin"] == "follow" or not skins:
         return "the skin's data follow the source's frequency" if skins else "there is no SKIN"

@@ -1,4 +1,4 @@
-"""Scenes of a batch in lockstep, with twice the steps wherever the error is not met."""
+"""Scenes of a batch in lockstep; the number of steps is doubled for the scenes whose error is too large."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ from fingerspice.engine.lockstep import ALL_MOMENTS
 from fingerspice.studies.batchscenes import Curves, LockstepForm, curves_of, table_of
 from fingerspice.studies.batchtask import LOCKSTEP, Answers, Task
 
-# Steps a period at first, and degree of the area's polynomial, by the error asked for; then steps double.
+# Initial number of steps per period, and initial degree of the area's polynomial, by the smallest rtol served.
 _RUNGS = ((5e-4, 32, 8), (5e-5, 48, 8), (5e-6, 80, 12), (5e-7, 144, 12), (0.0, 192, 16))
 _HIGHEST_DEGREE, _MOST_STEPS = 16, 4096
-# What the periodic state may be off, over the error asked for; and rounding.
+# Allowed defect of the periodic state relative to rtol, and the relative round-off added to every stated error.
 CLOSING, ROUNDING = 0.02, 1e-11
-# What is stated of a change from half the steps: at kinks the order is 2, elsewhere 3 and more. The change may be small
-# by chance, so no error is stated to fall by more than this from one number of steps to twice as many.
+# The stated error is _STATED times the change from half the steps to all steps: at kinks the order is 2, which gives a
+# third, and elsewhere the order is 3 or more. As the change may be small by chance, doubling the steps may not reduce
+# the stated error by more than the factor _MOST_GAIN.
 _STATED, _MOST_GAIN = 1.0 / 3.0, 12.0
-# After a jump of the source a step should not be longer than the fastest cell's time constant.
+# Longest step for a source with jumps, in time constants of the fastest cell.
 _LONGEST_STEP = 1.0
-# A scene is done where its stated error is so much of what was asked: the statement is an estimate.
+# A scene is accepted if its stated error is at most this fraction of rtol, because the stated error is an estimate.
 _ENOUGH = 0.7
 _Figure = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
-#: Figures of the whole run by the moments (4, n), load, stress at 1 V and friction coefficient, and what they need.
+#: For each figure, the indices of the moments that it needs, and the function that gives it from the moments (4, n),
+#: the load, the stress at 1 V and the friction coefficient.
 FIGURES: dict[str, tuple[tuple[int, ...], _Figure]] = {
     "f_el_mean": ((0,), lambda m, load, stress, mu: stress * m[0]),
     "f_el_rms": ((1,), lambda m, load, stress, mu: stress * np.sqrt(m[1])),
@@ -40,17 +42,17 @@ FIGURES: dict[str, tuple[tuple[int, ...], _Figure]] = {
 
 
 def _loaded(m: FloatArray, load: FloatArray, stress: FloatArray) -> FloatArray:
-    """Root of the mean square of the load and the force together, N."""
+    """Root mean square of the sum of load and electroadhesive force, N."""
     return np.asarray(np.sqrt(load * load + 2.0 * load * stress * m[0] + stress * stress * m[1]))
 
 
 def in_lockstep(name: str) -> bool:
-    """Whether an output follows from what lockstep integrates."""
+    """Whether an output can be computed from the moments and gap voltages of a lockstep."""
     return name == "u_gap" or name.removesuffix("_periodic") in FIGURES
 
 
 def _wave(n: int, jumping: bool) -> FloatArray:
-    """x and y of the source at n steps of a period, or at the n / 2 of the half period before it turns."""
+    """Sine and cosine of the source's phase at n steps of a period; for a square, 1 and 0 at the first n / 2 steps."""
     if jumping:
         return np.concatenate([np.ones((1, n // 2)), np.zeros((1, n // 2))])
     turn = 2.0 * np.pi * np.arange(n) / n
@@ -58,7 +60,7 @@ def _wave(n: int, jumping: bool) -> FloatArray:
 
 
 def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halves: int) -> Answers:
-    """Scenes over so many half periods; those that stay above the error asked for are not done.
+    """Integrate scenes in lockstep, doubling the steps; scenes whose error stays too large are marked as not done.
 
     Parameters
     ----------
@@ -67,6 +69,7 @@ def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halv
     scenes : mapping of str to ndarray, shape (n,)
         Values by path in lower case.
     halves : int
+        Length of the runs in half periods.
     """
     table = table_of(form, scenes)
     others, gap = CELL_ROWS * len(form.layers), form.layers[form.gap]
@@ -79,7 +82,7 @@ def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halv
     if traced:
         steps = task.points * -(-steps // task.points)
     pending = np.flatnonzero(table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2)
-    # The fastest cell relaxes faster than any mode.
+    # The largest leakage rate of a cell is an upper bound of the rates of the modes.
     cells = len(form.layers)
     leaks = table[cells : 2 * cells] / table[others + REST] + table[2 * cells : 3 * cells]
     fastest = np.max(leaks / table[:cells], axis=0) * (2.0 * np.pi / table[others + OMEGA]) * form.jumping
@@ -108,7 +111,7 @@ def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halv
 
 
 class _Run(NamedTuple):
-    """What `march` gives with half the steps and with all, and the gap voltages of both."""
+    """Results of `march` with half the steps and with all steps, and the gap voltages of both."""
 
     coarse: FloatArray
     fine: FloatArray
@@ -117,7 +120,7 @@ class _Run(NamedTuple):
 
 
 class _Level(NamedTuple):
-    """A number of steps a period and a degree."""
+    """An integration with a given number of steps per period and degree of the area's polynomial."""
 
     task: Task
     form: LockstepForm
@@ -128,7 +131,7 @@ class _Level(NamedTuple):
     traced: bool
 
     def run(self, table: FloatArray, pending: NDArray[np.int64], curves: Curves, before: _Run | None) -> _Run:
-        """The scenes `pending`; what half the steps give is known from `before`, or found too."""
+        """Integrate the scenes `pending`; the results with half the steps come from `before`, or are computed, too."""
         sizes = (self.steps // 2 if before is None else 0, self.steps)
         jumping = self.form.jumping
         out = np.empty((2, 2 * self.moments + 3, pending.size))
@@ -144,7 +147,7 @@ class _Level(NamedTuple):
         return _Run(before.fine, out[1], before.trace, traces[1])
 
     def error(self, run: _Run, needed: list[int]) -> FloatArray:
-        """Stated error of every output, relative."""
+        """Largest stated relative error of the outputs, for each scene."""
         peak, closing, tail = run.fine[2 * self.moments :]
         changes = [np.zeros(peak.size)]
         parts = (0, 1) if self.halves > 1 else (0,)

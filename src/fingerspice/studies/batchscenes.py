@@ -1,4 +1,4 @@
-"""Which scenes of a batch go in lockstep, and their tables for `engine.lockscenes`."""
+"""Choice of the scenes of a batch that are integrated in lockstep, and their tables for `engine.lockscenes`."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from fingerspice.waveforms.waveform import DC, Sine
 
 Value = float | FloatArray
 Curves = tuple[FloatArray, FloatArray, FloatArray]
-# Parameters that are the same in all scenes in lockstep: they decide on the form of the equations.
+# Parameters that must be equal in all scenes of a lockstep, because the form of the equations depends on them.
 _FORM = ("m_exp", "n_exp", "a_fix", "tau")
 _OF_SOURCE = ("amplitude", "frequency", "phase_deg")
-# Cells of a stack in lockstep; each number has code of its own.
+# Numbers of cells for which a lockstep exists; each number is compiled separately.
 _CELLS = (2, 3, 4)
-# Points of the universal curve's series, and its error, relative.
+# Numbers of points tried for the universal curve's Chebyshev series, and the relative error allowed.
 _CURVE_SIZES, _CURVE_ERROR = (16, 20, 24, 28), 1e-13
 
 
 @dataclass(frozen=True)
 class LockstepForm:
-    """What the scenes in lockstep have in common.
+    """Properties that all scenes in lockstep have in common.
 
     Attributes
     ----------
     layers : tuple of Element
-        Along the loop.
+        Layers in the order of the loop.
     gap : int
-        The gap among them.
+        Index of the gap among them.
     sign : float
-        That of the gap along the loop, times the source's.
+        Sign of the gap along the loop times the sign of the source.
     source : Element
     jumping : bool
         Whether the source is a square.
@@ -55,7 +55,7 @@ class LockstepForm:
 
 
 def lockstep_form(circuit: Circuit, varied: Mapping[str, object]) -> LockstepForm | str:
-    """What scenes in lockstep have in common, or why they cannot go so; `varied` has the paths that vary."""
+    """The common form of scenes in lockstep, or the reason why there is none; `varied` has the paths that vary."""
     if not is_stack(circuit):
         return "the circuit is no series stack of layers"
     stack = build_stack(circuit)
@@ -86,7 +86,7 @@ def lockstep_form(circuit: Circuit, varied: Mapping[str, object]) -> LockstepFor
 
 
 def _plain(wave: object) -> bool:
-    """Whether a source is a sine from t = 0 on, or a square whose period begins there, without offset."""
+    """Whether a source has no offset and is a sine from t = 0 on, or a square whose period begins at t = 0."""
     if isinstance(wave, Sine):
         return wave.offset == 0.0 and wave.delay == 0.0 and wave.damping == 0.0
     if isinstance(wave, Pulse):
@@ -108,7 +108,7 @@ def _starts_uncharged(circuit: Circuit, jumping: bool, varied: Mapping[str, obje
         return False
     if tran is None or tran.uic:
         return True
-    # At the operating point a sine that starts at 0 V leaves nothing charged.
+    # The operating point of a sine that starts at 0 V is the uncharged state.
     phases = [getattr(e.waveform, "phase_deg", 0.0) for e in circuit.by_device("V")]
     return not jumping and not any(phases) and not any(path.endswith(".phase_deg") for path in varied)
 
@@ -120,7 +120,7 @@ def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray
     ----------
     form : LockstepForm
     scenes : mapping of str to ndarray, shape (n,)
-        Values by path in lower case, in the netlist's units; others are the circuit's.
+        Values by path in lower case, in the netlist's units; all other values are the circuit's.
     """
 
     def values(element: Element) -> dict[str, Value]:
@@ -177,7 +177,10 @@ def _contact_rows(v: Mapping[str, Value]) -> tuple[Value, ...]:
 
 @lru_cache(maxsize=32)
 def curves_of(m: float, n: float, degree: int) -> Curves | None:
-    """The universal curve of two exponents and the transforms of a degree, as `march` takes them; None without one."""
+    """Power series of the universal curve of two exponents, Chebyshev nodes and matrix of a degree, as for `march`.
+
+    None if no series of the allowed sizes reaches the error allowed.
+    """
     p = 0.5 * (1.0 + 1.0 / m - 1.0 / n)
 
     def curve(x: FloatArray) -> FloatArray:

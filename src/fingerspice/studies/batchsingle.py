@@ -1,4 +1,4 @@
-"""A scene of a batch by itself, through `simulate` or `steady_state`."""
+"""One scene of a batch, run by itself through `simulate` or `steady_state`."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from fingerspice.solve.simulation import RTOL_RANGE, simulate
 from fingerspice.studies.batchtask import FAILED, ONE_BY_ONE, REFUSED, Task
 from fingerspice.studies.steady import SteadyState, steady_state
 
-# A run's error is relative to peaks; a mean over it may be so much smaller.
+# A run's rtol is relative to peaks, and a batch's to the output itself: the first attempt assumes that an output is at
+# least this fraction of its peak.
 _OVER_PEAK = 0.1
 
 
 class Single(NamedTuple):
-    """The outputs of one scene, its stated error, its status, and why it has no outputs."""
+    """The outputs of one scene, its stated error, its status, and the message if it has no outputs."""
 
     values: Mapping[str, FloatArray]
     error: float
@@ -31,12 +32,12 @@ class Single(NamedTuple):
 
 
 def run_single(task: Task, changes: Mapping[str, float], frequency: float) -> Single:
-    """One scene, with the frequency (Hz) that its periods are counted by; a refusal or failure is an answer too."""
+    """Run one scene, whose periods are those of `frequency` (Hz); a refusal or failure is returned, not raised."""
     try:
         circuit, rtol = task.circuit.varied(changes), max(_OVER_PEAK * task.rtol, RTOL_RANGE[0])
         found = _run(task, circuit, frequency, rtol)
         if found.error > task.rtol and rtol > RTOL_RANGE[0]:
-            # The mean is smaller still.
+            # The mean is smaller than assumed, relative to the peak: repeat with the rtol that the error asks for.
             found = _run(task, circuit, frequency, max(0.5 * rtol * task.rtol / found.error, RTOL_RANGE[0]))
         return found
     except InputError as error:
@@ -74,7 +75,7 @@ SIGNALS_OF_BATCH = ("f_el", "f_t", "friction", "u_gap", "area")
 
 
 def _error(ran: Solution | SteadyState) -> float:
-    """Stated error of the gap voltage over its peak, or of the force over its mean, whichever is larger."""
+    """Stated error of the gap voltage relative to its peak, or of the force relative to its mean, if that is larger."""
     error: ErrorEstimate = ran.error
     pairs = (error.u_gap, ran.u_gap_peak), (error.f_el, ran.f_el_mean)
     sizes = [float(np.min(size)) if size is not None else 0.0 for _, size in pairs]

@@ -1,4 +1,4 @@
-"""What a batch is asked for, and what it answers."""
+"""The request of a batch (`Task`), and its results (`Answers`)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STATUS_NAMES = ("lockstep", "one_by_one", "refused", "failed")
 
 @dataclass(frozen=True)
 class Task:
-    """A checked request; attributes as the arguments of `batch`, with one of `t_stop` and `periods`."""
+    """A checked request; its attributes are arguments of `batch`, with exactly one of `t_stop` and `periods` given."""
 
     circuit: Circuit
     outputs: tuple[str, ...]
@@ -28,7 +28,7 @@ class Task:
     points: int
 
     def count(self, frequency: FloatArray) -> FloatArray:
-        """Periods that runs with such sources (Hz) last."""
+        """Number of periods in runs with sources of these frequencies (Hz)."""
         if self.t_stop is not None:
             return np.asarray(frequency * self.t_stop)
         return np.full(frequency.shape, self.periods)
@@ -36,17 +36,20 @@ class Task:
 
 @dataclass
 class Answers:
-    """Outputs of some scenes, their stated errors, and how each was found.
+    """Outputs of some scenes, their stated errors, and their status.
 
     Attributes
     ----------
     values : dict of str to ndarray, shape (n,) or (n, n_t)
-        NaN where there is none.
+        Outputs; NaN for a scene without a result.
     error : ndarray, shape (n,)
+        Stated relative error.
     status : ndarray, shape (n,)
+        Index into `STATUS_NAMES`.
     done : ndarray, shape (n,)
+        Whether results have been entered.
     messages : dict of int to str
-        Of scenes without a result.
+        Messages of the scenes without a result.
     """
 
     values: dict[str, FloatArray]
@@ -57,13 +60,13 @@ class Answers:
 
     @classmethod
     def empty(cls, task: Task, n: int, width: int) -> Answers:
-        """Of n scenes, none of them done, with so many gap voltages each."""
+        """Answers of n scenes, none of them done, with room for `width` gap voltages each."""
         shapes = {name: (n, width) if name == "u_gap" else (n,) for name in task.outputs}
         values = {name: np.full(shape, np.nan) for name, shape in shapes.items()}
         return cls(values, np.full(n, np.nan), np.full(n, ONE_BY_ONE, np.int8), np.zeros(n, bool), {})
 
     def put(self, at: NDArray[np.int64], values: Mapping[str, FloatArray], error: FloatArray, status: int) -> None:
-        """Enter what was found for the scenes `at`."""
+        """Enter the results of the scenes `at`."""
         for name, found in values.items():
             if found.ndim == 2:
                 self.values[name][at, : found.shape[1]] = found
@@ -72,7 +75,7 @@ class Answers:
         self.error[at], self.status[at], self.done[at] = error, status, True
 
     def put_single(self, i: int, values: Mapping[str, FloatArray], error: float, status: int) -> None:
-        """Enter what was found for one scene; several gaps give a column each."""
+        """Enter the result of one scene; several gaps have one column each."""
         for name, value in values.items():
             if value.ndim == 1 and self.values[name].ndim == 1:
                 self.values[name] = np.full((self.error.size, value.size), np.nan)

@@ -1,4 +1,4 @@
-"""What a screen can make a finger feel: the friction's modulation and mean that a largest voltage allows."""
+"""Capability of a screen: the mean and the modulation of the friction that a largest source voltage allows."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from fingerspice.waveforms.waveform import require
 if TYPE_CHECKING:
     from fingerspice.plots.picture import Picture
 
-# Samples of a modulation's and of a carrier's period, and the lowest rate, Hz.
+# Samples per period of the modulation and of the carrier, and the lowest sample rate, Hz.
 _PER_PERIOD, _PER_CARRIER, _LEAST_RATE = 64, 32, 8000.0
-# How long a force lasts: so many periods of the modulation, and so many seconds at least.
+# Duration of a force: this many periods of the modulation, and at least this many seconds.
 _PERIODS, _LASTS = 3.0, 0.05
-# Exactness of an amplitude, of the largest possible.
+# Relative accuracy of the amplitudes.
 _EXACT = 1e-3
 
 
@@ -38,8 +38,8 @@ _EXACT = 1e-3
 class Capability(Shown):
     """Largest amplitudes of the friction that a voltage allows.
 
-    The friction is mean + amplitude sin(2 pi f t), made by the inverse drive from an uncharged stack for 3 periods, and
-    50 ms at least, with |U| <= limit all the time; the amplitude is at most the mean less the friction without voltage.
+    The friction is mean + amplitude sin(2 pi f t), produced by the inverse drive from an uncharged stack for 3 periods,
+    and at least 50 ms, with |U| <= limit all the time; the amplitude is at most the mean less the friction at 0 V.
 
     Attributes
     ----------
@@ -47,15 +47,15 @@ class Capability(Shown):
     limit : float
         V.
     carrier : float or None
-        Hz.
+        Frequency of the carrier, Hz.
     frequency : ndarray, shape (n_f,)
-        Of the modulation, Hz.
+        Frequency of the modulation, Hz.
     mean : ndarray, shape (n_m,)
-        Of the friction, N.
+        Mean friction, N.
     amplitude : ndarray, shape (n_m, n_f)
         Largest amplitude of the friction, N.
     smallest_mean, largest_mean : float
-        Of a friction that does not change, N.
+        Smallest and largest constant friction, N.
     """
 
     circuit: Circuit
@@ -69,12 +69,12 @@ class Capability(Shown):
 
     @property
     def largest(self) -> FloatArray:
-        """Largest amplitude at each frequency, at whichever mean allows it, N, shape (n_f,)."""
+        """Largest amplitude at each frequency, over all means, N, shape (n_f,)."""
         return np.asarray(self.amplitude.max(axis=0))
 
     @property
     def best_mean(self) -> FloatArray:
-        """The mean at which that is, N, shape (n_f,)."""
+        """Mean friction at which the amplitude is largest, N, shape (n_f,)."""
         return np.asarray(self.mean[self.amplitude.argmax(axis=0)])
 
     def to_dict(self) -> dict[str, Any]:
@@ -99,7 +99,7 @@ class Capability(Shown):
         return Page([*head_lines(self.circuit), said, "", Table(("modulation", "largest amplitude", "at mean"), rows)])
 
     def plot(self) -> Picture:
-        """The amplitude over frequency and mean as a map, and the largest over frequency."""
+        """Picture with a map of the amplitude over frequency and mean, and the largest amplitude over frequency."""
         return plot_capability(self)
 
     def to_csv(self, path: str | Path) -> Path:
@@ -123,7 +123,7 @@ def capability(
     charge_law: str | None = None,
     progress: Progress | None = None,
 ) -> Capability:
-    """Map the friction that a series stack can make with a source of at most `limit` (V).
+    """Map the friction that a series stack can produce with a source of at most `limit` (V).
 
     Parameters
     ----------
@@ -134,9 +134,9 @@ def capability(
     carrier : float, optional
         Hz; without it the drive is unipolar.
     frequency : array_like, optional
-        Of the modulation, Hz; by default 13 from 5 Hz to 1 kHz, with a carrier to an eighth of it at most.
+        Frequencies of the modulation, Hz; by default 13 from 5 Hz to 1 kHz, or to an eighth of a carrier below 8 kHz.
     means : int
-        Means of the friction, from the smallest to the largest, 3 or more.
+        Number of mean frictions, from the smallest to the largest, 3 or more.
     charge_law : str, optional
         As in `simulate`.
     progress : callable, optional
@@ -145,7 +145,7 @@ def capability(
     Raises
     ------
     InputError
-        For another circuit, and numbers out of range.
+        If the circuit is not such a stack, or a number is out of range.
     """
     require_circuit(circuit)
     require(math.isfinite(limit) and limit > 0.0, "limit", f"{limit:g} V", "> 0")
@@ -169,7 +169,7 @@ def capability(
     contact = finger.contact
     if contact.mu == 0.0:
         raise InputError(f"{finger.gap.name} has mu=0 and no friction; allowed: mu > 0")
-    # A gap voltage of ten times the limit is beyond what the layers' charges may add.
+    # The charges in the layers can raise the gap voltage above the source voltage, but not to ten times the limit.
     points = None if carrier is None else float(_PER_CARRIER)
     area = finger.area
     most = float(contact.stress(10.0 * limit)) * (float(contact.area(10.0 * limit)) if area is None else area)
@@ -191,7 +191,7 @@ def capability(
 
 @dataclass(frozen=True)
 class _Search:
-    """Whether forces are within the limit, by the inverse drive."""
+    """Search for the largest forces whose inverse drive stays within the voltage limit."""
 
     curve: ForceCurve
     inverter: Inverter
@@ -199,7 +199,7 @@ class _Search:
     carrier: float | None
 
     def holds(self, mean: float, amplitude: float, frequency: float) -> bool:
-        """Whether a force (N) of this modulation (N, Hz) takes no more than the limit."""
+        """Whether the drive of a mean force (N) with this modulation (N, Hz) stays within the limit."""
         rate = max(_PER_PERIOD * frequency, _LEAST_RATE) if self.carrier is None else _PER_CARRIER * self.carrier
         t = np.arange(math.ceil(max(_PERIODS / frequency, _LASTS) * rate)) / rate
         u = self.curve.amplitude(np.maximum(mean + amplitude * np.sin(2.0 * np.pi * frequency * t), 0.0))
@@ -208,7 +208,7 @@ class _Search:
         return not self.inverter.drive(u, 1.0 / rate, Limits(self.limit))[1].any()
 
     def largest_mean(self, most: float) -> float:
-        """Largest force that lasts, N, to `_EXACT`."""
+        """Largest constant force, N, to the relative accuracy `_EXACT`."""
         return _largest(lambda x: self.holds(x, 0.0, 1.0 / _LASTS), most)
 
     def amplitude(self, mean: float, frequency: float) -> float:
@@ -217,7 +217,7 @@ class _Search:
 
 
 def _largest(holds: Callable[[float], bool], most: float) -> float:
-    """Largest number up to `most` that holds, to `_EXACT` of itself or a thousandth of that of `most`."""
+    """Largest number up to `most` that holds, by bisection, to `_EXACT` times itself or 1e-3 `_EXACT` times `most`."""
     if holds(most):
         return most
     low, high = 0.0, most
@@ -228,7 +228,7 @@ def _largest(holds: Callable[[float], bool], most: float) -> float:
 
 
 def plot_capability(found: Capability) -> Picture:
-    """The map of amplitudes, and the largest over frequency."""
+    """Picture with the map of amplitudes, and the largest amplitude over frequency."""
     from fingerspice.plots.drawing import BLUE, caption, dress, engineering, new_figure
 
     figure, (left, right) = new_figure(1, 2, height=3.4, width_ratios=(1.25, 1))

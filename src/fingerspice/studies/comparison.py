@@ -1,4 +1,4 @@
-"""The transient's periodic state beside the phasor, and what the ripple of the area has to do with it."""
+"""Comparison of the transient's periodic state with the phasor, and the part that the area's ripple has in it."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Figures:
-    """Gap voltage at the fundamental, mean force and mean area of one way of solving.
+    """Gap voltage at the fundamental, mean force and mean area from one method.
 
-    Each is a number, or an array (n_gap,) where the circuit has several GAPs.
+    Each is a number, or an array (n_gap,) if the circuit has several GAPs.
 
     Attributes
     ----------
@@ -53,16 +53,16 @@ class Figures:
 
 @dataclass(frozen=True, repr=False)
 class Comparison(Shown):
-    """The same scene solved three ways.
+    """The same scene solved by three methods.
 
     Attributes
     ----------
     phasor : Figures
-        Eqs. 9 to 15, every area coupled through its mean stress.
+        Eqs. 9 to 15, with every area coupled through its mean stress.
     mean : Figures
-        Transient with the phasor's areas: what it differs by from `phasor` is not the area's doing.
+        Transient with the phasor's constant areas; its difference from `phasor` is due to the source's harmonics.
     coupled : Figures
-        Transient with the areas coupled at every instant: what it differs by from `mean` is the area's ripple.
+        Transient with the areas coupled at every instant; its difference from `mean` is due to the areas' ripple.
     frequency : float
         Hz.
     solution : Solution
@@ -81,15 +81,15 @@ class Comparison(Shown):
         return comparison_table(self)
 
     def plot(self) -> Picture:
-        """One period of the transient over the phasor's, and the figures of both."""
+        """Picture of one period of the transient and of the phasor, with the figures of both."""
         from fingerspice.studies.pictures import plot_comparison
 
         return plot_comparison(self)
 
     def rows(self) -> list[tuple[str, str, float, float, float, float, float]]:
-        """Table: quantity, unit, phasor, transient at mean area, coupled, difference, share of the ripple in it.
+        """Rows of quantity, unit, phasor, transient at mean area, coupled, coupled - phasor, coupled - mean area.
 
-        Where the circuit has several GAPs the quantity is ``name:gap``.
+        If the circuit has several GAPs, the quantity is ``name:gap``.
         """
         out = []
         for i, gap in enumerate(self.gaps):
@@ -109,7 +109,7 @@ class Comparison(Shown):
         return self.solution.gaps
 
     def to_dict(self) -> dict[str, Any]:
-        """The figures as plain data, SI."""
+        """The figures as plain data, in SI units."""
 
         def plain(figures: Figures) -> dict[str, Any]:
             return {name: np.asarray(value).tolist() for name, value in vars(figures).items()}
@@ -131,12 +131,12 @@ def compare(
     charge_law: str | None = None,
     rtol: float = 1e-8,
 ) -> Comparison:
-    """Set the periodic state of the transient beside the phasor.
+    """Compare the periodic state of the transient with the phasor.
 
     Parameters
     ----------
     circuit : Circuit
-        With one GAP or more, and one periodic source that has a fundamental; a series stack may have several sources.
+        A circuit with at least one GAP and one periodic source with a fundamental; a stack may have several sources.
     sources, parameters, charge_law
         As in `simulate`.
     rtol : float
@@ -149,9 +149,9 @@ def compare(
     Raises
     ------
     InputError
-        For a circuit without GAP, a network with several sources, or a source without period or fundamental.
+        If the circuit has no GAP, a network has several sources, or the source has no period or fundamental.
     SolveError
-        Where a transient fails.
+        If a transient fails.
     """
     circuit = overridden(circuit, sources, parameters)
     names = [e.name for e in circuit.by_device("GAP")]
@@ -171,14 +171,14 @@ def compare(
 
 
 def _phasor_figures(found: list[PhasorSolution]) -> Figures:
-    """Of the phasors of every GAP."""
+    """Figures from the phasors of every GAP."""
     amplitude = [float(abs(p.u_gap[0])) for p in found]
     lead = [float(np.degrees(np.angle(p.gain[0]))) for p in found]
     return _together(amplitude, lead, [float(p.f_el_mean[0]) for p in found], [float(p.area[0]) for p in found])
 
 
 def _figures(solution: Solution, phase: float) -> Figures:
-    """Of a period of the transient, whose source has its fundamental at `phase` (rad)."""
+    """Figures of a period of the transient; `phase` (rad) is that of the source's fundamental."""
     found = solution._figures
     lead = np.asarray(solution.u_gap_phase_deg, float) - np.degrees(phase)
     return _together(
@@ -190,6 +190,6 @@ def _figures(solution: Solution, phase: float) -> Figures:
 
 
 def _together(*values: Value | list[float]) -> Figures:
-    """Figures that are numbers where there is one GAP."""
+    """Figures as arrays over the GAPs, or as numbers if there is one GAP."""
     arrays = [np.atleast_1d(np.asarray(value, float)) for value in values]
     return Figures(*(float(x[0]) if x.size == 1 else x for x in arrays))

@@ -1,4 +1,4 @@
-"""A drive found by `inverse_drive` as a page, a picture, a recording and tables."""
+"""Output of a drive found by `inverse_drive`: as a page, a picture, a WAV file and tables."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FULL = 2.0**31
 
 
 def drive_page(found: InverseDrive) -> Page:
-    """What the drive reaches, in a sentence, and a table of its figures."""
+    """A sentence about the accuracy that the drive reaches, and a table of its figures."""
     d = found.to_dict()
     wave = "without a carrier" if found.carrier is None else f"on a carrier of {format_si(found.carrier, 'Hz')}"
     said = f"drive for a wanted {found.kind}, {wave}: {_verdict(found)}"
@@ -54,7 +54,7 @@ def _verdict(found: InverseDrive) -> str:
 
 
 def plot_drive(found: InverseDrive) -> Picture:
-    """Wanted against reached, the miss, and the drive, over time."""
+    """Picture of the wanted and the reached quantity, their difference, and the drive, against time."""
     figure, (top, middle, bottom) = drawing.new_figure(3, height=5.2, sharex=True, height_ratios=(3, 1.4, 2))
     wanted: FloatArray = found.wanted
     reached: FloatArray = found.force
@@ -90,7 +90,7 @@ def plot_drive(found: InverseDrive) -> Picture:
 
 
 def drive_wav(found: InverseDrive, path: Path, gain: float | None) -> Path:
-    """As `InverseDrive.to_wav`."""
+    """Write the drive as `InverseDrive.to_wav` describes."""
     from scipy.io import wavfile
 
     rate = found.drive.rate
@@ -109,7 +109,7 @@ def drive_wav(found: InverseDrive, path: Path, gain: float | None) -> Path:
 
 
 def write_columns(path: Path, names: tuple[str, ...], columns: tuple[FloatArray, ...]) -> Path:
-    """Write columns as CSV under their names; every number to its last bit."""
+    """Write columns as CSV under their names, with enough digits to read back the same doubles."""
 
     def write(target: Path) -> None:
         with target.open("w", newline="", encoding="utf-8") as stream:

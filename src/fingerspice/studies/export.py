@@ -1,4 +1,4 @@
-"""A circuit as one self-contained ngspice deck."""
+"""Export of a circuit as one self-contained ngspice deck."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ from fingerspice.waveforms.waveform import DC, Sine, Waveform
 EDGE = 1e-9
 """Rise time (s) of an ideal jump in the export, since ngspice has none; a thousandth of TSTEP if that is shorter."""
 NOW = 1e-30
-"""Written for a time of 0 (s), which ngspice takes for "not given"."""
+"""Time (s) that is written for 0, because ngspice takes 0 for "not given"."""
 
-# Found by tests with ngspice 39 on edges, constant voltages and sines under both laws. At an edge its step control
-# would reduce the step to nothing; a large trtol switches it off, so that TMAX (by default TSTEP) sets the accuracy.
-# Inside a capacitor C='...' a current of du/dt (in A) flows. At a constant voltage that is rounding divided by the
-# step, about 1e-6 in the first steps and thus above the usual abstol of 1e-12. The last of several .options lines
-# counts, so this one follows the library.
+# Found by tests with ngspice 39 on edges, constant voltages and sines under both laws. At an edge ngspice's step
+# control reduces the step until the run fails; a large trtol switches it off, so that TMAX (by default TSTEP) sets the
+# accuracy. Inside a capacitor C='...' an auxiliary current of du/dt (in A) flows. At a constant voltage that current is
+# round-off divided by the step, about 1e-6 in the first steps and thus above the usual abstol of 1e-12. The last of
+# several .options lines counts, so this one follows the library.
 _OPTIONS = ".options reltol=1e-4 trtol=1e4 abstol=1e-4"
 
-# With so many points straight lines miss a sine by 5e-6 of its amplitude.
+# Points per shortest time scale of a waveform; linear interpolation of a sine then has an error of 5e-6 of its
+# amplitude.
 _POINTS_PER_TIME_SCALE = 1000
 _MAX_POINTS = 2_000_000
 _FEW_POINTS = 1000
@@ -43,7 +44,7 @@ _FEW_POINTS = 1000
 def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     """A deck that ngspice 39 runs without other files.
 
-    It has the devices' bodies, numbers in place of parameters, and PWL in place of sources that ngspice lacks.
+    The deck contains the devices' subcircuits, numbers in place of parameters, and PWL for sources that ngspice lacks.
 
     Parameters
     ----------
@@ -59,8 +60,7 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     Raises
     ------
     InputError
-        For a source that has to be written as points in a circuit without .tran line, and for different names that
-        would become the same.
+        If a source has to be written as points and the circuit has no .tran line, or if two names would become equal.
     """
     require_circuit(circuit)
     law = charge_law or circuit.charge_law or "local"
@@ -85,14 +85,16 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
 
 
 def _name(name: str) -> str:
-    # In ngspice a dot names what is inside a subcircuit, while this circuit is flat. A node called temper ends ngspice.
+    # In ngspice a dot in a name separates a subcircuit from its element, but this deck is flat: replace it. A node
+    # named temper makes ngspice exit.
     return "temper_" if name.lower() == "temper" else name.replace(".", "_")
 
 
 def _element_name(element: Element) -> str:
     name = _name(element.name)
     letter = element.device if len(element.device) == 1 else "X"
-    # ngspice knows elements by their first letter; the flat name of one in a subcircuit begins with that of the call.
+    # ngspice takes the device from the first letter of the name; the flat name of an element in a subcircuit begins
+    # with the X of the call, so put the right letter in front.
     return name if name[0].upper() == letter else f"{letter}{name}"
 
 
@@ -114,7 +116,7 @@ def _contacts(circuit: Circuit) -> dict[str, Contact]:
 
 
 def _start_areas(circuit: Circuit, law: str) -> dict[str, float]:
-    """Area (mm^2) of each area node at the start of a run with ``uic``; empty where a run starts otherwise."""
+    """Area (mm^2) of each area node at the start of a run with ``uic``; empty for a run that starts otherwise."""
     if circuit.tran is None or not starts_uncharged(circuit):
         return {}
     areas, _ = find_branches(circuit)
@@ -132,7 +134,7 @@ def _start_areas(circuit: Circuit, law: str) -> dict[str, float]:
 
 
 def _slow_areas(circuit: Circuit, law: str) -> dict[str, float]:
-    """Start values (mm^2) of areas with dynamics of their own."""
+    """Start values (mm^2) of the areas that follow with a delay (tau > 0)."""
     problem = prepare(circuit, t_stop=None, t_eval=None, charge_law=law, area="coupled", start="deck", charge=False)
     net, n = problem.scene.net, problem.scene.net.k.shape[0]
     slow = problem.initial.y[n:]
@@ -144,7 +146,7 @@ def _slow_areas(circuit: Circuit, law: str) -> dict[str, float]:
 
 
 def _start_lines(circuit: Circuit, areas: Mapping[str, float]) -> Iterator[str]:
-    """Start values and guesses of nodes; with ``uic`` the lines of the layers have their start voltages."""
+    """Start values (.ic) and guesses (.nodeset) of nodes; with ``uic`` the layers' own lines hold start voltages."""
     written = {node: name for e in circuit.elements for node, name in zip(e.nodes, e.node_names, strict=True)}
     gaps = {gap.nodes[2]: gap for gap in circuit.by_device("GAP")}
     contacts = _contacts(circuit)
@@ -155,7 +157,7 @@ def _start_lines(circuit: Circuit, areas: Mapping[str, float]) -> Iterator[str]:
         guess = gap.values["a_fix"] or 1e6 * float(contacts[node].area(0.0))
         held = circuit.initial.get(node)
         if areas:
-            # An area with dynamics of its own needs a start value; for one that follows instantly a guess is enough.
+            # An area with a delay is a state and needs a start value; for an area without delay a guess is enough.
             held = areas[node] if gap.values["tau"] > 0.0 else None
             guess = areas[node]
         word, value = (".nodeset", guess) if held is None else (".ic", held)
@@ -165,7 +167,7 @@ def _start_lines(circuit: Circuit, areas: Mapping[str, float]) -> Iterator[str]:
 
 
 def _guesses_inside(gap: Element, contact: Contact, u: float) -> Iterator[str]:
-    """Guesses for the nodes inside a GAP at `u` V: with stored charge ngspice finds no first point without them."""
+    """Guesses for the nodes inside a GAP at `u` V, without which ngspice's first Newton iteration fails at u != 0."""
     at_rest, adhesive = (float(contact.area_adhesive(v)) for v in (0.0, u))
     y = adhesive / at_rest
     guesses = {
@@ -191,7 +193,7 @@ def _element_lines(
         initial = f" IC={element.initial!r}" if element.initial is not None else ""
         yield f"{name} {nodes} {element.values['value']!r}{initial}"
         return
-    # The strength of a dielectric only serves a warning here.
+    # e_max is left out: it only serves a warning of this package.
     values = " ".join(f"{k}={_number(v)}" for k, v in element.values.items() if k != "e_max")
     extra = f" wk={work_ratio!r}" if element.device == "GAP" and work_ratio != 1.0 else ""
     area = start_areas.get(element.nodes[2])
@@ -234,13 +236,14 @@ def _source_text(waveform: Waveform, element: Element, circuit: Circuit) -> str:
     else:
         t, v = _sampled(waveform, element, circuit)
     if _starts_empty(circuit):
-        # Everything starts at 0 V, and the source jumps from there: ngspice can hardly take its first step otherwise.
+        # All voltages start at 0, so let the source start at 0 V and jump: otherwise ngspice often fails at its first
+        # step.
         t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append([0.0, waveform.value(0.0)], v[t > 0.0])
     return _pwl_text(t, v, _edge(circuit))
 
 
 def _own_points(waveform: PWL | Samples, element: Element, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
-    """The points of straight lines from 0 s to the first after the end of the run, where its end is known."""
+    """The waveform's own points from 0 s to the first one after the end of the run; all if the end is not known."""
     v = np.asarray(waveform.values)
     at = waveform.times if isinstance(waveform, PWL) else waveform.start + np.arange(v.size) / waveform.rate
     t = np.asarray(at)
@@ -277,11 +280,11 @@ def _edge(circuit: Circuit) -> float:
 
 
 def _pulse_text(p: Pulse, circuit: Circuit) -> str | None:
-    """A pulse as ngspice has it; None where its edges have no room, or it does not start from rest."""
+    """A pulse in ngspice's notation; None if its edges have no room, or if it should start at 0 V and does not."""
     if _starts_empty(circuit) and p.value(0.0) != 0.0 and p.breakpoint_rate() * _stop(circuit) < _FEW_POINTS:
         return None
     edge, span = _edge(circuit), _stop(circuit) + abs(p.delay)
-    # The edge of a jump takes its time from what follows, which then ends when it should.
+    # The rise time of a jump is subtracted from the width, so that the pulse still ends at its time.
     width = p.width - (0.0 if p.rise else edge) if math.isfinite(p.width) else 10.0 * span
     rise, fall = p.rise or edge, p.fall or edge
     period = p.pulse_period if math.isfinite(p.pulse_period) else 20.0 * span + rise + width + fall
@@ -292,7 +295,7 @@ def _pulse_text(p: Pulse, circuit: Circuit) -> str | None:
 
 
 def _sampled(waveform: Waveform, element: Element, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
-    """Points of a waveform over the run: both sides of its breakpoints, and enough points between them."""
+    """Points (s, V) of a waveform over the run: left and right values at breakpoints, and dense points between them."""
     if circuit.tran is None:
         raise InputError(f"{element.name}: exporting this source as PWL needs a .tran line to know how far")
     stop = circuit.tran.stop
@@ -303,13 +306,13 @@ def _sampled(waveform: Waveform, element: Element, circuit: Circuit) -> tuple[np
     count = 1 if not math.isfinite(spacing) else math.ceil(stop / spacing)
     points = count + 2.0 * waveform.breakpoint_rate() * stop
     breaks = np.empty(0)
-    # The rate is an upper bound, tested first since there may be too many breakpoints to list.
+    # Test with the rate, an upper bound, before the breakpoints are listed: there may be too many to list.
     if points <= 10 * _MAX_POINTS:
         breaks = waveform.breakpoints(0.0, stop)
         points = count + 2 * breaks.size
     _refuse_many(points, element)
     if circuit.tran.uic:
-        # The value before t = 0 only matters to an operating point.
+        # The left value at t = 0 only matters for an operating point, which a run with uic does not have.
         breaks = breaks[breaks > 0.0]
     smooth = np.linspace(0.0, stop, count + 1)
     t = np.concatenate([smooth, breaks, breaks])
@@ -320,14 +323,14 @@ def _sampled(waveform: Waveform, element: Element, circuit: Circuit) -> tuple[np
 
 
 def _pwl_text(t: np.ndarray, v: np.ndarray, edge: float) -> str:
-    """PWL text, in which jumps become edges of `edge` seconds and repeated points are left out."""
+    """PWL text; a jump becomes an edge of `edge` seconds, and repeated points are left out."""
     times: list[float] = []
     values: list[float] = []
     for time, value in zip(t.tolist(), v.tolist(), strict=True):
         if times and time <= times[-1]:
             if value == values[-1]:
                 continue
-            # Late in a long run an edge may be shorter than the rounding of the time.
+            # Late in a long run an edge may be shorter than the spacing of doubles: use the next double then.
             time = max(times[-1] + edge, np.nextafter(times[-1], math.inf).item())
         times.append(time)
         values.append(value)

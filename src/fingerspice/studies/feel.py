@@ -1,4 +1,4 @@
-"""What the hand feels of a run: the friction's spectrum as movement of the skin, and its level above a threshold."""
+"""Perception of a run: the skin's motion under the friction's spectrum, and its level above a threshold."""
 
 from __future__ import annotations
 
@@ -30,36 +30,36 @@ if TYPE_CHECKING:
     from fingerspice.results.solution import Solution
     from fingerspice.results.spectrum import Spectrum
 
-#: Edges of a third-octave band, relative to its middle, of which one is at 1 kHz; fewest bins of a density in a band.
+#: Upper edge of a third-octave band, relative to its middle (one band's middle is 1 kHz); fewest bins in a band.
 _EDGE, _FEWEST = 2.0 ** (1.0 / 6.0), 2
-#: Lines weaker than the strongest acceleration by this factor are rounding, and are left out.
+#: Lines weaker than this fraction of the strongest acceleration are round-off, and are left out.
 _NOTHING = 1e-9
-#: Rows of a report.
+#: Largest number of rows in a report.
 _SHOWN = 10
 
 
 @dataclass(frozen=True, repr=False)
 class Feel(Sealed, Shown):
-    """What a hand may feel of a friction force: lines of a periodic one, else third-octave bands.
+    """Estimated perception of a friction force: by spectral lines if it is periodic, else by third-octave bands.
 
-    The threshold is that of the device that the hand holds, and the skin is one mass on a spring, so a level is an
-    estimate to compare drives by, and no measurement. Sounds, warmth and edges are not looked at.
+    The threshold was measured with a device held in the hand, and the skin is modelled as one mass on a spring, so a
+    level is an estimate for comparing drives, not a measurement. Sounds, warmth and edges are not modelled.
 
     Attributes
     ----------
     signal : str
-        The friction force that was looked at: ``f_t``, or ``f_t:GAP`` of one of several fingers.
+        The friction force: ``f_t``, or ``f_t:GAP`` for one of several fingers.
     kind : str
-        ``"lines"`` or ``"bands"``; a band has the amplitude of the sine with its rms.
+        ``"lines"`` or ``"bands"``; the amplitude of a band is that of a sine with the same rms.
     frequency : ndarray, shape (n,)
-        Of the lines, or in the middle of the bands, Hz.
+        Frequencies of the lines, or middles of the bands, Hz.
     force, displacement, acceleration : ndarray, shape (n,)
         Amplitudes of the friction force (N), and of the skin's movement (m, m/s^2).
     level : ndarray, shape (n,)
-        Of the acceleration above the threshold, dB; NaN at frequencies of which the threshold says nothing.
+        Level of the acceleration above the threshold, dB; NaN outside the threshold's frequencies.
     change : float
-        Friction's change relative to its highest value, by what of it lies within the threshold's frequencies: that of
-        a sine of its rms.
+        Peak-to-peak change of the friction relative to its highest value, for a sine with the rms of the lines or bands
+        within the threshold's frequencies.
     mechanics : SkinMechanics
     threshold : Threshold
     """
@@ -81,12 +81,12 @@ class Feel(Sealed, Shown):
 
     @property
     def strongest(self) -> int | None:
-        """Number of the line or band with the highest level; None where the threshold judges none."""
+        """Index of the line or band with the highest level; None if none is within the threshold's frequencies."""
         return int(np.nanargmax(self.level)) if np.isfinite(self.level).any() else None
 
     @property
     def highest(self) -> float | None:
-        """The highest level, dB; None where the threshold judges no line or band."""
+        """The highest level, dB; None if no line or band is within the threshold's frequencies."""
         return None if self.strongest is None else float(self.level[self.strongest])
 
     @property
@@ -101,11 +101,11 @@ class Feel(Sealed, Shown):
 
     @property
     def steps(self) -> float | None:
-        """The highest level in difference thresholds of 1.21 dB (`perception.DIFFERENCE_DB`); None where not felt."""
+        """The highest level in difference thresholds of 1.21 dB (`perception.DIFFERENCE_DB`); None if not felt."""
         return self.highest / DIFFERENCE_DB if self.highest is not None and self.felt else None
 
     def to_dict(self) -> dict[str, Any]:
-        """The keys of ``--json``; lines that the threshold does not judge are left out."""
+        """The keys of ``--json``; lines outside the threshold's frequencies are left out."""
         every = (self.frequency, self.force, self.displacement, self.acceleration, self.level)
         rows = zip(*(x[np.isfinite(self.level)] for x in every), strict=True)
         keys = ("frequency", "force", "displacement", "acceleration", "level_db")
@@ -152,7 +152,7 @@ class Feel(Sealed, Shown):
         return Page(blocks)
 
     def verdict(self) -> str:
-        """Felt or not, where, and how far above the threshold, in one sentence."""
+        """A sentence: whether it is felt, at which frequency most, and the level above the threshold."""
         finger = f"finger {self.signal.partition(':')[2]}: " if ":" in self.signal else ""
         place = self.strongest
         low, high = self.threshold.frequency[[0, -1]]
@@ -167,7 +167,7 @@ class Feel(Sealed, Shown):
         )
 
     def plot(self, others: Sequence[Feel] = ()) -> Figure:
-        """Draw acceleration against the threshold over frequency, with that of other fingers.
+        """Draw the acceleration, also that of other fingers, and the threshold against frequency.
 
         Returns
         -------
@@ -186,25 +186,25 @@ def feel(
     mechanics: SkinMechanics = FINGERPAD,
     threshold: Threshold | None = None,
 ) -> Feel:
-    """What a hand may feel of a run: its friction as movement of the skin, and its level above a threshold.
+    """Estimate what a hand may feel of a run, from the skin's motion under the friction and a threshold.
 
-    The friction's lines, or for a source without a period the third-octave bands of its density (see
+    The friction's spectral lines, or for a source without a period the third-octave bands of its spectral density (see
     `Solution.spectrum`), move the skin by its mechanics; the acceleration's amplitude is compared with the threshold.
 
     Parameters
     ----------
     solution : Solution
     signal : str
-        ``"f_t"``, or ``"f_t:GAP"`` of one of several fingers.
+        ``"f_t"``, or ``"f_t:GAP"`` for one of several fingers.
     mechanics : SkinMechanics
         `fingerspice.studies.perception.FINGERPAD` by default.
     threshold : Threshold, optional
-        Android's least perceptible acceleration by default, which is that of a device held in the hand.
+        Android's least perceptible acceleration by default, which is for a device held in the hand.
 
     Raises
     ------
     InputError
-        For a signal that is no friction force, or a run whose spectrum cannot be computed.
+        If the signal is not a friction force, or the run's spectrum cannot be computed.
     """
     require(signal.partition(":")[0] == "f_t", "signal", repr(signal), "'f_t', the friction force, or 'f_t:GAP'")
     require(isinstance(mechanics, SkinMechanics), "mechanics", repr(mechanics), "a SkinMechanics")
@@ -214,7 +214,8 @@ def feel(
         raise InputError("the circuit has no GAP, so there is no friction to feel; allowed: a circuit with a GAP")
     spectrum = solution.spectrum(signal)
     if spectrum.amplitude is not None and spectrum.frequency[-1] < table.frequency[-1]:
-        # The lines of a long period are too many, and too close to be felt one by one.
+        # A long period has so many lines that the spectrum ends below the threshold's highest frequency, and they are
+        # too close to be felt separately: use the spectral density.
         spectrum = solution.spectrum(signal, method="welch")
     kind = "bands" if spectrum.amplitude is None else "lines"
     f, force = _bands(spectrum) if spectrum.amplitude is None else (spectrum.frequency, spectrum.amplitude)
@@ -230,16 +231,16 @@ def feel(
 
 
 def _change(mean: float, force: FloatArray) -> float:
-    """Peak to peak of a sine with the rms of these amplitudes (N), relative to its highest value about a mean (N)."""
+    """Peak-to-peak change relative to the highest value, of a mean (N) plus a sine with the amplitudes' rms (N)."""
     amplitude = math.sqrt(float((force**2).sum()))
     return 2.0 * amplitude / (mean + amplitude) if amplitude > 0.0 else 0.0
 
 
 def _bands(spectrum: Spectrum) -> tuple[FloatArray, FloatArray]:
-    """Middles (Hz) of the third octaves that the density resolves, and amplitudes of sines with their rms."""
+    """Middles (Hz) of the third-octave bands that the density resolves, and amplitudes of sines with the bands' rms."""
     assert spectrum.density is not None
     width = spectrum.resolution
-    # A bin belongs to the band in which its middle lies; the lowest band is as wide as some bins.
+    # A bin belongs to the band that contains its middle; the lowest band is at least _FEWEST bins wide.
     lowest = math.ceil(3.0 * math.log2(_FEWEST * width / (_EDGE - 1.0 / _EDGE) / 1e3))
     highest = math.floor(3.0 * math.log2(float(spectrum.frequency[-1]) / _EDGE / 1e3))
     middle = 1e3 * 2.0 ** (np.arange(lowest, max(highest, lowest) + 1) / 3.0)

@@ -1,4 +1,4 @@
-"""Picture of what the hand feels: the skin's acceleration against the threshold."""
+"""Picture of the skin's acceleration and of the threshold of perception, against frequency."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from fingerspice.studies.feel import Feel
 
 _MARKERS = "osD^vP"
-#: A panel goes down to the threshold, but not below its highest point by more than this factor.
+#: The vertical axis reaches down to the threshold, but spans at most this factor.
 _DEPTH = 1e7
-#: It ends at this multiple of the threshold's highest frequency.
+#: The frequency axis ends at this multiple of the threshold's highest frequency.
 _BEYOND = 5.0
-#: Lines that are named in the picture.
+#: Largest number of lines whose level is written in the picture.
 _NAMED = 6
 
 

@@ -52,11 +52,11 @@ class Variation:
     name : str
         Name in the data file.
     paths : tuple of str
-        Paths of the circuit parameters that are proportional to it.
+        Paths of the circuit parameters that are proportional to the varied parameter.
     base : float
-        Its value in Table 1, in `unit`.
+        Value in Table 1, in `unit`.
     values : tuple of float
-        Value of each curve, in `unit`.
+        Value for each curve, in `unit`.
     """
 
     title: str
@@ -115,9 +115,9 @@ def make_figures(
     Parameters
     ----------
     folder : str or Path
-        Made where it does not exist.
+        Folder of the files; it is created if it does not exist.
     only : int or iterable of int, optional
-        Numbers of the figures wanted, from 2 to 5; all by default.
+        Numbers of the wanted figures, from 2 to 5; all by default.
     progress : callable, optional
         Called with the fraction done.
 
@@ -129,7 +129,7 @@ def make_figures(
     Raises
     ------
     InputError
-        For another number of a figure, or a folder that cannot be written.
+        If there is no figure of that number, or the folder cannot be written.
     """
     wanted = list(FIGURES) if only is None else [only] if isinstance(only, int) else list(only)
     for number in wanted:
@@ -191,7 +191,7 @@ def figure_3(points: int = 46) -> tuple[Figure, Table]:
         )
         ax.set_xlim(f[0], f[-1])
         ax.set_ylim(0.0, 0.25 if variation.name == "d_a" else 0.125)
-        # The corner in which the panel's curves leave room.
+        # The legend stands in the corner that the panel's curves leave free.
         corner: Any = "lower right" if variation.name == "r_a" else "upper left"
         ax.legend(loc=corner, fontsize=drawing.FONT - 1.0, frameon=False)
     for ax in axes[::2]:
@@ -228,9 +228,9 @@ def time_response(shape: type[Sine] | type[Square], frequency: float, *, dispers
 
 
 def two_periods(solution: Solution) -> dict[str, FloatArray]:
-    """Columns ``t``, ``u_source``, ``u_gap``, ``f_el``, ``area`` of one period, twice over, from t = 0.
+    """Columns ``t``, ``u_source``, ``u_gap``, ``f_el``, ``area`` of one period, repeated twice from t = 0.
 
-    The end of the first copy is left out where it repeats the start of the second.
+    The last row of the first copy is left out if it repeats the first row of the second copy.
     """
     assert solution.period is not None
     t = solution.t - solution.t[0]
@@ -272,7 +272,7 @@ def _time_column(axes: Sequence[Axes], data: dict[str, FloatArray], frequency: f
     factor, unit = drawing.engineering(2.0 / frequency, "s")
     mean = float(np.trapezoid(data["f_el"], data["t"]) / data["t"][-1])
     dash = drawing.DASHES[1]
-    # Before t = 0 there is the end of a period; with its last value an edge at t = 0 is drawn, too.
+    # The last value of the period is put in front, so that an edge at t = 0 is drawn as a vertical line.
     t = factor * np.append(0.0, data["t"])
     y = {name: np.append(x[-1], x) for name, x in data.items()}
     upper.plot(t, y["u_source"], color=drawing.GREY, linewidth=1.2, linestyle=dash, label="source $U$")
@@ -280,7 +280,7 @@ def _time_column(axes: Sequence[Axes], data: dict[str, FloatArray], frequency: f
     lower.plot(t, y["f_el"], color=drawing.VERMILION, linewidth=1.6, label=r"force $F_\mathrm{el}$")
     for ax, name in ((upper, "u_gap_dispersive"), (lower, "f_el_dispersive")):
         if name in y:
-            # Named once, in the legend of the force, where there is room.
+            # The name appears only in the legend of the force, which has room for it.
             label = "dispersive" if ax is lower else "_"
             ax.plot(t, y[name], color=drawing.BLACK, linewidth=0.9, linestyle=drawing.DASHES[3], label=label)
     lower.axhline(mean, color=drawing.BLACK, linewidth=1.0, linestyle=dash, label=f"mean {mean:.3f} N")
@@ -302,14 +302,14 @@ FIGURES: dict[int, Callable[[], tuple[Figure, Table]]] = {
 
 
 def figure_numbers() -> dict[str, float]:
-    """The numbers that the paper's text states about its figures, as this package computes them.
+    """The numbers that the paper's text gives about its figures, computed by this package.
 
     Returns
     -------
     dict of str to float
         ``area_unloaded`` (m^2); at 200 V ``gain_100Hz``, ``lead_100Hz`` (degrees), the same at 5000 Hz; at
         140 V ``rise`` (ratio of the mean forces at 10 kHz and 100 Hz, also for each gap resistance) and
-        ``rise_above_2kHz``; least, largest and mean force (N) of the time responses; and those of `trends`.
+        ``rise_above_2kHz``; smallest, largest and mean force (N) of the time responses; and the numbers of `trends`.
     """
     circuit = table1_circuit()
     out: dict[str, float] = {"area_unloaded": variations()[1].base * 1e-6}
@@ -334,7 +334,7 @@ def figure_numbers() -> dict[str, float]:
 
 
 def trends(frequencies: Sequence[float] = (10.0, 100.0, 1000.0, 10000.0)) -> dict[str, float]:
-    """How the mean force of Fig. 3 depends on its parameters.
+    """Elasticity, range and curvature of the mean force of Fig. 3 against each of its parameters.
 
     Parameters
     ----------
@@ -346,8 +346,8 @@ def trends(frequencies: Sequence[float] = (10.0, 100.0, 1000.0, 10000.0)) -> dic
     dict of str to float
         For each parameter and frequency: ``elasticity_...``, the relative change of the force per relative change of
         the parameter at Table 1; ``span_...``, the change of the force over the panel's range, relative to the force of
-        Table 1; ``bend_...``, the largest distance from the best straight line over that range, relative to that
-        change.
+        Table 1; ``bend_...``, the largest distance of the force from the best straight line over that range, relative
+        to the force's change over the range.
     """
     circuit = table1_circuit().replace({"Vdrive.amplitude": U0_FORCE})
     base = phasor(circuit, frequencies).f_el_mean

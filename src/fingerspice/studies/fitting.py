@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_POLES = 12
-# The best fit by any causal and passive material has this many poles per decade, and poles this many decades beyond the
+# The densely placed poles that stand for any causal and passive material: number per decade, and decades beyond the
 # band.
 _DENSE, _BEYOND = 8, 2.0
-# Misfit (rms) of a fit, or of data to any material, from which on there is a warning, and above which it is refused.
+# Misfit (rms), of a fit or of the data to any material, above which a warning is given, and above which it is refused.
 NOTABLE, TOO_MUCH = 0.1, 0.3
-# Range of data in Hz, ohm m and 1: far beyond any material, and such that products and quotients do not overflow.
+# Range allowed of data in Hz, ohm m and 1: wide enough for any material, and narrow enough to avoid overflow.
 _LEAST, _MOST = 1e-20, 1e20
 
 
@@ -102,7 +102,7 @@ class MaterialFit(Shown):
     misfit : ndarray, shape (n,)
         Misfit at each frequency.
     kramers_kronig : Consistency
-        The misfit that no ladder can go below.
+        Smallest misfit that any ladder can have.
     data : ndarray of complex, shape (n,)
         Admittivity of the data, S/m.
     """
@@ -123,13 +123,13 @@ class MaterialFit(Shown):
     def to_netlist(self, name: str) -> str:
         """A subcircuit of slabs in series with the thickness as parameter, for decks here and in ngspice.
 
-        Write it to ``myskin.lib`` beside the deck; ``.include myskin.lib`` and ``Xskin skin 0 area NAME d=350u`` then
-        take the place of a SKIN.
+        Write it to ``myskin.lib`` in the folder of the deck; ``.include myskin.lib`` and
+        ``Xskin skin 0 area NAME d=350u`` then replace a SKIN.
 
         Raises
         ------
         InputError
-            For a name that a netlist cannot hold.
+            If the name is not allowed in a netlist.
         """
         require(name.isidentifier(), "name", repr(name), "letters, digits and _, not first a digit")
         return subcircuit(self.ladder, name)
@@ -165,8 +165,8 @@ def fit_material(
     poles : int, optional
         Number of branches.
     error : float, optional
-        Take the fewest branches whose rms misfit is at most this, or at most 1.05 times that of the data's own
-        inconsistency. The default, if `poles` is not given either, is 0.02.
+        Take the fewest branches whose rms misfit is at most `error`, or at most 1.05 times the misfit of the data to
+        any material. The default, if `poles` is not given either, is 0.02.
 
     Returns
     -------
@@ -175,13 +175,13 @@ def fit_material(
     Raises
     ------
     InputError
-        For data that cannot be read or belong to no material (with the likely slip), for a misfit above 30 %, and where
-        both `poles` and `error` are given.
+        If the data cannot be read or fit no material (the message names likely slips), if the misfit is above 30 %, or
+        if both `poles` and `error` are given.
 
     Warns
     -----
     FingerspiceWarning
-        Where the misfit is above 10 %: of the data to any causal and passive material, or of the fit to the data.
+        If the misfit is above 10 %, either of the data to any causal and passive material, or of the fit to the data.
 
     Examples
     --------
@@ -250,7 +250,7 @@ def _admittivity(table: FloatArray) -> tuple[FloatArray, ComplexArray]:
 
 
 def _doubt(table: FloatArray, found: Consistency) -> str:
-    """Warn of data that no material can have, or refuse them, with the likely slip; returns the warning, or nothing."""
+    """Warn about data that no material can have, or refuse them, with likely slips; returns the warning, else ''."""
     if found.rms <= NOTABLE:
         return ""
     slips = likely_slips(table, lambda other: _consistency(*_admittivity(other)).rms, found.rms)
@@ -283,7 +283,7 @@ def _least_ladder(
 
 
 def _weights(f: FloatArray, y: ComplexArray, poles: FloatArray) -> tuple[FloatArray, ComplexArray]:
-    """Best weights (g0, eps0 eps_inf, k_j) that are not negative, and the relative misfit that remains."""
+    """Best non-negative weights (g0, eps0 eps_inf, k_j), and the complex relative residual."""
     from scipy.optimize import nnls
 
     s = 2j * np.pi * f
@@ -306,7 +306,7 @@ def _fit(f: FloatArray, y: ComplexArray, count: int) -> tuple[Ladder, FloatArray
         _, left = _weights(f, y, 10.0**place)
         return np.concatenate([left.real, left.imag])
 
-    # A pole far above the band would act as eps_inf, and leave nothing for it.
+    # A pole far above the band cannot be distinguished from eps_inf, which would then be fitted as 0: bound the poles.
     found = least_squares(residual, start, bounds=(low - 0.5, high + 0.25), max_nfev=60)
     poles = 10.0 ** np.sort(found.x)
     x, left = _weights(f, y, poles)

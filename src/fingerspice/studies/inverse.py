@@ -1,4 +1,4 @@
-"""The drive that makes a wanted electroadhesive force or friction, and a run that shows what it makes."""
+"""The drive that produces a wanted electroadhesive force or friction, checked by forward runs."""
 
 from __future__ import annotations
 
@@ -27,45 +27,45 @@ if TYPE_CHECKING:
 
 BoolArray = NDArray[np.bool_]
 
-# Rate of a drive where nothing gives one, Hz; of a carrier's period so many samples, and the fewest.
+# Default rate of a drive, Hz; default and smallest number of samples in a period of the carrier.
 RATE, PER_PERIOD, FEWEST = 48_000.0, 128, 20
-# Most samples of a drive: its transform and its run stay within a gigabyte.
+# Largest number of samples of a drive: its Fourier transform and its run then need less than a gigabyte.
 MOST_SAMPLES = 5_000_000
-# Error of the forward run; the miss of the gap voltage at which the correction ends, and corrections at most. A
-# correction that leaves more than this share of the miss is the last.
+# Relative error of the forward run; relative error of the gap voltage at which the corrections end; largest number of
+# corrections. A correction that leaves more than the fraction STALLED of the smallest error so far is the last one.
 RTOL, CLOSE, CORRECTIONS, STALLED = 1e-6, 1e-5, 25, 0.7
-# Time in which the force rises to its first value where something stands before the stack, s.
+# Default time in which the force rises to its first value, for networks other than a series stack, s.
 LEAD = 2e-3
 
 
 @dataclass(frozen=True, repr=False)
 class InverseDrive(Shown):
-    """A drive, what it was to make and what a forward run says that it makes.
+    """A drive, the force and friction wanted from it, and those that a forward run gives.
 
     Attributes
     ----------
     circuit : Circuit
-        With the drive as its source.
+        The circuit with the drive as its source.
     drive : Samples
-        Of the source, V.
+        Voltage of the source, V.
     times : ndarray, shape (n,)
-        Where wanted and reached are compared, s: the samples, or with a carrier the middles of its periods.
+        Times at which wanted and reached values are compared, s: the samples, or the middles of the carrier's periods.
     wanted, force : ndarray, shape (n,)
-        Electroadhesive force wanted, and of the forward run, N; with a carrier means over its periods.
+        Wanted electroadhesive force, and that of the forward run, N; with a carrier the means over its periods.
     wanted_friction, friction : ndarray, shape (n,)
-        Friction, F_T = mu (F_N + F_el), N.
+        Wanted friction F_T = mu (F_N + F_el), and that of the forward run, N.
     kind : str
-        ``"force"`` or ``"friction"``: what was asked for.
+        The quantity asked for, ``"force"`` or ``"friction"``.
     carrier : float or None
-        Hz.
+        Frequency of the carrier, Hz.
     limit, slew : float
-        V and V/s; inf for none.
+        Largest voltage (V) and slew rate (V/s) of the source; inf for no limit.
     lead : float
-        Time in which the drive rises to the first wanted value, s; it is no part of the comparison.
+        Time in which the drive rises to the first wanted value, s; it is left out of the comparison.
     at_limit : float
-        Share of the samples at which a limit holds the drive.
+        Fraction of the samples at which a limit holds the drive.
     corrections : int
-        Forward runs after the first.
+        Number of forward runs after the first.
     """
 
     circuit: Circuit
@@ -93,22 +93,22 @@ class InverseDrive(Shown):
 
     @property
     def worst(self) -> float:
-        """Largest miss of what was asked for, N."""
+        """Largest difference between reached and wanted force or friction, N."""
         return float(np.abs(self._miss).max())
 
     @property
     def rms(self) -> float:
-        """Root of the mean square of the miss, N."""
+        """Root mean square of the difference between reached and wanted force or friction, N."""
         return float(np.sqrt(np.mean(self._miss**2)))
 
     @property
     def worst_share(self) -> float:
-        """Largest miss over the largest wanted value."""
+        """`worst` relative to the largest wanted value."""
         return self.worst / self._scale if self._scale > 0.0 else 0.0
 
     @property
     def rms_share(self) -> float:
-        """Rms miss over the largest wanted value."""
+        """`rms` relative to the largest wanted value."""
         return self.rms / self._scale if self._scale > 0.0 else 0.0
 
     @property
@@ -117,7 +117,7 @@ class InverseDrive(Shown):
         return float(np.abs(self.drive.values).max())
 
     def to_dict(self) -> dict[str, Any]:
-        """The figures as plain data, SI."""
+        """The figures as plain data, in SI units."""
         return {
             "kind": self.kind, "rate": self.drive.rate, "samples": self.drive.values.size, "carrier": self.carrier,
             "limit": self.limit, "slew": self.slew, "lead": self.lead, "peak": self.peak, "at_limit": self.at_limit,
@@ -133,7 +133,7 @@ class InverseDrive(Shown):
         return drive_page(self)
 
     def plot(self) -> Picture:
-        """Wanted against reached, the miss, and the drive."""
+        """Picture of the wanted and the reached quantity, their difference, and the drive, against time."""
         from fingerspice.studies.drive_files import plot_drive
 
         return plot_drive(self)
@@ -150,7 +150,7 @@ class InverseDrive(Shown):
         Raises
         ------
         InputError
-            For a rate that is no whole number of Hz, a gain below the peak, or a path that cannot be written.
+            If the rate is not a whole number of Hz, the gain is below the peak, or the path cannot be written.
         """
         from fingerspice.studies.drive_files import drive_wav
 
@@ -186,30 +186,30 @@ def inverse_drive(
     lead: float | None = None,
     charge_law: str | None = None,
 ) -> InverseDrive:
-    """Find the source's voltage that makes a wanted electroadhesive force or friction, from an uncharged circuit on.
+    """Find the source voltage that produces a wanted electroadhesive force or friction, starting uncharged.
 
     Parameters
     ----------
     circuit : Circuit
-        With one GAP and one V source, whose own waveform does not matter.
+        A circuit with one GAP and one V source, whose own waveform is not used.
     force, friction : array_like, waveform or function of time (s)
-        What is wanted, N, one of the two; an array is at `rate`. The force is that of Eq. 2 times the area, and the
-        friction mu (F_N + force).
+        Wanted force, or wanted friction, N; one of the two. An array has the sample rate `rate`. The force is Eq. 2
+        times the area, and the friction is mu (F_N + force).
     rate : float, optional
-        Samples per second of the drive, linear between them; by default that of the wanted samples, else 48 kHz, and
-        with a carrier 128 times that.
+        Samples per second of the drive, which is linear between them. By default it is the rate of the wanted samples,
+        or else 48 kHz; with a carrier it is 128 times the carrier's frequency.
     carrier : float, optional
-        Hz: the gap's voltage is then an envelope times a sine, such that the mean force over a period of it is the
-        wanted one. Without a carrier the gap's voltage does not change its sign.
+        Hz: the gap voltage is then an envelope times a sine, such that the mean force over each period of the sine is
+        the wanted one. Without a carrier the gap voltage does not change its sign.
     limit : float, optional
         Largest voltage of the source, V.
     slew : float, optional
-        Its largest change, V/s.
+        Largest slew rate of the source, V/s.
     duration : float, optional
         Length of a waveform or function without an end, s.
     lead : float, optional
-        Time, s, in which the gap's voltage rises to its first value; by default 0 for a series stack, whose gap follows
-        the source at once, and 2 ms for another network.
+        Time in which the gap voltage rises to its first value, s; by default 0 for a series stack, whose gap voltage
+        jumps with the source, and 2 ms for another network.
     charge_law : str, optional
         As in `simulate`.
 
@@ -220,15 +220,15 @@ def inverse_drive(
     Raises
     ------
     InputError
-        For a force that no voltage makes, a circuit with several fingers or sources, and arguments that contradict
-        each other.
+        If no voltage produces the force, if the circuit has several fingers or sources, or if arguments contradict each
+        other.
     SolveError
-        Where the forward run fails.
+        If the forward run fails.
 
     Notes
     -----
-    Where a limit holds the drive it stays at it and the layers go on from there; the force is the wanted one again as
-    soon as the limits allow. It does not prepare beforehand for what it cannot follow later.
+    While a limit holds the drive, the drive stays at the limit and the layers' state follows from it; the force is the
+    wanted one again as soon as the limits allow. The drive does not act in advance of a limit that it will reach later.
     """
     require_circuit(circuit)
     if (force is None) == (friction is None):
@@ -270,7 +270,7 @@ def _rate(rate: float | None, carrier: float | None, profile: Profile) -> float:
 
 
 class _Task:
-    """What is wanted of one circuit: at the drive's samples, and as it is compared."""
+    """The wanted force and the gap voltage that produces it, for one circuit, with the iteration for its drive."""
 
     def __init__(
         self, circuit: Circuit, finger: Finger, kind: str, profile: Profile, rate: float, carrier: float | None,
@@ -278,7 +278,7 @@ class _Task:
     ) -> None:  # fmt: skip
         self.circuit, self.finger, self.kind, self.law = circuit, finger, kind, law
         self.rate, self.carrier, self.lead = rate, carrier, lead
-        # With a carrier the middles between the samples too: Simpson's rule needs them.
+        # With a carrier the force is also evaluated midway between samples, as Simpson's rule for its mean needs it.
         self.fine = 1 if carrier is None else 2
         count = math.floor(profile.duration * rate * (1.0 + 1e-12)) + 1
         t = np.arange(self.fine * (count - 1) + 1) / (self.fine * rate)
@@ -296,7 +296,7 @@ class _Task:
         self.target = u
 
     def solve(self, limits: Limits) -> InverseDrive:
-        """The drive, corrected by what forward runs miss of the gap's voltage."""
+        """The drive, corrected by the errors of the gap voltage that forward runs show."""
         peak = float(np.abs(self.target).max())
         inverter = inverter_of(self.circuit, peak, self.law)
         target, best, least, done = self.target, None, math.inf, -1
@@ -314,7 +314,8 @@ class _Task:
                 break
             wish = wish + miss
             if size <= CLOSE or stalled:
-                # Between samples the voltage of the gap is no sine: what that makes of the mean force is known now.
+                # The gap voltage is linear between samples, not a sine, which changes the mean force: now that the
+                # force is known, scale the envelope once.
                 factor, levelled, least = np.where(held, 1.0, self._level(force)), True, math.inf
                 target, wish = target * factor, wish * factor
         assert best is not None
@@ -324,7 +325,7 @@ class _Task:
         """Gap voltage at the samples (V), along the inverter's direction, and force at the fine times (N)."""
         t = np.arange(self.fine * (drive.size - 1) + 1) / (self.fine * self.rate)
         with warnings.catch_warnings():
-            # Those of the deck are said where it is read, and those of the last run are not of a drive on its way.
+            # The reader has given the deck's warnings, and warnings about an uncorrected drive do not concern the user.
             warnings.simplefilter("ignore", FingerspiceWarning)
             run = simulate(
                 self._driven(drive), t_stop=float(t[-1]), t_eval=t, charge_law=self.law, rtol=RTOL, start="uncharged",
@@ -345,7 +346,7 @@ class _Task:
         return np.arange(count + 1) / self.carrier
 
     def _level(self, force: FloatArray) -> FloatArray:
-        """Factors for the gap voltage, at the samples, that lift the mean force of each period to the wanted one."""
+        """Factors for the gap voltage at the samples, by which the mean force of each period becomes the wanted one."""
         edges = self._edges()
         reached, wanted = (_means(x, self.rate, edges) for x in (force[2 * self.lead :], self.wanted))
         some = (reached > 0.5 * wanted) & (wanted > 1e-3 * wanted.max())
@@ -378,13 +379,13 @@ class _Task:
 
 
 def _rise(count: int) -> FloatArray:
-    """From 0 to 1 in `count` steps, 1 left out, with two smooth derivatives."""
+    """A rise from 0 to 1 (left out) in `count` steps, with zero first and second derivative at both ends."""
     x = np.arange(count) / max(count, 1)
     return np.asarray(x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
 
 
 def _means(fine: FloatArray, rate: float, edges: FloatArray) -> FloatArray:
-    """Means between `edges` (s) of values at a rate (Hz) and in the middles between, by Simpson's rule."""
+    """Means between `edges` (s), by Simpson's rule, of values at samples of a rate (Hz) and midway between them."""
     parts = (fine[:-2:2] + 4.0 * fine[1::2] + fine[2::2]) / (6.0 * rate)
     total = np.append(0.0, np.cumsum(parts))
     return np.asarray(np.diff(np.interp(edges, np.arange(total.size) / rate, total)) / np.diff(edges))

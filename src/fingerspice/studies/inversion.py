@@ -1,4 +1,4 @@
-"""The source's voltage for a wanted gap voltage: exact for a stack, by the linear response for another network."""
+"""Source voltage for a wanted gap voltage: exact for a stack, from the linear response for another network."""
 
 from __future__ import annotations
 
@@ -22,28 +22,30 @@ from fingerspice.physics.contact import Contact, fixed_area_curve
 
 BoolArray = NDArray[np.bool_]
 
-# Factor by which a signal is damped over the time of its transform, as exponent, so that its end does not reach its
-# begin: of what is damped the rounding grows by half of it.
+# Over the length of the Fourier transform a signal is damped by exp(-_DAMPING), so that its end does not wrap round to
+# its beginning. The signal fills at most half of that length, so undoing the damping amplifies round-off by the square
+# root of that factor.
 _DAMPING = 14.0
-# A source that moves the gap by less than this share of its largest response at some frequency does not drive it there.
+# Smallest response of the gap voltage to the source, relative to the largest over all frequencies; a smaller response
+# counts as none.
 _DEAF = 1e-9
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What the source may do: at most `voltage` (V), and changes of `slew` (V/s)."""
+    """Limits of the source: its largest absolute `voltage` (V) and its largest `slew` rate (V/s)."""
 
     voltage: float = math.inf
     slew: float = math.inf
 
 
 class Inverter(Protocol):
-    """What makes a source's voltage of the gap's."""
+    """Computes the source voltage for a wanted gap voltage."""
 
     sign: float
 
     def drive(self, u: FloatArray, h: float, limits: Limits) -> tuple[FloatArray, BoolArray]:
-        """Voltages of the source for gap voltages `u` (V, shape (n,)) every `h` (s), and where the limits hold it."""
+        """Source voltages for gap voltages `u` (V, shape (n,)) at intervals `h` (s), and the samples at a limit."""
         ...
 
 
@@ -56,9 +58,9 @@ class Finger:
     gap, source : Element
     contact : Contact
     area : float or None
-        Where the deck fixes it, m^2.
+        Area fixed by the deck, m^2, or None.
     direct : bool
-        Whether nothing stands between the source and the stack.
+        Whether the circuit is a series stack, so that the gap voltage jumps with the source.
     """
 
     gap: Element
@@ -74,7 +76,7 @@ def the_finger(circuit: Circuit) -> Finger:
     Raises
     ------
     InputError
-        For several fingers or none, several sources or none, a current source, or an area that follows with a delay.
+        If there is not exactly one finger and one voltage source, or if the area follows with a delay.
     """
     gaps = circuit.by_device("GAP")
     if len(gaps) != 1:
@@ -97,14 +99,14 @@ def the_finger(circuit: Circuit) -> Finger:
 
 
 def inverter_of(circuit: Circuit, u_max: float, law: str) -> Inverter:
-    """What inverts the circuit up to gap voltages of `u_max` (V) under a charge law."""
+    """The inverter of a circuit for gap voltages up to `u_max` (V) under a charge law."""
     if not is_stack(circuit):
         return NetworkInverter(network_of(circuit))
     return StackInverter(build_stack(circuit), u_max, law == "mobile")
 
 
 class StackInverter:
-    """Inverts a stack step by step; where a limit holds the source it goes on from the state of the layers."""
+    """Inverts a stack step by step; while a limit holds the source, it integrates the layers' state from the source."""
 
     def __init__(self, stack: Stack, u_max: float, mobile: bool) -> None:
         assert stack.contact is not None
@@ -114,11 +116,11 @@ class StackInverter:
         self._cells = np.column_stack([stack.c, stack.g_total, stack.g_area])
         self._gap, self._mobile = stack.gap, mobile
         self._source = stack.sources[0][1]
-        #: Of a voltage along the loop that of the GAP, from p to n.
+        #: Sign of the GAP's voltage, from p to n, relative to the voltage along the source.
         self.sign = float(stack.sign[stack.gap]) * self._source
 
     def drive(self, u: FloatArray, h: float, limits: Limits) -> tuple[FloatArray, BoolArray]:
-        """As `Inverter.drive`; `u` counts along the source."""
+        """As `Inverter.drive`; `u` is positive in the direction of the source."""
         out, held = np.empty(u.size), np.empty(u.size, np.bool_)
         drive_stack(
             u, h, self._curve, self._cells, self._gap, self._mobile, limits.voltage, limits.slew * h, out, held
@@ -129,8 +131,8 @@ class StackInverter:
 class NetworkInverter:
     """Inverts the linear response of a network at its areas at rest.
 
-    The signals are damped, exp(-a t): then the response has no zero on the way (a body that floats passes no direct
-    voltage), and the end of the signal does not reach round to its begin.
+    The signals are damped by exp(-a t), which evaluates the response at s = a + i omega. There it has no zero (a
+    floating body passes no direct voltage, a zero at s = 0), and the end of the signal does not wrap round.
     """
 
     sign = 1.0
@@ -142,12 +144,12 @@ class NetworkInverter:
         self._gap = next(g for g in network.gaps if g is not None)
 
     def response(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Gap voltage over the source's at complex frequencies (1/s), shape (n,).
+        """Ratio of the gap voltage to the source voltage at complex frequencies (1/s), shape (n,).
 
         Raises
         ------
         InputError
-            Where the source does not reach the gap.
+            If the source does not drive the gap at one of the frequencies.
         """
         net = self._network
         y = self._leak + s[:, None] * self._c

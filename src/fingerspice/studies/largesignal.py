@@ -1,4 +1,7 @@
-"""Response to sines of given amplitude, the area coupled at every instant: a phasor's figures without its mean area."""
+"""Response to sines of given amplitude from the transient's periodic state, with the area coupled at every instant.
+
+It gives the figures of a phasor solution without the approximation of a constant area.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ from fingerspice.studies.steady import steady_state
 from fingerspice.studies.sweeps import Drive, sweep_drive, sweep_notes
 from fingerspice.waveforms.waveform import Sine, Waveform, require
 
-# Outputs in a period: cubics through them are good to 1e-9 of a sine.
+# Number of outputs in a period; cubics through them interpolate a sine with an error of 1e-9 of its amplitude.
 POINTS = 400
 
 
@@ -37,21 +40,21 @@ def large_signal(
     finger: str | None = None,
     progress: Progress | None = None,
 ) -> tuple[PhasorSolution, ...]:
-    """Periodic states under sines, by frequency and amplitude; SKIN evaluated at each frequency.
+    """Periodic states under sines, for each frequency and amplitude; SKIN is evaluated at each frequency.
 
     Parameters
     ----------
     circuit : Circuit
-        With a GAP and one source.
+        A circuit with a GAP and one source.
     frequency : array_like
         Hz, positive.
     amplitude : array_like, optional
-        V (A of a current source), positive; by default that of the source's own ``AC``, or without it of its
+        V (A for a current source), positive; by default the amplitude of the source's ``AC``, or without AC that of its
         fundamental.
     charge_law, rtol, progress
         As in `simulate`.
     finger : str, optional
-        Name of the GAP whose figures are wanted, where the circuit has several.
+        Name of the GAP whose figures are wanted; needed if the circuit has several.
 
     Returns
     -------
@@ -61,10 +64,10 @@ def large_signal(
     Raises
     ------
     InputError
-        For a circuit without GAP or with several sources, several GAPs of which none is named, or frequencies or
-        amplitudes that are not positive.
+        If the circuit has no GAP or several sources, if none of several GAPs is named, or if a frequency or amplitude
+        is not positive.
     SolveError
-        Where there is no periodic state.
+        If there is no periodic state.
     """
     require_circuit(circuit)
     scene = linear_scene(circuit, finger)
@@ -106,7 +109,8 @@ def _sweep(
             circuit.varied(changes), charge_law=charge_law, rtol=rtol, points=POINTS, charge=False
         )  # fmt: skip
         s = state.solution
-        # The start of the period is a multiple of it: phases are those of the source.
+        # The output starts at a multiple of the period, so that phases from its start are phases relative to the
+        # source.
         period = s.t - s.t[0]
         area, force = (s.by_name(key)[key if len(s.gaps) == 1 else f"{key}:{name}"] for key in ("area", "f_el"))
         gains.append([weigh_outputs(period, u).phasor(float(f)) * sign / amplitude for u in s.u_layer.T])

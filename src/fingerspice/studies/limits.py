@@ -1,4 +1,4 @@
-"""Where the `mobile` charge law folds: the source voltage it takes, against load, gap and frequency."""
+"""Source voltage at which the `mobile` charge law folds, against load, gap and frequency."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from fingerspice.plots.picture import Picture
 
 
-# Voltages looked at, V, how exactly the fold's is found, relative, and the error of each run.
+# Range of voltages that is searched, V; relative accuracy of the voltage at the fold; relative error of each run.
 LOWEST, HIGHEST = 1e-3, 1e5
 EXACT = 1e-3
 RTOL = 1e-5
@@ -43,7 +43,7 @@ class FoldSweep:
     own : float
         The deck's value.
     values, voltages : ndarray, shape (n,)
-        The parameter, and the source's peak voltage at the fold (V); NaN where there is none up to `HIGHEST`.
+        The parameter, and the source's peak voltage at the fold (V); NaN if there is no fold up to `HIGHEST`.
     """
 
     name: str
@@ -55,7 +55,7 @@ class FoldSweep:
 
 @dataclass(frozen=True, repr=False)
 class FoldLimits(Shown):
-    """Where a circuit folds under the `mobile` law.
+    """Source voltages at which a circuit folds under the `mobile` law.
 
     Attributes
     ----------
@@ -63,9 +63,9 @@ class FoldLimits(Shown):
     peak : float
         The deck's own source voltage, V.
     voltage : float
-        Peak source voltage at the fold with the deck's values, V; NaN where there is none up to `HIGHEST`.
+        Peak source voltage at the fold with the deck's values, V; NaN if there is no fold up to `HIGHEST`.
     sweeps : tuple of FoldSweep
-        Load, gap, and where the source has one, frequency.
+        Sweeps of load, gap, and frequency if the source has one.
     """
 
     circuit: Circuit
@@ -79,7 +79,7 @@ class FoldLimits(Shown):
         return limits_text(self)
 
     def plot(self) -> Picture:
-        """The fold's voltage against every parameter, the deck's own point marked."""
+        """Picture of the fold's voltage against every parameter, with a mark at the deck's own point."""
         return plot_limits(self)
 
     def to_dict(self) -> dict[str, Any]:
@@ -97,29 +97,29 @@ class FoldLimits(Shown):
 def fold_limits(
     circuit: Circuit, *, points: int = 9, span: float = 10.0, progress: Progress | None = None
 ) -> FoldLimits:
-    """Find the source voltage at which runs under the `mobile` law meet their fold, to 1e-3.
+    """Find the source voltage at which runs under the `mobile` law reach their fold, to a relative 1e-3.
 
-    Every run starts as the deck's does (uncharged, from the operating point of the source so raised, or from .ic as it
-    is) and lasts as many periods. Each parameter goes from its own value over `span` to `span` times it, the others as
-    in the deck; SKIN is evaluated at each frequency.
+    Every run starts as the deck's run does (uncharged, from the operating point of the raised source, or from the
+    deck's .ic) and has as many periods. Each parameter goes from its own value divided by `span` to its own value times
+    `span`, with the others as in the deck; SKIN is evaluated at each frequency.
 
     Parameters
     ----------
     circuit : Circuit
-        With one GAP, a source and a .tran line.
+        A circuit with one GAP, a source and a .tran line.
     points : int
-        Values of each parameter, 3 or more.
+        Number of values of each parameter, 3 or more.
     span : float
-        Above 1.
+        Factor between a parameter's own value and the ends of its range, above 1.
     progress : callable, optional
         Called with the fraction done.
 
     Raises
     ------
     InputError
-        For a circuit without these, and where .ic stands past the fold itself.
+        If the circuit lacks one of these, or its .ic is already past the fold.
     SolveError
-        Where a run fails for another reason than a fold.
+        If a run fails for another reason than a fold.
     """
     require_circuit(circuit)
     require(3 <= points <= 1000, "points", points, "3 to 1000")
@@ -161,14 +161,14 @@ def fold_limits(
 
 
 def _with_own(sweep: FoldSweep, voltage: float) -> FoldSweep:
-    """The sweep with the fold voltage already found at the deck's own value: another bisection ends elsewhere in it."""
+    """The sweep with the fold voltage known at the deck's own value, as its own bisection may end 1e-3 beside it."""
     own = np.abs(sweep.values - sweep.own) <= 1e-12 * sweep.own
     return dataclasses.replace(sweep, voltages=np.where(own, voltage, sweep.voltages))
 
 
 @dataclass
 class _Count:
-    """Voltages found, of how many."""
+    """Count of the fold voltages found so far, and of all, for reports of progress."""
 
     all: int
     told: Progress | None
@@ -182,7 +182,7 @@ class _Count:
 
 
 def _along(circuits: list[Circuit], peak: float, ends: list[float], done: _Count) -> FloatArray:
-    """Fold voltages of circuits, each looked for near that of the one before."""
+    """Fold voltages of circuits; each search starts at the voltage of the circuit before."""
     out = []
     guess = peak
     for circuit, t_stop in zip(circuits, ends, strict=True):
@@ -193,9 +193,10 @@ def _along(circuits: list[Circuit], peak: float, ends: list[float], done: _Count
 
 
 def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | None = None) -> float:
-    """Peak source voltage (V) at which a run up to `t_stop` (s) meets the fold, to 1e-3; NaN for none up to `HIGHEST`.
+    """Peak source voltage (V) at which a run up to `t_stop` (s) reaches the fold; NaN for no fold up to `HIGHEST`.
 
-    It starts as the deck's run does. `peak` is what the circuit's sources reach now, V; `guess` where to look first.
+    It is found by bisection to a relative 1e-3. The run starts as the deck's run does. `peak` is the present peak
+    voltage of the circuit's sources (V), and `guess` the voltage where the search starts (V).
     """
 
     def folds(voltage: float) -> bool:
@@ -210,10 +211,11 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
             )  # fmt: skip
             if problem.scene.stack is not None:
                 return meets_fold(problem, RTOL)
-            # Not by `simulate`: warnings of voltages that nobody asked for are none.
+            # Not by `simulate`, which would warn about voltages that the user did not ask for.
             run = run_problem(problem, np.array([0.0, problem.t_stop]), RTOL)
         except InputError as error:
-            # An operating point goes with the source, and may itself stand past the fold; a given start does not.
+            # An operating point depends on the raised source, and may itself be past the fold, which counts as a fold.
+            # A start given by .ic does not depend on the source: report the error.
             if circuit.initial or "past the fold" not in str(error):
                 raise
             return True
@@ -243,7 +245,7 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
 
 
 def plot_limits(limits: FoldLimits) -> Picture:
-    """The fold's voltage against every parameter, the deck's own point marked."""
+    """Picture of the fold's voltage against every parameter, with a mark at the deck's own point."""
     from fingerspice.plots.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
 
     figure, axes = new_figure(1, len(limits.sweeps), height=3.2, sharey=True)

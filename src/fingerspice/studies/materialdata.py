@@ -1,4 +1,4 @@
-"""Tables of measured resistivity and permittivity: units in their headers, and likely slips in their numbers."""
+"""Tables of measured resistivity and permittivity: reading units from headers, and finding likely slips in numbers."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "G": 1e9, "m": 1e-3, "u": 1e-6, "µ": 
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _PREFIX = f"(?P<prefix>[{''.join(_PREFIXES)}]?)"
 _METRE = "(?P<metre>cm|mm|m)"
-# Names of a column's quantity, and patterns of its unit: the value in SI units is value * prefix * metre^power *
-# factor.
+# Patterns of a column's name, by quantity, and below them the patterns of its unit with a factor and a power: the SI
+# value is value * prefix * metre^power * factor.
 _NAMES = {
     "frequency": "f|freq|frequency|frequenz|hz",
     "angular frequency": "w|omega|ω|angular frequency|angular_frequency",
@@ -43,12 +43,12 @@ def read_table(path: Path) -> FloatArray:
     """Rows of frequency (Hz), resistivity (ohm m) and relative permittivity from a text file of three columns.
 
     Columns are separated by commas, tabs or semicolons; with semicolons decimal commas are allowed. A line of names
-    gives quantities, order and units of the columns, among them conductivities and angular frequencies.
+    may give quantities, order and units of the columns; conductivities and angular frequencies are converted.
 
     Raises
     ------
     InputError
-        For a file that cannot be read, with the row at fault.
+        If the file cannot be read; the message names the row at fault.
     """
     try:
         lines = read_text(path, str(path)).splitlines(keepends=True)
@@ -72,7 +72,7 @@ def read_table(path: Path) -> FloatArray:
 
 
 def _as_named(table: FloatArray, head: list[str], file: str) -> FloatArray:
-    """Columns put into order and SI units by their names; columns whose name is not understood fill what is left."""
+    """Columns put into order and SI units by their names; columns with unknown names fill the remaining places."""
     named = [_column(name, file) for name in head]
     out = table.copy()
     left = [k for k in range(3) if named[k] is None]
@@ -100,7 +100,7 @@ def _as_named(table: FloatArray, head: list[str], file: str) -> FloatArray:
 
 
 def _column(name: str, file: str) -> tuple[str, float] | None:
-    """Quantity of a column by its name, and the factor to SI units; None for a name that is not understood."""
+    """Quantity of a column by its name, and the factor to SI units; None for an unknown name."""
     bare = name.strip().strip("\"'")
     match = re.fullmatch(r"(?P<what>[^\[(/]*?)\s*(?:[\[(](?P<bracket>[^\])]*)[\])]|/\s*(?P<slash>.+))?", bare)
     if match is None:
@@ -108,7 +108,7 @@ def _column(name: str, file: str) -> tuple[str, float] | None:
     what, unit = match["what"].strip(), (match["bracket"] or match["slash"] or "").strip()
     quantity = next((q for q, names in _NAMES.items() if re.fullmatch(names, what, re.IGNORECASE)), None)
     if quantity is None and "_" in what and not unit:
-        # f_kHz
+        # A name such as f_kHz ends with its unit.
         what, _, unit = what.rpartition("_")
         quantity = next((q for q, names in _NAMES.items() if re.fullmatch(names, what, re.IGNORECASE)), None)
     if quantity is None:
@@ -128,7 +128,7 @@ def _column(name: str, file: str) -> tuple[str, float] | None:
     )
 
 
-#: Possible slips, each with the function that gives the table that was meant.
+#: Possible slips of the user, each with the function from the table as given to the table as meant.
 _SLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
     ("the frequency is in rad/s", lambda t: _scaled(t, 0, 0.5 / np.pi)),
     ("the second column is a conductivity in S/m", lambda t: _inverse(t, 1.0)),
@@ -161,7 +161,7 @@ def _inverse(table: FloatArray, unit: float) -> FloatArray:
 
 
 def likely_slips(table: FloatArray, misfit: Callable[[FloatArray], float], least: float) -> list[str]:
-    """Slips that would explain data of no material: those that reduce the misfit to less than a third, best first.
+    """Slips that may explain data that fit no material: at most two that reduce the misfit to less than a third.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def likely_slips(table: FloatArray, misfit: Callable[[FloatArray], float], least
     misfit : callable
         Misfit of a table to the nearest causal and passive material.
     least : float
-        Misfit of the data as they are.
+        Misfit of the data as given.
     """
     found = []
     for text, meant in _SLIPS:
@@ -179,5 +179,5 @@ def likely_slips(table: FloatArray, misfit: Callable[[FloatArray], float], least
         if np.all(np.diff(other[:, 0]) > 0.0):
             found.append((misfit(other), text))
     best = min((value for value, _ in found), default=np.inf)
-    # Two slips with the same factor, such as kHz and kohm m, cannot be distinguished.
+    # Name two slips at most, as those with the same factor, such as kHz and kohm m, cannot be distinguished.
     return [text for value, text in found if value <= min(1.1 * best, least / 3.0)][:2]

@@ -1,4 +1,4 @@
-"""What is known of feeling: the skin's mechanics, and thresholds of perception, each with its source and caveat."""
+"""Data about perception: the skin's mechanics and thresholds of perception, each with its source and caveat."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ DIFFERENCE_DB = 1.21
 """Smallest difference of two electrovibrations that is noticed, dB of the stimulus.
 
 Source: S. Ryu et al., "Mechanical vibration influences the perception of electrovibration", Scientific Reports 8, 4555
-(2018), doi:10.1038/s41598-018-22865-x: an average, where Weber's law holds. Caveat: only the abstract was at hand. It
-does not say whether the decibels are of voltage or of force; force follows the voltage's square, so that the step would
-be twice as many decibels of force if they are of voltage.
+(2018), doi:10.1038/s41598-018-22865-x: an average, in the range of Weber's law. Caveat: only the abstract was at hand.
+It does not say whether the decibels are of voltage or of force; the force is proportional to the square of the voltage,
+so that a step in decibels of voltage is twice as many decibels of force.
 """
 WEBER_FRICTION = 0.11
 """Smallest reduction of the friction force that is noticed, relative to the force before it.
 
 Source: D. Gueorguiev et al., "The tactile perception of transient changes in friction", Journal of the Royal Society
-Interface 14, 20170641 (2017), doi:10.1098/rsif.2017.0641: in all conditions. Caveat: transient reductions by ultrasonic
-lubrication of a finger that a robot rubs, so other than an electroadhesive increase.
+Interface 14, 20170641 (2017), doi:10.1098/rsif.2017.0641: in all conditions. Caveat: the experiment reduced friction
+for a short time by ultrasonic lubrication of a passive finger, while electroadhesion increases friction.
 """
 
 
 @dataclass(frozen=True)
 class SkinMechanics:
-    """How far the skin moves sideways under a tangential force: one mass on a spring and a damper.
+    """Lateral motion of the skin under a tangential force: one mass on a spring and a damper.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class SkinMechanics:
     mass, damping, stiffness : float
         kg, N s/m and N/m.
     source : str
-        Where the values are from, and what they do not claim.
+        Origin of the values, and their limits.
     """
 
     name: str
@@ -90,7 +90,7 @@ not be checked.
 
 @dataclass(frozen=True)
 class Threshold(Sealed):
-    """Smallest amplitude of a vibration that is felt, against frequency; nothing is said beyond its frequencies.
+    """Smallest amplitude of a vibration that is felt, against frequency; undefined outside the table's frequencies.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ class Threshold(Sealed):
     reference : float
         m/s^2; 1 by default.
     source : str
-        Where the values are from, and what they do not claim.
+        Origin of the values, and their limits.
     """
 
     name: str
@@ -136,9 +136,9 @@ def android_threshold() -> Threshold:
     """Least perceptible acceleration as published by Android: 41 points, 0.4 to 400 Hz.
 
     Source: the Android Open Source Project, Apache License 2.0; the head of `least_perceptible_acceleration.csv` names
-    its files. Caveat: it is of a device held in the hand, not of a bare finger that slides. Whether the acceleration is
-    a peak or an rms, and from which experiment it is, Android does not say. It is taken as a peak here; as an rms it
-    would be 3 dB higher, and every level 3 dB lower.
+    its files. Caveats: the threshold is that of a device held in the hand, not of a bare finger that slides, and
+    Android gives neither the experiment nor whether the acceleration is a peak or an rms value. Here it is taken as a
+    peak; if it is an rms value, the threshold is 3 dB higher, and every level above it 3 dB lower.
     """
     path = Path(__file__).with_name("least_perceptible_acceleration.csv")
     rows = [row for row in csv.reader(path.read_text(encoding="utf-8").splitlines()) if not row[0].startswith("#")]

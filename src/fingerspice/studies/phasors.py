@@ -35,7 +35,7 @@ def _frequencies(frequency: ArrayLike | None, fundamental: Fundamental | None) -
 
 
 def _check_area(area: str | float, amplitude: float, fixed: bool) -> None:
-    """Refuse anything but a mode or an area, and the mean area of a source without amplitude."""
+    """Refuse an area that is neither a known mode nor a positive number, and ``"mean"`` without an amplitude."""
     if not isinstance(area, str):
         require(math.isfinite(area) and area > 0.0, "area", f"{area:g} m^2", "a positive area in m^2")
         return
@@ -48,7 +48,7 @@ def _check_area(area: str | float, amplitude: float, fixed: bool) -> None:
 
 
 def _refuse_no_number(f: FloatArray, *results: NDArray[np.inexact]) -> None:
-    """Refuse a sweep in which numbers overflow."""
+    """Refuse a sweep with results that are not finite."""
     bad = ~np.logical_and.reduce([np.isfinite(x).reshape(f.size, -1).all(axis=1) for x in results])
     if np.any(bad):
         raise InputError(
@@ -73,17 +73,17 @@ def phasor(
     ----------
     circuit : Circuit
     frequency : array_like, optional
-        Hz, positive; the source's fundamental by default. At given frequencies a deck's ``AC magnitude [phase]`` drives
-        the circuit, as in ngspice. Without AC, and by default, the source's fundamental drives it.
+        Hz, positive; the source's fundamental by default. If frequencies are given, the drive is the deck's
+        ``AC magnitude [phase]``, as in ngspice; without AC, or without frequencies, it is the source's fundamental.
     sources, parameters
         As in `simulate`.
     area : str or float
         ``"mean"``: the area under the mean stress at the amplitude of the source's fundamental; ``"frozen"``: the area
         at 0 V; or an area in m^2. An area that the deck fixes takes precedence over ``"mean"`` and ``"frozen"``.
     skin : str
-        ``"swept"``: SKIN's data at each frequency; ``"own"``: at SKIN's own f, as in ngspice.
+        ``"swept"``: SKIN's data at each frequency; ``"own"``: its data at its own f, as in ngspice.
     finger : str, optional
-        Name of the GAP whose figures are wanted, where the circuit has several.
+        Name of the GAP whose figures are wanted; needed if the circuit has several.
 
     Returns
     -------
@@ -92,8 +92,8 @@ def phasor(
     Raises
     ------
     InputError
-        For a circuit without GAP, several GAPs of which none is named, a network with several sources, a source without
-        fundamental where one is needed, frequencies or an area not positive, or a result beyond the range of numbers.
+        If the circuit has no GAP, none of several GAPs is named, a network has several sources, a fundamental is needed
+        and missing, a frequency or the area is not positive, or a result is not finite.
     """
     require(skin in ("swept", "own"), "skin", repr(skin), "'swept' or 'own'")
     require_area(area)
@@ -107,7 +107,7 @@ def phasor(
         layers = np.array([scene.layer_gain(float(x), a) for x, a in zip(f, areas, strict=True)])
         gain, own = layers[:, scene.gap], areas[:, scene.finger].copy()
         u_gap = gain * drive.amplitude * np.exp(1j * drive.phase)
-        # The mean of stress times area over a period of a sine is half its peak.
+        # At a constant area the mean force over a period of a sine is half its peak.
         force = 0.5 * scene.contact.stress(np.abs(u_gap)) * own
     _refuse_no_number(f, layers, own, *((u_gap, force) if math.isfinite(drive.amplitude) else ()))
     notes, warned = sweep_notes(circuit, f, skin)

@@ -74,7 +74,7 @@ def comparison_table(comparison: Comparison) -> Page:
     for i, gap in enumerate(comparison.gaps):
         figures = comparison.phasor, comparison.mean, comparison.coupled
         reference, mean, coupled = (f.of_gap(i)["f_el_mean"] for f in figures)
-        # Rounded here, and 0.0 added, so that -0.00 is not printed.
+        # Round before formatting, and add 0.0, so that -0.00 is not printed.
         total = round(100.0 * (coupled / reference - 1.0), 2) + 0.0
         waveform = round(100.0 * (mean / reference - 1.0), 2) + 0.0
         said.append(
@@ -115,7 +115,7 @@ def limits_text(limits: FoldLimits) -> Page:
 
 
 def limits_csv(limits: FoldLimits, path: Path) -> Path:
-    """Write a map of the fold as CSV; the voltage is left empty where there is no fold."""
+    """Write a map of the fold as CSV; a row without a fold has an empty voltage."""
 
     def write(target: Path) -> None:
         with target.open("w", newline="") as stream:

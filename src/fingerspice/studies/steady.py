@@ -1,4 +1,4 @@
-"""Periodic state of a circuit under a periodic source, found directly, with its certificate and its stability."""
+"""Periodic state of a circuit under a periodic source, found by Newton's method, with its defect and stability."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class SteadyState(Shown, Figured):
-    """The periodic state, and what vouches for it; its figures (`f_el_mean` and others) are those of the period.
+    """The periodic state with its defect, stability and error; its figures (`f_el_mean`, ...) are those of the period.
 
     Attributes
     ----------
     problem : Problem
-        One period from the periodic state on, at the first whole period after the source has settled.
+        The run of one period from the periodic state, at the first whole period after the source has settled.
     rtol : float
     defect : float
         Largest change of a capacitor's or layer's voltage over a further period, V.
     map_slope : ndarray, shape (n, n)
-        Derivative of the circuit's modes after a period by those before it, to about 1e-5: of the n independent
-        voltages (of a stack's n + 1 cells), and of the areas with a time constant.
+        Derivative of the map of a period, to about 1e-5, in the circuit's modes: the independent voltages (one less
+        than the cells of a stack), and the areas with a time constant.
     memory : float
-        Error of the periodic state over that of one period; large where a disturbance outlasts many periods.
+        Ratio of the error of the periodic state to the error of one period; large if a disturbance lasts many periods.
     error : ErrorEstimate
-        What the state may be off, as its effect on the gap voltage and the force of the period.
+        Estimated error of the state, as its effect on the gap voltage and the force of the period.
     periods : float
-        Periods integrated to find it.
+        Number of periods integrated to find the state.
     """
 
     problem: Problem
@@ -71,18 +71,18 @@ class SteadyState(Shown, Figured):
 
     @property
     def period(self) -> float:
-        """Of the source, s."""
+        """Period of the source, s."""
         assert self.problem.waveform.period is not None
         return self.problem.waveform.period
 
     @property
     def multipliers(self) -> FloatArray:
-        """Sizes of the Floquet multipliers: what a period leaves of a small disturbance, shape (n,)."""
+        """Absolute values of the Floquet multipliers, the factors of small disturbances over a period, shape (n,)."""
         return np.abs(np.linalg.eigvals(self.map_slope)) if self.map_slope.size else np.zeros(0)
 
     @property
     def stability_margin(self) -> float:
-        """One less the largest multiplier: 0 where a disturbance stays for ever."""
+        """1 minus the largest multiplier: 0 if a disturbance never decays."""
         return 1.0 - float(self.multipliers.max(initial=0.0))
 
     @property
@@ -91,19 +91,19 @@ class SteadyState(Shown, Figured):
 
     @cached_property
     def solution(self) -> Solution:
-        """The period's signals, integrated when first asked for; its warnings are said then.
+        """The period's signals, integrated at the first access, which also gives the warnings.
 
         Raises
         ------
         SolveError
-            Where that fails.
+            If the integration fails.
         """
         solution = run_problem(self.problem, rtol=self.rtol, start="periodic")
         if solution.failure is not None:
             raise SolveError(solution.failure, solution)
         for text in solution.warnings:
             if text not in self.problem.circuit.warnings:
-                # Past functools, to the line that asked.
+                # The third level is the caller's line, beyond the frame of `cached_property`.
                 warnings.warn(text, FingerspiceWarning, stacklevel=3)
         return solution
 
@@ -121,15 +121,14 @@ def steady_state(
 ) -> SteadyState:
     """Periodic state of a circuit, by Newton's method on the map of one period.
 
-    A charge that nothing drains has no periodic state of its own: it keeps what it has in a circuit that starts
-    uncharged.
+    A charge that no conductance drains is not determined by periodicity: it keeps the value of the uncharged start.
 
     Parameters
     ----------
     circuit : Circuit
-        With a periodic source, or several with a common period.
+        A circuit with a periodic source, or with several sources that have a common period.
     sources, parameters, charge_law, area, rtol, charge
-        As in `simulate`: the error is relative to the peaks over the period.
+        As in `simulate`; the error is relative to the peaks over the period.
     points : int
         Output steps in the period.
 
@@ -140,9 +139,9 @@ def steady_state(
     Raises
     ------
     InputError
-        For a source without a period.
+        If the source has no period.
     SolveError
-        Where a period cannot be integrated, or the iteration does not close it.
+        If a period cannot be integrated, or Newton's method does not converge.
     """
     require(RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-13 to 0.1")
     require(points >= 1, "points", points, "1 or more")

@@ -23,11 +23,11 @@ class Drive:
     Attributes
     ----------
     amplitude : float
-        V (A of a current source); NaN where there is neither AC nor a fundamental.
+        V (A for a current source); NaN if there is neither AC nor a fundamental.
     phase : float
         rad.
     text : str
-        Where amplitude and phase come from, in words.
+        Origin of amplitude and phase, in words.
     """
 
     amplitude: float
@@ -36,10 +36,10 @@ class Drive:
 
 
 def sweep_drive(sources: tuple[tuple[Element, float], ...], fundamental: Fundamental | None, swept: bool) -> Drive:
-    """The drive of a circuit: in a sweep the ``AC`` of its sources, where the deck has it; else the fundamental."""
+    """The drive of a circuit: in a sweep the ``AC`` of its sources, if the deck has it, and else the fundamental."""
     given = [(e, sign) for e, sign in sources if e.ac is not None]
     if swept and given:
-        # As in ngspice, a source without AC is silent.
+        # As in ngspice, a source without AC has an AC amplitude of 0.
         total = sum(sign * e.ac.phasor for e, sign in given if e.ac is not None)
         words = [f"AC {e.ac.magnitude:g} {e.ac.phase_deg:g} of {e.name}" for e, _ in given if e.ac is not None]
         return Drive(abs(total), math.atan2(total.imag, total.real), " and ".join(words))
@@ -50,7 +50,7 @@ def sweep_drive(sources: tuple[tuple[Element, float], ...], fundamental: Fundame
 
 
 def sweep_notes(circuit: Circuit, f: FloatArray, skin: str = "swept") -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Remarks and warnings of a sweep over frequencies (Hz): where a skin's data are taken, and extrapolation."""
+    """Remarks on the frequency of the skin's data, and warnings about extrapolation, for a sweep (Hz)."""
     skins = {e.name: e.values["f"] for e in circuit.by_device("SKIN")}
     own = ", ".join(f"{name} f = {x:g} Hz" for name, x in skins.items())
     notes: tuple[str, ...] = ()
@@ -61,7 +61,7 @@ def sweep_notes(circuit: Circuit, f: FloatArray, skin: str = "swept") -> tuple[t
     swept = bool(circuit.by_device("SKIN_DISPERSIVE")) or (bool(skins) and skin != "own")
     low, high = float(f.min()), float(f.max())
     beyond = []
-    # Rounding of the end of a decade is allowed for.
+    # The tolerance of 1e-6 allows for rounding of a sweep's end.
     if low < SKIN_BAND[0] * (1.0 - 1e-6):
         beyond.append(f"down to {low:g} Hz, {math.log10(SKIN_BAND[0] / low):.2g} decades below")
     if high > SKIN_BAND[1] * (1.0 + 1e-6):
@@ -80,7 +80,7 @@ def sweep_frequencies(sweep: AcSweep) -> FloatArray:
     Raises
     ------
     InputError
-        For more than `MAX_FREQUENCIES` of them.
+        If there are more than `MAX_FREQUENCIES`.
     """
     base, ratio = (10.0 if sweep.scale == "dec" else 2.0), sweep.stop / sweep.start
     count = sweep.points - 1.0 if sweep.scale == "lin" else math.log(ratio) / math.log(base) * sweep.points

@@ -1,4 +1,4 @@
-"""The paper's scene as netlist text, for code that cannot rely on the folder of decks."""
+"""The paper's scene as netlist text, for code that runs where the folder of decks may be missing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Xskin   skin  0    area  SKIN  d=350u f=100
 
 
 def table1_circuit(*, dispersive: bool = False) -> Circuit:
-    """The circuit of `TABLE1_DECK`; where `dispersive` is set, with the skin's data at every frequency."""
+    """The circuit of `TABLE1_DECK`; with `dispersive` its skin has its own data at every frequency."""
     text = TABLE1_DECK
     if dispersive:
         text = text.replace("SKIN  d=350u f=100", "SKIN_DISPERSIVE d=350u")

@@ -1,4 +1,4 @@
-"""A wanted force or friction: from arrays, waveforms, functions and tables, and what gap voltage makes it."""
+"""A wanted force or friction, from arrays, waveforms, functions and tables, and the gap voltage that produces it."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import Waveform, as_waveform, require
 
-#: What may be given as a wanted force.
+#: Types that may be given as a wanted force.
 Wanted = ArrayLike | Waveform | Callable[[float], float]
-# Envelopes between which the force is interpolated.
+# Number of amplitudes of the carrier between which the mean force is interpolated.
 _GRID = 80
 
 
 @dataclass(frozen=True)
 class Profile:
-    """A wanted quantity (N) in time, from 0 to `duration` (s); `rate` (Hz) is that of its samples, where it has one."""
+    """A wanted quantity (N) against time, from 0 to `duration` (s); `rate` (Hz) is its sample rate, or None."""
 
     wave: Waveform
     duration: float
@@ -35,12 +35,12 @@ class Profile:
 
 
 def as_profile(given: Wanted, what: str, rate: float | None, duration: float | None) -> Profile:
-    """The profile that a caller gave; an array is at `rate`, and a waveform without an end needs a `duration`.
+    """The profile that a caller gave; an array needs its `rate`, and a waveform without an end a `duration`.
 
     Raises
     ------
     InputError
-        For anything without numbers, times or an end.
+        If it is not made of finite numbers, or its rate or duration is missing.
     """
     if isinstance(given, Waveform) or callable(given):
         wave = as_waveform(given)
@@ -68,16 +68,16 @@ def as_profile(given: Wanted, what: str, rate: float | None, duration: float | N
 
 
 def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Profile]:
-    """What a table wants, ``"force"`` or ``"friction"``, and its profile.
+    """The wanted quantity of a table, ``"force"`` or ``"friction"``, and its profile.
 
-    The header names a column ``force`` or ``friction`` (N or mN), and one of times, ``t`` or ``time``, where no `rate`
-    (Hz) is given: ``time (ms), friction (N)``.
+    The header names a column ``force`` or ``friction`` (N or mN), and a column of times, ``t`` or ``time``, unless a
+    `rate` (Hz) is given: ``time (ms), friction (N)``.
 
     Raises
     ------
     InputError
-        With the line: for NaN, semicolons, decimal commas, decreasing times; without a header, or both columns, or
-        times that contradict the rate.
+        If the table has NaN, semicolons, decimal commas, or decreasing times (with the line); if it has no header, or
+        columns of both quantities; if its times contradict the rate.
     """
     path = checked_file(path, MAX_TEXT_BYTES)
     found = read_text_columns(path)
@@ -100,7 +100,7 @@ def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Profi
 
 
 def _timed(found: Columns, t: FloatArray, values: FloatArray, rate: float | None) -> Profile:
-    """The profile of values at times, which are counted from the first."""
+    """The profile of values at times; time 0 of the profile is the first of them."""
     back = np.flatnonzero(np.diff(t) <= 0.0)
     if back.size:
         i = int(back[0])
@@ -125,7 +125,7 @@ def force_of_friction(friction: FloatArray, contact: Contact) -> FloatArray:
     Raises
     ------
     InputError
-        Where there is no friction at all.
+        If mu is 0, so that there is no friction at all.
     """
     if contact.mu == 0.0:
         raise InputError("the GAP has mu=0, so that no voltage makes friction; allowed: mu > 0, or a wanted force")
@@ -133,17 +133,17 @@ def force_of_friction(friction: FloatArray, contact: Contact) -> FloatArray:
 
 
 class ForceCurve:
-    """Mean force over a carrier's period against its amplitude, or the force itself without a carrier.
+    """Mean force over a period of the carrier against the carrier's amplitude; without a carrier, the force itself.
 
     Parameters
     ----------
     contact : Contact
     area : float or None
-        Where the deck fixes it, m^2.
+        Area fixed by the deck, m^2, or None.
     points : float or None
-        Samples in a period of the carrier, between which the voltage is a straight line; None for no carrier.
+        Number of samples in a period of the carrier, between which the voltage is linear; None for no carrier.
     most : float
-        Largest force looked for, N.
+        Largest force that is needed, N.
     """
 
     def __init__(self, contact: Contact, area: float | None, points: float | None, most: float) -> None:
@@ -156,7 +156,8 @@ class ForceCurve:
             count = round(points) if abs(points - round(points)) < 1e-9 else round(8 * points)
             at = np.sin(2.0 * np.pi * np.arange(count + 1) / points)
             self._shape = np.abs(np.concatenate([at[:-1], 0.5 * (at[1:] + at[:-1])]))
-            # Simpson: in each sample the voltage is a line and the force a parabola; all but the area's own change.
+            # Simpson's rule between samples: the voltage is linear there, so the force is a parabola but for the change
+            # of the area.
             self._weight = np.repeat([1.0 / 3.0, 2.0 / 3.0], count) / count
         top = 1.0
         while self.mean(np.array([top]))[0] < 1.01 * most:
@@ -179,7 +180,7 @@ class ForceCurve:
         self._spline = CubicSpline(np.append(0.0, root), np.append(at_zero, ratio))
 
     def _scale(self, u: float) -> float:
-        """Force over the square of the voltage, N/V^2."""
+        """Force divided by the square of the voltage, N/V^2."""
         return float(self.force(np.array([max(u, 1e-3)]))[0]) / max(u, 1e-3) ** 2
 
     def force(self, u: FloatArray) -> FloatArray:
@@ -198,12 +199,12 @@ class ForceCurve:
 
 
 def check_forces(force: FloatArray, times: FloatArray, what: str, contact: Contact) -> FloatArray:
-    """Forces (N) that voltages can have.
+    """The forces (N), checked to be attractive, with negative round-off set to 0.
 
     Raises
     ------
     InputError
-        For the first that is negative: voltages only attract.
+        If a force is negative, as voltages only attract; the message gives the first such time.
     """
     floor = -1e-12 * max(1.0, float(np.abs(force).max()))
     bad = np.flatnonzero(~(force >= floor))

@@ -16,12 +16,13 @@ from fingerspice.base.errors import InputError
 if TYPE_CHECKING:
     from fingerspice.waveforms.waveform import Waveform
 
-#: Largest and smallest size allowed of a number other than 0, by unit (V stands for A, too); and for other units.
+#: Largest and smallest absolute value allowed of a nonzero number, by unit (the entry V also serves A).
 RANGES = {"V": (1e12, 0.0), "deg": (1e9, 0.0)}
+#: The same limits for all other units.
 ANY_RANGE = (1e30, 1e-30)
-#: Breakpoints that are listed at once; each takes about 40 bytes, with what is computed from it.
+#: Largest number of breakpoints listed at once; each takes about 40 bytes, the arrays computed from it included.
 MOST_LISTED = 20_000_000
-#: Breakpoints of one window, within which values are looked up together.
+#: Number of breakpoints in a window of time; the values at all times in one window are looked up together.
 _WINDOW = 1_000_000
 
 
@@ -40,7 +41,7 @@ def check_finite(waveform: Waveform) -> None:
 
 
 def check_range(what: str, values: ArrayLike, unit: str) -> None:
-    """Refuse finite numbers so large or small that products and quotients of them would overflow or underflow."""
+    """Refuse finite numbers so large or so small that their products and quotients would overflow or underflow."""
     largest, smallest = RANGES.get(unit, ANY_RANGE)
     size = np.abs(np.asarray(values, float))
     bad = np.flatnonzero(np.isfinite(size) & (((size < smallest) & (size > 0.0)) | (size > largest)))
@@ -51,12 +52,12 @@ def check_range(what: str, values: ArrayLike, unit: str) -> None:
 
 
 def runs_through(first: float, last: float, count: int, t0: float, t1: float) -> FloatArray:
-    """Numbers of the periods from `first` to `last`, which cover t0 to t1 (s) and have `count` breakpoints each.
+    """Indices of the periods `first` to `last`, which cover t0 to t1 (s); each period has `count` breakpoints.
 
     Raises
     ------
     InputError
-        Where that makes more breakpoints than may be listed at once.
+        If these periods together have more than `MOST_LISTED` breakpoints.
     """
     total = (last - first + 1.0) * count
     if not total <= MOST_LISTED:
@@ -68,9 +69,10 @@ def runs_through(first: float, last: float, count: int, t0: float, t1: float) ->
 
 
 def in_windows(t: FloatArray, rate: float) -> Iterator[slice | NDArray[np.intp]]:
-    """Indices of times (s) in groups, each within a window of `_WINDOW` breakpoints at `rate` breakpoints per second.
+    """Indices of the times (s), grouped by windows that hold `_WINDOW` breakpoints at `rate` breakpoints per second.
 
-    So the value at ten times in a year of square waves needs ten windows, and not every breakpoint of the year.
+    The windows save memory: for the values at ten times in a year of square waves the breakpoints of at most ten
+    windows are listed, instead of all breakpoints of the year.
     """
     if t.size == 0:
         return

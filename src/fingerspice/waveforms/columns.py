@@ -1,4 +1,4 @@
-"""A text with columns of numbers, such as CSV: what its separators, header and units are, and what is wrong in it."""
+"""Reader of text tables such as CSV: finds separators, header and units, and refuses bad cells with their line."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _VOLTS = {"v": 1.0, "mv": 1e-3, "uv": 1e-6, "µv": 1e-6, "μv": 1e-6, "kv": 1e3}
 _AMPERES = {"a": 1.0, "ma": 1e-3, "ua": 1e-6, "µa": 1e-6, "μa": 1e-6, "na": 1e-9}
 _NEWTONS = {"n": 1.0, "mn": 1e-3, "un": 1e-6, "µn": 1e-6, "μn": 1e-6, "kn": 1e3}
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
-# Columns whose names are shown.
+# Largest number of column names shown in a message.
 _SHOWN = 8
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns of finite numbers with what they are called.
+    """Columns of finite numbers, with their names and units.
 
     Attributes
     ----------
@@ -35,9 +35,9 @@ class Columns:
     names : tuple of str
         Without units; empty where the file has no header.
     data : ndarray, shape (n_row, n_column)
-        As written.
+        Numbers as written in the file, before any conversion of units.
     units : tuple of str
-        Of every column, empty where none is given; an empty tuple where no column has one.
+        Unit of every column, an empty text for a column without a unit; an empty tuple if the file has no header.
     lines : ndarray of int, shape (n_row,), or None
         Number of each row's line in the file, from 1; None for a file without lines.
     """
@@ -56,11 +56,11 @@ class Columns:
             raise InputError(f"{self.place(row)}: column {name} is {self.data[row, column]}; allowed: finite numbers")
 
     def place(self, row: int) -> str:
-        """Where a row, counted from 0, stands."""
+        """File and line (or row) of a row counted from 0, as text for messages."""
         return f"'{self.file}', " + (f"row {row}" if self.lines is None else f"line {self.lines[row]}")
 
     def listed(self) -> str:
-        """How many columns there are, and what they are called."""
+        """Number and names of the columns, as text for messages."""
         count = self.data.shape[1]
         shown = ", ".join(self.names[:_SHOWN]) + (", ..." if len(self.names) > _SHOWN else "")
         called = f"({shown})" if self.names else f"without a header (0 to {count - 1})"
@@ -72,7 +72,7 @@ class Columns:
         Raises
         ------
         InputError
-            For one that is not there.
+            If there is no such column, or if several columns have this name.
         """
         count = self.data.shape[1]
         if isinstance(column, str):
@@ -94,7 +94,7 @@ class Columns:
         return self._scaled(column, _SECONDS)
 
     def volts(self, column: int) -> FloatArray:
-        """A column in V, or in A, shape (n_row,)."""
+        """A column in V (or in A, for a current), shape (n_row,)."""
         return self._scaled(column, _VOLTS | _AMPERES)
 
     def newtons(self, column: int) -> FloatArray:
@@ -116,7 +116,7 @@ def read_text_columns(path: Path) -> Columns:
     Raises
     ------
     InputError
-        With the line, for anything but rows of as many finite numbers.
+        If the rows are not finite numbers, the same count in each row; the message names the line.
     """
     data = path.read_bytes()
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
@@ -143,12 +143,12 @@ def read_text_columns(path: Path) -> Columns:
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
-    """The cells of a line, without the quotes that spreadsheets put around them; blanks separate where nothing does."""
+    """Cells of a line without the quotes that spreadsheets put around them; None as separator splits at blanks."""
     return [cell.strip().strip('"').strip() for cell in line.strip().split(separator)]
 
 
 def _begins_with_number(line: str) -> bool:
-    """Whether the first cell of a line that is not empty is a number, NaN included, so that the line is no header."""
+    """Whether the first cell of the line that is not empty is a number or NaN, so that the line is not a header."""
     cells = (cell.strip('"') for cell in re.split(r"[\s,;]+", line.strip()))
     return re.match(r"[+-]?\.?\d|[+-]?(?:nan|inf)\b|$", next(filter(None, cells), ""), re.IGNORECASE) is not None
 
@@ -167,7 +167,7 @@ def _refuse_semicolons(path: Path, number: int, line: str) -> None:
 
 
 def _refuse_decimal_commas(path: Path, number: int, line: str) -> None:
-    """Refuse cells such as ``0,5`` between blanks; where commas separate, the number of cells tells."""
+    """Refuse cells such as ``0,5`` separated by blanks; in a comma-separated table the number of cells shows them."""
     cells = line.split()
     if len(cells) > 1 and any(map(_DECIMAL_COMMA.fullmatch, cells)) and not any(c.endswith(",") for c in cells):
         cell = next(filter(_DECIMAL_COMMA.fullmatch, cells))
@@ -181,7 +181,7 @@ def _comma(cell: str) -> str:
 def _header(
     path: Path, numbered: list[tuple[int, str]], begin: int, separator: str | None, count: int
 ) -> tuple[str, ...]:
-    """Names of the columns from the line before the first numbers, which may be a comment; empty where it has none."""
+    """Column names from the line before the first numbers, which may be a comment; empty if it holds no names."""
     before = [(number, line) for number, line in numbered if number < begin]
     if not before:
         return ()
@@ -198,11 +198,12 @@ def _header(
 
 
 def _numbers(path: Path, rows: list[tuple[int, str]], separator: str | None, count: int) -> FloatArray:
-    """The numbers, shape (n_row, count); refusals with their line."""
+    """The numbers, shape (n_row, count); a bad cell is refused with its line."""
     try:
         table = np.loadtxt((line for _, line in rows), delimiter=separator, ndmin=2, comments=None)
     except ValueError:
-        # NumPy does not know SPICE's scales and quotes, and does not say well what is wrong.
+        # NumPy reads neither SPICE's scale suffixes nor quoted cells, and its message does not help the user: read the
+        # rows one by one.
         return np.array([_row(path, number, line, separator, count) for number, line in rows])
     return np.asarray(table, float)
 
@@ -217,7 +218,7 @@ def _row(path: Path, number: int, line: str, separator: str | None, count: int) 
 
 def _number(path: Path, number: int, column: int, cell: str) -> float:
     try:
-        # Of NaN and inf the caller says where they stand.
+        # NaN and inf pass here; `Columns` refuses them with their line and column.
         return float(cell)
     except ValueError:
         pass

@@ -58,7 +58,7 @@ class _Combination(Waveform):
 
 @dataclass(frozen=True)
 class Sum(_Combination):
-    """Sum of waveforms; its fundamental is the lowest tone of its parts, if all others are harmonics of that."""
+    """Sum of waveforms; its fundamental is the lowest tone of its parts, if all other tones are harmonics of it."""
 
     parts: tuple[Waveform, ...]
 
@@ -80,7 +80,7 @@ class Sum(_Combination):
 
 @dataclass(frozen=True)
 class Product(_Combination):
-    """Product of waveforms; its fundamental is that of the factor with the highest tone, the carrier."""
+    """Product of waveforms; its fundamental is the highest tone of its factors, which is the carrier's."""
 
     parts: tuple[Waveform, ...]
 

@@ -1,7 +1,7 @@
 """Recordings from files: WAV, tables as text (CSV and the like), and tables as NPZ.
 
 WAV files are read by `scipy.io.wavfile`: it is a dependency already, and reads integers of 8 to 64 bits, floats,
-extensible headers and RF64. What it leaves unsaid about broken files is said here.
+extensible headers and RF64. Its errors and warnings about broken files become clear messages here.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.waveforms.columns import Columns, read_text_columns
 
-#: Largest size of a binary file and of a text, bytes.
+#: Largest size of a binary file and of a text file, bytes.
 MAX_BYTES, MAX_TEXT_BYTES = 2**30, 2**26
 #: Largest number of samples: an hour at 48 kHz has 1.7e8, which take 1.4 GB.
 MAX_SAMPLES = 200_000_000
-#: Bytes of a WAV file that is read piece by piece, and of a part of its header.
+#: Largest size of a WAV file that is read piece by piece, and of one chunk of its header, bytes.
 LARGEST_STREAMED, MAX_HEADER = 2**40, 2**16
-# How far times that stand beside a rate may be off by their rounding, in samples.
+# Largest deviation, in samples, of a file's times from those that its rate gives: the written times are rounded.
 _JITTER = 0.1
 _RATE_NAMES = ("rate", "fs", "sample_rate")
 _TIME_NAMES = ("t", "time")
-# What scipy 1.17 raises on broken headers, found by 20,000 of them, and what it might.
+# Exceptions that scipy 1.17 raised on 20,000 randomly broken headers, and others that it may raise.
 _BROKEN = (ValueError, struct.error, ArithmeticError, NameError, TypeError, LookupError, MemoryError, OSError)
-# What other formats begin with.
+# First bytes of other file formats, to name the format in the message.
 _OTHERS = {
     b"ID3": "MP3",
     b"\xff\xfb": "MP3",
@@ -52,7 +52,7 @@ class Recording:
     Attributes
     ----------
     values : ndarray, shape (n,)
-        V, or for a WAV file shares of full scale.
+        V, or A; for a WAV file fractions of full scale.
     rate : float or None
         Samples per second.
     times : ndarray, shape (n,), or None
@@ -65,10 +65,10 @@ class Recording:
 
 
 def read_wav(path: str | Path, channel: int | None = None) -> Recording:
-    """One channel of a WAV file, as shares of full scale.
+    """One channel of a WAV file, as fractions of full scale.
 
-    An integer is divided by half the range of its type (8-bit ones have their middle, 128, taken off before), so that
-    full scale is -1 to just below 1. A float is taken as it is.
+    An integer is divided by half the range of its type (from 8-bit integers their middle, 128, is subtracted first), so
+    that full scale is -1 to just below 1. A float is taken as it is.
 
     Parameters
     ----------
@@ -80,8 +80,8 @@ def read_wav(path: str | Path, channel: int | None = None) -> Recording:
     Raises
     ------
     InputError
-        For a file that is missing, too large, no WAV file, broken, cut short or empty, and for a missing or wrong
-        channel; one sentence each.
+        If the file is missing, too large, not a WAV file, broken, cut short or empty, or if the channel is missing or
+        wrong.
     """
     path = checked_file(path, MAX_BYTES)
     rate, data = _wav_data(path)
@@ -102,7 +102,7 @@ def read_wav(path: str | Path, channel: int | None = None) -> Recording:
 
 
 def _shares(data: np.ndarray) -> FloatArray:
-    """Samples as they are stored as shares of full scale."""
+    """Convert stored samples to fractions of full scale."""
     values = data.astype(float)
     if data.dtype.kind == "u":
         # Only 8-bit samples are unsigned.
@@ -114,17 +114,17 @@ def _shares(data: np.ndarray) -> FloatArray:
 
 @dataclass(frozen=True)
 class WavLayout:
-    """Where a WAV file has its samples, so that some of them can be read.
+    """Position and number format of the samples in a WAV file, so that some of them can be read.
 
     Attributes
     ----------
     path : Path
     rate, channels, channel, count : int
-        Hz; of these channels, this one is read; samples of each.
+        Sample rate (Hz), number of channels, index of the channel that is read, and number of samples per channel.
     kind : str
-        Of a number as NumPy names it, such as ``<i2``; ``<i3`` and ``>i3`` have three bytes.
+        NumPy's name of the number format, such as ``<i2``; ``<i3`` and ``>i3``, of three bytes, are not known to NumPy.
     offset : int
-        Where the first one begins, bytes.
+        Position of the first sample, bytes.
     """
 
     path: Path
@@ -136,12 +136,12 @@ class WavLayout:
     offset: int
 
     def read(self, first: int, last: int) -> FloatArray:
-        """Samples number `first` to `last` - 1 as shares of full scale.
+        """Samples number `first` to `last` - 1 as fractions of full scale.
 
         Raises
         ------
         InputError
-            Where they cannot be read any more.
+            If the file cannot be read any more, or has become shorter.
         """
         width = int(self.kind[2])
         block = self.channels * width
@@ -155,7 +155,7 @@ class WavLayout:
             raise InputError(f"'{self.path}' has become shorter while it was read")
         if width != 3:
             return _shares(np.frombuffer(raw, self.kind).reshape(-1, self.channels)[:, self.channel])
-        # As `scipy.io.wavfile` has them: the fourth byte is the lowest.
+        # As in `scipy.io.wavfile`, a sample of three bytes fills the upper bytes of a 32-bit integer.
         wide = np.zeros((last - first, 4), np.uint8)
         low = 1 if self.kind[0] == "<" else 0
         wide[:, low : low + 3] = np.frombuffer(raw, np.uint8).reshape(-1, self.channels, 3)[:, self.channel]
@@ -163,12 +163,12 @@ class WavLayout:
 
 
 def wav_layout(path: str | Path, channel: int | None) -> WavLayout | None:
-    """Where a WAV file has the samples of a channel; None where the file, or the channel, is not beyond all doubt.
+    """Position of a channel's samples; None where only `read_wav` can tell: for a strange header or a wrong channel.
 
     Raises
     ------
     InputError
-        For a file that is missing, none, or empty.
+        If the path is not an ordinary file, or the file is empty or larger than `LARGEST_STREAMED`.
     """
     path = checked_file(path, LARGEST_STREAMED)
     with path.open("rb") as file:
@@ -193,7 +193,7 @@ def wav_layout(path: str | Path, channel: int | None) -> WavLayout | None:
 
 
 def _wav_header(file: BinaryIO) -> tuple[str, bytes, int] | None:
-    """Byte order, format, and length of the samples (bytes), at the first of which the file stands then."""
+    """Byte order, format chunk, and length of the samples (bytes); the file is then positioned at the first sample."""
     start = file.read(12)
     order = {b"RIFF": "<", b"RIFX": ">", b"RF64": "<"}.get(start[:4])
     form, long = b"", 0
@@ -240,28 +240,28 @@ def _wav_data(path: Path) -> tuple[int, np.ndarray]:
 def read_table(
     path: str | Path, time: str | int | None = None, value: str | int | None = None, rate: float | None = None
 ) -> Recording:
-    """Columns of a table: a text with one row a line, or an NPZ file of NumPy.
+    """Columns of a table: a text file with one row per line, or an NPZ file of NumPy.
 
-    Numbers in a text are separated by commas, tabs or blanks, may have SPICE's scales (``1m``), and have points. Lines
-    that begin with ``#`` are comments. The line before the first numbers may name the columns, with units in brackets:
-    ``time (ms), drive [kV]``; without units they are s and V. An NPZ file holds one array a column, and instead of
-    times it may hold a number named ``rate``.
+    Numbers in a text have decimal points and may have SPICE's scales (``1m``); commas, tabs or blanks separate them.
+    Lines that begin with ``#`` are comments. The line before the first numbers may name the columns, with units in
+    brackets: ``time (ms), drive [kV]``; the units s and V are assumed where none is given. An NPZ file holds one array
+    per column, and may hold a number named ``rate`` instead of times.
 
     Parameters
     ----------
     path : str or Path
         A text of at most `MAX_TEXT_BYTES`, or an NPZ file of at most `MAX_BYTES`.
     time, value : str or int, optional
-        Names of the columns, or their numbers counted from 0; may be left out where nothing else can be meant.
+        Names of the columns, or their numbers counted from 0; may be left out where only one choice is possible.
     rate : float, optional
-        Samples per second, where there is no column of times.
+        Samples per second, for a table without a column of times.
 
     Raises
     ------
     InputError
-        One sentence with the line: for a file that is missing, too large, empty or broken; for semicolons, decimal
-        commas, cells that are no finite numbers, rows of different length and decreasing times; for a column that is
-        not there; where times and a rate contradict each other.
+        If the file is missing, too large, empty or broken; has semicolons, decimal commas, cells that are not finite
+        numbers, rows of different length or decreasing times; has no such column; or if its times and rate contradict
+        each other. The message names the line.
     """
     path = checked_file(path, MAX_BYTES)
     with path.open("rb") as file:
@@ -302,12 +302,12 @@ def read_table(
 
 
 def checked_file(path: str | Path, most: int) -> Path:
-    """The path of an ordinary file that is not empty and not larger than `most` bytes.
+    """The path, after a check that it is a readable ordinary file, not empty and not larger than `most` bytes.
 
     Raises
     ------
     InputError
-        For anything else.
+        If it is not.
     """
     path = Path(path)
     try:
@@ -333,7 +333,7 @@ def checked_file(path: str | Path, most: int) -> Path:
 
 
 def check_count(what: str, count: int) -> None:
-    """Refuse more samples than are kept in memory."""
+    """Refuse more than `MAX_SAMPLES` samples, the most that are kept in memory."""
     if count > MAX_SAMPLES:
         raise InputError(f"'{what}' has {count:,} samples; allowed: at most {MAX_SAMPLES:,}")
 
@@ -344,7 +344,7 @@ def _check_rate(path: Path, rate: float) -> None:
 
 
 def _chosen_time(found: Columns, time: str | int | None) -> int:
-    """Index of the column of times; where none is named the one called so, and else the first of two."""
+    """Index of the column of times: as given, else the only one named ``t`` or ``time``, else the first of two."""
     if time is None:
         named = [i for i, name in enumerate(found.names) if name.lower() in _TIME_NAMES]
         return named[0] if len(named) == 1 else _only(found, None, "time", 2)
@@ -352,7 +352,7 @@ def _chosen_time(found: Columns, time: str | int | None) -> int:
 
 
 def _only(found: Columns, column: str | int | None, role: str, most: int, other: int | None = None) -> int:
-    """Index of a column; where it is left out the only one (`most` is 1), or of two the first or the `other`'s."""
+    """Index of a column; if none is given, the only one (`most` is 1), or the first of two, or the one not `other`."""
     if column is not None:
         index = found.index(column)
         if index == other:
@@ -387,7 +387,7 @@ def _npz_columns(path: Path) -> tuple[Columns, float | None]:
                     raise InputError(f"{problem}; allowed: one row a column, and one number named rate")
     except InputError:
         raise
-    # What zipfile and NumPy raise on broken files, and on arrays of objects, which are not read.
+    # Exceptions of zipfile and NumPy for broken files, and for arrays of objects, which NumPy refuses to load.
     except (ValueError, OSError, zipfile.BadZipFile, EOFError, KeyError, MemoryError, NotImplementedError) as error:
         raise InputError(f"'{path}' cannot be read as NPZ: {str(error).partition('. ')[0]}") from None
     lengths = {array.size for array in arrays.values()}

@@ -42,7 +42,7 @@ class _Periodic(Ramps):
         return 1.0 / self.frequency
 
     def _times(self, t0: float, t1: float) -> FloatArray:
-        # Computed as (k + x) / f, an edge is rounded to the very number that a user writes for its time.
+        # Computed as (k + x) / f, an edge is rounded to the same double as the time that a user writes for it.
         x = self._knots()[0] * self.frequency
         shift = self.delay - self.phase_deg / 360.0 / self.frequency
         low = np.floor((t0 - shift) * self.frequency) - 1.0
@@ -52,7 +52,8 @@ class _Periodic(Ramps):
 
     @property
     def _first(self) -> float:  # type: ignore[override]
-        # Begin a whole number of periods earlier, at or before t = 0: the delay shifts the shape, and delays nothing.
+        # Begin a whole number of periods earlier, at or before t = 0: the delay only shifts the shape in time, and does
+        # not hold the source before it.
         shift = self.delay - self.phase_deg / 360.0 / self.frequency
         period = 1.0 / self.frequency
         return shift - math.ceil(shift / period - 1e-12) * period if shift > 0.0 else shift
@@ -128,7 +129,7 @@ class Sawtooth(_Periodic):
 
 @dataclass(frozen=True)
 class Pulse(Ramps):
-    """SPICE's PULSE: v1 until `delay`; then, in every `pulse_period`, a rise to v2, a width, and a fall back to v1.
+    """SPICE's PULSE: v1 until `delay`; then, in every `pulse_period`, a rise to v2, `width` at v2, a fall back to v1.
 
     Voltages in V, times in s. A rise or fall of 0 is an ideal jump. Without `pulse_period` there is one pulse.
     """

@@ -1,4 +1,4 @@
-"""Waveforms made of straight pieces: `PWL`, and the class on which all such waveforms rest.
+"""Waveforms made of straight pieces: `PWL`, and the base class of all such waveforms.
 
 A subclass of `Ramps` only lists its knots.
 """
@@ -21,7 +21,7 @@ from fingerspice.waveforms.bounds import check_range, in_windows, runs_through
 from fingerspice.waveforms.files import read_table
 from fingerspice.waveforms.waveform import Waveform, blank_terms, require
 
-# So few knots need not be divided into windows, however close together they are.
+# A waveform with at most this many knots is not divided into windows, however close together its knots are.
 FEW_KNOTS = 1000
 
 
@@ -36,7 +36,7 @@ class Ramps(Waveform):
 
     @cached_property
     def _listed(self) -> tuple[FloatArray, FloatArray]:
-        """`_knots`, made once."""
+        """Result of `_knots`, cached."""
         return self._knots()
 
     @cached_property
@@ -59,7 +59,7 @@ class Ramps(Waveform):
         return start, t - start
 
     def _times(self, t0: float, t1: float) -> FloatArray:
-        """Times of a periodic waveform's knots (s, ascending) over [t0, t1] and somewhat beyond; jumps appear twice."""
+        """Times of a periodic waveform's knots (s, ascending) over [t0, t1] and a period beyond; jumps appear twice."""
         assert self.period is not None
         times, _ = self._listed
         low = max(0.0, np.floor((t0 - self._first) / self.period) - 1.0)
@@ -116,7 +116,7 @@ class Ramps(Waveform):
         inside = ~before & ~after & (width > 0.0)
         slope = np.where(inside, (values[j] - values[j - 1]) / np.where(width > 0.0, width, 1.0), 0.0)
         offset = np.where(np.isfinite(start), start - run, 0.0) - times[j - 1]
-        # A piece that starts at a knot, but for rounding, starts with exactly the knot's value.
+        # A piece whose start differs from a knot only by rounding starts with exactly the knot's value.
         offset = np.where(np.abs(offset) <= 1e-9 * width, 0.0, offset)
         v0 = np.where(inside, values[j - 1] + slope * offset, np.where(before, values[0], values[-1]))
         return v0, slope
@@ -138,16 +138,16 @@ class Ramps(Waveform):
     def breakpoint_rate(self) -> float:
         times, _ = self._listed
         if self.period is None and times.size <= FEW_KNOTS:
-            # No window can contain more breakpoints than these few.
+            # The rate is only used to divide time into windows; so few breakpoints need none.
             return 0.0
         span = self.period or (times[-1] - times[0])
         return times.size / span if span > 0.0 else 0.0
 
 
 def _once(times: FloatArray) -> FloatArray:
-    """Ascending times (s) without those that differ from the one before by rounding.
+    """Ascending times (s) without each time that differs from the time before it only by rounding.
 
-    The last knot of a period and the first of the next are the same time but for that.
+    The last knot of a period and the first knot of the next period are such a pair.
     """
     keep = np.ones(times.size, bool)
     keep[1:] = np.diff(times) > 1e-15 * np.abs(times[1:])
@@ -247,7 +247,8 @@ class PWL(Ramps):
     def _knots(self) -> tuple[FloatArray, FloatArray]:
         return np.asarray(self.times), np.asarray(self.values)
 
-    # What comes before `repeat` is passed once only, so that the knots are not those of one period.
+    # The part before `repeat` occurs only once, so that the knots span more than one period, and the base class's
+    # `_phase` and `_times` do not apply.
     def _phase(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         if self.repeat is None:
             return np.zeros_like(t), t

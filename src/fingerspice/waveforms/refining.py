@@ -1,4 +1,4 @@
-"""A function as Chebyshev series, refined until they reproduce it at points from which they were not built."""
+"""Fit of a function by Chebyshev series, refined until they reproduce it at points that are not their nodes."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from fingerspice.numerics import chebyshev
 from fingerspice.waveforms.waveform import Waveform
 
 POINTS = 20
-# Points between the nodes at which a series is compared with the function. They are irregular, so that no periodic
-# function can pass through all of them unnoticed.
+# The points `_PROOF` between the nodes, at which a series is compared with the function, are irregular: so no periodic
+# function can agree with its series at all of them and differ elsewhere.
 _AT_START = (-1.0) ** np.arange(POINTS)
 _PROOF = 2.0 * np.modf(np.arange(1, 28) * 0.6180339887498949)[0] - 1.0
 _PLACES = np.concatenate([chebyshev.nodes(POINTS, -1.0, 1.0), _PROOF])
 _NODE_STEPS = np.diff(_PLACES[:POINTS])
 
-# After this many halvings in a row without gain, a misfit below the second number (relative to the largest |U|) is
-# taken for rounding of the function's values.
+# After `_IDLE` halvings in a row that do not reduce the misfit, a misfit below `_ROUGHEST` (relative to the largest
+# |U|) is taken for round-off of the function's values.
 _IDLE, _ROUGHEST = 3, 1e-8
-# Change, relative to the largest |U|, from which on short series are reported as an edge; around a kink it is smaller.
+# Smallest change over short series, relative to the largest |U|, that is reported as an edge; at a kink it is smaller.
 _STEEP = 0.05
-# Smallest tolerance, V: below it doubles lose digits, and no function appears smooth.
+# Smallest tolerance, V: below it doubles are nearly denormal and lose digits, so that no function appears smooth.
 _NOTHING = 1e-290
-# An interval halved more often than this lies at a jump or a kink, around which some 60 such intervals are needed. A
-# table may have so many of them, and so many more for each interval that it starts from.
+# An interval halved more than `_DEEP` times lies at a jump or a kink, around which some 60 such intervals are needed. A
+# table may have `_MOST_DEEP` of them, and `_MOST_DEEP_EACH` more for each of its initial intervals.
 _DEEP, _MOST_DEEP, _MOST_DEEP_EACH = 12, 10_000, 100
 
 
@@ -44,7 +44,7 @@ class _Interval(NamedTuple):
     depth : int
         Number of halvings that led to it.
     misfit, largest : float
-        Misfit (V) before the last halving, and the largest before any.
+        Misfit (V) before the last halving, and the largest misfit before any of the halvings.
     idle : int
         Number of halvings in a row that did not reduce the misfit.
     """
@@ -57,7 +57,7 @@ class _Interval(NamedTuple):
     idle: int = 0
 
     def halves(self, misfit: float = math.inf, largest: float | None = None, idle: int = 0) -> list[_Interval]:
-        """Both halves, the second one first: the list that they go to is a stack."""
+        """Both halves, the later one first, because they are put on a stack."""
         middle, known = 0.5 * (self.lo + self.hi), self.largest if largest is None else largest
         return [
             _Interval(lo, hi, self.depth + 1, misfit, known, idle) for lo, hi in ((middle, self.hi), (self.lo, middle))
@@ -76,7 +76,7 @@ class Refiner:
     ----------
     waveform : Waveform
     tol : float
-        Error allowed of a series, relative to `scale`.
+        Allowed error of a series, relative to `scale`.
     step : float
         Output step, s.
     scale, steepest : float
@@ -86,7 +86,7 @@ class Refiner:
     series : list of ndarray, shape (POINTS,)
         Chebyshev coefficients on each interval.
     jumps : list of (float, float)
-        Times (s) at which neighbouring series differ, and by how much (V).
+        Times (s) at which neighbouring series differ, and the difference (V).
     located, narrow : list of float
         Times (s) of the jumps found by bisection, and of intervals much shorter than the output step.
     short : list of (float, float)
@@ -94,9 +94,9 @@ class Refiner:
     not_finite : float or None
         Time (s) of the first NaN or inf.
     rough : float
-        Largest misfit (V) taken for rounding of the function's values.
+        Largest misfit (V) taken for round-off of the function's values.
     allowed, deep : int
-        How many often halved intervals there may be, and are.
+        Largest allowed and present number of intervals that were halved more than `_DEEP` times.
     """
 
     waveform: Waveform
@@ -116,7 +116,7 @@ class Refiner:
     deep: int = 0
 
     def cover(self, a: float, b: float) -> bool:
-        """Add series for [a, b] (s); False where the waveform stops being finite inside."""
+        """Add series for [a, b] (s); False if the waveform has a NaN or inf inside."""
         if not self.edges:
             self.edges.append(a)
         # The ends of a window are breakpoints, where the waveform may jump: series use interior points only.
@@ -140,8 +140,8 @@ class Refiner:
                 if piece.depth > _DEEP:
                     self._refuse_noise(piece, values)
                 if idle >= _IDLE and misfit <= _ROUGHEST * self.scale:
-                    # Halving divides the misfit of a smooth function by 2^20 and that of a kink by 2. A misfit that
-                    # stays as it is comes from the rounding of the function's own values.
+                    # Halving divides the misfit of a smooth function by 2^20 and the misfit at a kink by 2. A misfit
+                    # that halving does not reduce is round-off of the function's own values.
                     self.rough = max(self.rough, misfit)
                     series = chebyshev.coefficients(values)
             floor = max(4e-15 * max(abs(lo), abs(hi)), 1e-13 * self.step)
@@ -150,7 +150,7 @@ class Refiner:
             elif hi - lo > floor:
                 waiting += piece.halves(misfit, max(piece.largest, misfit), idle)
             else:
-                # What cannot be refined at this width is a jump (or a kink), and becomes an edge.
+                # An interval of this width without a good series holds a jump (or a kink), which becomes an edge.
                 self.jumps.append((hi, float(values[-1] - values[0])))
                 self.located.append(hi)
                 if self.series:
@@ -158,13 +158,14 @@ class Refiner:
         return True
 
     def _add(self, piece: _Interval, series: FloatArray, floor: float, first: bool) -> list[_Interval]:
-        """Add an interval's series, or return the intervals to look at again where the waveform jumps at its start."""
+        """Add an interval's series; if the waveform jumps at its start, return the intervals to refine instead."""
         if piece.hi - piece.lo < 0.75 * self.step:
             self.short.append((piece.lo, float(series.sum() - series @ _AT_START)))
             if piece.largest > _ROUGHEST * self.scale:
                 self.narrow.append(0.5 * (piece.lo + piece.hi))
         if self.series and not first and not (self.jumps and self.jumps[-1][0] >= piece.lo):
-            # A jump, or a steep edge, may lie exactly on a cut, where no point of either side shows it.
+            # A jump or a steep edge may lie exactly on a cut, so that the points of neither interval show it: refine
+            # both intervals until they are short.
             change = float(series @ _AT_START - self.series[-1].sum())
             if abs(change) > self._least and piece.hi - piece.lo > floor:
                 again = piece.halves(largest=piece.largest)
@@ -184,11 +185,11 @@ class Refiner:
         Returns
         -------
         series : ndarray, shape (POINTS,), or None
-            Chebyshev coefficients; None where they miss the waveform between the nodes by more than is allowed.
+            Chebyshev coefficients; None if their error between the nodes is larger than allowed.
         values : ndarray
-            The waveform at the nodes, V; also between them where one of the values is not finite.
+            The waveform at the nodes, V; if a value is not finite, also at the points between the nodes.
         misfit : float
-            Largest difference of series and waveform between the nodes, V.
+            Largest difference between series and waveform at the points between the nodes, V.
         """
         lo, hi = piece.lo, piece.hi
         t = piece.points()
@@ -200,19 +201,19 @@ class Refiner:
         proof = np.polynomial.chebyshev.chebval(_PROOF, c)
         if piece.depth == 0:
             self.steepest = float(np.abs(np.diff(values[:POINTS]) / (0.5 * (hi - lo) * _NODE_STEPS)).max())
-        # Rounding of the time itself changes the value by up to this much.
+        # The rounding of the time itself changes the value by up to `noise`.
         noise = 2e-15 * max(abs(lo), abs(hi)) * self.steepest
         misfit = float(np.abs(proof - values[POINTS:]).max())
         good = misfit <= max(self.tol * self.scale, noise, _NOTHING)
         return (c if good else None), values[:POINTS], misfit
 
     def _refuse_noise(self, piece: _Interval, values: FloatArray) -> None:
-        """Count an interval that stays rough, and refuse a waveform with so many of them that refining never ends.
+        """Count an interval that stays rough, and refuse a waveform with so many of them that refining would not end.
 
         Raises
         ------
         InputError
-            Where the function gives another value at the same time, or is too rough.
+            If the function gives two values at the same time, or is too rough.
         """
         self.deep += 1
         if self.deep not in (1, self.allowed):
@@ -221,7 +222,7 @@ class Refiner:
         again = self.waveform.value(t)[:POINTS]
         i = int(np.argmax(np.abs(again - values)))
         remedy = "of noise draw the values once and give fs.Samples(values, rate)"
-        # A function of arrays may sum in another order, so the last digits may differ.
+        # A function of arrays may sum in another order at the second call, so allow the last digits to differ.
         if abs(again[i] - values[i]) > _ROUGHEST * self.scale:
             raise InputError(
                 f"the source function gives {values[i]:.4g} V and then {again[i]:.4g} V at the same t = {t[i]:.9g} s; "
@@ -251,7 +252,7 @@ class Refiner:
                 FingerspiceWarning,
                 stacklevel=2,
             )
-        # Short series are to be expected around a jump, a kink, or where the waveform stops being finite.
+        # Around a jump, a kink, or a NaN short series are expected; report only the short ones far from all of these.
         known = [*self.located, *(t for t, _ in real), *([] if self.not_finite is None else [self.not_finite])]
         apart = [t for t in self.narrow if all(abs(t - k) > 8.0 * self.step for k in known)]
         apart = sorted(apart + self._edges_found())
@@ -265,7 +266,7 @@ class Refiner:
             )
 
     def _edges_found(self) -> list[float]:
-        """Time (s) of the first edge found by short series that together change much within a tenth of a step."""
+        """Time (s) of the first edge: short series whose change sums to more than `_STEEP` in a tenth of a step."""
         if not self.short:
             return []
         t, change = np.array(self.short).T

@@ -1,4 +1,4 @@
-"""A waveform for a while, and a waveform again and again: `Burst` and `Repeat`."""
+"""Waveforms that use a stretch of another waveform: once (`Burst`) or periodically (`Repeat`)."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.waveforms.bounds import check_finite, runs_through
 from fingerspice.waveforms.waveform import Waveform, as_waveform, blank_terms, require
 
-# Times closer than this to a breakpoint, relative to themselves, are that breakpoint but for rounding.
+# A time within this relative distance of a breakpoint differs from it only by rounding, and is replaced by it.
 _ROUNDING = 8e-16
 
 
 class _Shifted(Waveform):
-    """Made of stretches of another waveform from its time 0 on, each shifted to where it begins."""
+    """A waveform made of copies of the first stretch of another waveform, each shifted to the start of the copy."""
 
     waveform: Waveform
 
@@ -29,13 +29,13 @@ class _Shifted(Waveform):
 
     @cached_property
     def _marks(self) -> FloatArray:
-        """Breakpoints of the other waveform within a stretch, both its ends among them, s."""
+        """Breakpoints of the other waveform within a stretch, and both ends of the stretch, s."""
         length = self._stretch()
         inner = self.waveform.breakpoints(0.0, length)
         return np.concatenate([[0.0], inner[(inner > 0.0) & (inner < length * (1.0 - _ROUNDING))], [length]])
 
     def _inner(self, t: FloatArray, begin: FloatArray | float) -> FloatArray:
-        """Times (s) since the stretch began; those that are a breakpoint but for rounding are exactly that."""
+        """Times (s) since the stretch began; a time that differs from a breakpoint only by rounding is set to it."""
         tau = np.asarray(t - begin, float)
         marks = self._marks
         right = np.clip(np.searchsorted(marks, tau), 1, marks.size - 1)
@@ -48,12 +48,12 @@ class _Shifted(Waveform):
 
 @dataclass(frozen=True)
 class Burst(_Shifted):
-    """A waveform from its beginning, during `duration` from `delay` on; 0 V before and after.
+    """The first `duration` of a waveform, beginning at `delay`; 0 V before and after.
 
     Parameters
     ----------
     waveform : Waveform
-        Its time 0 is the beginning of the burst. A number or a function of time (s) will do, too.
+        Its time 0 is the beginning of the burst. A number or a function of time (s) is accepted, too.
     duration : float
         s, positive.
     delay : float
@@ -100,12 +100,14 @@ class Burst(_Shifted):
 
 @dataclass(frozen=True)
 class Repeat(_Shifted):
-    """The first `period` of a waveform, again and again; its fundamental is that of a tone inside, if it fits.
+    """The first `period` of a waveform, repeated for ever.
+
+    The fundamental is the tone of the waveform, if a whole number of its cycles fits `period`, and else 1/period.
 
     Parameters
     ----------
     waveform : Waveform
-        Used from its time 0 to `period`. A number or a function of time (s) will do, too.
+        Used from its time 0 to `period`. A number or a function of time (s) is accepted, too.
     period : float
         s, positive.
     """
@@ -125,7 +127,7 @@ class Repeat(_Shifted):
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         t = np.asarray(t, float)
         tau = self._inner(t, np.floor(t / self.period) * self.period)
-        # Rounding may put a time that begins a period into the one before it or after it.
+        # By rounding, the start of a period may count as the end of the period before, or an end as a start.
         first, last = (0.0, self.period) if side == "right" else (self.period, 0.0)
         tau = np.where(tau == last, first, tau)
         return self.waveform.value(tau, side)

@@ -1,4 +1,4 @@
-"""Samples at a constant rate: in memory, or in a WAV file of which parts are read as they are needed."""
+"""Samples at a constant rate: in memory, or in a WAV file whose parts are read when they are needed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from fingerspice.waveforms.ramps import FEW_KNOTS, Ramps
 from fingerspice.waveforms.upsampling import upsample
 from fingerspice.waveforms.waveform import require
 
-# Samples of a file that are read at once.
+# Number of samples of a file that are read at once.
 AT_ONCE = 1 << 20
 
 
@@ -28,15 +28,15 @@ AT_ONCE = 1 << 20
 def _along(
     values: FloatArray, first: int, start: float, rate: float, t: FloatArray, left: bool
 ) -> FloatArray:  # fmt: skip
-    """Values (V) at times `t` (s) of samples at a rate (Hz); the sample at a time exactly, from either side.
+    """Values (V), at times `t` (s), of the straight lines between samples at a rate (Hz); exact at a sample's time.
 
-    `first` is the number of the first of them, and sample number 0 is at `start` (s).
+    `first` is the number of the first of the samples given; sample number 0 is at `start` (s).
     """
     out = np.empty(t.size)
     last = first + values.size - 1
     for i in range(t.size):
         j = int(min(max((t[i] - start) * rate, float(first)), float(last)))
-        # By rounding it may be the neighbour.
+        # Rounding may have given a neighbour of the sample at or before `t[i]`: correct the number.
         while j < last and (start + (j + 1) / rate < t[i] or (not left and start + (j + 1) / rate == t[i])):
             j += 1
         while j > first and (start + j / rate > t[i] or (left and start + j / rate == t[i])):
@@ -68,7 +68,7 @@ class Samples(Ramps):
     rate: float
     start: float = 0.0
     units: ClassVar[dict[str, str]] = {"rate": "Hz", "start": "s"}
-    # Number of the first of `values`, which is at `start` where that is 0.
+    # Number of the sample `values[0]` in the whole recording, whose sample number 0 is at `start`.
     _number: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
@@ -95,18 +95,19 @@ class Samples(Ramps):
         ----------
         path : str or Path
         gain : float
-            V at full scale, which is half the range of the file's integers, and 1 of floats.
+            V at full scale; full scale is half the range of the file's integers, or 1 for floats.
         channel : int, optional
             Counted from 0; needed where there are several.
         at_once : bool
             Whether all samples are kept in memory, 8 bytes each. Otherwise they are read from the file
-            piece by piece as they are needed, and it must stay as it is meanwhile; `stream` then takes the same
+            piece by piece when they are needed, and the file must not change meanwhile; `stream` then takes the same
             memory for an hour as for a second.
 
         Raises
         ------
         InputError
-            For a file that cannot be read or is broken, and for a channel that is missing or not there.
+            If the file cannot be read or is broken, if it has several channels and none is chosen, or if it has no
+            such channel.
         """
         require(math.isfinite(gain), "gain", gain, "a finite number of V at full scale")
         if not at_once:
@@ -131,7 +132,7 @@ class Samples(Ramps):
         Raises
         ------
         InputError
-            For a file that cannot be read, with the line, and for one that has times and no rate.
+            If the file cannot be read (the message names the line), or has times and no rate.
         """
         table = read_table(path, None, value, rate)
         require(table.rate is not None, f"'{path}'", "a table with times", "one with a rate; fs.PWL.from_table")
@@ -140,20 +141,21 @@ class Samples(Ramps):
     def upsampled(self, factor: int = 16) -> Samples:
         """The same recording at `factor` (2 to 64) times the rate, by band-limited interpolation.
 
-        Of a tone at f the straight lines between the new samples miss up to (pi f / (factor rate))^2 / 2 of the
-        amplitude: with a factor of 16 it is 0.08 % at 0.2 of the old rate and 0.4 % at 0.45 of it. The filter adds
-        0.02 % up to 0.46 of that rate, and attenuates what lies above. Beyond its ends the recording counts as held.
+        The straight lines between the new samples interpolate a tone at f with an error of up to
+        (pi f / (factor rate))^2 / 2 of its amplitude: with a factor of 16 this is 0.08 % at f = 0.2 rate and 0.4 % at
+        0.45 rate. The filter adds 0.02 % up to 0.46 rate, and attenuates higher frequencies. Before its first and
+        after its last sample the recording counts as constant.
 
         Raises
         ------
         InputError
-            For another factor, or too many samples.
+            If the factor is not a whole number from 2 to 64, or the result has too many samples.
         """
         return Samples(upsample(self.values, factor), factor * self.rate, self.start)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        # An unpickled array would be writable.
+        # NumPy unpickles every array as writable.
         self.values.flags.writeable = False
 
     @property
@@ -162,17 +164,17 @@ class Samples(Ramps):
         return self.values.size
 
     def digest(self) -> str:
-        """A text that differs from that of other samples."""
+        """SHA-256 of the samples, rate and start, as a key of caches."""
         return hashlib.sha256(repr((self.rate, self.start)).encode() + self.values.tobytes()).hexdigest()
 
     def between(self, first: int, last: int) -> FloatArray:
-        """Samples number `first` to `last` - 1, V; beyond the ends those at the ends, shape (last - first,)."""
+        """Samples number `first` to `last` - 1, V, shape (last - first,); beyond the ends, the first or last sample."""
         if first >= 0 and last <= self.count:
             return self.values[first:last].copy()
         return np.asarray(self.values[np.clip(np.arange(first, last), 0, self.count - 1)])
 
     def part(self, t0: float, t1: float) -> Samples:
-        """The samples that give the values between two times (s), for which the whole is not needed any more."""
+        """The samples that determine the values between two times (s), as a waveform that needs no other samples."""
         first, last = ((t - self.start) * self.rate for t in (t0, t1))
         low = min(max(math.floor(first) - 2, 0), self.count - 2)
         high = min(max(math.ceil(last) + 3, low + 2), self.count)
@@ -183,7 +185,7 @@ class Samples(Ramps):
         return out
 
     def _number_of(self, t: float) -> float:
-        """Which of `values` is at a time (s), as a fraction."""
+        """Index into `values` at a time (s), as a fractional number."""
         return (t - self.start) * self.rate - self._number
 
     def _times_of(self, low: int, high: int) -> FloatArray:
@@ -208,7 +210,7 @@ class Samples(Ramps):
         return peak
 
     def breakpoint_rate(self) -> float:
-        # No window can contain more breakpoints than these few.
+        # The rate is only used to divide time into windows; so few breakpoints need none.
         return 0.0 if self.count <= FEW_KNOTS else self.count / ((self.count - 1) / self.rate)
 
     def _values(self, flat: FloatArray, side: str) -> FloatArray:
@@ -217,7 +219,7 @@ class Samples(Ramps):
 
 
 def _check_samples(values: FloatArray, first: int) -> None:
-    """Refuse samples (V) that are no numbers, or too large; the first of them has this number."""
+    """Refuse samples (V) that are not finite or too large; `first` is the number of the first of them."""
     bad = np.flatnonzero(~np.isfinite(values))
     if bad.size:
         raise InputError(f"sample number {first + bad[0]} is {values[bad[0]]}; allowed: finite numbers")
@@ -225,7 +227,7 @@ def _check_samples(values: FloatArray, first: int) -> None:
 
 
 class _WavFile(Samples):
-    """Samples in a file: what is asked of all of them at once reads them all, and they stay."""
+    """Samples in a file, read in parts; the first use of `values` reads all samples and keeps them in memory."""
 
     layout: WavLayout
     gain: float
@@ -233,7 +235,7 @@ class _WavFile(Samples):
     def __init__(self, layout: WavLayout, gain: float) -> None:
         self.__dict__.update(layout=layout, gain=gain, rate=float(layout.rate), start=0.0)
         check_range("a sample", [gain], "V")
-        # Integers are finite, and within full scale.
+        # Only floats need the check: integers are finite, and within full scale.
         for first in range(0, self.count if layout.kind[1] == "f" else 0, AT_ONCE):
             _check_samples(self.between(first, min(first + AT_ONCE, self.count)), first)
 

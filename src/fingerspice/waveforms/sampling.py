@@ -1,8 +1,8 @@
 """A user's function of time as a waveform, and any waveform as a table for compiled code.
 
-Between its breakpoints a function is represented by Chebyshev series, which are refined until they reproduce it at
-points from which they were not built. Where refining does not help there is a jump that was not declared: it is
-located, becomes an edge of a segment, and a warning says so.
+Between its breakpoints a function is represented by Chebyshev series, which are refined until they reproduce the
+function at points that are not interpolation nodes. Where refining does not help there is a jump that was not
+declared: its time is located and becomes an edge of a segment, with a warning.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from fingerspice.waveforms.bounds import in_windows, runs_through
 from fingerspice.waveforms.refining import POINTS, Refiner
 from fingerspice.waveforms.waveform import Waveform, blank_terms, require
 
-#: Longer segments of an oscillation are divided, since the rounding of a phase grows with the phase.
+#: Longest segment of an oscillation, in periods; longer ones are divided, since a phase's rounding error grows with it.
 _PERIODS_PER_SEGMENT = 64.0
 
 
@@ -37,9 +37,9 @@ class Function(Waveform):
     function : callable
         A function of a time, or of an array of times.
     breaks : tuple of float
-        Times (s) at which it jumps or has a kink; of a periodic function those of its first period.
+        Times (s) at which the function jumps or has a kink; for a periodic function the times in its first period.
     repeat : float, optional
-        Its period (s), where it has one; only then is there a fundamental.
+        Period (s) of a periodic function; without it the function has no fundamental.
     """
 
     function: Callable[..., object]
@@ -106,13 +106,13 @@ class SourceTable:
         Segment edges, s.
     terms : ndarray, shape (m, k, 6)
     series : ndarray, shape (m, l)
-        Chebyshev coefficients of each segment, to be added to its terms; l = 0 where there are none.
+        Chebyshev coefficients of each segment's series, which is added to its terms; l = 0 without series.
     scale : float
-        Largest |U| (V) seen in making series; 0 where there are none.
+        Largest |U| (V) at the points where the series were fitted and checked; 0 without series.
     not_finite : float or None
         Time (s) of the first NaN or inf; the table then ends just before it.
     rough : float
-        Largest misfit (V) that finer series do not reduce, because it is rounding of the function's own values.
+        Largest misfit (V) that finer series do not reduce, because it is round-off of the function's own values.
     """
 
     edges: FloatArray
@@ -137,7 +137,7 @@ class SourceTable:
         t = t[(t > self.edges[0]) & (t < self.edges[-1])]
         if t.size == 0 or self.series.size == 0:
             return None
-        # At an edge the function may jump, so that either value is right.
+        # At an edge the function may jump, and its left and right values are both correct: leave such times out.
         right = np.clip(np.searchsorted(self.edges, t), 1, self.edges.size - 1)
         near = np.minimum(np.abs(t - self.edges[right]), np.abs(t - self.edges[right - 1]))
         t = t[near > 8e-15 * np.abs(t)]
@@ -148,7 +148,7 @@ class SourceTable:
 
 
 def same_time(t: float) -> float:
-    """Distance (s) within which two times near `t` count as the same: a few roundings of t."""
+    """Distance (s) within which two times near `t` count as equal: a few units in the last place of t."""
     return 8e-16 * abs(t)
 
 
@@ -162,7 +162,7 @@ def misses(t: FloatArray, marks: FloatArray, slack: float) -> BoolArray:
     first = 0
     for k in range(marks.size):
         low = marks[k] - slack * abs(marks[k])
-        # Find the first time that is not below `low`: double the stride until it is passed, then bisect.
+        # Find the first time that is not below `low`: double the stride until it passes `low`, then bisect.
         stride = 1
         while first + stride < t.size and t[first + stride] < low:
             stride *= 2
@@ -182,18 +182,18 @@ def misses(t: FloatArray, marks: FloatArray, slack: float) -> BoolArray:
 
 
 def breakpoints_at(waveform: Waveform, t: float) -> FloatArray:
-    """Breakpoints that are equal to `t` (s) but for rounding."""
+    """Breakpoints that differ from `t` (s) at most by rounding."""
     return waveform.breakpoints(t - same_time(t), t + same_time(t))
 
 
 def on_breakpoint(waveform: Waveform, t: float) -> float:
-    """The breakpoint equal to `t` (s) but for rounding, else `t`: a run of three periods ends at the jump there."""
+    """The breakpoint that differs from `t` (s) only by rounding, else `t`; so a run of three periods ends at a jump."""
     near = breakpoints_at(waveform, t)
     return float(near[0]) if near.size else t
 
 
 def is_sampled(waveform: Waveform) -> bool:
-    """Whether a waveform has no terms, so that it is represented by series."""
+    """Whether a waveform has no terms and is therefore represented by Chebyshev series."""
     found = waveform.kept.get("sampled")
     if found is None:
         found = waveform.kept["sampled"] = waveform.terms(np.zeros(1), np.ones(1)) is None
@@ -211,16 +211,16 @@ def source_table(
     t0, t1 : float
         Window, s.
     tol : float
-        Error allowed of a Chebyshev series, relative to the largest |U| seen.
+        Allowed error of a Chebyshev series, relative to the largest |U| seen.
     step : float
         Output step, s; a function is sampled at least that finely.
     no_chirps : bool
-        Whether a term with a changing frequency, for which there is no closed-form response, becomes a series too.
+        Whether a term with a changing frequency, which has no closed-form response, is represented by a series too.
     scale : float
-        Largest |U| (V) seen in earlier windows; the error allowed is relative to it, too.
+        Largest |U| (V) seen in earlier windows; it counts in the largest |U| that `tol` refers to.
     """
     inner = waveform.breakpoints(t0, t1)
-    # A breakpoint equal to an end of the window but for rounding is that end, and makes no segment of its own.
+    # A breakpoint that differs from an end of the window only by rounding is that end, and bounds no extra segment.
     inner = inner[(inner > t0 + same_time(t0)) & (inner < t1 - same_time(t1))]
     edges = np.concatenate([[t0], inner, [t1]])
     between = _rephased(edges, waveform.shortest_time())
@@ -250,7 +250,7 @@ def source_table(
 
 
 def _rephased(edges: FloatArray, period: float) -> FloatArray:
-    """Edges (s) with others inserted, so that no phase within a segment grows until its rounding matters."""
+    """Edges (s) with further ones inserted, so that the rounding error of a phase stays small within each segment."""
     longest = _PERIODS_PER_SEGMENT * period
     if not np.any(np.diff(edges) > longest):
         return edges

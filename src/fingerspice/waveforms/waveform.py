@@ -64,7 +64,7 @@ class Waveform:
 
     @cached_property
     def kept(self) -> dict[Any, Any]:
-        """What was computed of this waveform, for every circuit that has it."""
+        """Cache of results about this waveform, shared by all circuits that use it."""
         return {}
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
@@ -104,7 +104,7 @@ class Waveform:
         return math.inf
 
     def breakpoint_rate(self) -> float:
-        """Upper bound of the breakpoints per second, from which long runs are divided into windows."""
+        """Upper bound of the number of breakpoints per second; it sets the windows into which long runs are divided."""
         return 0.0
 
     @property
@@ -130,7 +130,7 @@ class Waveform:
         if frequency is None:
             return None
         period = self.period or 1.0 / frequency
-        # With the convention of sines, U ~ Im(P exp(i Omega t)).
+        # The phase refers to a sine: U ~ Im(P exp(i Omega t)).
         start = self.settled
         p = 2j * fourier_integral(self, frequency, start, start + period) / period
         if abs(p) <= 1e-12 * self.peak(start, start + period):
@@ -140,7 +140,7 @@ class Waveform:
     def peak(self, t0: float, t1: float) -> float:
         """Largest |U| (V) over [t0, t1]; exact at breakpoints, within a few parts in a thousand elsewhere."""
         if self.period is not None:
-            # One settled period stands for all that follow.
+            # All periods after `settled` are equal, so that the first of them gives the peak of all.
             t1 = min(t1, max(t0, self.settled) + self.period)
         values = [self.value(np.linspace(t0, t1, 513))]
         breakpoints = self.breakpoints(t0, t1)
@@ -175,7 +175,7 @@ def as_waveform(value: Waveform | float | Callable[[float], float]) -> Waveform:
     Raises
     ------
     InputError
-        For anything else.
+        If the value is of another kind.
     """
     if isinstance(value, Waveform):
         return value
@@ -197,7 +197,7 @@ def require(condition: bool, what: str, given: Any, allowed: str) -> None:
     Raises
     ------
     InputError
-        With what was given and what is allowed.
+        If the condition is false; the message names the given value and the allowed ones.
     """
     if not condition:
         raise InputError(f"{what} is {given}; allowed: {allowed}")
