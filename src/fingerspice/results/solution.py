@@ -54,14 +54,12 @@ class Solution(Sealed, Shown, Figured):
         Evaluations of the right-hand side.
     stats : dict
         Numbers of steps, rejected steps, zeros of the gap voltage and repeated periods; the wall time (s).
-    error : ErrorEstimate
-    rtol : float
-        Error asked for, relative to the peaks.
+    error, rtol : ErrorEstimate, float
+        Error stated, and error asked for relative to the peaks.
     charge_law, area_mode, method : str
     plan : Plan
         The model that was run, and the reasons for it.
-    circuit : Circuit
-    state : State
+    circuit, state : Circuit, State
     first, t_stop : float
         TSTART and the end of the run, s.
     continuous : Recorded or ClosedForm or None
