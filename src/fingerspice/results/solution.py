@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.results.plan import Plan
     from fingerspice.results.refined import ClosedForm
+    from fingerspice.results.sensitivity import Sensitivity
     from fingerspice.results.spectrum import Spectrum
     from fingerspice.results.steps import Recorded
     from fingerspice.waveforms.waveform import Fundamental
@@ -53,14 +54,12 @@ class Solution(Sealed, Shown, Figured):
         Evaluations of the right-hand side.
     stats : dict
         Numbers of steps, rejected steps, zeros of the gap voltage and repeated periods; the wall time (s).
-    error : ErrorEstimate
-    rtol : float
-        Error asked for, relative to the peaks.
+    error, rtol : ErrorEstimate, float
+        Error stated, and error asked for relative to the peaks.
     charge_law, area_mode, method : str
     plan : Plan
         The model that was run, and the reasons for it.
-    circuit : Circuit
-    state : State
+    circuit, state : Circuit, State
     first, t_stop : float
         TSTART and the end of the run, s.
     continuous : Recorded or ClosedForm or None
@@ -69,6 +68,8 @@ class Solution(Sealed, Shown, Figured):
         Fundamental and period (s) of the source; None where it has none.
     fold_margin_min : float
         Smallest distance to the fold in the run's steps.
+    sensitivities : mapping of str to Sensitivity
+        By the path of each parameter that was asked for.
     stored : mapping or None
         The summary of a run that was read from a file.
     """
@@ -95,6 +96,7 @@ class Solution(Sealed, Shown, Figured):
     t_stop: float = 0.0
     continuous: Recorded | ClosedForm | None = None
     stored: Mapping[str, Any] | None = None
+    sensitivities: Mapping[str, Sensitivity] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         sealed(self.t)

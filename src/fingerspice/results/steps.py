@@ -199,7 +199,7 @@ class Stretches:
         fraction = self.reach[:, None] * POINTS
         short = np.flatnonzero(self.reach != 1.0)
         if short.size:
-            columns[short] = np.einsum("pcn,pqn->pcq", self.values[short], _basis(fraction[short]))
+            columns[short] = np.einsum("pcn,pqn->pcq", self.values[short], basis(fraction[short]))
         t, left = self._times(slice(None), fraction)
         return t, self._make(t.ravel(), left.ravel(), columns.transpose(1, 0, 2).reshape(columns.shape[1], t.size))
 
@@ -224,13 +224,13 @@ class Stretches:
 
     def values_at(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See `measures.Run`; evaluates the polynomials of the steps."""
-        columns = np.einsum("pcn,pqn->cpq", self.values[index], _basis(fraction))
+        columns = np.einsum("pcn,pqn->cpq", self.values[index], basis(fraction))
         t, left = self._times(index, fraction)
         record = self._make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], t.size))
         return t, read(record).reshape(t.shape)
 
 
-def _basis(fraction: FloatArray) -> FloatArray:
+def basis(fraction: FloatArray) -> FloatArray:
     """Weights (p, q, NODES) for interpolating values at the nodes to fractions (p, q) of a step."""
     distance = fraction[:, :, None] - _NODES
     hit = distance == 0.0

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -56,6 +58,7 @@ def simulate(
     jumps: str = "both",
     throw: bool = True,
     progress: Progress | None = None,
+    sensitivities: Sequence[str] = (),
 ) -> Solution:
     """Simulate a circuit in time.
 
@@ -99,6 +102,9 @@ def simulate(
         Raise an error if the run fails; otherwise return the outputs before the failure, with its status.
     progress : callable, optional
         Called with the fraction of the run that is done.
+    sensitivities : sequence of str
+        Paths of parameters, as in `Circuit.replace`, by which signals and means are differentiated; the result is
+        `Solution.sensitivities`. For series stacks whose area is coupled; the run is then stepped.
 
     Returns
     -------
@@ -119,7 +125,15 @@ def simulate(
         circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=start, charge=charge, rtol=rtol
     )  # fmt: skip
     how = start if isinstance(start, str) else "given"
-    return _given_back(run_problem(problem, times, rtol, method, progress, tier, how, jumps), throw)
+    if not sensitivities:
+        return _given_back(run_problem(problem, times, rtol, method, progress, tier, how, jumps), throw)
+    from fingerspice.solve.sensitivities import check_request, sensitivities_of
+
+    method = check_request(problem, sensitivities, method, how)
+    solution = run_problem(problem, times, rtol, method, progress, "coupled", how, jumps)
+    if solution.success:
+        solution = dataclasses.replace(solution, sensitivities=sensitivities_of(problem, solution, sensitivities, how))
+    return _given_back(solution, throw)
 
 
 def asked(
