@@ -35,16 +35,14 @@ class Changes(NamedTuple):
 
     Attributes
     ----------
-    k, rate, rate0 : ndarray, shape (n_parameter, n + 1)
+    layers : ndarray, shape (n_parameter, 3, n + 1)
         Of `Model.k`, `Model.rate` and `Model.rate0`.
     k_gap : ndarray, shape (n_parameter,)
     contact : ndarray, shape (n_parameter, N_PACKED)
         Of `Contact.packed`.
     """
 
-    k: FloatArray
-    rate: FloatArray
-    rate0: FloatArray
+    layers: FloatArray
     k_gap: FloatArray
     contact: FloatArray
 
@@ -104,18 +102,19 @@ def _live(live: FloatArray, w: FloatArray, x: FloatArray) -> None:
 
 @jit_rows
 def _forcing(
-    q0: float, rate: FloatArray, rate0: FloatArray, k: FloatArray, by_rate: FloatArray, by_rate0: FloatArray,
-    by_k: FloatArray, project: FloatArray, q: FloatArray, x: FloatArray, v: FloatArray, source: FloatArray,
-    moved: FloatArray, dq: FloatArray, pull: FloatArray,
+    q0: float, layers: FloatArray, by: FloatArray, project: FloatArray, q: FloatArray, x: FloatArray, v: FloatArray,
+    source: FloatArray, moved: FloatArray, dq: FloatArray, pull: FloatArray,
 ) -> None:  # fmt: skip
     """Forcing of the modes besides their own decay, at every row: x' less F(q0) x.
 
+    `layers` and `by` hold k, the rates and their changes, shape (3, n + 1), as in `Changes.layers`.
     `source` is U*, `moved` its change, `dq` that of q, and `v` the voltages k U* + x of the run's own state.
     """
-    n = k.size - 1
+    n = layers.shape[1] - 1
+    k, by_k = layers[0], by[0]
     h, total, held = np.empty((n + 1, ROWS)), np.zeros(ROWS), np.zeros(ROWS)
     for j in range(n + 1):
-        a, b, da, db, share, by_share = rate[j], rate0[j], by_rate[j], by_rate0[j], k[j], by_k[j]
+        a, b, da, db, share, by_share = layers[1, j], layers[2, j], by[1, j], by[2, j], k[j], by_k[j]
         for i in range(ROWS):
             leak = a + q[i] * b
             h[j, i] = (
@@ -137,12 +136,13 @@ def _forcing(
 @jit_rows
 def _moves(
     mobile: bool, k_gap: float, by_k_gap: float, s: FloatArray, ds: FloatArray, q: FloatArray, slope: FloatArray,
-    by_contact: FloatArray, x_gap: FloatArray, own: FloatArray, du: FloatArray, dq: FloatArray, moved: FloatArray,
+    by_contact: FloatArray, x_gap: FloatArray, own: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Changes of u, q and U* from that of the source and of the gap's part of the state, `x_gap`.
+    """Changes of u, q and U*, into `out` (3, ROWS), from those of the source and of the gap's part of the state.
 
-    `own` is that part in the run itself, V; `slope` and `by_contact` are the changes of q with u and with the contact.
+    These parts are `x_gap` and, in the run itself, `own`, V; q changes by `slope` with u and by `by_contact` directly.
     """
+    du, dq, moved = out[0], out[1], out[2]
     for i in range(ROWS):
         at_once = by_k_gap * s[i] + k_gap * ds[i]
         if mobile:
@@ -203,10 +203,12 @@ def follow(
         np.zeros((n, ROWS)),
     )  # fmt: skip
     nothing, weight, w0 = np.zeros((n, ROWS)), np.zeros(n), np.zeros(n)
-    x, v, none = np.zeros((n + 1, ROWS)), np.zeros((n + 1, ROWS)), np.zeros(n + 1)
+    x, v, none, layers = np.zeros((n + 1, ROWS)), np.zeros((n + 1, ROWS)), np.zeros((3, n + 1)), np.zeros((3, n + 1))
+    for j in range(n + 1):
+        layers[0, j], layers[1, j], layers[2, j] = model.k[j], model.rate[j], model.rate0[j]
     q, slopes, quiet = np.zeros(ROWS), np.zeros((ROWS, 1 + N_PACKED)), np.zeros(ROWS)
     slope, source, own, by_contact = np.zeros(ROWS), np.zeros(ROWS), np.zeros(ROWS), np.zeros(ROWS)
-    x_gap, du, dq, moved = np.zeros(ROWS), np.zeros(ROWS), np.zeros(ROWS), np.zeros(ROWS)
+    x_gap, moves = np.zeros(ROWS), np.zeros((3, ROWS))
     for at in range(course.order.size):
         i = course.order[at]
         u, s, h = course.u[i], course.s[i], course.h[i]
@@ -250,8 +252,7 @@ def follow(
                 if c == 0:
                     # The state's own equation is that of a tangent whose U* changes by all of itself.
                     _forcing(
-                        system.q0[level], model.rate, model.rate0, model.k, none, none, none, project, q, x, x, source,
-                        source, quiet, pull,
+                        system.q0[level], layers, none, project, q, x, x, source, source, quiet, pull
                     )  # fmt: skip
                 else:
                     for j in range(ROWS):
@@ -259,12 +260,11 @@ def follow(
                         for k in range(n):
                             x_gap[j] += gap[k] * w[k, j]
                     _moves(
-                        model.mobile, model.k_gap, changes.k_gap[c - 1], s, ds, q, slope, by_contact, x_gap, own, du,
-                        dq, moved,
+                        model.mobile, model.k_gap, changes.k_gap[c - 1], s, ds, q, slope, by_contact, x_gap, own, moves
                     )  # fmt: skip
                     _forcing(
-                        system.q0[level], model.rate, model.rate0, model.k, changes.rate[c - 1], changes.rate0[c - 1],
-                        changes.k[c - 1], project, q, x, v, source, moved, dq, pull,
+                        system.q0[level], layers, changes.layers[c - 1], project, q, x, v, source, moves[2], moves[1],
+                        pull,
                     )  # fmt: skip
                 left = distance(pull, used, weight)
                 if not left < math.inf:
@@ -281,8 +281,7 @@ def follow(
                         v[j, m] = model.k[j] * source[m] + x[j, m]
             else:
                 for j in range(NODES):
-                    out[c - 1, 0, at, j] = du[j]
-                    out[c - 1, 1, at, j] = dq[j]
+                    out[c - 1, 0, at, j], out[c - 1, 1, at, j] = moves[0, j], moves[1, j]
             for j in range(n):
                 x_at[c, j] = x[j, END]
     for c in range(columns):

@@ -125,7 +125,7 @@ def _changes(varied: Sequence[_Varied], scene: Scene) -> Changes:
         rate, rate0 = (
             (dg - g * dc / stack.c) / stack.c for dg, g in ((dg_area, stack.g_area), (dg_total, stack.g_total))
         )
-        rows.append((dk[order], rate[order], rate0[order], dk[stack.gap], packed))
+        rows.append((np.array([dk, rate, rate0])[:, order], dk[stack.gap], packed))
     return Changes(*(np.ascontiguousarray(np.array(x, float)) for x in zip(*rows, strict=True)))
 
 
