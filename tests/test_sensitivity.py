@@ -77,6 +77,18 @@ def test_starts_that_move_with_the_parameter(table_1: fs.Circuit, law: str, star
     check(circuit, ("Xgap.d", "Xcoat.r", "Vdrive.offset"), charge_law=law, start=start)
 
 
+def test_the_periodic_state_has_them(table_1: fs.Circuit) -> None:
+    state = fs.steady_state(table_1, rtol=1e-10, sensitivities=("Xgap.d", "Xcoat.r"))
+    for path in ("Xgap.d", "Xcoat.r"):
+        value, weights = table_1.parameters[path].value, {-2: 1.0, -1: -8.0, 1: 8.0, 2: -1.0}
+        means = [
+            weight * fs.steady_state(table_1.replace({path: value * (1.0 + k * STEP)}), rtol=1e-12).f_el_mean
+            for k, weight in weights.items()
+        ]
+        expected = sum(means) / (12.0 * STEP)
+        assert state.sensitivities[path].f_el_mean * value == pytest.approx(expected, rel=2e-9)
+
+
 def test_repeated_periods_are_followed_one_by_one(table_1: fs.Circuit) -> None:
     run = fs.simulate(table_1, t_stop=0.3, rtol=1e-8, sensitivities=("Xgap.r",))
     assert run.stats["repeated"] > 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -18,10 +18,12 @@ from fingerspice.circuit.arguments import Parameters, Sources, overridden, requi
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.loop import network_of
 from fingerspice.results.outcome import ErrorEstimate, SolveError
+from fingerspice.results.sensitivity import Sensitivity
 from fingerspice.results.solution import Solution
 from fingerspice.results.summary import Figured, Figures, KeptFigures
 from fingerspice.solve.periodic import close_period
 from fingerspice.solve.problem import Problem, prepare
+from fingerspice.solve.sensitivities import check_request, sensitivities_of
 from fingerspice.solve.simulation import RTOL_RANGE, run_problem
 from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.waveform import require
@@ -50,6 +52,8 @@ class SteadyState(Shown, Figured):
         Estimated error of the state, as its effect on the gap voltage and the force of the period.
     periods : float
         Number of periods integrated to find the state.
+    asked : tuple of str
+        Parameters by which `sensitivities` are wanted.
     """
 
     problem: Problem
@@ -59,6 +63,7 @@ class SteadyState(Shown, Figured):
     memory: float
     error: ErrorEstimate
     periods: float
+    asked: tuple[str, ...] = ()
 
     def _page(self) -> Page:
         from fingerspice.studies.reports import steady_page
@@ -89,6 +94,11 @@ class SteadyState(Shown, Figured):
     def _figures(self) -> Figures | KeptFigures:
         return self.solution._figures
 
+    @property
+    def sensitivities(self) -> Mapping[str, Sensitivity]:
+        """Derivatives of the period's signals and means, by the path of each parameter that was asked for."""
+        return self.solution.sensitivities
+
     @cached_property
     def solution(self) -> Solution:
         """The period's signals, integrated at the first access, which also gives the warnings.
@@ -98,9 +108,13 @@ class SteadyState(Shown, Figured):
         SolveError
             If the integration fails.
         """
-        solution = run_problem(self.problem, rtol=self.rtol, start="periodic")
+        tier = "coupled" if self.asked else "auto"
+        solution = run_problem(self.problem, rtol=self.rtol, tier=tier, start="periodic")
         if solution.failure is not None:
             raise SolveError(solution.failure, solution)
+        if self.asked:
+            found = sensitivities_of(self.problem, solution, self.asked, "periodic")
+            solution = dataclasses.replace(solution, sensitivities=found)
         for text in solution.warnings:
             if text not in self.problem.circuit.warnings:
                 # The third level is the caller's line, beyond the frame of `cached_property`.
@@ -118,6 +132,7 @@ def steady_state(
     rtol: float = 1e-8,
     points: int = 200,
     charge: bool = True,
+    sensitivities: Sequence[str] = (),
 ) -> SteadyState:
     """Periodic state of a circuit, by Newton's method on the map of one period.
 
@@ -131,6 +146,8 @@ def steady_state(
         As in `simulate`; the error is relative to the peaks over the period.
     points : int
         Output steps in the period.
+    sensitivities : sequence of str
+        As in `simulate`: how the periodic state changes with these parameters.
 
     Returns
     -------
@@ -154,7 +171,10 @@ def steady_state(
     problem = prepare(
         circuit, t_stop=period, t_eval=None, charge_law=charge_law, area=area, start="uncharged", charge=charge
     )
+    if sensitivities:
+        check_request(problem, sensitivities, "auto", "periodic")
     closed = close_period(dataclasses.replace(problem, first=0.0, step=period / points), 0.5 * rtol)
     return SteadyState(
-        closed.problem, rtol, closed.defect, closed.map_slope, closed.memory, closed.error, closed.periods
-    )
+        closed.problem, rtol, closed.defect, closed.map_slope, closed.memory, closed.error, closed.periods,
+        tuple(sensitivities),
+    )  # fmt: skip
