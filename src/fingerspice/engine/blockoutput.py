@@ -122,6 +122,7 @@ def _write_points(
 
 @jit
 def _every(sub: int, count: int, x: FloatArray, out: FloatArray) -> None:
+    """Copy every entry of x that is at a sample: a sample has `sub` steps."""
     for j in range(count):
         out[j] = x[j * sub]
 

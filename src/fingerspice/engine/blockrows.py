@@ -99,12 +99,14 @@ def product_of(n: int, x: FloatArray, y: FloatArray, out: FloatArray) -> None:
 
 @jit_rows
 def _doubled(n: int, decay: float, by: int, x: FloatArray, out: FloatArray) -> None:
+    """Decayed sums over twice as many increments: each sum plus that of the `by` increments before it."""
     for i in range(n):
         out[PAD + i] = x[PAD + i] + decay * x[PAD + i - by]
 
 
 @jit_rows
 def _by_eight(n: int, decay: float, x: FloatArray, w: FloatArray) -> None:
+    """Each entry of w from the one eight places before it and a sum of eight increments."""
     for i in range(min(n, PAD)):
         w[i + 1] = x[i + PAD]
     for i in range(n - PAD):

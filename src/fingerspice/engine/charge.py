@@ -83,6 +83,7 @@ def charge_step(
 
 @jit
 def _lobe(q: FloatArray) -> float:
+    """`LOBE`, or the larger value where the area changes more than tenfold within the step."""
     lowest, highest = q[0], q[0]
     for j in range(1, NODES):
         lowest, highest = min(lowest, q[j]), max(highest, q[j])
@@ -151,7 +152,7 @@ def _account(
         now = capacitance * area * error
         lasting, lasting_gap = error - brief[p], gap_error - brief_gap[p]
         if model.mobile:
-            # Q = A U / S + z: the error of A counts, that is, of u, which grows near the fold.
+            # Q = A U / S + z has the error of A, too, by that of u, which the fold magnifies.
             scale = model.area0 * q
             magnified = scale / max(1.0 - model.area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
             now = capacitance * model.area0 * error - r[DQ, row] * area * area * magnified * gap_error * (
@@ -163,7 +164,7 @@ def _account(
         voltage = slow[n] * r[SOURCE, row] + v
         if p == 0:
             if not model.mobile and control[LAST_Q] > 0.0:
-                # The charge of a jump is the integral of A over the gap voltage, whose error shifts both limits.
+                # A jump's charge is an integral of A over the gap voltage; the error of the latter shifts both limits.
                 added += (area - 1.0 / control[LAST_Q]) * lasting_gap / (model.k_gap * model.s)
         else:
             reached = min(POINTS[row], theta)

@@ -55,6 +55,7 @@ def _signed(
     net: Net, room: Room, work: Work, sources: Sources, i: int, sign: float, t: float, h: float, theta: float,
     y: FloatArray,
 ) -> float:  # fmt: skip
+    """Gap voltage i (V) at fraction `theta` of a step, times the sign of its branch: negative off the branch."""
     dense_state(theta, y, work.poly, work.stage)
     at_sources(sources, work.place, work.base[0], t + theta * h, room.s, room.ds)
     return sign * gap_voltage(net, room, i, work.stage)

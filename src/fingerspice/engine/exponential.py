@@ -227,6 +227,7 @@ def mix(
 
 @jit_rows
 def distance(a: FloatArray, b: FloatArray, weight: FloatArray) -> float:
+    """Norm of the difference of two nonlinear terms, with the weight of each mode from `weigh`."""
     total = 0.0
     for k in range(a.shape[0]):
         size = 0.0
