@@ -1,4 +1,4 @@
-"""Outputs of a stack that does not leak: its voltages follow the source at once."""
+"""Outputs of a stack that does not leak, whose voltages follow the source without delay."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ def source_at(
 def follow(model: Model, u: FloatArray, slope: FloatArray, y: FloatArray, u_before: float, rows: FloatArray) -> float:
     """Fill `rows` (see `write_row`) for source voltages u and slopes, from state y at source voltage `u_before`.
 
-    The charge of the path from one voltage to another depends on these two alone. Returns its largest error, C.
+    The charge that flows between two source voltages depends on these two alone, not on the path between them, so that
+    each row is computed from `u_before`. Returns the largest error of the charge, C.
     """
     here = y.copy()
     worst = 0.0

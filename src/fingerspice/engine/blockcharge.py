@@ -1,9 +1,10 @@
 """Charge of the blocks of a recording, and current at the starts of their steps.
 
-The charge goes through the slowest layer, as in `engine.charge`. Under `local` that is the integral of
-A (c V' + g V) + g0 V. A step may take the gap voltage u through most of its range, and A with it: but with
-V = r u + v, r the ratio of both voltages' shares of the source, A c r u' is the derivative of c r G(u), G' = A, and v
-moves as slowly as the layers leak. Quadrature is left with A c v' and the leaks.
+The charge is computed through the layer that leaks slowest, as in `engine.charge`. Under `local` it is the integral of
+A (c V' + g V) + g0 V, where V is the voltage of that layer. In one step the gap voltage u may pass through most of its
+range, and A with it, so that quadrature of A c V' would need short steps. Therefore V is split into r u + v, where r is
+the ratio of the shares that the layer and the gap take of the source. A c r u' is the derivative of c r G(u), G' = A,
+and v moves as slowly as the layers leak: only A c v' and the leakage currents are left to quadrature.
 """
 
 from __future__ import annotations
@@ -41,9 +42,10 @@ class Charges(NamedTuple):
     q : ndarray, shape (4, n)
         1/A at the ends of the steps and at `PLACES`, 1/m^2.
     steps : ndarray, shape (5, n)
-        Rates at 0, 1/2 and 1 of each step (A), what it gains, and the error of that (C).
+        Rate of the charge at 0, 1/2 and 1 of each step (A), the charge gained in the step, and the error of this gain
+        (C).
     z, current, error : ndarray, shape (n,)
-        Charge and current at the starts of the steps, and the error of the slowest layer's voltage.
+        Charge (C) and current (A) at the starts of the steps, and error of the slowest layer's voltage (V).
     """
 
     q: FloatArray
@@ -54,9 +56,9 @@ class Charges(NamedTuple):
 
 
 class Course(NamedTuple):
-    """What the march along a recording works on; `w` and `error` (m,) are the modes and their error.
+    """State and scratch arrays of the loop along a recording; `w` and `error` (m,) are the modes and their error.
 
-    `spare` (3, n) is room for single outputs; `control` and `counters` as `engine.relaxation` lists them.
+    `spare` (3, n) is scratch for single outputs; `engine.relaxation` lists the entries of `control` and `counters`.
     """
 
     model: Model
@@ -72,7 +74,7 @@ class Course(NamedTuple):
 
 
 def new_charges() -> Charges:
-    """Room for one block."""
+    """Rows for one block, all zero."""
     n = BLOCK + 8
     return Charges(np.zeros((4, n)), np.zeros((5, n)), np.zeros(n), np.zeros(n), np.zeros(n))
 
@@ -82,11 +84,12 @@ def _charge_rows(
     n: int, h: float, slow: FloatArray, area0: float, kink: float, s: FloatArray, u: FloatArray,
     middle: FloatArray, ends: FloatArray, within: FloatArray, q: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
-    """Charge gained in each step but for what follows u, its rates, and Boole's rule less Simpson's (`Charges.steps`).
+    """Charge gained in each step without c r G(u), its rates, and its error by Boole's rule, into `steps` (`Charges`).
 
-    `ends` (2, n) and `within` (3, 2, n) are the part v of the slowest layer's voltage that does not follow u, and that
-    by which it leaks. What is stored moves with the area at the start of the step; along the polynomial of v goes what
-    the area moves meanwhile. `area0` is that of the state under `mobile`, 0 under `local`.
+    `ends` (2, n) and `within` (3, 2, n) hold two voltages of the slowest layer: its part v, which does not follow u,
+    and the voltage that drives its leakage current (under `mobile` the modes' part of it alone). The displacement
+    charge c A dv is exact with the area at the start of the step; the change of the area since then is integrated along
+    the polynomial of v. `area0` is the reference area under `mobile`, 0 under `local`.
     """
     mobile = area0 > 0.0
     share, c, g_area, g_total = slow[slow.size - 4], slow[slow.size - 3], slow[slow.size - 2], slow[slow.size - 1]
@@ -111,7 +114,7 @@ def _charge_rows(
         r4 = (g_area * a4 + g_total) * l4
         m2, m4 = r2 + turn * (a2 - a0) * (v4 - v0), r4 + turn * (a4 - a0) * (v0 - 4.0 * v2 + 3.0 * v4)
         simpson = (r0 + 4.0 * m2 + m4) / 6.0
-        # Slopes of the polynomial through all five.
+        # Slopes of the quartic through all five values of v; at 0 none is needed, as the area has not changed there.
         d1 = -v0 - (10.0 * v1 - 18.0 * v2 + 6.0 * v3 - v4) / 3.0
         d2 = (v0 - 8.0 * v1 + 8.0 * v3 - v4) / 3.0
         d3 = (-v0 + 6.0 * v1 - 18.0 * v2 + 10.0 * v3) / 3.0 + v4
@@ -123,7 +126,7 @@ def _charge_rows(
             + 32.0 * (r3 + turn * (a3 - a0) * d3)
             + 7.0 * (r4 + turn * (a4 - a0) * d4)
         ) / 90.0
-        # Of the area's kink both rules miss a known part.
+        # Both rules miss a part of the integral at the area's kink; this part is known and added.
         at, jump = crossing(u[i], middle[i], u[i + 1])
         rest, early = 1.0 - at, max(0.5 - at, 0.0)
         by_simpson = (4.0 * early + rest) / 6.0
@@ -139,7 +142,7 @@ def _charge_rows(
 def _leaked_error(
     n: int, h: float, slow: FloatArray, q: FloatArray, error: FloatArray, off: FloatArray
 ) -> None:  # fmt: skip
-    """Add to a step's error of the charge what the error of the slow layer's voltage leaks in it."""
+    """Add to each step's error of the charge (C) the leakage that the error of the slow layer's voltage causes."""
     g_area, g_total = slow[slow.size - 2], slow[slow.size - 1]
     for i in range(n):
         off[i] += 0.5 * h * (g_area / q[i] + g_total) * (error[i] + error[i + 1])
@@ -147,7 +150,7 @@ def _leaked_error(
 
 @jit
 def moved_with(moved: FloatArray, scale: float, shift: float, u: float) -> float:
-    """Charge (C) that has followed the gap voltage: odd in it."""
+    """The part c r G(u) of the charge (C), which follows the gap voltage u (V); it is odd in u."""
     x = abs(u) * scale + shift
     total = 0.0
     for j in range(moved.size - 1, -1, -1):
@@ -159,7 +162,7 @@ def moved_with(moved: FloatArray, scale: float, shift: float, u: float) -> float
 def moved_rows(
     n: int, moved: FloatArray, scale: float, shift: float, u: FloatArray, row: FloatArray, z: FloatArray
 ) -> None:  # fmt: skip
-    """Add it to charges, by way of `row`."""
+    """Add `moved_with` at the gap voltages u (n,) to the charges z (n,); `row` (n,) is scratch."""
     last = moved.size - 1
     for i in range(n):
         row[i] = moved[last]
@@ -175,7 +178,7 @@ def moved_rows(
 def charge_block(c: Course, r: int, level: int, n: int, h: float, local: float) -> None:
     """Charge at the ends of a block's steps, and its error; `Room.own` holds the error of the modes.
 
-    `local` is what the gap voltage is off by this block, V.
+    `local` is the error of the gap voltage (V) that this block itself makes.
     """
     form, room, own, slow, v = c.form, c.room, c.charges, c.model.slow, c.form.tap_s.size - 2
     project_for_charge(form, room, r, level, n)
@@ -206,7 +209,7 @@ def charge_block(c: Course, r: int, level: int, n: int, h: float, local: float) 
 
 @jit
 def inverse_area_at(form: Form, u: float) -> tuple[float, float]:
-    """1/A and its slope by the gap voltage, from the polynomial that the blocks use."""
+    """1/A and its derivative with respect to the gap voltage, from the polynomial that the blocks use."""
     x = abs(u) * form.scale + form.shift
     q, slope = 0.0, 0.0
     for j in range(form.area.size - 1, -1, -1):
@@ -219,7 +222,7 @@ def inverse_area_at(form: Form, u: float) -> tuple[float, float]:
 def current_at(
     c: Course, r: int, w: FloatArray, g: FloatArray, source: float, slope: float, u: float
 ) -> float:  # fmt: skip
-    """Current (A) from modes, drives, the source's value and slope, and the gap voltage."""
+    """Current (A) from the modes w, the drives g, the source's value (V) and slope (V/s), and the gap voltage u (V)."""
     model, form, slow = c.model, c.form, c.model.slow
     n = slow.size - 4
     dv, v, x_gap, dx_gap = 0.0, 0.0, 0.0, 0.0
@@ -247,7 +250,7 @@ def _current_rows(
     n: int, slow: FloatArray, over_s: float, h: float, s: FloatArray, dv: FloatArray, v: FloatArray, q: FloatArray,
     out: FloatArray,
 ) -> None:  # fmt: skip
-    """The current right of the start of each step, under `local`."""
+    """Right-hand limit of the current (A) at the start of each step, under `local`."""
     c, g_area, g_total = slow[slow.size - 3], slow[slow.size - 2], slow[slow.size - 1]
     for i in range(n):
         out[i] = (c * dv[i] + g_area * v[i] + (s[i + 1] - s[i]) / h * over_s) / q[i] + g_total * v[i]
@@ -255,7 +258,7 @@ def _current_rows(
 
 @jit_within
 def current_block(c: Course, r: int, n: int, h: float) -> None:
-    """The current right of the start of each step into `Charges.current`."""
+    """Right-hand limit of the current (A) at the start of each step, into `Charges.current`."""
     form, room, shown, own = c.form, c.room, c.shown, c.charges
     m, drives = form.rates.shape[1], room.g.shape[0]
     if form.mobile:

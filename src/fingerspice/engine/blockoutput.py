@@ -1,4 +1,4 @@
-"""Outputs of a recording, block by block: at its samples all at once, at other times one by one."""
+"""Outputs of a recording, block by block: those at its samples all at once, those at other times one by one."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
     for k in range(w.size):
         z = form.rates[r, k] * h * at
         moments(z, found)
-        # Constant, linear and square parts of what forces the mode along the step.
+        # Constant, linear and square coefficient of the mode's forcing, a parabola in the fraction of the step.
         whole, linear, square = form.gain[r, k] * room.s[i], form.gain[r, k] * (room.s[i + 1] - room.s[i]), 0.0
         for t in range(drives):
             g0, g1, g2 = room.g[t, i], room.g_within[MIDDLE, t, i], room.g[t, i + 1]
@@ -32,7 +32,7 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
     if jump > 0.0:
         early, rest, since = max(0.5 - zero, 0.0), 1.0 - zero, max(at - zero, 0.0)
         for k in range(w.size):
-            # As `add_kinks`, up to here.
+            # The kink's correction as in `add_kinks`, but up to fraction `at` instead of the end of the step.
             moments(form.rates[r, k] * h * at, found)
             one, two = at * at * found[1], at * at * at * found[2]
             own = -4.0 * (one - two) * early - (2.0 * two - one) * rest
@@ -45,7 +45,7 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
 
 @jit
 def _charge_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, u: float) -> float:
-    """Charge at a fraction of step i, where the modes and the gap voltage (V) are known."""
+    """Charge (C) at fraction `at` of step i, where the modes w and the gap voltage u (V) are known."""
     form, room, own, shown = c.form, c.room, c.charges, c.shown
     p = form.tap_s.size - 2
     stored, followed, area = 0.0, 0.0, form.area0
@@ -68,7 +68,7 @@ def _charge_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, u:
 def _write_point(
     c: Course, r: int, h: float, i: int, at: float, slope: float, out: FloatArray, place: int
 ) -> None:  # fmt: skip
-    """One output at fraction `at` of step i; `slope` is that of the source there, V/s."""
+    """Write one output at fraction `at` of step i; `slope` is the source's slope there, V/s."""
     form, room, shown, model = c.form, c.room, c.shown, c.model
     w, g = c.spare[0, : c.w.size], c.spare[1, : room.g.shape[0]]
     source = room.s[i] + at * (room.s[i + 1] - room.s[i])
@@ -107,7 +107,7 @@ def _write_point(
 def _write_points(
     c: Course, r: int, n: int, h: float, start: float, slack: float, t_out: FloatArray, out: FloatArray, last: int
 ) -> None:  # fmt: skip
-    """The outputs before number `last`, wherever they are in the block."""
+    """Write the outputs before number `last` one by one, at any times in the block."""
     s = c.room.s
     for place in range(c.counters[OUTPUT], last):
         along = max((t_out[place] - start) / h, 0.0)
@@ -122,6 +122,7 @@ def _write_points(
 
 @jit
 def _every(sub: int, count: int, x: FloatArray, out: FloatArray) -> None:
+    """Copy every entry of x that is at a sample: a sample has `sub` steps."""
     for j in range(count):
         out[j] = x[j * sub]
 
@@ -130,7 +131,7 @@ def _every(sub: int, count: int, x: FloatArray, out: FloatArray) -> None:
 def write_block(
     c: Course, r: int, sub: int, count: int, h: float, start: float, t_out: FloatArray, out: FloatArray
 ) -> None:  # fmt: skip
-    """Outputs from the start of a block (s) of `count` samples up to, and without, its end."""
+    """Write the outputs of a block of `count` samples from its start (s) on, without those at its very end."""
     form, room, shown, n, first = c.form, c.room, c.shown, count * sub, c.counters[OUTPUT]
     slack = 8e-16 * (abs(start) + n * h)
     last, aligned = first, True
@@ -163,7 +164,7 @@ def write_block(
 
 @jit
 def write_end(c: Course, value: float, slope: float, t_out: FloatArray, out: FloatArray) -> None:
-    """The outputs at the end of a run, where the source has this value (V) and slope (V/s)."""
+    """Write the outputs at the end of a run, where the source has this value (V) and slope (V/s)."""
     r = int(c.control[REFERENCE])
     room, form = c.room, c.form
     for k in range(c.w.size):

@@ -1,11 +1,14 @@
-"""Loops over the rows of a block of steps, one place a step: what `engine.relaxation` is made of."""
+"""Loops over the rows of a block, with one entry for each step; `engine.relaxation` is composed of them.
+
+Each is a function of its own, so that the compiler turns it into vector instructions.
+"""
 
 from __future__ import annotations
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_inline, jit_rows, jit_within
 
-# Zeros in front of rows that a recursion looks back from.
+# Zeros in front of a row that `recursion` works on, because it reads entries before the first.
 PAD = 8
 
 
@@ -62,7 +65,7 @@ def of_end(n: int, a: float, s: FloatArray, c: float, w: FloatArray, d: float, v
 
 @jit_within
 def drives_into(n: int, c: FloatArray, g: FloatArray, middle: FloatArray, out: FloatArray) -> None:
-    """Add what the drives (T, n) make with weights (T, 3) of their ends and middles."""
+    """Add the sum over the drives: c (T, 3) weights their values at the start, middle and end of each step."""
     t = 0
     while t + 1 < c.shape[0]:
         add_six(n, c[t], g[t], middle[t], c[t + 1], g[t + 1], middle[t + 1], out)
@@ -96,12 +99,14 @@ def product_of(n: int, x: FloatArray, y: FloatArray, out: FloatArray) -> None:
 
 @jit_rows
 def _doubled(n: int, decay: float, by: int, x: FloatArray, out: FloatArray) -> None:
+    """Decayed sums over twice as many increments: each sum plus that of the `by` increments before it."""
     for i in range(n):
         out[PAD + i] = x[PAD + i] + decay * x[PAD + i - by]
 
 
 @jit_rows
 def _by_eight(n: int, decay: float, x: FloatArray, w: FloatArray) -> None:
+    """Each entry of w from the one eight places before it and a sum of eight increments."""
     for i in range(min(n, PAD)):
         w[i + 1] = x[i + PAD]
     for i in range(n - PAD):
@@ -110,9 +115,10 @@ def _by_eight(n: int, decay: float, x: FloatArray, w: FloatArray) -> None:
 
 @jit_within
 def recursion(n: int, decay: float, inc: FloatArray, other: FloatArray, w: FloatArray) -> None:
-    """w[i + 1] = decay w[i] + inc[i], eight at a time: sums over 2, 4 and 8 increments, then over those before.
+    """Compute w[i + 1] = decay w[i] + inc[i], eight entries at a time.
 
-    `inc` and `other` have `PAD` zeros in front; `inc` is lost.
+    Decayed sums of 2, 4 and 8 successive increments come first, so that each entry then depends on the one eight places
+    before it, no longer on its neighbour. `inc` and `other` have `PAD` zeros in front; both are overwritten.
     """
     inc[PAD] += decay * w[0]
     two = decay * decay
@@ -125,7 +131,7 @@ def recursion(n: int, decay: float, inc: FloatArray, other: FloatArray, w: Float
 
 @jit_rows
 def area_rows(n: int, area: FloatArray, scale: float, shift: float, q0: float, u: FloatArray, z: FloatArray) -> None:
-    """q - q0 at gap voltages."""
+    """1/A - q0 (1/m^2) at the gap voltages u (V), into z; the polynomial `area` has the degree 4 k."""
     d = area.size - 1
     a, b, c, e, f = area[d], area[d - 1], area[d - 2], area[d - 3], area[d - 4]
     last = f - q0 if d == 4 else f
@@ -145,7 +151,10 @@ def newton_rows(
     n: int, area: FloatArray, scale: float, shift: float, k_gap: float, area0: float, s: FloatArray, x_gap: FloatArray,
     u: FloatArray, z: FloatArray, slope: FloatArray,
 ) -> float:  # fmt: skip
-    """One step of Newton for u = k_gap U + A0 x_gap q(|u|) in every place; the least slope of the difference."""
+    """One step of Newton's method for u = k_gap U + A0 x_gap q(|u|) in every entry.
+
+    Returns the smallest slope of the residual by u, which is the distance to the fold.
+    """
     d = area.size - 1
     top = area[d]
     for i in range(n):
@@ -167,9 +176,9 @@ def newton_rows(
 
 @jit_rows
 def change_of(n: int, u: FloatArray, before: FloatArray) -> float:
-    """The largest |u - before|, or up to twice that: a mean of eighth powers, several of which are added at once.
+    """Upper bound of |u - before|, at most n^(1/8) times its maximum: twice that for 256 steps, 2.2 times for 512.
 
-    `before` becomes u.
+    It is the eighth root of the sum of eighth powers, as vector instructions add several at once. `before` becomes u.
     """
     total = 0.0
     for i in range(n):
@@ -192,7 +201,10 @@ def crosses(n: int, u: FloatArray) -> bool:
 
 @jit_inline
 def crossing(a: float, m: float, b: float) -> tuple[float, float]:
-    """Where in a step u crosses 0 V, given at 0, 1/2 and 1, and by how much the slope of |u| jumps there; 0 if not."""
+    """Fraction of a step at which u crosses 0 V, and the jump of the slope of |u| there (V per step; 0 if no crossing).
+
+    u is given at 0, 1/2 and 1 as a, m and b, and taken as straight in between.
+    """
     early = a * m < 0.0
     before, after = (a, m) if early else (m, b)
     size = abs(before) + abs(after) + 1e-300
@@ -203,7 +215,10 @@ def crossing(a: float, m: float, b: float) -> tuple[float, float]:
 def kink_rows(
     n: int, kink: float, u: FloatArray, middle: FloatArray, x: FloatArray, at: FloatArray, out: FloatArray
 ) -> None:  # fmt: skip
-    """Where each step crosses 0 V, and the jump of the slope of kink |u| x there; 0 if it does not."""
+    """Fraction of each step at which u crosses 0 V, into `at`, and the jump of the slope of kink |u| x, into `out`.
+
+    The jump is 0 where u does not cross 0 V.
+    """
     for i in range(n):
         place, jump = crossing(u[i], middle[i], u[i + 1])
         at[i], out[i] = place, kink * jump * (x[i] + place * (x[i + 1] - x[i]))
@@ -213,10 +228,11 @@ def kink_rows(
 def add_kinks(
     n: int, z: float, weight: FloatArray, feed: float, at: FloatArray, jump: FloatArray, out: FloatArray
 ) -> None:
-    """Add what a mode of rate z makes of a jump of the slope, and the parabola through its 0, 1/2 and 1 does not.
+    """Add a mode's exact response to a jump of the forcing's slope, less that to the parabola through 0, 1/2 and 1.
 
-    `weight` are those of values at 1/2 and 1. Since the jump the mode has made (y - 1 + exp(-y)) / y^2 of the square of
-    the rest of the step, y = z rest, here to 3e-4: the correction is itself a small one.
+    The mode has rate z per step; `weight` (2,) are its quadrature weights at 1/2 and 1. The response to the ramp that
+    begins at the jump is the square of the rest of the step times (y - 1 + exp(-y)) / y^2, y = z rest. A rational
+    approximation, right to 3e-4, is enough, as the correction itself is small.
     """
     by_middle, by_end = weight[0], weight[1]
     for i in range(n):
@@ -231,7 +247,7 @@ def add_kinks(
 def kink_at(
     n: int, kink: float, place: float, u: FloatArray, middle: FloatArray, x: FloatArray, out: FloatArray
 ) -> None:  # fmt: skip
-    """Take from misfits at a place of the steps what the kink is known to make of them."""
+    """Subtract from interpolation errors at fraction `place` of the steps the known part that the kink causes."""
     m, r = 4.0 * place * (1.0 - place), place * (2.0 * place - 1.0)
     for i in range(n):
         at, jump = crossing(u[i], middle[i], u[i + 1])

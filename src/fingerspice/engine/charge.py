@@ -1,4 +1,4 @@
-"""Charge through the terminals over a step, and its error: both through the layer that leaks slowest."""
+"""Charge through the terminals over a step, and its error: both are computed through the layer that leaks slowest."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, PEAK_Q, SPREA
 from fingerspice.engine.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U
 from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, FIRST, NODES, POINTS
 
-# What a polynomial misses of a rate changes its sign at every node: of its integral over the step's length so much is
-# left. It is 0.03 to 0.14 where what is missed are Chebyshev polynomials of degree 13 to 21; where the area changes
-# tenfold within a step it is no such polynomial, and 0.22 in scene 7391 of tests/stress.py.
+# The interpolation error of a rate changes its sign at every node, so that its integral is at most this fraction of its
+# largest value times the step length. The fraction is 0.03 to 0.14 where the error is a Chebyshev polynomial of degree
+# 13 to 21. Where the area changes tenfold within a step the error is no such polynomial; the fraction is then 0.22 in
+# scene 7391 of tests/stress.py.
 LOBE, _STEEP_LOBE, _STEEP = 0.15, 0.3, 10.0
-# Slope at each node, per step length, of the polynomial through values at the nodes.
+# Differentiation matrix: slope at each node, per step length, of the polynomial through values at the nodes.
 DERIVATIVE = np.zeros((NODES, NODES))
 for _i in range(NODES):
     for _j in set(range(NODES)) - {_i}:
         DERIVATIVE[_i, _j] = BARYCENTRIC[_j] / BARYCENTRIC[_i] / (POINTS[_i] - POINTS[_j])
     DERIVATIVE[_i, _i] = -DERIVATIVE[_i].sum()
-# The same at the points between the nodes, shape (3, NODES).
+# Differentiation matrix for the points between the nodes, shape (3, NODES).
 _DERIVATIVE_BETWEEN = np.ascontiguousarray(BETWEEN.T @ DERIVATIVE)
 
 
@@ -34,12 +35,13 @@ def charge_step(
     pull: FloatArray, r: FloatArray, integral: FloatArray, h: float, z0: float, places: FloatArray, theta: float,
     control: FloatArray, z: FloatArray, current: FloatArray,
 ) -> None:  # fmt: skip
-    """z and the current at the nodes of a step of length h that starts with z0.
+    """Charge z (C) and current (A) at the nodes of a step of length h (s) that starts with the charge z0.
 
-    Both go through the layer that leaks slowest: the sum over all leaks would be a small difference of large currents.
-    What that layer stores is taken from its voltages themselves: in w' a fast mode that has died away still holds its
-    rate times the error of w, which a sum over a step much longer than the mode would turn into charge. `places` holds
-    the error of the modes (see `exponential.assess`), of which the part up to fraction `theta` of the step counts.
+    Both are computed through the layer that leaks slowest: the sum over all leaks would be a small difference of large
+    currents. The charge that this layer stores follows from its voltages, not from the integral of w': for a fast mode
+    that has decayed w' still contains its rate times the error of w, and quadrature over a step much longer than the
+    mode's time constant would turn this into charge. `places` holds the error of the modes (see `exponential.assess`),
+    of which the part up to fraction `theta` of the step counts.
     """
     n = rates.size
     slow = model.slow
@@ -56,9 +58,9 @@ def charge_step(
         q = r[Q, j]
         scale = model.area0 * q if model.mobile else 1.0
         lam = slow[n + 1] * dv * scale + (slow[n + 2] + q * slow[n + 3]) * (slow[n] * r[SOURCE, j] + v * scale)
-        # What the layer stores, over its capacitance: A_0 x under `mobile`; under `local` its voltage moves at A.
+        # The voltage whose change, times the capacitance A_0 c (`mobile`) or A c (`local`), is stored charge.
         voltage[j] = v if model.mobile else slow[n] * r[SOURCE, j] + v
-        # The leak alone, for the integral.
+        # The leakage current alone; `_integrate` makes charge of it.
         z[j] = (slow[n + 2] / q + slow[n + 3]) * (slow[n] * r[SOURCE, j] + v * scale)
         if model.mobile:
             # i = Q' with Q = A U / S + z, and u' from the area equation.
@@ -69,7 +71,7 @@ def charge_step(
             current[j] = (lam + r[SLOPE, j] / model.s) / q
     start = model.area0 if model.mobile else 1.0 / r[Q, 0]
     if not model.mobile and model.coupled:
-        # A c du, of which A at the start of the step is taken exactly and the rest along the polynomial.
+        # Charge A c dv: exact with A at the start of the step; the change of A is integrated along the polynomial.
         _add_moves(slow[n + 1] / h, voltage, r[Q], z)
     missed, kept = _missed(model, slow_share, w, r, h, voltage, z)
     _integrate(integral, h, z0, z)
@@ -81,6 +83,7 @@ def charge_step(
 
 @jit
 def _lobe(q: FloatArray) -> float:
+    """`LOBE`, or the larger value where the area changes more than tenfold within the step."""
     lowest, highest = q[0], q[0]
     for j in range(1, NODES):
         lowest, highest = min(lowest, q[j]), max(highest, q[j])
@@ -89,7 +92,7 @@ def _lobe(q: FloatArray) -> float:
 
 @jit_rows
 def _add_moves(factor: float, voltage: FloatArray, q: FloatArray, rate: FloatArray) -> None:
-    """Add factor (A - A at the start) times the slope of the voltage's polynomial, per step length."""
+    """Add to `rate` factor (A - A at the start) times the slope of the voltage's polynomial, per step length."""
     for j in range(NODES):
         slope = 0.0
         for m in range(NODES):
@@ -99,7 +102,7 @@ def _add_moves(factor: float, voltage: FloatArray, q: FloatArray, rate: FloatArr
 
 @jit_rows
 def _integrate(integral: FloatArray, h: float, z0: float, z: FloatArray) -> None:
-    """z at the nodes from z' there, in place."""
+    """Replace z' at the nodes by z there: its integral from the start of the step, plus z0."""
     total = np.zeros(NODES)
     for m in range(NODES):
         for j in range(NODES):
@@ -113,13 +116,14 @@ def _account(
     model: Model, gap: FloatArray, slow_share: FloatArray, w: FloatArray, r: FloatArray, h: float, places: FloatArray,
     theta: float, missed: float, kept: float, control: FloatArray,
 ) -> None:  # fmt: skip
-    """Largest error of the charge over the part of a step that counts, from the signed error of the modes.
+    """Update the largest error of the charge, over the part of a step that counts, from the signed error of the modes.
 
-    With dv the error of the slow layer's voltage and dA that of the area, the charge is off by c A dv now, and by what
-    stays: the leak of dv, and under `local` the integral of c (dA v' - A' dv). Where the slow layer is the gap, whose
-    voltage decides the area, the latter is nothing. What the modes' polynomials miss changes its sign at every node: it
-    is off now, but nothing of it stays. `missed` is what the polynomial of the charge's rate misses of the charge on
-    the way, and `kept` what of that stays, C.
+    Let dv be the error of the slow layer's voltage and dA the error of the area. At a given time the charge has the
+    error c A dv. It also keeps a lasting error: the leakage of dv and, under `local`, the integral of
+    c (dA v' - A' dv), which vanishes where the slow layer is the gap, whose voltage determines the area. The
+    interpolation error of the modes changes its sign at every node: it counts in the former error and is left out of
+    the latter. `missed` is the error of the charge within the step by interpolation of its rate, and `kept` the part of
+    it that lasts, C.
     """
     n = gap.size
     slow = model.slow
@@ -148,7 +152,7 @@ def _account(
         now = capacitance * area * error
         lasting, lasting_gap = error - brief[p], gap_error - brief_gap[p]
         if model.mobile:
-            # Q = A U / S + z, and the fold magnifies the error of u, which is that of A.
+            # Q = A U / S + z has the error of A, too, by that of u, which the fold magnifies.
             scale = model.area0 * q
             magnified = scale / max(1.0 - model.area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
             now = capacitance * model.area0 * error - r[DQ, row] * area * area * magnified * gap_error * (
@@ -160,7 +164,7 @@ def _account(
         voltage = slow[n] * r[SOURCE, row] + v
         if p == 0:
             if not model.mobile and control[LAST_Q] > 0.0:
-                # The charge of a jump of the source is the integral of A over the gap's move: both ends of it are off.
+                # A jump's charge is an integral of A over the gap voltage; the error of the latter shifts both limits.
                 added += (area - 1.0 / control[LAST_Q]) * lasting_gap / (model.k_gap * model.s)
         else:
             reached = min(POINTS[row], theta)
@@ -178,7 +182,7 @@ def _account(
                 break
             last_theta = reached
         known = now + control[COLLECTED] + added
-        # The signs of the rest are not known.
+        # The signs of `missed` and of the shares in SPREAD are not known: add squares.
         control[ERROR_Q] = max(control[ERROR_Q], math.sqrt(known * known + missed * missed + control[SPREAD]))
         last_area, last_voltage, last_gap = area, voltage, r[U, row]
         last_error, last_gap_error = lasting, lasting_gap
@@ -190,10 +194,11 @@ def _account(
 def _missed(
     model: Model, slow_share: FloatArray, w: FloatArray, r: FloatArray, h: float, voltage: FloatArray, rate: FloatArray
 ) -> tuple[float, float]:  # fmt: skip
-    """What the polynomial through a rate of the charge misses of the charge on the way and at the end of a step, C.
+    """Error of the charge (C) within a step, and at its end, by interpolation of the charge's rate.
 
-    Where the area falls by decades within a step, it does so long before the voltages' own polynomials miss anything.
-    At the end the rule of quadrature is of twice the order: what the polynomial misses, relative, counts squared.
+    Where the area falls by decades within a step, this error shows long before the voltages' own interpolation errors.
+    At the end of the step the quadrature has twice the order of the interpolation: there the relative error of the rate
+    counts squared.
     """
     n = slow_share.size
     slow = model.slow

@@ -33,20 +33,20 @@ from fingerspice.numerics.small import copy_to
 
 # Codes returned by `advance`.
 DONE, JUMP, STEP_UNDERFLOW, PAUSED = 0, 1, 2, 3
-# Entries of `control`: an edge, the time since (steps after a jump may be shorter than the rounding of the time
-# itself), the next step (0: choose one), the first step after the last jump, whether that is looked for, and the step
-# before a pause.
+# Entries of `control`, s: the last edge; the time since then (a number of its own, as steps after a jump may be shorter
+# than the rounding of the absolute time); the next step (0: choose one); the first step after the last jump; whether
+# that step is still to come (1 or 0); and the last step before a pause.
 BASE, T, H, H_AFTER_JUMP, JUMPED, BEFORE = 0, 1, 2, 3, 4, 5
 N_CONTROL = 6
 # Entries of `counters`, after the evaluations.
 ACCEPTED, REJECTED, ZEROS, OUTPUT = 1, 2, 3, 4
 N_COUNTERS = 5
-# Steps between pauses: a tenth of a second, after which Python may see to a Ctrl-C, and count the steps.
+# Steps between pauses, about a tenth of a second of computation: in a pause Python can handle a Ctrl-C and count steps.
 STEPS_AT_ONCE = 250
-# No step is shorter than this share of the time since the last edge, and of the time to the next one: what decays right
-# after an edge may be faster than the rounding of the time itself.
+# The shortest step is the sum of these shares of the time since the last edge and of the time to the next edge. The
+# first vanishes at the edge: a transient right after it may be faster than the rounding of the absolute time.
 SHORTEST, SHORTEST_FIRST = 1e-15, 1e-25
-# A source's change at an edge, relative, that is its rounding and no jump.
+# A relative change of a source at an edge up to this size is rounding, not a jump.
 ROUNDING = 1e-14
 
 
@@ -55,6 +55,7 @@ def _signed(
     net: Net, room: Room, work: Work, sources: Sources, i: int, sign: float, t: float, h: float, theta: float,
     y: FloatArray,
 ) -> float:  # fmt: skip
+    """Gap voltage i (V) at fraction `theta` of a step, times the sign of its branch: negative off the branch."""
     dense_state(theta, y, work.poly, work.stage)
     at_sources(sources, work.place, work.base[0], t + theta * h, room.s, room.ds)
     return sign * gap_voltage(net, room, i, work.stage)
@@ -64,7 +65,10 @@ def _signed(
 def _first_zero(
     net: Net, room: Room, work: Work, sources: Sources, t: float, h: float, y: FloatArray, sign: FloatArray
 ) -> tuple[float, int]:
-    """First fraction of the step at which a gap voltage leaves its branch, and whose; 2 where none does."""
+    """First fraction of the step at which a gap voltage leaves its branch, and the index of its area; 2 and -1 if none.
+
+    Each gap voltage is sampled at the eighths of the step, and its sign change found by regula falsi.
+    """
     first = 2.0
     which = -1
     for i in range(sign.size):
@@ -91,7 +95,7 @@ def _first_zero(
                 if not lo < mid < hi:
                     break
                 f_mid = _signed(net, room, work, sources, i, sign[i], t, h, mid, y)
-                # Illinois: the end that stays counts half.
+                # Illinois variant of regula falsi: the value at the end that stays is halved.
                 if f_mid < 0.0:
                     hi = mid
                     f_hi = f_mid
@@ -113,7 +117,7 @@ def _write_outputs(
     net: Net, room: Room, work: Work, sources: Sources, charge: bool, t: float, h: float, t_new: float, y: FloatArray,
     sign: FloatArray, counters: IntArray, t_out: FloatArray, left: NDArray[np.bool_], rows: FloatArray,
 ) -> None:  # fmt: skip
-    """Outputs of one step: right-hand ones in [t, t_new), left-hand ones in (t, t_new]."""
+    """Write the outputs of one step: right-hand limits in [t, t_new), left-hand limits in (t, t_new]."""
     n_s = net.b.shape[1]
     while counters[OUTPUT] < t_out.size:
         i = counters[OUTPUT]
@@ -136,7 +140,7 @@ def _write_outputs(
 def _account(
     net: Net, room: Room, work: Work, sources: Sources, t: float, h: float, y: FloatArray, peaks: FloatArray
 ) -> None:
-    """Largest |gap voltage| of every area (V), met at the ends and the quarters of steps."""
+    """Update the largest |gap voltage| of every area (V), sampled at the ends and the quarters of a step."""
     for part in range(5):
         dense_state(0.25 * part, y, work.poly, work.stage)
         at_sources(sources, work.place, work.base[0], t + 0.25 * part * h, room.s, room.ds)
@@ -157,31 +161,32 @@ def advance(
     Parameters
     ----------
     net, scheme, sources
-        What to step, how, and what drives it; `room` and `work` to do it in.
+        The network, the Runge-Kutta scheme and the sources; `room` and `work` are scratch arrays.
     jump : bool
         Whether the sources' "time" is the fraction of a jump.
     charge : bool
-        Whether rows get the sources' currents.
+        Whether the output rows contain the sources' currents.
     t_end : float
-        s, not past the last edge.
+        Where to stop, s; not past the last edge.
     y, sign, s_before : ndarray
         State, branch of each area (0: choose) and the sources' values just before the time reached; updated.
     scale : ndarray, shape (size,)
-        Of each entry of the state.
+        Size of each entry of the state, to which its error is relative.
     tol : float
-        Error allowed in a step, over `scale`.
+        Error allowed in a step, as a fraction of `scale`.
     control, counters, peaks : ndarray
         Bookkeeping, updated; peaks (n_area,) in V.
     t_out, left, rows : ndarray
-        Output times (ascending), whether the left-hand value is meant, and the rows to fill: the state, then the
+        Output times (s, ascending), whether the left-hand limit is meant, and the rows to fill: the state, then the
         currents.
     tried : ndarray, shape (n, 4)
-        Takes the last steps tried, in turn: start and length (s), error over the one allowed, number from 1.
+        Ring buffer of the last steps tried: start and length (s), ratio of the error to the allowed one, number from 1.
 
     Returns
     -------
     int
-        DONE; JUMP: a source jumps at the time reached, take that first; STEP_UNDERFLOW; or PAUSED: call again.
+        DONE; JUMP: a source jumps at the time reached, and the caller must apply the jump first; STEP_UNDERFLOW; or
+        PAUSED: call again.
     """
     net, room, work, scheme, sources = borrow(net), borrow(room), borrow(work), borrow(scheme), borrow(sources)
     y, sign, s_before, scale = borrow(y), borrow(sign), borrow(s_before), borrow(scale)
@@ -250,12 +255,12 @@ def advance(
         if theta < 1.0:
             t_new = t + theta * h
             if t_new <= t:
-                # The zero is here: change branch without advancing.
+                # The zero is at the start of the step: change the branch without advancing.
                 sign[which] = -sign[which]
                 flips += 1
                 h_before = 0.0
                 continue
-            # A step that ends on the zero has it where collocation is most exact.
+            # Repeat the step so that it ends on the zero: collocation is most accurate at the end of a step.
             h = t_new - t
             if not step(net, room, scheme, work, sources, jump, t, h, y, sign, scale, tol, counters) <= 2.0:
                 control[H] = 0.5 * h

@@ -1,25 +1,25 @@
-"""What the areas of a network add to its modes' rates, at all rows of a step.
+"""Currents of a network's cells beside those at the reference areas, which add to the modes' rates at all rows.
 
-In the notation of `fingerspice.engine.netrows`, each cell b whose area moves takes the current
+In the notation of `fingerspice.engine.netrows`, each cell b whose area moves carries the current
 
     j_b = e (c_b u_b' + g_b u_b)  [mobile: + c_b u_b A'],    e = A - A0,
 
-beside the one at the reference area, and the currents drive the cells' own voltages: u' = u0' + M j, where u0' is what
-the modes' rates are without j, and M = tap feed is symmetric and negative. With M = -V L V' in the metric of the
-cells' capacitances, one area at a time, and
+beside the current at the reference area. These currents in turn drive the cells' voltages: u' = u0' + M j, where u0' is
+the rate without j, and M = tap feed is symmetric and negative. For one area at a time let C^1/2 M C^1/2 = -V L V', with
+the cells' capacitances C and the eigenvectors V, and
 
-    eta = V' (C^1/2 u0' + C^-1/2 G u),    chi = V' C^1/2 u,
+    eta = V' (C^1/2 u0' + C^-1/2 G u),    chi = V' C^1/2 u.
 
-all cells of an area answer independently of one another,
+Then the equations of an area's cells are independent of one another,
 
     j = C^1/2 V rho,    rho_i = (e eta_i + [mobile: chi_i A']) / (1 + e L_i):
 
-one division for each, and linear maps of the modes before and after. Cells of different areas answer one another by
-what is left of M between them, `cross`. Under `mobile` A' = (dA/du) u' of the gap's own cell closes one scalar equation
-for each area; where its factor, or the determinant for several areas, falls to 0 is the fold.
+one division for each, and linear maps of the modes before and after. Cells of different areas stay coupled by the
+blocks of M between them, `cross`. Under `mobile` A' = (dA/du) u' of the gap's own cell closes one scalar equation for
+each area; the fold is where its factor, or for several areas the determinant, falls to 0.
 
-The rate of a mode that is much faster than the step is taken from its own polynomial, which holds j already: such modes
-count in u0' and not in M.
+The rate of a mode that is much faster than the step is the slope of its interpolation polynomial, which contains the
+effect of j already: such modes count in u0' and not in M.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.numerics.lobatto import ROWS
 from fingerspice.numerics.small import copy_to, diagonalise
 
-# Steps over the time constant of a mode from which on its rate is taken from its polynomial: -rate w + gain s + feed j
-# would be what is left of large numbers, and j hands that on to every other mode.
+# From this ratio of step length to time constant on, a mode's rate is the slope of its polynomial: -rate w + gain s +
+# feed j would be a small difference of large numbers, and j would pass its rounding on to every other mode.
 STIFF = 300.0
-# Over the areas, each time the currents are evaluated.
+# Gauss-Seidel sweeps over the areas in each evaluation of the currents.
 _SWEEPS = 2
-# Couplings that are kept for when they are needed again, and numbers of them, at most.
+# Most couplings that are kept for reuse, and most numbers in all of them (two are kept whatever their size).
 _KEPT, _MOST_NUMBERS = 16, 65_536
 
 
 class Coupling(NamedTuple):
-    """See the module; n_f cells in the bases of their areas, n live voltages, n_s sources.
+    """Maps to and from eta, chi and rho of the module; n_f cells in their areas' bases, n modes, n_s sources.
 
     Attributes
     ----------
@@ -52,23 +52,23 @@ class Coupling(NamedTuple):
     root : ndarray, shape (n_f, n_f)
         C^1/2 V: currents of the cells from rho.
     from_modes, from_rates, from_stiff, held : ndarray, shape (n_f, n)
-        eta from the modes, from what drives them, and from the rates of those that are stiff; chi from the modes.
+        eta from the modes, from their forcing, and from the rates of the stiff ones; chi from the modes.
     from_sources, from_slopes : ndarray, shape (n_f, n_s)
-        eta from the sources and their slopes; chi follows the sources as eta does their slopes.
+        eta from the sources and from their slopes; `from_slopes` also maps the sources to chi.
     feed : ndarray, shape (n, n_f)
         Rates of the modes from rho.
     gap, leak : ndarray, shape (n_f,)
-        Rate of the voltage that the area follows is gap (eta - L chi A') / (1 + e L), summed, less leak u.
+        The voltage u that the area follows has the rate sum of gap (eta - L chi A') / (1 + e L), less leak u.
     cross : ndarray, shape (n_f, n_f)
         eta from rho of other areas.
     numbers : ndarray, shape (size,)
-        All of the above, which are views of it.
+        Memory of all arrays above, which are views of it.
     key : ndarray of int, shape (2,)
-        Of what this is the coupling, and the number of stiff modes, which says which they are; -1 for nothing yet.
+        Number of this coupling as the caller counts them, and number of stiff modes (the fastest ones); -1: not filled.
     kept, keys : ndarray, shape (room, size) and (room, 2)
-        `numbers` and `key` of couplings that were filled in before, the oldest of which give way.
+        Cache: `numbers` and `key` of couplings filled in before; a new one overwrites the oldest.
     used : ndarray of int, shape (1,)
-        How many of them there were.
+        How many couplings have been put into the cache.
     """
 
     answer: FloatArray
@@ -91,7 +91,7 @@ class Coupling(NamedTuple):
 
 
 def new_coupling(n: int, cells: int, sources: int) -> Coupling:
-    """Nothing filled in yet."""
+    """A coupling with an empty cache, not filled in yet."""
     shapes = (
         (cells,), (cells, cells), (cells, n), (cells, n), (cells, n), (cells, n), (cells, sources), (cells, sources),
         (n, cells), (cells,), (cells,), (cells, cells),
@@ -114,7 +114,7 @@ def take_coupling(
     out: Coupling, which: int, h: float, rates: FloatArray, feed: FloatArray, tap: FloatArray, tap_s: FloatArray,
     c: FloatArray, g: FloatArray, home: IntArray, cell: IntArray,
 ) -> None:  # fmt: skip
-    """The coupling number `which` for steps of length h (s), made if it is not kept; with h = 0 no mode is stiff."""
+    """Set `out` to coupling `which` for steps of length h (s), from the cache or anew; with h = 0 no mode is stiff."""
     stiff = 0
     for k in range(rates.size):
         if rates[k] * h > STIFF:
@@ -139,7 +139,7 @@ def fill_coupling(
     out: Coupling, h: float, rates: FloatArray, feed: FloatArray, tap: FloatArray, tap_s: FloatArray, c: FloatArray,
     g: FloatArray, home: IntArray, cell: IntArray,
 ) -> None:  # fmt: skip
-    """Fill in a coupling for steps of length h (s)."""
+    """Compute the coupling for steps of length h (s), with the eigenvectors of each area's cells."""
     n_f, n = tap.shape
     met = np.zeros((n_f, n_f))
     for p in range(n_f):
@@ -199,7 +199,7 @@ def fill_coupling(
 
 @jit_rows
 def answer_alone(home: IntArray, answer: FloatArray, more: FloatArray, eta: FloatArray, rho: FloatArray) -> None:
-    """rho under `local` where no other area answers; `more` (n_area, ROWS) is e."""
+    """rho under `local` where the areas are not coupled with one another; `more` (n_area, ROWS) is e."""
     for c in range(answer.size):
         e = more[home[c]]
         for i in range(ROWS):
@@ -213,7 +213,7 @@ def _rate_of_area(
 ) -> None:  # fmt: skip
     """A' = known + sum of share_c eta_c over one area's cells first to last; `factor` (ROWS,) falls to 0 at a fold.
 
-    `rate` is what time makes of the area, beside what its gap voltage does.
+    `rate` is the part of A' that does not come from the gap voltage (an area that follows with a delay).
     """
     for i in range(ROWS):
         factor[i] = 1.0
@@ -232,7 +232,7 @@ def _fill_matrix(
     slopes: bool, home: IntArray, answer: FloatArray, cross: FloatArray, more: FloatArray, eta: FloatArray,
     known: FloatArray, share: FloatArray, mixed: FloatArray, matrix: FloatArray,
 ) -> None:  # fmt: skip
-    """(I - cross d rho / d eta) eta = what does not hang on other areas, into `matrix` (n_f, n_f + 1, ROWS)."""
+    """(I - cross d rho / d eta) eta = part of eta independent of other areas, into `matrix` (n_f, n_f + 1, ROWS)."""
     n_f, n_area = answer.size, more.shape[0]
     for b in range(n_f):
         for c in range(n_f):
@@ -256,10 +256,10 @@ def _fill_matrix(
 
 @jit_rows
 def _eliminate(matrix: FloatArray, inverse: FloatArray, least: FloatArray, divide: bool) -> None:
-    """Solve the systems (n, n + 1, ROWS) of all rows at once, the solutions in the last column's place.
+    """Solve the systems (n, n + 1, ROWS) of all rows at once; the solutions replace the last column.
 
-    Without pivoting: they are a unit matrix and as much again as the areas move. `least` is multiplied by the
-    determinant or divided by it; `inverse` (ROWS,) is for passing use.
+    No pivots are sought: the matrices differ from the unit matrix by as much as the areas move. `least` is multiplied
+    by the determinant or, with `divide`, divided by it; `inverse` (ROWS,) is scratch.
     """
     n = matrix.shape[0]
     for p in range(n):
@@ -284,7 +284,7 @@ def _eliminate(matrix: FloatArray, inverse: FloatArray, least: FloatArray, divid
 def _mix(
     home: IntArray, answer: FloatArray, cross: FloatArray, more: FloatArray, chi: FloatArray, mixed: FloatArray
 ) -> None:
-    """eta from the rates of the areas, by what their cells hold, into `mixed` (n_f, n_area, ROWS)."""
+    """Derivative of eta by the rates A' of other areas, through their cells' chi, into `mixed` (n_f, n_area, ROWS)."""
     for b in range(answer.size):
         for a in range(more.shape[0]):
             for i in range(ROWS):
@@ -327,9 +327,9 @@ def answer_mobile(
     chi: FloatArray, eta: FloatArray, rho: FloatArray, known: FloatArray, share: FloatArray, mixed: FloatArray,
     matrix: FloatArray, least: FloatArray,
 ) -> None:  # fmt: skip
-    """rho under `mobile`, with all answers of the areas; `least` (ROWS,) takes the distance to the fold.
+    """rho under `mobile`, with all couplings of the areas; `least` (ROWS,) takes the distance to the fold.
 
-    That is the determinant of the capacitances that small changes meet, over that with every area held.
+    This is the ratio of two determinants of the capacitances for small changes: with moving areas to with areas held.
     """
     for i in range(ROWS):
         least[i] = 1.0
@@ -358,10 +358,10 @@ def answer_together(
     home: IntArray, answer: FloatArray, cross: FloatArray, more: FloatArray, own: FloatArray, eta: FloatArray,
     rho: FloatArray,
 ) -> None:  # fmt: skip
-    """rho under `local` with the answers of other areas, from an earlier one.
+    """rho under `local` where the areas are coupled, improved from its last value by Gauss-Seidel sweeps.
 
-    By sweeps over the areas (Gauss-Seidel), each of which leaves a fraction (A - A0)^2 / A0^2 at most; the iteration of
-    the step, which starts each sweep where the last one ended, does the rest. `own` (n_f, ROWS) is for passing use.
+    A sweep reduces the error to at most the fraction (A - A0)^2 / A0^2 of it. The step's own iteration, whose every
+    evaluation goes on from the last rho, reduces it further. `own` (n_f, ROWS) is scratch.
     """
     n_f = answer.size
     for _ in range(_SWEEPS):
@@ -374,7 +374,7 @@ def answer_together(
                     for i in range(ROWS):
                         own[b, i] += x * rho[c, i]
             if b + 1 == n_f or home[b + 1] != home[b]:
-                # The cells of an area do not answer one another: all of them at once.
+                # The cells of an area are independent of one another: update all of them at once.
                 for c in range(n_f):
                     if home[c] == home[b]:
                         e = more[home[c]]
@@ -384,7 +384,7 @@ def answer_together(
 
 @jit_rows
 def cell_currents(root: FloatArray, rho: FloatArray, j: FloatArray) -> None:
-    """The cells' currents beside those at the reference areas, A."""
+    """The cells' currents beside those at the reference areas (A), from rho."""
     for b in range(root.shape[0]):
         for i in range(ROWS):
             j[b, i] = 0.0

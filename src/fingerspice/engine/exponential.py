@@ -1,4 +1,4 @@
-"""One step of exponential collocation: the linear part exact, the area's by iteration, the error by what it misses."""
+"""One step of exponential collocation: exact linear part, iteration on the area's nonlinear term, error estimate."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from fingerspice.base.compiled import jit, jit_inline, jit_rows
 from fingerspice.engine.rows import DQ, GUESS, SOURCE, X_GAP, Q, U, evaluate, moved
 from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
 
-# Step lengths with tables of their own; fewer where there are many modes, each of which takes 2 kB a slot.
+# Step lengths whose tables are kept; fewer where there are many modes, each of which takes 2 kB for a step length.
 N_SLOTS, FEWEST_SLOTS, MOST_ENTRIES = 192, 8, 8_192
-# Places between which the error is followed: start, the points between nodes, end.
+# Places of a step at which the error is known: its start, the three points between nodes, its end.
 N_PLACES = 5
 
 
 class Tables(NamedTuple):
-    """Exponentials and their integrals, by step length and reference area, made when first needed.
+    """Exponentials and their integrals, by step length and reference area, computed when first needed.
 
     Attributes
     ----------
     h : ndarray, shape (n_slots,)
         Step length of each slot, s.
     level, used : ndarray of int
-        Reference area of each slot, and [slots in use, slot used last].
+        Reference area of each slot (-1: empty), and [slots in use, slot used last].
     decay, phi, miss : ndarray, shape (n_slots, n, ...)
-        See `fill_table`; `phi` and `miss` times h.
+        The tables of `fill_table`, with `phi` and `miss` multiplied by h.
     """
 
     h: FloatArray
@@ -40,7 +40,7 @@ class Tables(NamedTuple):
 
 
 def new_tables(n: int) -> Tables:
-    """No tables yet, for n modes."""
+    """Empty tables for n modes."""
     slots = max(FEWEST_SLOTS, min(N_SLOTS, MOST_ENTRIES // max(n, 1)))
     return Tables(
         np.zeros(slots),
@@ -57,7 +57,7 @@ def make_tables(
     rates: FloatArray, level: int, h: float, keys_h: FloatArray, keys_level: IntArray, count: IntArray,
     decay: FloatArray, phi: FloatArray, miss: FloatArray,
 ) -> int:  # fmt: skip
-    """The slot with the tables of a step, filled now if need be; when all are in use the oldest give way."""
+    """The slot with the tables of a step, filled now if need be; when all are in use the oldest is overwritten."""
     slots = keys_h.size
     for slot in range(min(count[0], slots)):
         if keys_h[slot] == h and keys_level[slot] == level:
@@ -65,7 +65,7 @@ def make_tables(
             return slot
     slot = int(count[0] % slots)
     count[0] += 1
-    # Beyond twice the slots the count means only "all in use" and where to go on.
+    # A count beyond the slots tells only that all are in use and which is next: it is kept below twice their number.
     if count[0] >= 2 * slots:
         count[0] -= slots
     count[1] = slot
@@ -82,10 +82,10 @@ def make_tables(
 
 @jit_rows
 def respond(forcing: FloatArray, phi: FloatArray, base: FloatArray, w: FloatArray) -> None:
-    """w = base + response to `forcing` (n, ROWS), of which the nodes count."""
+    """w = base + response to `forcing` (n, ROWS), of which only the values at the nodes are used."""
     for k in range(w.shape[0]):
         for i in range(ROWS):
-            # Two sums side by side: one alone would wait for itself.
+            # Two independent sums: in a single one every addition would wait for the result of the last.
             total = base[k, i] + phi[k, NODES - 1, i] * forcing[k, NODES - 1]
             other = 0.0
             for j in range(0, NODES - 1, 2):
@@ -99,7 +99,7 @@ def _linear(
     gain: FloatArray, decay: FloatArray, phi: FloatArray, w0: FloatArray, source: FloatArray, base: FloatArray,
     w: FloatArray,
 ) -> None:  # fmt: skip
-    """Response to the start and the source with the area at its reference, into `base` and `w`."""
+    """Response to the start values and the source, with the area held at its reference, into `base` and `w`."""
     for k in range(w0.size):
         factor = gain[k]
         start = w0[k]
@@ -123,8 +123,9 @@ def converge(
 ) -> tuple[int, bool]:  # fmt: skip
     """Fill `w` with the collocation solution of a step, iterating on the nonlinear term.
 
-    Returns the number of evaluations at all rows, and whether the iteration closed to `tol` (V). `pull` is the
-    nonlinear term at that solution, `used` the one that led to it; its modes are measured by what they move the gap.
+    Returns the number of evaluations at all rows, and whether the iteration converged to `tol` (V). `pull` is the
+    nonlinear term at that solution, `used` the term from which the solution was computed. Their difference is measured,
+    with `weight` for each mode, by how far it moves the gap voltage.
     """
     _linear(gain, decay, phi, w0, r[SOURCE], base, w)
     for k in range(w0.size):
@@ -132,7 +133,7 @@ def converge(
             used[k, i] = 0.0
     slow = False
     step = 0.0
-    # One loop from the first evaluation on: the code that it calls is put into this place, and so is compiled once.
+    # The loop includes the first evaluation: `evaluate` is inlined at each call, so that one call compiles once.
     for iteration in range(1, 41):
         if iteration > 1:
             if slow:
@@ -151,7 +152,7 @@ def converge(
             for i in range(ROWS):
                 r[GUESS, i] = r[U, i]
             continue
-        # What the gap voltage would move next, by what it moved for the last change of the nonlinear term.
+        # Estimate the next change of the gap voltage: its last one, times the ratio of the nonlinear term's changes.
         change = moved(r[U], r[GUESS])
         left = distance(pull, used, weight)
         if not left < math.inf:
@@ -164,7 +165,7 @@ def converge(
 
 @jit
 def weigh(rates: FloatArray, gap: FloatArray, decay: FloatArray, h: float, weight: FloatArray) -> None:
-    """Square of what a forcing of one in each mode moves the gap over a step, into `weight` (n,)."""
+    """Square of the move of the gap voltage over a step by a unit forcing of each mode, into `weight` (n,)."""
     for k in range(rates.size):
         reach = h if rates[k] * h < 1e-9 else (1.0 - decay[k, END]) / rates[k]
         weight[k] = (gap[k] * reach) ** 2
@@ -174,7 +175,7 @@ def weigh(rates: FloatArray, gap: FloatArray, decay: FloatArray, h: float, weigh
 def plain(
     pull: FloatArray, used: FloatArray, weight: FloatArray, pull_before: FloatArray, left_before: FloatArray
 ) -> float:
-    """Plain step of the iteration, remembered for a mixed one; returns the size of the move."""
+    """Picard step of the iteration, remembered for a later Anderson step (`mix`); returns the size of the move."""
     total = 0.0
     for k in range(pull.shape[0]):
         size = 0.0
@@ -194,7 +195,7 @@ def mix(
 ) -> float:
     """Next nonlinear term from the last two (Anderson 1965, one step back), into `used`; returns the size of the move.
 
-    What the iteration leaves decays by the area's share of the leak in a stiff stack: mixing squares that share.
+    In a stiff stack a Picard step reduces the residual by a factor, the area's share of the leakage. Mixing squares it.
     """
     across = 0.0
     along = 0.0
@@ -226,6 +227,7 @@ def mix(
 
 @jit_rows
 def distance(a: FloatArray, b: FloatArray, weight: FloatArray) -> float:
+    """Norm of the difference of two nonlinear terms, with the weight of each mode from `weigh`."""
     total = 0.0
     for k in range(a.shape[0]):
         size = 0.0
@@ -237,7 +239,7 @@ def distance(a: FloatArray, b: FloatArray, weight: FloatArray) -> float:
 
 @jit_rows
 def between(values: FloatArray) -> tuple[float, float, float]:
-    """What the polynomial through values at the nodes misses at the points between."""
+    """Interpolation error at the three points between nodes: values there less the polynomial through the nodes."""
     first = 0.0
     second = 0.0
     third = 0.0
@@ -250,7 +252,7 @@ def between(values: FloatArray) -> tuple[float, float, float]:
 
 @jit_rows
 def left_over(phi: FloatArray, pull: FloatArray, used: FloatArray, at: FloatArray) -> None:
-    """Response to what the iteration left, at the points between and the end."""
+    """Response of a mode to the residual of the iteration, at the points between nodes and the end, into `at` (4,)."""
     first = 0.0
     second = 0.0
     third = 0.0
@@ -269,7 +271,7 @@ def left_over(phi: FloatArray, pull: FloatArray, used: FloatArray, at: FloatArra
 
 @jit
 def largest(first: float, second: float, third: float) -> float:
-    """The entry of largest size."""
+    """The number of largest size, with its sign."""
     out = first if abs(first) > abs(second) else second
     return out if abs(out) > abs(third) else third
 
@@ -280,28 +282,29 @@ def assess(
     error: FloatArray, carried: FloatArray, w: FloatArray, pull: FloatArray, used: FloatArray, r: FloatArray,
     places: FloatArray, sums: FloatArray,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Error of a converged step, from what its polynomial misses between nodes and what its iteration left.
+    """Error of a converged step: interpolation error between the nodes, residual of the iteration, earlier error.
 
     Parameters
     ----------
     error : ndarray, shape (n,)
         Error of the modes at the start of the step, signed.
     carried : ndarray, shape (n, 4)
-        What has become of it at the points between and the end (see `engine.growth`).
+        This error propagated to the points between nodes and the end (see `engine.growth`).
     places : ndarray, shape (n, N_PLACES)
-        Filled with the error of the modes at the start, the points between and the end; dense output included.
+        Filled with the error of the modes at the start, the points between and the end; that of the dense output is
+        included.
     sums : ndarray, shape (4, 4)
-        Work.
+        Scratch.
 
     Returns
     -------
     step, run, magnified : float
-        Largest error of the gap voltage in the step, V: what the polynomial of this step misses (a longer or shorter
-        one misses more or less), and all of it with what the iteration left and what came before. Largest move of the
-        gap voltage for a move of a live one.
+        Largest error of the gap voltage in the step, V: that by this step's interpolation alone, which the step length
+        controls, and the whole error, with the residual of the iteration and the errors of earlier steps. Largest
+        ratio of a move of the gap voltage to the move of a state voltage that causes it.
     """
     source_first, source_second, source_third = between(r[SOURCE])
-    # The outputs are read off the polynomial through the nodes' gap voltages.
+    # Outputs are read from the polynomial through the gap voltages at the nodes: its interpolation error counts.
     sums[0, 0], sums[0, 1], sums[0, 2] = between(r[U])
     sums[0, 3] = 0.0
     for p in range(4):
@@ -334,12 +337,12 @@ def assess(
         row = FIRST + p if p < 3 else END
         factor = 1.0
         if mobile:
-            # The gap's part of the voltages is over A, and the fold magnifies its error.
+            # The modes' part of the gap voltage is multiplied by A_0 / A, and its error grows near the fold.
             factor = area0 * r[Q, row] / max(1.0 - area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
             magnified = max(magnified, factor)
         step = max(step, abs(factor * sums[1, p] + sums[0, p]))
         run = max(run, abs(factor * sums[2, p] + sums[0, p]))
-    # The charge is the integral of A dU among others: what the polynomial misses of 1/A counts with the source's move.
+    # The charge contains the integral of A dU: the interpolation error of 1/A counts times the change of the source.
     area_first, area_second, area_third = between(r[Q])
     swing = 0.3 * abs(r[SOURCE, END] - r[SOURCE, 0])
     missed = abs(largest(area_first / MISS[0], area_second / MISS[1], area_third / MISS[2]))
@@ -349,7 +352,7 @@ def assess(
 
 @jit
 def row_of(place: int) -> int:
-    """The row that a place of the error is."""
+    """Row of the work arrays that belongs to one of the `N_PLACES` places of the error."""
     if place == 0:
         return 0
     return END if place == N_PLACES - 1 else FIRST + place - 1

@@ -1,9 +1,9 @@
-"""How the error of a run is carried through a step, with what the area answers to it.
+"""Propagation of a run's error through a step, by the linearised equations including the change of the area.
 
-The modes' own decay carries an error e while the area stands still. The area answers with dq = q' du for an error du of
-the gap voltage, which forces the modes by G du: that may oppose du or support it, and near an instability of the
-circuit (a layer's leak that rises with the area, or an area that the stored charge drives on) errors grow thousandfold
-within a few steps.
+With the area held, an error of the modes decays with their rates. But an error du of the gap voltage also changes 1/A
+by dq = q' du, which forces the modes by G du. This feedback may oppose du or amplify it: near an instability of the
+circuit (a layer's leakage that rises with the area, or an area that the stored charge drives on) errors grow
+thousandfold within a few steps.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from fingerspice.engine.model import Model, branch_area
 from fingerspice.engine.rows import DQ, SOURCE, X_GAP, Q, U
 from fingerspice.numerics.lobatto import END, NODES, POINTS
 
-# Loop gain of the area, over a step, up to which the modes' own decay is taken for all; and up to which two halves of
-# the step are short enough.
+# Loop gain of the feedback through the area over a step: up to the first value the feedback is neglected, and up to the
+# second one two intervals in a step are enough, beyond it one between each two nodes.
 _SLIGHT, _MODERATE = 0.05, 1.0
-# Growth within an interval, at most.
+# Largest growth of the error that is admitted within one interval.
 _MOST = 10.0
 _MIDDLE = NODES // 2
 
@@ -29,9 +29,9 @@ def _answer(
     model: Model, push: FloatArray, tap: FloatArray, tap_k: FloatArray, feed: FloatArray, w: FloatArray,
     r: FloatArray, j: int, slope: float, forced: FloatArray,
 ) -> float:  # fmt: skip
-    """G at a node, into `forced` (n,): forcing of the modes for an error of the gap voltage; du for one of gap @ w.
+    """Forcing G of the modes by a unit error of the gap voltage at node j, into `forced` (n,).
 
-    `slope` is that of 1/A there, 1/(m^2 V).
+    Returns the error of the gap voltage for a unit error of gap @ w. `slope` is that of 1/A at the node, 1/(m^2 V).
     """
     q = r[Q, j]
     for k in range(push.size):
@@ -52,7 +52,7 @@ def _answer(
 
 @jit
 def _slope(model: Model, sign: float, r: FloatArray, j: int) -> float:
-    """Slope of 1/A at a node, 1/(m^2 V)."""
+    """Slope of 1/A by the gap voltage at node j, 1/(m^2 V)."""
     _, slope = branch_area(model, sign, r[U, j])
     return slope
 
@@ -63,14 +63,14 @@ def carry(
     feed: FloatArray, decay: FloatArray, h: float, sign: float, w: FloatArray, r: FloatArray, error: FloatArray,
     carried: FloatArray, forced: FloatArray,
 ) -> None:  # fmt: skip
-    """The error of the modes (n,) at the start of a step as it is at the points between and the end, into `carried`.
+    """Propagate the error of the modes (n,) from the start of a step to the points between nodes and to its end.
 
-    `carried` (n, 4); `forced` (n,) is for passing use; see `exponential.converge` for the rest.
+    The result goes into `carried` (n, 4); `forced` (n,) is scratch. See `exponential.converge` for the other arguments.
     """
     n = gap.size
     gain = 0.0
     for j in (_MIDDLE, END):
-        # The mean slope will do to see whether it matters.
+        # The mean slope of 1/A is enough to decide whether the feedback matters.
         way = r[U, j] - r[U, j - _MIDDLE]
         slope = r[DQ, j] if model.mobile else ((r[Q, j] - r[Q, j - _MIDDLE]) / way if way != 0.0 else 0.0)
         factor = _answer(model, push, tap, tap_k, feed, w, r, j, slope, forced)
@@ -83,7 +83,7 @@ def carry(
             carried[k, p] = decay[k, NODES + p if p < 3 else END] * error[k]
     if not gain > _SLIGHT:
         return
-    # By the exponential trapezoidal rule: only the gap voltage is implicit.
+    # Exponential trapezoidal rule: the only implicit unknown is the error `moved` of the gap voltage.
     stride = _MIDDLE if gain <= _MODERATE else 1
     moved = 0.0
     factor = _answer(model, push, tap, tap_k, feed, w, r, 0, _slope(model, sign, r, 0), forced)
@@ -107,7 +107,7 @@ def carry(
         for k in range(n):
             fade = decay[k, _MIDDLE] if stride == _MIDDLE else math.exp(-rates[k] * dt)
             carried[k, 3] += 0.5 * _reach(rates[k], dt, fade) * forced[k] * moved
-        # The points between that have been passed.
+        # Points between nodes that lie in this interval take the error at its end.
         while place < 3 and POINTS[NODES + place] < POINTS[j]:
             for k in range(n):
                 carried[k, place] = carried[k, 3]
@@ -116,5 +116,5 @@ def carry(
 
 @jit
 def _reach(rate: float, dt: float, fade: float) -> float:
-    """Response of a mode to a forcing of one for so long (s), in which it falls to `fade`."""
+    """Response of a mode to a unit forcing for `dt` (s), during which it decays to the fraction `fade`."""
     return dt if rate * dt < 1e-6 else (1.0 - fade) / rate

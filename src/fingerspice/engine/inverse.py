@@ -1,10 +1,10 @@
-"""The source's voltage that makes a wanted gap voltage in a series stack: no search where no limit holds it.
+"""The source voltage that produces a wanted gap voltage in a series stack, without a search unless a limit applies.
 
-With the gap voltage u given the area A is, and so is what flows through every layer. Per unit area (`local` law) or in
-all (`mobile`) the gap holds the charge q = c u a, with a = 1 or A, and leaks j = (g_total / A + g_area) u a. Each other
-cell has the charge s with s' = q' + j - r s, r = (g_total / A + g_area) / c, and the voltage s / (c a). The source's
-voltage is the sum. With p = s - q there is no derivative left: p' = (j - r q) - r p, stepped by an exponential with r
-at its mean and the rest a straight line.
+A given gap voltage u determines the area A and the current through the stack. Per unit area (`local` law) or in total
+(`mobile`) the gap stores the charge q = c u a, with a = 1 or A, and leaks j = (g_total / A + g_area) u a. Each other
+cell stores the charge s with s' = q' + j - r s, r = (g_total / A + g_area) / c, and has the voltage s / (c a). The
+source voltage is the sum over the cells. For p = s - q the derivative of q drops out: p' = (j - r q) - r p. A step
+solves this exactly for r at its mean over the step and a forcing that is a straight line.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from fingerspice.physics.contact import inverse_area
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-# Where a limit holds the source the gap voltage is found by secants to this, V, in at most so many.
+# Where a limit holds the source, the secant method finds the gap voltage: tolerance of the source voltage (V), and most
+# iterations.
 _CLOSE, _MOST = 1e-10, 60
 
 
@@ -29,10 +30,11 @@ def _step(
     u: float, before: FloatArray, h: float, curve: FloatArray, cells: FloatArray, gap: int, mobile: bool,
     after: FloatArray,
 ) -> float:  # fmt: skip
-    """Voltage of the source (V) where the gap has `u` at the end of a step of `h` (s).
+    """Source voltage (V) at the end of a step of `h` (s) at which the gap voltage is `u` (V).
 
-    `before` and `after`, shape (2, n_cell): p of each cell, and of the same (of the gap: leak j, charge q) the rates r;
-    at the first time `h` is 0 and `before` zeros.
+    `before` and `after`, shape (2, n_cell), are the states at the start and the end: p of each cell in the first row,
+    its r in the second one. The gap's column holds its leakage j and its charge q instead. At the first sample `h` is 0
+    and `before` is zero.
     """
     q_area = inverse_area(abs(u), curve)[0]
     scale = 1.0 / q_area if mobile else 1.0
@@ -52,7 +54,7 @@ def _step(
             mean = 0.5 * (r + before[1, i])
             z = mean * h
             decay = math.exp(-z)
-            # Integrals over the step of what is 1 at its begin, and of what is 1 at its end, each a straight line.
+            # Responses to a constant forcing of 1, and to one that rises from 0 to 1 at the end, over the step length.
             if z > 1e-3:
                 all_of = (1.0 - decay) / z
                 end = (1.0 - all_of) / z
@@ -70,11 +72,11 @@ def drive_stack(
     target: FloatArray, h: float, curve: FloatArray, cells: FloatArray, gap: int, mobile: bool, limit: float,
     change: float, drive: FloatArray, held: BoolArray,
 ) -> None:  # fmt: skip
-    """Fill `drive` (n,) with the source's voltages (V) for the gap voltages `target` (n,), V, at steps of `h` (s).
+    """Fill `drive` (n,) with the source voltages (V) for the gap voltages `target` (n,), V, at steps of `h` (s).
 
-    It starts uncharged. `cells` are c, total and areal leakage of each cell, shape (n_cell, 3). Where the source would
-    pass `limit` (V) or change by more than `change` (V) in a step, it is held there, marked in `held` (n,), and the
-    layers go on from the state that this makes.
+    The stack starts uncharged. `cells`, shape (n_cell, 3), are capacitance per area, total and areal leakage of each
+    cell. Where the source would pass `limit` (V) or change by more than `change` (V) in a step, it is held at that
+    limit, the sample is marked in `held` (n,), and the layers go on from the state at the gap voltage that results.
     """
     before = np.zeros((2, cells.shape[0]))
     after = np.zeros((2, cells.shape[0]))
@@ -105,7 +107,10 @@ def drive_stack(
 
 @jit
 def hold(wish: FloatArray, limit: float, change: float, drive: FloatArray, held: BoolArray) -> None:
-    """Fill `drive` (n,) with `wish` (n,) within `limit` (V) and changes of `change` (V) a step; `held` marks where."""
+    """Fill `drive` (n,) with `wish` (n,), limited to `limit` (V) and to changes of `change` (V) a step.
+
+    `held` (n,) marks the samples at which a limit applies.
+    """
     last = 0.0
     for n in range(wish.size):
         last = min(max(wish[n], max(-limit, last - change)), min(limit, last + change))

@@ -1,4 +1,4 @@
-"""What `engine.lockstep` needs to know of its scenes: modes, the source's response, area polynomials, step weights."""
+"""Constants of scenes for `engine.lockstep`: modes, response to the source, area polynomials, weights of the steps."""
 
 from __future__ import annotations
 
@@ -28,21 +28,24 @@ from fingerspice.engine.lockstep import (
 )  # fmt: skip
 from fingerspice.numerics.modes import modes as modes_of
 
-# Rows of a table of scenes, after those of each cell: capacitance (F/m^2), leakage in all (S) and per area (S/m^2).
+# A table of scenes has three rows for every cell: capacitance (F/m^2), total leakage (S), leakage per area (S/m^2).
 CELL_ROWS = 3
+# Its further rows.
 XI, REST, STRESS, LOAD, LOSS, AMPLITUDE, OMEGA, PHASE, N_OTHERS = 0, 1, 2, 3, 4, 5, 6, 7, 8
-"""Eq. 4's X at 1 V, A0 at 0 V (m^2), Pa at 1 V, N, c2 mu^2; V, rad/s and rad of the source."""
+"""X of Eq. 4 at 1 V, A0 at 0 V (m^2), stress at 1 V (Pa), load (N), c2 mu^2; the source's amplitude (V), angular
+frequency (rad/s) and phase (rad)."""
 LARGEST_X = 1.3
-"""To where the series of the universal curve reaches."""
-# Largest gap voltage that the area's polynomial covers, over the source's amplitude: a jump of both signs adds to what
-# leaked before it.
+"""Largest X that the series of the universal curve covers."""
+# Largest gap voltage that the area's polynomial covers, as a ratio to the source's amplitude. It is larger for a source
+# that jumps, as a jump from one sign to the other adds to the voltage left by the charge leaked before.
 COVERED, COVERED_JUMPING = 1.05, 1.6
 Scratch = tuple[
     FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray
 ]  # fmt: skip
-# Roots nearer than this to a pole, relative, leave too few digits of the distance.
+# A mode's rate nearer than this (relative) to the rate of a cell, a pole of the characteristic equation, has too few
+# correct digits in the difference of both.
 NEAR_POLE = 1e-5
-# Periods in which the periodic state has to be found.
+# Most periods in the search for the periodic state.
 MOST_PERIODS = 16
 
 
@@ -52,7 +55,7 @@ def _inverse_areas(
 ) -> None:  # fmt: skip
     """1/A at the voltages top (1 + at) / 2 of every lane, by the universal curve and the closed form of Eqs. 1 and 3.
 
-    `b` has the table's other rows of the block, from which X, A0 and the rest are taken.
+    `b` holds the table's further rows (X, A0, stress, ...) for the lanes of the block; `y` (LANES,) is scratch.
     """
     for i in range(LANES):
         x = b[XI * LANES + i] * (0.5 * (1.0 + at) * top[i]) * (2.0 / LARGEST_X) - 1.0
@@ -77,7 +80,7 @@ def _add_row(share: float, x: FloatArray, out: FloatArray) -> None:
 
 @jit
 def _three_modes(r: FloatArray, k: FloatArray, rates: FloatArray) -> bool:
-    """The two rates of three cells from a quadratic; False where they are too near to a cell's own."""
+    """The two rates of the modes of three cells from a quadratic; False where one is too near to a cell's own rate."""
     b = k[0] * (r[1] + r[2]) + k[1] * (r[0] + r[2]) + k[2] * (r[0] + r[1])
     c = k[0] * r[1] * r[2] + k[1] * r[0] * r[2] + k[2] * r[0] * r[1]
     square = b * b - 4.0 * c
@@ -96,7 +99,7 @@ def _three_modes(r: FloatArray, k: FloatArray, rates: FloatArray) -> bool:
 def _modes(
     r: FloatArray, k: FloatArray, rates: FloatArray, gain: FloatArray, feed: FloatArray, shape: FloatArray
 ) -> None:
-    """As `numerics.modes.modes`, into arrays, and without its iteration for three cells that differ."""
+    """As `numerics.modes.modes`, into given arrays, and without its iteration for three cells with different rates."""
     if r.size == 3 and _three_modes(r, k, rates):
         for m in range(2):
             norm = 0.0
@@ -115,7 +118,8 @@ def _modes(
 def moment_integrals(y: float) -> tuple[float, float, float]:
     """Integrals of exp(-y (1 - s)) s^k over [0, 1] for k = 0, 1, 2, y >= 0."""
     if y < 0.1:
-        # The sum of (-y)^j 2! / (j + 3)!, from the highest; then down, where rounding does not grow.
+        # k = 2: the sum of (-y)^j 2! / (j + 3)! from its last term on; then a recursion down to k = 0, which damps
+        # rounding.
         total = 0.0
         for j in range(8, -1, -1):
             total = 1.0 - y * total * (1.0 / (j + 4.0))
@@ -129,7 +133,7 @@ def moment_integrals(y: float) -> tuple[float, float, float]:
 
 @jit
 def weigh(i: int, h: float, rates: FloatArray, drive: FloatArray, g: Weights, modes: Marks) -> None:
-    """Weights of lane i for no step, a first one and all others of length h (s)."""
+    """Weights of lane i for a step of length 0, for a first step and for all other steps of length h (s)."""
     m_all = len(modes)
     still, first, rest = g
     for m in range(m_all):
@@ -144,7 +148,7 @@ def weigh(i: int, h: float, rates: FloatArray, drive: FloatArray, g: Weights, mo
 
 @jit
 def _scratch(m: int) -> Scratch:
-    """Room for the cells and modes of one lane: allocating it for each would cost as much as the work."""
+    """Scratch for the cells and modes of one lane, used by all in turn: allocation for each would double the time."""
     row = np.empty((5, m + 1))
     return row[0], row[1], row[2], row[3], row[4], np.empty(m), np.empty((m + 1, m)), np.empty((m + 1, m))
 
@@ -163,7 +167,7 @@ def _lane(
     i: int, gap: int, t: FloatArray, jumping: bool, c: FloatArray, start: FloatArray, rates: FloatArray,
     drive: FloatArray, scratch: Scratch, modes: Marks, powers: Marks,
 ) -> None:  # fmt: skip
-    """Constants and start of lane i from its column of the table; its area's polynomial is there already."""
+    """Constants and start of lane i from its column t of the table; the polynomial of its area is in `c` already."""
     m_all = len(modes)
     cells = m_all + 1
     area0 = SHAPE + 3 * m_all + m_all * m_all + len(powers) - 1
@@ -189,7 +193,7 @@ def _lane(
         if jumping:
             drive[m] = gain[m] * amplitude
             continue
-        # A sine's response is taken out: (rate - i omega) / (rate^2 + omega^2) of it, turned by its phase.
+        # z is the mode less its steady response to the sine, gain (rate - i omega) / (rate^2 + omega^2) of it.
         size = gain[m] * amplitude / (rates[m] * rates[m] + omega * omega)
         along = size * (rates[m] * cosine + omega * sine)
         across = size * (rates[m] * sine - omega * cosine)
@@ -217,9 +221,10 @@ def _lane(
 def _closed(
     s: FloatArray, start: FloatArray, back: FloatArray, c: FloatArray, closing: FloatArray, tol: float, modes: Marks
 ) -> bool:  # fmt: skip
-    """Whether a period leads every lane's start back to itself; else starts move by Newton's method.
+    """Whether a period leads every lane from its start back to it, to `tol`; if not, improve the starts.
 
-    Its slope is that of the stack with its area held. Lanes that have closed keep their start.
+    The improvement is a step of Newton's method with the derivative of the period map with the area held. A lane that
+    is within `tol` (relative to its peak gap voltage) keeps its start.
     """
     m_all, done = len(modes), True
     for i in range(LANES):
@@ -241,7 +246,7 @@ def _results(
     s: FloatArray, last: FloatArray, closing: FloatArray, steps: tuple[float, float], first: int, out: FloatArray,
     n_modes: int, count: int,
 ) -> None:  # fmt: skip
-    """Means over the run and over its last period, the peak (V), and what the periodic state may be off."""
+    """Means over the run and over its last period, the peak (V), and the relative error of the periodic state."""
     own = N_STATE * n_modes
     for i in range(min(LANES, out.shape[1] - first)):
         for j in range(count):
@@ -258,27 +263,28 @@ def march(
     how: tuple[int, bool, bool, float], out: FloatArray, traces: tuple[FloatArray, FloatArray], modes: Marks,
     powers: Marks, moments: Marks,
 ) -> None:  # fmt: skip
-    """Scenes of a table in blocks, by the steps of two waves; the first may be empty.
+    """Integrate scenes of a table, block by block, each with the steps of two waves; the first wave may be empty.
 
     Parameters
     ----------
     table : ndarray, shape (n_row, n_scene)
-        Rows of every cell, then `N_OTHERS`.
+        `CELL_ROWS` for all cells, then `N_OTHERS` rows.
     pending : ndarray, shape (n,)
-        Which scenes.
+        Indices of the scenes to integrate.
     gap : int
-        The gap among the cells.
+        Index of the gap among the cells.
     curves : tuple of ndarray
-        Powers of the universal curve over X, highest first; Chebyshev's points; and from values at these to powers
-        (d + 1, d + 1), highest first.
+        Polynomial coefficients of the universal curve over X, highest power first; Chebyshev points; and the matrix
+        from values at these points to polynomial coefficients (d + 1, d + 1), highest power first.
     waves : tuple of ndarray, each of shape (2, n)
-        As `lockstep.run` takes them: x and y at the steps of a period, or of half a one.
+        As `lockstep.run` takes them: x and y of the source at the steps of a period, or of half a period.
     how : tuple
-        Half periods; whether the source jumps and turns after each; whether the periodic state is looked for; and how
-        near it has to come.
+        Number of half periods; whether the source jumps to its negative after each; whether the periodic state is
+        wanted; and its tolerance, relative to the peak gap voltage.
     out : ndarray, shape (2, 2 len(moments) + 3, n)
-        Of each wave the means over the run and over its last period, the peak (V), what the periodic state is off, and
-        the last coefficient of the area's series, relative; infinite where the polynomial does not reach.
+        For each wave the means over the run and over its last period, the peak (V), the relative error of the periodic
+        state, and the relative size of the last coefficient of the area's series. The latter is infinite where the
+        polynomial does not cover the voltages met.
     traces : tuple of ndarray, each of shape (n, steps)
         Gap voltage before every step of each wave, V; (n, 0) for none.
     """
@@ -309,7 +315,7 @@ def march(
             for d in range(d_all + 1):
                 _add_row(curves[2][d, j], work[1], c[(area + d) * LANES : (area + d + 1) * LANES])
         for i in range(LANES):
-            # The highest power's coefficient is 2^(d - 1) times that of the series.
+            # The coefficient of the highest power is 2^(d - 1) times the Chebyshev coefficient.
             tail[i] = abs(c[area * LANES + i]) / 2.0 ** (d_all - 1) / c[(area + d_all) * LANES + i]
             if not b[XI * LANES + i] * top[i] <= LARGEST_X:
                 tail[i] = math.inf

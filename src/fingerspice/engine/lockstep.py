@@ -1,13 +1,14 @@
 """Many series stacks at once, in lockstep: the loop of steps of `fs.batch`.
 
-In the modes of a stack with its area held, what the area moves is a few per cent of the whole. An exponential Adams
-method (Hochbruck and Ostermann 2010, section 2.5) takes the rest exactly: z' = -rate z + drive x + dq n(x, y, z), with
-dq = 1/A - 1/A0 a polynomial of the gap voltage's size and n linear. Each step predicts by order 2, evaluates once, and
-corrects by order 3.
+In the modes of a stack with its area held, the change of the area contributes a few per cent of the modes' rates. An
+exponential Adams method (Hochbruck and Ostermann 2010, section 2.5) solves the linear part exactly:
+z' = -rate z + drive x + dq n(x, y, z), with dq = 1/A - 1/A0 a polynomial in |u_gap| and n linear. Each step predicts
+with order 2, evaluates the nonlinear term once, and corrects with order 3.
 
-A block holds `LANES` scenes, and each of its numbers stands in a row of so many places. The one loop over the lanes has
-a function of its own, whose other loops have constant lengths: `modes` and `powers` are tuples of which only the length
-counts. Then it is compiled into vector instructions without a branch, and no lane's result depends on the others.
+A block holds `LANES` scenes, one in each lane, and every quantity is a row with one entry for each lane. The only loop
+over the lanes is in a function of its own, whose inner loops have constant lengths: `modes` and `powers` are tuples of
+which only the length counts. So it is compiled into vector instructions without a branch, and no lane's result depends
+on the others.
 """
 
 from __future__ import annotations
@@ -24,18 +25,19 @@ Marks = tuple[int, ...]
 """A tuple of which only the length counts."""
 
 Weights = tuple[FloatArray, FloatArray, FloatArray]
-"""Of no step, of a first one, which knows nothing of before, and of all others."""
+"""Weights of a step of length 0, of a first step, which has no step before it, and of all other steps."""
 
-# Rows of the constants: u = A x + B y + shape z, and the scale of |u| to [-1, 1]; then those of every mode.
+# Rows of the constants: a and b in u = a x + b y + shape z, and the scale of |u| to [-1, 1]; then those of every mode.
 WAVE_X, WAVE_Y, SCALE, SHAPE = 0, 1, 2, 3
-# Rows of the weights, each for every mode: decay, drive, predictor now and before, corrector next, now and before.
+# Rows of the weights, each for every mode: decay, drive; predictor's weights of the nonlinear term at this step and the
+# one before; corrector's weights at the next step, this one and the one before.
 DECAY, DRIVE, PREDICT, PREDICT_OLD, CORRECT, CORRECT_NOW, CORRECT_OLD, N_WEIGHTS = 0, 1, 2, 3, 4, 5, 6, 7
-# Rows of the state for every mode: z, its rate now and before, and two for the step's own use.
+# Rows of the state for every mode: z, the nonlinear term now and a step before, and two scratch rows of the step.
 Z, RATE, OLD, KEPT, GUESS, N_STATE = 0, 1, 2, 3, 4, 5
-# Rows of the state after those: gap voltage, its peak, and what is integrated, as latest value and as sum.
+# Rows of the state after those: gap voltage, its peak, then the integrands' latest values and their weighted sums.
 GAP, PEAK, VALUE = 0, 1, 2
 ALL_MOMENTS = 3
-"""Integrals over time: of u^2 A, its square, and u^2. (A itself has a kink where u is 0: its sum is of order 2.)"""
+"""Number of the integrands u^2 A, (u^2 A)^2 and u^2. (A itself has a kink where u is 0: its sum is of order 2 only.)"""
 
 
 @jit
@@ -55,9 +57,9 @@ def _step(
     c: FloatArray, g: FloatArray, s: FloatArray, wave_at: tuple[float, float, float], weight: float, modes: Marks,
     powers: Marks, moments: Marks,
 ) -> None:  # fmt: skip
-    """One step of every lane, adding `weight` times what is integrated at its end.
+    """One step of every lane; adds `weight` times the integrands at its end to their sums.
 
-    The source is at (x, y) there, `wave_at` being x, y and the x before.
+    `wave_at` holds x and y of the source at the end of the step, and x at its start.
     """
     x, y, before = wave_at
     m_all, d_all, count = len(modes), len(powers) - 1, len(moments)
@@ -118,7 +120,7 @@ def _add_latest(first: int, count: int, weight: float, s: FloatArray) -> None:
 
 @jit
 def quadrature(k: int, steps: int) -> float:
-    """Weight of value k of `steps` + 1 equidistant ones: Gregory's, of order 4."""
+    """Weight of value k of `steps` + 1 equidistant values in Gregory's quadrature of order 4, in step lengths."""
     end = min(k, steps - k)
     return 0.375 if end == 0 else 7.0 / 6.0 if end == 1 else 23.0 / 24.0 if end == 2 else 1.0
 
@@ -128,7 +130,7 @@ def _window(
     c: FloatArray, g: Weights, s: FloatArray, wave: FloatArray, sign: float, steps: int, restart: bool,
     trace: FloatArray, at: int, modes: Marks, powers: Marks, moments: Marks,
 ) -> None:  # fmt: skip
-    """`steps` steps, which are one stretch of the integrals; the gap voltages go to trace (LANES, n) from `at` on."""
+    """Take `steps` steps, one range of Gregory's rule; the gap voltages go to trace (LANES, n) from `at` on."""
     count, own = len(moments), N_STATE * len(modes)
     period, stride = wave.shape[1], trace.shape[0] // LANES
     if restart:
@@ -152,17 +154,17 @@ def run(
     c: FloatArray, g: Weights, s: FloatArray, wave: FloatArray, halves: int, turned: bool, last: FloatArray,
     trace: FloatArray, modes: Marks, powers: Marks, moments: Marks,
 ) -> None:  # fmt: skip
-    """A block's scenes over `halves` half periods, from the modes in the state `s` on.
+    """Integrate a block's scenes over `halves` half periods, from the modes in the state `s` on.
 
     Parameters
     ----------
     c, g, s : ndarray
         Constants, weights and state, each flat.
     wave : ndarray, shape (2, n)
-        x and y of the source at the n steps of a period; of half a one where the source is `turned` after it, for then
-        it jumps and the steps begin anew.
+        x and y of the source at the n steps of a period. Where the source is `turned`, it jumps to its negative after
+        each half period and the method restarts: then n steps are half a period.
     last : ndarray
-        The sums of the last period, as the state holds those of the whole run; NaN in a shorter one.
+        Takes the sums over the last period, as the state holds those over the whole run; NaN in a shorter run.
     trace : ndarray, shape (LANES * steps,) or (0,)
         The gap voltage before each step, V.
     """
@@ -178,9 +180,9 @@ def run(
     while done < halves:
         if done == halves - 2:
             last[:] = s[sums : sums + last.size]
-        # What has no jumps is one stretch up to the last period.
+        # A source without jumps is integrated in one piece up to the last period.
         ahead = 1 if turned or halves < 2 else (halves - 2 if done < halves - 2 else 2)
-        # After half a period a sine, too, is the negative of what it was.
+        # The value of a sine, as of a turned source, is the negative of its value half a period earlier.
         sign = -1.0 if done % 2 == 1 else 1.0
         restart = turned or done == 0
         _window(c, g, s, wave, sign, ahead * half, restart, trace, done * half, modes, powers, moments)

@@ -103,34 +103,34 @@ def march(
     Parameters
     ----------
     system, pace, tables, work, integral
-        What to step, how and where; `integral` is `lobatto.integral_table()`.
+        The stack, the rules for steps, tables and scratch arrays; `integral` is `lobatto.integral_table()`.
     edges : ndarray, shape (m + 1,)
         Segment edges, s; `terms` (m, k, 6) and `series` (m, l) hold the source on each (see `Segment`).
     t_end : float
         Where to stop, s; not past the last edge.
     y : ndarray, shape (n + 1,)
-        Live voltages (V) and charge (C), updated in place.
+        State voltages (V) and charge (C), updated in place.
     error : ndarray, shape (n + 1,)
-        Estimated error of the modes, signed, and the reference area it belongs to; updated in place.
+        Estimated error of the modes, signed, and the number of the reference area that these modes belong to; updated.
     control, counters : ndarray
         Bookkeeping, updated in place.
     t_out, left, out : ndarray
-        Output times (ascending), whether the left-hand value is meant, and the columns to fill: recorded voltages
+        Output times (s, ascending), whether the left-hand limit is meant, and the columns to fill: recorded voltages
         (see `System.shown`), then charge and current if wanted.
     kept : Kept
-        Takes the steps, as long as there is room (none: nothing is kept); `counters` holds how many there were.
+        Takes the first steps, for repeated periods, until it is full; `counters` tells how many steps there were.
     steps : Steps
-        Takes the steps too.
+        Takes all steps, for figures of the run; where it is full the loop pauses.
     tried : ndarray, shape (TRIED, 4)
-        Takes the last steps tried, in turn: start and length (s), error over the one allowed, number from 1.
+        Ring buffer of the last steps tried: start and length (s), ratio of the error to the allowed one, number from 1.
 
     Returns
     -------
     int
         DONE, NO_STEP (no step is short enough: a fold, or an error that cannot be met), OUT_OF_RANGE (a gap voltage
-        beyond the range of the area's polynomial), TOO_MANY steps, or PAUSED: make room in `steps`, and call again.
+        beyond the range of the area's polynomial), TOO_MANY steps, or PAUSED: empty `steps`, and call again.
     """
-    # Arrays are taken out of their tuples once: doing it where they are used costs more than the use.
+    # Arrays are taken out of their tuples once: an access to a tuple inside the loop costs more than the array's use.
     model = system.model
     mobile, coupled, k_gap, area0, tau = model.mobile, model.coupled, model.k_gap, model.area0, model.tau
     curve, k_shown, gap_share = borrow(model.curve), borrow(system.k_shown), borrow(model.gap)
@@ -166,7 +166,7 @@ def march(
     tap, feed = all_tap[0], all_feed[0]
     decay, phi, miss = all_decay[0], all_phi[0], all_miss[0]
     h_slot, flips = 0.0, 0
-    # Where the length of a step is kept that is the first after an edge or a zero; -1 for others.
+    # Entry of `control` that keeps the length of the first step after an edge or a zero; -1 for all other steps.
     fresh = -1
     first_out = int(counters[OUTPUT])
     next_out = t_out[first_out] if first_out < t_out.size else math.inf
@@ -178,7 +178,7 @@ def march(
     most = counters[ACCEPTED] + counters[REJECTED] + MOST_STEPS
     begun, evaluated = control[T], counters[NFEV]
     if paused[0] > 0.0:
-        # In the middle of a segment: go on as if there had been no pause.
+        # The pause was in the middle of a segment: continue as if there had been none.
         index = segment_at(edges, control[T])
         while index >= 0 and edges[index] >= control[T]:
             index -= 1
@@ -203,7 +203,7 @@ def march(
             edge = edges[index + 1]
             if edge <= t:
                 continue
-            # Time is counted from the edge: what decays after it may be faster than the rounding of t.
+            # Time is counted from the edge: a transient after it may be faster than the rounding of t.
             since = t - start
             begun, evaluated = t, counters[NFEV]
             segment_terms, segment_series = terms[index], series[index]
@@ -216,7 +216,7 @@ def march(
                 for i in range(n):
                     control[U_GAP] += gap_share[i] * y[i]
                 take_branch(1.0 if control[U_GAP] >= 0.0 or not coupled else -1.0, control)
-            # The steps after a jump are often those after the one before.
+            # Try the step that was right after the edge before: similar jumps often need similar steps.
             control[H] = control[H_AFTER_EDGE]
             control[TOO_LONG] = 0.0
             control[ALLOWED] = 0.0
@@ -267,15 +267,15 @@ def march(
             )  # fmt: skip
             counters[NFEV] += passes * NODES
             wrong = first_wrong(u_rows, sign, tol) if coupled else 0
-            # An iteration that has not closed may lead anywhere.
+            # Node 1 may be off its branch only because the iteration did not converge: also require a start near 0 V.
             at_zero = sign * u_rows[0] <= 1e-9 * min(abs(u_rows[1]), u_top)
             if wrong == 1 and flips < 2 and at_zero:
-                # The step starts at a zero and leaves on the other side.
+                # The step starts at a zero, and the gap voltage leaves it to the other side: change the branch.
                 flip = True
                 break
             below = dip(u_rows, sign, tol, wrong, coefficients[0]) if coupled and closed else 0.0
             if 0.0 < below < POINTS[1] and at_zero:
-                # The step starts at a zero and is soon back there: a shorter one will see it.
+                # The gap voltage starts at a zero and soon returns to it: a shorter step resolves this.
                 counters[REJECTED] += 1
                 h = rung(2.0 * below * h)
                 wanted = h
@@ -298,18 +298,18 @@ def march(
                 break
             tries += 1
             counters[REJECTED] += 1
-            # Near the end of the area's polynomial no step ends beyond it: the kink there would be crept up to.
+            # A step rejected beyond the end of the area's polynomial: shorter ones would creep up to the kink there.
             if coupled and abs(control[U_GAP]) > 0.9 * u_top and largest_size(u_rows) > u_top:
                 return OUT_OF_RANGE
-            # Refused at this length, which is rounding of the time: a singularity.
+            # A step of the size of the time's rounding is rejected: the solution has a singularity here.
             if h <= 1e-15 * since + 1e-25 * (edge - start):
                 return NO_STEP
-            # Close to a fold the iteration closes on short steps only: methods that solve the area equation at
-            # every evaluation get there sooner.
+            # Close to a fold the iteration converges for very short steps only. Methods that solve the area equation
+            # at every evaluation reach the fold sooner and take over.
             if mobile and 1.0 - area0 * r[X_GAP, 0] * r[DQ, 0] < 0.01:
                 return NO_STEP
             if wrong > 1 and sign * u_rows[END] < lo:
-                # It went far over a zero, where the branch has no meaning: end soon after the zero.
+                # The voltage is far beyond a zero, where the branch has no meaning: end the step soon after the zero.
                 h = rung(h * min(0.9, 1.1 * POINTS[wrong]))
             else:
                 h = shorten(h, factor, control)
@@ -398,9 +398,9 @@ def march(
                 control[SIGN] = -control[SIGN]
                 control[MARGIN] = 0.0
                 return NO_STEP
-            # The area has a kink here: fast modes start anew.
+            # The area has a kink here, which excites fast modes again: the first step is chosen as after other zeros.
             if below > 0.0:
-                # It will soon be back.
+                # The gap voltage returns to 0 V soon.
                 control[H] = 2.0 * (below - theta) * h
                 control[ALLOWED] = 0.0
             elif control[H_AFTER_ZERO] > 0.0:
@@ -420,9 +420,9 @@ def march(
 def end_row(
     model: Model, segment: Segment, tau: float, charge: bool, y: FloatArray, control: FloatArray, row: FloatArray
 ) -> None:
-    """Output row (see `model.write_row`) `tau` s into a segment, after the jump of the source that may begin it.
+    """Output row (see `model.write_row`) `tau` s into a segment, at 0 after the jump of the source that may begin it.
 
-    The jump's charge is put into `y`, and its branch into `control`; NaN where it goes past a fold.
+    The jump's charge is added to `y`, its branch goes into `control`; the row is NaN where the jump passes a fold.
     """
     u_source, du_source = source(segment, tau)
     if tau == 0.0 and not enter(model, charge, u_source, y, control):

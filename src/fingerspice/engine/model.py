@@ -1,4 +1,4 @@
-"""Stack, contact and source as one compiled right-hand side.
+"""The differential equation of a stack with its contact and source, as compiled functions.
 
 State y = [x (n,) in volt, z in coulomb]. With q = 1/A, the reference area A_0 and layer voltages u = k U + E v,
 
@@ -6,8 +6,9 @@ State y = [x (n,) in volt, z in coulomb]. With q = 1/A, the reference area A_0 a
     mobile   v = x A_0 q      x' = f A / A_0  z' = A lam             charge is A U / S + z
 
 where h_x = (rate_x + q rate0_x) u_x is the leak of layer x over its capacitance, f_x = k_x sum(h) - h_x and
-lam = sum(h) / S. Leaks are taken from layer voltages, not from one matrix: what cancels in a layer that leaks fast
-then cancels in every row alike. Only z' needs the slope of the source.
+lam = sum(h) / S. The leakage currents are computed from the layer voltages, not from one matrix times the state: then
+all rows contain the same rounded currents, and the large ones of a fast-leaking layer cancel alike in every row. Only
+z' needs the slope of the source.
 """
 
 from __future__ import annotations
@@ -30,12 +31,13 @@ class Model(NamedTuple):
     mobile : bool
         Charge law.
     coupled : bool
-        Whether the area follows the gap voltage; then steps end on its zeros.
+        Whether the area follows the gap voltage; then steps end on the zeros of this voltage.
     k : ndarray, shape (n + 1,)
-        Share of a jump of U that each layer takes. The first n layers' voltages over k U are the state; the last
-        layer's is minus their sum.
+        Share of a jump of U that each layer takes. The state is x = layer voltage - k U (`local`) of the first n
+        layers; that of the last layer is minus their sum.
     rate, rate0 : ndarray, shape (n + 1,)
-        Leak rate of each layer: the part that does not depend on the area (1/s), and that over 1/A (m^2/s).
+        Leak rate of each layer: the part that does not depend on the area (1/s), and the factor of 1/A in the rest
+        (m^2/s).
     k_gap : float
         Share of a jump of U that the gap takes.
     gap : ndarray, shape (n,)
@@ -43,8 +45,8 @@ class Model(NamedTuple):
     s : float
         Sum of 1/c_x over the layers, m^2/F.
     slow : ndarray, shape (n + 4,)
-        The layer that leaks slowest: its row of the embedding, share k, capacitance c (F/m^2), and leak per area
-        (S/m^2) as a constant and over 1/A. The current through it suffers least from cancellation.
+        The layer that leaks slowest, through which the current suffers least from cancellation: its row of E, share k,
+        capacitance c (F/m^2), and the two parts of its leak per area, constant (S/m^2) and factor of 1/A (S).
     area0 : float
         Reference area of the mobile state, m^2.
     tau : float
@@ -67,13 +69,13 @@ class Model(NamedTuple):
     curve: FloatArray
 
 
-# Gauss-Legendre rule for the charge of a jump under the local law: A is analytic on either side of 0 V. From the values
-# at its points follow the last Legendre coefficients, _TAIL @ values: what the rule misses goes with their square.
+# Gauss-Legendre rule for the charge of a jump under the local law: A is analytic on either side of 0 V. The last
+# Legendre coefficients are _TAIL @ values; the quadrature error is proportional to their square.
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(24)
 _TAIL = np.array([(k + 0.5) * _GAUSS_W * np.polynomial.legendre.Legendre.basis(k)(_GAUSS_X) for k in (20, 21, 22, 23)])
-# Of a panel's charge, and the most panels that a jump is split into.
+# Quadrature error allowed in a panel, relative to its charge, and the most panels that a jump is split into.
 _RULE_ERROR, _MOST_PANELS = 1e-15, 200
-# Legendre coefficients below this share of the values are their rounding.
+# Legendre coefficients below this fraction of the largest value are rounding.
 _TAIL_ROUNDING = 1e-14
 
 
@@ -90,8 +92,8 @@ def dot(a: FloatArray, x: FloatArray) -> float:
 def branch_area(model: Model, sign: float, u: float) -> tuple[float, float]:
     """1/A and its slope d(1/A)/du on the branch A(|u|) = A(sign u), continued a little past 0 V.
 
-    Under `mobile`, farther on the wrong side it is the true area, so that a walk towards the branch starts on solid
-    ground; under `local` nothing walks, and a step across 0 V must see no kink.
+    Under `mobile`, beyond this continuation on the wrong side, it is the true area A(|u|), so that `walk` can approach
+    the branch from there. Under `local` there is no such search, and a step across 0 V must see no kink.
     """
     if model.mobile and sign * u < model.curve[0]:
         sign = -sign
@@ -103,8 +105,9 @@ def branch_area(model: Model, sign: float, u: float) -> tuple[float, float]:
 def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: float) -> float:
     """Gap voltage (V): k U + x under `local`; under `mobile` the root of u = k U + x A_0 / A(|u|).
 
-    The root meant is the one connected to `guess`, a gap voltage not long before; with k U for a guess, to the
-    uncharged state. NaN where the branch holds no such root: past the fold.
+    Of several roots it is the one connected with `guess`, a gap voltage shortly before. The guess k U, which is the gap
+    voltage of the uncharged state, gives the root connected with that state. NaN past the fold, where the branch has no
+    such root.
     """
     if not model.mobile or x_gap == 0.0:
         return k_u + x_gap
@@ -114,7 +117,7 @@ def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: floa
     last = math.inf
     for _ in range(12):
         slope = 1.0 - b * dq
-        # Past the fold Newton would go to another root: leave it to the walk.
+        # Past the fold Newton's method would go to another root: `walk` decides.
         if not slope > 1e-3:
             break
         step = (k_u - u + b * q) / slope
@@ -138,16 +141,16 @@ def _rises(
 ) -> bool:  # fmt: skip
     """Whether k_u(u) = u - b / A rises all along a step from (u, q, dq) to (q_new, dq_new), so that no fold is crossed.
 
-    No step takes off more than three quarters of the slope, at its end or in between, as far as the slopes at both ends
-    miss the mean one; nor does the area change by a third, nor the voltage by more than a half or by its own scale, as
-    far as which (`lowest`, V) the area may be continued past 0 V.
+    The slope of k_u may fall by at most three quarters to the end of the step, and its mean over the step may differ
+    from the average of both ends by at most half of the smaller one. 1/A may change by no more than 30 %, and the
+    voltage by no more than half of itself or |lowest| (V), the distance to which A is continued past 0 V.
     """
     if abs(step) > max(0.5 * abs(u), abs(lowest)):
         return False
     slope, slope_new = 1.0 - b * dq, 1.0 - b * dq_new
     if not (slope_new > 0.25 * slope and abs(q_new - q) < 0.3 * min(q, q_new)):
         return False
-    # A change as small as rounding tells no mean slope; but nothing can lie in between.
+    # For so small a change the mean slope would be rounding; but then no fold can lie in between.
     if abs(q_new - q) < 1e-6 * q and abs(b * (dq_new - dq)) < 0.5 * slope:
         return True
     return abs(b * ((q_new - q) / step - 0.5 * (dq + dq_new))) < 0.5 * min(slope, slope_new)
@@ -155,18 +158,18 @@ def _rises(
 
 @jit
 def _settled(step: float, last: float, slope: float, size: float) -> bool:
-    """Whether Newton's step is down to rounding of `size`, or no longer falls close to that.
+    """Whether Newton's step has fallen to rounding of `size`, or is close to it and no longer falls.
 
-    A small slope, close to a fold, magnifies what rounding leaves.
+    Close to a fold the slope is small, and the step is rounding divided by this slope.
     """
     return abs(step) <= 4e-16 * size or (abs(step) * min(slope, 1.0) <= 1e-13 * size and abs(step) >= last)
 
 
 @jit
 def walk(model: Model, k_u: float, b: float, sign: float, u: float, stops: bool) -> float:
-    """From gap voltage u to the root of u = k_u + b / A on the same branch, or to 0 V if that comes first and `stops`.
+    """Follow the branch from gap voltage u to the root of u = k_u + b / A; with `stops`, to 0 V if that comes first.
 
-    k_u(u) = u - b / A must rise all the way. NaN where a fold comes first.
+    Newton's steps are halved until k_u(u) = u - b / A rises along each (`_rises`). NaN where a fold comes first.
     """
     q, dq = branch_area(model, sign, u)
     slope = 1.0 - b * dq
@@ -207,7 +210,7 @@ def ramp(model: Model, k_u: float, x_gap: float, u: float) -> float:
         return k_u + x_gap
     b = x_gap * model.area0
     q, _ = branch_area(model, 1.0, 0.0)
-    # The side of 0 V that k_u leads to from there.
+    # The side of 0 V to which the gap voltage goes from 0 V where the source's share is k_u.
     after = 1.0 if k_u + b * q >= 0.0 else -1.0
     before = after if u == 0.0 else math.copysign(1.0, u)
     if before != after:
@@ -219,21 +222,21 @@ def ramp(model: Model, k_u: float, x_gap: float, u: float) -> float:
 
 @jit
 def turns_at_zero(model: Model, x_gap: float, sign: float) -> bool:
-    """Whether the mobile law folds at 0 V towards a sign: the area has its kink there, and the root may end in it."""
+    """Whether the mobile law has a fold at 0 V on the side `sign`: A has a kink there, at which a root may vanish."""
     _, dq = branch_area(model, sign, 0.0)
     return model.mobile and not 1.0 - x_gap * model.area0 * dq > 0.0
 
 
 @jit
 def choose_branch(model: Model, u_source: float, y: FloatArray) -> float:
-    """Sign of the gap voltage; 1 at zero or where the area does not follow it."""
+    """Sign of the gap voltage; 1 at 0 V, and where the area does not depend on the gap voltage."""
     if not model.coupled:
         return 1.0
     k_u = model.k_gap * u_source
     x_gap = dot(model.gap, y)
     zero = k_u + x_gap
     if model.mobile and zero * k_u < 0.0:
-        # Charge opposes U and would win at the area of 0 V; a larger area may still hold a root on U's own side.
+        # With the area at 0 V the charge would outweigh U; with a larger area a root may still be on U's own side.
         sign = 1.0 if k_u > 0.0 else -1.0
         if sign * gap_voltage(model, k_u, x_gap, sign, k_u) > 0.0:
             return sign
@@ -278,7 +281,7 @@ def rates_at(
 def voltage_by_time(
     model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, u: float, dy: FloatArray
 ) -> tuple[float, float]:
-    """Distance to the fold, and the gap voltage's rate times it, V/s: both stay finite where the fold is met.
+    """Distance to the fold, and its product with the gap voltage's rate (V/s), which both stay finite at the fold.
 
     `dy` takes y'.
     """
@@ -315,7 +318,7 @@ def write_row_at(
     row[2] = q
     row[3] = current
     row[4] = margin
-    # A slice on the left would be compiled with a message for every shape.
+    # A loop, as the assignment to a slice would compile an error message for every shape.
     for j in range(y.size):
         row[5 + j] = y[j]
 
@@ -324,8 +327,8 @@ def write_row_at(
 def jump_charge(model: Model, x_gap: float, u_from: float, u_to: float) -> tuple[float, float]:
     """Charge through the terminals in a jump of the source under `local` and its error, C: integral of A dD = A dU / S.
 
-    Split at 0 V, where the area has a kink, and then in halves until the rule is right on each: a jump of many times
-    the voltage on which the area changes takes several.
+    The range is split at 0 V, where the area has a kink, and then halved into panels until the quadrature error of each
+    is at rounding: a jump of many times the voltage scale of the area needs several panels.
     """
     crossing = -x_gap / model.k_gap if model.k_gap != 0.0 else u_from
     inside = min(u_from, u_to) < crossing < max(u_from, u_to)
@@ -336,7 +339,7 @@ def jump_charge(model: Model, x_gap: float, u_from: float, u_to: float) -> tuple
         start, length = first, last - first
         while start != last:
             end = start + length
-            # The last panel ends exactly at the end.
+            # The last panel must end exactly at `last`, whatever the rounding of the sums.
             if abs(last - end) <= 1e-12 * abs(last - first):
                 end = last
             charge, missed = _panel_charge(model, x_gap, start, end)
@@ -353,7 +356,7 @@ def jump_charge(model: Model, x_gap: float, u_from: float, u_to: float) -> tuple
 
 @jit
 def _panel_charge(model: Model, x_gap: float, u_from: float, u_to: float) -> tuple[float, float]:
-    """Integral of A dU between source voltages on one side of the gap's 0 V, and what the rule misses of it, m^2 V."""
+    """Integral of A dU between two source voltages at which the gap voltage has one sign, and its error, m^2 V."""
     half, middle = 0.5 * (u_to - u_from), 0.5 * (u_to + u_from)
     total = 0.0
     centre = 1.0 / inverse_area(abs(model.k_gap * middle + x_gap), model.curve)[0]
@@ -369,6 +372,7 @@ def _panel_charge(model: Model, x_gap: float, u_from: float, u_to: float) -> tup
     left = 0.0
     for k in range(tail.size):
         left = max(left, abs(tail[k]))
-    # Coefficients that fall as a geometric series from the range of the values to these end there squared.
+    # If the coefficients fall geometrically from the range of the values to `left`, those of twice the degree, which
+    # are the first that the rule misses, have the size left^2 / (high - low).
     missed = 2.0 * left * min(1.0, left / (high - low)) if left > _TAIL_ROUNDING * high else 0.0
     return half * total, abs(half) * missed
