@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.export import export_netlist as export_netlist
     from fingerspice.studies.feel import Feel as Feel
     from fingerspice.studies.feel import feel as feel
+    from fingerspice.studies.fit import fit as fit
+    from fingerspice.studies.fitresult import Fit as Fit
     from fingerspice.studies.fitting import ColeCole as ColeCole
     from fingerspice.studies.fitting import MaterialFit as MaterialFit
     from fingerspice.studies.fitting import fit_material as fit_material
@@ -84,6 +86,8 @@ _HOMES = {
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "studies.export": ("export_netlist",),
     "studies.feel": ("Feel", "feel"),
+    "studies.fit": ("fit",),
+    "studies.fitresult": ("Fit",),
     "studies.fitting": ("ColeCole", "MaterialFit", "fit_material"),
     "studies.inverse": ("InverseDrive", "inverse_drive"),
     "studies.largesignal": ("large_signal",),

@@ -39,6 +39,7 @@ OWN: dict[str, tuple[str, ...]] = {
         *("kind", "rate", "samples", "carrier", "limit", "slew", "lead", "peak", "at_limit", "worst", "rms"),
         *("worst_share", "rms_share", "largest_wanted", "largest_reached", "corrections"),
     ),
+    "fit": ("parameters", "correlation", "signal", "count", "residual_rms", "objective", "objectives", "notes"),
     "export": (),
     "figures": (),
 }

@@ -12,6 +12,7 @@ import typer
 from fingerspice.base.errors import InputError
 from fingerspice.cli import answers, options
 from fingerspice.cli import design as designs
+from fingerspice.cli import fit as fits
 from fingerspice.cli.arguments import (
     AsJson,
     ChargeLaw,
@@ -347,6 +348,7 @@ def limits(
 
 
 app.command()(designs.design)
+app.command()(fits.fit)
 
 
 @app.command()

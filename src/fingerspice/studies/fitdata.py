@@ -1,0 +1,158 @@
+"""Measured data for a fit: means under several conditions, or a signal over time, from arrays or a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import InputError
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.topology import driving_sources
+from fingerspice.waveforms.columns import read_text_columns
+from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file
+
+#: Signals that can be fitted, over time or (with ``_mean``) as means, and their units.
+MEASURED = {"f_el": "N", "f_t": "N", "friction": "", "area": "m^2", "u_gap": "V"}
+MEANS = ("f_el", "f_t", "friction", "area")
+_PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
+TIME, SIGMA, SOURCE = "t", "sigma", "source"
+
+
+@dataclass(frozen=True)
+class Data:
+    """Measured values with their conditions.
+
+    Attributes
+    ----------
+    signal : str
+        A key of `MEASURED`.
+    values : ndarray, shape (n,)
+        Measured values in SI units: means, or, with `t`, values over time.
+    sigma : ndarray, shape (n,), or None
+        Standard deviation of every value; None where it is not known.
+    conditions : dict of str to ndarray, shape (n,)
+        Path to the values that a parameter had in the measurements, in the unit of the netlist.
+    t : ndarray, shape (n,), or None
+        Times, s.
+    """
+
+    signal: str
+    values: FloatArray
+    sigma: FloatArray | None
+    conditions: dict[str, FloatArray]
+    t: FloatArray | None = None
+
+    @property
+    def varying(self) -> dict[str, FloatArray]:
+        """The conditions that are not the same in all measurements."""
+        return {path: x for path, x in self.conditions.items() if np.ptp(x) > 0.0}
+
+
+def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> Data:
+    """The data that a caller gave: a mapping of columns, or a table with a header.
+
+    The columns are one of ``f_el_mean``, ``f_t_mean``, ``friction_mean`` and ``area_mean`` with conditions (paths such
+    as ``Vdrive.amplitude``, ``source.frequency``, ``Xgap.fn``), or ``t`` with ``f_el``, ``f_t``, ``friction``, ``area``
+    or ``u_gap``; and ``sigma``, the standard deviation, where it is known.
+
+    Raises
+    ------
+    InputError
+        If a column or unit is unknown, columns have different lengths, or a value is no finite number.
+    """
+    columns, place = _columns(circuit, given)
+    names = {
+        **{f"{name}_mean": name for name in MEANS},
+        **({name: name for name in MEASURED} if TIME in columns else {}),
+    }
+    measured = [name for name in columns if name in names]
+    if len(measured) != 1:
+        allowed = ", ".join(names)
+        what = f"several measured columns ({', '.join(measured)})" if measured else "no measured column"
+        raise InputError(f"{place} have {what}, and the columns {', '.join(columns)}; allowed: one of {allowed}")
+    values = columns.pop(measured[0])
+    sigma, t = columns.pop(SIGMA, None), columns.pop(TIME, None)
+    if sigma is not None and not np.all(sigma > 0.0):
+        raise InputError(f"{place}: the smallest sigma is {sigma.min():g}; allowed: more than 0")
+    if t is not None and (measured[0].endswith("_mean") or np.any(np.diff(t) <= 0.0)):
+        raise InputError(f"{place} have the column t; allowed: rising times, with a signal that is no mean")
+    conditions = {_path(circuit, name): x for name, x in columns.items()}
+    if t is not None and any(np.ptp(x) > 0.0 for x in conditions.values()):
+        raise InputError(f"{place} have times and changing conditions; allowed: one run over time, or means")
+    return Data(names[measured[0]], values, sigma, conditions, t)
+
+
+def _columns(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> tuple[dict[str, FloatArray], str]:
+    if isinstance(given, (str, Path)):
+        return _from_table(circuit, Path(given)), f"the data in '{given}'"
+    if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
+        raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, or the path of a table")
+    try:
+        found = {name: np.atleast_1d(np.asarray(x, float)) for name, x in given.items()}
+    except (TypeError, ValueError):
+        raise InputError("data has a column that is no array of numbers; allowed: numbers") from None
+    size = max((x.size for x in found.values()), default=0)
+    for name, x in found.items():
+        if x.ndim != 1 or x.size not in (1, size):
+            raise InputError(f"data column {name!r} has the shape {x.shape}, others have {size} rows; allowed: as many")
+        bad = np.flatnonzero(~np.isfinite(x))
+        if bad.size:
+            raise InputError(f"data column {name!r} is {x[bad[0]]} in row {bad[0]}; allowed: finite numbers")
+    return {name: np.broadcast_to(x, size).copy() for name, x in found.items()}, "the data"
+
+
+def _from_table(circuit: Circuit, path: Path) -> dict[str, FloatArray]:
+    table = read_text_columns(checked_file(path, MAX_TEXT_BYTES))
+    if not table.names:
+        raise InputError(
+            f"'{path}' has no header; allowed: names with units, such as Vdrive.amplitude (V), f_el_mean (N)"
+        )
+    found: dict[str, FloatArray] = {}
+    measured = next((name.removesuffix("_mean") for name in table.names if name.removesuffix("_mean") in MEASURED), "")
+    for i, (name, unit) in enumerate(zip(table.names, table.units, strict=True)):
+        signal = name.removesuffix("_mean")
+        key = name.lower() if name.lower() in (TIME, SIGMA) else name
+        if key == TIME:
+            base = "s"
+        elif key == SIGMA:
+            base = MEASURED.get(measured, "")
+        elif signal in MEASURED:
+            base = MEASURED[signal]
+        else:
+            base = circuit.parameters[_path(circuit, name)].unit
+        found[key] = table.data[:, i] * _factor(unit, base, f"'{path}': the unit of column {name!r}")
+    return found
+
+
+def _factor(unit: str, base: str, what: str) -> float:
+    """Of a header's unit over the netlist's."""
+    if unit in ("", base):
+        return 1.0
+    if base == "" and unit == "%":
+        return 0.01
+    if base == "m^2" and unit in ("mm^2", "mm2", "mm²"):
+        return 1e-6
+    prefix = unit.removesuffix(base) if base and unit.endswith(base) else None
+    if prefix in _PREFIXES and len(base) > 0:
+        return _PREFIXES[prefix]
+    scaled = ", with k, m, u or n before it where need be" if base else ""
+    raise InputError(f"{what} is {unit!r}; allowed: {base or 'none'}{scaled}")
+
+
+def _path(circuit: Circuit, name: str) -> str:
+    """A condition's path; ``source.`` stands for the only source."""
+    element, _, parameter = name.partition(".")
+    if element.lower() == SOURCE:
+        driving = driving_sources(circuit)
+        if len(driving) != 1:
+            raise InputError(f"{name} is the only source's, and the circuit has {len(driving)}; allowed: its name")
+        name = f"{driving[0].name}.{parameter}"
+    known = {path.lower(): path for path in circuit.parameters}
+    if name.lower() not in known:
+        circuit.varied({name: 1.0})
+    return known[name.lower()]

@@ -1,0 +1,144 @@
+"""Fits find true values again, with intervals that cover them, say what data cannot tell, and refuse bad data."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+from commands import Command
+from fingerspice.base.errors import InputError
+
+CIRCUITS = Path(__file__).parents[1] / "circuits"
+TRUE = {"Xgap.d": 3.1e-6, "Xgap.r": 1.4e6, "Xgap.alpha": 48.0}
+
+
+@pytest.fixture(scope="module")
+def circuit() -> fs.Circuit:
+    return fs.read_netlist(CIRCUITS / "fingerpad.cir")
+
+
+def measured(circuit: fs.Circuit, amplitudes: list[float], frequencies: list[float]) -> dict[str, np.ndarray]:
+    """Mean forces of a known finger without noise."""
+    u, f = (x.ravel() for x in np.meshgrid(amplitudes, frequencies))
+    finger = circuit.replace({path: TRUE[path] for path in ("Xgap.d", "Xgap.r", "Xgap.alpha")})
+    force = [
+        fs.steady_state(
+            finger, parameters={"Vdrive.amplitude": a, "Vdrive.frequency": b, "Xskin.f": b}, rtol=1e-9
+        ).f_el_mean
+        for a, b in zip(u, f, strict=True)
+    ]
+    return {"Vdrive.amplitude": u, "source.frequency": f, "f_el_mean": np.array(force)}
+
+
+@pytest.fixture(scope="module")
+def data(circuit: fs.Circuit) -> dict[str, np.ndarray]:
+    return measured(circuit, [100.0, 200.0], [30.0, 100.0, 500.0])
+
+
+def test_true_values_are_found_again(circuit: fs.Circuit, data: dict[str, np.ndarray]) -> None:
+    found = fs.fit(circuit, data, list(TRUE), skin="follow")
+    for path, value in TRUE.items():
+        assert found.estimates[path].value == pytest.approx(value, rel=1e-4)
+        assert found.circuit.parameters[path].value == found.estimates[path].value
+    assert np.abs(found.residual).max() < 1e-6 * np.abs(data["f_el_mean"]).max()
+    assert found.notes == ()
+    assert max(found.objectives) < 1e-8
+
+
+def test_intervals_cover_the_truth(circuit: fs.Circuit, data: dict[str, np.ndarray]) -> None:
+    # 60 intervals of 95 %: fewer than 51 would have a probability of 0.3 % even if errors were independent.
+    rng = np.random.default_rng(3)
+    covered, paths = 0, ["Xgap.d", "Xgap.r"]
+    finger = circuit.replace({"Xgap.alpha": TRUE["Xgap.alpha"]})
+    for _ in range(30):
+        sigma = 0.02 * data["f_el_mean"]
+        noisy = {**data, "f_el_mean": data["f_el_mean"] + sigma * rng.standard_normal(sigma.size), "sigma": sigma}
+        found = fs.fit(finger, noisy, paths, starts=1, rtol=1e-5, skin="follow")
+        covered += sum(found.estimates[path].low <= TRUE[path] <= found.estimates[path].high for path in paths)
+    assert 51 <= covered <= 60
+
+
+def test_a_signal_over_time(circuit: fs.Circuit) -> None:
+    t = np.linspace(0.0, 0.02, 41)
+    force = fs.simulate(circuit.replace({"Xgap.d": 3.1e-6, "Xgap.r": 1.4e6}), t_eval=t, rtol=1e-9).f_el
+    found = fs.fit(circuit, {"t": t, "f_el": force}, ["Xgap.d", "Xgap.r"])
+    assert found.estimates["Xgap.d"].value == pytest.approx(3.1e-6, rel=1e-5)
+    assert found.estimates["Xgap.r"].value == pytest.approx(1.4e6, rel=1e-4)
+
+
+def test_what_one_voltage_cannot_tell_is_said() -> None:
+    # One frequency at one voltage has one mean force, from which no two parameters follow.
+    circuit = fs.read_netlist(CIRCUITS / "fingerpad.cir")
+    force = fs.steady_state(circuit).f_el_mean
+    data = {"Vdrive.amplitude": [200.0] * 3, "f_el_mean": np.array([1.0, 1.01, 0.99]) * force}
+    found = fs.fit(circuit, data, ["Xgap.d", "Xgap.alpha"], starts=1)
+    assert len(found.notes) == 1
+    assert "Xgap.d and Xgap.alpha are not told apart" in found.notes[0]
+    assert "Measure at a second voltage as well" in found.notes[0]
+
+
+def test_a_value_at_its_bound_is_named(circuit: fs.Circuit, data: dict[str, np.ndarray]) -> None:
+    found = fs.fit(circuit, data, ["Xgap.d", "Xgap.r"], bounds={"Xgap.d": (3.45e-6, 4e-6)}, starts=1, skin="follow")
+    assert found.estimates["Xgap.d"].at_bound
+    assert any("at its bound" in note for note in found.notes)
+
+
+def test_a_network_is_fitted_by_differences() -> None:
+    circuit = fs.read_netlist(CIRCUITS / "amplifier.cir")
+    path = next(path for path in circuit.parameters if path.endswith("gap.d"))
+    gap = circuit.parameters[path].value
+    source = next(p for p in circuit.parameters if p.endswith(".amplitude"))
+    amplitudes = np.array([0.5, 1.0]) * circuit.parameters[source].value
+    force = [fs.steady_state(circuit, parameters={path: 0.9 * gap, source: a}).f_el_mean for a in amplitudes]
+    found = fs.fit(circuit, {source: amplitudes, "f_el_mean": force}, [path], rtol=1e-8)
+    assert found.estimates[path].value == pytest.approx(0.9 * gap, rel=1e-5)
+
+
+def test_the_command_reads_a_table_with_units(command: Command, tmp_path: Path) -> None:
+    deck, table = CIRCUITS / "fingerpad.cir", CIRCUITS / "measured.csv"
+    free = "Xgap.d,Xgap.r,Xgap.alpha"
+    result = command("fit", str(table), str(deck), "--free", free, "--skin", "follow", "--out", str(tmp_path), "--json")
+    assert result.code == 0
+    rows = {row["path"]: row for row in json.loads(result.out)["parameters"]}
+    for path, value in TRUE.items():
+        assert rows[path]["low"] < value < rows[path]["high"]
+    assert {"fingerpad_fit.csv", "fingerpad_fit.png"} <= {p.name for p in tmp_path.iterdir()}
+    again = np.genfromtxt(tmp_path / "fingerpad_fit.csv", delimiter=",", names=True)
+    assert again["f_el"] == pytest.approx(again["fitted"], rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("data", "parameters", "text"),
+    [
+        ({"f_el_mean": [1e-2, 2e-2]}, ["Xgap.dd"], "nearest: 'Xgap.d'"),
+        ({"f_el_mean": [1e-2]}, ["Xgap.d", "Xgap.r"], "1 data cannot tell 2 parameters"),
+        ({"f_el_mean": [1e-2, np.nan]}, ["Xgap.d"], "is nan in row 1"),
+        ({"f_el_mean": [1e-2, 2e-2], "Vdrive.amplitude": [1.0, 2.0, 3.0]}, ["Xgap.d"], "allowed: as many"),
+        ({"Vdrive.amplitude": [1.0, 2.0]}, ["Xgap.d"], "no measured column"),
+        ({"f_el_mean": [1e-2], "Xgap.d": [3e-6]}, ["Xgap.d"], "is a condition of the data"),
+        ({"f_el_mean": [1e-2], "sigma": [0.0]}, ["Xgap.d"], "smallest sigma is 0"),
+        ({"t": [1.0, 0.5], "f_el": [0.0, 0.0]}, ["Xgap.d"], "rising times"),
+        ([1.0, 2.0], ["Xgap.d"], "data is a list"),
+        ({"f_el_mean": [1e-2]}, "Xgap.d", "a sequence of paths"),
+        ({"f_el_mean": [1e-2]}, ["Xgap.tau"], "fitted in its logarithm"),
+    ],
+)
+def test_bad_requests(circuit: fs.Circuit, data: object, parameters: object, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        fs.fit(circuit, data, parameters)  # type: ignore[arg-type]
+
+
+def test_bad_tables(circuit: fs.Circuit, tmp_path: Path) -> None:
+    table = tmp_path / "data.csv"
+    table.write_text("Vdrive.amplitude (A),f_el_mean (mN)\n100,1\n200,4\n")
+    with pytest.raises(InputError, match=r"the unit of column 'Vdrive.amplitude' is 'A'; allowed: V"):
+        fs.fit(circuit, table, ["Xgap.d"])
+    table.write_text("100,1\n200,4\n")
+    with pytest.raises(InputError, match="has no header"):
+        fs.fit(circuit, table, ["Xgap.d"])
+    with pytest.raises(InputError, match=r"bounds names Xgap\.r, which is not fitted"):
+        fs.fit(circuit, {"f_el_mean": [1e-2]}, ["Xgap.d"], bounds={"Xgap.r": (1.0, 2.0)})
