@@ -35,10 +35,13 @@ MANY_PARAMETERS = {
     "cli.app.compare",
     "cli.app.limits",
     "cli.design.design",
+    "cli.fit.fit",
     "studies.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",
     "studies.batch.batch",
+    "studies.fit.fit",
+    "studies.steady.steady_state",
     "solve.streaming.stream",
 }
 # Functions over the limits, with their lines and parameters: no other may be, and these may only shrink.

@@ -144,7 +144,7 @@ class Fit(Shown):
 
     def plot(self) -> Figure:
         """Data and fit, with the residuals below."""
-        from fingerspice.plots.fits import plot_fit
+        from fingerspice.plots.fits import Curve, plot_fit
 
         data, signal = self.data, self.data.signal if self.data.t is not None else f"{self.data.signal}_mean"
         varying = sorted(data.varying.items(), key=lambda item: -np.unique(item[1]).size)
@@ -160,9 +160,12 @@ class Fit(Shown):
                 names = [", ".join(f"{a} = {b:g}" for a, b in zip(paths, kind, strict=True)) for kind in kinds]
         else:
             x, label = np.arange(1.0, data.values.size + 1.0), "measurement"
-        return plot_fit(
-            x, label, groups, names, data.values, self.predicted, self.sigma, signal, MEASURED[data.signal]
-        )  # fmt: skip
+        curves = [
+            Curve(name, x[own], data.values[own], self.predicted[own], self.sigma[own])
+            for group, name in enumerate(names)
+            for own in [groups == group]
+        ]
+        return plot_fit(curves, label, signal, MEASURED[data.signal])
 
     def _labelled(self, path: str) -> str:
         unit = self.circuit.parameters[path].unit
