@@ -81,19 +81,19 @@ def stored(path: Path, seconds: float, rtol: float) -> Report:
     return {"seconds": seconds, "took": took, "times_real_time": seconds / took, "bytes": size}
 
 
-def main() -> None:
-    """Measure, print and write."""
+def main(arguments: list[str] | None = None) -> list[Report]:
+    """Measure, print and write; the points, one for each recording and tolerance."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--quick", action="store_true", help="short recordings, one run each, nothing written")
     parser.add_argument("--case", nargs=3, help=argparse.SUPPRESS)
-    given = parser.parse_args()
+    given = parser.parse_args(arguments)
     if given.case:
         print(json.dumps(case(given.case[0], *map(float, given.case[1:]))))
-        return
-    lengths, repeats = ((1.0, 2.0), 1) if given.quick else ((60.0, 600.0), 3)
+        return []
+    bands, lengths, repeats = (BANDS[:1], (2.0,), 1) if given.quick else (BANDS, (60.0, 600.0), 3)
     points: list[Report] = []
     with tempfile.TemporaryDirectory() as folder:
-        for high in BANDS:
+        for high in bands:
             for seconds in lengths:
                 path = recording(Path(folder) / "noise.wav", seconds, high)
                 for rtol in RTOLS:
@@ -123,6 +123,7 @@ def main() -> None:
         }
         report = {"machine": machine, "points": points, "store": written}
         (HERE / "results" / "streaming.json").write_text(json.dumps(report, indent=1) + "\n")
+    return points
 
 
 if __name__ == "__main__":

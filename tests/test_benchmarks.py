@@ -206,3 +206,11 @@ def test_the_batch_benchmark_runs_and_meets_its_errors(monkeypatch, capsys):
     ours = [row for row in results["rows"] if row["who"] == "fs.batch"]
     assert {row["scenes"] for row in ours} == {"sine, narrow", "sine, wide"}
     assert all(row["largest_error"] <= row["rtol"] for row in ours)
+
+
+def test_the_streaming_benchmark_takes_every_sample(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    points = importlib.import_module("streaming").main(["--quick"])
+    assert [point["rtol"] for point in points] == [1e-4, 1e-6]
+    assert all(point["samples"] == 2 * 48_000 + 1 for point in points)
+    assert "times real time" in capsys.readouterr().out
