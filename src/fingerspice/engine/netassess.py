@@ -1,4 +1,4 @@
-"""What a finished step of a network is off, and its peaks; see `exponential.assess` and `readout` for a stack."""
+"""Error and peaks of a finished step of a network; `exponential.assess` and `readout` do the same for a stack."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from fingerspice.engine.netrows import combine
 from fingerspice.engine.readout import first_wrong, leaves
 from fingerspice.numerics.lobatto import END, MISS, NODES, POINTS, ROWS
 
-# Columns of `peaks`: of each gap, and last of the nodes, the largest voltage (V) and force (N), and the errors of both.
+# Columns of `peaks`: the largest voltage (V) and force (N) of each gap and, in the last row, of the nodes; then the
+# errors of both.
 PEAK_U, PEAK_F, ERROR_U, ERROR_F = 0, 1, 2, 3
-# Share of a step in which its polynomials may miss a decay: a third of the way to the first node.
+# A decay that is over within this fraction of the step, a third of the way to the first node, is not seen by the
+# polynomials.
 _EARLY = POINTS[1] / 3.0
-# Rows from which the response to what the polynomials miss is taken, for the points between and the end: what is missed
-# changes its sign at every node, and so its integral is largest at the nodes beside those points, and small at them.
+# Rows at which the response to the interpolation error is taken for the points between the nodes and for the end: this
+# error changes its sign at every node, so that its integral is largest at the nodes beside those points.
 _WORST = (1, NODES // 2, 9, END)
-# The first and the last node, for each place, between the places beside it.
+# For each place: the first and the last node between its neighbouring places.
 _NEAR = ((0, 1), (0, 5), (1, 9), (6, END), (10, END))
 
 
@@ -45,7 +47,7 @@ def load(inverse: FloatArray, follow: FloatArray, y: FloatArray, s: FloatArray, 
 def store(
     shape: FloatArray, follow: FloatArray, w: FloatArray, s: FloatArray, gained: FloatArray, y: FloatArray
 ) -> None:
-    """State from the modes, the sources' values and what the charges have gained."""
+    """State from the modes, the sources' values and the charges gained in the step."""
     n = shape.shape[0]
     for i in range(n):
         y[i] = 0.0
@@ -61,7 +63,7 @@ def store(
 
 @jit_rows
 def moved(u: FloatArray, before: FloatArray) -> float:
-    """Root of the summed squares of u - before; `before` becomes u."""
+    """Euclidean norm of u - before; then `before` becomes u."""
     total = 0.0
     for a in range(u.shape[0]):
         for i in range(ROWS):
@@ -73,7 +75,7 @@ def moved(u: FloatArray, before: FloatArray) -> float:
 
 @jit_rows
 def _largest_voltage(shape: FloatArray, follow: FloatArray, m: int, off: FloatArray) -> float:
-    """Largest of what the live voltages are off, V, from what the m modes and, behind them, the sources are."""
+    """Largest error of a state voltage, V, from the errors `off` of the m modes and, behind them, of the sources."""
     n = shape.shape[0]
     largest_one = 0.0
     for i in range(n):
@@ -96,12 +98,12 @@ def assess(
     pull: FloatArray, used: FloatArray, s: FloatArray, magnified: float, off: FloatArray, places: FloatArray,
     run: FloatArray,
 ) -> float:  # fmt: skip
-    """Error of a converged step, V, from what its polynomials miss between nodes; see `exponential.assess`.
+    """Error of a converged step, V, from the interpolation errors between its nodes; see `exponential.assess`.
 
-    `places` (m, N_PLACES) takes the error of the modes, `run` (n_area, N_PLACES) that of each gap's voltage, with
-    what the iteration left and what came before. `off` (5, m + n_s) takes what of the errors of the modes, and of the
-    sources behind them, the polynomials miss at the points between and the end, and last of a decay that is over before
-    the first node.
+    `places` (m, N_PLACES) receives the errors of the modes, `run` (n_area, N_PLACES) those of the gaps' voltages; both
+    contain the residual of the iteration and the errors of earlier steps. `off` (5, m + n_s) receives the interpolation
+    errors of the modes, and of the sources behind them, at the points between the nodes and at the end; its last row is
+    that of a decay which is over before the first node.
     """
     n, m = shape.shape[0], w.shape[0]
     left = np.zeros(4)
@@ -116,7 +118,7 @@ def assess(
         left_over(phi[k], pull[k], used[k], left)
         places[k, 0] = error[k]
         mode_first, mode_second, mode_third = between(w[k])
-        # Its slope at the start tells: it is off by the size of the decay times its rate.
+        # The slope of the mode at the start shows such a decay: it differs by the decay's size times its rate.
         fall = 0.0
         for j in range(NODES):
             fall += DERIVATIVE[0, j] * w[k, j]
@@ -148,7 +150,7 @@ def assess(
 
 @jit
 def charged(cell: IntArray, u: FloatArray, area: FloatArray) -> float:
-    """What the polynomials of the areas miss between nodes, V: a charge is the integral of A du among others."""
+    """Interpolation error of the areas as a voltage, V: it enters the charge through the integral of A du."""
     worst = 0.0
     for a in range(cell.size):
         if cell[a] >= 0:
@@ -160,7 +162,7 @@ def charged(cell: IntArray, u: FloatArray, area: FloatArray) -> float:
 
 @jit
 def turn_at_start(cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t: float, branch: FloatArray) -> bool:
-    """Change the branch of every area whose gap voltage starts at 0 and leaves on the other side; whether one did."""
+    """Switch the branch of every area whose gap voltage starts at 0 and leaves to the other side; True if one did."""
     turned = False
     for a in range(cell.size):
         if cell[a] >= 0 and sign[a] * u[a, 0] <= 1e-9 * abs(u[a, 1]) and first_wrong(u[a], sign[a], tol) == 1:
@@ -175,7 +177,7 @@ def first_zero(
     cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t: float, h: float, theta: float, t_new: float,
     series: FloatArray,
 ) -> tuple[int, float, float]:  # fmt: skip
-    """The area whose gap voltage is first to leave its branch before t_new, or -1, at what fraction, and when."""
+    """The area whose gap voltage is the first to leave its branch before t_new, or -1; the fraction and the time."""
     which = -1
     for a in range(cell.size):
         if cell[a] >= 0:
@@ -190,10 +192,10 @@ def account(
     u: FloatArray, area: FloatArray, stress: float, theta: float, run: FloatArray, places: FloatArray, slow: int,
     peaks: FloatArray,
 ) -> None:  # fmt: skip
-    """Peaks of a gap's voltage and force over what counts of a step, and the errors of both.
+    """Peaks of a gap's voltage and force over the part of a step that counts, and the errors of both.
 
-    `run` and `places` hold the errors of the voltage and of the modes (see `assess`), of which `slow` is the area's, if
-    it is not negative.
+    `run` and `places` hold the errors of the voltage and of the modes (see `assess`); mode number `slow` is the area
+    itself, unless `slow` is negative.
     """
     area_off = 0.0
     if slow >= 0:
@@ -210,7 +212,7 @@ def account(
         steepest = 0.0
         for i in range(_NEAR[p][0], _NEAR[p][1] + 1):
             if POINTS[i] <= theta:
-                # F ~ u^2 A: what moves u by du moves F by at most 2 F du / u, as the area falls with u.
+                # F ~ u^2 A: an error du changes F by at most 2 F du / u, because the area falls with |u|.
                 steepest = max(steepest, 2.0 * stress * abs(u[i]) * area[i])
         moved = max(moved, run[p] * steepest)
         peaks[ERROR_U] = max(peaks[ERROR_U], run[p])
@@ -246,7 +248,7 @@ def write_columns(
     n: int, first_z: int, charge: bool, shape: FloatArray, follow: FloatArray, w: FloatArray, s: FloatArray,
     y: FloatArray, values: FloatArray,
 ) -> None:  # fmt: skip
-    """The state at all rows, into the first of `values`; charges hold what they have gained, where they are wanted."""
+    """Write the state at all rows into the first rows of `values`; charges, if wanted, as gained since the start."""
     for j in range(n):
         for i in range(ROWS):
             values[j, i] = 0.0

@@ -1,4 +1,4 @@
-"""Charge that the sources of a network deliver over a step, and its error; `charge` is the same for a stack."""
+"""Charge that the sources of a network deliver over a step, and its error; `charge` does the same for a stack."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from fingerspice.engine.netrows import AREA, MORE, SLOPE, Form, Work
 from fingerspice.engine.readout import ERROR_Q
 from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
 
-# What changes its sign at every node, as the node polynomial does, collects so much of itself within a step.
+# Largest integral within a step of a function that changes its sign at every node, as the node polynomial does, over
+# the function's size and the step's length.
 _HALF_LOBE = 0.041
 
 
@@ -31,11 +32,11 @@ def _integrate(integral: FloatArray, h: float, rate: FloatArray, out: FloatArray
 def _leaks(
     mobile: bool, h: float, c: float, g: float, u: FloatArray, more: FloatArray, leak: FloatArray, moved: FloatArray
 ) -> None:
-    """Of a cell's current beyond the reference area what is collected (A), and what is stored since the start (C).
+    """A cell's current beyond the one at the reference area: the part to be integrated (A) and the charge stored (C).
 
-    Under `local` the charge that stands on the area moves with it: A - A0 at the start is taken exactly, the rest along
-    the voltage's polynomial. In the rate of the voltage itself a mode that has died away still holds its own rate times
-    the rounding of its voltage.
+    The stored charge counts from the start of the step. Under `local` the charge on the area moves with the area: the
+    part of A - A0 at the start is exact, the rest is integrated along the polynomial of the voltage. The voltage's own
+    rate would not do, because a decayed mode contributes its rate times the rounding error of its voltage.
     """
     for i in range(ROWS):
         leak[i] = g * more[i] * u[i]
@@ -57,7 +58,7 @@ def charge_rows(
 ) -> None:  # fmt: skip
     """Charge since the start of a step and current of each source at the nodes, into `z` and `current` (n_s, ROWS).
 
-    `rate` (m, ROWS) are the modes' own; `room` (3, ROWS) is for passing use.
+    `rate` (m, ROWS) holds the derivatives of the modes; `room` (3, ROWS) is scratch.
     """
     n = stored.shape[1]
     collected, leak, moved = room[0], room[1], room[2]
@@ -97,22 +98,22 @@ def charge_error(
 ) -> None:  # fmt: skip
     """Largest error of the charges over the part of a step that counts, from the signed error of the modes.
 
-    With du the error of a cell's voltage and dA that of its area, a charge is off by what is stored of them now, and by
-    what stays: their leak, and under `local` the integral of c (dA u' - A' du). What polynomials miss between nodes
-    changes its sign at every node: it is stored, but nothing of it leaks in a whole step. What lobe is left on the way
-    stays where a step is cut short.
+    With du the error of a cell's voltage and dA that of its area, the error of a charge has a stored part, which goes
+    with du and dA at the time, and a lasting part: their leak and, under `local`, the integral of c (dA u' - A' du).
+    Interpolation errors change their sign at every node: they are stored, but over a whole step nothing of them leaks. If
+    a step is cut short, the lobe between the last two nodes lasts.
 
     Parameters
     ----------
     form, h, lost, g, theta
         Of the step; `g` (n_f,) are the leaks that count, none in a jump.
     work : Work
-        Its `places` (m, N_PLACES) are the errors of the modes, and `off` (5, m + n_s) what of these the polynomials of
-        this step miss; see `netassess.assess`.
+        Its `places` (m, N_PLACES) are the errors of the modes, and `off` (5, m + n_s) the interpolation errors of this
+        step among them; see `netassess.assess`.
     u, areas, z : ndarray
         Rows of the cells' voltages (n_f, ROWS), blocks of the areas', and charges gained (n_s, ROWS).
     collected : ndarray, shape (2, n_s)
-        What has stayed so far, and the squares of what has with a sign that is not known.
+        Lasting errors so far: the sum of those with a known sign, and the sum of squares of the others.
     control : ndarray
         See `readout`.
     """
@@ -138,8 +139,8 @@ def charge_error(
             own = first if p == 1 else (second if p == 2 else (third if p == 3 else 0.0))
             off_briefly[p] = max(abs(held), abs(own), swing, lobe)
             apart = max(apart, abs(own - held) if 0 < p < N_PLACES - 1 else 0.0)
-        # Of a step that is cut short the lobes stay, and what its charge and its modes disagree by. Their signs are not
-        # known.
+        # After a step that is cut short its lobes last, and the difference between its charge and its modes. The signs
+        # of both are unknown.
         kept = end if theta == 1.0 else math.sqrt(swing * swing + lobe * lobe + apart * apart)
         collected[1, source] += kept * kept
         added, last_leak, last_theta = 0.0, 0.0, 0.0
@@ -164,7 +165,7 @@ def charge_error(
 
 @jit
 def _cell_errors(form: Form, places: FloatArray, slope: FloatArray, off: FloatArray) -> None:
-    """Errors of the cells' voltages (V) and, behind them, of the areas (m^2) from those of the modes, at the places."""
+    """Errors of the cells' voltages (V) and, behind them, of the areas (m^2), at the places, from those of the modes."""
     n_f = form.c.size
     for p in range(N_PLACES):
         for b in range(n_f):
@@ -181,7 +182,7 @@ def _cell_errors(form: Form, places: FloatArray, slope: FloatArray, off: FloatAr
 def _held(
     form: Form, source: int, p: int, places: FloatArray, off: FloatArray, u: FloatArray, more: FloatArray
 ) -> float:  # fmt: skip
-    """What the error at a place is worth that is stored there, C."""
+    """Stored part of a charge's error at a place, C."""
     total = 0.0
     row = row_of(p)
     for k in range(form.stored.shape[1]):
@@ -200,7 +201,7 @@ def _leak(
     form: Form, source: int, p: int, lost: FloatArray, g: FloatArray, places: FloatArray, off: FloatArray,
     u: FloatArray, more: FloatArray,
 ) -> float:  # fmt: skip
-    """What of the error at a place leaks, A."""
+    """Rate at which the error at a place adds to the lasting error of a charge by leaking, A."""
     total = 0.0
     row = row_of(p)
     for k in range(lost.shape[1]):
@@ -227,10 +228,10 @@ def _turned(form: Form, source: int, p: int, off: FloatArray, u: FloatArray, are
 
 @jit
 def _area_missed(form: Form, source: int, u: FloatArray, area: FloatArray) -> tuple[float, float]:
-    """What the areas' polynomials miss of the integral of c A u' on the way and at the end of a step, C.
+    """Errors of the integral of c A u' by the interpolation of the areas, within a step and at its end, C.
 
-    Between two nodes it is a lobe. At the end the rule of quadrature is of twice the order: what the polynomial misses,
-    relative, counts squared.
+    Within the step the error is the lobe between two nodes. At the end the quadrature rule has twice the order, so that
+    the relative interpolation error counts squared.
     """
     way, end = 0.0, 0.0
     for b in range(form.c.size):
@@ -245,7 +246,7 @@ def _area_missed(form: Form, source: int, u: FloatArray, area: FloatArray) -> tu
 
 @jit
 def _way(values: FloatArray) -> float:
-    """Length of the way that values at the nodes go, up and down."""
+    """Total variation of values at the nodes."""
     total = 0.0
     for i in range(1, NODES):
         total += abs(values[i] - values[i - 1])

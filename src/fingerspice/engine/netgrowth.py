@@ -1,7 +1,7 @@
 """How the error of a network's run is carried through a step, with what the areas answer to it.
 
-As `fingerspice.engine.growth`, of which see; but by differences: the currents that the areas move are evaluated at
-modes that are off by the error, and answer as those of the step itself do, a few times over.
+The method is that of `fingerspice.engine.growth`, but with differences: the currents that the areas cause are evaluated
+once more at modes shifted by the error, and the response to their change is iterated a few times.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from fingerspice.engine.netrows import CHI_S, ETA_S, LIN, PULL, RHO, U_S, Form, 
 from fingerspice.numerics.lobatto import END, NODES, ROWS
 from fingerspice.numerics.small import copy_to
 
-# What the modes are moved by, over the largest; half of the digits for the difference.
+# Shift of the modes for the difference, over the largest mode: half of the digits are left for the difference.
 _SHIFT = 1e-7
-# Answers to answers that are reckoned, at most, and the change from which on the next one matters.
+# Most iterations, and the relative change below which the next iteration does not matter.
 _PASSES, _ENOUGH = 6, 0.1
 
 
@@ -41,9 +41,9 @@ def carry(
     form: Form, work: Work, several: bool, h: float, rates: FloatArray, pace: FloatArray, coupling: Coupling,
     decay: FloatArray, phi: FloatArray, error: FloatArray, sign: FloatArray,
 ) -> None:  # fmt: skip
-    """The error of the modes (m,) at the start of a converged step at the points between and the end: `work.carried`.
+    """Carry the error of the modes (m,) from the start of a converged step to the points between and the end.
 
-    Uses `work.spare`, `matrix`, `mixed` and one row of `room`, and leaves all else of the step as it is.
+    The result is `work.carried`. `work.spare`, `matrix`, `mixed` and one row of `room` are overwritten, nothing else.
     """
     base, forced, off, shifted, d, pull = work.spare
     modes, cells, areas = work.modes, work.spare_cells, work.spare_areas

@@ -1,4 +1,4 @@
-"""The loop of exponential steps of a network; `march` is the same for a stack, whose ways of pacing it shares."""
+"""The loop of exponential steps of a network; `march` is that of a stack, and both choose step lengths by `pace`."""
 
 from __future__ import annotations
 
@@ -55,16 +55,17 @@ from fingerspice.physics.contact import inverse_area
 
 # Codes returned by `march`.
 DONE, NO_STEP, TOO_MANY, REFERENCE, PAUSED = 0, 1, 2, 3, 4
-# One entry of `control` more than `readout` has: steps taken and refused, at most.
+# One entry of `control` in addition to those of `readout`: the most steps, accepted and rejected.
 MOST = N_CONTROL
-# A source's change at an edge, relative, that is its rounding and no jump.
+# Relative change of a source at an edge that counts as rounding error, not as a jump.
 ROUNDING, UNNOTICED = 1e-14, 1e-9
-# Closer to the fold, other methods get there sooner.
+# Distance to the fold below which another method takes over, because it needs fewer evaluations there.
 NEAR_FOLD = 0.02
-# Lengths on which the iteration did not close, at least, and share of the steps taken: an implicit method gets there
-# sooner, and what such steps leave is more than their estimate (a hundred times, behind a fold that a resistor mends).
+# Step lengths at which the iteration did not converge: if there are more than this number and this share of the steps
+# taken, an implicit method is faster, and the error of such steps exceeds their estimate (a hundredfold behind a fold
+# that a resistor bridges).
 UNCLOSED, UNCLOSED_SHARE = 40, 0.2
-# Modes times steps between pauses, after which Python may see to a Ctrl-C.
+# Number of modes times steps between two pauses, in which Python can react to Ctrl-C.
 AT_ONCE = 40_000
 
 
@@ -78,46 +79,46 @@ def march(
 ) -> int:  # fmt: skip
     """Step to `t_end` through the sources' segments, writing outputs on the way.
 
-    A jump of the sources is stepped through in its fraction, while time stands still: the same network with nothing
-    leaking.
+    Within a jump of the sources the independent variable is the fraction of the jump, and time stands still: the same
+    network, in which nothing leaks.
 
     Parameters
     ----------
     form, references, pace, tables, work, integral
-        What to step, how and where; `integral` is `lobatto.integral_table()`. The form's numbers are those of one of
-        the references, whose number is in `work.at`: both change with the areas.
+        The network, the rules for steps, tables and scratch; `integral` is `lobatto.integral_table()`. The form is that
+        of one reference, whose number is in `work.at`; both change if an area moves away from its reference.
     sources : Sources
     u_scale : float
-        Largest voltage, V: a slow area counts as its share of it.
+        Largest voltage, V; the error of an area with a time constant is measured as a fraction of it.
     t_end : float
-        s, not past the last edge; if it is the time reached, only a jump that stands there is taken.
+        s, not past the last edge; if it equals the time reached, only a jump at that time is taken.
     y : ndarray
-        State as in `engine.network`; updated, as all that follow.
+        State as in `engine.network`; updated, as all arrays that follow.
     error : ndarray, shape (m,)
         Estimated error of the modes, signed.
     sign, s_before : ndarray
-        Branch of each area (0: choose), and the sources' values just before the time reached.
+        Branch of each area (0: to be chosen), and the sources' values just before the time reached.
     branch : ndarray, shape (n_area, 2)
-        When each area's branch began, and how long the one before was, s.
+        Time at which each area's branch began, and length of the branch before, s.
     control, counters, peaks, collected : ndarray
-        Bookkeeping: `readout`, the columns above, and `charge_error`.
+        Bookkeeping, as described in `readout`, `netassess` and `charge_error`.
     t_out, left, out : ndarray
-        Output times (ascending), whether the left-hand value is meant, and the columns to fill: the state, then the
-        currents.
+        Output times (s, ascending), whether the left-hand limit is meant, and the columns to fill: the state, then
+        the currents.
     kept : Kept
-        Takes the steps, as long as there is room.
+        Takes the first steps, for repeated periods, until it is full.
     steps : Steps
-        Takes the steps too: the voltages and slow areas of the state.
+        Takes all steps: state voltages, and areas that have a time constant.
     tried : ndarray, shape (TRIED, 4)
-        Takes the last steps tried, in turn: start and length (s), error over the one allowed, number from 1.
+        Ring buffer of the last steps tried: start and length (s), ratio of the error to the allowed one, number from 1.
 
     Returns
     -------
     int
-        DONE; NO_STEP is short enough; TOO_MANY steps; REFERENCE: the areas want one that is not known yet; or PAUSED:
-        call again.
+        DONE; NO_STEP (no step is short enough); TOO_MANY (steps); REFERENCE (the areas need a reference that has not
+        been made yet); or PAUSED (call again).
     """
-    # Without a count of their users: an atomic operation wherever an array is taken out of its tuple.
+    # Borrowed arrays have no reference count: it would cost an atomic operation at every access to a tuple.
     form, references, tables, work, sources = (
         borrow(form), borrow(references), borrow(tables), borrow(work), borrow(sources)
     )  # fmt: skip
@@ -142,7 +143,7 @@ def march(
     several = False
     for b in range(1, home.size):
         several |= home[b] != home[0]
-    # Inside of a jump: what it starts from and goes to, and what is put aside meanwhile.
+    # Within a jump: the sources before and after it, and the quantities that are put aside for its duration.
     inside = False
     jump_from, jump_to, aside = np.zeros(n_s), np.zeros(n_s), np.zeros(control.size)
     sign_aside, jump_branch = np.zeros(n_area), np.zeros((n_area, 2))
@@ -192,7 +193,7 @@ def march(
                 at_edge |= sources.edges[sources.first[i] + index[i]] == t
                 stop = min(stop, sources.edges[sources.first[i] + index[i] + 1])
             at_sources(sources, index, t, 0.0, now, slopes_now)
-            # The time of a call may miss an edge by rounding.
+            # The time at which a call starts may differ from an edge by rounding.
             least = ROUNDING if at_edge else (math.inf if begun else UNNOTICED)
             begun = True
             jumps = False
@@ -220,7 +221,7 @@ def march(
             for e in range(n_s):
                 now[e] = s_before[e]
         if at_edge:
-            # The steps after a jump are often those after the one before.
+            # Step lengths after a jump are often those after the previous jump.
             control[H] = control[H_AFTER_EDGE]
             control[TOO_LONG] = 0.0
             control[ALLOWED] = 0.0
@@ -259,7 +260,7 @@ def march(
             start_at(form.area0, areas[netrows.AREA])
             load(form.inverse, follow, y, now, w0)
         longest = Pace(tol, 1.0, True, charge) if inside else pace
-        # With no rate at all: infinity.
+        # If all rates are zero, the time constant is infinite.
         h = choose_step(longest, 1.0 / rates.max(), True, is_series and not inside, t, stop - t, control)
         wanted_h, tries = control[H], 1
         which, magnified = -1, 1.0
@@ -283,7 +284,7 @@ def march(
             passes, closed = solve_step(form, work, own, several, h, rates, area_pace, sign, decay, phi, 0.3 * tol)
             counters[NFEV] += passes * NODES
             step_error = math.inf
-            # What did not close says nothing about where it goes.
+            # An iteration that has not converged says nothing about the sign of the gap voltage.
             if closed and flips <= n_area and turn_at_start(cell, u, sign, tol, t, branch):
                 flips += 1
                 continue
@@ -309,14 +310,14 @@ def march(
             counters[REJECTED] += 1
             unclosed += not closed
             stuck = unclosed > UNCLOSED + UNCLOSED_SHARE * (counters[ACCEPTED] - accepted)
-            # Refused at this length: a singularity, of which rounding hides the last bit.
+            # A step of this length is rounding of the time: if it is rejected, there is a singularity.
             if stuck or h <= 1e-13 * max(abs(t), 1e-3 * (stop - t)) or (whole and lowest < NEAR_FOLD):
                 code = NO_STEP
                 break
             shorter = 1.0
             for a in range(n_area):
                 if cell[a] >= 0 and sign[a] * u[a, END] < form.lo[a]:
-                    # It went far over a zero, where the branch has no meaning: end soon after the zero.
+                    # The step went far beyond a zero, where the branch has no meaning: end soon after the zero.
                     found = first_wrong(u[a], sign[a], tol)
                     if found > 1:
                         shorter = min(shorter, 1.1 * POINTS[found])
@@ -399,7 +400,7 @@ def march(
             branch[which, 1] = t_new - branch[which, 0]
             branch[which, 0] = t_new
             counters[ZEROS] += 1
-            # The area has a kink here: fast modes start anew.
+            # The area has a kink here, which excites the fast modes again.
             if control[H_AFTER_ZERO] > 0.0:
                 control[H] = control[H_AFTER_ZERO]
                 control[ALLOWED] = 0.0
@@ -407,7 +408,7 @@ def march(
         control[T] = t_new
         counters[ACCEPTED] += 1
     if inside:
-        # Left in the middle of a jump: at the time where it stands.
+        # The loop has stopped within a jump: the time is that of the jump.
         aside[ERROR_Q], aside[MAGNIFIED] = control[ERROR_Q], control[MAGNIFIED]
         copy_to(control, aside)
     return code
