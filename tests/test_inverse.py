@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,33 @@ def test_a_stack_makes_the_wanted_friction(seed: int, carrier: float | None, law
     found = fs.inverse_drive(table1(), friction=profile(seed), carrier=carrier, charge_law=law)
     assert found.worst_share < 1e-4
     assert found.at_limit == 0.0
+
+
+# Of 50 random profiles for each kind of circuit, those with the largest miss.
+HARDEST = [
+    (1013, "stack", None, "local"), (1013, "stack", None, "mobile"), (1028, "stack", 2000.0, "local"),
+    (1028, "stack", 2000.0, "mobile"), (1013, "dispersive", None, "local"), (1028, "dispersive", 2000.0, "local"),
+    (1010, "amplifier", None, "local"), (1005, "amplifier", 2000.0, "local"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("seed", "kind", "carrier", "law"), HARDEST)
+def test_the_hardest_of_fifty_profiles_are_made(seed: int, kind: str, carrier: float | None, law: str) -> None:
+    circuit = {"stack": table1, "dispersive": lambda: fs.parse_netlist(DISPERSIVE), "amplifier": amplifier}[kind]()
+    wanted = profile(seed, 0.005 if carrier and kind == "amplifier" else 0.01)
+    assert fs.inverse_drive(circuit, friction=wanted, carrier=carrier, charge_law=law).worst_share < 1e-4
+
+
+def test_a_drive_of_a_thousand_volts_is_warned_about() -> None:
+    wanted = np.full(100, 0.2)
+    # A gap that leaks takes a small share of the source's voltage.
+    leaky = table1(gap={"r": 5e4})
+    with pytest.warns(fs.FingerspiceWarning, match=r"the drive reaches \d{4,} V; limit="):
+        fs.inverse_drive(leaky, force=wanted, rate=48e3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", fs.FingerspiceWarning)
+        fs.inverse_drive(leaky, force=wanted, rate=48e3, limit=300.0)
+        fs.inverse_drive(table1(), force=wanted, rate=48e3)
 
 
 @pytest.mark.parametrize("carrier", [None, 2000.0])

@@ -13,6 +13,7 @@ import analytic
 import fingerspice as fs
 import recording_errors
 from fingerspice.numerics.moments import moments, weights
+from fingerspice.waveforms.recorded import as_samples
 from scenes import table1_deck
 
 RATE = 8000.0
@@ -135,3 +136,31 @@ def test_moments_are_integrals() -> None:
                 lambda x, i=i, end=until: mpmath.exp(-z[i] * (end - x)) * (1 - 3 * x + 2 * x * x), [0, until]
             )
             assert found[i] == pytest.approx(float(exact), rel=1e-12)
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+@pytest.mark.parametrize("rtol", [1e-3, 1e-6])
+def test_points_on_a_grid_are_followed_like_samples(law: str, rtol: float) -> None:
+    number = np.append(0, np.cumsum(np.random.default_rng(5).integers(1, 4, 99)))
+    t = number / RATE
+    wave = fs.PWL(tuple(t), tuple(recording(300)[number]))
+    exact = follow(wave, t[-1], t_eval=t, charge_law=law, rtol=1e-11, method="exponential")
+    run = follow(wave, t[-1], t_eval=t, charge_law=law, rtol=rtol)
+    assert run.method == "relaxation"
+    for name in ("u_gap", "f_el"):
+        off = np.abs(getattr(run, name) - getattr(exact, name)).max()
+        assert off <= min(getattr(run.error, name), rtol * np.abs(getattr(exact, name)).max())
+
+
+def test_sums_of_samples_are_samples_and_products_with_a_sine_are_not() -> None:
+    a, b = fs.Samples(recording(volts=80.0), RATE), fs.Samples(recording(high=900.0, volts=40.0), RATE, 10 / RATE)
+    total, stop = fs.Sum((a, b, fs.DC(5.0))), 100 / RATE
+    assert follow(total, stop).method == "relaxation"
+    found = as_samples(total)
+    assert found is not None
+    times = np.linspace(-0.01, 0.05, 997)
+    np.testing.assert_allclose(found.value(times), total.value(times), rtol=0.0, atol=1e-9)
+    assert as_samples(fs.Product((a, fs.Sine(1.0, 60.0)))) is None
+    assert as_samples(fs.Sum((a, fs.Samples(recording(), 2.0 * RATE)))) is None
+    assert as_samples(fs.PWL((0.0, 1e-3, 1e-3, 2e-3), (0.0, 1.0, 2.0, 0.0))) is None
+    assert as_samples(fs.PWL((0.0, 1e-3, 2.5e-3), (0.0, 1.0, 2.0))) is None

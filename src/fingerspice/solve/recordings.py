@@ -28,6 +28,7 @@ from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Progress, Run, excess_of, kept_with
 from fingerspice.solve.stackstate import StackState, from_stack, model_of
 from fingerspice.solve.track import as_recorded, on_branch
+from fingerspice.waveforms.recorded import MOST_PER_POINT, as_samples
 from fingerspice.waveforms.samples import Samples
 
 # Fewest samples for which this method pays, and the samples of a piece; pieces begin at multiples of that number.
@@ -74,12 +75,17 @@ class Piece:
 
 def pieces_of(problem: Problem) -> list[Piece] | None:
     """The pieces of a run if it is a coupled stack driven by a recording of enough samples; else None."""
-    wave = problem.waveform
-    if problem.scene.stack is None or not problem.scene.coupled or not isinstance(wave, Samples):
+    if problem.scene.stack is None or not problem.scene.coupled:
+        return None
+    wave = as_samples(problem.waveform)
+    if wave is None:
         return None
     spacing, t0, t1 = 1.0 / wave.rate, problem.t_start, problem.t_stop
     first, last = math.ceil((t0 - wave.start) * wave.rate - 1e-6), math.floor((t1 - wave.start) * wave.rate + 1e-6)
     if last - first < LEAST_SAMPLES:
+        return None
+    if wave is not problem.waveform and last - first > MOST_PER_POINT * problem.breakpoints().size:
+        # In most of the run the source is one long line, of which the other methods need few steps.
         return None
     edges = [first, *range((first // PIECE + 1) * PIECE, last, PIECE), last]
     out = [Piece(wave.start + a * spacing, spacing, a, b) for a, b in itertools.pairwise(edges)]
@@ -131,8 +137,8 @@ class March:
 
     @property
     def wave(self) -> Samples:
-        wave = self.problem.waveform
-        assert isinstance(wave, Samples)
+        wave = as_samples(self.problem.waveform)
+        assert wave is not None
         return wave
 
     def _form(self, spacing: float) -> Form:

@@ -30,7 +30,7 @@ from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import Scene, scene_of
 from fingerspice.solve.stackstate import model_of, to_stack
 from fingerspice.solve.track import prepare_system
-from fingerspice.waveforms.samples import Samples
+from fingerspice.waveforms.recorded import as_samples
 
 # Relative changes of a parameter at which formulas are evaluated, and the weights of a fourth-order difference.
 _STEP = 3e-4
@@ -101,7 +101,7 @@ def check_request(problem: Problem, paths: Sequence[str], method: str, start: st
             "starts, and the methods 'auto' and 'exponential'"
         )
     # A recording is otherwise followed sample by sample, without steps that are kept.
-    return "exponential" if isinstance(problem.waveform, Samples) else method
+    return "exponential" if as_samples(problem.waveform) is not None else method
 
 
 def _layers(one: _Varied, stack: Stack, scene: Scene) -> tuple[FloatArray, FloatArray]:

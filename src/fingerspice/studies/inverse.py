@@ -17,6 +17,7 @@ from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import require_circuit, require_number
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.solve.simulation import simulate
+from fingerspice.studies.drive_shapes import means, rise
 from fingerspice.studies.inversion import Finger, Inverter, Limits, inverter_of, the_finger
 from fingerspice.studies.wanted import ForceCurve, Profile, Wanted, as_profile, check_forces, force_of_friction
 from fingerspice.waveforms.samples import Samples
@@ -34,6 +35,8 @@ MOST_SAMPLES = 5_000_000
 # Relative error of the forward run; relative error of the gap voltage at which the corrections end; largest number of
 # corrections. A correction that leaves more than the fraction STALLED of the smallest error so far is the last one.
 RTOL, CLOSE, CORRECTIONS, STALLED = 1e-6, 1e-5, 25, 0.7
+# Largest voltage of a drive without a warning where no limit is given, V: usual amplifiers end below it.
+HUGE = 1000.0
 # Default time in which the force rises to its first value, for networks other than a series stack, s.
 LEAD = 2e-3
 
@@ -225,6 +228,11 @@ def inverse_drive(
     SolveError
         If the forward run fails.
 
+    Warns
+    -----
+    FingerspiceWarning
+        If no limit is given and the drive exceeds 1000 V.
+
     Notes
     -----
     While a limit holds the drive, the drive stays at the limit and the layers' state follows from it; the force is the
@@ -245,10 +253,21 @@ def inverse_drive(
     assert given_profile is not None
     profile = as_profile(given_profile, kind, rate, duration)
     rate = _rate(rate, carrier, profile)
-    rise = (0.0 if finger.direct else LEAD) if lead is None else lead
-    require(0.0 <= rise < 1e3, "lead", f"{rise:g} s", "0 or more, less than 1000")
-    task = _Task(circuit, finger, kind, profile, rate, carrier, round(rise * rate), law)
-    return task.solve(Limits(limit or math.inf, slew or math.inf))
+    begin = (0.0 if finger.direct else LEAD) if lead is None else lead
+    require(0.0 <= begin < 1e3, "lead", f"{begin:g} s", "0 or more, less than 1000")
+    task = _Task(circuit, finger, kind, profile, rate, carrier, round(begin * rate), law)
+    found = task.solve(Limits(limit or math.inf, slew or math.inf))
+    if limit is None and found.peak > HUGE:
+        _warn_of(found.peak)
+    return found
+
+
+def _warn_of(peak: float) -> None:
+    """Warn about a drive without a limit, with its largest voltage, V."""
+    text = (
+        f"the drive reaches {peak:.0f} V; limit= (V) keeps it within what the amplifier gives, and says what that costs"
+    )
+    warnings.warn(text, FingerspiceWarning, stacklevel=3)
 
 
 def _rate(rate: float | None, carrier: float | None, profile: Profile) -> float:
@@ -290,7 +309,7 @@ class _Task:
             finger.contact, finger.area, None if carrier is None else rate / carrier, float(self.wanted.max())
         )
         u = self.curve.amplitude(self.wanted[:: self.fine])
-        u = np.append(u[0] * _rise(lead), u)
+        u = np.append(u[0] * rise(lead), u)
         if carrier is not None:
             u *= np.sin(2.0 * np.pi * carrier / rate * (np.arange(u.size) - lead))
         self.target = u
@@ -348,7 +367,7 @@ class _Task:
     def _level(self, force: FloatArray) -> FloatArray:
         """Factors for the gap voltage at the samples, by which the mean force of each period becomes the wanted one."""
         edges = self._edges()
-        reached, wanted = (_means(x, self.rate, edges) for x in (force[2 * self.lead :], self.wanted))
+        reached, wanted = (means(x, self.rate, edges) for x in (force[2 * self.lead :], self.wanted))
         some = (reached > 0.5 * wanted) & (wanted > 1e-3 * wanted.max())
         factor = np.sqrt(np.divide(wanted, reached, out=np.ones_like(wanted), where=some))
         t = (np.arange(self.target.size) - self.lead) / self.rate
@@ -363,7 +382,7 @@ class _Task:
             times = lead + np.arange(wanted.size) / self.rate
         else:
             edges = self._edges()
-            reached, wanted = (_means(x, self.rate, edges) for x in (reached, wanted))
+            reached, wanted = (means(x, self.rate, edges) for x in (reached, wanted))
             times = lead + 0.5 * (edges[1:] + edges[:-1])
         contact = self.finger.contact
         wanted_friction, friction = (contact.mu * (contact.f_n + x) for x in (wanted, reached))
@@ -376,16 +395,3 @@ class _Task:
             driven, wave, times, wanted, reached, wanted_friction, friction, self.kind, self.carrier, limits.voltage,
             limits.slew, lead, float(held.mean()), corrections,
         )  # fmt: skip
-
-
-def _rise(count: int) -> FloatArray:
-    """A rise from 0 to 1 (left out) in `count` steps, with zero first and second derivative at both ends."""
-    x = np.arange(count) / max(count, 1)
-    return np.asarray(x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
-
-
-def _means(fine: FloatArray, rate: float, edges: FloatArray) -> FloatArray:
-    """Means between `edges` (s), by Simpson's rule, of values at samples of a rate (Hz) and midway between them."""
-    parts = (fine[:-2:2] + 4.0 * fine[1::2] + fine[2::2]) / (6.0 * rate)
-    total = np.append(0.0, np.cumsum(parts))
-    return np.asarray(np.diff(np.interp(edges, np.arange(total.size) / rate, total)) / np.diff(edges))
