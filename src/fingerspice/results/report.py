@@ -63,7 +63,7 @@ def summary_table(solution: Solution) -> Page:
                 )
         out.append(Table(("", "min", "max", "mean", "last period", "rms", "ripple"), rows))
         if any(s.get(f"{name}_mean_periodic") is not None for name in ("u_source", "f_el")):
-            out.append("last period: the mean over it, and so are rms and ripple (max - min)")
+            out.append("last period: the mean over it; rms and ripple (max - min) are those of the last period, too")
         if "u_gap_amplitude" in s:
             lead = s["u_gap_phase_deg"] - s["u_source_phase_deg"]
             lead = (lead + 180.0) % 360.0 - 180.0
@@ -74,7 +74,7 @@ def summary_table(solution: Solution) -> Page:
                 f"{100.0 * share:.2f} % of the source, leading by {lead:.2f} deg"
             )
     out.append("")
-    nodes = "" if solution.error.v_nodes is None else f", nodes {solution.error.v_nodes:.2g} V"
+    nodes = "" if solution.error.v_nodes is None else f", node voltages {solution.error.v_nodes:.2g} V"
     if solution.u_gap is None:
         inside = "layer" if solution.layers else "capacitor"
         out.append(f"no GAP, no forces; estimated error: {inside} voltage {solution.error.u_gap:.2g} V{nodes}")

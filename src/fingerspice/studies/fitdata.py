@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,7 +117,8 @@ def _from_table(circuit: Circuit, path: Path) -> dict[str, FloatArray]:
     measured = next((name.removesuffix("_mean") for name in table.names if name.removesuffix("_mean") in MEASURED), "")
     for i, (name, unit) in enumerate(zip(table.names, table.units, strict=True)):
         signal = name.removesuffix("_mean")
-        key = name.lower() if name.lower() in (TIME, SIGMA) else name
+        key = {"time": TIME}.get(name.lower(), name.lower())
+        key = key if key in (TIME, SIGMA) else name
         if key == TIME:
             base = "s"
         elif key == SIGMA:
@@ -154,5 +156,11 @@ def _path(circuit: Circuit, name: str) -> str:
         name = f"{driving[0].name}.{parameter}"
     known = {path.lower(): path for path in circuit.parameters}
     if name.lower() not in known:
-        circuit.varied({name: 1.0})
+        near = difflib.get_close_matches(name.lower(), known, 1, 0.0)
+        hint = f", such as {known[near[0]]}" if near else ""
+        allowed = ", ".join((*(f"{signal}_mean" for signal in MEANS), SIGMA, TIME))
+        raise InputError(
+            f"the data have a column {name!r}, which is no parameter of the circuit; allowed: {allowed} with a signal, "
+            f"and conditions{hint}"
+        )
     return known[name.lower()]
