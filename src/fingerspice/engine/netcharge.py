@@ -100,8 +100,8 @@ def charge_error(
 
     With du the error of a cell's voltage and dA that of its area, the error of a charge has a stored part, which goes
     with du and dA at the time, and a lasting part: their leak and, under `local`, the integral of c (dA u' - A' du).
-    Interpolation errors change their sign at every node: they are stored, but over a whole step nothing of them leaks. If
-    a step is cut short, the lobe between the last two nodes lasts.
+    Interpolation errors change their sign at every node: they are stored, but over a whole step nothing of them leaks.
+    If a step is cut short, the lobe between the last two nodes lasts.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def charge_error(
 
 @jit
 def _cell_errors(form: Form, places: FloatArray, slope: FloatArray, off: FloatArray) -> None:
-    """Errors of the cells' voltages (V) and, behind them, of the areas (m^2), at the places, from those of the modes."""
+    """Errors of the cells' voltages (V) and, behind them, of the areas (m^2) at the places, from those of the modes."""
     n_f = form.c.size
     for p in range(N_PLACES):
         for b in range(n_f):

@@ -1,15 +1,16 @@
 """A network in modal form around reference areas, and what an exponential step of it evaluates at all its rows.
 
-With areas A0 held every network is linear, x = shape v - follow s with v' = -rates v + gain s. What the areas move
-beside that is a current j in each cell whose area follows a voltage,
+With its areas fixed at A0 every network is linear: x = shape v - follow s with v' = -rates v + gain s. The change of an
+area adds a current j in each cell whose area follows a voltage,
 
     v' = -rates v + gain s + feed j,    j = (A - A0) (c u' + g u)  [mobile: + c u A'],    u = tap v + tap_s s.
 
-j holds the voltages' rates, but pointwise and linearly: each row solves for them (see `fingerspice.engine.coupling`),
-and where that has no solution is the fold. An area with dynamics of its own is one more mode, of rate 1 / tau. A jump
-of the sources is the same in the fraction of the jump, with nothing leaking: all rates zero.
+j contains the derivatives of the voltages, but linearly and at the same time only, so that each row of a step solves
+for them (see `fingerspice.engine.coupling`); the fold is where this equation has no solution. An area with a time
+constant is one more mode, of rate 1 / tau. Within a jump of the sources the independent variable is the fraction of the
+jump, and nothing leaks: all rates are zero.
 
-These functions take plain arrays, as those of `fingerspice.engine.rows`.
+These functions take plain arrays, as those of `fingerspice.engine.rows` do.
 """
 
 from __future__ import annotations
@@ -30,9 +31,11 @@ from fingerspice.physics.contact import inverse_area
 
 # Blocks of the modes' rows.
 W, BASE, LIN, D, PULL, USED, PULL_BEFORE, LEFT_BEFORE = range(8)
-# Of the cells': what of eta and chi follows the sources, both in whole, rho, shares of A', voltages, currents.
+# Blocks of the cells' rows: the parts of eta and chi that follow the sources, eta and chi, rho, shares of A', voltages,
+# currents.
 ETA_S, CHI_S, ETA, CHI, RHO, SHARE, CELL_U, J = range(8)
-# Of the areas': A, dA/du, A' of what time moves, A - A0, A'; gap voltages, their guess, and what follows the sources.
+# Blocks of the areas' rows: A, dA/du, the part of A' that depends on time, A - A0, A'; gap voltages, their guess, and
+# their part that follows the sources.
 AREA, SLOPE, RATE, MORE, KNOWN, U, GUESS, U_S = range(8)
 
 # From values at the nodes to slopes at all rows, per step length: slopes = values @ TO_RATES.
@@ -45,8 +48,8 @@ class Form(NamedTuple):
     Attributes
     ----------
     numbers : ndarray, shape (size,)
-        All that belongs to the reference areas, of which the arrays in `REFERRED` are views: copying other numbers into
-        it is all that a change of the reference areas takes.
+        All numbers that depend on the reference areas; the arrays named in `REFERRED` are views of it, so that a change
+        of the reference areas is one copy.
     rates : ndarray, shape (m,)
     gain : ndarray, shape (m, n_s)
     shape, inverse : ndarray, shape (n, n)
@@ -59,29 +62,29 @@ class Form(NamedTuple):
     home : ndarray of int, shape (n_f,)
         The area of each of these cells, ascending.
     first : ndarray of int, shape (n_area + 1,)
-        Where the cells of each area begin.
+        First of these cells of each area.
     cell : ndarray of int, shape (n_area,)
-        The one of them whose voltage the area follows; -1 where it is fixed.
+        The cell whose voltage the area follows; -1 if the area is fixed.
     area0, unit : ndarray, shape (n_area,)
-        Reference area, and the area at 0 V that slow ones are counted in, m^2.
+        Reference area, and the area at 0 V, m^2: areas with a time constant are states in units of it.
     slow : ndarray of int, shape (n_area,)
-        The mode of each area, -1 where it has none; `pace` (n_area,) is its rate, 1/s.
+        The mode of each area that has a time constant, else -1; `pace` (n_area,) is its rate, 1/s.
     gap, gap_s : ndarray, shape (n_area, n) and (n_area, n_s)
         Voltage of each area's GAP from x and s; zero without one.
     node, node_s : ndarray, shape (n_node, n) and (n_node, n_s)
         Voltage of each node from the same.
     size : ndarray, shape (n,)
-        Voltage (V) that each mode of the live voltages moves.
+        Largest state voltage (V) for one unit of each mode.
     mobile : bool
         Charge law.
     stress : ndarray, shape (n_area,)
         Force per area and squared gap voltage, Pa/V^2.
     powers, slopes : ndarray, shape (n_area, DEGREE + 1)
-        1/A as `engine.system.System` has it; with `lo`, `scale` (n_area,) and the long way, `curves`.
+        1/A as in `engine.system.System`, with `lo`, `scale` (n_area,); `curves` solve Eq. 4 where these do not reach.
     stored, stored_s, lost, lost_s : ndarray, shape (n_s, n) and (n_s, n_s)
         Current that each source delivers at the reference areas: stored v' + stored_s s' + lost v + lost_s s.
     through : ndarray, shape (n_s, n_f)
-        And what of j comes on top.
+        Share of the current j of each cell that the source delivers in addition.
     """
 
     numbers: FloatArray
@@ -229,7 +232,7 @@ def combine_from(matrix: FloatArray, rows: FloatArray, start: FloatArray, out: F
 def mode_rates(
     h: float, rates: FloatArray, w: FloatArray, lin: FloatArray, pull: FloatArray, stiff_only: bool, out: FloatArray
 ) -> None:
-    """Rates of the modes; those of stiff ones, which may be all that is wanted, by their polynomials."""
+    """Derivatives of the modes: of stiff modes (perhaps only of these) by the derivative of their polynomials."""
     for k in range(w.shape[0]):
         rate = rates[k]
         if rate * h > STIFF:
@@ -276,7 +279,7 @@ def wanted(
     slopes_too: bool, sign: float, powers: FloatArray, slopes: FloatArray, lo: float, scale: float, curve: FloatArray,
     u: FloatArray, area: FloatArray, slope: FloatArray,
 ) -> None:  # fmt: skip
-    """Area that the gap voltages u (ROWS,) ask for on the branch of a sign, and perhaps its slope by them."""
+    """Area at the gap voltages u (ROWS,) on the branch of a sign and, if wanted, its derivative by them."""
     if scale > 0.0 and _highest(sign, u) <= curve[1]:
         polynomial_rows(powers, lo, scale, u, sign, area)
         _invert(area)
@@ -295,7 +298,7 @@ def _moving(
     mobile: bool, h: float, rate_k: float, pace: float, unit: float, w: FloatArray, lin: FloatArray, d: FloatArray,
     forced: FloatArray, area: FloatArray, slope: FloatArray, rate: FloatArray,
 ) -> None:  # fmt: skip
-    """An area with dynamics: its forcing by the area wanted, which stands in `area`; then itself, and its rate."""
+    """An area with a time constant: its forcing by the equilibrium area in `area`; then the area and its derivative."""
     for i in range(ROWS):
         forced[i] = pace / unit * area[i]
         area[i] = unit * w[i]
@@ -319,8 +322,9 @@ def evaluate(
 ) -> bool:  # fmt: skip
     """What the areas add to the modes' rates, into `pull` (m, ROWS), from the modes w (m, ROWS).
 
-    `lin` is gain s, and `d` takes the rates of stiff modes. `cells` and `areas` are blocks of rows, whose parts that
-    follow the sources are given. False past a fold; under `mobile`, `least` (ROWS,) takes the distance to it.
+    `lin` is gain s, and `d` receives the derivatives of stiff modes. `cells` and `areas` are blocks of rows, whose
+    parts that follow the sources are given. False beyond a fold; under `mobile`, `least` (ROWS,) receives the distance
+    to it.
     """
     mobile = form.mobile
     n = form.gap.shape[1]
@@ -369,7 +373,7 @@ def follow_sources(
     form: Form, coupling: Coupling, gain: FloatArray, s: FloatArray, ds: FloatArray, lin: FloatArray,
     cells: FloatArray, areas: FloatArray,
 ) -> None:  # fmt: skip
-    """What of a step's rows follows the sources alone; see `evaluate`."""
+    """The parts of a step's rows that depend on the sources alone; see `evaluate`."""
     n = form.gap.shape[1]
     clear(lin)
     combine(gain, s, lin)

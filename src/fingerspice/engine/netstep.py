@@ -1,4 +1,4 @@
-"""What the loop of a network does in a step: the sources at its rows, its solution, and the charges of it."""
+"""Parts of a network's step: the sources at its rows, the collocation solution, and the charges."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def source_rows(
 
 @jit
 def ramp_rows(t: float, h: float, before: FloatArray, after: FloatArray, s: FloatArray, ds: FloatArray) -> None:
-    """The same within a jump, from the fraction t on."""
+    """Values and slopes of the sources at all rows of a step within a jump, which starts at the fraction t."""
     for e in range(before.size):
         for i in range(ROWS):
             ds[e, i] = after[e] - before[e]
@@ -43,7 +43,7 @@ def ramp_rows(t: float, h: float, before: FloatArray, after: FloatArray, s: Floa
 
 @jit_rows
 def _free(decay: FloatArray, w0: FloatArray, out: FloatArray) -> None:
-    """Decay of the modes from where they start."""
+    """Decay of the modes from their values at the start of a step."""
     for k in range(w0.size):
         for i in range(ROWS):
             out[k, i] = decay[k, i] * w0[k]
@@ -54,7 +54,7 @@ def solve_step(
     form: Form, work: Work, own: Coupling, several: bool, h: float, rates: FloatArray, area_pace: FloatArray,
     sign: FloatArray, decay: FloatArray, phi: FloatArray, tol: float,
 ) -> tuple[int, bool]:  # fmt: skip
-    """Collocation solution of a step from the modes `work.w0`, by iteration on what the areas add.
+    """Collocation solution of a step from the modes `work.w0`, by iteration on the currents that the areas add.
 
     Returns the number of evaluations, and whether the gap voltages are settled to `tol` (V).
     """
@@ -88,7 +88,7 @@ def solve_step(
         change = moved(u, guess)
         if iteration == 1:
             continue
-        # What the gap voltages would move next, by what they moved for the last change of the currents.
+        # The next change of the gap voltages, estimated from their change for the last change of the currents.
         off = distance(pull, used, weight)
         if not off < math.inf:
             return iteration, False
@@ -137,9 +137,9 @@ def all_zero(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> bool
 
 @jit
 def magnified_whole(form: Form, work: Work, which: int, several: bool) -> float:
-    """Inverse distance of a step to the fold, with the modes that follow at once: they take no part in its own.
+    """Inverse distance of a step to the fold with all modes, also those that the step takes for stiff.
 
-    `work.own` becomes the coupling number `which` with no mode taken for stiff.
+    `work.own` becomes coupling number `which`, in which no mode is taken for stiff.
     """
     whole, areas, spare = work.own, work.areas, work.spare_cells
     take_coupling(whole, which, 0.0, form.rates, form.feed, form.tap, form.tap_s, form.c, form.g, form.home, form.cell)

@@ -1,15 +1,15 @@
 """A network of capacitors, resistors, sources and contacts as one compiled right-hand side.
 
-State y = [x (n,) in volt, a (n_slow,), z (n_s,) in coulomb]: live capacitor voltages, areas with dynamics of their own
-over their value at 0 V, and the charge that each source has delivered. Cells have u = P x + Q s. With capacitances
+State y = [x (n,) in volt, a (n_slow,), z (n_s,) in coulomb]: capacitor voltages, areas with a time constant (over their
+values at 0 V), and the charge that each source has delivered. Cells have u = P x + Q s. With capacitances
 C = c A and leaks G = g + g_A A, Kirchhoff's current law on the cuts of the live capacitors is
 
     P^T (C u' + [mobile: c u A'] + G u) + K x + B s = 0,     A = g(|u_gap|)  or  tau A' = g(|u_gap|) - A.
 
-It is kept in that form, linear in x', and never solved for x' but at the start of a step and for outputs.
+It is kept in that form, linear in x', and solved for x' only at the start of a step and for outputs.
 
-Under `mobile` A' = dg/du u_gap' stands on both sides: where its matrix turns singular is the fold. An ideal jump is the
-limit of a fast ramp: the same equation in the fraction of the jump, with nothing leaking meanwhile.
+Under `mobile` A' = dg/du u_gap' makes the matrix of x' depend on the charge; the fold is where it becomes singular. An
+ideal jump is the limit of a fast ramp: the same equation in the fraction of the jump, with nothing leaking meanwhile.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Net(NamedTuple):
     tau : ndarray, shape (n_area,)
         Time constant of the area, s; 0 where it follows at once.
     slow : ndarray of int, shape (n_area,)
-        Place of the area among the state's own, -1 where it follows at once or is fixed.
+        Place of the area among those in the state; -1 if it follows at once or is fixed.
     curves : ndarray, shape (n_area, l)
         See `fingerspice.physics.contact.inverse_area`; series padded with zeros.
     """
@@ -69,12 +69,12 @@ class Net(NamedTuple):
 
 
 class Sources(NamedTuple):
-    """Every source on one window of time: tables of `Segment`s one behind the other.
+    """All sources on one window of time: their tables of `Segment`s, one after the other.
 
     Attributes
     ----------
     first : ndarray of int, shape (n_s + 1,)
-        Where each source's edges begin; its segments begin there less the number of sources before.
+        First edge of each source; its first segment has that number less the number of sources before.
     edges : ndarray, shape (sum of m + 1,)
         s.
     terms, series : ndarray, shape (sum of m, k, 6) and (sum of m, l)
@@ -127,9 +127,10 @@ def at_sources(sources: Sources, index: IntArray, base: float, t: float, s: Floa
 
 @jit
 def followed(net: Net, i: int, sign: float, u: float) -> tuple[float, float]:
-    """Area (m^2) that gap voltage u asks for on the branch g(|u|) = g(sign u), and its slope dg/du (m^2/V).
+    """Area (m^2) at gap voltage u on the branch g(|u|) = g(sign u), and its slope dg/du (m^2/V).
 
-    Under `mobile`, well on the wrong side of 0 V it is the true area: a walk towards the branch stays on solid ground.
+    Under `mobile`, far on the wrong side of 0 V it is the true area, so that an iteration towards the branch stays
+    where the area exists.
     """
     if net.mobile and sign * u < net.curves[i, 0]:
         sign = -sign
@@ -187,7 +188,7 @@ def _voltages(net: Net, room: Room, y: FloatArray, k: FloatArray) -> None:
 
 @jit
 def _areas(net: Net, room: Room, y: FloatArray, sign: FloatArray, leak: float) -> None:
-    """Areas, what of their change the gap voltage makes (per volt), and what time makes (per second)."""
+    """Areas, and the parts of their change by the gap voltage (per volt) and by time (per second)."""
     n = net.k.shape[0]
     for i in range(net.gap.size):
         room.area[i] = net.area0[i]
@@ -205,14 +206,14 @@ def _areas(net: Net, room: Room, y: FloatArray, sign: FloatArray, leak: float) -
 
 @jit
 def residual(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray, k: FloatArray, out: FloatArray) -> None:
-    """What is missing for `k` to be y', for the sources in `room`: currents into the cuts of the live capacitors (A).
+    """Residual of y' = `k` for the sources in `room`: currents into the cuts of the state's capacitors (A).
 
-    For areas with dynamics of their own it is their rate less that in `k`; for the charges z' itself, given x' = k.
+    For areas with a time constant it is their rate less that in `k`; for the charges it is z' itself, given x' = k.
     `sign` (n_area,) chooses the branch of each area, continued analytically through 0 V. In a `jump` time stands still
     and derivatives are by the fraction of the jump, of which `room.ds` is the whole.
 
-    Linear in k. Nothing is divided by a capacitance: where a small resistance makes a current large, its rounding stays
-    on the one cut that it flows through.
+    The residual is linear in k. Nothing is divided by a capacitance: the rounding error of a large current through a
+    small resistance stays on the one cut that it flows through.
     """
     n, n_s = net.b.shape
     slow = y.size - n - n_s
@@ -251,10 +252,10 @@ def residual(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray, 
 
 @jit
 def capacitances(net: Net, room: Room, y: FloatArray, sign: FloatArray) -> None:
-    """The matrix (n, n) in F that small changes of the live voltages meet, into `room.matrix`.
+    """The differential capacitance matrix of the state voltages (n, n), F, into `room.matrix`.
 
-    From the capacitors alone: beside the current of a small resistance, or of what a fast source pushes, that of a
-    capacitor would be lost in rounding, and with it the distance to a fold.
+    It is computed from the capacitors alone: beside the current of a small resistance or of a fast source, that of a
+    capacitor would be lost in rounding errors, and with it the distance to a fold.
     """
     n = net.k.shape[0]
     _voltages(net, room, y, y)
@@ -275,7 +276,7 @@ def capacitances(net: Net, room: Room, y: FloatArray, sign: FloatArray) -> None:
 
 @jit
 def rates(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray, out: FloatArray) -> bool:
-    """Write y' into `out` for the sources in `room`; False past a fold, where no y' continues the solution."""
+    """Write y' into `out` for the sources in `room`; False beyond a fold, where no y' continues the solution."""
     n, n_s = net.b.shape
     capacitances(net, room, y, sign)
     room.k[:] = 0.0
@@ -302,7 +303,7 @@ def gap_voltage(net: Net, room: Room, i: int, y: FloatArray) -> float:
 
 @jit
 def choose_signs(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray) -> None:
-    """Branch of each area: the sign of its gap voltage, or at 0 V of where that goes."""
+    """Branch of each area: the sign of its gap voltage or, at 0 V, of the voltage's derivative."""
     rate = np.zeros(y.size)
     for i in range(sign.size):
         sign[i] = 1.0

@@ -24,16 +24,17 @@ from fingerspice.engine.readout import (
 )
 from fingerspice.numerics.lobatto import NODES
 
-# Neighbouring step lengths of the ladder, as a power of two: fine enough to waste little, coarse enough to recur.
+# Ratio of neighbouring step lengths of the ladder, as a power of two: small enough to waste little, large enough for
+# lengths to recur, whose tables are kept.
 _RUNGS = 16.0
-# A step meant to reach a zero of the gap voltage goes this much farther.
+# A step that is to reach a zero of the gap voltage is this much longer, relative to its length.
 _BEYOND = 1.02
-# Step over the one before, at most; and what of it may be foreseen growth.
+# Largest ratio of a step to the one before, and the part of it that may come from the trend of earlier steps.
 _MOST_GROWTH, _MOST_TREND = 8.0, 2.5
-# Over a length once found too long: if the error allows this much, what made it so has passed.
+# If the error allows a step so many times as long as one that was rejected, the reason of the rejection has passed.
 _REFUTED = 1.5
-# The first step after an edge or a zero is tried so much longer than the one before at such a place, at most; less
-# where that one was found by trying.
+# Largest ratio of the first step after an edge or a zero to the first step after the previous one; the smaller value
+# holds if that step was found by rejections.
 _MOST_FRESH, _TRIED_FRESH = 2.0, 1.1
 
 
@@ -73,7 +74,7 @@ def nearest_level(q0: FloatArray, q: float) -> int:
 
 @jit
 def enter(model: Model, charge: bool, u_source: float, y: FloatArray, control: FloatArray) -> bool:
-    """Take the jump of the source that may stand here, and the branch after it; False where a fold lies in between."""
+    """Take a jump of the source at this time, if there is one, and the branch after it; False if it meets a fold."""
     x_gap = dot(model.gap, y)
     if not model.mobile and u_source != control[U_BEFORE] and charge:
         moved, error = jump_charge(model, x_gap, control[U_BEFORE], u_source)
@@ -95,7 +96,7 @@ def enter(model: Model, charge: bool, u_source: float, y: FloatArray, control: F
 
 @jit
 def take_branch(sign: float, control: FloatArray) -> None:
-    """Take the branch of a sign; one that is new starts here, and how long it will be is not known."""
+    """Take the branch of a sign; a new branch starts here, and its length is not known yet."""
     if sign != control[SIGN]:
         control[BRANCH_START] = control[T]
         control[BRANCH_LENGTH] = math.inf
@@ -106,7 +107,7 @@ def take_branch(sign: float, control: FloatArray) -> None:
 def choose_step(
     pace: Pace, tau: float, coupled: bool, is_series: bool, t: float, remaining: float, control: FloatArray
 ) -> float:
-    """Length of the next step, s: on the ladder, or to the very end of a segment that cannot be continued."""
+    """Length of the next step, s: one of the ladder, or exactly to the end of a segment that cannot be continued."""
     if not pace.controlled:
         return pace.h_max
     h = control[H]
@@ -119,7 +120,7 @@ def choose_step(
         target = ahead
     h = target / math.ceil(target / h) if h < target else target
     if is_series:
-        # A series is worthless past its end: the last step of a segment has its exact length.
+        # A series must not be evaluated beyond its end: the last step of a segment ends exactly there.
         if h >= remaining * (1.0 - 1e-9):
             return remaining
         h = rung(h)
@@ -130,7 +131,7 @@ def choose_step(
 
 @jit
 def allowed_factor(error: float, tol: float) -> float:
-    """Length that the error of a step allows, over its own."""
+    """Ratio of the length that the error of a step allows to the step's own length."""
     if error == 0.0:
         return 6.0
     return 0.9 * (tol / error) ** (1.0 / NODES) if error < math.inf else 0.5
@@ -149,10 +150,10 @@ def accept(h: float, wanted: float, factor: float, tries: int, fresh: int, close
     tries : int
         Lengths that were tried.
     fresh : int
-        Where the length of a first step after an edge or a zero is kept; -1 for other steps.
+        Entry of `control` for the length of a first step after an edge or a zero; -1 for other steps.
     closed : bool
-        False where the length last found too long was one on which the iteration did not close: the error of a shorter
-        step says nothing about that.
+        False if the last rejected length was one at which the iteration did not converge: the error of a shorter step
+        says nothing about that.
     control : ndarray
         Bookkeeping, updated in place.
     """
@@ -174,7 +175,7 @@ def accept(h: float, wanted: float, factor: float, tries: int, fresh: int, close
 
 @jit
 def shorten(h: float, factor: float, control: FloatArray) -> float:
-    """The length to try after one that is too long, of which note is taken."""
+    """The length to try after a rejected one, which is remembered."""
     control[TOO_LONG] = h
     control[ALLOWED] = 0.0
     shorter: float = rung(h * min(0.9, max(0.25, factor)))

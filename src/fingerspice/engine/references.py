@@ -1,4 +1,4 @@
-"""Reference areas of a network: which the areas at hand want, and going over from one to another."""
+"""Reference areas of a network: which of them fits the present areas, and the change from one to another."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from fingerspice.base.compiled import jit
 from fingerspice.engine.netrows import Form
 from fingerspice.numerics.small import copy_to
 
-# Ratio of neighbouring reference areas; an area this many times its reference's, or a part of it, wants another one.
+# Ratio of neighbouring reference areas, and the ratio of an area to its reference beyond which another one is taken.
 LEVEL_RATIO, FARTHEST = 1.28, 1.2
 
 
 class References(NamedTuple):
-    """What is known of a network around several reference areas.
+    """The forms of a network around several reference areas.
 
     Attributes
     ----------
     levels : ndarray of int, shape (room, n_area)
-        Powers of LEVEL_RATIO that the areas of each reference are over those at 0 V.
+        Areas of each reference over those at 0 V, as powers of LEVEL_RATIO.
     numbers : ndarray, shape (room, size)
         See `Form`.
     used, wanted : ndarray of int, shape (1,) and (n_area,)
-        How many references there are; the levels that were looked for last.
+        Number of references; the levels that were looked for last.
     """
 
     levels: IntArray
@@ -37,7 +37,7 @@ class References(NamedTuple):
 
 @jit
 def far_from(form: Form, area: FloatArray) -> bool:
-    """Whether some area that moves (n_area,) wants another reference."""
+    """Whether some area (n_area,) is too far away from its reference."""
     for a in range(area.size):
         if form.cell[a] >= 0 and max(area[a] / form.area0[a], form.area0[a] / area[a]) > FARTHEST:
             return True
@@ -46,7 +46,7 @@ def far_from(form: Form, area: FloatArray) -> bool:
 
 @jit
 def find(references: References, form: Form, area: FloatArray) -> int:
-    """The reference nearest to these areas (n_area,), or -1 where it is not known yet; its levels into `wanted`."""
+    """The reference nearest to these areas (n_area,), or -1 if it has not been made; its levels into `wanted`."""
     wanted = references.wanted
     for a in range(area.size):
         wanted[a] = 0
@@ -63,7 +63,7 @@ def find(references: References, form: Form, area: FloatArray) -> int:
 
 @jit
 def go_over(references: References, one: int, form: Form, error: FloatArray) -> None:
-    """Make a form that of another reference, and carry the error of its modes over."""
+    """Turn a form into that of another reference, and transform the error of the modes."""
     n = form.shape.shape[0]
     x = np.zeros(n)
     for i in range(n):

@@ -1,7 +1,7 @@
-"""Outputs of periods from the polynomials of one: the same again, or moved by what its start has moved.
+"""Outputs of many periods from the polynomials of one: equal periods, or periods related by an affine map.
 
-A walk over a billion periods takes half a minute: it is made in compiled calls of some milliseconds, between which
-Python sees to a Ctrl-C. What one of them knows is handed to the next, so that no result depends on where it was cut.
+A billion periods take half a minute. They are written by compiled calls of some milliseconds, between which Python can
+react to Ctrl-C; each call hands its state to the next, so that no result depends on where the calls are divided.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from fingerspice.numerics.chebyshev import to_powers
 from fingerspice.numerics.lobatto import NODES, ROWS
 from fingerspice.numerics.small import copy_to
 
-# A boundary of a step, moved by whole periods, is one of the times asked for if it is this near, relative.
+# Relative distance within which the end of a step, shifted by whole periods, counts as equal to an output time.
 _SLACK = 8e-16
 AT_ZERO, AT_EDGE = 1.0, 2.0
-# Steps gone through in one compiled call.
+# Number of steps in one compiled call.
 AT_ONCE = 1_000_000
 
 
@@ -48,7 +48,7 @@ def new_kept(steps: int, columns: int) -> Kept:
 
 
 class _Walk(NamedTuple):
-    """What compiled calls hand on: of each step, its outputs in the period before, and whether it is in powers of x."""
+    """State handed from call to call: each step's outputs in the period before, and whether it is in powers of x."""
 
     held: NDArray[np.int64]
     as_powers: NDArray[np.bool_]
@@ -59,7 +59,7 @@ def _new_walk(steps: int) -> _Walk:
 
 
 def _calls(periods: int, steps: int) -> Iterator[tuple[int, int]]:
-    """Where a walk over periods 0, 1, ... is cut: the first period of each call, and the first that is not its own."""
+    """Division of periods 0, 1, ... into calls: the first period of each call, and the first of the next one."""
     most = max(1, AT_ONCE // max(1, steps))
     for begin in range(0, periods, most):
         yield begin, min(begin + most, periods)
@@ -80,7 +80,7 @@ def repeat(
     periods : int
         How often to repeat it.
     drifts : ndarray, shape (n_column,)
-        What each column gains in a period: a charge does, C.
+        Gain of each column in a period; only charges have one, C.
     first, t_out, left, out
         As `readout.write_outputs`.
 
@@ -121,7 +121,7 @@ def _repeat(
                 continue
             h = times[i, 1]
             reached = (times[i, 2] - times[i, 0]) / h
-            # As many as in the period before, mostly.
+            # Mostly a period has as many outputs as the one before.
             held[i] = write_outputs(
                 times[i, 0] + shift, h, min(reached, 1.0), stop, slack, as_powers[i], series[i], work, first, held[i],
                 t_out, left, out,
@@ -136,9 +136,10 @@ def _repeat(
 
 @jit
 def _make_powers(series: FloatArray, by: FloatArray, made: NDArray[np.bool_]) -> None:
-    """Turn coefficients (n_step, n_column, ROWS) into those of 1, x, x^2, ... where these are as exact: half the work.
+    """Turn Chebyshev coefficients (n_step, n_column, ROWS) into those of 1, x, x^2, ..., which halve the work.
 
-    `made` (n_step,) takes for which steps; their derivatives `by` (n, n_step, n_column, ROWS) are turned as well.
+    This is done for steps where the powers are as exact, which `made` (n_step,) marks; the derivatives `by` (n, n_step,
+    n_column, ROWS) of these steps are turned as well.
     """
     room = np.zeros(NODES)
     for i in range(made.size):
@@ -180,7 +181,7 @@ def approach(
     shown : int
         Columns that are voltages; after them come charge and current, if wanted.
     still : float
-        What a period may start off the one before and have its outputs, V.
+        Largest change of a period's start for which the period before provides the outputs, V.
     period : float
         s.
     periods : int
@@ -204,17 +205,17 @@ def approach(
 
 
 class _Formed(NamedTuple):
-    """The period that was formed last, and is written until its start has moved on.
+    """The period that was formed last; it serves until the start has changed too much.
 
     Attributes
     ----------
     at : ndarray, shape (n,)
-        How far off its start was, V.
+        Difference of its start from `x`, V.
     stops : ndarray, shape (n_step + 1,)
         Its marks, s.
     series : ndarray, shape (n_step, n_column, ROWS)
     stale : ndarray of bool, shape (1,)
-        Whether `stops` and `series` are still those of an earlier start than `at`.
+        Whether `stops` and `series` still belong to an earlier start than `at`.
     """
 
     at: FloatArray
@@ -242,7 +243,7 @@ def _approach(
         for m in range(n):
             delta[m] = state[m] - x[m]
             moved = max(moved, abs(delta[m] - formed.at[m]))
-        # Whether outputs are asked for or not: none of them depends on the others.
+        # Also in periods without outputs, so that no output depends on which others are asked for.
         if moved > still:
             copy_to(formed.at, delta)
             formed.stale[0] = True
@@ -275,7 +276,7 @@ def _form(
     marks: FloatArray, marks_by: FloatArray, series: FloatArray, by: FloatArray, delta: FloatArray, stops: FloatArray,
     formed: FloatArray,
 ) -> None:  # fmt: skip
-    """Marks and series of the period that starts `delta` (V) off, see `approach`, into `stops` and `formed`."""
+    """Marks and series of the period whose start differs by `delta` (V), see `approach`, into `stops` and `formed`."""
     copy_to(stops, marks)
     copy_to(formed, series)
     for m in range(delta.size):
