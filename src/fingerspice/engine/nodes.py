@@ -18,8 +18,8 @@ def node_error(
 ) -> float:  # fmt: skip
     """Largest error of any node's voltage over a step (V) from that of the modes; see `assess`.
 
-    Under `mobile` the voltages are the modes' over A, and so are off by what A is, and by what the polynomial of that
-    product misses.
+    Under `mobile` the voltages are the modes times 1/A: their error contains that of A, and the interpolation error of
+    the product.
     """
     if not mobile:
         return _linear_error(node, k_node, r[SOURCE], places)
@@ -55,7 +55,7 @@ def node_error(
 
 @jit_rows
 def _linear_error(node: FloatArray, k_node: FloatArray, source: FloatArray, places: FloatArray) -> float:
-    """The same where the nodes' voltages are linear in the modes and the source."""
+    """Largest error of a node's voltage under `local`, where the voltages are linear in the modes and the source, V."""
     first, second, third = between(source)
     worst = 0.0
     for i in range(k_node.size):

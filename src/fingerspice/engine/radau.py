@@ -14,9 +14,9 @@ from fingerspice.numerics.small import copy_to, invert
 
 # Entry of `counters`: evaluations of the right-hand side.
 NFEV = 0
-# What Newton's method leaves, over the error allowed in a step.
+# Error that Newton's method may leave, over the error allowed in a step.
 CONVERGED = 0.01
-# How far a step's polynomial is followed past its end for a guess of the next one, in its own length.
+# Length over which a step's polynomial is extrapolated for a guess of the next step, over the step's own length.
 FARTHEST = 2.0
 
 
@@ -78,10 +78,10 @@ def new_work(net: Net, stages: int, n_eigen: int, size: int) -> Work:
 
 @jit
 def linearise(net: Net, room: Room, work: Work, jump: bool, y: FloatArray, sign: FloatArray, scale: FloatArray) -> None:
-    """Derivatives of the residual by the state, by differences, and by its rate, at the rate in `work.rate`.
+    """Derivatives of the residual by the state (by differences) and by its time derivative, at `work.rate`.
 
-    Only the part of the state that feeds back; rows over their largest capacitance, as currents are tiny beside rates
-    of areas. The sources are those in `room`.
+    Only for the part of the state on which the residual depends; each row is divided by its largest capacitance,
+    because currents are tiny beside the derivatives of areas. The sources are those in `room`.
     """
     n = net.k.shape[0]
     m = work.slope.shape[0]
@@ -166,7 +166,7 @@ def _residuals(
         residual(net, room, jump, work.stage, sign, work.k[i], room.base)
         for j in range(m):
             work.residual[i, j] = work.weight[j] * room.base[j]
-        # Nothing depends on the charges: they are only collected.
+        # Nothing depends on the charges: they are only integrated.
         for j in range(m, y.size):
             work.k[i, j] = room.base[j]
 
@@ -200,7 +200,7 @@ def step(
                     change = value
         if not change < math.inf or (iteration > 1 and change > before and change > tol):
             return math.inf
-        # What is left, as each iteration takes the same share off; or at rounding, where nothing falls any more.
+        # The remaining error, if every iteration reduces it by the same factor; or rounding errors, which do not fall.
         falls = change / before if iteration > 0 else 0.5
         left = change * falls / (1.0 - falls) if falls < 1.0 else math.inf
         if left <= CONVERGED * tol or (iteration > 2 and falls > 0.3 and change <= 1e-13):
@@ -209,7 +209,7 @@ def step(
     else:
         return math.inf
     if y.size > m and scale[m] < math.inf:
-        # The charges' rates are those of the last but one iteration: once more, where charges are wanted.
+        # The charges' derivatives belong to the last iteration but one: evaluate them again if charges are wanted.
         _residuals(net, room, scheme, work, jump, h, y, sign)
         counters[NFEV] += stages
     norm = 0.0
@@ -224,7 +224,7 @@ def step(
         if not value <= norm:
             norm = value
     if net.mobile and norm <= 1.0:
-        # Past a fold there may be a solution that does not continue this one, and a step may reach it.
+        # Beyond a fold there may be a solution that does not continue this one, and a step may reach it.
         for i in range(stages):
             _stage(scheme, work, i, h, y)
             copy_to(room.s, work.s[i])
@@ -236,7 +236,7 @@ def step(
 
 @jit
 def guess(scheme: Scheme, work: Work, start: FloatArray, h: float, h_before: float) -> None:
-    """Stages of the next step from the polynomial of the one before, or where there is none from the rate now."""
+    """Guess of the next step's stages from the polynomial of the step before or, without one, the derivative now."""
     follows = h_before > 0.0 and h <= FARTHEST * h_before
     for i in range(scheme.c.size):
         theta = 1.0 + scheme.c[i] * h / h_before if follows else 0.0

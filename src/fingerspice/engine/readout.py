@@ -1,4 +1,4 @@
-"""What is read off a finished step: zeros of the gap voltage, state and error inside it, outputs, peaks."""
+"""Quantities computed from a finished step: zeros of the gap voltage, state and error inside it, outputs, peaks."""
 
 from __future__ import annotations
 
@@ -14,45 +14,45 @@ from fingerspice.numerics.lobatto import BARYCENTRIC, FIRST, NODES, POINTS, ROWS
 # Entries of `control`.
 T, H, SIGN, U_BEFORE, U_GAP = 0, 1, 2, 3, 4
 BRANCH_START, BRANCH_LENGTH, PEAK_U, PEAK_F, ERROR_U, ERROR_F = 5, 6, 7, 8, 9, 10
-# A length found too long not long ago, s.
+# A step length that was rejected recently, s.
 TOO_LONG = 11
 # The first step taken after an edge of the source, s.
 H_AFTER_EDGE = 12
-# Largest move of the gap voltage for a move of a live one.
+# Largest change of the gap voltage for a change of 1 V of a state voltage.
 MAGNIFIED = 13
-# Error of the charge, C: the largest so far, what has been collected, and the squares of what each step added, C^2.
+# Error of the charge: the largest so far (C), the sum with known signs (C), and the sum of squares of the others (C^2).
 ERROR_Q, COLLECTED, SPREAD = 14, 15, 16
 # 1/A where the last step ended, 1/m^2.
 LAST_Q = 17
-# Length that the last step's error would have allowed, s; 0 where it says nothing about the next.
+# Length that the last step's error would have allowed, s; 0 if it says nothing about the next step.
 ALLOWED = 18
 # The first step taken after a zero of the gap voltage, s; 0 before the first.
 H_AFTER_ZERO = 19
-# Smallest distance to the fold met.
+# Smallest distance to the fold so far.
 MARGIN = 20
-# Largest charge met, C.
+# Largest charge so far, C.
 PEAK_Q = 21
 # Largest error of a node's voltage, V.
 ERROR_V = 22
 N_CONTROL = 23
-# Entries of `counters`: rows evaluated, steps accepted and refused, zeros met, outputs written, steps kept, recorded.
+# Entries of `counters`: rows evaluated, steps accepted and rejected, zeros, outputs written, steps kept, recorded.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT, RECORDED = 0, 1, 2, 3, 4, 5, 6
 N_COUNTERS = 7
-# The last steps tried are kept, this many, as rows: start and length (s), error over the one allowed, number.
+# Number of last steps tried that are kept, as rows: start and length (s), error over the one allowed, number.
 TRIED = 8
-# Steps taken and refused in a window of the source, which holds a few thousand of its periods at most: what needs more
-# has a cause that smaller steps do not mend.
+# Most steps, accepted and rejected, in a window of the source, which has a few thousand periods at most. A run that
+# needs more has a problem that smaller steps do not solve.
 MOST_STEPS = 200_000
-# Evaluations at all rows, to begin with after each edge of the source and over the longest step that it allows: a fast
-# mode that the area moves may let only short steps converge, and another method is soon done there.
+# Most evaluations at all rows, at first after each edge of the source and then for each longest step: a fast mode that
+# the area affects may let only short steps converge, and another method is faster there.
 FIRST_PASSES, MOST_PASSES = 20_000, 2_000
-# Outputs are read in groups of a processor's vectors, and looked for in strides.
+# Outputs are evaluated in groups as wide as the processor's vectors, and searched in strides.
 WRITTEN_AT_ONCE = _GROUP = 8
 _STRIDE = 32
 
 
 class Steps(NamedTuple):
-    """Takes every step, for figures of the run that no outputs are needed for.
+    """Takes every step, so that figures of the run do not depend on its outputs.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Steps(NamedTuple):
     values : ndarray, shape (capacity, n_column, NODES)
         Recorded voltages, or the state of a network, at the nodes of the whole length.
     paused : ndarray, shape (6,)
-        Where a loop stopped because all places are taken; the first entry is 1 then, else 0.
+        State of a loop that stopped because all places are taken; its first entry is 1 then, else 0.
     """
 
     times: FloatArray
@@ -126,16 +126,16 @@ def _value_and_slope(series: FloatArray, x: float) -> tuple[float, float]:
 
 @jit
 def dip(u: FloatArray, sign: float, tol: float, wrong: int, series: FloatArray) -> float:
-    """Fraction of the step at which the gap voltage is farthest off its branch between two nodes that are on it, or 0.
+    """Fraction of the step at which the gap voltage is farthest off its branch between two nodes on it, or 0.
 
-    Looked for before node `wrong`, if that is not 0; what is off by no more than `tol` (V) is no matter.
+    Only nodes before node `wrong` are considered, unless that is 0; deviations up to `tol` (V) are ignored.
     """
     last = wrong if wrong > 0 else NODES
     for j in range(last):
         here = sign * u[j]
         before = sign * u[j - 1] - here if j > 0 else 0.0
         after = sign * u[j + 1] - here if j + 1 < last else 0.0
-        # A parabola through three nodes goes below the lowest by less than that.
+        # A parabola through three nodes falls below the lowest node by less than the sum of the differences.
         if before < 0.0 or after < 0.0 or here > before + after or (j + 1 == last and wrong > 0):
             continue
         lo = POINTS[max(j - 1, 0)]
@@ -177,7 +177,7 @@ def zero(u: FloatArray, sign: float, last: int, below: float, series: FloatArray
     theta: float = 0.5 * (lo + hi)
     if below == 0.0:
         theta = lo + (hi - lo) * u[last - 1] / (u[last - 1] - u[last])
-    # Newton, in a bracket that only closes; after a move of 1e-9 its next one is below rounding.
+    # Newton's method in a shrinking bracket; after a step of 1e-9 the next one is below rounding.
     for _ in range(60):
         value, slope = _value_and_slope(series, 2.0 * theta - 1.0)
         if sign * value > 0.0:
@@ -208,7 +208,7 @@ def leaves(u: FloatArray, sign: float, tol: float, series: FloatArray) -> float:
 def first_wrong(u: FloatArray, sign: float, tol: float) -> int:
     """First node past the start at which the gap voltage is off its branch, or 0.
 
-    A voltage that stays below the error allowed (V) may be all rounding: its zeros mean nothing.
+    A voltage that stays below the error allowed, `tol` (V), may be rounding errors alone, whose zeros mean nothing.
     """
     first = 0
     largest = 0.0
@@ -237,7 +237,7 @@ def at(values: FloatArray, theta: float) -> float:
 
 @jit
 def error_at(places: FloatArray, theta: float, error: FloatArray) -> None:
-    """Error of the modes where a step is cut short: between the places it is known at."""
+    """Error of the modes at the end of a step that is cut short, interpolated between the places where it is known."""
     p = 0
     left = 0.0
     right = POINTS[FIRST]
@@ -311,7 +311,7 @@ def _powers_at(
 
 @jit
 def _outputs_within(first: int, guess: int, low: float, high: float, t_out: FloatArray, left: NDArray[np.bool_]) -> int:
-    """How many outputs from number `first` on lie in a step, its end known to lie between `low` and `high`."""
+    """Number of outputs from number `first` on that lie in a step, known to be between `low` and `high`."""
     after = first + guess
     if guess > 0 and after <= t_out.size and t_out[after - 1] < low and (after == t_out.size or t_out[after] > high):
         return guess
@@ -331,14 +331,14 @@ def write_outputs(
     """Outputs of one step from number `first` on: right-hand ones in [t, t_new), left-hand ones in (t, t_new].
 
     With `powers` the series holds the coefficients of 1, x, x^2, ... instead. Times within `slack` of t_new are t_new;
-    `guess` says how many there may be. Places after the last one are written over: they belong to later steps.
+    `guess` is the expected number. Places after the last output are overwritten: they belong to later steps.
     `work` has shape (2, WRITTEN_AT_ONCE). Returns how many there were.
     """
     count = _outputs_within(first, guess, t_new - slack, t_new + slack, t_out, left)
     groups = (count + _GROUP - 1) // _GROUP
     scale = 2.0 / h
     top = 2.0 * reached - 1.0
-    # The last group of all may not fit: it is written by way of `work`.
+    # The last group of a run may be too wide for the array: it is written through `work`.
     whole = groups if first + _GROUP * groups <= t_out.size else groups - 1
     rest = first + _GROUP * whole
     for column in range(out.shape[0]):
@@ -363,7 +363,7 @@ def account(
     mobile: bool, area0: float, stress: float, u: FloatArray, q: FloatArray, x_gap: FloatArray, dq: FloatArray,
     theta: float, run_error: float, control: FloatArray,
 ) -> None:  # fmt: skip
-    """Peaks of gap voltage and force, the largest error of each and the fold's distance, over what counts of a step."""
+    """Peaks of gap voltage and force, their largest errors and the distance to the fold in the part that counts."""
     if mobile:
         margin = control[MARGIN]
         for j in range(NODES):
@@ -379,7 +379,7 @@ def account(
             pressure = stress * size / q[j]
             peak_u = max(peak_u, size)
             peak_f = max(peak_f, pressure * size)
-            # F ~ u^2 A: what moves u by du moves F by at most 2 F du / u, as the area falls with u.
+            # F ~ u^2 A: an error du changes F by at most 2 F du / u, because the area falls with |u|.
             steepest = max(steepest, 2.0 * pressure)
     control[PEAK_U] = peak_u
     control[PEAK_F] = peak_f

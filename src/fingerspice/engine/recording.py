@@ -1,4 +1,4 @@
-"""A recorded source followed block by block (`engine.relaxation`): accuracy, error, peaks."""
+"""Integration under a recorded source block by block (`engine.relaxation`): step lengths, errors, peaks."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ from fingerspice.engine.relaxation import (
     relax,
 )
 
-# What a march returns.
+# Codes returned by `march`.
 DONE, NOT_CLOSED, TOO_COARSE = range(3)
-# A reference serves up to so many times its own 1/A.
+# Largest ratio of 1/A to that of the reference in use.
 _FARTHEST = 1.2
 
 
@@ -70,7 +70,7 @@ def _largest(n: int, x: FloatArray) -> float:
 
 @jit
 def _nearest(form: Form, q: float, r: int) -> int:
-    """The reference for a value of 1/A: the one at hand, unless that is far off."""
+    """The reference for a value of 1/A: the present one, unless it is too far away."""
     if max(q / form.q0[r], form.q0[r] / q) <= _FARTHEST:
         return r
     best = r
@@ -82,7 +82,7 @@ def _nearest(form: Form, q: float, r: int) -> int:
 
 @jit
 def _go_over(c: Course, r: int, to: int, w: FloatArray) -> None:
-    """Modes around one reference as those around another."""
+    """Transform modes around one reference into those around another."""
     live, shown = c.spare[0], c.shown
     for i in range(w.size):
         live[i] = 0.0
@@ -121,7 +121,7 @@ def _sources(values: FloatArray, at: int, count: int, sub: int, s: FloatArray) -
 
 @jit_within
 def _block_error(c: Course, r: int, level: int, n: int) -> float:
-    """What a block adds to the error of the gap voltage's modes at most, V; that of the modes into `Room.own`."""
+    """Largest error of the gap voltage that a block adds, V; the errors of the modes go into `Room.own`."""
     form, room = c.form, c.room
     for k in range(c.w.size):
         room.own[k, 0] = 0.0
@@ -129,7 +129,7 @@ def _block_error(c: Course, r: int, level: int, n: int) -> float:
     scaled(n + 1, 0.0, room.s, room.before)
     modes_into(n + 1, 0, form.taps[r, 0], room.own, room.before)
     worst = _largest(n + 1, room.before)
-    # In the middle of the steps what the parabolas miss has not cancelled yet.
+    # In the middle of a step the interpolation error of its parabola has not cancelled yet.
     for t in range(room.g.shape[0]):
         early = form.early[r, level, t]
         add_two(
@@ -156,9 +156,9 @@ def _node_error(c: Course, r: int, n: int, left_over: float, magnified: float) -
 def _accept(
     c: Course, r: int, level: int, n: int, h: float, local: float, left_over: float, magnified: float
 ) -> None:  # fmt: skip
-    """Note the peaks and the errors of a block that is good, and go on to its end.
+    """Account for the peaks and errors of an accepted block, and move to its end.
 
-    `local` is what it adds to the gap voltage's error, of which `left_over` is anywhere, V.
+    `local` is the error of the gap voltage that the block adds, V; `left_over` is its part from the iteration.
     """
     room, control, decay = c.room, c.control, c.form.decay[r, level]
     carried = 0.0
@@ -166,11 +166,11 @@ def _accept(
         carried += abs(c.form.taps[r, 0, k] * c.error[k])
     peak, force, steepest, worst = _peaks(n + 1, c.shown.stress, room.u, c.charges.q[0], room.before)
     control[PEAK_U], control[PEAK_F] = max(control[PEAK_U], peak), max(control[PEAK_F], force)
-    # The force goes with the square of the voltage, and a little with the area.
+    # The force is proportional to the square of the voltage, and depends a little on the area.
     off = magnified * worst + steepest * (left_over + magnified * carried)
     control[ERROR_U] = max(control[ERROR_U], local + magnified * carried)
     control[ERROR_F] = max(control[ERROR_F], 2.2 * off)
-    # Under `mobile` what the gap voltage is off moves the area, and with it all other voltages.
+    # Under `mobile` an error of the gap voltage changes the area, and thereby all other voltages.
     moved = local + magnified * carried if c.form.mobile else 0.0
     control[ERROR_V] = max(control[ERROR_V], moved + _node_error(c, r, n, left_over, magnified))
     if c.shown.charge:
@@ -189,8 +189,7 @@ def march(
 ) -> int:  # fmt: skip
     """Follow samples `values` at `start` + i `spacing` (s) from number `at` to `stop`.
 
-    Outputs are written up to, and without, the end. `tol` is the error of the gap voltage (V) allowed to come from a
-    block.
+    Outputs before the end are written. `tol` is the error of the gap voltage (V) that a block may add.
     """
     c, values = borrow(c), borrow(values)
     form, room, control = c.form, c.room, c.control
@@ -217,7 +216,7 @@ def march(
             misfit(form, room, r, level, h, c.shown.kink, n)
             area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
             if form.mobile:
-                # Of the state the gap voltage is 1/A times as much, and the fold magnifies it.
+                # The gap voltage contains the state times 1/A, and a near fold magnifies its error.
                 magnified = form.area0 * _largest(n + 1, c.charges.q[0]) / margin
             local = left_over + magnified * _block_error(c, r, level, n)
         if not local <= tol:

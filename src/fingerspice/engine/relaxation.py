@@ -1,17 +1,17 @@
-"""Waveform relaxation over blocks of equal steps: how a recording, whose slope breaks at every sample, is followed.
+"""Waveform relaxation over blocks of equal steps, for recordings, whose slope jumps at every sample.
 
-In modes around a reference q0 of q = 1/A a stack is w' = -rates w + gain U + sum_t feed_t g_t (`engine.system`), and
-what the area moves, g_t = (q - q0) (tap_t w + tap_k U), is a few per cent of what leaks. Between two samples U is a
-straight line, and g so smooth that a parabola through three nodes serves: exponential Simpson, of fourth order, the
-response to U exact. All steps of a block are solved together: from g at all nodes the modes follow by a recursion, from
-these the gap voltage and g anew. Each sweep leaves a few hundredths of the error, and is a loop over rows of hundreds
-of steps, as fast as a processor's vectors.
+In modes around a reference q0 of q = 1/A a stack is w' = -rates w + gain U + sum_t feed_t g_t (`engine.system`). The
+term of the area, g_t = (q - q0) (tap_t w + tap_k U), is a few per cent of the leaks. Between two samples U is a
+straight line, to which the response is exact, and g is so smooth that a parabola through three nodes suffices: the
+exponential Simpson rule, of fourth order. All steps of a block are solved together: from g at all nodes the modes
+follow by a recursion, from the modes the gap voltage and the next g. Each sweep reduces the error to a few hundredths,
+and is a set of loops over rows of hundreds of steps, which use the processor's vectors fully.
 
-1/A has a kink where the gap voltage is 0. In a step across it the parabola misses kappa (|u| - its own parabola),
-kappa = dg/d|u|: what the jump of the slope of |u| makes of it is known, and is added.
+1/A has a kink where the gap voltage is 0. In a step across it the parabola misses kappa times |u| less the parabola of
+|u|, with kappa = dg/d|u|. The response to this difference is known in closed form, and is added.
 
-The error is looked for at 1/4 and 3/4 of every step, where the parabola's misfit tells the quadrature's own error
-(Boole's rule against Simpson's). Where that is too much, a block is taken again with steps half as long.
+The error is measured at 1/4 and 3/4 of every step, where the interpolation error of the parabola gives the quadrature
+error (Boole's rule against Simpson's). If it is too large, the block is repeated with steps half as long.
 """
 
 from __future__ import annotations
@@ -44,25 +44,26 @@ from fingerspice.engine.blockrows import (
     scaled,
 )
 
-# Steps of a block, and halvings of a sample's length at most.
+# Number of steps in a block, and most halvings of a sample's length.
 BLOCK, LEVELS = 512, 7
-# Degree of the polynomial for 1/A at most.
+# Largest degree of the polynomial for 1/A.
 MOST_DEGREE = 28
-# Where a step is looked at besides its ends: its middle, and the two places that tell the error.
+# Places of a step besides its ends: its middle, and the two at which the error is measured.
 PLACES = (0.5, 0.25, 0.75)
 MIDDLE, FIRST_QUARTER, LAST_QUARTER = 0, 1, 2
-# Of the parabola through 0, 1/2 and 1, at those places; and Simpson's and Boole's weights.
+# Weights of the parabola through 0, 1/2 and 1 at these places.
 PARABOLA = np.array([[0.0, 1.0, 0.0], [0.375, 0.75, -0.125], [-0.125, 0.75, 0.375]])
-# Sweeps of a block, after which it is not going to close; and how little of the error allowed they may leave.
+# Most sweeps of a block, and the fraction of the error allowed that the last one may leave.
 _MOST_SWEEPS, _LEFT = 40, 0.25
-# What the error of a sweep is over that of the one before, at least: the first sweeps may close faster than the rest.
+# Smallest ratio assumed between the errors of two sweeps: the first sweeps may converge faster than the later ones.
 _SLOWEST = 0.05
-# The sweep from which on the places of the kinks are known well enough, and how fast sweeps close.
+# First sweep in which the places of the kinks and the rate of convergence are known well enough.
 _KINKED = 2
-# Under `mobile` the gap voltage is found by Newton: at first, and in every later sweep; and the least distance to the
-# fold at which that is safe.
+# Newton steps for the gap voltage under `mobile`, in the first sweep and in later ones; and the smallest distance to
+# the fold at which they are safe.
 FIRST_NEWTON, _NEWTON, LEAST_MARGIN = 6, 2, 0.2
-# An error this far below the one allowed lets the steps of the next block be longer: it rises sixteenfold.
+# If the error is below this fraction of the one allowed, the next block has steps twice as long, whose error is sixteen
+# times as large.
 SPARE = 0.02
 
 
@@ -89,9 +90,9 @@ class Form(NamedTuple):
     decay : ndarray, shape (r, LEVELS, m)
         Over a step.
     source : ndarray, shape (r, LEVELS, m, 2)
-        What the source's values at both ends add to a mode.
+        Contribution of the source's values at both ends to a mode.
     drive : ndarray, shape (r, LEVELS, m, T, 3)
-        And what those of the drives at 0, 1/2 and 1 add.
+        Contribution of the drives at 0, 1/2 and 1 to a mode.
     feed : ndarray, shape (r, m, T)
     taps, tap_s : ndarray, shape (r, P, m) and (P,)
         Projections of modes and source.
@@ -100,9 +101,9 @@ class Form(NamedTuple):
     share : ndarray, shape (r, LEVELS, m, 2)
         The weights of 1/2 and 1 in the integral of a parabola over a step, in units of its length.
     defect : ndarray, shape (r, LEVELS, m, T, 2)
-        What misfits at the quarters add to the error of a mode.
+        Contribution of the interpolation errors at the quarters to the error of a mode.
     early : ndarray, shape (r, LEVELS, T, 2)
-        And to that of the gap voltage in the middle of the step.
+        Their contribution to the error of the gap voltage in the middle of the step.
     area : ndarray, shape (4 k + 1,)
         1/A as a polynomial in `scale` |u| + `shift`.
     """
@@ -131,7 +132,7 @@ class Form(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """What is written at the outputs.
+    """Constants of the outputs.
 
     Attributes
     ----------
@@ -147,7 +148,7 @@ class Shown(NamedTuple):
     stress : float
         Force per area and squared gap voltage, Pa/V^2.
     kink : ndarray, shape (T,)
-        Slope of each drive over what it multiplies, by |u_gap| at 0 V.
+        Derivative by |u_gap| at 0 V of the factor of each drive.
     area_kink : float
         dA/d|u| at 0 V, m^2/V.
     moved : ndarray
@@ -275,7 +276,7 @@ def look_at_ends(form: Form, room: Room, r: int, n: int, newton: int) -> float:
 
 @jit_within
 def project_for_charge(form: Form, room: Room, r: int, level: int, n: int) -> None:
-    """The projections that only the charge needs, everywhere; those at the quarters along the parabolas."""
+    """The projections that only the charge needs, at all places; those at the quarters follow the parabolas."""
     for p in range(1 + room.g.shape[0], form.tap_s.size):
         project_at_ends(form, room, r, n + 1, p)
         for place in range(len(PLACES)):
@@ -284,7 +285,7 @@ def project_for_charge(form: Form, room: Room, r: int, level: int, n: int) -> No
 
 @jit_within
 def _kinks(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
-    """Add to `room.inc` what the parabolas miss of the kink."""
+    """Add the response to the kink that the parabolas miss to `room.inc`."""
     for t in range(kink.size):
         kink_rows(n, h * kink[t], room.u, room.u_within[MIDDLE], room.end[1 + t], room.crossed, room.jumps)
         for k in range(form.rates.shape[1]):
@@ -300,8 +301,8 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
 ]:  # fmt: skip
     """Solve n steps of length h from `room.w[:, 0]` and `room.g[:, 0]`, for the source in `room.s`.
 
-    Returns what the last sweep leaves (V; inf where sweeps do not close), the least distance to the fold, and the
-    number of sweeps.
+    Returns the error that the last sweep leaves (V; inf if the sweeps do not converge), the least distance to the fold,
+    and the number of sweeps.
     """
     modes, drives = form.rates.shape[1], room.g.shape[0]
     for t in range(drives):
@@ -309,7 +310,8 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
         for i in range(n):
             room.g[t, i + 1] = start
             room.g_within[MIDDLE, t, i] = start
-    # As at the start but for the source, from where Newton begins, and the first sweep's change is counted.
+    # First guess: the state as at the start, under the source's own values. Newton's method begins there, and the
+    # change by the first sweep is measured from there.
     charged = room.u[0] - form.k_gap * room.s[0]
     for i in range(n + 1):
         room.u[i] = room.before[i] = form.k_gap * room.s[i] + charged
@@ -331,14 +333,14 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
         if sweep > 0 and not margin > LEAST_MARGIN:
             return math.inf, margin, sweep
         if not abs(room.u[n]) < math.inf:
-            # Whatever is no number any more is carried to the end.
+            # A NaN within the block has been carried to its end by the recursion.
             return math.inf, margin, sweep
         change = change_of(n + 1, room.u, room.before)
         if sweep > 0:
             ratio = max(change / last, _SLOWEST) if last > 0.0 else 0.0
             if not ratio < 0.9 and change > tol:
                 return math.inf, margin, sweep
-            # What is left goes on falling by about the same ratio.
+            # The remaining error falls by about the same ratio.
             left = 2.0 * change * ratio
             if left <= _LEFT * tol and sweep >= _KINKED:
                 return left, margin, sweep
@@ -348,7 +350,7 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
 
 @jit_within
 def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
-    """What each step adds to the error of the modes, into `room.inc`: Boole's rule less Simpson's."""
+    """Error of the modes that each step adds, into `room.inc`: Boole's rule less Simpson's."""
     crossing = crosses(n, room.u)
     for k in range(form.rates.shape[1]):
         for i in range(n):

@@ -1,4 +1,4 @@
-"""What a step evaluates at all its rows at once: the source, the area and the nonlinear term.
+"""Evaluations of a step at all its rows at once: the source, the area and the nonlinear term.
 
 These functions take plain arrays: a tuple of arrays handed to a compiled function costs more than the work done here.
 """
@@ -17,7 +17,7 @@ from fingerspice.numerics.lobatto import POINTS, ROWS
 from fingerspice.physics.contact import inverse_area
 
 # Rows of the work array `r` (N_FLAT, ROWS): source (V) and its slope (V/s), k_gap U, gap voltage and its guess (V),
-# gap w, 1/A (1/m^2), its slope by the gap voltage, two for passing use.
+# gap w, 1/A (1/m^2), its slope by the gap voltage, and two rows of scratch.
 SOURCE, SLOPE, FREE, U, GUESS, X_GAP, Q, DQ, SCRATCH, MORE = range(10)
 N_FLAT = 10
 
@@ -141,7 +141,7 @@ def _powers_rows(powers: FloatArray, lo: float, scale: float, u: FloatArray, sig
     """The polynomial in (sign u - lo) scale - 1 at every row."""
     for i in range(ROWS):
         x = (sign * u[i] - lo) * scale - 1.0
-        # Outside, anything finite: a step that needs it is refused.
+        # Outside the range any finite value will do: a step that needs it is rejected.
         x = min(max(x, -1.0), 1.0)
         value = powers[DEGREE]
         for d in range(DEGREE - 1, -1, -1):
@@ -250,7 +250,7 @@ def _solve_mobile(
 ) -> bool:  # fmt: skip
     """u = k U + b q(u) at all rows at once, by Newton; r[U] holds k U + x on entry."""
     size = 0.0
-    # A longer series is rounded more.
+    # A longer series has larger rounding errors.
     rounding = 1e-15 if powers.size == DEGREE + 1 else 2e-13
     for i in range(ROWS):
         r[FREE, i] = r[U, i] - r[X_GAP, i]
@@ -273,10 +273,10 @@ def _solve_mobile(
             r[U, i] -= step
             worst = max(worst, abs(step))
             lowest = min(lowest, margin)
-        # Past the fold the slope has turned: that root is not connected to the uncharged state.
+        # Beyond the fold the slope has changed its sign: such a root is not connected to the uncharged state.
         if not lowest > 0.0 or not worst < math.inf:
             return False
-        # Close to the fold the voltage is as uncertain as rounding over the distance to it.
+        # Close to the fold the error of the voltage is rounding error over the distance to the fold.
         if worst * lowest <= rounding * size:
             return True
     return False
@@ -293,7 +293,7 @@ def largest_size(values: FloatArray) -> float:
 
 @jit_rows
 def moved(u: FloatArray, before: FloatArray) -> float:
-    """Root of the summed squares of u - before; `before` becomes u."""
+    """Euclidean norm of u - before; then `before` becomes u."""
     total = 0.0
     for i in range(ROWS):
         change = u[i] - before[i]

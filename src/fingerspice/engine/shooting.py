@@ -1,4 +1,4 @@
-"""The state that one period leads back to, by Newton on the period map: compiled, so that only steps cost."""
+"""Periodic state of a stack by Newton's method on the map of one period; compiled, so that the steps are the cost."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from fingerspice.numerics.lobatto import NODES, ROWS
 from fingerspice.numerics.small import inverse
 
 CLOSED, NOT_CLOSED = 100, 101
-"""Codes of `close_period` beside those of `march`."""
+"""Codes returned by `close_period`, in addition to those of `march`."""
 N_FIGURES = 7
-"""Of a period: peaks of gap voltage (V) and force (N), errors of both, the gap voltage's last move by Newton (V), the
-first step's length (s), and the largest factor by which an error of the live voltages made in every period grows until
-it is periodic."""
+"""Figures of a period: peaks of gap voltage (V) and force (N), their errors, the last change of the gap voltage by
+Newton's method (V), the length of the first step (s), and the largest factor by which an error of the state voltages
+that is made in every period grows until it is periodic."""
 # Tolerance of the map's derivative, over the voltage scale.
 _SLOPE_TOL, _LEAST_SLOPE_TOL = 1e-7, 1e-9
-# Of a first guess, over the voltage scale.
+# Tolerance of a first guess, over the voltage scale.
 _CRUDE_TOL = 1e-4
 
 
@@ -48,7 +48,7 @@ def _map(
     series: FloatArray, u_before: float, turned: float, w: FloatArray, counters: IntArray, end: FloatArray,
     figures: FloatArray,
 ) -> int:  # fmt: skip
-    """From modes w through the table; `end` takes those at its end, `turned`, `figures` the peaks and errors met."""
+    """Integrate modes w over the table; `end` receives them at its end, times `turned`, `figures` peaks and errors."""
     n = w.size
     control = np.zeros(N_CONTROL)
     control[T] = edges[0]
@@ -86,7 +86,7 @@ def close_period(
     series: FloatArray, u_before: float, turned: float, scale: float, known: bool, w: FloatArray, slope: FloatArray,
     counters: IntArray, figures: FloatArray,
 ) -> tuple[int, float]:  # fmt: skip
-    """Find modes that a period leads back to. A mode that does not decay keeps what it starts with.
+    """Find modes that a period maps onto themselves. A mode that does not decay keeps its first value.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def close_period(
     u_before : float
         Source voltage just before the period, V.
     turned : float
-        -1 where a half period leads to the state with its sign turned, else 1.
+        -1 if the table is half a period, which leads to the state with its sign changed; else 1.
     scale : float
         Voltage scale, V.
     known : bool
@@ -125,7 +125,7 @@ def close_period(
     for k in range(n):
         if system.rates[0, k] > 0.0:
             slowest = min(slowest, system.rates[0, k])
-    # What a mode forgets must show in its slope.
+    # The decay of a mode over the period must be visible in the slope of the map.
     span = edges[-1] - edges[0]
     forgets = min(1.0, slowest * span)
     fine = Pace(max(_SLOPE_TOL * forgets, _LEAST_SLOPE_TOL) * scale, pace.h_max, pace.controlled, False)
@@ -134,7 +134,7 @@ def close_period(
     unused = np.zeros(N_FIGURES)
     worst = 0.0
     if not known:
-        # Near enough for the slope to be that of the solution: as if the area stood still.
+        # First solve with the area fixed: near enough for the slope of the map to be that at the solution.
         crude = Pace(_CRUDE_TOL * scale, pace.h_max, pace.controlled, False)
         code = _map(
             system, crude, tables, work, integral, edges, terms, series, u_before, turned, w, counters, end, unused
@@ -147,7 +147,7 @@ def close_period(
                 w[k] += (end[k] - w[k]) / (1.0 - turned * np.exp(-system.rates[0, k] * span))
     for round_ in range(40):
         first = round_ == 0 and not known
-        # What the slope needs is as much as the first guess is worth.
+        # The slope is needed no more accurately than the first guess is.
         here = fine if first else plain
         code = _map(
             system, here, tables, work, integral, edges, terms, series, u_before, turned, w, counters, end, figures
@@ -189,7 +189,7 @@ def close_period(
         for k in range(n):
             figures[4] += system.gap[0, k] * step[k]
         figures[4] = abs(figures[4])
-        # What the last step moved, the next would move by the error of the slope only.
+        # The next Newton step would be this one times the error of the slope.
         if not first and (_largest_voltage(system, step) <= pace.tol or worst <= 1e-15 * scale):
             figures[6] = _memory(system, solver)
             return CLOSED, worst
@@ -210,7 +210,7 @@ def _largest_voltage(system: System, w: FloatArray) -> float:
 
 @jit
 def _memory(system: System, solver: FloatArray) -> float:
-    """Largest factor by which an error made in every period grows; modes that do not decay collect nothing."""
+    """Largest factor by which an error made in every period grows; modes that do not decay are left out."""
     n = solver.shape[0]
     worst = 1.0
     for i in range(n):

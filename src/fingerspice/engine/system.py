@@ -8,7 +8,7 @@ With q = 1/A near a reference q0, every stack is a linear system with one nonlin
 where tap w + tap_k U are the voltages of the cells whose leak does not scale with the area: few, however many modes.
 
 u_gap = k_gap U + gap w under `local`, and k_gap U + A0 q gap w under `mobile`. The linear part is solved exactly;
-only what the area moves is left to iterate on.
+the iteration is on the terms of the area alone.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from fingerspice.numerics.modes import modes
 from fingerspice.physics.contact import N_PACKED, inverse_area_range, ridge_area, ridge_area_array
 
 DEGREE = 27
-"""Of the polynomial for 1/A; where it does not reach the error asked for, a longer Chebyshev series serves."""
-# Terms of the longer series, and the error that its rounding leaves. It is that exact whatever error is asked for: some
-# circuits magnify what the area is off by a thousandfold, and terms cost little.
+"""Degree of the polynomial for 1/A; if it is not exact enough, a longer Chebyshev series is used."""
+# Lengths of the longer series, and its error by rounding. It is made as exact as that for every tolerance: some
+# circuits magnify an error of the area a thousandfold, and terms cost little.
 _LONG_SIZES, _LONG_ROUNDING = (48, 64, 96, 128, 160), 9e-13
-# Ratio of neighbouring reference values of 1/A: the nonlinear term is at most an eighth of what it perturbs.
+# Ratio of neighbouring reference values of 1/A: the nonlinear term is at most an eighth of the linear leak.
 _LEVEL_RATIO = 1.28
 
 
-# Over the error asked for; finer than rounding, the polynomial would give way to the long series, which nobody's
-# voltage can tell.
+# Error of the polynomial over the error asked for, and the smallest error asked of it: below rounding the long series
+# would replace it without any visible effect.
 _AREA_SHARE, _AREA_ROUNDING = 1e-3, 2e-14
 
 
@@ -112,7 +112,7 @@ def build_system(
     q_range : tuple of float
         Smallest and largest 1/A (1/m^2) to expect.
     grouping : ndarray, shape (n_column, n)
-        Which live voltages add up to each recorded one.
+        Which state voltages add up to each recorded one.
     nodes : ndarray, shape (n_node, n + 1)
         Voltages of the nodes from the live ones and U.
     stress : float
@@ -187,12 +187,12 @@ def _polynomial(model: Model, tol: float) -> tuple[FloatArray, FloatArray, float
 
 
 def area_error(decade: int) -> float:
-    """What the area's polynomial may miss, relative, where an error of that decade is asked for."""
+    """Relative error allowed of the area's polynomial if an error of that decade is asked for."""
     return max(_AREA_SHARE * 10.0**decade, _AREA_ROUNDING)
 
 
 def area_missed(curve: FloatArray, decade: int) -> float:
-    """What the run's form of a `Contact.curve` (see `area_polynomial`) misses of 1/A at most, relative."""
+    """Largest relative error of 1/A in the form of a `Contact.curve` that a run uses (see `area_polynomial`)."""
     series = np.abs(curve[2 + N_PACKED :])
     if series.size == 1 or not curve[0] < curve[1]:
         return 0.0
@@ -202,14 +202,14 @@ def area_missed(curve: FloatArray, decade: int) -> float:
 
 
 def _kept(curve: FloatArray, tol: float) -> int:
-    """Terms of a curve's series that are taken for an error of `tol` of 1/A: those of a polynomial, or all."""
+    """Number of terms of a curve's series for an error of `tol` of 1/A: those of a polynomial, or all."""
     left = np.abs(curve[2 + N_PACKED + DEGREE + 1 :]).sum()
     size = curve.size - 2 - N_PACKED
     return min(DEGREE + 1, size) if left <= tol * _at_rest(curve) else size
 
 
 def _at_rest(curve: FloatArray) -> float:
-    """1/A at 0 V (1/m^2): nowhere, in what a series covers, is it much less."""
+    """1/A at 0 V (1/m^2); in the range of a series it is nowhere much less."""
     packed = curve[2 : 2 + N_PACKED]
     return float(packed[1] / (packed[1] ** 2 - packed[7] * packed[5] ** 2))
 
@@ -217,7 +217,7 @@ def _at_rest(curve: FloatArray) -> float:
 def area_polynomial(curve: FloatArray, tol: float) -> tuple[FloatArray, FloatArray, float, float]:
     """1/A as a polynomial, its slopes, `lo` and `scale` (see `System`) from a `Contact.curve`.
 
-    Of `DEGREE` and in powers where that misses at most `tol` (relative); else a longer Chebyshev series that does.
+    A polynomial of `DEGREE` in powers if its relative error is at most `tol`; else a longer Chebyshev series.
     """
     lo, hi = float(curve[0]), float(curve[1])
     series: FloatArray | None = curve[2 + N_PACKED :]
@@ -240,11 +240,11 @@ def area_polynomial(curve: FloatArray, tol: float) -> tuple[FloatArray, FloatArr
 
 
 def _long_series(curve: FloatArray, tol: float) -> FloatArray | None:
-    """A series over a curve's range, longer than those that curves have; None where its rounding is more than `tol`."""
+    """A series over a curve's range, longer than those of curves; None if its rounding error exceeds `tol`."""
     if tol < _LONG_ROUNDING:
         return None
     packed = curve[2 : 2 + N_PACKED]
-    # 1/A rises to many times its value at 0 V: what is missed is a smaller share of the largest term.
+    # 1/A rises to many times its value at 0 V, so that the error allowed is a smaller share of the largest term.
     share = 0.1 * _LONG_ROUNDING * _at_rest(curve) * float(ridge_area(curve[1], packed))
     return fit(lambda u: 1.0 / np.asarray(ridge_area_array(u, packed)), curve[0], curve[1], share, _LONG_SIZES)
 
@@ -268,7 +268,7 @@ def area_polynomials(
     for i, curve, (power, slope, low, one) in zip(np.flatnonzero(follows), curves[follows], found, strict=True):
         lo[i], scale[i] = low, one
         if power.size == DEGREE + 1 < width and one > 0.0:
-            # Beside a longer series it is one too.
+            # Beside a longer series, this one has to be a Chebyshev series, too.
             power, slope = _both(curve[2 + N_PACKED :][: _kept(curve, tol)], width)
         powers[i, : power.size], slopes[i, : slope.size] = power, slope
     return powers, slopes, lo, scale
@@ -278,7 +278,7 @@ def area_polynomials(
 def _to_polynomial(series: FloatArray, powers: FloatArray, slopes: FloatArray, allowed: float) -> bool:
     """Turn as many terms of a Chebyshev series into powers as there is room for, with their derivative.
 
-    Whether the powers miss no more than `allowed` of the whole series, looked for at 33 points.
+    True if the powers differ by at most `allowed` from the whole series, at 33 points.
     """
     kept = min(series.size, powers.size)
     to_powers(series[:kept], powers[:kept])
