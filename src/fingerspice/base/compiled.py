@@ -30,16 +30,16 @@ from fingerspice.base.errors import InputError
 Lent = TypeVar("Lent")
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGE = Path(__file__).resolve().parents[1]
-#: Where functions stand that compiled code of other files may call.
+#: Folders whose functions compiled code of other files may call.
 SHARED_FOLDERS = ("engine", "numerics", "physics")
 _SOURCES = [Path(__file__).resolve(), *sorted(p for name in SHARED_FOLDERS for p in (_PACKAGE / name).rglob("*.py"))]
-# By content: a package that is copied, or packed into an image, brings along what was compiled for it.
+# By content, so that a package that is copied, or packed into an image, keeps its compiled code.
 _STAMP = hashlib.sha256(b"".join(p.name.encode() + p.read_bytes() for p in _SOURCES)).hexdigest()
 _COMPILER = Compiling()
 
 
 def _drop_stale_cache() -> None:
-    """Delete what no key leads to any more, where it stands in the package."""
+    """Delete cached code in the package that no key matches any more."""
     record = _PACKAGE / "__pycache__" / "compiled.stamp"
     try:
         if record.is_file() and record.read_text() == _STAMP:
@@ -58,7 +58,7 @@ _InPackage: Any = next(c for c in CompileResultCacheImpl._locator_classes if c._
 
 
 class _ReadOnly(_InPackage):  # type: ignore[misc]
-    """The package's own folder, where neither that nor any other can be written."""
+    """The package's own folder, for reading alone, if no folder can be written."""
 
     def ensure_cache_path(self) -> None:
         return
@@ -69,10 +69,10 @@ class _Place(CompileResultCacheImpl):
 
 
 class _Cache(FunctionCache):
-    """numba's, for this state of the shared folders.
+    """numba's cache of a function, for this state of the shared folders.
 
-    What came with the package is read even where nothing can be written; a disk that is full means that the next
-    process compiles again. What is found nowhere is announced: compiling takes its time.
+    Compiled code that came with the package is read even if nothing can be written. If the disk is full, the next
+    process compiles again. Compilation is announced, because it takes long.
     """
 
     _impl_class = _Place
@@ -89,7 +89,7 @@ class _Cache(FunctionCache):
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
         key = self._index_key(sig, target_context.codegen())
         for place in (self._cache_file, self._came):
-            # What cannot be read is not there.
+            # A file that cannot be read counts as absent.
             with suppress(OSError):
                 data = place.load(key)
                 if data is not None:
@@ -137,7 +137,7 @@ class _Flags(Flags):
 
 @contextmanager
 def _without_collection() -> Iterator[None]:
-    """Without looking for cycles of objects: compiling makes millions that live until it ends."""
+    """Context without garbage collection of cycles: compilation makes millions of objects that live until it ends."""
     looking = gc.isenabled()
     gc.disable()
     try:
@@ -148,9 +148,9 @@ def _without_collection() -> Iterator[None]:
 
 
 class _Called:
-    """A function as compiled code calls it: without machine code of its own, and without a door to Python.
+    """A function as compiled code calls it: without machine code of its own, and without a wrapper for Python.
 
-    numba makes both for every function, and writes them to the disk; but functions are put into those that call them.
+    numba would make and store both for every function, although functions are inlined into their callers.
     """
 
     def __init__(self, dispatcher: Any, noalias: bool) -> None:
@@ -158,7 +158,7 @@ class _Called:
         self.found: dict[Any, tuple[object, Any]] = {}
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """What numba asks where it meets a call: the signature, with the function compiled for it."""
+        """numba's query at a call: the signature, with the function compiled for it."""
         pysig, args = self.of.fold_argument_types(args, kws)
         args = tuple(args)
         with cast(Any, global_compiler_lock):
@@ -169,7 +169,7 @@ class _Called:
         return cast(Any, make_concrete_template)(f"CallTemplate({name})", name, signatures), pysig, args, {}
 
     def get_overload(self, args: Any) -> object:
-        """By what numba knows the function of such arguments."""
+        """Key under which numba knows the function compiled for these arguments."""
         return self.found[tuple(args)][0]
 
     def _compile(self, args: Any) -> tuple[object, Any]:
@@ -189,7 +189,7 @@ def _cached(*, noalias: bool = False, **options: Any) -> Callable[[Function], Fu
     """`njit` with a cache; `noalias`: where compiled code calls it, it writes to no memory that it reads."""
 
     def compile_when_called(function: Function) -> Function:
-        # What is not said here, numba takes from whichever caller comes first.
+        # numba would take options that are missing here from whichever caller comes first.
         compiled = njit(**{"error_model": "numpy", "nogil": True, "fastmath": False, **options})(function)
         compiled._cache = cast(Any, _Cache)(function)
         compile_signature = compiled.compile
@@ -212,22 +212,23 @@ if cast(Any, config).DISABLE_JIT:
 _drop_stale_cache()
 # A division by zero is an infinity that the step control refuses, not an exception out of compiled code.
 jit = _cached()
-# For loops over the rows of a step: fused, so that they vectorise; and where sums may be reordered (always alike). What
-# they write shares no memory with what they read: else every loop would be compiled twice, with a test before it.
+# For loops over the rows of a step: with fused multiplication and addition, and with sums that may be reordered (always
+# alike), so that they vectorise. Outputs share no memory with inputs: otherwise every loop would be compiled twice, with
+# a test before it.
 jit_fused = _cached(fastmath={"contract"}, noalias=True)
 jit_rows = _cached(fastmath={"contract", "reassoc"}, noalias=True)
-# Put into its caller by the compiler of machine code: handing over a tuple of arrays would cost as much as the work.
+# Inlined by LLVM: a call with a tuple of arrays would cost as much as the work.
 jit_within = _cached(forceinline=True)
-# Put into its caller before compilation, for the same reason.
+# Inlined by numba before compilation, for the same reason.
 jit_inline = _cached(inline="always")
 
 
 @intrinsic
 def _borrow(typing: Any, value: Any) -> Any:
-    """The same array, or tuple of arrays, without a count of its users, which would be an atomic operation a view.
+    """The same array, or tuple of arrays, without a reference count, which would cost an atomic operation for each view.
 
-    What is given must outlive what is returned: borrow only arguments of the function, never what it allocates, for
-    that is freed after its last use by name.
+    The argument must outlive the result: borrow only arguments of the function, never arrays that it allocates, because
+    these are freed after their last use by name.
     """
 
     make: Any = make_array

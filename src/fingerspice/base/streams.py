@@ -17,7 +17,7 @@ class _Raw(io.FileIO):
         except BrokenPipeError:
             return len(data)
         except OSError:
-            # Failing to write to stderr is ignored; of a full disk under stdout the caller has to tell.
+            # A failure to write to stderr is ignored; the caller has to report a full disk under stdout.
             if self.fileno() != 2:
                 raise
             return len(data)

@@ -1,7 +1,8 @@
 """Linear systems in modal form, w_k' = -rate_k w_k + gain_k U(t), driven by samples joined by straight lines.
 
-The recursion w <- exp(-rate dt) w + input waits for itself at every sample. Eight stretches of each block are therefore
-advanced side by side, all from zero; what each inherits from the one before, a decaying exponential, is added after.
+Each sample of the recursion w <- exp(-rate dt) w + input depends on the one before. Eight stretches of each block are
+therefore advanced side by side, all from zero; the decaying exponential that each inherits from the one before is added
+afterwards.
 Blocks are counted from the first sample, so that an input that comes in whole blocks gives the bits of a single call.
 """
 
@@ -23,7 +24,7 @@ _STRETCH = 125
 _LANES = 8
 BLOCK = _LANES * _STRETCH
 """Samples: an input streamed in multiples of this gives the same bits as in one call."""
-# Samples taken at a time, so that converting an input that is no plain array needs little memory.
+# Number of samples converted at a time, so that an input that is no plain array needs little memory.
 _PIECE = 250 * BLOCK
 _SMALLEST = 1e-300
 
@@ -94,7 +95,7 @@ def _sweep(
 
 @jit
 def _flushed(x: float) -> float:
-    """Zero in place of what would soon be a (slow) denormal number; NaN stays."""
+    """Zero in place of a number that would soon become a (slow) denormal one; NaN stays."""
     return 0.0 if abs(x) < _SMALLEST else x
 
 
@@ -220,7 +221,7 @@ def first_order_hold(
     rates, gains, weights : array_like, shape (n,)
         Decay rates (>= 0, 1/s), input gains (1/s for a w in the unit of U) and output weights of the modes.
     direct : float
-        What passes without delay.
+        Share of the input that appears in the output at once.
     w0 : array_like, shape (n,)
         State at the first sample or, with `u_before`, one step before it.
     u_before : float, optional

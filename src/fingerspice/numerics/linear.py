@@ -32,7 +32,7 @@ def _exp(x: float) -> float:
 
 @jit
 def _difference(a: float, b: float) -> tuple[float, float]:
-    """a - b rounded, and what the rounding left out."""
+    """a - b rounded, and its rounding error."""
     d = a - b
     back = d - a
     return d, (a - (d - back)) - (b + back)
@@ -195,7 +195,7 @@ def respond_into(
     n_terms = terms.shape[1]
     decay = np.zeros(n)
     kept = np.zeros(n)
-    # What rounding w at the end of a segment left out.
+    # The rounding error of w at the end of a segment.
     carry = np.zeros(n)
     new = np.zeros(n)
     amplitude = np.zeros(n_terms, np.complex128)
@@ -376,5 +376,5 @@ def periodic_state(
 
 
 def _plain(x: ArrayLike) -> FloatArray:
-    """As the one kind of array that the compiled code is compiled for."""
+    """The argument as an array of the one kind that the code is compiled for."""
     return np.require(x, float, ["C", "W"])

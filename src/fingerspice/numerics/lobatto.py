@@ -6,7 +6,7 @@ On a step of length h a mode w' = -rate w + g(t) has, with g interpolated at the
     phi_ij = integral over [0, c_i] of exp(-rate h (c_i - s)) l_j(s) ds
 
 (Hochbruck and Ostermann 2010, exponential Runge-Kutta methods of collocation type). Three points between the nodes
-are rows of the tables too: what a solution misses there is its error.
+are rows of the tables, too: the difference between solution and interpolant there is the error.
 
 The sizes are constants, so that the compiler unrolls every inner loop.
 """
@@ -65,14 +65,14 @@ _LATE = 60.0
 _GAUSS = 12
 _GAUSS_X, _GAUSS_W = (0.5 * x for x in legendre.leggauss(_GAUSS))
 _GAUSS_X = _GAUSS_X + 0.5
-# The row from which each row goes on, and how far; the lengths without their repetitions.
+# The row from which each row is continued, and the distance; these distances without repetitions.
 _FROM = np.array([0, *range(NODES - 1), 0, 5, 9])
 _LENGTH = POINTS - POINTS[_FROM]
 _LENGTHS, _KIND = np.unique(_LENGTH.round(14), return_inverse=True)
 _LENGTHS = np.array([_LENGTH[kind == _KIND].mean() for kind in range(_LENGTHS.size)])
-# There, basis polynomials, shape (ROWS, _GAUSS, NODES), and the node polynomial.
+# At Gauss's points: basis polynomials, shape (ROWS, _GAUSS, NODES), and the node polynomial.
 _OFF = (POINTS[:, None] - _LENGTH[:, None] * (1.0 - _GAUSS_X))[:, :, None] - _X
-# The first row has no way behind it, and its point is a node.
+# The first row has the distance 0, and its point is a node.
 _OFF[_OFF == 0.0] = 1e-300
 _BASIS = BARYCENTRIC / _OFF
 _BASIS = np.ascontiguousarray(_BASIS / _BASIS.sum(axis=2, keepdims=True))
@@ -103,7 +103,7 @@ _LARGEST = np.abs(_SLOPES).max(axis=(1, 2))
 
 @jit_fused
 def _fill_early(z: float, phi: FloatArray, miss: FloatArray) -> None:
-    """`phi` and `miss` from row to row: what stood at the last one decays, and what came since is added."""
+    """`phi` and `miss` from row to row: the integral up to the last row decays, and the integral since is added."""
     fades = np.empty(_LENGTHS.size)
     weights = np.empty((_LENGTHS.size, _GAUSS))
     for kind in range(_LENGTHS.size):
