@@ -212,9 +212,9 @@ if cast(Any, config).DISABLE_JIT:
 _drop_stale_cache()
 # A division by zero is an infinity that the step control refuses, not an exception out of compiled code.
 jit = _cached()
-# For loops over the rows of a step: with fused multiplication and addition, and with sums that may be reordered (always
-# alike), so that they vectorise. Outputs share no memory with inputs: otherwise every loop would be compiled twice, with
-# a test before it.
+# For loops over the rows of a step: with fused multiplication and addition, and with sums that may be reordered
+# (always alike), so that they vectorise. Outputs share no memory with inputs: otherwise every loop would be compiled
+# twice, with a test before it.
 jit_fused = _cached(fastmath={"contract"}, noalias=True)
 jit_rows = _cached(fastmath={"contract", "reassoc"}, noalias=True)
 # Inlined by LLVM: a call with a tuple of arrays would cost as much as the work.
@@ -225,7 +225,7 @@ jit_inline = _cached(inline="always")
 
 @intrinsic
 def _borrow(typing: Any, value: Any) -> Any:
-    """The same array, or tuple of arrays, without a reference count, which would cost an atomic operation for each view.
+    """The same array, or tuple of arrays, without a reference count, which costs an atomic operation for each view.
 
     The argument must outlive the result: borrow only arguments of the function, never arrays that it allocates, because
     these are freed after their last use by name.
