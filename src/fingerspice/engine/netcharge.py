@@ -106,7 +106,7 @@ def charge_error(
     Parameters
     ----------
     form, h, lost, g, theta
-        Of the step; `g` (n_f,) are the leaks that count, none in a jump.
+        Form, length (s) and fraction of the step that counts; `g` (n_f,) are the leaks, which are zero within a jump.
     work : Work
         Its `places` (m, N_PLACES) are the errors of the modes, and `off` (5, m + n_s) the interpolation errors of this
         step among them; see `netassess.assess`.

@@ -74,7 +74,7 @@ class Form(NamedTuple):
     node, node_s : ndarray, shape (n_node, n) and (n_node, n_s)
         Voltage of each node from the same.
     size : ndarray, shape (n,)
-        Largest state voltage (V) for one unit of each mode.
+        Euclidean norm of the state voltages (V) for one unit of each mode.
     mobile : bool
         Charge law.
     stress : ndarray, shape (n_area,)
@@ -320,7 +320,7 @@ def evaluate(
     w: FloatArray, lin: FloatArray, d: FloatArray, pull: FloatArray, cells: FloatArray, areas: FloatArray,
     matrix: FloatArray, mixed: FloatArray, least: FloatArray,
 ) -> bool:  # fmt: skip
-    """What the areas add to the modes' rates, into `pull` (m, ROWS), from the modes w (m, ROWS).
+    """Forcing of the modes by the areas, into `pull` (m, ROWS), from the modes w (m, ROWS).
 
     `lin` is gain s, and `d` receives the derivatives of stiff modes. `cells` and `areas` are blocks of rows, whose
     parts that follow the sources are given. False beyond a fold; under `mobile`, `least` (ROWS,) receives the distance

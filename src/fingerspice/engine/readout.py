@@ -43,8 +43,9 @@ TRIED = 8
 # Most steps, accepted and rejected, in a window of the source, which has a few thousand periods at most. A run that
 # needs more has a problem that smaller steps do not solve.
 MOST_STEPS = 200_000
-# Most evaluations at all rows, at first after each edge of the source and then for each longest step: a fast mode that
-# the area affects may let only short steps converge, and another method is faster there.
+# Most evaluations at all rows since an edge of the source: a first allowance, and one more for each longest step that
+# fits into the time since. A fast mode that the area affects may let only short steps converge, and another method is
+# faster there.
 FIRST_PASSES, MOST_PASSES = 20_000, 2_000
 # Outputs are evaluated in groups as wide as the processor's vectors, and searched in strides.
 WRITTEN_AT_ONCE = _GROUP = 8

@@ -44,7 +44,7 @@ from fingerspice.engine.blockrows import (
     scaled,
 )
 
-# Number of steps in a block, and most halvings of a sample's length.
+# Number of steps in a block, and of step lengths: that of a sample and its halvings.
 BLOCK, LEVELS = 512, 7
 # Largest degree of the polynomial for 1/A.
 MOST_DEGREE = 28
@@ -78,9 +78,9 @@ N_COUNTERS = 4
 class Form(NamedTuple):
     """A stack around reference areas, and the weights of steps of one length and its halves.
 
-    r references, `LEVELS` halvings, m modes, T drives g_t, and P projections at the ends and `PLACES` of a step: the
-    gap voltage (under `mobile` its modes' part alone), the taps, and what the slowest layer stores and leaks by (see
-    `engine.recording`).
+    r references, `LEVELS` step lengths, m modes, T drives g_t, and P projections at the ends and `PLACES` of a step:
+    the gap voltage (under `mobile` its modes' part alone), the taps, and what the slowest layer stores and leaks by
+    (see `engine.recording`).
 
     Attributes
     ----------

@@ -31,7 +31,7 @@ _MOST_SWEEPS, _SLOW = 80, 0.15
 
 
 class Changes(NamedTuple):
-    """What parameters move, per unit of each; the cells are in the order of `Model.k`.
+    """Derivatives of a stack's constants by the parameters; the cells are in the order of `Model.k`.
 
     Attributes
     ----------

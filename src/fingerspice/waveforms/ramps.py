@@ -5,6 +5,7 @@ A subclass of `Ramps` only lists its knots.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,6 +24,8 @@ from fingerspice.waveforms.waveform import Waveform, blank_terms, require
 
 # A waveform with at most this many knots is not divided into windows, however close together its knots are.
 FEW_KNOTS = 1000
+# Most points that the text of a PWL shows.
+MOST_SHOWN = 64
 
 
 class Ramps(Waveform):
@@ -216,6 +219,17 @@ class PWL(Ramps):
                 f"{self.repeat:g} s",
                 "one of the PWL's own times before the last",
             )
+
+    def __repr__(self) -> str:
+        if len(self.times) <= MOST_SHOWN:
+            return f"PWL(times={self.times!r}, values={self.values!r}, repeat={self.repeat!r})"
+        if "repr" not in self.kept:
+            # Runs store this text to know which source they had: the digest stands for the points.
+            digest = hashlib.sha256(np.array([self.times, self.values]).tobytes()).hexdigest()[:16]
+            span = f"{self.times[0]:g} s to {self.times[-1]:g} s"
+            self.kept["repr"] = f"PWL({len(self.times)} points, {span}, sha256 {digest}, repeat={self.repeat!r})"
+        text: str = self.kept["repr"]
+        return text
 
     @classmethod
     def from_table(cls, path: str | Path, time: str | int | None = None, value: str | int | None = None) -> PWL:
