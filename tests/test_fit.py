@@ -143,7 +143,7 @@ def test_bad_tables(circuit: fs.Circuit, tmp_path: Path) -> None:
     table.write_text("time (ms),friction (mN)\n0,150\n1,160\n")
     with pytest.raises(InputError, match="the unit of column 'friction' is 'mN'; allowed: none"):
         fs.fit(circuit, table, ["Xgap.d"])
-    with pytest.raises(InputError, match=r"a column 'voltage', which is no parameter.*conditions, such as V"):
+    with pytest.raises(InputError, match=r"a column 'voltage', which is no parameter.*conditions, such as X"):
         fs.fit(circuit, {"voltage": [100.0], "f_el_mean": [1e-2]}, ["Xgap.d"])
     with pytest.raises(InputError, match=r"bounds names Xgap\.r, which is not fitted"):
         fs.fit(circuit, {"f_el_mean": [1e-2]}, ["Xgap.d"], bounds={"Xgap.r": (1.0, 2.0)})
