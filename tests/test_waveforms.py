@@ -361,8 +361,8 @@ def test_no_times_have_no_values(waveform: fs.Waveform) -> None:
 
 
 def test_the_text_of_a_long_pwl_is_short_and_tells_points_apart() -> None:
-    t = tuple(np.linspace(0.0, 1.0, 1001).tolist())
+    t = tuple(np.linspace(0.0, 1.0, 10_001).tolist())
     one, same, other = fs.PWL(t, t), fs.PWL(t, t), fs.PWL(t, (*t[:-1], 0.5))
     assert repr(one) == repr(same) != repr(other)
-    assert repr(one).startswith("PWL(1001 points, 0 s to 1 s, sha256 ")
+    assert repr(one).startswith("PWL(10001 points, 0 s to 1 s, sha256 ")
     assert repr(fs.PWL((0.0, 1.0), (0.0, 2.0))) == "PWL(times=(0.0, 1.0), values=(0.0, 2.0), repeat=None)"

@@ -71,6 +71,7 @@ def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
     from fingerspice.circuit.arguments import overridden
     from fingerspice.circuit.topology import driving_sources
     from fingerspice.netlist.netlist import source_from_text
+    from fingerspice.waveforms.ramps import MOST_SHOWN, PWL
     from fingerspice.waveforms.samples import Samples
 
     if not texts:
@@ -95,7 +96,9 @@ def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
             sources[name] = source_from_text(spec, circuit)
         except InputError as error:
             raise InputError(f"--source {error.message}") from None
-        if isinstance(sources[name], Samples) or len(repr(sources[name])) > LONGEST_SOURCE:
+        wave = sources[name]
+        long = isinstance(wave, PWL) and len(wave.times) > MOST_SHOWN
+        if long or isinstance(wave, Samples) or len(repr(wave)) > LONGEST_SOURCE:
             named_by[name] = spec
     changed = overridden(circuit, sources)
     return dataclasses.replace(changed, overrides={**changed.overrides, **named_by})
