@@ -520,3 +520,11 @@ def test_start_and_stop_replace_those_of_the_deck(command: Command) -> None:
     header = Path("out/pad.csv").read_text().splitlines()[0].split(",")
     column = next(i for i, name in enumerate(header) if name.startswith("u_gap"))
     np.testing.assert_allclose(table[:, column], whole.u_gap, atol=1e-5)
+
+
+def test_a_name_that_no_file_has_is_refused_in_one_sentence(command: Command) -> None:
+    for name in ("x" * 400, "~nobody_of_this_name/a"):
+        result = command("run", "pad.cir", "--source", f"WAV({name}.wav 150)", "--no-plot")
+        assert result.code == 2
+        assert "cannot be read" in result.err
+        assert len(result.lines) == 1

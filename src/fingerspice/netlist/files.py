@@ -95,11 +95,17 @@ class SourceFiles:
         Raises
         ------
         InputError
-            If the file is outside the folder, or the files are too large in all; the message has the place.
+            If the file is outside the folder, its name is no file's, or the files are too large in all; the message has
+            the place.
         """
-        path = Path(name).expanduser() if self.anywhere else self._below(name, where)
-        if path.is_file():
-            self.size += path.stat().st_size
+        try:
+            path = Path(name).expanduser() if self.anywhere else self._below(name, where)
+            size = path.stat().st_size if path.is_file() else None
+        except (OSError, RuntimeError) as error:  # a name that is too long, or the folder of an unknown user
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+            raise InputError(f"'{name}' cannot be read: {reason}", where) from None
+        if size is not None:
+            self.size += size
             if self.size > MAX_SOURCE_BYTES:
                 raise InputError(f"the sources' files are larger than {MAX_SOURCE_BYTES >> 20:,} MiB in all", where)
         return path
