@@ -10,21 +10,15 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.exponential import N_PLACES, between, row_of
 from fingerspice.engine.model import Model
-from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, PEAK_Q, SPREAD, at
+from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, PEAK_Q, SPREAD
 from fingerspice.engine.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U
-from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, FIRST, NODES, POINTS
+from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, FIRST, NODES, POINTS
 
 # The interpolation error of a rate changes its sign at every node, so that its integral is at most this fraction of its
 # largest value times the step length. The fraction is 0.03 to 0.14 where the error is a Chebyshev polynomial of degree
 # 13 to 21. Where the area changes tenfold within a step the error is no such polynomial; the fraction is then 0.22 in
 # scene 7391 of tests/stress.py.
 LOBE, _STEEP_LOBE, _STEEP = 0.15, 0.3, 10.0
-# Differentiation matrix: slope at each node, per step length, of the polynomial through values at the nodes.
-DERIVATIVE = np.zeros((NODES, NODES))
-for _i in range(NODES):
-    for _j in set(range(NODES)) - {_i}:
-        DERIVATIVE[_i, _j] = BARYCENTRIC[_j] / BARYCENTRIC[_i] / (POINTS[_i] - POINTS[_j])
-    DERIVATIVE[_i, _i] = -DERIVATIVE[_i].sum()
 # Differentiation matrix for the points between the nodes, shape (3, NODES).
 _DERIVATIVE_BETWEEN = np.ascontiguousarray(BETWEEN.T @ DERIVATIVE)
 
@@ -187,7 +181,6 @@ def _account(
         last_area, last_voltage, last_gap = area, voltage, r[U, row]
         last_error, last_gap_error = lasting, lasting_gap
     control[COLLECTED] += added
-    control[LAST_Q] = at(r[Q], theta)
 
 
 @jit

@@ -165,10 +165,9 @@ def converge(
 
 @jit
 def weigh(rates: FloatArray, gap: FloatArray, decay: FloatArray, h: float, weight: FloatArray) -> None:
-    """Square of the move of the gap voltage over a step by a unit forcing of each mode, into `weight` (n,)."""
+    """Move of the gap voltage over a step by a unit forcing of each mode, into `weight` (n,)."""
     for k in range(rates.size):
-        reach = h if rates[k] * h < 1e-9 else (1.0 - decay[k, END]) / rates[k]
-        weight[k] = (gap[k] * reach) ** 2
+        weight[k] = gap[k] * (h if rates[k] * h < 1e-9 else (1.0 - decay[k, END]) / rates[k])
 
 
 @jit_rows
@@ -185,7 +184,7 @@ def plain(
             left_before[k, i] = left
             pull_before[k, i] = pull[k, i]
             used[k, i] = pull[k, i]
-        total += weight[k] * size
+        total += weight[k] * weight[k] * size
     return math.sqrt(total)
 
 
@@ -207,8 +206,8 @@ def mix(
             difference = left - left_before[k, i]
             mine += left * difference
             size += difference * difference
-        across += weight[k] * mine
-        along += weight[k] * size
+        across += weight[k] * weight[k] * mine
+        along += weight[k] * weight[k] * size
     share = across / along if along > 0.0 else 0.0
     share = min(max(share, -1.0), 0.9)
     total = 0.0
@@ -221,7 +220,7 @@ def mix(
             move = new - used[k, i]
             size += move * move
             used[k, i] = new
-        total += weight[k] * size
+        total += weight[k] * weight[k] * size
     return math.sqrt(total)
 
 
@@ -233,7 +232,7 @@ def distance(a: FloatArray, b: FloatArray, weight: FloatArray) -> float:
         size = 0.0
         for i in range(ROWS):
             size += (a[k, i] - b[k, i]) ** 2
-        total += weight[k] * size
+        total += weight[k] * weight[k] * size
     return math.sqrt(total)
 
 

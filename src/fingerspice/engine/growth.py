@@ -11,14 +11,14 @@ from __future__ import annotations
 import math
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit
+from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.model import Model, branch_area
 from fingerspice.engine.rows import DQ, SOURCE, X_GAP, Q, U
 from fingerspice.numerics.lobatto import END, NODES, POINTS
 
 # Loop gain of the feedback through the area over a step: up to the first value the feedback is neglected, and up to the
 # second one two intervals in a step are enough, beyond it one between each two nodes.
-_SLIGHT, _MODERATE = 0.05, 1.0
+SLIGHT, _MODERATE = 0.05, 1.0
 # Largest growth of the error that is admitted within one interval.
 _MOST = 10.0
 _MIDDLE = NODES // 2
@@ -57,32 +57,51 @@ def _slope(model: Model, sign: float, r: FloatArray, j: int) -> float:
     return slope
 
 
-@jit
-def carry(
-    model: Model, rates: FloatArray, gap: FloatArray, push: FloatArray, tap: FloatArray, tap_k: FloatArray,
-    feed: FloatArray, decay: FloatArray, h: float, sign: float, w: FloatArray, r: FloatArray, error: FloatArray,
-    carried: FloatArray, forced: FloatArray,
-) -> None:  # fmt: skip
-    """Propagate the error of the modes (n,) from the start of a step to the points between nodes and to its end.
+@jit_within
+def loop_gain(
+    mobile: bool, area0: float, push: FloatArray, tap: FloatArray, tap_k: FloatArray, feed: FloatArray,
+    weight: FloatArray, w: FloatArray, r: FloatArray,
+) -> float:  # fmt: skip
+    """Loop gain of the feedback through the area over a step, from its middle and its end; `weight`: see `weigh`.
 
-    The result goes into `carried` (n, 4); `forced` (n,) is scratch. See `exponential.converge` for the other arguments.
+    Up to `SLIGHT` the feedback may be neglected. Every step needs this, and few need `carry`.
     """
-    n = gap.size
     gain = 0.0
     for j in (_MIDDLE, END):
         # The mean slope of 1/A is enough to decide whether the feedback matters.
-        way = r[U, j] - r[U, j - _MIDDLE]
-        slope = r[DQ, j] if model.mobile else ((r[Q, j] - r[Q, j - _MIDDLE]) / way if way != 0.0 else 0.0)
-        factor = _answer(model, push, tap, tap_k, feed, w, r, j, slope, forced)
+        q, way = r[Q, j], r[U, j] - r[U, j - _MIDDLE]
+        slope = r[DQ, j] if mobile else ((q - r[Q, j - _MIDDLE]) / way if way != 0.0 else 0.0)
         loop = 0.0
-        for k in range(n):
-            loop += gap[k] * forced[k] * (h if rates[k] * h < 1e-9 else (1.0 - decay[k, END]) / rates[k])
-        gain = max(gain, abs(factor * loop))
-    for k in range(n):
-        for p in range(4):
-            carried[k, p] = decay[k, NODES + p if p < 3 else END] * error[k]
-    if not gain > _SLIGHT:
-        return
+        for t in range(tap_k.size):
+            tapped = tap_k[t] * r[SOURCE, j]
+            reach = 0.0
+            for k in range(weight.size):
+                tapped += tap[t, k] * w[k, j]
+                reach += weight[k] * feed[k, t]
+            loop += reach * tapped
+        factor = 1.0
+        if mobile:
+            reach = 0.0
+            for k in range(weight.size):
+                reach += weight[k] * push[k]
+            loop -= reach * r[SOURCE, j] / (area0 * q * q)
+            factor = area0 * q / max(1.0 - area0 * r[X_GAP, j] * slope, 1e-12)
+        gain = max(gain, abs(factor * loop * slope))
+    return gain
+
+
+@jit
+def carry(
+    model: Model, rates: FloatArray, gap: FloatArray, push: FloatArray, tap: FloatArray, tap_k: FloatArray,
+    feed: FloatArray, decay: FloatArray, h: float, sign: float, gain: float, w: FloatArray, r: FloatArray,
+    error: FloatArray, carried: FloatArray, forced: FloatArray,
+) -> None:  # fmt: skip
+    """Propagate the error of the modes (n,) through a step whose loop gain is `gain`.
+
+    The error at the points between nodes and at the end goes into `carried` (n, 4); `forced` (n,) is scratch. See
+    `exponential.converge` for the other arguments.
+    """
+    n = gap.size
     # Exponential trapezoidal rule: the only implicit unknown is the error `moved` of the gap voltage.
     stride = _MIDDLE if gain <= _MODERATE else 1
     moved = 0.0

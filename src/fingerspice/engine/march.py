@@ -11,7 +11,7 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine.charge import charge_step
 from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, weigh
-from fingerspice.engine.growth import carry
+from fingerspice.engine.growth import SLIGHT, carry, loop_gain
 from fingerspice.engine.model import Model, branch_area, dot, gap_voltage, turns_at_zero, write_row_at
 from fingerspice.engine.nodes import node_error
 from fingerspice.engine.pace import (
@@ -36,6 +36,7 @@ from fingerspice.engine.readout import (
     H_AFTER_EDGE,
     H_AFTER_ZERO,
     KEPT,
+    LAST_Q,
     MAGNIFIED,
     MARGIN,
     MOST_PASSES,
@@ -55,6 +56,7 @@ from fingerspice.engine.readout import (
     T,
     account,
     at,
+    basis_at,
     dip,
     error_at,
     first_wrong,
@@ -153,6 +155,7 @@ def march(
     pull_before, left_before = borrow(work.pull_before), borrow(work.left_before)
     w0, places, sums, weight = borrow(work.w0), borrow(work.places), borrow(work.sums), borrow(work.weight)
     outputs, carried, forced = borrow(work.outputs), borrow(work.carried), borrow(work.forced)
+    basis = borrow(work.basis)
     t_out, left, out = borrow(t_out), borrow(left), borrow(out)
     values, coefficients = borrow(work.values), borrow(work.coefficients)
     kept_times, kept_series, tried = borrow(kept.times), borrow(kept.series), borrow(tried)
@@ -284,7 +287,14 @@ def march(
                 continue
             step_error = math.inf
             if closed:
-                carry(model, rates, gap, push, tap, tap_k, feed, decay, h, sign, w, r, error, carried, forced)
+                for k in range(n):
+                    for p in range(N_PLACES - 1):
+                        carried[k, p] = decay[k, NODES + p if p < N_PLACES - 2 else END] * error[k]
+                grown = loop_gain(mobile, area0, push, tap, tap_k, feed, weight, w, r)
+                if grown > SLIGHT:
+                    carry(
+                        model, rates, gap, push, tap, tap_k, feed, decay, h, sign, grown, w, r, error, carried, forced
+                    )
                 step_error, run_error, magnified = assess(
                     mobile, area0, gain, gap, phi, miss, error, carried, w, pull, used, r, places, sums
                 )
@@ -371,18 +381,21 @@ def march(
         v_error = node_error(mobile, area0, all_node[level], k_node, gap, w, r, places)
         control[ERROR_V] = max(control[ERROR_V], v_error)
         if theta < 1.0:
+            basis_at(theta, basis)
             for k in range(n):
-                w0[k] = at(w[k], theta)
+                w0[k] = at(w[k], basis)
             error_at(places, theta, error)
             if charge:
-                y[n] = at(values[n_shown], theta)
-            control[U_GAP] = 0.0 if crossed else at(u_rows, theta)
+                y[n] = at(values[n_shown], basis)
+                control[LAST_Q] = at(q_rows, basis)
+            control[U_GAP] = 0.0 if crossed else at(u_rows, basis)
         else:
             for k in range(n):
                 w0[k] = w[k, END]
                 error[k] = places[k, N_PLACES - 1]
             if charge:
                 y[n] = values[n_shown, END]
+                control[LAST_Q] = q_rows[END]
             control[U_GAP] = u_rows[END]
         for i in range(n):
             y[i] = 0.0

@@ -8,11 +8,10 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.charge import DERIVATIVE
 from fingerspice.engine.exponential import N_PLACES, between, largest, left_over
 from fingerspice.engine.netrows import combine
 from fingerspice.engine.readout import first_wrong, leaves
-from fingerspice.numerics.lobatto import END, MISS, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import DERIVATIVE, END, MISS, NODES, POINTS, ROWS
 
 # Columns of `peaks`: the largest voltage (V) and force (N) of each gap and, in the last row, of the nodes; then the
 # errors of both.

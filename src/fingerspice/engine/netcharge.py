@@ -8,11 +8,11 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.charge import DERIVATIVE, LOBE
+from fingerspice.engine.charge import LOBE
 from fingerspice.engine.exponential import N_PLACES, between, row_of
 from fingerspice.engine.netrows import AREA, MORE, SLOPE, Form, Work
 from fingerspice.engine.readout import ERROR_Q
-from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import DERIVATIVE, NODES, POINTS, ROWS
 
 # Largest integral within a step of a function that changes its sign at every node, as the node polynomial does, over
 # the function's size and the step's length.

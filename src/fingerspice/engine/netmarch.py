@@ -40,6 +40,7 @@ from fingerspice.engine.readout import (
     Steps,
     T,
     at,
+    basis_at,
     error_at,
     first_wrong,
     note,
@@ -139,7 +140,7 @@ def march(
     is_series = sources.series.shape[1] > 0
     index = np.zeros(n_s, np.int64)
     now, slopes_now = np.zeros(n_s), np.zeros(n_s)
-    run, gained = np.zeros((n_area, N_PLACES)), np.zeros(n_s)
+    run, gained, basis = np.zeros((n_area, N_PLACES)), np.zeros(n_s), np.zeros(NODES)
     several = False
     for b in range(1, home.size):
         several |= home[b] != home[0]
@@ -356,8 +357,9 @@ def march(
             charge_error(
                 form, work, h, lost, g, theta, cells[netrows.CELL_U], areas, values[first_z:], collected, control
             )  # fmt: skip
+        basis_at(theta, basis)
         for e in range(n_s):
-            gained[e] = at(values[first_z + e], theta) if charge else 0.0
+            gained[e] = at(values[first_z + e], basis) if charge else 0.0
         if not inside:
             if step_times.shape[0] > 0 or next_out <= t_new or kept_times.size > 0:
                 write_columns(n, first_z, charge, shape, follow, w, s, y, values)
@@ -383,7 +385,7 @@ def march(
                 account(u[a], areas[netrows.AREA, a], form.stress[a], theta, run[a], places, slow[a], peaks[a])
         netassess.account_nodes(form.node, form.node_s, places, work.off, peaks[n_area])
         for k in range(m):
-            w0[k] = at(w[k], theta) if theta < 1.0 else w[k, END]
+            w0[k] = at(w[k], basis)
         if theta < 1.0:
             error_at(places, theta, error)
         else:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_fused, jit_rows
-from fingerspice.numerics.lobatto import BARYCENTRIC, FIRST, NODES, POINTS, ROWS, SECOND, THIRD, TO_SERIES
+from fingerspice.numerics.lobatto import BARYCENTRIC, DERIVATIVE, FIRST, NODES, POINTS, ROWS, SECOND, THIRD, TO_SERIES
 
 # Entries of `control`.
 T, H, SIGN, U_BEFORE, U_GAP = 0, 1, 2, 3, 4
@@ -125,6 +125,15 @@ def _value_and_slope(series: FloatArray, x: float) -> tuple[float, float]:
     return x * b1 + (series[0] - b2), b1 + x * d1 - d2
 
 
+@jit_rows
+def slope_at(u: FloatArray, j: int) -> float:
+    """Slope at node j of the polynomial through values at the nodes, per step."""
+    slope = 0.0
+    for i in range(NODES):
+        slope += DERIVATIVE[j, i] * u[i]
+    return slope
+
+
 @jit
 def dip(u: FloatArray, sign: float, tol: float, wrong: int, series: FloatArray) -> float:
     """Fraction of the step at which the gap voltage is farthest off its branch between two nodes on it, or 0.
@@ -141,11 +150,9 @@ def dip(u: FloatArray, sign: float, tol: float, wrong: int, series: FloatArray) 
             continue
         lo = POINTS[max(j - 1, 0)]
         hi = POINTS[min(j + 1, NODES - 1)]
-        series_of(u, series)
-        _, slope_lo = _value_and_slope(series, 2.0 * lo - 1.0)
-        _, slope_hi = _value_and_slope(series, 2.0 * hi - 1.0)
-        if not (sign * slope_lo < 0.0 < sign * slope_hi):
+        if not (sign * slope_at(u, max(j - 1, 0)) < 0.0 < sign * slope_at(u, min(j + 1, NODES - 1))):
             continue
+        series_of(u, series)
         for _ in range(40):
             mid = 0.5 * (lo + hi)
             _, slope = _value_and_slope(series, 2.0 * mid - 1.0)
@@ -157,6 +164,22 @@ def dip(u: FloatArray, sign: float, tol: float, wrong: int, series: FloatArray) 
         if sign * lowest < -tol:
             return float(0.5 * (lo + hi))
     return 0.0
+
+
+@jit
+def _inverted(lo: float, hi: float, at_lo: float, at_hi: float, slope_lo: float, slope_hi: float) -> float:
+    """Where a function is about zero, from its values at both ends of an interval, of different sign, and its slopes.
+
+    Hermite's cubic through the inverse function; by the secant where a slope has the wrong sign.
+    """
+    rise = at_hi - at_lo
+    part = -at_lo / rise
+    secant = lo + (hi - lo) * part
+    if not (slope_lo * rise > 0.0 and slope_hi * rise > 0.0):
+        return secant
+    left, right = rise / slope_lo - (hi - lo), rise / slope_hi - (hi - lo)
+    found = secant + part * (1.0 - part) * (left * (1.0 - part) - right * part)
+    return found if lo < found < hi else secant
 
 
 @jit
@@ -174,11 +197,13 @@ def zero(u: FloatArray, sign: float, last: int, below: float, series: FloatArray
     hi: float = POINTS[last] if below == 0.0 else below
     if not sign * u[last - 1] > 0.0:
         return lo
-    series_of(u, series)
     theta: float = 0.5 * (lo + hi)
     if below == 0.0:
-        theta = lo + (hi - lo) * u[last - 1] / (u[last - 1] - u[last])
-    # Newton's method in a shrinking bracket; after a step of 1e-9 the next one is below rounding.
+        theta = _inverted(lo, hi, u[last - 1], u[last], slope_at(u, last - 1), slope_at(u, last))
+    series_of(u, series)
+    # Newton's method in a shrinking bracket. Each move is about the last one squared: it ends where the next one would
+    # be below rounding.
+    before = hi - lo
     for _ in range(60):
         value, slope = _value_and_slope(series, 2.0 * theta - 1.0)
         if sign * value > 0.0:
@@ -192,8 +217,9 @@ def zero(u: FloatArray, sign: float, last: int, below: float, series: FloatArray
                 break
         moved = abs(new - theta)
         theta = new
-        if moved <= 1e-9 * (hi - lo) or hi - lo <= 4e-16:
+        if moved * (moved / before) ** 2 <= 1e-16 or hi - lo <= 4e-16:
             break
+        before = moved
     return theta
 
 
@@ -221,19 +247,28 @@ def first_wrong(u: FloatArray, sign: float, tol: float) -> int:
 
 
 @jit
-def at(values: FloatArray, theta: float) -> float:
-    """The polynomial through values at the nodes, at fraction `theta` of the step."""
-    top = 0.0
-    bottom = 0.0
-    for j in range(NODES):
+def basis_at(theta: float, basis: FloatArray) -> None:
+    """Basis polynomials at fraction `theta` of the step, into `basis` (NODES,): values there are basis @ values."""
+    total = 0.0
+    for j in range(NODES - 1, -1, -1):
         distance = theta - POINTS[j]
         if distance == 0.0:
-            value: float = values[j]
-            return value
-        weight = BARYCENTRIC[j] / distance
-        top += weight * values[j]
-        bottom += weight
-    return top / bottom
+            basis[:] = 0.0
+            basis[j] = 1.0
+            return
+        basis[j] = BARYCENTRIC[j] / distance
+        total += basis[j]
+    for j in range(NODES):
+        basis[j] /= total
+
+
+@jit_rows
+def at(values: FloatArray, basis: FloatArray) -> float:
+    """The polynomial through values at the nodes, where `basis` belongs to (see `basis_at`)."""
+    total = 0.0
+    for j in range(NODES):
+        total += basis[j] * values[j]
+    return total
 
 
 @jit

@@ -10,7 +10,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.engine.exponential import N_PLACES
 from fingerspice.engine.readout import WRITTEN_AT_ONCE
 from fingerspice.engine.rows import N_FLAT
-from fingerspice.numerics.lobatto import ROWS
+from fingerspice.numerics.lobatto import NODES, ROWS
 
 
 class Work(NamedTuple):
@@ -32,6 +32,7 @@ class Work(NamedTuple):
     outputs: FloatArray
     sums: FloatArray
     weight: FloatArray
+    basis: FloatArray
     tapped: FloatArray
 
 
@@ -54,5 +55,6 @@ def new_work(n: int) -> Work:
         np.zeros((2, WRITTEN_AT_ONCE)),
         np.zeros((4, 4)),
         np.zeros(n),
+        np.zeros(NODES),
         np.zeros((n + 1, ROWS)),
     )

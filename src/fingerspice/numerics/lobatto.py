@@ -51,6 +51,12 @@ POINTS = np.concatenate([_X, _BETWEEN])
 """Fractions of the step, shape (ROWS,)."""
 BETWEEN = np.ascontiguousarray(_lagrange(_BETWEEN, _X, BARYCENTRIC).T)
 """Interpolation from the nodes to the points between, shape (NODES, 3)."""
+DERIVATIVE = np.zeros((NODES, NODES))
+"""Differentiation matrix: slope at each node, per step length, of the polynomial through values at the nodes."""
+for _i in range(NODES):
+    for _j in set(range(NODES)) - {_i}:
+        DERIVATIVE[_i, _j] = BARYCENTRIC[_j] / BARYCENTRIC[_i] / (_X[_i] - _X[_j])
+    DERIVATIVE[_i, _i] = -DERIVATIVE[_i].sum()
 _SCALE = float(np.abs(np.prod(_BETWEEN[:, None] - _X, axis=1)).max())
 MISS = np.prod(_BETWEEN[:, None] - _X, axis=1) / _SCALE
 """The node polynomial, of largest size 1, at the points between, shape (3,)."""
