@@ -11,13 +11,15 @@ import math
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
 from fingerspice.engine.coupling import Coupling
-from fingerspice.engine.exponential import respond
+from fingerspice.engine.exponential import N_PLACES, respond
 from fingerspice.engine.netrows import CHI_S, ETA_S, LIN, PULL, RHO, U_S, Form, W, Work, evaluate
 from fingerspice.numerics.lobatto import END, NODES, ROWS
 from fingerspice.numerics.small import copy_to
 
 # Shift of the modes for the difference, over the largest mode: half of the digits are left for the difference.
 _SHIFT = 1e-7
+# Answer of the areas up to which it is neglected: the error carried changes by at most 6 times as much of itself.
+_SLIGHT = 0.01
 # Most iterations, and the relative change below which the next iteration does not matter.
 _PASSES, _ENOUGH = 6, 0.1
 
@@ -39,13 +41,20 @@ def _difference(a: FloatArray, b: FloatArray, factor: float, out: FloatArray) ->
 @jit_within
 def carry(
     form: Form, work: Work, several: bool, h: float, rates: FloatArray, pace: FloatArray, coupling: Coupling,
-    decay: FloatArray, phi: FloatArray, error: FloatArray, sign: FloatArray,
+    decay: FloatArray, phi: FloatArray, error: FloatArray, sign: FloatArray, answer: float,
 ) -> None:  # fmt: skip
     """Carry the error of the modes (m,) from the start of a converged step to the points between and the end.
 
-    The result is `work.carried`. `work.spare`, `matrix`, `mixed` and one row of `room` are overwritten, nothing else.
+    The result is `work.carried`. `answer` is how strongly the areas answered to the last change of the modes (see
+    `solve_step`): where they hardly do, the error decays with the modes. `work.spare`, `matrix`, `mixed` and one row of
+    `room` are overwritten, nothing else.
     """
     base, forced, off, shifted, d, pull = work.spare
+    if answer <= _SLIGHT:
+        for k in range(error.size):
+            for p in range(N_PLACES - 1):
+                work.carried[k, p] = decay[k, NODES + p if p < N_PLACES - 2 else END] * error[k]
+        return
     modes, cells, areas = work.modes, work.spare_cells, work.spare_areas
     largest = 0.0
     size = 0.0

@@ -280,9 +280,11 @@ def march(
             if inside:
                 ramp_rows(t, h, jump_from, jump_to, s, ds)
             else:
-                source_rows(sources, index, t, h, work.r, s, ds)
+                source_rows(sources, index, t, h, charge or not smooth, work.r, s, ds)
             follow_sources(form, own, gain, s, ds, modes[netrows.LIN], cells, areas)
-            passes, closed = solve_step(form, work, own, several, h, rates, area_pace, sign, decay, phi, 0.3 * tol)
+            passes, closed, answer = solve_step(
+                form, work, own, several, h, rates, area_pace, sign, decay, phi, 0.3 * tol
+            )
             counters[NFEV] += passes * NODES
             step_error = math.inf
             # An iteration that has not converged says nothing about the sign of the gap voltage.
@@ -294,7 +296,7 @@ def march(
                 if mobile:
                     lowest = room[3].min()
                 magnified = 1.0 / lowest
-                carry(form, work, several, h, rates, area_pace, own, decay, phi, error, sign)
+                carry(form, work, several, h, rates, area_pace, own, decay, phi, error, sign, answer)
                 step_error = assess(
                     rates, h, shape, follow, form.gap, size, phi, miss, error, work.carried, w, modes[netrows.LIN],
                     modes[netrows.PULL], modes[netrows.USED], s, magnified, work.off, places, run,

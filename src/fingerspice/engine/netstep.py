@@ -18,14 +18,14 @@ from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
 
 @jit
 def source_rows(
-    sources: Sources, index: IntArray, t: float, h: float, r: FloatArray, s: FloatArray, ds: FloatArray
+    sources: Sources, index: IntArray, t: float, h: float, slopes: bool, r: FloatArray, s: FloatArray, ds: FloatArray
 ) -> None:
-    """Values and slopes of the sources at all rows of a step."""
+    """Values of the sources at all rows of a step and, if wanted, their slopes."""
     for e in range(s.shape[0]):
         row = sources.first[e] + index[e]
         start = sources.edges[row]
         rows.source_rows(
-            sources.terms[row - e], sources.series[row - e], sources.edges[row + 1] - start, t - start, h, True, r[e]
+            sources.terms[row - e], sources.series[row - e], sources.edges[row + 1] - start, t - start, h, slopes, r[e]
         )
         for i in range(ROWS):
             s[e, i] = r[e, rows.SOURCE, i]
@@ -53,10 +53,11 @@ def _free(decay: FloatArray, w0: FloatArray, out: FloatArray) -> None:
 def solve_step(
     form: Form, work: Work, own: Coupling, several: bool, h: float, rates: FloatArray, area_pace: FloatArray,
     sign: FloatArray, decay: FloatArray, phi: FloatArray, tol: float,
-) -> tuple[int, bool]:  # fmt: skip
+) -> tuple[int, bool, float]:  # fmt: skip
     """Collocation solution of a step from the modes `work.w0`, by iteration on the currents that the areas add.
 
-    Returns the number of evaluations, and whether the gap voltages are settled to `tol` (V).
+    Returns the number of evaluations, whether the gap voltages are settled to `tol` (V), and the factor by which the
+    first iteration reduced the change of the currents: how strongly the areas answer to a change of the modes.
     """
     modes, cells, areas, weight = work.modes, work.cells, work.areas, work.weight
     w, base, lin, pull, used = (
@@ -72,6 +73,7 @@ def solve_step(
     current = base
     slowly = False
     step = 0.0
+    answer = 0.0
     for iteration in range(1, 41):
         if iteration > 1:
             if slowly:
@@ -84,18 +86,20 @@ def solve_step(
             form, own, several, h, rates, area_pace, sign, current, lin, modes[netrows.D], pull, cells, areas,
             work.matrix, work.mixed, work.room[3],
         ):  # fmt: skip
-            return iteration, False
+            return iteration, False, answer
         change = moved(u, guess)
         if iteration == 1:
             continue
         # The next change of the gap voltages, estimated from their change for the last change of the currents.
         off = distance(pull, used, weight)
+        if iteration == 2 and step > 0.0:
+            answer = off / step
         if not off < math.inf:
-            return iteration, False
+            return iteration, False, answer
         if change * off <= tol * step:
-            return iteration, True
+            return iteration, True, answer
         slowly = off > 0.15 * step
-    return 40, False
+    return 40, False, answer
 
 
 @jit_within
