@@ -219,6 +219,23 @@ def inverse_area_at(form: Form, u: float) -> tuple[float, float]:
 
 
 @jit
+def bend_at(form: Form, xi: float) -> float:
+    """N of `relaxation.Form`, V m^2."""
+    x, value = abs(xi) * form.scale + form.shift, 0.0
+    for j in range(form.bend.size - 1, -1, -1):
+        value = value * x + form.bend[j]
+    return value if xi >= 0.0 else -value
+
+
+@jit
+def steepness(form: Form, xi: float) -> float:
+    """Derivative of the gap voltage by xi; 1 in a stack."""
+    q, _ = inverse_area_at(form, xi)
+    share: float = 1.0 + form.kappa * (1.0 / q - 1.0 / form.q0[0])
+    return 1.0 / share
+
+
+@jit
 def current_at(
     c: Course, r: int, w: FloatArray, g: FloatArray, source: float, slope: float, u: float
 ) -> float:  # fmt: skip

@@ -6,8 +6,17 @@ import math
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_within
-from fingerspice.engine.blockcharge import Course, current_at, current_block, inverse_area_at, moved_rows, moved_with
-from fingerspice.engine.blockrows import crossing, modes_into, scaled
+from fingerspice.engine.blockcharge import (
+    Course,
+    bend_at,
+    current_at,
+    current_block,
+    inverse_area_at,
+    moved_rows,
+    moved_with,
+    steepness,
+)
+from fingerspice.engine.blockrows import add, crossing, modes_into, scaled
 from fingerspice.engine.relaxation import FIRST_NEWTON, MIDDLE, OUTPUT, REFERENCE, U_GAP, Z, look_at_ends
 from fingerspice.numerics.moments import moments
 
@@ -65,6 +74,28 @@ def _charge_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, u:
 
 
 @jit
+def _write_flows(
+    c: Course, r: int, w: FloatArray, g: FloatArray, source: float, slope: float, xi: float, out: FloatArray
+) -> None:  # fmt: skip
+    """Write the rates (A) of the columns that are charges; `slope` is the source's, V/s."""
+    form, shown = c.form, c.shown
+    for i in range(shown.flows):
+        out[i] = shown.k[shown.k.size - shown.flows + i] * slope
+    rate_xi = form.k_gap * slope
+    for k in range(w.size):
+        rate = form.gain[r, k] * source - form.rates[r, k] * w[k]
+        for t in range(g.size):
+            rate += form.feed[r, k, t] * g[t]
+        rate_xi += form.taps[r, 0, k] * rate
+        for i in range(shown.flows):
+            out[i] += shown.columns[r, shown.k.size - shown.flows + i, k] * rate
+    q, _ = inverse_area_at(form, xi)
+    rate_bend = (1.0 / q - 1.0 / form.q0[r]) * steepness(form, xi) * rate_xi
+    for i in range(shown.flows):
+        out[i] += shown.bend[shown.k.size - shown.flows + i] * rate_bend
+
+
+@jit
 def _write_point(
     c: Course, r: int, h: float, i: int, at: float, slope: float, out: FloatArray, place: int
 ) -> None:  # fmt: skip
@@ -93,11 +124,16 @@ def _write_point(
             u -= (u - model.k_gap * source - b * q) / (1.0 - b * dq)
         scale = model.area0 * inverse_area_at(form, u)[0]
     n = shown.k.size
+    bent = bend_at(form, u) if form.bend.size > 0 else 0.0
     for column in range(n):
         v = 0.0
         for k in range(w.size):
             v += shown.columns[r, column, k] * w[k]
+        if form.bend.size > 0:
+            v += shown.bend[column] * bent
         out[column, place] = shown.k[column] * source + scale * v
+    if shown.flows > 0:
+        _write_flows(c, r, w, g, source, slope, u, out[n:, place])
     if shown.charge:
         out[n, place] = _charge_at(c, r, h, i, at, w, u)
         out[n + 1, place] = current_at(c, r, w, g, source, slope, u)
@@ -141,7 +177,7 @@ def write_block(
         last += 1
     if last == first:
         return
-    if not aligned or last - first != count:
+    if not aligned or last - first != count or shown.flows > 0:
         _write_points(c, r, n, h, start, slack, t_out, out, last)
     else:
         row = room.before
@@ -154,6 +190,8 @@ def write_block(
             else:
                 scaled(n, shown.k[column], room.s, row)
                 modes_into(n, 0, shown.columns[r, column], room.w, row)
+                if form.bend.size > 0:
+                    add(n, shown.bend[column], room.g[room.g.shape[0] - 1], row)
             _every(sub, count, row, out[column, first:last])
         if shown.charge:
             current_block(c, r, n, h)

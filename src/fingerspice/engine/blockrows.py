@@ -98,6 +98,13 @@ def product_of(n: int, x: FloatArray, y: FloatArray, out: FloatArray) -> None:
 
 
 @jit_rows
+def sign_as(n: int, x: FloatArray, out: FloatArray) -> None:
+    """Give each entry the sign of x."""
+    for i in range(n):
+        out[i] = out[i] if x[i] >= 0.0 else -out[i]
+
+
+@jit_rows
 def _doubled(n: int, decay: float, by: int, x: FloatArray, out: FloatArray) -> None:
     """Decayed sums over twice as many increments: each sum plus that of the `by` increments before it."""
     for i in range(n):

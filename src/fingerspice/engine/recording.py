@@ -6,13 +6,14 @@ import math
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
-from fingerspice.engine.blockcharge import Course, charge_block
+from fingerspice.engine.blockcharge import Course, charge_block, steepness
 from fingerspice.engine.blockoutput import write_block
-from fingerspice.engine.blockrows import add_two, area_rows, modes_into, recursion, scaled
+from fingerspice.engine.blockrows import add, add_two, area_rows, modes_into, recursion, scaled
 from fingerspice.engine.model import ramp
 from fingerspice.engine.relaxation import (
     BLOCK,
     ERROR_F,
+    ERROR_Q,
     ERROR_U,
     ERROR_V,
     FIRST_NEWTON,
@@ -139,17 +140,17 @@ def _block_error(c: Course, r: int, level: int, n: int) -> float:
 
 
 @jit_within
-def _node_error(c: Course, r: int, n: int, left_over: float, magnified: float) -> float:
-    """The largest error of a node's voltage in a block, V."""
+def _largest_error(c: Course, rows: FloatArray, n: int) -> float:
+    """The largest error in a block of any of the quantities `rows` (n_row, m) @ modes."""
     room, worst = c.room, 0.0
-    for i in range(c.shown.node.shape[1]):
+    for i in range(rows.shape[0]):
         scaled(n + 1, 0.0, room.s, room.before)
-        modes_into(n + 1, 0, c.shown.node[r, i], room.own, room.before)
+        modes_into(n + 1, 0, rows[i], room.own, room.before)
         carried = 0.0
         for k in range(c.w.size):
-            carried += abs(c.shown.node[r, i, k] * c.error[k])
+            carried += abs(rows[i, k] * c.error[k])
         worst = max(worst, _largest(n + 1, room.before) + carried)
-    return left_over + magnified * worst
+    return worst
 
 
 @jit_within
@@ -164,15 +165,26 @@ def _accept(
     carried = 0.0
     for k in range(c.w.size):
         carried += abs(c.form.taps[r, 0, k] * c.error[k])
-    peak, force, steepest, worst = _peaks(n + 1, c.shown.stress, room.u, c.charges.q[0], room.before)
+    gap = room.u
+    if c.form.bend.size > 0:
+        gap = room.slope
+        scaled(n + 1, 1.0, room.u, gap)
+        add(n + 1, -c.form.kappa, room.g[room.g.shape[0] - 1], gap)
+    peak, force, steepest, worst = _peaks(n + 1, c.shown.stress, gap, c.charges.q[0], room.before)
     control[PEAK_U], control[PEAK_F] = max(control[PEAK_U], peak), max(control[PEAK_F], force)
+    off_u = local + magnified * carried
     # The force is proportional to the square of the voltage, and depends a little on the area.
     off = magnified * worst + steepest * (left_over + magnified * carried)
-    control[ERROR_U] = max(control[ERROR_U], local + magnified * carried)
+    control[ERROR_U] = max(control[ERROR_U], off_u)
     control[ERROR_F] = max(control[ERROR_F], 2.2 * off)
-    # Under `mobile` an error of the gap voltage changes the area, and thereby all other voltages.
-    moved = local + magnified * carried if c.form.mobile else 0.0
-    control[ERROR_V] = max(control[ERROR_V], moved + _node_error(c, r, n, left_over, magnified))
+    # An error of the gap voltage changes the area, and thereby other voltages.
+    node_error = left_over + magnified * _largest_error(c, c.shown.node[r], n)
+    control[ERROR_V] = max(control[ERROR_V], c.shown.moves[0] * off_u + node_error)
+    first = c.shown.k.size - c.shown.flows
+    if c.shown.flows > 0:
+        charge_error = _largest_error(c, c.shown.columns[r, first:], n)
+        charge_error += c.shown.capacitance * left_over + c.shown.moves[1] * off_u
+        control[ERROR_Q] = max(control[ERROR_Q], charge_error)
     if c.shown.charge:
         charge_block(c, r, level, n, h, local)
     for k in range(c.w.size):
@@ -193,6 +205,7 @@ def march(
     """
     c, values = borrow(c), borrow(values)
     form, room, control = c.form, c.room, c.control
+    steepest = steepness(form, 0.0)
     while at < stop:
         level, r = int(control[LEVEL]), int(control[REFERENCE])
         sub = 1 << level
@@ -211,7 +224,8 @@ def march(
             continue
         left_over, margin, sweeps = relax(form, room, r, level, h, c.shown.kink, n, tol)
         c.counters[SWEEPS] += sweeps
-        closed, local, magnified = left_over < math.inf, math.inf, 1.0
+        # An error of xi is one of the gap voltage, enlarged where the area at 0 V is smaller than the reference.
+        closed, local, magnified = left_over < math.inf, math.inf, steepest
         if closed:
             misfit(form, room, r, level, h, c.shown.kink, n)
             area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])

@@ -7,6 +7,10 @@ exponential Simpson rule, of fourth order. All steps of a block are solved toget
 follow by a recursion, from the modes the gap voltage and the next g. Each sweep reduces the error to a few hundredths,
 and is a set of loops over rows of hundreds of steps, which use the processor's vectors fully.
 
+In a network the area also changes the finger's displacement current, as in `solve.netforms`: there the gap voltage u
+follows from xi = tap w + tap U, which is 0 with it, by u + kappa N(u) = xi, and N is one more drive and part of each
+tap. 1/A and N are polynomials in |xi|, and what is said here of u holds for xi.
+
 1/A has a kink where the gap voltage is 0. In a step across it the parabola misses kappa times |u| less the parabola of
 |u|, with kappa = dg/d|u|. The response to this difference is known in closed form, and is added.
 
@@ -42,6 +46,7 @@ from fingerspice.engine.blockrows import (
     product_of,
     recursion,
     scaled,
+    sign_as,
 )
 
 # Number of steps in a block, and of step lengths: that of a sample and its halvings.
@@ -106,6 +111,12 @@ class Form(NamedTuple):
         Their contribution to the error of the gap voltage in the middle of the step.
     area : ndarray, shape (4 k + 1,)
         1/A as a polynomial in `scale` |u| + `shift`.
+    kappa : float
+        1/m^2; 0 in a stack.
+    bend : ndarray, shape (4 l + 1,)
+        N (V m^2) for positive xi, as `area`; no entry in a stack. In a network N is the last drive, which has no tap.
+    bent : ndarray, shape (T - 1,)
+        Share of N in each tap; no entry in a stack.
     """
 
     mobile: bool
@@ -129,6 +140,9 @@ class Form(NamedTuple):
     shift: float
     k_gap: float
     area0: float
+    kappa: float
+    bend: FloatArray
+    bent: FloatArray
 
 
 class Shown(NamedTuple):
@@ -154,6 +168,16 @@ class Shown(NamedTuple):
     moved : ndarray
         c r G(|u|) under `local`, a polynomial as `Form.area`, C.
     charge : bool
+        Whether the charge follows from that, as in a stack.
+    bend : ndarray, shape (C,)
+        Share of N in each column; no entry in a stack.
+    flows : int
+        Number of the last columns that are charges of a network, whose rates are outputs, too.
+    capacitance : float
+        Sum of all capacitances of the network, F, where there are such columns.
+    moves : ndarray, shape (2,)
+        Largest error of a node's voltage (V), and of such a charge (C), that the area causes, per volt of the gap
+        voltage's error.
     """
 
     columns: FloatArray
@@ -167,6 +191,10 @@ class Shown(NamedTuple):
     area_kink: float
     moved: FloatArray
     charge: bool
+    bend: FloatArray
+    flows: int
+    capacitance: float
+    moves: FloatArray
 
 
 class Room(NamedTuple):
@@ -219,6 +247,12 @@ def _drives(
         for i in range(n):
             u[i] = x[0, i]
     area_rows(n, form.area, form.scale, form.shift, q0, u, z)
+    if form.bend.size > 0:
+        drives -= 1
+        area_rows(n, form.bend, form.scale, form.shift, 0.0, u, g[drives])
+        sign_as(n, u, g[drives])
+        for t in range(drives):
+            add(n, form.bent[t], g[drives], x[1 + t])
     for t in range(drives):
         product_of(n, z, x[1 + t], g[t])
     if form.mobile:

@@ -1,4 +1,4 @@
-"""Tables for recordings on a series stack: weights of the exponential Simpson steps, and 1/A as a polynomial.
+"""Circuits prepared for recordings: weights of the exponential Simpson steps, and 1/A of a stack as a polynomial.
 
 They depend on the scene, the sample spacing and the error asked for only, so that they are made once for all blocks.
 """
@@ -6,21 +6,26 @@ They depend on the scene, the sample spacing and the error asked for only, so th
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import chebyshev as series_of
 from numpy.polynomial.polynomial import polyval
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine import relaxation
+from fingerspice.engine.blockcharge import Course, new_charges
 from fingerspice.engine.relaxation import LEVELS, PLACES, Form
 from fingerspice.engine.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.numerics.moments import weights
 from fingerspice.physics.contact import N_PACKED
+from fingerspice.results.outcome import State
+from fingerspice.results.record import sided
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.track import Prepared, prepare_system
+from fingerspice.solve.stackstate import StackState, from_stack
+from fingerspice.solve.track import Prepared, as_recorded, on_branch, prepare_system
 
 # Truncation error allowed for the polynomial of 1/A, relative to the error asked for.
 AREA_SHARE = 0.02
@@ -64,8 +69,6 @@ def _moved(system: System, area: FloatArray, at_rest: float) -> FloatArray:
 def form_of(system: System, area: FloatArray, spacing: float) -> Form:
     """The stack's modes at its reference areas, with weights for steps of one sample spacing and its halvings."""
     model = system.model
-    h = spacing / 2.0 ** np.arange(LEVELS)[:, None]
-    z = system.rates[:, None, :] * h
     n, slow = model.gap.size, model.slow
     feed, taps, tap_s = system.feed, [system.gap[:, None], system.tap], [model.k_gap, *system.tap_k]
     if model.mobile:
@@ -75,15 +78,29 @@ def form_of(system: System, area: FloatArray, spacing: float) -> Form:
     ratio = 0.0 if model.mobile else slow[n] / model.k_gap
     taps += [(system.slow - ratio * system.gap)[:, None], system.slow[:, None]]
     tap_s += [0.0, 0.0 if model.mobile else slow[n]]
-    every, direct = np.concatenate(taps, axis=1), np.array(tap_s)
-    gain = system.gain[:, None, :, None] * h[..., None]
+    return weighted(
+        model.mobile, system.q0, system.rates, system.gain, feed, np.concatenate(taps, axis=1), np.array(tap_s),
+        spacing, area, system.scale, -system.lo * system.scale - 1.0, model.k_gap, model.area0, 0.0, np.zeros(0),
+        np.zeros(0),
+    )  # fmt: skip
+
+
+def weighted(
+    mobile: bool, q0: FloatArray, rates: FloatArray, gain: FloatArray, feed: FloatArray, taps: FloatArray,
+    tap_s: FloatArray, spacing: float, area: FloatArray, scale: float, shift: float, k_gap: float, area0: float,
+    kappa: float, bend: FloatArray, bent: FloatArray,
+) -> Form:  # fmt: skip
+    """The form with these parts (see `Form`) and the weights that follow from them for a sample spacing (s)."""
+    h = spacing / 2.0 ** np.arange(LEVELS)[:, None]
+    z = rates[:, None, :] * h
+    by_step = gain[:, None, :, None] * h[..., None]
     drives = feed[:, None, :, :, None] * h[..., None, None]
 
     def within(at: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        own = every[:, None] * np.exp(-z * at)[:, :, None]
-        of_s = np.einsum("rpk,rskj->rspj", every, gain * weights(z, (0.0, 1.0), at))
-        of_s += direct[:, None] * np.array([1.0 - at, at])
-        of_g = np.einsum("rpk,rsktj->rsptj", every, drives * weights(z, (0.0, 0.5, 1.0), at)[..., None, :])
+        own = taps[:, None] * np.exp(-z * at)[:, :, None]
+        of_s = np.einsum("rpk,rskj->rspj", taps, by_step * weights(z, (0.0, 1.0), at))
+        of_s += tap_s[:, None] * np.array([1.0 - at, at])
+        of_g = np.einsum("rpk,rsktj->rsptj", taps, drives * weights(z, (0.0, 0.5, 1.0), at)[..., None, :])
         return own, of_s, of_g
 
     inner, inner_s, inner_g = (
@@ -92,41 +109,117 @@ def form_of(system: System, area: FloatArray, spacing: float) -> Form:
     five = (0.0, 0.25, 0.5, 0.75, 1.0)
     quarters, early = (weights(z, five, until)[..., None, [1, 3]] for until in (1.0, 0.5))
     return Form(
-        model.mobile, system.q0, system.rates, system.gain, np.exp(-z), gain * weights(z, (0.0, 1.0)),
-        drives * weights(z, (0.0, 0.5, 1.0))[..., None, :], np.ascontiguousarray(feed), np.ascontiguousarray(every),
-        direct, inner, inner_s, inner_g, np.ascontiguousarray(weights(z, (0.0, 0.5, 1.0))[..., 1:]), drives * quarters,
-        np.einsum("rk,rsktj->rstj", system.gap, drives * early), area, system.scale, -system.lo * system.scale - 1.0,
-        model.k_gap, model.area0,
+        mobile, q0, np.ascontiguousarray(rates), np.ascontiguousarray(gain), np.exp(-z),
+        by_step * weights(z, (0.0, 1.0)), drives * weights(z, (0.0, 0.5, 1.0))[..., None, :],
+        np.ascontiguousarray(feed), np.ascontiguousarray(taps), tap_s, inner, inner_s, inner_g,
+        np.ascontiguousarray(weights(z, (0.0, 0.5, 1.0))[..., 1:]), drives * quarters,
+        np.einsum("rk,rsktj->rstj", taps[:, 0], drives * early), area, scale, shift, k_gap, area0, kappa, bend, bent,
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Followed:
+class Follower(ABC):
     """A scene prepared for recordings, for all tolerances of one decade.
+
+    Attributes
+    ----------
+    shown : relaxation.Shown
+    share : float
+        Largest gap voltage to expect for a peak of the source of 1, V/V or V/A.
+    u_top : float
+        Largest gap voltage that the polynomials cover, V.
+    q_rest : float
+        1/A at 0 V, 1/m^2.
+    """
+
+    shown: relaxation.Shown
+    share: float
+    u_top: float
+    q_rest: float
+
+    @abstractmethod
+    def form(self, spacing: float) -> Form:
+        """The form for steps of one sample spacing (s) and its halvings."""
+
+    @abstractmethod
+    def course(self, problem: Problem, form: Form) -> Course:
+        """State and scratch arrays at the start of a run."""
+
+    @abstractmethod
+    def rows(self, problem: Problem, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
+        """Outputs at times `t` (s), as the compiled loop has written them, as rows of a record."""
+
+    @abstractmethod
+    def state(self, problem: Problem, course: Course, t: float, u_last: float) -> State:
+        """The state reached at `t` (s), where the source has the value `u_last`."""
+
+    @abstractmethod
+    def charge_error(self, problem: Problem, course: Course, peak_u: float) -> float:
+        """Rounding of the charge so far, C."""
+
+    @property
+    def width(self) -> int:
+        """Number of rows that the compiled loop writes."""
+        return int(self.shown.k.size) + (2 if self.shown.charge else self.shown.flows)
+
+
+@dataclass(frozen=True)
+class Followed(Follower):
+    """A stack prepared for recordings.
 
     Attributes
     ----------
     prepared : Prepared
     area : ndarray
         Polynomial of 1/A, see `Form.area`.
-    at_rest, q_rest : float
-        Variable of that polynomial, and 1/A (1/m^2), at 0 V.
-    shown : relaxation.Shown
+    at_rest : float
+        Variable of that polynomial at 0 V.
     """
 
     prepared: Prepared
     area: FloatArray
     at_rest: float
-    q_rest: float
-    shown: relaxation.Shown
 
     @property
     def system(self) -> System:
         return self.prepared.system
 
-    def charge_with(self, u_gap: float) -> float:
+    def _charge_with(self, u_gap: float) -> float:
         """Part of the charge (C) that is a function of the gap voltage (V)."""
         return math.copysign(float(polyval(abs(u_gap) * self.system.scale + self.at_rest, self.shown.moved)), u_gap)
+
+    def form(self, spacing: float) -> Form:
+        return form_of(self.system, self.area, spacing)
+
+    def course(self, problem: Problem, form: Form) -> Course:
+        system, start = self.system, problem.inner
+        m, drives = system.rates.shape[1], self.shown.kink.size
+        r = int(np.argmin(np.abs(np.log(system.q0 / self.q_rest))))
+        control, counters = np.zeros(relaxation.N_CONTROL), np.zeros(relaxation.N_COUNTERS, np.int64)
+        control[relaxation.MARGIN], control[relaxation.REFERENCE], control[relaxation.U_GAP] = 1.0, r, start.u_gap
+        control[relaxation.Z] = start.y[-1] - self._charge_with(start.u_gap)
+        return Course(
+            system.model, form, self.shown, relaxation.new_room(m, drives, drives + 3), new_charges(),
+            np.zeros((3, max(m, drives, 3))), system.project[r] @ start.y[:-1], np.zeros(m), control, counters,
+        )  # fmt: skip
+
+    def rows(self, problem: Problem, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
+        model = self.system.model
+        u = sided(problem.waveform, t, left) if problem.charge and model.mobile else np.empty(0)
+        return as_recorded(problem, model, out[:, : t.size].T, u)
+
+    def state(self, problem: Problem, course: Course, t: float, u_last: float) -> State:
+        control, system, offset = course.control, self.system, problem.inner.offset
+        u_gap = float(control[relaxation.U_GAP])
+        live = system.live[int(control[relaxation.REFERENCE])] @ course.w
+        y = np.append(live, control[relaxation.Z] + self._charge_with(u_gap))
+        state = StackState(t, y, u_last, u_gap, offset)
+        return from_stack(problem.scene, on_branch(system.model, state, math.copysign(1.0, u_gap)))
+
+    def charge_error(self, problem: Problem, course: Course, peak_u: float) -> float:
+        model = self.system.model
+        held = float(model.slow[-3]) * model.area0 * (problem.scene.u_peak + peak_u)
+        return 4e-16 * held * (1.0 + int(course.counters[relaxation.STEPS]))
 
 
 def followed(problem: Problem, rtol: float) -> Followed | None:
@@ -144,6 +237,7 @@ def followed(problem: Problem, rtol: float) -> Followed | None:
         kinks = np.append(kinks, -kink / q_rest**2)
     shown = relaxation.Shown(
         system.shown, system.k_shown, system.node, system.slow, system.live, system.project, system.stress, kinks,
-        -kink / q_rest**2, _moved(system, area, at_rest), problem.charge,
+        -kink / q_rest**2, _moved(system, area, at_rest), problem.charge, np.zeros(0), 0, 0.0,
+        np.array([1.0 if system.model.mobile else 0.0, 0.0]),
     )  # fmt: skip
-    return Followed(prepared, area, at_rest, q_rest, shown)
+    return Followed(shown, system.model.k_gap, system.u_top, q_rest, prepared, area, at_rest)

@@ -1,4 +1,4 @@
-"""Runs of a series stack under a recorded source, sample by sample, in pieces of fixed length; see `engine.recording`.
+"""Runs under a recorded source, sample by sample, in pieces of fixed length; see `engine.recording`.
 
 The error of each piece is judged at its end, independently of later pieces. Its outputs are therefore the same however
 long the run is, and whether all outputs are held in one array or streamed in chunks.
@@ -17,17 +17,15 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine import recording, relaxation
-from fingerspice.engine.blockcharge import Course, new_charges
 from fingerspice.engine.blockoutput import write_end
 from fingerspice.engine.relaxation import BLOCK, Form
 from fingerspice.results.outcome import State, Status
-from fingerspice.results.record import Record, sided
+from fingerspice.results.record import Record
 from fingerspice.results.refined import ClosedForm
-from fingerspice.solve.forms import Followed, followed, form_of
+from fingerspice.solve.forms import Follower, followed
+from fingerspice.solve.netforms import finger, recording_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Progress, Run, excess_of, kept_with
-from fingerspice.solve.stackstate import StackState, from_stack, model_of
-from fingerspice.solve.track import as_recorded, on_branch
 from fingerspice.waveforms.recorded import MOST_PER_POINT, as_samples
 from fingerspice.waveforms.samples import Samples
 
@@ -73,18 +71,27 @@ class Piece:
         return wave.between(self.first, self.last + 1)
 
 
+def driving(problem: Problem) -> Samples | None:
+    """The recording that drives a stack, or one source of a network whose other sources are at 0; else None."""
+    if problem.scene.stack is not None:
+        return as_samples(problem.waveform)
+    found = recording_of(problem)
+    return None if found is None else found[1]
+
+
 def pieces_of(problem: Problem) -> list[Piece] | None:
-    """The pieces of a run if it is a coupled stack driven by a recording of enough samples; else None."""
-    if problem.scene.stack is None or not problem.scene.coupled:
-        return None
-    wave = as_samples(problem.waveform)
+    """The pieces of a run with a moving area that is driven by a recording of enough samples; else None."""
+    wave = driving(problem) if problem.scene.coupled else None
     if wave is None:
         return None
     spacing, t0, t1 = 1.0 / wave.rate, problem.t_start, problem.t_stop
     first, last = math.ceil((t0 - wave.start) * wave.rate - 1e-6), math.floor((t1 - wave.start) * wave.rate + 1e-6)
     if last - first < LEAST_SAMPLES:
         return None
-    if wave is not problem.waveform and last - first > MOST_PER_POINT * problem.breakpoints().size:
+    if (
+        not any(isinstance(one, Samples) for one in problem.waveforms)
+        and last - first > MOST_PER_POINT * problem.breakpoints().size
+    ):
         # In most of the run the source is one long line, of which the other methods need few steps.
         return None
     edges = [first, *range((first // PIECE + 1) * PIECE, last, PIECE), last]
@@ -116,54 +123,43 @@ class March:
         Largest |U| of the source so far, V.
     """
 
-    def __init__(self, problem: Problem, one: Followed, rtol: float, share: float = 1.0) -> None:
+    def __init__(self, problem: Problem, one: Follower, rtol: float, share: float = 1.0) -> None:
         self.problem, self.one, self.rtol, self.share = problem, one, rtol, share
         self.t, self.loudest, self.u_last, self.spacing = problem.t_start, 0.0, 0.0, 0.0
-        system, start = one.system, problem.inner
-        m, drives = system.rates.shape[1], one.shown.kink.size
-        r = int(np.argmin(np.abs(np.log(system.q0 / one.q_rest))))
-        control, counters = np.zeros(relaxation.N_CONTROL), np.zeros(relaxation.N_COUNTERS, np.int64)
-        control[relaxation.MARGIN], control[relaxation.REFERENCE], control[relaxation.U_GAP] = 1.0, r, start.u_gap
-        control[relaxation.Z] = start.y[-1] - one.charge_with(start.u_gap)
-        self.width = one.shown.k.size + (2 if problem.charge else 0)
-        self.course = Course(
-            system.model, self._form(1.0 / self.wave.rate), one.shown, relaxation.new_room(m, drives, drives + 3),
-            new_charges(), np.zeros((3, max(m, drives, 3))), system.project[r] @ start.y[:-1], np.zeros(m), control,
-            counters,
-        )  # fmt: skip
+        self.width = one.width
+        self.course = one.course(problem, self._form(1.0 / self.wave.rate))
         held = float(np.abs(problem.initial.y).max(initial=0.0))
-        whole = max(problem.scene.u_peak * model_of(problem.scene).k_gap, held)
-        self.least = max(held, LEAST_PEAK * whole)
+        self.least = max(held, LEAST_PEAK * problem.scene.u_peak * one.share)
 
     @property
     def wave(self) -> Samples:
-        wave = as_samples(self.problem.waveform)
+        wave = driving(self.problem)
         assert wave is not None
         return wave
 
     def _form(self, spacing: float) -> Form:
         kept, decade = self.problem.scene.prepared, _decade(self.rtol)
-        make = partial(form_of, self.one.system, self.one.area, spacing)
-        form: Form = kept_with(kept, ("form", decade, spacing, threading.get_ident()), MOST_FORMS, make)
+        key = ("form", decade, spacing, self.problem.charge, threading.get_ident())
+        form: Form = kept_with(kept, key, MOST_FORMS, partial(self.one.form, spacing))
         return form
 
     def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
         """Integrate a piece with the source's `values` (V), and write the outputs before its end as rows of `out`."""
-        one, control, k_gap = self.one, self.course.control, self.one.system.model.k_gap
+        one, control = self.one, self.course.control
         if piece.spacing != self.spacing:
             # The source may jump where the spacing changes, and does so at the start of the run.
             self.course, self.spacing = self.course._replace(form=self._form(piece.spacing)), piece.spacing
             if not recording.jump(self.course, float(values[0])):
                 return Outcome.LOST
         self.loudest = max(self.loudest, float(values.max()), -float(values.min()))
-        scale = max(self.loudest * k_gap, self.least)
+        scale = max(self.loudest * one.share, self.least)
         before = self.mark()
         for _ in range(ATTEMPTS):
             tol = self.share * SHARE * self.rtol * scale
             code = recording.march(
                 self.course, values, 0, values.size - 1, piece.start, piece.spacing, tol, t_out, out
             )  # fmt: skip
-            if code != recording.DONE or control[relaxation.PEAK_U] > one.system.u_top:
+            if code != recording.DONE or control[relaxation.PEAK_U] > one.u_top:
                 return Outcome.LOST
             gaps, _, _ = self.stated()
             gaps[0, 0], gaps[0, 1] = max(gaps[0, 0], self.least), max(gaps[0, 1], self._force(self.least))
@@ -217,33 +213,25 @@ class March:
 
     def rows(self, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
         """Outputs at times `t` (s) as rows of a record."""
-        model = self.one.system.model
-        u = sided(self.wave, t, left) if self.problem.charge and model.mobile else np.empty(0)
-        return as_recorded(self.problem, model, out[:, : t.size].T, u)
+        return self.one.rows(self.problem, t, left, out)
 
     def state(self) -> State:
         """The state reached."""
-        control, system, offset = self.course.control, self.one.system, self.problem.inner.offset
-        u_gap = float(control[relaxation.U_GAP])
-        live = system.live[int(control[relaxation.REFERENCE])] @ self.course.w
-        y = np.append(live, control[relaxation.Z] + self.one.charge_with(u_gap))
-        state = StackState(self.t, y, self.u_last, u_gap, offset)
-        return from_stack(self.problem.scene, on_branch(system.model, state, math.copysign(1.0, u_gap)))
+        return self.one.state(self.problem, self.course, self.t, self.u_last)
 
     def stated(self) -> tuple[FloatArray, float, float | None]:
         """Peaks and stated errors as in `Run.gaps`, and stated errors of the nodes (V) and the charge (C), so far."""
-        control, model, u_peak = self.course.control, self.one.system.model, self.problem.scene.u_peak
+        control, u_peak = self.course.control, self.problem.scene.u_peak
         peak_u, peak_f = float(control[relaxation.PEAK_U]), float(control[relaxation.PEAK_F])
         # Round-off adds to the errors estimated in the blocks.
-        floor = 4e-16 * (peak_u + model.k_gap * u_peak)
+        floor = 4e-16 * (peak_u + self.one.share * max(u_peak, self.loudest))
         u_error = SAFETY * float(control[relaxation.ERROR_U]) + floor
         f_error = SAFETY * float(control[relaxation.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f
         node_error = SAFETY * float(control[relaxation.ERROR_V]) + 4e-16 * (peak_u + u_peak)
-        if not self.problem.charge:
-            return np.array([[peak_u, peak_f, u_error, f_error]]), node_error, None
-        held = float(model.slow[-3]) * model.area0 * (u_peak + peak_u)
-        rounding = 4e-16 * held * (1.0 + int(self.course.counters[relaxation.STEPS]))
-        charge_error = SAFETY * float(control[relaxation.ERROR_Q]) + rounding
+        charge_error = None
+        if self.problem.charge:
+            charge_error = SAFETY * float(control[relaxation.ERROR_Q])
+            charge_error += self.one.charge_error(self.problem, self.course, peak_u)
         return np.array([[peak_u, peak_f, u_error, f_error]]), node_error, charge_error
 
     def run(self, t: FloatArray, left: BoolArray, rows: FloatArray) -> Run:
@@ -253,7 +241,7 @@ class March:
         evaluated = 2 * BLOCK * int(counters[relaxation.SWEEPS])
         run = Run(t, left, rows, Status.SUCCESS, evaluated, stats, self.state())
         run.gaps, run.node_error, run.charge_error = self.stated()
-        run.margin, run.by_layer = float(self.course.control[relaxation.MARGIN]), True
+        run.margin, run.by_layer = float(self.course.control[relaxation.MARGIN]), self.problem.scene.stack is not None
         return run
 
 
@@ -261,11 +249,12 @@ def _decade(rtol: float) -> float:
     return float(10.0 ** np.floor(np.log10(rtol)))
 
 
-def ready(problem: Problem, rtol: float) -> Followed | None:
-    """The scene prepared for this method, cached by decade; None where no polynomial represents 1/A well enough."""
+def ready(problem: Problem, rtol: float) -> Follower | None:
+    """The scene prepared for this method, cached by decade; None where it does not apply (see `forms`, `netforms`)."""
     decade, kept = _decade(rtol), problem.scene.prepared
     key = ("followed", decade, problem.charge, threading.get_ident())
-    one: Followed | None = kept_with(kept, key, MOST_FORMS, lambda: followed(problem, decade))
+    make = followed if problem.scene.stack is not None else finger
+    one: Follower | None = kept_with(kept, key, MOST_FORMS, partial(make, problem, decade))
     return one
 
 
