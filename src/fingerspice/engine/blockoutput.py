@@ -26,6 +26,7 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
     """Modes at fraction `at` > 0 of step i, along the parabolas through the drives."""
     form, room, found = c.form, c.room, c.spare[2, :3]
     drives = room.g.shape[0]
+    pulse = room.pulse[i] if form.fast >= 0 else 0.0
     for k in range(w.size):
         z = form.rates[r, k] * h * at
         moments(z, found)
@@ -37,6 +38,14 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
             linear += form.feed[r, k, t] * (4.0 * g1 - 3.0 * g0 - g2)
             square += form.feed[r, k, t] * 2.0 * (g0 - 2.0 * g1 + g2)
         w[k] = w[k] * math.exp(-z) + h * at * (whole * found[0] + at * (linear * found[1] + at * square * found[2]))
+        if pulse != 0.0:
+            # The parabola shows (1 - x) (1 - 2 x) of the part of N that is exp(-rate t).
+            shown = found[0] + at * (2.0 * at * found[2] - 3.0 * found[1])
+            true = math.exp(-z)
+            if k != form.fast:
+                gone = form.rates[r, form.fast] * h * at
+                true = (math.exp(-gone) - true) / (z - gone)
+            w[k] += form.feed[r, k, drives - 1] * pulse * h * at * (true - shown)
     zero, jump = crossing(room.u[i], room.u_within[MIDDLE, i], room.u[i + 1])
     if jump > 0.0:
         early, rest, since = max(0.5 - zero, 0.0), 1.0 - zero, max(at - zero, 0.0)
@@ -74,6 +83,24 @@ def _charge_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, u:
 
 
 @jit
+def _follow_fast(c: Course, r: int, since: float, source: float, w: FloatArray, g: FloatArray) -> None:
+    """Correct the mode that follows N at once, and the drive N, for what the parabola misses `since` (s) after a node.
+
+    The ends and the middle of a step need no correction. Between them the parabola misses a kink of the slope.
+    """
+    form, last = c.form, g.size - 1
+    rate = form.rates[r, form.fast]
+    start, shown = w[form.fast], g[last]
+    share = form.feed[r, form.fast, last] / rate * (1.0 - math.exp(-rate * since))
+    for _ in range(3):
+        xi = form.k_gap * source
+        for k in range(w.size):
+            xi += form.taps[r, 0, k] * w[k]
+        g[last] = bend_at(form, xi)
+        w[form.fast] = start + share * (g[last] - shown)
+
+
+@jit
 def _write_flows(
     c: Course, r: int, w: FloatArray, g: FloatArray, source: float, slope: float, xi: float, out: FloatArray
 ) -> None:  # fmt: skip
@@ -106,10 +133,14 @@ def _write_point(
     first, middle, last = (2.0 * at - 1.0) * (at - 1.0), 4.0 * at * (1.0 - at), at * (2.0 * at - 1.0)
     for t in range(g.size):
         g[t] = first * room.g[t, i] + middle * room.g_within[MIDDLE, t, i] + last * room.g[t, i + 1]
+    if form.fast >= 0:
+        g[g.size - 1] += room.pulse[i] * (math.exp(-form.rates[r, form.fast] * h * at) - first)
     for k in range(w.size):
         w[k] = room.w[k, i]
     if at > 0.0:
         _modes_at(c, r, h, i, at, w)
+        if form.fast >= 0:
+            _follow_fast(c, r, h * at, source, w, g)
     x_gap = 0.0
     for k in range(w.size):
         x_gap += form.taps[r, 0, k] * w[k]

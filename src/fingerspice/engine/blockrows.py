@@ -105,6 +105,21 @@ def sign_as(n: int, x: FloatArray, out: FloatArray) -> None:
 
 
 @jit_rows
+def pulse_rows(
+    n: int, h: float, kappa: float, q0: float, faded: float, z: FloatArray, slope: FloatArray, bend: FloatArray,
+    middle: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Size of the part exp(-faded x) of N in each step, x from 0 to 1, where xi starts with this slope, into `out`.
+
+    N is given at the ends and in the middle, where that part has decayed.
+    """
+    for i in range(n):
+        e = -z[i] / (q0 * (q0 + z[i]))
+        true = h * slope[i] * e / (1.0 + kappa * e)
+        out[i] = (4.0 * middle[i] - 3.0 * bend[i] - bend[i + 1] - true) / (faded - 3.0)
+
+
+@jit_rows
 def _doubled(n: int, decay: float, by: int, x: FloatArray, out: FloatArray) -> None:
     """Decayed sums over twice as many increments: each sum plus that of the `by` increments before it."""
     for i in range(n):

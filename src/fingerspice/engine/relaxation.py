@@ -14,6 +14,10 @@ tap. 1/A and N are polynomials in |xi|, and what is said here of u holds for xi.
 1/A has a kink where the gap voltage is 0. In a step across it the parabola misses kappa times |u| less the parabola of
 |u|, with kappa = dg/d|u|. The response to this difference is known in closed form, and is added.
 
+In a network a mode may decay within a small part of a step. After each sample, where the slope of the source jumps, N
+then has a part a exp(-rate t) that no parabola shows. Its size a follows from the slope of N at the start of the step,
+and the response to it is known in closed form, too.
+
 The error is measured at 1/4 and 3/4 of every step, where the interpolation error of the parabola gives the quadrature
 error (Boole's rule against Simpson's). If it is too large, the block is repeated with steps half as long.
 """
@@ -32,6 +36,7 @@ from fingerspice.engine.blockrows import (
     add,
     add_kinks,
     add_three,
+    add_two,
     area_rows,
     both_ends,
     change_of,
@@ -44,6 +49,7 @@ from fingerspice.engine.blockrows import (
     of_end,
     of_step,
     product_of,
+    pulse_rows,
     recursion,
     scaled,
     sign_as,
@@ -117,6 +123,12 @@ class Form(NamedTuple):
         N (V m^2) for positive xi, as `area`; no entry in a stack. In a network N is the last drive, which has no tap.
     bent : ndarray, shape (T - 1,)
         Share of N in each tap; no entry in a stack.
+    fast : int
+        The mode that decays within a small part of a step and has the largest share in kappa; -1 if there is none.
+    faded : ndarray, shape (r, LEVELS)
+        Its rate times the step length; 0 where that is too small.
+    pulse, pulse_within : ndarray, shape (r, LEVELS, m) and (r, LEVELS, 3, P)
+        What a part exp(-rate t) of N adds to the modes and to the projections, in place of the parabola through it.
     """
 
     mobile: bool
@@ -143,6 +155,10 @@ class Form(NamedTuple):
     kappa: float
     bend: FloatArray
     bent: FloatArray
+    fast: int
+    faded: FloatArray
+    pulse: FloatArray
+    pulse_within: FloatArray
 
 
 class Shown(NamedTuple):
@@ -217,6 +233,7 @@ class Room(NamedTuple):
     before: FloatArray
     crossed: FloatArray
     jumps: FloatArray
+    pulse: FloatArray
 
 
 def new_room(modes: int, drives: int, projections: int) -> Room:
@@ -225,7 +242,7 @@ def new_room(modes: int, drives: int, projections: int) -> Room:
     return Room(
         np.zeros(n), np.zeros(n), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n),
         np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)),
-        np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
+        np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
     )  # fmt: skip
 
 
@@ -273,6 +290,8 @@ def _project(form: Form, room: Room, r: int, level: int, place: int, n: int, p: 
         add(n, c[0], room.w[0], x)
     modes_into(n, 2, c, room.w, x)
     drives_into(n, form.within_g[r, level, place, p], room.g, room.g_within[MIDDLE], x)
+    if form.faded[r, level] > 0.0:
+        add(n, form.pulse_within[r, level, place, p], room.pulse, x)
 
 
 @jit_within
@@ -330,6 +349,20 @@ def _kinks(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
 
 
 @jit_within
+def _pulses(form: Form, room: Room, r: int, level: int, h: float, n: int) -> None:
+    """The size a of the fast part of N in each step, into `room.pulse`, from a look at the ends of the steps."""
+    last, xi = room.g.shape[0] - 1, room.slope
+    both_ends(n, -form.k_gap / h, form.k_gap / h, room.s, xi)
+    for k in range(form.rates.shape[1]):
+        share = form.taps[r, 0, k]
+        add_two(n, share * form.gain[r, k], room.s, -share * form.rates[r, k], room.w[k], xi)
+        for t in range(last + 1):
+            add(n, share * form.feed[r, k, t], room.g[t], xi)
+    q0, faded = form.q0[r], form.faded[r, level]
+    pulse_rows(n, h, form.kappa, q0, faded, room.z, xi, room.g[last], room.g_within[MIDDLE, last], room.pulse)
+
+
+@jit_within
 def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int, tol: float) -> tuple[
     float, float, int
 ]:  # fmt: skip
@@ -352,11 +385,15 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
     for i in range(n):
         room.u_within[MIDDLE, i] = 0.5 * (room.u[i] + room.u[i + 1])
     last, margin = math.inf, 1.0
+    fades = form.faded[r, level] > 0.0
+    scaled(n, 0.0, room.s, room.pulse)
     for sweep in range(_MOST_SWEEPS):
         for k in range(modes):
             own = room.inc[k, PAD:]
             both_ends(n, form.source[r, level, k, 0], form.source[r, level, k, 1], room.s, own)
             drives_into(n, form.drive[r, level, k], room.g, room.g_within[MIDDLE], own)
+            if fades:
+                add(n, form.pulse[r, level, k], room.pulse, own)
         if sweep >= _KINKED and crosses(n, room.u):
             _kinks(form, room, r, level, h, kink, n)
         for k in range(modes):
@@ -364,6 +401,8 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
         newton = FIRST_NEWTON if sweep == 0 else _NEWTON
         margin = _look(form, room, r, level, MIDDLE, n, newton)
         margin = min(margin, look_at_ends(form, room, r, n + 1, newton))
+        if fades:
+            _pulses(form, room, r, level, h, n)
         if sweep > 0 and not margin > LEAST_MARGIN:
             return math.inf, margin, sweep
         if not abs(room.u[n]) < math.inf:
@@ -400,6 +439,9 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
             add_three(
                 n, -weight[0], room.g[t], -weight[1], room.g_within[MIDDLE, t], -weight[2], room.g[t, 1:], off
             )  # fmt: skip
+            if t + 1 == room.g.shape[0] and form.faded[r, level] > 0.0:
+                # What the parabola shows of the fast part is known, and is corrected in the step.
+                add(n, weight[0], room.pulse, off)
             if crossing:
                 kink_at(n, kink[t], PLACES[place], room.u, room.u_within[MIDDLE], room.end[1 + t], off)
             for k in range(form.rates.shape[1]):

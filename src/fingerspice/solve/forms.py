@@ -29,6 +29,8 @@ from fingerspice.solve.track import Prepared, as_recorded, on_branch, prepare_sy
 
 # Truncation error allowed for the polynomial of 1/A, relative to the error asked for.
 AREA_SHARE = 0.02
+# Fewest time constants of a step in which a fast mode has decayed, so that nothing of it is left in the middle.
+FADED = 30.0
 # Matrix from values at Chebyshev nodes to the Chebyshev coefficients of the antiderivative of their interpolant.
 _POINTS = 40
 _AT = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
@@ -88,7 +90,7 @@ def form_of(system: System, area: FloatArray, spacing: float) -> Form:
 def weighted(
     mobile: bool, q0: FloatArray, rates: FloatArray, gain: FloatArray, feed: FloatArray, taps: FloatArray,
     tap_s: FloatArray, spacing: float, area: FloatArray, scale: float, shift: float, k_gap: float, area0: float,
-    kappa: float, bend: FloatArray, bent: FloatArray,
+    kappa: float, bend: FloatArray, bent: FloatArray, fast: int = -1,
 ) -> Form:  # fmt: skip
     """The form with these parts (see `Form`) and the weights that follow from them for a sample spacing (s)."""
     h = spacing / 2.0 ** np.arange(LEVELS)[:, None]
@@ -106,6 +108,11 @@ def weighted(
     inner, inner_s, inner_g = (
         np.ascontiguousarray(np.stack(x, axis=2)) for x in zip(*map(within, PLACES), strict=True)
     )
+    faded = np.zeros(z.shape[:2]) if fast < 0 else np.where(z[..., fast] > FADED, z[..., fast], 0.0)
+    # To the modes at fractions of a step, from the part exp(-faded x) of the last drive.
+    passed = [_pulse(z, faded, at) for at in (1.0, *PLACES)]
+    pulse, *pulses = (feed[:, None, :, -1] * h * one for one in passed) if faded.any() else [np.zeros(z.shape)] * 4
+    pulse_within = np.stack([np.einsum("rpk,rsk->rsp", taps, one) for one in pulses], axis=2)
     five = (0.0, 0.25, 0.5, 0.75, 1.0)
     quarters, early = (weights(z, five, until)[..., None, [1, 3]] for until in (1.0, 0.5))
     return Form(
@@ -114,7 +121,17 @@ def weighted(
         np.ascontiguousarray(feed), np.ascontiguousarray(taps), tap_s, inner, inner_s, inner_g,
         np.ascontiguousarray(weights(z, (0.0, 0.5, 1.0))[..., 1:]), drives * quarters,
         np.einsum("rk,rsktj->rstj", taps[:, 0], drives * early), area, scale, shift, k_gap, area0, kappa, bend, bent,
+        fast, faded, pulse, pulse_within,
     )  # fmt: skip
+
+
+def _pulse(z: FloatArray, faded: FloatArray, at: float) -> FloatArray:
+    """Integral of exp(-z (at - x)) times exp(-faded x) less (1 - x) (1 - 2 x), from 0 to `at`; 0 where `faded` is."""
+    gone = np.exp(-z * at)
+    rate = faded[..., None]
+    apart = np.where(z == rate, 1.0, z - rate)
+    true = np.where(z == rate, at * gone, (np.exp(-rate * at) - gone) / apart)
+    return np.asarray(np.where(rate > 0.0, true - weights(z, (0.0, 0.5, 1.0), at)[..., 0], 0.0))
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from fingerspice.engine.relaxation import Form
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area, inverse_area_array
 from fingerspice.results.outcome import State
-from fingerspice.solve.forms import AREA_SHARE, Follower, weighted
+from fingerspice.solve.forms import AREA_SHARE, FADED, Follower, weighted
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import Scene
 from fingerspice.waveforms.recorded import as_samples
@@ -120,7 +120,14 @@ class Finger(Follower):
         return weighted(
             False, np.array([self.q0]), self.rates[None], self.gain[None], self.feed[None], self.taps[None], self.tap_s,
             spacing, self.area, self.scale, -1.0, float(self.tap_s[0]), 1.0 / self.q0, self.kappa, self.bend, self.bent,
+            self._fast(spacing),
         )  # fmt: skip
+
+    def _fast(self, spacing: float) -> int:
+        """The mode with the largest share in kappa of those that decay within a small part of a spacing (s), or -1."""
+        n = self.absorbed.size
+        shares = np.where(self.rates[:n] * spacing > FADED, np.abs(self.taps[0, :n] * self.absorbed), 0.0)
+        return int(np.argmax(shares)) if shares.max(initial=0.0) > 0.0 else -1
 
     @cached_property
     def _model(self) -> Model:
@@ -132,7 +139,8 @@ class Finger(Follower):
         )  # fmt: skip
 
     def _bend(self, xi: float) -> float:
-        return float(np.copysign(polyval(abs(xi) * self.scale - 1.0, self.bend), xi))
+        value = float(polyval(abs(xi) * self.scale - 1.0, self.bend))
+        return value if xi >= 0.0 else -value
 
     def course(self, problem: Problem, form: Form) -> Course:
         start, n = problem.initial, self.follow.shape[0]

@@ -12,6 +12,7 @@ import threading
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.refined import ClosedForm
 from fingerspice.solve.forms import Follower, followed
+from fingerspice.solve.marching import solve as solve_ordinary
 from fingerspice.solve.netforms import finger, recording_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Progress, Run, excess_of, kept_with
@@ -39,6 +41,8 @@ LEAST_PEAK = 1e-3
 # Share of the blocks' allowed error in the first and in the second attempt at the whole run: where errors decay slowly
 # and add up, a later piece cannot make up for errors of the earlier ones.
 BEGINNINGS = (1.0, 0.03)
+# Error allowed in the piece that the ordinary engine integrates, relative to the error asked for.
+LED_SHARE = 0.1
 # Number of forms cached with a scene, of up to 0.2 MB each: one for each tolerance, sample spacing and thread.
 MOST_FORMS = 16
 
@@ -53,12 +57,16 @@ class Piece:
         Time of the first sample and distance of the samples, s.
     first, last : int
         Numbers of the first and the last sample; both 0 for a single step between two times that are no samples.
+    led : bool
+        Whether the ordinary engine integrates it: where a run of a network starts, the source may jump, after which
+        fast modes decay that no step of a sample resolves.
     """
 
     start: float
     spacing: float
     first: int = 0
     last: int = 0
+    led: bool = False
 
     @property
     def stop(self) -> float:
@@ -94,11 +102,16 @@ def pieces_of(problem: Problem) -> list[Piece] | None:
     ):
         # In most of the run the source is one long line, of which the other methods need few steps.
         return None
+    led, begin, end = problem.scene.stack is None, wave.start + first * spacing, wave.start + last * spacing
+    early = begin - t0 > 1e-6 * spacing
     edges = [first, *range((first // PIECE + 1) * PIECE, last, PIECE), last]
-    out = [Piece(wave.start + a * spacing, spacing, a, b) for a, b in itertools.pairwise(edges)]
-    begin, end = out[0].start, wave.start + last * spacing
-    if begin - t0 > 1e-6 * spacing:
+    if led and not early:
+        edges.insert(1, first + 1)
+    out = [Piece(wave.start + a * spacing, spacing, a, b) for a, b in itertools.pairwise(edges) if a < b]
+    if early:
         out.insert(0, Piece(t0, begin - t0))
+    if led:
+        out[0] = replace(out[0], led=True)
     if t1 - end > 1e-6 * spacing:
         out.append(Piece(end, t1 - end))
     return out
@@ -121,11 +134,15 @@ class March:
         Factor of the error allowed in a block, reduced each time that a piece is rejected.
     loudest : float
         Largest |U| of the source so far, V.
+    led : list of float
+        Stated errors of the piece that the ordinary engine has integrated: gap voltage (V), force (N), nodes (V) and
+        charge (C).
     """
 
     def __init__(self, problem: Problem, one: Follower, rtol: float, share: float = 1.0) -> None:
         self.problem, self.one, self.rtol, self.share = problem, one, rtol, share
         self.t, self.loudest, self.u_last, self.spacing = problem.t_start, 0.0, 0.0, 0.0
+        self.led = [0.0] * 4
         self.width = one.width
         self.course = one.course(problem, self._form(1.0 / self.wave.rate))
         held = float(np.abs(problem.initial.y).max(initial=0.0))
@@ -146,6 +163,8 @@ class March:
     def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
         """Integrate a piece with the source's `values` (V), and write the outputs before its end as rows of `out`."""
         one, control = self.one, self.course.control
+        if piece.led:
+            return self._lead(piece, values, t_out, out)
         if piece.spacing != self.spacing:
             # The source may jump where the spacing changes, and does so at the start of the run.
             self.course, self.spacing = self.course._replace(form=self._form(piece.spacing)), piece.spacing
@@ -173,6 +192,25 @@ class March:
             self.share *= min(0.3, 0.5 / excess)
         return Outcome.NOT_MET
 
+    def _lead(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
+        """Integrate a piece by the ordinary engine, and take over its state."""
+        count = int(np.searchsorted(t_out, piece.stop - 1e-9 * piece.spacing))
+        problem = replace(self.problem, t_start=piece.start, t_stop=piece.stop, first=piece.start)
+        run = solve_ordinary(
+            problem, LED_SHARE * self.rtol, t_out[:count], np.zeros(count, bool), repeat=False
+        )  # fmt: skip
+        if run.status is not Status.SUCCESS:
+            return Outcome.LOST
+        out[:, :count] = run.rows.T[: self.width]
+        self.course = self.one.course(replace(self.problem, initial=run.state), self.course.form)
+        self.course.counters[relaxation.OUTPUT] = count
+        control, error, (gap,) = self.course.control, run.error, run.gaps
+        control[relaxation.PEAK_U], control[relaxation.PEAK_F] = gap[0], gap[1]
+        self.led = [error.u_gap, error.f_el, error.v_nodes or 0.0, error.q_source or 0.0]
+        self.loudest, self.u_last = float(np.abs(values).max()), float(values[-1])
+        self.t, self.spacing = piece.stop, 0.0
+        return Outcome.MET
+
     def _force(self, u_gap: float) -> float:
         """Force (N) at a gap voltage (V), with the area at 0 V."""
         return self.one.shown.stress * u_gap**2 / self.one.q_rest
@@ -189,7 +227,7 @@ class March:
         for x, kept in zip(self._parts(), mark, strict=True):
             x[:] = kept
 
-    def stand(self, numbers: dict[str, float], arrays: list[list[float]]) -> None:
+    def stand(self, numbers: dict[str, Any], arrays: list[list[float]]) -> None:
         """Restore the state of another march through the same run, from its attributes and its `mark`."""
         for name, value in numbers.items():
             setattr(self, name, value)
@@ -225,12 +263,12 @@ class March:
         peak_u, peak_f = float(control[relaxation.PEAK_U]), float(control[relaxation.PEAK_F])
         # Round-off adds to the errors estimated in the blocks.
         floor = 4e-16 * (peak_u + self.one.share * max(u_peak, self.loudest))
-        u_error = SAFETY * float(control[relaxation.ERROR_U]) + floor
-        f_error = SAFETY * float(control[relaxation.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f
-        node_error = SAFETY * float(control[relaxation.ERROR_V]) + 4e-16 * (peak_u + u_peak)
+        u_error = SAFETY * float(control[relaxation.ERROR_U]) + floor + self.led[0]
+        f_error = SAFETY * float(control[relaxation.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f + self.led[1]
+        node_error = SAFETY * float(control[relaxation.ERROR_V]) + 4e-16 * (peak_u + u_peak) + self.led[2]
         charge_error = None
         if self.problem.charge:
-            charge_error = SAFETY * float(control[relaxation.ERROR_Q])
+            charge_error = SAFETY * float(control[relaxation.ERROR_Q]) + self.led[3]
             charge_error += self.one.charge_error(self.problem, self.course, peak_u)
         return np.array([[peak_u, peak_f, u_error, f_error]]), node_error, charge_error
 

@@ -100,7 +100,14 @@ class BySamples:
 
     def mark(self) -> Mark:
         m = self.march
-        numbers = {"t": m.t, "share": m.share, "loudest": m.loudest, "u_last": m.u_last, "spacing": m.spacing}
+        numbers: dict[str, Any] = {
+            "t": m.t,
+            "share": m.share,
+            "loudest": m.loudest,
+            "u_last": m.u_last,
+            "spacing": m.spacing,
+        }
+        numbers["led"] = m.led
         arrays = [x.tolist() for x in m.mark()]
         return {"written": self.written, "place": self.place, "numbers": numbers, "arrays": arrays}
 
