@@ -75,15 +75,12 @@ def _waveform(rng: random.Random, kind: str, f: float, volts: float) -> fs.Wavef
     return fs.PWL((0.0, t[0], t[1], t[1], t[2], t[3]), (0.0, *levels[:3], levels[3], levels[3]))
 
 
-def draw(number: int) -> Network:
-    """Network of a number."""
-    rng = random.Random(f"stated errors {number}")
-    around, source = AROUND[number % 4], SOURCES[number // 4 % 4]
-    law, fingers = rng.choice(("local", "mobile")), rng.choice((1, 1, 2, 3))
-    slow, volts, f = rng.random() < 0.15, rng.uniform(30.0, 160.0), 10.0 ** rng.uniform(1.7, 3.8)
+def surrounded(
+    rng: random.Random, around: str, fingers: int = 1, slow: bool = False, row: bool = False
+) -> tuple[str, list[str]]:
+    """Node of the source, and lines of a deck: fingers with random layers, and what is around them."""
     ground = "body" if "floating" in around else "0"
     # Where the fingers stand one behind the other, each has a node with a capacitance to ground below it.
-    row = fingers > 1 and rng.random() < 0.3
     ends = ["drive", *(f"n{i}" for i in range(1, fingers)), ground] if row else ["drive", ground]
     lines = [f"C{node} {node} 0 {rng.uniform(20.0, 200.0):.1f}p" for node in ends[1:-1]]
     for i in range(fingers):
@@ -95,7 +92,17 @@ def draw(number: int) -> Network:
         lines += [f"Rload drive far {10.0 ** rng.uniform(4.0, 6.0):.4g}", f"Cload far 0 {rng.uniform(0.1, 2.0):.2f}n"]
     if "floating" in around:
         lines += [f"Rbody body earth {10.0 ** rng.uniform(3.0, 5.0):.4g}", f"Cbody earth 0 {rng.uniform(80, 400):.1f}p"]
-    entry = "amp" if "amplifier" in around else "drive"
+    return "amp" if "amplifier" in around else "drive", lines
+
+
+def draw(number: int) -> Network:
+    """Network of a number."""
+    rng = random.Random(f"stated errors {number}")
+    around, source = AROUND[number % 4], SOURCES[number // 4 % 4]
+    law, fingers = rng.choice(("local", "mobile")), rng.choice((1, 1, 2, 3))
+    slow, volts, f = rng.random() < 0.15, rng.uniform(30.0, 160.0), 10.0 ** rng.uniform(1.7, 3.8)
+    row = fingers > 1 and rng.random() < 0.3
+    entry, lines = surrounded(rng, around, fingers, slow, row)
     text = "\n".join(
         [f"network {number}", f"Vdrive {entry} 0 0", *lines, f".tran {0.01 / f:g} {2.0 / f:g} uic", ".end\n"]
     )

@@ -1,10 +1,12 @@
 """Statistics on random recordings: fraction of runs whose stated error covers the true error, and their ratio.
 
 A recording is noise of a random band at a random rate, with or without an offset; a circuit is a stack of random
-layers, with either charge law. It is run at each of `RTOLS`, and once at `TIGHT` by the `exponential` method, which
+layers, with either charge law, or with `--networks` such a finger behind an amplifier, beside a load or on a floating
+body, with the local law. It is run at each of `RTOLS`, and once at `TIGHT` by the `exponential` method, which
 gives the true errors of gap voltage, force, charge and node voltages.
 
-Run: python tests/recording_errors.py [--recordings 100] [--first 0]. A recording is determined by its number alone.
+Run: python tests/recording_errors.py [--recordings 100] [--first 0] [--networks].
+A recording is determined by its number alone.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import fingerspice as fs
+from network_errors import AROUND, surrounded
 from random_decks import layers
 
 RTOLS, TIGHT = (1e-3, 1e-4, 1e-6, 1e-8), 1e-12
@@ -68,16 +71,20 @@ def noise(seed: int, count: int, rate: float, low: float, high: float) -> np.nda
     return np.asarray(values / np.abs(values).max())
 
 
-def draw(number: int, count: int = 600) -> Recording:
+def draw(number: int, count: int = 600, network: bool = False) -> Recording:
     """Recording of a number."""
     rng = random.Random(f"recordings {number}")
     law, rate = rng.choice(("local", "mobile")), rng.choice((2e3, 8e3, 48e3, 48e3, 192e3))
     high = rate * rng.choice((0.02, 0.1, 0.4))
     volts, offset = rng.uniform(30.0, 200.0), rng.choice((0.0, 0.0, 0.5))
-    text = ["recording", "Vdrive drive 0 0", *layers(rng, False, "drive", "0", "area"), ".end\n"]
+    entry, lines, around = "drive", layers(rng, False, "drive", "0", "area"), ""
+    if network:
+        law, around = "local", rng.choice(AROUND)
+        entry, lines = surrounded(rng, around)
+    text = ["recording", f"Vdrive {entry} 0 0", *lines, ".end\n"]
     values = volts * (offset + noise(number, count, rate, 0.1 * high, high))
     start = rng.choice((0.0, 0.0, 2.3 / rate))
-    kind = f"{rate / 1e3:g} kHz, up to {high:g} Hz, {volts:.0f} V, offset {offset:g}, {law}"
+    kind = f"{rate / 1e3:g} kHz, up to {high:g} Hz, {volts:.0f} V, offset {offset:g}, {law} {around}"
     return Recording(number, kind, fs.parse_netlist("\n".join(text)), fs.Samples(values, rate, start), law)
 
 
@@ -120,11 +127,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--recordings", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--networks", action="store_true")
     given = parser.parse_args()
     found: list[Beside] = []
     not_followed = 0
     for number in range(given.first, given.first + given.recordings):
-        one = judge(draw(number))
+        one = judge(draw(number, network=given.networks))
         not_followed += not one
         found += one
         for x in one:

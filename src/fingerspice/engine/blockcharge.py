@@ -17,21 +17,10 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
+from fingerspice.engine.blockforms import BLOCK, COLLECTED, ERROR_Q, MIDDLE, PEAK_Q, PLACES, Form, Room, Shown, Z
 from fingerspice.engine.blockrows import area_rows, crossing, modes_into, scaled
 from fingerspice.engine.model import Model
-from fingerspice.engine.relaxation import (
-    BLOCK,
-    COLLECTED,
-    ERROR_Q,
-    MIDDLE,
-    PEAK_Q,
-    PLACES,
-    Form,
-    Room,
-    Shown,
-    Z,
-    project_for_charge,
-)
+from fingerspice.engine.relaxation import project_for_charge
 
 
 class Charges(NamedTuple):
@@ -220,7 +209,7 @@ def inverse_area_at(form: Form, u: float) -> tuple[float, float]:
 
 @jit
 def bend_at(form: Form, xi: float) -> float:
-    """N of `relaxation.Form`, V m^2."""
+    """N of `blockforms.Form`, V m^2."""
     x, value = abs(xi) * form.scale + form.shift, 0.0
     for j in range(form.bend.size - 1, -1, -1):
         value = value * x + form.bend[j]

@@ -16,8 +16,9 @@ from fingerspice.engine.blockcharge import (
     moved_with,
     steepness,
 )
+from fingerspice.engine.blockforms import MIDDLE, OUTPUT, REFERENCE, U_GAP, Z
 from fingerspice.engine.blockrows import add, crossing, modes_into, scaled
-from fingerspice.engine.relaxation import FIRST_NEWTON, MIDDLE, OUTPUT, REFERENCE, U_GAP, Z, look_at_ends
+from fingerspice.engine.relaxation import FIRST_NEWTON, look_at_ends
 from fingerspice.numerics.moments import moments
 
 
@@ -27,6 +28,8 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
     form, room, found = c.form, c.room, c.spare[2, :3]
     drives = room.g.shape[0]
     pulse = room.pulse[i] if form.fast >= 0 else 0.0
+    half = math.exp(-0.5 * form.rates[r, max(form.fast, 0)] * h)
+    whole_step = half * half
     for k in range(w.size):
         z = form.rates[r, k] * h * at
         moments(z, found)
@@ -39,8 +42,10 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
             square += form.feed[r, k, t] * 2.0 * (g0 - 2.0 * g1 + g2)
         w[k] = w[k] * math.exp(-z) + h * at * (whole * found[0] + at * (linear * found[1] + at * square * found[2]))
         if pulse != 0.0:
-            # The parabola shows (1 - x) (1 - 2 x) of the part of N that is exp(-rate t).
-            shown = found[0] + at * (2.0 * at * found[2] - 3.0 * found[1])
+            # The parabola through the part of N that is exp(-rate t), and its response.
+            shown = found[0] + at * (
+                (4.0 * half - 3.0 - whole_step) * found[1] + 2.0 * at * (1.0 - 2.0 * half + whole_step) * found[2]
+            )
             true = math.exp(-z)
             if k != form.fast:
                 gone = form.rates[r, form.fast] * h * at
@@ -134,7 +139,9 @@ def _write_point(
     for t in range(g.size):
         g[t] = first * room.g[t, i] + middle * room.g_within[MIDDLE, t, i] + last * room.g[t, i + 1]
     if form.fast >= 0:
-        g[g.size - 1] += room.pulse[i] * (math.exp(-form.rates[r, form.fast] * h * at) - first)
+        faded = form.rates[r, form.fast] * h
+        parabola = first + middle * math.exp(-0.5 * faded) + last * math.exp(-faded)
+        g[g.size - 1] += room.pulse[i] * (math.exp(-faded * at) - parabola)
     for k in range(w.size):
         w[k] = room.w[k, i]
     if at > 0.0:

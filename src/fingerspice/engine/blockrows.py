@@ -5,6 +5,8 @@ Each is a function of its own, so that the compiler turns it into vector instruc
 
 from __future__ import annotations
 
+import math
+
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_inline, jit_rows, jit_within
 
@@ -111,12 +113,13 @@ def pulse_rows(
 ) -> None:  # fmt: skip
     """Size of the part exp(-faded x) of N in each step, x from 0 to 1, where xi starts with this slope, into `out`.
 
-    N is given at the ends and in the middle, where that part has decayed.
+    N is given at the ends and in the middle; the rest of it is a parabola.
     """
+    over = faded - 3.0 + 4.0 * math.exp(-0.5 * faded) - math.exp(-faded)
     for i in range(n):
         e = -z[i] / (q0 * (q0 + z[i]))
         true = h * slope[i] * e / (1.0 + kappa * e)
-        out[i] = (4.0 * middle[i] - 3.0 * bend[i] - bend[i + 1] - true) / (faded - 3.0)
+        out[i] = (4.0 * middle[i] - 3.0 * bend[i] - bend[i + 1] - true) / over
 
 
 @jit_rows

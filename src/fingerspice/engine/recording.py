@@ -7,19 +7,14 @@ import math
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
 from fingerspice.engine.blockcharge import Course, charge_block, steepness
-from fingerspice.engine.blockoutput import write_block
-from fingerspice.engine.blockrows import add, add_two, area_rows, modes_into, recursion, scaled
-from fingerspice.engine.model import ramp
-from fingerspice.engine.relaxation import (
+from fingerspice.engine.blockforms import (
     BLOCK,
     ERROR_F,
     ERROR_Q,
     ERROR_U,
     ERROR_V,
-    FIRST_NEWTON,
     FIRST_QUARTER,
     LAST_QUARTER,
-    LEAST_MARGIN,
     LEVEL,
     LEVELS,
     MARGIN,
@@ -27,15 +22,15 @@ from fingerspice.engine.relaxation import (
     PEAK_U,
     REFERENCE,
     REFUSED,
-    SPARE,
     STEPS,
     SWEEPS,
     U_GAP,
     Form,
-    look_at_ends,
-    misfit,
-    relax,
 )
+from fingerspice.engine.blockoutput import write_block
+from fingerspice.engine.blockrows import add, add_two, area_rows, modes_into, recursion, scaled
+from fingerspice.engine.model import ramp
+from fingerspice.engine.relaxation import FIRST_NEWTON, LEAST_MARGIN, SPARE, look_at_ends, misfit, relax
 
 # Codes returned by `march`.
 DONE, NOT_CLOSED, TOO_COARSE = range(3)

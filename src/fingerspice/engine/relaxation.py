@@ -25,12 +25,12 @@ error (Boole's rule against Simpson's). If it is too large, the block is repeate
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_within
+from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, PLACES, Form, Room
 from fingerspice.engine.blockrows import (
     PAD,
     add,
@@ -55,13 +55,6 @@ from fingerspice.engine.blockrows import (
     sign_as,
 )
 
-# Number of steps in a block, and of step lengths: that of a sample and its halvings.
-BLOCK, LEVELS = 512, 7
-# Largest degree of the polynomial for 1/A.
-MOST_DEGREE = 28
-# Places of a step besides its ends: its middle, and the two at which the error is measured.
-PLACES = (0.5, 0.25, 0.75)
-MIDDLE, FIRST_QUARTER, LAST_QUARTER = 0, 1, 2
 # Weights of the parabola through 0, 1/2 and 1 at these places.
 PARABOLA = np.array([[0.0, 1.0, 0.0], [0.375, 0.75, -0.125], [-0.125, 0.75, 0.375]])
 # Most sweeps of a block, and the fraction of the error allowed that the last one may leave.
@@ -76,174 +69,6 @@ FIRST_NEWTON, _NEWTON, LEAST_MARGIN = 6, 2, 0.2
 # If the error is below this fraction of the one allowed, the next block has steps twice as long, whose error is sixteen
 # times as large.
 SPARE = 0.02
-
-
-# Entries of `control`: halvings of a sample, reference, and as in `engine.readout`.
-LEVEL, REFERENCE, PEAK_U, PEAK_F, ERROR_U, ERROR_F, MARGIN, Z, PEAK_Q, ERROR_Q, COLLECTED, U_GAP, ERROR_V = range(13)
-N_CONTROL = 13
-# Entries of `counters`.
-OUTPUT, STEPS, REFUSED, SWEEPS = range(4)
-N_COUNTERS = 4
-
-
-class Form(NamedTuple):
-    """A stack around reference areas, and the weights of steps of one length and its halves.
-
-    r references, `LEVELS` step lengths, m modes, T drives g_t, and P projections at the ends and `PLACES` of a step:
-    the gap voltage (under `mobile` its modes' part alone), the taps, and what the slowest layer stores and leaks by
-    (see `engine.recording`).
-
-    Attributes
-    ----------
-    mobile : bool
-        Charge law. Then the last drive is (1/q - 1/q0) U.
-    q0 : ndarray, shape (r,)
-    decay : ndarray, shape (r, LEVELS, m)
-        Over a step.
-    source : ndarray, shape (r, LEVELS, m, 2)
-        Contribution of the source's values at both ends to a mode.
-    drive : ndarray, shape (r, LEVELS, m, T, 3)
-        Contribution of the drives at 0, 1/2 and 1 to a mode.
-    feed : ndarray, shape (r, m, T)
-    taps, tap_s : ndarray, shape (r, P, m) and (P,)
-        Projections of modes and source.
-    within, within_s, within_g : ndarray, shape (r, LEVELS, 3, P, m), (r, LEVELS, 3, P, 2) and (r, LEVELS, 3, P, T, 3)
-        The same at `PLACES`, from the modes at the start of a step, the source at both ends, and the drives.
-    share : ndarray, shape (r, LEVELS, m, 2)
-        The weights of 1/2 and 1 in the integral of a parabola over a step, in units of its length.
-    defect : ndarray, shape (r, LEVELS, m, T, 2)
-        Contribution of the interpolation errors at the quarters to the error of a mode.
-    early : ndarray, shape (r, LEVELS, T, 2)
-        Their contribution to the error of the gap voltage in the middle of the step.
-    area : ndarray, shape (4 k + 1,)
-        1/A as a polynomial in `scale` |u| + `shift`.
-    kappa : float
-        1/m^2; 0 in a stack.
-    bend : ndarray, shape (4 l + 1,)
-        N (V m^2) for positive xi, as `area`; no entry in a stack. In a network N is the last drive, which has no tap.
-    bent : ndarray, shape (T - 1,)
-        Share of N in each tap; no entry in a stack.
-    fast : int
-        The mode that decays within a small part of a step and has the largest share in kappa; -1 if there is none.
-    faded : ndarray, shape (r, LEVELS)
-        Its rate times the step length; 0 where that is too small.
-    pulse, pulse_within : ndarray, shape (r, LEVELS, m) and (r, LEVELS, 3, P)
-        What a part exp(-rate t) of N adds to the modes and to the projections, in place of the parabola through it.
-    """
-
-    mobile: bool
-    q0: FloatArray
-    rates: FloatArray
-    gain: FloatArray
-    decay: FloatArray
-    source: FloatArray
-    drive: FloatArray
-    feed: FloatArray
-    taps: FloatArray
-    tap_s: FloatArray
-    within: FloatArray
-    within_s: FloatArray
-    within_g: FloatArray
-    share: FloatArray
-    defect: FloatArray
-    early: FloatArray
-    area: FloatArray
-    scale: float
-    shift: float
-    k_gap: float
-    area0: float
-    kappa: float
-    bend: FloatArray
-    bent: FloatArray
-    fast: int
-    faded: FloatArray
-    pulse: FloatArray
-    pulse_within: FloatArray
-
-
-class Shown(NamedTuple):
-    """Constants of the outputs.
-
-    Attributes
-    ----------
-    columns : ndarray, shape (r, C, m)
-        Recorded voltages over k U.
-    k : ndarray, shape (C,)
-    node : ndarray, shape (r, n_node, m)
-        Voltages of the nodes, as `columns`.
-    slow : ndarray, shape (r, m)
-        The slowest layer's share of each mode (see `Model.slow`).
-    live, project : ndarray, shape (r, m, m)
-        From modes to live voltages and back.
-    stress : float
-        Force per area and squared gap voltage, Pa/V^2.
-    kink : ndarray, shape (T,)
-        Derivative by |u_gap| at 0 V of the factor of each drive.
-    area_kink : float
-        dA/d|u| at 0 V, m^2/V.
-    moved : ndarray
-        c r G(|u|) under `local`, a polynomial as `Form.area`, C.
-    charge : bool
-        Whether the charge follows from that, as in a stack.
-    bend : ndarray, shape (C,)
-        Share of N in each column; no entry in a stack.
-    flows : int
-        Number of the last columns that are charges of a network, whose rates are outputs, too.
-    capacitance : float
-        Sum of all capacitances of the network, F, where there are such columns.
-    moves : ndarray, shape (2,)
-        Largest error of a node's voltage (V), and of such a charge (C), that the area causes, per volt of the gap
-        voltage's error.
-    """
-
-    columns: FloatArray
-    k: FloatArray
-    node: FloatArray
-    slow: FloatArray
-    live: FloatArray
-    project: FloatArray
-    stress: float
-    kink: FloatArray
-    area_kink: float
-    moved: FloatArray
-    charge: bool
-    bend: FloatArray
-    flows: int
-    capacitance: float
-    moves: FloatArray
-
-
-class Room(NamedTuple):
-    """Rows of a block to work in: of the source, modes, increments, projections, drives, and single ones."""
-
-    s: FloatArray
-    s_within: FloatArray
-    w: FloatArray
-    own: FloatArray
-    inc: FloatArray
-    other: FloatArray
-    end: FloatArray
-    within: FloatArray
-    g: FloatArray
-    g_within: FloatArray
-    u: FloatArray
-    u_within: FloatArray
-    z: FloatArray
-    slope: FloatArray
-    before: FloatArray
-    crossed: FloatArray
-    jumps: FloatArray
-    pulse: FloatArray
-
-
-def new_room(modes: int, drives: int, projections: int) -> Room:
-    """Room for a form of so many."""
-    n = BLOCK + PAD
-    return Room(
-        np.zeros(n), np.zeros(n), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n),
-        np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)),
-        np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
-    )  # fmt: skip
 
 
 @jit_within
@@ -441,7 +266,9 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
             )  # fmt: skip
             if t + 1 == room.g.shape[0] and form.faded[r, level] > 0.0:
                 # What the parabola shows of the fast part is known, and is corrected in the step.
-                add(n, weight[0], room.pulse, off)
+                faded = form.faded[r, level]
+                shown = weight[0] + weight[1] * math.exp(-0.5 * faded) + weight[2] * math.exp(-faded)
+                add(n, shown - math.exp(-faded * PLACES[place]), room.pulse, off)
             if crossing:
                 kink_at(n, kink[t], PLACES[place], room.u, room.u_within[MIDDLE], room.end[1 + t], off)
             for k in range(form.rates.shape[1]):

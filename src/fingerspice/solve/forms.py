@@ -14,9 +14,9 @@ from numpy.polynomial import chebyshev as series_of
 from numpy.polynomial.polynomial import polyval
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.engine import relaxation
+from fingerspice.engine import blockforms
 from fingerspice.engine.blockcharge import Course, new_charges
-from fingerspice.engine.relaxation import LEVELS, PLACES, Form
+from fingerspice.engine.blockforms import LEVELS, PLACES, Form
 from fingerspice.engine.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.numerics.moments import weights
@@ -29,29 +29,30 @@ from fingerspice.solve.track import Prepared, as_recorded, on_branch, prepare_sy
 
 # Truncation error allowed for the polynomial of 1/A, relative to the error asked for.
 AREA_SHARE = 0.02
-# Fewest time constants of a step in which a fast mode has decayed, so that nothing of it is left in the middle.
-FADED = 30.0
+# Time constants in a step from which on a fast mode is taken apart from the parabola, which resolves slower ones.
+FADED = 5.0
 # Matrix from values at Chebyshev nodes to the Chebyshev coefficients of the antiderivative of their interpolant.
 _POINTS = 40
 _AT = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
 _INTEGRAL = series_of.chebint(np.linalg.inv(series_of.chebvander(_AT, _POINTS - 1)))
 
 
-def _area(system: System, tol: float) -> FloatArray | None:
-    """Coefficients of 1/A as a polynomial in the variable of `System`, with a relative error of at most `tol`.
+def _area(system: System, tol: float) -> tuple[FloatArray, float] | None:
+    """Coefficients of 1/A as a polynomial in the variable of `System`, and its relative error, at most `tol`.
 
     The degree is a multiple of 4, for the compiled evaluation; None if no degree up to MOST_DEGREE is enough.
     """
     series = np.asarray(system.model.curve[2 + N_PACKED :])
     if not system.scale > 0.0 or series.size < 2:
         return None
-    for degree in range(4, min(relaxation.MOST_DEGREE, series.size + 2) + 1, 4):
-        if np.abs(series[degree + 1 :]).sum() <= tol * np.abs(series[0]):
+    for degree in range(4, min(blockforms.MOST_DEGREE, series.size + 2) + 1, 4):
+        missed = float(np.abs(series[degree + 1 :]).sum() / np.abs(series[0]))
+        if missed <= tol:
             kept = np.zeros(degree + 1)
             kept[: min(series.size, degree + 1)] = series[: degree + 1]
             out = np.empty(degree + 1)
             chebyshev.to_powers(kept, out)
-            return out
+            return out, missed
     return None
 
 
@@ -126,12 +127,14 @@ def weighted(
 
 
 def _pulse(z: FloatArray, faded: FloatArray, at: float) -> FloatArray:
-    """Integral of exp(-z (at - x)) times exp(-faded x) less (1 - x) (1 - 2 x), from 0 to `at`; 0 where `faded` is."""
+    """Integral of exp(-z (at - x)) times what a parabola misses of exp(-faded x), x from 0 to `at`."""
     gone = np.exp(-z * at)
     rate = faded[..., None]
     apart = np.where(z == rate, 1.0, z - rate)
     true = np.where(z == rate, at * gone, (np.exp(-rate * at) - gone) / apart)
-    return np.asarray(np.where(rate > 0.0, true - weights(z, (0.0, 0.5, 1.0), at)[..., 0], 0.0))
+    at_nodes = np.exp(-rate[..., None] * np.array([0.0, 0.5, 1.0]))
+    shown = (weights(z, (0.0, 0.5, 1.0), at) * at_nodes).sum(axis=-1)
+    return np.asarray(np.where(rate > 0.0, true - shown, 0.0))
 
 
 @dataclass(frozen=True)
@@ -140,19 +143,23 @@ class Follower(ABC):
 
     Attributes
     ----------
-    shown : relaxation.Shown
+    shown : blockforms.Shown
     share : float
         Largest gap voltage to expect for a peak of the source of 1, V/V or V/A.
     u_top : float
         Largest gap voltage that the polynomials cover, V.
     q_rest : float
         1/A at 0 V, 1/m^2.
+    missed, missed_u : float
+        Error of the polynomials: of 1/A, relative, and of the gap voltage in addition, V.
     """
 
-    shown: relaxation.Shown
+    shown: blockforms.Shown
     share: float
     u_top: float
     q_rest: float
+    missed: float
+    missed_u: float
 
     @abstractmethod
     def form(self, spacing: float) -> Form:
@@ -172,7 +179,7 @@ class Follower(ABC):
 
     @abstractmethod
     def charge_error(self, problem: Problem, course: Course, peak_u: float) -> float:
-        """Rounding of the charge so far, C."""
+        """Error of the charge by rounding and by the polynomials so far, C."""
 
     @property
     def width(self) -> int:
@@ -212,11 +219,11 @@ class Followed(Follower):
         system, start = self.system, problem.inner
         m, drives = system.rates.shape[1], self.shown.kink.size
         r = int(np.argmin(np.abs(np.log(system.q0 / self.q_rest))))
-        control, counters = np.zeros(relaxation.N_CONTROL), np.zeros(relaxation.N_COUNTERS, np.int64)
-        control[relaxation.MARGIN], control[relaxation.REFERENCE], control[relaxation.U_GAP] = 1.0, r, start.u_gap
-        control[relaxation.Z] = start.y[-1] - self._charge_with(start.u_gap)
+        control, counters = np.zeros(blockforms.N_CONTROL), np.zeros(blockforms.N_COUNTERS, np.int64)
+        control[blockforms.MARGIN], control[blockforms.REFERENCE], control[blockforms.U_GAP] = 1.0, r, start.u_gap
+        control[blockforms.Z] = start.y[-1] - self._charge_with(start.u_gap)
         return Course(
-            system.model, form, self.shown, relaxation.new_room(m, drives, drives + 3), new_charges(),
+            system.model, form, self.shown, blockforms.new_room(m, drives, drives + 3), new_charges(),
             np.zeros((3, max(m, drives, 3))), system.project[r] @ start.y[:-1], np.zeros(m), control, counters,
         )  # fmt: skip
 
@@ -227,34 +234,35 @@ class Followed(Follower):
 
     def state(self, problem: Problem, course: Course, t: float, u_last: float) -> State:
         control, system, offset = course.control, self.system, problem.inner.offset
-        u_gap = float(control[relaxation.U_GAP])
-        live = system.live[int(control[relaxation.REFERENCE])] @ course.w
-        y = np.append(live, control[relaxation.Z] + self._charge_with(u_gap))
+        u_gap = float(control[blockforms.U_GAP])
+        live = system.live[int(control[blockforms.REFERENCE])] @ course.w
+        y = np.append(live, control[blockforms.Z] + self._charge_with(u_gap))
         state = StackState(t, y, u_last, u_gap, offset)
         return from_stack(problem.scene, on_branch(system.model, state, math.copysign(1.0, u_gap)))
 
     def charge_error(self, problem: Problem, course: Course, peak_u: float) -> float:
         model = self.system.model
         held = float(model.slow[-3]) * model.area0 * (problem.scene.u_peak + peak_u)
-        return 4e-16 * held * (1.0 + int(course.counters[relaxation.STEPS]))
+        return 4e-16 * held * (1.0 + int(course.counters[blockforms.STEPS]))
 
 
 def followed(problem: Problem, rtol: float) -> Followed | None:
     """The scene prepared for recordings; None where no polynomial represents 1/A well enough."""
     prepared = prepare_system(problem.scene, rtol)
     system = prepared.system
-    area = _area(system, AREA_SHARE * rtol)
-    if area is None:
+    found = _area(system, AREA_SHARE * rtol)
+    if found is None:
         return None
+    area, missed = found
     at_rest = -system.lo * system.scale - 1.0
     q_rest = float(polyval(at_rest, area))
     kink = float(polyval(at_rest, area[1:] * np.arange(1, area.size))) * system.scale
     kinks = np.full(system.tap_k.size, kink)
     if system.model.mobile:
         kinks = np.append(kinks, -kink / q_rest**2)
-    shown = relaxation.Shown(
+    shown = blockforms.Shown(
         system.shown, system.k_shown, system.node, system.slow, system.live, system.project, system.stress, kinks,
         -kink / q_rest**2, _moved(system, area, at_rest), problem.charge, np.zeros(0), 0, 0.0,
         np.array([1.0 if system.model.mobile else 0.0, 0.0]),
     )  # fmt: skip
-    return Followed(shown, system.model.k_gap, system.u_top, q_rest, prepared, area, at_rest)
+    return Followed(shown, system.model.k_gap, system.u_top, q_rest, missed, 0.0, prepared, area, at_rest)

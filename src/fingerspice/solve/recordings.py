@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.engine import recording, relaxation
+from fingerspice.engine import blockforms, recording
+from fingerspice.engine.blockforms import BLOCK, Form
 from fingerspice.engine.blockoutput import write_end
-from fingerspice.engine.relaxation import BLOCK, Form
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.refined import ClosedForm
@@ -178,7 +178,7 @@ class March:
             code = recording.march(
                 self.course, values, 0, values.size - 1, piece.start, piece.spacing, tol, t_out, out
             )  # fmt: skip
-            if code != recording.DONE or control[relaxation.PEAK_U] > one.u_top:
+            if code != recording.DONE or control[blockforms.PEAK_U] > one.u_top:
                 return Outcome.LOST
             gaps, _, _ = self.stated()
             gaps[0, 0], gaps[0, 1] = max(gaps[0, 0], self.least), max(gaps[0, 1], self._force(self.least))
@@ -186,9 +186,9 @@ class March:
             if excess <= 1.0:
                 self.t, self.u_last = piece.stop, float(values[-1])
                 return Outcome.MET
-            refused = self.course.counters[relaxation.REFUSED]
+            refused = self.course.counters[blockforms.REFUSED]
             self.recall(before)
-            self.course.counters[relaxation.REFUSED] = refused
+            self.course.counters[blockforms.REFUSED] = refused
             self.share *= min(0.3, 0.5 / excess)
         return Outcome.NOT_MET
 
@@ -203,9 +203,9 @@ class March:
             return Outcome.LOST
         out[:, :count] = run.rows.T[: self.width]
         self.course = self.one.course(replace(self.problem, initial=run.state), self.course.form)
-        self.course.counters[relaxation.OUTPUT] = count
+        self.course.counters[blockforms.OUTPUT] = count
         control, error, (gap,) = self.course.control, run.error, run.gaps
-        control[relaxation.PEAK_U], control[relaxation.PEAK_F] = gap[0], gap[1]
+        control[blockforms.PEAK_U], control[blockforms.PEAK_F] = gap[0], gap[1]
         self.led = [error.u_gap, error.f_el, error.v_nodes or 0.0, error.q_source or 0.0]
         self.loudest, self.u_last = float(np.abs(values).max()), float(values[-1])
         self.t, self.spacing = piece.stop, 0.0
@@ -237,11 +237,11 @@ class March:
     @property
     def outputs(self) -> int:
         """Number of outputs written since `begin_outputs`."""
-        return int(self.course.counters[relaxation.OUTPUT])
+        return int(self.course.counters[blockforms.OUTPUT])
 
     def begin_outputs(self) -> None:
         """Start counting outputs from 0, for a new array of outputs."""
-        self.course.counters[relaxation.OUTPUT] = 0
+        self.course.counters[blockforms.OUTPUT] = 0
 
     def finish(self, t_out: FloatArray, out: FloatArray) -> None:
         """Write the outputs at the end of the run."""
@@ -260,26 +260,30 @@ class March:
     def stated(self) -> tuple[FloatArray, float, float | None]:
         """Peaks and stated errors as in `Run.gaps`, and stated errors of the nodes (V) and the charge (C), so far."""
         control, u_peak = self.course.control, self.problem.scene.u_peak
-        peak_u, peak_f = float(control[relaxation.PEAK_U]), float(control[relaxation.PEAK_F])
+        peak_u, peak_f = float(control[blockforms.PEAK_U]), float(control[blockforms.PEAK_F])
         # Round-off adds to the errors estimated in the blocks.
+        missed = self.one.missed
         floor = 4e-16 * (peak_u + self.one.share * max(u_peak, self.loudest))
-        u_error = SAFETY * float(control[relaxation.ERROR_U]) + floor + self.led[0]
-        f_error = SAFETY * float(control[relaxation.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f + self.led[1]
-        node_error = SAFETY * float(control[relaxation.ERROR_V]) + 4e-16 * (peak_u + u_peak) + self.led[2]
+        floor += missed * peak_u + self.one.missed_u
+        u_error = SAFETY * float(control[blockforms.ERROR_U]) + floor + self.led[0]
+        f_error = SAFETY * float(control[blockforms.ERROR_F]) + self.led[1]
+        f_error += (2.0 * floor / (peak_u or 1.0) + missed) * peak_f
+        node_error = SAFETY * float(control[blockforms.ERROR_V]) + self.led[2]
+        node_error += 4e-16 * (peak_u + u_peak) + missed * peak_u + self.one.missed_u
         charge_error = None
         if self.problem.charge:
-            charge_error = SAFETY * float(control[relaxation.ERROR_Q]) + self.led[3]
+            charge_error = SAFETY * float(control[blockforms.ERROR_Q]) + self.led[3]
             charge_error += self.one.charge_error(self.problem, self.course, peak_u)
         return np.array([[peak_u, peak_f, u_error, f_error]]), node_error, charge_error
 
     def run(self, t: FloatArray, left: BoolArray, rows: FloatArray) -> Run:
         """The run so far, with the given outputs."""
         counters = self.course.counters
-        stats = {"steps": int(counters[relaxation.STEPS]), "rejected": int(counters[relaxation.REFUSED]), "zeros": 0}
-        evaluated = 2 * BLOCK * int(counters[relaxation.SWEEPS])
+        stats = {"steps": int(counters[blockforms.STEPS]), "rejected": int(counters[blockforms.REFUSED]), "zeros": 0}
+        evaluated = 2 * BLOCK * int(counters[blockforms.SWEEPS])
         run = Run(t, left, rows, Status.SUCCESS, evaluated, stats, self.state())
         run.gaps, run.node_error, run.charge_error = self.stated()
-        run.margin, run.by_layer = float(self.course.control[relaxation.MARGIN]), self.problem.scene.stack is not None
+        run.margin, run.by_layer = float(self.course.control[blockforms.MARGIN]), self.problem.scene.stack is not None
         return run
 
 
@@ -321,7 +325,7 @@ def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, pro
                 look, problem.waveform, problem.t_start, problem.first, problem.t_stop, rtol
             )  # fmt: skip
             return run
-        refused += int(march.course.counters[relaxation.REFUSED])
+        refused += int(march.course.counters[blockforms.REFUSED])
     return None
 
 

@@ -1,0 +1,185 @@
+"""What the loops over blocks of a recording work with: constants, form and outputs of a circuit, scratch rows."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.engine.blockrows import PAD
+
+# Number of steps in a block, and of step lengths: that of a sample and its halvings.
+BLOCK, LEVELS = 512, 7
+# Largest degree of the polynomial for 1/A.
+MOST_DEGREE = 28
+# Places of a step besides its ends: its middle, and the two at which the error is measured.
+PLACES = (0.5, 0.25, 0.75)
+MIDDLE, FIRST_QUARTER, LAST_QUARTER = 0, 1, 2
+
+# Entries of `control`: halvings of a sample, reference, and as in `engine.readout`.
+LEVEL, REFERENCE, PEAK_U, PEAK_F, ERROR_U, ERROR_F, MARGIN, Z, PEAK_Q, ERROR_Q, COLLECTED, U_GAP, ERROR_V = range(13)
+N_CONTROL = 13
+# Entries of `counters`.
+OUTPUT, STEPS, REFUSED, SWEEPS = range(4)
+N_COUNTERS = 4
+
+
+class Form(NamedTuple):
+    """A stack around reference areas, and the weights of steps of one length and its halves.
+
+    r references, `LEVELS` step lengths, m modes, T drives g_t, and P projections at the ends and `PLACES` of a step:
+    the gap voltage (under `mobile` its modes' part alone), the taps, and what the slowest layer stores and leaks by
+    (see `engine.recording`).
+
+    Attributes
+    ----------
+    mobile : bool
+        Charge law. Then the last drive is (1/q - 1/q0) U.
+    q0 : ndarray, shape (r,)
+    decay : ndarray, shape (r, LEVELS, m)
+        Over a step.
+    source : ndarray, shape (r, LEVELS, m, 2)
+        Contribution of the source's values at both ends to a mode.
+    drive : ndarray, shape (r, LEVELS, m, T, 3)
+        Contribution of the drives at 0, 1/2 and 1 to a mode.
+    feed : ndarray, shape (r, m, T)
+    taps, tap_s : ndarray, shape (r, P, m) and (P,)
+        Projections of modes and source.
+    within, within_s, within_g : ndarray, shape (r, LEVELS, 3, P, m), (r, LEVELS, 3, P, 2) and (r, LEVELS, 3, P, T, 3)
+        The same at `PLACES`, from the modes at the start of a step, the source at both ends, and the drives.
+    share : ndarray, shape (r, LEVELS, m, 2)
+        The weights of 1/2 and 1 in the integral of a parabola over a step, in units of its length.
+    defect : ndarray, shape (r, LEVELS, m, T, 2)
+        Contribution of the interpolation errors at the quarters to the error of a mode.
+    early : ndarray, shape (r, LEVELS, T, 2)
+        Their contribution to the error of the gap voltage in the middle of the step.
+    area : ndarray, shape (4 k + 1,)
+        1/A as a polynomial in `scale` |u| + `shift`.
+    kappa : float
+        1/m^2; 0 in a stack.
+    bend : ndarray, shape (4 l + 1,)
+        N (V m^2) for positive xi, as `area`; no entry in a stack. In a network N is the last drive, which has no tap.
+    bent : ndarray, shape (T - 1,)
+        Share of N in each tap; no entry in a stack.
+    fast : int
+        The mode that decays within a small part of a step and has the largest share in kappa; -1 if there is none.
+    faded : ndarray, shape (r, LEVELS)
+        Its rate times the step length; 0 where that is too small.
+    pulse, pulse_within : ndarray, shape (r, LEVELS, m) and (r, LEVELS, 3, P)
+        What a part exp(-rate t) of N adds to the modes and to the projections, in place of the parabola through it.
+    """
+
+    mobile: bool
+    q0: FloatArray
+    rates: FloatArray
+    gain: FloatArray
+    decay: FloatArray
+    source: FloatArray
+    drive: FloatArray
+    feed: FloatArray
+    taps: FloatArray
+    tap_s: FloatArray
+    within: FloatArray
+    within_s: FloatArray
+    within_g: FloatArray
+    share: FloatArray
+    defect: FloatArray
+    early: FloatArray
+    area: FloatArray
+    scale: float
+    shift: float
+    k_gap: float
+    area0: float
+    kappa: float
+    bend: FloatArray
+    bent: FloatArray
+    fast: int
+    faded: FloatArray
+    pulse: FloatArray
+    pulse_within: FloatArray
+
+
+class Shown(NamedTuple):
+    """Constants of the outputs.
+
+    Attributes
+    ----------
+    columns : ndarray, shape (r, C, m)
+        Recorded voltages over k U.
+    k : ndarray, shape (C,)
+    node : ndarray, shape (r, n_node, m)
+        Voltages of the nodes, as `columns`.
+    slow : ndarray, shape (r, m)
+        The slowest layer's share of each mode (see `Model.slow`).
+    live, project : ndarray, shape (r, m, m)
+        From modes to live voltages and back.
+    stress : float
+        Force per area and squared gap voltage, Pa/V^2.
+    kink : ndarray, shape (T,)
+        Derivative by |u_gap| at 0 V of the factor of each drive.
+    area_kink : float
+        dA/d|u| at 0 V, m^2/V.
+    moved : ndarray
+        c r G(|u|) under `local`, a polynomial as `Form.area`, C.
+    charge : bool
+        Whether the charge follows from that, as in a stack.
+    bend : ndarray, shape (C,)
+        Share of N in each column; no entry in a stack.
+    flows : int
+        Number of the last columns that are charges of a network, whose rates are outputs, too.
+    capacitance : float
+        Sum of all capacitances of the network, F, where there are such columns.
+    moves : ndarray, shape (2,)
+        Largest error of a node's voltage (V), and of such a charge (C), that the area causes, per volt of the gap
+        voltage's error.
+    """
+
+    columns: FloatArray
+    k: FloatArray
+    node: FloatArray
+    slow: FloatArray
+    live: FloatArray
+    project: FloatArray
+    stress: float
+    kink: FloatArray
+    area_kink: float
+    moved: FloatArray
+    charge: bool
+    bend: FloatArray
+    flows: int
+    capacitance: float
+    moves: FloatArray
+
+
+class Room(NamedTuple):
+    """Rows of a block to work in: of the source, modes, increments, projections, drives, and single ones."""
+
+    s: FloatArray
+    s_within: FloatArray
+    w: FloatArray
+    own: FloatArray
+    inc: FloatArray
+    other: FloatArray
+    end: FloatArray
+    within: FloatArray
+    g: FloatArray
+    g_within: FloatArray
+    u: FloatArray
+    u_within: FloatArray
+    z: FloatArray
+    slope: FloatArray
+    before: FloatArray
+    crossed: FloatArray
+    jumps: FloatArray
+    pulse: FloatArray
+
+
+def new_room(modes: int, drives: int, projections: int) -> Room:
+    """Room for a form of so many."""
+    n = BLOCK + PAD
+    return Room(
+        np.zeros(n), np.zeros(n), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n),
+        np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)),
+        np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
+    )  # fmt: skip
