@@ -19,7 +19,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 400
 # Files that are longer still, with their lines: no other may be, and these may only shrink.
 LONGER = {
-    "engine.march": 433,
+    "engine.march": 424,
     "engine.netmarch": 416,
 }
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.model import Model, branch_area
@@ -94,14 +96,15 @@ def loop_gain(
 def carry(
     model: Model, rates: FloatArray, gap: FloatArray, push: FloatArray, tap: FloatArray, tap_k: FloatArray,
     feed: FloatArray, decay: FloatArray, h: float, sign: float, gain: float, w: FloatArray, r: FloatArray,
-    error: FloatArray, carried: FloatArray, forced: FloatArray,
+    error: FloatArray, carried: FloatArray,
 ) -> None:  # fmt: skip
     """Propagate the error of the modes (n,) through a step whose loop gain is `gain`.
 
-    The error at the points between nodes and at the end goes into `carried` (n, 4); `forced` (n,) is scratch. See
-    `exponential.converge` for the other arguments.
+    The error at the points between nodes and at the end goes into `carried` (n, 4). See `exponential.converge` for the
+    other arguments.
     """
     n = gap.size
+    forced = np.zeros(n)
     # Exponential trapezoidal rule: the only implicit unknown is the error `moved` of the gap voltage.
     stride = _MIDDLE if gain <= _MODERATE else 1
     moved = 0.0

@@ -12,7 +12,7 @@ from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine.charge import charge_step
 from fingerspice.engine.exponential import N_PLACES, Tables, assess, converge, make_tables, weigh
 from fingerspice.engine.growth import SLIGHT, carry, loop_gain
-from fingerspice.engine.model import Model, branch_area, dot, gap_voltage, turns_at_zero, write_row_at
+from fingerspice.engine.model import branch_area, dot, turns_at_zero
 from fingerspice.engine.nodes import node_error
 from fingerspice.engine.pace import (
     Pace,
@@ -57,21 +57,19 @@ from fingerspice.engine.readout import (
     account,
     at,
     basis_at,
-    dip,
     error_at,
-    first_wrong,
     layers,
     note,
     record,
     series_of,
     write_outputs,
-    zero,
 )  # fmt: skip
 from fingerspice.engine.repeat import AT_EDGE, AT_ZERO, Kept
 from fingerspice.engine.rows import DQ, GUESS, SOURCE, X_GAP, Q, U, largest_size, source_rows
 from fingerspice.engine.segment import Segment, segment_at, source
 from fingerspice.engine.system import System
 from fingerspice.engine.work import Work
+from fingerspice.engine.zeros import dip, first_wrong, zero
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
 
 # Codes returned by `march`.
@@ -154,8 +152,7 @@ def march(
     r, base, w, pull, used = borrow(work.r), borrow(work.base), borrow(work.w), borrow(work.pull), borrow(work.used)
     pull_before, left_before = borrow(work.pull_before), borrow(work.left_before)
     w0, places, sums, weight = borrow(work.w0), borrow(work.places), borrow(work.sums), borrow(work.weight)
-    outputs, carried, forced = borrow(work.outputs), borrow(work.carried), borrow(work.forced)
-    basis = borrow(work.basis)
+    outputs, carried, basis = borrow(work.outputs), borrow(work.carried), borrow(work.basis)
     t_out, left, out = borrow(t_out), borrow(left), borrow(out)
     values, coefficients = borrow(work.values), borrow(work.coefficients)
     kept_times, kept_series, tried = borrow(kept.times), borrow(kept.series), borrow(tried)
@@ -292,9 +289,7 @@ def march(
                         carried[k, p] = decay[k, NODES + p if p < N_PLACES - 2 else END] * error[k]
                 grown = loop_gain(mobile, area0, push, tap, tap_k, feed, weight, w, r)
                 if grown > SLIGHT:
-                    carry(
-                        model, rates, gap, push, tap, tap_k, feed, decay, h, sign, grown, w, r, error, carried, forced
-                    )
+                    carry(model, rates, gap, push, tap, tap_k, feed, decay, h, sign, grown, w, r, error, carried)
                 step_error, run_error, magnified = assess(
                     mobile, area0, gain, gap, phi, miss, error, carried, w, pull, used, r, places, sums
                 )
@@ -427,18 +422,3 @@ def march(
         if control[PEAK_U] > u_top:
             return OUT_OF_RANGE
     return DONE
-
-
-@jit
-def end_row(
-    model: Model, segment: Segment, tau: float, charge: bool, y: FloatArray, control: FloatArray, row: FloatArray
-) -> None:
-    """Output row (see `model.write_row`) `tau` s into a segment, at 0 after the jump of the source that may begin it.
-
-    The jump's charge is added to `y`, its branch goes into `control`; the row is NaN where the jump passes a fold.
-    """
-    u_source, du_source = source(segment, tau)
-    if tau == 0.0 and not enter(model, charge, u_source, y, control):
-        u_source = math.nan
-    u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), control[SIGN], control[U_GAP])
-    write_row_at(model, u_source, du_source, y, control[SIGN], u, row)

@@ -10,7 +10,7 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.exponential import N_PLACES, between, largest, left_over
 from fingerspice.engine.netrows import combine
-from fingerspice.engine.readout import first_wrong, leaves
+from fingerspice.engine.zeros import first_wrong, leaves
 from fingerspice.numerics.lobatto import DERIVATIVE, END, MISS, NODES, POINTS, ROWS
 
 # Columns of `peaks`: the largest voltage (V) and force (N) of each gap and, in the last row, of the nodes; then the

@@ -42,14 +42,14 @@ from fingerspice.engine.readout import (
     at,
     basis_at,
     error_at,
-    first_wrong,
     note,
     record,
     series_of,
     write_outputs,
-)
+)  # fmt: skip
 from fingerspice.engine.references import References, far_from, find, go_over, start_at
 from fingerspice.engine.repeat import Kept
+from fingerspice.engine.zeros import first_wrong
 from fingerspice.numerics.lobatto import END, NODES, POINTS
 from fingerspice.numerics.small import copy_to
 from fingerspice.physics.contact import inverse_area
@@ -138,8 +138,7 @@ def march(
     first_z = y.size - n_s
     tol, charge = pace.tol, pace.charge
     is_series = sources.series.shape[1] > 0
-    index = np.zeros(n_s, np.int64)
-    now, slopes_now = np.zeros(n_s), np.zeros(n_s)
+    index, now, slopes_now = np.zeros(n_s, np.int64), np.zeros(n_s), np.zeros(n_s)
     run, gained, basis = np.zeros((n_area, N_PLACES)), np.zeros(n_s), np.zeros(NODES)
     several = False
     for b in range(1, home.size):
@@ -219,8 +218,7 @@ def march(
             if not inside and t >= t_end:
                 break
         else:
-            for e in range(n_s):
-                now[e] = s_before[e]
+            copy_to(now, s_before)
         if at_edge:
             # Step lengths after a jump are often those after the previous jump.
             control[H] = control[H_AFTER_EDGE]

@@ -9,7 +9,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
-from fingerspice.engine.model import Model, choose_branch, dot, gap_voltage, jump_charge, ramp
+from fingerspice.engine.model import Model, choose_branch, dot, gap_voltage, jump_charge, ramp, write_row_at
 from fingerspice.engine.readout import (
     ALLOWED,
     BRANCH_LENGTH,
@@ -22,6 +22,7 @@ from fingerspice.engine.readout import (
     H,
     T,
 )
+from fingerspice.engine.segment import Segment, source
 from fingerspice.numerics.lobatto import NODES
 
 # Ratio of neighbouring step lengths of the ladder, as a power of two: small enough to waste little, large enough for
@@ -92,6 +93,21 @@ def enter(model: Model, charge: bool, u_source: float, y: FloatArray, control: F
     take_branch(sign if model.coupled else 1.0, control)
     control[U_GAP] = u
     return True
+
+
+@jit
+def end_row(
+    model: Model, segment: Segment, tau: float, charge: bool, y: FloatArray, control: FloatArray, row: FloatArray
+) -> None:
+    """Output row (see `model.write_row`) `tau` s into a segment, at 0 after the jump of the source that may begin it.
+
+    The jump's charge is added to `y`, its branch goes into `control`; the row is NaN where the jump passes a fold.
+    """
+    u_source, du_source = source(segment, tau)
+    if tau == 0.0 and not enter(model, charge, u_source, y, control):
+        u_source = math.nan
+    u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), control[SIGN], control[U_GAP])
+    write_row_at(model, u_source, du_source, y, control[SIGN], u, row)
 
 
 @jit

@@ -26,7 +26,6 @@ class Work(NamedTuple):
     w0: FloatArray
     places: FloatArray
     carried: FloatArray
-    forced: FloatArray
     values: FloatArray
     coefficients: FloatArray
     outputs: FloatArray
@@ -49,7 +48,6 @@ def new_work(n: int) -> Work:
         np.zeros(n),
         np.zeros((n, N_PLACES)),
         np.zeros((n, N_PLACES - 1)),
-        np.zeros(n),
         np.zeros((n + 2, ROWS)),
         np.zeros((n + 2, ROWS)),
         np.zeros((2, WRITTEN_AT_ONCE)),

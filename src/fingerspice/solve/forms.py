@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev as series_of
@@ -82,18 +83,17 @@ def form_of(system: System, area: FloatArray, spacing: float) -> Form:
     taps += [(system.slow - ratio * system.gap)[:, None], system.slow[:, None]]
     tap_s += [0.0, 0.0 if model.mobile else slow[n]]
     return weighted(
-        model.mobile, system.q0, system.rates, system.gain, feed, np.concatenate(taps, axis=1), np.array(tap_s),
-        spacing, area, system.scale, -system.lo * system.scale - 1.0, model.k_gap, model.area0, 0.0, np.zeros(0),
-        np.zeros(0),
+        system.rates, system.gain, feed, np.concatenate(taps, axis=1), np.array(tap_s), spacing, mobile=model.mobile,
+        q0=system.q0, area=area, scale=system.scale, shift=-system.lo * system.scale - 1.0, k_gap=model.k_gap,
+        area0=model.area0, kappa=0.0, bend=np.zeros(0), bent=np.zeros(0),
     )  # fmt: skip
 
 
 def weighted(
-    mobile: bool, q0: FloatArray, rates: FloatArray, gain: FloatArray, feed: FloatArray, taps: FloatArray,
-    tap_s: FloatArray, spacing: float, area: FloatArray, scale: float, shift: float, k_gap: float, area0: float,
-    kappa: float, bend: FloatArray, bent: FloatArray, fast: int = -1,
+    rates: FloatArray, gain: FloatArray, feed: FloatArray, taps: FloatArray, tap_s: FloatArray, spacing: float,
+    fast: int = -1, **others: Any,
 ) -> Form:  # fmt: skip
-    """The form with these parts (see `Form`) and the weights that follow from them for a sample spacing (s)."""
+    """The form with these parts and `others` (see `Form`), and the weights that follow from them for a spacing (s)."""
     h = spacing / 2.0 ** np.arange(LEVELS)[:, None]
     z = rates[:, None, :] * h
     by_step = gain[:, None, :, None] * h[..., None]
@@ -117,12 +117,12 @@ def weighted(
     five = (0.0, 0.25, 0.5, 0.75, 1.0)
     quarters, early = (weights(z, five, until)[..., None, [1, 3]] for until in (1.0, 0.5))
     return Form(
-        mobile, q0, np.ascontiguousarray(rates), np.ascontiguousarray(gain), np.exp(-z),
-        by_step * weights(z, (0.0, 1.0)), drives * weights(z, (0.0, 0.5, 1.0))[..., None, :],
-        np.ascontiguousarray(feed), np.ascontiguousarray(taps), tap_s, inner, inner_s, inner_g,
-        np.ascontiguousarray(weights(z, (0.0, 0.5, 1.0))[..., 1:]), drives * quarters,
-        np.einsum("rk,rsktj->rstj", taps[:, 0], drives * early), area, scale, shift, k_gap, area0, kappa, bend, bent,
-        fast, faded, pulse, pulse_within,
+        rates=np.ascontiguousarray(rates), gain=np.ascontiguousarray(gain), decay=np.exp(-z),
+        source=by_step * weights(z, (0.0, 1.0)), drive=drives * weights(z, (0.0, 0.5, 1.0))[..., None, :],
+        feed=np.ascontiguousarray(feed), taps=np.ascontiguousarray(taps), tap_s=tap_s, within=inner, within_s=inner_s,
+        within_g=inner_g, share=np.ascontiguousarray(weights(z, (0.0, 0.5, 1.0))[..., 1:]), defect=drives * quarters,
+        early=np.einsum("rk,rsktj->rstj", taps[:, 0], drives * early), fast=fast, faded=faded, pulse=pulse,
+        pulse_within=pulse_within, **others,
     )  # fmt: skip
 
 

@@ -89,9 +89,10 @@ class Finger(Follower):
         one, reduced = self.modal, self.reduced
         n = reduced.absorbed.size
         return weighted(
-            False, np.array([reduced.q0]), one.rates[None], one.gain[None], one.drives[None], one.taps[None], one.tap_s,
-            spacing, self.area, self.scale, -1.0, float(one.tap_s[0]), 1.0 / reduced.q0, reduced.kappa, self.bend,
-            one.taps[1:-1, :n] @ reduced.absorbed, self._fast(spacing),
+            one.rates[None], one.gain[None], one.drives[None], one.taps[None], one.tap_s, spacing, self._fast(spacing),
+            mobile=False, q0=np.array([reduced.q0]), area=self.area, scale=self.scale, shift=-1.0,
+            k_gap=float(one.tap_s[0]), area0=1.0 / reduced.q0, kappa=reduced.kappa, bend=self.bend,
+            bent=one.taps[1:-1, :n] @ reduced.absorbed,
         )  # fmt: skip
 
     def _fast(self, spacing: float) -> int:

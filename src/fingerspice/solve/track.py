@@ -17,6 +17,7 @@ from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
 from fingerspice.engine.model import Model, dot, gap_voltage, write_row_at
 from fingerspice.engine.network import Sources
+from fingerspice.engine.pace import end_row
 from fingerspice.engine.segment import Segment, source
 from fingerspice.engine.system import System, area_error, area_missed, area_range, build_system
 from fingerspice.engine.work import Work, new_work
@@ -212,7 +213,7 @@ class Track(Stepping):
         segment, tau = _segment(after or sources, self.problem.t_stop, "right")
         model = self.prepared.system.model
         # `end_row` applies a jump at the end to these copies, so that the final state remains the left-hand one.
-        march.end_row(model, segment, tau, self.pace.charge, self.y.copy(), self.control.copy(), row)
+        end_row(model, segment, tau, self.pace.charge, self.y.copy(), self.control.copy(), row)
         self.out[:, first:] = as_marched(self.problem.scene, row[None, :])[0, : len(self.out), None]
         self.counters[readout.OUTPUT] = self.t_out.size
 
