@@ -4,7 +4,8 @@ Noise of three bands, sampled at 48 kHz, drives Table 1's stack. Every contestan
 its error over the first tenth of a second, relative to the peak, is taken against fingerspice's `exponential` method at
 1e-11. Contestants: whole calls of `fs.simulate` at four tolerances, with and without charge and current, and with the
 dispersive skin; a loop in numba (classical Runge-Kutta, one step per sample, the area from a table); scipy's LSODA,
-restarted at every sample; and, for a given area, scipy's lfilter.
+restarted at every sample; and, for a given area, scipy's lfilter. Then one finger behind an amplifier, on a floating
+body and under a current, beside the `exponential` method, which takes every sample as a corner of straight lines.
 
 Run: python benchmarks/recordings.py [--quick]. Medians of 7, without compile time; writes results/recordings.json.
 """
@@ -36,6 +37,7 @@ CIRCUITS = HERE.parent / "circuits"
 RATE = 48_000.0
 BANDS = (1_000.0, 8_000.0, 20_000.0)
 RTOLS = (1e-3, 1e-4, 1e-6, 1e-8)
+NETWORKS = ("amplifier", "ungrounded_user", "current_drive")
 # Number of samples, from the start, over which errors are taken.
 CHECKED = 4_801
 Report = dict[str, Any]
@@ -212,6 +214,42 @@ def lengths(all_seconds: tuple[float, ...], repeats: int) -> list[Report]:
     return out
 
 
+def networks(seconds: float, repeats: int) -> list[Report]:
+    """Whole calls on networks with one finger, sample by sample and by the method that serves every source."""
+    out = []
+    for deck in NETWORKS:
+        circuit = fs.read_netlist(CIRCUITS / f"{deck}.cir")
+        first = next(e.name for e in circuit.elements if e.name[0] in "VI")
+        # A current that gives the gap about the same voltage.
+        unit = 1.0 if first[0] == "V" else 1e-6
+        for high in BANDS[:2]:
+            values = unit * noise(int(seconds * RATE) + 1, high)
+            few = values[:CHECKED]
+            waves = {"all": values, "few": few}
+            drives = {which: circuit.replace({first: fs.Samples(x, RATE)}) for which, x in waves.items()}
+            sizes = {which: x.size for which, x in waves.items()}
+
+            def gap(which: str, rtol: float, method: str, drives: Any = drives, sizes: Any = sizes) -> np.ndarray:
+                count = sizes[which]
+                how = {"t_eval": np.arange(count - 1) / RATE, "t_stop": (count - 1) / RATE, "method": method}
+                return np.asarray(fs.simulate(drives[which], charge_law="local", charge=False, rtol=rtol, **how).u_gap)
+
+            exact = gap("few", 1e-11, "exponential")
+            peak = float(np.abs(exact).max())
+            for rtol in (1e-4, 1e-6):
+                for which, method in (("all", "auto"), ("few", "exponential")):
+                    found = gap(which, rtol, method)[: exact.size]
+                    took = median_seconds(lambda w=which, r=rtol, m=method: gap(w, r, m), repeats)
+                    off = float(np.abs(found - exact[: found.size]).max()) / peak
+                    out.append(
+                        {
+                            "deck": deck, "band_Hz": high, "rtol": rtol, "method": method, "error": off,
+                            "ns_per_sample": 1e9 * took / sizes[which],
+                        }
+                    )  # fmt: skip
+    return out
+
+
 def linear(seconds: float, repeats: int) -> Report:
     """Time of the whole call with a given area, and of lfilter with the equivalent filter."""
     values, area = noise(int(seconds * RATE) + 1, 8_000.0), 35e-6
@@ -239,6 +277,10 @@ def main() -> None:
         error = "unstable" if p["error"] is None else f"{p['error']:.1e}"
         name = f"{p['band_Hz']:6g} Hz {p['skin']:16} {p['contestant']:40}"
         print(f"{name} {error:8} {p['ns_per_sample']:12,.1f} ns a sample")
+    around = networks(seconds, repeats)
+    for p in around:
+        name = f"{p['band_Hz']:6g} Hz {p['deck']:16} {p['method']:12} {p['rtol']:g}"
+        print(f"{name} {p['error']:.1e} {p['ns_per_sample']:12,.1f} ns a sample")
     by_length = lengths((0.1, 0.2) if quick else (1.0, 10.0, 60.0, 300.0), repeats)
     for p in by_length:
         speed = f"{p['ns_per_sample']:.1f} ns a sample, {p['times_real_time']:,.0f} times real time"
@@ -256,7 +298,14 @@ def main() -> None:
             "python": platform.python_version(),
             "commit": commit,
         }
-        report = {"machine": machine, "seconds": seconds, "points": points, "lengths": by_length, "area_given": given}
+        report = {
+            "machine": machine,
+            "seconds": seconds,
+            "points": points,
+            "networks": around,
+            "lengths": by_length,
+            "area_given": given,
+        }
         (HERE / "results" / "recordings.json").write_text(json.dumps(report, indent=1) + "\n")
 
 
