@@ -126,10 +126,10 @@ class _Flags(Flags):
     _HASH = hash(cast(Any, Flags)())
 
     def __eq__(self, other: object) -> bool:
-        mine: Any = self
-        if isinstance(other, Flags) and mine._values == cast(Any, other)._values:
-            return True
-        return bool(cast(Any, super()).__eq__(other))
+        if not isinstance(other, Flags):
+            return False
+        mine, its = cast(Any, self)._values, cast(Any, other)._values
+        return mine == its or all(getattr(self, name) == getattr(other, name) for name in mine.keys() | its.keys())
 
     def __hash__(self) -> int:
         return self._HASH
