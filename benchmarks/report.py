@@ -171,6 +171,10 @@ def waits(folder: Path) -> str:
         at = {p["contestant"]: p for p in recorded["points"] if p["skin"] == skin and p["band_Hz"] == 1000.0}
         return " / ".join(number(at[f"fingerspice {rtol:g}"]["ns_per_sample"]) for rtol in (1e-4, 1e-6)) + " ns"
 
+    def sample_around(deck: str) -> str:
+        found = [p for p in recorded["networks"] if p["deck"] == deck and p["band_Hz"] == 1000.0]
+        return " / ".join(number(p["ns_per_sample"]) for p in found if p["method"] == "auto") + " ns"
+
     sources = ", ".join(row["source"] for row in base["times"] if row["circuit"] == "fingerpad")
     rows = [
         ["what you wait for", "time"],
@@ -187,6 +191,8 @@ def waits(folder: Path) -> str:
         ["the same with two fingers and a floating body", period("two_fingers", "auto")],
         ["a sample of a recording of up to 1 kHz at 48 kHz, at 1e-4 / 1e-6", sample("SKIN")],
         ["the same with the dispersive skin", sample("SKIN_DISPERSIVE")],
+        ["the same behind an amplifier and a cable", sample_around("amplifier")],
+        ["the same with a floating body", sample_around("ungrounded_user")],
     ]  # fmt: skip
     text = (
         f"Medians of 7 at an error of 1e-6 of the peak, after the first use, on {base['machine']}, commit "
