@@ -172,7 +172,8 @@ def finger(problem: Problem, rtol: float) -> Finger | None:
     source, wave = found
     share = _largest_share(Reduced(scene, source, scene.area0), wave.rate, problem.t_stop)
     (moving,) = np.flatnonzero(scene.net.gap >= 0)
-    typical = _TYPICAL * min(scene.u_top, share * float(np.abs(wave.values).max(initial=0.0)))
+    # The peak of a current is not known to the scene; that of a voltage has been looked up in the file already.
+    typical = _TYPICAL * min(scene.u_top, share * (scene.u_peak or wave.peak(0.0, problem.t_stop)))
     area0 = scene.area0.copy()
     area0[moving] = 1.0 / inverse_area(typical, scene.net.curves[moving])[0]
     reduced = Reduced(scene, source, area0)
