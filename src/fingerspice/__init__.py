@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.limits import FoldLimits as FoldLimits
     from fingerspice.studies.limits import fold_limits as fold_limits
     from fingerspice.studies.phasors import phasor as phasor
+    from fingerspice.studies.populations import sobol as sobol
+    from fingerspice.studies.populations import sweep as sweep
     from fingerspice.studies.steady import SteadyState as SteadyState
     from fingerspice.studies.steady import steady_state as steady_state
     from fingerspice.waveforms.combinations import AM as AM
@@ -92,6 +94,7 @@ _HOMES = {
     "studies.inverse": ("InverseDrive", "inverse_drive"),
     "studies.largesignal": ("large_signal",),
     "studies.limits": ("FoldLimits", "fold_limits"),
+    "studies.populations": ("sobol", "sweep"),
     "results.loading": ("load",),
     "studies.phasors": ("phasor",),
     "results.plan": ("Plan",),

@@ -13,6 +13,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.cli import answers, options
 from fingerspice.cli import design as designs
 from fingerspice.cli import fit as fits
+from fingerspice.cli import sweep as sweeps
 from fingerspice.cli.arguments import (
     AsJson,
     ChargeLaw,
@@ -349,6 +350,7 @@ def limits(
 
 app.command()(designs.design)
 app.command()(fits.fit)
+app.command()(sweeps.sweep)
 
 
 @app.command()

@@ -163,7 +163,7 @@ def _scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, 
         raise InputError(f"parameters is {parameters!r}; allowed: a mapping such as {{'Xgap.d': [3e-6, 4e-6]}}")
     given: dict[str, FloatArray] = {}
     for path, values in parameters.items():
-        name = _path(circuit, path)
+        name = own_path(circuit, path)
         try:
             array = np.asarray(values, float)
         except (TypeError, ValueError):
@@ -185,7 +185,7 @@ def _scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, 
     return scenes
 
 
-def _path(circuit: Circuit, path: Any) -> str:
+def own_path(circuit: Circuit, path: Any) -> str:
     """A path in the circuit's own spelling."""
     if isinstance(path, str) and path.lower().startswith("source."):
         on = driving_sources(circuit)

@@ -1,0 +1,183 @@
+"""The command `sweep`, which runs a grid or a random population that a TOML file describes."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from fingerspice.base.errors import InputError
+from fingerspice.cli import answers
+from fingerspice.cli.arguments import AsJson, Name, NoPlot, Out, Overwrite
+from fingerspice.cli.options import read_circuit
+from fingerspice.cli.result_files import Results
+from fingerspice.cli.terminal import Answering
+
+#: Keys of the file, and the arguments of `batch` among them.
+_KEYS = ("deck", "n", "seed", "indices", "outputs", "rtol", "t_stop", "periods", "periodic", "skin", "parameters")
+_OPTIONS = ("outputs", "rtol", "t_stop", "periods", "periodic", "skin")
+#: Kinds of a parameter, with the numbers that each takes.
+_KINDS = {
+    "values": "[a, b, ...]", "linear": "[first, last, count]", "log": "[first, last, count]",
+    "uniform": "[low, high]", "loguniform": "[low, high]", "normal": "[mean, standard deviation]",
+    "lognormal": "[median, standard deviation of the logarithm]",
+}  # fmt: skip
+#: Largest size of the file, bytes.
+_LARGEST = 1 << 20
+
+
+def sweep(
+    file: Annotated[Path, typer.Argument(metavar="SWEEP.toml", help="Deck, parameters and outputs.")],
+    out: Out = None,
+    name: Name = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+    no_plot: NoPlot = False,
+) -> None:
+    """Run a grid or a random population of parameters: table, NetCDF, picture, and what the variance comes from.
+
+    Example:
+
+      fingerspice sweep circuits/population.toml
+    """
+    with Answering("sweep", as_json) as answer:
+        from fingerspice.plots.drawing import save
+        from fingerspice.plots.populations import plot_sweep
+        from fingerspice.studies import populations
+
+        asked = _read(file)
+        deck = _beside(file, asked["deck"])
+        circuit = read_circuit(deck, None, None)
+        parameters = {path: _parameter(path, one) for path, one in asked["parameters"].items()}
+        how = {key: asked[key] for key in ("n", "seed") if key in asked}
+        options = {key: asked[key] for key in _OPTIONS if key in asked}
+        answer.update(**answers.of_circuit(circuit, None))
+        results = Results(deck, circuit, out, name or file.stem, overwrite, None)
+        table, image = results.file(".nc"), None if no_plot else results.file(".png")
+        found = populations.sweep(circuit, parameters, **how, **options)
+        indices = populations.sobol(circuit, parameters, **how, **options) if asked.get("indices") else None
+        results.open()
+        output, about = str(next(iter(found.data_vars))), {"deck": circuit.text, **results.about}
+        writes: list[Callable[[], Path]] = [lambda: _written(found, indices, about, table)]
+        if image is not None:
+            writes.append(lambda: save(plot_sweep(found, output, indices), image, about=results.about))
+        told = populations.summary(found)
+        shares = [] if indices is None else populations.ranking(indices, output)
+        answer.update(
+            scenes=int(found.status.size), failed=int((found.status >= 2).sum()), n=found.attrs.get("n"),
+            seed=found.attrs.get("seed"), figures=told, shares=shares or None,
+        )  # fmt: skip
+        answer.give(lambda: _told(told) + (f"\n\n{_shared(shares, output)}" if shares else ""), writes)
+
+
+def _read(file: Path) -> dict[str, Any]:
+    """The file's keys, checked."""
+    try:
+        if file.stat().st_size > _LARGEST:
+            raise InputError(f"{file} has {file.stat().st_size:,} bytes; allowed: at most {_LARGEST:,}")
+        asked = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeError, ValueError) as error:
+        raise InputError(f"{file} cannot be read as TOML: {error}") from None
+    for key in asked:
+        if key not in _KEYS:
+            raise InputError(f"{file}: unknown key {key!r}; allowed: {', '.join(_KEYS)}")
+    for key, kind in (("deck", str), ("parameters", dict)):
+        if not isinstance(asked.get(key), kind) or not asked[key]:
+            what = "the deck's file name" if key == "deck" else "a table such as [parameters] with Xgap.d = {...}"
+            raise InputError(f"{file}: {key} is {asked.get(key)!r}; allowed: {what}")
+    return asked
+
+
+def _beside(file: Path, deck: str) -> Path:
+    """The deck, which stands in the file's folder or below it."""
+    folder = file.resolve().parent
+    path = (folder / deck).resolve()
+    if not path.is_relative_to(folder):
+        raise InputError(f"{file}: deck is {deck!r}; allowed: a file in the same folder or below it")
+    return path
+
+
+def _parameter(path: str, one: Any) -> Any:
+    """Numbers or a distribution from ``{kind = [numbers]}``."""
+    import numpy as np
+    from scipy import stats
+
+    if isinstance(one, int | float) and not isinstance(one, bool):
+        return float(one)
+    allowed = "a number, or one of " + ", ".join(f"{{{kind} = {what}}}" for kind, what in _KINDS.items())
+    if not isinstance(one, Mapping) or len(one) != 1 or next(iter(one)) not in _KINDS:
+        raise InputError(f"{path} is {one!r}; allowed: {allowed}")
+    kind, numbers = next(iter(one.items()))
+    if not isinstance(numbers, list) or not all(isinstance(x, int | float) for x in numbers) or not numbers:
+        raise InputError(f"{path}: {kind} is {numbers!r}; allowed: {_KINDS[kind]}")
+    if kind == "values":
+        return np.array(numbers, float)
+    if len(numbers) != _KINDS[kind].count(",") + 1:
+        raise InputError(f"{path}: {kind} is {numbers!r}; allowed: {_KINDS[kind]}")
+    if kind in ("linear", "log"):
+        first, last, count = numbers
+        if not (count == int(count) and 1 <= count <= 100_000) or (kind == "log" and min(first, last) <= 0.0):
+            raise InputError(f"{path}: {kind} is {numbers!r}; allowed: {_KINDS[kind]}, a whole count, for log above 0")
+        return (np.linspace if kind == "linear" else np.geomspace)(first, last, int(count))
+    a, b = map(float, numbers)
+    in_order = a < b if kind.endswith("uniform") else b > 0.0
+    if not in_order or (kind.startswith("log") and a <= 0.0):
+        raise InputError(f"{path}: {kind} is {numbers!r}; allowed: {_KINDS[kind]}, ascending or above 0")
+    if kind == "uniform":
+        return stats.uniform(a, b - a)
+    if kind == "loguniform":
+        return stats.loguniform(a, b)
+    return stats.norm(a, b) if kind == "normal" else stats.lognorm(b, scale=a)
+
+
+def _told(rows: list[dict[str, float | str]]) -> str:
+    """The percentiles of every output as text."""
+    head = f"{'output':<24}{'unit':<8}{'5 %':>12}{'median':>12}{'95 %':>12}{'mean':>12}"
+    lines = [
+        f"{row['output']:<24}{row['unit']:<8}"
+        + "".join(f"{row[key]:>12.4g}" for key in ("p5", "median", "p95", "mean"))
+        for row in rows
+    ]
+    return "\n".join([head, *lines])
+
+
+def _shared(rows: list[dict[str, Any]], output: str) -> str:
+    """Total indices as text: a line for each place, a column for each parameter, and what is largest where."""
+    names = sorted({row["parameter"] for row in rows}, key=str.lower)
+    lines: dict[str, dict[str, str]] = {}
+    first: dict[str, list[str]] = {}
+    for row in rows:
+        place = ", ".join(f"{name} = {value:.4g}" for name, value in row["place"].items())
+        if place not in lines:
+            first.setdefault(row["parameter"], []).append(place)
+        told = f"{row['total']:.2f} ({row['low']:.2f}-{row['high']:.2f})"
+        lines.setdefault(place, {})[row["parameter"]] = told
+    wide = max(len(place) for place in lines) + 2 * any(lines)
+    head = " " * wide + "".join(f"{name:>{_wide(name)}}" for name in names)
+    body = [
+        f"{place:<{wide}}" + "".join(f"{told[name]:>{_wide(name)}}" for name in names) for place, told in lines.items()
+    ]
+    most = "; ".join(
+        name + ("" if len(first) == 1 else f" ({places[0]}{f' to {places[-1]}' if len(places) > 1 else ''})")
+        for name, places in first.items()
+    )
+    title = f"share of the variance of {output} that comes from a parameter, its interactions included (95 % interval)"
+    return "\n".join([title, head, *body, f"largest share: {most}"])
+
+
+def _wide(name: str) -> int:
+    """Width of a parameter's column."""
+    return max(len(name), 16) + 2
+
+
+def _written(found: Any, indices: Any, about: Mapping[str, str], path: Path) -> Path:
+    """Write both Datasets into one NetCDF file, with what it is about."""
+    from fingerspice.base.files import write_aside
+
+    whole = found if indices is None else found.merge(indices, compat="override", combine_attrs="drop_conflicts")
+    known = {key: value for key, value in whole.attrs.items() if value is not None and value != []}
+    whole.attrs = {**known, **about}
+    return write_aside(path, lambda aside: whole.to_netcdf(aside, engine="h5netcdf"))

@@ -1,0 +1,140 @@
+"""Pictures of sweeps: percentile bands along a grid or a histogram, and the parameters behind the variance."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import InputError
+from fingerspice.plots import drawing
+from fingerspice.plots.picture import Picture
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from xarray import Dataset
+
+# Ratio of the largest to the smallest abscissa from which on the axis is logarithmic.
+_WIDE = 20.0
+
+
+def plot_sweep(found: Dataset, output: str, indices: Dataset | None = None) -> Picture:
+    """An output of `sweep` along its grid, with the band from 5 to 95 %, or its histogram.
+
+    Parameters
+    ----------
+    found : xarray.Dataset
+        Of `sweep`, with at most one dimension beside ``scene``.
+    output : str
+    indices : xarray.Dataset, optional
+        Of `sobol`, for the same parameters. Then each parameter has a panel with the band and three curves, where it
+        takes low, middle and high values and the others stay at their medians; the last panel has the total indices.
+
+    Returns
+    -------
+    Picture
+
+    Raises
+    ------
+    InputError
+        If the grid has several dimensions.
+    """
+    one = found[output]
+    dims = [str(dim) for dim in one.dims if dim != "scene"]
+    if len(dims) > 1:
+        raise InputError(f"{output} has the dimensions {', '.join(dims)}; allowed in a picture: one beside scene")
+    values = one.transpose(*dims, *(["scene"] if "scene" in one.dims else [])).values
+    factor, unit = drawing.engineering(drawing.peak_of(np.nan_to_num(values)), one.attrs.get("units", ""), 0.05)
+    label = f"{output} [{unit}]" if unit else output
+    if dims:
+        x, x_label = found[dims[0]].values, f"{dims[0]} [{found[dims[0]].attrs.get('units', '')}]"
+        figure = _along(x, x_label, factor * values, label, indices, factor, output)
+        for ax in figure.axes:
+            if x.min() > 0.0 and x.max() > _WIDE * x.min():
+                ax.set_xscale("log")
+            ax.set_xlim(x.min(), x.max() if x.size > 1 else None)
+    else:
+        figure = _at_once(factor * np.ravel(values), label, indices, output)
+    if "scene" in one.dims:
+        drawing.caption(figure, f"{found.sizes['scene']:,} scenes, seed {found.attrs.get('seed', 0)}")
+    return figure
+
+
+def _along(
+    x: FloatArray, x_label: str, values: FloatArray, label: str, indices: Dataset | None, factor: float, output: str
+) -> Picture:
+    """Band and median along the grid: one panel, or one for each parameter and one for its shares."""
+    names = [] if indices is None else [str(name) for name in indices.parameter.values]
+    rows, columns = ((len(names) + 2) // 2, 2) if names else (1, 1)
+    figure, axes = drawing.new_figure(rows, columns, height=2.4 * rows, sharex=True)
+    for j, ax in enumerate(axes[: max(1, len(names))]):
+        _band(ax, x, values, indices is None)
+        if indices is not None:
+            _alone(ax, x, factor * indices[f"{output}_alone"].values[:, j], indices, j)
+        ax.set_ylim(bottom=min(0.0, float(np.nanmin(values))))
+        drawing.dress(ax, label if j % columns == 0 else "", "")
+    told = axes[0].get_legend_handles_labels()
+    if len(told[0]) > 1:
+        figure.legend(*told, loc="outside upper center", ncols=len(told[0]), fontsize=drawing.FONT, frameon=False)
+    if indices is not None:
+        _shares(axes[len(names)], indices, output, x)
+        drawing.dress(axes[len(names)], "share of variance", "")
+    for ax in axes[max(1, len(names) + 1) :]:
+        ax.remove()
+    for ax in axes[: max(1, len(names) + 1)][-columns:]:
+        drawing.dress(ax, ax.get_ylabel(), x_label)
+        ax.tick_params(labelbottom=True)
+    return figure
+
+
+def _alone(ax: Axes, x: FloatArray, values: FloatArray, indices: Dataset, j: int) -> None:
+    """Curves (n_x, n_quantile) where parameter `j` takes the quantiles of its distribution."""
+    at, unit = indices["at"].values[j], str(indices["unit"].values[j])
+    factor, unit = drawing.engineering(float(np.abs(at).max()), unit)
+    if unit.strip() == "1":
+        unit = "times"
+    told = f"{indices.parameter.values[j]}: {', '.join(f'{factor * one:.3g}' for one in at)} {unit}"
+    ax.set_title(drawing.drawable(told, 60), fontsize=drawing.FONT, loc="left", parse_math=False)
+    for k, colour in enumerate((drawing.BLUE, drawing.BLACK, drawing.VERMILION)):
+        name = f"its {100 * float(indices['quantile'][k]):g} % quantile"
+        ax.plot(x, values[:, k], linestyle=drawing.DASHES[k], color=colour, linewidth=1.3, label=name)
+
+
+def _at_once(values: FloatArray, label: str, indices: Dataset | None, output: str) -> Picture:
+    """A histogram, and bars for the shares."""
+    rows = 1 if indices is None else 2
+    figure, axes = drawing.new_figure(rows, height=2.4 * rows)
+    axes[0].hist(values, bins=40, color=drawing.CYCLE[0])
+    drawing.dress(axes[0], "scenes", label)
+    if indices is not None:
+        _shares(axes[1], indices, output, None)
+        drawing.dress(axes[1], "share of variance", "")
+    return figure
+
+
+def _band(ax: Axes, x: FloatArray, values: FloatArray, with_median: bool) -> None:
+    """Values (n_x,), or the middle nine tenths of those of each place, (n_x, n_scene)."""
+    if values.ndim == 1:
+        ax.plot(x, values, color=drawing.CYCLE[0], linewidth=1.3)
+        return
+    low, middle, high = np.nanquantile(values, [0.05, 0.5, 0.95], axis=-1)
+    ax.fill_between(x, low, high, color="0.85", linewidth=0.0, label="5 to 95 % of all")
+    if with_median:
+        ax.plot(x, middle, color=drawing.CYCLE[0], linewidth=1.3, label="median of all")
+
+
+def _shares(ax: Axes, indices: Dataset, output: str, x: FloatArray | None) -> None:
+    """Total index of every parameter with its interval, along the grid or as bars."""
+    total, low, high = (indices[f"{output}_total{kind}"].values for kind in ("", "_low", "_high"))
+    for j, name in enumerate(map(str, indices.parameter.values)):
+        color = drawing.CYCLE[j % len(drawing.CYCLE)]
+        if x is not None:
+            ax.fill_between(x, low[:, j], high[:, j], color=color, alpha=0.2, linewidth=0.0)
+            ax.plot(x, total[:, j], color=color, linewidth=1.3, label=name)
+        else:
+            off = [[max(total[j] - low[j], 0.0)], [max(high[j] - total[j], 0.0)]]
+            ax.bar([name], [total[j]], yerr=off, color=color, capsize=2.0)
+    ax.set_ylim(0.0, max(1.05, float(np.max(high))))
+    if x is not None:
+        drawing.legend_within(ax, 44)

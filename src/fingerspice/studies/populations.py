@@ -1,0 +1,332 @@
+"""Grids and random populations of a circuit's parameters, and which of them a figure's variance comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import InputError
+from fingerspice.circuit.arguments import require_circuit, require_number
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.studies.batch import batch, own_path
+from fingerspice.studies.batchtask import REFUSED
+from fingerspice.waveforms.waveform import require
+
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+# Largest number of scenes of a sweep, whose figures are kept in memory (some 100 bytes each), and of a population.
+MOST_SCENES, MOST_SAMPLES = 1 << 26, 1 << 20
+# Quantiles are taken no nearer to 0 and 1 than this, so that a distribution without bounds gives finite values.
+_EDGE = 1e-12
+# Quantiles of one parameter at which its influence is shown, all others being at their medians.
+QUANTILES = (0.05, 0.5, 0.95)
+# Resamples of the population for the intervals of the indices. (scipy's own cannot be given a seed.)
+RESAMPLES = 499
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Parameters that make a grid, those that are drawn (`n` draws by `seed`), and those that are one number.
+
+    Names are paths, or several paths with commas, whose numbers are factors; `own` has the paths of each and the values
+    that the factors are of.
+    """
+
+    grid: dict[str, FloatArray]
+    drawn: dict[str, Any]
+    fixed: dict[str, FloatArray]
+    own: dict[str, dict[str, float]]
+    units: dict[str, str]
+    n: int
+    seed: int
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(values.size for values in self.grid.values())
+
+    def scenes(self, values: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
+        """Values of each path from those of each name that is no fixed one."""
+        every = {**self.fixed, **values}
+        return {
+            path: factor * np.asarray(every[name], float)
+            for name, paths in self.own.items() for path, factor in paths.items()
+        }  # fmt: skip
+
+
+def _plan(circuit: Circuit, parameters: Mapping[str, Any], n: int, seed: int) -> _Plan:
+    require_circuit(circuit)
+    if not isinstance(parameters, Mapping) or not parameters:
+        raise InputError(f"parameters is {parameters!r}; allowed: a mapping such as {{'Xgap.d': [3e-6, 4e-6]}}")
+    for what, value in (("n", n), ("seed", seed)):
+        require_number(what, value, "a whole number")
+        require(value == int(value) and value >= 0, what, value, "a whole number, 0 or more")
+    require(1 < n <= MOST_SAMPLES and n & (n - 1) == 0, "n", n, "a power of two such as 1024, at most 2^20")
+    grid: dict[str, FloatArray] = {}
+    drawn: dict[str, Any] = {}
+    fixed: dict[str, FloatArray] = {}
+    own: dict[str, dict[str, float]] = {}
+    units: dict[str, str] = {}
+    for given, value in parameters.items():
+        paths = [own_path(circuit, one.strip()) for one in str(given).split(",")]
+        twice = [one for i, one in enumerate(paths) if one in paths[:i] or any(one in told for told in own.values())]
+        if twice:
+            raise InputError(f"{twice[0]} is given twice; allowed: once")
+        path = ",".join(paths)
+        alone = len(paths) == 1
+        own[path] = {one: 1.0 if alone else circuit.parameters[one].value for one in paths}
+        units[path] = circuit.parameters[path].unit if alone else "1"
+        if hasattr(value, "ppf"):
+            drawn[path] = value
+            continue
+        try:
+            array = np.asarray(value, float)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"{path} is {value!r}; allowed: a number, an array of numbers, or a frozen distribution of scipy.stats "
+                "such as norm(3.5e-6, 0.3e-6)"
+            ) from None
+        require(array.ndim < 2 and array.size > 0, path, f"of shape {array.shape}", "numbers in one row")
+        (grid if array.ndim else fixed)[path] = array
+    return _Plan(grid, drawn, fixed, own, units, int(n), int(seed))
+
+
+def sweep(
+    circuit: Circuit, parameters: Mapping[str, ArrayLike | Any], *, n: int = 1024, seed: int = 0, **options: Any
+) -> Dataset:
+    """Figures over a grid of some parameters and a random population of others.
+
+    Every array makes a dimension of the grid; a single number holds in all scenes. All
+    distributions together make the dimension ``scene``: `n` points of a scrambled Sobol sequence, mapped by their
+    inverse distribution functions, the same points at each place of the grid.
+
+    Parameters
+    ----------
+    circuit : Circuit
+    parameters : mapping of str to array_like or distribution
+        Path, as in `Circuit.replace`, to numbers in the netlist's unit, or to a frozen distribution of `scipy.stats`.
+        Several paths with commas between them are scaled together: their numbers are factors on the circuit's values.
+    n : int
+        Number of draws, a power of two.
+    seed : int
+        Of the sequence's scrambling.
+    **options
+        As of `batch`: `outputs`, `rtol`, `t_stop`, `periods`, `periodic`, `skin`, `points`, `threads`.
+
+    Returns
+    -------
+    xarray.Dataset
+        As of `batch`, with a dimension for each array, named by its path, and ``scene`` where something is drawn.
+
+    Raises
+    ------
+    InputError
+        As `batch`, for an `n` that is no power of two, and for too many scenes.
+    """
+    plan = _plan(circuit, parameters, n, seed)
+    return _run(circuit, plan, _draws(plan), options)
+
+
+def _draws(plan: _Plan) -> dict[str, FloatArray]:
+    """Values of the drawn parameters, shape (n,) each."""
+    if not plan.drawn:
+        return {}
+    from scipy.stats import qmc
+
+    points = qmc.Sobol(len(plan.drawn), scramble=True, rng=plan.seed).random(plan.n)
+    points = np.clip(points, _EDGE, 1.0 - _EDGE)
+    return {path: np.asarray(law.ppf(points[:, i]), float) for i, (path, law) in enumerate(plan.drawn.items())}
+
+
+def _run(circuit: Circuit, plan: _Plan, draws: Mapping[str, FloatArray], options: Mapping[str, Any]) -> Dataset:
+    """The batch of all scenes, in the shape of the grid."""
+    from xarray import Dataset
+
+    count = next(iter(draws.values())).size if draws else 1
+    places = int(np.prod(plan.shape))
+    require(places * count <= MOST_SCENES, "the sweep", f"{places * count:,} scenes", f"at most {MOST_SCENES:,}")
+    mesh = np.meshgrid(*plan.grid.values(), indexing="ij")
+    flat = {path: np.repeat(values.ravel(), count) for path, values in zip(plan.grid, mesh, strict=True)}
+    flat |= {path: np.tile(values, places) for path, values in draws.items()}
+    found = batch(circuit, plan.scenes(flat), **options)
+    dims, own = tuple(plan.grid), ("scene",) if draws else ()
+
+    def shaped(values: FloatArray) -> FloatArray:
+        whole = values.reshape(*plan.shape, count, *values.shape[1:])
+        return whole if draws else whole.reshape(*plan.shape, *values.shape[1:])
+
+    data = {
+        name: ((*dims, *own, *one.dims[1:]), shaped(one.values), one.attrs) for name, one in found.data_vars.items()
+    }
+    coords: dict[str, Any] = {name: (name, values, {"units": plan.units[name]}) for name, values in plan.grid.items()}
+    coords |= {name: ("scene", values, {"units": plan.units[name]}) for name, values in draws.items()}
+    coords |= {name: one for name, one in found.coords.items() if name == "turn"}
+    return Dataset(data, coords, found.attrs | ({"n": plan.n, "seed": plan.seed} if draws else {}))
+
+
+def sobol(
+    circuit: Circuit,
+    parameters: Mapping[str, ArrayLike | Any],
+    *,
+    n: int = 1024,
+    seed: int = 0,
+    confidence: float = 0.95,
+    **options: Any,
+) -> Dataset:
+    """Shares of a figure's variance that come from each random parameter: Sobol indices at every place of a grid.
+
+    The index of first order is the share that the parameter causes alone, the total one that with all its interactions
+    (Saltelli et al. 2010, by `scipy.stats.sobol_indices`). n (d + 2) scenes at each place of the grid, where d
+    parameters are drawn.
+
+    Parameters
+    ----------
+    circuit, parameters, n, seed, **options
+        As of `sweep`; one parameter or more must be a distribution, and outputs are numbers, not ``u_gap``.
+    confidence : float
+        Probability of the intervals, which come from resampling the population.
+
+    Returns
+    -------
+    xarray.Dataset
+        With the dimensions of the grid and ``parameter``: for each output ``OUTPUT_first`` and ``OUTPUT_total``, each
+        with its interval (``_low``, ``_high``); over the population ``OUTPUT_mean`` and ``OUTPUT_std``; and with the
+        dimension ``quantile`` ``OUTPUT_alone``, where one parameter takes these quantiles of its distribution (their
+        values are ``at``), and the others their medians.
+
+    Raises
+    ------
+    InputError
+        As `sweep`; if nothing is drawn; and if a scene has no result, because indices need all of them.
+    """
+    plan = _plan(circuit, parameters, n, seed)
+    require(bool(plan.drawn), "parameters", "all numbers", "one distribution or more, such as scipy.stats.norm(...)")
+    require_number("confidence", confidence, "a number")
+    require(0.0 < confidence < 1.0, "confidence", confidence, "a number between 0 and 1")
+    outputs = options.get("outputs", ("f_el_mean",))
+    outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+    require("u_gap" not in outputs, "outputs", "u_gap", "figures, which are one number for each scene")
+    places = [dict(zip(plan.grid, values, strict=True)) for values in _product(plan)]
+    rows = [_indices(circuit, plan, place, outputs, confidence, options) for place in places]
+    return _as_dataset(plan, outputs, rows)
+
+
+def _product(plan: _Plan) -> FloatArray:
+    """Values at every place of the grid, shape (n_place, n_grid)."""
+    mesh = np.meshgrid(*plan.grid.values(), indexing="ij")
+    return np.array([values.ravel() for values in mesh]).T if mesh else np.zeros((1, 0))
+
+
+def _indices(
+    circuit: Circuit, plan: _Plan, place: dict[str, float], outputs: tuple[str, ...], confidence: float,
+    options: Mapping[str, Any],
+) -> dict[str, FloatArray]:  # fmt: skip
+    """Indices (n_output, d), their intervals, and mean and standard deviation of the outputs, at one place."""
+    from scipy.stats import sobol_indices
+
+    told: list[FloatArray] = []
+
+    def figures(x: FloatArray) -> FloatArray:
+        found = batch(circuit, plan.scenes(dict(zip(plan.drawn, np.asarray(x, float), strict=True)) | place), **options)
+        lost = int(np.count_nonzero(found.status >= REFUSED))
+        if lost:
+            why = f" ({found.attrs['failures'][0]})" if len(found.attrs["failures"]) else ""
+            raise InputError(
+                f"{lost} of {found.sizes['scene']} scenes have no result{why}, and indices need all; allowed: "
+                "distributions that stay where the circuit works"
+            )
+        values = np.array([found[name].values for name in outputs])
+        require(values.ndim == 2, "outputs", "one for each of several gaps", "figures of a circuit with one GAP")
+        # A copy: scipy takes the mean off what it is given.
+        told.append(values.copy())
+        return values
+
+    found = sobol_indices(func=figures, n=plan.n, dists=list(plan.drawn.values()), rng=plan.seed)
+    d = len(plan.drawn)
+    a, b = told[0], told[1]
+    # The third call has the scenes in which parameter j is taken from the other population, at every d-th place.
+    mixed = np.moveaxis(told[2].reshape(len(outputs), plan.n, d), -1, 0)
+    # Then each parameter by itself.
+    alone = np.full((d, len(QUANTILES), d), 0.5)
+    alone[np.arange(d), :, np.arange(d)] = QUANTILES
+    x = np.array([law.ppf(alone[..., j].ravel()) for j, law in enumerate(plan.drawn.values())])
+    picks = np.random.default_rng(plan.seed).integers(0, plan.n, (RESAMPLES, plan.n))
+    drawn = np.array([_saltelli(a[:, pick], b[:, pick], mixed[..., pick]) for pick in picks])
+    low, high = np.quantile(drawn, [0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence], axis=0)
+    both = np.concatenate([a, b], axis=1)
+    return {
+        "first": np.reshape(found.first_order, (len(outputs), d)), "first_low": low[0], "first_high": high[0],
+        "total": np.reshape(found.total_order, (len(outputs), d)), "total_low": low[1], "total_high": high[1],
+        "mean": both.mean(axis=1), "std": both.std(axis=1),
+        "alone": figures(x).reshape(len(outputs), d, len(QUANTILES)),
+    }  # fmt: skip
+
+
+def _saltelli(a: FloatArray, b: FloatArray, mixed: FloatArray) -> FloatArray:
+    """Indices of first order and total ones (Saltelli et al. 2010, rows b and f of its Table 2), (2, n_output, d)."""
+    both = np.concatenate([a, b], axis=1)
+    middle, variance = both.mean(axis=1, keepdims=True), both.var(axis=1)
+    a, b, mixed = a - middle, b - middle, mixed - middle
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = np.mean(b * (mixed - a), axis=-1) / variance
+        total = 0.5 * np.mean((a - mixed) ** 2, axis=-1) / variance
+    # A figure that does not change has indices of 0.
+    return np.asarray(np.nan_to_num(np.array([first.T, total.T]), nan=0.0, posinf=0.0, neginf=0.0), float)
+
+
+def _as_dataset(plan: _Plan, outputs: tuple[str, ...], rows: list[dict[str, FloatArray]]) -> Dataset:
+    from xarray import Dataset
+
+    dims = tuple(plan.grid)
+    data: dict[str, Any] = {}
+    for i, output in enumerate(outputs):
+        for kind in rows[0]:
+            values = np.array([row[kind][i] for row in rows])
+            own = ("parameter", "quantile")[: values.ndim - 1]
+            data[f"{output}_{kind}"] = ((*dims, *own), values.reshape((*plan.shape, *values.shape[1:])))
+    coords: dict[str, Any] = {path: (path, values, {"units": plan.units[path]}) for path, values in plan.grid.items()}
+    coords |= {"parameter": list(plan.drawn), "quantile": list(QUANTILES)}
+    coords["unit"] = ("parameter", [plan.units[name] for name in plan.drawn])
+    data["at"] = (("parameter", "quantile"), [law.ppf(QUANTILES) for law in plan.drawn.values()])
+    return Dataset(data, coords, {"n": plan.n, "seed": plan.seed, "outputs": list(outputs)})
+
+
+def ranking(found: Dataset, output: str) -> list[dict[str, Any]]:
+    """Which parameters the variance of an output of `sobol` comes from: rows, at each place the largest index first.
+
+    A row has ``place`` (values on the grid), ``parameter``, ``first``, ``total``, ``low`` and ``high`` (of ``total``).
+    """
+    dims = [str(dim) for dim in found[f"{output}_total"].dims[:-1]]
+    rows: list[dict[str, Any]] = []
+    for index in np.ndindex(*(found.sizes[dim] for dim in dims)):
+        one = found.isel(dict(zip(dims, index, strict=True)))
+        first, total, low, high = (
+            one[f"{output}_{kind}"].values for kind in ("first", "total", "total_low", "total_high")
+        )
+        place = {dim: float(one[dim]) for dim in dims}
+        rows += [
+            {
+                "place": place, "parameter": str(one.parameter.values[j]), "first": float(first[j]),
+                "total": float(total[j]), "low": float(low[j]), "high": float(high[j]),
+            }
+            for j in np.argsort(-total, kind="stable")
+        ]  # fmt: skip
+    return rows
+
+
+def summary(found: Dataset) -> list[dict[str, float | str]]:
+    """Median, 5 and 95 percent and mean of every output of `sweep`, over all its scenes, as rows."""
+    rows: list[dict[str, float | str]] = []
+    for name, one in found.data_vars.items():
+        if name in ("error", "status", "u_gap"):
+            continue
+        low, middle, high = np.nanquantile(one.values, [0.05, 0.5, 0.95]).tolist()
+        unit = str(one.attrs.get("units", ""))
+        mean = float(np.nanmean(one.values))
+        rows.append({"output": str(name), "unit": unit, "p5": low, "median": middle, "p95": high, "mean": mean})
+    return rows
