@@ -47,6 +47,8 @@ MENDED = {
     (0, 354): "right",  # Radau's tolerance was one of 1 V, however large the source.
     (0, 5490): "right",
     (1, 920): "refused: fold",
+    # A gap voltage below rounding went over the fold, and the end of the steps was taken for it.
+    (0, 1969): "refused: fold",
     # The path to a fold is followed only at a loose tolerance, for the rounding of a fast leak.
     (0, 1204): "refused: fold",
     (1, 45): "refused: fold",

@@ -21,9 +21,10 @@ from fingerspice.engine.segment import Segment, source
 from fingerspice.results.outcome import Failure, SolveError, Status, last_tried
 from fingerspice.solve.marching import solve as solve_marching
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Run
+from fingerspice.solve.runs import PAST_FOLD, Run
 from fingerspice.solve.sources import Tables
 from fingerspice.solve.stackstate import StackState, from_stack, from_written, model_of, row_width, to_stack
+from fingerspice.waveforms.sampling import breakpoints_at
 
 FINEST_RTOL = 1e-12
 # Where leaks are much faster than the path to the fold, their round-off makes a tight tolerance unattainable. The
@@ -52,6 +53,10 @@ def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | N
         Output times (s, ascending), and whether the left-hand limit is wanted there.
     """
     run = solve_marching(problem, FINEST_RTOL, t_out, left, repeat=False)
+    jumped = run.t_failed is not None and breakpoints_at(problem.waveform, run.t_failed).size > 0
+    if not jumped and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD:
+        # Where the gap voltage is as small as rounding, steps may cross a fold unseen: their end is not the fold.
+        return None
     if run.status is Status.FOLD:
         return lead_to_fold(problem, run, t_out, left)
     return run if run.status is Status.SUCCESS else None

@@ -19,7 +19,7 @@ from fingerspice.numerics.radau_tableau import radau
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import NetworkIntegration, Progress, Run, gap_signals, integrate, nodes_apart
+from fingerspice.solve.runs import PAST_FOLD, NetworkIntegration, Progress, Run, gap_signals, integrate, nodes_apart
 from fingerspice.solve.sources import Tables, ramp, values_at
 
 # Stages of a run and of the coarser run, and the ratio of the coarser run's tolerance to the run's. The stated error is
@@ -42,8 +42,6 @@ ATTEMPTS = 6
 # Relative difference of a fold's times in two successive runs at which the fold is accepted at once; and the one at
 # which it is accepted after the last attempt.
 FOLD_TIME, FOLD_SPREAD = 1e-10, 1e-5
-# A distance to the fold below this means that the run has stepped over a fold: at the fold it is 0 to rounding.
-PAST_FOLD = -0.01
 # Limit of accepted and rejected steps: at the start, and over the whole run. A run that needs more has a cause that
 # smaller steps do not remove.
 FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000

@@ -23,6 +23,8 @@ Progress = Callable[[float], None]
 
 # Round-off of a gap voltage relative to the voltages that cancel in it; finer steps cannot reduce the error below that.
 ROUNDING = 2e-14
+# A distance to the fold below this means that the run has stepped over a fold: at the fold it is 0 to rounding.
+PAST_FOLD = -0.01
 # Smallest force (N) whose error is judged; the error of a smaller one may be a denormal number with too few digits.
 LEAST_FORCE = 1e-290
 
