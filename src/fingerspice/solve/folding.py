@@ -27,7 +27,7 @@ from fingerspice.solve.stackstate import StackState, from_stack, from_written, m
 from fingerspice.waveforms.sampling import breakpoints_at
 
 FINEST_RTOL = 1e-12
-# Stated over estimated error of a run at that tolerance towards a fold: the estimate alone was as low as half the error.
+# Stated over estimated error of such a run towards a fold: alone, the estimate was as low as half the true error.
 SAFETY = 4.0
 # Where leaks are much faster than the path to the fold, their round-off makes a tight tolerance unattainable. The
 # second attempt uses LOOSER_RTOL. The third, with LOOSEST_RTOL, is made only within the distance NEAR of the fold,
