@@ -147,3 +147,44 @@ def test_bad_tables(circuit: fs.Circuit, tmp_path: Path) -> None:
         fs.fit(circuit, {"voltage": [100.0], "f_el_mean": [1e-2]}, ["Xgap.d"])
     with pytest.raises(InputError, match=r"bounds names Xgap\.r, which is not fitted"):
         fs.fit(circuit, {"f_el_mean": [1e-2]}, ["Xgap.d"], bounds={"Xgap.r": (1.0, 2.0)})
+
+
+def test_a_profile_of_clear_data_is_the_interval_of_the_derivatives() -> None:
+    circuit = fs.read_netlist(CIRCUITS / "fingerpad.cir")
+    found = fs.fit(circuit, CIRCUITS / "measured.csv", ["Xgap.d", "Xgap.r"], skin="follow", profiles=["xgap.d"])
+    assert list(found.profiles) == ["Xgap.d"]
+    profile, estimate = found.profiles["Xgap.d"], found.estimates["Xgap.d"]
+    assert profile.shape == "symmetric"
+    reach = np.log(estimate.high / estimate.low)
+    assert np.log(profile.low / estimate.low) == pytest.approx(0.0, abs=0.03 * reach)
+    assert np.log(profile.high / estimate.high) == pytest.approx(0.0, abs=0.03 * reach)
+    # At the ends of the interval the best fit is worse by the quantile of chi squared.
+    assert profile.limit == pytest.approx(found.objective + 3.8415, rel=1e-4)
+    for end in (profile.low, profile.high):
+        held = circuit.replace({"Xgap.d": end})
+        again = fs.fit(held, CIRCUITS / "measured.csv", ["Xgap.r"], skin="follow")
+        assert again.objective == pytest.approx(profile.limit, abs=0.1)
+    assert "profile of Xgap.d" in str(found)
+
+
+def test_a_profile_says_where_the_data_set_no_end() -> None:
+    circuit = fs.read_netlist(CIRCUITS / "fingerpad.cir")
+    # Far above the corner of the gap's resistance and capacitance, a larger resistance changes nothing.
+    frequency = np.array([5e3, 7e3, 1e4, 2e4])
+    runs = [fs.steady_state(circuit.replace({"Vdrive.frequency": f}), rtol=1e-8).solution.f_el_mean for f in frequency]
+    data = {"source.frequency": frequency, "f_el_mean": runs, "sigma": 0.02 * np.array(runs)}
+    found = fs.fit(circuit, data, ["Xgap.r"], profiles=True)
+    profile = found.profiles["Xgap.r"]
+    assert profile.shape == "open above"
+    assert profile.high == np.inf
+    assert 0.0 < profile.low < 1e6
+    bounded = fs.fit(circuit, data, ["Xgap.r"], bounds={"Xgap.r": (1e4, 1e7)}, profiles=True)
+    assert bounded.profiles["Xgap.r"].high == 1e7
+
+
+def test_profiles_of_what_is_not_fitted_are_refused() -> None:
+    circuit = fs.read_netlist(CIRCUITS / "fingerpad.cir")
+    with pytest.raises(
+        fs.InputError, match=r"profiles names 'Xskin\.d', which is not fitted; allowed: True, or Xgap\.d"
+    ):
+        fs.fit(circuit, CIRCUITS / "measured.csv", ["Xgap.d"], profiles=["Xskin.d"])

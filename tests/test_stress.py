@@ -70,7 +70,6 @@ MENDED = {
 }
 
 
-
 @pytest.mark.parametrize(("seed", "number"), list(MENDED))
 def test_a_scene_that_was_wrong_or_endless_is_mended(seed: int, number: int) -> None:
     assert stress.judge(stress.draw(seed, number)).end == MENDED[seed, number]

@@ -24,6 +24,7 @@ def fit(
     overwrite: Overwrite = False,
     average: Annotated[str, typer.Option(help="periodic (periodic state) or run (over the deck's run).")] = "periodic",
     skin: Annotated[str, typer.Option(help="own, or follow: a SKIN's f is the source's frequency.")] = "own",
+    profile: Annotated[bool, typer.Option("--profile", help="Profile likelihood of every parameter.")] = False,
     charge_law: ChargeLaw = None,
     changes: Set = None,
     as_json: AsJson = False,
@@ -44,7 +45,7 @@ def fit(
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         file, image = results.file("_fit.csv"), None if no_plot else results.file("_fit.png")
         paths = [path.strip() for path in free.split(",")]
-        found = find(circuit, table, paths, average=average, skin=skin, charge_law=charge_law)
+        found = find(circuit, table, paths, average=average, skin=skin, charge_law=charge_law, profiles=profile)
         results.open()
         writes: list[Callable[[], Path]] = [lambda: found.to_csv(file)]
         if image is not None:

@@ -3,136 +3,30 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.errors import InputError
 from fingerspice.circuit.arguments import require_circuit, require_number
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack, is_stack
-from fingerspice.results.outcome import SolveError
-from fingerspice.solve.simulation import RTOL_RANGE, simulate
+from fingerspice.solve.simulation import RTOL_RANGE
 from fingerspice.studies.batch import batch
-from fingerspice.studies.fitdata import Data, data_of
-from fingerspice.studies.fitresult import Fit, Fitted, fit_result
-from fingerspice.studies.steady import steady_state
+from fingerspice.studies.fitdata import data_of
+from fingerspice.studies.fitprofile import profile_of
+from fingerspice.studies.fitresult import Fit, fit_result
+from fingerspice.studies.fittask import REFUSED, Task, followed
 from fingerspice.waveforms.waveform import require
 
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.
 _SPREAD, _FOLLOWED = 4.0, 3
-# Relative step of a difference, where derivatives are not exact: of networks.
-_STEP = 1e-4
-# What a scene that cannot be run counts as, over the scale of the data.
-_REFUSED = 1e6
-# Error of the least squares' last step, relative, and of the means by which starts are compared.
-_CLOSE, _ROUGH = 1e-8, 1e-3
-
-
-@dataclass(frozen=True)
-class Task:
-    """What is fitted.
-
-    Attributes
-    ----------
-    circuit : Circuit
-        With the values to start from.
-    data : Data
-    paths : tuple of str
-    bounds : ndarray, shape (n_parameter, 2)
-        Smallest and largest values.
-    average : str
-    skin : str
-    rtol : float
-    charge_law : str or None
-    scale : ndarray, shape (n,)
-        By which residuals are divided.
-    exact : bool
-        Whether derivatives are those of a series stack, and not differences.
-    """
-
-    circuit: Circuit
-    data: Data
-    paths: tuple[str, ...]
-    bounds: FloatArray
-    average: str
-    skin: str
-    rtol: float
-    charge_law: str | None
-    scale: FloatArray
-    exact: bool
-
-    @property
-    def initial(self) -> FloatArray:
-        """Values to start from."""
-        return np.array([self.circuit.parameters[path].value for path in self.paths])
-
-    def scene(self, values: FloatArray, row: int) -> Circuit:
-        """The circuit of one measurement."""
-        changes = {path: float(x[row]) for path, x in self.data.conditions.items()}
-        changed = self.circuit.varied(changes | dict(zip(self.paths, values.tolist(), strict=True)))
-        if self.skin == "follow":
-            fundamental = build_stack(changed).waveform.fundamental if is_stack(changed) else None
-            skins = {f"{e.name}.f": fundamental.frequency for e in changed.by_device("SKIN") if fundamental is not None}
-            changed = changed.varied(skins)
-        return changed
-
-    def predict(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Predicted data (n,), and their derivatives by the logarithms of the parameters (n, n_parameter)."""
-        if self.exact:
-            return self._predicted(values, self.paths)
-        middle, _ = self._predicted(values, ())
-        by = np.empty((middle.size, values.size))
-        for k in range(values.size):
-            pair = []
-            for sign in (-1.0, 1.0):
-                moved = values.copy()
-                moved[k] *= 1.0 + sign * _STEP
-                pair.append(self._predicted(moved, ())[0])
-            by[:, k] = (pair[1] - pair[0]) / (2.0 * _STEP)
-        return middle, by
-
-    def _predicted(self, values: FloatArray, paths: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
-        data, how = self.data, {"rtol": self.rtol, "charge_law": self.charge_law, "charge": False}
-        if data.t is not None:
-            run = simulate(self.scene(values, 0), t_eval=data.t, sensitivities=paths, **how)  # type: ignore[arg-type]
-            slopes = [getattr(run.sensitivities[path], data.signal) for path in paths]
-            return np.asarray(getattr(run, data.signal)), np.array(slopes).reshape(len(paths), -1).T * values[
-                : len(paths)
-            ]
-        name, found, by = f"{data.signal}_mean", np.empty(data.values.size), np.empty((data.values.size, len(paths)))
-        for row in range(data.values.size):
-            circuit = self.scene(values, row)
-            if self.average == "periodic":
-                one = steady_state(circuit, sensitivities=paths, points=4, **how)  # type: ignore[arg-type]
-            else:
-                one = simulate(circuit, sensitivities=paths, t_eval=[0.0], t_stop=_end(circuit), **how)  # type: ignore[arg-type,assignment]
-            found[row] = getattr(one, name)
-            for k, path in enumerate(paths):
-                by[row, k] = getattr(one.sensitivities[path], name) * values[k]
-        return found, by
-
-    def residuals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals over their scale, and their derivatives; large ones where a scene cannot be run."""
-        try:
-            with warnings.catch_warnings():
-                # Of values that no user has written.
-                warnings.simplefilter("ignore", FingerspiceWarning)
-                found, by = self.predict(values)
-        except (InputError, SolveError):
-            return np.full(self.scale.size, _REFUSED), np.zeros((self.scale.size, values.size))
-        return (found - self.data.values) / self.scale, by / self.scale[:, None]
-
-
-def _end(circuit: Circuit) -> float:
-    if circuit.tran is None:
-        raise InputError("the deck has no .tran, and average is 'run'; allowed: a deck with .tran, or 'periodic'")
-    return circuit.tran.stop
+# Error of the means by which starts are compared.
+_ROUGH = 1e-3
 
 
 def fit(
@@ -146,6 +40,7 @@ def fit(
     charge_law: str | None = None,
     starts: int = 8,
     rtol: float = 1e-7,
+    profiles: bool | Sequence[str] = False,
 ) -> Fit:
     """Fit parameters of a circuit to measured data, by least squares in their logarithms.
 
@@ -173,6 +68,9 @@ def fit(
         Values from which the fit may start: those of the circuit, and others around them. The best three are followed.
     rtol : float
         Error of every run.
+    profiles : bool or sequence of str
+        Paths whose profile likelihood is wanted, or True for all: the data are fitted again and again with the
+        parameter held at values ever farther away, until the fit is too bad.
 
     Returns
     -------
@@ -187,16 +85,34 @@ def fit(
     task = _task(circuit, data, parameters, bounds, average, skin, charge_law, rtol)
     require_number("starts", starts, "a whole number")
     require(starts >= 1, "starts", starts, "1 or more")
-    ends = [_followed(task, begin) for begin in _starts(task, int(starts))]
+    wanted = _profiled(task.paths, profiles)
+    ends = [followed(task, begin) for begin in _starts(task, int(starts))]
     best = min(ends, key=lambda end: end.objective)
-    if not best.objective < 0.5 * _REFUSED**2:
+    if not best.objective < 0.5 * REFUSED**2:
         raise InputError(
             "none of the starts can be run: there is no contact, no solution, or a value out of range; allowed: a "
             "circuit that runs under the conditions of the data"
         )
-    return fit_result(
+    found = fit_result(
         task.circuit, task.data, task.paths, task.bounds, best, [end.objective for end in ends], task.scale
     )
+    return replace(found, profiles={path: profile_of(task, best, path, _error(found, path)) for path in wanted})
+
+
+def _error(found: Fit, path: str) -> float:
+    """Standard error of a parameter's logarithm."""
+    return found.estimates[path].error / found.estimates[path].value
+
+
+def _profiled(paths: tuple[str, ...], wanted: bool | Sequence[str]) -> list[str]:
+    """The paths whose profiles are wanted, in the circuit's own spelling."""
+    if isinstance(wanted, bool):
+        return list(paths) if wanted else []
+    known = {path.lower(): path for path in paths}
+    for path in wanted:
+        if not isinstance(path, str) or path.lower() not in known:
+            raise InputError(f"profiles names {path!r}, which is not fitted; allowed: True, or {', '.join(paths)}")
+    return [known[path.lower()] for path in wanted]
 
 
 def _task(
@@ -271,26 +187,3 @@ def _starts(task: Task, count: int) -> list[FloatArray]:
     off = (((found - task.data.values) / task.scale) ** 2).sum(axis=1)
     order = np.argsort(np.where(np.isfinite(off), off, math.inf), kind="stable")
     return [initial, *(tried[i] for i in order[:_FOLLOWED].tolist() if i > 0)]
-
-
-def _followed(task: Task, begin: FloatArray) -> Fitted:
-    """Where least squares lead from a start."""
-    from scipy.optimize import least_squares
-
-    known: dict[bytes, tuple[FloatArray, FloatArray]] = {}
-
-    def at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        key = x.tobytes()
-        if key not in known:
-            known.clear()
-            known[key] = task.residuals(np.exp(x))
-        return known[key]
-
-    with np.errstate(divide="ignore"):
-        box = np.log(task.bounds).T
-    x0 = np.clip(np.log(begin), *box)
-    found = least_squares(
-        lambda x: at(x)[0], x0, lambda x: at(x)[1], bounds=box, xtol=_CLOSE, ftol=1e-12, gtol=1e-12, max_nfev=100
-    )
-    residual, by = at(found.x)
-    return Fitted(np.exp(found.x), residual, by, float(residual @ residual), int(found.nfev), bool(found.status > 0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,6 +66,34 @@ class Estimate:
     at_bound: bool
 
 
+@dataclass(frozen=True)
+class Profile:
+    """The best fits with one parameter held at each of several values.
+
+    Attributes
+    ----------
+    path : str
+    values : ndarray, shape (n,)
+        Values of the parameter, ascending.
+    objective : ndarray, shape (n,)
+        Sum of the squared residuals at each, as `Fit.objective`.
+    limit : float
+        The objective at the ends of the 95 % interval.
+    low, high : float
+        The interval; 0 or a bound, and infinity or a bound, where the data set no end.
+    shape : str
+        ``"symmetric"`` (in the logarithm), ``"skewed"``, ``"open below"``, ``"open above"`` or ``"open"``.
+    """
+
+    path: str
+    values: FloatArray
+    objective: FloatArray
+    limit: float
+    low: float
+    high: float
+    shape: str
+
+
 @dataclass(frozen=True, repr=False)
 class Fit(Shown):
     """A fit of parameters to data; `circuit` is ready to run.
@@ -94,6 +122,8 @@ class Fit(Shown):
         Whether the iteration closed.
     notes : tuple of str
         What the data do not tell, and which measurement would.
+    profiles : dict of str to Profile
+        By path, as far as they were asked for.
     """
 
     circuit: Circuit
@@ -108,6 +138,7 @@ class Fit(Shown):
     evaluations: int
     closed: bool
     notes: tuple[str, ...]
+    profiles: dict[str, Profile] = field(default_factory=dict)
 
     @property
     def residual(self) -> FloatArray:
@@ -140,6 +171,9 @@ class Fit(Shown):
         ]
         if pairs:
             lines += ["", "correlations beyond 0.1: " + "; ".join(pairs)]
+        for one in self.profiles.values():
+            unit = self.estimates[one.path].unit
+            lines += [f"profile of {one.path}: {one.low:.4g} to {one.high:.4g} {unit}, {one.shape}"]
         return Page([*lines, *(["", *self.notes] if self.notes else [])])
 
     def plot(self) -> Figure:
@@ -182,6 +216,10 @@ class Fit(Shown):
             "objective": self.objective,
             "objectives": list(self.objectives),
             "notes": list(self.notes),
+            "profiles": [
+                {**vars(one), "values": one.values.tolist(), "objective": one.objective.tolist()}
+                for one in self.profiles.values()
+            ],
         }
 
     def to_csv(self, path: str | Path) -> Path:

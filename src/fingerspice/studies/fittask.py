@@ -1,0 +1,149 @@
+"""What is fitted: predictions and residuals with their derivatives, and the least squares from one start."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.statespace import build_stack, is_stack
+from fingerspice.results.outcome import SolveError
+from fingerspice.solve.simulation import simulate
+from fingerspice.studies.fitdata import Data
+from fingerspice.studies.fitresult import Fitted
+from fingerspice.studies.steady import steady_state
+
+# Relative step of a difference, where derivatives are not exact: of networks.
+_STEP = 1e-4
+# What a scene that cannot be run counts as, over the scale of the data.
+REFUSED = 1e6
+# Error of the least squares' last step, relative.
+CLOSE = 1e-8
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is fitted.
+
+    Attributes
+    ----------
+    circuit : Circuit
+        With the values to start from.
+    data : Data
+    paths : tuple of str
+    bounds : ndarray, shape (n_parameter, 2)
+        Smallest and largest values.
+    average : str
+    skin : str
+    rtol : float
+    charge_law : str or None
+    scale : ndarray, shape (n,)
+        By which residuals are divided.
+    exact : bool
+        Whether derivatives are those of a series stack, and not differences.
+    """
+
+    circuit: Circuit
+    data: Data
+    paths: tuple[str, ...]
+    bounds: FloatArray
+    average: str
+    skin: str
+    rtol: float
+    charge_law: str | None
+    scale: FloatArray
+    exact: bool
+
+    @property
+    def initial(self) -> FloatArray:
+        """Values to start from."""
+        return np.array([self.circuit.parameters[path].value for path in self.paths])
+
+    def scene(self, values: FloatArray, row: int) -> Circuit:
+        """The circuit of one measurement."""
+        changes = {path: float(x[row]) for path, x in self.data.conditions.items()}
+        changed = self.circuit.varied(changes | dict(zip(self.paths, values.tolist(), strict=True)))
+        if self.skin == "follow":
+            fundamental = build_stack(changed).waveform.fundamental if is_stack(changed) else None
+            skins = {f"{e.name}.f": fundamental.frequency for e in changed.by_device("SKIN") if fundamental is not None}
+            changed = changed.varied(skins)
+        return changed
+
+    def predict(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Predicted data (n,), and their derivatives by the logarithms of the parameters (n, n_parameter)."""
+        if self.exact:
+            return self._predicted(values, self.paths)
+        middle, _ = self._predicted(values, ())
+        by = np.empty((middle.size, values.size))
+        for k in range(values.size):
+            pair = []
+            for sign in (-1.0, 1.0):
+                moved = values.copy()
+                moved[k] *= 1.0 + sign * _STEP
+                pair.append(self._predicted(moved, ())[0])
+            by[:, k] = (pair[1] - pair[0]) / (2.0 * _STEP)
+        return middle, by
+
+    def _predicted(self, values: FloatArray, paths: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
+        data, how = self.data, {"rtol": self.rtol, "charge_law": self.charge_law, "charge": False}
+        if data.t is not None:
+            run = simulate(self.scene(values, 0), t_eval=data.t, sensitivities=paths, **how)  # type: ignore[arg-type]
+            slopes = [getattr(run.sensitivities[path], data.signal) for path in paths]
+            return np.asarray(getattr(run, data.signal)), np.array(slopes).reshape(len(paths), -1).T * values[
+                : len(paths)
+            ]
+        name, found, by = f"{data.signal}_mean", np.empty(data.values.size), np.empty((data.values.size, len(paths)))
+        for row in range(data.values.size):
+            circuit = self.scene(values, row)
+            if self.average == "periodic":
+                one = steady_state(circuit, sensitivities=paths, points=4, **how)  # type: ignore[arg-type]
+            else:
+                one = simulate(circuit, sensitivities=paths, t_eval=[0.0], t_stop=_end(circuit), **how)  # type: ignore[arg-type,assignment]
+            found[row] = getattr(one, name)
+            for k, path in enumerate(paths):
+                by[row, k] = getattr(one.sensitivities[path], name) * values[k]
+        return found, by
+
+    def residuals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals over their scale, and their derivatives; large ones where a scene cannot be run."""
+        try:
+            with warnings.catch_warnings():
+                # Of values that no user has written.
+                warnings.simplefilter("ignore", FingerspiceWarning)
+                found, by = self.predict(values)
+        except (InputError, SolveError):
+            return np.full(self.scale.size, REFUSED), np.zeros((self.scale.size, values.size))
+        return (found - self.data.values) / self.scale, by / self.scale[:, None]
+
+
+def _end(circuit: Circuit) -> float:
+    if circuit.tran is None:
+        raise InputError("the deck has no .tran, and average is 'run'; allowed: a deck with .tran, or 'periodic'")
+    return circuit.tran.stop
+
+
+def followed(task: Task, begin: FloatArray, close: float = CLOSE) -> Fitted:
+    """Where least squares lead from a start; `close` is the relative error of the last step."""
+    from scipy.optimize import least_squares
+
+    known: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+
+    def at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        key = x.tobytes()
+        if key not in known:
+            known.clear()
+            known[key] = task.residuals(np.exp(x))
+        return known[key]
+
+    with np.errstate(divide="ignore"):
+        box = np.log(task.bounds).T
+    x0 = np.clip(np.log(begin), *box)
+    found = least_squares(
+        lambda x: at(x)[0], x0, lambda x: at(x)[1], bounds=box, xtol=close, ftol=close**1.5, gtol=1e-12, max_nfev=100
+    )
+    residual, by = at(found.x)
+    return Fitted(np.exp(found.x), residual, by, float(residual @ residual), int(found.nfev), bool(found.status > 0))
