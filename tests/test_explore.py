@@ -13,6 +13,7 @@ import time
 import urllib.error
 import urllib.request
 import warnings
+import wave
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,10 @@ def explorer() -> Iterator[Explorer]:
 
 def array(x: dict[str, str]) -> FloatArray:
     return np.frombuffer(base64.b64decode(x["f64"]), "<f8")
+
+
+def packed(values: list[float]) -> str:
+    return base64.b64encode(np.array(values, "<f8").tobytes()).decode()
 
 
 def asked(explorer: Explorer, what: str, body: bytes | None, **headers: str) -> tuple[int, dict[str, Any]]:
@@ -136,12 +141,13 @@ def test_there_are_examples_of_all_that_the_page_is_for() -> None:
 @pytest.mark.parametrize("kind", WAVEFORMS)
 def test_every_waveform_of_the_menu_runs_as_the_menu_writes_it(kind: str) -> None:
     numbers = " ".join(f"{a.value:g}" for a in WAVEFORMS[kind][1])
-    answer = scene(
-        {"deck": SINE, "source": f"Vdrive={kind}({numbers})", "rtol": 1e-4, "periods": 2, "skin": "dispersive"}
-    )
+    request = {"deck": SINE, "source": f"Vdrive={kind}({numbers})", "rtol": 1e-4, "periods": 2, "skin": "dispersive"}
+    if kind == "RECORDING":
+        request["recording"] = {"name": "a.wav", "rate": 1e3, "values": packed([0.0, 1.0, 0.0, -1.0, 0.0])}
+    answer = scene(request)
     assert answer["ok"], answer["message"]
     peak = np.abs(answer["traces"][0]["values"]).max()
-    assert peak == pytest.approx(150.0 if kind == "CHIRP" else 200.0, rel=4e-3)
+    assert peak == pytest.approx(150.0 if kind in ("CHIRP", "RECORDING") else 200.0, rel=4e-3)
 
 
 def test_sliders_show_every_parameter_within_its_range() -> None:
@@ -272,6 +278,47 @@ def test_the_deck_of_a_scene_gives_its_traces() -> None:
     np.testing.assert_allclose(solution.f_el, answer["traces"][2]["values"], atol=1e-6)
 
 
+def test_a_recording_is_the_source_that_its_file_gives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    values = np.round(20_000 * np.sin(np.arange(400) / 7.0)).astype("<i2")
+    with wave.open("a.wav", "wb") as file:
+        file.setparams((1, 2, 8000, 400, "NONE", ""))
+        file.writeframes(values.tobytes())
+    (tmp_path / "a.csv").write_text("t,u\n0,0\n1e-3,100\n4e-3,-50\n")
+    deck = BY_NAME["click"].deck
+    recording = {"name": "a.wav", "rate": 8000, "values": packed(list(values / 2.0**15))}
+    table = {"name": "a.csv", "times": packed([0.0, 1e-3, 4e-3]), "values": packed([0.0, 100.0, -50.0])}
+    for gain, data, stop in ((150.0, recording, 0.05), (2.0, table, 4e-3)):
+        request = {"deck": deck, "source": f"RECORDING({gain})", "recording": data}
+        answer = scene(request)
+        assert answer["ok"], answer["message"]
+        assert answer["t_stop"] == pytest.approx(stop)
+        names: dict[str, Any] = {}
+        exec(as_python(request), names)
+        np.testing.assert_allclose(names["solution"].f_el, answer["traces"][2]["values"], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("recording", "words"),
+    [
+        (None, "which a link does not carry"),
+        (5, "an object with the keys"),
+        ({"name": "a"}, "not base64 of doubles"),
+        ({"name": "a", "values": "é"}, "not base64 of doubles"),
+        ({"name": "a", "values": packed([1.0])}, "allowed: 2 to 200,000"),
+        ({"name": "a", "values": packed([1.0, 2.0])}, "samples per second"),
+        ({"name": 7, "values": packed([1.0, 2.0])}, "a file's name"),
+        ({"name": "a", "values": packed([1.0, 2.0]), "times": packed([1.0, 2.0, 3.0])}, "as many of each"),
+        ({"name": "a", "values": packed([1.0, 2.0]), "times": packed([2.0, 1.0])}, "PWL times decrease"),
+        ({"name": "a", "values": packed([1.0, float("nan")]), "rate": 100}, "allowed: finite numbers"),
+    ],
+)  # fmt: skip
+def test_a_wrong_recording_is_refused_in_a_sentence(recording: Any, words: str) -> None:
+    answer = scene({"deck": SINE, "source": "RECORDING(150)", "recording": recording})
+    assert (answer["ok"], answer["status"]) == (False, "BAD_INPUT")
+    assert words in answer["message"]
+
+
 def test_the_mean_force_against_frequency_is_that_of_large_signal() -> None:
     found = means({"deck": SINE, "frequencies": [100, 1000]})
     (expected,) = fs.large_signal(fs.parse_netlist(SINE), [100, 1000], rtol=1e-5)
@@ -366,7 +413,7 @@ _REQUESTS = st.fixed_dictionaries(
         "source": st.sampled_from([f"{kind}(1 2 3 4)" for kind in WAVEFORMS] + ["SIN(0 1e3 1e3)", "DC 5"]) | _ANY,
         "charge_law": st.sampled_from(["local", "mobile"]) | _ANY, "area": st.sampled_from(["mean", 3e-5]) | _ANY,
         "skin": st.sampled_from(["follow", "dispersive"]) | _ANY, "rtol": st.sampled_from([1e-3, 1e-6]) | _ANY,
-        "periods": st.floats(0.1, 10) | _ANY, "last": st.floats(0.1, 10) | _ANY, "other": _ANY,
+        "periods": st.floats(0.1, 10) | _ANY, "last": st.floats(0.1, 10) | _ANY, "other": _ANY, "recording": _ANY,
     },
 )  # fmt: skip
 

@@ -16,7 +16,8 @@ from fingerspice.base.units import parse_number
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.topology import driving_sources
-from fingerspice.explorer.waveforms import read_source
+from fingerspice.explorer.recordings import Recording, recording_of
+from fingerspice.explorer.waveforms import gain_of, read_source
 from fingerspice.netlist.netlist import parse_netlist
 from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.waveform import Waveform, require
@@ -54,6 +55,8 @@ class Request:
         Length of the run in periods of the source; a source without a period runs to the deck's TSTOP.
     last : float or None
         How many of the last periods are shown; None for all of the run.
+    recording : Recording or None
+        The file dropped on the page, for the source ``RECORDING(gain)``.
     unknown : tuple of str
         Names that mean nothing here, each in a sentence.
     """
@@ -67,6 +70,7 @@ class Request:
     rtol: float = 1e-6
     periods: float = 5.0
     last: float | None = None
+    recording: Recording | None = None
     unknown: tuple[str, ...] = ()
 
 
@@ -103,6 +107,8 @@ def request_of(given: Any) -> Request:
         require(good, name, _short(value), "1e-12 to 0.1" if name == "rtol" else f"0.01 to {most:g}")
         asked[name] = float(value)
     asked |= {"source": source.strip(), "overrides": _overrides(asked.get("overrides", {}))}
+    if "recording" in asked:
+        asked["recording"] = recording_of(asked["recording"])
     return Request(**asked, unknown=unknown)
 
 
@@ -145,7 +151,7 @@ def circuits_of(request: Request, own: Circuit | None = None) -> tuple[Circuit, 
         base = base.remember("dispersive", lambda: _dispersive(own_skins))
     circuit = base
     if request.source:
-        name, waveform = read_source(request.source, circuit)
+        name, waveform = read_source(request.source, circuit, request.recording)
         circuit = circuit.replace({name: waveform})
     paths = {path.lower(): path for path in circuit.parameters}
     known = {paths[path.lower()]: x for path, x in request.overrides.items() if path.lower() in paths}
@@ -177,6 +183,8 @@ def times_of(circuit: Circuit, request: Request) -> tuple[float, float, float | 
     if period is None or not math.isfinite(period):
         period = None
         stop = circuit.tran.stop if circuit.tran is not None else 0.05
+        if request.recording is not None and gain_of(request.source) is not None:
+            stop = request.recording.duration
     else:
         stop = waveform.settled + request.periods * period
         if request.last is not None:

@@ -28,7 +28,7 @@ from fingerspice.explorer.waveforms import menu
 
 ADDRESS = "127.0.0.1"
 #: Largest request, bytes; seconds that a connection may be silent; connections at once.
-MOST_BYTES, SILENCE, MOST_CONNECTIONS = 400_000, 30.0, 32
+MOST_BYTES, SILENCE, MOST_CONNECTIONS = 5_000_000, 30.0, 32
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 _HEADERS = {
     "Content-Security-Policy": (
@@ -297,7 +297,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Read what was sent with a refused request, up to a limit, so that the browser takes the answer."""
         self.close_connection = True
         length = self.headers.get("Content-Length", "")
-        left = min(int(length), 10 * MOST_BYTES) if length.isascii() and length.isdigit() and len(length) < 12 else 0
+        left = min(int(length), 4 * MOST_BYTES) if length.isascii() and length.isdigit() and len(length) < 12 else 0
         while left > 0 and not self._read:
             piece = self.rfile.read(min(left, 65_536))
             left = left - len(piece) if piece else 0

@@ -15,7 +15,7 @@ from fingerspice.base.units import format_si, parse_number
 from fingerspice.circuit.circuit import Circuit, Tran
 from fingerspice.explorer.request import Request, circuits_of, request_of, times_of
 from fingerspice.explorer.scene import POINTS, deadline
-from fingerspice.explorer.waveforms import read_source
+from fingerspice.explorer.waveforms import gain_of, read_source
 from fingerspice.results.outcome import SolveError
 from fingerspice.studies.export import export_netlist
 from fingerspice.studies.largesignal import large_signal
@@ -69,8 +69,10 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
     if request.skin == "dispersive":
         lines += _DISPERSIVE.splitlines()
     if request.source:
-        name, waveform = read_source(request.source, base)
-        code = _AS_CODE.sub(r"fs.\1(", repr(waveform))
+        name, waveform = read_source(request.source, base, request.recording)
+        gain = gain_of(request.source)
+        recorded = request.recording.python(gain) if request.recording is not None and gain is not None else None
+        code = recorded or _AS_CODE.sub(r"fs.\1(", repr(waveform))
         lines.append(f"circuit = circuit.replace({{{name!r}: {code}}})")
     known = {path.lower() for path in circuit.parameters}
     changes |= {path: x for path, x in request.overrides.items() if path.lower() in known}

@@ -11,6 +11,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import parse_number
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
+from fingerspice.explorer.recordings import Recording
 from fingerspice.netlist.netlist import source_from_text
 from fingerspice.waveforms.combinations import AM
 from fingerspice.waveforms.periodic import Sawtooth, Triangle
@@ -44,6 +45,8 @@ def _volt(name: str = "amplitude", value: float = 200.0) -> Argument:
     return Argument(name, "V", value, 0.0 if name == "amplitude" else -400.0, 400.0)
 
 
+#: The source that stands for the file dropped on the page.
+RECORDING = "RECORDING"
 _DUTY = Argument("duty", "", 0.5, 0.01, 0.99, optional=True)
 WAVEFORMS: dict[str, tuple[str, tuple[Argument, ...]]] = {
     "SIN": ("Sine", (_volt("offset", 0.0), _volt(), _hz("frequency", 100.0))),
@@ -76,6 +79,7 @@ WAVEFORMS: dict[str, tuple[str, tuple[Argument, ...]]] = {
             *(Argument("end", "s", 20e-3, 0.0, 0.1), Argument("fall", "s", 2e-3, 1e-5, 0.1, True)),
         ),
     ),
+    RECORDING: ("Recording or table, dropped here", (Argument("gain", "V", 150.0, 0.0, 400.0),)),
     "DC": ("Constant", (_volt("level", 200.0),)),
 }
 """By function: its name on the page, and its numbers in their order."""
@@ -89,10 +93,10 @@ def menu() -> list[dict[str, Any]]:
     ]
 
 
-def read_source(text: str, circuit: Circuit) -> tuple[str, Waveform]:
+def read_source(text: str, circuit: Circuit, recording: Recording | None = None) -> tuple[str, Waveform]:
     """The source's name and its new waveform, from text such as ``SQUARE(200 100)`` or ``Vdrive=AM(200 5k 50)``.
 
-    No file is read, whatever the text names.
+    No file is read, whatever the text names; ``RECORDING(150)`` is the recording given.
 
     Raises
     ------
@@ -111,15 +115,32 @@ def read_source(text: str, circuit: Circuit) -> tuple[str, Waveform]:
     else:
         name = next(iter(names.values()))
     call = _CALL.fullmatch(text)
-    if call is not None and call[1].upper() in _EXTRA:
-        return name, _extra(call[1].upper(), call[2])
+    if call is not None and call[1].upper() in (RECORDING, *_EXTRA):
+        return name, _extra(call[1].upper(), call[2], recording)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FingerspiceWarning)
         return name, source_from_text(text, circuit, files=False)
 
 
-def _extra(kind: str, text: str) -> Waveform:
+def gain_of(text: str) -> float | None:
+    """The gain of a source that is a recording; None of another source."""
+    named = _NAMED.fullmatch(text)
+    call = _CALL.fullmatch(text if named is None else named[2])
+    return _given(RECORDING, call[2])[0] if call is not None and call[1].upper() == RECORDING else None
+
+
+def _extra(kind: str, text: str, recording: Recording | None) -> Waveform:
     """One of the waveforms that netlists lack."""
+    numbers = _given(kind, text)
+    if kind != RECORDING:
+        return _EXTRA[kind](*numbers)
+    if recording is None:
+        raise InputError("the source is a recording, which a link does not carry; allowed: drop its file on the page")
+    return recording.waveform(*numbers)
+
+
+def _given(kind: str, text: str) -> list[float]:
+    """The numbers of a call."""
     words = text.replace(",", " ").split()
     arguments = WAVEFORMS[kind][1]
     names = " ".join(a.name for a in arguments)
@@ -127,7 +148,6 @@ def _extra(kind: str, text: str) -> Waveform:
     if not least <= len(words) <= len(arguments):
         raise InputError(f"{kind} is given {len(words)} numbers; allowed: {kind}({names})")
     try:
-        numbers = [parse_number(word) for word in words]
+        return [parse_number(word) for word in words]
     except ValueError as error:
         raise InputError(f"{kind}: {error}") from None
-    return _EXTRA[kind](*numbers)

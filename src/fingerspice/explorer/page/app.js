@@ -1,6 +1,7 @@
 // The explorer: a state, a request in flight, and what its answer shows.
 
 import { Sliders, Waveforms } from "./controls.js";
+import { read } from "./recording.js";
 import { Harmonics, Means, Traces, decoded } from "./plots.js";
 import { OWN, fromHash, ofExample, request, toHash } from "./state.js";
 import { numbers, quantity } from "./units.js";
@@ -19,13 +20,31 @@ let harmonics = null;
 let means = null;
 let sliders = null;
 let waveforms = null;
-let sweep = { key: "", points: [], message: "" };
+let sweep = { key: "", points: [], message: "", level: 0, left: [] };
 let idle = 0;
+let recording = null;
+let address = 0;
 let written = "";
 
 async function ask(what, body) {
   const answer = await fetch(what, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
   return answer.json();
+}
+
+/** The request of now, with the recording where the source is one. */
+function asking() {
+  const asked = request(state, examples);
+  return recording && /RECORDING/i.test(asked.source || "") ? { ...asked, recording } : asked;
+}
+
+/** Take a file that was chosen or dropped as the source. */
+async function take(file) {
+  try {
+    recording = await read(file);
+    set("source", `RECORDING(${recording.times ? 1 : 150})`);
+  } catch (error) {
+    say(error.message, true);
+  }
 }
 
 /** Ask for the scene of now; while a request is in flight, only the latest state waits for it. */
@@ -40,7 +59,7 @@ async function refresh() {
   try {
     do {
       again = false;
-      const answer = await ask("scene", request(state, examples));
+      const answer = await ask("scene", asking());
       if (!again) show(decoded(answer));
     } while (again);
   } catch (error) {
@@ -50,7 +69,8 @@ async function refresh() {
     inFlight = false;
     if (again) refresh();
   }
-  keepAddress();
+  clearTimeout(address);
+  address = setTimeout(keepAddress, 200);
   idle = setTimeout(sweepMore, 400);
 }
 
@@ -111,7 +131,7 @@ function table() {
     if (pinned) {
       const before = old.has(f.name) ? old.get(f.name).mean : null;
       const usable = before !== null && f.mean !== null && Math.abs(before) > 1e-9 * size;
-      texts.push(quantity(before, f.unit, 5), usable ? `${(100 * (f.mean / before - 1)).toFixed(2)} %` : "–");
+      texts.push(quantity(clean(before), f.unit, 5), usable ? `${(100 * (f.mean / before - 1)).toFixed(2)} %` : "–");
     }
     return row("td", texts);
   });
@@ -121,17 +141,20 @@ function table() {
 /** Mean force against frequency: a few points at first, then those between them. */
 async function sweepMore() {
   if (inFlight || !now || !now.ok || !now.figures.some((f) => f.name.startsWith("f_el"))) return;
-  const asked = request(state, examples);
-  const key = JSON.stringify(asked);
-  if (sweep.key !== key) sweep = { key, points: [], message: "", level: 0 };
-  if (sweep.message || sweep.level > 3) {
+  const asked = asking();
+  const key = JSON.stringify(request(state, examples));
+  if (sweep.key !== key) sweep = { key, points: [], message: "", level: 0, left: [] };
+  if (sweep.message || (!sweep.left.length && sweep.level > 3)) {
     drawMeans();
     return;
   }
-  const counts = [5, 4, 8, 16];
-  const all = (n) => Array.from({ length: n }, (_, i) => i);
-  const between = sweep.points.slice(1).map(([f], i) => Math.sqrt(f * sweep.points[i][0]));
-  const frequencies = sweep.level === 0 ? all(counts[0]).map((i) => 10 ** (1 + i)) : between;
+  if (!sweep.left.length) {
+    const between = sweep.points.slice(1).map(([f], i) => Math.sqrt(f * sweep.points[i][0]));
+    sweep.left = sweep.level === 0 ? [10, 100, 1e3, 1e4, 1e5] : between;
+    sweep.level += 1;
+  }
+  // A few at a time, since a slider that moves has to wait for them.
+  const frequencies = sweep.left.splice(0, 3);
   const mine = sweep;
   inFlight = true;
   try {
@@ -140,7 +163,6 @@ async function sweepMore() {
       const force = numbers(found.force);
       mine.points.push(...Array.from(numbers(found.frequency), (f, i) => [f, force[i]]));
       mine.points.sort((a, b) => a[0] - b[0]);
-      mine.level += 1;
       mine.amplitude = found.amplitude;
     } else {
       mine.message = found.message;
@@ -155,7 +177,7 @@ async function sweepMore() {
     return;
   }
   drawMeans();
-  if (!mine.message && mine.level <= 3) idle = setTimeout(sweepMore, 0);
+  if (!mine.message) idle = setTimeout(sweepMore, 0);
 }
 
 function drawMeans() {
@@ -235,7 +257,7 @@ async function copied(text, what) {
 }
 
 async function text(what, use) {
-  const answer = await ask(what, request(state, examples));
+  const answer = await ask(what, asking());
   if (answer.ok) use(answer.text);
   else say(answer.message, true);
 }
@@ -261,6 +283,17 @@ function listen() {
   $("csv").addEventListener("click", csv);
   $("png").addEventListener("click", () => traces.picture().toBlob((blob) => save("fingerspice.png", blob)));
   $("run").addEventListener("click", () => choose({ ...state, deck: $("netlist").value, set: {}, options: { last: "2" } }));
+  $("file").addEventListener("change", () => $("file").files.length && take($("file").files[0]));
+  addEventListener("dragover", (event) => {
+    event.preventDefault();
+    document.body.classList.add("dropping");
+  });
+  addEventListener("dragleave", () => document.body.classList.remove("dropping"));
+  addEventListener("drop", (event) => {
+    event.preventDefault();
+    document.body.classList.remove("dropping");
+    if (event.dataTransfer.files.length) take(event.dataTransfer.files[0]);
+  });
   $("link").addEventListener("change", () => open($("link").value));
   addEventListener("hashchange", () => {
     if (location.hash !== written) open(location.hash);

@@ -108,13 +108,14 @@ export class Traces {
     if (this.failedAt === null || this.failedAt === undefined) return;
     const at = u.valToPos(this.failedAt * this.factor, "x", true);
     const { left, top, width, height } = u.bbox;
-    if (!(at >= left && at <= left + width)) return;
+    // A run that failed before what is shown has its line at the left edge.
+    const x = Math.min(Math.max(at, left), left + width);
     u.ctx.save();
     u.ctx.strokeStyle = "#a11212";
     u.ctx.lineWidth = 2;
     u.ctx.beginPath();
-    u.ctx.moveTo(at, top);
-    u.ctx.lineTo(at, top + height);
+    u.ctx.moveTo(x, top);
+    u.ctx.lineTo(x, top + height);
     u.ctx.stroke();
     u.ctx.restore();
   }
@@ -195,10 +196,8 @@ export class Harmonics extends Small {
     const bars = uPlot.paths.bars({ size: [0.5, 24] });
     const series = harmonics.map((_, i) => ({ stroke: COLOURS[i], fill: `${COLOURS[i]}80`, paths: bars, points: { show: false } }));
     const data = [frequency.map((f) => f * fBy), ...lists.map((l) => l.map((a) => a * by))];
-    const step = data[0][0];
     this.draw(series, data, [`frequency (${fUnit})`, `amplitude (${unit})`],
       { x: { time: false, range: (u) => [0, u.data[0][u.data[0].length - 1] + u.data[0][0]] }, y: { range: (u, low, high) => [0, high * 1.05 || 1] } });
-    return step;
   }
 }
 

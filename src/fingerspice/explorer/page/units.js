@@ -49,6 +49,16 @@ export function quantity(value, unit, digits = 4) {
 
 /** The numbers of an array from the server. */
 export function numbers(given) {
-  const bytes = Uint8Array.from(atob(given.f64), (c) => c.charCodeAt(0));
+  const text = atob(given.f64);
+  const bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i += 1) bytes[i] = text.charCodeAt(i);
   return new Float64Array(bytes.buffer);
+}
+
+/** An array of numbers for the server. */
+export function encoded(values) {
+  const bytes = new Uint8Array(Float64Array.from(values).buffer);
+  let text = "";
+  for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
+  return btoa(text);
 }
