@@ -110,6 +110,10 @@ def test_the_values_of_a_scene_are_those_of_simulate(explorer: Explorer) -> None
     assert answer["error"]["u_gap"] == expected.error.u_gap
     figures = {row["name"]: row for row in answer["figures"]}
     assert figures["f_el"]["mean_periodic"] == expected.f_el_mean_periodic
+    (stack,) = answer["stacks"]
+    assert (stack["gap"], [layer["d"] for layer in stack["layers"]]) == ("Xgap", [1e-6, 4e-6, 350e-6])
+    for layer, column in zip(stack["layers"], expected.u_layer.T, strict=True):
+        np.testing.assert_array_equal(array(layer["values"]), column)
     (friction,) = answer["harmonics"]
     lines = expected.spectrum("f_t", highest=20 * 200.0)
     np.testing.assert_allclose(array(friction["frequency"]), lines.frequency)
@@ -131,7 +135,9 @@ def test_every_example_shows_what_it_promises(example: Any) -> None:
     names = {trace["signal"] for trace in answer["traces"]}
     assert names == {"u_source", "u_gap", "f_el", "area", "friction"}
     assert all(trace["values"].shape == answer["t"].shape == (POINTS,) for trace in answer["traces"])
-    assert len([t for t in answer["traces"] if t["signal"] == "f_el"]) == (2 if example.name == "two-fingers" else 1)
+    fingers = 2 if example.name == "two-fingers" else 1
+    assert len([t for t in answer["traces"] if t["signal"] == "f_el"]) == len(answer["stacks"]) == fingers
+    assert ".tran" in as_deck({"deck": example.deck, **example.asked})
 
 
 def test_there_are_examples_of_all_that_the_page_is_for() -> None:

@@ -42,9 +42,9 @@ def scene(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
     -------
     dict
         ``ok``, ``status`` and ``message``; ``sliders``, ``sources``, ``warnings`` and ``unknown``; of a run ``t`` and
-        ``traces`` (arrays in SI units), ``figures``, ``error``, ``plan``, ``harmonics``, ``period``, ``t_stop`` and
-        ``failed_at``. A request that is refused, or a run that fails, says why in ``message``; neither raises an
-        exception.
+        ``traces`` (arrays in SI units), ``figures``, ``error``, ``plan``, ``harmonics``, ``stacks``, ``period``,
+        ``t_stop`` and ``failed_at``. A request that is refused, or a run that fails, says why in ``message``; neither
+        raises an exception.
     """
     answer: dict[str, Any] = {"ok": False, "status": "BAD_INPUT", "message": "", "sliders": [], "traces": []}
     with warnings.catch_warnings(record=True) as noticed:
@@ -102,6 +102,7 @@ def _run(circuit: Circuit, request: Request) -> dict[str, Any]:
     }  # fmt: skip
     if solution.success:
         answer |= {"figures": _figures(solution, traces), "harmonics": _harmonics(solution, period)}
+        answer["stacks"] = _stacks(solution)
     return answer
 
 
@@ -113,6 +114,20 @@ def _traces(solution: Solution, key: str) -> list[dict[str, Any]]:
         element = name.partition(":")[2]
         out.append({"name": name, "signal": key, "element": element, "unit": unit, "label": label, "values": values})
     return out
+
+
+def _stacks(solution: Solution) -> list[dict[str, Any]]:
+    """The layers on each contact area with their thickness and voltage, for the drawing of the stack."""
+    stacks: dict[str, dict[str, Any]] = {}
+    voltages = solution.by_name("u_layer")
+    for name in solution.layers:
+        e = solution.circuit[name]
+        stack = stacks.setdefault(e.nodes[2], {"gap": None, "layers": []})
+        if e.device == "GAP":
+            stack["gap"] = name
+        layer = {"name": name, "device": e.device, "d": e.values["d"], "values": voltages[f"u_layer:{name}"]}
+        stack["layers"].append(layer)
+    return [stack for stack in stacks.values() if stack["gap"] is not None][:MOST_TRACES]
 
 
 def _error_text(solution: Solution) -> str:

@@ -21,7 +21,7 @@ from fingerspice.studies.export import export_netlist
 from fingerspice.studies.largesignal import large_signal
 
 #: Characters of an exported deck beyond which the page does not take it.
-_LONGEST_EXPORT = 5_000_000
+_LONGEST_EXPORT = 20_000_000
 #: Largest error of the means against frequency: a picture shows no more.
 _RTOL = 1e-5
 _INFINITE = 'float("inf")'

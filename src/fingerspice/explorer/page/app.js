@@ -3,6 +3,7 @@
 import { Sliders, Waveforms } from "./controls.js";
 import { read } from "./recording.js";
 import { Harmonics, Means, Traces, decoded } from "./plots.js";
+import { Stack } from "./stack.js";
 import { OWN, fromHash, ofExample, request, toHash } from "./state.js";
 import { numbers, quantity } from "./units.js";
 
@@ -18,6 +19,7 @@ let pinned = null;
 let traces = null;
 let harmonics = null;
 let means = null;
+let stack = null;
 let sliders = null;
 let waveforms = null;
 let sweep = { key: "", points: [], message: "", level: 0, left: [] };
@@ -93,6 +95,7 @@ function show(answer) {
   else if (usable) traces.show(answer, null, pinned);
   if (answer.ok) {
     harmonics.show(answer.harmonics);
+    stack.show(answer);
     table();
     $("facts").textContent = [
       `Model: ${answer.plan.tier} (${answer.plan.text}).`,
@@ -115,7 +118,7 @@ function replacedSource(answer) {
 
 function table() {
   const old = new Map((pinned && pinned.figures ? pinned.figures : []).map((f) => [f.name, f]));
-  const head = ["", "mean", "mean, last period", "smallest", "largest", ...(pinned ? ["pinned mean", "change"] : [])];
+  const head = ["signal", "mean", "mean, last period", "smallest", "largest", ...(pinned ? ["pinned mean", "change"] : [])];
   const cell = (tag, text) => Object.assign(document.createElement(tag), { textContent: text });
   const row = (tag, texts) => {
     const out = document.createElement("tr");
@@ -307,6 +310,7 @@ async function start() {
   $("scene").append(...examples.map((e) => new Option(e.title, e.name)), Object.assign(new Option("(another netlist)", ""), { hidden: true }));
   traces = new Traces($("plots"));
   harmonics = new Harmonics($("harmonics"));
+  stack = new Stack($("stack"), (at) => traces.point(at));
   means = new Means($("means"));
   sliders = new Sliders($("sliders"), (path, value) => {
     state.set[path] = value;

@@ -3,6 +3,7 @@
 import { parse, spice } from "./units.js";
 
 const STEPS = 1000;
+const UNITS = { ohm: "Ω", "ohm m": "Ω m", "mm^2": "mm²", "mm^2/N^m": "mm²/Nᵐ", "mm^(2-n)": "mm²⁻ⁿ", "mm^4/N^2": "mm⁴/N²", deg: "°" };
 let count = 0;
 
 /** Place on the range, 0 to STEPS, of a value. */
@@ -36,7 +37,7 @@ export function slider(s, name, changed) {
   field.setAttribute("aria-label", `${name}, typed`);
   range.dataset.path = name;
   field.dataset.path = name;
-  make("span", { className: "unit", textContent: s.unit.replaceAll("^2", "²").replace("ohm", "Ω") }, row);
+  make("span", { className: "unit", textContent: UNITS[s.unit] || s.unit }, row);
   const show = (value) => {
     if (document.activeElement !== range) range.value = place(value, s);
     if (document.activeElement !== field) field.value = spice(value, s.unit, 6);

@@ -120,6 +120,14 @@ export class Traces {
     u.ctx.restore();
   }
 
+  /** Put the cursors of all panels at an output, counted from 0; null takes them away. */
+  point(at) {
+    for (const plot of this.plots) {
+      const left = at === null || plot.data[0].length <= at ? -10 : plot.valToPos(plot.data[0][at], "x");
+      plot.setCursor({ left, top: at === null ? -10 : 0 }, false);
+    }
+  }
+
   width() {
     return Math.max(this.parent.clientWidth - 12, 260);
   }
@@ -152,6 +160,11 @@ class Small {
     this.parent = parent;
     this.title = title;
     this.plot = null;
+    new ResizeObserver(() => this.plot && this.plot.width !== this.width() && this.plot.setSize({ width: this.width(), height: 190 })).observe(parent);
+  }
+
+  width() {
+    return Math.max(this.parent.clientWidth - 12, 200);
   }
 
   clear(text = "") {
@@ -168,7 +181,7 @@ class Small {
       this.clear();
       this.parent.append(Object.assign(document.createElement("h2"), { textContent: this.title }));
       const axis = { font: "11px sans-serif", labelFont: "12px sans-serif", labelSize: 18, label: "" };
-      this.plot = new uPlot({ width: Math.max(this.parent.clientWidth - 12, 200), height: 190, scales,
+      this.plot = new uPlot({ width: this.width(), height: 190, scales,
         axes: [{ ...axis, size: 30 }, { ...axis, size: 52, space: 28 }], legend: { show: false }, cursor: { show: false },
         series: [{}, ...series] }, data, this.parent);
     }
