@@ -6,6 +6,7 @@ import base64
 import http.client
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -457,6 +458,23 @@ def test_the_command_serves_until_it_is_interrupted_and_leaves_no_file(tmp_path:
 def test_the_command_refuses_a_deck_that_is_none(command: Command) -> None:
     result = command("explore", "none.cir", "--no-browser", "--json")
     assert (result.code, json.loads(result.out)["status"]) == (2, "BAD_INPUT")
+
+
+def test_the_static_page_needs_no_other_file_and_holds_the_run(command: Command, tmp_path: Path) -> None:
+    (tmp_path / "pad.cir").write_text(SINE.replace("Table 1,", "</script>"))
+    result = command("explore", "pad.cir", "--static", "page.html", "--json")
+    answer = json.loads(result.out)
+    assert (result.code, answer["files"], answer["url"]) == (0, ["page.html"], None)
+    page = (tmp_path / "page.html").read_text()
+    assert not re.search(r'(src|href)="(?!data:)', page)
+    baked = re.search(r'<script type="application/json" id="baked">(.*?)</script>', page, re.DOTALL)
+    assert baked is not None
+    data = json.loads(baked[1])
+    assert data["start"]["own"]["title"] == "</script> sine of 100 Hz"
+    np.testing.assert_array_equal(
+        array(data["scenes"]["own"]["traces"][1]["values"]), scene({"deck": SINE, "last": 2})["traces"][1]["values"]
+    )
+    assert command("explore", "pad.cir", "--static", "pad.cir").code == 2
 
 
 def test_a_circuit_shows_itself(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 import fingerspice as fs
 from fingerspice.explorer.examples import EXAMPLES
+from fingerspice.explorer.static import static_page
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright for Python")
 CHROMIUM = shutil.which("chromium")
@@ -157,6 +158,18 @@ def test_what_is_saved_is_what_is_shown(page: Page, tmp_path: Path) -> None:
     assert len(rows) == 2000
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
     assert "Vdrive drive 0 SIN(" in (tmp_path / "a.cir").read_text()
+
+
+def test_the_static_page_shows_its_scenes_from_the_disk(browser: Any, tmp_path: Path) -> None:
+    (tmp_path / "page.html").write_text(static_page())
+    opened = Page(browser, (tmp_path / "page.html").as_uri())
+    expected = fs.simulate(SINE, rtol=1e-6)
+    assert opened.shown("electroadhesive force")[1] == f"{float(f'{1e3 * expected.f_el_mean_periodic:.5g}')} mN"
+    opened.after(lambda: opened.page.select_option("#scene", "two-fingers"))
+    assert opened.status().startswith("Two fingers")
+    assert opened.page.locator("#sliders input[type=range]").first.is_disabled()
+    assert all(url.startswith(("file:", "data:")) for url in opened.asked)
+    opened.close()
 
 
 def test_without_its_token_there_is_no_page(browser: Any, explorer: fs.Explorer) -> None:

@@ -139,11 +139,10 @@ def _error_text(solution: Solution) -> str:
 
 def _figures(solution: Solution, traces: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Mean, largest and smallest value of each trace's signal over the run, and the mean over the last period."""
-    summary = solution.summary()
     rows = []
     for trace in traces:
         name = trace["name"]
-        found = {figure: summary.get(f"{name}_{figure}") for figure in _FIGURES}
+        found = {figure: solution._figures.value(name, figure) for figure in _FIGURES}
         rows.append(
             {"name": name, "label": trace["label"], "element": trace["element"], "unit": trace["unit"], **found}
         )

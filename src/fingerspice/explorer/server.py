@@ -111,14 +111,6 @@ class Explorer:
         self._server.server_close()
         self._thread.join()
 
-    def start(self) -> dict[str, Any]:
-        """What the page needs first: its menus, and the scene to begin with."""
-        examples = [
-            {"name": e.name, "title": e.title, "note": e.note, "request": {"deck": e.deck, **e.asked}} for e in EXAMPLES
-        ]
-        own = None if self.circuit is None else {"title": self.circuit.title, "request": {"deck": self.circuit.text}}
-        return {"version": __version__, "own": own, "examples": examples, "waveforms": menu()}
-
     def answer(self, what: str, given: Any) -> Answer:
         """The answer to what the page asks for."""
         run: Callable[[Any, Circuit | None], Any] = _ACTIONS[what]
@@ -129,6 +121,15 @@ class Explorer:
             except InputError as error:
                 found = {"ok": False, "message": str(error)}
         return HTTPStatus.OK, "application/json", as_json(found)
+
+
+def beginning(circuit: Circuit | None) -> dict[str, Any]:
+    """What the page needs first: its menus, and the scene to begin with."""
+    examples = [
+        {"name": e.name, "title": e.title, "note": e.note, "request": {"deck": e.deck, **e.asked}} for e in EXAMPLES
+    ]
+    own = None if circuit is None else {"title": circuit.title, "request": {"deck": circuit.text}}
+    return {"version": __version__, "own": own, "examples": examples, "waveforms": menu()}
 
 
 def explore(circuit: Circuit | None = None, *, port: int = 0, browser: bool = True) -> Explorer:
@@ -269,7 +270,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _got(self, what: str) -> Answer:
         if what == "start":
-            return HTTPStatus.OK, "application/json", as_json(self.explorer.start())
+            return HTTPStatus.OK, "application/json", as_json(beginning(self.explorer.circuit))
         name = what or "index.html"
         if name not in self.explorer.files:
             raise _Refused(HTTPStatus.NOT_FOUND, "there is no such file")

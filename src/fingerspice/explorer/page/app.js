@@ -28,7 +28,14 @@ let recording = null;
 let address = 0;
 let written = "";
 
+/** What a page without a server holds; null of a page with one. */
+const baked = $("baked") ? JSON.parse($("baked").textContent) : null;
+
 async function ask(what, body) {
+  if (baked) {
+    const found = what === "scene" && state.deck === null ? baked.scenes[state.scene] : null;
+    return found || { ok: false, message: "this page has no program behind it: fingerspice explore has", sliders: [], traces: [] };
+  }
   const answer = await fetch(what, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
   return answer.json();
 }
@@ -97,6 +104,7 @@ function show(answer) {
     harmonics.show(answer.harmonics);
     stack.show(answer);
     table();
+    if (baked) still();
     $("facts").textContent = [
       `Model: ${answer.plan.tier} (${answer.plan.text}).`,
       `Charge law ${answer.charge_law}, area ${answer.area}, method ${answer.method}.`,
@@ -114,6 +122,13 @@ function replacedSource(answer) {
   const sources = answer.sliders.filter((g) => g.device === "V" || g.device === "I");
   const found = named && sources.find((g) => g.element.toLowerCase() === named[1].toLowerCase());
   return found ? found.element : sources.length ? sources[0].element : null;
+}
+
+/** A page without a server shows the values, and cannot move them. */
+function still() {
+  for (const control of document.querySelectorAll("#controls input, #controls select, #controls textarea, #run, #deck, #python, #reset")) {
+    control.disabled = true;
+  }
 }
 
 function table() {
@@ -143,7 +158,7 @@ function table() {
 
 /** Mean force against frequency: a few points at first, then those between them. */
 async function sweepMore() {
-  if (inFlight || !now || !now.ok || !now.figures.some((f) => f.name.startsWith("f_el"))) return;
+  if (baked || inFlight || !now || !now.ok || !now.figures.some((f) => f.name.startsWith("f_el"))) return;
   const asked = asking();
   const key = JSON.stringify(request(state, examples));
   if (sweep.key !== key) sweep = { key, points: [], message: "", level: 0, left: [] };
@@ -304,7 +319,7 @@ function listen() {
 }
 
 async function start() {
-  const first = await (await fetch("start")).json();
+  const first = baked ? baked.start : await (await fetch("start")).json();
   examples = first.examples;
   if (first.own) examples.unshift({ name: OWN, note: "The circuit for which this page was opened.", ...first.own });
   $("scene").append(...examples.map((e) => new Option(e.title, e.name)), Object.assign(new Option("(another netlist)", ""), { hidden: true }));
