@@ -28,7 +28,7 @@ import fingerspice as fs
 from commands import Command
 from fingerspice.base.arrays import FloatArray
 from fingerspice.explorer.examples import EXAMPLES
-from fingerspice.explorer.request import LONGEST_DECK, MOST_ELEMENTS
+from fingerspice.explorer.request import LONGEST_DECK
 from fingerspice.explorer.scene import POINTS, scene
 from fingerspice.explorer.server import MOST_BYTES, Explorer, pages
 from fingerspice.explorer.sharing import as_deck, as_python, means
@@ -200,7 +200,7 @@ def test_unknown_names_are_said_and_the_rest_is_shown() -> None:
         ({"deck": 5}, "deck is of type int"),
         ({"deck": "x" * (LONGEST_DECK + 1)}, "characters long; allowed: at most"),
         ({"deck": "t\nV1 a 0 1\n" + "R1 a 0 1\n" * 2}, "R1"),
-        ({"deck": "t\nV0 1 0 1\n" + "".join(f"R{i} 1 0 1\n" for i in range(MOST_ELEMENTS))}, "elements; allowed: at"),
+        ({"deck": "t\nV0 1 0 1\n" + "".join(f"R{i} 1 0 1\n" for i in range(200))}, "at most 200 on this page"),
         ({"deck": SINE, "overrides": {"Xgap.d": -1}}, "Xgap d is -1 m; allowed: more than 0"),
         ({"deck": SINE, "overrides": {"Xgap.d": "2k7"}}, "write 2.7k"),
         ({"deck": SINE, "overrides": {"Xgap.d": [1]}}, "a number, or text such as 3.5u"),
@@ -232,6 +232,16 @@ def test_a_wrong_request_is_refused_in_a_sentence(request_: Any, words: str) -> 
     assert (answer["ok"], answer["status"]) == (False, "BAD_INPUT")
     assert words in answer["message"]
     assert "Traceback" not in answer["message"]
+
+
+def test_dispersive_skins_count_by_their_slabs() -> None:
+    fingers = "".join(
+        f"Xc{i} d t{i} a{i} LAYER d=1u eps_r=4\nXg{i} t{i} s{i} a{i} GAP\nXs{i} s{i} 0 a{i} SKIN d=350u f=5k\n"
+        for i in range(25)
+    )
+    deck = f"t\nV1 d 0 SIN(0 200 5k)\n{fingers}.tran 1u 1m uic\n.end\n"
+    assert scene({"deck": deck, "rtol": 1e-3, "periods": 1})["ok"]
+    assert "dispersive skin counted as its" in scene({"deck": deck, "skin": "dispersive"})["message"]
 
 
 def test_a_run_that_takes_too_long_is_stopped_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,7 @@ from fingerspice.circuit.topology import driving_sources
 from fingerspice.explorer.recordings import Recording, recording_of
 from fingerspice.explorer.waveforms import gain_of, read_source
 from fingerspice.netlist.netlist import parse_netlist
+from fingerspice.physics.ladder import SKIN_LADDER
 from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.waveform import Waveform, require
 
@@ -149,6 +150,8 @@ def circuits_of(request: Request, own: Circuit | None = None) -> tuple[Circuit, 
     if request.skin == "dispersive":
         own_skins = base
         base = base.remember("dispersive", lambda: _dispersive(own_skins))
+    if base is not own:
+        _refuse_large(base)
     circuit = base
     if request.source:
         name, waveform = read_source(request.source, circuit, request.recording)
@@ -201,12 +204,19 @@ def times_of(circuit: Circuit, request: Request) -> tuple[float, float, float | 
 def _parsed(text: str) -> Circuit:
     """The circuit of a text from the page, which may include no file."""
     circuit = parse_netlist(text)
-    if len(circuit.elements) > MOST_ELEMENTS:
-        raise InputError(
-            f"the deck has {len(circuit.elements):,} elements; allowed: at most {MOST_ELEMENTS} on this page"
-        )
     driving_sources(circuit)
     return circuit
+
+
+def _refuse_large(circuit: Circuit) -> None:
+    """Refuse a circuit whose run would take longer than a page may."""
+    slabs = len(SKIN_LADDER.poles)
+    count = len(circuit.elements) + slabs * len(circuit.by_device("SKIN_DISPERSIVE"))
+    if count > MOST_ELEMENTS:
+        raise InputError(
+            f"the deck has {count:,} elements, a dispersive skin counted as its {slabs + 1} slabs; allowed: at most "
+            f"{MOST_ELEMENTS} on this page"
+        )
 
 
 def _dispersive(circuit: Circuit) -> Circuit:
