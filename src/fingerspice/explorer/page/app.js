@@ -58,6 +58,9 @@ async function take(file) {
 
 /** Ask for the scene of now; while a request is in flight, only the latest state waits for it. */
 async function refresh() {
+  // The address follows a slider that moves at some distance, since browsers limit how often it changes.
+  clearTimeout(address);
+  address = setTimeout(keepAddress, 200);
   if (inFlight) {
     again = true;
     return;
@@ -78,8 +81,6 @@ async function refresh() {
     inFlight = false;
     if (again) refresh();
   }
-  clearTimeout(address);
-  address = setTimeout(keepAddress, 200);
   idle = setTimeout(sweepMore, 400);
 }
 
