@@ -77,7 +77,7 @@ LARGER = {
 # From the bottom up: a part imports its own files and the parts above it in this list, nothing below.
 ORDER = (
     *("base", "numerics", "physics", "engine", "waveforms", "circuit", "netlist"),
-    *("results", "solve", "plots", "studies", "cli", "__main__"),
+    *("results", "solve", "plots", "studies", "explorer", "cli", "__main__"),
 )
 # Beside each other, not one on the other.
 STRANGERS = (
@@ -90,6 +90,7 @@ STRANGERS = (
 # Methods that call a part above their own, and load it only when they are called.
 LENT = {
     "circuit.circuit.Circuit._waveform": "netlist.netlist",
+    "circuit.circuit.Circuit.explore": "explorer.server",
     "results.solution.Solution.plot": "plots.traces",
     "results.spectrum.Spectrum.plot": "plots.spectra",
     "results.phasor_solution.PhasorSolution.plot": "plots.phasors",

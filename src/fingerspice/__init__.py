@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from fingerspice.base.errors import FingerspiceWarning as FingerspiceWarning
     from fingerspice.base.errors import InputError as InputError
     from fingerspice.circuit.circuit import Circuit as Circuit
+    from fingerspice.explorer.server import Explorer as Explorer
+    from fingerspice.explorer.server import explore as explore
     from fingerspice.netlist.netlist import parse_netlist as parse_netlist
     from fingerspice.netlist.netlist import read_netlist as read_netlist
     from fingerspice.results.loading import load as load
@@ -86,6 +88,7 @@ _HOMES = {
     "studies.capability": ("Capability", "capability"),
     "studies.comparison": ("Comparison", "compare"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
+    "explorer.server": ("Explorer", "explore"),
     "studies.export": ("export_netlist",),
     "studies.feel": ("Feel", "feel"),
     "studies.fit": ("fit",),

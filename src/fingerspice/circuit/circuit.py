@@ -302,6 +302,12 @@ class Circuit(Shown):
         vars(changed)["related"] = self.related
         return changed
 
+    def explore(self) -> Any:
+        """Show the circuit on a local page (docs/explore.md); gives the running `Explorer`."""
+        from fingerspice.explorer.server import explore
+
+        return explore(self)
+
     def _unknown_path(self, path: str) -> str:
         """The message about a path that `replace` does not know."""
         name = path.rpartition(".")[0] or path

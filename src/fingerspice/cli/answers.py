@@ -53,6 +53,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "sweep": ("scenes", "failed", "n", "seed", "figures", "shares"),
     "export": (),
     "figures": (),
+    "explore": ("url",),
 }
 #: Figures of a signal; a figure that a signal lacks is null.
 FIGURES = ("min", "max", "peak", "mean", "rms", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")

@@ -31,6 +31,7 @@ from fingerspice.cli.arguments import (
     Stop,
     Streamed,
 )  # fmt: skip
+from fingerspice.cli.explore import explore
 from fingerspice.cli.figures import figures
 from fingerspice.cli.options import area_from_text, check_output, read_circuit
 from fingerspice.cli.result_files import Results
@@ -382,6 +383,7 @@ def export(
 
 
 app.command()(figures)
+app.command()(explore)
 
 
 @app.callback(invoke_without_command=True)
