@@ -163,7 +163,15 @@ def phasor_table(result: PhasorSolution, most: int = 40) -> Page:
 
 def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:
     """Write sweeps as CSV, one after the other where there are several amplitudes."""
-    units = {"frequency": "Hz", "gain": "1", "phase_deg": "deg", "u_gap": "V", "area": "m^2", "f_el_mean": "N"}
+    units = {
+        "frequency": "Hz",
+        "gain": "1",
+        "phase_deg": "deg",
+        "u_gap": "V",
+        "area": "m^2",
+        "f_el_mean": "N",
+        "amplitude": "V",
+    }
     if all(result.impedance is not None for result in results):
         units |= {"impedance": "ohm", "impedance_phase_deg": "deg"}
 
@@ -171,10 +179,10 @@ def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:
         with target.open("w", newline="", encoding="utf-8") as stream:
             writer = csv.writer(stream)
             head = [f"{name} [{unit}]" for name, unit in units.items()]
-            writer.writerow([*head, "amplitude [V]"])
+            writer.writerow(head)
             for result in results:
-                data = phasor_dict(result)
+                data = phasor_dict(result) | {"amplitude": [result.amplitude] * result.frequency.size}
                 for row in zip(*(data[name] for name in units), strict=True):
-                    writer.writerow([*map(repr, row), repr(result.amplitude)])
+                    writer.writerow(map(repr, row))
 
     return write_aside(path, write)
