@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
+from analytic import table1_layers
 from commands import Command
 from fingerspice.base.errors import InputError
 
@@ -188,3 +190,76 @@ def test_profiles_of_what_is_not_fitted_are_refused() -> None:
         fs.InputError, match=r"profiles names 'Xskin\.d', which is not fitted; allowed: True, or Xgap\.d"
     ):
         fs.fit(circuit, CIRCUITS / "measured.csv", ["Xgap.d"], profiles=["Xskin.d"])
+
+
+def impedances(circuit: fs.Circuit, f: np.ndarray) -> np.ndarray:
+    """What the source of Table 1's finger with other values sees, from the layers in series (Eq. 9)."""
+    swept = fs.phasor(circuit, f)
+    out = []
+    for x, area in zip(f, swept.area, strict=True):
+        coat, gap, skin = table1_layers(x)
+        # Of the gap: 3.1 um instead of 3.5, and 1.4 Mohm instead of 1.
+        changed = (coat, dataclasses.replace(gap, c=gap.c * 3.5 / 3.1, r_total=1.4e6), skin)
+        w = 2j * np.pi * x
+        out.append(sum(1.0 / (1.0 / y.r_total + area / y.r_area + w * y.c * area) for y in changed))
+    return np.array(out)
+
+
+@pytest.mark.parametrize("with_phase", [True, False])
+def test_an_impedance_against_frequency(tmp_path: Path, with_phase: bool) -> None:
+    quiet = fs.read_netlist(CIRCUITS / "fingerpad.cir").replace({"Vdrive.amplitude": 1.0})
+    f = np.geomspace(20.0, 2e4, 12)
+    finger = quiet.replace({"Xgap.d": 3.1e-6, "Xgap.r": 1.4e6})
+    z = impedances(finger, f)
+    data = {"frequency": f, "impedance": np.abs(z), "impedance_phase": np.degrees(np.angle(z))}
+    if not with_phase:
+        del data["impedance_phase"]
+    found = fs.fit(quiet, data, ["Xgap.d", "Xgap.r"], skin="follow")
+    assert found.estimates["Xgap.d"].value == pytest.approx(3.1e-6, rel=1e-6)
+    assert found.estimates["Xgap.r"].value == pytest.approx(1.4e6, rel=1e-6)
+    assert found.freedom == (24 if with_phase else 12) - 2
+    np.testing.assert_allclose(found.predicted, np.abs(z), rtol=1e-6)
+    assert "values of impedance" in str(found)
+    found.plot()
+    # From a table in kilohm.
+    head = "frequency (kHz),impedance (kohm)" + (",impedance_phase (deg)" if with_phase else "")
+    rows = [
+        f"{x / 1e3:.12g},{abs(y) / 1e3:.12g}" + (f",{np.degrees(np.angle(y)):.12g}" if with_phase else "")
+        for x, y in zip(f, z, strict=True)
+    ]
+    (tmp_path / "z.csv").write_text("\n".join([head, *rows]))
+    again = fs.fit(quiet, tmp_path / "z.csv", ["Xgap.d", "Xgap.r"], skin="follow")
+    assert again.estimates["Xgap.d"].value == pytest.approx(3.1e-6, rel=1e-6)
+
+
+def test_intervals_from_noisy_impedances_cover_the_truth() -> None:
+    quiet = fs.read_netlist(CIRCUITS / "fingerpad.cir").replace({"Vdrive.amplitude": 1.0})
+    f, rng, covered = np.geomspace(20.0, 2e4, 10), np.random.default_rng(5), 0
+    z = impedances(quiet.replace({"Xgap.d": 3.1e-6, "Xgap.r": 1.4e6}), f)
+    for _ in range(25):
+        noisy = z * (1.0 + 0.02 * (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size)))
+        data = {"frequency": f, "impedance": np.abs(noisy), "impedance_phase": np.degrees(np.angle(noisy))}
+        found = fs.fit(quiet, data, ["Xgap.d", "Xgap.r"], skin="follow")
+        for path, value in (("Xgap.d", 3.1e-6), ("Xgap.r", 1.4e6)):
+            covered += found.estimates[path].low <= value <= found.estimates[path].high
+    # 50 intervals of 95 %: fewer than 42 would have a probability of 0.3 %.
+    assert 42 <= covered <= 50
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        ({"frequency": [1e3, 2e3], "impedance": [1e5, -1e5]}, "magnitudes above 0"),
+        ({"frequency": [1e3, 2e3], "f_el_mean": [0.1, 0.2], "impedance_phase": [-30.0, -40.0]}, "beside impedance"),
+        ({"frequency": [1e3, 2e3], "impedance": [1e5]}, "as many"),
+    ],
+)
+def test_bad_impedances_are_refused(data: dict[str, list[float]], said: str) -> None:
+    circuit = fs.read_netlist(CIRCUITS / "fingerpad.cir")
+    try:
+        fs.fit(circuit, data, ["Xgap.d"])
+    except fs.InputError as error:
+        assert said in str(error)
+    else:
+        # One value is taken for all rows.
+        assert said == "as many"

@@ -17,7 +17,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.solve.simulation import RTOL_RANGE
 from fingerspice.studies.batch import batch
-from fingerspice.studies.fitdata import data_of
+from fingerspice.studies.fitdata import IMPEDANCE, Data, data_of
 from fingerspice.studies.fitprofile import profile_of
 from fingerspice.studies.fitresult import Fit, fit_result
 from fingerspice.studies.fittask import REFUSED, Task, followed
@@ -51,9 +51,11 @@ def fit(
     data : mapping of str to array_like, shape (n,), or path
         Columns: the measured means (``f_el_mean``, ``f_t_mean``, ``friction_mean`` or ``area_mean``) and the conditions
         under which they were measured, as paths (``Vdrive.amplitude``, ``source.frequency``, ``Xgap.fn``); or ``t``
-        and a signal over time (``f_el``, ``f_t``, ``friction``, ``area``, ``u_gap``). ``sigma`` is the standard
-        deviation of every value; where it is missing, it is taken as equal for all and estimated from the residuals. A
-        table (CSV) has the columns in a header, with units: ``Vdrive.amplitude (V), f_el_mean (mN)``.
+        and a signal over time (``f_el``, ``f_t``, ``friction``, ``area``, ``u_gap``); or ``frequency`` and
+        ``impedance``, the magnitude (ohm) of what the source sees, with ``impedance_phase`` (deg) where it is known.
+        ``sigma`` is the standard deviation of every value; where it is missing, it is taken as equal for all (of
+        impedances, as equal shares) and estimated from the residuals. A table (CSV)
+        has the columns in a header, with units: ``Vdrive.amplitude (V), f_el_mean (mN)``.
     parameters : sequence of str
         Paths of the parameters to fit.
     bounds : mapping of str to tuple of float, optional
@@ -134,19 +136,30 @@ def _task(
     both = sorted(set(paths) & set(table.conditions))
     if both:
         raise InputError(f"{both[0]} is to be fitted, and is a condition of the data; allowed: one of both")
-    if table.values.size < len(paths):
-        raise InputError(
-            f"{table.values.size} data cannot tell {len(paths)} parameters; allowed: at least as many data"
-        )
+    count = table.values.size * (1 if table.phase is None else 2)
+    if count < len(paths):
+        raise InputError(f"{count} data cannot tell {len(paths)} parameters; allowed: at least as many data")
     initial = [circuit.parameters[path].value for path in paths]
     for path, value in zip(paths, initial, strict=True):
         if not (math.isfinite(value) and value > 0.0):
             raise InputError(f"{path} is {value:g}, and is fitted in its logarithm; allowed: finite and more than 0")
-    sizes = np.abs(table.values)
-    scale = table.sigma if table.sigma is not None else np.full(sizes.size, float(sizes.max()) or 1.0)
-    exact = is_stack(circuit) and build_stack(circuit).contact is not None
+    target, scale = _target(table)
+    exact = is_stack(circuit) and build_stack(circuit).contact is not None and table.signal != IMPEDANCE
     box = _bounds(paths, initial, bounds or {})
-    return Task(circuit, table, paths, box, average, skin, rtol, charge_law, scale, exact)
+    return Task(circuit, table, paths, box, average, skin, rtol, charge_law, target, scale, exact)
+
+
+def _target(table: Data) -> tuple[FloatArray, FloatArray]:
+    """What is to be predicted, and its scale: sigma, or the largest value; of an impedance each value's own size."""
+    sizes = np.abs(table.values)
+    if table.signal != IMPEDANCE:
+        scale = table.sigma if table.sigma is not None else np.full(sizes.size, float(sizes.max()) or 1.0)
+        return table.values, scale
+    scale = table.sigma if table.sigma is not None else sizes
+    if table.phase is None:
+        return table.values, scale
+    # An error of the complex impedance, equal in all directions, is as large across as along.
+    return np.concatenate([table.values, table.phase]), np.concatenate([scale, np.degrees(scale / sizes)])
 
 
 def _bounds(paths: tuple[str, ...], initial: list[float], given: Mapping[str, tuple[float, float]]) -> FloatArray:

@@ -18,10 +18,12 @@ from fingerspice.waveforms.columns import read_text_columns
 from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file
 
 #: Signals that can be fitted, over time or (with ``_mean``) as means, and their units.
-MEASURED = {"f_el": "N", "f_t": "N", "friction": "", "area": "m^2", "u_gap": "V"}
+MEASURED = {"f_el": "N", "f_t": "N", "friction": "", "area": "m^2", "u_gap": "V", "impedance": "ohm"}
 MEANS = ("f_el", "f_t", "friction", "area")
 _PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
 TIME, SIGMA, SOURCE = "t", "sigma", "source"
+#: The one measured quantity that is no mean, and the column that may stand beside it.
+IMPEDANCE, PHASE = "impedance", "impedance_phase"
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ class Data:
         Path to the values that a parameter had in the measurements, in the unit of the netlist.
     t : ndarray, shape (n,), or None
         Times, s.
+    phase : ndarray, shape (n,), or None
+        Phase of an impedance, deg.
     """
 
     signal: str
@@ -47,6 +51,12 @@ class Data:
     sigma: FloatArray | None
     conditions: dict[str, FloatArray]
     t: FloatArray | None = None
+    phase: FloatArray | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the measured column."""
+        return self.signal if self.t is not None or self.signal == IMPEDANCE else f"{self.signal}_mean"
 
     @property
     def varying(self) -> dict[str, FloatArray]:
@@ -58,8 +68,9 @@ def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> Da
     """The data that a caller gave: a mapping of columns, or a table with a header.
 
     The columns are one of ``f_el_mean``, ``f_t_mean``, ``friction_mean`` and ``area_mean`` with conditions (paths such
-    as ``Vdrive.amplitude``, ``source.frequency``, ``Xgap.fn``), or ``t`` with ``f_el``, ``f_t``, ``friction``, ``area``
-    or ``u_gap``; and ``sigma``, the standard deviation, where it is known.
+    as ``Vdrive.amplitude``, ``source.frequency``, ``Xgap.fn``); or ``impedance`` with conditions, and
+    ``impedance_phase`` beside it; or ``t`` with ``f_el``, ``f_t``, ``friction``, ``area`` or ``u_gap``; and ``sigma``,
+    the standard deviation, where it is known.
 
     Raises
     ------
@@ -69,7 +80,7 @@ def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> Da
     columns, place = _columns(circuit, given)
     names = {
         **{f"{name}_mean": name for name in MEANS},
-        **({name: name for name in MEASURED} if TIME in columns else {}),
+        **({name: name for name in MEASURED if name != IMPEDANCE} if TIME in columns else {IMPEDANCE: IMPEDANCE}),
     }
     measured = [name for name in columns if name in names]
     if len(measured) != 1:
@@ -77,7 +88,11 @@ def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> Da
         what = f"several measured columns ({', '.join(measured)})" if measured else "no measured column"
         raise InputError(f"{place} have {what}, and the columns {', '.join(columns)}; allowed: one of {allowed}")
     values = columns.pop(measured[0])
-    sigma, t = columns.pop(SIGMA, None), columns.pop(TIME, None)
+    sigma, t, phase = columns.pop(SIGMA, None), columns.pop(TIME, None), columns.pop(PHASE, None)
+    if phase is not None and measured[0] != IMPEDANCE:
+        raise InputError(f"{place} have the column {PHASE} beside {measured[0]}; allowed: beside {IMPEDANCE}")
+    if measured[0] == IMPEDANCE and not np.all(values > 0.0):
+        raise InputError(f"{place}: the smallest {IMPEDANCE} is {values.min():g} ohm; allowed: magnitudes above 0")
     if sigma is not None and not np.all(sigma > 0.0):
         raise InputError(f"{place}: the smallest sigma is {sigma.min():g}; allowed: more than 0")
     if t is not None and (measured[0].endswith("_mean") or np.any(np.diff(t) <= 0.0)):
@@ -85,7 +100,7 @@ def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> Da
     conditions = {_path(circuit, name): x for name, x in columns.items()}
     if t is not None and any(np.ptp(x) > 0.0 for x in conditions.values()):
         raise InputError(f"{place} have times and changing conditions; allowed: one run over time, or means")
-    return Data(names[measured[0]], values, sigma, conditions, t)
+    return Data(names[measured[0]], values, sigma, conditions, t, phase)
 
 
 def _columns(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> tuple[dict[str, FloatArray], str]:
@@ -123,6 +138,8 @@ def _from_table(circuit: Circuit, path: Path) -> dict[str, FloatArray]:
             base = "s"
         elif key == SIGMA:
             base = MEASURED.get(measured, "")
+        elif key == PHASE:
+            base = "deg"
         elif signal in MEASURED:
             base = MEASURED[signal]
         else:
@@ -147,7 +164,9 @@ def _factor(unit: str, base: str, what: str) -> float:
 
 
 def _path(circuit: Circuit, name: str) -> str:
-    """A condition's path; ``source.`` stands for the only source."""
+    """A condition's path; ``source.`` stands for the only source, and ``frequency`` for its frequency."""
+    if name.lower() == "frequency":
+        name = f"{SOURCE}.frequency"
     element, _, parameter = name.partition(".")
     if element.lower() == SOURCE:
         driving = driving_sources(circuit)
@@ -158,7 +177,7 @@ def _path(circuit: Circuit, name: str) -> str:
     if name.lower() not in known:
         near = difflib.get_close_matches(name.lower(), known, 1, 0.0)
         hint = f", such as {known[near[0]]}" if near else ""
-        allowed = ", ".join((*(f"{signal}_mean" for signal in MEANS), SIGMA, TIME))
+        allowed = ", ".join((*(f"{signal}_mean" for signal in MEANS), IMPEDANCE, PHASE, SIGMA, TIME))
         raise InputError(
             f"the data have a column {name!r}, which is no parameter of the circuit; allowed: {allowed} with a signal, "
             f"and conditions{hint}"

@@ -31,7 +31,7 @@ def profile_of(task: Task, best: Fitted, path: str, error: float) -> Profile:
     """
     from scipy.stats import chi2, f
 
-    freedom = task.data.values.size - len(task.paths)
+    freedom = task.target.size - len(task.paths)
     limit = best.objective + float(chi2.ppf(0.95, 1))
     if task.data.sigma is None:
         limit = best.objective * (1.0 + float(f.ppf(0.95, 1, freedom)) / freedom) if freedom > 0 else math.inf

@@ -153,11 +153,10 @@ class Fit(Shown):
             )
             for e in self.estimates.values()
         ]  # fmt: skip
-        name = self.data.signal + ("" if self.data.t is not None else "_mean")
         rms = float(np.sqrt(np.mean(self.residual**2)))
         peak = float(np.abs(self.data.values).max()) or 1.0
         lines: list[str | Table] = [
-            f"{len(rows)} parameters fitted to {self.data.values.size} values of {name}, "
+            f"{len(rows)} parameters fitted to {self.data.values.size} values of {self.data.name}, "
             f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}",
             f"residual {rms:.3g} {MEASURED[self.data.signal]} rms, {100.0 * rms / peak:.2g} % of the largest value; "
             f"{'sigma as given' if self.data.sigma is not None else 'sigma estimated from the residuals'}",
@@ -180,7 +179,7 @@ class Fit(Shown):
         """Data and fit, with the residuals below."""
         from fingerspice.plots.fits import Curve, plot_fit
 
-        data, signal = self.data, self.data.signal if self.data.t is not None else f"{self.data.signal}_mean"
+        data, signal = self.data, self.data.name
         varying = sorted(data.varying.items(), key=lambda item: -np.unique(item[1]).size)
         groups, names = np.zeros(data.values.size, int), ["measured and fitted"]
         if data.t is not None:
@@ -243,7 +242,7 @@ def fit_result(
     """The result of the best of several fits."""
     from scipy.stats import norm, t
 
-    freedom = data.values.size - len(paths)
+    freedom, n = best.residual.size - len(paths), data.values.size
     at_bound = [
         bool(np.any(np.abs(value / pair[np.isfinite(pair) & (pair > 0.0)] - 1.0) < _AT_BOUND))
         for value, pair in zip(best.values, bounds, strict=True)
@@ -265,11 +264,11 @@ def fit_result(
         )
         for path, value, off, bound in zip(paths, best.values, error, at_bound, strict=True)
     }  # fmt: skip
-    sigma = data.sigma if data.sigma is not None else np.full(scale.size, math.sqrt(variance) * scale[0])
+    sigma = data.sigma if data.sigma is not None else math.sqrt(variance) * scale[:n]
     notes = _notes(circuit, data, paths, estimates, correlation, error)
     fitted = circuit.varied(dict(zip(paths, best.values.tolist(), strict=True)))
     return Fit(
-        fitted, estimates, correlation, data, data.values + best.residual * scale, sigma, best.objective,
+        fitted, estimates, correlation, data, data.values + (best.residual * scale)[:n], sigma, best.objective,
         tuple(objectives), freedom, best.evaluations, best.closed, notes,
     )  # fmt: skip
 

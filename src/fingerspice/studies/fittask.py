@@ -13,8 +13,9 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.results.outcome import SolveError
 from fingerspice.solve.simulation import simulate
-from fingerspice.studies.fitdata import Data
+from fingerspice.studies.fitdata import IMPEDANCE, Data
 from fingerspice.studies.fitresult import Fitted
+from fingerspice.studies.phasors import phasor
 from fingerspice.studies.steady import steady_state
 
 # Relative step of a difference, where derivatives are not exact: of networks.
@@ -41,8 +42,9 @@ class Task:
     skin : str
     rtol : float
     charge_law : str or None
-    scale : ndarray, shape (n,)
-        By which residuals are divided.
+    target, scale : ndarray, shape (n,) or (2 n,)
+        What is to be predicted, and that by which residuals are divided: the data's values, and, where the phase of an
+        impedance is given, the phases (deg) after them.
     exact : bool
         Whether derivatives are those of a series stack, and not differences.
     """
@@ -55,6 +57,7 @@ class Task:
     skin: str
     rtol: float
     charge_law: str | None
+    target: FloatArray
     scale: FloatArray
     exact: bool
 
@@ -96,7 +99,9 @@ class Task:
             return np.asarray(getattr(run, data.signal)), np.array(slopes).reshape(len(paths), -1).T * values[
                 : len(paths)
             ]
-        name, found, by = f"{data.signal}_mean", np.empty(data.values.size), np.empty((data.values.size, len(paths)))
+        if data.signal == IMPEDANCE:
+            return self._impedance(values), np.empty((self.target.size, 0))
+        name, found, by = data.name, np.empty(data.values.size), np.empty((data.values.size, len(paths)))
         for row in range(data.values.size):
             circuit = self.scene(values, row)
             if self.average == "periodic":
@@ -108,6 +113,13 @@ class Task:
                 by[row, k] = getattr(one.sensitivities[path], name) * values[k]
         return found, by
 
+    def _impedance(self, values: FloatArray) -> FloatArray:
+        """Magnitudes (ohm), and phases (deg) where they are given, at the area that the deck's amplitude causes."""
+        how = "swept" if self.skin == "follow" else "own"
+        runs = [phasor(self.scene(values, row), skin=how).impedance for row in range(self.data.values.size)]
+        z = np.array([one[0] for one in runs if one is not None])
+        return np.abs(z) if self.data.phase is None else np.concatenate([np.abs(z), np.degrees(np.angle(z))])
+
     def residuals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals over their scale, and their derivatives; large ones where a scene cannot be run."""
         try:
@@ -117,7 +129,11 @@ class Task:
                 found, by = self.predict(values)
         except (InputError, SolveError):
             return np.full(self.scale.size, REFUSED), np.zeros((self.scale.size, values.size))
-        return (found - self.data.values) / self.scale, by / self.scale[:, None]
+        off = found - self.target
+        if self.data.phase is not None:
+            n = self.data.values.size
+            off[n:] = np.remainder(off[n:] + 180.0, 360.0) - 180.0
+        return off / self.scale, by / self.scale[:, None]
 
 
 def _end(circuit: Circuit) -> float:
