@@ -223,10 +223,9 @@ def test_an_impedance_against_frequency(tmp_path: Path, with_phase: bool) -> Non
     found.plot()
     # From a table in kilohm.
     head = "frequency (kHz),impedance (kohm)" + (",impedance_phase (deg)" if with_phase else "")
-    rows = [
-        f"{x / 1e3:.12g},{abs(y) / 1e3:.12g}" + (f",{np.degrees(np.angle(y)):.12g}" if with_phase else "")
-        for x, y in zip(f, z, strict=True)
-    ]
+    rows = [f"{x / 1e3:.12g},{abs(y) / 1e3:.12g}" for x, y in zip(f, z, strict=True)]
+    if with_phase:
+        rows = [f"{row},{np.degrees(np.angle(y)):.12g}" for row, y in zip(rows, z, strict=True)]
     (tmp_path / "z.csv").write_text("\n".join([head, *rows]))
     again = fs.fit(quiet, tmp_path / "z.csv", ["Xgap.d", "Xgap.r"], skin="follow")
     assert again.estimates["Xgap.d"].value == pytest.approx(3.1e-6, rel=1e-6)
@@ -251,15 +250,9 @@ def test_intervals_from_noisy_impedances_cover_the_truth() -> None:
     [
         ({"frequency": [1e3, 2e3], "impedance": [1e5, -1e5]}, "magnitudes above 0"),
         ({"frequency": [1e3, 2e3], "f_el_mean": [0.1, 0.2], "impedance_phase": [-30.0, -40.0]}, "beside impedance"),
-        ({"frequency": [1e3, 2e3], "impedance": [1e5]}, "as many"),
     ],
 )
 def test_bad_impedances_are_refused(data: dict[str, list[float]], said: str) -> None:
     circuit = fs.read_netlist(CIRCUITS / "fingerpad.cir")
-    try:
+    with pytest.raises(fs.InputError, match=said):
         fs.fit(circuit, data, ["Xgap.d"])
-    except fs.InputError as error:
-        assert said in str(error)
-    else:
-        # One value is taken for all rows.
-        assert said == "as many"
