@@ -47,7 +47,8 @@ class Steps(NamedTuple):
         Forcing of the modes at the ends and in the middle of the steps.
     w : ndarray, shape (m, n)
         Modes at a place.
-    top, low : ndarray, shape (n,)
+    moments : ndarray, shape (5, n)
+    low : ndarray, shape (n,)
         Scratch.
     """
 
@@ -57,7 +58,7 @@ class Steps(NamedTuple):
     forced: FloatArray
     forced_within: FloatArray
     w: FloatArray
-    top: FloatArray
+    moments: FloatArray
     low: FloatArray
 
 
@@ -66,7 +67,7 @@ def new_steps(modes: int) -> Steps:
     n = BLOCK + 8
     return Steps(
         np.zeros((modes, 4, n)), np.zeros((modes, 4, 3, n)), np.zeros((modes, 2, 2, n)),
-        np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n), np.zeros(n),
+        np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((5, n)), np.zeros(n),
     )  # fmt: skip
 
 
@@ -95,64 +96,48 @@ def _series(n: int, terms: int, c: FloatArray, rate: float, h: FloatArray, out: 
 
 
 @jit_rows
-def _three(n: int, rate: float, at: float, h: FloatArray, e: FloatArray, top: FloatArray, out: FloatArray) -> None:
+def _early(n: int, rate: float, h: FloatArray, e: FloatArray, m: FloatArray) -> None:
+    """Moments below the highest, which the last row of m holds without its factor exp(-rate h)."""
+    top = m.shape[0] - 1
+    for i in range(n):
+        m[top, i] *= e[i]
+    for j in range(top, 0, -1):
+        over = 1.0 / j
+        for i in range(n):
+            m[j - 1, i] = over * (1.0 - rate * h[i] * m[j, i])
+
+
+@jit_rows
+def _late(n: int, rate: float, h: FloatArray, e: FloatArray, m: FloatArray) -> None:
+    """Replace the moments of the steps beyond `_LATE` time constants by those that follow from the lowest."""
+    for i in range(n):
+        y = max(rate * h[i], _LATE)
+        late, over = rate * h[i] >= _LATE, 1.0 / y
+        value = (1.0 - e[i]) * over
+        m[0, i] = value if late else m[0, i]
+        for j in range(1, m.shape[0]):
+            value = (1.0 - j * value) * over
+            m[j, i] = value if late else m[j, i]
+
+
+@jit_rows
+def _parabolas(n: int, at: float, h: FloatArray, m: FloatArray, out: FloatArray) -> None:
     """Weights of a parabola at 0, 1/2 and 1 up to the place `at`."""
     for i in range(n):
-        y = rate * h[i] * at
-        early = y < 4.0
-        safe = max(y, 1e-300)
-        m2 = e[i] * top[i]
-        m1 = 0.5 * (1.0 - y * m2)
-        m0 = 1.0 - y * m1
-        l0 = (1.0 - e[i]) / safe
-        l1 = (1.0 - l0) / safe
-        l2 = (1.0 - 2.0 * l1) / safe
-        a = h[i] * at * (m0 if early else l0)
-        b = h[i] * at * at * (m1 if early else l1)
-        c = h[i] * at * at * at * (m2 if early else l2)
+        a = h[i] * at * m[0, i]
+        b = h[i] * at * at * m[1, i]
+        c = h[i] * at * at * at * m[2, i]
         out[0, i] = a - 3.0 * b + 2.0 * c
         out[1, i] = 4.0 * (b - c)
         out[2, i] = 2.0 * c - b
 
 
 @jit_rows
-def _five(
-    n: int, rate: float, at: float, h: FloatArray, e: FloatArray, top: FloatArray, first: FloatArray, last: FloatArray,
-    parabola: FloatArray, quarter: FloatArray,
-) -> None:  # fmt: skip
-    """Weights up to the place `at`: of a parabola, and of a quartic that is 1 at one quarter and 0 at other nodes."""
-    a1, a2, a3, a4, b1, b2, b3, b4 = (
-        first[0], first[1], first[2], first[3], last[0], last[1], last[2], last[3],
-    )  # fmt: skip
+def _quartics(n: int, at: float, h: FloatArray, m: FloatArray, c: FloatArray, out: FloatArray) -> None:
+    """Weights up to the place `at` of a quartic with the coefficients c, from that of the power 1 on."""
+    c1, c2, c3, c4 = c[0] * at * at, c[1] * at**3, c[2] * at**4, c[3] * at**5
     for i in range(n):
-        y = rate * h[i] * at
-        early = y < 4.0
-        safe = max(y, 1e-300)
-        m4 = e[i] * top[i]
-        m3 = 0.25 * (1.0 - y * m4)
-        m2 = (1.0 - y * m3) / 3.0
-        m1 = 0.5 * (1.0 - y * m2)
-        m0 = 1.0 - y * m1
-        l0 = (1.0 - e[i]) / safe
-        l1 = (1.0 - l0) / safe
-        l2 = (1.0 - 2.0 * l1) / safe
-        l3 = (1.0 - 3.0 * l2) / safe
-        l4 = (1.0 - 4.0 * l3) / safe
-        own = h[i] * at
-        w0 = own * (m0 if early else l0)
-        own *= at
-        w1 = own * (m1 if early else l1)
-        own *= at
-        w2 = own * (m2 if early else l2)
-        own *= at
-        w3 = own * (m3 if early else l3)
-        own *= at
-        w4 = own * (m4 if early else l4)
-        parabola[0, i] = w0 - 3.0 * w1 + 2.0 * w2
-        parabola[1, i] = 4.0 * (w1 - w2)
-        parabola[2, i] = 2.0 * w2 - w1
-        quarter[0, i] = a1 * w1 + a2 * w2 + a3 * w3 + a4 * w4
-        quarter[1, i] = b1 * w1 + b2 * w2 + b3 * w3 + b4 * w4
+        out[i] = h[i] * (c1 * m[1, i] + c2 * m[2, i] + c3 * m[3, i] + c4 * m[4, i])
 
 
 @jit_within
@@ -169,15 +154,13 @@ def weigh(form: Form, steps: Steps, h: FloatArray, r: int, n: int) -> None:
             for j in range(4 * terms - 3, 4 * terms + 1):
                 term *= y / j
             terms += 1
-        for place in (FIRST_QUARTER, LAST_QUARTER):
-            at = EVERY_PLACE[place]
-            _series(n, terms, _THREE, rate * at, h, steps.top)
-            _three(n, rate, at, h, decay[place], steps.top, steps.parabola[k, place])
-        for i in range(2):
-            place = END if i == 1 else MIDDLE
-            at = EVERY_PLACE[place]
-            _series(n, terms, _FIVE, rate * at, h, steps.top)
-            _five(
-                n, rate, at, h, decay[place], steps.top, _QUARTERS[0], _QUARTERS[1], steps.parabola[k, place],
-                steps.quarter[k, i],
-            )  # fmt: skip
+        for place in range(EVERY_PLACE.size):
+            at, inner = EVERY_PLACE[place], place in (FIRST_QUARTER, LAST_QUARTER)
+            m = steps.moments[:3] if inner else steps.moments
+            _series(n, terms, _THREE if inner else _FIVE, rate * at, h, m[m.shape[0] - 1])
+            _early(n, rate * at, h, decay[place], m)
+            if rate * at * longest >= _LATE:
+                _late(n, rate * at, h, decay[place], m)
+            _parabolas(n, at, h, m, steps.parabola[k, place])
+            for quarter in range(0 if inner else 2):
+                _quartics(n, at, h, m, _QUARTERS[quarter], steps.quarter[k, 1 if place == END else 0, quarter])

@@ -79,8 +79,18 @@ def driving(problem: Problem) -> Samples | PWL | None:
 
 
 def _points(problem: Problem, wave: PWL) -> FloatArray | None:
-    """Times (s) of the points within a run, with its start and end, and with more on long lines; None if not dense."""
-    t, t0, t1 = np.asarray(wave.times), problem.t_start, problem.t_stop
+    """Times (s) of the points within a run, with its start and end, and with more on long lines; None if not dense.
+
+    They are kept with the waveform, for the last run that asked.
+    """
+    key = problem.t_start, problem.t_stop
+    found: tuple[tuple[float, float], FloatArray | None] | None = wave.kept.get("points")
+    if found is None or found[0] != key:
+        found = wave.kept["points"] = key, _dense(wave.knots[0], *key)
+    return found[1]
+
+
+def _dense(t: FloatArray, t0: float, t1: float) -> FloatArray | None:
     slack = 1e-6 * (t1 - t0) / t.size
     inside = np.concatenate([[t0], t[(t > t0 + slack) & (t < t1 - slack)], [t1]])
     intervals = np.diff(inside)
@@ -89,6 +99,8 @@ def _points(problem: Problem, wave: PWL) -> FloatArray | None:
     parts = np.ceil(intervals / (LONGEST * np.median(intervals))).astype(int)
     if parts.sum() > 2 * inside.size:
         return None
+    if parts.sum() == parts.size:
+        return inside
     before = np.repeat(np.concatenate([[0], np.cumsum(parts)[:-1]]), parts)
     share = (np.arange(before.size) - before) / np.repeat(parts, parts)
     return np.append(np.repeat(inside[:-1], parts) + share * np.repeat(intervals, parts), t1)

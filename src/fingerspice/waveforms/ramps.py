@@ -42,6 +42,11 @@ class Ramps(Waveform):
         """Result of `_knots`, cached."""
         return self._knots()
 
+    @property
+    def knots(self) -> tuple[FloatArray, FloatArray]:
+        """Times (s, ascending) and values (V) of the knots of one run or period."""
+        return self._listed
+
     @cached_property
     def _distinct(self) -> FloatArray:
         """Times of the knots, each once, s."""
