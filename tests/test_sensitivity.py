@@ -131,6 +131,13 @@ def test_refused(table_1: fs.Circuit, how: dict[str, Any], text: str) -> None:
         fs.simulate(table_1, t_stop=0.02, **how)
 
 
+def test_a_parameter_that_changes_the_period_of_a_periodic_state_is_refused(table_1: fs.Circuit) -> None:
+    with pytest.raises(InputError, match=r"Vdrive\.frequency, which changes the period"):
+        _ = fs.steady_state(table_1, sensitivities=("Vdrive.frequency",)).sensitivities
+    with pytest.raises(InputError, match=r"Vdrive\.frequency, which changes the period"):
+        fs.simulate(table_1, t_stop=0.02, start="periodic", sensitivities=("Xgap.d", "Vdrive.frequency"))
+
+
 def test_networks_are_refused() -> None:
     two_fingers = fs.read_netlist(CIRCUITS / "two_fingers.cir")
     with pytest.raises(InputError, match="no series stack"):

@@ -254,6 +254,16 @@ def _closed(
     return out
 
 
+def _refuse_other_periods(varied: Sequence[_Varied], problem: Problem) -> None:
+    """The tangents of a periodic state close over the period of the run, which no parameter may change."""
+    for one in varied:
+        if any(build_stack(circuit).waveform.period != problem.waveform.period for circuit in one.circuits):
+            raise InputError(
+                f"sensitivities of a periodic state name {one.path}, which changes the period; allowed: other "
+                "parameters, or a run from another start"
+            )
+
+
 def _at_outputs(steps: _Steps, record: Record, at_nodes: FloatArray) -> FloatArray:
     """What is known at the nodes of all steps (m, n, NODES) at the outputs, shape (m, n_t)."""
     t, last = record.t, steps.end.size - 1
@@ -312,6 +322,7 @@ def sensitivities_of(problem: Problem, solution: Solution, paths: Sequence[str],
     course = Course(stretches.length * stretches.reach, steps.order, u, s, moved)
     begun = _starts(varied, problem, start)
     if start == "periodic":
+        _refuse_other_periods(varied, problem)
         begun = _closed(problem, rtol, course, changes, begun, steps)
     nodes, _ = _followed(problem, rtol, course, changes, begun, steps)
     outputs = _at_outputs(steps, record, nodes.reshape(-1, *nodes.shape[2:])).reshape(len(varied), 2, -1)
