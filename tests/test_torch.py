@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import importlib.util
+import re
 import subprocess
 import sys
 import warnings
@@ -18,7 +20,11 @@ from scenes import table1
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install '.[test]'")
 
-CIRCUITS = Path(__file__).parents[1] / "circuits"
+# What torch itself does when its forward mode is first used.
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
+
+ROOT = Path(__file__).parents[1]
+CIRCUITS = ROOT / "circuits"
 T_STOP, TIMES = 0.012, (0.0013, 0.0071, 0.011)
 # Values about which scenes vary, and shares of them: two scenes with three parameters each.
 MIDDLE = {"Xgap.d": 3.5e-6, "Xgap.r": 1e6, "Vdrive.amplitude": 200.0}
@@ -41,7 +47,9 @@ def shares() -> Any:
 
 @pytest.fixture
 def means() -> Any:
-    return by_shares(fs.torch.Simulator(table1(), (), ("f_el_mean", "area_mean"), t_stop=T_STOP, rtol=1e-9), "f_el_mean")
+    return by_shares(
+        fs.torch.Simulator(table1(), (), ("f_el_mean", "area_mean"), t_stop=T_STOP, rtol=1e-9), "f_el_mean"
+    )
 
 
 def mixed(**how: Any) -> Any:
@@ -88,7 +96,7 @@ def test_values_and_derivatives_are_those_of_differences_of_runs(law: str) -> No
     found = simulator()
     run = fs.simulate(circuit, t_eval=TIMES, t_stop=T_STOP, rtol=1e-12)
     np.testing.assert_allclose(found["f_t"].detach().numpy(), run.f_t, rtol=1e-9)
-    assert float(found["f_el_mean"]) == pytest.approx(run.f_el_mean, rel=1e-9)
+    assert float(found["f_el_mean"].detach()) == pytest.approx(run.f_el_mean, rel=1e-9)
     (2.0 * found["f_el_mean"] - found["f_t"][1]).backward()
     for path in paths:
         value, expected = circuit.parameters[path].value, 0.0
@@ -110,8 +118,8 @@ def test_the_same_model_in_torchdiffeq_agrees(law: str, source: str, adjoint: bo
     paths = ("Xgap.d", "Xgap.r", "Xgap.alpha", "Xgap.m_exp", "Xcoat.d", "Xskin.f", "Vdrive.amplitude")
     word = {"sine": "SIN(0 200 100)", "square": "SQUARE(200 100)"}[source]
     circuit = table1(word, library="fingerspice.lib" if law == "local" else "fingerspice_mobile.lib")
-    # One edge of the square lies between.
-    t = torch.tensor([0.0, 0.003, 0.0062], dtype=torch.float64)
+    # One edge of the square lies between the times.
+    t = torch.linspace(0.0, 0.0062, 31, dtype=torch.float64)
     simulator = fs.torch.Simulator(circuit, paths, ("u_gap", "f_el_mean"), t=t, t_stop=0.0062, rtol=1e-9)
     ours = simulator()
     values = {
@@ -125,12 +133,12 @@ def test_the_same_model_in_torchdiffeq_agrees(law: str, source: str, adjoint: bo
     assert float(force.detach()) == pytest.approx(float(ours["f_el_mean"].detach()), rel=2e-7)
 
     def slopes(u: Any, force: Any, by: Any) -> Any:
-        return torch.stack(torch.autograd.grad(force + 1e-3 * u[1] - 2e-3 * u[2], by))
+        return torch.stack(torch.autograd.grad(force + 1e-3 * u[14] - 2e-3 * u[30], by))
 
     scale = torch.stack([values[path].detach() for path in paths])
     theirs = slopes(u, force, [values[path] for path in paths]) * scale
     mine = slopes(ours["u_gap"], ours["f_el_mean"], list(simulator.parameters())) * scale
-    torch.testing.assert_close(mine, theirs, rtol=0.0, atol=(1e-5 if adjoint else 1e-6) * float(theirs.abs().max()))
+    torch.testing.assert_close(mine, theirs, rtol=0.0, atol=1e-6 * float(theirs.abs().max()))
 
 
 def test_shapes_and_names() -> None:
@@ -149,7 +157,7 @@ def test_shapes_and_names() -> None:
     assert one().shape == (3,)
     np.testing.assert_allclose(one().detach(), found["f_el"][1, 1].detach(), rtol=1e-3)
     other = copy.deepcopy(one)
-    other.load_state_dict({"Xgap_d": torch.tensor(3e-6)})
+    other.load_state_dict({"Xgap_d": torch.tensor(3e-6, dtype=torch.float64)})
     assert torch.equal(other(), one({"Xgap.d": 3e-6}))
     assert one({"Xgap.d": torch.tensor(3e-6, dtype=torch.float32)}).dtype == torch.float64
 
@@ -180,7 +188,7 @@ def test_one_tensor_for_two_parameters_adds_their_derivatives() -> None:
 def test_logarithms() -> None:
     plain = fs.torch.Simulator(table1(), ("Xgap.d",), t_stop=T_STOP, rtol=1e-8)
     log = fs.torch.Simulator(table1(), ("Xgap.d",), t_stop=T_STOP, rtol=1e-8, logarithms=True)
-    assert float(log.value("xgap.d")) == pytest.approx(3.5e-6, rel=1e-14)
+    assert float(log.value("xgap.d").detach()) == pytest.approx(3.5e-6, rel=1e-14)
     for one in (plain, log):
         one().backward()
     assert float(log.Xgap_d.grad) == pytest.approx(float(plain.Xgap_d.grad) * 3.5e-6, rel=1e-9)
@@ -242,7 +250,7 @@ def test_refused_when_it_is_called(values: dict[str, Any], text: str) -> None:
 
 def test_the_scene_that_cannot_be_run_is_named() -> None:
     simulator = fs.torch.Simulator(table1(), {"Xgap.mu": [0.3, 50.0]}, "u_gap", t=TIMES, t_stop=T_STOP)
-    with pytest.raises(InputError, match="scene 1: .*no contact"):
+    with pytest.raises(InputError, match=r"scene 1: .*no contact"):
         simulator()
     zero = fs.torch.Simulator(table1(), ("Vdrive.offset",), t_stop=T_STOP)
     with pytest.raises(InputError, match=r"scene 0: .*Vdrive.offset, which is 0; allowed"):
@@ -278,3 +286,29 @@ except fs.InputError as error:
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "fingerspice.torch needs torch, which is not installed; pip install 'fingerspice[torch]'\n"
+
+
+def test_the_code_of_the_page_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (ROOT / "docs" / "torch.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    assert page.count("```") == 2 * len(blocks)
+    monkeypatch.chdir(ROOT)
+    names: dict[str, Any] = {}
+    for block in blocks:
+        exec(block, names)
+    d, r = (names["model"].value(path).item() for path in ("Xgap.d", "Xgap.r"))
+    assert (d, r) == (pytest.approx(3.1e-6, rel=1e-4), pytest.approx(0.7e6, rel=1e-4))
+
+
+def test_the_example_learns_a_drive() -> None:
+    spec = importlib.util.spec_from_file_location("learned_drive", CIRCUITS / "learned_drive.py")
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    module = script.simulator()
+    deviations = script.learn(module, 20)
+    assert deviations[-1] < 0.66 * deviations[0]
+    # Where 150 steps lead.
+    found = [getattr(module, f"V{k}_amplitude").item() for k in (1, 3, 5, 7)]
+    assert found == pytest.approx([169.4, 47.8, 24.8, 15.1], rel=0.1)

@@ -37,12 +37,10 @@ def area_and_force(u: Tensor, p: Values) -> tuple[Tensor, Tensor]:
     # The root of (4) in the logarithm of A_R0 (mm^2).
     pull = u.abs() * work * alpha ** (-0.5 / m)
     power = 0.5 * (1.0 + 1.0 / m - 1.0 / n)
-    y = _root(float(alpha), float(m), float(load), float(pull), float(power))
+    y = _root(*(float(one.detach()) for one in (alpha, m, load, pull, power)))
     # One step of Newton's method from the root has the derivatives of the root by everything.
-    left, adhesion = math.exp(y / float(m)) * alpha ** (-1.0 / m) * torch.exp(y * (1.0 / m - 1.0 / float(m))), (
-        pull * torch.exp(power * y)
-    )
-    slope = float(left) / float(m) - float(power) * float(adhesion)
+    left, adhesion = torch.exp(y / m) * alpha ** (-1.0 / m), pull * torch.exp(power * y)
+    slope = (left / m - power * adhesion).detach()
     a0 = 1e-6 * torch.exp(y - (left - adhesion - load) / slope)
     b = 1e-12 * p["Xgap.c2"] * mu**2 / a0
     linear, rest = 1.0 + 2.0 * b * stress * load, a0 - b * load**2
@@ -69,13 +67,15 @@ def sine(t: Tensor, p: Values) -> Tensor:
 
 def square(t: Tensor, p: Values) -> Tensor:
     """SQUARE(amplitude frequency); torchdiffeq asks for either side of an edge by a time just beside it."""
-    half = int(torch.searchsorted(edges(float(t) + 1.0 / float(p["Vdrive.frequency"]), p), t, right=True))
+    half = int(
+        torch.searchsorted(edges(float(t.detach()) + 1.0 / float(p["Vdrive.frequency"].detach()), p), t, right=True)
+    )
     return p["Vdrive.amplitude"] * (1.0 - 2.0 * (half % 2))
 
 
 def edges(t_stop: float, p: Values) -> Tensor:
     """Times of a square's jumps after the start, s."""
-    half = 0.5 / float(p["Vdrive.frequency"])
+    half = 0.5 / float(p["Vdrive.frequency"].detach())
     return half * torch.arange(1, max(2, math.ceil(t_stop / half)), dtype=torch.float64)
 
 
@@ -114,7 +114,7 @@ class Finger:
                 miss = one - self._gap(at_once[1].detach(), inside[1].detach(), one)
                 slope = torch.autograd.grad(miss, one)[0]
             u = u - miss.detach() / slope
-            if abs(float(miss)) < 1e-13 * (1.0 + abs(float(u))):
+            if abs(float(miss.detach())) < 1e-13 * (1.0 + abs(float(u))):
                 break
         gap = u - (u - self._gap(at_once[1], inside[1], u)) / slope
         return at_once + inside * self.area0 / area_and_force(gap, self.p)[0]
@@ -133,14 +133,16 @@ class Finger:
     def run(
         self, t: Tensor, *, adjoint: bool = False, tol: float = 1e-9, jumps: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Gap voltages at times `t` from 0 s on, and the mean force; edges of the source are `jumps`."""
+        """Gap voltages at times `t` from 0 s on, and the mean force; edges of the source are `jumps`.
+
+        The adjoint solves the state backward from one time to the next, which is unstable: the times should lie close.
+        """
         how = {"method": "dopri5", "rtol": tol, "atol": tol * 1e-6}
         if jumps is not None:
             how["options"] = {"jump_t": jumps}
         y0 = torch.zeros(4, dtype=torch.float64)
         if adjoint:
             wanted = tuple(one for one in self.p.values() if one.requires_grad)
-            # The adjoint carries the layers' constants along: they are made anew inside.
             states = odeint_adjoint(
                 _Anew(self), y0, t, adjoint_params=wanted, adjoint_options=dict(how.get("options", {})),
                 **how,
@@ -152,7 +154,7 @@ class Finger:
 
 
 class _Anew(torch.nn.Module):
-    """The rate as a function of the parameters themselves, for the adjoint equation."""
+    """The rate with the layers' constants made of the parameters anew, as the adjoint equation differentiates it."""
 
     def __init__(self, finger: Finger) -> None:
         super().__init__()

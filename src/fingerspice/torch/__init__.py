@@ -7,7 +7,9 @@ from fingerspice.base.errors import InputError
 try:
     import torch as _torch  # noqa: F401
 except ImportError:
-    raise InputError("fingerspice.torch needs torch, which is not installed; pip install 'fingerspice[torch]'") from None
+    raise InputError(
+        "fingerspice.torch needs torch, which is not installed; pip install 'fingerspice[torch]'"
+    ) from None
 
 from fingerspice.torch.simulator import Simulator as Simulator
 

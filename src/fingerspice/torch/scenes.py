@@ -13,7 +13,6 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.results.outcome import SolveError
-from fingerspice.results.sensitivity import Sensitivity
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.batch import batch
@@ -69,10 +68,10 @@ class Scenes:
         out = np.empty((len(given), sum(self.sizes), len(wanted)))
         for i, row in enumerate(given):
             with _named(i):
+                runs = self._runs(paths, row, wanted)
                 for k, path in enumerate(wanted):
-                    runs = self._runs(paths, row, wanted) if k == 0 else runs
-                    by: list[tuple[str, Sensitivity]] = [(name, run.sensitivities[path]) for name, run in runs]
-                    out[i, :, k] = np.concatenate([np.ravel(getattr(one, name)) for name, one in by])
+                    parts = [np.ravel(getattr(run.sensitivities[path], name)) for name, run in runs]
+                    out[i, :, k] = np.concatenate(parts)
         return out
 
     def _means(self, paths: Sequence[str], given: FloatArray) -> FloatArray:
@@ -101,7 +100,7 @@ class Scenes:
                 found.append((name, state))
                 continue
             run = run or simulate(
-                circuit, t_stop=self.t_stop, t_eval=self.t if self.t.size else [self.t_stop], rtol=self.rtol,
+                circuit, t_stop=self.t_stop, t_eval=self.t if self.t.size else np.array([self.t_stop]), rtol=self.rtol,
                 charge=False, start="periodic" if self.periodic else "deck", sensitivities=wanted,
             )  # fmt: skip
             found.append((name, run))

@@ -72,7 +72,9 @@ class Simulator(torch.nn.Module):
         super().__init__()
         require_circuit(circuit)
         if not is_stack(circuit) or build_stack(circuit).contact is None:
-            raise InputError("the circuit is no series stack with a GAP; allowed: one with derivatives, which these are")
+            raise InputError(
+                "the circuit is no series stack with a GAP; allowed: one with derivatives, which these are"
+            )
         self.circuit, self.logarithms = circuit, logarithms
         self._alone = isinstance(outputs, str)
         names = (outputs,) if isinstance(outputs, str) else tuple(outputs)
