@@ -67,6 +67,16 @@ def test_gradcheck_backward_and_forward(shares: Any, output: str, periodic: bool
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("periodic", [False, True])
+def test_gradcheck_where_values_come_from_lockstep_and_slopes_from_runs(shares: Any, periodic: bool) -> None:
+    how = {"periodic": True} if periodic else {"t_stop": 0.02}
+    function = by_shares(fs.torch.Simulator(table1(), (), ("area_mean", "f_el_mean"), rtol=1e-9, **how), "f_el_mean")
+    size = float(function(shares).max())
+    torch.autograd.gradcheck(
+        lambda s: function(s) / size, (shares.requires_grad_(),), eps=1e-4, atol=1e-6, rtol=1e-6, check_forward_ad=True
+    )
+
+
 def test_every_transform_of_torch_gives_the_same(means: Any, shares: Any) -> None:
     func = torch.func
     values = torch.stack([means(one) for one in shares])
