@@ -43,6 +43,7 @@ MANY_PARAMETERS = {
     "studies.fit.fit",
     "studies.steady.steady_state",
     "solve.streaming.stream",
+    "torch.simulator.Simulator.__init__",
 }
 # Functions over the limits, with their lines and parameters: no other may be, and these may only shrink.
 LARGER = {
@@ -77,7 +78,7 @@ LARGER = {
 # From the bottom up: a part imports its own files and the parts above it in this list, nothing below.
 ORDER = (
     *("base", "numerics", "physics", "engine", "waveforms", "circuit", "netlist"),
-    *("results", "solve", "plots", "studies", "explorer", "cli", "__main__"),
+    *("results", "solve", "plots", "studies", "torch", "explorer", "cli", "__main__"),
 )
 # Beside each other, not one on the other.
 STRANGERS = (

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from fingerspice import torch as torch
     from fingerspice.base.errors import FingerspiceError as FingerspiceError
     from fingerspice.base.errors import FingerspiceWarning as FingerspiceWarning
     from fingerspice.base.errors import InputError as InputError
@@ -112,6 +113,9 @@ __all__ = ["__version__", *sorted(_HOME)]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "torch":
+        # Not among the names of the package, which all load without torch.
+        return import_module("fingerspice.torch")
     if name not in _HOME:
         raise AttributeError(f"module 'fingerspice' has no attribute {name!r}")
     value = getattr(import_module(f"fingerspice.{_HOME[name]}"), name)
