@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 import fingerspice as fs
+from commands import Command
 from fingerspice.plots.placement import place
 from fingerspice.plots.schematic import MOST_ELEMENTS, Schematic
 from scenes import table1
@@ -166,3 +168,21 @@ def test_a_circuit_too_large_for_a_picture_is_refused() -> None:
         fs.parse_netlist(f"Large\nV1 a 0 1\n{rows}.tran 1u 1m\n").draw()
     figure = fs.parse_netlist(f"Large\nV1 a 0 1\n{rows[: rows.rindex('R199')]}.tran 1u 1m\n").draw()
     assert np.prod(figure.get_size_inches()) < 1000.0
+
+
+def test_run_writes_the_schematic_beside_its_picture_and_keeps_that_of_another_circuit(
+    command: Command, tmp_path: Path
+) -> None:
+    run = ("run", str(CIRCUITS / "fingerpad.cir"), "--schematic", "--stop", "10m", "--out", str(tmp_path))
+    file = tmp_path / "fingerpad_schematic.svg"
+    for _ in range(2):
+        done = command(*run, "--no-plot", "--json")
+        assert done.code == 0
+        assert json.loads(done.out)["files"] == [str(tmp_path / "fingerpad.nc"), str(file)]
+    assert "Xgap" in texts(file.read_text(encoding="utf-8"))
+    refused = command(*run, "--csv", "--set", "Xgap.d=3u")
+    assert refused.code == 2
+    assert f"{file} holds a result of the deck as it is, and this one is with Xgap.d=3u" in refused.err
+    file.write_text("<svg/>", encoding="utf-8")
+    assert "nothing says which circuit it is of" in command(*run).err
+    assert "--schematic does not go with --stream" in command(*run, "--stream").err
