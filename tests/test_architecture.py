@@ -91,7 +91,8 @@ STRANGERS = (
 # Methods that call a part above their own, and load it only when they are called.
 LENT = {
     "circuit.circuit.Circuit._waveform": "netlist.netlist",
-    "circuit.circuit.Circuit.explore": "explorer.server",
+    "circuit.doors.Doors.draw": "plots.schematic",
+    "circuit.doors.Doors.explore": "explorer.server",
     "results.solution.Solution.plot": "plots.traces",
     "results.spectrum.Spectrum.plot": "plots.spectra",
     "results.phasor_solution.PhasorSolution.plot": "plots.phasors",

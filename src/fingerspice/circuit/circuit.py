@@ -16,8 +16,9 @@ from types import MappingProxyType
 from typing import Any
 
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
-from fingerspice.base.pages import Page, Shown
+from fingerspice.base.pages import Page
 from fingerspice.circuit.devices import DEVICES, DeviceSpec
+from fingerspice.circuit.doors import Doors
 from fingerspice.circuit.values import concerns, unusual, unusual_of_changed, value_of
 from fingerspice.waveforms.waveform import Waveform, as_waveform
 
@@ -130,7 +131,7 @@ class Parameter:
 
 
 @dataclass(frozen=True, repr=False)
-class Circuit(Shown):
+class Circuit(Doors):
     """A netlist, read.
 
     Attributes
@@ -301,12 +302,6 @@ class Circuit(Shown):
         changed = dataclasses.replace(self, **changes)
         vars(changed)["related"] = self.related
         return changed
-
-    def explore(self) -> Any:
-        """Show the circuit on a local page (docs/explore.md); gives the running `Explorer`."""
-        from fingerspice.explorer.server import explore
-
-        return explore(self)
 
     def _unknown_path(self, path: str) -> str:
         """The message about a path that `replace` does not know."""

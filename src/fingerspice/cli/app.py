@@ -25,6 +25,7 @@ from fingerspice.cli.arguments import (
     Out,
     Overwrite,
     Rtol,
+    Schematic,
     Set,
     Signals,
     Source,
@@ -97,6 +98,7 @@ def run(
     signals: Signals = None,
     netcdf: NetCdf = False,
     feel: Annotated[bool, typer.Option("--feel", help="Say, and draw, what the hand feels of the friction.")] = False,
+    schematic: Schematic = False,
     as_json: AsJson = False,
     no_plot: NoPlot = False,
 ) -> None:
@@ -129,13 +131,14 @@ def run(
             raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         if stream or chunk or signals or netcdf:
-            options.check_streamed(stream, csv=csv, feel=feel)
+            options.check_streamed(stream, csv=csv, feel=feel, schematic=schematic)
             how = {"charge_law": charge_law, "area": area_from_text(area), "rtol": rtol}
             how |= {"method": method, "start": start}
             run_streamed(answer, results, circuit, how, chunk=chunk, signals=signals, netcdf=netcdf)
             return
         data = results.file(".csv" if csv else ".nc")
         picture = None if no_plot else results.file(".png")
+        drawn = results.file("_schematic.svg") if schematic else None
         touch = Touch(circuit, None if no_plot else results) if feel else None
         with progress() as update:
             solution = simulate(
@@ -144,7 +147,7 @@ def run(
             )  # fmt: skip
         if as_json:
             answer.update(**answers.of_run(solution))
-        writes = written(solution, data, picture, results)
+        writes = written(solution, data, picture, results, drawn)
         if touch is not None and solution.success:
             answer.update(feel=touch.look(solution))
             writes += touch.writes
