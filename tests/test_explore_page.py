@@ -178,3 +178,24 @@ def test_without_its_token_there_is_no_page(browser: Any, explorer: fs.Explorer)
     assert answer.status == 403
     assert "token" in page.inner_text("body")
     page.close()
+
+
+def test_a_page_of_this_computer_shows_the_explorer_in_a_frame_where_a_notebook_asked_for_it(browser: Any) -> None:
+    framed, alone = fs.Explorer(SINE, framed=True), fs.Explorer(SINE)
+    notebook = f"<html><body>{framed._repr_html_()}<iframe src='{alone.url}' id='refused'></iframe></body></html>"
+    page = browser.new_context().new_page()
+    try:
+        for origin in ("http://localhost:8888", "http://127.0.0.1:8888"):
+            page.route(f"{origin}/**", lambda route: route.fulfill(body=notebook, content_type="text/html"))
+            page.goto(f"{origin}/lab")
+            shown, refused = page.frame_locator("iframe[title]"), page.frame_locator("#refused")
+            shown.locator("body[data-answers]").wait_for(timeout=120_000, state="attached")
+            assert shown.locator("input[data-path='Xgap.d']").count() > 0
+            assert refused.locator("input[data-path]").count() == 0
+        page.route("http://elsewhere.example/**", lambda route: route.fulfill(body=notebook, content_type="text/html"))
+        page.goto("http://elsewhere.example/lab")
+        page.wait_for_timeout(2000)
+        assert page.frame_locator("iframe[title]").locator("input[data-path]").count() == 0
+    finally:
+        framed.stop()
+        alone.stop()
