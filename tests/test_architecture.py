@@ -93,7 +93,8 @@ LENT = {
     "circuit.circuit.Circuit._waveform": "netlist.netlist",
     "circuit.doors.Doors.draw": "plots.schematic",
     "circuit.doors.Doors.explore": "explorer.server",
-    "results.solution.Solution.plot": "plots.traces",
+    "results.doors.Doors.plot": "plots.traces",
+    "results.doors.Doors.explore": "explorer.server",
     "results.spectrum.Spectrum.plot": "plots.spectra",
     "results.phasor_solution.PhasorSolution.plot": "plots.phasors",
 }

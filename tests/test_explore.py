@@ -361,6 +361,65 @@ def test_the_page_and_its_files_come_with_headers_that_shut_it_in(explorer: Expl
     assert "uplot.js" in (ROOT / "NOTICE").read_text()
 
 
+@pytest.fixture(scope="module")
+def framed() -> Iterator[Explorer]:
+    running = Explorer(framed=True)
+    yield running
+    running.stop()
+    running.stop()
+
+
+def loaded(explorer: Explorer, what: str, **headers: str) -> int:
+    """Status of a request that another site's page makes."""
+    request = urllib.request.Request(f"{explorer.url}{what}", None, {"Sec-Fetch-Site": "cross-site", **headers})
+    try:
+        with urllib.request.urlopen(request) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code
+
+
+def test_another_page_may_frame_the_explorer_only_where_a_notebook_asked_for_it(
+    explorer: Explorer, framed: Explorer
+) -> None:
+    frame = {"Sec-Fetch-Dest": "iframe", "Sec-Fetch-Mode": "navigate"}
+    assert loaded(framed, "", **frame) == 200
+    assert loaded(explorer, "", **frame) == 403
+    # A frame is all: no data, no script, no page in a window, nothing without the token.
+    assert loaded(framed, "start", **frame) == 403
+    assert loaded(framed, "app.js", **{"Sec-Fetch-Dest": "script"}) == 403
+    assert loaded(framed, "", **{"Sec-Fetch-Dest": "document"}) == 403
+    assert loaded(framed, "../", **frame) == 403
+    assert raw(framed, "POST", "/x/", b"{}", **{"Sec-Fetch-Site": "cross-site", **frame})[0] == 403
+    for one, allowed in ((explorer, "'none'"), (framed, "http://127.0.0.1:* http://localhost:* ")):
+        with urllib.request.urlopen(one.url) as answer:
+            ancestors = answer.headers["Content-Security-Policy"].partition("frame-ancestors ")[2]
+            assert ancestors.startswith(allowed)
+            assert "https://" not in ancestors.replace("https://127.0.0.1:*", "").replace("https://localhost:*", "")
+    assert explorer._repr_html_() is None
+    assert f'<iframe src="{framed.url}"' in str(framed._repr_html_())
+
+
+def test_a_solution_opens_the_page_as_it_was_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    circuit = fs.parse_netlist(SINE).replace({"Xgap.d": 5e-6})
+    solution = fs.simulate(circuit, charge_law="mobile", area="frozen", rtol=1e-5, t_stop=0.03)
+    running = solution.explore()
+    try:
+        assert opened == [running.url]
+        start = asked(running, "start", None)[1]
+        assert start["own"]["request"] == {
+            "deck": SINE, "charge_law": "mobile", "area": "frozen", "rtol": 1e-5, "periods": 3.0,
+        }  # fmt: skip
+        shown = post(running, start["own"]["request"])
+        force = next(trace for trace in shown["traces"] if trace["signal"] == "f_el")
+        np.testing.assert_allclose(array(force["values"]).max(), solution.f_el.max(), rtol=1e-3)
+    finally:
+        running.stop()
+
+
 def test_the_server_listens_on_the_loopback_address_alone(explorer: Explorer) -> None:
     assert explorer._server.server_address[0] == "127.0.0.1"
     assert explorer.url.startswith(f"http://127.0.0.1:{explorer.port}/")

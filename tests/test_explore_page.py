@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import threading
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -178,3 +180,42 @@ def test_without_its_token_there_is_no_page(browser: Any, explorer: fs.Explorer)
     assert answer.status == 403
     assert "token" in page.inner_text("body")
     page.close()
+
+
+class Notebook(BaseHTTPRequestHandler):
+    """A page that holds what a notebook's cell shows, and an explorer that no notebook asked for."""
+
+    body = b""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html")
+        self.send_header("Content-Length", str(len(self.body)))
+        self.end_headers()
+        self.wfile.write(self.body)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+def test_a_page_of_this_computer_shows_the_explorer_in_a_frame_where_a_notebook_asked_for_it(browser: Any) -> None:
+    framed, alone = fs.Explorer(SINE, framed=True), fs.Explorer(SINE)
+    Notebook.body = f"{framed._repr_html_()}<iframe src='{alone.url}' id='refused'></iframe>".encode()
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Notebook)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    page = browser.new_context().new_page()
+    try:
+        for host in ("localhost", "127.0.0.1"):
+            page.goto(f"http://{host}:{server.server_port}/")
+            shown, refused = page.frame_locator("iframe[title]"), page.frame_locator("#refused")
+            shown.locator("body[data-answers]").wait_for(timeout=60_000, state="attached")
+            assert shown.locator("input[data-path='Xgap.d']").count() > 0
+            assert refused.locator("input[data-path]").count() == 0
+        page.goto(f"http://elsewhere.localhost:{server.server_port}/")
+        page.wait_for_timeout(2000)
+        assert page.frame_locator("iframe[title]").locator("input[data-path]").count() == 0
+    finally:
+        for running in (framed, alone):
+            running.stop()
+        server.shutdown()
+        server.server_close()

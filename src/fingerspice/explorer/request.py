@@ -20,6 +20,7 @@ from fingerspice.explorer.recordings import Recording, recording_of
 from fingerspice.explorer.waveforms import gain_of, read_source
 from fingerspice.netlist.netlist import parse_netlist
 from fingerspice.physics.ladder import SKIN_LADDER
+from fingerspice.results.solution import Solution
 from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.waveform import Waveform, require
 
@@ -111,6 +112,16 @@ def request_of(given: Any) -> Request:
     if "recording" in asked:
         asked["recording"] = recording_of(asked["recording"])
     return Request(**asked, unknown=unknown)
+
+
+def asked_by(solution: Solution) -> dict[str, Any]:
+    """How a run was made, as far as a request can say it."""
+    asked: dict[str, Any] = {"charge_law": solution.charge_law, "rtol": min(max(solution.rtol, 1e-12), 0.1)}
+    if solution.area_mode in _AREAS:
+        asked["area"] = solution.area_mode
+    if solution.period:
+        asked["periods"] = float(f"{min(max(solution.t_stop / solution.period, 0.01), MOST_PERIODS):.6g}")
+    return asked
 
 
 def _overrides(given: Any) -> dict[str, float]:

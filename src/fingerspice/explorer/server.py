@@ -10,7 +10,8 @@ import secrets
 import socket
 import threading
 import webbrowser
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
@@ -20,21 +21,28 @@ import numpy as np
 
 from fingerspice import __version__
 from fingerspice.base.errors import InputError, printable
+from fingerspice.base.pages import in_notebook
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.explorer.examples import EXAMPLES
+from fingerspice.explorer.request import asked_by
 from fingerspice.explorer.scene import scene
 from fingerspice.explorer.sharing import as_deck, as_python, means
 from fingerspice.explorer.waveforms import menu
+from fingerspice.results.solution import Solution
 
 ADDRESS = "127.0.0.1"
+FRAME_HEIGHT, MOST_FRAMES = 900, 8
+"""Height (px) of the page in a notebook; explorers that one notebook keeps running."""
 #: Largest request, bytes; seconds that a connection may be silent; connections at once.
 MOST_BYTES, SILENCE, MOST_CONNECTIONS = 5_000_000, 30.0, 32
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+#: Pages that may show the explorer within them, where a notebook has asked for it: those of this computer.
+_NOTEBOOKS = " ".join(f"{kind}://{host}:*" for kind in ("http", "https") for host in (ADDRESS, "localhost"))
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors "
+)
 _HEADERS = {
-    "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
-        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    ),
     "Cache-Control": "no-store",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -42,6 +50,8 @@ _HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 Answer = tuple[HTTPStatus, str, bytes]
+#: Explorers that this notebook shows, the oldest first: a cell that is run again starts another one.
+_FRAMES: deque[Explorer] = deque()
 
 
 def pages() -> dict[str, bytes]:
@@ -60,6 +70,10 @@ class Explorer:
         What the page shows first; by default the first example.
     port : int
         0 takes a free one.
+    asked : mapping, optional
+        How the page runs the circuit first: keys and values as in `request.Request`.
+    framed : bool
+        Whether a notebook on this computer may show the page in a frame; a cell then shows this object as the page.
 
     Attributes
     ----------
@@ -72,11 +86,18 @@ class Explorer:
         If the port is taken, or no port number.
     """
 
-    def __init__(self, circuit: Circuit | None = None, port: int = 0) -> None:
+    def __init__(
+        self,
+        circuit: Circuit | None = None,
+        port: int = 0,
+        *,
+        asked: Mapping[str, Any] | None = None,
+        framed: bool = False,
+    ) -> None:
         if not 0 <= port <= 65535:
             raise InputError(f"port is {port}; allowed: 0 to 65535, where 0 takes a free one")
         self.token = secrets.token_urlsafe(24)
-        self.circuit = circuit
+        self.circuit, self.asked, self.framed = circuit, dict(asked or {}), framed
         self.files = pages()
         self._one_at_a_time = threading.Lock()
         try:
@@ -93,6 +114,14 @@ class Explorer:
     def __repr__(self) -> str:
         return f"<Explorer at {self.url}>"
 
+    def _repr_html_(self) -> str | None:
+        if not self.framed:
+            return None
+        style = f"width: 100%; height: {FRAME_HEIGHT}px; border: 1px solid #CCCCCC;"
+        return (
+            f'<iframe src="{self.url}" title="fingerspice explorer" style="{style}" allow="clipboard-write"></iframe>'
+        )
+
     def open(self) -> None:
         """Open the page in the browser."""
         webbrowser.open(self.url)
@@ -106,7 +135,9 @@ class Explorer:
             self.stop()
 
     def stop(self) -> None:
-        """Close the server."""
+        """Close the server; a second call does nothing."""
+        if not self._thread.is_alive():
+            return
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
@@ -123,39 +154,48 @@ class Explorer:
         return HTTPStatus.OK, "application/json", as_json(found)
 
 
-def beginning(circuit: Circuit | None) -> dict[str, Any]:
+def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """What the page needs first: its menus, and the scene to begin with."""
     examples = [
         {"name": e.name, "title": e.title, "note": e.note, "request": {"deck": e.deck, **e.asked}} for e in EXAMPLES
     ]
-    own = None if circuit is None else {"title": circuit.title, "request": {"deck": circuit.text}}
+    own = None if circuit is None else {"title": circuit.title, "request": {"deck": circuit.text, **(asked or {})}}
     return {"version": __version__, "own": own, "examples": examples, "waveforms": menu()}
 
 
-def explore(circuit: Circuit | None = None, *, port: int = 0, browser: bool = True) -> Explorer:
-    """Show a circuit on a local page on which its values can be changed (docs/explore.md).
+def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: bool = True) -> Explorer:
+    """Show a circuit, or a run's circuit, on a local page on which its values can be changed (docs/explore.md).
 
     Parameters
     ----------
-    circuit : Circuit, optional
-        By default the first of the page's example scenes.
+    shown : Circuit or Solution, optional
+        By default the first of the page's example scenes. A run's circuit begins with the run's charge law, area mode,
+        error and number of periods, as far as the page has them.
     port : int
         Port of the loopback address; 0 takes a free one.
     browser : bool
-        Whether the page is opened in the browser.
+        Whether the page is shown: in a notebook below the cell whose last line this is, and otherwise in the browser.
 
     Returns
     -------
     Explorer
-        It runs until its `stop` is called, or the program ends; `wait` lets a script wait for Ctrl-C.
+        It runs until its `stop` is called, or the program ends; `wait` lets a script wait for Ctrl-C. A notebook keeps
+        the latest eight that it shows.
 
     Raises
     ------
     InputError
         If the port is taken, or no port number.
     """
-    explorer = Explorer(circuit, port)
-    if browser:
+    asked = asked_by(shown) if isinstance(shown, Solution) else {}
+    circuit = shown.circuit if isinstance(shown, Solution) else shown
+    framed = browser and in_notebook()
+    explorer = Explorer(circuit, port, asked=asked, framed=framed)
+    if framed:
+        _FRAMES.append(explorer)
+        while len(_FRAMES) > MOST_FRAMES:
+            _FRAMES.popleft().stop()
+    elif browser:
         explorer.open()
     return explorer
 
@@ -261,16 +301,19 @@ class _Handler(BaseHTTPRequestHandler):
         origin = self.headers.get("Origin")
         if origin is not None and origin not in [f"http://{host}" for host in hosts]:
             raise _Refused(HTTPStatus.FORBIDDEN, "another page may not ask")
-        if self.headers.get("Sec-Fetch-Site", "same-origin") not in ("same-origin", "none"):
-            raise _Refused(HTTPStatus.FORBIDDEN, "another page may not ask")
         token, _, what = self.path.lstrip("/").partition("?")[0].partition("/")
+        # A notebook's page is another site; it may load this one into a frame, and nothing else.
+        frame = self.command == "GET" and what == "" and self.headers.get("Sec-Fetch-Dest") == "iframe"
+        own = self.headers.get("Sec-Fetch-Site", "same-origin") in ("same-origin", "none")
+        if not own and not (frame and self.explorer.framed):
+            raise _Refused(HTTPStatus.FORBIDDEN, "another page may not ask")
         if not hmac.compare_digest(token.encode(), self.explorer.token.encode()):
             raise _Refused(HTTPStatus.FORBIDDEN, "the link's token is missing or wrong; open the link that was printed")
         return what
 
     def _got(self, what: str) -> Answer:
         if what == "start":
-            return HTTPStatus.OK, "application/json", as_json(beginning(self.explorer.circuit))
+            return HTTPStatus.OK, "application/json", as_json(beginning(self.explorer.circuit, self.explorer.asked))
         name = what or "index.html"
         if name not in self.explorer.files:
             raise _Refused(HTTPStatus.NOT_FOUND, "there is no such file")
@@ -307,6 +350,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(status)
         self.send_header("Content-Type", f"{kind}; charset=utf-8")
         self.send_header("Content-Length", str(len(body)))
+        self.send_header("Content-Security-Policy", _POLICY + (_NOTEBOOKS if self.explorer.framed else "'none'"))
         for name, value in _HEADERS.items():
             self.send_header(name, value)
         if self.close_connection:
