@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,12 +57,13 @@ def in_lockstep(name: str) -> bool:
     return name == "u_gap" or name.removesuffix("_periodic") in FIGURES
 
 
-def _wave(n: int, jumping: bool) -> FloatArray:
-    """Sine and cosine of the source's phase at n steps of a period; for a square, 1 and 0 at the first n / 2 steps."""
-    if jumping:
-        return np.concatenate([np.ones((1, n // 2)), np.zeros((1, n // 2))])
-    turn = 2.0 * np.pi * np.arange(n) / n
-    return np.array([np.sin(turn), np.cos(turn)])
+def _waves(n: int, form: LockstepForm) -> FloatArray:
+    """Sine and cosine of every tone at n steps of the source's period; for a square, its value in both halves."""
+    if n == 0 or form.jumping:
+        return np.array([[1.0], [-1.0]])[: 2 * n]
+    # The phase in turns is reduced before it is multiplied by 2 pi, so that high tones keep their accuracy.
+    turns = np.outer(np.arange(n), form.multiples) % n * (2.0 * np.pi / n)
+    return np.stack([np.sin(turns), np.cos(turns)], axis=2).reshape(n, -1)
 
 
 def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halves: int) -> Answers:
@@ -78,8 +79,9 @@ def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halv
         Length of the runs in half periods.
     """
     table = table_of(form, scenes)
-    others, cells, gap = CELL_ROWS * len(form.layers), len(form.layers), form.layers[form.gap]
-    mu = np.broadcast_to(scenes.get(f"{gap.name.lower()}.mu", np.asarray(gap.values["mu"])), table.shape[1:])
+    others, cells = CELL_ROWS * form.cells, form.cells
+    mu = np.asarray(scenes.get(f"{form.layer.name.lower()}.mu", form.layer.values["mu"]))
+    mu = np.broadcast_to(mu, table.shape[1:])
     found = Answers.empty(task, table.shape[1], halves * task.points // 2)
     touching = table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2
     pieces, decays = np.zeros(table.shape[1], int), np.zeros(table.shape[1])
@@ -107,11 +109,12 @@ def _climb_one(
     task: Task, form: LockstepForm, scenes: _Scenes, mesh: tuple[int, int], chosen: BoolArray, found: Answers
 ) -> None:  # fmt: skip
     """Integrate the `chosen` scenes; `mesh` is the number of half periods, and of pieces of each (0: no jumps)."""
-    others, table = CELL_ROWS * len(form.layers), scenes.table
+    others, table = CELL_ROWS * form.cells, scenes.table
     figures = [name for name in task.outputs if name != "u_gap"]
     needed = sorted({i for name in figures for i in FIGURES[name.removesuffix("_periodic")][0]} or {0})
     traced, pieces = len(figures) < len(task.outputs), mesh[1]
     steps, degree = next((s, d) for least, s, d in _RUNGS if task.rtol >= least)
+    steps *= max(form.multiples)
     if pieces > 1:
         steps = 2 * pieces * next(s for least, s in _PIECES if task.rtol >= least)
     if traced:
@@ -120,8 +123,8 @@ def _climb_one(
     shortest = 2.0 * max(pieces, 1) / (2.0 ** max(pieces, 1) - 1.0)
     pending = np.flatnonzero(chosen)
     before, least = None, np.zeros(pending.size)
-    while pending.size and steps <= _MOST_STEPS:
-        curves = curves_of(form.layers[form.gap].values["m_exp"], form.layers[form.gap].values["n_exp"], degree)
+    while pending.size and steps <= _MOST_STEPS * max(form.multiples):
+        curves = curves_of(form.layer.values["m_exp"], form.layer.values["n_exp"], degree)
         if curves is None:
             break
         level = _Level(task, form, mesh, steps, degree, ALL_MOMENTS if needed[-1] else 1, traced)
@@ -169,15 +172,18 @@ class _Level(NamedTuple):
         """Integrate the scenes `pending`; the results with half the steps come from `before`, or are computed, too."""
         sizes = (self.steps // 2 if before is None else 0, self.steps)
         halves, pieces = self.mesh
-        jumping = pieces > 0
         out = np.empty((2, 2 * self.moments + 3, pending.size))
-        covered = _COVERED if before is None else _COVERED_LATER
         widths = [halves * n // 2 if self.traced else 0 for n in sizes]
         traces = np.empty((pending.size, widths[0])), np.empty((pending.size, widths[1]))
+        covered = _COVERED if before is None else _COVERED_LATER
+        leaks = np.array(self.form.leaks)
+        waves = _waves(sizes[0], self.form), _waves(sizes[1], self.form)
+        lengths = (self.form.cells - 1, waves[1].shape[1], leaks.size, self.degree + 1, self.moments)
+        marks: Any = tuple((0,) * n for n in lengths)
         march(
-            table, pending, self.form.gap, curves, (_wave(sizes[0], jumping), _wave(sizes[1], jumping)),
-            (halves, pieces, self.task.periodic, CLOSING * self.task.rtol, covered), out, traces,
-            (0,) * (len(self.form.layers) - 1), (0,) * (self.degree + 1), (0,) * self.moments,
+            table, pending, (self.form.gap_cell, leaks), curves, (np.array(self.form.multiples, float), waves),
+            (halves, self.steps // 2, pieces, self.task.periodic, CLOSING * self.task.rtol, covered), out, traces,
+            marks,
         )  # fmt: skip
         if before is None:
             return _Run(out[0], out[1], traces[0], traces[1])
