@@ -33,7 +33,7 @@ MANY_PARAMETERS = {
     "cli.app.ac",
     "cli.app.plan",
     "cli.app.compare",
-    "cli.app.limits",
+    "cli.limits.limits",
     "cli.design.design",
     "cli.fit.fit",
     "studies.inverse.inverse_drive",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 import pickle
 import re
 import warnings
@@ -13,7 +14,10 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
+import sets_page
+from commands import Command
 from fingerspice.circuit.devices import DEVICES
+from fingerspice.explorer.examples import EXAMPLES
 from fingerspice.sets.applying import WAVEFORMS
 from fingerspice.sets.reading import DATA, ELEMENTS, KINDS, keys_in, references, tables
 
@@ -155,9 +159,9 @@ def test_the_drives_of_the_figures_are_those_of_the_shipped_decks(name: str, dec
     assert {p: x.value for p, x in made.parameters.items() if p == "Xskin.f"} == {
         "Xskin.f": wanted.parameters["Xskin.f"].value
     }
-    t = np.linspace(1e-5, 1.9e-2, 997)
+    t = (np.arange(997) + 0.37) * 1.9e-5
     waves = [c["Vdrive"].waveform for c in (made, wanted)]
-    # The decks' squares have edges of 1 ns, for ngspice; the times avoid these.
+    # The decks' squares have edges of 1 ns, for ngspice; the times lie between them.
     a, b = (wave.value(t) for wave in waves if wave is not None)
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-9)
 
@@ -395,3 +399,112 @@ def test_the_bibtex_has_one_entry_for_every_reference_and_closes_its_braces() ->
         assert one.text().endswith(".")
     assert "pages = {39--49}" in references()["Forsbach2021"].bibtex()
     assert "Heß, Markus" in references()["Hess2020"].bibtex()
+
+
+# The command line, the explorer and the page.
+
+
+def applied(command: Command, *words: str, deck: str = "pad.cir") -> dict[str, object]:
+    """The answer of `plan`, or of `run` where the options belong to it."""
+    kind = "run" if set(words) & {"--finger", "--coating", "--drive"} else "plan"
+    result = command(
+        kind, deck, *words, "--json", *(["--no-plot", "--stop", "0.5m", "--overwrite"] if kind == "run" else [])
+    )
+    assert result.code == 0, result.err
+    found: dict[str, object] = json.loads(result.out)
+    return found
+
+
+def test_the_options_apply_sets_and_later_ones_have_the_last_word(command: Command) -> None:
+    found = applied(command, "--finger", "Moist", "--coating", "3m-insulating", "--drive", "Fig4-5kHz")
+    assert found["sets"] == ["moist", "3M-insulating", "Fig4-5kHz"]
+    assert isinstance(found["overrides"], dict)
+    assert found["overrides"]["Xgap.r"] == "100000.0"
+    assert found["overrides"]["Xcoat.r"] == "inf"
+    assert found["overrides"]["Vdrive"].startswith("Sine(amplitude=200.0, frequency=5000.0")
+    mixed = applied(command, "--finger", "dry", "--set", "Forsbach2021", "--set", "Xgap.r=2meg", "--set", "light")
+    assert mixed["sets"] == ["Forsbach2021", "light", "dry"]
+    assert isinstance(mixed["overrides"], dict)
+    assert [mixed["overrides"][f"Xgap.{key}"] for key in ("r", "mu", "fn")] == ["2meg", "0.2", "0.2"]
+    assert applied(command)["sets"] == []
+    assert applied(command, "--set", "Xgap.d=3u")["sets"] == []
+
+
+def test_a_run_on_the_command_line_is_that_of_python_and_its_file_cites(command: Command, pad: fs.Circuit) -> None:
+    Path("own.cir").write_text(PAD.read_text())
+    result = command("run", "own.cir", "--no-plot", "--finger", "moist", "--stop", "10m")
+    assert result.code == 0
+    assert f"{pad.title} (changed: set moist)" in result.out
+    loaded = fs.load("out/own.nc")
+    expected = fs.simulate(fs.parameters("moist").apply(pad), t_stop=1e-2)
+    np.testing.assert_array_equal(loaded.f_el, expected.f_el)  # type: ignore[arg-type]
+    assert str(loaded.cite()) == str(expected.cite())
+
+
+def test_one_of_several_fingers_may_be_named(command: Command) -> None:
+    Path("two.cir").write_text((CIRCUITS / "two_fingers.cir").read_text())
+    found = applied(command, "--finger", "Xlight=moist", "--finger", "xfirm = dry", deck="two.cir")
+    assert isinstance(found["overrides"], dict)
+    assert [found["overrides"][f"{one}.Xgap.r"] for one in ("Xlight", "Xfirm")] == ["100000.0", "7000000.0"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["run", "--finger", "3M"],
+            "--finger '3M': the set '3M' is a coating, not a finger; allowed: dry, moist, normal",
+        ),
+        (["run", "--finger", "moits"], "--finger 'moits': unknown finger set 'moits'; nearest: 'moist'"),
+        (
+            ["run", "--drive", "Xgap=TeslaTouch"],
+            "--drive 'Xgap=TeslaTouch': the set 'TeslaTouch' has values for a driving",
+        ),
+        (["run", "--coating", "Xlayer=3M"], "a LAYER, which 'Xlayer' of the circuit lacks; allowed: its Xcoat"),
+        (["plan", "--set", "moits"], "--set 'moits': unknown set 'moits'; nearest: 'moist', 'light'; or PATH=VALUE"),
+        (["compare", "--set", ""], "--set '' is not understood; allowed: PATH=VALUE"),
+        (
+            ["ac", "--finger", "moist"],
+            "--finger 'moist' is a set of parameters, and here a GAP is meant; allowed: --set mo",
+        ),
+        (["ac", "--finger", "Xgpa"], "Xgpa"),
+    ],
+)
+def test_wrong_names_on_the_command_line_are_refused(command: Command, words: list[str], said: str) -> None:
+    result = command(words[0], "pad.cir", *words[1:])
+    assert result.code == 2
+    assert said in result.err
+    assert "Traceback" not in result.err
+
+
+def test_the_sets_are_listed_and_shown(command: Command) -> None:
+    listed = command("sets")
+    assert listed.out.strip() == str(fs.parameters())
+    assert command("sets", "MOIST").out.strip() == str(fs.parameters("moist"))
+    rows = json.loads(command("sets", "--json").out)["parameter_sets"]
+    assert [row["name"] for row in rows] == NAMES
+    (glass,) = json.loads(command("sets", "thick-glass", "--json").out)["parameter_sets"]
+    leak = next(value for value in glass["values"] if value["parameter"] == "r")
+    assert (leak["value"], leak["unit"], leak["low"], leak["assumed"]) == (None, "ohm", 1e9, True)
+    refused = command("sets", "moits")
+    assert (refused.code, refused.err) == (2, "fingerspice: unknown set 'moits'; nearest: 'moist', 'light'\n")
+
+
+@pytest.mark.parametrize(("example", "name"), [("wet", "moist"), ("dry", "dry")])
+def test_the_fingers_of_the_explorer_are_those_of_the_sets(example: str, name: str) -> None:
+    decks = {one.name: one.deck for one in EXAMPLES}
+    wanted = fs.parameters(name).apply(fs.parse_netlist(decks["sine"]))
+    found = fs.parse_netlist(decks[example])
+    assert {p: x.value for p, x in found.parameters.items()} == {p: x.value for p, x in wanted.parameters.items()}
+
+
+def test_the_page_has_the_tables_of_the_sets() -> None:
+    page = sets_page.PAGE.read_text(encoding="utf-8")
+    assert page == sets_page.filled(page), "run: python tests/sets_page.py"
+
+
+def test_the_forces_that_the_page_states_are_right(pad: fs.Circuit) -> None:
+    page = " ".join(sets_page.PAGE.read_text(encoding="utf-8").split())
+    force = {name: mean_force(fs.parameters(name).apply(pad)) for name in ("dry", "normal", "moist")}
+    assert f"is {force['dry']:.2g} N for `dry`, {force['normal']:.2g} N for `normal`" in page
+    assert f"and {force['moist']:.2g} N for `moist`" in page

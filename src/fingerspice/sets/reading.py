@@ -86,7 +86,7 @@ class Reference:
 
     def text(self) -> str:
         """The reference in one sentence."""
-        names = [" ".join(reversed(a.strip("{}").split(", ", 1))) for a in self.authors]
+        names = [a.strip("{}") if a[0] == "{" else " ".join(reversed(a.split(", ", 1))) for a in self.authors]
         who = ", ".join(names).replace(", others", " et al.")
         said = [f"{who}, “{self.title}”"]
         for key, word in _SAID:
