@@ -385,6 +385,20 @@ def test_a_stored_run_and_a_copied_circuit_still_know_their_sets(name: str, pad:
     assert dataclasses.replace(made, title="x").sets == made.sets
 
 
+def test_works_that_only_give_a_range_are_not_cited(pad: fs.Circuit) -> None:
+    cited = fs.simulate(fs.parameters("Forsbach2021").apply(pad), t_stop=1e-3, rtol=1e-4).cite()
+    assert {r.key for r in cited.references} == {"Forsbach2021", "fingerspice", "Hess2020"}
+    assert "Balasubramanian2025" in {r.key for r in fs.parameters("Forsbach2021").references}
+
+
+def test_a_stored_run_whose_circuit_cannot_be_made_again_still_cites(pad: fs.Circuit, tmp_path: Path) -> None:
+    run = fs.simulate(fs.parameters("moist").apply(pad), sources=lambda t: 100.0 * t, t_stop=1e-3, rtol=1e-4)
+    with pytest.warns(fs.FingerspiceWarning, match="its elements are left out"):
+        loaded = fs.load(run.to_netcdf(tmp_path / "x.nc"))
+    assert "AliAbbasi2024" in loaded.cite().bibtex
+    assert "assumed, not published: Xgap.r, Xgap.mu." in str(loaded.cite())
+
+
 def test_a_run_of_scipys_method_cites_scipy(pad: fs.Circuit) -> None:
     cited = fs.simulate(pad, method="scipy:LSODA", t_stop=1e-3, rtol=1e-4).cite()
     assert cited.references[-1].doi == "10.1038/s41592-019-0686-2"

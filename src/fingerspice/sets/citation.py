@@ -9,7 +9,7 @@ from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.provenance import in_force
 from fingerspice.sets.parameters import ParameterSet, parameters
-from fingerspice.sets.reading import ELEMENTS, Reference, SetValue, references
+from fingerspice.sets.reading import ELEMENTS, Reference, SetValue, keys_in, references
 
 #: The paper whose model is simulated.
 MODEL = "Forsbach2021"
@@ -26,7 +26,7 @@ class Citation(Shown):
     statements : tuple of str
         What was used, one sentence or more each, with keys of references in brackets.
     references : tuple of Reference
-        The works named in the statements, and those of the sets of parameters.
+        The works named in the statements, and those from which the values of the sets come.
     """
 
     statements: tuple[str, ...]
@@ -52,9 +52,11 @@ def cite(circuit: Circuit, method: str) -> Citation:
     said = [f"The model is that of [{MODEL}], simulated with fingerspice {__version__} [{program.key}]."]
     for name, (kept, changed) in in_force(circuit).items():
         one = parameters(name)
-        said.append(_sentence(one, circuit, tuple(kept), changed))
-        if kept:
-            found |= {reference.key: reference for reference in one.references}
+        given = {path: _given(one, circuit, path) for path in kept}
+        said.append(_sentence(one, given, changed))
+        # The works behind the values that were used; those that only say how far a value may vary are not cited.
+        texts = [one.claims, *(value.source for values in given.values() for value in values)] if kept else []
+        found |= {key: known[key] for text in texts for key in keys_in(text)}
     if not circuit.sets:
         said.append("No set of parameters was applied.")
     said.append(
@@ -68,12 +70,12 @@ def cite(circuit: Circuit, method: str) -> Citation:
     return Citation(tuple(said), tuple(found.values()))
 
 
-def _sentence(one: ParameterSet, circuit: Circuit, kept: tuple[str, ...], changed: tuple[str, ...]) -> str:
+def _sentence(one: ParameterSet, given: dict[str, list[SetValue]], changed: tuple[str, ...]) -> str:
     """What a set gave to the circuit, what of it is assumed, and what was changed since."""
-    if not kept:
+    if not given:
         return f"All values of the set {one.name} were changed since it was applied."
-    said = [f"The set {one.name} ({one.title}) gave {', '.join(kept)}"]
-    assumed = [path for path in kept if any(value.assumed for value in _given(one, circuit, path))]
+    said = [f"The set {one.name} ({one.title}) gave {', '.join(given)}"]
+    assumed = [path for path, values in given.items() if any(value.assumed for value in values)]
     said += [f"assumed, not published: {', '.join(assumed)}"] if assumed else []
     said += [f"changed since: {', '.join(changed)}"] if changed else []
     return f"{'; '.join(said)}."
