@@ -397,6 +397,14 @@ def test_a_stored_run_whose_circuit_cannot_be_made_again_still_cites(pad: fs.Cir
         loaded = fs.load(run.to_netcdf(tmp_path / "x.nc"))
     assert "AliAbbasi2024" in loaded.cite().bibtex
     assert "assumed, not published: Xgap.r, Xgap.mu." in str(loaded.cite())
+    deck = Path(tmp_path / "main.cir")
+    (tmp_path / "coat.inc").write_text("Xcoat drive top area LAYER d=1u eps_r=3.9 r=0.2meg\n")
+    lines = [".include coat.inc" if x.startswith("Xcoat") else x for x in pad.text.splitlines()]
+    deck.write_text("\n".join(lines) + "\n")
+    run = fs.simulate(fs.parameters("TeslaTouch").apply(fs.read_netlist(deck)), t_stop=1e-3, rtol=1e-4)
+    with pytest.warns(fs.FingerspiceWarning, match="its elements are left out"):
+        loaded = fs.load(run.to_netcdf(tmp_path / "y.nc"))
+    assert "Bau2010" in loaded.cite().bibtex
 
 
 def test_a_run_of_scipys_method_cites_scipy(pad: fs.Circuit) -> None:

@@ -85,7 +85,7 @@ def _given(one: ParameterSet, circuit: Circuit, path: str) -> list[SetValue]:
     """The values of a set that a path of the circuit got: one, or those of a waveform."""
     name, _, parameter = path.rpartition(".")
     devices = {e.name: e.device for e in circuit.elements}
-    if path in devices:
+    if path in devices or not name:
         return [value for value in one.values.values() if value.element == "source"]
     fitting = [value for value in one.values.values() if value.parameter == parameter]
     # Where the elements are unknown, any value of the set with this parameter may be meant.
