@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from fingerspice.results.outcome import Status as Status
     from fingerspice.results.plan import Plan as Plan
     from fingerspice.results.solution import Solution as Solution
+    from fingerspice.sets.citation import Citation as Citation
+    from fingerspice.sets.parameters import ParameterSet as ParameterSet
+    from fingerspice.sets.parameters import parameters as parameters
     from fingerspice.solve.simulation import plan as plan
     from fingerspice.solve.simulation import simulate as simulate
     from fingerspice.solve.streaming import stream as stream
@@ -102,6 +105,8 @@ _HOMES = {
     "results.loading": ("load",),
     "studies.phasors": ("phasor",),
     "results.plan": ("Plan",),
+    "sets.citation": ("Citation",),
+    "sets.parameters": ("ParameterSet", "parameters"),
     "solve.simulation": ("plan", "simulate"),
     "solve.streaming": ("stream",),
     "results.outcome": ("SolveError", "Status"),
