@@ -352,9 +352,8 @@ def limits(
         answer.give(lambda: limits_text(result), writes)
 
 
-app.command()(designs.design)
-app.command()(fits.fit)
-app.command()(sweeps.sweep)
+for _command in (designs.design, fits.fit, fits.fit_contact, sweeps.sweep):
+    app.command()(_command)
 
 
 @app.command()

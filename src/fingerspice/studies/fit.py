@@ -18,7 +18,7 @@ from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.solve.simulation import RTOL_RANGE
 from fingerspice.studies.batch import batch
 from fingerspice.studies.fitdata import IMPEDANCE, Data, data_of
-from fingerspice.studies.fitprofile import profile_of
+from fingerspice.studies.fitprofile import limit_of, profile_of
 from fingerspice.studies.fitresult import Fit, fit_result
 from fingerspice.studies.fittask import REFUSED, Task, followed
 from fingerspice.waveforms.waveform import require
@@ -87,7 +87,7 @@ def fit(
     task = _task(circuit, data, parameters, bounds, average, skin, charge_law, rtol)
     require_number("starts", starts, "a whole number")
     require(starts >= 1, "starts", starts, "1 or more")
-    wanted = _profiled(task.paths, profiles)
+    wanted = profiled(task.paths, profiles)
     ends = [followed(task, begin) for begin in _starts(task, int(starts))]
     best = min(ends, key=lambda end: end.objective)
     if not best.objective < 0.5 * REFUSED**2:
@@ -98,7 +98,11 @@ def fit(
     found = fit_result(
         task.circuit, task.data, task.paths, task.bounds, best, [end.objective for end in ends], task.scale
     )
-    return replace(found, profiles={path: profile_of(task, best, path, _error(found, path)) for path in wanted})
+    limit = limit_of(best.objective, found.freedom, given=task.data.sigma is not None)
+    return replace(
+        found,
+        profiles={path: profile_of(task, task.paths, best, path, _error(found, path), limit) for path in wanted},
+    )
 
 
 def _error(found: Fit, path: str) -> float:
@@ -106,7 +110,7 @@ def _error(found: Fit, path: str) -> float:
     return found.estimates[path].error / found.estimates[path].value
 
 
-def _profiled(paths: tuple[str, ...], wanted: bool | Sequence[str]) -> list[str]:
+def profiled(paths: tuple[str, ...], wanted: bool | Sequence[str]) -> list[str]:
     """The paths whose profiles are wanted, in the circuit's own spelling."""
     if isinstance(wanted, bool):
         return list(paths) if wanted else []
@@ -145,7 +149,7 @@ def _task(
             raise InputError(f"{path} is {value:g}, and is fitted in its logarithm; allowed: finite and more than 0")
     target, scale = _target(table)
     exact = is_stack(circuit) and build_stack(circuit).contact is not None and table.signal != IMPEDANCE
-    box = _bounds(paths, initial, bounds or {})
+    box = bounds_of(paths, initial, bounds or {})
     return Task(circuit, table, paths, box, average, skin, rtol, charge_law, target, scale, exact)
 
 
@@ -162,7 +166,8 @@ def _target(table: Data) -> tuple[FloatArray, FloatArray]:
     return np.concatenate([table.values, table.phase]), np.concatenate([scale, np.degrees(scale / sizes)])
 
 
-def _bounds(paths: tuple[str, ...], initial: list[float], given: Mapping[str, tuple[float, float]]) -> FloatArray:
+def bounds_of(paths: tuple[str, ...], initial: list[float], given: Mapping[str, tuple[float, float]]) -> FloatArray:
+    """Smallest and largest values of the parameters, shape (n_parameter, 2); 0 and infinity where none are given."""
     lower = {path.lower(): tuple(pair) for path, pair in given.items()}
     unknown = [path for path in given if path.lower() not in {p.lower() for p in paths}]
     if unknown:

@@ -106,6 +106,17 @@ def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> Da
 def _columns(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> tuple[dict[str, FloatArray], str]:
     if isinstance(given, (str, Path)):
         return _from_table(circuit, Path(given)), f"the data in '{given}'"
+    return number_columns(given), "the data"
+
+
+def number_columns(given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
+    """The columns of a mapping as arrays of one length.
+
+    Raises
+    ------
+    InputError
+        If it is no mapping, columns have different lengths, or a value is no finite number.
+    """
     if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
         raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, or the path of a table")
     try:
@@ -119,7 +130,7 @@ def _columns(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> t
         bad = np.flatnonzero(~np.isfinite(x))
         if bad.size:
             raise InputError(f"data column {name!r} is {x[bad[0]]} in row {bad[0]}; allowed: finite numbers")
-    return {name: np.broadcast_to(x, size).copy() for name, x in found.items()}, "the data"
+    return {name: np.broadcast_to(x, size).copy() for name, x in found.items()}
 
 
 def _from_table(circuit: Circuit, path: Path) -> dict[str, FloatArray]:
@@ -144,11 +155,11 @@ def _from_table(circuit: Circuit, path: Path) -> dict[str, FloatArray]:
             base = MEASURED[signal]
         else:
             base = circuit.parameters[_path(circuit, name)].unit
-        found[key] = table.data[:, i] * _factor(unit, base, f"'{path}': the unit of column {name!r}")
+        found[key] = table.data[:, i] * unit_factor(unit, base, f"'{path}': the unit of column {name!r}")
     return found
 
 
-def _factor(unit: str, base: str, what: str) -> float:
+def unit_factor(unit: str, base: str, what: str) -> float:
     """Of a header's unit over the netlist's."""
     if unit in ("", base):
         return 1.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -24,6 +25,17 @@ _STEP = 1e-4
 REFUSED = 1e6
 # Error of the least squares' last step, relative.
 CLOSE = 1e-8
+
+
+class Problem(Protocol):
+    """What least squares need: residuals over their scale with derivatives by logarithms, and bounds of the values."""
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Smallest and largest values, shape (n_parameter, 2)."""
+
+    def residuals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals, shape (n,), and their derivatives, shape (n, n_parameter)."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +154,7 @@ def _end(circuit: Circuit) -> float:
     return circuit.tran.stop
 
 
-def followed(task: Task, begin: FloatArray, close: float = CLOSE) -> Fitted:
+def followed(task: Problem, begin: FloatArray, close: float = CLOSE) -> Fitted:
     """Where least squares lead from a start; `close` is the relative error of the last step."""
     from scipy.optimize import least_squares
 
