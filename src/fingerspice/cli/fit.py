@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fingerspice.base.errors import InputError
 from fingerspice.cli import answers
 from fingerspice.cli.arguments import AsJson, ChargeLaw, Deck, Name, NoPlot, Out, Overwrite, Set
 from fingerspice.cli.options import read_circuit
@@ -23,6 +24,9 @@ def fit(
     table: Annotated[Path, typer.Argument(metavar="DATA.csv", help="Conditions and a measured mean, with units.")],
     deck: Deck,
     free: Annotated[str, typer.Option(metavar="PATH,...", help="Parameters to fit: Xgap.d,Xgap.r.")],
+    groups: Annotated[
+        str | None, typer.Option(metavar="COLUMN:PATH,...", help="Free parameters of each group: finger:Xgap.d.")
+    ] = None,
     out: Out = None,
     name: Name = None,
     overwrite: Overwrite = False,
@@ -48,8 +52,21 @@ def fit(
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         file, image = results.file("_fit.csv"), None if no_plot else results.file("_fit.png")
         paths = [path.strip() for path in free.split(",")]
-        found = find(circuit, table, paths, average=average, skin=skin, charge_law=charge_law, profiles=profile)
+        found = find(
+            circuit, table, paths, groups=_groups(groups), average=average, skin=skin, charge_law=charge_law,
+            profiles=profile,
+        )  # fmt: skip
         _give(answer, results, found, file, image)
+
+
+def _groups(text: str | None) -> dict[str, list[str]] | None:
+    """The argument of `--groups`."""
+    if text is None:
+        return None
+    column, _, paths = text.partition(":")
+    if not (column.strip() and paths.strip()):
+        raise InputError(f"--groups is {text!r}; allowed: a column of the data and paths, such as finger:Xgap.d,Xgap.r")
+    return {column.strip(): [path.strip() for path in paths.split(",")]}
 
 
 def fit_contact(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
+from fingerspice.base.files import write_aside
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.studies.drive_files import write_columns
 from fingerspice.studies.fitdata import MEASURED, Data
 from fingerspice.studies.fitestimates import (
     Estimate,
@@ -25,6 +26,7 @@ from fingerspice.studies.fitestimates import (
     misfit_note,
     notes_of,
 )
+from fingerspice.studies.fitgroups import Unknown, fitted_circuits
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,7 +53,7 @@ class Fit(Shown):
     circuit : Circuit
         With the fitted values.
     estimates : dict of str to Estimate
-        By path.
+        By path; that of a group's parameter is followed by the group in brackets: ``Xgap.d[left]``.
     correlation : ndarray, shape (n_parameter, n_parameter)
         Of the errors of the logarithms.
     data : Data
@@ -70,6 +72,8 @@ class Fit(Shown):
         Whether the iteration closed.
     notes : tuple of str
         What the data do not tell, and which measurement would.
+    circuits : dict of str to Circuit
+        With groups: the circuit of each, by its name. `circuit` then has the geometric means of their parameters.
     profiles : dict of str to Profile
         By path, as far as they were asked for.
     """
@@ -86,6 +90,7 @@ class Fit(Shown):
     evaluations: int
     closed: bool
     notes: tuple[str, ...]
+    circuits: dict[str, Circuit] = field(default_factory=dict)
     profiles: dict[str, Profile] = field(default_factory=dict)
 
     @property
@@ -102,6 +107,8 @@ class Fit(Shown):
             f"residual {rms:.3g} {MEASURED[self.data.signal]} rms, {100.0 * rms / peak:.2g} % of the largest value; "
             f"{'sigma as given' if self.data.sigma is not None else 'sigma estimated from the residuals'}",
         ]
+        if self.data.groups is not None:
+            lines.append(f"groups by {self.data.groups.column}: {', '.join(self.data.groups.labels)}")
         return Page([*lines, *estimate_lines(self.estimates, self.correlation, self.profiles, self.notes)])
 
     def plot(self) -> Figure:
@@ -116,10 +123,13 @@ class Fit(Shown):
         elif varying:
             (path, x), others = varying[0], varying[1:]
             label = self._labelled(path)
-            if others:
-                kinds, groups = np.unique(np.column_stack([y for _, y in others]), axis=0, return_inverse=True)
-                paths = [self._labelled(path) for path, _ in others]
-                names = [", ".join(f"{a} = {b:g}" for a, b in zip(paths, kind, strict=True)) for kind in kinds]
+            keys = [(self._labelled(path), [f"{y:g}" for y in values]) for path, values in others]
+            if data.groups is not None:
+                keys.insert(0, (data.groups.column, [data.groups.labels[i] for i in data.groups.of]))
+            if keys:
+                told = [", ".join(f"{a} = {b[row]}" for a, b in keys) for row in range(x.size)]
+                names = list(dict.fromkeys(told))
+                groups = np.array([names.index(one) for one in told])
         else:
             x, label = np.arange(1.0, data.values.size + 1.0), "measurement"
         curves = [
@@ -138,6 +148,7 @@ class Fit(Shown):
         return {
             "parameters": [vars(e) for e in self.estimates.values()],
             "correlation": self.correlation.tolist(),
+            "groups": list(self.circuits),
             "signal": self.data.signal,
             "count": int(self.data.values.size),
             "residual_rms": float(np.sqrt(np.mean(self.residual**2))),
@@ -158,36 +169,46 @@ class Fit(Shown):
         InputError
             If the folder cannot be written.
         """
-        data = self.data
+        data, groups = self.data, self.data.groups
         columns = {"t": data.t} if data.t is not None else {}
         columns |= {**data.conditions, data.signal: data.values, "fitted": self.predicted, "sigma": self.sigma}
-        return write_columns(Path(path), tuple(columns), tuple(columns.values()))
+        texts = {name: [f"{x:.17g}" for x in values] for name, values in columns.items()}
+        if groups is not None:
+            texts = {groups.column: [groups.labels[i] for i in groups.of], **texts}
+
+        def write(target: Path) -> None:
+            with target.open("w", newline="", encoding="utf-8") as stream:
+                out = csv.writer(stream, lineterminator="\n")
+                out.writerow(texts)
+                out.writerows(zip(*texts.values(), strict=True))
+
+        return write_aside(Path(path), write)
 
 
 def fit_result(
-    circuit: Circuit, data: Data, paths: tuple[str, ...], bounds: FloatArray, best: Fitted, objectives: Sequence[float],
-    scale: FloatArray,
+    circuit: Circuit, data: Data, unknowns: tuple[Unknown, ...], bounds: FloatArray, best: Fitted,
+    objectives: Sequence[float], scale: FloatArray,
 ) -> Fit:  # fmt: skip
     """The result of the best of several fits."""
     from scipy.stats import norm, t
 
-    freedom, n = best.residual.size - len(paths), data.values.size
+    freedom, n = best.residual.size - len(unknowns), data.values.size
     variance = 1.0 if data.sigma is not None else best.objective / freedom if freedom > 0 else math.inf
     covariance = covariance_of(best.by_log)
     error = np.sqrt(np.diag(covariance) * variance)
     reach = float(norm.ppf(0.975) if data.sigma is not None else t.ppf(0.975, freedom) if freedom > 0 else math.inf)
-    estimates = {
-        path: estimate_of(path, circuit.parameters[path].unit, circuit.parameters[path].value, value, off, reach, box)
-        for path, value, off, box in zip(paths, best.values.tolist(), error.tolist(), bounds, strict=True)
-    }
+    estimates = {}
+    for one, value, off, box in zip(unknowns, best.values.tolist(), error.tolist(), bounds, strict=True):
+        start = circuit.parameters[one.path]
+        estimates[one.name] = estimate_of(one.name, start.unit, start.value, value, off, reach, box)
     sigma = data.sigma if data.sigma is not None else math.sqrt(variance) * scale[:n]
     correlation, remedy = correlation_of(covariance), _remedy(circuit, data)
     notes = notes_of(estimates, correlation, error.tolist(), lambda _: remedy)
     notes += misfit_note(best.objective, freedom) if data.sigma is not None else []
-    fitted = circuit.varied(dict(zip(paths, best.values.tolist(), strict=True)))
+    fitted, each = fitted_circuits(circuit, unknowns, best.values.tolist(), data.groups)
     return Fit(
         fitted, estimates, correlation, data, data.values + (best.residual * scale)[:n], sigma, best.objective,
-        tuple(objectives), freedom, best.evaluations, best.closed, tuple(notes),
+        tuple(objectives), freedom, best.evaluations, best.closed, tuple(notes), each,
     )  # fmt: skip
 
 
