@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 from pathlib import Path
 
@@ -350,6 +351,8 @@ def test_bad_groups_are_refused(circuit: fs.Circuit, tmp_path: Path, groups: obj
     (tmp_path / "a.csv").write_text("finger,f_el_mean (N)\na,0.1\nb,0.2\n")
     with pytest.raises(InputError, match="has no column 'hand' in its header; it has finger, f_el_mean"):
         fs.fit(circuit, tmp_path / "a.csv", ["Xgap.d"], groups={"hand": ["Xgap.d"]})
+    with pytest.raises(InputError, match="no rows of numbers; allowed: numbers, and names in the column that groups"):
+        fs.fit(circuit, tmp_path / "a.csv", ["Xgap.d"])
     (tmp_path / "b.csv").write_text("finger,f_el_mean (N)\na,0.1\nb,0.2 oops\n")
     with pytest.raises(InputError, match="line 3"):
         fs.fit(circuit, tmp_path / "b.csv", ["Xgap.d"], groups={"finger": ["Xgap.d"]})
@@ -359,3 +362,60 @@ def test_residuals_beyond_the_given_sigma_are_named(circuit: fs.Circuit, data: d
     wrong = data["f_el_mean"] * (1.0 + 0.1 * (-1.0) ** np.arange(data["f_el_mean"].size))
     found = fs.fit(circuit, {**data, "f_el_mean": wrong, "sigma": 0.01 * wrong}, ["Xgap.d"], starts=1, skin="follow")
     assert any("times as large as sigma" in note and "so are the intervals" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(("kind", "said"), [("equal", "equal for all"), ("shares", "as equal shares of the values")])
+def test_an_unknown_sigma_is_equal_or_a_share_whichever_is_likelier(circuit: fs.Circuit, kind: str, said: str) -> None:
+    data = measured(circuit, [60.0, 120.0, 200.0], [30.0, 100.0, 500.0])
+    force, rng = data["f_el_mean"], np.random.default_rng(0)
+    sigma = 0.02 * (force if kind == "shares" else np.full(force.size, force.mean()))
+    finger = circuit.replace({"Xgap.alpha": TRUE["Xgap.alpha"]})
+    covered = 0
+    for number in range(12):
+        noisy = {**data, "f_el_mean": force + sigma * rng.standard_normal(force.size)}
+        found = fs.fit(finger, noisy, ["Xgap.d", "Xgap.r"], starts=1, rtol=1e-5, skin="follow")
+        covered += sum(
+            found.estimates[path].low <= TRUE[path] <= found.estimates[path].high for path in found.estimates
+        )
+        if number == 0:
+            assert f"sigma estimated from the residuals, {said}" in str(found)
+            like = found.sigma / (force if kind == "shares" else np.ones(force.size))
+            np.testing.assert_allclose(like, like[0], rtol=0.1)
+    # 24 intervals of 95 %: fewer than 19 would have a probability of 0.1 %.
+    assert covered >= 19
+
+
+def test_gap_and_area_are_one_product_at_one_voltage(circuit: fs.Circuit) -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        true = circuit.replace({path: value * np.exp(0.2 * rng.standard_normal()) for path, value in TRUE.items()})
+        force = fs.steady_state(true, rtol=1e-8).f_el_mean * (1.0 + 0.02 * rng.standard_normal(6))
+        start = true.replace({path: circuit.parameters[path].value for path in ("Xgap.d", "Xgap.alpha")})
+        data = {"Vdrive.amplitude": [200.0] * 6, "f_el_mean": force}
+        notes = fs.fit(start, data, ["Xgap.d", "Xgap.alpha"], starts=1, rtol=1e-5).notes
+        assert any("Xgap.d and Xgap.alpha are not told apart" in note and "second voltage" in note for note in notes)
+
+
+def test_the_example_finds_its_finger_and_predicts_another_force(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    spec = importlib.util.spec_from_file_location("fit_finger", CIRCUITS / "fit_finger.py")
+    assert spec is not None
+    assert spec.loader is not None
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    example.main(tmp_path)
+    said = capsys.readouterr().out
+    assert (tmp_path / "fit_finger.png").stat().st_size > 10_000
+    found = example.fitted()
+    for path, value in TRUE.items():
+        assert found.estimates[path].low < value < found.estimates[path].high
+    true = fs.read_netlist(CIRCUITS / "fingerpad.cir").replace(dict(TRUE))
+    at = {"Vdrive.amplitude": 180.0, "Vdrive.frequency": 300.0, "Xskin.f": 300.0}
+    middle, low, high = example.predicted(found)
+    assert low < fs.steady_state(true, parameters=at).f_el_mean < high
+    assert f"force at 180 V and 300 Hz: {1e3 * middle:.4g} mN" in said
+    # The force is known better than the area, as the errors of gap and area are correlated.
+    area, least, most = example.area_at_rest(found)
+    assert least < TRUE["Xgap.alpha"] * 0.5**0.52 < most
+    assert (high - low) / middle < 0.3 * (most - least) / area

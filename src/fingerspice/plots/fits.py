@@ -83,7 +83,12 @@ def _draw(top: Axes, bottom: Axes, panel: Panel, room: int, *, first: bool) -> N
         bottom.plot(x, (measured - fitted) / sigma, "o", markersize=3.5, color=color)
     x = np.concatenate([curve.x for curve in panel.curves])
     if x.min() > 0.0 and x.max() > _WIDE * x.min():
+        from matplotlib.ticker import LogFormatter
+
         bottom.set_xscale("log")
+        # Plain numbers: 20, 50, 100, and no powers of ten.
+        bottom.xaxis.set_major_formatter(LogFormatter())
+        bottom.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.5)))
     drawing.dress(top, f"{panel.quantity} [{shown}]" if shown else panel.quantity)
     if len(panel.curves) > 1 or room == _ROOM:
         drawing.legend_within(top, room)

@@ -74,7 +74,13 @@ def relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, .
         raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, a table's path, or a list")
     found: dict[tuple[str, bool], Relation] = {}
     for number, one in enumerate(several, 1):
-        place = f"'{one}'" if isinstance(one, (str, Path)) else "the data" if len(several) == 1 else f"data {number}"
+        place = (
+            f"the data in '{one}'"
+            if isinstance(one, (str, Path))
+            else "the data"
+            if len(several) == 1
+            else f"data {number}"
+        )
         columns = _from_table(Path(one)) if isinstance(one, (str, Path)) else number_columns(one)
         for relation in _relations(columns, fn, place):
             key = relation.kind, relation.sigma is None

@@ -20,7 +20,7 @@ from fingerspice.studies.batch import batch
 from fingerspice.studies.fitdata import IMPEDANCE, Data, data_of
 from fingerspice.studies.fitgroups import Unknown, group_column, unknowns_of
 from fingerspice.studies.fitprofile import limit_of, profile_of
-from fingerspice.studies.fitresult import Fit, fit_result
+from fingerspice.studies.fitresult import Fit, Fitted, fit_result
 from fingerspice.studies.fittask import REFUSED, Task, followed
 from fingerspice.waveforms.waveform import require
 
@@ -55,9 +55,10 @@ def fit(
         under which they were measured, as paths (``Vdrive.amplitude``, ``source.frequency``, ``Xgap.fn``); or ``t``
         and a signal over time (``f_el``, ``f_t``, ``friction``, ``area``, ``u_gap``); or ``frequency`` and
         ``impedance``, the magnitude (ohm) of what the source sees, with ``impedance_phase`` (deg) where it is known.
-        ``sigma`` is the standard deviation of every value; where it is missing, it is taken as equal for all (of
-        impedances, as equal shares) and estimated from the residuals. A table (CSV)
-        has the columns in a header, with units: ``Vdrive.amplitude (V), f_el_mean (mN)``.
+        ``sigma`` is the standard deviation of every value; where it is missing, it is estimated from the residuals, as
+        equal for all or as equal shares of the values, whichever is likelier (of signals over time as equal, of
+        impedances as equal shares). A table (CSV) has the columns in a header, with units:
+        ``Vdrive.amplitude (V), f_el_mean (mN)``.
     parameters : sequence of str
         Paths of the parameters to fit.
     bounds : mapping of str to tuple of float, optional
@@ -102,6 +103,9 @@ def fit(
             "none of the starts can be run: there is no contact, no solution, or a value out of range; allowed: a "
             "circuit that runs under the conditions of the data"
         )
+    if table.sigma is None and table.t is None and table.signal != IMPEDANCE:
+        task, ends = _with_likelier_noise(task, ends, best)
+        best = min(ends, key=lambda end: end.objective)
     found = fit_result(
         task.circuit, task.data, task.unknowns, task.bounds, best, [end.objective for end in ends], task.scale
     )
@@ -110,6 +114,21 @@ def fit(
         found,
         profiles={name: profile_of(task, names, best, name, _error(found, name), limit) for name in wanted},
     )
+
+
+def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[Task, list[Fitted]]:
+    """The fits with errors equal for all data, or with errors that are equal shares, whichever is likelier.
+
+    The largest likelihood of normal errors of unknown size is RSS^(-n/2) over the product of the scales.
+    """
+    predicted = np.abs(task.target + best.residual * task.scale)
+    if not np.all(predicted > 0.0) or best.objective == 0.0:
+        return task, ends
+    shares = replace(task, scale=predicted)
+    others = [followed(shares, end.values) for end in ends]
+    least, n = min(end.objective for end in others), predicted.size
+    equal = 0.5 * n * math.log(best.objective) + float(np.log(task.scale).sum())
+    return (shares, others) if 0.5 * n * math.log(least) + float(np.log(predicted).sum()) < equal else (task, ends)
 
 
 def _error(found: Fit, path: str) -> float:

@@ -155,7 +155,14 @@ def _from_table(circuit: Circuit, path: Path, by: str | None) -> tuple[dict[str,
     file = checked_file(path, MAX_TEXT_BYTES)
     words: tuple[str, ...] = ()
     if by is None:
-        table = read_text_columns(file)
+        try:
+            table = read_text_columns(file)
+        except InputError as refused:
+            if "no rows of numbers" not in refused.message:
+                raise
+            raise InputError(
+                f"{refused.message}; allowed: numbers, and names in the column that groups names"
+            ) from None
     else:
         table, words = read_labelled_columns(file, by)
     if not table.names:

@@ -62,7 +62,8 @@ class Fit(Shown):
     sigma : ndarray, shape (n,)
         Standard deviation of every value: as given, or as the residuals have it.
     objective : float
-        Sum of the squared residuals over sigma as given, or over the largest value of the data.
+        Sum of the squared residuals over sigma as given, or over the largest value of the data, or, where errors are
+        likelier equal shares of the values, over these.
     objectives : tuple of float
         That reached from every start that was followed.
     freedom : int
@@ -105,11 +106,17 @@ class Fit(Shown):
             f"{len(self.estimates)} parameters fitted to {self.data.values.size} values of {self.data.name}, "
             f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}",
             f"residual {rms:.3g} {MEASURED[self.data.signal]} rms, {100.0 * rms / peak:.2g} % of the largest value; "
-            f"{'sigma as given' if self.data.sigma is not None else 'sigma estimated from the residuals'}",
+            f"{self._noise()}",
         ]
         if self.data.groups is not None:
             lines.append(f"groups by {self.data.groups.column}: {', '.join(self.data.groups.labels)}")
         return Page([*lines, *estimate_lines(self.estimates, self.correlation, self.profiles, self.notes)])
+
+    def _noise(self) -> str:
+        if self.data.sigma is not None:
+            return "sigma as given"
+        equal = float(np.ptp(self.sigma)) <= 1e-9 * float(self.sigma.max())
+        return f"sigma estimated from the residuals, {'equal for all' if equal else 'as equal shares of the values'}"
 
     def plot(self) -> Figure:
         """Data and fit, with the residuals below."""
