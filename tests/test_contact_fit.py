@@ -179,6 +179,19 @@ def test_a_profile_agrees_with_the_interval(circuit: fs.Circuit) -> None:
     assert profile.high == pytest.approx(estimate.high, rel=1e-3)
 
 
+def test_report_and_page_name_every_parameter(circuit: fs.Circuit) -> None:
+    found = fs.fit_contact(circuit, finger(np.random.default_rng(2), 0.02))
+    assert "# data points      = 38" in found.report()
+    for name in TRUE:
+        assert f"    Xgap.{name}:" in found.report()
+        assert f"\nXgap.{name} " in str(found)
+    assert "ridge area while sliding: 10 values, residual" in str(found)
+    assert [axis.get_ylabel() for axis in found.plot().axes[:2]] == [
+        "ridge area at rest [mm²]",
+        "ridge area by indentation [mm²]",
+    ]
+
+
 def test_the_command_reads_the_tables_of_the_examples(command: Command, tmp_path: Path) -> None:
     tables = [str(CIRCUITS / name) for name in ("contact.csv", "indentation.csv")]
     result = command("fit-contact", *tables, str(CIRCUITS / "fingerpad.cir"), "--out", str(tmp_path), "--json")

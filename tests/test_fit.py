@@ -419,3 +419,22 @@ def test_the_example_finds_its_finger_and_predicts_another_force(
     area, least, most = example.area_at_rest(found)
     assert least < TRUE["Xgap.alpha"] * 0.5**0.52 < most
     assert (high - low) / middle < 0.3 * (most - least) / area
+
+
+def test_a_report_has_the_layout_of_lmfit(circuit: fs.Circuit) -> None:
+    found = fs.fit(circuit, CIRCUITS / "measured.csv", ["Xgap.d", "Xgap.r"], skin="follow", starts=1)
+    lines = found.report().splitlines()
+    heads = [line for line in lines if line.startswith("[[")]
+    assert heads == ["[[Fit Statistics]]", "[[Variables]]", "[[Correlations]] (unreported correlations are < 0.100)"]
+    statistics = dict(line.strip().lstrip("# ").split(" = ") for line in lines[1:9])
+    numbers = {name.strip(): value for name, value in statistics.items()}
+    assert (numbers["data points"], numbers["variables"]) == ("15", "2")
+    chi = float(numbers["chi-square"])
+    assert chi == pytest.approx(float(np.sum((found.residual / found.sigma) ** 2)), rel=1e-6)
+    assert float(numbers["reduced chi-square"]) == pytest.approx(chi / 13)
+    assert float(numbers["Akaike info crit"]) == pytest.approx(15 * np.log(chi / 15) + 4)
+    assert float(numbers["Bayesian info crit"]) == pytest.approx(15 * np.log(chi / 15) + 2 * np.log(15))
+    one = found.estimates["Xgap.d"]
+    share = f"({100 * one.error / one.value:.2f}%)"
+    assert f"    Xgap.d:  {one.value:.8g} +/- {one.error:.8g} {share} (init = 3.5e-06)" in lines
+    assert lines[-1] == f"    C(Xgap.d, Xgap.r) = {found.correlation[0, 1]:+.4f}"

@@ -24,6 +24,7 @@ from fingerspice.studies.fitestimates import (
     covariance_of,
     estimate_lines,
     estimate_of,
+    lmfit_report,
     misfit_note,
     notes_of,
 )
@@ -109,6 +110,11 @@ class ContactFit(Shown):
             lines.append(f"{one.name}: {one.values.size} values, residual {100.0 * misfit:.3g} % rms; {known}")
         own = estimate_lines(self.estimates, self.correlation, self.profiles, self.notes)
         return Page([*lines, *own, "", f"in the deck: {self.gap} ... {self.line}"])
+
+    def report(self) -> str:
+        """Statistics, parameters and correlations in the layout of lmfit's ``fit_report``."""
+        count = self.freedom + len(self.estimates)
+        return lmfit_report(self.estimates, self.correlation, self.objective, count, self.evaluations)
 
     def plot(self) -> Figure:
         """Data and fit of every relation, with the residuals below."""

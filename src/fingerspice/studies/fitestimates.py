@@ -131,6 +131,43 @@ def estimate_lines(
     return [*lines, *(["", *notes] if notes else [])]
 
 
+def lmfit_report(
+    estimates: Mapping[str, Estimate], correlation: FloatArray, square: float, count: int, evaluations: int
+) -> str:
+    """The layout of lmfit's ``fit_report``, for programs and eyes that know it.
+
+    `square` is the sum of the squared residuals over sigma, `count` the number of data. As there, the criteria of
+    Akaike and Bayes are count log(square / count) + 2 k, and + k log(count), of k parameters.
+    """
+    k, freedom = len(estimates), count - len(estimates)
+    level = count * math.log(max(square, 1e-300) / count)
+    wide = max(map(len, estimates)) + 1
+    lines = [
+        "[[Fit Statistics]]",
+        "    # fitting method   = least_squares",
+        f"    # function evals   = {evaluations}",
+        f"    # data points      = {count}",
+        f"    # variables        = {k}",
+        f"    chi-square         = {square:.8g}",
+        f"    reduced chi-square = {square / freedom if freedom > 0 else math.inf:.8g}",
+        f"    Akaike info crit   = {level + 2.0 * k:.8g}",
+        f"    Bayesian info crit = {level + k * math.log(count):.8g}",
+        "[[Variables]]",
+    ]
+    for name, e in estimates.items():
+        share = 100.0 * e.error / e.value
+        lines.append(
+            f"    {name + ':':<{wide}} {e.value: .8g} +/- {e.error:.8g} ({share:.2f}%) (init = {e.initial:.7g})"
+        )
+    pairs = [(i, j) for i, j in itertools.combinations(range(k), 2) if abs(correlation[i, j]) >= 0.1]
+    if pairs:
+        names = list(estimates)
+        lines.append("[[Correlations]] (unreported correlations are < 0.100)")
+        pairs.sort(key=lambda pair: -abs(correlation[pair]))
+        lines += [f"    C({names[i]}, {names[j]}) = {correlation[i, j]:+.4f}" for i, j in pairs]
+    return "\n".join(lines)
+
+
 def notes_of(
     estimates: Mapping[str, Estimate], correlation: FloatArray, error: Sequence[float],
     remedy: Callable[[tuple[str, ...]], str],

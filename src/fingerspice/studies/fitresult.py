@@ -23,6 +23,7 @@ from fingerspice.studies.fitestimates import (
     covariance_of,
     estimate_lines,
     estimate_of,
+    lmfit_report,
     misfit_note,
     notes_of,
 )
@@ -117,6 +118,11 @@ class Fit(Shown):
             return "sigma as given"
         equal = float(np.ptp(self.sigma)) <= 1e-9 * float(self.sigma.max())
         return f"sigma estimated from the residuals, {'equal for all' if equal else 'as equal shares of the values'}"
+
+    def report(self) -> str:
+        """Statistics, parameters and correlations in the layout of lmfit's ``fit_report``."""
+        count = self.freedom + len(self.estimates)
+        return lmfit_report(self.estimates, self.correlation, self.objective, count, self.evaluations)
 
     def plot(self) -> Figure:
         """Data and fit, with the residuals below."""
