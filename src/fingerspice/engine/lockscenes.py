@@ -36,9 +36,6 @@ XI, REST, STRESS, LOAD, LOSS, AMPLITUDE, OMEGA, PHASE, N_OTHERS = 0, 1, 2, 3, 4,
 frequency (rad/s) and phase (rad)."""
 LARGEST_X = 1.3
 """Largest X that the series of the universal curve covers."""
-# Largest gap voltage that the area's polynomial covers, as a ratio to the source's amplitude. It is larger for a source
-# that jumps, as a jump from one sign to the other adds to the voltage left by the charge leaked before.
-COVERED, COVERED_JUMPING = 1.05, 1.6
 Scratch = tuple[
     FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray
 ]  # fmt: skip
@@ -76,6 +73,24 @@ def _inverse_areas(
 def _add_row(share: float, x: FloatArray, out: FloatArray) -> None:
     for i in range(LANES):
         out[i] += share * x[i]
+
+
+@jit
+def _largest_voltage(t: FloatArray, gap: int, cells: int, jumping: bool) -> float:
+    """Estimate of the largest gap voltage (V) of the scene with column t of the table, its area at rest held.
+
+    The gap's share of the source is between the capacitive and the resistive divider's; the jump of a square adds the
+    difference of both, which is left of the half period before.
+    """
+    elastance, resistance = 0.0, 0.0
+    area = t[CELL_ROWS * cells + REST]
+    for j in range(cells):
+        elastance += 1.0 / t[j]
+        resistance += 1.0 / (t[cells + j] + area * t[2 * cells + j] + 1e-300)
+    at_once = 1.0 / (t[gap] * elastance)
+    at_last = 1.0 / ((t[cells + gap] + area * t[2 * cells + gap] + 1e-300) * resistance)
+    share = max(at_once, at_last) + (abs(at_once - at_last) if jumping else 0.0)
+    return float(abs(t[CELL_ROWS * cells + AMPLITUDE]) * share)
 
 
 @jit
@@ -133,17 +148,27 @@ def moment_integrals(y: float) -> tuple[float, float, float]:
 
 @jit
 def weigh(i: int, h: float, rates: FloatArray, drive: FloatArray, g: Weights, modes: Marks) -> None:
-    """Weights of lane i for a step of length 0, for a first step and for all other steps of length h (s)."""
+    """Weights of lane i for a step of length 0 and for the pieces, the first of steps of length h (s).
+
+    The first step of all has no step before it; that of a later piece follows a step of half its length.
+    """
     m_all = len(modes)
     still, first, rest = g
-    for m in range(m_all):
-        zeroth, once, twice = moment_integrals(rates[m] * h)
-        i0, i1, i2 = h * zeroth, h * once, h * twice
-        decay, driven, at = 1.0 - rates[m] * i0, drive[m] * i0, m * LANES + i
-        _set_row(still, at, m_all * LANES, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-        _set_row(first, at, m_all * LANES, (decay, driven, i0, 0.0, i1, i0 - i1, 0.0))
-        later = (decay, driven, i0 + i1, -i1, 0.5 * (i1 + i2), i0 - i2, 0.5 * (i2 - i1))
-        _set_row(rest, at, m_all * LANES, later)
+    for piece in range(first.shape[0]):
+        for m in range(m_all):
+            zeroth, once, twice = moment_integrals(rates[m] * h)
+            i0, i1, i2 = h * zeroth, h * once, h * twice
+            decay, driven, at = 1.0 - rates[m] * i0, drive[m] * i0, m * LANES + i
+            if piece == 0:
+                _set_row(still, at, m_all * LANES, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+                _set_row(first[piece], at, m_all * LANES, (decay, driven, i0, 0.0, i1, i0 - i1, 0.0))
+            else:
+                next_one, now, old = (2.0 * i2 + i1) / 3.0, i0 + i1 - 2.0 * i2, (i2 - i1) * (4.0 / 3.0)
+                after = (decay, driven, i0 + 2.0 * i1, -2.0 * i1, next_one, now, old)
+                _set_row(first[piece], at, m_all * LANES, after)
+            later = (decay, driven, i0 + i1, -i1, 0.5 * (i1 + i2), i0 - i2, 0.5 * (i2 - i1))
+            _set_row(rest[piece], at, m_all * LANES, later)
+        h *= 2.0
 
 
 @jit
@@ -260,7 +285,7 @@ def _results(
 def march(
     table: FloatArray, pending: NDArray[np.int64], gap: int,
     curves: tuple[FloatArray, FloatArray, FloatArray], waves: tuple[FloatArray, FloatArray],
-    how: tuple[int, bool, bool, float], out: FloatArray, traces: tuple[FloatArray, FloatArray], modes: Marks,
+    how: tuple[int, int, bool, float, float], out: FloatArray, traces: tuple[FloatArray, FloatArray], modes: Marks,
     powers: Marks, moments: Marks,
 ) -> None:  # fmt: skip
     """Integrate scenes of a table, block by block, each with the steps of two waves; the first wave may be empty.
@@ -279,8 +304,9 @@ def march(
     waves : tuple of ndarray, each of shape (2, n)
         As `lockstep.run` takes them: x and y of the source at the steps of a period, or of half a period.
     how : tuple
-        Number of half periods; whether the source jumps to its negative after each; whether the periodic state is
-        wanted; and its tolerance, relative to the peak gap voltage.
+        Number of half periods; number of pieces of a half period if the source jumps to its negative after each, else
+        0; whether the periodic state is wanted; its tolerance, relative to the peak gap voltage; and the largest gap
+        voltage that the area's polynomial covers, as a ratio to its estimate.
     out : ndarray, shape (2, 2 len(moments) + 3, n)
         For each wave the means over the run and over its last period, the peak (V), the relative error of the periodic
         state, and the relative size of the last coefficient of the area's series. The latter is infinite where the
@@ -289,12 +315,11 @@ def march(
         Gap voltage before every step of each wave, V; (n, 0) for none.
     """
     m_all, d_all, count = len(modes), len(powers) - 1, len(moments)
-    halves, jumping, periodic, tol = how
-    cells = m_all + 1
-    c, g = (
-        np.zeros(n_constants(m_all, d_all) * LANES),
-        (np.empty(N_WEIGHTS * m_all * LANES), np.empty(N_WEIGHTS * m_all * LANES), np.empty(N_WEIGHTS * m_all * LANES)),
-    )
+    halves, pieces, periodic, tol, covered = how
+    jumping = pieces > 0
+    cells, row = m_all + 1, N_WEIGHTS * m_all * LANES
+    c = np.zeros(n_constants(m_all, d_all) * LANES)
+    g = (np.empty(row), np.empty((max(pieces, 1), row)), np.empty((max(pieces, 1), row)))
     s, last = np.empty(n_state(m_all, count) * LANES), np.empty(count * LANES)
     start, back, closing = np.empty(m_all * LANES), np.zeros(m_all * LANES), np.zeros(LANES)
     rates, drive = np.empty((LANES, m_all)), np.empty((LANES, m_all))
@@ -305,9 +330,10 @@ def march(
     for first in range(0, pending.size, LANES):
         for i in range(LANES):
             scene = pending[min(first + i, pending.size - 1)]
+            column[:] = table[:, scene]
             for j in range(N_OTHERS):
-                b[j * LANES + i] = table[CELL_ROWS * cells + j, scene]
-            top[i] = (COVERED_JUMPING if jumping else COVERED) * abs(b[AMPLITUDE * LANES + i]) + 1e-12
+                b[j * LANES + i] = column[CELL_ROWS * cells + j]
+            top[i] = covered * _largest_voltage(column, gap, cells, jumping) + 1e-12
             c[SCALE * LANES + i] = 2.0 / top[i]
         c[area * LANES :] = 0.0
         for j in range(d_all + 1):
@@ -315,8 +341,10 @@ def march(
             for d in range(d_all + 1):
                 _add_row(curves[2][d, j], work[1], c[(area + d) * LANES : (area + d + 1) * LANES])
         for i in range(LANES):
-            # The coefficient of the highest power is 2^(d - 1) times the Chebyshev coefficient.
-            tail[i] = abs(c[area * LANES + i]) / 2.0 ** (d_all - 1) / c[(area + d_all) * LANES + i]
+            # The coefficients of the two highest powers are 2^(d - 1) and 2^(d - 2) times those of Chebyshev's series.
+            # These fall to about a third from one to the next; the last one alone may be small by chance.
+            tail[i] = max(abs(c[area * LANES + i]), 2.0 / 3.0 * abs(c[(area + 1) * LANES + i])) / 2.0 ** (d_all - 1)
+            tail[i] /= c[(area + d_all) * LANES + i]
             if not b[XI * LANES + i] * top[i] <= LARGEST_X:
                 tail[i] = math.inf
             column[:] = table[:, pending[min(first + i, pending.size - 1)]]
@@ -329,8 +357,11 @@ def march(
             n = waves[w].shape[1] * (2 if jumping else 1)
             if n == 0:
                 continue
+            # All pieces together are 2^pieces - 1 times the first, which has n / 2 / pieces of the shortest steps.
+            shorter = max(pieces, 1) / (2.0 ** max(pieces, 1) - 1.0)
             for i in range(LANES):
-                weigh(i, 2.0 * math.pi / b[OMEGA * LANES + i] / n, rates[i], drive[i], g, modes)
+                h = 2.0 * math.pi / b[OMEGA * LANES + i] / n * shorter
+                weigh(i, h, rates[i], drive[i], g, modes)
             for _ in range(MOST_PERIODS if periodic else 1):
                 s[:] = 0.0
                 s[: m_all * LANES] = start

@@ -15,6 +15,9 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
 
@@ -24,8 +27,8 @@ LANES = 16
 Marks = tuple[int, ...]
 """A tuple of which only the length counts."""
 
-Weights = tuple[FloatArray, FloatArray, FloatArray]
-"""Weights of a step of length 0, of a first step, which has no step before it, and of all other steps."""
+Weights = tuple[FloatArray, NDArray[np.float64], NDArray[np.float64]]
+"""Weights of a step of length 0; and for every piece of a window, those of its first step and of all other steps."""
 
 # Rows of the constants: a and b in u = a x + b y + shape z, and the scale of |u| to [-1, 1]; then those of every mode.
 WAVE_X, WAVE_Y, SCALE, SHAPE = 0, 1, 2, 3
@@ -120,33 +123,45 @@ def _add_latest(first: int, count: int, weight: float, s: FloatArray) -> None:
 
 @jit
 def quadrature(k: int, steps: int) -> float:
-    """Weight of value k of `steps` + 1 equidistant values in Gregory's quadrature of order 4, in step lengths."""
+    """Weight of value k of `steps` + 1 equidistant values in Gregory's quadrature of order 4, in step lengths.
+
+    Simpson's rule, of the same order, serves 2 or 4 steps, where the two ends of Gregory's would overlap.
+    """
     end = min(k, steps - k)
+    if steps < 5:
+        return (1.0 if end == 0 else 4.0 if k % 2 == 1 else 2.0) / 3.0
     return 0.375 if end == 0 else 7.0 / 6.0 if end == 1 else 23.0 / 24.0 if end == 2 else 1.0
 
 
 @jit
-def _window(
-    c: FloatArray, g: Weights, s: FloatArray, wave: FloatArray, sign: float, steps: int, restart: bool,
-    trace: FloatArray, at: int, modes: Marks, powers: Marks, moments: Marks,
+def _start(
+    c: FloatArray, still: FloatArray, s: FloatArray, x: float, y: float, modes: Marks, powers: Marks, moments: Marks
 ) -> None:  # fmt: skip
-    """Take `steps` steps, one range of Gregory's rule; the gap voltages go to trace (LANES, n) from `at` on."""
+    """Evaluate the integrands and the nonlinear term without a step: at t = 0, and after a jump of the source."""
+    _step(c, still, s, (x, y, 0.0), 0.0, modes, powers, moments)
+
+
+@jit
+def _window(
+    c: FloatArray, g: tuple[FloatArray, FloatArray], s: FloatArray, wave: FloatArray, sign: float, steps: int,
+    unit: float, trace: FloatArray, at: int, modes: Marks, powers: Marks, moments: Marks,
+) -> None:  # fmt: skip
+    """Take `steps` steps of one length, a range of Gregory's rule; gap voltages go to trace (LANES, n) from `at` on.
+
+    `g` holds the weights of the first step and of all others, `unit` is the length of a step in those of the sums.
+    """
     count, own = len(moments), N_STATE * len(modes)
     period, stride = wave.shape[1], trace.shape[0] // LANES
-    if restart:
-        weight = quadrature(0, steps)
-        _step(c, g[0], s, (sign * wave[0, 0], sign * wave[1, 0], 0.0), weight, modes, powers, moments)
-    else:
-        _add_latest(own + VALUE, count, quadrature(0, steps), s)
-    place, before, weights = 0, sign * wave[0, 0], g[1] if restart else g[2]
+    _add_latest(own + VALUE, count, unit * quadrature(0, steps), s)
+    place, before, weights = 0, sign * wave[0, 0], g[0]
     for k in range(steps):
         if trace.size > 0:
             for i in range(LANES):
                 trace[i * stride + at + k] = s[(own + GAP) * LANES + i]
         place = place + 1 if place + 1 < period else 0
         x, y = sign * wave[0, place], sign * wave[1, place]
-        _step(c, weights, s, (x, y, before), quadrature(k + 1, steps), modes, powers, moments)
-        before, weights = x, g[2]
+        _step(c, weights, s, (x, y, before), unit * quadrature(k + 1, steps), modes, powers, moments)
+        before, weights = x, g[1]
 
 
 @jit
@@ -162,7 +177,8 @@ def run(
         Constants, weights and state, each flat.
     wave : ndarray, shape (2, n)
         x and y of the source at the n steps of a period. Where the source is `turned`, it jumps to its negative after
-        each half period and the method restarts: then n steps are half a period.
+        each half period and the method restarts: then n steps are half a period, in pieces as `g` has them: of equally
+        many steps, which are twice as long in every piece as in the one before.
     last : ndarray
         Takes the sums over the last period, as the state holds those over the whole run; NaN in a shorter run.
     trace : ndarray, shape (LANES * steps,) or (0,)
@@ -176,6 +192,7 @@ def run(
     for i in range(LANES):
         s[(own + PEAK) * LANES + i] = 0.0
     half = wave.shape[1] if turned else wave.shape[1] // 2
+    pieces = g[1].shape[0]
     done = 0
     while done < halves:
         if done == halves - 2:
@@ -185,7 +202,14 @@ def run(
         # The value of a sine, as of a turned source, is the negative of its value half a period earlier.
         sign = -1.0 if done % 2 == 1 else 1.0
         restart = turned or done == 0
-        _window(c, g, s, wave, sign, ahead * half, restart, trace, done * half, modes, powers, moments)
+        if restart:
+            _start(c, g[0], s, sign * wave[0, 0], sign * wave[1, 0], modes, powers, moments)
+        steps, unit = ahead * half // pieces, pieces / (2.0**pieces - 1.0)
+        for piece in range(pieces):
+            weights = (g[1][piece] if restart else g[2][piece], g[2][piece])
+            at = done * half + piece * steps
+            _window(c, weights, s, wave, sign, steps, unit, trace, at, modes, powers, moments)
+            unit *= 2.0
         done += ahead
     for i in range(last.size):
         last[i] = s[sums + i] - last[i]
