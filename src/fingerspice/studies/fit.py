@@ -26,6 +26,9 @@ from fingerspice.waveforms.waveform import require
 
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.
 _SPREAD, _FOLLOWED = 4.0, 3
+# Errors of unknown size are equal shares of the data unless errors equal for all are likelier by this logarithm. The
+# choice takes a degree of freedom, and is made where so many are there; else errors are taken as equal.
+_CLEARLY, _CHOOSING = 2.0, 4
 # Error of the means by which starts are compared.
 _ROUGH = 1e-3
 
@@ -56,9 +59,9 @@ def fit(
         and a signal over time (``f_el``, ``f_t``, ``friction``, ``area``, ``u_gap``); or ``frequency`` and
         ``impedance``, the magnitude (ohm) of what the source sees, with ``impedance_phase`` (deg) where it is known.
         ``sigma`` is the standard deviation of every value; where it is missing, it is estimated from the residuals, as
-        equal for all or as equal shares of the values, whichever is likelier (of signals over time as equal, of
-        impedances as equal shares). A table (CSV) has the columns in a header, with units:
-        ``Vdrive.amplitude (V), f_el_mean (mN)``.
+        equal shares of the values or, where that is clearly likelier, as equal for all (so, too, of signals over time,
+        and where hardly more data than parameters are given; of impedances always as equal shares). A table (CSV) has
+        the columns in a header, with units: ``Vdrive.amplitude (V), f_el_mean (mN)``.
     parameters : sequence of str
         Paths of the parameters to fit.
     bounds : mapping of str to tuple of float, optional
@@ -103,11 +106,20 @@ def fit(
             "none of the starts can be run: there is no contact, no solution, or a value out of range; allowed: a "
             "circuit that runs under the conditions of the data"
         )
-    if table.sigma is None and table.t is None and table.signal != IMPEDANCE:
+    spare = task.target.size - len(unknowns)
+    chosen = table.sigma is None and table.t is None and table.signal != IMPEDANCE and spare >= _CHOOSING
+    if chosen:
         task, ends = _with_likelier_noise(task, ends, best)
         best = min(ends, key=lambda end: end.objective)
     found = fit_result(
-        task.circuit, task.data, task.unknowns, task.bounds, best, [end.objective for end in ends], task.scale
+        task.circuit,
+        task.data,
+        task.unknowns,
+        task.bounds,
+        best,
+        [end.objective for end in ends],
+        task.scale,
+        spare - chosen,
     )
     limit = limit_of(best.objective, found.freedom, given=task.data.sigma is not None)
     return replace(
@@ -117,7 +129,7 @@ def fit(
 
 
 def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[Task, list[Fitted]]:
-    """The fits with errors equal for all data, or with errors that are equal shares, whichever is likelier.
+    """The fits with errors that are equal shares of the data, or, where this is clearly likelier, equal for all.
 
     The largest likelihood of normal errors of unknown size is RSS^(-n/2) over the product of the scales.
     """
@@ -128,7 +140,11 @@ def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[
     others = [followed(shares, end.values) for end in ends]
     least, n = min(end.objective for end in others), predicted.size
     equal = 0.5 * n * math.log(best.objective) + float(np.log(task.scale).sum())
-    return (shares, others) if 0.5 * n * math.log(least) + float(np.log(predicted).sum()) < equal else (task, ends)
+    return (
+        (shares, others)
+        if 0.5 * n * math.log(least) + float(np.log(predicted).sum()) < equal + _CLEARLY
+        else (task, ends)
+    )
 
 
 def _error(found: Fit, path: str) -> float:

@@ -68,7 +68,7 @@ class Fit(Shown):
     objectives : tuple of float
         That reached from every start that was followed.
     freedom : int
-        Data less parameters.
+        Data less parameters, and less one where the residuals say whether errors are equal or shares.
     evaluations : int
     closed : bool
         Whether the iteration closed.
@@ -121,7 +121,7 @@ class Fit(Shown):
 
     def report(self) -> str:
         """Statistics, parameters and correlations in the layout of lmfit's ``fit_report``."""
-        count = self.freedom + len(self.estimates)
+        count = self.data.values.size * (1 if self.data.phase is None else 2)
         return lmfit_report(self.estimates, self.correlation, self.objective, count, self.evaluations)
 
     def plot(self) -> Figure:
@@ -200,12 +200,12 @@ class Fit(Shown):
 
 def fit_result(
     circuit: Circuit, data: Data, unknowns: tuple[Unknown, ...], bounds: FloatArray, best: Fitted,
-    objectives: Sequence[float], scale: FloatArray,
+    objectives: Sequence[float], scale: FloatArray, freedom: int,
 ) -> Fit:  # fmt: skip
     """The result of the best of several fits."""
     from scipy.stats import norm, t
 
-    freedom, n = best.residual.size - len(unknowns), data.values.size
+    n = data.values.size
     variance = 1.0 if data.sigma is not None else best.objective / freedom if freedom > 0 else math.inf
     covariance = covariance_of(best.by_log)
     error = np.sqrt(np.diag(covariance) * variance)
