@@ -36,6 +36,7 @@ MANY_PARAMETERS = {
     "cli.limits.limits",
     "cli.design.design",
     "cli.fit.fit",
+    "cli.fit.fit_contact",
     "studies.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",

@@ -215,3 +215,11 @@ def test_the_streaming_benchmark_takes_every_sample(monkeypatch, capsys):
     assert [point["rtol"] for point in points] == [1e-4, 1e-6]
     assert all(point["samples"] == 2 * 48_000 + 1 for point in points)
     assert "times real time" in capsys.readouterr().out
+
+
+def test_the_coverage_of_fits_runs_and_writes_nothing_when_quick(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    results = importlib.import_module("fit_coverage").main(["--quick"])
+    assert set(results["coverage"]) == {"given", "equal", "shares", "contact"}
+    assert results["named"]["gap and alpha at one voltage and frequency"] == results["named"]["of"]
+    assert results["named"]["gap and resistance at several"] == 0

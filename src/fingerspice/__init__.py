@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.capability import capability as capability
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
+    from fingerspice.studies.contactfit import fit_contact as fit_contact
+    from fingerspice.studies.contactresult import ContactFit as ContactFit
     from fingerspice.studies.export import export_netlist as export_netlist
     from fingerspice.studies.feel import Feel as Feel
     from fingerspice.studies.feel import feel as feel
@@ -93,6 +95,8 @@ _HOMES = {
     "studies.comparison": ("Comparison", "compare"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "explorer.server": ("Explorer", "explore"),
+    "studies.contactfit": ("fit_contact",),
+    "studies.contactresult": ("ContactFit",),
     "studies.export": ("export_netlist",),
     "studies.feel": ("Feel", "feel"),
     "studies.fit": ("fit",),

@@ -307,10 +307,8 @@ def compare(
         answer.give(lambda: comparison_table(result), writes)
 
 
-app.command()(limits)
-app.command()(designs.design)
-app.command()(fits.fit)
-app.command()(sweeps.sweep)
+for _command in (limits, designs.design, fits.fit, fits.fit_contact, sweeps.sweep):
+    app.command()(_command)
 
 
 @app.command()
