@@ -32,8 +32,9 @@ _KINDS = ("mean", "rms", "min", "max", "peak", "mean_periodic", "rms_periodic", 
 RTOL_RANGE = (1e-12, 0.1)
 # Largest number of failure messages that a Dataset keeps, and of gap voltages (8 GB) that a batch may return.
 MESSAGES, MOST_VOLTAGES = 16, 1e9
-# Number of scenes in a job; fewer if gap voltages are wanted, so that these stay in the processor's cache.
-CHUNK, TRACED = 4096, 256
+# Largest number of scenes in a job, and the smallest to which a batch is divided so that all threads have jobs; and
+# their number if gap voltages are wanted, so that these stay in the processor's cache.
+CHUNK, SMALL_CHUNK, TRACED = 4096, 256, 256
 # Relative distance from a whole number within which a number of half periods counts as whole.
 WHOLE = 1e-9
 
@@ -268,7 +269,8 @@ def _lockstep(task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExec
         good &= halves >= 2.0
     jobs = []
     for size in np.unique(halves[good]).astype(int).tolist():
-        members, chunk = np.flatnonzero(good & (halves == size)), (TRACED if traced else CHUNK)
+        members = np.flatnonzero(good & (halves == size))
+        chunk = TRACED if traced else int(np.clip(members.size // 16, SMALL_CHUNK, CHUNK))
         jobs += [(size, members[i : i + chunk]) for i in range(0, members.size, chunk)]
 
     def one(job: tuple[int, NDArray[np.int64]]) -> Answers:
