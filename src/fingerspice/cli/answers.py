@@ -40,7 +40,7 @@ OWN: dict[str, tuple[str, ...]] = {
         *("worst_share", "rms_share", "largest_wanted", "largest_reached", "corrections"),
     ),
     "fit": ("parameters", "correlation", "signal", "count", "residual_rms", "objective", "objectives", "notes"),
-    "sweep": ("scenes", "failed", "n", "seed", "figures", "shares"),
+    "sweep": ("scenes", "failed", "n", "seed", "figures", "shares", "store"),
     "export": (),
     "figures": (),
 }
