@@ -36,11 +36,13 @@ MANY_PARAMETERS = {
     "cli.app.limits",
     "cli.design.design",
     "cli.fit.fit",
+    "cli.sweep.sweep",
     "studies.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",
     "studies.batch.batch",
     "studies.fit.fit",
+    "studies.populations.sweep",
     "studies.steady.steady_state",
     "solve.streaming.stream",
 }

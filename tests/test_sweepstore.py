@@ -128,9 +128,9 @@ def test_a_network_and_several_fingers_go_into_a_store(tmp_path: Path) -> None:
 
 
 def test_scenes_without_a_result_are_named_by_their_number_in_the_sweep(circuit: fs.Circuit, tmp_path: Path) -> None:
-    # Beyond the fold there is no solution under the mobile law, which goes scene by scene.
-    asked = {"Xgap.fn": [0.4, 0.5], "Vdrive.amplitude": np.where(np.arange(80) == 70, 1e6, 10.0)}
-    how = {"outputs": ("f_el_mean",), "t_stop": 2e-3}
+    # Adhesion that leaves no contact.
+    asked = {"Xgap.r": [1e6, 2e6], "Xgap.c2": np.where(np.arange(80) == 70, 1e9, 5000.0)}
+    how = {"outputs": ("f_el_mean",), "t_stop": 2e-2, "threads": 1}
     memory = fs.sweep(circuit, asked, **how)
     lost = np.flatnonzero(memory.status.values.ravel() >= 2)
     stored = fs.sweep(circuit, asked, store=tmp_path / "s.zarr", **how)

@@ -108,7 +108,7 @@ def _in_memory(circuit: Circuit, plan: Plan, options: Mapping[str, Any]) -> Data
     draws = plan.draws()
     found = batch(circuit, plan.spread(plan.grid, draws), **options)
     data = {
-        name: ((*plan.dims, *one.dims[1:]), one.values.reshape(*plan.sizes, *one.shape[1:]), one.attrs)
+        name: ((*plan.dims, *one.dims[1:]), one.values.reshape((*plan.sizes, *one.shape[1:])), one.attrs)
         for name, one in found.data_vars.items()
     }
     coords: dict[str, Any] = {name: (name, values, {"units": plan.units[name]}) for name, values in plan.grid.items()}

@@ -9,17 +9,21 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from multiprocessing.reduction import ForkingPickler
-from typing import Any
+from threading import Lock
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fingerspice import __version__
 from fingerspice.base.announcing import Bar
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies import sweepplan
@@ -27,6 +31,12 @@ from fingerspice.studies.batch import MESSAGES, batch
 from fingerspice.studies.sweepplan import Plan
 from fingerspice.studies.sweepstore import SweepStore
 
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+# Chunks that a process has at once: it computes one while another one is waiting for the disk.
+AT_ONCE = 2
+_FREE = nullcontext()
 # Workers that may be lost one after another while no chunk is finished.
 MOST_LOST = 20
 # Chunks that a scheduler is given at once, and how long it may take to answer, s.
@@ -61,8 +71,10 @@ def programs() -> str:
     return f"fingerspice {__version__}, NumPy {np.__version__}, SciPy {scipy.__version__}"
 
 
-def run_chunk(work: Work, index: int) -> Done:
+def run_chunk(work: Work, index: int, computing: AbstractContextManager[Any] = _FREE) -> Done:
     """Run the scenes of a chunk, write them to the store, and mark the chunk as done.
+
+    Scenes are run within `computing`: a lock, where several chunks of a process are to be computed one after another.
 
     Raises
     ------
@@ -75,9 +87,8 @@ def run_chunk(work: Work, index: int) -> Done:
     if programs() != work.programs:
         raise InputError(f"a worker has {programs()}, and the sweep is of {work.programs}; allowed: the same")
     part = store.part(index)
-    draws = {} if work.draws is None else work.draws.part(store.place(index)[-1])
-    grid = {name: values[one] for (name, values), one in zip(work.plan.grid.items(), part, strict=False)}
-    found = batch(work.circuit, work.plan.spread(grid, draws), **work.options)
+    with computing:
+        found, draws = _computed(work, index, part)
     shape = tuple(one.stop - one.start for one in part)
     values = {}
     for name in store.arrays:
@@ -88,6 +99,13 @@ def run_chunk(work: Work, index: int) -> Done:
         values[name] = own.reshape((*shape, *more))
     store.write(index, values | draws)
     return Done(index, found.sizes["scene"], [_by_its_number(told, work, part) for told in found.attrs["failures"]])
+
+
+def _computed(work: Work, index: int, part: tuple[slice, ...]) -> tuple[Dataset, dict[str, FloatArray]]:
+    """The batch of a chunk's scenes, and the values that are drawn."""
+    draws = {} if work.draws is None else work.draws.part(work.store.place(index)[-1])
+    grid = {name: values[one] for (name, values), one in zip(work.plan.grid.items(), part, strict=False)}
+    return batch(work.circuit, work.plan.spread(grid, draws), **work.options), draws
 
 
 def _by_its_number(told: str, work: Work, part: tuple[slice, ...]) -> str:
@@ -123,7 +141,7 @@ def run_chunks(work: Work, shard: tuple[int, int], workers: int | None, client: 
     elif missing and workers is not None:
         answers = _by_processes(work, missing, min(workers, len(missing)))
     elif missing:
-        answers = (run_chunk(work, index) for index in missing)
+        answers = _here(work, missing)
     failures: list[str] = []
     with _Pace(len(mine), len(mine) - len(missing)) as pace:
         for done in answers:
@@ -161,13 +179,20 @@ class _Pace:
             self.bar.show(self.done / self.total, f", {self.scenes / took:,.3g} scenes/s, {left} left")
 
 
+def _here(work: Work, missing: Sequence[int]) -> Iterator[Done]:
+    """Chunks by this process."""
+    # A batch changes the filters for a while, and two of them at once for good.
+    with warnings.catch_warnings(), ThreadPoolExecutor(AT_ONCE) as pool:
+        yield from pool.map(partial(run_chunk, work, computing=Lock()), missing)
+
+
 @dataclass
 class _Worker:
-    """A process, the pipe to it, the chunk that it has, and whether it has told that it is there."""
+    """A process, the pipe to it, the chunks that it has, and whether it has told that it is there."""
 
     process: BaseProcess
     pipe: Connection
-    index: int | None = None
+    has: set[int] = field(default_factory=set)
     ready: bool = False
 
 
@@ -190,18 +215,20 @@ def _by_processes(work: Work, missing: Sequence[int], count: int) -> Iterator[Do
                     del crew[pipe]
                     lost += 1
                     _mourn(worker, lost)
-                    if worker.index is not None:
-                        todo.append(worker.index)
+                    todo.extend(worker.has)
                     new = _hired(sent)
                     crew[new.pipe] = new
                     continue
                 if isinstance(answer, Exception):
                     raise answer
-                worker.ready, worker.index = True, todo.popleft() if todo else None
-                if worker.index is not None:
+                worker.ready = True
+                if answer is not None:
+                    worker.has.remove(answer.index)
+                while todo and len(worker.has) < AT_ONCE:
+                    worker.has.add(todo[0])
                     # A process that is lost meanwhile is found by its closed pipe.
                     with suppress(OSError):
-                        pipe.send(worker.index)
+                        pipe.send(todo.popleft())
                 if answer is not None:
                     lost, left = 0, left - 1
                     yield answer
@@ -247,16 +274,23 @@ def _serve(pipe: Connection) -> None:
     # Ctrl-C is for the process that has started this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     warnings.simplefilter("ignore")
-    with suppress(EOFError, OSError):
-        work: Work = pipe.recv()
-        answer: Done | Exception | None = None
-        while True:
+    sending, computing = Lock(), Lock()
+
+    def tell(answer: Done | Exception | None) -> None:
+        with sending, suppress(OSError):
             pipe.send(answer)
-            index = pipe.recv()
-            try:
-                answer = run_chunk(work, index)
-            except Exception as error:
-                answer = error
+
+    def run(index: int) -> None:
+        try:
+            tell(run_chunk(work, index, computing))
+        except Exception as error:
+            tell(error)
+
+    with suppress(EOFError, OSError), ThreadPoolExecutor(AT_ONCE) as pool:
+        work: Work = pipe.recv()
+        tell(None)
+        while True:
+            pool.submit(run, pipe.recv())
 
 
 @contextmanager

@@ -93,7 +93,7 @@ class Plan:
         return Sequence(self, count, steps)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sequence:
     """The draws of a plan in parts of `count`, each of which costs the same.
 
@@ -108,11 +108,17 @@ class Sequence:
 
     def part(self, number: int) -> dict[str, FloatArray]:
         """Values of the drawn parameters in the part with this number, shape (count,) each."""
-        bits = _first_part(len(self.plan.drawn), self.plan.seed, self.count)
-        for i, step in enumerate(self.steps):
-            if number >> i & 1:
-                bits = bits ^ step
-        return self.plan.quantiles(np.asarray(bits * 2.0**-BITS, float))
+        return _part(self, number)
+
+
+# Two chunks may run at once, and those after them mostly have the same draws.
+@lru_cache(2)
+def _part(sequence: Sequence, number: int) -> dict[str, FloatArray]:
+    bits = _first_part(len(sequence.plan.drawn), sequence.plan.seed, sequence.count)
+    for i, step in enumerate(sequence.steps):
+        if number >> i & 1:
+            bits = bits ^ step
+    return sequence.plan.quantiles(np.asarray(bits * 2.0**-BITS, float))
 
 
 def _sobol(dimensions: int, seed: int) -> Any:

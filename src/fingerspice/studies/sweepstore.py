@@ -75,8 +75,8 @@ class SweepStore:
         return tuple(-(-size // own) for size, own in zip(self.sizes, self.block, strict=True))
 
     def place(self, index: int) -> tuple[int, ...]:
-        """Number of a chunk along each dimension."""
-        return tuple(int(i) for i in np.unravel_index(index, self._grid))
+        """Number of a chunk along each dimension: chunks one after another have the same draws at other places."""
+        return tuple(int(i) for i in np.unravel_index(index, self._grid, "F" if self.drawn else "C"))
 
     def part(self, index: int) -> tuple[slice, ...]:
         """Scenes of a chunk along each dimension."""
@@ -109,7 +109,10 @@ class SweepStore:
             ) from None
 
     def _put(self, file: Path, content: bytes) -> None:
-        """Write a file under a temporary name, and rename it once it is on the disk."""
+        """Write a file under a temporary name, and rename it once it is on the disk.
+
+        The name may be lost in a crash of the machine: the chunk is not done then, whatever else of it is there.
+        """
         temporary = self.path / STATUS / f"{UNFINISHED}{os.urandom(6).hex()}"
         with temporary.open("wb") as stream:
             stream.write(content)
@@ -122,7 +125,6 @@ class SweepStore:
             # Another process has written the same chunk, and the whole sweep is done and tidied up.
             if not file.exists():
                 raise
-        settle_on_disk(file.parent)
 
     def _files(self, index: int) -> dict[str, tuple[Path, int]]:
         """File and size of every array's part in a chunk; the draws belong to the first place of the grid."""

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 # Scenes of a chunk, if the first scene goes in lockstep, and if it does not; largest number of chunks.
-CHUNK, SLOW_CHUNK, MOST_CHUNKS = 1 << 16, 1 << 8, 1 << 20
+CHUNK, SLOW_CHUNK, MOST_CHUNKS = 1 << 17, 1 << 8, 1 << 20
 # Quantiles by which a distribution is recognised.
 _PROBES = np.linspace(0.015625, 0.984375, 63)
 
