@@ -250,6 +250,43 @@ def networks(seconds: float, repeats: int) -> list[Report]:
     return out
 
 
+def uneven(seconds: float, repeats: int) -> list[Report]:
+    """Whole calls under a PWL whose points lie up to a third of a sample beside the samples of the same noise."""
+    count = int(seconds * RATE) + 1
+    moved = np.random.default_rng(0).uniform(-1.0, 1.0, count) / 3.0
+    moved[0] = moved[-1] = 0.0
+    t = (np.arange(count) + moved) / RATE
+    out: list[Report] = []
+    for skin in ("SKIN", "SKIN_DISPERSIVE"):
+        for high in BANDS[:2]:
+            values = noise(count, high)
+            drives = {
+                (which, method): (stack(skin).replace({"Vdrive": fs.PWL(t[:some], values[:some])}), t[:some])
+                for which, method, some in (("all", "auto", count), ("few", "exponential", CHECKED))
+            }
+
+            def gap(rtol: float, key: tuple[str, str], drives: Any = drives) -> np.ndarray:
+                circuit, at = drives[key]
+                how = {"t_eval": at, "t_stop": at[-1], "start": "uncharged", "jumps": "none", "charge": False}
+                return np.asarray(fs.simulate(circuit, rtol=rtol, method=key[1], **how).u_gap)
+
+            exact = gap(1e-11, ("few", "exponential"))
+            peak = float(np.abs(exact).max())
+            for rtol in (1e-4, 1e-6):
+                for key, (_, at) in drives.items():
+                    found = gap(rtol, key)[: exact.size]
+                    took = median_seconds(lambda k=key, r=rtol: gap(r, k), repeats)
+                    # The last point of the short run is the start of no line.
+                    off = float(np.abs(found - exact)[:-1].max()) / peak
+                    out.append(
+                        {
+                            "skin": skin, "band_Hz": high, "rtol": rtol, "method": key[1], "error": off,
+                            "ns_per_point": 1e9 * took / at.size,
+                        }
+                    )  # fmt: skip
+    return out
+
+
 def linear(seconds: float, repeats: int) -> Report:
     """Time of the whole call with a given area, and of lfilter with the equivalent filter."""
     values, area = noise(int(seconds * RATE) + 1, 8_000.0), 35e-6
@@ -281,6 +318,10 @@ def main() -> None:
     for p in around:
         name = f"{p['band_Hz']:6g} Hz {p['deck']:16} {p['method']:12} {p['rtol']:g}"
         print(f"{name} {p['error']:.1e} {p['ns_per_sample']:12,.1f} ns a sample")
+    points_apart = uneven(seconds, repeats)
+    for p in points_apart:
+        name = f"{p['band_Hz']:6g} Hz {p['skin']:16} {p['method']:12} {p['rtol']:g}"
+        print(f"uneven points {name} {p['error']:.1e} {p['ns_per_point']:12,.1f} ns a point")
     by_length = lengths((0.1, 0.2) if quick else (1.0, 10.0, 60.0, 300.0), repeats)
     for p in by_length:
         speed = f"{p['ns_per_sample']:.1f} ns a sample, {p['times_real_time']:,.0f} times real time"
@@ -303,6 +344,7 @@ def main() -> None:
             "seconds": seconds,
             "points": points,
             "networks": around,
+            "uneven": points_apart,
             "lengths": by_length,
             "area_given": given,
         }

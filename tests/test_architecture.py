@@ -33,10 +33,11 @@ MANY_PARAMETERS = {
     "cli.app.ac",
     "cli.app.plan",
     "cli.app.compare",
-    "cli.app.limits",
+    "cli.limits.limits",
     "cli.design.design",
     "cli.fit.fit",
     "cli.sweep.sweep",
+    "cli.fit.fit_contact",
     "studies.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",
@@ -45,6 +46,7 @@ MANY_PARAMETERS = {
     "studies.populations.sweep",
     "studies.steady.steady_state",
     "solve.streaming.stream",
+    "torch.simulator.Simulator.__init__",
 }
 # Functions over the limits, with their lines and parameters: no other may be, and these may only shrink.
 LARGER = {
@@ -78,8 +80,8 @@ LARGER = {
 
 # From the bottom up: a part imports its own files and the parts above it in this list, nothing below.
 ORDER = (
-    *("base", "numerics", "physics", "engine", "waveforms", "circuit", "netlist"),
-    *("results", "solve", "plots", "studies", "cli", "__main__"),
+    *("base", "numerics", "physics", "engine", "waveforms", "circuit", "netlist", "sets"),
+    *("results", "solve", "plots", "studies", "torch", "explorer", "cli", "__main__"),
 )
 # Beside each other, not one on the other.
 STRANGERS = (
@@ -92,7 +94,10 @@ STRANGERS = (
 # Methods that call a part above their own, and load it only when they are called.
 LENT = {
     "circuit.circuit.Circuit._waveform": "netlist.netlist",
-    "results.solution.Solution.plot": "plots.traces",
+    "circuit.doors.Doors.draw": "plots.schematic",
+    "circuit.doors.Doors.explore": "explorer.server",
+    "results.doors.Doors.plot": "plots.traces",
+    "results.doors.Doors.explore": "explorer.server",
     "results.spectrum.Spectrum.plot": "plots.spectra",
     "results.phasor_solution.PhasorSolution.plot": "plots.phasors",
 }
@@ -102,6 +107,7 @@ THIRD_PARTY = {
     "engine": {"numpy", "numba"},
     "circuit": {"numpy"},
     "netlist": {"numpy"},
+    "sets": set(),
     "base": {"numba", "numpy", "rich"},
     "base.errors": set(),
     "base.units": set(),

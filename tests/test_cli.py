@@ -180,11 +180,12 @@ def test_ac_sweeps_the_decks_line_or_the_one_given(command: Command) -> None:
     with Path("out/pad_ac.csv").open(newline="") as stream:
         head, *body = csv.reader(stream)
     assert head[:5] == ["frequency [Hz]", "gain [1]", "phase_deg [deg]", "u_gap [V]", "area [m^2]"]
-    assert head[5:] == ["f_el_mean [N]", "amplitude [V]"]
+    assert head[5:] == ["f_el_mean [N]", "amplitude [V]", "impedance [ohm]", "impedance_phase_deg [deg]"]
     table = np.array(body, float)
     np.testing.assert_allclose(table[:, 0], 10.0 ** np.arange(1.0, 3.01, 0.5), rtol=1e-12)
     expected = fs.phasor(fs.read_netlist("pad.cir"), table[:, 0])
     np.testing.assert_array_equal(table[:, 5], expected.f_el_mean)
+    np.testing.assert_array_equal(table[:, 7], np.abs(expected.impedance))
     given = figures(command("ac", "pad.cir", "--sweep", "LIN 3 100 300", "--area", "frozen", "--json", "--no-plot"))
     assert given["sweeps"][0]["frequency"] == [100.0, 200.0, 300.0]
     assert given["files"] == ["out/pad_ac.csv"]
@@ -215,7 +216,7 @@ def test_export_writes_one_deck_with_the_changes_in_it(command: Command) -> None
     assert "* fingerspice_mobile.lib - " in Path("sub/y.cir").read_text()
 
 
-@pytest.mark.parametrize("name", ["run", "ac", "compare", "export", "figures"])
+@pytest.mark.parametrize("name", ["run", "ac", "compare", "export", "figures", "explore", "sets"])
 @pytest.mark.parametrize("flag", ["--help", "-h"])
 def test_help_of_every_command_shows_an_example(command: Command, name: str, flag: str) -> None:
     result = command(name, flag)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,12 @@ CELLS = (
     "fs.load(solution.to_netcdf('run.nc')).plot(window=(0.0, 0.02))",
     "solution.to_dataframe()[['u_gap', 'f_el']].describe()",
     "%matplotlib inline\nsolution.plot()",
+    "circuit.draw()",
+    "explorer = circuit.explore()\nexplorer",
+    "import urllib.request\nurllib.request.urlopen(explorer.url).headers['Content-Security-Policy']",
+    "fs.simulate(circuit, charge_law='mobile', rtol=1e-5, t_stop=0.03, area='frozen').explore()",
+    "fs.explore(browser=False)._repr_html_() is None",
+    "explorers = [circuit.explore() for _ in range(9)]\n[one._thread.is_alive() for one in explorers]",
 )
 
 
@@ -66,3 +73,22 @@ def test_a_result_is_shown_as_a_table(outputs: list[list[Any]], number: int, sai
     page = shown(outputs[number])["text/html"]
     assert "<table" in page
     assert said in page
+
+
+def test_a_schematic_is_shown_as_svg(outputs: list[list[Any]]) -> None:
+    picture = shown(outputs[10])["image/svg+xml"]
+    assert all(f">{name}</text>" in picture for name in ("Vdrive", "Xcoat", "Xgap", "Xskin"))
+
+
+def test_the_explorer_is_shown_as_a_frame_which_this_computers_pages_may_hold(outputs: list[list[Any]]) -> None:
+    for number in (11, 13):
+        page = shown(outputs[number])["text/html"]
+        assert re.search(r'<iframe src="http://127\.0\.0\.1:\d+/[-\w]{32,}/"', page)
+    policy = shown(outputs[12])["text/plain"].strip("'\"")
+    allowed = "http://127.0.0.1:* http://localhost:* https://127.0.0.1:* https://localhost:*"
+    assert policy.endswith(f"frame-ancestors {allowed}")
+
+
+def test_a_notebook_keeps_a_bounded_number_of_explorers(outputs: list[list[Any]]) -> None:
+    assert shown(outputs[14])["text/plain"] == "True"
+    assert shown(outputs[15])["text/plain"] == str([False] + 8 * [True])

@@ -258,3 +258,26 @@ def test_a_stack_without_a_gap_is_refused() -> None:
 )
 def test_the_frequencies_of_an_ac_line_run_from_start_to_stop(sweep: AcSweep, expected: list[float]) -> None:
     np.testing.assert_allclose(sweep_frequencies(sweep), expected, rtol=1e-12)
+
+
+def test_the_source_sees_the_layers_in_series_and_what_stands_beside_them():
+    f = np.array([20.0, 100.0, 5e3])
+    swept = fs.phasor(table1(), f)
+
+    def of_layers(x: float, area: float) -> complex:
+        w = 2j * np.pi * x
+        return sum(1.0 / (1.0 / y.r_total + area / y.r_area + w * y.c * area) for y in table1_layers(x))
+
+    known = np.array([of_layers(x, area) for x, area in zip(f, swept.area, strict=True)])
+    np.testing.assert_allclose(swept.impedance, known, rtol=1e-12)
+    # An amplifier's resistor before the finger, and a cable beside it; and the finger under a current.
+    apart = table1_deck().replace("Vdrive drive 0", "Rout amp drive 47k\nCcable drive 0 150p\nVdrive amp 0")
+    assert "Rout" in apart
+    loaded = fs.phasor(fs.parse_netlist(apart), f)
+    known = np.array([of_layers(x, area) for x, area in zip(f, loaded.area, strict=True)])
+    beside = 47e3 + 1.0 / (1.0 / known + 2j * np.pi * f * 150e-12)
+    np.testing.assert_allclose(loaded.impedance, beside, rtol=1e-10)
+    driven = apart.replace("Rout amp drive 47k\n", "").replace("Vdrive amp 0", "Idrive 0 drive")
+    current = fs.phasor(fs.parse_netlist(driven), f, area=36e-6)
+    known = np.array([of_layers(x, 36e-6) for x in f])
+    np.testing.assert_allclose(current.impedance, 1.0 / (1.0 / known + 2j * np.pi * f * 150e-12), rtol=1e-10)

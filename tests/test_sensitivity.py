@@ -75,18 +75,27 @@ def test_a_dispersive_skin() -> None:
 def test_starts_that_move_with_the_parameter(table_1: fs.Circuit, law: str, start: str) -> None:
     circuit = table_1.replace({"Vdrive": fs.Sine(150, 100, offset=30.0)})
     check(circuit, ("Xgap.d", "Xcoat.r", "Vdrive.offset"), charge_law=law, start=start)
+    check(circuit, ("Vdrive.frequency",), tol=1e-8, charge_law=law, start=start)
 
 
-def test_the_periodic_state_has_them(table_1: fs.Circuit) -> None:
-    state = fs.steady_state(table_1, rtol=1e-10, sensitivities=("Xgap.d", "Xcoat.r"))
-    for path in ("Xgap.d", "Xcoat.r"):
-        value, weights = table_1.parameters[path].value, {-2: 1.0, -1: -8.0, 1: 8.0, 2: -1.0}
-        means = [
-            weight * fs.steady_state(table_1.replace({path: value * (1.0 + k * STEP)}), rtol=1e-12).f_el_mean
-            for k, weight in weights.items()
-        ]
-        expected = sum(means) / (12.0 * STEP)
-        assert state.sensitivities[path].f_el_mean * value == pytest.approx(expected, rel=2e-9)
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_the_periodic_state_has_them(table_1: fs.Circuit, law: str) -> None:
+    # The frequency changes the period, and so the mean over it; at 30 V of offset the force at its ends is no mean.
+    circuit, paths = (
+        table_1.replace({"Vdrive": fs.Sine(150, 100, offset=30.0)}),
+        ("Xgap.d", "Xcoat.r", "Vdrive.frequency"),
+    )
+    state = fs.steady_state(circuit, rtol=1e-10, charge_law=law, sensitivities=paths)
+    for path in paths:
+        value, weights = circuit.parameters[path].value, {-2: 1.0, -1: -8.0, 1: 8.0, 2: -1.0}
+        states = {
+            k: fs.steady_state(circuit.replace({path: value * (1.0 + k * STEP)}), rtol=1e-12, charge_law=law)
+            for k in weights
+        }
+        for name in ("f_el_mean", "f_t_mean", "friction_mean", "area_mean"):
+            expected = sum(weight * getattr(states[k], name) for k, weight in weights.items()) / (12.0 * STEP)
+            found = getattr(state.sensitivities[path], name) * value
+            assert found == pytest.approx(expected, abs=2e-9 * getattr(state, name)), (path, name)
 
 
 def test_repeated_periods_are_followed_one_by_one(table_1: fs.Circuit) -> None:
@@ -129,6 +138,14 @@ X2 b 0 area GAP d=3u fn=0.5
 def test_refused(table_1: fs.Circuit, how: dict[str, Any], text: str) -> None:
     with pytest.raises(InputError, match=text):
         fs.simulate(table_1, t_stop=0.02, **how)
+
+
+def test_a_parameter_near_whose_value_there_is_no_period_is_refused_in_a_periodic_state(table_1: fs.Circuit) -> None:
+    circuit = table_1.replace({"Vdrive": fs.AM(150, 1000, 100)})
+    with pytest.raises(InputError, match=r"Vdrive\.carrier, near whose value the source has no such period"):
+        _ = fs.steady_state(circuit, sensitivities=("Vdrive.carrier",)).sensitivities
+    with pytest.raises(InputError, match=r"Vdrive\.modulation, near whose value the source has no such period"):
+        fs.simulate(circuit, t_stop=0.02, start="periodic", sensitivities=("Xgap.d", "Vdrive.modulation"))
 
 
 def test_networks_are_refused() -> None:

@@ -21,7 +21,7 @@ import fingerspice as fs
 import recording_errors
 from commands import Command, tree
 from fingerspice.cli.store import Store
-from fingerspice.solve import recordings, windows
+from fingerspice.solve import pieces, windows
 from fingerspice.waveforms import samples
 from processes import ended, no_room, start
 from scenes import table1_deck
@@ -65,7 +65,7 @@ def joined(chunks: list[fs.Solution], name: str) -> np.ndarray:
 @pytest.mark.parametrize("skin", ["frozen", "dispersive"])
 @pytest.mark.parametrize("law", ["local", "mobile"])
 def test_chunks_are_the_whole_to_the_last_bit(law: str, skin: str, tmp_path: Path) -> None:
-    count = 2 * recordings.PIECE + 1234
+    count = 2 * pieces.PIECE + 1234
     path = wav(tmp_path / "a.wav", count)
     text = table1_deck()
     circuit = fs.parse_netlist(
@@ -77,7 +77,7 @@ def test_chunks_are_the_whole_to_the_last_bit(law: str, skin: str, tmp_path: Pat
     t = np.arange(count - 1) / RATE
     whole = fs.simulate(circuit, sources=drive, t_eval=t, **how)
     assert whole.method == "relaxation"
-    for length in (977, recordings.PIECE, 10**6):
+    for length in (977, pieces.PIECE, 10**6):
         lazy = fs.Samples.from_wav(path, 150.0, at_once=False)
         stream = fs.stream(circuit, sources=lazy, count=length, **how)
         chunks = list(stream)
@@ -91,7 +91,7 @@ def test_chunks_are_the_whole_to_the_last_bit(law: str, skin: str, tmp_path: Pat
 
 @pytest.mark.parametrize("step", [1e-3, 1.7e-5])
 def test_outputs_between_samples_are_those_of_the_whole_too(step: float) -> None:
-    values = 150.0 * recording_errors.noise(5, recordings.PIECE + 500, RATE, 50.0, 4000.0)
+    values = 150.0 * recording_errors.noise(5, pieces.PIECE + 500, RATE, 50.0, 4000.0)
     samples, circuit = fs.Samples(values, RATE, start=0.3 / RATE), fs.parse_netlist(table1_deck())
     how = {"sources": samples, "t_stop": (values.size - 3) / RATE, "rtol": 1e-5, "start": "uncharged"}
     chunks = list(fs.stream(circuit, chunk=0.31, step=step, **how))
@@ -103,11 +103,11 @@ def test_outputs_between_samples_are_those_of_the_whole_too(step: float) -> None
 
 
 def test_a_quiet_beginning_is_followed_to_its_own_scale() -> None:
-    values = 150.0 * recording_errors.noise(5, 2 * recordings.PIECE, RATE, 50.0, 4000.0)
-    values[: recordings.PIECE] *= 0.05
+    values = 150.0 * recording_errors.noise(5, 2 * pieces.PIECE, RATE, 50.0, 4000.0)
+    values[: pieces.PIECE] *= 0.05
     samples, circuit = fs.Samples(values, RATE), fs.parse_netlist(table1_deck())
     how = {"sources": samples, "t_stop": (values.size - 1) / RATE, "rtol": 1e-4, "start": "uncharged", "charge": False}
-    first = next(fs.stream(circuit, count=recordings.PIECE, **how))
+    first = next(fs.stream(circuit, count=pieces.PIECE, **how))
     exact = fs.simulate(circuit, t_eval=first.t[:4000], **how | {"t_stop": 0.1, "rtol": 1e-10})
     peak = np.abs(first.u_gap).max()
     assert peak < 10.0
@@ -128,19 +128,19 @@ def test_any_circuit_is_streamed(name: str, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_what_cannot_be_followed_by_samples_goes_on_by_other_steps() -> None:
-    values = 100.0 * recording_errors.noise(5, recordings.PIECE + 600, RATE, 50.0, 2000.0)
+    values = 100.0 * recording_errors.noise(5, pieces.PIECE + 600, RATE, 50.0, 2000.0)
     # Beyond the range of the area's polynomial, in the second piece only.
-    values[recordings.PIECE + 300 :] *= 40.0
+    values[pieces.PIECE + 300 :] *= 40.0
     samples, circuit = fs.Samples(values, RATE), fs.parse_netlist(table1_deck())
     how = {"sources": samples, "t_stop": (values.size - 1) / RATE, "rtol": 1e-4, "start": "uncharged"}
-    chunks = list(fs.stream(circuit, count=recordings.PIECE // 2, **how))
+    chunks = list(fs.stream(circuit, count=pieces.PIECE // 2, **how))
     assert chunks[-1].success
     tail = fs.simulate(circuit, t_eval=chunks[-1].t, **how)
     assert np.abs(chunks[-1].u_gap - tail.u_gap).max() <= 3e-4 * np.abs(tail.u_gap).max()
 
 
 def test_a_stream_goes_on_from_a_mark() -> None:
-    values = 150.0 * recording_errors.noise(5, 2 * recordings.PIECE, RATE, 50.0, 4000.0)
+    values = 150.0 * recording_errors.noise(5, 2 * pieces.PIECE, RATE, 50.0, 4000.0)
     circuit = fs.parse_netlist(table1_deck())
     for sources in (fs.Samples(values, RATE), fs.Square(200.0, 100.0)):
         how = {"sources": sources, "t_stop": 2.7, "rtol": 1e-4, "step": 3e-5, "count": 20_011, "start": "uncharged"}
@@ -256,11 +256,11 @@ def test_a_file_that_is_not_sound_is_refused_as_ever(tmp_path: Path) -> None:
 
 
 def test_a_file_that_becomes_shorter_ends_a_stream_in_one_sentence(tmp_path: Path) -> None:
-    path = wav(tmp_path / "a.wav", 3 * recordings.PIECE)
+    path = wav(tmp_path / "a.wav", 3 * pieces.PIECE)
     drive = fs.Samples.from_wav(path, 150.0, at_once=False)
-    stream = fs.stream(fs.parse_netlist(table1_deck()), sources=drive, t_stop=4.0, rtol=1e-3, count=recordings.PIECE)
+    stream = fs.stream(fs.parse_netlist(table1_deck()), sources=drive, t_stop=4.0, rtol=1e-3, count=pieces.PIECE)
     next(stream)
-    path.write_bytes(path.read_bytes()[: 3 * recordings.PIECE])
+    path.write_bytes(path.read_bytes()[: 3 * pieces.PIECE])
     with pytest.raises(fs.InputError, match="has become shorter while it was read"):
         list(stream)
 

@@ -70,13 +70,7 @@ MENDED = {
 }
 
 
-# Its gap takes 5e-5 of the source: the time of its fold stays uncertain by rounding, and ERROR_NOT_MET stands there.
-UNCERTAIN = pytest.mark.xfail(reason="Radau's rounding hides when it folds", strict=True)
-
-
-@pytest.mark.parametrize(
-    ("seed", "number"), [pytest.param(*key, marks=UNCERTAIN if key == (0, 3773) else ()) for key in MENDED]
-)
+@pytest.mark.parametrize(("seed", "number"), list(MENDED))
 def test_a_scene_that_was_wrong_or_endless_is_mended(seed: int, number: int) -> None:
     assert stress.judge(stress.draw(seed, number)).end == MENDED[seed, number]
 

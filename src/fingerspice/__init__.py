@@ -16,10 +16,13 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from fingerspice import torch as torch
     from fingerspice.base.errors import FingerspiceError as FingerspiceError
     from fingerspice.base.errors import FingerspiceWarning as FingerspiceWarning
     from fingerspice.base.errors import InputError as InputError
     from fingerspice.circuit.circuit import Circuit as Circuit
+    from fingerspice.explorer.server import Explorer as Explorer
+    from fingerspice.explorer.server import explore as explore
     from fingerspice.netlist.netlist import parse_netlist as parse_netlist
     from fingerspice.netlist.netlist import read_netlist as read_netlist
     from fingerspice.results.loading import load as load
@@ -27,6 +30,9 @@ if TYPE_CHECKING:
     from fingerspice.results.outcome import Status as Status
     from fingerspice.results.plan import Plan as Plan
     from fingerspice.results.solution import Solution as Solution
+    from fingerspice.sets.citation import Citation as Citation
+    from fingerspice.sets.parameters import ParameterSet as ParameterSet
+    from fingerspice.sets.parameters import parameters as parameters
     from fingerspice.solve.simulation import plan as plan
     from fingerspice.solve.simulation import simulate as simulate
     from fingerspice.solve.streaming import stream as stream
@@ -35,6 +41,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.capability import capability as capability
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
+    from fingerspice.studies.contactfit import fit_contact as fit_contact
+    from fingerspice.studies.contactresult import ContactFit as ContactFit
     from fingerspice.studies.export import export_netlist as export_netlist
     from fingerspice.studies.feel import Feel as Feel
     from fingerspice.studies.feel import feel as feel
@@ -86,6 +94,9 @@ _HOMES = {
     "studies.capability": ("Capability", "capability"),
     "studies.comparison": ("Comparison", "compare"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
+    "explorer.server": ("Explorer", "explore"),
+    "studies.contactfit": ("fit_contact",),
+    "studies.contactresult": ("ContactFit",),
     "studies.export": ("export_netlist",),
     "studies.feel": ("Feel", "feel"),
     "studies.fit": ("fit",),
@@ -98,6 +109,8 @@ _HOMES = {
     "results.loading": ("load",),
     "studies.phasors": ("phasor",),
     "results.plan": ("Plan",),
+    "sets.citation": ("Citation",),
+    "sets.parameters": ("ParameterSet", "parameters"),
     "solve.simulation": ("plan", "simulate"),
     "solve.streaming": ("stream",),
     "results.outcome": ("SolveError", "Status"),
@@ -109,6 +122,9 @@ __all__ = ["__version__", *sorted(_HOME)]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "torch":
+        # Not among the names of the package, which all load without torch.
+        return import_module("fingerspice.torch")
     if name not in _HOME:
         raise AttributeError(f"module 'fingerspice' has no attribute {name!r}")
     value = getattr(import_module(f"fingerspice.{_HOME[name]}"), name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -96,3 +97,11 @@ class Shown:
 
     def _repr_html_(self) -> str:
         return self._page().html
+
+
+def in_notebook() -> bool:
+    """Whether this program runs in a notebook's kernel."""
+    # IPython is not a dependency: a notebook has imported it.
+    interactive = sys.modules.get("IPython")
+    shell = interactive.get_ipython() if interactive is not None else None
+    return shell is not None and hasattr(shell, "kernel")

@@ -16,8 +16,9 @@ from types import MappingProxyType
 from typing import Any
 
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
-from fingerspice.base.pages import Page, Shown
+from fingerspice.base.pages import Page
 from fingerspice.circuit.devices import DEVICES, DeviceSpec
+from fingerspice.circuit.doors import Doors
 from fingerspice.circuit.values import concerns, unusual, unusual_of_changed, value_of
 from fingerspice.waveforms.waveform import Waveform, as_waveform
 
@@ -130,7 +131,7 @@ class Parameter:
 
 
 @dataclass(frozen=True, repr=False)
-class Circuit(Shown):
+class Circuit(Doors):
     """A netlist, read.
 
     Attributes
@@ -155,6 +156,8 @@ class Circuit(Shown):
     path : Path or None
     overrides : mapping of str to str
         Changes made by `replace`, from path to value as text.
+    sets : mapping of str to mapping
+        Named sets of parameters that were applied, each with the values that it gave, by path.
     related : dict
         Cache of results that depend on nodes and devices alone, shared by all circuits that `replace` derives.
     """
@@ -171,6 +174,7 @@ class Circuit(Shown):
     text: str = ""
     path: Path | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
+    sets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     related: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     _memory: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 

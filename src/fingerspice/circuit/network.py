@@ -162,10 +162,25 @@ class Network:
 
     def phasors(self, frequency: ArrayLike, area: FloatArray, s: ComplexArray) -> ComplexArray:
         """Cell voltages (..., n_cell) at frequencies (Hz) and areas (n_area,) in m^2 for source phasors s (n_s,)."""
-        y = self.admittances(frequency, area)[..., None]
+        return np.asarray(self._live(self.admittances(frequency, area), s) @ self.p.T + self.q @ s)
+
+    def _live(self, y: ComplexArray, s: ComplexArray) -> ComplexArray:
+        """Phasors of the live voltages (..., n) for cells of the admittances y (..., n_cell)."""
+        y = y[..., None]
         driven = (self.b + self.p.T @ (y * self.q)) @ s
-        x = np.linalg.solve(self.k + self.p.T @ (y * self.p), -driven[..., None])[..., 0]
-        return np.asarray(x @ self.p.T + self.q @ s)
+        return np.asarray(np.linalg.solve(self.k + self.p.T @ (y * self.p), -driven[..., None])[..., 0])
+
+    def impedance(self, frequency: float, area: FloatArray) -> complex:
+        """Voltage of the one source over the current that it delivers, at a frequency (Hz), ohm."""
+        one, y = np.ones(1, complex), self.admittances(frequency, area)
+        x = self._live(y, one)
+        both = np.concatenate([x, one])
+        if self.n_voltage:
+            current = self.through[0] @ (y * (self.p @ x + self.q @ one)) + self.delivered[0] @ both
+            return complex(1.0 / current) if current != 0.0 else complex(np.inf)
+        source, at = self.sources[0], dict(zip(self.node_names, self.nodes[:, : both.size] @ both, strict=True))
+        p, n = (at.get(name, 0.0) for name in source.node_names[:2])
+        return complex(n - p)
 
 
 def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:

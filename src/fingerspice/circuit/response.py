@@ -75,6 +75,10 @@ class LinearScene:
             return np.asarray(network.grouping @ network.phasors(f, areas, np.ones(1, complex)))
         return np.asarray(_stack_gains(stack, f, areas) * stack.sign[stack.first_cell])
 
+    def impedance(self, f: float, areas: FloatArray) -> complex:
+        """What the source sees at one frequency (Hz): its voltage over the current that it delivers, ohm."""
+        return self.network.impedance(f, areas)
+
 
 def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
     """The linear scene of a circuit's GAP, which has to be named if there are several.

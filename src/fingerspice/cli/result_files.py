@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import html
 import json
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -132,7 +134,7 @@ def _hash(text: str) -> str:
 def _held(file: Path) -> dict[str, str] | None:
     """Attributes of a file that name its deck, changes and charge law; None if it has none."""
     try:
-        found = _of_data(file) if file.suffix == ".nc" else _of_picture(file)
+        found = {".nc": _of_data, ".svg": _of_drawing}.get(file.suffix, _of_picture)(file)
         if found is None or not all(isinstance(found.get(key), str) for key in _KNOWN):
             return None
         return found if isinstance(json.loads(found["overrides"]), dict) else None
@@ -154,6 +156,12 @@ def _of_data(file: Path) -> dict[str, str]:
     with h5netcdf.File(file, "r") as data:
         attributes = {str(key): str(value) for key, value in data.attrs.items()}
     return {**attributes, "deck_sha256": _hash(attributes["deck"])}
+
+
+def _of_drawing(file: Path) -> dict[str, str] | None:
+    """Attributes of a schematic, which are its description."""
+    found = re.search(r"<dc:description>(.*?)</dc:description>", file.read_text(encoding="utf-8"), re.DOTALL)
+    return None if found is None else dict(json.loads(html.unescape(found[1])))
 
 
 def _of_picture(file: Path) -> dict[str, str] | None:

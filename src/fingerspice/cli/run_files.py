@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -19,8 +20,10 @@ if TYPE_CHECKING:
     from fingerspice.studies.feel import Feel
 
 
-def written(solution: Solution, data: Path, picture: Path | None, results: Results) -> list[Callable[[], Path]]:
-    """Functions that write the files of a run: the data, then the picture if `picture` is not None."""
+def written(
+    solution: Solution, data: Path, picture: Path | None, results: Results, schematic: Path | None
+) -> list[Callable[[], Path]]:
+    """Functions that write the files of a run: the data, then the picture and the schematic where they have a path."""
     from fingerspice.plots.drawing import save
 
     if not solution.t.size:
@@ -29,6 +32,10 @@ def written(solution: Solution, data: Path, picture: Path | None, results: Resul
     writes: list[Callable[[], Path]] = [partial(solution.to_csv if data.suffix == ".csv" else solution.to_netcdf, data)]
     if picture is not None:
         writes.append(lambda: save(solution.plot(), picture, about=results.about))
+    if schematic is not None:
+        # An SVG file knows no names of our own, and keeps all of them as one text.
+        about = {"Description": json.dumps(results.about)}
+        writes.append(lambda: results.circuit.draw().write(schematic, about))
     return writes
 
 

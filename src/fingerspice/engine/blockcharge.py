@@ -20,7 +20,6 @@ from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockforms import BLOCK, COLLECTED, ERROR_Q, MIDDLE, PEAK_Q, PLACES, Form, Room, Shown, Z
 from fingerspice.engine.blockrows import area_rows, crossing, modes_into, scaled
 from fingerspice.engine.model import Model
-from fingerspice.engine.relaxation import project_for_charge
 
 
 class Charges(NamedTuple):
@@ -35,6 +34,8 @@ class Charges(NamedTuple):
         (C).
     z, current, error : ndarray, shape (n,)
         Charge (C) and current (A) at the starts of the steps, and error of the slowest layer's voltage (V).
+    h, t : ndarray, shape (n,)
+        Lengths of the steps, and their limits, s; the limits are needed for outputs within steps only.
     """
 
     q: FloatArray
@@ -42,6 +43,8 @@ class Charges(NamedTuple):
     z: FloatArray
     current: FloatArray
     error: FloatArray
+    h: FloatArray
+    t: FloatArray
 
 
 class Course(NamedTuple):
@@ -65,12 +68,12 @@ class Course(NamedTuple):
 def new_charges() -> Charges:
     """Rows for one block, all zero."""
     n = BLOCK + 8
-    return Charges(np.zeros((4, n)), np.zeros((5, n)), np.zeros(n), np.zeros(n), np.zeros(n))
+    return Charges(np.zeros((4, n)), np.zeros((5, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n))
 
 
 @jit_rows
 def _charge_rows(
-    n: int, h: float, slow: FloatArray, area0: float, kink: float, s: FloatArray, u: FloatArray,
+    n: int, h: FloatArray, slow: FloatArray, area0: float, kink: float, s: FloatArray, u: FloatArray,
     middle: FloatArray, ends: FloatArray, within: FloatArray, q: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
     """Charge gained in each step without c r G(u), its rates, and its error by Boole's rule, into `steps` (`Charges`).
@@ -88,7 +91,7 @@ def _charge_rows(
         a0, a1, a2, a3 = 1.0 / q[0, i], 1.0 / q[2, i], 1.0 / q[1, i], 1.0 / q[3, i]
         a4 = 1.0 / q[0, i + 1]
         l0, l1, l2, l3, l4 = ends[1, i], within[1, 1, i], within[0, 1, i], within[2, 1, i], ends[1, i + 1]
-        turn = c / h
+        turn = c / h[i]
         if mobile:
             turn = 0.0
             l0 = share * s0 + area0 * l0 / a0
@@ -123,18 +126,18 @@ def _charge_rows(
         bent = kink * jump * (g_area * (l0 + at * (l4 - l0)) + turn * (v4 - v0))
         steps[0, i], steps[1, i], steps[2, i] = r0, m2, m4
         kinked = bent * (0.5 * rest * rest - by_simpson)
-        steps[3, i] = c * (area0 if mobile else a0) * (v4 - v0) + h * (simpson + kinked)
-        steps[4, i] = h * (boole - simpson - bent * (by_boole - by_simpson))
+        steps[3, i] = c * (area0 if mobile else a0) * (v4 - v0) + h[i] * (simpson + kinked)
+        steps[4, i] = h[i] * (boole - simpson - bent * (by_boole - by_simpson))
 
 
 @jit_rows
 def _leaked_error(
-    n: int, h: float, slow: FloatArray, q: FloatArray, error: FloatArray, off: FloatArray
+    n: int, h: FloatArray, slow: FloatArray, q: FloatArray, error: FloatArray, off: FloatArray
 ) -> None:  # fmt: skip
     """Add to each step's error of the charge (C) the leakage that the error of the slow layer's voltage causes."""
     g_area, g_total = slow[slow.size - 2], slow[slow.size - 1]
     for i in range(n):
-        off[i] += 0.5 * h * (g_area / q[i] + g_total) * (error[i] + error[i + 1])
+        off[i] += 0.5 * h[i] * (g_area / q[i] + g_total) * (error[i] + error[i + 1])
 
 
 @jit
@@ -164,22 +167,22 @@ def moved_rows(
 
 
 @jit_within
-def charge_block(c: Course, r: int, level: int, n: int, h: float, local: float) -> None:
+def charge_block(c: Course, r: int, n: int, local: float) -> None:
     """Charge at the ends of a block's steps, and its error; `Room.own` holds the error of the modes.
 
-    `local` is the error of the gap voltage (V) that this block itself makes.
+    `local` is the error of the gap voltage (V) that this block itself makes. The projections that only the charge needs
+    are known, and `Charges.h`.
     """
     form, room, own, slow, v = c.form, c.room, c.charges, c.model.slow, c.form.tap_s.size - 2
-    project_for_charge(form, room, r, level, n)
     for place in range(len(PLACES)):
         area_rows(n, form.area, form.scale, form.shift, 0.0, room.u_within[place], own.q[1 + place])
     _charge_rows(
-        n, h, slow, form.area0 if form.mobile else 0.0, c.shown.area_kink, room.s, room.u, room.u_within[MIDDLE],
+        n, own.h, slow, form.area0 if form.mobile else 0.0, c.shown.area_kink, room.s, room.u, room.u_within[MIDDLE],
         room.end[v:], room.within[:, v:], own.q, own.steps,
     )  # fmt: skip
     scaled(n + 1, 0.0, room.s, own.error)
     modes_into(n + 1, 0, c.shown.slow[r], room.own, own.error)
-    _leaked_error(n, h, slow, own.q[0], own.error, own.steps[4])
+    _leaked_error(n, own.h, slow, own.q[0], own.error, own.steps[4])
     control = c.control
     z, collected, worst, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]
     stored = slow[slow.size - 3]
@@ -253,17 +256,17 @@ def current_at(
 
 @jit_rows
 def _current_rows(
-    n: int, slow: FloatArray, over_s: float, h: float, s: FloatArray, dv: FloatArray, v: FloatArray, q: FloatArray,
+    n: int, slow: FloatArray, over_s: float, h: FloatArray, s: FloatArray, dv: FloatArray, v: FloatArray, q: FloatArray,
     out: FloatArray,
 ) -> None:  # fmt: skip
     """Right-hand limit of the current (A) at the start of each step, under `local`."""
     c, g_area, g_total = slow[slow.size - 3], slow[slow.size - 2], slow[slow.size - 1]
     for i in range(n):
-        out[i] = (c * dv[i] + g_area * v[i] + (s[i + 1] - s[i]) / h * over_s) / q[i] + g_total * v[i]
+        out[i] = (c * dv[i] + g_area * v[i] + (s[i + 1] - s[i]) / h[i] * over_s) / q[i] + g_total * v[i]
 
 
 @jit_within
-def current_block(c: Course, r: int, n: int, h: float) -> None:
+def current_block(c: Course, r: int, n: int) -> None:
     """Right-hand limit of the current (A) at the start of each step, into `Charges.current`."""
     form, room, shown, own = c.form, c.room, c.shown, c.charges
     m, drives = form.rates.shape[1], room.g.shape[0]
@@ -274,7 +277,7 @@ def current_block(c: Course, r: int, n: int, h: float) -> None:
                 w[k] = room.w[k, i]
             for t in range(drives):
                 g[t] = room.g[t, i]
-            own.current[i] = current_at(c, r, w, g, room.s[i], (room.s[i + 1] - room.s[i]) / h, room.u[i])
+            own.current[i] = current_at(c, r, w, g, room.s[i], (room.s[i + 1] - room.s[i]) / own.h[i], room.u[i])
         return
     share, by_g, by_s = c.spare[0, :m], c.spare[1, :drives], 0.0
     for t in range(drives):
@@ -288,5 +291,6 @@ def current_block(c: Course, r: int, n: int, h: float) -> None:
     modes_into(n, 0, share, room.w, room.before)
     modes_into(n, 0, by_g, room.g, room.before)
     _current_rows(
-        n, c.model.slow, 1.0 / c.model.s, h, room.s, room.before, room.end[form.tap_s.size - 1], own.q[0], own.current
+        n, c.model.slow, 1.0 / c.model.s, own.h, room.s, room.before, room.end[form.tap_s.size - 1], own.q[0],
+        own.current,
     )  # fmt: skip

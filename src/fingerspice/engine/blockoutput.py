@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit, jit_within
+from fingerspice.base.compiled import borrow, jit, jit_within
 from fingerspice.engine.blockcharge import (
     Course,
     bend_at,
@@ -178,20 +178,16 @@ def _write_point(
 
 
 @jit
-def _write_points(
-    c: Course, r: int, n: int, h: float, start: float, slack: float, t_out: FloatArray, out: FloatArray, last: int
-) -> None:  # fmt: skip
-    """Write the outputs before number `last` one by one, at any times in the block."""
-    s = c.room.s
+def write_points(c: Course, r: int, n: int, slack: float, t_out: FloatArray, out: FloatArray, last: int) -> None:
+    """Write the outputs before number `last` one by one, at any times in the block, whose steps `Charges` lists."""
+    c = borrow(c)
+    s, t, h, i = c.room.s, c.charges.t, c.charges.h, 0
     for place in range(c.counters[OUTPUT], last):
-        along = max((t_out[place] - start) / h, 0.0)
-        i = min(int(along), n - 1)
-        at = min(along - i, 1.0)
-        if abs(t_out[place] - (start + (i + 1) * h)) <= slack and i + 1 < n:
-            i, at = i + 1, 0.0
-        elif abs(at * h) <= slack:
-            at = 0.0
-        _write_point(c, r, h, i, at, (s[i + 1] - s[i]) / h, out, place)
+        while i + 1 < n and t_out[place] >= t[i + 1] - slack:
+            i += 1
+        since = t_out[place] - t[i]
+        at = 0.0 if since <= slack else min(since / h[i], 1.0)
+        _write_point(c, r, h[i], i, at, (s[i + 1] - s[i]) / h[i], out, place)
 
 
 @jit
@@ -202,11 +198,33 @@ def _every(sub: int, count: int, x: FloatArray, out: FloatArray) -> None:
 
 
 @jit_within
+def write_samples(c: Course, r: int, sub: int, count: int, out: FloatArray) -> None:
+    """Write the outputs at the first `count` samples of a block; a sample has `sub` steps."""
+    form, room, shown, n, row = c.form, c.room, c.shown, count * sub, c.room.before
+    for column in range(shown.k.size):
+        if form.mobile:
+            scaled(n, 0.0, room.s, row)
+            modes_into(n, 0, shown.columns[r, column], room.w, row)
+            for i in range(n):
+                row[i] = shown.k[column] * room.s[i] + form.area0 * c.charges.q[0, i] * row[i]
+        else:
+            scaled(n, shown.k[column], room.s, row)
+            modes_into(n, 0, shown.columns[r, column], room.w, row)
+            if form.bend.size > 0:
+                add(n, shown.bend[column], room.g[room.g.shape[0] - 1], row)
+        _every(sub, count, row, out[column])
+    if shown.charge:
+        current_block(c, r, n)
+        _every(sub, count, c.charges.z, out[shown.k.size])
+        _every(sub, count, c.charges.current, out[shown.k.size + 1])
+
+
+@jit_within
 def write_block(
     c: Course, r: int, sub: int, count: int, h: float, start: float, t_out: FloatArray, out: FloatArray
 ) -> None:  # fmt: skip
     """Write the outputs of a block of `count` samples from its start (s) on, without those at its very end."""
-    form, room, shown, n, first = c.form, c.room, c.shown, count * sub, c.counters[OUTPUT]
+    shown, n, first = c.shown, count * sub, c.counters[OUTPUT]
     slack = 8e-16 * (abs(start) + n * h)
     last, aligned = first, True
     while last < t_out.size and t_out[last] < start + n * h - slack:
@@ -216,25 +234,11 @@ def write_block(
     if last == first:
         return
     if not aligned or last - first != count or shown.flows > 0:
-        _write_points(c, r, n, h, start, slack, t_out, out, last)
+        for i in range(n + 1):
+            c.charges.t[i] = start + i * h
+        write_points(c, r, n, slack, t_out, out, last)
     else:
-        row = room.before
-        for column in range(shown.k.size):
-            if form.mobile:
-                scaled(n, 0.0, room.s, row)
-                modes_into(n, 0, shown.columns[r, column], room.w, row)
-                for i in range(n):
-                    row[i] = shown.k[column] * room.s[i] + form.area0 * c.charges.q[0, i] * row[i]
-            else:
-                scaled(n, shown.k[column], room.s, row)
-                modes_into(n, 0, shown.columns[r, column], room.w, row)
-                if form.bend.size > 0:
-                    add(n, shown.bend[column], room.g[room.g.shape[0] - 1], row)
-            _every(sub, count, row, out[column, first:last])
-        if shown.charge:
-            current_block(c, r, n, h)
-            _every(sub, count, c.charges.z, out[shown.k.size, first:last])
-            _every(sub, count, c.charges.current, out[shown.k.size + 1, first:last])
+        write_samples(c, r, sub, count, out[:, first:last])
     c.counters[OUTPUT] = last
 
 

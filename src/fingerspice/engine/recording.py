@@ -30,7 +30,15 @@ from fingerspice.engine.blockforms import (
 from fingerspice.engine.blockoutput import write_block
 from fingerspice.engine.blockrows import add, add_two, area_rows, modes_into, recursion, scaled
 from fingerspice.engine.model import ramp
-from fingerspice.engine.relaxation import FIRST_NEWTON, LEAST_MARGIN, SPARE, look_at_ends, misfit, relax
+from fingerspice.engine.relaxation import (
+    FIRST_NEWTON,
+    LEAST_MARGIN,
+    SPARE,
+    look_at_ends,
+    misfit,
+    project_for_charge,
+    relax,
+)
 
 # Codes returned by `march`.
 DONE, NOT_CLOSED, TOO_COARSE = range(3)
@@ -39,7 +47,7 @@ _FARTHEST = 1.2
 
 
 @jit_rows
-def _peaks(
+def peaks_of(
     n: int, stress: float, u: FloatArray, q: FloatArray, error: FloatArray
 ) -> tuple[float, float, float, float]:  # fmt: skip
     """The largest |u|, force, force over voltage, and that times the error of the voltage in its place."""
@@ -56,7 +64,7 @@ def _peaks(
 
 
 @jit_rows
-def _largest(n: int, x: FloatArray) -> float:
+def largest_of(n: int, x: FloatArray) -> float:
     largest = 0.0
     for i in range(n):
         a = abs(x[i])
@@ -65,7 +73,7 @@ def _largest(n: int, x: FloatArray) -> float:
 
 
 @jit
-def _nearest(form: Form, q: float, r: int) -> int:
+def nearest(form: Form, q: float, r: int) -> int:
     """The reference for a value of 1/A: the present one, unless it is too far away."""
     if max(q / form.q0[r], form.q0[r] / q) <= _FARTHEST:
         return r
@@ -77,7 +85,7 @@ def _nearest(form: Form, q: float, r: int) -> int:
 
 
 @jit
-def _go_over(c: Course, r: int, to: int, w: FloatArray) -> None:
+def go_over(c: Course, r: int, to: int, w: FloatArray) -> None:
     """Transform modes around one reference into those around another."""
     live, shown = c.spare[0], c.shown
     for i in range(w.size):
@@ -124,14 +132,14 @@ def _block_error(c: Course, r: int, level: int, n: int) -> float:
         recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.own[k])
     scaled(n + 1, 0.0, room.s, room.before)
     modes_into(n + 1, 0, form.taps[r, 0], room.own, room.before)
-    worst = _largest(n + 1, room.before)
+    worst = largest_of(n + 1, room.before)
     # In the middle of a step the interpolation error of its parabola has not cancelled yet.
     for t in range(room.g.shape[0]):
         early = form.early[r, level, t]
         add_two(
             n, early[0], room.g_within[FIRST_QUARTER, t], early[1], room.g_within[LAST_QUARTER, t], room.before
         )  # fmt: skip
-    return max(worst, _largest(n, room.before))
+    return max(worst, largest_of(n, room.before))
 
 
 @jit_within
@@ -144,19 +152,18 @@ def _largest_error(c: Course, rows: FloatArray, n: int) -> float:
         carried = 0.0
         for k in range(c.w.size):
             carried += abs(rows[i, k] * c.error[k])
-        worst = max(worst, _largest(n + 1, room.before) + carried)
+        worst = max(worst, largest_of(n + 1, room.before) + carried)
     return worst
 
 
 @jit_within
-def _accept(
-    c: Course, r: int, level: int, n: int, h: float, local: float, left_over: float, magnified: float
-) -> None:  # fmt: skip
+def accept(c: Course, r: int, n: int, local: float, left_over: float, magnified: float) -> None:
     """Account for the peaks and errors of an accepted block, and move to its end.
 
-    `local` is the error of the gap voltage that the block adds, V; `left_over` is its part from the iteration.
+    `local` is the error of the gap voltage that the block adds, V; `left_over` is its part from the iteration. Row 2 of
+    `Course.spare` has the decay of every mode over the block, and `Charges.h` the lengths of its steps.
     """
-    room, control, decay = c.room, c.control, c.form.decay[r, level]
+    room, control = c.room, c.control
     carried = 0.0
     for k in range(c.w.size):
         carried += abs(c.form.taps[r, 0, k] * c.error[k])
@@ -165,7 +172,7 @@ def _accept(
         gap = room.slope
         scaled(n + 1, 1.0, room.u, gap)
         add(n + 1, -c.form.kappa, room.g[room.g.shape[0] - 1], gap)
-    peak, force, steepest, worst = _peaks(n + 1, c.shown.stress, gap, c.charges.q[0], room.before)
+    peak, force, steepest, worst = peaks_of(n + 1, c.shown.stress, gap, c.charges.q[0], room.before)
     control[PEAK_U], control[PEAK_F] = max(control[PEAK_U], peak), max(control[PEAK_F], force)
     off_u = local + magnified * carried
     # The force is proportional to the square of the voltage, and depends a little on the area.
@@ -181,10 +188,10 @@ def _accept(
         charge_error += c.shown.capacitance * left_over + c.shown.moves[1] * off_u
         control[ERROR_Q] = max(control[ERROR_Q], charge_error)
     if c.shown.charge:
-        charge_block(c, r, level, n, h, local)
+        charge_block(c, r, n, local)
     for k in range(c.w.size):
         c.w[k] = room.w[k, n]
-        c.error[k] = c.error[k] * decay[k] ** n + room.own[k, n]
+        c.error[k] = c.error[k] * c.spare[2, k] + room.own[k, n]
     control[U_GAP] = room.u[n]
     c.counters[STEPS] += n
 
@@ -211,10 +218,10 @@ def march(
             room.w[k, 0] = c.w[k]
         room.u[0] = control[U_GAP]
         look_at_ends(form, room, r, 1, FIRST_NEWTON)
-        to = _nearest(form, form.q0[r] + room.z[0], r)
+        to = nearest(form, form.q0[r] + room.z[0], r)
         if to != r:
-            _go_over(c, r, to, c.w)
-            _go_over(c, r, to, c.error)
+            go_over(c, r, to, c.w)
+            go_over(c, r, to, c.error)
             control[REFERENCE] = to
             continue
         left_over, margin, sweeps = relax(form, room, r, level, h, c.shown.kink, n, tol)
@@ -226,7 +233,7 @@ def march(
             area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
             if form.mobile:
                 # The gap voltage contains the state times 1/A, and a near fold magnifies its error.
-                magnified = form.area0 * _largest(n + 1, c.charges.q[0]) / margin
+                magnified = form.area0 * largest_of(n + 1, c.charges.q[0]) / margin
             local = left_over + magnified * _block_error(c, r, level, n)
         if not local <= tol:
             if level + 1 == LEVELS or margin <= LEAST_MARGIN:
@@ -236,7 +243,13 @@ def march(
             c.counters[REFUSED] += n
             continue
         control[MARGIN] = min(control[MARGIN], margin)
-        _accept(c, r, level, n, h, local, left_over, magnified)
+        for k in range(c.w.size):
+            c.spare[2, k] = form.decay[r, level, k] ** n
+        for i in range(n):
+            c.charges.h[i] = h
+        if c.shown.charge:
+            project_for_charge(form, room, r, level, n)
+        accept(c, r, n, local, left_over, magnified)
         write_block(c, r, sub, count, h, start + at * spacing, t_out, out)
         at += count
         if level > 0 and local < SPARE * tol:

@@ -148,10 +148,11 @@ def _charge_law(includes: tuple[str, ...]) -> str | None:
     return laws.pop() if laws else None
 
 
-def source_from_text(text: str, circuit: Circuit) -> Waveform:
+def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Waveform:
     """A waveform from netlist text such as ``SQUARE(200 100)`` or ``WAVEFILE(a.wav 150)``.
 
-    SPICE's defaults come from the circuit's .tran, and file names are relative to the working directory.
+    SPICE's defaults come from the circuit's .tran, and file names are relative to the working directory. Without
+    `files`, for a text from elsewhere, no file is read.
 
     Raises
     ------
@@ -160,8 +161,8 @@ def source_from_text(text: str, circuit: Circuit) -> Waveform:
     """
     tran = circuit.tran
     line = f".tran {tran.step!r} {tran.stop!r}\n" if tran else ""
-    files = SourceFiles(anywhere=True)
-    context = Context(tran.step if tran else None, tran.stop if tran else None, files)
+    found = SourceFiles(anywhere=files)
+    context = Context(tran.step if tran else None, tran.stop if tran else None, found)
     try:
         deck = parse_deck(f"source\nVsource a 0 {text}\n{line}")
         if len(deck.statements) != 1:

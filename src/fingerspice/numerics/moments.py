@@ -22,11 +22,12 @@ def moments(z: float, out: FloatArray) -> None:
         for j in range(1, count):
             out[j] = (1.0 - j * out[j - 1]) / z
         return
-    # exp(-z) sum of z^k / (k! (k + count)): all terms are positive.
-    total, term = 0.0, 1.0
-    for k in range(60):
+    # exp(-z) sum of z^k / (k! (k + count)): all terms are positive, and once one is small the next are smaller.
+    total, term, k = 0.0, 1.0, 0.0
+    while term > 1e-17 * total:
         total += term / (k + count)
-        term *= z / (k + 1.0)
+        k += 1.0
+        term *= z / k
     out[count - 1] = math.exp(-z) * total
     for j in range(count - 1, 0, -1):
         out[j - 1] = (1.0 - z * out[j]) / j

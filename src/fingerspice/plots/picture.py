@@ -10,6 +10,7 @@ from matplotlib.backend_bases import FigureManagerBase
 from matplotlib.figure import Figure
 
 from fingerspice.base.errors import InputError
+from fingerspice.base.pages import in_notebook
 
 #: Resolution (dots per inch) of the picture in a notebook, and the factor by which the notebook scales it down.
 _DPI, _SHARPER = 200, 2
@@ -32,7 +33,7 @@ class Picture(Figure):
         InputError
             If there is no notebook and no window can be opened.
         """
-        if _in_notebook():
+        if in_notebook():
             # IPython is not a dependency: take it from `sys.modules`, as a notebook has imported it.
             sys.modules["IPython"].display.display(self)
             return
@@ -52,12 +53,6 @@ class Picture(Figure):
         manager = canvas.new_manager(self, max(pyplot.get_fignums(), default=0) + 1)
         Gcf._set_new_active_manager(manager)
         pyplot.show()
-
-
-def _in_notebook() -> bool:
-    interactive = sys.modules.get("IPython")
-    shell = interactive.get_ipython() if interactive is not None else None
-    return shell is not None and hasattr(shell, "kernel")
 
 
 def _opens(manager: Any) -> bool:

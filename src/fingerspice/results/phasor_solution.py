@@ -45,6 +45,8 @@ class PhasorSolution(Shown):
         Warnings of extrapolation and of implausible results.
     circuit : Circuit or None
         The circuit of the sweep.
+    impedance : ndarray of complex or None
+        Voltage of the source over its current, ohm; None for a large-signal sweep.
     """
 
     frequency: FloatArray
@@ -60,6 +62,7 @@ class PhasorSolution(Shown):
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     circuit: Circuit | None = None
+    impedance: ComplexArray | None = None
 
     def _page(self) -> Page:
         from fingerspice.results.report import phasor_table

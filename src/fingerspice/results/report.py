@@ -119,6 +119,8 @@ def phasor_dict(result: PhasorSolution) -> dict[str, Any]:
         "u_gap": np.abs(result.u_gap).tolist(),
         "area": result.area.tolist(),
         "f_el_mean": result.f_el_mean.tolist(),
+        "impedance": None if result.impedance is None else np.abs(result.impedance).tolist(),
+        "impedance_phase_deg": None if result.impedance is None else np.degrees(np.angle(result.impedance)).tolist(),
         "amplitude": result.amplitude,
         "source_phase_deg": math.degrees(result.phase),
         "drive": result.drive,
@@ -144,10 +146,16 @@ def phasor_table(result: PhasorSolution, most: int = 40) -> Page:
             f"{data['u_gap'][i]:.5g}",
             f"{1e6 * data['area'][i]:.5g}",
             f"{data['f_el_mean'][i]:.5g}",
+            *(
+                ()
+                if result.impedance is None
+                else (f"{data['impedance'][i]:.5g}", f"{data['impedance_phase_deg'][i]:.3f}")
+            ),
         )
         for i in keep
     ]
-    head = ("frequency [Hz]", "|u_gap/U|", "phase [deg]", "u_gap [V]", "area [mm^2]", "mean force [N]")
+    head: tuple[str, ...] = ("frequency [Hz]", "|u_gap/U|", "phase [deg]", "u_gap [V]", "area [mm^2]", "mean force [N]")
+    head += () if result.impedance is None else ("|Z| [ohm]", "phase of Z [deg]")
     drive = f"source amplitude {format_si(result.amplitude, 'V')}, phase {math.degrees(result.phase):.4g} deg"
     said = [f"{drive}: {result.drive}", *result.notes]
     return Page([*said, Table(head, rows)])
@@ -155,17 +163,26 @@ def phasor_table(result: PhasorSolution, most: int = 40) -> Page:
 
 def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:
     """Write sweeps as CSV, one after the other where there are several amplitudes."""
-    columns = ("frequency", "gain", "phase_deg", "u_gap", "area", "f_el_mean")
-    units = ("Hz", "1", "deg", "V", "m^2", "N")
+    units = {
+        "frequency": "Hz",
+        "gain": "1",
+        "phase_deg": "deg",
+        "u_gap": "V",
+        "area": "m^2",
+        "f_el_mean": "N",
+        "amplitude": "V",
+    }
+    if all(result.impedance is not None for result in results):
+        units |= {"impedance": "ohm", "impedance_phase_deg": "deg"}
 
     def write(target: Path) -> None:
         with target.open("w", newline="", encoding="utf-8") as stream:
             writer = csv.writer(stream)
-            head = [f"{c} [{u}]" for c, u in zip(columns, units, strict=True)]
-            writer.writerow([*head, "amplitude [V]"])
+            head = [f"{name} [{unit}]" for name, unit in units.items()]
+            writer.writerow(head)
             for result in results:
-                data = phasor_dict(result)
-                for row in zip(*(data[c] for c in columns), strict=True):
-                    writer.writerow([*map(repr, row), repr(result.amplitude)])
+                data = phasor_dict(result) | {"amplitude": [result.amplitude] * result.frequency.size}
+                for row in zip(*(data[name] for name in units), strict=True):
+                    writer.writerow(map(repr, row))
 
     return write_aside(path, write)

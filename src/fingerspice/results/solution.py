@@ -9,19 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.pages import Page, Shown
+from fingerspice.base.pages import Page
 from fingerspice.results.datafiles import dataset, to_dataframe, write_csv, write_netcdf
+from fingerspice.results.doors import Doors
 from fingerspice.results.outcome import ErrorEstimate, Failure, State, Status
 from fingerspice.results.record import Sealed, sealed
 from fingerspice.results.signals import SIGNALS, AnyRecord, Signals
 from fingerspice.results.summary import Figured, Figures, KeptFigures
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     import pandas
     import xarray
-    from matplotlib.figure import Figure
 
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.results.plan import Plan
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, repr=False)
-class Solution(Sealed, Shown, Figured):
+class Solution(Sealed, Doors, Figured):
     """Time response of a circuit.
 
     Signals are read-only arrays in SI units, computed when they are first asked for. A jump of the source has two rows
@@ -258,6 +258,7 @@ class Solution(Sealed, Shown, Figured):
             "file": str(self.circuit.path or ""),
             "deck": self.circuit.text,
             "overrides": json.dumps(dict(self.circuit.overrides)),
+            "sets": json.dumps({n: {path: repr(x) for path, x in s.items()} for n, s in self.circuit.sets.items()}),
             "charge_law": self.charge_law,
             "area": self.area_mode,
             "method": self.method,
@@ -362,39 +363,3 @@ class Solution(Sealed, Shown, Figured):
         from fingerspice.results.spectrum import spectrum_of
 
         return spectrum_of(self, signal, method, highest, resolution, since)
-
-    def plot(
-        self,
-        signals: str | Sequence[str] | None = None,
-        *,
-        window: tuple[float, float] | None = None,
-        others: Solution | Sequence[Solution] | Mapping[str, Solution] = (),
-    ) -> Figure:
-        """Draw signals against time: a notebook shows the figure, and from a script ``plot().show()`` opens a window.
-
-        More than about 30 oscillations are drawn as envelopes, and a second column shows the last few of them enlarged;
-        it also shows a short event enlarged.
-
-        Parameters
-        ----------
-        signals : str or sequence of str, optional
-            Keys of `signals`, such as ``"f_el"``, ``"u_layer:Xcoat"``, or ``"u_layer"`` for all layers; signals of the
-            same quantity share a panel. The default is source and gap voltage, force, area and friction.
-        window : tuple of float, optional
-            Start and end, s; the whole run by default.
-        others : Solution, sequence or mapping of str to Solution, optional
-            Runs to draw over this one; without names they are called by the facts in which they differ.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            ``savefig("x.pdf")`` saves it, ``show()`` shows it.
-
-        Raises
-        ------
-        InputError
-            For an unknown signal, or a window without outputs.
-        """
-        from fingerspice.plots.traces import plot_solution
-
-        return plot_solution(self, signals, window, others)

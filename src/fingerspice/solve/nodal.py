@@ -39,8 +39,8 @@ PROBES, PROBES_PER_PERIOD, MOST_PROBES = 512, 32, 20_000
 # They are also compared after at most so many edges of the sources, at these fractions of the time to the next edge.
 MOST_EDGES, AFTER_EDGE = 256, np.geomspace(1e-15, 0.3, 30)
 ATTEMPTS = 6
-# Relative difference of a fold's times in two successive runs at which the fold is accepted at once; and the one at
-# which it is accepted after the last attempt.
+# Difference of a fold's times in two successive runs at which the fold is accepted at once, over its time; and the one
+# at which it is accepted after the last attempt, over its time or the source's shortest time, if that is longer.
 FOLD_TIME, FOLD_SPREAD = 1e-10, 1e-5
 # Limit of accepted and rejected steps: at the start, and over the whole run. A run that needs more has a cause that
 # smaller steps do not remove.
@@ -187,10 +187,10 @@ def solve_coupled(
             tol, run.status = max(0.03 * tol, FINEST), Status.ERROR_NOT_MET
         elif run.status is Status.FOLD and run.t_failed is not None:
             # The error of the state shifts the fold: reduce the tolerance until the fold's time no longer moves.
-            moved, folded = abs(run.t_failed - folded) / run.t_failed if run.t_failed > 0.0 else 0.0, run.t_failed
+            moved, folded = abs(run.t_failed - folded), run.t_failed
             if nearest is None or moved < nearest[0]:
                 nearest = moved, run
-            if moved <= FOLD_TIME:
+            if moved <= FOLD_TIME * folded:
                 break
             tol = max(0.03 * tol, FINEST)
         elif run.status is not Status.SUCCESS or (worst <= 1.0 and beside.status is not Status.FOLD):
@@ -201,7 +201,8 @@ def solve_coupled(
             tol = max(tol * min(0.3, 0.5 / worst if worst > 0.0 else 0.3), FINEST)
         if last:
             break
-    believed = nearest is not None and nearest[0] <= FOLD_SPREAD
+    span = max(folded, min(problem.waveform.shortest_time(), problem.t_stop - problem.t_start))
+    believed = nearest is not None and nearest[0] <= FOLD_SPREAD * span
     if nearest is not None and (run.status is Status.FOLD or (believed and run.status is not Status.SUCCESS)):
         # Round-off may dominate at the finest tolerances: take the run whose fold differs least from its predecessor's.
         run = nearest[1]

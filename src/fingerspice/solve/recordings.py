@@ -6,10 +6,8 @@ long the run is, and whether all outputs are held in one array or streamed in ch
 
 from __future__ import annotations
 
-import itertools
-import math
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 from functools import partial
 from typing import Any
@@ -17,22 +15,21 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.engine import blockforms, recording
+from fingerspice.engine import blockforms, recording, uneven
 from fingerspice.engine.blockforms import BLOCK, Form
 from fingerspice.engine.blockoutput import write_end
+from fingerspice.engine.unevenweights import new_steps
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.refined import ClosedForm
 from fingerspice.solve.forms import Follower, followed
 from fingerspice.solve.marching import solve as solve_ordinary
-from fingerspice.solve.netforms import finger, recording_of
+from fingerspice.solve.netforms import finger
+from fingerspice.solve.pieces import Piece, driving, pieces_of, spacing_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Progress, Run, excess_of, kept_with
-from fingerspice.waveforms.recorded import MOST_PER_POINT, as_samples
-from fingerspice.waveforms.samples import Samples
+from fingerspice.waveforms.ramps import PWL
 
-# Fewest samples for which this method pays, and the samples of a piece; pieces begin at multiples of that number.
-LEAST_SAMPLES, PIECE = 64, 1 << 16
 # Error allowed in a block, relative to the error asked for; ratio of stated to estimated error; attempts at a piece.
 SHARE, SAFETY, ATTEMPTS = 0.2, 2.0, 4
 # The error of a piece is related to the peaks up to its end, or to this share of the largest gap voltage that the
@@ -45,76 +42,6 @@ BEGINNINGS = (1.0, 0.03)
 LED_SHARE = 0.1
 # Number of forms cached with a scene, of up to 0.2 MB each: one for each tolerance, sample spacing and thread.
 MOST_FORMS = 16
-
-
-@dataclass(frozen=True)
-class Piece:
-    """A part of a run with evenly spaced samples.
-
-    Attributes
-    ----------
-    start, spacing : float
-        Time of the first sample and distance of the samples, s.
-    first, last : int
-        Numbers of the first and the last sample; both 0 for a single step between two times that are no samples.
-    led : bool
-        Whether the ordinary engine integrates it: where a run of a network starts, the source may jump, after which
-        fast modes decay that no step of a sample resolves.
-    """
-
-    start: float
-    spacing: float
-    first: int = 0
-    last: int = 0
-    led: bool = False
-
-    @property
-    def stop(self) -> float:
-        return self.start + max(self.last - self.first, 1) * self.spacing
-
-    def values(self, wave: Samples) -> FloatArray:
-        """The source at the limits of the steps, V."""
-        if self.first == self.last:
-            return wave.value([self.start, self.start + self.spacing])
-        return wave.between(self.first, self.last + 1)
-
-
-def driving(problem: Problem) -> Samples | None:
-    """The recording that drives a stack, or one source of a network whose other sources are at 0; else None."""
-    if problem.scene.stack is not None:
-        return as_samples(problem.waveform)
-    found = recording_of(problem)
-    return None if found is None else found[1]
-
-
-def pieces_of(problem: Problem) -> list[Piece] | None:
-    """The pieces of a run with a moving area that is driven by a recording of enough samples; else None."""
-    wave = driving(problem) if problem.scene.coupled else None
-    if wave is None:
-        return None
-    spacing, t0, t1 = 1.0 / wave.rate, problem.t_start, problem.t_stop
-    first, last = math.ceil((t0 - wave.start) * wave.rate - 1e-6), math.floor((t1 - wave.start) * wave.rate + 1e-6)
-    if last - first < LEAST_SAMPLES:
-        return None
-    if (
-        not any(isinstance(one, Samples) for one in problem.waveforms)
-        and last - first > MOST_PER_POINT * problem.breakpoints().size
-    ):
-        # In most of the run the source is one long line, of which the other methods need few steps.
-        return None
-    led, begin, end = problem.scene.stack is None, wave.start + first * spacing, wave.start + last * spacing
-    early = begin - t0 > 1e-6 * spacing
-    edges = [first, *range((first // PIECE + 1) * PIECE, last, PIECE), last]
-    if led and not early:
-        edges.insert(1, first + 1)
-    out = [Piece(wave.start + a * spacing, spacing, a, b) for a, b in itertools.pairwise(edges) if a < b]
-    if early:
-        out.insert(0, Piece(t0, begin - t0))
-    if led:
-        out[0] = replace(out[0], led=True)
-    if t1 - end > 1e-6 * spacing:
-        out.append(Piece(end, t1 - end))
-    return out
 
 
 class Outcome(Enum):
@@ -144,15 +71,13 @@ class March:
         self.t, self.loudest, self.u_last, self.spacing = problem.t_start, 0.0, 0.0, 0.0
         self.led = [0.0] * 4
         self.width = one.width
-        self.course = one.course(problem, self._form(1.0 / self.wave.rate))
+        wave = driving(problem)
+        assert wave is not None
+        self.wave, self.usual = wave, spacing_of(wave)
+        self.course = one.course(problem, self._form(self.usual))
+        self.steps = new_steps(self.course.w.size) if isinstance(wave, PWL) else None
         held = float(np.abs(problem.initial.y).max(initial=0.0))
         self.least = max(held, LEAST_PEAK * problem.scene.u_peak * one.share)
-
-    @property
-    def wave(self) -> Samples:
-        wave = driving(self.problem)
-        assert wave is not None
-        return wave
 
     def _form(self, spacing: float) -> Form:
         kept, decade = self.problem.scene.prepared, _decade(self.rtol)
@@ -175,9 +100,12 @@ class March:
         before = self.mark()
         for _ in range(ATTEMPTS):
             tol = self.share * SHARE * self.rtol * scale
-            code = recording.march(
-                self.course, values, 0, values.size - 1, piece.start, piece.spacing, tol, t_out, out
-            )  # fmt: skip
+            if self.steps is not None and piece.times is not None:
+                code = uneven.march(self.course, self.steps, piece.times, values, tol, t_out, out)
+            else:
+                code = recording.march(
+                    self.course, values, 0, values.size - 1, piece.start, piece.spacing, tol, t_out, out
+                )  # fmt: skip
             if code != recording.DONE or control[blockforms.PEAK_U] > one.u_top:
                 return Outcome.LOST
             gaps, _, _ = self.stated()
@@ -232,7 +160,7 @@ class March:
         for name, value in numbers.items():
             setattr(self, name, value)
         self.recall([np.array(x) for x in arrays])
-        self.course = self.course._replace(form=self._form(self.spacing or 1.0 / self.wave.rate))
+        self.course = self.course._replace(form=self._form(self.spacing or self.usual))
 
     @property
     def outputs(self) -> int:
@@ -245,7 +173,7 @@ class March:
 
     def finish(self, t_out: FloatArray, out: FloatArray) -> None:
         """Write the outputs at the end of the run."""
-        stop, after = self.problem.t_stop, 1e-3 / self.wave.rate
+        stop, after = self.problem.t_stop, 1e-3 * self.usual
         here, later = self.wave.value([stop, stop + after]).tolist()
         write_end(self.course, self.u_last, (later - here) / after, t_out, out)
 

@@ -22,7 +22,7 @@ from fingerspice.numerics.lobatto import NODES, POINTS, integral_table
 from fingerspice.physics.contact import N_PACKED, areas
 from fingerspice.results.outcome import Failure, SolveError, Status
 from fingerspice.results.record import Record, sided
-from fingerspice.results.sensitivity import Sensitivity, sensitivity_of, tangents_at
+from fingerspice.results.sensitivity import Sensitivity, Tangents, sensitivity_of, tangents_at
 from fingerspice.results.solution import Solution
 from fingerspice.results.steps import Recorded, Stretches, basis
 from fingerspice.solve.initial import initial_state
@@ -234,10 +234,36 @@ def _one_period(course: Course, steps: _Steps, end: float) -> Course:
     return Course(np.append(course.h, share * course.h[step]), order, u, s, moved)
 
 
+def _longer(varied: Sequence[_Varied], problem: Problem) -> FloatArray:
+    """Changes of the source's period by every parameter, s per unit."""
+    own, out = problem.waveform.period, np.zeros(len(varied))
+    for i, one in enumerate(varied):
+        periods = [build_stack(circuit).waveform.period for circuit in one.circuits]
+        if own is None or any(period is None or abs(period / own - 1.0) > 0.01 for period in periods):
+            raise InputError(
+                f"sensitivities of a periodic state name {one.path}, near whose value the source has no such period; "
+                "allowed: other parameters, or a run from another start"
+            )
+        out[i] = 0.0 if all(period == own for period in periods) else one.by([period or own for period in periods])
+    return out
+
+
+def _drift(problem: Problem, course: Course, own: FloatArray) -> FloatArray:
+    """x' of the run's own state x at its start, 1/s."""
+    model, first = model_of(problem.scene), course.order[0]
+    q = float(1.0 / areas(course.u[first, :1], model.curve)[0])
+    k, rate, rate0 = (np.asarray(x, float) for x in (model.k, model.rate, model.rate0))
+    source = course.s[first, 0] / q if model.mobile else course.s[first, 0]
+    leak = (rate + q * rate0) * (k * source + np.append(own, -own.sum()))
+    return np.asarray((k * leak.sum() - leak)[:-1])
+
+
 def _closed(
-    problem: Problem, rtol: float, course: Course, changes: Changes, start: FloatArray, steps: _Steps
-) -> FloatArray:
-    """The tangents at the start of a periodic state: those that a period leads back to."""
+    problem: Problem, rtol: float, course: Course, changes: Changes, start: FloatArray, steps: _Steps,
+    longer: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """The tangents at the start of a periodic state: those that a period leads back to; it grows by `longer`."""
+    drift = np.outer(longer, _drift(problem, course, start[0]))
     period, n, count = problem.waveform.period or math.inf, start.shape[1], len(start) - 1
     if problem.t_stop - problem.t_start < period * (1.0 - 1e-9):
         raise InputError(
@@ -250,7 +276,7 @@ def _closed(
     first = np.concatenate([start, np.eye(n)])
     _, ends = _followed(problem, rtol, course._replace(moved=moved), more, first, steps)
     out = start.copy()
-    out[1:] = np.linalg.solve(np.eye(n) - ends[1 + count :].T, ends[1 : 1 + count].T).T
+    out[1:] = np.linalg.solve(np.eye(n) - ends[1 + count :].T, (ends[1 : 1 + count] + drift).T).T
     return out
 
 
@@ -274,7 +300,23 @@ def _weights(problem: Problem, steps: _Steps) -> tuple[FloatArray, FloatArray]:
     return low + (1.0 - low) * POINTS[:NODES], weight / weight.sum()
 
 
-def sensitivities_of(problem: Problem, solution: Solution, paths: Sequence[str], start: str) -> dict[str, Sensitivity]:
+def _grown(
+    at: Tangents, packed: FloatArray, u: FloatArray, area: FloatArray, weight: FloatArray, growth: float
+) -> Tangents:
+    """The changes at the nodes, with what means over a period gain where it grows by `growth`, relative to itself."""
+    stress, f_n, mu = packed[4:7]
+
+    def gain(x: FloatArray) -> float:
+        return float(growth * (x[-1] - (weight * x).sum()))
+
+    f_el = gain(stress * u**2 * area)
+    f_t = mu * f_el
+    return Tangents(at.u_gap, at.area + gain(area), at.f_el + f_el, at.f_t + f_t, at.friction + f_t / f_n)
+
+
+def sensitivities_of(
+    problem: Problem, solution: Solution, paths: Sequence[str], start: str, over_period: bool = False
+) -> dict[str, Sensitivity]:
     """Derivatives of a run's signals by parameters.
 
     Parameters
@@ -286,6 +328,8 @@ def sensitivities_of(problem: Problem, solution: Solution, paths: Sequence[str],
         As in `Circuit.replace`.
     start : str
         How the run started.
+    over_period : bool
+        Whether means are over a period, which a parameter may change.
 
     Raises
     ------
@@ -310,9 +354,10 @@ def sensitivities_of(problem: Problem, solution: Solution, paths: Sequence[str],
     u, s = (stretches.at_points(read, every)[1] for read in (lambda one: turn * one.u_gap, lambda one: one.u_source))
     moved = _source_changes(varied, steps, problem)
     course = Course(stretches.length * stretches.reach, steps.order, u, s, moved)
-    begun = _starts(varied, problem, start)
+    begun, longer = _starts(varied, problem, start), np.zeros(len(varied))
     if start == "periodic":
-        begun = _closed(problem, rtol, course, changes, begun, steps)
+        longer = _longer(varied, problem)
+        begun = _closed(problem, rtol, course, changes, begun, steps, longer)
     nodes, _ = _followed(problem, rtol, course, changes, begun, steps)
     outputs = _at_outputs(steps, record, nodes.reshape(-1, *nodes.shape[2:])).reshape(len(varied), 2, -1)
     fraction, weight = _weights(problem, steps)
@@ -327,5 +372,8 @@ def sensitivities_of(problem: Problem, solution: Solution, paths: Sequence[str],
         by_packed = changes.contact[i]
         at_outputs = tangents_at(packed, by_packed, turn * record.u_gap, area, *outputs[i])
         at_nodes = tangents_at(packed, by_packed, flat[0], area_inside, *flat[1 + 2 * i : 3 + 2 * i])
+        if over_period:
+            growth = float(longer[i] / (problem.waveform.period or math.inf))
+            at_nodes = _grown(at_nodes, packed, flat[0], area_inside, weight.ravel(), growth)
         found[one.path] = sensitivity_of(one.path, one.unit, one.value, at_outputs, at_nodes, weight.ravel(), turn)
     return found

@@ -3,136 +3,34 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.errors import InputError
 from fingerspice.circuit.arguments import require_circuit, require_number
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack, is_stack
-from fingerspice.results.outcome import SolveError
-from fingerspice.solve.simulation import RTOL_RANGE, simulate
+from fingerspice.solve.simulation import RTOL_RANGE
 from fingerspice.studies.batch import batch
-from fingerspice.studies.fitdata import Data, data_of
+from fingerspice.studies.fitdata import IMPEDANCE, Data, data_of
+from fingerspice.studies.fitgroups import Unknown, group_column, unknowns_of
+from fingerspice.studies.fitprofile import limit_of, profile_of
 from fingerspice.studies.fitresult import Fit, Fitted, fit_result
-from fingerspice.studies.steady import steady_state
+from fingerspice.studies.fittask import REFUSED, Task, followed
 from fingerspice.waveforms.waveform import require
 
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.
 _SPREAD, _FOLLOWED = 4.0, 3
-# Relative step of a difference, where derivatives are not exact: of networks.
-_STEP = 1e-4
-# What a scene that cannot be run counts as, over the scale of the data.
-_REFUSED = 1e6
-# Error of the least squares' last step, relative, and of the means by which starts are compared.
-_CLOSE, _ROUGH = 1e-8, 1e-3
-
-
-@dataclass(frozen=True)
-class Task:
-    """What is fitted.
-
-    Attributes
-    ----------
-    circuit : Circuit
-        With the values to start from.
-    data : Data
-    paths : tuple of str
-    bounds : ndarray, shape (n_parameter, 2)
-        Smallest and largest values.
-    average : str
-    skin : str
-    rtol : float
-    charge_law : str or None
-    scale : ndarray, shape (n,)
-        By which residuals are divided.
-    exact : bool
-        Whether derivatives are those of a series stack, and not differences.
-    """
-
-    circuit: Circuit
-    data: Data
-    paths: tuple[str, ...]
-    bounds: FloatArray
-    average: str
-    skin: str
-    rtol: float
-    charge_law: str | None
-    scale: FloatArray
-    exact: bool
-
-    @property
-    def initial(self) -> FloatArray:
-        """Values to start from."""
-        return np.array([self.circuit.parameters[path].value for path in self.paths])
-
-    def scene(self, values: FloatArray, row: int) -> Circuit:
-        """The circuit of one measurement."""
-        changes = {path: float(x[row]) for path, x in self.data.conditions.items()}
-        changed = self.circuit.varied(changes | dict(zip(self.paths, values.tolist(), strict=True)))
-        if self.skin == "follow":
-            fundamental = build_stack(changed).waveform.fundamental if is_stack(changed) else None
-            skins = {f"{e.name}.f": fundamental.frequency for e in changed.by_device("SKIN") if fundamental is not None}
-            changed = changed.varied(skins)
-        return changed
-
-    def predict(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Predicted data (n,), and their derivatives by the logarithms of the parameters (n, n_parameter)."""
-        if self.exact:
-            return self._predicted(values, self.paths)
-        middle, _ = self._predicted(values, ())
-        by = np.empty((middle.size, values.size))
-        for k in range(values.size):
-            pair = []
-            for sign in (-1.0, 1.0):
-                moved = values.copy()
-                moved[k] *= 1.0 + sign * _STEP
-                pair.append(self._predicted(moved, ())[0])
-            by[:, k] = (pair[1] - pair[0]) / (2.0 * _STEP)
-        return middle, by
-
-    def _predicted(self, values: FloatArray, paths: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
-        data, how = self.data, {"rtol": self.rtol, "charge_law": self.charge_law, "charge": False}
-        if data.t is not None:
-            run = simulate(self.scene(values, 0), t_eval=data.t, sensitivities=paths, **how)  # type: ignore[arg-type]
-            slopes = [getattr(run.sensitivities[path], data.signal) for path in paths]
-            return np.asarray(getattr(run, data.signal)), np.array(slopes).reshape(len(paths), -1).T * values[
-                : len(paths)
-            ]
-        name, found, by = f"{data.signal}_mean", np.empty(data.values.size), np.empty((data.values.size, len(paths)))
-        for row in range(data.values.size):
-            circuit = self.scene(values, row)
-            if self.average == "periodic":
-                one = steady_state(circuit, sensitivities=paths, points=4, **how)  # type: ignore[arg-type]
-            else:
-                one = simulate(circuit, sensitivities=paths, t_eval=[0.0], t_stop=_end(circuit), **how)  # type: ignore[arg-type,assignment]
-            found[row] = getattr(one, name)
-            for k, path in enumerate(paths):
-                by[row, k] = getattr(one.sensitivities[path], name) * values[k]
-        return found, by
-
-    def residuals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals over their scale, and their derivatives; large ones where a scene cannot be run."""
-        try:
-            with warnings.catch_warnings():
-                # Of values that no user has written.
-                warnings.simplefilter("ignore", FingerspiceWarning)
-                found, by = self.predict(values)
-        except (InputError, SolveError):
-            return np.full(self.scale.size, _REFUSED), np.zeros((self.scale.size, values.size))
-        return (found - self.data.values) / self.scale, by / self.scale[:, None]
-
-
-def _end(circuit: Circuit) -> float:
-    if circuit.tran is None:
-        raise InputError("the deck has no .tran, and average is 'run'; allowed: a deck with .tran, or 'periodic'")
-    return circuit.tran.stop
+# Errors of unknown size are equal shares of the data unless errors equal for all are likelier by this logarithm. The
+# choice takes a degree of freedom, and is made where so many are there; else errors are taken as equal.
+_CLEARLY, _CHOOSING = 2.0, 4
+# Error of the means by which starts are compared.
+_ROUGH = 1e-3
 
 
 def fit(
@@ -141,11 +39,13 @@ def fit(
     parameters: Sequence[str],
     *,
     bounds: Mapping[str, tuple[float, float]] | None = None,
+    groups: Mapping[str, Sequence[str]] | None = None,
     average: str = "periodic",
     skin: str = "own",
     charge_law: str | None = None,
     starts: int = 8,
     rtol: float = 1e-7,
+    profiles: bool | Sequence[str] = False,
 ) -> Fit:
     """Fit parameters of a circuit to measured data, by least squares in their logarithms.
 
@@ -156,13 +56,19 @@ def fit(
     data : mapping of str to array_like, shape (n,), or path
         Columns: the measured means (``f_el_mean``, ``f_t_mean``, ``friction_mean`` or ``area_mean``) and the conditions
         under which they were measured, as paths (``Vdrive.amplitude``, ``source.frequency``, ``Xgap.fn``); or ``t``
-        and a signal over time (``f_el``, ``f_t``, ``friction``, ``area``, ``u_gap``). ``sigma`` is the standard
-        deviation of every value; where it is missing, it is taken as equal for all and estimated from the residuals. A
-        table (CSV) has the columns in a header, with units: ``Vdrive.amplitude (V), f_el_mean (mN)``.
+        and a signal over time (``f_el``, ``f_t``, ``friction``, ``area``, ``u_gap``); or ``frequency`` and
+        ``impedance``, the magnitude (ohm) of what the source sees, with ``impedance_phase`` (deg) where it is known.
+        ``sigma`` is the standard deviation of every value; where it is missing, it is estimated from the residuals, as
+        equal shares of the values or, where that is clearly likelier, as equal for all (so, too, of signals over time,
+        and where hardly more data than parameters are given; of impedances always as equal shares). A table (CSV) has
+        the columns in a header, with units: ``Vdrive.amplitude (V), f_el_mean (mN)``.
     parameters : sequence of str
         Paths of the parameters to fit.
     bounds : mapping of str to tuple of float, optional
         Smallest and largest value by path.
+    groups : mapping of str to sequence of str, optional
+        The column that tells which measurements belong together, and the parameters of which every such group has its
+        own: ``{"finger": ["Xgap.d"]}``. The others are the same for all.
     average : str
         ``"periodic"`` (means over a period of the periodic state) or ``"run"`` (over the deck's run).
     skin : str
@@ -173,6 +79,9 @@ def fit(
         Values from which the fit may start: those of the circuit, and others around them. The best three are followed.
     rtol : float
         Error of every run.
+    profiles : bool or sequence of str
+        Paths whose profile likelihood is wanted, or True for all: the data are fitted again and again with the
+        parameter held at values ever farther away, until the fit is too bad.
 
     Returns
     -------
@@ -184,29 +93,81 @@ def fit(
         If a column, unit or path is unknown, there are fewer data than parameters, or no start can be run.
     """
     require_circuit(circuit)
-    task = _task(circuit, data, parameters, bounds, average, skin, charge_law, rtol)
+    table, unknowns = _request(circuit, data, parameters, groups)
+    task = _task(circuit, table, unknowns, bounds, average, skin, charge_law, rtol)
     require_number("starts", starts, "a whole number")
     require(starts >= 1, "starts", starts, "1 or more")
-    ends = [_followed(task, begin) for begin in _starts(task, int(starts))]
+    names = tuple(one.name for one in task.unknowns)
+    wanted = profiled(names, profiles)
+    ends = [followed(task, begin) for begin in _starts(task, int(starts))]
     best = min(ends, key=lambda end: end.objective)
-    if not best.objective < 0.5 * _REFUSED**2:
+    if not best.objective < 0.5 * REFUSED**2:
         raise InputError(
             "none of the starts can be run: there is no contact, no solution, or a value out of range; allowed: a "
             "circuit that runs under the conditions of the data"
         )
-    return fit_result(
-        task.circuit, task.data, task.paths, task.bounds, best, [end.objective for end in ends], task.scale
+    spare = task.target.size - len(unknowns)
+    chosen = table.sigma is None and table.t is None and table.signal != IMPEDANCE and spare >= _CHOOSING
+    if chosen:
+        task, ends = _with_likelier_noise(task, ends, best)
+        best = min(ends, key=lambda end: end.objective)
+    found = fit_result(
+        task.circuit,
+        task.data,
+        task.unknowns,
+        task.bounds,
+        best,
+        [end.objective for end in ends],
+        task.scale,
+        spare - chosen,
+    )
+    limit = limit_of(best.objective, found.freedom, given=task.data.sigma is not None)
+    return replace(
+        found,
+        profiles={name: profile_of(task, names, best, name, _error(found, name), limit) for name in wanted},
     )
 
 
-def _task(
+def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[Task, list[Fitted]]:
+    """The fits with errors that are equal shares of the data, or, where this is clearly likelier, equal for all.
+
+    The largest likelihood of normal errors of unknown size is RSS^(-n/2) over the product of the scales.
+    """
+    predicted = np.abs(task.target + best.residual * task.scale)
+    if not np.all(predicted > 0.0) or best.objective == 0.0:
+        return task, ends
+    shares = replace(task, scale=predicted)
+    others = [followed(shares, end.values) for end in ends]
+    least, n = min(end.objective for end in others), predicted.size
+    equal = 0.5 * n * math.log(best.objective) + float(np.log(task.scale).sum())
+    return (
+        (shares, others)
+        if 0.5 * n * math.log(least) + float(np.log(predicted).sum()) < equal + _CLEARLY
+        else (task, ends)
+    )
+
+
+def _error(found: Fit, path: str) -> float:
+    """Standard error of a parameter's logarithm."""
+    return found.estimates[path].error / found.estimates[path].value
+
+
+def profiled(paths: tuple[str, ...], wanted: bool | Sequence[str]) -> list[str]:
+    """The paths whose profiles are wanted, in the circuit's own spelling."""
+    if isinstance(wanted, bool):
+        return list(paths) if wanted else []
+    known = {path.lower(): path for path in paths}
+    for path in wanted:
+        if not isinstance(path, str) or path.lower() not in known:
+            raise InputError(f"profiles names {path!r}, which is not fitted; allowed: True, or {', '.join(paths)}")
+    return [known[path.lower()] for path in wanted]
+
+
+def _request(
     circuit: Circuit, data: Mapping[str, ArrayLike] | str | Path, parameters: Sequence[str],
-    bounds: Mapping[str, tuple[float, float]] | None, average: str, skin: str, charge_law: str | None, rtol: float,
-) -> Task:  # fmt: skip
-    """The checked request."""
-    require(average in ("periodic", "run"), "average", repr(average), "'periodic' or 'run'")
-    require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
-    require(RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-13 to 0.1")
+    groups: Mapping[str, Sequence[str]] | None,
+) -> tuple[Data, tuple[Unknown, ...]]:  # fmt: skip
+    """The checked data, and what is to be fitted to them."""
     if isinstance(parameters, str) or not parameters:
         raise InputError(f"parameters is {parameters!r}; allowed: a sequence of paths such as ['Xgap.d', 'Xgap.r']")
     known = {path.lower(): path for path in circuit.parameters}
@@ -214,26 +175,52 @@ def _task(
         if path.lower() not in known:
             circuit.varied({path: 1.0})
     paths = tuple(known[path.lower()] for path in parameters)
-    table = data_of(circuit, data)
+    by = group_column(circuit, groups)
+    table = data_of(circuit, data, by)
     both = sorted(set(paths) & set(table.conditions))
     if both:
         raise InputError(f"{both[0]} is to be fitted, and is a condition of the data; allowed: one of both")
-    if table.values.size < len(paths):
-        raise InputError(
-            f"{table.values.size} data cannot tell {len(paths)} parameters; allowed: at least as many data"
-        )
-    initial = [circuit.parameters[path].value for path in paths]
-    for path, value in zip(paths, initial, strict=True):
+    for path in paths:
+        value = circuit.parameters[path].value
         if not (math.isfinite(value) and value > 0.0):
             raise InputError(f"{path} is {value:g}, and is fitted in its logarithm; allowed: finite and more than 0")
+    unknowns = unknowns_of(paths, (groups or {}).get(by or "", ()), table.groups)
+    count = table.values.size * (1 if table.phase is None else 2)
+    if count < len(unknowns):
+        raise InputError(f"{count} data cannot tell {len(unknowns)} parameters; allowed: at least as many data")
+    return table, unknowns
+
+
+def _task(
+    circuit: Circuit, table: Data, unknowns: tuple[Unknown, ...], bounds: Mapping[str, tuple[float, float]] | None,
+    average: str, skin: str, charge_law: str | None, rtol: float,
+) -> Task:  # fmt: skip
+    """The checked request."""
+    require(average in ("periodic", "run"), "average", repr(average), "'periodic' or 'run'")
+    require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
+    require(RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-13 to 0.1")
+    target, scale = _target(table)
+    exact = is_stack(circuit) and build_stack(circuit).contact is not None and table.signal != IMPEDANCE
+    every = tuple(one.path for one in unknowns)
+    box = bounds_of(every, [circuit.parameters[path].value for path in every], bounds or {})
+    return Task(circuit, table, unknowns, box, average, skin, rtol, charge_law, target, scale, exact)
+
+
+def _target(table: Data) -> tuple[FloatArray, FloatArray]:
+    """What is to be predicted, and its scale: sigma, or the largest value; of an impedance each value's own size."""
     sizes = np.abs(table.values)
-    scale = table.sigma if table.sigma is not None else np.full(sizes.size, float(sizes.max()) or 1.0)
-    exact = is_stack(circuit) and build_stack(circuit).contact is not None
-    box = _bounds(paths, initial, bounds or {})
-    return Task(circuit, table, paths, box, average, skin, rtol, charge_law, scale, exact)
+    if table.signal != IMPEDANCE:
+        scale = table.sigma if table.sigma is not None else np.full(sizes.size, float(sizes.max()) or 1.0)
+        return table.values, scale
+    scale = table.sigma if table.sigma is not None else sizes
+    if table.phase is None:
+        return table.values, scale
+    # An error of the complex impedance, equal in all directions, is as large across as along.
+    return np.concatenate([table.values, table.phase]), np.concatenate([scale, np.degrees(scale / sizes)])
 
 
-def _bounds(paths: tuple[str, ...], initial: list[float], given: Mapping[str, tuple[float, float]]) -> FloatArray:
+def bounds_of(paths: tuple[str, ...], initial: list[float], given: Mapping[str, tuple[float, float]]) -> FloatArray:
+    """Smallest and largest values of the parameters, shape (n_parameter, 2); 0 and infinity where none are given."""
     lower = {path.lower(): tuple(pair) for path, pair in given.items()}
     unknown = [path for path in given if path.lower() not in {p.lower() for p in paths}]
     if unknown:
@@ -263,7 +250,9 @@ def _starts(task: Task, count: int) -> list[FloatArray]:
     tried = np.vstack([initial, np.exp(np.log(low) + share * np.log(high / low))])
     rows, n = task.data.values.size, len(tried)
     table = {path: np.tile(x, n) for path, x in task.data.conditions.items()}
-    table |= {path: np.repeat(tried[:, k], rows) for k, path in enumerate(task.paths)}
+    for path in dict.fromkeys(one.path for one in task.unknowns):
+        own = [k for k, one in enumerate(task.unknowns) if one.path == path]
+        table[path] = (tried[:, own] @ task.members[own]).ravel()
     periodic = task.average == "periodic"
     found = batch(
         task.circuit, table, outputs=(f"{task.data.signal}_mean",), rtol=_ROUGH, periodic=periodic, skin=task.skin
@@ -271,26 +260,3 @@ def _starts(task: Task, count: int) -> list[FloatArray]:
     off = (((found - task.data.values) / task.scale) ** 2).sum(axis=1)
     order = np.argsort(np.where(np.isfinite(off), off, math.inf), kind="stable")
     return [initial, *(tried[i] for i in order[:_FOLLOWED].tolist() if i > 0)]
-
-
-def _followed(task: Task, begin: FloatArray) -> Fitted:
-    """Where least squares lead from a start."""
-    from scipy.optimize import least_squares
-
-    known: dict[bytes, tuple[FloatArray, FloatArray]] = {}
-
-    def at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        key = x.tobytes()
-        if key not in known:
-            known.clear()
-            known[key] = task.residuals(np.exp(x))
-        return known[key]
-
-    with np.errstate(divide="ignore"):
-        box = np.log(task.bounds).T
-    x0 = np.clip(np.log(begin), *box)
-    found = least_squares(
-        lambda x: at(x)[0], x0, lambda x: at(x)[1], bounds=box, xtol=_CLOSE, ftol=1e-12, gtol=1e-12, max_nfev=100
-    )
-    residual, by = at(found.x)
-    return Fitted(np.exp(found.x), residual, by, float(residual @ residual), int(found.nfev), bool(found.status > 0))

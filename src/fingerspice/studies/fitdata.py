@@ -14,14 +14,17 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
-from fingerspice.waveforms.columns import read_text_columns
+from fingerspice.studies.fitgroups import Groups, labels_of
+from fingerspice.waveforms.columns import read_labelled_columns, read_text_columns
 from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file
 
 #: Signals that can be fitted, over time or (with ``_mean``) as means, and their units.
-MEASURED = {"f_el": "N", "f_t": "N", "friction": "", "area": "m^2", "u_gap": "V"}
+MEASURED = {"f_el": "N", "f_t": "N", "friction": "", "area": "m^2", "u_gap": "V", "impedance": "ohm"}
 MEANS = ("f_el", "f_t", "friction", "area")
 _PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
 TIME, SIGMA, SOURCE = "t", "sigma", "source"
+#: The one measured quantity that is no mean, and the column that may stand beside it.
+IMPEDANCE, PHASE = "impedance", "impedance_phase"
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,10 @@ class Data:
         Path to the values that a parameter had in the measurements, in the unit of the netlist.
     t : ndarray, shape (n,), or None
         Times, s.
+    phase : ndarray, shape (n,), or None
+        Phase of an impedance, deg.
+    groups : Groups or None
+        Which measurements belong together, such as those of one finger.
     """
 
     signal: str
@@ -47,6 +54,13 @@ class Data:
     sigma: FloatArray | None
     conditions: dict[str, FloatArray]
     t: FloatArray | None = None
+    phase: FloatArray | None = None
+    groups: Groups | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the measured column."""
+        return self.signal if self.t is not None or self.signal == IMPEDANCE else f"{self.signal}_mean"
 
     @property
     def varying(self) -> dict[str, FloatArray]:
@@ -54,22 +68,24 @@ class Data:
         return {path: x for path, x in self.conditions.items() if np.ptp(x) > 0.0}
 
 
-def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> Data:
+def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path, by: str | None = None) -> Data:
     """The data that a caller gave: a mapping of columns, or a table with a header.
 
     The columns are one of ``f_el_mean``, ``f_t_mean``, ``friction_mean`` and ``area_mean`` with conditions (paths such
-    as ``Vdrive.amplitude``, ``source.frequency``, ``Xgap.fn``), or ``t`` with ``f_el``, ``f_t``, ``friction``, ``area``
-    or ``u_gap``; and ``sigma``, the standard deviation, where it is known.
+    as ``Vdrive.amplitude``, ``source.frequency``, ``Xgap.fn``); or ``impedance`` with conditions, and
+    ``impedance_phase`` beside it; or ``t`` with ``f_el``, ``f_t``, ``friction``, ``area`` or ``u_gap``; and ``sigma``,
+    the standard deviation, where it is known. The column `by` has names or numbers that tell which group a measurement
+    belongs to.
 
     Raises
     ------
     InputError
         If a column or unit is unknown, columns have different lengths, or a value is no finite number.
     """
-    columns, place = _columns(circuit, given)
+    columns, groups, place = _columns(circuit, given, by)
     names = {
         **{f"{name}_mean": name for name in MEANS},
-        **({name: name for name in MEASURED} if TIME in columns else {}),
+        **({name: name for name in MEASURED if name != IMPEDANCE} if TIME in columns else {IMPEDANCE: IMPEDANCE}),
     }
     measured = [name for name in columns if name in names]
     if len(measured) != 1:
@@ -77,7 +93,11 @@ def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> Da
         what = f"several measured columns ({', '.join(measured)})" if measured else "no measured column"
         raise InputError(f"{place} have {what}, and the columns {', '.join(columns)}; allowed: one of {allowed}")
     values = columns.pop(measured[0])
-    sigma, t = columns.pop(SIGMA, None), columns.pop(TIME, None)
+    sigma, t, phase = columns.pop(SIGMA, None), columns.pop(TIME, None), columns.pop(PHASE, None)
+    if phase is not None and measured[0] != IMPEDANCE:
+        raise InputError(f"{place} have the column {PHASE} beside {measured[0]}; allowed: beside {IMPEDANCE}")
+    if measured[0] == IMPEDANCE and not np.all(values > 0.0):
+        raise InputError(f"{place}: the smallest {IMPEDANCE} is {values.min():g} ohm; allowed: magnitudes above 0")
     if sigma is not None and not np.all(sigma > 0.0):
         raise InputError(f"{place}: the smallest sigma is {sigma.min():g}; allowed: more than 0")
     if t is not None and (measured[0].endswith("_mean") or np.any(np.diff(t) <= 0.0)):
@@ -85,12 +105,36 @@ def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> Da
     conditions = {_path(circuit, name): x for name, x in columns.items()}
     if t is not None and any(np.ptp(x) > 0.0 for x in conditions.values()):
         raise InputError(f"{place} have times and changing conditions; allowed: one run over time, or means")
-    return Data(names[measured[0]], values, sigma, conditions, t)
+    if t is not None and groups is not None:
+        raise InputError(f"{place} have times and groups; allowed: groups of means or of impedances")
+    return Data(names[measured[0]], values, sigma, conditions, t, phase, groups)
 
 
-def _columns(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> tuple[dict[str, FloatArray], str]:
+def _columns(
+    circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path, by: str | None
+) -> tuple[dict[str, FloatArray], Groups | None, str]:
     if isinstance(given, (str, Path)):
-        return _from_table(circuit, Path(given)), f"the data in '{given}'"
+        return *_from_table(circuit, Path(given), by), f"the data in '{given}'"
+    if by is None or not isinstance(given, Mapping):
+        return number_columns(given), None, "the data"
+    if by not in given:
+        raise InputError(f"the data have no column {by!r}, which groups names; they have {', '.join(given)}")
+    groups = labels_of(by, given[by])
+    found = number_columns({name: x for name, x in given.items() if name != by})
+    size = next(iter(found.values())).size if found else 0
+    if groups.of.size != size:
+        raise InputError(f"data column {by!r} has {groups.of.size} rows, others have {size}; allowed: as many")
+    return found, groups, "the data"
+
+
+def number_columns(given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
+    """The columns of a mapping as arrays of one length.
+
+    Raises
+    ------
+    InputError
+        If it is no mapping, columns have different lengths, or a value is no finite number.
+    """
     if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
         raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, or the path of a table")
     try:
@@ -104,18 +148,34 @@ def _columns(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> t
         bad = np.flatnonzero(~np.isfinite(x))
         if bad.size:
             raise InputError(f"data column {name!r} is {x[bad[0]]} in row {bad[0]}; allowed: finite numbers")
-    return {name: np.broadcast_to(x, size).copy() for name, x in found.items()}, "the data"
+    return {name: np.broadcast_to(x, size).copy() for name, x in found.items()}
 
 
-def _from_table(circuit: Circuit, path: Path) -> dict[str, FloatArray]:
-    table = read_text_columns(checked_file(path, MAX_TEXT_BYTES))
+def _from_table(circuit: Circuit, path: Path, by: str | None) -> tuple[dict[str, FloatArray], Groups | None]:
+    file = checked_file(path, MAX_TEXT_BYTES)
+    words: tuple[str, ...] = ()
+    if by is None:
+        try:
+            table = read_text_columns(file)
+        except InputError as refused:
+            if "no rows of numbers" not in refused.message:
+                raise
+            raise InputError(
+                f"{refused.message}; allowed: numbers, and names in the column that groups names"
+            ) from None
+    else:
+        table, words = read_labelled_columns(file, by)
     if not table.names:
         raise InputError(
             f"'{path}' has no header; allowed: names with units, such as Vdrive.amplitude (V), f_el_mean (N)"
         )
     found: dict[str, FloatArray] = {}
+    groups: Groups | None = None
     measured = next((name.removesuffix("_mean") for name in table.names if name.removesuffix("_mean") in MEASURED), "")
     for i, (name, unit) in enumerate(zip(table.names, table.units, strict=True)):
+        if by is not None and name.lower() == by.lower():
+            groups = Groups(by, words, table.data[:, i].astype(int))
+            continue
         signal = name.removesuffix("_mean")
         key = {"time": TIME}.get(name.lower(), name.lower())
         key = key if key in (TIME, SIGMA) else name
@@ -123,15 +183,17 @@ def _from_table(circuit: Circuit, path: Path) -> dict[str, FloatArray]:
             base = "s"
         elif key == SIGMA:
             base = MEASURED.get(measured, "")
+        elif key == PHASE:
+            base = "deg"
         elif signal in MEASURED:
             base = MEASURED[signal]
         else:
             base = circuit.parameters[_path(circuit, name)].unit
-        found[key] = table.data[:, i] * _factor(unit, base, f"'{path}': the unit of column {name!r}")
-    return found
+        found[key] = table.data[:, i] * unit_factor(unit, base, f"'{path}': the unit of column {name!r}")
+    return found, groups
 
 
-def _factor(unit: str, base: str, what: str) -> float:
+def unit_factor(unit: str, base: str, what: str) -> float:
     """Of a header's unit over the netlist's."""
     if unit in ("", base):
         return 1.0
@@ -147,7 +209,9 @@ def _factor(unit: str, base: str, what: str) -> float:
 
 
 def _path(circuit: Circuit, name: str) -> str:
-    """A condition's path; ``source.`` stands for the only source."""
+    """A condition's path; ``source.`` stands for the only source, and ``frequency`` for its frequency."""
+    if name.lower() == "frequency":
+        name = f"{SOURCE}.frequency"
     element, _, parameter = name.partition(".")
     if element.lower() == SOURCE:
         driving = driving_sources(circuit)
@@ -158,7 +222,7 @@ def _path(circuit: Circuit, name: str) -> str:
     if name.lower() not in known:
         near = difflib.get_close_matches(name.lower(), known, 1, 0.0)
         hint = f", such as {known[near[0]]}" if near else ""
-        allowed = ", ".join((*(f"{signal}_mean" for signal in MEANS), SIGMA, TIME))
+        allowed = ", ".join((*(f"{signal}_mean" for signal in MEANS), IMPEDANCE, PHASE, SIGMA, TIME))
         raise InputError(
             f"the data have a column {name!r}, which is no parameter of the circuit; allowed: {allowed} with a signal, "
             f"and conditions{hint}"

@@ -113,7 +113,7 @@ class SteadyState(Shown, Figured):
         if solution.failure is not None:
             raise SolveError(solution.failure, solution)
         if self.asked:
-            found = sensitivities_of(self.problem, solution, self.asked, "periodic")
+            found = sensitivities_of(self.problem, solution, self.asked, "periodic", over_period=True)
             solution = dataclasses.replace(solution, sensitivities=found)
         for text in solution.warnings:
             if text not in self.problem.circuit.warnings:

@@ -42,6 +42,11 @@ class Ramps(Waveform):
         """Result of `_knots`, cached."""
         return self._knots()
 
+    @property
+    def knots(self) -> tuple[FloatArray, FloatArray]:
+        """Times (s, ascending) and values (V) of the knots of one run or period."""
+        return self._listed
+
     @cached_property
     def _distinct(self) -> FloatArray:
         """Times of the knots, each once, s."""
@@ -221,15 +226,18 @@ class PWL(Ramps):
             )
 
     def __repr__(self) -> str:
-        if len(self.times) <= MOST_SHOWN:
-            return f"PWL(times={self.times!r}, values={self.values!r}, repeat={self.repeat!r})"
         if "repr" not in self.kept:
-            # Runs store this text to know which source they had: the digest stands for the points.
-            digest = hashlib.sha256(np.array([self.times, self.values]).tobytes()).hexdigest()[:16]
-            span = f"{self.times[0]:g} s to {self.times[-1]:g} s"
-            self.kept["repr"] = f"PWL({len(self.times)} points, {span}, sha256 {digest}, repeat={self.repeat!r})"
+            self.kept["repr"] = self._text()
         text: str = self.kept["repr"]
         return text
+
+    def _text(self) -> str:
+        if len(self.times) <= MOST_SHOWN:
+            return f"PWL(times={self.times!r}, values={self.values!r}, repeat={self.repeat!r})"
+        # Runs store this text to know which source they had: the digest stands for the points.
+        digest = hashlib.sha256(np.array([self.times, self.values]).tobytes()).hexdigest()[:16]
+        span = f"{self.times[0]:g} s to {self.times[-1]:g} s"
+        return f"PWL({len(self.times)} points, {span}, sha256 {digest}, repeat={self.repeat!r})"
 
     @classmethod
     def from_table(cls, path: str | Path, time: str | int | None = None, value: str | int | None = None) -> PWL:

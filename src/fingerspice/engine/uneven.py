@@ -1,0 +1,289 @@
+"""Integration under a PWL with dense points at uneven times, block by block, as `engine.recording` does for samples.
+
+Every step has a length of its own, and its weights are computed with it (`engine.unevenweights`). Only series stacks
+under `local` are integrated.
+"""
+
+from __future__ import annotations
+
+import math
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
+from fingerspice.engine.blockcharge import Charges, Course
+from fingerspice.engine.blockforms import (
+    BLOCK,
+    FIRST_QUARTER,
+    LAST_QUARTER,
+    LEVEL,
+    MIDDLE,
+    OUTPUT,
+    PLACES,
+    REFERENCE,
+    REFUSED,
+    SWEEPS,
+    U_GAP,
+    Form,
+    Room,
+)
+from fingerspice.engine.blockoutput import write_points, write_samples
+from fingerspice.engine.blockrows import (
+    add,
+    add_three,
+    area_rows,
+    change_of,
+    crosses,
+    kink_at,
+    kink_rows,
+    modes_into,
+    scaled,
+)
+from fingerspice.engine.recording import DONE, NOT_CLOSED, TOO_COARSE, accept, go_over, largest_of, nearest
+from fingerspice.engine.relaxation import PARABOLA, SPARE, drives_at, look_at_ends, project_at_ends
+from fingerspice.engine.unevenweights import END, EVERY_PLACE, Steps, weigh
+
+# Largest number of halvings of a step.
+MOST_HALVINGS = 4
+# As in `engine.relaxation`.
+_MOST_SWEEPS, _LEFT, _SLOWEST, _KINKED = 40, 0.25, 0.05, 2
+
+
+@jit_rows
+def _forced_rows(
+    n: int, w: FloatArray, decay: FloatArray, c: FloatArray, f: FloatArray, f_m: FloatArray, out: FloatArray
+) -> None:
+    """Modes at a place: decayed from the start of each step, and forced along a parabola."""
+    for i in range(n):
+        out[i] = decay[i] * w[i] + c[0, i] * f[i] + c[1, i] * f_m[i] + c[2, i] * f[i + 1]
+
+
+@jit_rows
+def _increments(n: int, c: FloatArray, f: FloatArray, f_m: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = c[0, i] * f[i] + c[1, i] * f_m[i] + c[2, i] * f[i + 1]
+
+
+@jit
+def _pass(n: int, decay: FloatArray, inc: FloatArray, w: FloatArray) -> None:
+    """w[i + 1] = decay[i] w[i] + inc[i]."""
+    now = w[0]
+    for i in range(n):
+        now = decay[i] * now + inc[i]
+        w[i + 1] = now
+
+
+@jit_rows
+def _between(n: int, at: float, s: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = s[i] + at * (s[i + 1] - s[i])
+
+
+@jit_rows
+def _add_kinks(
+    n: int, rate: float, h: FloatArray, c: FloatArray, feed: float, at: FloatArray, jump: FloatArray, out: FloatArray
+) -> None:
+    """As `blockrows.add_kinks`, for steps of different lengths with the weights c (3, n) of their parabolas."""
+    for i in range(n):
+        rest = 1.0 - at[i]
+        y = rate * h[i] * rest
+        ramp = rest * rest * (1.0 + y * (0.32058491 + 0.06524308 * y))
+        ramp /= 2.0 + y * (1.31296923 + y * (0.38813995 + 0.06524308 * y))
+        out[i] += feed * jump[i] * (h[i] * ramp - c[1, i] * max(0.5 - at[i], 0.0) - c[2, i] * rest)
+
+
+@jit_rows
+def _add_product(n: int, a: float, x: FloatArray, y: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] += a * x[i] * y[i]
+
+
+@jit_within
+def _look(form: Form, room: Room, steps: Steps, r: int, place: int, n: int, last: int) -> None:
+    """Modes at a place within the steps, their projections up to number `last`, gap voltage and drives."""
+    at, x = EVERY_PLACE[place], room.within[place]
+    _between(n, at, room.s, room.s_within)
+    for p in range(last):
+        scaled(n, form.tap_s[p], room.s_within, x[p])
+    for k in range(form.rates.shape[1]):
+        _forced_rows(
+            n, room.w[k], steps.decay[k, place], steps.parabola[k, place], steps.forced[k], steps.forced_within[k],
+            steps.w[k],
+        )  # fmt: skip
+    for p in range(last):
+        modes_into(n, 0, form.taps[r, p], steps.w, x[p])
+    drives_at(form, r, n, room, place)
+
+
+@jit_within
+def _relax(
+    form: Form, room: Room, steps: Steps, h: FloatArray, r: int, kink: FloatArray, n: int, tol: float
+) -> tuple[float, int]:
+    """As `relaxation.relax`, for steps with weights of their own: the error that is left (V), and the sweeps."""
+    modes, drives = form.rates.shape[1], room.g.shape[0]
+    for t in range(drives):
+        start = room.g[t, 0]
+        for i in range(n):
+            room.g[t, i + 1] = start
+            room.g_within[MIDDLE, t, i] = start
+    charged = room.u[0] - form.k_gap * room.s[0]
+    for i in range(n + 1):
+        room.u[i] = room.before[i] = form.k_gap * room.s[i] + charged
+    for i in range(n):
+        room.u_within[MIDDLE, i] = 0.5 * (room.u[i] + room.u[i + 1])
+    last = math.inf
+    for sweep in range(_MOST_SWEEPS):
+        for k in range(modes):
+            scaled(n + 1, form.gain[r, k], room.s, steps.forced[k])
+            modes_into(n + 1, 0, form.feed[r, k], room.g, steps.forced[k])
+            _between(n, 0.5, room.s, steps.low)
+            scaled(n, form.gain[r, k], steps.low, steps.forced_within[k])
+            modes_into(n, 0, form.feed[r, k], room.g_within[MIDDLE], steps.forced_within[k])
+            _increments(n, steps.parabola[k, END], steps.forced[k], steps.forced_within[k], room.inc[k])
+        if sweep >= _KINKED and crosses(n, room.u):
+            for t in range(drives):
+                kink_rows(n, kink[t], room.u, room.u_within[MIDDLE], room.end[1 + t], room.crossed, room.jumps)
+                for k in range(modes):
+                    _add_kinks(
+                        n, form.rates[r, k], h, steps.parabola[k, END], form.feed[r, k, t], room.crossed,
+                        room.jumps, room.inc[k],
+                    )  # fmt: skip
+        for k in range(modes):
+            _pass(n, steps.decay[k, END], room.inc[k], room.w[k])
+        _look(form, room, steps, r, MIDDLE, n, 1 + drives)
+        look_at_ends(form, room, r, n + 1, 0)
+        if not abs(room.u[n]) < math.inf:
+            return math.inf, sweep
+        change = change_of(n + 1, room.u, room.before)
+        if sweep > 0:
+            ratio = max(change / last, _SLOWEST) if last > 0.0 else 0.0
+            if not ratio < 0.9 and change > tol:
+                return math.inf, sweep
+            left = 2.0 * change * ratio
+            if left <= _LEFT * tol and sweep >= _KINKED:
+                return left, sweep
+        last = change
+    return math.inf, _MOST_SWEEPS
+
+
+@jit_within
+def _misfit(form: Form, room: Room, steps: Steps, r: int, kink: FloatArray, n: int, taps: int) -> float:
+    """Error of the modes into `Room.own`, that of the gap voltage into `Room.before`, and the largest of that (V)."""
+    modes = form.rates.shape[1]
+    bends = crosses(n, room.u)
+    for k in range(modes):
+        scaled(n, 0.0, room.s, room.inc[k])
+    scaled(n + 1, 0.0, room.s, steps.low)
+    for place in (FIRST_QUARTER, LAST_QUARTER):
+        _look(form, room, steps, r, place, n, taps)
+        for t in range(room.g.shape[0]):
+            off, weight = room.g_within[place, t], PARABOLA[place]
+            add_three(
+                n, -weight[0], room.g[t], -weight[1], room.g_within[MIDDLE, t], -weight[2], room.g[t, 1:], off
+            )  # fmt: skip
+            if bends:
+                kink_at(n, kink[t], PLACES[place], room.u, room.u_within[MIDDLE], room.end[1 + t], off)
+            for k in range(modes):
+                feed = form.feed[r, k, t]
+                _add_product(n, feed, steps.quarter[k, 1, place - FIRST_QUARTER], off, room.inc[k])
+                share = form.taps[r, 0, k] * feed
+                _add_product(n, share, steps.quarter[k, 0, place - FIRST_QUARTER], off, steps.low)
+    scaled(n + 1, 0.0, room.s, room.before)
+    for k in range(modes):
+        room.own[k, 0] = 0.0
+        _pass(n, steps.decay[k, END], room.inc[k], room.own[k])
+    modes_into(n + 1, 0, form.taps[r, 0], room.own, room.before)
+    worst = largest_of(n + 1, room.before)
+    # In the middle of a step the interpolation error of its parabola has not cancelled yet.
+    add(n, 1.0, steps.low, room.before)
+    return max(worst, largest_of(n, room.before))
+
+
+@jit
+def _load(times: FloatArray, values: FloatArray, at: int, count: int, sub: int, room: Room, own: Charges) -> None:
+    """Source, times and lengths of the steps from point number `at` on; each interval has `sub` equal steps."""
+    for j in range(count):
+        here, t, length = values[at + j], times[at + j], times[at + j + 1] - times[at + j]
+        for i in range(sub):
+            place = j * sub + i
+            room.s[place] = here + (i / sub) * (values[at + j + 1] - here)
+            own.t[place] = t + (i / sub) * length
+            own.h[place] = length / sub
+    room.s[count * sub], own.t[count * sub] = values[at + count], times[at + count]
+
+
+@jit_within
+def _write(c: Course, r: int, sub: int, count: int, t_out: FloatArray, out: FloatArray) -> None:
+    """Write the outputs of a block, without those at its very end."""
+    n, first, t = count * sub, c.counters[OUTPUT], c.charges.t
+    slack = 8e-16 * abs(t[n])
+    last, aligned = first, True
+    while last < t_out.size and t_out[last] < t[n] - slack:
+        j = last - first
+        aligned &= j < count and abs(t_out[last] - t[min(j, count) * sub]) <= slack
+        last += 1
+    if last == first:
+        return
+    if aligned and last - first == count:
+        write_samples(c, r, sub, count, out[:, first:last])
+    else:
+        write_points(c, r, n, slack, t_out, out, last)
+    c.counters[OUTPUT] = last
+
+
+@jit
+def march(
+    c: Course, steps: Steps, times: FloatArray, values: FloatArray, tol: float, t_out: FloatArray, out: FloatArray
+) -> int:
+    """Follow the points `times` (s) and `values` (V), straight in between, from the first to the last.
+
+    Outputs before the end are written. `tol` is the error of the gap voltage (V) that a block may add.
+    """
+    c, steps, times, values = borrow(c), borrow(steps), borrow(times), borrow(values)
+    form, room, control = c.form, c.room, c.control
+    at, stop, drives = 0, values.size - 1, room.g.shape[0]
+    taps = form.tap_s.size if c.shown.charge else 1 + drives
+    while at < stop:
+        level, r = int(control[LEVEL]), int(control[REFERENCE])
+        sub = 1 << level
+        count = min(BLOCK >> level, stop - at)
+        n = count * sub
+        _load(times, values, at, count, sub, room, c.charges)
+        for k in range(c.w.size):
+            room.w[k, 0] = c.w[k]
+        room.u[0] = control[U_GAP]
+        look_at_ends(form, room, r, 1, 0)
+        to = nearest(form, form.q0[r] + room.z[0], r)
+        if to != r:
+            go_over(c, r, to, c.w)
+            go_over(c, r, to, c.error)
+            control[REFERENCE] = to
+            continue
+        weigh(form, steps, c.charges.h, r, n)
+        left_over, sweeps = _relax(form, room, steps, c.charges.h, r, c.shown.kink, n, tol)
+        c.counters[SWEEPS] += sweeps
+        closed, local = left_over < math.inf, math.inf
+        if closed:
+            local = left_over + _misfit(form, room, steps, r, c.shown.kink, n, taps)
+            area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
+        if not local <= tol:
+            if level == MOST_HALVINGS:
+                return TOO_COARSE if closed else NOT_CLOSED
+            halvings = max(1.0, math.ceil(0.25 * math.log2(local / tol))) if closed else 1.0
+            control[LEVEL] = min(float(MOST_HALVINGS), level + halvings)
+            c.counters[REFUSED] += n
+            continue
+        for k in range(c.w.size):
+            passed = 1.0
+            for i in range(n):
+                passed *= steps.decay[k, END, i]
+            c.spare[2, k] = passed
+        if c.shown.charge:
+            _look(form, room, steps, r, MIDDLE, n, taps)
+            for p in range(1 + drives, taps):
+                project_at_ends(form, room, r, n + 1, p)
+        accept(c, r, n, local, left_over, 1.0)
+        _write(c, r, sub, count, t_out, out)
+        at += count
+        if level > 0 and local < SPARE * tol:
+            control[LEVEL] -= 1.0
+    return DONE

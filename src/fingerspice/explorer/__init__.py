@@ -1,0 +1,1 @@
+"""The explorer: a local page on which values change and the run follows."""

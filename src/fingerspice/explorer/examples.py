@@ -1,0 +1,133 @@
+"""The explorer's example scenes: decks made of the paper's Table 1 and what differs from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from fingerspice.base.units import spice_text
+from fingerspice.sets.parameters import parameters
+
+_COAT = "Xcoat   drive top  area  LAYER d=1u eps_r=3.9 r=0.2meg"
+_CONTACT = "alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
+_GAP = f"Xgap    top   skin area  GAP   d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3\n+                              {_CONTACT}"
+_DISPERSIVE = "Xskin   skin  0    area  SKIN_DISPERSIVE d=350u"
+
+
+def _skin(frequency: str, node: str = "0") -> str:
+    return f"Xskin   skin  {node:<4} area  SKIN  d=350u f={frequency}"
+
+
+def _deck(title: str, *lines: str) -> str:
+    return "\n".join([title, ".include fingerspice.lib", *lines, ".end", ""])
+
+
+def _finger(title: str, source: str, skin: str, tran: str, *more: str, gap: str = _GAP) -> str:
+    """Table 1's finger on one source."""
+    return _deck(title, f"Vdrive  drive 0          {source}", *more, _COAT, gap, skin, f".tran {tran} uic")
+
+
+_TWO = """\
+Vdrive  drive 0           SIN(0 200 5k)
+.subckt finger drive body area fn=0.5
+Xcoat   drive top  area  LAYER d=1u eps_r=3.9 r=0.2meg
+Xgap    top   skin area  GAP   d=3.5u eps_r=1 r=1meg fn={fn} mu=0.3
++                              alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000
+Xskin   skin  body area  SKIN  d=350u f=5k
+.ends
+Xfirm   drive body firm   finger fn=0.5
+Xlight  drive body light  finger fn=0.2
+Rbody   body  far         1.5k
+Cbody   far   0           150p
+.tran 0.5u 1m uic"""
+
+
+@dataclass(frozen=True)
+class Example:
+    """One scene of the page's menu: a deck, and what the page asks for with it.
+
+    Attributes
+    ----------
+    name : str
+        Short name, which stands in the page's address.
+    title, note : str
+        What the menu and the page say about it.
+    deck : str
+    asked : dict
+        Further keys of the request, as in `scene.scene`.
+    """
+
+    name: str
+    title: str
+    note: str
+    deck: str
+    asked: dict[str, object] = field(default_factory=dict)
+
+
+def _made(gap: str, **changes: str) -> str:
+    """The line of the gap with other values."""
+    for name, value in changes.items():
+        head, _, rest = gap.partition(f" {name}=")
+        gap = f"{head} {name}={value}{rest[len(rest.split()[0]) :]}"
+    return gap
+
+
+_AMPLIFIER = _deck(
+    "Finger behind an amplifier with a safety resistor, 5 kHz",
+    "Vdrive  amp   0          SIN(0 200 5k)",
+    "Rout    amp   drive      47k",
+    "Ccable  drive 0          150p",
+    *(_COAT, _GAP, _skin("5k"), ".tran 0.5u 1m uic"),
+)
+_UNGROUNDED = _finger(
+    "User not grounded, 5 kHz", "SIN(0 200 5k)", _skin("5k", "body"), "0.5u 1m",
+    "Rbody   body  far        1.5k", "Cbody   far   0          150p",
+)  # fmt: skip
+_TONES = _deck(
+    "Two tones on a dispersive skin",
+    "Vdrive  drive fast       SIN(0 120 100)",
+    "Vfast   fast  0          SIN(0 80 5k)",
+    *(_COAT, _GAP, _DISPERSIVE, ".tran 1u 30m uic"),
+)
+
+
+def _gap_of(finger: str) -> str:
+    """The line of Table 1's gap with the values in which a named set of parameters differs from the normal finger."""
+    normal, values = parameters("normal").values, parameters(finger).values
+    changed = [v for path, v in values.items() if v.element == "gap" and v.value != normal[path].value]
+    return _made(_GAP, **{v.parameter: spice_text(v.value) if v.unit else f"{v.value:g}" for v in changed})
+
+
+EXAMPLES: tuple[Example, ...] = (
+    Example("sine", "Sine, 100 Hz (Fig. 4, left)", "Table 1: the layers leak, and the force follows the sine.",
+            _finger("Table 1, sine of 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m")),
+    Example("sine-5k", "Sine, 5 kHz (Fig. 4, right)", "At 5 kHz the capacitances divide the voltage.",
+            _finger("Table 1, sine of 5 kHz", "SIN(0 200 5k)", _skin("5k"), "0.2u 1m")),
+    Example("square", "Square wave, 100 Hz (Fig. 5, left)", "After each edge the gap's voltage leaks away.",
+            _finger("Table 1, square wave of 100 Hz", "SQUARE(200 100)", _skin("100"), "10u 50m")),
+    Example("square-5k", "Square wave, 5 kHz (Fig. 5, right)", "The force is nearly constant.",
+            _finger("Table 1, square wave of 5 kHz", "SQUARE(200 5k)", _skin("5k"), "0.2u 1m")),
+    Example("ungrounded", "User not grounded", "The body's capacitance to ground takes voltage.", _UNGROUNDED),
+    Example("two-fingers", "Two fingers of one hand", "A firm and a light finger share a body that floats.",
+            _deck("Two fingers on one screen, 5 kHz", *_TWO.splitlines())),
+    Example("amplifier", "Amplifier's limit", "A safety resistor and the cable take voltage at high frequencies.",
+            _AMPLIFIER),
+    Example("tones", "Two tones, dispersive skin", "The skin's data at all frequencies, for two tones at once.", _TONES,
+            {"periods": 3}),
+    Example("am", "AM texture", "A carrier of 5 kHz whose envelope of 50 Hz is what the finger feels.",
+            _finger("AM texture", "SIN(0 200 5k)", _skin("5k"), "2u 40m"),
+            {"source": "AM(200 5k 50)", "periods": 2}),
+    Example("click", "Click", "A damped sine of 250 Hz, where fingers feel best.",
+            _finger("Click", "SIN(0 200 250 0 250)", _DISPERSIVE, "10u 40m")),
+    Example("chirp", "Chirp, 20 Hz to 2 kHz", "All frequencies that fingers feel, one after the other.",
+            _finger("Chirp", "CHIRP(150 20 2k 0.3)", _DISPERSIVE, "20u 0.3")),
+    Example("bursts", "Bursts of 5 kHz", "Ten cycles every 10 ms: the finger feels 100 Hz.",
+            _finger("Bursts of 5 kHz", "BURST(200 5k 10 10m)", _DISPERSIVE, "5u 50m")),
+    Example("wet", "Moist finger", "Sweat in the gap conducts: the set `moist`, whose leak and friction are assumed.",
+            _finger("Moist finger, 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m", gap=_gap_of("moist"))),
+    Example("dry", "Dry finger", "The gap hardly leaks: the set `dry`, whose leak and friction are assumed.",
+            _finger("Dry finger, 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m", gap=_gap_of("dry"))),
+    Example("fold", "Fold of the mobile law", "A thin gap under the law `mobile`: no solution, and why.",
+            _finger("A gap of 10 nm under the law mobile", "SIN(0 200 100)", _skin("100"), "10u 50m",
+                    gap=_made(_GAP, d="10n")), {"charge_law": "mobile"}),
+)  # fmt: skip
+"""The scenes of the menu, the first of which is shown at the start."""

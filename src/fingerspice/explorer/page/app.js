@@ -1,0 +1,347 @@
+// The explorer: a state, a request in flight, and what its answer shows.
+
+import { Sliders, Waveforms } from "./controls.js";
+import { read } from "./recording.js";
+import { Harmonics, Means, Traces, decoded } from "./plots.js";
+import { Stack } from "./stack.js";
+import { OWN, fromHash, ofExample, request, toHash } from "./state.js";
+import { numbers, quantity } from "./units.js";
+
+const $ = (id) => document.getElementById(id);
+let examples = [];
+let state = null;
+let unknownInLink = [];
+let inFlight = false;
+let again = false;
+let now = null;
+let good = null;
+let pinned = null;
+let traces = null;
+let harmonics = null;
+let means = null;
+let stack = null;
+let sliders = null;
+let waveforms = null;
+let sweep = { key: "", points: [], message: "", level: 0, left: [] };
+let idle = 0;
+let recording = null;
+let address = 0;
+let written = "";
+
+/** What a page without a server holds; null of a page with one. */
+const baked = $("baked") ? JSON.parse($("baked").textContent) : null;
+
+async function ask(what, body) {
+  if (baked) {
+    const found = what === "scene" && state.deck === null ? baked.scenes[state.scene] : null;
+    return found || { ok: false, message: "this page has no program behind it: fingerspice explore has", sliders: [], traces: [] };
+  }
+  const answer = await fetch(what, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+  return answer.json();
+}
+
+/** The request of now, with the recording where the source is one. */
+function asking() {
+  const asked = request(state, examples);
+  return recording && /RECORDING/i.test(asked.source || "") ? { ...asked, recording } : asked;
+}
+
+/** Take a file that was chosen or dropped as the source. */
+async function take(file) {
+  try {
+    recording = await read(file);
+    set("source", `RECORDING(${recording.times ? 1 : 150})`);
+  } catch (error) {
+    say(error.message, true);
+  }
+}
+
+/** Ask for the scene of now; while a request is in flight, only the latest state waits for it. */
+async function refresh() {
+  // The address follows a slider that moves at some distance, since browsers limit how often it changes.
+  clearTimeout(address);
+  address = setTimeout(keepAddress, 200);
+  if (inFlight) {
+    again = true;
+    return;
+  }
+  inFlight = true;
+  clearTimeout(idle);
+  const slow = setTimeout(() => say("computing; the first run of its kind compiles, which takes up to a minute"), 700);
+  try {
+    do {
+      again = false;
+      const answer = await ask("scene", asking());
+      if (!again) show(decoded(answer));
+    } while (again);
+  } catch (error) {
+    say(`no answer from the program that opened this page: is it still running? (${error.message})`, true);
+  } finally {
+    clearTimeout(slow);
+    inFlight = false;
+    if (again) refresh();
+  }
+  idle = setTimeout(sweepMore, 400);
+}
+
+function say(text, failed = false) {
+  $("status").textContent = text;
+  $("status").className = failed ? "failed" : "";
+}
+
+function show(answer) {
+  now = answer;
+  if (answer.ok) good = answer;
+  say(answer.ok ? `${answer.title}: ${answer.error.text}` : answer.message, !answer.ok);
+  const said = [...unknownInLink, ...(answer.unknown || []), ...(answer.warnings || [])];
+  $("warnings").replaceChildren(...said.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+  if (answer.sliders.length) sliders.update(answer.sliders, replacedSource(answer), state.set);
+  controls();
+  const usable = answer.t.length > 1;
+  if (answer.ok) traces.show(answer, null, pinned);
+  else if (good) traces.show(answer, good, pinned);
+  else if (usable) traces.show(answer, null, pinned);
+  if (answer.ok) {
+    harmonics.show(answer.harmonics);
+    stack.show(answer);
+    table();
+    if (baked) still();
+    $("facts").textContent = [
+      `Model: ${answer.plan.tier} (${answer.plan.text}).`,
+      `Charge law ${answer.charge_law}, area ${answer.area}, method ${answer.method}.`,
+      `Run of ${quantity(answer.t_stop, "s")}${answer.period ? `, period ${quantity(answer.period, "s")}` : ""}.`,
+    ].join("\n");
+  }
+  document.body.dataset.answers = Number(document.body.dataset.answers || 0) + 1;
+}
+
+/** The element whose waveform the page's text replaces. */
+function replacedSource(answer) {
+  const text = state.options.source || "";
+  if (!text) return null;
+  const named = /^\s*([\w.]+)\s*=/.exec(text);
+  const sources = answer.sliders.filter((g) => g.device === "V" || g.device === "I");
+  const found = named && sources.find((g) => g.element.toLowerCase() === named[1].toLowerCase());
+  return found ? found.element : sources.length ? sources[0].element : null;
+}
+
+/** A page without a server shows the values, and cannot move them. */
+function still() {
+  for (const control of document.querySelectorAll("#controls input, #controls select, #controls textarea, #run, #deck, #python, #reset")) {
+    control.disabled = true;
+  }
+}
+
+function table() {
+  const old = new Map((pinned && pinned.figures ? pinned.figures : []).map((f) => [f.name, f]));
+  const head = ["signal", "mean", "mean, last period", "smallest", "largest", ...(pinned ? ["pinned mean", "change"] : [])];
+  const cell = (tag, text) => Object.assign(document.createElement(tag), { textContent: text });
+  const row = (tag, texts) => {
+    const out = document.createElement("tr");
+    out.append(...texts.map((text) => cell(tag, text)));
+    return out;
+  };
+  const rows = now.figures.map((f) => {
+    const size = Math.max(Math.abs(f.max), Math.abs(f.min));
+    // What is left of a mean after the rounding of large values is nought.
+    const clean = (x) => (x !== null && Math.abs(x) < 1e-9 * size ? 0 : x);
+    const figures = [f.mean, f.mean_periodic, f.min, f.max].map((x) => quantity(clean(x), f.unit, 5));
+    const texts = [f.element ? `${f.label} ${f.element}` : f.label, ...figures];
+    if (pinned) {
+      const before = old.has(f.name) ? old.get(f.name).mean : null;
+      const usable = before !== null && f.mean !== null && Math.abs(before) > 1e-9 * size;
+      texts.push(quantity(clean(before), f.unit, 5), usable ? `${(100 * (f.mean / before - 1)).toFixed(2)} %` : "–");
+    }
+    return row("td", texts);
+  });
+  $("figures").replaceChildren(row("th", head), ...rows);
+}
+
+/** Mean force against frequency: a few points at first, then those between them. */
+async function sweepMore() {
+  if (baked || inFlight || !now || !now.ok || !now.figures.some((f) => f.name.startsWith("f_el"))) return;
+  const asked = asking();
+  const key = JSON.stringify(request(state, examples));
+  if (sweep.key !== key) sweep = { key, points: [], message: "", level: 0, left: [] };
+  if (sweep.message || (!sweep.left.length && sweep.level > 3)) {
+    drawMeans();
+    return;
+  }
+  if (!sweep.left.length) {
+    const between = sweep.points.slice(1).map(([f], i) => Math.sqrt(f * sweep.points[i][0]));
+    sweep.left = sweep.level === 0 ? [10, 100, 1e3, 1e4, 1e5] : between;
+    sweep.level += 1;
+  }
+  // A few at a time, since a slider that moves has to wait for them.
+  const frequencies = sweep.left.splice(0, 3);
+  const mine = sweep;
+  inFlight = true;
+  try {
+    const found = await ask("means", { ...asked, frequencies });
+    if (found.ok) {
+      const force = numbers(found.force);
+      mine.points.push(...Array.from(numbers(found.frequency), (f, i) => [f, force[i]]));
+      mine.points.sort((a, b) => a[0] - b[0]);
+      mine.amplitude = found.amplitude;
+    } else {
+      mine.message = found.message;
+    }
+  } catch {
+    mine.message = "no answer";
+  } finally {
+    inFlight = false;
+  }
+  if (again) {
+    refresh();
+    return;
+  }
+  drawMeans();
+  if (!mine.message) idle = setTimeout(sweepMore, 0);
+}
+
+function drawMeans() {
+  const figure = good && good.figures.find((f) => f.signal === "f_el" || f.name.startsWith("f_el"));
+  const force = figure ? figure.mean_periodic : null;
+  const here = good && good.frequency && force !== null ? [good.frequency, force] : null;
+  means.show(sweep.points, here, sweep.message, sweep.amplitude);
+}
+
+function controls() {
+  const option = (key) => state.options[key] || "";
+  for (const id of ["charge_law", "area", "skin", "last", "rtol"]) {
+    const select = $(id);
+    const value = option(id);
+    if (![...select.options].some((o) => o.value === value)) select.append(new Option(value, value));
+    select.value = value;
+  }
+  if (document.activeElement !== $("periods")) $("periods").value = option("periods");
+  waveforms.update(option("source"));
+  $("scene").value = state.deck === null ? state.scene : "";
+  const example = examples.find((e) => e.name === state.scene);
+  $("note").textContent = state.deck === null && example ? example.note : "";
+  if (document.activeElement !== $("netlist")) $("netlist").value = request(state, examples).deck;
+}
+
+function keepAddress() {
+  const hash = toHash(state, examples);
+  if (hash === written) return;
+  written = hash;
+  history.replaceState(null, "", hash);
+}
+
+function set(key, value) {
+  if (value === "") delete state.options[key];
+  else state.options[key] = value;
+  unknownInLink = [];
+  refresh();
+}
+
+function open(hash) {
+  [state, unknownInLink] = fromHash(hash, examples);
+  written = "";
+  good = null;
+  refresh();
+}
+
+function choose(next) {
+  state = next;
+  unknownInLink = [];
+  good = null;
+  refresh();
+}
+
+function save(name, blob) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
+
+function csv() {
+  if (!good) return;
+  const head = ["t (s)", ...good.traces.map((x) => `${x.name} (${x.unit})`)];
+  const lines = Array.from(good.t, (t, i) => [t, ...good.traces.map((x) => x.values[i])].join(","));
+  save("fingerspice.csv", new Blob([[head.join(","), ...lines, ""].join("\n")], { type: "text/csv" }));
+}
+
+async function copied(text, what) {
+  try {
+    await navigator.clipboard.writeText(text);
+    say(`${what} copied`);
+  } catch {
+    // A browser may refuse the clipboard: then the text is given as a file.
+    save("fingerspice.txt", new Blob([text], { type: "text/plain" }));
+  }
+}
+
+async function text(what, use) {
+  const answer = await ask(what, asking());
+  if (answer.ok) use(answer.text);
+  else say(answer.message, true);
+}
+
+function listen() {
+  $("scene").addEventListener("change", () => choose(ofExample(examples.find((e) => e.name === $("scene").value))));
+  for (const id of ["charge_law", "area", "skin", "last", "rtol", "periods"]) {
+    $(id).addEventListener("change", () => set(id, $(id).value.trim()));
+  }
+  $("pin").addEventListener("click", () => {
+    pinned = pinned ? null : good;
+    $("pin").textContent = pinned ? "Unpin" : "Pin";
+    $("pin").setAttribute("aria-pressed", String(Boolean(pinned)));
+    if (now && (now.ok || good)) show(now);
+  });
+  $("reset").addEventListener("click", () => {
+    state.set = {};
+    refresh();
+  });
+  $("share").addEventListener("click", () => copied(location.href.replace(/#.*$/, "") + toHash(state, examples), "link"));
+  $("deck").addEventListener("click", () => text("deck", (x) => save("fingerspice.cir", new Blob([x], { type: "text/plain" }))));
+  $("python").addEventListener("click", () => text("python", (x) => copied(x, "Python")));
+  $("csv").addEventListener("click", csv);
+  $("png").addEventListener("click", () => traces.picture().toBlob((blob) => save("fingerspice.png", blob)));
+  $("run").addEventListener("click", () => choose({ ...state, deck: $("netlist").value, set: {}, options: { last: "2" } }));
+  $("file").addEventListener("change", () => $("file").files.length && take($("file").files[0]));
+  addEventListener("dragover", (event) => {
+    event.preventDefault();
+    document.body.classList.add("dropping");
+  });
+  addEventListener("dragleave", () => document.body.classList.remove("dropping"));
+  addEventListener("drop", (event) => {
+    event.preventDefault();
+    document.body.classList.remove("dropping");
+    if (event.dataTransfer.files.length) take(event.dataTransfer.files[0]);
+  });
+  $("link").addEventListener("change", () => open($("link").value));
+  addEventListener("hashchange", () => {
+    if (location.hash !== written) open(location.hash);
+  });
+}
+
+async function start() {
+  const first = baked ? baked.start : await (await fetch("start")).json();
+  examples = first.examples;
+  if (first.own) examples.unshift({ name: OWN, note: "The circuit for which this page was opened.", ...first.own });
+  $("scene").append(...examples.map((e) => new Option(e.title, e.name)), Object.assign(new Option("(another netlist)", ""), { hidden: true }));
+  traces = new Traces($("plots"));
+  harmonics = new Harmonics($("harmonics"));
+  stack = new Stack($("stack"), (at) => traces.point(at));
+  means = new Means($("means"));
+  sliders = new Sliders($("sliders"), (path, value) => {
+    state.set[path] = value;
+    unknownInLink = [];
+    refresh();
+  });
+  waveforms = new Waveforms(first.waveforms, (value) => {
+    const source = now ? replacedSource({ sliders: now.sliders }) : null;
+    const replaced = source || (now && now.sliders.length ? now.sliders[0].element : null);
+    for (const path of Object.keys(state.set)) if (replaced && path.startsWith(`${replaced}.`)) delete state.set[path];
+    set("source", value);
+  });
+  listen();
+  if (location.hash.length > 1) open(location.hash);
+  else choose(ofExample(examples[0]));
+}
+
+start().catch((error) => say(`the page could not start: ${error.message}`, true));

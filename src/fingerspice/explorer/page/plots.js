@@ -1,0 +1,242 @@
+// Traces against time, harmonics, and mean force against frequency.
+
+import { numbers, quantity, scale } from "./units.js";
+
+const COLOURS = ["#0a5a9c", "#b3400d", "#2c7a3f", "#7b3f9e", "#8a6d00", "#00707a", "#9c1f56", "#444"];
+const GREY = "#9aa3ad";
+const PANELS = [
+  { title: "voltage", signals: ["u_source", "u_gap", "u_layer", "v"], unit: "V", height: 190 },
+  { title: "force", signals: ["f_el"], unit: "N", height: 150 },
+  { title: "area", signals: ["area"], unit: "m^2", height: 140 },
+  { title: "friction", signals: ["friction"], unit: "1", height: 140 },
+];
+
+/** A run of the server with its arrays as numbers. */
+export function decoded(answer) {
+  const traces = answer.traces.map((x) => ({ ...x, values: numbers(x.values) }));
+  return { ...answer, t: answer.t ? numbers(answer.t) : new Float64Array(0), traces };
+}
+
+/** Values at other times, by straight lines; null outside. */
+function resampled(times, x, values) {
+  const out = new Array(times.length);
+  let k = 0;
+  for (let i = 0; i < times.length; i += 1) {
+    while (k < x.length - 2 && x[k + 1] < times[i]) k += 1;
+    const span = x[k + 1] - x[k];
+    const share = span > 0 ? (times[i] - x[k]) / span : 0;
+    out[i] = share < -1e-6 || share > 1 + 1e-6 || x.length < 2 ? null : values[k] + share * (values[k + 1] - values[k]);
+  }
+  return out;
+}
+
+function extreme(lists) {
+  let most = 0;
+  for (const list of lists) for (const x of list) if (x !== null && Math.abs(x) > most) most = Math.abs(x);
+  return most;
+}
+
+const name = (trace) => (trace.element ? `${trace.label} ${trace.element}` : trace.label);
+
+/** The panels of traces: the run of now, the last good one in grey where that failed, and the pinned one dashed. */
+export class Traces {
+  constructor(parent) {
+    this.parent = parent;
+    this.plots = [];
+    this.key = "";
+    this.failedAt = null;
+    new ResizeObserver(() => this.resize()).observe(parent);
+  }
+
+  /** Draw runs; `good` is the last good one where `now` failed, else null. */
+  show(now, good, pinned) {
+    const base = good || now;
+    const inPeriods = pinned && base.period && pinned.period && Math.abs(pinned.period / base.period - 1) > 1e-9;
+    const x = (run) => (inPeriods ? Array.from(run.t, (t) => (t - run.t[0]) / run.period) : Array.from(run.t));
+    const layers = [{ run: base, grey: Boolean(good) }];
+    if (good && now.t.length > 1) layers.push({ run: now });
+    if (pinned) layers.push({ run: pinned, dashed: true });
+    this.failedAt = now.ok || inPeriods ? null : now.failed_at;
+    const times = x(base);
+    const [factor, unit] = inPeriods ? [1, "periods"] : scale(times[times.length - 1] || 0, "s");
+    const wanted = [];
+    for (const panel of PANELS) {
+      const series = layers.flatMap(({ run, grey, dashed }) =>
+        run.traces.filter((t) => panel.signals.includes(t.signal)).map((t, i) => ({
+          label: `${name(t)}${dashed ? ", pinned" : ""}${grey ? ", before" : ""}`, colour: grey ? GREY : COLOURS[i % COLOURS.length], dashed,
+          values: run === base ? Array.from(t.values) : resampled(times, x(run), t.values),
+        })));
+      if (series.length) wanted.push({ panel, series });
+    }
+    const key = JSON.stringify(wanted.map((w) => [w.panel.title, w.series.map((s) => [s.label, s.colour, s.dashed])]));
+    if (key !== this.key) this.build(wanted, key);
+    this.factor = factor;
+    const scaled = times.map((t) => t * factor);
+    wanted.forEach(({ panel, series }, i) => {
+      const plot = this.plots[i];
+      const [by, named] = scale(extreme(series.map((s) => s.values)), panel.unit);
+      plot.axes[0].label = inPeriods ? "time (periods)" : `time (${unit})`;
+      plot.axes[1].label = named ? `${panel.title} (${named})` : panel.title;
+      plot.setData([scaled, ...series.map((s) => s.values.map((v) => (v === null ? null : v * by)))]);
+    });
+  }
+
+  build(wanted, key) {
+    this.key = key;
+    for (const plot of this.plots) plot.destroy();
+    this.parent.replaceChildren();
+    this.plots = wanted.map(({ panel, series }, i) => {
+      const box = document.createElement("div");
+      box.className = "panel";
+      this.parent.append(box);
+      const line = (s) => ({ label: s.label, stroke: s.colour, width: s.dashed ? 1.2 : 1.6, dash: s.dashed ? [6, 4] : undefined,
+        points: { show: false }, value: (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5)))) });
+      const options = {
+        width: this.width(), height: panel.height, cursor: { sync: { key: "time" } },
+        scales: { x: { time: false } },
+        axes: [{ size: i === wanted.length - 1 ? 34 : 30, labelSize: 18, font: "11px sans-serif", labelFont: "12px sans-serif", label: "" },
+          { size: 58, labelSize: 20, space: 24, font: "11px sans-serif", labelFont: "12px sans-serif", label: "" }],
+        series: [{ label: "time", value: (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5)))) }, ...series.map(line)],
+        hooks: { draw: [(u) => this.mark(u)] },
+      };
+      return new uPlot(options, [[], ...series.map(() => [])], box);
+    });
+  }
+
+  /** A line at the time at which the run failed. */
+  mark(u) {
+    if (this.failedAt === null || this.failedAt === undefined) return;
+    const at = u.valToPos(this.failedAt * this.factor, "x", true);
+    const { left, top, width, height } = u.bbox;
+    // A run that failed before what is shown has its line at the left edge.
+    const x = Math.min(Math.max(at, left), left + width);
+    u.ctx.save();
+    u.ctx.strokeStyle = "#a11212";
+    u.ctx.lineWidth = 2;
+    u.ctx.beginPath();
+    u.ctx.moveTo(x, top);
+    u.ctx.lineTo(x, top + height);
+    u.ctx.stroke();
+    u.ctx.restore();
+  }
+
+  /** Put the cursors of all panels at an output, counted from 0; null takes them away. */
+  point(at) {
+    for (const plot of this.plots) {
+      const left = at === null || plot.data[0].length <= at ? -10 : plot.valToPos(plot.data[0][at], "x");
+      plot.setCursor({ left, top: at === null ? -10 : 0 }, false);
+    }
+  }
+
+  width() {
+    return Math.max(this.parent.clientWidth - 12, 260);
+  }
+
+  resize() {
+    for (const plot of this.plots) plot.setSize({ width: this.width(), height: plot.height });
+  }
+
+  /** The panels as one picture. */
+  picture() {
+    const parts = this.plots.map((p) => p.ctx.canvas);
+    const canvas = document.createElement("canvas");
+    canvas.width = Math.max(...parts.map((c) => c.width));
+    canvas.height = parts.reduce((sum, c) => sum + c.height, 0);
+    const context = canvas.getContext("2d");
+    context.fillStyle = "#fff";
+    context.fillRect(0, 0, canvas.width, canvas.height);
+    let top = 0;
+    for (const part of parts) {
+      context.drawImage(part, 0, top);
+      top += part.height;
+    }
+    return canvas;
+  }
+}
+
+/** A small plot against frequency with a title, in a panel of its own. */
+class Small {
+  constructor(parent, title) {
+    this.parent = parent;
+    this.title = title;
+    this.plot = null;
+    new ResizeObserver(() => this.plot && this.plot.width !== this.width() && this.plot.setSize({ width: this.width(), height: 190 })).observe(parent);
+  }
+
+  width() {
+    return Math.max(this.parent.clientWidth - 12, 200);
+  }
+
+  clear(text = "") {
+    if (this.plot) this.plot.destroy();
+    this.plot = null;
+    this.parent.replaceChildren();
+    if (!text) return;
+    this.parent.append(Object.assign(document.createElement("h2"), { textContent: this.title }));
+    this.parent.append(Object.assign(document.createElement("p"), { textContent: text }));
+  }
+
+  draw(series, data, labels, scales) {
+    if (!this.plot || this.plot.series.length !== series.length + 1) {
+      this.clear();
+      this.parent.append(Object.assign(document.createElement("h2"), { textContent: this.title }));
+      const axis = { font: "11px sans-serif", labelFont: "12px sans-serif", labelSize: 18, label: "" };
+      this.plot = new uPlot({ width: this.width(), height: 190, scales,
+        axes: [{ ...axis, size: 30 }, { ...axis, size: 52, space: 28 }], legend: { show: false }, cursor: { show: false },
+        series: [{}, ...series] }, data, this.parent);
+    }
+    this.plot.axes[0].label = labels[0];
+    this.plot.axes[1].label = labels[1];
+    this.plot.setData(data);
+  }
+}
+
+/** Amplitudes of the friction force at the harmonics of the source. */
+export class Harmonics extends Small {
+  constructor(parent) {
+    super(parent, "harmonics of the friction force");
+  }
+
+  show(harmonics) {
+    if (!harmonics || !harmonics.length) {
+      this.clear();
+      return;
+    }
+    const lists = harmonics.map((h) => Array.from(numbers(h.amplitude)));
+    const frequency = Array.from(numbers(harmonics[0].frequency));
+    const [by, unit] = scale(extreme(lists), "N");
+    const [fBy, fUnit] = scale(frequency[0], "Hz");
+    const bars = uPlot.paths.bars({ size: [0.5, 24] });
+    const series = harmonics.map((_, i) => ({ stroke: COLOURS[i], fill: `${COLOURS[i]}80`, paths: bars, points: { show: false } }));
+    const data = [frequency.map((f) => f * fBy), ...lists.map((l) => l.map((a) => a * by))];
+    this.draw(series, data, [`frequency (${fUnit})`, `amplitude (${unit})`],
+      { x: { time: false, range: (u) => [0, u.data[0][u.data[0].length - 1] + u.data[0][0]] }, y: { range: (u, low, high) => [0, high * 1.05 || 1] } });
+  }
+}
+
+/** Mean force against frequency, with a dot at the run of now. */
+export class Means extends Small {
+  constructor(parent) {
+    super(parent, "");
+  }
+
+  /** `points` are pairs of frequency (Hz) and force (N), ascending; `here` is one such pair or null. */
+  show(points, here, text, amplitude) {
+    const title = `mean force of a sine${amplitude ? ` of ${amplitude}` : ""} against its frequency`;
+    if (title !== this.title) this.clear();
+    this.title = title;
+    const all = [...points.map(([f, y]) => [f, y, null]), ...(here ? [[here[0], null, here[1]]] : [])].sort((a, b) => a[0] - b[0]);
+    if (!points.length) {
+      this.clear(text);
+      return;
+    }
+    const [by, unit] = scale(extreme([all.map((p) => p[1]), all.map((p) => p[2])]), "N");
+    const times = (v) => (v === null ? null : v * by);
+    const series = [{ stroke: COLOURS[0], width: 1.6, spanGaps: true, points: { show: true, size: 4 } },
+      { stroke: COLOURS[1], width: 0, points: { show: true, size: 10, fill: COLOURS[1] } }];
+    this.draw(series, [all.map((p) => p[0]), all.map((p) => times(p[1])), all.map((p) => times(p[2]))],
+      ["frequency (Hz)", `mean force (${unit})`], { x: { time: false, distr: 3 }, y: { range: (u, low, high) => [0, high * 1.08 || 1] } });
+    this.plot.axes[0].values = (u, splits) => splits.map((f) => (f !== null && /^1e/.test(f.toExponential()) ? quantity(f, "Hz", 2).replace(" Hz", "").replace("Hz", "") : ""));
+    this.plot.redraw(false, true);
+  }
+}

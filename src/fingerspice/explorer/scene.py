@@ -1,0 +1,166 @@
+"""One scene of the explorer: from what the page asks for to traces, figures and sentences, without any state."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.units import format_si
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.explorer.request import Request, circuits_of, request_of, times_of
+from fingerspice.explorer.sliders import sliders
+from fingerspice.results.outcome import SolveError
+from fingerspice.results.signals import SIGNALS
+from fingerspice.results.solution import Solution
+from fingerspice.solve.simulation import simulate
+
+#: Points of each trace, traces of each kind, and harmonics.
+POINTS, MOST_TRACES, HARMONICS = 2000, 8, 20
+#: Longest time of a run after its compilation, s.
+LONGEST_RUN = 10.0
+_SHOWN = ("u_source", "u_gap", "f_el", "area", "friction")
+_WITHOUT_GAP = ("u_source", "u_layer", "v", "area")
+_FIGURES = ("mean", "max", "min", "mean_periodic")
+
+
+def scene(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
+    """Run what the page asks for.
+
+    Parameters
+    ----------
+    given : dict
+        Keys and values as in `request.Request`; only ``deck`` is needed.
+    own : Circuit, optional
+        The circuit for which the page was opened; it stands for its own text.
+
+    Returns
+    -------
+    dict
+        ``ok``, ``status`` and ``message``; ``sliders``, ``sources``, ``warnings`` and ``unknown``; of a run ``t`` and
+        ``traces`` (arrays in SI units), ``figures``, ``error``, ``plan``, ``harmonics``, ``stacks``, ``period``,
+        ``t_stop`` and ``failed_at``. A request that is refused, or a run that fails, says why in ``message``; neither
+        raises an exception.
+    """
+    answer: dict[str, Any] = {"ok": False, "status": "BAD_INPUT", "message": "", "sliders": [], "traces": []}
+    with warnings.catch_warnings(record=True) as noticed:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", FingerspiceWarning)
+        try:
+            request = request_of(given)
+            base, circuit, lost = circuits_of(request, own)
+            answer |= {"title": circuit.title, "sliders": sliders(base, circuit), "unknown": [*request.unknown, *lost]}
+            answer |= _run(circuit, request)
+        except InputError as error:
+            answer["message"] = str(error)
+        except SolveError as error:
+            answer |= {"status": error.failure.status.name, "message": error.message, "failed_at": error.failure.t}
+        except MemoryError:
+            answer["message"] = "not enough memory for this scene; allowed: fewer periods or elements"
+    said = [*answer.get("warnings", ()), *(str(w.message) for w in noticed)]
+    answer["warnings"] = list(dict.fromkeys(said))
+    return answer
+
+
+def deadline(seconds: float = LONGEST_RUN) -> Callable[[float], None]:
+    """A `progress` function that ends a run which takes longer; compiling, before the first call, does not count."""
+    begin: list[float] = []
+
+    def check(done: float) -> None:
+        begin.append(time.monotonic())
+        if begin[-1] - begin[0] > seconds:
+            raise InputError(
+                f"the run was stopped after {seconds:g} s at {100.0 * done:.3g} % of its length; allowed: fewer "
+                "periods, or a larger error"
+            )
+        del begin[1:]
+
+    return check
+
+
+def _run(circuit: Circuit, request: Request) -> dict[str, Any]:
+    """The part of an answer that a run gives."""
+    first, stop, period = times_of(circuit, request)
+    solution = simulate(
+        circuit, t_stop=stop, t_eval=np.linspace(first, stop, POINTS), charge_law=request.charge_law, area=request.area,
+        rtol=request.rtol, charge=False, throw=False, progress=deadline(),
+    )  # fmt: skip
+    keys = _SHOWN if solution.gaps else _WITHOUT_GAP
+    traces = [one for key in keys for one in _traces(solution, key)]
+    answer: dict[str, Any] = {
+        "ok": solution.success, "status": solution.status.name, "message": solution.message, "t": solution.t,
+        "traces": traces, "warnings": list(solution.warnings), "period": period, "t_stop": stop,
+        "frequency": None if solution.fundamental is None else solution.fundamental.frequency,
+        "charge_law": solution.charge_law, "method": solution.method, "area": solution.area_mode,
+        "error": {"u_gap": solution.error.u_gap, "f_el": solution.error.f_el, "text": _error_text(solution)},
+        "plan": {"tier": solution.plan.tier, "text": "; ".join(solution.plan.reasons)},
+        "failed_at": solution.failure.t if solution.failure is not None else None,
+    }  # fmt: skip
+    if solution.success:
+        answer |= {"figures": _figures(solution, traces), "harmonics": _harmonics(solution, period)}
+        answer["stacks"] = _stacks(solution)
+    return answer
+
+
+def _traces(solution: Solution, key: str) -> list[dict[str, Any]]:
+    """The columns of a signal, each as one trace."""
+    unit, label = SIGNALS[key]
+    out = []
+    for name, values in list(solution.by_name(key).items())[:MOST_TRACES]:
+        element = name.partition(":")[2]
+        out.append({"name": name, "signal": key, "element": element, "unit": unit, "label": label, "values": values})
+    return out
+
+
+def _stacks(solution: Solution) -> list[dict[str, Any]]:
+    """The layers on each contact area with their thickness and voltage, for the drawing of the stack."""
+    stacks: dict[str, dict[str, Any]] = {}
+    voltages = solution.by_name("u_layer")
+    for name in solution.layers:
+        e = solution.circuit[name]
+        stack = stacks.setdefault(e.nodes[2], {"gap": None, "layers": []})
+        if e.device == "GAP":
+            stack["gap"] = name
+        layer = {"name": name, "device": e.device, "d": e.values["d"], "values": voltages[f"u_layer:{name}"]}
+        stack["layers"].append(layer)
+    return [stack for stack in stacks.values() if stack["gap"] is not None][:MOST_TRACES]
+
+
+def _error_text(solution: Solution) -> str:
+    error = solution.error
+    said = f"gap voltage within {format_si(error.u_gap, 'V', 2)}" if solution.gaps else ""
+    force = f", force within {format_si(error.f_el, 'N', 2)}" if solution.gaps else ""
+    return f"{said}{force}" or f"voltages within {format_si(error.u_gap, 'V', 2)}"
+
+
+def _figures(solution: Solution, traces: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Mean, largest and smallest value of each trace's signal over the run, and the mean over the last period."""
+    rows = []
+    for trace in traces:
+        name = trace["name"]
+        found = {figure: solution._figures.value(name, figure) for figure in _FIGURES}
+        rows.append(
+            {"name": name, "label": trace["label"], "element": trace["element"], "unit": trace["unit"], **found}
+        )
+    return rows
+
+
+def _harmonics(solution: Solution, period: float | None) -> list[dict[str, Any]]:
+    """Amplitudes of the friction force at multiples of the source's frequency, for each gap."""
+    if period is None or not solution.gaps:
+        return []
+    out = []
+    for name in solution.by_name("f_t"):
+        try:
+            found = solution.spectrum(name, method="lines", highest=HARMONICS / period)
+        except InputError:
+            return []
+        out.append(
+            {"name": name, "element": name.partition(":")[2], "unit": "N", "frequency": found.frequency,
+             "amplitude": found.amplitude, "mean": found.mean}
+        )  # fmt: skip
+    return out

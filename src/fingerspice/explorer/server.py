@@ -1,0 +1,359 @@
+"""The explorer's server: on the loopback address alone, for whoever has the token in its link."""
+
+from __future__ import annotations
+
+import base64
+import hmac
+import json
+import math
+import secrets
+import socket
+import threading
+import webbrowser
+from collections import deque
+from collections.abc import Callable, Mapping
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+from typing import Any, ClassVar
+
+import numpy as np
+
+from fingerspice import __version__
+from fingerspice.base.errors import InputError, printable
+from fingerspice.base.pages import in_notebook
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.explorer.examples import EXAMPLES
+from fingerspice.explorer.request import asked_by
+from fingerspice.explorer.scene import scene
+from fingerspice.explorer.sharing import as_deck, as_python, means
+from fingerspice.explorer.waveforms import menu
+from fingerspice.results.solution import Solution
+
+ADDRESS = "127.0.0.1"
+FRAME_HEIGHT, MOST_FRAMES = 900, 8
+"""Height (px) of the page in a notebook; explorers that one notebook keeps running."""
+#: Largest request, bytes; seconds that a connection may be silent; connections at once.
+MOST_BYTES, SILENCE, MOST_CONNECTIONS = 5_000_000, 30.0, 32
+_TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+#: Pages that may show the explorer within them, where a notebook has asked for it: those of this computer.
+_NOTEBOOKS = " ".join(f"{kind}://{host}:*" for kind in ("http", "https") for host in (ADDRESS, "localhost"))
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors "
+)
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+Answer = tuple[HTTPStatus, str, bytes]
+#: Explorers that this notebook shows, the oldest first: a cell that is run again starts another one.
+_FRAMES: deque[Explorer] = deque()
+
+
+def pages() -> dict[str, bytes]:
+    """The files of the page by name."""
+    folder = resources.files("fingerspice.explorer") / "page"
+    names = (entry.name for entry in folder.iterdir())
+    return {name: (folder / name).read_bytes() for name in names if name.rpartition(".")[2] in _TYPES}
+
+
+class Explorer:
+    """A running explorer: its address, and how it ends.
+
+    Parameters
+    ----------
+    circuit : Circuit, optional
+        What the page shows first; by default the first example.
+    port : int
+        0 takes a free one.
+    asked : mapping, optional
+        How the page runs the circuit first: keys and values as in `request.Request`.
+    framed : bool
+        Whether a notebook on this computer may show the page in a frame; a cell then shows this object as the page.
+
+    Attributes
+    ----------
+    url : str
+        The link to the page, token included. Whoever has it can run scenes on this computer, and nothing else.
+
+    Raises
+    ------
+    InputError
+        If the port is taken, or no port number.
+    """
+
+    def __init__(
+        self,
+        circuit: Circuit | None = None,
+        port: int = 0,
+        *,
+        asked: Mapping[str, Any] | None = None,
+        framed: bool = False,
+    ) -> None:
+        if not 0 <= port <= 65535:
+            raise InputError(f"port is {port}; allowed: 0 to 65535, where 0 takes a free one")
+        self.token = secrets.token_urlsafe(24)
+        self.circuit, self.asked, self.framed = circuit, dict(asked or {}), framed
+        self.files = pages()
+        self._one_at_a_time = threading.Lock()
+        try:
+            self._server = _Server((ADDRESS, port), type("Handler", (_Handler,), {"explorer": self}))
+        except OSError as error:
+            raise InputError(
+                f"port {port} of {ADDRESS} cannot be used: {error.strerror}; allowed: a free port"
+            ) from None
+        self.port = int(self._server.server_address[1])
+        self.url = f"http://{ADDRESS}:{self.port}/{self.token}/"
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
+        self._thread.start()
+
+    def __repr__(self) -> str:
+        return f"<Explorer at {self.url}>"
+
+    def _repr_html_(self) -> str | None:
+        if not self.framed:
+            return None
+        style = f"width: 100%; height: {FRAME_HEIGHT}px; border: 1px solid #CCCCCC;"
+        return (
+            f'<iframe src="{self.url}" title="fingerspice explorer" style="{style}" allow="clipboard-write"></iframe>'
+        )
+
+    def open(self) -> None:
+        """Open the page in the browser."""
+        webbrowser.open(self.url)
+
+    def wait(self) -> None:
+        """Return when the explorer is stopped, or this program interrupted (Ctrl-C)."""
+        try:
+            while self._thread.is_alive():
+                self._thread.join(0.5)
+        except KeyboardInterrupt:
+            self.stop()
+
+    def stop(self) -> None:
+        """Close the server; a second call does nothing."""
+        if not self._thread.is_alive():
+            return
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def answer(self, what: str, given: Any) -> Answer:
+        """The answer to what the page asks for."""
+        run: Callable[[Any, Circuit | None], Any] = _ACTIONS[what]
+        # Python's filters of warnings belong to the whole process, and two runs at once would not be faster.
+        with self._one_at_a_time:
+            try:
+                found = run(given, self.circuit)
+            except InputError as error:
+                found = {"ok": False, "message": str(error)}
+        return HTTPStatus.OK, "application/json", as_json(found)
+
+
+def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """What the page needs first: its menus, and the scene to begin with."""
+    examples = [
+        {"name": e.name, "title": e.title, "note": e.note, "request": {"deck": e.deck, **e.asked}} for e in EXAMPLES
+    ]
+    own = None if circuit is None else {"title": circuit.title, "request": {"deck": circuit.text, **(asked or {})}}
+    return {"version": __version__, "own": own, "examples": examples, "waveforms": menu()}
+
+
+def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: bool = True) -> Explorer:
+    """Show a circuit, or a run's circuit, on a local page on which its values can be changed (docs/explore.md).
+
+    Parameters
+    ----------
+    shown : Circuit or Solution, optional
+        By default the first of the page's example scenes. A run's circuit begins with the run's charge law, area mode,
+        error and number of periods, as far as the page has them.
+    port : int
+        Port of the loopback address; 0 takes a free one.
+    browser : bool
+        Whether the page is shown: in a notebook below the cell whose last line this is, and otherwise in the browser.
+
+    Returns
+    -------
+    Explorer
+        It runs until its `stop` is called, or the program ends; `wait` lets a script wait for Ctrl-C. A notebook keeps
+        the latest eight that it shows.
+
+    Raises
+    ------
+    InputError
+        If the port is taken, or no port number.
+    """
+    asked = asked_by(shown) if isinstance(shown, Solution) else {}
+    circuit = shown.circuit if isinstance(shown, Solution) else shown
+    framed = browser and in_notebook()
+    explorer = Explorer(circuit, port, asked=asked, framed=framed)
+    if framed:
+        _FRAMES.append(explorer)
+        while len(_FRAMES) > MOST_FRAMES:
+            _FRAMES.popleft().stop()
+    elif browser:
+        explorer.open()
+    return explorer
+
+
+def as_json(data: Any) -> bytes:
+    """Data as JSON: arrays of numbers as base64 of little-endian doubles, and null for what is not finite."""
+
+    def plain(x: Any) -> Any:
+        if isinstance(x, dict):
+            return {key: plain(value) for key, value in x.items()}
+        if isinstance(x, list | tuple):
+            return [plain(value) for value in x]
+        if isinstance(x, np.ndarray):
+            return {"f64": base64.b64encode(np.ascontiguousarray(x, "<f8").tobytes()).decode("ascii")}
+        if isinstance(x, float):
+            return float(x) if math.isfinite(x) else None
+        return x
+
+    return json.dumps(plain(data), allow_nan=False).encode()
+
+
+_ACTIONS: dict[str, Callable[[Any, Circuit | None], Any]] = {
+    "scene": scene,
+    "means": means,
+    "deck": lambda given, own: {"ok": True, "text": as_deck(given, own)},
+    "python": lambda given, own: {"ok": True, "text": as_python(given, own)},
+}
+
+
+class _Server(ThreadingHTTPServer):
+    """A server with a bounded number of connections, which says nothing about those that break."""
+
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, *arguments: Any) -> None:
+        self._room = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        super().__init__(*arguments)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if not self._room.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._room.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A browser that is closed breaks its connections: no error of ours."""
+
+
+class _Refused(Exception):
+    """A request that gets no answer but a sentence."""
+
+    def __init__(self, status: HTTPStatus, text: str) -> None:
+        self.status, self.text = status, text
+        super().__init__(text)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers to the requests of one explorer, which a subclass names."""
+
+    explorer: ClassVar[Explorer]
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "fingerspice", ""
+    timeout = SILENCE
+    _read = False
+
+    def setup(self) -> None:
+        super().setup()
+        self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Nothing is logged: the token stands in every line."""
+
+    def do_GET(self) -> None:
+        self._answered(lambda what: self._got(what))
+
+    def do_POST(self) -> None:
+        self._read = False
+        self._answered(lambda what: self.explorer.answer(self._action(what), self._body()))
+
+    def _answered(self, make: Callable[[str], Answer]) -> None:
+        try:
+            answer = make(self._allowed())
+        except _Refused as error:
+            self._discard()
+            answer = error.status, "application/json", as_json({"ok": False, "message": error.text})
+        except Exception as error:
+            text = printable(f"this is a fault of fingerspice, please report it ({type(error).__name__}: {error})")
+            answer = HTTPStatus.OK, "application/json", as_json({"ok": False, "status": "FAULT", "message": text})
+        self._send(*answer)
+
+    def _allowed(self) -> str:
+        """What is asked for, of a request that may ask."""
+        hosts = (f"{ADDRESS}:{self.explorer.port}", f"localhost:{self.explorer.port}")
+        if self.headers.get("Host") not in hosts:
+            raise _Refused(HTTPStatus.FORBIDDEN, f"the host is not {hosts[0]}")
+        origin = self.headers.get("Origin")
+        if origin is not None and origin not in [f"http://{host}" for host in hosts]:
+            raise _Refused(HTTPStatus.FORBIDDEN, "another page may not ask")
+        token, _, what = self.path.lstrip("/").partition("?")[0].partition("/")
+        # A notebook's page is another site; it may load this one into a frame, and nothing else.
+        frame = self.command == "GET" and what == "" and self.headers.get("Sec-Fetch-Dest") == "iframe"
+        own = self.headers.get("Sec-Fetch-Site", "same-origin") in ("same-origin", "none")
+        if not own and not (frame and self.explorer.framed):
+            raise _Refused(HTTPStatus.FORBIDDEN, "another page may not ask")
+        if not hmac.compare_digest(token.encode(), self.explorer.token.encode()):
+            raise _Refused(HTTPStatus.FORBIDDEN, "the link's token is missing or wrong; open the link that was printed")
+        return what
+
+    def _got(self, what: str) -> Answer:
+        if what == "start":
+            return HTTPStatus.OK, "application/json", as_json(beginning(self.explorer.circuit, self.explorer.asked))
+        name = what or "index.html"
+        if name not in self.explorer.files:
+            raise _Refused(HTTPStatus.NOT_FOUND, "there is no such file")
+        return HTTPStatus.OK, _TYPES[name.rpartition(".")[2]], self.explorer.files[name]
+
+    def _action(self, what: str) -> str:
+        if what not in _ACTIONS:
+            raise _Refused(HTTPStatus.NOT_FOUND, f"nothing of that name; allowed: {', '.join(_ACTIONS)}")
+        return what
+
+    def _body(self) -> Any:
+        length = self.headers.get("Content-Length", "")
+        if not (length.isascii() and length.isdigit()) or "Transfer-Encoding" in self.headers:
+            raise _Refused(HTTPStatus.LENGTH_REQUIRED, "the request has no length")
+        if len(length) > 12 or int(length) > MOST_BYTES:
+            text = f"the request has {length[:12]} bytes; allowed: at most {MOST_BYTES:,}"
+            raise _Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, text)
+        try:
+            self._read = True
+            return json.loads(self.rfile.read(int(length)))
+        except (ValueError, RecursionError):
+            raise _Refused(HTTPStatus.BAD_REQUEST, "the request is not JSON") from None
+
+    def _discard(self) -> None:
+        """Read what was sent with a refused request, up to a limit, so that the browser takes the answer."""
+        self.close_connection = True
+        length = self.headers.get("Content-Length", "")
+        left = min(int(length), 4 * MOST_BYTES) if length.isascii() and length.isdigit() and len(length) < 12 else 0
+        while left > 0 and not self._read:
+            piece = self.rfile.read(min(left, 65_536))
+            left = left - len(piece) if piece else 0
+
+    def _send(self, status: HTTPStatus, kind: str, body: bytes) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", f"{kind}; charset=utf-8")
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Content-Security-Policy", _POLICY + (_NOTEBOOKS if self.explorer.framed else "'none'"))
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        if self.close_connection:
+            self.send_header("Connection", "close")
+        self.end_headers()
+        self.wfile.write(body)

@@ -1,0 +1,281 @@
+"""The schematic of a circuit: its layers as a ladder, each a resistor beside a capacitor, with names and values."""
+
+from __future__ import annotations
+
+import io
+import math
+import textwrap
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fingerspice.base.errors import InputError
+from fingerspice.base.files import write_aside
+from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.describe import waveform_text
+from fingerspice.plots import drawing
+from fingerspice.plots.picture import Picture
+from fingerspice.plots.placement import GROUND, Place, Placement, place
+from fingerspice.plots.symbols import Stroke, ground, symbol
+
+#: Largest number of elements that a picture can show.
+MOST_ELEMENTS = 200
+#: Letters in a line of values and in a name, and lines of values at most.
+_LETTERS, _LONGEST, _LINES = 34, 40, 7
+#: Inches: height of a line of text, from a symbol to its label, around everything, and around a label in its row.
+_LINE, _BESIDE, _MARGIN, _ROOM = 0.135, 0.08, 0.15, 0.1
+_PER_INCH = 72.0
+_TINTS = {"LAYER": drawing.SKY, "SLAB": drawing.SKY, "SKIN": drawing.ORANGE, "SKIN_DISPERSIVE": drawing.ORANGE}
+
+
+class Schematic(Picture):
+    """A picture that a notebook shows as SVG."""
+
+    def _repr_svg_(self) -> str:
+        content = io.StringIO()
+        self._write_svg(content, {})
+        return content.getvalue()
+
+    def _write_svg(self, target: Path | io.StringIO, about: Mapping[str, str]) -> None:
+        from matplotlib import rc_context
+
+        # Texts stay texts, and the same circuit gives the same file.
+        with rc_context({"svg.fonttype": "none", "svg.hashsalt": "fingerspice"}):
+            self.savefig(target, format="svg", metadata={"Date": None, **about})
+
+    def write(self, path: str | Path, about: Mapping[str, str] | None = None) -> Path:
+        """Write the schematic as SVG or PNG, whichever the path's end says; the file is complete or absent.
+
+        Parameters
+        ----------
+        path : str or Path
+        about : mapping, optional
+            Texts that are stored in the file, under names that the format knows.
+
+        Raises
+        ------
+        InputError
+            If the path has another end, or the folder cannot be written.
+        """
+        path = Path(path)
+        if path.suffix.lower() == ".png":
+            return drawing.save(self, path, about=about, dpi=200.0)
+        if path.suffix.lower() != ".svg":
+            raise InputError(f"the schematic's file is {str(path)!r}; allowed: a name that ends in .svg or .png")
+        return write_aside(path, lambda target: self._write_svg(target, about or {}))
+
+
+@dataclass(frozen=True)
+class _Label:
+    """Name and values beside a symbol, with the width of its longest line, inches."""
+
+    lines: tuple[str, ...]
+    width: float
+
+    @property
+    def height(self) -> float:
+        return _LINE * len(self.lines)
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """Where columns and rows lie, inches."""
+
+    x: list[float]
+    y: list[float]
+    width: float
+    height: float
+
+
+def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
+    """The schematic of a circuit; arguments as in `Circuit.draw`."""
+    if len(circuit.elements) > MOST_ELEMENTS:
+        count = f"{len(circuit.elements):,}"
+        raise InputError(f"the circuit has {count} elements; allowed: at most {MOST_ELEMENTS} in a picture")
+    figure = _new()
+    size = _measure(figure)
+    placed = place(circuit)
+    names = _node_names(circuit)
+    areas = {node for e in circuit.elements for node in e.nodes[2:]}
+    # One area that no source gives goes without saying.
+    told = areas if len(areas) > 1 or areas & set(names) else set()
+    labels = {p.element.name: _label(p.element, told, size) for p in placed.places}
+    title = textwrap.wrap(drawing.drawable(circuit.title), 60) or [""]
+    widths = {node: size(names[node], False) for node in names}
+    sheet = _sheet(placed, labels, widths, max(size(line, True) for line in title), len(title))
+    figure.set_size_inches(sheet.width, sheet.height)
+    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    ax.set(xlim=(0.0, sheet.width), ylim=(0.0, sheet.height))
+    ax.set_axis_off()
+    write = _writer(figure)
+    for k, line in enumerate(title):
+        write(_MARGIN, sheet.height - _MARGIN - (k + 0.5) * _LINE * 1.2, line, bold=True)
+    strokes = _wires(placed, sheet)
+    for p in placed.places:
+        strokes += _draw_element(figure, sheet, p, labels[p.element.name])
+    for node, name in names.items():
+        x, y = sheet.x[placed.extents[node][0]] + 0.07, sheet.y[placed.rows[node]] + 0.08
+        write(x, y, name, color=drawing.BLUE)
+    for stroke in strokes:
+        ax.plot(*zip(*stroke, strict=True), color=drawing.BLACK, linewidth=1.0, solid_capstyle="round")
+    for x, y in _dots(placed, sheet):
+        ax.plot([x], [y], "o", color=drawing.BLACK, markersize=3.5)
+    if path is not None:
+        figure.write(path)
+    return figure
+
+
+def _new() -> Schematic:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure = Schematic(facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _measure(figure: Schematic) -> Callable[[str, bool], float]:
+    """A function that gives the width of a text, inches."""
+    from matplotlib.font_manager import FontProperties
+
+    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
+    fonts = {bold: FontProperties(size=drawing.FONT, weight="bold" if bold else "normal") for bold in (False, True)}
+    dots = float(figure.dpi)
+    return lambda text, bold: float(renderer.get_text_width_height_descent(text, fonts[bold], False)[0]) / dots
+
+
+def _writer(figure: Schematic) -> Callable[..., None]:
+    """A function that writes a line of text, its left middle at (x, y)."""
+    (ax,) = figure.axes
+
+    def write(x: float, y: float, text: str, *, bold: bool = False, color: str = drawing.BLACK) -> None:
+        how: dict[str, Any] = {
+            "fontsize": drawing.FONT,
+            "weight": "bold" if bold else "normal",
+            "color": color,
+            "va": "center",
+        }
+        ax.text(x, y, text, parse_math=False, **how)
+
+    return write
+
+
+def _node_names(circuit: Circuit) -> dict[str, str]:
+    """Nodes but ground, with their names as written."""
+    pairs = [pair for e in circuit.elements for pair in zip(e.nodes[:2], e.node_names[:2], strict=True)]
+    return {node: drawing.drawable(name, _LONGEST) for node, name in reversed(pairs) if node != GROUND}
+
+
+def _label(element: Element, areas: Set[str], size: Callable[[str, bool], float]) -> _Label:
+    """Name and values of an element; of a layer also its area where it is among `areas`."""
+    said = [element.device] if element.spec.is_layer else []
+    for spec in element.spec.parameters:
+        value = element.values[spec.name]
+        # A default of 0 or infinity is an effect that the element does not have.
+        if math.isinf(value) or (value == 0.0 and spec.default == 0.0):
+            continue
+        text = _quantity(value, spec.unit)
+        said.append(text if spec.name == "value" else f"{spec.name} = {text}")
+    unit = "A" if element.device == "I" else "mm^2" if areas & set(element.nodes[:2]) else "V"
+    if element.waveform is not None:
+        said.append(waveform_text(element.waveform, unit).replace(" u", " µ"))
+    if element.ac is not None:
+        said.append(f"AC = {_quantity(element.ac.magnitude, unit)}")
+    if element.initial is not None:
+        said.append(f"IC = {_quantity(element.initial, 'V')}")
+    if areas & set(element.nodes[2:]):
+        said.append(f"area = {element.node_names[2]}")
+    values = _wrapped([drawing.drawable(text) for text in said])
+    name = drawing.drawable(element.name, _LONGEST)
+    return _Label((name, *values), max(size(name, True), *(size(line, False) for line in values), 0.0))
+
+
+def _wrapped(said: Sequence[str]) -> list[str]:
+    """Values in lines; one that fits a line is not divided, since textwrap breaks at plain spaces only."""
+    pieces = [piece for text in said for piece in text.split(", ")]
+    kept = ", ".join(text.replace(" ", "\N{NO-BREAK SPACE}") if len(text) <= _LETTERS else text for text in pieces)
+    lines = textwrap.wrap(kept, _LETTERS + 1, break_on_hyphens=False)
+    if len(lines) > _LINES:
+        lines = [*lines[: _LINES - 1], f"{lines[_LINES - 1][: _LETTERS - 4]} ..."]
+    return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]
+
+
+def _quantity(value: float, unit: str) -> str:
+    # Powers of a unit take no prefix: 1 kmm^2 would not be 1000 mm^2.
+    if "^" in unit or unit == "":
+        return f"{value:.4g} {unit}".rstrip()
+    factor, prefixed = drawing.engineering(value, unit)
+    return f"{factor * value:.4g} {prefixed}".replace("ohm", "Ω")
+
+
+def _sheet(
+    placed: Placement, labels: Mapping[str, _Label], names: Mapping[str, float], title: float, lines: int
+) -> _Sheet:
+    """Columns so wide and rows so high that nothing meets."""
+    columns = 1 + max(p.column for p in placed.places)
+    gaps = max(p.bottom for p in placed.places)
+    left, right, high = [0.2] * columns, [0.3] * columns, [0.0] * gaps
+    for p in placed.places:
+        _, tall, wide = symbol(p.element)
+        label = labels[p.element.name]
+        left[p.column] = max(left[p.column], wide)
+        right[p.column] = max(right[p.column], wide + _BESIDE + label.width)
+        high[p.gap] = max(high[p.gap], 2.0 * tall, label.height)
+    for node, width in names.items():
+        column = placed.extents[node][0]
+        right[column] = max(right[column], 0.07 + width)
+    x = [_MARGIN + left[0]]
+    for k in range(1, columns):
+        x.append(x[-1] + right[k - 1] + _MARGIN + left[k])
+    width = max(x[-1] + right[-1] + _MARGIN, title + 2.0 * _MARGIN)
+    # Names of nodes stand above their rows, also above the first one; ground hangs below the last.
+    above = [_MARGIN + 1.2 * _LINE * lines + _ROOM + _LINE, *(h + 2.0 * _ROOM + _LINE for h in high)]
+    height = sum(above) + 0.24 + _MARGIN
+    y = [height - above[0]]
+    for step in above[1:]:
+        y.append(y[-1] - step)
+    return _Sheet(x, y, width, height)
+
+
+def _draw_element(figure: Schematic, sheet: _Sheet, p: Place, label: _Label) -> list[Stroke]:
+    """Write an element's label; gives the strokes of its symbol and of its wires."""
+    from matplotlib.patches import Rectangle
+
+    strokes, tall, wide = symbol(p.element)
+    x = sheet.x[p.column]
+    # The name of the node below needs the lowest line.
+    y = 0.5 * (sheet.y[p.gap] + sheet.y[p.gap + 1] + _LINE)
+    tint = _TINTS.get(p.element.device)
+    if tint is not None:
+        corner = (x - wide - 0.02, y - tall)
+        figure.axes[0].add_patch(Rectangle(corner, 2.0 * wide + 0.04, 2.0 * tall, color=tint, alpha=0.2, linewidth=0))
+    write = _writer(figure)
+    for k, line in enumerate(label.lines):
+        write(x + wide + _BESIDE, y + 0.5 * label.height - (k + 0.5) * _LINE, line, bold=k == 0)
+    up = 1.0 if p.upright else -1.0
+    moved: list[Stroke] = [[(x + dx, y + up * dy) for dx, dy in stroke] for stroke in strokes]
+    return [*moved, [(x, sheet.y[p.top]), (x, y + tall)], [(x, y - tall), (x, sheet.y[p.bottom])]]
+
+
+def _wires(placed: Placement, sheet: _Sheet) -> list[Stroke]:
+    """The rows of nodes, and ground."""
+    rows: list[Stroke] = []
+    for node, (first, last) in placed.extents.items():
+        y = sheet.y[placed.rows[node]]
+        if last > first:
+            rows.append([(sheet.x[first], y), (sheet.x[last], y)])
+    column = placed.extents[GROUND][0]
+    return [*rows, *ground(sheet.x[column], sheet.y[placed.rows[GROUND]])]
+
+
+def _dots(placed: Placement, sheet: _Sheet) -> Sequence[tuple[float, float]]:
+    """Points where three wires or more meet."""
+    found = []
+    for node, (first, last) in placed.extents.items():
+        row = placed.rows[node]
+        ends = [p.column for p in placed.places if node in p.element.nodes[:2]]
+        for column in sorted(set(ends)):
+            meeting = ends.count(column) + (column > first) + (column < last)
+            if meeting + (node == GROUND and column == first) >= 3:
+                found.append((sheet.x[column], sheet.y[row]))
+    return found

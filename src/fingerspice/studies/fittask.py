@@ -1,0 +1,189 @@
+"""What is fitted: predictions and residuals with their derivatives, and the least squares from one start."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.statespace import build_stack, is_stack
+from fingerspice.results.outcome import SolveError
+from fingerspice.solve.simulation import simulate
+from fingerspice.studies.fitdata import IMPEDANCE, Data
+from fingerspice.studies.fitgroups import Unknown, members_of
+from fingerspice.studies.fitresult import Fitted
+from fingerspice.studies.phasors import phasor
+from fingerspice.studies.steady import steady_state
+
+# Relative step of a difference, where derivatives are not exact: of networks.
+_STEP = 1e-4
+# What a scene that cannot be run counts as, over the scale of the data.
+REFUSED = 1e6
+# Error of the least squares' last step, relative.
+CLOSE = 1e-8
+
+
+class Problem(Protocol):
+    """What least squares need: residuals over their scale with derivatives by logarithms, and bounds of the values."""
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Smallest and largest values, shape (n_parameter, 2)."""
+
+    def residuals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals, shape (n,), and their derivatives, shape (n, n_parameter)."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is fitted.
+
+    Attributes
+    ----------
+    circuit : Circuit
+        With the values to start from.
+    data : Data
+    unknowns : tuple of Unknown
+    bounds : ndarray, shape (n_parameter, 2)
+        Smallest and largest values.
+    average : str
+    skin : str
+    rtol : float
+    charge_law : str or None
+    target, scale : ndarray, shape (n,) or (2 n,)
+        What is to be predicted, and that by which residuals are divided: the data's values, and, where the phase of an
+        impedance is given, the phases (deg) after them.
+    exact : bool
+        Whether derivatives are those of a series stack, and not differences.
+    """
+
+    circuit: Circuit
+    data: Data
+    unknowns: tuple[Unknown, ...]
+    bounds: FloatArray
+    average: str
+    skin: str
+    rtol: float
+    charge_law: str | None
+    target: FloatArray
+    scale: FloatArray
+    exact: bool
+
+    @property
+    def initial(self) -> FloatArray:
+        """Values to start from."""
+        return np.array([self.circuit.parameters[one.path].value for one in self.unknowns])
+
+    @cached_property
+    def members(self) -> NDArray[np.bool_]:
+        """Whether each unknown belongs to each measurement, shape (n_parameter, n)."""
+        return members_of(self.unknowns, self.data.groups, self.data.values.size)
+
+    def scene(self, values: FloatArray, row: int) -> Circuit:
+        """The circuit of one measurement."""
+        changes = {path: float(x[row]) for path, x in self.data.conditions.items()}
+        changes |= {self.unknowns[k].path: float(values[k]) for k in np.flatnonzero(self.members[:, row])}
+        changed = self.circuit.varied(changes)
+        if self.skin == "follow":
+            fundamental = build_stack(changed).waveform.fundamental if is_stack(changed) else None
+            skins = {f"{e.name}.f": fundamental.frequency for e in changed.by_device("SKIN") if fundamental is not None}
+            changed = changed.varied(skins)
+        return changed
+
+    def predict(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Predicted data (n,), and their derivatives by the logarithms of the parameters (n, n_parameter)."""
+        if self.exact:
+            return self._predicted(values, exact=True)
+        middle, _ = self._predicted(values, exact=False)
+        by = np.empty((middle.size, values.size))
+        for k in range(values.size):
+            pair = []
+            for sign in (-1.0, 1.0):
+                moved = values.copy()
+                moved[k] *= 1.0 + sign * _STEP
+                pair.append(self._predicted(moved, exact=False)[0])
+            by[:, k] = (pair[1] - pair[0]) / (2.0 * _STEP)
+        return middle, by
+
+    def _predicted(self, values: FloatArray, *, exact: bool) -> tuple[FloatArray, FloatArray]:
+        data, how = self.data, {"rtol": self.rtol, "charge_law": self.charge_law, "charge": False}
+        if data.t is not None:
+            paths = tuple(one.path for one in self.unknowns) if exact else ()
+            run = simulate(self.scene(values, 0), t_eval=data.t, sensitivities=paths, **how)  # type: ignore[arg-type]
+            slopes = [getattr(run.sensitivities[path], data.signal) for path in paths]
+            return np.asarray(getattr(run, data.signal)), np.array(slopes).reshape(len(paths), -1).T * values[
+                : len(paths)
+            ]
+        if data.signal == IMPEDANCE:
+            return self._impedance(values), np.empty((self.target.size, 0))
+        name, found, by = data.name, np.empty(data.values.size), np.zeros((data.values.size, values.size))
+        for row in range(data.values.size):
+            circuit = self.scene(values, row)
+            felt = np.flatnonzero(self.members[:, row]) if exact else ()
+            paths = tuple(self.unknowns[k].path for k in felt)
+            if self.average == "periodic":
+                one = steady_state(circuit, sensitivities=paths, points=4, **how)  # type: ignore[arg-type]
+            else:
+                one = simulate(circuit, sensitivities=paths, t_eval=[0.0], t_stop=_end(circuit), **how)  # type: ignore[arg-type,assignment]
+            found[row] = getattr(one, name)
+            for k, path in zip(felt, paths, strict=True):
+                by[row, k] = getattr(one.sensitivities[path], name) * values[k]
+        return found, by
+
+    def _impedance(self, values: FloatArray) -> FloatArray:
+        """Magnitudes (ohm), and phases (deg) where they are given, at the area that the deck's amplitude causes."""
+        how = "swept" if self.skin == "follow" else "own"
+        runs = [phasor(self.scene(values, row), skin=how).impedance for row in range(self.data.values.size)]
+        z = np.array([one[0] for one in runs if one is not None])
+        return np.abs(z) if self.data.phase is None else np.concatenate([np.abs(z), np.degrees(np.angle(z))])
+
+    def residuals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals over their scale, and their derivatives; large ones where a scene cannot be run."""
+        try:
+            with warnings.catch_warnings():
+                # Of values that no user has written.
+                warnings.simplefilter("ignore", FingerspiceWarning)
+                found, by = self.predict(values)
+        except (InputError, SolveError):
+            return np.full(self.scale.size, REFUSED), np.zeros((self.scale.size, values.size))
+        off = found - self.target
+        if self.data.phase is not None:
+            n = self.data.values.size
+            off[n:] = np.remainder(off[n:] + 180.0, 360.0) - 180.0
+        return off / self.scale, by / self.scale[:, None]
+
+
+def _end(circuit: Circuit) -> float:
+    if circuit.tran is None:
+        raise InputError("the deck has no .tran, and average is 'run'; allowed: a deck with .tran, or 'periodic'")
+    return circuit.tran.stop
+
+
+def followed(task: Problem, begin: FloatArray, close: float = CLOSE) -> Fitted:
+    """Where least squares lead from a start; `close` is the relative error of the last step."""
+    from scipy.optimize import least_squares
+
+    known: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+
+    def at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        key = x.tobytes()
+        if key not in known:
+            known.clear()
+            known[key] = task.residuals(np.exp(x))
+        return known[key]
+
+    with np.errstate(divide="ignore"):
+        box = np.log(task.bounds).T
+    x0 = np.clip(np.log(begin), *box)
+    found = least_squares(
+        lambda x: at(x)[0], x0, lambda x: at(x)[1], bounds=box, xtol=close, ftol=close**1.5, gtol=1e-12, max_nfev=100
+    )
+    residual, by = at(found.x)
+    return Fitted(np.exp(found.x), residual, by, float(residual @ residual), int(found.nfev), bool(found.status > 0))

@@ -1,0 +1,276 @@
+"""A circuit as a module of PyTorch: values from the package's own runs, derivatives from their tangents."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from fingerspice.base.errors import InputError
+from fingerspice.circuit.arguments import require_circuit, require_number, times_given
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.statespace import build_stack, is_stack
+from fingerspice.solve.simulation import RTOL_RANGE
+from fingerspice.studies.batch import own_path
+from fingerspice.torch.scenes import MEANS, SIGNALS, Scenes
+from fingerspice.waveforms.waveform import require
+
+# What batches and runs accept both.
+_LEAST_RTOL = 1e-12
+
+
+class Simulator(torch.nn.Module):
+    """A series stack whose parameters are those of a module, and whose runs have exact derivatives by them.
+
+    Every parameter is a `torch.nn.Parameter` in double precision, in the netlist's unit, whose name is the path with
+    ``_`` for its dots: ``Xgap.d`` is `Xgap_d`. Tensors of several values are many scenes; their shapes are broadcast.
+
+    Parameters
+    ----------
+    circuit : Circuit
+        A series stack with a GAP whose area follows the voltage.
+    parameters : sequence of str, or mapping of str to array_like
+        Paths, as in `Circuit.replace`, of the circuit and its waveform; a mapping gives the values to start from, which
+        are otherwise the circuit's. ``source.`` stands for the only source.
+    outputs : str or sequence of str
+        Means ``f_el_mean``, ``f_t_mean``, ``friction_mean`` and ``area_mean``, and signals at the times `t`: ``u_gap``,
+        ``area``, ``f_el``, ``f_t`` and ``friction``.
+    t : array_like, optional
+        Times of the signals, s, ascending.
+    t_stop : float, optional
+        End of every run, s; the deck's TSTOP by default.
+    periodic : bool
+        Take the periodic state: means are those of a period.
+    logarithms : bool
+        Let the module's parameters be the natural logarithms of the values, so that one step length suits all of them.
+    rtol : float
+        Error of every run, as in `simulate`, and of means relative to themselves, as in `batch`.
+
+    Raises
+    ------
+    InputError
+        If the circuit is another network, or a path, output or time is unknown or missing.
+    """
+
+    def __init__(
+        self,
+        circuit: Circuit,
+        parameters: Sequence[str] | Mapping[str, ArrayLike] = (),
+        outputs: str | Sequence[str] = "f_el_mean",
+        *,
+        t: ArrayLike | None = None,
+        t_stop: float | None = None,
+        periodic: bool = False,
+        logarithms: bool = False,
+        rtol: float = 1e-8,
+    ) -> None:
+        super().__init__()
+        require_circuit(circuit)
+        if not is_stack(circuit) or build_stack(circuit).contact is None:
+            raise InputError(
+                "the circuit is no series stack with a GAP; allowed: one with derivatives, which these are"
+            )
+        self.circuit, self.logarithms = circuit, logarithms
+        self._alone = isinstance(outputs, str)
+        names = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+        self._scenes = _scenes(circuit, names, t, t_stop, periodic, rtol)
+        self.paths: dict[str, str] = {}
+        for path, value in _initial(circuit, parameters).items():
+            if logarithms and not bool((value > 0.0).all()):
+                raise InputError(f"{path} is {value.min():g}, and logarithms are asked for; allowed: more than 0")
+            self.paths[path] = path.replace(".", "_")
+            self.register_parameter(self.paths[path], torch.nn.Parameter(value.log() if logarithms else value))
+
+    def extra_repr(self) -> str:
+        """The module's parameters and outputs, for its text."""
+        return f"{', '.join(self.paths)} -> {', '.join(self._scenes.outputs)}"
+
+    def value(self, path: str) -> Tensor:
+        """Value of one of the module's parameters in the netlist's unit.
+
+        Raises
+        ------
+        InputError
+            If it is no parameter of the module.
+        """
+        name = own_path(self.circuit, path)
+        if name not in self.paths:
+            raise InputError(f"{name} is no parameter of this module; allowed: {', '.join(self.paths) or 'none'}")
+        held: Tensor = getattr(self, self.paths[name])
+        return held.exp() if self.logarithms else held
+
+    def forward(self, values: Mapping[str, Tensor | ArrayLike] | None = None) -> Tensor | dict[str, Tensor]:
+        """Run all scenes.
+
+        Parameters
+        ----------
+        values : mapping of str to tensor or array_like, optional
+            Path to values in the netlist's unit; instead of the module's own parameters, or besides them.
+
+        Returns
+        -------
+        tensor, or dict of str to tensor
+            Of the shape that the values' shapes give together, and of one more dimension, the times, for signals. A
+            dict by name if several outputs were asked for.
+
+        Raises
+        ------
+        InputError
+            If a path is unknown, a value is out of range, shapes do not fit, or a scene cannot be run.
+        """
+        given = {}
+        for path, one in ({} if values is None else values).items():
+            given[own_path(self.circuit, path)] = _tensor(path, one)
+        own = {path: _tensor(path, self.value(path)) for path in self.paths if path not in given}
+        every = {**own, **given}
+        if not every:
+            raise InputError("there are no values; allowed: parameters of the module, or values for its call")
+        try:
+            shaped = torch.broadcast_tensors(*every.values())
+        except RuntimeError:
+            shapes = ", ".join(f"{tuple(one.shape)} ({path})" for path, one in every.items())
+            raise InputError(f"the values have shapes {shapes}; allowed: shapes that broadcast") from None
+        found: Tensor = _Run.apply(self._scenes, tuple(every), *shaped)
+        parts = dict(zip(self._scenes.outputs, found.split(self._scenes.sizes, dim=-1), strict=True))
+        parts = {name: part.squeeze(-1) if name in MEANS else part for name, part in parts.items()}
+        return parts[self._scenes.outputs[0]] if self._alone else parts
+
+
+def _scenes(
+    circuit: Circuit, names: tuple[str, ...], t: ArrayLike | None, t_stop: float | None, periodic: bool, rtol: float
+) -> Scenes:
+    """The checked request."""
+    for name in names:
+        if name not in (*MEANS, *SIGNALS):
+            raise InputError(f"unknown output {name!r}; allowed: {', '.join((*MEANS, *SIGNALS))}")
+    require(len(names) > 0, "outputs", "empty", "one or more names")
+    require(len(set(names)) == len(names), "outputs", repr(names), "every name once")
+    signals = [name for name in names if name in SIGNALS]
+    times = times_given("t", t)
+    if signals and (times is None or times.ndim != 1 or not times.size):
+        raise InputError(f"{signals[0]} is asked for, and t is {t!r}; allowed: a row of times in s")
+    if not signals and times is not None:
+        raise InputError(f"t is given, and no signal is asked for; allowed: outputs such as {', '.join(SIGNALS)}")
+    if t_stop is not None:
+        require_number("t_stop", t_stop, "a number in s")
+        require(math.isfinite(t_stop) and t_stop > 0.0, "t_stop", t_stop, "more than 0")
+    elif circuit.tran is not None:
+        t_stop = circuit.tran.stop
+    elif signals or not periodic:
+        raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
+    require_number("rtol", rtol, "1e-12 to 0.1")
+    require(_LEAST_RTOL <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-12 to 0.1")
+    return Scenes(circuit, names, np.zeros(0) if times is None else times, t_stop, bool(periodic), float(rtol))
+
+
+def _initial(circuit: Circuit, parameters: Sequence[str] | Mapping[str, ArrayLike]) -> dict[str, Tensor]:
+    """The values to start from, by path in the circuit's own spelling."""
+    if isinstance(parameters, str):
+        raise InputError(f"parameters is {parameters!r}; allowed: a sequence of paths such as ('Xgap.d',)")
+    found: dict[str, Tensor] = {}
+    for path in parameters:
+        name = own_path(circuit, path)
+        if name in found:
+            raise InputError(f"{name} is given twice; allowed: once")
+        one = parameters[path] if isinstance(parameters, Mapping) else circuit.parameters[name].value
+        found[name] = _tensor(path, one).detach().clone()
+    return found
+
+
+def _tensor(path: str, one: Tensor | ArrayLike) -> Tensor:
+    """A value in double precision on the processor."""
+    if not isinstance(one, Tensor):
+        try:
+            one = torch.from_numpy(np.array(one, float))
+        except (TypeError, ValueError):
+            raise InputError(f"{path} is {one!r}; allowed: a tensor or array of numbers") from None
+    if one.is_complex():
+        raise InputError(f"{path} is complex; allowed: real numbers")
+    return one.to("cpu", torch.float64)
+
+
+def _rows(tensors: Sequence[Tensor]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Values as an array, shape (n_scene, n_path)."""
+    return np.stack([one.detach().numpy().ravel() for one in tensors], axis=1)
+
+
+def _in_front(size: int, dims: Sequence[int | None], tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Tensors of one shape, with the mapped dimension first in all of them."""
+    return [
+        one.movedim(dim, 0) if dim is not None else one.expand(size, *one.shape)
+        for one, dim in zip(tensors, dims, strict=True)
+    ]
+
+
+# The methods of both functions have the names and signatures that torch calls.
+class _Run(torch.autograd.Function):
+    """The outputs of scenes at values of one shape (...): a tensor of shape (..., number of outputs)."""
+
+    generate_vmap_rule = False
+
+    @staticmethod
+    def forward(scenes: Scenes, paths: tuple[str, ...], *values: Tensor) -> Tensor:
+        found = torch.from_numpy(scenes.values(paths, _rows(values)))
+        return found.reshape(*values[0].shape, -1)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.scenes, ctx.paths = inputs[:2]
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*inputs[2:])
+        ctx.save_for_forward(*inputs[2:])
+
+    @staticmethod
+    def backward(ctx: Any, by_output: Tensor | None) -> tuple[Tensor | None, ...]:
+        needed = ctx.needs_input_grad[2:]
+        wanted = tuple(path for path, need in zip(ctx.paths, needed, strict=True) if need)
+        if by_output is None or not wanted:
+            return (None,) * (2 + len(needed))
+        slopes = _Slopes.apply(ctx.scenes, ctx.paths, wanted, *ctx.saved_tensors)
+        each = iter((by_output.unsqueeze(-1) * slopes).sum(-2).unbind(-1))
+        return (None, None, *(next(each) if need else None for need in needed))
+
+    @staticmethod
+    def jvp(ctx: Any, *moves: Tensor | None) -> Tensor | None:
+        moved = [(path, one) for path, one in zip(ctx.paths, moves[2:], strict=True) if one is not None]
+        if not moved:
+            return None
+        slopes = _Slopes.apply(ctx.scenes, ctx.paths, tuple(path for path, _ in moved), *ctx.saved_tensors)
+        return (slopes * torch.stack([one for _, one in moved], dim=-1).unsqueeze(-2)).sum(-1)
+
+    @staticmethod
+    def vmap(info: Any, dims: tuple[Any, ...], scenes: Scenes, paths: tuple[str, ...], *values: Tensor) -> Any:
+        return _Run.apply(scenes, paths, *_in_front(info.batch_size, dims[2:], values)), 0
+
+
+class _Slopes(torch.autograd.Function):
+    """Derivatives of `_Run` by some of the values: a tensor of shape (..., number of outputs, number of values)."""
+
+    generate_vmap_rule = False
+
+    @staticmethod
+    def forward(scenes: Scenes, paths: tuple[str, ...], wanted: tuple[str, ...], *values: Tensor) -> Tensor:
+        found = torch.from_numpy(scenes.slopes(paths, wanted, _rows(values)))
+        return found.reshape(*values[0].shape, -1, len(wanted))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        """Nothing is kept: there are no further derivatives."""
+
+    @staticmethod
+    def backward(ctx: Any, *by_output: Tensor) -> Any:
+        raise InputError("second derivatives of a run are asked for; allowed: first derivatives")
+
+    jvp = backward
+
+    @staticmethod
+    def vmap(
+        info: Any, dims: tuple[Any, ...], scenes: Scenes, paths: tuple[str, ...], wanted: tuple[str, ...],
+        *values: Tensor,
+    ) -> Any:  # fmt: skip
+        return _Slopes.apply(scenes, paths, wanted, *_in_front(info.batch_size, dims[3:], values)), 0

@@ -1,0 +1,560 @@
+"""The explorer: its scenes equal `fs.simulate`, its server answers whom it may, and nothing makes it stumble."""
+
+from __future__ import annotations
+
+import base64
+import http.client
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+import warnings
+import wave
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import fingerspice as fs
+from commands import Command
+from fingerspice.base.arrays import FloatArray
+from fingerspice.explorer.examples import EXAMPLES
+from fingerspice.explorer.request import LONGEST_DECK
+from fingerspice.explorer.scene import POINTS, scene
+from fingerspice.explorer.server import MOST_BYTES, Explorer, pages
+from fingerspice.explorer.sharing import as_deck, as_python, means
+from fingerspice.explorer.waveforms import WAVEFORMS
+
+ROOT = Path(__file__).parents[1]
+SINE = EXAMPLES[0].deck
+BY_NAME = {e.name: e for e in EXAMPLES}
+OWN = """Its own
+.include fingerspice.lib
+Vdrive  drive 0          PWL FILE=drive.csv
+Xcoat   drive top  area  LAYER d=1u eps_r=3.9 r=0.2meg
+Xgap    top   skin area  GAP   r=1meg
+Xskin   skin  0    area  SKIN_DISPERSIVE d=350u
+.tran 10u 20m uic
+.end
+"""
+
+
+@pytest.fixture(scope="module")
+def explorer() -> Iterator[Explorer]:
+    running = fs.explore(browser=False)
+    yield running
+    running.stop()
+
+
+def array(x: dict[str, str]) -> FloatArray:
+    return np.frombuffer(base64.b64decode(x["f64"]), "<f8")
+
+
+def packed(values: list[float]) -> str:
+    return base64.b64encode(np.array(values, "<f8").tobytes()).decode()
+
+
+def asked(explorer: Explorer, what: str, body: bytes | None, **headers: str) -> tuple[int, dict[str, Any]]:
+    """Status and answer of one request, whether refused or not."""
+    request = urllib.request.Request(f"{explorer.url}{what}", body, headers)
+    try:
+        with urllib.request.urlopen(request, timeout=60) as answer:
+            return answer.status, json.load(answer)
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, json.load(error)
+
+
+def post(explorer: Explorer, request: Any, what: str = "scene") -> dict[str, Any]:
+    status, answer = asked(explorer, what, json.dumps(request).encode())
+    assert status == 200
+    return answer
+
+
+def refused(status: int, answer: dict[str, Any], expected: int, *words: str) -> None:
+    assert status == expected
+    assert answer["ok"] is False
+    for word in words:
+        assert word in answer["message"]
+
+
+def test_the_values_of_a_scene_are_those_of_simulate(explorer: Explorer) -> None:
+    request = {
+        "deck": SINE, "overrides": {"Xgap.d": "4u", "xgap.fn": 0.7}, "source": "SQUARE(150 200)", "rtol": 1e-7,
+        "charge_law": "mobile", "periods": 3, "last": 2,
+    }  # fmt: skip
+    answer = post(explorer, request)
+    assert answer["ok"], answer["message"]
+    t = array(answer["t"])
+    assert t.size == POINTS
+    np.testing.assert_allclose(t, np.linspace(5e-3, 15e-3, POINTS), rtol=1e-14)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        circuit = fs.parse_netlist(SINE).replace({"Xgap.d": 4e-6, "Xgap.fn": 0.7})
+        expected = fs.simulate(
+            circuit, sources=fs.Square(150.0, 200.0), charge_law="mobile", rtol=1e-7, t_stop=15e-3, t_eval=t,
+            charge=False,
+        )  # fmt: skip
+    signals = {trace["name"]: array(trace["values"]) for trace in answer["traces"]}
+    assert set(signals) == {"u_source", "u_gap", "f_el", "area", "friction"}
+    for name, values in signals.items():
+        np.testing.assert_array_equal(values, getattr(expected, name))
+    assert answer["error"]["u_gap"] == expected.error.u_gap
+    figures = {row["name"]: row for row in answer["figures"]}
+    assert figures["f_el"]["mean_periodic"] == expected.f_el_mean_periodic
+    (stack,) = answer["stacks"]
+    assert (stack["gap"], [layer["d"] for layer in stack["layers"]]) == ("Xgap", [1e-6, 4e-6, 350e-6])
+    for layer, column in zip(stack["layers"], expected.u_layer.T, strict=True):
+        np.testing.assert_array_equal(array(layer["values"]), column)
+    (friction,) = answer["harmonics"]
+    lines = expected.spectrum("f_t", highest=20 * 200.0)
+    np.testing.assert_allclose(array(friction["frequency"]), lines.frequency)
+    np.testing.assert_allclose(array(friction["amplitude"]), lines.amplitude)
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda e: e.name)
+def test_every_example_shows_what_it_promises(example: Any) -> None:
+    answer = scene({"deck": example.deck, **example.asked})
+    if example.name == "fold":
+        assert (answer["ok"], answer["status"]) == (False, "FOLD")
+        assert "no solution" in answer["message"]
+        assert 0.0 < answer["failed_at"] < 1e-3
+        assert answer["sliders"]
+        return
+    assert answer["ok"], answer["message"]
+    assert answer["warnings"] == []
+    assert answer["unknown"] == []
+    names = {trace["signal"] for trace in answer["traces"]}
+    assert names == {"u_source", "u_gap", "f_el", "area", "friction"}
+    assert all(trace["values"].shape == answer["t"].shape == (POINTS,) for trace in answer["traces"])
+    fingers = 2 if example.name == "two-fingers" else 1
+    assert len([t for t in answer["traces"] if t["signal"] == "f_el"]) == len(answer["stacks"]) == fingers
+    assert ".tran" in as_deck({"deck": example.deck, **example.asked})
+
+
+def test_there_are_examples_of_all_that_the_page_is_for() -> None:
+    assert len(BY_NAME) == len(EXAMPLES) >= 12
+
+
+@pytest.mark.parametrize("kind", WAVEFORMS)
+def test_every_waveform_of_the_menu_runs_as_the_menu_writes_it(kind: str) -> None:
+    numbers = " ".join(f"{a.value:g}" for a in WAVEFORMS[kind][1])
+    request = {"deck": SINE, "source": f"Vdrive={kind}({numbers})", "rtol": 1e-4, "periods": 2, "skin": "dispersive"}
+    if kind == "RECORDING":
+        request["recording"] = {"name": "a.wav", "rate": 1e3, "values": packed([0.0, 1.0, 0.0, -1.0, 0.0])}
+    answer = scene(request)
+    assert answer["ok"], answer["message"]
+    peak = np.abs(answer["traces"][0]["values"]).max()
+    assert peak == pytest.approx(150.0 if kind in ("CHIRP", "RECORDING") else 200.0, rel=4e-3)
+
+
+def test_sliders_show_every_parameter_within_its_range() -> None:
+    answer = scene({"deck": BY_NAME["ungrounded"].deck, "overrides": {"Xgap.d": "4u"}})
+    sliders = {s["path"]: s for group in answer["sliders"] for s in group["sliders"]}
+    circuit = fs.parse_netlist(BY_NAME["ungrounded"].deck)
+    assert set(sliders) == set(circuit.parameters)
+    assert sliders["Xgap.d"]["value"] == 4e-6
+    assert sliders["Xgap.d"]["text"] == "4u"
+    assert (sliders["Xgap.d"]["log"], sliders["Xgap.mu"]["log"]) == (True, False)
+    for slider in sliders.values():
+        assert slider["low"] < slider["high"], slider
+        assert slider["value"] is None or slider["low"] <= slider["value"] <= slider["high"], slider
+        assert not slider["log"] or slider["low"] > 0.0, slider
+    unmoved = scene({"deck": BY_NAME["ungrounded"].deck})
+    ranges = {s["path"]: (s["low"], s["high"]) for group in unmoved["sliders"] for s in group["sliders"]}
+    assert ranges == {path: (s["low"], s["high"]) for path, s in sliders.items()}
+
+
+def test_both_ends_of_every_slider_give_a_run_or_a_sentence() -> None:
+    groups = scene({"deck": SINE})["sliders"]
+    for slider in (s for group in groups for s in group["sliders"]):
+        for end in ("low", "high"):
+            answer = scene({"deck": SINE, "overrides": {slider["path"]: slider[end]}, "rtol": 1e-4, "periods": 1})
+            assert answer["ok"] or len(answer["message"]) > 20, (slider["path"], end)
+            assert answer["status"] != "FAULT"
+
+
+def test_unknown_names_are_said_and_the_rest_is_shown() -> None:
+    answer = scene({"deck": SINE, "overrides": {"Xgpa.d": 1e-6}, "areas": "frozen"})
+    assert answer["ok"]
+    assert answer["unknown"] == [
+        "unknown name 'areas', which is left out; nearest: 'area'",
+        "unknown parameter 'Xgpa.d', which is left out; nearest: 'Xgap.d'",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("request_", "words"),
+    [
+        ([], "the request is list"),
+        ({}, "deck is of type NoneType"),
+        ({"deck": 5}, "deck is of type int"),
+        ({"deck": "x" * (LONGEST_DECK + 1)}, "characters long; allowed: at most"),
+        ({"deck": "t\nV1 a 0 1\n" + "R1 a 0 1\n" * 2}, "R1"),
+        ({"deck": "t\nV0 1 0 1\n" + "".join(f"R{i} 1 0 1\n" for i in range(200))}, "at most 200 on this page"),
+        ({"deck": SINE, "overrides": {"Xgap.d": -1}}, "Xgap d is -1 m; allowed: more than 0"),
+        ({"deck": SINE, "overrides": {"Xgap.d": "2k7"}}, "write 2.7k"),
+        ({"deck": SINE, "overrides": {"Xgap.d": [1]}}, "a number, or text such as 3.5u"),
+        ({"deck": SINE, "overrides": {"Xgap.d": 10**400}}, "a number, or text such as 3.5u"),
+        ({"deck": SINE, "overrides": 3}, "overrides is int"),
+        ({"deck": SINE, "source": "SQARE(1 2)"}, "SQUARE"),
+        ({"deck": SINE, "source": "Vother=SIN(0 1 1)"}, "allowed: Vdrive"),
+        ({"deck": SINE, "source": "AM(200)"}, "AM(amplitude carrier envelope depth)"),
+        ({"deck": SINE, "source": 7}, "text such as SQUARE(200 100)"),
+        ({"deck": SINE, "charge_law": "other"}, "local or mobile"),
+        ({"deck": SINE, "area": "wide"}, "coupled, mean, frozen or a number"),
+        ({"deck": SINE, "area": True}, "coupled, mean, frozen or a number"),
+        ({"deck": SINE, "skin": ["own"]}, "own or follow or dispersive"),
+        ({"deck": SINE, "rtol": 2}, "1e-12 to 0.1"),
+        ({"deck": SINE, "periods": 1e9}, "0.01 to 200"),
+        ({"deck": SINE, "periods": "five"}, "0.01 to 200"),
+        ({"deck": SINE, "source": "BURST(1 100k 100 10000)"}, "on this page"),
+        ({"deck": "t\n.include other.cir\nV1 a 0 1\nR1 a 0 1\n.end"}, "no folder to look in"),
+        ({"deck": SINE.replace("SIN(0 200 100)", "WAVEFILE(/etc/hostname 1)")}, "no folder to look in"),
+        ({"deck": SINE, "source": "WAVEFILE(/etc/hostname 1)"}, "no folder to look in"),
+        ({"deck": SINE, "source": "TABLE(/etc/passwd)"}, "no folder to look in"),
+        ({"deck": SINE, "source": "PWL FILE=/etc/passwd"}, "no folder to look in"),
+        ({"deck": SINE, "overrides": {"Vdrive": "WAVEFILE(/etc/hostname 1)"}}, "is not a number"),
+    ],
+    ids=lambda x: x if isinstance(x, str) else "",
+)  # fmt: skip
+def test_a_wrong_request_is_refused_in_a_sentence(request_: Any, words: str) -> None:
+    answer = scene(request_)
+    assert (answer["ok"], answer["status"]) == (False, "BAD_INPUT")
+    assert words in answer["message"]
+    assert "Traceback" not in answer["message"]
+
+
+def test_dispersive_skins_count_by_their_slabs() -> None:
+    fingers = "".join(
+        f"Xc{i} d t{i} a{i} LAYER d=1u eps_r=4\nXg{i} t{i} s{i} a{i} GAP\nXs{i} s{i} 0 a{i} SKIN d=350u f=5k\n"
+        for i in range(25)
+    )
+    deck = f"t\nV1 d 0 SIN(0 200 5k)\n{fingers}.tran 1u 1m uic\n.end\n"
+    assert scene({"deck": deck, "rtol": 1e-3, "periods": 1})["ok"]
+    assert "dispersive skin counted as its" in scene({"deck": deck, "skin": "dispersive"})["message"]
+
+
+def test_a_run_that_takes_too_long_is_stopped_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fingerspice.explorer.scene.LONGEST_RUN", -1.0)
+    monkeypatch.setattr("fingerspice.explorer.scene.deadline.__defaults__", (-1.0,))
+    answer = scene({"deck": SINE})
+    assert "the run was stopped after" in answer["message"]
+
+
+def test_a_circuit_of_the_users_stands_for_its_text_with_its_files_and_changes(tmp_path: Path) -> None:
+    (tmp_path / "own.cir").write_text(OWN)
+    (tmp_path / "drive.csv").write_text("t,u\n0,0\n1m,100\n5m,100\n6m,0\n")
+    own = fs.read_netlist(tmp_path / "own.cir").replace({"Xgap.d": 5e-6})
+    assert "no folder to look in" in scene({"deck": OWN})["message"]
+    answer = scene({"deck": own.text, "overrides": {"Xgap.r": "2meg"}}, own)
+    assert answer["ok"], answer["message"]
+    expected = fs.simulate(own.replace({"Xgap.r": 2e6}), t_eval=answer["t"], rtol=1e-6, charge=False)
+    np.testing.assert_array_equal(answer["traces"][1]["values"], expected.u_gap)
+    assert f"fs.read_netlist({str(tmp_path / 'own.cir')!r})" in as_python({"deck": own.text}, own)
+
+
+@pytest.mark.parametrize(
+    "asks",
+    [
+        {"overrides": {"Xgap.d": "4u", "Xgap.r": "inf"}, "source": "AM(200 5k 50)", "periods": 1, "skin": "follow"},
+        {"skin": "dispersive", "charge_law": "mobile", "area": "frozen", "last": 1},
+        {"source": "BURST(200 5k 10 10m)", "periods": 1, "rtol": 1e-4},
+    ],
+)
+def test_the_python_of_a_scene_gives_its_traces(asks: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    request = {"deck": SINE, **asks}
+    names: dict[str, Any] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        exec(as_python(request), names)
+    capsys.readouterr()
+    answer = scene(request)
+    np.testing.assert_array_equal(names["solution"].t, answer["t"])
+    for trace in answer["traces"]:
+        np.testing.assert_allclose(getattr(names["solution"], trace["name"]), trace["values"], rtol=1e-12, atol=1e-15)
+
+
+def test_the_deck_of_a_scene_gives_its_traces() -> None:
+    request = {"deck": SINE, "overrides": {"Xgap.d": "4u"}, "source": "SIN(0 150 200)", "skin": "follow"}
+    with warnings.catch_warnings():
+        # The deck holds ngspice's subcircuits of the devices.
+        warnings.filterwarnings("ignore", ".*not read$")
+        circuit = fs.parse_netlist(as_deck(request))
+    answer = scene(request)
+    solution = fs.simulate(circuit, t_eval=answer["t"], rtol=1e-6)
+    np.testing.assert_allclose(solution.f_el, answer["traces"][2]["values"], atol=1e-6)
+
+
+def test_a_recording_is_the_source_that_its_file_gives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    values = np.round(20_000 * np.sin(np.arange(400) / 7.0)).astype("<i2")
+    with wave.open("a.wav", "wb") as file:
+        file.setparams((1, 2, 8000, 400, "NONE", ""))
+        file.writeframes(values.tobytes())
+    (tmp_path / "a.csv").write_text("t,u\n0,0\n1e-3,100\n4e-3,-50\n")
+    deck = BY_NAME["click"].deck
+    recording = {"name": "a.wav", "rate": 8000, "values": packed(list(values / 2.0**15))}
+    table = {"name": "a.csv", "times": packed([0.0, 1e-3, 4e-3]), "values": packed([0.0, 100.0, -50.0])}
+    for gain, data, stop in ((150.0, recording, 0.05), (2.0, table, 4e-3)):
+        request = {"deck": deck, "source": f"RECORDING({gain})", "recording": data}
+        answer = scene(request)
+        assert answer["ok"], answer["message"]
+        assert answer["t_stop"] == pytest.approx(stop)
+        names: dict[str, Any] = {}
+        exec(as_python(request), names)
+        np.testing.assert_allclose(names["solution"].f_el, answer["traces"][2]["values"], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("recording", "words"),
+    [
+        (None, "which a link does not carry"),
+        (5, "an object with the keys"),
+        ({"name": "a"}, "not base64 of doubles"),
+        ({"name": "a", "values": "é"}, "not base64 of doubles"),
+        ({"name": "a", "values": packed([1.0])}, "allowed: 2 to 200,000"),
+        ({"name": "a", "values": packed([1.0, 2.0])}, "samples per second"),
+        ({"name": 7, "values": packed([1.0, 2.0])}, "a file's name"),
+        ({"name": "a", "values": packed([1.0, 2.0]), "times": packed([1.0, 2.0, 3.0])}, "as many of each"),
+        ({"name": "a", "values": packed([1.0, 2.0]), "times": packed([2.0, 1.0])}, "PWL times decrease"),
+        ({"name": "a", "values": packed([1.0, float("nan")]), "rate": 100}, "allowed: finite numbers"),
+    ],
+)  # fmt: skip
+def test_a_wrong_recording_is_refused_in_a_sentence(recording: Any, words: str) -> None:
+    answer = scene({"deck": SINE, "source": "RECORDING(150)", "recording": recording})
+    assert (answer["ok"], answer["status"]) == (False, "BAD_INPUT")
+    assert words in answer["message"]
+
+
+def test_the_mean_force_against_frequency_is_that_of_large_signal() -> None:
+    found = means({"deck": SINE, "frequencies": [100, 1000]})
+    (expected,) = fs.large_signal(fs.parse_netlist(SINE), [100, 1000], rtol=1e-5)
+    np.testing.assert_allclose(found["force"], expected.f_el_mean)
+    for wrong in ({}, {"frequencies": []}, {"frequencies": ["x"]}, {"frequencies": [1.0] * 17}, []):
+        assert "at most 16 numbers" in means({"deck": SINE, **wrong} if isinstance(wrong, dict) else wrong)["message"]  # type: ignore[dict-item, arg-type]
+
+
+def test_the_page_and_its_files_come_with_headers_that_shut_it_in(explorer: Explorer) -> None:
+    for name in ("", *pages()):
+        with urllib.request.urlopen(explorer.url + name) as answer:
+            policy = answer.headers["Content-Security-Policy"]
+            assert "default-src 'none'" in policy
+            assert "unsafe" not in policy
+            assert answer.headers["X-Content-Type-Options"] == "nosniff"
+            assert answer.headers["Referrer-Policy"] == "no-referrer"
+            assert answer.read() == pages()[name or "index.html"]
+    assert sum(map(len, pages().values())) < 300_000
+    text = b"".join(content for name, content in pages().items() if not name.startswith("uplot")).decode()
+    assert "http:" not in text.replace("http://www.w3.org/2000/svg", "")
+    assert "https:" not in text
+    assert "MIT License" in (ROOT / "LICENSES" / "uPlot-MIT.txt").read_text()
+    assert "uplot.js" in (ROOT / "NOTICE").read_text()
+
+
+@pytest.fixture(scope="module")
+def framed() -> Iterator[Explorer]:
+    running = Explorer(framed=True)
+    yield running
+    running.stop()
+    running.stop()
+
+
+def loaded(explorer: Explorer, what: str, **headers: str) -> int:
+    """Status of a request that another site's page makes."""
+    request = urllib.request.Request(f"{explorer.url}{what}", None, {"Sec-Fetch-Site": "cross-site", **headers})
+    try:
+        with urllib.request.urlopen(request) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code
+
+
+def test_another_page_may_frame_the_explorer_only_where_a_notebook_asked_for_it(
+    explorer: Explorer, framed: Explorer
+) -> None:
+    frame = {"Sec-Fetch-Dest": "iframe", "Sec-Fetch-Mode": "navigate"}
+    assert loaded(framed, "", **frame) == 200
+    assert loaded(explorer, "", **frame) == 403
+    # A frame is all: no data, no script, no page in a window, nothing without the token.
+    assert loaded(framed, "start", **frame) == 403
+    assert loaded(framed, "app.js", **{"Sec-Fetch-Dest": "script"}) == 403
+    assert loaded(framed, "", **{"Sec-Fetch-Dest": "document"}) == 403
+    assert loaded(framed, "../", **frame) == 403
+    assert raw(framed, "POST", "/x/", b"{}", **{"Sec-Fetch-Site": "cross-site", **frame})[0] == 403
+    for one, allowed in ((explorer, "'none'"), (framed, "http://127.0.0.1:* http://localhost:* ")):
+        with urllib.request.urlopen(one.url) as answer:
+            ancestors = answer.headers["Content-Security-Policy"].partition("frame-ancestors ")[2]
+            assert ancestors.startswith(allowed)
+            assert "https://" not in ancestors.replace("https://127.0.0.1:*", "").replace("https://localhost:*", "")
+    assert explorer._repr_html_() is None
+    assert f'<iframe src="{framed.url}"' in str(framed._repr_html_())
+
+
+def test_a_solution_opens_the_page_as_it_was_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    circuit = fs.parse_netlist(SINE).replace({"Xgap.d": 5e-6})
+    solution = fs.simulate(circuit, charge_law="mobile", area="frozen", rtol=1e-5, t_stop=0.03)
+    running = solution.explore()
+    try:
+        assert opened == [running.url]
+        start = asked(running, "start", None)[1]
+        assert start["own"]["request"] == {
+            "deck": SINE, "charge_law": "mobile", "area": "frozen", "rtol": 1e-5, "periods": 3.0,
+        }  # fmt: skip
+        shown = post(running, start["own"]["request"])
+        force = next(trace for trace in shown["traces"] if trace["signal"] == "f_el")
+        np.testing.assert_allclose(array(force["values"]).max(), solution.f_el.max(), rtol=1e-3)
+    finally:
+        running.stop()
+
+
+def test_the_server_listens_on_the_loopback_address_alone(explorer: Explorer) -> None:
+    assert explorer._server.server_address[0] == "127.0.0.1"
+    assert explorer.url.startswith(f"http://127.0.0.1:{explorer.port}/")
+    assert len(explorer.token) >= 32
+
+
+def raw(explorer: Explorer, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, dict[str, Any]]:
+    connection = http.client.HTTPConnection("127.0.0.1", explorer.port, timeout=60)
+    names = {key.replace("_", "-"): value for key, value in headers.items()}
+    connection.request(method, path, body, names)
+    answer = connection.getresponse()
+    found = answer.status, json.loads(answer.read())
+    connection.close()
+    return found
+
+
+def test_whoever_lacks_the_token_is_refused(explorer: Explorer) -> None:
+    body = json.dumps({"deck": SINE}).encode()
+    for path in ("/", "/scene", "/start", f"/{explorer.token[:-1]}x/scene", f"/x/{explorer.token}/scene", "/ä/"):
+        refused(*raw(explorer, "GET", urllib.request.quote(path)), 403, "token")  # type: ignore[attr-defined]
+        refused(*raw(explorer, "POST", urllib.request.quote(path), body), 403, "token")  # type: ignore[attr-defined]
+
+
+def test_another_host_or_page_is_refused(explorer: Explorer) -> None:
+    path, body = f"/{explorer.token}/scene", json.dumps({"deck": SINE}).encode()
+    refused(*raw(explorer, "POST", path, body, Host="evil.example"), 403, "host")
+    refused(*raw(explorer, "POST", path, body, Host=f"127.0.0.1:{explorer.port + 1}"), 403, "host")
+    refused(*raw(explorer, "POST", path, body, Origin="http://evil.example"), 403, "another page")
+    refused(*raw(explorer, "POST", path, body, Origin="null"), 403, "another page")
+    refused(*raw(explorer, "POST", path, body, Sec_Fetch_Site="cross-site"), 403, "another page")
+    status, answer = raw(explorer, "POST", path, body, Origin=f"http://localhost:{explorer.port}")
+    assert (status, answer["ok"]) == (200, True)
+
+
+def test_bodies_that_are_too_large_or_no_json_are_refused(explorer: Explorer) -> None:
+    refused(*asked(explorer, "scene", b" " * (MOST_BYTES + 1)), 413, "bytes; allowed: at most")
+    path = f"/{explorer.token}/scene"
+    for body in (b"", b"{", b"\xff\xfe", b"[" * 100_000, b'{"deck": 1e'):
+        refused(*raw(explorer, "POST", path, body), 400, "not JSON")
+    refused(*raw(explorer, "POST", path, b"{}", Transfer_Encoding="chunked"), 411, "no length")
+    refused(*raw(explorer, "POST", f"/{explorer.token}/nothing", b"{}"), 404, "allowed: scene")
+    refused(*raw(explorer, "GET", f"/{explorer.token}/../server.py"), 404)
+    refused(*raw(explorer, "GET", f"/{explorer.token}/%2e%2e/server.py"), 404)
+    assert "the request is list" in post(explorer, [])["message"]
+
+
+def test_a_port_that_is_taken_or_none_is_refused(explorer: Explorer) -> None:
+    with pytest.raises(fs.InputError, match="cannot be used"):
+        Explorer(port=explorer.port)
+    with pytest.raises(fs.InputError, match="allowed: 0 to 65535"):
+        Explorer(port=70_000)
+
+
+_WORDS = st.sampled_from(
+    ["SIN(0 200 100)", "local", "frozen", "follow", "x", "", "inf", "nan", "3.5u", "\x00", "é", "Vdrive=AM(1 2 3)"]
+)
+_ANY = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | _WORDS | st.text(max_size=12),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=6,
+)
+_PATHS = st.sampled_from([*fs.parse_netlist(SINE).parameters, "Vdrive", "Xgap", "x.y", ""])
+_REQUESTS = st.fixed_dictionaries(
+    {"deck": st.just(SINE)},
+    optional={
+        "overrides": st.dictionaries(_PATHS, st.floats(-1e3, 1e9) | _WORDS, max_size=3) | _ANY,
+        "source": st.sampled_from([f"{kind}(1 2 3 4)" for kind in WAVEFORMS] + ["SIN(0 1e3 1e3)", "DC 5"]) | _ANY,
+        "charge_law": st.sampled_from(["local", "mobile"]) | _ANY, "area": st.sampled_from(["mean", 3e-5]) | _ANY,
+        "skin": st.sampled_from(["follow", "dispersive"]) | _ANY, "rtol": st.sampled_from([1e-3, 1e-6]) | _ANY,
+        "periods": st.floats(0.1, 10) | _ANY, "last": st.floats(0.1, 10) | _ANY, "other": _ANY, "recording": _ANY,
+    },
+)  # fmt: skip
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@given(request=_REQUESTS | _ANY)
+def test_no_request_gives_a_fault_a_hang_or_a_file(request: Any, explorer: Explorer) -> None:
+    begin = time.monotonic()
+    status, answer = asked(explorer, "scene", json.dumps(request).encode())
+    assert status == 200
+    assert answer["status"] != "FAULT", answer["message"]
+    assert answer["ok"] or answer["message"]
+    assert time.monotonic() - begin < 60.0
+
+
+def test_the_command_serves_until_it_is_interrupted_and_leaves_no_file(tmp_path: Path) -> None:
+    (tmp_path / "pad.cir").write_text(SINE)
+    words = [sys.executable, "-m", "fingerspice", "explore", "pad.cir", "--no-browser", "--json"]
+    with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        lines = []
+        while not lines or lines[-1] != "}\n":
+            lines.append(process.stdout.readline())
+            assert lines[-1], "the command ended"
+        said = json.loads("".join(lines))
+        assert (said["command"], said["success"], said["title"]) == ("explore", True, "Table 1, sine of 100 Hz")
+        with urllib.request.urlopen(said["url"] + "start") as answer:
+            assert json.load(answer)["own"]["request"]["deck"] == SINE
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=20)
+    assert (process.returncode, out, err) == (0, "", "")
+    assert os.listdir(tmp_path) == ["pad.cir"]
+
+
+def test_the_command_refuses_a_deck_that_is_none(command: Command) -> None:
+    result = command("explore", "none.cir", "--no-browser", "--json")
+    assert (result.code, json.loads(result.out)["status"]) == (2, "BAD_INPUT")
+
+
+def test_the_static_page_needs_no_other_file_and_holds_the_run(command: Command, tmp_path: Path) -> None:
+    (tmp_path / "pad.cir").write_text(SINE.replace("Table 1,", "</script>"))
+    result = command("explore", "pad.cir", "--static", "page.html", "--json")
+    answer = json.loads(result.out)
+    assert (result.code, answer["files"], answer["url"]) == (0, ["page.html"], None)
+    page = (tmp_path / "page.html").read_text()
+    assert not re.search(r'(src|href)="(?!data:)', page)
+    baked = re.search(r'<script type="application/json" id="baked">(.*?)</script>', page, re.DOTALL)
+    assert baked is not None
+    data = json.loads(baked[1])
+    assert data["start"]["own"]["title"] == "</script> sine of 100 Hz"
+    np.testing.assert_array_equal(
+        array(data["scenes"]["own"]["traces"][1]["values"]), scene({"deck": SINE, "last": 2})["traces"][1]["values"]
+    )
+    assert command("explore", "pad.cir", "--static", "pad.cir").code == 2
+
+
+def test_a_circuit_shows_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    circuit = fs.parse_netlist(SINE)
+    running = circuit.explore()
+    try:
+        assert opened == [running.url]
+        assert running.circuit is circuit
+    finally:
+        running.stop()
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(running.url)

@@ -1,0 +1,221 @@
+"""The explorer's page in a real browser; skipped where Playwright or Chromium is missing."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fingerspice as fs
+from fingerspice.explorer.examples import EXAMPLES
+from fingerspice.explorer.static import static_page
+
+playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright for Python")
+CHROMIUM = shutil.which("chromium")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+CIRCUITS = Path(__file__).parents[1] / "circuits"
+SINE = fs.parse_netlist(EXAMPLES[0].deck)
+
+
+@pytest.fixture(scope="module")
+def explorer() -> Iterator[fs.Explorer]:
+    running = fs.explore(browser=False)
+    yield running
+    running.stop()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as started:
+        yield started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+
+
+class Page:
+    """A page with its errors, and what it asked for."""
+
+    def __init__(self, browser: Any, url: str) -> None:
+        self.page = browser.new_context(accept_downloads=True).new_page()
+        self.errors: list[str] = []
+        self.asked: list[str] = []
+        self.page.on("console", lambda m: self.errors.append(m.text) if m.type == "error" else None)
+        self.page.on("pageerror", lambda e: self.errors.append(str(e)))
+        self.page.on("request", lambda r: self.asked.append(r.url))
+        self.page.goto(url)
+        self.page.wait_for_selector("body[data-answers]", timeout=120_000)
+
+    def answers(self) -> int:
+        return int(self.page.get_attribute("body", "data-answers"))
+
+    def after(self, change: Any) -> None:
+        """Make a change, and wait for the answer to it."""
+        before = self.answers()
+        change()
+        self.page.wait_for_selector(f'body:not([data-answers="{before}"])', timeout=60_000)
+        self.page.wait_for_timeout(100)
+
+    def typed(self, path: str, text: str) -> None:
+        field = self.page.locator(f'input[type=text][data-path="{path}"]')
+        field.fill(text)
+        self.after(lambda: field.press("Enter"))
+
+    def shown(self, signal: str) -> list[str]:
+        """The figures of a signal as the page writes them."""
+        return self.page.locator("#figures tr", has_text=signal).locator("td").all_inner_texts()[1:]  # type: ignore[no-any-return]
+
+    def status(self) -> str:
+        return self.page.inner_text("#status")  # type: ignore[no-any-return]
+
+    def close(self) -> None:
+        assert self.errors == []
+        self.page.context.close()
+
+
+@pytest.fixture
+def page(browser: Any, explorer: fs.Explorer) -> Iterator[Page]:
+    opened = Page(browser, explorer.url)
+    yield opened
+    opened.close()
+
+
+def test_the_page_shows_what_simulate_gives_and_asks_nobody_else(page: Page, explorer: fs.Explorer) -> None:
+    expected = fs.simulate(SINE, rtol=1e-6)
+    assert page.shown("electroadhesive force")[1] == f"{float(f'{1e3 * expected.f_el_mean_periodic:.5g}')} mN"
+    page.typed("Xgap.d", "4.2u")
+    expected = fs.simulate(SINE.replace({"Xgap.d": 4.2e-6}), rtol=1e-6)
+    assert page.shown("electroadhesive force")[1] == f"{float(f'{1e3 * expected.f_el_mean_periodic:.5g}')} mN"
+    assert page.page.locator("#plots canvas").count() == 4
+    assert all(url.startswith((explorer.url, "data:")) for url in page.asked)
+
+
+def test_every_slider_of_the_first_scene_moves_the_figures(page: Page) -> None:
+    sliders = page.page.locator("#sliders > fieldset > .slider input[type=range]")
+    names = [sliders.nth(i).get_attribute("data-path") for i in range(sliders.count())]
+    assert {"Vdrive.amplitude", "Vdrive.frequency", "Xgap.d", "Xgap.fn", "Xcoat.r", "Xskin.d"} <= set(names)
+    for name in names:
+        before = page.page.inner_text("#figures")
+        slider = page.page.locator(f'input[type=range][data-path="{name}"]')
+        slider.focus()
+        page.after(lambda: page.page.keyboard.press("PageUp"))
+        assert page.page.inner_text("#figures") != before, name
+
+
+def test_a_link_restores_the_scene_in_another_browser_and_says_what_it_does_not_know(
+    page: Page, browser: Any, explorer: fs.Explorer
+) -> None:
+    page.typed("Xgap.d", "4u")
+    page.after(lambda: page.page.select_option("#kind", "SQUARE"))
+    page.after(lambda: page.page.select_option("#charge_law", "mobile"))
+    page.page.wait_for_timeout(500)
+    figures = page.page.inner_text("#figures")
+    other = Page(browser, f"{page.page.url}&bar=1&set.Xgpa.d=3u")
+    assert other.page.inner_text("#figures") == figures
+    assert other.page.input_value("#source") == "SQUARE(200 100 0.5)"
+    said = other.page.inner_text("#warnings")
+    assert 'unknown name "bar"' in said
+    assert "unknown parameter 'Xgpa.d', which is left out; nearest: 'Xgap.d'" in said
+    other.close()
+
+
+def test_a_fold_shows_its_sentence_and_keeps_the_last_good_traces(page: Page) -> None:
+    page.after(lambda: page.page.select_option("#charge_law", "mobile"))
+    page.typed("Xgap.d", "30n")
+    assert "no solution" in page.status()
+    assert "source voltage, before" in page.page.inner_text("#plots")
+    page.typed("Xgap.d", "4u")
+    assert "before" not in page.page.inner_text("#plots")
+    assert page.status().startswith("Table 1")
+
+
+def test_pinned_traces_stay_with_the_difference(page: Page) -> None:
+    page.page.click("#pin")
+    page.typed("Xgap.d", "4u")
+    assert "gap voltage, pinned" in page.page.inner_text("#plots")
+    a, b = (fs.simulate(SINE.replace({"Xgap.d": d}), rtol=1e-6).f_el_mean for d in (3.5e-6, 4e-6))
+    assert page.shown("electroadhesive force")[-1] == f"{100 * (b / a - 1):.2f} %"
+
+
+def test_a_recording_is_taken_and_a_wrong_file_refused(page: Page, tmp_path: Path) -> None:
+    page.after(lambda: page.page.set_input_files("#file", CIRCUITS / "texture.wav"))
+    assert page.page.input_value("#source") == "RECORDING(150)"
+    wave = fs.Samples.from_wav(CIRCUITS / "texture.wav", 150.0)
+    assert page.shown("source voltage")[3] == f"{float(f'{wave.values.max():.5g}'):g} V"
+    (tmp_path / "wrong.csv").write_text("t,u\n0,1\n1,x\n")
+    page.page.set_input_files("#file", tmp_path / "wrong.csv")
+    page.page.wait_for_selector("#status.failed")
+    assert page.status() == "wrong.csv, row 3: allowed: two numbers, time in s and voltage in V"
+
+
+def test_what_is_saved_is_what_is_shown(page: Page, tmp_path: Path) -> None:
+    for button, name in (("#csv", "a.csv"), ("#png", "a.png"), ("#deck", "a.cir")):
+        with page.page.expect_download() as download:
+            page.page.click(button)
+        download.value.save_as(tmp_path / name)
+    head, *rows = (tmp_path / "a.csv").read_text().splitlines()
+    assert head == "t (s),u_source (V),u_gap (V),f_el (N),area (m^2),friction (1)"
+    assert len(rows) == 2000
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert "Vdrive drive 0 SIN(" in (tmp_path / "a.cir").read_text()
+
+
+def test_the_static_page_shows_its_scenes_from_the_disk(browser: Any, tmp_path: Path) -> None:
+    (tmp_path / "page.html").write_text(static_page())
+    opened = Page(browser, (tmp_path / "page.html").as_uri())
+    expected = fs.simulate(SINE, rtol=1e-6)
+    assert opened.shown("electroadhesive force")[1] == f"{float(f'{1e3 * expected.f_el_mean_periodic:.5g}')} mN"
+    opened.after(lambda: opened.page.select_option("#scene", "two-fingers"))
+    assert opened.status().startswith("Two fingers")
+    assert opened.page.locator("#sliders input[type=range]").first.is_disabled()
+    assert all(url.startswith(("file:", "data:")) for url in opened.asked)
+    opened.close()
+
+
+def test_without_its_token_there_is_no_page(browser: Any, explorer: fs.Explorer) -> None:
+    page = browser.new_page()
+    answer = page.goto(f"http://127.0.0.1:{explorer.port}/")
+    assert answer.status == 403
+    assert "token" in page.inner_text("body")
+    page.close()
+
+
+class Notebook(BaseHTTPRequestHandler):
+    """A page that holds what a notebook's cell shows, and an explorer that no notebook asked for."""
+
+    body = b""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html")
+        self.send_header("Content-Length", str(len(self.body)))
+        self.end_headers()
+        self.wfile.write(self.body)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+def test_a_page_of_this_computer_shows_the_explorer_in_a_frame_where_a_notebook_asked_for_it(browser: Any) -> None:
+    framed, alone = fs.Explorer(SINE, framed=True), fs.Explorer(SINE)
+    Notebook.body = f"{framed._repr_html_()}<iframe src='{alone.url}' id='refused'></iframe>".encode()
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Notebook)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    page = browser.new_context().new_page()
+    try:
+        for host in ("localhost", "127.0.0.1"):
+            page.goto(f"http://{host}:{server.server_port}/")
+            shown, refused = page.frame_locator("iframe[title]"), page.frame_locator("#refused")
+            shown.locator("body[data-answers]").wait_for(timeout=60_000, state="attached")
+            assert shown.locator("input[data-path='Xgap.d']").count() > 0
+            assert refused.locator("input[data-path]").count() == 0
+        page.goto(f"http://elsewhere.localhost:{server.server_port}/")
+        page.wait_for_timeout(2000)
+        assert page.frame_locator("iframe[title]").locator("input[data-path]").count() == 0
+    finally:
+        for running in (framed, alone):
+            running.stop()
+        server.shutdown()
+        server.server_close()

@@ -1,0 +1,188 @@
+"""Schematics: every element drawn once, nothing over anything else, files and answers to wrong requests."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
+
+import fingerspice as fs
+from commands import Command
+from fingerspice.plots.placement import place
+from fingerspice.plots.schematic import MOST_ELEMENTS, Schematic
+from scenes import table1
+
+CIRCUITS = Path(__file__).parents[1] / "circuits"
+DECKS = sorted(CIRCUITS.glob("*.cir"))
+BRIDGE = """A bridge of long names, a delay, a fixed area and a current
+Vdrive_of_the_whole_bridge drive 0 SIN(0 200 5k) AC 2
+Rupper drive left 1k
+Rlower left 0 1k
+Cupper drive right 1n IC=5
+Clower right 0 1n
+Xacross left right spot LAYER d=1u eps_r=3.9
+Vspot spot 0 100
+Iextra 0 left SIN(0 1m 5k)
+.tran 1u 1m
+"""
+LADDER = "A ladder\nV1 n0 0 1\n" + "".join(
+    f"R{k} n{k} n{k + 1} 1k\nC{k} n{k + 1} 0 1n\n" for k in range(12)
+) + ".tran 1u 1m\n"  # fmt: skip
+OTHERS = {"bridge": BRIDGE, "ladder": LADDER}
+
+
+@pytest.fixture(params=[*(p.stem for p in DECKS), *OTHERS])
+def circuit(request: pytest.FixtureRequest) -> fs.Circuit:
+    if request.param in OTHERS:
+        return fs.parse_netlist(OTHERS[request.param])
+    return fs.read_netlist(CIRCUITS / f"{request.param}.cir")
+
+
+def texts(svg: str) -> list[str]:
+    return ["".join(x.itertext()) for x in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")]
+
+
+def boxes(figure: Schematic) -> list[tuple[str, Bbox]]:
+    found = [text for text in figure.axes[0].findobj(Text) if isinstance(text, Text) and text.get_text()]
+    return [(text.get_text(), text.get_window_extent()) for text in found]
+
+
+def test_every_element_is_drawn_once_with_its_name_and_values(circuit: fs.Circuit) -> None:
+    said = texts(circuit.draw()._repr_svg_())
+    for element in circuit.elements:
+        assert said.count(element.name) == 1
+    assert "".join(said).startswith(circuit.title[:40])
+    drawn = " ".join(said)
+    for element in circuit.by_device("GAP"):
+        assert f"d = {1e6 * element.values['d']:g} µm" in drawn
+        assert f"fn = {1e3 * element.values['fn']:g} mN" in drawn
+        assert "c2 = 5000 mm^4/N^2" in drawn
+
+
+def test_no_label_meets_another_one_or_a_line(circuit: fs.Circuit) -> None:
+    figure = circuit.draw()
+    found = boxes(figure)
+    assert len(found) >= 2 * len(circuit.elements)
+    page = figure.bbox
+    for name, box in found:
+        assert page.x0 <= box.x0, name
+        assert box.x1 <= page.x1, name
+        assert page.y0 <= box.y0, name
+        assert box.y1 <= page.y1, name
+    for (name, box), (other, near) in itertools.combinations(found, 2):
+        # Boxes of lines of one label have the font's whole height and touch.
+        assert not box.padded(-1.0).overlaps(near.padded(-1.0)), (name, other)
+    for line in figure.axes[0].lines:
+        path = line.get_transform().transform_path(line.get_path())
+        for name, box in found:
+            assert not path.intersects_bbox(box.padded(-1.0), filled=False), name
+
+
+def test_no_two_elements_and_no_two_nodes_meet(circuit: fs.Circuit) -> None:
+    check_places(circuit)
+
+
+def check_places(circuit: fs.Circuit) -> None:
+    placed = place(circuit)
+    assert {p.element.name for p in placed.places} == {e.name for e in circuit.elements}
+    for p in placed.places:
+        assert p.top < p.bottom
+        assert {p.top, p.bottom} == {placed.rows[node] for node in p.element.nodes[:2]}
+        assert p.upright == (placed.rows[p.element.nodes[0]] == p.top)
+        for node in p.element.nodes[:2]:
+            assert placed.extents[node][0] <= p.column <= placed.extents[node][1]
+    for p, q in itertools.combinations(placed.places, 2):
+        assert p.column != q.column or p.bottom <= q.top or q.bottom <= p.top
+    for (a, x), (b, y) in itertools.combinations(placed.extents.items(), 2):
+        assert placed.rows[a] != placed.rows[b] or x[1] < y[0] or y[1] < x[0]
+    assert placed.rows["0"] == max(placed.rows.values())
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 7), st.integers(0, 7)), min_size=1, max_size=24), st.integers(1, 7))
+def test_any_network_has_places(pairs: list[tuple[int, int]], driven: int) -> None:
+    # Every node has a capacitor and a resistor to ground, so that none is floating.
+    nodes = sorted({driven, *itertools.chain(*pairs)} - {0})
+    lines = [f"V1 {driven} 0 1", *(f"C{n} {n} 0 1n\nRg{n} {n} 0 1k" for n in nodes)]
+    lines += [f"R{k} {p} {n} 1k" for k, (p, n) in enumerate(pairs) if p != n]
+    check_places(fs.parse_netlist("\n".join(["Any", *lines, ".tran 1u 1m"])))
+
+
+def test_a_stack_is_one_ladder_beside_its_source() -> None:
+    placed = place(table1())
+    assert [(p.element.name, p.column, p.top, p.bottom) for p in placed.places] == [
+        ("Vdrive", 0, 0, 3), ("Xcoat", 1, 0, 1), ("Xgap", 1, 1, 2), ("Xskin", 1, 2, 3),
+    ]  # fmt: skip
+
+
+def test_areas_are_said_where_there_are_several_or_a_source_gives_one() -> None:
+    said = [" ".join(texts(c.draw()._repr_svg_())) for c in (fs.parse_netlist(BRIDGE), table1())]
+    assert "area = spot" in said[0]
+    assert "DC 100 mm^2" in said[0]
+    assert "area" not in said[1]
+
+
+def test_a_layer_that_does_not_leak_has_no_resistor() -> None:
+    strokes = [len(table1().replace({"Xcoat.r": r}).draw().axes[0].lines) for r in (2e5, float("inf"))]
+    assert strokes[0] > strokes[1]
+
+
+def test_changed_values_are_drawn_and_changed_circuits_give_the_same_picture_again() -> None:
+    changed = table1().replace({"Xgap.d": 5e-6, "Vdrive": "SQUARE(150 70)"})
+    drawn = changed.draw()._repr_svg_()
+    assert any("d = 5 µm" in text for text in texts(drawn))
+    assert "Square(150 V, 70 Hz)" in texts(drawn)
+    assert changed.draw()._repr_svg_() == drawn
+
+
+def test_a_file_is_svg_or_png_by_its_end(tmp_path: Path) -> None:
+    circuit = table1()
+    circuit.draw(tmp_path / "a.svg")
+    circuit.draw(str(tmp_path / "a.PNG"))
+    assert "Xgap" in texts((tmp_path / "a.svg").read_text(encoding="utf-8"))
+    assert (tmp_path / "a.PNG").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(fs.InputError, match=r"'.*a\.pdf'; allowed: a name that ends in \.svg or \.png"):
+        circuit.draw(tmp_path / "a.pdf")
+    with pytest.raises(fs.InputError, match="cannot write"):
+        circuit.draw(tmp_path / "a.svg" / "b.svg")
+
+
+def test_a_title_of_another_kind_is_text_and_not_a_formula_or_markup() -> None:
+    circuit = fs.parse_netlist("$\\frac{1}$ <b> & \N{SNOWMAN}\nV1 a_$x$ 0 1\nR1 a_$x$ 0 1k\n.tran 1u 1m\n")
+    said = texts(circuit.draw()._repr_svg_())
+    assert "$\\frac{1}$ <b> & \N{SNOWMAN}" in said
+    assert "a_$x$" in said
+
+
+def test_a_circuit_too_large_for_a_picture_is_refused() -> None:
+    rows = "".join(f"R{k} a 0 1k\n" for k in range(MOST_ELEMENTS))
+    with pytest.raises(fs.InputError, match="the circuit has 201 elements; allowed: at most 200 in a picture"):
+        fs.parse_netlist(f"Large\nV1 a 0 1\n{rows}.tran 1u 1m\n").draw()
+    figure = fs.parse_netlist(f"Large\nV1 a 0 1\n{rows[: rows.rindex('R199')]}.tran 1u 1m\n").draw()
+    assert np.prod(figure.get_size_inches()) < 1000.0
+
+
+def test_run_writes_the_schematic_beside_its_picture_and_keeps_that_of_another_circuit(
+    command: Command, tmp_path: Path
+) -> None:
+    run = ("run", str(CIRCUITS / "fingerpad.cir"), "--schematic", "--stop", "10m", "--out", str(tmp_path))
+    file = tmp_path / "fingerpad_schematic.svg"
+    for _ in range(2):
+        done = command(*run, "--no-plot", "--json")
+        assert done.code == 0
+        assert json.loads(done.out)["files"] == [str(tmp_path / "fingerpad.nc"), str(file)]
+    assert "Xgap" in texts(file.read_text(encoding="utf-8"))
+    refused = command(*run, "--csv", "--set", "Xgap.d=3u")
+    assert refused.code == 2
+    assert f"{file} holds a result of the deck as it is, and this one is with Xgap.d=3u" in refused.err
+    file.write_text("<svg/>", encoding="utf-8")
+    assert "nothing says which circuit it is of" in command(*run).err
+    assert "--schematic does not go with --stream" in command(*run, "--stream").err
