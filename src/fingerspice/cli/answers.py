@@ -50,7 +50,7 @@ OWN: dict[str, tuple[str, ...]] = {
         "notes",
         "profiles",
     ),
-    "sweep": ("scenes", "failed", "n", "seed", "figures", "shares"),
+    "sweep": ("scenes", "failed", "n", "seed", "figures", "shares", "store"),
     "export": (),
     "figures": (),
     "explore": ("url",),

@@ -25,6 +25,8 @@ _KINDS = {
     "uniform": "[low, high]", "loguniform": "[low, high]", "normal": "[mean, standard deviation]",
     "lognormal": "[median, standard deviation of the logarithm]",
 }  # fmt: skip
+#: Largest number of messages about scenes without a result that are printed.
+_MOST_TOLD = 8
 #: Largest size of the file, bytes.
 _LARGEST = 1 << 20
 
@@ -36,6 +38,19 @@ def sweep(
     overwrite: Overwrite = False,
     as_json: AsJson = False,
     no_plot: NoPlot = False,
+    store: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="OUT.zarr", help="Write piece by piece to a Zarr store, which a second call goes on with."
+        ),
+    ] = None,
+    workers: Annotated[int | None, typer.Option(metavar="N", help="With --store: in N processes.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="With --store: by the workers of a Dask scheduler.")
+    ] = None,
+    shard: Annotated[
+        str | None, typer.Option(metavar="I/M", help="With --store: the I-th of M parts, from 1/M to M/M.")
+    ] = None,
 ) -> None:
     """Run a grid or a random population of parameters: table, NetCDF, picture, and what the variance comes from.
 
@@ -44,33 +59,84 @@ def sweep(
       fingerspice sweep circuits/population.toml
     """
     with Answering("sweep", as_json) as answer:
-        from fingerspice.plots.drawing import save
-        from fingerspice.plots.populations import plot_sweep
         from fingerspice.studies import populations
 
         asked = _read(file)
         deck = _beside(file, asked["deck"])
         circuit = read_circuit(deck, None, None)
         parameters = {path: _parameter(path, one) for path, one in asked["parameters"].items()}
-        how = {key: asked[key] for key in ("n", "seed") if key in asked}
-        options = {key: asked[key] for key in _OPTIONS if key in asked}
+        options = {key: asked[key] for key in ("n", "seed", *_OPTIONS) if key in asked}
         answer.update(**answers.of_circuit(circuit, None))
+        if store is not None:
+            if asked.get("indices"):
+                raise InputError(f"{file}: indices = true and --store are both given; allowed: one of them")
+            found = populations.sweep(
+                circuit, parameters, store=store, workers=workers, scheduler=scheduler, shard=_shard(shard), **options
+            )
+            _give_stored(answer, found, store)
+            return
+        for option, given in (("workers", workers), ("scheduler", scheduler), ("shard", shard)):
+            if given is not None:
+                raise InputError(f"--{option} is given without --store; allowed: --store OUT.zarr, too")
         results = Results(deck, circuit, out, name or file.stem, overwrite, None)
         table, image = results.file(".nc"), None if no_plot else results.file(".png")
-        found = populations.sweep(circuit, parameters, **how, **options)
-        indices = populations.sobol(circuit, parameters, **how, **options) if asked.get("indices") else None
+        found = populations.sweep(circuit, parameters, **options)
+        indices = populations.sobol(circuit, parameters, **options) if asked.get("indices") else None
         results.open()
-        output, about = str(next(iter(found.data_vars))), {"deck": circuit.text, **results.about}
-        writes: list[Callable[[], Path]] = [lambda: _written(found, indices, about, table)]
-        if image is not None:
-            writes.append(lambda: save(plot_sweep(found, output, indices), image, about=results.about))
+        _give(answer, found, indices, {"deck": circuit.text, **results.about}, table, image)
+
+
+def _give(
+    answer: Answering, found: Any, indices: Any, about: Mapping[str, str], table: Path, image: Path | None
+) -> None:
+    """Write the table and the picture, and fill the answer."""
+    from fingerspice.plots.drawing import save
+    from fingerspice.plots.populations import plot_sweep
+    from fingerspice.studies import populations
+
+    output = str(next(iter(found.data_vars)))
+    writes: list[Callable[[], Path]] = [lambda: _written(found, indices, about, table)]
+    if image is not None:
+        own = {key: text for key, text in about.items() if key != "deck"}
+        writes.append(lambda: save(plot_sweep(found, output, indices), image, about=own))
+    told = populations.summary(found)
+    shares = [] if indices is None else populations.ranking(indices, output)
+    answer.update(
+        scenes=int(found.status.size), failed=int((found.status >= 2).sum()), n=found.attrs.get("n"),
+        seed=found.attrs.get("seed"), figures=told, shares=shares or None,
+    )  # fmt: skip
+    answer.give(lambda: _told(told) + (f"\n\n{_shared(shares, output)}" if shares else ""), writes)
+
+
+def _give_stored(answer: Answering, found: Any, store: Path) -> None:
+    """Fill the answer with what a call has done for a store, and percentiles of a store that is whole."""
+    from fingerspice.studies import populations
+
+    about = found.attrs
+    answer.data["files"].append(str(store))
+    answer.update(
+        scenes=int(found.status.size), n=about.get("n"), seed=about.get("seed"),
+        store={key: about[key] for key in ("chunks", "chunks_found", "chunks_missing", "seconds")},
+    )  # fmt: skip
+    said = [f"{about['chunks']:,} pieces ({about['chunks_found']:,} were there already) in {store}"]
+    if about["chunks_missing"]:
+        said.append(f"{about['chunks_missing']:,} pieces of other parts are missing")
+    elif found.status.size <= populations.MOST_SCENES:
         told = populations.summary(found)
-        shares = [] if indices is None else populations.ranking(indices, output)
-        answer.update(
-            scenes=int(found.status.size), failed=int((found.status >= 2).sum()), n=found.attrs.get("n"),
-            seed=found.attrs.get("seed"), figures=told, shares=shares or None,
-        )  # fmt: skip
-        answer.give(lambda: _told(told) + (f"\n\n{_shared(shares, output)}" if shares else ""), writes)
+        answer.update(figures=told, failed=int((found.status >= 2).sum()))
+        said.insert(0, _told(told))
+    said += about["failures"][:_MOST_TOLD]
+    answer.give(lambda: "\n".join(said))
+
+
+def _shard(text: str | None) -> tuple[int, int]:
+    """The numbers of ``I/M``."""
+    if text is None:
+        return 1, 1
+    first, _, last = text.partition("/")
+    if not (first.isascii() and first.isdigit() and last.isascii() and last.isdigit()):
+        raise InputError(f"--shard is {text!r}; allowed: two whole numbers such as 1/8")
+    return int(first), int(last)
 
 
 def _read(file: Path) -> dict[str, Any]:

@@ -98,7 +98,7 @@ def batch(
     if threads is not None:
         require_number("threads", threads, "a whole number")
         require(threads >= 1, "threads", threads, "1 or more")
-    scenes = _scenes(circuit, parameters)
+    scenes = checked_scenes(circuit, parameters)
     changed = dict(scenes)
     if skin == "follow":
         frequency = _frequencies(circuit, scenes, of_skin=True)
@@ -153,7 +153,7 @@ def _task(
     return Task(circuit, tuple(outputs), float(rtol), t_stop, 1.0 if periodic else periods, periodic, points)
 
 
-def _scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
+def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
     """Values by path, all of one shape (n_scene,).
 
     Raises

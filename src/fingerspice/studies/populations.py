@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,93 +12,36 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
-from fingerspice.circuit.arguments import require_circuit, require_number
+from fingerspice.circuit.arguments import require_number
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.studies.batch import batch, own_path
+from fingerspice.studies.batch import batch
 from fingerspice.studies.batchtask import REFUSED
+from fingerspice.studies.sweepplan import BITS, Plan, make_plan
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
     from xarray import Dataset
 
-# Largest number of scenes of a sweep, whose figures are kept in memory (some 100 bytes each), and of a population.
-MOST_SCENES, MOST_SAMPLES = 1 << 26, 1 << 20
-# Quantiles are taken no nearer to 0 and 1 than this, so that a distribution without bounds gives finite values.
-_EDGE = 1e-12
+# Largest number of scenes of a sweep, whose figures are kept in memory (some 100 bytes each), of a population, and of a
+# population in a store.
+MOST_SCENES, MOST_SAMPLES, MOST_STORED_SAMPLES = 1 << 26, 1 << 20, 1 << BITS
 # Quantiles of one parameter at which its influence is shown, all others being at their medians.
 QUANTILES = (0.05, 0.5, 0.95)
 # Resamples of the population for the intervals of the indices. (scipy's own cannot be given a seed.)
 RESAMPLES = 499
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """Parameters that make a grid, those that are drawn (`n` draws by `seed`), and those that are one number.
-
-    Names are paths, or several paths with commas, whose numbers are factors; `own` has the paths of each and the values
-    that the factors are of.
-    """
-
-    grid: dict[str, FloatArray]
-    drawn: dict[str, Any]
-    fixed: dict[str, FloatArray]
-    own: dict[str, dict[str, float]]
-    units: dict[str, str]
-    n: int
-    seed: int
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return tuple(values.size for values in self.grid.values())
-
-    def scenes(self, values: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
-        """Values of each path from those of each name that is no fixed one."""
-        every = {**self.fixed, **values}
-        return {
-            path: factor * np.asarray(every[name], float)
-            for name, paths in self.own.items() for path, factor in paths.items()
-        }  # fmt: skip
-
-
-def _plan(circuit: Circuit, parameters: Mapping[str, Any], n: int, seed: int) -> _Plan:
-    require_circuit(circuit)
-    if not isinstance(parameters, Mapping) or not parameters:
-        raise InputError(f"parameters is {parameters!r}; allowed: a mapping such as {{'Xgap.d': [3e-6, 4e-6]}}")
-    for what, value in (("n", n), ("seed", seed)):
-        require_number(what, value, "a whole number")
-        require(value == int(value) and value >= 0, what, value, "a whole number, 0 or more")
-    require(1 < n <= MOST_SAMPLES and n & (n - 1) == 0, "n", n, "a power of two such as 1024, at most 2^20")
-    grid: dict[str, FloatArray] = {}
-    drawn: dict[str, Any] = {}
-    fixed: dict[str, FloatArray] = {}
-    own: dict[str, dict[str, float]] = {}
-    units: dict[str, str] = {}
-    for given, value in parameters.items():
-        paths = [own_path(circuit, one.strip()) for one in str(given).split(",")]
-        twice = [one for i, one in enumerate(paths) if one in paths[:i] or any(one in told for told in own.values())]
-        if twice:
-            raise InputError(f"{twice[0]} is given twice; allowed: once")
-        path = ",".join(paths)
-        alone = len(paths) == 1
-        own[path] = {one: 1.0 if alone else circuit.parameters[one].value for one in paths}
-        units[path] = circuit.parameters[path].unit if alone else "1"
-        if hasattr(value, "ppf"):
-            drawn[path] = value
-            continue
-        try:
-            array = np.asarray(value, float)
-        except (TypeError, ValueError):
-            raise InputError(
-                f"{path} is {value!r}; allowed: a number, an array of numbers, or a frozen distribution of scipy.stats "
-                "such as norm(3.5e-6, 0.3e-6)"
-            ) from None
-        require(array.ndim < 2 and array.size > 0, path, f"of shape {array.shape}", "numbers in one row")
-        (grid if array.ndim else fixed)[path] = array
-    return _Plan(grid, drawn, fixed, own, units, int(n), int(seed))
-
-
 def sweep(
-    circuit: Circuit, parameters: Mapping[str, ArrayLike | Any], *, n: int = 1024, seed: int = 0, **options: Any
+    circuit: Circuit,
+    parameters: Mapping[str, ArrayLike | Any],
+    *,
+    n: int = 1024,
+    seed: int = 0,
+    store: Path | str | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    shard: tuple[int, int] = (1, 1),
+    **options: Any,
 ) -> Dataset:
     """Figures over a grid of some parameters and a random population of others.
 
@@ -115,53 +59,57 @@ def sweep(
         Number of draws, a power of two.
     seed : int
         Of the sequence's scrambling.
+    store : Path or str, optional
+        Folder of a Zarr store, into which the scenes go chunk by chunk; chunks that are there already are not run
+        again. Its bytes do not depend on who has run which chunk.
+    workers : int, optional
+        With `store`: number of processes that run its chunks. A script starts them under
+        ``if __name__ == "__main__"``.
+    scheduler : str, optional
+        With `store`: address of a Dask scheduler, whose workers see the same folder.
+    shard : tuple of int
+        With `store`: (i, m) runs the chunks i, i + m, i + 2 m, ..., for i from 1 to m.
     **options
         As of `batch`: `outputs`, `rtol`, `t_stop`, `periods`, `periodic`, `skin`, `points`, `threads`.
 
     Returns
     -------
     xarray.Dataset
-        As of `batch`, with a dimension for each array, named by its path, and ``scene`` where something is drawn.
+        As of `batch`, with a dimension for each array, named by its path, and ``scene`` where something is drawn. With
+        `store`, values are read when they are used, and `status` is 4 where a scene has not been run. The attribute
+        `chunks` is the number of chunks of the shard, `chunks_found` how many of them were there already, and
+        `chunks_missing` how many the whole store lacks; `failures` are those of this call.
 
     Raises
     ------
     InputError
-        As `batch`, for an `n` that is no power of two, and for too many scenes.
+        As `batch`, for an `n` that is no power of two, and for too many scenes. With `store`, if the folder is there
+        and is no store of this sweep, or the scheduler does not answer.
     """
-    plan = _plan(circuit, parameters, n, seed)
-    return _run(circuit, plan, _draws(plan), options)
+    if store is not None:
+        from fingerspice.studies.sweepstored import stored
+
+        plan = make_plan(circuit, parameters, n, seed, MOST_STORED_SAMPLES)
+        return stored(circuit, plan, options, Path(store), workers, scheduler, shard)
+    if workers is not None or scheduler is not None or tuple(shard) != (1, 1):
+        raise InputError(
+            "workers, scheduler or shard is given without store; allowed: a folder such as 'out/sweep.zarr'"
+        )
+    plan = make_plan(circuit, parameters, n, seed, MOST_SAMPLES)
+    return _in_memory(circuit, plan, options)
 
 
-def _draws(plan: _Plan) -> dict[str, FloatArray]:
-    """Values of the drawn parameters, shape (n,) each."""
-    if not plan.drawn:
-        return {}
-    from scipy.stats import qmc
-
-    points = qmc.Sobol(len(plan.drawn), scramble=True, rng=plan.seed).random(plan.n)
-    points = np.clip(points, _EDGE, 1.0 - _EDGE)
-    return {path: np.asarray(law.ppf(points[:, i]), float) for i, (path, law) in enumerate(plan.drawn.items())}
-
-
-def _run(circuit: Circuit, plan: _Plan, draws: Mapping[str, FloatArray], options: Mapping[str, Any]) -> Dataset:
+def _in_memory(circuit: Circuit, plan: Plan, options: Mapping[str, Any]) -> Dataset:
     """The batch of all scenes, in the shape of the grid."""
     from xarray import Dataset
 
-    count = next(iter(draws.values())).size if draws else 1
-    places = int(np.prod(plan.shape))
-    require(places * count <= MOST_SCENES, "the sweep", f"{places * count:,} scenes", f"at most {MOST_SCENES:,}")
-    mesh = np.meshgrid(*plan.grid.values(), indexing="ij")
-    flat = {path: np.repeat(values.ravel(), count) for path, values in zip(plan.grid, mesh, strict=True)}
-    flat |= {path: np.tile(values, places) for path, values in draws.items()}
-    found = batch(circuit, plan.scenes(flat), **options)
-    dims, own = tuple(plan.grid), ("scene",) if draws else ()
-
-    def shaped(values: FloatArray) -> FloatArray:
-        whole = values.reshape(*plan.shape, count, *values.shape[1:])
-        return whole if draws else whole.reshape(*plan.shape, *values.shape[1:])
-
+    total = math.prod(plan.sizes)
+    require(total <= MOST_SCENES, "the sweep", f"{total:,} scenes", f"at most {MOST_SCENES:,}, or a store")
+    draws = plan.draws()
+    found = batch(circuit, plan.spread(plan.grid, draws), **options)
     data = {
-        name: ((*dims, *own, *one.dims[1:]), shaped(one.values), one.attrs) for name, one in found.data_vars.items()
+        name: ((*plan.dims, *one.dims[1:]), one.values.reshape((*plan.sizes, *one.shape[1:])), one.attrs)
+        for name, one in found.data_vars.items()
     }
     coords: dict[str, Any] = {name: (name, values, {"units": plan.units[name]}) for name, values in plan.grid.items()}
     coords |= {name: ("scene", values, {"units": plan.units[name]}) for name, values in draws.items()}
@@ -204,7 +152,7 @@ def sobol(
     InputError
         As `sweep`; if nothing is drawn; and if a scene has no result, because indices need all of them.
     """
-    plan = _plan(circuit, parameters, n, seed)
+    plan = make_plan(circuit, parameters, n, seed, MOST_SAMPLES)
     require(bool(plan.drawn), "parameters", "all numbers", "one distribution or more, such as scipy.stats.norm(...)")
     require_number("confidence", confidence, "a number")
     require(0.0 < confidence < 1.0, "confidence", confidence, "a number between 0 and 1")
@@ -216,14 +164,14 @@ def sobol(
     return _as_dataset(plan, outputs, rows)
 
 
-def _product(plan: _Plan) -> FloatArray:
+def _product(plan: Plan) -> FloatArray:
     """Values at every place of the grid, shape (n_place, n_grid)."""
     mesh = np.meshgrid(*plan.grid.values(), indexing="ij")
     return np.array([values.ravel() for values in mesh]).T if mesh else np.zeros((1, 0))
 
 
 def _indices(
-    circuit: Circuit, plan: _Plan, place: dict[str, float], outputs: tuple[str, ...], confidence: float,
+    circuit: Circuit, plan: Plan, place: dict[str, float], outputs: tuple[str, ...], confidence: float,
     options: Mapping[str, Any],
 ) -> dict[str, FloatArray]:  # fmt: skip
     """Indices (n_output, d), their intervals, and mean and standard deviation of the outputs, at one place."""
@@ -279,7 +227,7 @@ def _saltelli(a: FloatArray, b: FloatArray, mixed: FloatArray) -> FloatArray:
     return np.asarray(np.nan_to_num(np.array([first.T, total.T]), nan=0.0, posinf=0.0, neginf=0.0), float)
 
 
-def _as_dataset(plan: _Plan, outputs: tuple[str, ...], rows: list[dict[str, FloatArray]]) -> Dataset:
+def _as_dataset(plan: Plan, outputs: tuple[str, ...], rows: list[dict[str, FloatArray]]) -> Dataset:
     from xarray import Dataset
 
     dims = tuple(plan.grid)

@@ -1,0 +1,182 @@
+"""What a sweep runs: parameters that make a grid, parameters that are drawn, and the draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import InputError
+from fingerspice.circuit.arguments import require_circuit, require_number
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.studies.batch import own_path
+from fingerspice.waveforms.waveform import require
+
+# Bits of a Sobol point, and so the largest number of draws of all.
+BITS = 30
+# Quantiles are taken no nearer to 0 and 1 than this, so that a distribution without bounds gives finite values.
+_EDGE = 1e-12
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Parameters that make a grid, those that are drawn (`n` draws by `seed`), and those that are one number.
+
+    Names are paths, or several paths with commas, whose numbers are factors; `own` has the paths of each and the values
+    that the factors are of.
+    """
+
+    grid: dict[str, FloatArray]
+    drawn: dict[str, Any]
+    fixed: dict[str, FloatArray]
+    own: dict[str, dict[str, float]]
+    units: dict[str, str]
+    n: int
+    seed: int
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of values of each parameter of the grid."""
+        return tuple(values.size for values in self.grid.values())
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Dimensions of the sweep."""
+        return (*self.grid, *(("scene",) if self.drawn else ()))
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Number of scenes along each dimension."""
+        return (*self.shape, *((self.n,) if self.drawn else ()))
+
+    def scenes(self, values: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
+        """Values of each path from those of each name that is no fixed one."""
+        return self.paths({**self.fixed, **values})
+
+    def paths(self, values: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
+        """Values of each path of these names."""
+        return {
+            path: factor * np.asarray(every, float)
+            for name, every in values.items() for path, factor in self.own[name].items()
+        }  # fmt: skip
+
+    def spread(self, grid: Mapping[str, FloatArray], draws: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Values of each path in all scenes of a part of the grid with a part of the draws, shape (n_scene,)."""
+        count = next(iter(draws.values())).size if draws else 1
+        mesh = np.meshgrid(*grid.values(), indexing="ij")
+        places = mesh[0].size if mesh else 1
+        flat = {path: np.repeat(values.ravel(), count) for path, values in zip(grid, mesh, strict=True)}
+        return self.scenes(flat | {path: np.tile(values, places) for path, values in draws.items()})
+
+    def quantiles(self, points: FloatArray) -> dict[str, FloatArray]:
+        """Values of the drawn parameters at points of the unit cube, shape (n_point, n_drawn)."""
+        points = np.clip(points, _EDGE, 1.0 - _EDGE)
+        return {path: np.asarray(law.ppf(points[:, i]), float) for i, (path, law) in enumerate(self.drawn.items())}
+
+    def draws(self) -> dict[str, FloatArray]:
+        """All values of the drawn parameters, shape (n,) each."""
+        return self.quantiles(_sobol(len(self.drawn), self.seed).random(self.n)) if self.drawn else {}
+
+    def sequence(self, count: int) -> Sequence:
+        """The draws, to be had in parts of `count` (a power of two, at most `n`)."""
+        engine, steps, at = _sobol(len(self.drawn), self.seed), [], count
+        first = _bits(engine.random(1))[0]
+        while at < self.n:
+            engine.fast_forward(at - engine.num_generated)
+            steps.append(_bits(engine.random(1))[0] ^ first)
+            at *= 2
+        return Sequence(self, count, steps)
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """The draws of a plan in parts of `count`, each of which costs the same.
+
+    The bits of a Sobol point are a linear function of those of its index: point i + j, of two indices without a common
+    bit, is the sum (exclusive or) of points i, j and 0. `steps` are the sums of point 0 and the points `count`,
+    2 `count`, 4 `count`, ..., shape (n_drawn,) each.
+    """
+
+    plan: Plan
+    count: int
+    steps: list[NDArray[np.int64]]
+
+    def part(self, number: int) -> dict[str, FloatArray]:
+        """Values of the drawn parameters in the part with this number, shape (count,) each."""
+        return _part(self, number)
+
+
+# Two chunks may run at once, and those after them mostly have the same draws.
+@lru_cache(2)
+def _part(sequence: Sequence, number: int) -> dict[str, FloatArray]:
+    bits = _first_part(len(sequence.plan.drawn), sequence.plan.seed, sequence.count)
+    for i, step in enumerate(sequence.steps):
+        if number >> i & 1:
+            bits = bits ^ step
+    return sequence.plan.quantiles(np.asarray(bits * 2.0**-BITS, float))
+
+
+def _sobol(dimensions: int, seed: int) -> Any:
+    from scipy.stats import qmc
+
+    return qmc.Sobol(dimensions, scramble=True, bits=BITS, rng=seed)
+
+
+@lru_cache(1)
+def _first_part(dimensions: int, seed: int, count: int) -> NDArray[np.int64]:
+    """Bits of the first points of a sequence, shape (count, dimensions)."""
+    return _bits(_sobol(dimensions, seed).random(count))
+
+
+def _bits(points: FloatArray) -> NDArray[np.int64]:
+    return np.asarray(points * 2.0**BITS, np.int64)
+
+
+def make_plan(circuit: Circuit, parameters: Mapping[str, Any], n: int, seed: int, most: int) -> Plan:
+    """The plan of checked arguments of `sweep`, with `most` draws or fewer.
+
+    Raises
+    ------
+    InputError
+        If a path is unknown or given twice, or its values are none.
+    """
+    require_circuit(circuit)
+    if not isinstance(parameters, Mapping) or not parameters:
+        raise InputError(f"parameters is {parameters!r}; allowed: a mapping such as {{'Xgap.d': [3e-6, 4e-6]}}")
+    for what, value in (("n", n), ("seed", seed)):
+        require_number(what, value, "a whole number")
+        require(value == int(value) and value >= 0, what, value, "a whole number, 0 or more")
+    power = most.bit_length() - 1
+    require(1 < n <= most and n & (n - 1) == 0, "n", n, f"a power of two such as 1024, at most 2^{power}")
+    grid: dict[str, FloatArray] = {}
+    drawn: dict[str, Any] = {}
+    fixed: dict[str, FloatArray] = {}
+    own: dict[str, dict[str, float]] = {}
+    units: dict[str, str] = {}
+    for given, value in parameters.items():
+        paths = [own_path(circuit, one.strip()) for one in str(given).split(",")]
+        twice = [one for i, one in enumerate(paths) if one in paths[:i] or any(one in told for told in own.values())]
+        if twice:
+            raise InputError(f"{twice[0]} is given twice; allowed: once")
+        path = ",".join(paths)
+        alone = len(paths) == 1
+        own[path] = {one: 1.0 if alone else circuit.parameters[one].value for one in paths}
+        units[path] = circuit.parameters[path].unit if alone else "1"
+        if hasattr(value, "ppf"):
+            drawn[path] = value
+            continue
+        try:
+            array = np.asarray(value, float)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"{path} is {value!r}; allowed: a number, an array of numbers, or a frozen distribution of scipy.stats "
+                "such as norm(3.5e-6, 0.3e-6)"
+            ) from None
+        require(array.ndim < 2 and array.size > 0, path, f"of shape {array.shape}", "numbers in one row")
+        (grid if array.ndim else fixed)[path] = array
+    return Plan(grid, drawn, fixed, own, units, int(n), int(seed))

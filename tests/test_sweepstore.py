@@ -1,0 +1,444 @@
+"""Sweeps in a store: the same bytes whoever runs the chunks, and however often they are killed."""
+
+from __future__ import annotations
+
+import json
+import logging
+import multiprocessing
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import fingerspice as fs
+from commands import Command, tree
+from fingerspice.studies import sweepchunks, sweepstored
+from fingerspice.studies.sweepplan import make_plan
+from processes import ended, no_room, start
+
+CIRCUITS = Path(__file__).parents[1] / "circuits"
+PARAMETERS: dict[str, Any] = {
+    "source.frequency": [100.0, 1000.0, 5000.0],
+    "Xgap.d": stats.lognorm(0.1, scale=3.5e-6),
+    "Xskin.d": stats.norm(350e-6, 50e-6),
+    "Xgap.fn": 0.4,
+}
+HOW: dict[str, Any] = {
+    "periodic": True, "outputs": ("f_el_mean_periodic",), "skin": "follow", "n": 4096, "seed": 3,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def circuit() -> fs.Circuit:
+    return fs.read_netlist(CIRCUITS / "fingerpad.cir")
+
+
+@pytest.fixture(autouse=True)
+def _small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweepstored, "CHUNK", 64)
+
+
+@pytest.fixture(scope="module")
+def whole(circuit: fs.Circuit, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes | None]:
+    """The store that one call makes, file by file."""
+    path = tmp_path_factory.mktemp("whole") / "whole.zarr"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweepstored, "CHUNK", 64)
+        found = fs.sweep(circuit, PARAMETERS, store=path, **HOW)
+    assert (found.attrs["chunks"], found.attrs["chunks_found"], found.attrs["chunks_missing"]) == (192, 0, 0)
+    return tree(path)
+
+
+def marks(store: Path) -> int:
+    return sum(len(files) for _, _, files in os.walk(store / "status" / "c"))
+
+
+@contextmanager
+def killing(pids: Callable[[], list[int]], pause: float) -> Iterator[list[int]]:
+    """Kills one of these processes after the other while the context lasts; the list has those that were killed."""
+    killed: list[int] = []
+    over = threading.Event()
+
+    def kill() -> None:
+        while not over.wait(pause):
+            for pid in pids()[:1]:
+                try:
+                    os.kill(pid, signal.SIGKILL)
+                    killed.append(pid)
+                except OSError:
+                    continue
+
+    thread = threading.Thread(target=kill, daemon=True)
+    thread.start()
+    try:
+        yield killed
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_draws_in_parts_are_those_of_the_whole(circuit: fs.Circuit) -> None:
+    plan = make_plan(circuit, PARAMETERS, 1 << 14, 5, 1 << 30)
+    draws = plan.draws()
+    for count in (1 << 9, 1 << 14):
+        parts = [plan.sequence(count).part(i) for i in range(plan.n // count)]
+        for name, values in draws.items():
+            np.testing.assert_array_equal(np.concatenate([part[name] for part in parts]), values)
+
+
+def test_a_store_has_what_a_sweep_in_memory_has(circuit: fs.Circuit, tmp_path: Path) -> None:
+    # 3 x 5 x 1 places and 32 draws, chunks of 2 x 32: also such that reach over the edge.
+    asked = {**PARAMETERS, "Xgap.r": [5e5, 6e5, 7e5, 8e5, 9e5], "Xcoat.r": [2e5]}
+    how = {**HOW, "n": 32, "outputs": ("f_el_mean_periodic", "f_el_rms_periodic")}
+    memory = fs.sweep(circuit, asked, **how)
+    stored = fs.sweep(circuit, asked, store=tmp_path / "s.zarr", **how)
+    assert stored.attrs["chunks"] == 9
+    assert list(stored.data_vars) == list(memory.data_vars)
+    for name in memory.variables:
+        assert stored[name].dims == memory[name].dims
+        assert stored[name].attrs.get("units") == memory[name].attrs.get("units")
+        np.testing.assert_array_equal(stored[name].values, memory[name].values)
+    known = {key: value for key, value in memory.attrs.items() if key not in ("n_ordinary", "ordinary", "failures")}
+    assert known == {key: stored.attrs[key] for key in known}
+    # A grid alone, and one scene alone.
+    for values in ({"Xgap.d": [3e-6, 4e-6]}, {"Xgap.d": 3e-6}):
+        alone = fs.sweep(circuit, values, store=tmp_path / f"{len(str(values))}.zarr", **how)
+        held = fs.sweep(circuit, values, **how)
+        np.testing.assert_array_equal(alone.f_el_rms_periodic.values, held.f_el_rms_periodic.values)
+
+
+def test_a_network_and_several_fingers_go_into_a_store(tmp_path: Path) -> None:
+    circuit = fs.read_netlist(CIRCUITS / "two_fingers.cir")
+    path = next(name for name in circuit.parameters if name.endswith("ap.d"))
+    asked, how = {path: [3e-6, 3.2e-6, 3.4e-6]}, {"outputs": ("f_el_mean",), "t_stop": 5e-3}
+    memory = fs.sweep(circuit, asked, **how)
+    stored = fs.sweep(circuit, asked, store=tmp_path / "s.zarr", **how)
+    assert stored.f_el_mean.dims == memory.f_el_mean.dims == (path, "gap")
+    np.testing.assert_array_equal(stored.f_el_mean.values, memory.f_el_mean.values)
+
+
+def test_scenes_without_a_result_are_named_by_their_number_in_the_sweep(circuit: fs.Circuit, tmp_path: Path) -> None:
+    # Adhesion that leaves no contact.
+    asked = {"Xgap.r": [1e6, 2e6], "Xgap.c2": np.where(np.arange(80) == 70, 1e9, 5000.0)}
+    how = {"outputs": ("f_el_mean",), "t_stop": 2e-2, "threads": 1}
+    memory = fs.sweep(circuit, asked, **how)
+    lost = np.flatnonzero(memory.status.values.ravel() >= 2)
+    stored = fs.sweep(circuit, asked, store=tmp_path / "s.zarr", **how)
+    assert lost.tolist() == [70, 150]
+    assert stored.attrs["failures"] == memory.attrs["failures"]
+    np.testing.assert_array_equal(stored.status.values, memory.status.values)
+
+
+def test_workers_that_are_killed_cost_nothing(
+    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
+) -> None:
+    path = tmp_path / "s.zarr"
+
+    def children() -> list[int]:
+        # Not before they are at work: two chunks and more are there since the last kill.
+        now = marks(path)
+        if now < children.seen + 8 or now > 180:  # type: ignore[attr-defined]
+            return []
+        children.seen = now  # type: ignore[attr-defined]
+        return [one.pid for one in multiprocessing.active_children() if one.pid]
+
+    children.seen = 0  # type: ignore[attr-defined]
+    with killing(children, 0.01) as killed:
+        found = fs.sweep(circuit, PARAMETERS, store=path, workers=2, **HOW)
+    assert len(killed) >= 3
+    assert found.attrs["chunks_missing"] == 0
+    assert tree(path) == whole
+    assert not multiprocessing.active_children()
+
+
+class Deadly:
+    """A distribution whose draws end every process but the one that started the sweep."""
+
+    home = os.getpid()
+
+    def __init__(self) -> None:
+        self.pid = os.getpid()
+
+    def ppf(self, points: Any) -> Any:
+        if os.getpid() != self.pid:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return 3e-6 + 1e-6 * np.asarray(points)
+
+
+def test_a_chunk_that_always_costs_its_worker_ends_the_sweep(
+    circuit: fs.Circuit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sweepchunks, "MOST_LOST", 2)
+    with pytest.raises(fs.InputError, match="2 workers were lost one after another, the last with code -9"):
+        fs.sweep(circuit, {"Xgap.d": Deadly()}, store=tmp_path / "s.zarr", workers=1, **{**HOW, "n": 64})
+
+
+SCRIPT = """
+import sys
+import fingerspice as fs
+import test_sweepstore as here
+from fingerspice.studies import sweepstored
+
+if __name__ == "__main__":
+    sweepstored.CHUNK = 64
+    circuit = fs.read_netlist(here.CIRCUITS / "fingerpad.cir")
+    asked = {"store": sys.argv[1], "shard": (int(sys.argv[2]), int(sys.argv[3]))}
+    fs.sweep(circuit, here.PARAMETERS, **asked, **({"workers": 2} if len(sys.argv) > 4 else {}), **here.HOW)
+"""
+
+
+@pytest.fixture
+def script(tmp_path: Path) -> list[str]:
+    (tmp_path / "script.py").write_text(SCRIPT)
+    return [sys.executable, str(tmp_path / "script.py")]
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+
+
+# By hand: FINGERSPICE_KILLS=20.
+KILLS = int(os.environ.get("FINGERSPICE_KILLS", "5"))
+
+
+def test_a_sweep_killed_again_and_again_comes_to_the_same_bytes(
+    whole: dict[str, bytes | None], tmp_path: Path, script: list[str]
+) -> None:
+    path = tmp_path / "s.zarr"
+    for kill in range(KILLS):
+        # With workers at every other time: these end by themselves.
+        more = ["workers"] if kill % 2 else []
+        process = start(tmp_path, str(path), "1", "1", *more, entry=script, env=_environment())
+        wanted = marks(path) + 150 // KILLS
+        while marks(path) < wanted and process.poll() is None:
+            time.sleep(0.002)
+        assert process.poll() is None
+        process.kill()
+        process.communicate()
+    assert 150 // KILLS * KILLS <= marks(path) < 192
+    code, said, _ = ended(start(tmp_path, str(path), "1", "1", entry=script, env=_environment()))
+    assert (code, said) == (0, [])
+    assert tree(path) == whole
+
+
+def test_shards_by_separate_processes_make_the_whole(
+    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, script: list[str]
+) -> None:
+    path = tmp_path / "s.zarr"
+    # At once: whichever comes first creates the store.
+    shards = [start(tmp_path, str(path), str(i), "3", entry=script, env=_environment()) for i in (1, 2)]
+    assert [ended(one)[:2] for one in shards] == [(0, []), (0, [])]
+    assert marks(path) == 128
+    last = fs.sweep(circuit, PARAMETERS, store=path, shard=(2, 3), **HOW)
+    assert (last.attrs["chunks"], last.attrs["chunks_found"], last.attrs["chunks_missing"]) == (64, 64, 64)
+    assert np.count_nonzero(last.status.values == 4) == 64 * 64
+    assert np.isnan(last.f_el_mean_periodic.values[last.status.values == 4]).all()
+    fs.sweep(circuit, PARAMETERS, store=path, shard=(3, 3), **HOW)
+    assert tree(path) == whole
+
+
+def test_dask_workers_that_are_killed_cost_nothing(
+    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    distributed = pytest.importorskip("distributed")
+    path = tmp_path / "s.zarr"
+    seen = 0
+
+    def workers() -> list[int]:
+        nonlocal seen
+        now = marks(path)
+        if now < seen + 8 or now > 180:
+            return []
+        seen = now
+        return [one.pid for one in cluster.workers.values() if one.pid]
+
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=logging.CRITICAL
+    ) as cluster:
+        with killing(workers, 0.01) as killed:
+            found = fs.sweep(circuit, PARAMETERS, store=path, scheduler=cluster.scheduler_address, **HOW)
+        assert len(killed) >= 3
+        assert found.attrs["chunks_missing"] == 0
+        assert tree(path) == whole
+        # What a worker refuses is told as it is.
+        monkeypatch.setattr(sweepstored, "programs", lambda: "fingerspice 0.0")
+        with pytest.raises(fs.InputError, match="a worker has fingerspice"):
+            fs.sweep(circuit, PARAMETERS, store=tmp_path / "o.zarr", scheduler=cluster.scheduler_address, **HOW)
+
+
+def test_a_scheduler_that_does_not_answer_is_refused_within_seconds(circuit: fs.Circuit, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    begun = time.perf_counter()
+    for address in ("tcp://127.0.0.1:1", "nowhere"):
+        with pytest.raises(fs.InputError, match=f"no scheduler answers at {address}") as told:
+            fs.sweep(circuit, PARAMETERS, store=tmp_path / "s.zarr", scheduler=address, **HOW)
+        assert "\n" not in str(told.value)
+    assert time.perf_counter() - begun < 15.0
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_half_written_store_of_another_sweep_is_refused_and_kept(circuit: fs.Circuit, tmp_path: Path) -> None:
+    path = tmp_path / "s.zarr"
+    fs.sweep(circuit, PARAMETERS, store=path, shard=(1, 2), **HOW)
+    before = tree(path)
+    other = {**PARAMETERS, "Xgap.d": stats.lognorm(0.11, scale=3.5e-6)}
+    cases: list[tuple[fs.Circuit, dict[str, Any], dict[str, Any], str]] = [
+        (circuit, PARAMETERS, {"seed": 4}, r"another seed \(3, and this one 4\)"),
+        (circuit, PARAMETERS, {"rtol": 1e-5}, "another rtol"),
+        (circuit, PARAMETERS, {"n": 2048}, "another n"),
+        (circuit, PARAMETERS, {"skin": "own"}, "another skin"),
+        (circuit, other, {}, r"another range of Xgap\.d"),
+        (circuit, {**PARAMETERS, "Xgap.fn": 0.5}, {}, r"another range of Xgap\.fn"),
+        (circuit, {**PARAMETERS, "Xgap.r": 1e6}, {}, "another list of parameters"),
+        (circuit.replace({"Xcoat.r": 3e5}), PARAMETERS, {}, "another circuit"),
+    ]
+    for own, parameters, change, said in cases:
+        with pytest.raises(fs.InputError, match=said) as told:
+            fs.sweep(own, parameters, store=path, **{**HOW, **change})
+        assert "\n" not in str(told.value)
+    assert tree(path) == before
+    # An option that is given as it is by default is the same sweep.
+    found = fs.sweep(circuit, PARAMETERS, store=path, shard=(1, 2), rtol=1e-4, threads=1, **HOW)
+    assert found.attrs["chunks_found"] == found.attrs["chunks"]
+    shutil.rmtree(path)
+    path.mkdir()
+    (path / "mine.txt").write_text("mine")
+    with pytest.raises(fs.InputError, match="is there already and is no store of a sweep"):
+        fs.sweep(circuit, PARAMETERS, store=path, **HOW)
+    assert (path / "mine.txt").read_text() == "mine"
+
+
+def test_a_chunk_that_is_cut_short_or_not_marked_is_run_again(
+    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
+) -> None:
+    path = tmp_path / "s.zarr"
+    for name, content in whole.items():
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        if content is not None:
+            (path / name).write_bytes(content)
+    os.truncate(path / "error" / "c" / "1" / "7", 100)
+    (path / "f_el_mean_periodic" / "c" / "0" / "3").unlink()
+    (path / "status" / "c" / "2" / "9").unlink()
+    (path / "Xgap.d" / "c" / "5").unlink()
+    # Left by a process that was killed.
+    (path / "status" / ".fingerspice-0123").write_bytes(b"half")
+    found = fs.sweep(circuit, PARAMETERS, store=path, **HOW)
+    assert found.attrs["chunks"] - found.attrs["chunks_found"] == 4
+    assert tree(path) == whole
+
+
+@pytest.mark.parametrize(
+    ("parameters", "how", "said"),
+    [
+        ({}, {"shard": (0, 3)}, "shard is"),
+        ({}, {"shard": (4, 3)}, "shard is"),
+        ({}, {"workers": 0}, "workers is 0"),
+        ({}, {"workers": 2, "scheduler": "tcp://127.0.0.1:1"}, "both given"),
+        ({}, {"outputs": ("f_el_mean", "u_gap")}, "u_gap"),
+        ({}, {"outputs": ("force",)}, "unknown output"),
+        ({}, {"n": 1 << 31}, r"at most 2\^30"),
+        ({"Xgap.d": stats.norm(1e-6, 1e-6)}, {}, r"the distribution of Xgap\.d"),
+        ({"Xgap.d": [1e-6, -1e-6]}, {}, r"the values of Xgap\.d"),
+        ({"Xgap.dd": 1e-6}, {}, "Xgap.d"),
+    ],
+)
+def test_bad_requests_are_refused_before_anything_is_written(
+    circuit: fs.Circuit, parameters: Any, how: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(fs.InputError, match=said) as told:
+        fs.sweep(circuit, {**PARAMETERS, **parameters}, store=tmp_path / "s.zarr", **{**HOW, **how})
+    assert "\n" not in str(told.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_workers_without_a_store_are_refused(circuit: fs.Circuit) -> None:
+    for how in ({"workers": 2}, {"scheduler": "tcp://127.0.0.1:1"}, {"shard": (1, 2)}):
+        with pytest.raises(fs.InputError, match="without store"):
+            fs.sweep(circuit, PARAMETERS, **HOW, **how)
+
+
+FILE = """deck = "fingerpad.cir"
+n = 64
+seed = 1
+outputs = ["f_el_mean_periodic"]
+periodic = true
+[parameters]
+"source.frequency" = { log = [20, 2000, 6] }
+"Xgap.d" = { lognormal = [3.5e-6, 0.1] }
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    for name in ("fingerpad.cir", "fingerspice.lib"):
+        (tmp_path / name).write_bytes((CIRCUITS / name).read_bytes())
+    (tmp_path / "fingers.toml").write_text(FILE)
+    return tmp_path / "fingers.toml"
+
+
+def test_the_command_fills_a_store_shard_by_shard(file: Path, command: Command) -> None:
+    store = file.parent / "o.zarr"
+    words = ("sweep", str(file), "--store", str(store))
+    first = command(*words, "--shard", "1/2", "--json")
+    answer = json.loads(first.out)
+    assert first.code == 0, first.err
+    assert (answer["scenes"], answer["failed"], answer["figures"]) == (384, None, None)
+    assert {key: answer["store"][key] for key in ("chunks", "chunks_found", "chunks_missing")} == {
+        "chunks": 3, "chunks_found": 0, "chunks_missing": 3,
+    }  # fmt: skip
+    assert answer["files"] == [str(store)]
+    assert "3 pieces of other parts are missing" in command(*words, "--shard", "1/2").out
+    last = command(*words, "--workers", "2", "--json")
+    answer = json.loads(last.out)
+    assert last.code == 0, last.err
+    assert (answer["failed"], answer["store"]["chunks_found"], answer["store"]["chunks_missing"]) == (0, 3, 0)
+    row = answer["figures"][0]
+    found = fs.sweep(
+        fs.read_netlist(file.parent / "fingerpad.cir"),
+        {"source.frequency": np.geomspace(20, 2000, 6), "Xgap.d": stats.lognorm(0.1, scale=3.5e-6)},
+        n=64, seed=1, outputs=("f_el_mean_periodic",), periodic=True,
+    )  # fmt: skip
+    assert row["median"] == float(found.f_el_mean_periodic.median())
+    assert "median" in command(*words).out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--workers", "2"), "--workers is given without --store"),
+        (("--shard", "1/2"), "--shard is given without --store"),
+        (("--store", "o.zarr", "--shard", "1-2"), "two whole numbers such as 1/8"),
+        (("--store", "o.zarr", "--shard", "3/2"), "shard is (3, 2)"),
+        (("--store", "fingers.toml"), "is no store of a sweep"),
+    ],
+)
+def test_bad_commands_are_refused_in_one_sentence(
+    file: Path, command: Command, words: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(file.parent)
+    before = tree(file.parent)
+    done = command("sweep", str(file), *words)
+    assert done.code == 2
+    assert said in done.err
+    assert len(done.lines) == 1
+    assert tree(file.parent) == before
+
+
+def test_a_full_disk_ends_in_one_sentence_and_the_sweep_goes_on_from_there(file: Path) -> None:
+    words = ("sweep", str(file), "--store", "o.zarr")
+    code, said, _ = ended(start(file.parent, *words, preexec_fn=no_room(2500), env=_environment()))
+    assert code == 2
+    assert len(said) == 1
+    assert "cannot write" in said[0]
+    assert "goes on from there" in said[0]
+    assert ended(start(file.parent, *words, env=_environment()))[:2] == (0, [])
