@@ -209,6 +209,13 @@ def test_the_batch_benchmark_runs_and_meets_its_errors(monkeypatch, capsys):
     assert all(row["largest_error"] <= row["rtol"] for row in checked)
 
 
+def test_the_benchmark_of_sweeps_finds_the_same_bytes_after_a_kill(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    results = importlib.import_module("sweeps").main(["--quick"])
+    assert {row["who"].split(",")[0] for row in results["rows"]} == {"memory", "store"}
+    assert results["killed"]["same_bytes"]
+
+
 def test_the_streaming_benchmark_takes_every_sample(monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(FOLDER))
     points = importlib.import_module("streaming").main(["--quick"])

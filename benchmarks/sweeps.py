@@ -1,0 +1,117 @@
+"""What a store costs a sweep of a million scenes, and whether a sweep that is killed again and again keeps its bytes.
+
+A scene is Table 1's stack with another gap, leak and skin; its output is the mean force of 5 periods at 1e-4. Usage:
+``python benchmarks/sweeps.py [--quick] [--kills N]``; writes ``benchmarks/results/sweeps.json`` unless quick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import platform
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+import fingerspice as fs
+
+HERE = Path(__file__).resolve().parent
+DECK = HERE.parent / "circuits" / "fingerpad.cir"
+PARAMETERS: dict[str, Any] = {
+    "Xgap.d": stats.lognorm(0.1, scale=3.5e-6),
+    "Xgap.r": stats.lognorm(0.4, scale=1e6),
+    "Xskin.d": stats.norm(350e-6, 30e-6),
+}
+FILE = """deck = "fingerpad.cir"
+n = {n}
+outputs = ["f_el_mean"]
+periods = 5
+[parameters]
+"Xgap.d" = {{ lognormal = [3.5e-6, 0.1] }}
+"Xgap.r" = {{ lognormal = [1e6, 0.4] }}
+"Xskin.d" = {{ normal = [350e-6, 30e-6] }}
+"""
+
+
+def measured(n: int, repeats: int, folder: Path) -> list[dict[str, Any]]:
+    """Seconds of the sweep in memory and into a store, by one thread and by two, and bytes on the disk."""
+    circuit, rows = fs.read_netlist(DECK), []
+    ways: dict[str, dict[str, Any]] = {
+        "memory, 1 thread": {"threads": 1},
+        "store, 1 thread": {"threads": 1, "store": folder / "own.zarr"},
+        "memory, 2 threads": {"threads": 2},
+        "store, 2 threads": {"threads": 2, "store": folder / "own.zarr"},
+        "store, 2 processes": {"workers": 2, "store": folder / "own.zarr"},
+    }
+    fs.sweep(circuit, PARAMETERS, n=n, outputs=("f_el_mean",), periods=5)
+    for who, how in ways.items():
+        times = []
+        for _ in range(repeats):
+            shutil.rmtree(folder / "own.zarr", ignore_errors=True)
+            begin = time.perf_counter()
+            found = fs.sweep(circuit, PARAMETERS, n=n, outputs=("f_el_mean",), periods=5, **how)
+            times.append(time.perf_counter() - begin)
+        row = {"who": who, "n": n, "median_s": float(np.median(times)), "scenes_per_s": n / float(np.median(times))}
+        if "store" in how:
+            assert found.attrs["chunks_missing"] == 0
+            row["bytes_per_scene"] = sum(p.stat().st_size for p in (folder / "own.zarr").rglob("*") if p.is_file()) / n
+        rows.append(row)
+        print(row)
+    return rows
+
+
+def digest(store: Path) -> str:
+    """Digest of all files of a store, with their names."""
+    told = hashlib.sha256()
+    for file in sorted(p for p in store.rglob("*") if p.is_file()):
+        told.update(str(file.relative_to(store)).encode() + file.read_bytes())
+    return told.hexdigest()
+
+
+def killed(n: int, kills: int, folder: Path) -> dict[str, Any]:
+    """Whether a sweep of the command line, killed at random moments, ends with the bytes of one that was not."""
+    shutil.copy(DECK, folder)
+    (folder / "sweep.toml").write_text(FILE.format(n=n))
+    command = [sys.executable, "-m", "fingerspice", "sweep", str(folder / "sweep.toml"), "--no-plot"]
+    command += ["--out", str(folder / "out"), "--overwrite", "--store"]
+    subprocess.run([*command, str(folder / "whole.zarr")], check=True, capture_output=True)
+    store, done = folder / "killed.zarr", 0
+    rng = random.Random(1)
+    for kill in range(kills):
+        more = ["--workers", "2"] if kill % 2 else []
+        process = subprocess.Popen([*command, str(store), *more], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(rng.uniform(1.0, 5.0))
+        done += process.poll() is None
+        process.kill()
+        process.wait()
+    subprocess.run([*command, str(store)], check=True, capture_output=True)
+    found = {"n": n, "kills": done, "same_bytes": digest(store) == digest(folder / "whole.zarr")}
+    print(found)
+    return found
+
+
+def main(arguments: list[str] | None = None) -> dict[str, Any]:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--kills", type=int, default=20)
+    options = parser.parse_args(arguments)
+    n, repeats, kills = (1 << 12, 1, 1) if options.quick else (1 << 20, 7, options.kills)
+    with tempfile.TemporaryDirectory() as name:
+        rows, found = measured(n, repeats, Path(name)), killed(4 * n, kills, Path(name))
+    results = {"python": platform.python_version(), "machine": platform.machine(), "rows": rows, "killed": found}
+    if not options.quick:
+        (HERE / "results" / "sweeps.json").write_text(json.dumps(results, indent=1) + "\n")
+    return results
+
+
+if __name__ == "__main__":
+    main()
