@@ -34,7 +34,7 @@ figures: $(VENV)/.run
 	$(BIN)/fingerspice figures --out out
 
 test: $(VENV)/.test
-	@sh tests/get_ngspice.sh
+	@sh tests/get_programs.sh
 	@echo "running the whole suite: about 8 minutes on two cores"
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal
 

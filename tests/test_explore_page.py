@@ -92,6 +92,13 @@ def test_the_page_shows_what_simulate_gives_and_asks_nobody_else(page: Page, exp
     assert all(url.startswith((explorer.url, "data:")) for url in page.asked)
 
 
+def test_nothing_on_the_page_shuts_anybody_out(page: Page) -> None:
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+    found = axe.Axe().run(page.page).response
+    assert len(found["passes"]) > 20
+    assert [one["help"] for one in found["violations"] if one["impact"] in ("serious", "critical")] == []
+
+
 def test_every_slider_of_the_first_scene_moves_the_figures(page: Page) -> None:
     sliders = page.page.locator("#sliders > fieldset > .slider input[type=range]")
     names = [sliders.nth(i).get_attribute("data-path") for i in range(sliders.count())]

@@ -62,21 +62,36 @@ def test_without_ngspice_the_last_line_says_what_was_not_run(tmp_path: Path) -> 
         ),
         (
             {"id": "echo 0", "apt_get": "exit 100"},
-            "ngspice could not be installed; the comparisons with it are left out",
+            "ngspice could not be installed; what needs it is left out",
+        ),
+        (
+            {
+                "ngspice": "exit 0",
+                "chromium": "",
+                "id": "echo 0",
+                "apt_get": "echo $@ >> {log}; [ $1 = update ] || cp {true} {here}/chromium",
+            },
+            "installing chromium",
         ),
         ({"id": "echo 1000"}, "ngspice is not installed, and installing it takes a password: sudo apt-get install"),
         ({"id": "echo 1000", "sudo": "exit 1"}, "takes a password"),
         ({"ngspice": "exit 0"}, ""),
     ],
 )
-def test_ngspice_is_installed_where_that_takes_no_question(tmp_path: Path, scripts: dict[str, str], said: str) -> None:
+def test_programs_are_installed_where_that_takes_no_question(
+    tmp_path: Path, scripts: dict[str, str], said: str
+) -> None:
     log, true = tmp_path / "log", shutil.which("true")
-    filled = {k: v.format(log=log, here=tmp_path, true=true) for k, v in scripts.items()}
+    filled = {
+        k: v.format(log=log, here=tmp_path, true=true) for k, v in ({"chromium": "exit 0"} | scripts).items() if v
+    }
     environment = bare(tmp_path, "sh", "env", "cp", **filled)
-    done = subprocess.run(["sh", TESTS / "get_ngspice.sh"], env=environment, capture_output=True, text=True, timeout=20)
+    done = subprocess.run(
+        ["sh", TESTS / "get_programs.sh"], env=environment, capture_output=True, text=True, timeout=20
+    )
     assert done.returncode == 0
     assert said in done.stdout
     assert bool(done.stdout) is bool(said)
     if "log" in scripts.get("apt_get", ""):
-        assert "install -y -qq ngspice" in log.read_text()
+        assert f"install -y -qq {said.split()[1]}" in log.read_text()
         assert "could not" not in done.stdout
