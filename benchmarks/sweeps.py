@@ -89,7 +89,7 @@ def killed(n: int, kills: int, folder: Path) -> dict[str, Any]:
     for kill in range(kills):
         more = ["--workers", "2"] if kill % 2 else []
         process = subprocess.Popen([*command, str(store), *more], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        time.sleep(rng.uniform(1.0, 5.0))
+        time.sleep(rng.uniform(1.0, 2.5))
         done += process.poll() is None
         process.kill()
         process.wait()
@@ -106,7 +106,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     options = parser.parse_args(arguments)
     n, repeats, kills = (1 << 12, 1, 1) if options.quick else (1 << 20, 7, options.kills)
     with tempfile.TemporaryDirectory() as name:
-        rows, found = measured(n, repeats, Path(name)), killed(4 * n, kills, Path(name))
+        rows, found = measured(n, repeats, Path(name)), killed(8 * n, kills, Path(name))
     results = {"python": platform.python_version(), "machine": platform.machine(), "rows": rows, "killed": found}
     if not options.quick:
         (HERE / "results" / "sweeps.json").write_text(json.dumps(results, indent=1) + "\n")
