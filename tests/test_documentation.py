@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import re
 import shlex
@@ -78,6 +80,7 @@ def test_the_code_of_a_page_runs_from_its_start_to_its_end(page: Path, command: 
     os.environ["MPLBACKEND"] = "Agg"
     shutil.copytree(ROOT / "circuits", tmp_path / "circuits")
     names: dict[str, object] = {"__name__": "__main__"}
+    printed = ""
     for block in blocks(page.read_text(encoding="utf-8")):
         assert block.language in LANGUAGES, block.text
         if block.before.startswith(NOT_RUN):
@@ -86,11 +89,17 @@ def test_the_code_of_a_page_runs_from_its_start_to_its_end(page: Path, command: 
         if file is not None:
             (tmp_path / file).write_text(block.text, encoding="utf-8")
         if block.language == "python":
-            exec(compile(block.text, id_of(page), "exec"), names)
+            with contextlib.redirect_stdout(io.StringIO()) as out:
+                exec(compile(block.text, id_of(page), "exec"), names)
             plt.close("all")
+            printed = out.getvalue()
         for arguments in commands_of(block) if block.language == "sh" else []:
             result = command(*arguments)
             assert result.code == 0, (arguments, result.err)
+            printed = result.out
+        if block.language == "text" and file is None:
+            # What a page shows was printed by the block before.
+            assert [line for line in block.text.splitlines() if line not in printed] == [], printed
 
 
 def anchors(text: str) -> set[str]:
