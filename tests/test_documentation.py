@@ -27,7 +27,7 @@ NOT_RUN = "<!-- not run:"
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block: its language, its text, and the line of text before it."""
+    """A fenced block: its language, its text, and the paragraph before it."""
 
     language: str
     text: str
@@ -37,7 +37,7 @@ class Block:
 def blocks(text: str) -> list[Block]:
     """The fenced blocks of a page in their order, and its indented commands as blocks of the shell."""
     found: list[Block] = []
-    language, inside, before = "", None, ""
+    language, inside, before, ended = "", None, "", False
     for line in text.splitlines():
         if line.startswith("```") and inside is None:
             language, inside = line[3:].strip(), []
@@ -49,15 +49,16 @@ def blocks(text: str) -> list[Block]:
         elif line.startswith("    fingerspice "):
             found.append(Block("sh", line.strip() + "\n", before))
         elif line.strip():
-            before = line.strip()
+            before = f"{'' if ended else before} {line.strip()}".strip()
+        ended = not line.strip()
     assert inside is None, "a block has no end"
     return found
 
 
 def file_of(block: Block) -> str | None:
-    """The file as which a page says to save a block: its name ends the line before."""
-    name = re.search(r"`([\w.]+\.(?:cir|csv|toml|txt))`:$", block.before)
-    return name.group(1) if name and block.language in ("spice", "csv", "toml", "text") else None
+    """The file as which the paragraph before a block says to save it."""
+    name = re.search(r"\b[Ss]ave\b.* as `([\w.]+)`", block.before)
+    return name.group(1) if name and block.language in ("spice", "csv", "toml") else None
 
 
 def commands_of(block: Block) -> list[list[str]]:
@@ -97,7 +98,7 @@ def test_the_code_of_a_page_runs_from_its_start_to_its_end(page: Path, command: 
             result = command(*arguments)
             assert result.code == 0, (arguments, result.err)
             printed = result.out
-        if block.language == "text" and file is None:
+        if block.language == "text":
             # What a page shows was printed by the block before.
             assert [line for line in block.text.splitlines() if line not in printed] == [], printed
 
