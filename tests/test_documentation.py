@@ -130,3 +130,12 @@ def test_the_reference_has_every_public_name_and_no_other() -> None:
     pages = "".join(p.read_text(encoding="utf-8") for p in (DOCS / "reference").glob("*.rst"))
     listed = re.findall(r"^\.\. auto(?:function|class|exception):: (\w+)$", pages, re.MULTILINE)
     assert sorted(listed) == sorted(set(fs.__all__) - {"__version__"})
+
+
+def test_the_times_of_the_readme_are_those_of_the_measured_table() -> None:
+    front = (ROOT / "README.md").read_text(encoding="utf-8").split("## How right and how fast")[1]
+    measured = (DOCS / "proof.md").read_text(encoding="utf-8").split("## What a user waits for")[1]
+    times = re.findall(r"\| ([\d.]+) (s|ms|ns)\b", front)
+    assert len(times) == 3
+    for number, unit in times:
+        assert re.search(rf"[|/] {number}(?: /[^|]*)? {unit} \|", measured), (number, unit)
