@@ -1,29 +1,37 @@
-"""Scenes per second of whole calls of `fs.batch`, of a loop over `simulate`, and of a numba loop of RK4 over scenes.
+"""Scenes per second of whole calls of `fs.batch`, of a loop over `simulate`, and of other packages at the same error.
 
-A scene is Table 1's stack with another gap, leak and amplitude; its output is the mean force of 5 periods. Usage:
+A scene is Table 1's stack with another gap, leak and amplitude; its output is the mean force of 5 periods of a sine or
+square, and of a whole AM envelope or period of `learned_drive.cir`. The peers (JAX, diffrax, torch, numba) are those that
+are installed; they and `fs.batch` with one thread run on one core. Usage:
 ``python benchmarks/batch.py [--quick] [--scenes N]``; writes ``benchmarks/results/batch.json`` unless quick.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
+import os
 import platform
 import time
+import tracemalloc
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
-from numba import njit
 
 import fingerspice as fs
 from fingerspice.circuit.statespace import build_stack
+from peers import many_scenes
 
 HERE = Path(__file__).resolve().parent
 PERIODS = 5
 REFERENCES = 24
+PLAIN = "sine, narrow"
 
 
 def population(n: int, wide: bool) -> dict[str, np.ndarray]:
@@ -57,81 +65,42 @@ def seconds(action: Callable[[], object], repeats: int) -> dict[str, float]:
     return {"least_s": min(times), "median_s": float(np.median(times)), "processor_s": min(busy)}
 
 
-@njit(nogil=True)
-def rk4(
-    c: np.ndarray, g: np.ndarray, g_area: np.ndarray, wave: np.ndarray, areas: np.ndarray, steps: int
-) -> np.ndarray:
-    """Mean of u_gap^2 A by the classical Runge-Kutta method, scene by scene, with linear tables of the areas."""
-    n, m = c.shape
-    out = np.empty(n)
-    u, v, k, total = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
-    for s in range(n):
-        inverse = np.sum(1.0 / c[s])
-        u[:] = 0.0
-        h = 2.0 * np.pi / wave[s, 1] / steps
-        scale = (areas.shape[1] - 1) / wave[s, 0]
-        mean = 0.0
-        last = steps * PERIODS
-        for i in range(last + 1):
-            total[:] = 0.0
-            for stage in range(4):
-                late = 0.0 if stage == 0 else 0.5 if stage < 3 else 1.0
-                source = wave[s, 0] * np.sin(wave[s, 1] * h * (i + late))
-                v[:] = u if stage == 0 else u + late * h * k
-                gap = abs(source / (c[s, 1] * inverse) + v[1])
-                place = min(gap * scale, areas.shape[1] - 1.001)
-                j = int(place)
-                area = areas[s, j] + (place - j) * (areas[s, j + 1] - areas[s, j])
-                if stage == 0:
-                    mean += (0.5 if i in (0, last) else 1.0) * gap * gap * area
-                common = 0.0
-                for x in range(m):
-                    k[x] = -(g[s, x] / area + g_area[s, x]) / c[s, x] * (source / (c[s, x] * inverse) + v[x])
-                    common -= k[x]
-                for x in range(m):
-                    k[x] += common / (c[s, x] * inverse)
-                total += (1.0 if stage in (0, 3) else 2.0) * k
-            u += h / 6.0 * total
-        out[s] = mean / last
-    return out
+@contextmanager
+def one_core() -> Iterator[None]:
+    """All threads on one core, also those that libraries start inside."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
 
 
-def by_rk4(circuit: fs.Circuit, parameters: dict[str, np.ndarray], n: int, steps: int) -> Callable[[], np.ndarray]:
-    """The loop of RK4 over the first n scenes; its set-up is not timed, which favours it."""
-    rows = []
-    for i in range(n):
-        stack = build_stack(circuit.varied({p: float(x[i]) for p, x in parameters.items()}))
-        assert stack.contact is not None
-        wave = stack.waveform
-        table = stack.contact.area(np.linspace(0.0, wave.amplitude, 2000))  # type: ignore[attr-defined]
-        rows.append((stack.c, stack.g_total, stack.g_area, [wave.amplitude, 2.0 * np.pi * wave.frequency], table,  # type: ignore[attr-defined]
-                     float(stack.contact.stress(1.0))))  # fmt: skip
-    c, g, g_area, wave_rows, areas, stress = (np.array(column) for column in zip(*rows, strict=True))
-    return lambda: stress * rk4(c, g, g_area, wave_rows, areas, steps)
-
-
-def single(circuit: fs.Circuit, parameters: dict[str, np.ndarray], i: int, rtol: float, follow: bool) -> float:
-    """Mean force of one scene by `simulate`, N."""
-    changes = {path: float(values[i]) for path, values in parameters.items()}
-    if follow:
-        changes["Xskin.f"] = changes["Vdrive.frequency"]
+def single(circuit: fs.Circuit, changes: dict[str, float], rtol: float, periods: float | None) -> float:
+    """Mean force of one scene by `simulate`, N; its length is that of the deck without `periods`."""
     changed = circuit.varied(changes)
-    frequency = changed["Vdrive"].waveform.frequency  # type: ignore[union-attr]
-    found = fs.simulate(changed, t_stop=PERIODS / frequency, rtol=rtol, charge=False).f_el_mean
-    return float(np.asarray(found))
+    stop = None if periods is None else periods / changed["Vdrive"].waveform.frequency  # type: ignore[union-attr]
+    return float(np.asarray(fs.simulate(changed, t_stop=stop, rtol=rtol, charge=False).f_el_mean))
 
 
-def measure(name: str, circuit: fs.Circuit, n: int, wide: bool, repeats: int) -> list[dict[str, Any]]:
-    """Scenes per second and errors of `fs.batch` at two tolerances, and of the other contestants."""
-    parameters, skin = population(n, wide), "follow" if wide else "own"
+def measure(
+    name: str, circuit: fs.Circuit, parameters: dict[str, np.ndarray], repeats: int, periods: float | None = PERIODS
+) -> list[dict[str, Any]]:
+    """Scenes per second and errors of `fs.batch` at two tolerances, and of a loop over `simulate`."""
+    n = next(iter(parameters.values())).size
+    skin = "follow" if "Vdrive.frequency" in parameters else "own"
     few = min(n, REFERENCES)
-    expected = np.array([single(circuit, parameters, i, 1e-11, wide) for i in range(few)])
+    scenes = [{path: float(x[i]) for path, x in parameters.items()} for i in range(few)]
+    if skin == "follow":
+        scenes = [changes | {"Xskin.f": changes["Vdrive.frequency"]} for changes in scenes]
+    expected = np.array([single(circuit, changes, 1e-11, periods) for changes in scenes])
     rows = []
     for rtol in (1e-4, 1e-6):
         for threads in (1, 2):
 
             def call(rtol: float = rtol, threads: int = threads) -> Any:
-                return fs.batch(circuit, parameters, periods=PERIODS, rtol=rtol, skin=skin, threads=threads)
+                return fs.batch(circuit, parameters, periods=periods, rtol=rtol, skin=skin, threads=threads)
 
             found = call()
             off = np.abs(found.f_el_mean.values[:few] / expected - 1.0)
@@ -139,16 +108,57 @@ def measure(name: str, circuit: fs.Circuit, n: int, wide: bool, repeats: int) ->
             rows.append({"scenes": name, "who": "fs.batch", "rtol": rtol, "threads": threads, "n": n, **took,
                          "scenes_per_s": n / took["least_s"], "median_error": float(np.median(off)),
                          "largest_error": float(off.max()), "n_ordinary": found.attrs["n_ordinary"]})  # fmt: skip
-        took = seconds(lambda rtol=rtol: [single(circuit, parameters, i, rtol, wide) for i in range(few)], 3)
+        took = seconds(lambda rtol=rtol: [single(circuit, changes, rtol, periods) for changes in scenes], 3)
         rows.append({"scenes": name, "who": "loop over simulate", "rtol": rtol, "threads": 1, "n": few, **took,
                      "scenes_per_s": few / took["least_s"]})  # fmt: skip
-    if name.startswith("sine") and not wide:
-        for steps in (28, 200):
-            run = by_rk4(circuit, parameters, few, steps)
-            off, took = np.abs(run() / expected - 1.0), seconds(run, repeats)
-            rows.append({"scenes": name, "who": f"numba RK4, {steps} steps a period, set-up not counted", "threads": 1,
-                         "n": few, **took, "scenes_per_s": few / took["least_s"],
-                         "median_error": float(np.median(off)), "largest_error": float(off.max())})  # fmt: skip
+    if name == PLAIN:
+        with one_core():
+            rows += peers(circuit, parameters, expected, repeats)
+    return rows
+
+
+def growth(circuit: fs.Circuit, largest: int) -> list[dict[str, Any]]:
+    """Time and memory of a call over the number of scenes, at 1e-4 with two threads."""
+    rows = []
+    for n in (1, 100, 10_000, 1_000_000):
+        if n > largest:
+            break
+        parameters = population(n, False)
+
+        def call(parameters: dict[str, np.ndarray] = parameters) -> Any:
+            return fs.batch(circuit, parameters, periods=PERIODS, rtol=1e-4, threads=2)
+
+        took = seconds(call, 3 if n == largest else 7)
+        tracemalloc.start()
+        call()
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        rows.append({"scenes": f"{PLAIN}, {n}", "who": "fs.batch", "rtol": 1e-4, "threads": 2, "n": n, **took,
+                     "scenes_per_s": n / took["least_s"], "bytes_per_scene": most / n})  # fmt: skip
+    return rows
+
+
+def peers(
+    circuit: fs.Circuit, parameters: dict[str, np.ndarray], expected: np.ndarray, repeats: int
+) -> list[dict[str, Any]]:
+    """Scenes per second of other packages at the errors 1e-4 and 1e-6; their set-up is not timed, which favours them."""
+    n = min(4096, parameters["Xgap.d"].size)
+    stacks = [build_stack(circuit.varied({p: float(x[i]) for p, x in parameters.items()})) for i in range(n)]
+    scenes, rows = many_scenes.scenes_of(stacks, 12), []
+    for who, (most, _, make) in many_scenes.CONTESTANTS.items():
+        if who.split()[0] != "numba" and importlib.util.find_spec(who.split()[0].lower()) is None:
+            print(f"{who}: not installed")
+            continue
+        for error in (1e-4, 1e-6):
+            found = many_scenes.cheapest(who, scenes, PERIODS, expected, error)
+            if found is None:
+                print(f"{who}: no setting has an error of {error:g}")
+                continue
+            count = min(most, n)
+            took = seconds(make(scenes.first(count), PERIODS, found[0]), repeats)
+            rows.append({"scenes": PLAIN, "who": f"{who}, set-up not counted", "rtol": error, "threads": 1,
+                         "n": count, "setting": found[0], **took, "scenes_per_s": count / took["least_s"],
+                         "largest_error": found[1]})  # fmt: skip
     return rows
 
 
@@ -158,12 +168,20 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--scenes", type=int, default=40000)
     options = parser.parse_args(arguments)
     n, repeats = (64, 1) if options.quick else (options.scenes, 7)
-    sine = fs.read_netlist(HERE.parent / "circuits" / "fingerpad.cir")
+    circuits = HERE.parent / "circuits"
+    sine = fs.read_netlist(circuits / "fingerpad.cir")
     square = sine.replace({"Vdrive": fs.Square(200.0, 100.0)})
+    narrow, few = population(n, False), max(n // 16, 16)
+    fingers = {path: values[:few] for path, values in narrow.items() if path.startswith("X")}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        rows = measure("sine, narrow", sine, n, False, repeats) + measure("sine, wide", sine, n, True, repeats)
-        rows += measure("square, narrow", square, n // 4, False, repeats) if not options.quick else []
+        rows = measure(PLAIN, sine, narrow, repeats) + measure("sine, wide", sine, population(n, True), repeats)
+        if not options.quick:
+            rows += measure("square, narrow", square, population(n // 4, False), repeats)
+            rows += measure("square, wide", square, population(n // 4, True), repeats)
+            for deck in ("am_carrier", "fingerpad_dispersive"):
+                rows += measure(deck, fs.read_netlist(circuits / f"{deck}.cir"), fingers, repeats, None)
+        rows += growth(sine, 100 if options.quick else 1_000_000)
     results = {"python": platform.python_version(), "machine": platform.machine(), "rows": rows}
     for row in rows:
         row["scenes_per_processor_s"] = row["n"] / row["processor_s"]

@@ -66,7 +66,7 @@ def test_a_wide_population_meets_what_was_asked_and_states_its_error(circuit: Ci
         assert found.error.max() <= rtol
         assert np.mean(np.all(off <= found.error.values, axis=0)) >= 0.95
         assert np.all(np.isin(found.status, (0, 1)))
-        assert found.attrs["n_ordinary"] == np.count_nonzero(found.status == 1) <= 15
+        assert found.attrs["n_ordinary"] == np.count_nonzero(found.status == 1) == 0
 
 
 @pytest.mark.parametrize("jumping", [False, True], ids=["sine", "square"])
@@ -128,6 +128,54 @@ def test_stacks_of_other_layers(layers: str) -> None:
         np.testing.assert_allclose(found.f_el_mean[i], run.f_el_mean, rtol=1e-6)
         np.testing.assert_allclose(found.u_gap_rms[i], run.u_gap_rms, rtol=1e-6)
         np.testing.assert_allclose(found.u_gap[i], run.u_gap, rtol=0.0, atol=1e-6 * np.abs(run.u_gap).max())
+
+
+DISPERSIVE = "Xskin skin 0 area SKIN_DISPERSIVE d=350u"
+STACK = """sources of several tones, and the dispersive skin
+{source}
+Xcoat in top area LAYER d=1u eps_r=3.9 r=0.2meg
+Xgap top skin area GAP d=3.5u r=1meg
+{skin}
+.tran 1u {stop} uic
+"""
+SOURCES = {
+    "three sines": ("V1 a 0 SIN(0 150 100)\nV2 b a SIN(0 40 300 0 0 60)\nV3 b in SIN(0 30 500 0 0 -20)", "25m"),
+    "AM": ("Vdrive in 0 SIN(0 200 2k)", "50m"),
+    "sine": ("Vdrive in 0 SIN(0 200 100)", "30m"),
+    "square": ("Vdrive in 0 PULSE(-200 200 0 0 0 5m 10m)", "30m"),
+}
+
+
+@pytest.mark.parametrize(
+    ("source", "skin"),
+    [("three sines", ""), ("AM", ""), ("AM", DISPERSIVE), ("sine", DISPERSIVE), ("square", DISPERSIVE)],
+)
+def test_tones_and_the_dispersive_skin(source: str, skin: str) -> None:
+    text, stop = SOURCES[source]
+    text = STACK.format(source=text, skin=skin or "Xskin skin 0 area SKIN d=350u f=500", stop=stop)
+    circuit = fs.parse_netlist(text)
+    if source == "AM":
+        circuit = circuit.replace({"Vdrive": fs.AM(200.0, 2e3, 50.0, depth=0.7, phase_deg=30.0)})
+    rng = np.random.default_rng(8)
+    parameters: dict[str, Any] = {
+        "Xgap.d": rng.uniform(2.5e-6, 5e-6, 20), "Xgap.r": 1e6 * 10.0 ** rng.uniform(-1.0, 1.0, 20),
+        "Xskin.d": rng.uniform(2e-4, 5e-4, 20),
+    }  # fmt: skip
+    if source == "AM":
+        parameters |= {"Vdrive.depth": rng.uniform(0.0, 1.0, 20), "Vdrive.phase_deg": rng.uniform(-90.0, 200.0, 20)}
+    if source == "three sines":
+        parameters |= {"V2.amplitude": rng.uniform(0.0, 80.0, 20), "V3.phase_deg": rng.uniform(-180.0, 180.0, 20)}
+    expected = []
+    for i in range(20):
+        changed = circuit.varied({path: float(values[i]) for path, values in parameters.items()})
+        summary = fs.simulate(changed, rtol=1e-10, charge=False).summary()
+        expected.append([summary[name] for name in OUTPUTS])
+    for rtol in (1e-4, 1e-6):
+        found = fs.batch(circuit, parameters, outputs=OUTPUTS, rtol=rtol)
+        off = np.abs(np.array([found[name].values for name in OUTPUTS]) / np.array(expected).T - 1.0)
+        assert np.all(found.status == 0)
+        assert off.max() <= rtol
+        assert np.mean(off <= found.error.values) >= 0.95
 
 
 def test_neither_threads_nor_the_order_of_scenes_change_a_byte() -> None:
@@ -288,7 +336,7 @@ def test_a_table_s_columns_are_what_a_circuit_has() -> None:
         stack = build_stack(scene(circuit, parameters, i, skin=False))
         assert stack.contact is not None
         packed = stack.contact.packed
-        wave = [parameters["Vdrive.amplitude"][i], 2.0 * np.pi * parameters["Vdrive.frequency"][i], 0.0]
+        wave = [2.0 * np.pi * parameters["Vdrive.frequency"][i], parameters["Vdrive.amplitude"][i], 0.0]
         rows = [*stack.c, *stack.g_total, *stack.g_area, *packed[[0, 1, 4, 5, 7]], *wave]
         np.testing.assert_allclose(table[:, i], rows, rtol=1e-13)
 

@@ -17,11 +17,10 @@ from fingerspice.engine.lockstep import (
     SCALE,
     SHAPE,
     VALUE,
-    WAVE_X,
-    WAVE_Y,
     Marks,
     Weights,
     Z,
+    area_row,
     n_constants,
     n_state,
     run,
@@ -31,14 +30,13 @@ from fingerspice.numerics.modes import modes as modes_of
 # A table of scenes has three rows for every cell: capacitance (F/m^2), total leakage (S), leakage per area (S/m^2).
 CELL_ROWS = 3
 # Its further rows.
-XI, REST, STRESS, LOAD, LOSS, AMPLITUDE, OMEGA, PHASE, N_OTHERS = 0, 1, 2, 3, 4, 5, 6, 7, 8
-"""X of Eq. 4 at 1 V, A0 at 0 V (m^2), stress at 1 V (Pa), load (N), c2 mu^2; the source's amplitude (V), angular
-frequency (rad/s) and phase (rad)."""
+XI, REST, STRESS, LOAD, LOSS, OMEGA, N_OTHERS = 0, 1, 2, 3, 4, 5, 6
+"""X of Eq. 4 at 1 V, A0 at 0 V (m^2), stress at 1 V (Pa), load (N), c2 mu^2; the source's angular frequency (rad/s).
+After them come amplitude (V) and phase (rad) of each of its tones."""
 LARGEST_X = 1.3
 """Largest X that the series of the universal curve covers."""
-# Largest gap voltage that the area's polynomial covers, as a ratio to the source's amplitude. It is larger for a source
-# that jumps, as a jump from one sign to the other adds to the voltage left by the charge leaked before.
-COVERED, COVERED_JUMPING = 1.05, 1.6
+Places = tuple[int, NDArray[np.int64]]
+"""Index of the gap among the cells, and of the cells whose leak has a total resistance."""
 Scratch = tuple[
     FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray
 ]  # fmt: skip
@@ -76,6 +74,27 @@ def _inverse_areas(
 def _add_row(share: float, x: FloatArray, out: FloatArray) -> None:
     for i in range(LANES):
         out[i] += share * x[i]
+
+
+@jit
+def _largest_voltage(t: FloatArray, gap: int, cells: int, jumping: bool) -> float:
+    """Estimate of the largest gap voltage (V) of the scene with column t of the table, its area at rest held.
+
+    The gap's share of the source is between the capacitive and the resistive divider's; the jump of a square adds the
+    difference of both, which is left of the half period before.
+    """
+    elastance, resistance = 0.0, 0.0
+    area = t[CELL_ROWS * cells + REST]
+    for j in range(cells):
+        elastance += 1.0 / t[j]
+        resistance += 1.0 / (t[cells + j] + area * t[2 * cells + j] + 1e-300)
+    at_once = 1.0 / (t[gap] * elastance)
+    at_last = 1.0 / ((t[cells + gap] + area * t[2 * cells + gap] + 1e-300) * resistance)
+    share = max(at_once, at_last) + (abs(at_once - at_last) if jumping else 0.0)
+    amplitude = 0.0
+    for row in range(CELL_ROWS * cells + N_OTHERS, t.size, 2):
+        amplitude += abs(t[row])
+    return float(amplitude * share)
 
 
 @jit
@@ -132,18 +151,28 @@ def moment_integrals(y: float) -> tuple[float, float, float]:
 
 
 @jit
-def weigh(i: int, h: float, rates: FloatArray, drive: FloatArray, g: Weights, modes: Marks) -> None:
-    """Weights of lane i for a step of length 0, for a first step and for all other steps of length h (s)."""
-    m_all = len(modes)
+def weigh(i: int, h: float, rates: FloatArray, drive: FloatArray, g: Weights, marks: Marks) -> None:
+    """Weights of lane i for a step of length 0 and for the pieces, the first of steps of length h (s).
+
+    The first step of all has no step before it; that of a later piece follows a step of half its length.
+    """
+    m_all = len(marks[0])
     still, first, rest = g
-    for m in range(m_all):
-        zeroth, once, twice = moment_integrals(rates[m] * h)
-        i0, i1, i2 = h * zeroth, h * once, h * twice
-        decay, driven, at = 1.0 - rates[m] * i0, drive[m] * i0, m * LANES + i
-        _set_row(still, at, m_all * LANES, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-        _set_row(first, at, m_all * LANES, (decay, driven, i0, 0.0, i1, i0 - i1, 0.0))
-        later = (decay, driven, i0 + i1, -i1, 0.5 * (i1 + i2), i0 - i2, 0.5 * (i2 - i1))
-        _set_row(rest, at, m_all * LANES, later)
+    for piece in range(first.shape[0]):
+        for m in range(m_all):
+            zeroth, once, twice = moment_integrals(rates[m] * h)
+            i0, i1, i2 = h * zeroth, h * once, h * twice
+            decay, driven, at = 1.0 - rates[m] * i0, drive[m] * i0, m * LANES + i
+            if piece == 0:
+                _set_row(still, at, m_all * LANES, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+                _set_row(first[piece], at, m_all * LANES, (decay, driven, i0, 0.0, i1, i0 - i1, 0.0))
+            else:
+                next_one, now, old = (2.0 * i2 + i1) / 3.0, i0 + i1 - 2.0 * i2, (i2 - i1) * (4.0 / 3.0)
+                after = (decay, driven, i0 + 2.0 * i1, -2.0 * i1, next_one, now, old)
+                _set_row(first[piece], at, m_all * LANES, after)
+            later = (decay, driven, i0 + i1, -i1, 0.5 * (i1 + i2), i0 - i2, 0.5 * (i2 - i1))
+            _set_row(rest[piece], at, m_all * LANES, later)
+        h *= 2.0
 
 
 @jit
@@ -164,69 +193,64 @@ def _set_row(
 
 @jit
 def _lane(
-    i: int, gap: int, t: FloatArray, jumping: bool, c: FloatArray, start: FloatArray, rates: FloatArray,
-    drive: FloatArray, scratch: Scratch, modes: Marks, powers: Marks,
+    i: int, places: Places, t: FloatArray, tones: FloatArray, jumping: bool, c: FloatArray, start: FloatArray,
+    rates: FloatArray, drive: FloatArray, scratch: Scratch, marks: Marks,
 ) -> None:  # fmt: skip
-    """Constants and start of lane i from its column t of the table; the polynomial of its area is in `c` already."""
-    m_all = len(modes)
+    """Constants and start of lane i from its column t of the table, with 1/A0 already in `scratch`."""
+    gap, leaks = places
+    m_all, w_all, l_all = len(marks[0]), len(marks[1]), leaks.size
     cells = m_all + 1
-    area0 = SHAPE + 3 * m_all + m_all * m_all + len(powers) - 1
-    q0 = c[area0 * LANES + i]
     others = CELL_ROWS * cells
-    amplitude, omega, phase = t[others + AMPLITUDE], t[others + OMEGA], t[others + PHASE]
-    cosine = 1.0 if jumping else math.cos(phase)
-    sine = 0.0 if jumping else math.sin(phase)
-    k, r, moved, x, y, gain, feed, shape = scratch
+    k, r, moved, u, inverse, gain, feed, shape = scratch
     total = 0.0
     for j in range(cells):
         total += 1.0 / t[j]
     for j in range(cells):
         k[j] = 1.0 / (t[j] * total)
         moved[j] = t[cells + j] / t[j]
-        r[j] = t[2 * cells + j] / t[j] + q0 * moved[j]
+        r[j] = t[2 * cells + j] / t[j] + inverse[0] * moved[j]
     _modes(r, k, rates, gain, feed, shape)
-    for j in range(cells):
-        x[j] = k[j] * amplitude * cosine
-        y[j] = k[j] * amplitude * sine
-    for m in range(m_all):
-        start[m * LANES + i], drive[m] = 0.0, 0.0
-        if jumping:
-            drive[m] = gain[m] * amplitude
-            continue
-        # z is the mode less its steady response to the sine, gain (rate - i omega) / (rate^2 + omega^2) of it.
-        size = gain[m] * amplitude / (rates[m] * rates[m] + omega * omega)
-        along = size * (rates[m] * cosine + omega * sine)
-        across = size * (rates[m] * sine - omega * cosine)
-        start[m * LANES + i] = -across
-        for j in range(cells):
-            x[j] += shape[j, m] * along
-            y[j] += shape[j, m] * across
-    c[WAVE_X * LANES + i], c[WAVE_Y * LANES + i] = x[gap], y[gap]
+    of_u, of_w = SHAPE + m_all, SHAPE + m_all + w_all
+    of_z = of_w + l_all * w_all
+    of_leak = of_z + l_all * m_all
     for m in range(m_all):
         c[(SHAPE + m) * LANES + i] = shape[gap, m]
-        of_x, of_y = 0.0, 0.0
+        start[m * LANES + i] = 0.0
+        drive[m] = gain[m] * t[others + N_OTHERS] if jumping else 0.0
+        for n in range(l_all):
+            c[(of_z + n * m_all + m) * LANES + i] = shape[leaks[n], m]
+            c[(of_leak + m * l_all + n) * LANES + i] = feed[leaks[n], m] * moved[leaks[n]]
+    for w in range(w_all):
+        # The cells' voltages at a unit of the wave: sine, then cosine, of a tone.
+        amplitude, phase = t[others + N_OTHERS + w // 2 * 2], t[others + N_OTHERS + w // 2 * 2 + 1]
+        omega = tones[w // 2] * t[others + OMEGA]
+        sine, cosine = (0.0, 1.0) if jumping else (math.sin(phase), math.cos(phase))
         for j in range(cells):
-            of_x += feed[j, m] * moved[j] * x[j]
-            of_y += feed[j, m] * moved[j] * y[j]
-        c[(SHAPE + m_all + m) * LANES + i] = of_x
-        c[(SHAPE + 2 * m_all + m) * LANES + i] = of_y
-        for of in range(m_all):
-            of_z = 0.0
-            for j in range(cells):
-                of_z += feed[j, m] * moved[j] * shape[j, of]
-            c[(SHAPE + 3 * m_all + m * m_all + of) * LANES + i] = of_z
+            u[j] = k[j] * amplitude * (cosine if w % 2 == 0 else sine)
+        if not jumping:
+            for m in range(m_all):
+                # z is the mode less its steady response to the tone, gain (rate - i omega) / (rate^2 + omega^2) of it.
+                size = gain[m] * amplitude / (rates[m] * rates[m] + omega * omega)
+                along, across = rates[m] * cosine + omega * sine, rates[m] * sine - omega * cosine
+                if w % 2 == 1:
+                    start[m * LANES + i] -= size * across
+                for j in range(cells):
+                    u[j] += shape[j, m] * size * (along if w % 2 == 0 else across)
+        c[(of_u + w) * LANES + i] = u[gap]
+        for n in range(l_all):
+            c[(of_w + n * w_all + w) * LANES + i] = u[leaks[n]]
 
 
 @jit
 def _closed(
-    s: FloatArray, start: FloatArray, back: FloatArray, c: FloatArray, closing: FloatArray, tol: float, modes: Marks
+    s: FloatArray, start: FloatArray, back: FloatArray, c: FloatArray, closing: FloatArray, tol: float, marks: Marks
 ) -> bool:  # fmt: skip
     """Whether a period leads every lane from its start back to it, to `tol`; if not, improve the starts.
 
     The improvement is a step of Newton's method with the derivative of the period map with the area held. A lane that
     is within `tol` (relative to its peak gap voltage) keeps its start.
     """
-    m_all, done = len(modes), True
+    m_all, done = len(marks[0]), True
     for i in range(LANES):
         off = 0.0
         for m in range(m_all):
@@ -258,56 +282,59 @@ def _results(
 
 @jit
 def march(
-    table: FloatArray, pending: NDArray[np.int64], gap: int,
-    curves: tuple[FloatArray, FloatArray, FloatArray], waves: tuple[FloatArray, FloatArray],
-    how: tuple[int, bool, bool, float], out: FloatArray, traces: tuple[FloatArray, FloatArray], modes: Marks,
-    powers: Marks, moments: Marks,
+    table: FloatArray, pending: NDArray[np.int64], places: Places,
+    curves: tuple[FloatArray, FloatArray, FloatArray], source: tuple[FloatArray, tuple[FloatArray, FloatArray]],
+    how: tuple[int, int, int, bool, float, float], out: FloatArray, traces: tuple[FloatArray, FloatArray],
+    marks: Marks,
 ) -> None:  # fmt: skip
-    """Integrate scenes of a table, block by block, each with the steps of two waves; the first wave may be empty.
+    """Integrate scenes of a table, block by block, with each of two numbers of steps; the first may be none.
 
     Parameters
     ----------
     table : ndarray, shape (n_row, n_scene)
-        `CELL_ROWS` for all cells, then `N_OTHERS` rows.
+        `CELL_ROWS` for all cells, `N_OTHERS` rows, and two for every tone.
     pending : ndarray, shape (n,)
         Indices of the scenes to integrate.
-    gap : int
-        Index of the gap among the cells.
+    places : tuple
+        Index of the gap among the cells, and of those with a total leakage, one for every leak of the marks.
     curves : tuple of ndarray
         Polynomial coefficients of the universal curve over X, highest power first; Chebyshev points; and the matrix
         from values at these points to polynomial coefficients (d + 1, d + 1), highest power first.
-    waves : tuple of ndarray, each of shape (2, n)
-        As `lockstep.run` takes them: x and y of the source at the steps of a period, or of half a period.
+    source : tuple of ndarray
+        Frequencies of the tones, in that of the source; and the waves as `lockstep.run` takes them, for both numbers of
+        steps.
     how : tuple
-        Number of half periods; whether the source jumps to its negative after each; whether the periodic state is
-        wanted; and its tolerance, relative to the peak gap voltage.
-    out : ndarray, shape (2, 2 len(moments) + 3, n)
-        For each wave the means over the run and over its last period, the peak (V), the relative error of the periodic
+        Number of half periods; of steps in each, in the second run (the first run has half as many, or none if its
+        waves are empty); of pieces of each if the source jumps to its negative after each, else 0; whether the periodic
+        state is wanted; its tolerance, relative to the peak gap voltage; and the largest gap voltage that the area's
+        polynomial covers, as a ratio to its estimate.
+    out : ndarray, shape (2, 2 n_moment + 3, n)
+        For each run the means over it and over its last period, the peak (V), the relative error of the periodic
         state, and the relative size of the last coefficient of the area's series. The latter is infinite where the
         polynomial does not cover the voltages met.
     traces : tuple of ndarray, each of shape (n, steps)
-        Gap voltage before every step of each wave, V; (n, 0) for none.
+        Gap voltage before every step of each run, V; (n, 0) for none.
     """
-    m_all, d_all, count = len(modes), len(powers) - 1, len(moments)
-    halves, jumping, periodic, tol = how
-    cells = m_all + 1
-    c, g = (
-        np.zeros(n_constants(m_all, d_all) * LANES),
-        (np.empty(N_WEIGHTS * m_all * LANES), np.empty(N_WEIGHTS * m_all * LANES), np.empty(N_WEIGHTS * m_all * LANES)),
-    )
-    s, last = np.empty(n_state(m_all, count) * LANES), np.empty(count * LANES)
+    m_all, w_all, l_all, d_all, count = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[3]) - 1, len(marks[4])
+    halves, half, pieces, periodic, tol, covered = how
+    jumping = pieces > 0
+    cells, row = m_all + 1, N_WEIGHTS * m_all * LANES
+    c = np.zeros(n_constants(m_all, w_all, l_all, d_all) * LANES)
+    g = (np.empty(row), np.empty((max(pieces, 1), row)), np.empty((max(pieces, 1), row)))
+    s, last = np.empty(n_state(m_all, l_all, count) * LANES), np.empty(count * LANES)
     start, back, closing = np.empty(m_all * LANES), np.zeros(m_all * LANES), np.zeros(LANES)
     rates, drive = np.empty((LANES, m_all)), np.empty((LANES, m_all))
     scratch = _scratch(m_all)
     b, top, work = np.empty(N_OTHERS * LANES), np.empty(LANES), np.empty((2, LANES))
-    column, tail, area = np.empty(table.shape[0]), np.empty(LANES), SHAPE + 3 * m_all + m_all * m_all
+    column, tail, area = np.empty(table.shape[0]), np.empty(LANES), area_row(m_all, w_all, l_all)
     voltages = np.empty(LANES * traces[0].shape[1]), np.empty(LANES * traces[1].shape[1])
     for first in range(0, pending.size, LANES):
         for i in range(LANES):
             scene = pending[min(first + i, pending.size - 1)]
+            column[:] = table[:, scene]
             for j in range(N_OTHERS):
-                b[j * LANES + i] = table[CELL_ROWS * cells + j, scene]
-            top[i] = (COVERED_JUMPING if jumping else COVERED) * abs(b[AMPLITUDE * LANES + i]) + 1e-12
+                b[j * LANES + i] = column[CELL_ROWS * cells + j]
+            top[i] = covered * _largest_voltage(column, places[0], cells, jumping) + 1e-12
             c[SCALE * LANES + i] = 2.0 / top[i]
         c[area * LANES :] = 0.0
         for j in range(d_all + 1):
@@ -315,29 +342,36 @@ def march(
             for d in range(d_all + 1):
                 _add_row(curves[2][d, j], work[1], c[(area + d) * LANES : (area + d + 1) * LANES])
         for i in range(LANES):
-            # The coefficient of the highest power is 2^(d - 1) times the Chebyshev coefficient.
-            tail[i] = abs(c[area * LANES + i]) / 2.0 ** (d_all - 1) / c[(area + d_all) * LANES + i]
+            # The coefficients of the two highest powers are 2^(d - 1) and 2^(d - 2) times those of Chebyshev's series.
+            # These fall to about a third from one to the next; the last one alone may be small by chance.
+            tail[i] = max(abs(c[area * LANES + i]), 2.0 / 3.0 * abs(c[(area + 1) * LANES + i])) / 2.0 ** (d_all - 1)
+            tail[i] /= c[(area + d_all) * LANES + i]
             if not b[XI * LANES + i] * top[i] <= LARGEST_X:
                 tail[i] = math.inf
             column[:] = table[:, pending[min(first + i, pending.size - 1)]]
-            _lane(i, gap, column, jumping, c, start, rates[i], drive[i], scratch, modes, powers)
+            scratch[4][0] = c[(area + d_all) * LANES + i]
+            _lane(i, places, column, source[0], jumping, c, start, rates[i], drive[i], scratch, marks)
             if periodic:
                 period = 2.0 * math.pi / b[OMEGA * LANES + i]
                 for m in range(m_all):
                     back[m * LANES + i] = -1.0 / math.expm1(-rates[i, m] * period)
         for w in range(2):
-            n = waves[w].shape[1] * (2 if jumping else 1)
-            if n == 0:
+            if source[1][w].size == 0:
                 continue
+            steps = half // 2 if w == 0 else half
+            # All pieces together are 2^pieces - 1 times the first, which has steps / pieces of the shortest steps.
+            shorter = max(pieces, 1) / (2.0 ** max(pieces, 1) - 1.0)
             for i in range(LANES):
-                weigh(i, 2.0 * math.pi / b[OMEGA * LANES + i] / n, rates[i], drive[i], g, modes)
+                h = math.pi / b[OMEGA * LANES + i] / steps * shorter
+                weigh(i, h, rates[i], drive[i], g, marks)
             for _ in range(MOST_PERIODS if periodic else 1):
                 s[:] = 0.0
                 s[: m_all * LANES] = start
-                run(c, g, s, waves[w], halves, jumping, last, voltages[w], modes, powers, moments)
-                if not periodic or _closed(s, start, back, c, closing, tol, modes):
+                size = (halves, steps, jumping)
+                run(c, g, s, source[1][w], size, last, voltages[w], marks)
+                if not periodic or _closed(s, start, back, c, closing, tol, marks):
                     break
-            _results(s, last, closing, (0.5 * halves * n, float(n)), first, out[w], m_all, count)
+            _results(s, last, closing, (float(halves * steps), 2.0 * steps), first, out[w], m_all, count)
             for i in range(min(LANES, pending.size - first)):
                 out[w, 2 * count + 2, first + i] = tail[i] if out[w, 2 * count, first + i] <= top[i] else math.inf
                 width = traces[w].shape[1]

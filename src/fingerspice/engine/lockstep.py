@@ -2,8 +2,10 @@
 
 In the modes of a stack with its area held, the change of the area contributes a few per cent of the modes' rates. An
 exponential Adams method (Hochbruck and Ostermann 2010, section 2.5) solves the linear part exactly:
-z' = -rate z + drive x + dq n(x, y, z), with dq = 1/A - 1/A0 a polynomial in |u_gap| and n linear. Each step predicts
-with order 2, evaluates the nonlinear term once, and corrects with order 3.
+z' = -rate z + drive w + n(w, z), with n linear in dq = 1/A - 1/A0 times the voltages of the leaks, which are the cells
+whose leak has a total resistance, and dq a polynomial in |u_gap|. The waves w are sine and cosine of every tone of the
+source, without a drive, as z is then what is left beside the steady response; or the value of a source of constant
+pieces. Each step predicts with order 2, evaluates the nonlinear term once, and corrects with order 3.
 
 A block holds `LANES` scenes, one in each lane, and every quantity is a row with one entry for each lane. The only loop
 over the lanes is in a function of its own, whose inner loops have constant lengths: `modes` and `powers` are tuples of
@@ -15,61 +17,76 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
 
 LANES = 16
 """Scenes of a block."""
 
-Marks = tuple[int, ...]
-"""A tuple of which only the length counts."""
+Marks = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...], tuple[int, ...], tuple[int, ...]]
+"""Tuples of which only the lengths count: of the modes, waves, leaks, powers of the polynomial and moments."""
 
-Weights = tuple[FloatArray, FloatArray, FloatArray]
-"""Weights of a step of length 0, of a first step, which has no step before it, and of all other steps."""
+Weights = tuple[FloatArray, NDArray[np.float64], NDArray[np.float64]]
+"""Weights of a step of length 0; and for every piece of a window, those of its first step and of all other steps."""
 
-# Rows of the constants: a and b in u = a x + b y + shape z, and the scale of |u| to [-1, 1]; then those of every mode.
-WAVE_X, WAVE_Y, SCALE, SHAPE = 0, 1, 2, 3
+# Rows of the constants: the scale of |u| to [-1, 1]; u by modes, and by waves; the voltages of the leaks by waves, and
+# by modes, leak after leak; n by leaks, mode after mode; and the polynomial of 1/A.
+SCALE, SHAPE = 0, 1
 # Rows of the weights, each for every mode: decay, drive; predictor's weights of the nonlinear term at this step and the
 # one before; corrector's weights at the next step, this one and the one before.
 DECAY, DRIVE, PREDICT, PREDICT_OLD, CORRECT, CORRECT_NOW, CORRECT_OLD, N_WEIGHTS = 0, 1, 2, 3, 4, 5, 6, 7
 # Rows of the state for every mode: z, the nonlinear term now and a step before, and two scratch rows of the step.
 Z, RATE, OLD, KEPT, GUESS, N_STATE = 0, 1, 2, 3, 4, 5
-# Rows of the state after those: gap voltage, its peak, then the integrands' latest values and their weighted sums.
+# Rows of the state after those: gap voltage, its peak, then the integrands' latest values and their weighted sums, and
+# last dq times the voltage of every leak.
 GAP, PEAK, VALUE = 0, 1, 2
 ALL_MOMENTS = 3
 """Number of the integrands u^2 A, (u^2 A)^2 and u^2. (A itself has a kink where u is 0: its sum is of order 2 only.)"""
 
 
 @jit
-def n_constants(m: int, d: int) -> int:
-    """Rows of the constants of m modes and a polynomial of degree d."""
-    return SHAPE + 3 * m + m * m + d + 1
+def area_row(m: int, w: int, k: int) -> int:
+    """First row of the area's polynomial, with m modes, w waves and k leaks."""
+    return SHAPE + m + w + k * w + 2 * k * m
 
 
 @jit
-def n_state(m: int, moments: int) -> int:
-    """Rows of the state."""
-    return N_STATE * m + VALUE + 2 * moments
+def n_constants(m: int, w: int, k: int, d: int) -> int:
+    """Rows of the constants of m modes, w waves, k leaks and a polynomial of degree d."""
+    return area_row(m, w, k) + d + 1
+
+
+@jit
+def n_state(m: int, k: int, moments: int) -> int:
+    """Rows of the state, with m modes and k leaks."""
+    return N_STATE * m + VALUE + 2 * moments + k
 
 
 @jit_rows
 def _step(
-    c: FloatArray, g: FloatArray, s: FloatArray, wave_at: tuple[float, float, float], weight: float, modes: Marks,
-    powers: Marks, moments: Marks,
+    c: FloatArray, g: FloatArray, s: FloatArray, source: FloatArray, before: float, weight: float, marks: Marks,
 ) -> None:  # fmt: skip
     """One step of every lane; adds `weight` times the integrands at its end to their sums.
 
-    `wave_at` holds x and y of the source at the end of the step, and x at its start.
+    `source` holds the waves at the end of the step, and `before` the first of them at its start.
     """
-    x, y, before = wave_at
-    m_all, d_all, count = len(modes), len(powers) - 1, len(moments)
-    of_x, of_y = SHAPE + m_all, SHAPE + 2 * m_all
-    of_z = SHAPE + 3 * m_all
-    area = of_z + m_all * m_all
+    modes, waves, leaks, powers, moments = marks
+    m_all, w_all, l_all, d_all, count = len(modes), len(waves), len(leaks), len(powers) - 1, len(moments)
+    of_u = SHAPE + m_all
+    of_w = of_u + w_all
+    of_z = of_w + l_all * w_all
+    of_leak = of_z + l_all * m_all
+    area = of_leak + m_all * l_all
     own = N_STATE * m_all
     value, total = own + VALUE, own + VALUE + count
+    current = total + count
     for i in range(LANES):
-        wave = c[WAVE_X * LANES + i] * x + c[WAVE_Y * LANES + i] * y
+        wave = c[of_u * LANES + i] * source[0]
+        for w in range(1, w_all):
+            wave += c[(of_u + w) * LANES + i] * source[w]
         u = wave
         for m in range(m_all):
             kept = g[(DECAY * m_all + m) * LANES + i] * s[(Z * m_all + m) * LANES + i]
@@ -84,12 +101,18 @@ def _step(
         for d in range(1, d_all):
             q = q * v + c[(area + d) * LANES + i]
         q *= v
+        for k in range(l_all):
+            change = c[(of_w + k * w_all) * LANES + i] * source[0]
+            for w in range(1, w_all):
+                change += c[(of_w + k * w_all + w) * LANES + i] * source[w]
+            for m in range(m_all):
+                change += c[(of_z + k * m_all + m) * LANES + i] * s[(GUESS * m_all + m) * LANES + i]
+            s[(current + k) * LANES + i] = q * change
         u = wave
         for m in range(m_all):
-            rate = c[(of_x + m) * LANES + i] * x + c[(of_y + m) * LANES + i] * y
-            for j in range(m_all):
-                rate += c[(of_z + m * m_all + j) * LANES + i] * s[(GUESS * m_all + j) * LANES + i]
-            rate *= q
+            rate = c[(of_leak + m * l_all) * LANES + i] * s[current * LANES + i]
+            for k in range(1, l_all):
+                rate += c[(of_leak + m * l_all + k) * LANES + i] * s[(current + k) * LANES + i]
             now = s[(RATE * m_all + m) * LANES + i]
             z = s[(KEPT * m_all + m) * LANES + i] + g[(CORRECT * m_all + m) * LANES + i] * rate
             z += g[(CORRECT_NOW * m_all + m) * LANES + i] * now
@@ -120,72 +143,87 @@ def _add_latest(first: int, count: int, weight: float, s: FloatArray) -> None:
 
 @jit
 def quadrature(k: int, steps: int) -> float:
-    """Weight of value k of `steps` + 1 equidistant values in Gregory's quadrature of order 4, in step lengths."""
+    """Weight of value k of `steps` + 1 equidistant values in Gregory's quadrature of order 4, in step lengths.
+
+    Simpson's rule, of the same order, serves 2 or 4 steps, where the two ends of Gregory's would overlap.
+    """
     end = min(k, steps - k)
+    if steps < 5:
+        return (1.0 if end == 0 else 4.0 if k % 2 == 1 else 2.0) / 3.0
     return 0.375 if end == 0 else 7.0 / 6.0 if end == 1 else 23.0 / 24.0 if end == 2 else 1.0
 
 
 @jit
 def _window(
-    c: FloatArray, g: Weights, s: FloatArray, wave: FloatArray, sign: float, steps: int, restart: bool,
-    trace: FloatArray, at: int, modes: Marks, powers: Marks, moments: Marks,
+    c: FloatArray, g: tuple[FloatArray, FloatArray], s: FloatArray, wave: FloatArray, place: int, turned: bool,
+    steps: int, unit: float, trace: FloatArray, at: int, marks: Marks,
 ) -> None:  # fmt: skip
-    """Take `steps` steps, one range of Gregory's rule; the gap voltages go to trace (LANES, n) from `at` on."""
-    count, own = len(moments), N_STATE * len(modes)
-    period, stride = wave.shape[1], trace.shape[0] // LANES
-    if restart:
-        weight = quadrature(0, steps)
-        _step(c, g[0], s, (sign * wave[0, 0], sign * wave[1, 0], 0.0), weight, modes, powers, moments)
-    else:
-        _add_latest(own + VALUE, count, quadrature(0, steps), s)
-    place, before, weights = 0, sign * wave[0, 0], g[1] if restart else g[2]
+    """Take `steps` steps of one length, a range of Gregory's rule; gap voltages go to trace (LANES, n) from `at` on.
+
+    `g` holds the weights of the first step and of all others, `unit` is the length of a step in those of the sums, and
+    `place` is the row of the waves at the start; a `turned` source stays there.
+    """
+    count, own, stride = len(marks[4]), N_STATE * len(marks[0]), trace.shape[0] // LANES
+    _add_latest(own + VALUE, count, unit * quadrature(0, steps), s)
+    weights = g[0]
     for k in range(steps):
         if trace.size > 0:
             for i in range(LANES):
                 trace[i * stride + at + k] = s[(own + GAP) * LANES + i]
-        place = place + 1 if place + 1 < period else 0
-        x, y = sign * wave[0, place], sign * wave[1, place]
-        _step(c, weights, s, (x, y, before), quadrature(k + 1, steps), modes, powers, moments)
-        before, weights = x, g[2]
+        before = wave[place, 0]
+        if not turned:
+            place = place + 1 if place + 1 < wave.shape[0] else 0
+        _step(c, weights, s, wave[place], before, unit * quadrature(k + 1, steps), marks)
+        weights = g[1]
 
 
 @jit
 def run(
-    c: FloatArray, g: Weights, s: FloatArray, wave: FloatArray, halves: int, turned: bool, last: FloatArray,
-    trace: FloatArray, modes: Marks, powers: Marks, moments: Marks,
+    c: FloatArray, g: Weights, s: FloatArray, wave: FloatArray, how: tuple[int, int, bool], last: FloatArray,
+    trace: FloatArray, marks: Marks,
 ) -> None:  # fmt: skip
-    """Integrate a block's scenes over `halves` half periods, from the modes in the state `s` on.
+    """Integrate a block's scenes over some half periods, from the modes in the state `s` on.
 
     Parameters
     ----------
     c, g, s : ndarray
         Constants, weights and state, each flat.
-    wave : ndarray, shape (2, n)
-        x and y of the source at the n steps of a period. Where the source is `turned`, it jumps to its negative after
-        each half period and the method restarts: then n steps are half a period.
+    wave : ndarray, shape (n, len(waves))
+        Waves at the n steps of a period; in the two halves of a period if the source is turned.
+    how : tuple
+        Number of half periods; of steps in each; and whether the source is turned: it is constant for a half period,
+        then jumps to its negative, and the method restarts. Such a half period has the pieces that `g` has: of equally
+        many steps, which are twice as long in every piece as in the one before.
     last : ndarray
         Takes the sums over the last period, as the state holds those over the whole run; NaN in a shorter run.
     trace : ndarray, shape (LANES * steps,) or (0,)
         The gap voltage before each step, V.
     """
-    count, own = len(moments), N_STATE * len(modes)
+    halves, half, turned = how
+    count, own, pieces = len(marks[4]), N_STATE * len(marks[0]), g[1].shape[0]
     sums = (own + VALUE + count) * LANES
     for i in range(count * LANES):
         s[sums + i] = 0.0
         last[i] = math.nan
     for i in range(LANES):
         s[(own + PEAK) * LANES + i] = 0.0
-    half = wave.shape[1] if turned else wave.shape[1] // 2
     done = 0
     while done < halves:
         if done == halves - 2:
             last[:] = s[sums : sums + last.size]
         # A source without jumps is integrated in one piece up to the last period.
         ahead = 1 if turned or halves < 2 else (halves - 2 if done < halves - 2 else 2)
-        # The value of a sine, as of a turned source, is the negative of its value half a period earlier.
-        sign = -1.0 if done % 2 == 1 else 1.0
+        place = done % 2 * (1 if turned else half)
         restart = turned or done == 0
-        _window(c, g, s, wave, sign, ahead * half, restart, trace, done * half, modes, powers, moments)
+        if restart:
+            # A step of length 0 evaluates the nonlinear term and the integrands.
+            _step(c, g[0], s, wave[place], 0.0, 0.0, marks)
+        steps, unit = ahead * half // pieces, pieces / (2.0**pieces - 1.0)
+        for piece in range(pieces):
+            weights = (g[1][piece] if restart else g[2][piece], g[2][piece])
+            at = done * half + piece * steps
+            _window(c, weights, s, wave, place, turned, steps, unit, trace, at, marks)
+            unit *= 2.0
         done += ahead
     for i in range(last.size):
         last[i] = s[sums + i] - last[i]

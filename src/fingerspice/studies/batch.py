@@ -22,6 +22,7 @@ from fingerspice.studies.batchladder import climb, in_lockstep
 from fingerspice.studies.batchscenes import lockstep_form
 from fingerspice.studies.batchsingle import SIGNALS_OF_BATCH, Single, run_single
 from fingerspice.studies.batchtask import LOCKSTEP, STATUS_NAMES, Answers, Task
+from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -52,8 +53,8 @@ def batch(
 ) -> Dataset:
     """Figures of many scenes, which are one circuit with different values of its parameters.
 
-    Series stacks of two to four LAYER, SLAB, SKIN and GAP under the local law, driven by a sine or square, are
-    integrated in lockstep. Every other scene, and every scene that does not reach `rtol` in lockstep, is run by itself
+    Series stacks of two to four layers under the local law, driven by sines, an AM carrier or a square, are integrated
+    in lockstep. Every other scene, and every scene that does not reach `rtol` in lockstep, is run by itself
     through `simulate` (`steady_state`).
 
     Parameters
@@ -99,7 +100,7 @@ def batch(
     scenes = _scenes(circuit, parameters)
     changed = dict(scenes)
     if skin == "follow":
-        frequency = _frequencies(circuit, scenes)
+        frequency = _frequencies(circuit, scenes, of_skin=True)
         for element in circuit.by_device("SKIN"):
             if f"{element.name}.f" in scenes:
                 raise InputError(f"skin='follow' and {element.name}.f are both given; allowed: one of them")
@@ -223,25 +224,27 @@ def _check_values(circuit: Circuit, path: str, array: FloatArray) -> None:
         raise InputError(f"{path} is {array[i]:g} in scene {i}; allowed: {allowed}")
 
 
-def _frequencies(circuit: Circuit, scenes: Mapping[str, FloatArray]) -> FloatArray:
-    """The source's frequency in every scene, Hz.
+def _frequencies(circuit: Circuit, scenes: Mapping[str, FloatArray], of_skin: bool = False) -> FloatArray:
+    """The source's frequency in every scene, Hz: that of several sources together, or the one that a SKIN follows.
 
     Raises
     ------
     InputError
-        If the number of sources with a period is not one.
+        If no source has a period, or several have none in common; a SKIN can follow one source only.
     """
     n = next(iter(scenes.values())).size
     on = [e for e in driving_sources(circuit) if e.waveform is not None and e.waveform.period is not None]
-    if len(on) != 1:
+    waves = [e.waveform for e in on if e.waveform is not None]
+    if len(on) == 1:
+        given = scenes.get(f"{on[0].name}.frequency")
+        tone = waves[0].tone() if of_skin else None
+        return given if given is not None else np.full(n, tone or 1.0 / (waves[0].period or math.nan))
+    moved = any(f"{e.name}.frequency" in scenes for e in on)
+    period = None if of_skin or moved or not on else Sum(tuple(waves)).period
+    if period is None:
         raise InputError(f"{len(on)} sources have a period; allowed: one, where periods, u_gap or the skin's frequency "
-                         "follow it")  # fmt: skip
-    given = scenes.get(f"{on[0].name}.frequency")
-    if given is not None:
-        return given
-    assert on[0].waveform is not None
-    assert on[0].waveform.period is not None
-    return np.full(n, 1.0 / on[0].waveform.period)
+                         "follow it, or several of fixed frequencies in a ratio of whole numbers")  # fmt: skip
+    return np.full(n, 1.0 / period)
 
 
 def _lockstep(task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExecutor) -> tuple[Answers, str]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, LOSS, OMEGA, REST, STRESS, march
 from fingerspice.engine.lockstep import ALL_MOMENTS
 from fingerspice.studies.batchscenes import Curves, LockstepForm, curves_of, table_of
@@ -16,15 +16,21 @@ from fingerspice.studies.batchtask import LOCKSTEP, Answers, Task
 
 # Initial number of steps per period, and initial degree of the area's polynomial, by the smallest rtol served.
 _RUNGS = ((5e-4, 32, 8), (5e-5, 48, 8), (5e-6, 80, 12), (5e-7, 144, 12), (0.0, 192, 16))
-_HIGHEST_DEGREE, _MOST_STEPS = 16, 4096
+_HIGHEST_DEGREE, _MOST_STEPS = 24, 8192
+# Largest gap voltage that the area's polynomial covers, as a ratio to its estimate, at first and later.
+_COVERED, _COVERED_LATER = 1.2, 1.5
 # Allowed defect of the periodic state relative to rtol, and the relative round-off added to every stated error.
 CLOSING, ROUNDING = 0.02, 1e-11
 # The stated error is _STATED times the change from half the steps to all steps: at kinks the order is 2, which gives a
 # third, and elsewhere the order is 3 or more. As the change may be small by chance, doubling the steps may not reduce
 # the stated error by more than the factor _MOST_GAIN.
 _STATED, _MOST_GAIN = 1.0 / 3.0, 12.0
-# Longest step for a source with jumps, in time constants of the fastest cell.
+# Longest first step after a jump of the source, in time constants of the fastest cell.
 _LONGEST_STEP = 1.0
+# Steps of a piece of a square's half period by the smallest rtol served; and the number by which the first step, with
+# `_PIECE_START` steps a piece, is shorter than the fastest cell's time constant.
+_PIECES = ((5e-5, 8), (5e-6, 12), (5e-7, 24), (0.0, 48))
+_PIECE_START, _MOST_PIECES = 2, 20
 # A scene is accepted if its stated error is at most this fraction of rtol, because the stated error is an estimate.
 _ENOUGH = 0.7
 _Figure = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
@@ -51,12 +57,13 @@ def in_lockstep(name: str) -> bool:
     return name == "u_gap" or name.removesuffix("_periodic") in FIGURES
 
 
-def _wave(n: int, jumping: bool) -> FloatArray:
-    """Sine and cosine of the source's phase at n steps of a period; for a square, 1 and 0 at the first n / 2 steps."""
-    if jumping:
-        return np.concatenate([np.ones((1, n // 2)), np.zeros((1, n // 2))])
-    turn = 2.0 * np.pi * np.arange(n) / n
-    return np.array([np.sin(turn), np.cos(turn)])
+def _waves(n: int, form: LockstepForm) -> FloatArray:
+    """Sine and cosine of every tone at n steps of the source's period; for a square, its value in both halves."""
+    if n == 0 or form.jumping:
+        return np.array([[1.0], [-1.0]])[: 2 * n]
+    # The phase in turns is reduced before it is multiplied by 2 pi, so that high tones keep their accuracy.
+    turns = np.outer(np.arange(n), form.multiples) % n * (2.0 * np.pi / n)
+    return np.stack([np.sin(turns), np.cos(turns)], axis=2).reshape(n, -1)
 
 
 def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halves: int) -> Answers:
@@ -72,42 +79,73 @@ def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halv
         Length of the runs in half periods.
     """
     table = table_of(form, scenes)
-    others, gap = CELL_ROWS * len(form.layers), form.layers[form.gap]
-    mu = np.broadcast_to(scenes.get(f"{gap.name.lower()}.mu", np.asarray(gap.values["mu"])), table.shape[1:])
+    others, cells = CELL_ROWS * form.cells, form.cells
+    mu = np.asarray(scenes.get(f"{form.layer.name.lower()}.mu", form.layer.values["mu"]))
+    mu = np.broadcast_to(mu, table.shape[1:])
     found = Answers.empty(task, table.shape[1], halves * task.points // 2)
+    touching = table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2
+    pieces, decays = np.zeros(table.shape[1], int), np.zeros(table.shape[1])
+    if form.jumping:
+        # The largest leakage rate of a cell is an upper bound of the rates of the modes.
+        leaks = table[cells : 2 * cells] / table[others + REST] + table[2 * cells : 3 * cells]
+        decays = np.max(leaks / table[:cells], axis=0) * (np.pi / table[others + OMEGA])
+        # Each piece is twice as long as the one before. Gap voltages at equal distances need a single piece.
+        most = 1 if "u_gap" in task.outputs else _MOST_PIECES
+        pieces = np.ceil(np.log2(1.0 + _PIECE_START * decays)).clip(1, most).astype(int)
+    for count in np.unique(pieces[touching]).tolist():
+        _climb_one(task, form, _Scenes(table, mu, decays), (halves, count), touching & (pieces == count), found)
+    return found
+
+
+class _Scenes(NamedTuple):
+    """Table of scenes, friction coefficient, and half periods in time constants of the fastest cell (0: no jumps)."""
+
+    table: FloatArray
+    mu: FloatArray
+    decays: FloatArray
+
+
+def _climb_one(
+    task: Task, form: LockstepForm, scenes: _Scenes, mesh: tuple[int, int], chosen: BoolArray, found: Answers
+) -> None:  # fmt: skip
+    """Integrate the `chosen` scenes; `mesh` is the number of half periods, and of pieces of each (0: no jumps)."""
+    others, table = CELL_ROWS * form.cells, scenes.table
     figures = [name for name in task.outputs if name != "u_gap"]
     needed = sorted({i for name in figures for i in FIGURES[name.removesuffix("_periodic")][0]} or {0})
-    traced = len(figures) < len(task.outputs)
+    traced, pieces = len(figures) < len(task.outputs), mesh[1]
     steps, degree = next((s, d) for least, s, d in _RUNGS if task.rtol >= least)
+    steps *= max(form.multiples)
+    if pieces > 1:
+        steps = 2 * pieces * next(s for least, s in _PIECES if task.rtol >= least)
     if traced:
         steps = task.points * -(-steps // task.points)
-    pending = np.flatnonzero(table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2)
-    # The largest leakage rate of a cell is an upper bound of the rates of the modes.
-    cells = len(form.layers)
-    leaks = table[cells : 2 * cells] / table[others + REST] + table[2 * cells : 3 * cells]
-    fastest = np.max(leaks / table[:cells], axis=0) * (2.0 * np.pi / table[others + OMEGA]) * form.jumping
+    # The first step after a jump, in half periods, times the number of steps a period.
+    shortest = 2.0 * max(pieces, 1) / (2.0 ** max(pieces, 1) - 1.0)
+    pending = np.flatnonzero(chosen)
     before, least = None, np.zeros(pending.size)
-    while pending.size and steps <= _MOST_STEPS:
-        curves = curves_of(gap.values["m_exp"], gap.values["n_exp"], degree)
+    while pending.size and steps <= _MOST_STEPS * max(form.multiples):
+        curves = curves_of(form.layer.values["m_exp"], form.layer.values["n_exp"], degree)
         if curves is None:
             break
-        level = _Level(task, form, halves, steps, degree, ALL_MOMENTS if needed[-1] else 1, traced)
+        level = _Level(task, form, mesh, steps, degree, ALL_MOMENTS if needed[-1] else 1, traced)
         now = level.run(table, pending, curves, before)
         error = np.maximum(level.error(now, needed), least)
-        good = (error <= _ENOUGH * task.rtol) & (fastest[pending] <= _LONGEST_STEP * steps)
+        good = (error <= _ENOUGH * task.rtol) & (scenes.decays[pending] * shortest <= _LONGEST_STEP * steps)
         at = pending[good]
         for name in figures:
             part = 1 if name.endswith("_periodic") or task.periodic else 0
             moments = now.fine[part * level.moments : (part + 1) * level.moments, good]
             figure = FIGURES[name.removesuffix("_periodic")][1]
-            found.values[name][at] = figure(moments, table[others + LOAD, at], table[others + STRESS, at], mu[at])
+            load, stress = table[others + LOAD, at], table[others + STRESS, at]
+            found.values[name][at] = figure(moments, load, stress, scenes.mu[at])
         if traced:
             found.values["u_gap"][at] = now.trace[good, :: steps // task.points]
         found.error[at], found.status[at], found.done[at] = error[good], LOCKSTEP, True
-        before = _Run(now.fine[:, ~good], now.fine[:, ~good], now.trace[~good], now.trace[~good])
-        least = error[~good] / _MOST_GAIN
-        pending, steps, degree = pending[~good], 2 * steps, _HIGHEST_DEGREE
-    return found
+        # More steps are no help where the area's polynomial of the highest degree is what limits the error.
+        left = ~good & ((degree < _HIGHEST_DEGREE) | (before is None) | (now.fine[-1] <= _ENOUGH * task.rtol))
+        before = _Run(now.fine[:, left], now.fine[:, left], now.trace[left], now.trace[left])
+        least = np.where(np.isfinite(error[left]), error[left], 0.0) / _MOST_GAIN
+        pending, steps, degree = pending[left], 2 * steps, _HIGHEST_DEGREE
 
 
 class _Run(NamedTuple):
@@ -124,7 +162,7 @@ class _Level(NamedTuple):
 
     task: Task
     form: LockstepForm
-    halves: int
+    mesh: tuple[int, int]
     steps: int
     degree: int
     moments: int
@@ -133,14 +171,19 @@ class _Level(NamedTuple):
     def run(self, table: FloatArray, pending: NDArray[np.int64], curves: Curves, before: _Run | None) -> _Run:
         """Integrate the scenes `pending`; the results with half the steps come from `before`, or are computed, too."""
         sizes = (self.steps // 2 if before is None else 0, self.steps)
-        jumping = self.form.jumping
+        halves, pieces = self.mesh
         out = np.empty((2, 2 * self.moments + 3, pending.size))
-        widths = [self.halves * n // 2 if self.traced else 0 for n in sizes]
+        widths = [halves * n // 2 if self.traced else 0 for n in sizes]
         traces = np.empty((pending.size, widths[0])), np.empty((pending.size, widths[1]))
+        covered = _COVERED if before is None else _COVERED_LATER
+        leaks = np.array(self.form.leaks)
+        waves = _waves(sizes[0], self.form), _waves(sizes[1], self.form)
+        lengths = (self.form.cells - 1, waves[1].shape[1], leaks.size, self.degree + 1, self.moments)
+        marks: Any = tuple((0,) * n for n in lengths)
         march(
-            table, pending, self.form.gap, curves, (_wave(sizes[0], jumping), _wave(sizes[1], jumping)),
-            (self.halves, jumping, self.task.periodic, CLOSING * self.task.rtol), out, traces,
-            (0,) * (len(self.form.layers) - 1), (0,) * (self.degree + 1), (0,) * self.moments,
+            table, pending, (self.form.gap_cell, leaks), curves, (np.array(self.form.multiples, float), waves),
+            (halves, self.steps // 2, pieces, self.task.periodic, CLOSING * self.task.rtol, covered), out, traces,
+            marks,
         )  # fmt: skip
         if before is None:
             return _Run(out[0], out[1], traces[0], traces[1])
@@ -150,11 +193,13 @@ class _Level(NamedTuple):
         """Largest stated relative error of the outputs, for each scene."""
         peak, closing, tail = run.fine[2 * self.moments :]
         changes = [np.zeros(peak.size)]
-        parts = (0, 1) if self.halves > 1 else (0,)
+        parts = (0, 1) if self.mesh[0] > 1 else (0,)
         for row in (part * self.moments + i for part in parts for i in needed):
             size = np.abs(run.fine[row])
             changes.append(np.abs(run.fine[row] - run.coarse[row]) / np.where(size > 0.0, size, 1.0))
         if self.traced:
             off = np.abs(run.trace[:, ::2] - run.trace_coarse).max(axis=1)
             changes.append(off / np.where(peak > 0.0, peak, 1.0))
-        return np.asarray(_STATED * np.max(changes, axis=0) + tail + 2.0 * closing + ROUNDING)
+        # The area's polynomial of the run with half the steps may be another one.
+        change = np.max(changes, axis=0) + run.coarse[-1]
+        return np.asarray(_STATED * change + tail + 2.0 * closing + ROUNDING)

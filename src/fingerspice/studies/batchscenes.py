@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.polynomial import chebyshev as powers
@@ -15,17 +15,23 @@ from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.engine.lockscenes import CELL_ROWS, LARGEST_X, N_OTHERS
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import universal_curve_array
+from fingerspice.physics.ladder import SKIN_LADDER
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
+from fingerspice.waveforms.combinations import AM
 from fingerspice.waveforms.periodic import Pulse, Square
-from fingerspice.waveforms.waveform import DC, Sine
+from fingerspice.waveforms.waveform import DC, Sine, Waveform
 
 Value = float | FloatArray
 Curves = tuple[FloatArray, FloatArray, FloatArray]
+Cell = tuple[Value, Value, Value]
 # Parameters that must be equal in all scenes of a lockstep, because the form of the equations depends on them.
 _FORM = ("m_exp", "n_exp", "a_fix", "tau")
-_OF_SOURCE = ("amplitude", "frequency", "phase_deg")
-# Numbers of cells for which a lockstep exists; each number is compiled separately.
-_CELLS = (2, 3, 4)
+# Most layers and most tones of a lockstep: code is compiled for each number of cells and of tones.
+_MOST_LAYERS, _MOST_TONES = 4, 4
+_SKIN_CELLS = SKIN_LADDER.cells()[0].size
+_LAYERS = ("LAYER", "SLAB", "SKIN", "SKIN_DISPERSIVE", "GAP")
+# Largest ratio of a tone's frequency to that of the whole source.
+_MOST_PERIODS = 2000
 # Numbers of points tried for the universal curve's Chebyshev series, and the relative error allowed.
 _CURVE_SIZES, _CURVE_ERROR = (16, 20, 24, 28), 1e-13
 
@@ -40,18 +46,47 @@ class LockstepForm:
         Layers in the order of the loop.
     gap : int
         Index of the gap among them.
-    sign : float
-        Sign of the gap along the loop times the sign of the source.
-    source : Element
+    sources : tuple of (Element, float)
+        The sources that are on; each with the sign of the gap along the loop times the sign of the source.
+    multiples : tuple of int
+        Frequency of every tone of the sources' sum, in that of the sum.
+    frequency : float or None
+        That of the sum, Hz; None for one source of one tone, whose frequency may vary.
     jumping : bool
         Whether the source is a square.
     """
 
     layers: tuple[Element, ...]
     gap: int
-    sign: float
-    source: Element
+    sources: tuple[tuple[Element, float], ...]
+    multiples: tuple[int, ...]
+    frequency: float | None
     jumping: bool
+
+    @property
+    def layer(self) -> Element:
+        """The gap."""
+        return self.layers[self.gap]
+
+    @cached_property
+    def layer_of_cells(self) -> tuple[Element, ...]:
+        """The layer of every cell."""
+        return tuple(e for e in self.layers for _ in range(_SKIN_CELLS if e.device == "SKIN_DISPERSIVE" else 1))
+
+    @property
+    def cells(self) -> int:
+        """Number of cells of all layers."""
+        return len(self.layer_of_cells)
+
+    @property
+    def gap_cell(self) -> int:
+        """Index of the gap among the cells."""
+        return self.layer_of_cells.index(self.layer)
+
+    @property
+    def leaks(self) -> tuple[int, ...]:
+        """Indices of the cells whose leak has a total resistance."""
+        return tuple(i for i, e in enumerate(self.layer_of_cells) if e.device in ("LAYER", "GAP"))
 
 
 def lockstep_form(circuit: Circuit, varied: Mapping[str, object]) -> LockstepForm | str:
@@ -59,47 +94,60 @@ def lockstep_form(circuit: Circuit, varied: Mapping[str, object]) -> LockstepFor
     if not is_stack(circuit):
         return "the circuit is no series stack of layers"
     stack = build_stack(circuit)
-    devices = {e.device for e in stack.layers}
-    if stack.contact is None or stack.gap is None or stack.area_given is not None:
+    gap = stack.gap_layer
+    if stack.contact is None or gap is None or stack.area_given is not None:
         return "the stack has no contact whose area follows the gap"
-    if not devices <= {"LAYER", "SLAB", "SKIN", "GAP"} or len(stack.layers) not in _CELLS:
-        return f"the stack has other layers than LAYER, SLAB, SKIN and GAP, or not {_CELLS[0]} to {_CELLS[-1]} of them"
+    if not {e.device for e in stack.layers} <= set(_LAYERS) or not 2 <= len(stack.layers) <= _MOST_LAYERS:
+        return f"the stack has other layers than {', '.join(_LAYERS)}, or not 2 to {_MOST_LAYERS} of them"
     if (circuit.charge_law or "local") != "local" or circuit.work != "gap":
         return "the charge law is mobile, or the total voltage is held"
-    on = [(e, sign) for e, sign in stack.sources if e.waveform != DC(0.0)]
-    if len(on) != 1 or not _plain(on[0][0].waveform):
-        return "the source is not one plain sine, or one plain square that starts with its period"
-    source, turn = on[0]
-    jumping = not isinstance(source.waveform, Sine)
+    sources = tuple((e, float(turn * stack.sign[stack.gap])) for e, turn in stack.sources if e.waveform != DC(0.0))
+    waves = [e.waveform for e, _ in sources]
+    jumping = len(waves) == 1 and isinstance(waves[0], Square | Pulse)
+    tones = [hz for wave in waves for hz in _tones(wave)]
+    if not waves or not (_plain_square(waves[0]) if jumping else all(tones) and len(tones) <= _MOST_TONES):
+        return f"the sources are not 1 to {_MOST_TONES} plain sines, and not a square that starts with its period"
+    multiples: tuple[int, ...] = (1,)
+    frequency: float | None = None
+    if len(tones) > 1:
+        period = stack.waveform.period
+        if period is None or max(tones) * period > _MOST_PERIODS:
+            return "the sources' tones have no common period, or one of very many of their own"
+        multiples, frequency = tuple(round(hz * period) for hz in tones), 1.0 / period
     if not _starts_uncharged(circuit, jumping, varied):
         return "the run does not start uncharged, or its figures start late"
+    layers, on = {e.name.lower() for e in stack.layers}, {e.name.lower(): e.waveform for e, _ in sources}
     for path in varied:
         name, _, parameter = path.rpartition(".")
-        fixed = None
-        if name == source.name.lower():
-            fixed = () if isinstance(source.waveform, Pulse) else _OF_SOURCE[: 2 if jumping else 3]
-        if (parameter not in fixed) if fixed is not None else parameter in _FORM:
+        if (parameter not in _varies(on[name], frequency)) if name in on else parameter in _FORM or name not in layers:
             return f"{path} varies"
-        if fixed is None and name not in {e.name.lower() for e in stack.layers}:
-            return f"{path} varies"
-    return LockstepForm(stack.layers, stack.gap, float(turn * stack.sign[stack.gap]), source, jumping)
+    return LockstepForm(stack.layers, gap, sources, multiples, frequency, jumping)
 
 
-def _plain(wave: object) -> bool:
-    """Whether a source has no offset and is a sine from t = 0 on, or a square whose period begins at t = 0."""
-    if isinstance(wave, Sine):
-        return wave.offset == 0.0 and wave.delay == 0.0 and wave.damping == 0.0
+def _tones(wave: object) -> tuple[float, ...]:
+    """Frequencies of a source without offset that consists of sines from t = 0 on; a zero for any other."""
+    if isinstance(wave, AM):
+        return (wave.carrier, wave.carrier - wave.modulation, wave.carrier + wave.modulation)
+    if isinstance(wave, Sine) and wave.offset == 0.0 and wave.delay == 0.0 and wave.damping == 0.0:
+        return (wave.frequency,)
+    return (0.0,)
+
+
+def _plain_square(wave: object) -> bool:
+    """Whether a square has no offset and its period begins at t = 0."""
     if isinstance(wave, Pulse):
         return wave.half_wave and wave.rise == 0.0 and wave.delay == 0.0
     return isinstance(wave, Square) and wave.half_wave and wave.phase_deg == 0.0 and wave.delay == 0.0
 
 
-def _of_wave(wave: object) -> dict[str, Value]:
-    """Amplitude (V), frequency (Hz) and phase of a plain source."""
+def _varies(wave: object, frequency: float | None) -> tuple[str, ...]:
+    """Parameters of a source that may vary from scene to scene."""
     if isinstance(wave, Pulse):
-        return {"amplitude": wave.v2, "frequency": 1.0 / wave.pulse_period, "phase_deg": 0.0}
-    assert isinstance(wave, Sine | Square)
-    return {name: getattr(wave, name) for name in _OF_SOURCE}
+        return ()
+    if isinstance(wave, AM):
+        return ("amplitude", "depth", "phase_deg")
+    may_vary = {"amplitude": True, "frequency": frequency is None, "phase_deg": isinstance(wave, Sine)}
+    return tuple(name for name, allowed in may_vary.items() if allowed)
 
 
 def _starts_uncharged(circuit: Circuit, jumping: bool, varied: Mapping[str, object]) -> bool:
@@ -108,9 +156,26 @@ def _starts_uncharged(circuit: Circuit, jumping: bool, varied: Mapping[str, obje
         return False
     if tran is None or tran.uic:
         return True
-    # The operating point of a sine that starts at 0 V is the uncharged state.
-    phases = [getattr(e.waveform, "phase_deg", 0.0) for e in circuit.by_device("V")]
+    # The operating point of sines that start at 0 V is the uncharged state.
+    phases = [getattr(e.waveform, "phase_deg", 0.0) for e in circuit.by_device("V") if not isinstance(e.waveform, AM)]
     return not jumping and not any(phases) and not any(path.endswith(".phase_deg") for path in varied)
+
+
+def _tones_of(wave: object, given: Mapping[str, Value]) -> list[tuple[Value, Value]]:
+    """Amplitude (V) and phase (rad) of the tones of a source, in the order of `_tones`; `given` has what varies."""
+
+    def value(name: str) -> Value:
+        return given.get(name, getattr(wave, name, 0.0))
+
+    if isinstance(wave, Pulse):
+        return [(wave.v2, 0.0)]
+    if isinstance(wave, AM):
+        # sin(x) sin(y) is half of cos(x - y) = sin(x - y + pi/2) and of -cos(x + y) = sin(x + y - pi/2).
+        depth, turn = value("depth"), np.radians(value("phase_deg"))
+        share = value("amplitude") / (1.0 + depth)
+        side = 0.5 * depth * share
+        return [(share, 0.0), (side, 0.5 * np.pi - turn), (side, turn - 0.5 * np.pi)]
+    return [(value("amplitude"), np.radians(value("phase_deg")))]
 
 
 def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray:
@@ -123,44 +188,54 @@ def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray
         Values by path in lower case, in the netlist's units; all other values are the circuit's.
     """
 
-    def values(element: Element) -> dict[str, Value]:
-        own: dict[str, Value] = dict(element.values)
-        wave = element.waveform
-        if wave is not None:
-            own |= _of_wave(wave)
-        return {key: scenes.get(f"{element.name.lower()}.{key}", own[key]) for key in own}
+    def given(element: Element) -> dict[str, Value]:
+        start = f"{element.name.lower()}."
+        return {path.removeprefix(start): array for path, array in scenes.items() if path.startswith(start)}
 
-    n, count = next(iter(scenes.values())).size, len(form.layers)
-    out = np.empty((CELL_ROWS * count + N_OTHERS, n))
-    for i, layer in enumerate(form.layers):
-        out[i], out[count + i], out[2 * count + i] = _CELL_OF[layer.device](values(layer))
-    source = values(form.source)
-    contact = _contact_rows(values(form.layers[form.gap]))
-    wave = (
-        form.sign * np.asarray(source["amplitude"]),
-        2.0 * np.pi * np.asarray(source["frequency"]),
-        np.radians(source["phase_deg"]),
-    )
-    for i, row in enumerate((*contact, *wave)):
+    count = form.cells
+    out = np.empty((CELL_ROWS * count + N_OTHERS + 2 * len(form.multiples), next(iter(scenes.values())).size))
+    cell = 0
+    for layer in form.layers:
+        for c, g, g_area in _CELLS_OF[layer.device](dict(layer.values) | given(layer)):
+            out[cell], out[count + cell], out[2 * count + cell] = c, g, g_area
+            cell += 1
+    first = form.sources[0][0]
+    frequency = form.frequency or given(first).get("frequency", 1.0 / (_period(first.waveform)))
+    rows = [*_contact_rows(dict(form.layer.values) | given(form.layer)), 2.0 * np.pi * np.asarray(frequency)]
+    for element, sign in form.sources:
+        for amplitude, phase in _tones_of(element.waveform, given(element)):
+            rows += [sign * np.asarray(amplitude), phase]
+    for i, row in enumerate(rows):
         out[CELL_ROWS * count + i] = row
     return out
 
 
-def _layer(v: Mapping[str, Value]) -> tuple[Value, Value, Value]:
-    return EPS0 * v["eps_r"] / v["d"], 1.0 / v["r"], 0.0
+def _period(wave: Waveform | None) -> float:
+    assert wave is not None
+    assert wave.period is not None
+    return wave.period
 
 
-def _slab(v: Mapping[str, Value]) -> tuple[Value, Value, Value]:
-    return EPS0 * v["eps_r"] / v["d"], 0.0, 1.0 / (v["rho"] * v["d"])
+def _layer(v: Mapping[str, Value]) -> list[Cell]:
+    return [(EPS0 * v["eps_r"] / v["d"], 1.0 / v["r"], 0.0)]
 
 
-def _skin(v: Mapping[str, Value]) -> tuple[Value, Value, Value]:
+def _slab(v: Mapping[str, Value]) -> list[Cell]:
+    return [(EPS0 * v["eps_r"] / v["d"], 0.0, 1.0 / (v["rho"] * v["d"]))]
+
+
+def _skin(v: Mapping[str, Value]) -> list[Cell]:
     return _slab({"d": v["d"], "eps_r": skin_permittivity(v["f"]), "rho": skin_resistivity(v["f"])})
 
 
-#: As `Element.spec.cells`, for arrays of values: capacitance per area, total leakage and leakage per area.
-_CELL_OF: dict[str, Callable[[Mapping[str, Value]], tuple[Value, Value, Value]]] = {
-    "LAYER": _layer, "GAP": _layer, "SLAB": _slab, "SKIN": _skin,
+def _dispersive(v: Mapping[str, Value]) -> list[Cell]:
+    ladder = zip(*SKIN_LADDER.cells(), strict=True)
+    return [cell for eps_r, rho in ladder for cell in _slab({"d": v["d"], "eps_r": eps_r, "rho": rho})]
+
+
+#: As `Element.spec.cells`, for arrays of values: capacitance per area, total leakage and leakage per area of each cell.
+_CELLS_OF: dict[str, Callable[[Mapping[str, Value]], list[Cell]]] = {
+    "LAYER": _layer, "GAP": _layer, "SLAB": _slab, "SKIN": _skin, "SKIN_DISPERSIVE": _dispersive,
 }  # fmt: skip
 
 
