@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import re
 
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.application import Sphinx
+from sphinx.writers.html5 import HTML5Translator
 
 import fingerspice
 
@@ -12,7 +15,7 @@ project = "fingerspice"
 author = "The fingerspice developers"
 version = release = fingerspice.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 
 # Headings are targets of links, as on a code host; $...$ and $$...$$ are formulas.
@@ -32,6 +35,7 @@ default_role = "code"
 suppress_warnings = ["misc.highlighting_failure", "ref.python"]
 show_warning_types = True
 
+html_math_renderer = "mathml"
 html_theme = "pydata_sphinx_theme"
 html_title = "fingerspice"
 html_show_sourcelink = False
@@ -51,6 +55,15 @@ def _files_beside(app: Sphinx, name: str, source: list[str]) -> None:
     source[0] = re.sub(r"(?<!!)(\[[^][]*\]\()(?=(\.\./)+(benchmarks|circuits|tests|src)/)", r"\1path:", source[0])
 
 
+def _formula(self: HTML5Translator, node: nodes.math | nodes.math_block) -> None:
+    """Formulas are MathML, which browsers show by themselves: a page needs nothing from the net."""
+    block = isinstance(node, nodes.math_block)
+    formula = tex2mathml(node.astext(), as_block=block)
+    self.body.append(f'<div style="margin: 1em 0">{formula}</div>' if block else formula)
+    raise nodes.SkipNode
+
+
 def setup(app: Sphinx) -> None:
     """Register what this file adds to Sphinx."""
     app.connect("source-read", _files_beside)
+    app.add_html_math_renderer("mathml", (_formula, None), (_formula, None))
