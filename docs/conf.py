@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import sys
+from pathlib import Path
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
@@ -10,6 +12,9 @@ from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
 
 import fingerspice
+
+sys.path.insert(0, str(Path(__file__).parent))
+import gallery  # noqa: E402
 
 project = "fingerspice"
 author = "The fingerspice developers"
@@ -37,6 +42,7 @@ show_warning_types = True
 
 html_math_renderer = "mathml"
 html_theme = "pydata_sphinx_theme"
+html_sidebars = {"index": [], "start/tutorial": []}
 html_title = "fingerspice"
 html_show_sourcelink = False
 html_copy_source = False
@@ -65,5 +71,6 @@ def _formula(self: HTML5Translator, node: nodes.math | nodes.math_block) -> None
 
 def setup(app: Sphinx) -> None:
     """Register what this file adds to Sphinx."""
+    app.connect("builder-inited", lambda _: gallery.main())
     app.connect("source-read", _files_beside)
     app.add_html_math_renderer("mathml", (_formula, None), (_formula, None))

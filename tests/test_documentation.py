@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import os
 import re
@@ -16,10 +17,11 @@ import pytest
 
 import fingerspice as fs
 from commands import Command
+from fingerspice.explorer.examples import EXAMPLES
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *DOCS.rglob("*.md")])
+PAGES = sorted({ROOT / "README.md", ROOT / "CHANGELOG.md", *DOCS.rglob("*.md")} - {DOCS / "gallery" / "index.md"})
 LANGUAGES = {"python", "sh", "spice", "text", "csv", "toml", "{toctree}"}
 NOT_RUN = "<!-- not run:"
 """A comment before a block, with the reason, says that it is not run here."""
@@ -130,6 +132,20 @@ def test_the_reference_has_every_public_name_and_no_other() -> None:
     pages = "".join(p.read_text(encoding="utf-8") for p in (DOCS / "reference").glob("*.rst"))
     listed = re.findall(r"^\.\. auto(?:function|class|exception):: (\w+)$", pages, re.MULTILINE)
     assert sorted(listed) == sorted(set(fs.__all__) - {"__version__"})
+
+
+def test_the_gallery_has_every_deck_and_every_scene(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.syspath_prepend(str(DOCS))
+    gallery = importlib.import_module("gallery")
+    entries = {entry.name: entry for entry in (*gallery.decks(), *gallery.scenes())}
+    decks, scenes = ROOT.glob("circuits/*.cir"), (f"scene-{example.name}" for example in EXAMPLES)
+    assert set(entries) == {*(path.stem for path in decks), *scenes}
+    assert all(f"]({name}.png)" in gallery.page() for name in entries)
+    assert "where fingers feel best" in entries["click"].about
+    for name in ("click", "scene-fold"):
+        gallery.draw(entries[name], tmp_path)
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+    assert not entries["scene-fold"].run().success
 
 
 def test_the_times_of_the_readme_are_those_of_the_measured_table() -> None:
