@@ -14,7 +14,7 @@ from sphinx.writers.html5 import HTML5Translator
 import fingerspice
 
 sys.path.insert(0, str(Path(__file__).parent))
-import gallery  # noqa: E402
+import gallery
 
 project = "fingerspice"
 author = "The fingerspice developers"

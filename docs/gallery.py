@@ -1,7 +1,7 @@
 """Draws every shipped deck and every example scene of the explorer, and writes the page that shows them.
 
-The build of the documentation calls it; `python docs/gallery.py` does the same alone. What it writes, docs/gallery, is not
-kept in the repository.
+The build of the documentation calls it; `python docs/gallery.py` does the same alone. What it writes, docs/gallery, is
+not kept in the repository.
 """
 
 from __future__ import annotations
