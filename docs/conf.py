@@ -42,7 +42,7 @@ show_warning_types = True
 
 html_math_renderer = "mathml"
 html_theme = "pydata_sphinx_theme"
-html_sidebars = {"index": [], "start/tutorial": []}
+html_sidebars = {"index": [], "start/tutorial": [], "gallery/index": []}
 html_title = "fingerspice"
 html_show_sourcelink = False
 html_copy_source = False

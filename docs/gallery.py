@@ -44,7 +44,15 @@ def decks() -> Iterator[Entry]:
         comments = [line[1:].strip() for line in lines[1 : lines.index(".include fingerspice.lib")] if line[:1] == "*"]
         about = re.split(r"Layers(?:,| and) contact|SI units|V\(area\)|In ngspice|Charge law:", " ".join(comments))[0]
         how = f"[`circuits/{path.name}`](../../circuits/{path.name}): `fingerspice run circuits/{path.name}`"
-        yield Entry(path.stem, lines[0], about.strip(), how, path, lambda path=path: fs.simulate(fs.read_netlist(path)))
+        title = re.sub(r"Fingerpad on a (3M-coated )?touchscreen,? (with )?", "", lines[0])
+        yield Entry(
+            path.stem,
+            title[0].upper() + title[1:],
+            about.strip(),
+            how,
+            path,
+            lambda path=path: fs.simulate(fs.read_netlist(path)),
+        )
 
 
 def scenes() -> Iterator[Entry]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -53,7 +55,8 @@ def tutorial_texture() -> Any:
     deck = re.findall(r"^```spice\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)[0]
     code = next(c for c in re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S) if "inverse_drive" in c)
     names: dict[str, Any] = {"np": np, "fs": fs, "finger": fs.parse_netlist(deck)}
-    exec(code, names)
+    with contextlib.redirect_stdout(None):
+        exec(code, names)
     return names["found"].plot()
 
 
@@ -93,6 +96,7 @@ def collocation() -> Any:
     starts, lengths = steps.start, steps.length * steps.reach
     inside = (starts + lengths > first + 1e-9) & (starts + lengths < first + period + 1e-9)
     starts, lengths = starts[inside], lengths[inside]
+    assert starts.size == 6, "the page says six steps"
     figure, (top, bottom) = new_figure(2, height=4.4)
     dress(top, "Voltage [V]", "Time [ms]")
     top.set_xlim(1e3 * starts[0], 1e3 * (starts[-1] + lengths[-1]))
@@ -137,6 +141,7 @@ def error_estimate() -> Any:
         runs = [fs.simulate(finger(), sources=source, t_eval=t, rtol=rtol) for rtol in asked]
         stated = [float(np.max(run.error.u_gap)) / peak for run in runs]
         true = [np.abs(run.u_gap - best.u_gap).max() / peak for run in runs]
+        assert 1.0 < np.median(np.divide(stated, true)) < 4.0, "the page says a factor of about 2"
         dress(ax, "Error of the gap voltage / its peak" if ax is panels[0] else "", "Error asked for (rtol)")
         ax.loglog(asked, asked, color=GREY, linestyle="--", label="asked for")
         ax.loglog(asked, stated, "s-", color=VERMILION, markersize=4, label="stated")
@@ -167,6 +172,7 @@ def fold() -> Any:
     u = np.linspace(-400.0, -20.0, 2001)
     needed = (u - x * rest / contact.area(u)) / share
     end = int(np.argmin(needed))
+    assert round(needed[end]) == -128, "the page says so"
     figure, (left, right) = new_figure(1, 2, height=3.0)
     dress(left, "Voltage [V]", "Time [ms]")
     left.plot(1e3 * run.t, run.u_source, color=GREY, linestyle="--", label="source")
@@ -216,7 +222,9 @@ def main() -> None:
     FOLDER.mkdir(exist_ok=True)
     for name, draw in PICTURES.items():
         if name in (sys.argv[1:] or PICTURES):
-            save(draw(), FOLDER / f"{name}.png", dpi=150.0)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", fs.FingerspiceWarning)
+                save(draw(), FOLDER / f"{name}.png", dpi=150.0)
 
 
 if __name__ == "__main__":

@@ -148,6 +148,18 @@ def test_the_gallery_has_every_deck_and_every_scene(monkeypatch: pytest.MonkeyPa
     assert not entries["scene-fold"].run().success
 
 
+def test_every_picture_of_a_page_can_be_drawn_and_is_shown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.syspath_prepend(str(DOCS))
+    pictures = importlib.import_module("pictures")
+    monkeypatch.setattr(pictures, "FOLDER", tmp_path / "pictures")
+    monkeypatch.setattr("sys.argv", ["pictures.py"])
+    pictures.main()
+    drawn = {path.name for path in (tmp_path / "pictures").iterdir()}
+    assert drawn == {path.name for path in (DOCS / "pictures").iterdir()}
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    assert all(f"pictures/{name})" in text for name in drawn)
+
+
 def test_the_times_of_the_readme_are_those_of_the_measured_table() -> None:
     front = (ROOT / "README.md").read_text(encoding="utf-8").split("## How right and how fast")[1]
     measured = (DOCS / "proof.md").read_text(encoding="utf-8").split("## What a user waits for")[1]
