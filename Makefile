@@ -58,5 +58,5 @@ docs: $(VENV)/.docs
 	$(BIN)/sphinx-build --builder html --fail-on-warning --keep-going --quiet docs out/docs
 
 clean:
-	rm -rf $(VENV) out .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) out docs/gallery .pytest_cache .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
