@@ -1,8 +1,8 @@
 """Scenes per second of whole calls of `fs.batch`, of a loop over `simulate`, and of other packages at the same error.
 
-A scene is Table 1's stack with another gap, leak and amplitude; its output is the mean force of 5 periods of a sine or
-square, and of a whole AM envelope or period of `learned_drive.cir`. The peers (JAX, diffrax, torch, numba) are those that
-are installed; they and `fs.batch` with one thread run on one core. Usage:
+A scene is Table 1's stack with another gap, leak and amplitude, or the stack of another shipped deck; its output is the
+mean force of 5 periods, or of the deck's run. The peers (JAX, diffrax, torch, numba) are those that are installed; they
+run on one core. Usage:
 ``python benchmarks/batch.py [--quick] [--scenes N]``; writes ``benchmarks/results/batch.json`` unless quick.
 """
 
@@ -141,7 +141,7 @@ def growth(circuit: fs.Circuit, largest: int) -> list[dict[str, Any]]:
 def peers(
     circuit: fs.Circuit, parameters: dict[str, np.ndarray], expected: np.ndarray, repeats: int
 ) -> list[dict[str, Any]]:
-    """Scenes per second of other packages at the errors 1e-4 and 1e-6; their set-up is not timed, which favours them."""
+    """Scenes per second of other packages at the errors 1e-4 and 1e-6; without their set-up, which favours them."""
     n = min(4096, parameters["Xgap.d"].size)
     stacks = [build_stack(circuit.varied({p: float(x[i]) for p, x in parameters.items()})) for i in range(n)]
     scenes, rows = many_scenes.scenes_of(stacks, 12), []

@@ -33,9 +33,10 @@ MANY_PARAMETERS = {
     "cli.app.ac",
     "cli.app.plan",
     "cli.app.compare",
-    "cli.app.limits",
+    "cli.limits.limits",
     "cli.design.design",
     "cli.fit.fit",
+    "cli.fit.fit_contact",
     "studies.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",
@@ -77,7 +78,7 @@ LARGER = {
 
 # From the bottom up: a part imports its own files and the parts above it in this list, nothing below.
 ORDER = (
-    *("base", "numerics", "physics", "engine", "waveforms", "circuit", "netlist"),
+    *("base", "numerics", "physics", "engine", "waveforms", "circuit", "netlist", "sets"),
     *("results", "solve", "plots", "studies", "torch", "explorer", "cli", "__main__"),
 )
 # Beside each other, not one on the other.
@@ -104,6 +105,7 @@ THIRD_PARTY = {
     "engine": {"numpy", "numba"},
     "circuit": {"numpy"},
     "netlist": {"numpy"},
+    "sets": set(),
     "base": {"numba", "numpy", "rich"},
     "base.errors": set(),
     "base.units": set(),

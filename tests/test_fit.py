@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 from pathlib import Path
 
@@ -256,3 +257,184 @@ def test_bad_impedances_are_refused(data: dict[str, list[float]], said: str) -> 
     circuit = fs.read_netlist(CIRCUITS / "fingerpad.cir")
     with pytest.raises(fs.InputError, match=said):
         fs.fit(circuit, data, ["Xgap.d"])
+
+
+def grouped(circuit: fs.Circuit, gaps: dict[str, float], leak: float) -> dict[str, list[object]]:
+    """Mean forces of several fingers on one coating, without noise."""
+    rows: list[tuple[str, float, float, float]] = []
+    for label, d in gaps.items():
+        one = circuit.replace({"Xgap.d": d, "Xcoat.r": leak})
+        for u, f in ((100.0, 30.0), (200.0, 30.0), (200.0, 1000.0)):
+            at = {"Vdrive.amplitude": u, "Vdrive.frequency": f, "Xskin.f": f}
+            rows.append((label, u, f, fs.steady_state(one, parameters=at, rtol=1e-9).f_el_mean))
+    names = ("finger", "Vdrive.amplitude", "source.frequency", "f_el_mean")
+    return dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
+
+
+GAPS = {"left": 3.1e-6, "right": 3.9e-6}
+
+
+def test_each_group_has_its_own_parameters_and_all_share_the_others(circuit: fs.Circuit) -> None:
+    data = grouped(circuit, GAPS, 4e5)
+    found = fs.fit(circuit, data, ["Xgap.d", "xcoat.r"], groups={"finger": ["xgap.d"]}, skin="follow")
+    assert list(found.estimates) == ["Xgap.d[left]", "Xgap.d[right]", "Xcoat.r"]
+    assert found.freedom == 3
+    for label, d in GAPS.items():
+        assert found.estimates[f"Xgap.d[{label}]"].value == pytest.approx(d, rel=1e-5)
+        assert found.circuits[label].parameters["Xgap.d"].value == pytest.approx(d, rel=1e-5)
+        assert found.circuits[label].parameters["Xcoat.r"].value == pytest.approx(4e5, rel=1e-4)
+    assert found.circuit.parameters["Xgap.d"].value == pytest.approx(np.sqrt(3.1e-6 * 3.9e-6), rel=1e-5)
+    assert "groups by finger: left, right" in str(found)
+    # Two curves (left and right) for each voltage or frequency.
+    labels = found.plot().axes[0].get_legend_handles_labels()[1]
+    assert sum("finger = left" in text for text in labels) == sum("finger = right" in text for text in labels) > 0
+    # One gap for both cannot describe them.
+    one = fs.fit(circuit, {k: x for k, x in data.items() if k != "finger"}, ["Xgap.d", "Xcoat.r"], skin="follow")
+    assert one.objective > 1e4 * found.objective
+
+
+def test_a_profile_of_one_groups_parameter_leaves_the_others_free(circuit: fs.Circuit) -> None:
+    data = grouped(circuit, GAPS, 4e5)
+    force = np.array(data["f_el_mean"], float)
+    data["sigma"] = list(0.02 * force)
+    found = fs.fit(
+        circuit, data, ["Xgap.d", "Xcoat.r"], groups={"finger": ["Xgap.d"]}, skin="follow", starts=1, rtol=1e-5,
+        profiles=["Xgap.d[left]"],
+    )  # fmt: skip
+    profile, estimate = found.profiles["Xgap.d[left]"], found.estimates["Xgap.d[left]"]
+    assert profile.low == pytest.approx(estimate.low, rel=2e-3)
+    assert profile.high == pytest.approx(estimate.high, rel=2e-3)
+
+
+def test_groups_of_impedances_are_fitted_by_differences(circuit: fs.Circuit) -> None:
+    quiet, f = circuit.replace({"Vdrive.amplitude": 1.0}), np.geomspace(20.0, 2e4, 5)
+    z = [fs.phasor(quiet.replace({"Xgap.d": d}), f, skin="swept").impedance for d in GAPS.values()]
+    data = {"frequency": np.tile(f, 2), "impedance": np.abs(np.concatenate(z)), "finger": np.repeat([1.0, 2.0], 5)}
+    found = fs.fit(quiet, data, ["Xgap.d"], groups={"finger": ["Xgap.d"]}, skin="follow")
+    assert found.estimates["Xgap.d[1]"].value == pytest.approx(3.1e-6, rel=1e-6)
+    assert found.estimates["Xgap.d[2]"].value == pytest.approx(3.9e-6, rel=1e-6)
+
+
+def test_the_command_fits_the_fingers_of_the_example(command: Command, tmp_path: Path) -> None:
+    result = command(
+        "fit", str(CIRCUITS / "fingers.csv"), str(CIRCUITS / "fingerpad.cir"), "--free", "Xgap.d,Xcoat.r", "--groups",
+        "finger:Xgap.d", "--skin", "follow", "--out", str(tmp_path), "--json",
+    )  # fmt: skip
+    assert result.code == 0
+    answer = json.loads(result.out)
+    assert answer["groups"] == ["left", "right", "thumb"]
+    rows = {row["path"]: row for row in answer["parameters"]}
+    true = {"Xgap.d[left]": 3.1e-6, "Xgap.d[right]": 3.6e-6, "Xgap.d[thumb]": 4.2e-6, "Xcoat.r": 4e5}
+    assert {path: row["low"] < true[path] < row["high"] for path, row in rows.items()} == dict.fromkeys(true, True)
+    lines = (tmp_path / "fingerpad_fit.csv").read_text().splitlines()
+    assert lines[0].startswith("finger,Vdrive.amplitude")
+    assert lines[1].startswith("left,100,20,")
+
+
+@pytest.mark.parametrize(
+    ("groups", "said"),
+    [
+        ({"hand": ["Xgap.d"]}, "no column 'hand', which groups names; they have"),
+        ({"finger": ["Xgap.r"]}, r"groups names 'Xgap.r', which is not fitted; allowed: Xgap\.d"),
+        ({"finger": "Xgap.d"}, "allowed: a mapping of a column"),
+        ({"finger": ["Xgap.d"], "hand": ["Xgap.d"]}, "allowed: a mapping of a column"),
+        ({"Xgap.fn": ["Xgap.d"]}, "the column 'Xgap.fn', which is a parameter"),
+        (["Xgap.d"], "allowed: a mapping of a column"),
+    ],
+)
+def test_bad_groups_are_refused(circuit: fs.Circuit, tmp_path: Path, groups: object, said: str) -> None:
+    data = {"finger": ["a", "b"], "f_el_mean": [0.1, 0.2]}
+    with pytest.raises(InputError, match=said):
+        fs.fit(circuit, data, ["Xgap.d"], groups=groups)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="have times and groups"):
+        fs.fit(circuit, {"t": [0.0, 1e-3], "f_el": [0.1, 0.2], "g": [1, 2]}, ["Xgap.d"], groups={"g": ["Xgap.d"]})
+    (tmp_path / "a.csv").write_text("finger,f_el_mean (N)\na,0.1\nb,0.2\n")
+    with pytest.raises(InputError, match="has no column 'hand' in its header; it has finger, f_el_mean"):
+        fs.fit(circuit, tmp_path / "a.csv", ["Xgap.d"], groups={"hand": ["Xgap.d"]})
+    with pytest.raises(InputError, match="no rows of numbers; allowed: numbers, and names in the column that groups"):
+        fs.fit(circuit, tmp_path / "a.csv", ["Xgap.d"])
+    (tmp_path / "b.csv").write_text("finger,f_el_mean (N)\na,0.1\nb,0.2 oops\n")
+    with pytest.raises(InputError, match="line 3"):
+        fs.fit(circuit, tmp_path / "b.csv", ["Xgap.d"], groups={"finger": ["Xgap.d"]})
+
+
+def test_residuals_beyond_the_given_sigma_are_named(circuit: fs.Circuit, data: dict[str, np.ndarray]) -> None:
+    wrong = data["f_el_mean"] * (1.0 + 0.1 * (-1.0) ** np.arange(data["f_el_mean"].size))
+    found = fs.fit(circuit, {**data, "f_el_mean": wrong, "sigma": 0.01 * wrong}, ["Xgap.d"], starts=1, skin="follow")
+    assert any("times as large as sigma" in note and "so are the intervals" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(("kind", "said"), [("equal", "equal for all"), ("shares", "as equal shares of the values")])
+def test_an_unknown_sigma_is_equal_or_a_share_whichever_is_likelier(circuit: fs.Circuit, kind: str, said: str) -> None:
+    data = measured(circuit, [60.0, 120.0, 200.0], [30.0, 100.0, 500.0])
+    force, rng = data["f_el_mean"], np.random.default_rng(0)
+    sigma = 0.02 * (force if kind == "shares" else np.full(force.size, force.mean()))
+    finger = circuit.replace({"Xgap.alpha": TRUE["Xgap.alpha"]})
+    covered = 0
+    for number in range(12):
+        noisy = {**data, "f_el_mean": force + sigma * rng.standard_normal(force.size)}
+        found = fs.fit(finger, noisy, ["Xgap.d", "Xgap.r"], starts=1, rtol=1e-5, skin="follow")
+        covered += sum(
+            found.estimates[path].low <= TRUE[path] <= found.estimates[path].high for path in found.estimates
+        )
+        if number == 0:
+            assert f"sigma estimated from the residuals, {said}" in str(found)
+            like = found.sigma / (force if kind == "shares" else np.ones(force.size))
+            np.testing.assert_allclose(like, like[0], rtol=0.1)
+    # 24 intervals of 95 %: fewer than 19 would have a probability of 0.1 %.
+    assert covered >= 19
+
+
+def test_gap_and_area_are_one_product_at_one_voltage(circuit: fs.Circuit) -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        true = circuit.replace({path: value * np.exp(0.2 * rng.standard_normal()) for path, value in TRUE.items()})
+        force = fs.steady_state(true, rtol=1e-8).f_el_mean * (1.0 + 0.02 * rng.standard_normal(6))
+        start = true.replace({path: circuit.parameters[path].value for path in ("Xgap.d", "Xgap.alpha")})
+        data = {"Vdrive.amplitude": [200.0] * 6, "f_el_mean": force}
+        notes = fs.fit(start, data, ["Xgap.d", "Xgap.alpha"], starts=1, rtol=1e-5).notes
+        assert any("Xgap.d and Xgap.alpha are not told apart" in note and "second voltage" in note for note in notes)
+
+
+def test_the_example_finds_its_finger_and_predicts_another_force(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    spec = importlib.util.spec_from_file_location("fit_finger", CIRCUITS / "fit_finger.py")
+    assert spec is not None
+    assert spec.loader is not None
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    example.main(tmp_path)
+    said = capsys.readouterr().out
+    assert (tmp_path / "fit_finger.png").stat().st_size > 10_000
+    found = example.fitted()
+    for path, value in TRUE.items():
+        assert found.estimates[path].low < value < found.estimates[path].high
+    true = fs.read_netlist(CIRCUITS / "fingerpad.cir").replace(dict(TRUE))
+    at = {"Vdrive.amplitude": 180.0, "Vdrive.frequency": 300.0, "Xskin.f": 300.0}
+    middle, low, high = example.predicted(found)
+    assert low < fs.steady_state(true, parameters=at).f_el_mean < high
+    assert f"force at 180 V and 300 Hz: {1e3 * middle:.4g} mN" in said
+    # The force is known better than the area, as the errors of gap and area are correlated.
+    area, least, most = example.area_at_rest(found)
+    assert least < TRUE["Xgap.alpha"] * 0.5**0.52 < most
+    assert (high - low) / middle < 0.3 * (most - least) / area
+
+
+def test_a_report_has_the_layout_of_lmfit(circuit: fs.Circuit) -> None:
+    found = fs.fit(circuit, CIRCUITS / "measured.csv", ["Xgap.d", "Xgap.r"], skin="follow", starts=1)
+    lines = found.report().splitlines()
+    heads = [line for line in lines if line.startswith("[[")]
+    assert heads == ["[[Fit Statistics]]", "[[Variables]]", "[[Correlations]] (unreported correlations are < 0.100)"]
+    statistics = dict(line.strip().lstrip("# ").split(" = ") for line in lines[1:9])
+    numbers = {name.strip(): value for name, value in statistics.items()}
+    assert (numbers["data points"], numbers["variables"]) == ("15", "2")
+    chi = float(numbers["chi-square"])
+    assert chi == pytest.approx(float(np.sum((found.residual / found.sigma) ** 2)), rel=1e-6)
+    assert float(numbers["reduced chi-square"]) == pytest.approx(chi / 13)
+    assert float(numbers["Akaike info crit"]) == pytest.approx(15 * np.log(chi / 15) + 4)
+    assert float(numbers["Bayesian info crit"]) == pytest.approx(15 * np.log(chi / 15) + 2 * np.log(15))
+    one = found.estimates["Xgap.d"]
+    share = f"({100 * one.error / one.value:.2f}%)"
+    assert f"    Xgap.d:  {one.value:.8g} +/- {one.error:.8g} {share} (init = 3.5e-06)" in lines
+    assert lines[-1] == f"    C(Xgap.d, Xgap.r) = {found.correlation[0, 1]:+.4f}"

@@ -65,6 +65,10 @@ def answer(result: Result, command: str) -> Any:
         (["export", "pad.cir"], 2),
         (["figures", "--only", "2"], 0),
         (["figures", "--only", "9"], 2),
+        (["run", "pad.cir", "--no-plot", "--finger", "moist", "--set", "3M"], 0),
+        (["sets"], 0),
+        (["sets", "MOIST"], 0),
+        (["sets", "moits"], 2),
     ],
     ids=lambda x: " ".join(x) if isinstance(x, list) else "",
 )

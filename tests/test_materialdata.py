@@ -107,6 +107,23 @@ def test_data_that_are_no_material_for_no_known_reason_are_warned_about_then_ref
         fs.fit_material(much)
 
 
+def test_a_drift_too_small_for_a_refusal_is_told_from_noise() -> None:
+    material = fs.ColeCole(10.0, ((1e4, 1e-3, 0.1), (100.0, 1e-6, 0.2)), 1e-4)
+    y = material.admittivity(F)
+    true = np.column_stack([F, 1.0 / y.real, y.imag / (2.0 * np.pi * F * EPS0)])
+    drift = true * np.column_stack([np.ones(F.size), np.geomspace(1.0, 1.3, F.size), np.ones(F.size)])
+    with pytest.warns(fs.FingerspiceWarning, match=r"the data are 4.4 % \(rms\) from .* along a smooth course, as of"):
+        found = fs.fit_material(drift).kramers_kronig
+    assert 0.03 < found.rms < 0.1
+    assert found.systematic > 0.5
+    # As large a misfit by noise is no cause for a warning; ten draws, as one may pass by chance.
+    for seed in range(10):
+        rough = np.exp(0.05 * np.random.default_rng(seed).normal(size=(F.size, 2)))
+        noisy = fs.fit_material(true * np.column_stack([np.ones(F.size), rough])).kramers_kronig
+        assert noisy.rms > 0.03
+        assert noisy.systematic < 0.5
+
+
 def test_too_few_poles_are_warned_about_then_refused() -> None:
     broad = fs.ColeCole(5.0, ((1000.0, 1e-3, 0.2), (60.0, 3e-6, 0.1)), 2e-5)
     with pytest.warns(fs.FingerspiceWarning, match="the ladder misses the data by .* % rms; more poles would come"):

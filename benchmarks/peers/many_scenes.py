@@ -1,7 +1,7 @@
 """The mean force of many fingers by other packages: one right-hand side, and each package's own way over scenes.
 
-Every contestant integrates the leaked voltages v of coating and gap, and the integral of u_gap^2 A, from rest over whole
-periods. All take 1/A as the polynomial in the gap voltage that `fs.batch` makes, and its making is not timed.
+Every contestant integrates the leaked voltages v of coating and gap, and the integral of u_gap^2 A, from rest over
+whole periods. All take 1/A as a polynomial in the gap voltage, whose making is not timed.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ CONTESTANTS: dict[str, tuple[int, list[float], Callable[[Scenes, int, Any], Run]
 
 
 def cheapest(name: str, scenes: Scenes, periods: int, expected: np.ndarray, error: float) -> tuple[float, float] | None:
-    """The coarsest setting with which the first scenes' means have at most this error, and that error; None if none has."""
+    """The coarsest setting with which the first scenes' means have at most this error, and that error; None if none."""
     _, settings, make = CONTESTANTS[name]
     few = scenes.first(expected.size)
     for setting in settings:

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from fingerspice.results.outcome import Status as Status
     from fingerspice.results.plan import Plan as Plan
     from fingerspice.results.solution import Solution as Solution
+    from fingerspice.sets.citation import Citation as Citation
+    from fingerspice.sets.parameters import ParameterSet as ParameterSet
+    from fingerspice.sets.parameters import parameters as parameters
     from fingerspice.solve.simulation import plan as plan
     from fingerspice.solve.simulation import simulate as simulate
     from fingerspice.solve.streaming import stream as stream
@@ -38,6 +41,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.capability import capability as capability
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
+    from fingerspice.studies.contactfit import fit_contact as fit_contact
+    from fingerspice.studies.contactresult import ContactFit as ContactFit
     from fingerspice.studies.export import export_netlist as export_netlist
     from fingerspice.studies.feel import Feel as Feel
     from fingerspice.studies.feel import feel as feel
@@ -90,6 +95,8 @@ _HOMES = {
     "studies.comparison": ("Comparison", "compare"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "explorer.server": ("Explorer", "explore"),
+    "studies.contactfit": ("fit_contact",),
+    "studies.contactresult": ("ContactFit",),
     "studies.export": ("export_netlist",),
     "studies.feel": ("Feel", "feel"),
     "studies.fit": ("fit",),
@@ -102,6 +109,8 @@ _HOMES = {
     "results.loading": ("load",),
     "studies.phasors": ("phasor",),
     "results.plan": ("Plan",),
+    "sets.citation": ("Citation",),
+    "sets.parameters": ("ParameterSet", "parameters"),
     "solve.simulation": ("plan", "simulate"),
     "solve.streaming": ("stream",),
     "results.outcome": ("SolveError", "Status"),

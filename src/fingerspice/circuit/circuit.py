@@ -156,6 +156,8 @@ class Circuit(Doors):
     path : Path or None
     overrides : mapping of str to str
         Changes made by `replace`, from path to value as text.
+    sets : mapping of str to mapping
+        Named sets of parameters that were applied, each with the values that it gave, by path.
     related : dict
         Cache of results that depend on nodes and devices alone, shared by all circuits that `replace` derives.
     """
@@ -172,6 +174,7 @@ class Circuit(Doors):
     text: str = ""
     path: Path | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
+    sets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     related: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     _memory: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 

@@ -8,6 +8,7 @@ import math
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.provenance import in_force
 from fingerspice.waveforms.combinations import Product, Sum
 from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.repeated import Burst, Repeat
@@ -54,7 +55,7 @@ def drive_text(circuit: Circuit) -> str:
     Sources that were replaced are left out, since `changes_text` lists them.
     """
     said = []
-    replaced = {path.lower() for path in circuit.overrides}
+    replaced = {path.lower() for path in circuit.overrides} - _given_by_sets(circuit)
     areas = {node for element in circuit.elements if element.spec.is_layer for node in element.nodes[2:]}
     for element in circuit.by_device("V", "I"):
         wave = element.waveform
@@ -66,11 +67,17 @@ def drive_text(circuit: Circuit) -> str:
 
 
 def changes_text(circuit: Circuit) -> str:
-    """Changes made after the deck was read, with the present values: ``Xgap.d = 5 um``; empty without changes."""
+    """Changes made after the deck was read, with the present values: ``Xgap.d = 5 um``; empty without changes.
+
+    Values that a set of parameters gave, and that still hold, are named by the set: ``set moist``.
+    """
     known = {path.lower(): (path, parameter) for path, parameter in circuit.parameters.items()}
-    said = []
+    said = [f"set {name}" for name, (kept, _) in in_force(circuit).items() if kept]
+    given = _given_by_sets(circuit)
     # A path may have been changed twice, in two spellings.
     for path in dict.fromkeys(path.lower() for path in circuit.overrides):
+        if path in given:
+            continue
         if path in known:
             name, parameter = known[path]
             said.append(f"{name} = {_quantity(parameter.value, parameter.unit)}")
@@ -81,6 +88,11 @@ def changes_text(circuit: Circuit) -> str:
             if element.name.lower() == path and element.waveform is not None
         ] or [f"{name} = {_as_given(text)}" for name, text in circuit.overrides.items() if name.lower() == path][-1:]
     return _joined(said)
+
+
+def _given_by_sets(circuit: Circuit) -> set[str]:
+    """Paths of the values that sets of parameters gave and that still hold, in lower case."""
+    return {path.lower() for kept, _ in in_force(circuit).values() for path in kept}
 
 
 def _as_given(text: str) -> str:

@@ -15,7 +15,7 @@ Answer = dict[str, Any]
 #: Keys of every answer.
 COMMON = (
     *("version", "command", "success", "status", "message", "failure", "warnings", "files"),
-    *("title", "overrides", "charge_law", "method", "rtol"),
+    *("title", "overrides", "sets", "charge_law", "method", "rtol"),
 )
 #: Further keys of each command.
 OWN: dict[str, tuple[str, ...]] = {
@@ -54,6 +54,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "export": (),
     "figures": (),
     "explore": ("url",),
+    "sets": ("parameter_sets",),
 }
 #: Figures of a signal; a figure that a signal lacks is null.
 FIGURES = ("min", "max", "peak", "mean", "rms", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
@@ -64,7 +65,7 @@ def blank(command: str | None) -> Answer:
     """An answer with all its keys, before any result is known."""
     keys = (*COMMON, *OWN.get(command or "", ()))
     known = {"version": __version__, "command": command, "success": False}
-    return {**dict.fromkeys(keys), "warnings": [], "files": [], "overrides": {}, **known}
+    return {**dict.fromkeys(keys), "warnings": [], "files": [], "overrides": {}, "sets": [], **known}
 
 
 def of_circuit(circuit: Circuit, charge_law: str | None) -> Answer:
@@ -80,7 +81,8 @@ def of_circuit(circuit: Circuit, charge_law: str | None) -> Answer:
 
     law = charge_law or circuit.charge_law or "local"
     require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
-    return {"title": circuit.title, "overrides": dict(circuit.overrides), "charge_law": law}
+    known = {"title": circuit.title, "overrides": dict(circuit.overrides), "sets": list(circuit.sets)}
+    return {**known, "charge_law": law}
 
 
 def of_run(solution: Solution) -> Answer:

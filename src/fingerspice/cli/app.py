@@ -18,7 +18,10 @@ from fingerspice.cli.arguments import (
     AsJson,
     ChargeLaw,
     Chunk,
+    Coating,
     Deck,
+    Drive,
+    Finger,
     Name,
     NetCdf,
     NoPlot,
@@ -34,9 +37,11 @@ from fingerspice.cli.arguments import (
 )  # fmt: skip
 from fingerspice.cli.explore import explore
 from fingerspice.cli.figures import figures
+from fingerspice.cli.limits import limits
 from fingerspice.cli.options import area_from_text, check_output, read_circuit
 from fingerspice.cli.result_files import Results
 from fingerspice.cli.run_files import Touch, large_sweep, written
+from fingerspice.cli.sets import sets
 from fingerspice.cli.streaming import run_streamed
 from fingerspice.cli.terminal import Answering, answer_usage, listen, plain_errors, progress, say
 from fingerspice.results.outcome import SolveError
@@ -84,6 +89,9 @@ def run(
         str, typer.Option(help="auto, exponential, radau, scipy:LSODA, torchdiffeq:dopri5, ...")
     ] = "auto",
     changes: Set = None,
+    finger: Finger = None,
+    coating: Coating = None,
+    drive: Drive = None,
     source: Source = None,
     stop: Stop = None,
     start: Annotated[
@@ -118,13 +126,15 @@ def run(
 
       fingerspice run circuits/am_carrier.cir --feel
 
+      fingerspice run circuits/fingerpad.cir --finger moist --coating 3M-insulating --drive Fig4-5kHz
+
       fingerspice run long.cir --stream --rtol 1e-5 --signals u_gap,friction
     """
     from fingerspice.results.report import summary_table
     from fingerspice.solve.simulation import simulate
 
     with Answering("run", as_json, charge_law=charge_law, method=method, rtol=rtol, area=area) as answer:
-        circuit = read_circuit(deck, changes, source)
+        circuit = read_circuit(deck, changes, source, finger=finger, coating=coating, drive=drive)
         answer.update(**answers.of_circuit(circuit, charge_law))
         circuit, start = options.with_times(circuit, stop, start)
         if circuit.tran is None:
@@ -200,6 +210,7 @@ def ac(
     with Answering("ac", as_json, charge_law=charge_law, method=how, rtol=rtol, area=area, skin=skin) as answer:
         circuit = read_circuit(deck, changes, source)
         answer.update(**answers.of_circuit(circuit, charge_law))
+        options.check_finger(finger, circuit)
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         data = results.file("_ac.csv")
         picture = None if no_plot else results.file("_ac.png")
@@ -296,65 +307,8 @@ def compare(
         answer.give(lambda: comparison_table(result), writes)
 
 
-@app.command()
-def limits(
-    deck: Deck,
-    out: Out = None,
-    name: Name = None,
-    overwrite: Overwrite = False,
-    points: Annotated[int, typer.Option(help="Values of each parameter.")] = 9,
-    span: Annotated[float, typer.Option(help="Each goes from its value over this to its value times this.")] = 10.0,
-    capability: Annotated[bool, typer.Option("--capability", help="Map the friction it can make instead.")] = False,
-    limit: Annotated[str | None, typer.Option(metavar="V", help="--capability: largest voltage of the source.")] = None,
-    carrier: Annotated[str | None, typer.Option(metavar="HZ", help="--capability: of the drive; none.")] = None,
-    changes: Set = None,
-    source: Source = None,
-    as_json: AsJson = False,
-    no_plot: NoPlot = False,
-) -> None:
-    """Map where DECK folds under the mobile charge law: source voltage against load, gap and frequency.
-
-    Examples:
-
-      fingerspice limits circuits/fingerpad.cir --set Xgap.d=100n --points 7 --out out
-
-      fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
-    """
-    from fingerspice.studies.limits import fold_limits, plot_limits
-    from fingerspice.studies.reports import limits_csv, limits_text
-
-    law = None if capability else "mobile"
-    with Answering("limits", as_json, charge_law=law) as answer:
-        circuit = read_circuit(deck, changes, source)
-        if capability:
-            answer.update(**answers.of_circuit(circuit, None))
-            numbers = designs.number("--limit", limit), designs.number("--carrier", carrier)
-            results = Results(deck, circuit, out, name, overwrite, None)
-            found, writes = designs.capability(circuit, results, not no_plot, *numbers)
-            answer.update(capability=found.to_dict())
-            answer.give(lambda: str(found), writes)
-            return
-        if limit is not None or carrier is not None:
-            raise InputError("--limit and --carrier belong to --capability")
-        answer.update(**answers.of_circuit(circuit, "mobile"))
-        results = Results(deck, circuit, out, name, overwrite, "mobile")
-        table = results.file("_limits.csv")
-        picture = None if no_plot else results.file("_limits.png")
-        with progress("looking for folds") as update:
-            result = fold_limits(circuit, points=points, span=span, progress=update)
-        results.open()
-        writes = [lambda: limits_csv(result, table)]
-        if picture is not None:
-            from fingerspice.plots.drawing import save
-
-            writes.append(lambda: save(plot_limits(result), picture, about=results.about))
-        answer.update(**result.to_dict())
-        answer.give(lambda: limits_text(result), writes)
-
-
-app.command()(designs.design)
-app.command()(fits.fit)
-app.command()(sweeps.sweep)
+for _command in (limits, designs.design, fits.fit, fits.fit_contact, sweeps.sweep):
+    app.command()(_command)
 
 
 @app.command()
@@ -387,6 +341,7 @@ def export(
 
 app.command()(figures)
 app.command()(explore)
+app.command()(sets)
 
 
 @app.callback(invoke_without_command=True)

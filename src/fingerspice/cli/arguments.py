@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -16,8 +16,21 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of
 Rtol = Annotated[float, typer.Option(help="Largest error of gap voltage and force, relative to their peaks.")]
 ChargeLaw = Annotated[str | None, typer.Option(help="local or mobile; the included library's by default.")]
 Set = Annotated[
-    list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Change a value: Xgap.d=3u. May be repeated.")
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="PATH=VALUE|NAME", help="Change a value: Xgap.d=3u; or apply a named set: moist. Repeatable."
+    ),
 ]
+
+
+def _named(kind: str, example: str) -> Any:
+    said = f"Apply a named set of this kind: {example} (list: fingerspice sets)."
+    return typer.Option(f"--{kind}", metavar="[ELEMENT=]NAME", help=said)
+
+
+Finger = Annotated[list[str] | None, _named("finger", "moist, or Xlight=dry for one of several")]
+Coating = Annotated[list[str] | None, _named("coating", "3M")]
+Drive = Annotated[list[str] | None, _named("drive", "Fig4-5kHz")]
 _SPECS = "'SQUARE(200 100)', 'Vdrive=DC 5', 'WAV(a.wav gain=150)', 'TABLE(a.csv)'"
 Source = Annotated[
     list[str] | None,

@@ -1,24 +1,32 @@
-"""The command `fit`, which fits parameters of a deck to measured data and writes table and picture."""
+"""The commands `fit` and `fit-contact`, which fit parameters of a deck to measured data: table and picture."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fingerspice.base.errors import InputError
 from fingerspice.cli import answers
 from fingerspice.cli.arguments import AsJson, ChargeLaw, Deck, Name, NoPlot, Out, Overwrite, Set
 from fingerspice.cli.options import read_circuit
 from fingerspice.cli.result_files import Results
 from fingerspice.cli.terminal import Answering
 
+if TYPE_CHECKING:
+    from fingerspice.studies.contactresult import ContactFit
+    from fingerspice.studies.fitresult import Fit
+
 
 def fit(
     table: Annotated[Path, typer.Argument(metavar="DATA.csv", help="Conditions and a measured mean, with units.")],
     deck: Deck,
     free: Annotated[str, typer.Option(metavar="PATH,...", help="Parameters to fit: Xgap.d,Xgap.r.")],
+    groups: Annotated[
+        str | None, typer.Option(metavar="COLUMN:PATH,...", help="Free parameters of each group: finger:Xgap.d.")
+    ] = None,
     out: Out = None,
     name: Name = None,
     overwrite: Overwrite = False,
@@ -37,7 +45,6 @@ def fit(
       fingerspice fit circuits/measured.csv circuits/fingerpad.cir --free Xgap.d,Xgap.r --skin follow
     """
     with Answering("fit", as_json, charge_law=charge_law) as answer:
-        from fingerspice.plots.drawing import save
         from fingerspice.studies.fit import fit as find
 
         circuit = read_circuit(deck, changes, None)
@@ -45,10 +52,65 @@ def fit(
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         file, image = results.file("_fit.csv"), None if no_plot else results.file("_fit.png")
         paths = [path.strip() for path in free.split(",")]
-        found = find(circuit, table, paths, average=average, skin=skin, charge_law=charge_law, profiles=profile)
-        results.open()
-        writes: list[Callable[[], Path]] = [lambda: found.to_csv(file)]
-        if image is not None:
-            writes.append(lambda: save(found.plot(), image, about=results.about))
-        answer.update(**found.to_dict())
-        answer.give(lambda: str(found), writes)
+        found = find(
+            circuit, table, paths, groups=_groups(groups), average=average, skin=skin, charge_law=charge_law,
+            profiles=profile,
+        )  # fmt: skip
+        _give(answer, results, found, file, image)
+
+
+def _groups(text: str | None) -> dict[str, list[str]] | None:
+    """The argument of `--groups`."""
+    if text is None:
+        return None
+    column, _, paths = text.partition(":")
+    if not (column.strip() and paths.strip()):
+        raise InputError(f"--groups is {text!r}; allowed: a column of the data and paths, such as finger:Xgap.d,Xgap.r")
+    return {column.strip(): [path.strip() for path in paths.split(",")]}
+
+
+def fit_contact(
+    tables: Annotated[
+        list[Path], typer.Argument(metavar="DATA.csv ...", help="Areas and friction forces, with units.")
+    ],
+    deck: Deck,
+    free: Annotated[
+        str | None, typer.Option(metavar="NAME,...", help="alpha,m_exp,beta,n_exp,mu,c2; those that the data tell.")
+    ] = None,
+    finger: Annotated[str | None, typer.Option(metavar="GAP", help="Which of several GAPs.")] = None,
+    out: Out = None,
+    name: Name = None,
+    overwrite: Overwrite = False,
+    profile: Annotated[bool, typer.Option("--profile", help="Profile likelihood of every parameter.")] = False,
+    changes: Set = None,
+    as_json: AsJson = False,
+    no_plot: NoPlot = False,
+) -> None:
+    """Fit the contact of DECK's finger to measured ridge areas and friction forces: values with intervals.
+
+    Example:
+
+      fingerspice fit-contact circuits/contact.csv circuits/indentation.csv circuits/fingerpad.cir
+    """
+    with Answering("fit-contact", as_json) as answer:
+        from fingerspice.studies.contactfit import fit_contact as find
+
+        circuit = read_circuit(deck, changes, None)
+        answer.update(**answers.of_circuit(circuit, None))
+        results = Results(deck, circuit, out, name, overwrite, None)
+        file, image = results.file("_contact.csv"), None if no_plot else results.file("_contact.png")
+        names = None if free is None else [one.strip() for one in free.split(",")]
+        found = find(circuit, list(tables), names, finger=finger, profiles=profile)
+        _give(answer, results, found, file, image)
+
+
+def _give(answer: Answering, results: Results, found: Fit | ContactFit, file: Path, image: Path | None) -> None:
+    """Write table and picture of a fit, and answer."""
+    from fingerspice.plots.drawing import save
+
+    results.open()
+    writes: list[Callable[[], Path]] = [lambda: found.to_csv(file)]
+    if image is not None:
+        writes.append(lambda: save(found.plot(), image, about=results.about))
+    answer.update(**found.to_dict())
+    answer.give(lambda: str(found), writes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,10 +23,11 @@ LONGEST_SOURCE = 1000
 """Largest number of characters of a source's numbers that are stored with the results."""
 
 
-def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | None) -> Circuit:
-    """The deck's circuit with ``--set`` and ``--source``.
+def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | None, **sets: list[str] | None) -> Circuit:
+    """The deck's circuit with the named sets of ``--set`` and of options by kind, ``--set`` values, and ``--source``.
 
-    Gives the reader's warnings, without those about replaced values, and warnings about directives without effect.
+    What comes later in this order has the last word. Gives the reader's warnings, without those about replaced values,
+    and warnings about directives without effect.
     """
     from fingerspice.circuit.notices import directive_warnings
     from fingerspice.netlist.netlist import read_netlist
@@ -35,6 +37,7 @@ def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | Non
         circuit = read_netlist(deck)
     given = circuit.warnings
     try:
+        circuit = _with_sets(circuit, changes or [], sets)
         circuit = _with_changes(circuit, changes or [])
         circuit = _with_sources(circuit, sources or [])
         given = circuit.warnings
@@ -49,10 +52,44 @@ def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | Non
     return circuit
 
 
+def _with_sets(circuit: Circuit, changes: list[str], by_kind: Mapping[str, list[str] | None]) -> Circuit:
+    """The circuit with the sets that ``--set`` and the options of their kinds name, in this order."""
+    from fingerspice.sets.parameters import parameters
+
+    asked = [("set", change) for change in changes if _is_name(change)]
+    asked += [(kind, text) for kind, texts in by_kind.items() for text in texts or []]
+    for option, text in asked:
+        element, equals, name = (part.strip() for part in text.rpartition("="))
+        try:
+            circuit = parameters(name, None if option == "set" else option).apply(circuit, element if equals else None)
+        except InputError as error:
+            other = "; or PATH=VALUE, such as Xgap.d=3u" if option == "set" and "unknown set" in error.message else ""
+            raise InputError(f"--{option} {text!r}: {error.message}{other}") from None
+    return circuit
+
+
+def check_finger(finger: str | None, circuit: Circuit) -> None:
+    """Refuse the name of a set of parameters where the name of a GAP is asked for."""
+    from fingerspice.sets.parameters import parameters
+
+    gaps = {e.name.lower() for e in circuit.by_device("GAP")}
+    if finger is not None and finger.lower() not in gaps and finger.lower() in map(str.lower, parameters()):
+        raise InputError(
+            f"--finger {finger!r} is a set of parameters, and here a GAP is meant; allowed: --set {finger}"
+        )
+
+
+def _is_name(change: str) -> bool:
+    """Whether a ``--set`` names a set of parameters; a path has a dot."""
+    return bool(change) and not set("=.") & set(change)
+
+
 def _with_changes(circuit: Circuit, changes: list[str]) -> Circuit:
     """The circuit with all ``--set`` changes applied together, as two exponents may only be legal together."""
     values: dict[str, str] = {}
     for change in changes:
+        if _is_name(change):
+            continue
         path, equals, text = (part.strip() for part in change.partition("="))
         if not equals or not path:
             raise InputError(f"--set {change!r} is not understood; allowed: PATH=VALUE, such as Xgap.d=3u")

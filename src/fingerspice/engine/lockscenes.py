@@ -16,15 +16,16 @@ from fingerspice.engine.lockstep import (
     PEAK,
     SCALE,
     SHAPE,
+    START_TIMES,
     VALUE,
     Marks,
-    Weights,
     Z,
     area_row,
     n_constants,
     n_state,
     run,
 )  # fmt: skip
+from fingerspice.engine.lockweights import weigh
 from fingerspice.numerics.modes import modes as modes_of
 
 # A table of scenes has three rows for every cell: capacitance (F/m^2), total leakage (S), leakage per area (S/m^2).
@@ -134,61 +135,10 @@ def _modes(
 
 
 @jit
-def moment_integrals(y: float) -> tuple[float, float, float]:
-    """Integrals of exp(-y (1 - s)) s^k over [0, 1] for k = 0, 1, 2, y >= 0."""
-    if y < 0.1:
-        # k = 2: the sum of (-y)^j 2! / (j + 3)! from its last term on; then a recursion down to k = 0, which damps
-        # rounding.
-        total = 0.0
-        for j in range(8, -1, -1):
-            total = 1.0 - y * total * (1.0 / (j + 4.0))
-        second = total / 3.0
-        first = 0.5 * (1.0 - y * second)
-        return 1.0 - y * first, first, second
-    zeroth = -math.expm1(-y) / y
-    first = (1.0 - zeroth) / y
-    return zeroth, first, (1.0 - 2.0 * first) / y
-
-
-@jit
-def weigh(i: int, h: float, rates: FloatArray, drive: FloatArray, g: Weights, marks: Marks) -> None:
-    """Weights of lane i for a step of length 0 and for the pieces, the first of steps of length h (s).
-
-    The first step of all has no step before it; that of a later piece follows a step of half its length.
-    """
-    m_all = len(marks[0])
-    still, first, rest = g
-    for piece in range(first.shape[0]):
-        for m in range(m_all):
-            zeroth, once, twice = moment_integrals(rates[m] * h)
-            i0, i1, i2 = h * zeroth, h * once, h * twice
-            decay, driven, at = 1.0 - rates[m] * i0, drive[m] * i0, m * LANES + i
-            if piece == 0:
-                _set_row(still, at, m_all * LANES, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-                _set_row(first[piece], at, m_all * LANES, (decay, driven, i0, 0.0, i1, i0 - i1, 0.0))
-            else:
-                next_one, now, old = (2.0 * i2 + i1) / 3.0, i0 + i1 - 2.0 * i2, (i2 - i1) * (4.0 / 3.0)
-                after = (decay, driven, i0 + 2.0 * i1, -2.0 * i1, next_one, now, old)
-                _set_row(first[piece], at, m_all * LANES, after)
-            later = (decay, driven, i0 + i1, -i1, 0.5 * (i1 + i2), i0 - i2, 0.5 * (i2 - i1))
-            _set_row(rest[piece], at, m_all * LANES, later)
-        h *= 2.0
-
-
-@jit
 def _scratch(m: int) -> Scratch:
     """Scratch for the cells and modes of one lane, used by all in turn: allocation for each would double the time."""
     row = np.empty((5, m + 1))
     return row[0], row[1], row[2], row[3], row[4], np.empty(m), np.empty((m + 1, m)), np.empty((m + 1, m))
-
-
-@jit
-def _set_row(
-    g: FloatArray, at: int, stride: int, values: tuple[float, float, float, float, float, float, float]
-) -> None:  # fmt: skip
-    """Weights of one mode of one lane, in the order of `lockstep`'s rows."""
-    for row in range(N_WEIGHTS):
-        g[row * stride + at] = values[row]
 
 
 @jit
@@ -320,12 +270,13 @@ def march(
     jumping = pieces > 0
     cells, row = m_all + 1, N_WEIGHTS * m_all * LANES
     c = np.zeros(n_constants(m_all, w_all, l_all, d_all) * LANES)
-    g = (np.empty(row), np.empty((max(pieces, 1), row)), np.empty((max(pieces, 1), row)))
+    g = (np.empty(row), np.empty((pieces if jumping else 4, 3, row)))
     s, last = np.empty(n_state(m_all, l_all, count) * LANES), np.empty(count * LANES)
     start, back, closing = np.empty(m_all * LANES), np.zeros(m_all * LANES), np.zeros(LANES)
-    rates, drive = np.empty((LANES, m_all)), np.empty((LANES, m_all))
+    rates, drive = np.empty((m_all, LANES)), np.empty((m_all, LANES))
     scratch = _scratch(m_all)
     b, top, work = np.empty(N_OTHERS * LANES), np.empty(LANES), np.empty((2, LANES))
+    length, moments = np.empty(LANES), np.empty((11, LANES))
     column, tail, area = np.empty(table.shape[0]), np.empty(LANES), area_row(m_all, w_all, l_all)
     voltages = np.empty(LANES * traces[0].shape[1]), np.empty(LANES * traces[1].shape[1])
     for first in range(0, pending.size, LANES):
@@ -350,20 +301,20 @@ def march(
                 tail[i] = math.inf
             column[:] = table[:, pending[min(first + i, pending.size - 1)]]
             scratch[4][0] = c[(area + d_all) * LANES + i]
-            _lane(i, places, column, source[0], jumping, c, start, rates[i], drive[i], scratch, marks)
+            _lane(i, places, column, source[0], jumping, c, start, rates[:, i], drive[:, i], scratch, marks)
             if periodic:
                 period = 2.0 * math.pi / b[OMEGA * LANES + i]
                 for m in range(m_all):
-                    back[m * LANES + i] = -1.0 / math.expm1(-rates[i, m] * period)
+                    back[m * LANES + i] = -1.0 / math.expm1(-rates[m, i] * period)
         for w in range(2):
             if source[1][w].size == 0:
                 continue
             steps = half // 2 if w == 0 else half
             # All pieces together are 2^pieces - 1 times the first, which has steps / pieces of the shortest steps.
-            shorter = max(pieces, 1) / (2.0 ** max(pieces, 1) - 1.0)
+            shorter = pieces / (2.0**pieces - 1.0) if jumping else START_TIMES[1]
             for i in range(LANES):
-                h = math.pi / b[OMEGA * LANES + i] / steps * shorter
-                weigh(i, h, rates[i], drive[i], g, marks)
+                length[i] = math.pi / b[OMEGA * LANES + i] / steps * shorter
+            weigh(length, rates, drive, g, moments, marks)
             for _ in range(MOST_PERIODS if periodic else 1):
                 s[:] = 0.0
                 s[: m_all * LANES] = start

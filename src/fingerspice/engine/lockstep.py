@@ -5,7 +5,7 @@ exponential Adams method (Hochbruck and Ostermann 2010, section 2.5) solves the 
 z' = -rate z + drive w + n(w, z), with n linear in dq = 1/A - 1/A0 times the voltages of the leaks, which are the cells
 whose leak has a total resistance, and dq a polynomial in |u_gap|. The waves w are sine and cosine of every tone of the
 source, without a drive, as z is then what is left beside the steady response; or the value of a source of constant
-pieces. Each step predicts with order 2, evaluates the nonlinear term once, and corrects with order 3.
+pieces. Each step predicts with order 3, evaluates the nonlinear term once, and corrects with order 4.
 
 A block holds `LANES` scenes, one in each lane, and every quantity is a row with one entry for each lane. The only loop
 over the lanes is in a function of its own, whose inner loops have constant lengths: `modes` and `powers` are tuples of
@@ -25,21 +25,26 @@ from fingerspice.base.compiled import jit, jit_rows
 
 LANES = 16
 """Scenes of a block."""
+START_TIMES = (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0, 1.5, 2.0)
+"""Times of the shorter steps at the start of a run without jumps, in steps."""
+START = len(START_TIMES) - 1
 
 Marks = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 """Tuples of which only the lengths count: of the modes, waves, leaks, powers of the polynomial and moments."""
 
-Weights = tuple[FloatArray, NDArray[np.float64], NDArray[np.float64]]
-"""Weights of a step of length 0; and for every piece of a window, those of its first step and of all other steps."""
+Weights = tuple[FloatArray, NDArray[np.float64]]
+"""Weights of a step of length 0; and for every piece of a window those of its first and second step and of all others,
+shape (pieces, 3, n)."""
 
 # Rows of the constants: the scale of |u| to [-1, 1]; u by modes, and by waves; the voltages of the leaks by waves, and
 # by modes, leak after leak; n by leaks, mode after mode; and the polynomial of 1/A.
 SCALE, SHAPE = 0, 1
 # Rows of the weights, each for every mode: decay, drive; predictor's weights of the nonlinear term at this step and the
-# one before; corrector's weights at the next step, this one and the one before.
-DECAY, DRIVE, PREDICT, PREDICT_OLD, CORRECT, CORRECT_NOW, CORRECT_OLD, N_WEIGHTS = 0, 1, 2, 3, 4, 5, 6, 7
-# Rows of the state for every mode: z, the nonlinear term now and a step before, and two scratch rows of the step.
-Z, RATE, OLD, KEPT, GUESS, N_STATE = 0, 1, 2, 3, 4, 5
+# two before; corrector's weights at the next step, this one and the two before.
+DECAY, DRIVE, PREDICT, PREDICT_OLD, PREDICT_OLDER = 0, 1, 2, 3, 4
+CORRECT, CORRECT_NOW, CORRECT_OLD, CORRECT_OLDER, N_WEIGHTS = 5, 6, 7, 8, 9
+# Rows of the state for every mode: z, the nonlinear term now, one and two steps before, and two scratch rows of a step.
+Z, RATE, OLD, OLDER, KEPT, GUESS, N_STATE = 0, 1, 2, 3, 4, 5, 6
 # Rows of the state after those: gap voltage, its peak, then the integrands' latest values and their weighted sums, and
 # last dq times the voltage of every leak.
 GAP, PEAK, VALUE = 0, 1, 2
@@ -93,6 +98,7 @@ def _step(
             kept += g[(DRIVE * m_all + m) * LANES + i] * before
             guess = kept + g[(PREDICT * m_all + m) * LANES + i] * s[(RATE * m_all + m) * LANES + i]
             guess += g[(PREDICT_OLD * m_all + m) * LANES + i] * s[(OLD * m_all + m) * LANES + i]
+            guess += g[(PREDICT_OLDER * m_all + m) * LANES + i] * s[(OLDER * m_all + m) * LANES + i]
             s[(KEPT * m_all + m) * LANES + i] = kept
             s[(GUESS * m_all + m) * LANES + i] = guess
             u += c[(SHAPE + m) * LANES + i] * guess
@@ -113,11 +119,13 @@ def _step(
             rate = c[(of_leak + m * l_all) * LANES + i] * s[current * LANES + i]
             for k in range(1, l_all):
                 rate += c[(of_leak + m * l_all + k) * LANES + i] * s[(current + k) * LANES + i]
-            now = s[(RATE * m_all + m) * LANES + i]
+            now, old = s[(RATE * m_all + m) * LANES + i], s[(OLD * m_all + m) * LANES + i]
             z = s[(KEPT * m_all + m) * LANES + i] + g[(CORRECT * m_all + m) * LANES + i] * rate
             z += g[(CORRECT_NOW * m_all + m) * LANES + i] * now
-            z += g[(CORRECT_OLD * m_all + m) * LANES + i] * s[(OLD * m_all + m) * LANES + i]
+            z += g[(CORRECT_OLD * m_all + m) * LANES + i] * old
+            z += g[(CORRECT_OLDER * m_all + m) * LANES + i] * s[(OLDER * m_all + m) * LANES + i]
             s[(Z * m_all + m) * LANES + i] = z
+            s[(OLDER * m_all + m) * LANES + i] = old
             s[(OLD * m_all + m) * LANES + i] = now
             s[(RATE * m_all + m) * LANES + i] = rate
             u += c[(SHAPE + m) * LANES + i] * z
@@ -154,27 +162,57 @@ def quadrature(k: int, steps: int) -> float:
 
 
 @jit
-def _window(
-    c: FloatArray, g: tuple[FloatArray, FloatArray], s: FloatArray, wave: FloatArray, place: int, turned: bool,
-    steps: int, unit: float, trace: FloatArray, at: int, marks: Marks,
-) -> None:  # fmt: skip
-    """Take `steps` steps of one length, a range of Gregory's rule; gap voltages go to trace (LANES, n) from `at` on.
+def _record(s: FloatArray, gap: int, trace: FloatArray, at: int) -> None:
+    """Write the gap voltages, row `gap` of the state, into column `at` of the trace, shape (LANES, n)."""
+    if trace.size > 0:
+        stride = trace.size // LANES
+        for i in range(LANES):
+            trace[i * stride + at] = s[gap * LANES + i]
 
-    `g` holds the weights of the first step and of all others, `unit` is the length of a step in those of the sums, and
-    `place` is the row of the waves at the start; a `turned` source stays there.
+
+@jit
+def _window(
+    c: FloatArray, g: NDArray[np.float64], s: FloatArray, wave: FloatArray, places: tuple[int, int, int],
+    steps: tuple[int, int], unit: float, trace: FloatArray, at: int, marks: Marks,
+) -> None:  # fmt: skip
+    """Take steps of one length, a range of Gregory's rule.
+
+    Parameters
+    ----------
+    g : ndarray, shape (3, n)
+        Weights of the first, second and all further steps.
+    places : tuple of int
+        Row of the waves at the start, its change from step to step, and the row after which the first one follows.
+    steps : tuple of int
+        Number of steps, and how many of this length precede them.
+    unit : float
+        Length of a step, in that of the sums.
+    trace : ndarray, shape (LANES * n,) or (0,)
+        Takes the gap voltages before the steps, from `at` on unless that is negative.
     """
-    count, own, stride = len(marks[4]), N_STATE * len(marks[0]), trace.shape[0] // LANES
-    _add_latest(own + VALUE, count, unit * quadrature(0, steps), s)
-    weights = g[0]
-    for k in range(steps):
-        if trace.size > 0:
-            for i in range(LANES):
-                trace[i * stride + at + k] = s[(own + GAP) * LANES + i]
+    count, own = len(marks[4]), N_STATE * len(marks[0])
+    place, stride, period = places
+    _add_latest(own + VALUE, count, unit * quadrature(0, steps[0]), s)
+    for k in range(steps[0]):
+        if at >= 0:
+            _record(s, own + GAP, trace, at + k)
         before = wave[place, 0]
-        if not turned:
-            place = place + 1 if place + 1 < wave.shape[0] else 0
-        _step(c, weights, s, wave[place], before, unit * quadrature(k + 1, steps), marks)
-        weights = g[1]
+        place = place + stride if place + stride != period else 0
+        weight = unit * quadrature(k + 1, steps[0])
+        _step(c, g[min(k + steps[1], 2)], s, wave[place], before, weight, marks)
+
+
+@jit
+def _ease_in(
+    c: FloatArray, g: NDArray[np.float64], s: FloatArray, wave: FloatArray, trace: FloatArray, marks: Marks
+) -> None:  # fmt: skip
+    """The first two steps of a run, in `START` shorter ones, as the first of all has no step before it."""
+    period, gap = wave.shape[0] - START - 1, N_STATE * len(marks[0]) + GAP
+    _record(s, gap, trace, 0)
+    _window(c, g[0], s, wave, (period, 1, period), (4, 0), 0.125, trace, -1, marks)
+    _window(c, g[1], s, wave, (period + 4, 1, period), (2, 0), 0.25, trace, -1, marks)
+    _record(s, gap, trace, 1)
+    _window(c, g[2], s, wave, (period + 6, 1, period), (2, 0), 0.5, trace, -1, marks)
 
 
 @jit
@@ -188,8 +226,9 @@ def run(
     ----------
     c, g, s : ndarray
         Constants, weights and state, each flat.
-    wave : ndarray, shape (n, len(waves))
-        Waves at the n steps of a period; in the two halves of a period if the source is turned.
+    wave : ndarray, shape (n + START + 1, len(waves)) or (2, 1)
+        Waves at the n steps of a period, and at the times of the shorter steps at the start (`START_TIMES`); for a
+        turned source its values in both halves of a period.
     how : tuple
         Number of half periods; of steps in each; and whether the source is turned: it is constant for a half period,
         then jumps to its negative, and the method restarts. Such a half period has the pieces that `g` has: of equally
@@ -211,19 +250,26 @@ def run(
     while done < halves:
         if done == halves - 2:
             last[:] = s[sums : sums + last.size]
-        # A source without jumps is integrated in one piece up to the last period.
-        ahead = 1 if turned or halves < 2 else (halves - 2 if done < halves - 2 else 2)
-        place = done % 2 * (1 if turned else half)
-        restart = turned or done == 0
-        if restart:
+        if turned or done == 0:
             # A step of length 0 evaluates the nonlinear term and the integrands.
-            _step(c, g[0], s, wave[place], 0.0, 0.0, marks)
-        steps, unit = ahead * half // pieces, pieces / (2.0**pieces - 1.0)
-        for piece in range(pieces):
-            weights = (g[1][piece] if restart else g[2][piece], g[2][piece])
-            at = done * half + piece * steps
-            _window(c, weights, s, wave, place, turned, steps, unit, trace, at, marks)
-            unit *= 2.0
+            _step(c, g[0], s, wave[done % 2 if turned else 0], 0.0, 0.0, marks)
+        if turned:
+            steps, unit = half // pieces, pieces / (2.0**pieces - 1.0)
+            for piece in range(pieces):
+                at = done * half + piece * steps
+                _window(c, g[1][piece], s, wave, (done % 2, 0, -1), (steps, 0), unit, trace, at, marks)
+                unit *= 2.0
+            done += 1
+            continue
+        # A source without jumps is integrated in one piece up to the last period.
+        ahead = halves if halves <= 2 else (halves - 2 if done == 0 else 2)
+        begun = 0
+        if done == 0:
+            _ease_in(c, g[1], s, wave, trace, marks)
+            begun = 2
+        place = (done % 2 * half + begun) % (2 * half)
+        steps, before = ahead * half - begun, 0 if done == 0 else 2
+        _window(c, g[1][3], s, wave, (place, 1, 2 * half), (steps, before), 1.0, trace, done * half + begun, marks)
         done += ahead
     for i in range(last.size):
         last[i] = s[sums + i] - last[i]

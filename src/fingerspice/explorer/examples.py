@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from fingerspice.base.units import spice_text
+from fingerspice.sets.parameters import parameters
+
 _COAT = "Xcoat   drive top  area  LAYER d=1u eps_r=3.9 r=0.2meg"
 _CONTACT = "alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
 _GAP = f"Xgap    top   skin area  GAP   d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3\n+                              {_CONTACT}"
@@ -85,8 +88,14 @@ _TONES = _deck(
     "Vfast   fast  0          SIN(0 80 5k)",
     *(_COAT, _GAP, _DISPERSIVE, ".tran 1u 30m uic"),
 )
-_WET = _made(_GAP, eps_r="4", r="20k", mu="0.7")
-_DRY = _made(_GAP, d="5u", r="100meg", mu="0.2")
+
+
+def _gap_of(finger: str) -> str:
+    """The line of Table 1's gap with the values in which a named set of parameters differs from the normal finger."""
+    normal, values = parameters("normal").values, parameters(finger).values
+    changed = [v for path, v in values.items() if v.element == "gap" and v.value != normal[path].value]
+    return _made(_GAP, **{v.parameter: spice_text(v.value) if v.unit else f"{v.value:g}" for v in changed})
+
 
 EXAMPLES: tuple[Example, ...] = (
     Example("sine", "Sine, 100 Hz (Fig. 4, left)", "Table 1: the layers leak, and the force follows the sine.",
@@ -113,10 +122,10 @@ EXAMPLES: tuple[Example, ...] = (
             _finger("Chirp", "CHIRP(150 20 2k 0.3)", _DISPERSIVE, "20u 0.3")),
     Example("bursts", "Bursts of 5 kHz", "Ten cycles every 10 ms: the finger feels 100 Hz.",
             _finger("Bursts of 5 kHz", "BURST(200 5k 10 10m)", _DISPERSIVE, "5u 50m")),
-    Example("wet", "Wet finger", "Moisture in the gap conducts: values for illustration, not measured ones.",
-            _finger("Wet finger, 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m", gap=_WET)),
-    Example("dry", "Dry finger", "A wide gap that hardly leaks: values for illustration, not measured ones.",
-            _finger("Dry finger, 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m", gap=_DRY)),
+    Example("wet", "Moist finger", "Sweat in the gap conducts: the set `moist`, whose leak and friction are assumed.",
+            _finger("Moist finger, 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m", gap=_gap_of("moist"))),
+    Example("dry", "Dry finger", "The gap hardly leaks: the set `dry`, whose leak and friction are assumed.",
+            _finger("Dry finger, 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m", gap=_gap_of("dry"))),
     Example("fold", "Fold of the mobile law", "A thin gap under the law `mobile`: no solution, and why.",
             _finger("A gap of 10 nm under the law mobile", "SIN(0 200 100)", _skin("100"), "10u 50m",
                     gap=_made(_GAP, d="10n")), {"charge_law": "mobile"}),

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from fingerspice.results.solution import Solution
+    from fingerspice.sets.citation import Citation
 
 
 class Doors(Shown):
@@ -64,3 +65,15 @@ class Doors(Shown):
         from fingerspice.explorer.server import explore
 
         return explore(self)  # type: ignore[arg-type]
+
+    def cite(self) -> Citation:
+        """What to cite for this run: the model's paper, the program, and the sets of parameters that were applied.
+
+        Returns
+        -------
+        Citation
+            ``print`` shows the text and the BibTeX, which is also in `Citation.bibtex`.
+        """
+        from fingerspice.sets.citation import cite
+
+        return cite(self.circuit, self.method)  # type: ignore[attr-defined]

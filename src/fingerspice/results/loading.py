@@ -106,7 +106,7 @@ def _solution(file: Any) -> Solution:
         area_mode=str(run["area_mode"]),
         method=str(run["method"]),
         plan=Plan(**{**plan, "reasons": tuple(plan["reasons"]), "rates": tuple(plan["rates"])}),
-        circuit=_circuit(file, run["overrides"]),
+        circuit=_circuit(file, run["overrides"])._with(sets=_sets(file)),
         state=_state(run["state"], str(run["charge_law"])),
         fundamental=None if run["fundamental"] is None else Fundamental(**run["fundamental"]),
         period=run["period"],
@@ -179,6 +179,12 @@ def _circuit(file: Any, overrides: dict[str, str]) -> Circuit:
             stacklevel=4,
         )
         return Circuit(title, (), text=text, overrides=dict(overrides))
+
+
+def _sets(file: Any) -> dict[str, dict[str, float | Waveform]]:
+    """The named sets of parameters that were applied; files of earlier versions name none."""
+    found = json.loads(_text(file.attrs["sets"])) if "sets" in file.attrs else {}
+    return {str(name): {path: _value(text) for path, text in values.items()} for name, values in found.items()}
 
 
 def _value(text: str) -> float | Waveform:

@@ -258,6 +258,7 @@ class Solution(Sealed, Doors, Figured):
             "file": str(self.circuit.path or ""),
             "deck": self.circuit.text,
             "overrides": json.dumps(dict(self.circuit.overrides)),
+            "sets": json.dumps({n: {path: repr(x) for path, x in s.items()} for n, s in self.circuit.sets.items()}),
             "charge_law": self.charge_law,
             "area": self.area_mode,
             "method": self.method,

@@ -10,26 +10,29 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, LOSS, OMEGA, REST, STRESS, march
-from fingerspice.engine.lockstep import ALL_MOMENTS
+from fingerspice.engine.lockstep import ALL_MOMENTS, START_TIMES
 from fingerspice.studies.batchscenes import Curves, LockstepForm, curves_of, table_of
 from fingerspice.studies.batchtask import LOCKSTEP, Answers, Task
 
 # Initial number of steps per period, and initial degree of the area's polynomial, by the smallest rtol served.
-_RUNGS = ((5e-4, 32, 8), (5e-5, 48, 8), (5e-6, 80, 12), (5e-7, 144, 12), (0.0, 192, 16))
+_RUNGS = ((5e-4, 32, 8), (5e-5, 48, 8), (5e-6, 80, 12), (5e-7, 144, 12), (0.0, 288, 16))
 _HIGHEST_DEGREE, _MOST_STEPS = 24, 8192
 # Largest gap voltage that the area's polynomial covers, as a ratio to its estimate, at first and later.
 _COVERED, _COVERED_LATER = 1.2, 1.5
 # Allowed defect of the periodic state relative to rtol, and the relative round-off added to every stated error.
 CLOSING, ROUNDING = 0.02, 1e-11
-# The stated error is _STATED times the change from half the steps to all steps: at kinks the order is 2, which gives a
-# third, and elsewhere the order is 3 or more. As the change may be small by chance, doubling the steps may not reduce
-# the stated error by more than the factor _MOST_GAIN.
-_STATED, _MOST_GAIN = 1.0 / 3.0, 12.0
+# The stated error is this share of the change from half the steps to all steps, by the smallest rtol served. The order
+# is 4, which would give a fifteenth. But the kink of 1/A where the gap voltage is 0 has order 2, with a factor that
+# depends on where between two steps it falls: that is most of a small error. Pieces of 4 and of 8 steps are still far
+# from the order. As the change may be small by chance, doubling the steps may not reduce the stated error by more than
+# the factor _MOST_GAIN.
+_STATED, _STATED_JUMPING = ((5e-6, 0.25), (0.0, 0.5)), 0.5
+_MOST_GAIN = 24.0
 # Longest first step after a jump of the source, in time constants of the fastest cell.
 _LONGEST_STEP = 1.0
 # Steps of a piece of a square's half period by the smallest rtol served; and the number by which the first step, with
 # `_PIECE_START` steps a piece, is shorter than the fastest cell's time constant.
-_PIECES = ((5e-5, 8), (5e-6, 12), (5e-7, 24), (0.0, 48))
+_PIECES = ((5e-5, 8), (5e-7, 12), (0.0, 24))
 _PIECE_START, _MOST_PIECES = 2, 20
 # A scene is accepted if its stated error is at most this fraction of rtol, because the stated error is an estimate.
 _ENOUGH = 0.7
@@ -58,12 +61,13 @@ def in_lockstep(name: str) -> bool:
 
 
 def _waves(n: int, form: LockstepForm) -> FloatArray:
-    """Sine and cosine of every tone at n steps of the source's period; for a square, its value in both halves."""
+    """Sine and cosine of every tone at the times that `engine.lockstep.run` needs; a square's value in both halves."""
     if n == 0 or form.jumping:
         return np.array([[1.0], [-1.0]])[: 2 * n]
     # The phase in turns is reduced before it is multiplied by 2 pi, so that high tones keep their accuracy.
-    turns = np.outer(np.arange(n), form.multiples) % n * (2.0 * np.pi / n)
-    return np.stack([np.sin(turns), np.cos(turns)], axis=2).reshape(n, -1)
+    times = np.concatenate([np.arange(n), START_TIMES])
+    turns = np.outer(times, form.multiples) % n * (2.0 * np.pi / n)
+    return np.stack([np.sin(turns), np.cos(turns)], axis=2).reshape(times.size, -1)
 
 
 def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halves: int) -> Answers:
@@ -202,4 +206,7 @@ class _Level(NamedTuple):
             changes.append(off / np.where(peak > 0.0, peak, 1.0))
         # The area's polynomial of the run with half the steps may be another one.
         change = np.max(changes, axis=0) + run.coarse[-1]
-        return np.asarray(_STATED * change + tail + 2.0 * closing + ROUNDING)
+        share = next(s for least, s in _STATED if self.task.rtol >= least)
+        if self.form.jumping:
+            share = _STATED_JUMPING
+        return np.asarray(share * change + tail + 2.0 * closing + ROUNDING)

@@ -18,13 +18,17 @@ from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.solve.simulation import RTOL_RANGE
 from fingerspice.studies.batch import batch
 from fingerspice.studies.fitdata import IMPEDANCE, Data, data_of
-from fingerspice.studies.fitprofile import profile_of
-from fingerspice.studies.fitresult import Fit, fit_result
+from fingerspice.studies.fitgroups import Unknown, group_column, unknowns_of
+from fingerspice.studies.fitprofile import limit_of, profile_of
+from fingerspice.studies.fitresult import Fit, Fitted, fit_result
 from fingerspice.studies.fittask import REFUSED, Task, followed
 from fingerspice.waveforms.waveform import require
 
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.
 _SPREAD, _FOLLOWED = 4.0, 3
+# Errors of unknown size are equal shares of the data unless errors equal for all are likelier by this logarithm. The
+# choice takes a degree of freedom, and is made where so many are there; else errors are taken as equal.
+_CLEARLY, _CHOOSING = 2.0, 4
 # Error of the means by which starts are compared.
 _ROUGH = 1e-3
 
@@ -35,6 +39,7 @@ def fit(
     parameters: Sequence[str],
     *,
     bounds: Mapping[str, tuple[float, float]] | None = None,
+    groups: Mapping[str, Sequence[str]] | None = None,
     average: str = "periodic",
     skin: str = "own",
     charge_law: str | None = None,
@@ -53,13 +58,17 @@ def fit(
         under which they were measured, as paths (``Vdrive.amplitude``, ``source.frequency``, ``Xgap.fn``); or ``t``
         and a signal over time (``f_el``, ``f_t``, ``friction``, ``area``, ``u_gap``); or ``frequency`` and
         ``impedance``, the magnitude (ohm) of what the source sees, with ``impedance_phase`` (deg) where it is known.
-        ``sigma`` is the standard deviation of every value; where it is missing, it is taken as equal for all (of
-        impedances, as equal shares) and estimated from the residuals. A table (CSV)
-        has the columns in a header, with units: ``Vdrive.amplitude (V), f_el_mean (mN)``.
+        ``sigma`` is the standard deviation of every value; where it is missing, it is estimated from the residuals, as
+        equal shares of the values or, where that is clearly likelier, as equal for all (so, too, of signals over time,
+        and where hardly more data than parameters are given; of impedances always as equal shares). A table (CSV) has
+        the columns in a header, with units: ``Vdrive.amplitude (V), f_el_mean (mN)``.
     parameters : sequence of str
         Paths of the parameters to fit.
     bounds : mapping of str to tuple of float, optional
         Smallest and largest value by path.
+    groups : mapping of str to sequence of str, optional
+        The column that tells which measurements belong together, and the parameters of which every such group has its
+        own: ``{"finger": ["Xgap.d"]}``. The others are the same for all.
     average : str
         ``"periodic"`` (means over a period of the periodic state) or ``"run"`` (over the deck's run).
     skin : str
@@ -84,10 +93,12 @@ def fit(
         If a column, unit or path is unknown, there are fewer data than parameters, or no start can be run.
     """
     require_circuit(circuit)
-    task = _task(circuit, data, parameters, bounds, average, skin, charge_law, rtol)
+    table, unknowns = _request(circuit, data, parameters, groups)
+    task = _task(circuit, table, unknowns, bounds, average, skin, charge_law, rtol)
     require_number("starts", starts, "a whole number")
     require(starts >= 1, "starts", starts, "1 or more")
-    wanted = _profiled(task.paths, profiles)
+    names = tuple(one.name for one in task.unknowns)
+    wanted = profiled(names, profiles)
     ends = [followed(task, begin) for begin in _starts(task, int(starts))]
     best = min(ends, key=lambda end: end.objective)
     if not best.objective < 0.5 * REFUSED**2:
@@ -95,10 +106,45 @@ def fit(
             "none of the starts can be run: there is no contact, no solution, or a value out of range; allowed: a "
             "circuit that runs under the conditions of the data"
         )
+    spare = task.target.size - len(unknowns)
+    chosen = table.sigma is None and table.t is None and table.signal != IMPEDANCE and spare >= _CHOOSING
+    if chosen:
+        task, ends = _with_likelier_noise(task, ends, best)
+        best = min(ends, key=lambda end: end.objective)
     found = fit_result(
-        task.circuit, task.data, task.paths, task.bounds, best, [end.objective for end in ends], task.scale
+        task.circuit,
+        task.data,
+        task.unknowns,
+        task.bounds,
+        best,
+        [end.objective for end in ends],
+        task.scale,
+        spare - chosen,
     )
-    return replace(found, profiles={path: profile_of(task, best, path, _error(found, path)) for path in wanted})
+    limit = limit_of(best.objective, found.freedom, given=task.data.sigma is not None)
+    return replace(
+        found,
+        profiles={name: profile_of(task, names, best, name, _error(found, name), limit) for name in wanted},
+    )
+
+
+def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[Task, list[Fitted]]:
+    """The fits with errors that are equal shares of the data, or, where this is clearly likelier, equal for all.
+
+    The largest likelihood of normal errors of unknown size is RSS^(-n/2) over the product of the scales.
+    """
+    predicted = np.abs(task.target + best.residual * task.scale)
+    if not np.all(predicted > 0.0) or best.objective == 0.0:
+        return task, ends
+    shares = replace(task, scale=predicted)
+    others = [followed(shares, end.values) for end in ends]
+    least, n = min(end.objective for end in others), predicted.size
+    equal = 0.5 * n * math.log(best.objective) + float(np.log(task.scale).sum())
+    return (
+        (shares, others)
+        if 0.5 * n * math.log(least) + float(np.log(predicted).sum()) < equal + _CLEARLY
+        else (task, ends)
+    )
 
 
 def _error(found: Fit, path: str) -> float:
@@ -106,7 +152,7 @@ def _error(found: Fit, path: str) -> float:
     return found.estimates[path].error / found.estimates[path].value
 
 
-def _profiled(paths: tuple[str, ...], wanted: bool | Sequence[str]) -> list[str]:
+def profiled(paths: tuple[str, ...], wanted: bool | Sequence[str]) -> list[str]:
     """The paths whose profiles are wanted, in the circuit's own spelling."""
     if isinstance(wanted, bool):
         return list(paths) if wanted else []
@@ -117,14 +163,11 @@ def _profiled(paths: tuple[str, ...], wanted: bool | Sequence[str]) -> list[str]
     return [known[path.lower()] for path in wanted]
 
 
-def _task(
+def _request(
     circuit: Circuit, data: Mapping[str, ArrayLike] | str | Path, parameters: Sequence[str],
-    bounds: Mapping[str, tuple[float, float]] | None, average: str, skin: str, charge_law: str | None, rtol: float,
-) -> Task:  # fmt: skip
-    """The checked request."""
-    require(average in ("periodic", "run"), "average", repr(average), "'periodic' or 'run'")
-    require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
-    require(RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-13 to 0.1")
+    groups: Mapping[str, Sequence[str]] | None,
+) -> tuple[Data, tuple[Unknown, ...]]:  # fmt: skip
+    """The checked data, and what is to be fitted to them."""
     if isinstance(parameters, str) or not parameters:
         raise InputError(f"parameters is {parameters!r}; allowed: a sequence of paths such as ['Xgap.d', 'Xgap.r']")
     known = {path.lower(): path for path in circuit.parameters}
@@ -132,21 +175,35 @@ def _task(
         if path.lower() not in known:
             circuit.varied({path: 1.0})
     paths = tuple(known[path.lower()] for path in parameters)
-    table = data_of(circuit, data)
+    by = group_column(circuit, groups)
+    table = data_of(circuit, data, by)
     both = sorted(set(paths) & set(table.conditions))
     if both:
         raise InputError(f"{both[0]} is to be fitted, and is a condition of the data; allowed: one of both")
-    count = table.values.size * (1 if table.phase is None else 2)
-    if count < len(paths):
-        raise InputError(f"{count} data cannot tell {len(paths)} parameters; allowed: at least as many data")
-    initial = [circuit.parameters[path].value for path in paths]
-    for path, value in zip(paths, initial, strict=True):
+    for path in paths:
+        value = circuit.parameters[path].value
         if not (math.isfinite(value) and value > 0.0):
             raise InputError(f"{path} is {value:g}, and is fitted in its logarithm; allowed: finite and more than 0")
+    unknowns = unknowns_of(paths, (groups or {}).get(by or "", ()), table.groups)
+    count = table.values.size * (1 if table.phase is None else 2)
+    if count < len(unknowns):
+        raise InputError(f"{count} data cannot tell {len(unknowns)} parameters; allowed: at least as many data")
+    return table, unknowns
+
+
+def _task(
+    circuit: Circuit, table: Data, unknowns: tuple[Unknown, ...], bounds: Mapping[str, tuple[float, float]] | None,
+    average: str, skin: str, charge_law: str | None, rtol: float,
+) -> Task:  # fmt: skip
+    """The checked request."""
+    require(average in ("periodic", "run"), "average", repr(average), "'periodic' or 'run'")
+    require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
+    require(RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-13 to 0.1")
     target, scale = _target(table)
     exact = is_stack(circuit) and build_stack(circuit).contact is not None and table.signal != IMPEDANCE
-    box = _bounds(paths, initial, bounds or {})
-    return Task(circuit, table, paths, box, average, skin, rtol, charge_law, target, scale, exact)
+    every = tuple(one.path for one in unknowns)
+    box = bounds_of(every, [circuit.parameters[path].value for path in every], bounds or {})
+    return Task(circuit, table, unknowns, box, average, skin, rtol, charge_law, target, scale, exact)
 
 
 def _target(table: Data) -> tuple[FloatArray, FloatArray]:
@@ -162,7 +219,8 @@ def _target(table: Data) -> tuple[FloatArray, FloatArray]:
     return np.concatenate([table.values, table.phase]), np.concatenate([scale, np.degrees(scale / sizes)])
 
 
-def _bounds(paths: tuple[str, ...], initial: list[float], given: Mapping[str, tuple[float, float]]) -> FloatArray:
+def bounds_of(paths: tuple[str, ...], initial: list[float], given: Mapping[str, tuple[float, float]]) -> FloatArray:
+    """Smallest and largest values of the parameters, shape (n_parameter, 2); 0 and infinity where none are given."""
     lower = {path.lower(): tuple(pair) for path, pair in given.items()}
     unknown = [path for path in given if path.lower() not in {p.lower() for p in paths}]
     if unknown:
@@ -192,7 +250,9 @@ def _starts(task: Task, count: int) -> list[FloatArray]:
     tried = np.vstack([initial, np.exp(np.log(low) + share * np.log(high / low))])
     rows, n = task.data.values.size, len(tried)
     table = {path: np.tile(x, n) for path, x in task.data.conditions.items()}
-    table |= {path: np.repeat(tried[:, k], rows) for k, path in enumerate(task.paths)}
+    for path in dict.fromkeys(one.path for one in task.unknowns):
+        own = [k for k, one in enumerate(task.unknowns) if one.path == path]
+        table[path] = (tried[:, own] @ task.members[own]).ravel()
     periodic = task.average == "periodic"
     found = batch(
         task.circuit, table, outputs=(f"{task.data.signal}_mean",), rtol=_ROUGH, periodic=periodic, skin=task.skin

@@ -14,7 +14,8 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
-from fingerspice.waveforms.columns import read_text_columns
+from fingerspice.studies.fitgroups import Groups, labels_of
+from fingerspice.waveforms.columns import read_labelled_columns, read_text_columns
 from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file
 
 #: Signals that can be fitted, over time or (with ``_mean``) as means, and their units.
@@ -44,6 +45,8 @@ class Data:
         Times, s.
     phase : ndarray, shape (n,), or None
         Phase of an impedance, deg.
+    groups : Groups or None
+        Which measurements belong together, such as those of one finger.
     """
 
     signal: str
@@ -52,6 +55,7 @@ class Data:
     conditions: dict[str, FloatArray]
     t: FloatArray | None = None
     phase: FloatArray | None = None
+    groups: Groups | None = None
 
     @property
     def name(self) -> str:
@@ -64,20 +68,21 @@ class Data:
         return {path: x for path, x in self.conditions.items() if np.ptp(x) > 0.0}
 
 
-def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> Data:
+def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path, by: str | None = None) -> Data:
     """The data that a caller gave: a mapping of columns, or a table with a header.
 
     The columns are one of ``f_el_mean``, ``f_t_mean``, ``friction_mean`` and ``area_mean`` with conditions (paths such
     as ``Vdrive.amplitude``, ``source.frequency``, ``Xgap.fn``); or ``impedance`` with conditions, and
     ``impedance_phase`` beside it; or ``t`` with ``f_el``, ``f_t``, ``friction``, ``area`` or ``u_gap``; and ``sigma``,
-    the standard deviation, where it is known.
+    the standard deviation, where it is known. The column `by` has names or numbers that tell which group a measurement
+    belongs to.
 
     Raises
     ------
     InputError
         If a column or unit is unknown, columns have different lengths, or a value is no finite number.
     """
-    columns, place = _columns(circuit, given)
+    columns, groups, place = _columns(circuit, given, by)
     names = {
         **{f"{name}_mean": name for name in MEANS},
         **({name: name for name in MEASURED if name != IMPEDANCE} if TIME in columns else {IMPEDANCE: IMPEDANCE}),
@@ -100,12 +105,36 @@ def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> Da
     conditions = {_path(circuit, name): x for name, x in columns.items()}
     if t is not None and any(np.ptp(x) > 0.0 for x in conditions.values()):
         raise InputError(f"{place} have times and changing conditions; allowed: one run over time, or means")
-    return Data(names[measured[0]], values, sigma, conditions, t, phase)
+    if t is not None and groups is not None:
+        raise InputError(f"{place} have times and groups; allowed: groups of means or of impedances")
+    return Data(names[measured[0]], values, sigma, conditions, t, phase, groups)
 
 
-def _columns(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> tuple[dict[str, FloatArray], str]:
+def _columns(
+    circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path, by: str | None
+) -> tuple[dict[str, FloatArray], Groups | None, str]:
     if isinstance(given, (str, Path)):
-        return _from_table(circuit, Path(given)), f"the data in '{given}'"
+        return *_from_table(circuit, Path(given), by), f"the data in '{given}'"
+    if by is None or not isinstance(given, Mapping):
+        return number_columns(given), None, "the data"
+    if by not in given:
+        raise InputError(f"the data have no column {by!r}, which groups names; they have {', '.join(given)}")
+    groups = labels_of(by, given[by])
+    found = number_columns({name: x for name, x in given.items() if name != by})
+    size = next(iter(found.values())).size if found else 0
+    if groups.of.size != size:
+        raise InputError(f"data column {by!r} has {groups.of.size} rows, others have {size}; allowed: as many")
+    return found, groups, "the data"
+
+
+def number_columns(given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
+    """The columns of a mapping as arrays of one length.
+
+    Raises
+    ------
+    InputError
+        If it is no mapping, columns have different lengths, or a value is no finite number.
+    """
     if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
         raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, or the path of a table")
     try:
@@ -119,18 +148,34 @@ def _columns(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path) -> t
         bad = np.flatnonzero(~np.isfinite(x))
         if bad.size:
             raise InputError(f"data column {name!r} is {x[bad[0]]} in row {bad[0]}; allowed: finite numbers")
-    return {name: np.broadcast_to(x, size).copy() for name, x in found.items()}, "the data"
+    return {name: np.broadcast_to(x, size).copy() for name, x in found.items()}
 
 
-def _from_table(circuit: Circuit, path: Path) -> dict[str, FloatArray]:
-    table = read_text_columns(checked_file(path, MAX_TEXT_BYTES))
+def _from_table(circuit: Circuit, path: Path, by: str | None) -> tuple[dict[str, FloatArray], Groups | None]:
+    file = checked_file(path, MAX_TEXT_BYTES)
+    words: tuple[str, ...] = ()
+    if by is None:
+        try:
+            table = read_text_columns(file)
+        except InputError as refused:
+            if "no rows of numbers" not in refused.message:
+                raise
+            raise InputError(
+                f"{refused.message}; allowed: numbers, and names in the column that groups names"
+            ) from None
+    else:
+        table, words = read_labelled_columns(file, by)
     if not table.names:
         raise InputError(
             f"'{path}' has no header; allowed: names with units, such as Vdrive.amplitude (V), f_el_mean (N)"
         )
     found: dict[str, FloatArray] = {}
+    groups: Groups | None = None
     measured = next((name.removesuffix("_mean") for name in table.names if name.removesuffix("_mean") in MEASURED), "")
     for i, (name, unit) in enumerate(zip(table.names, table.units, strict=True)):
+        if by is not None and name.lower() == by.lower():
+            groups = Groups(by, words, table.data[:, i].astype(int))
+            continue
         signal = name.removesuffix("_mean")
         key = {"time": TIME}.get(name.lower(), name.lower())
         key = key if key in (TIME, SIGMA) else name
@@ -144,11 +189,11 @@ def _from_table(circuit: Circuit, path: Path) -> dict[str, FloatArray]:
             base = MEASURED[signal]
         else:
             base = circuit.parameters[_path(circuit, name)].unit
-        found[key] = table.data[:, i] * _factor(unit, base, f"'{path}': the unit of column {name!r}")
-    return found
+        found[key] = table.data[:, i] * unit_factor(unit, base, f"'{path}': the unit of column {name!r}")
+    return found, groups
 
 
-def _factor(unit: str, base: str, what: str) -> float:
+def unit_factor(unit: str, base: str, what: str) -> float:
     """Of a header's unit over the netlist's."""
     if unit in ("", base):
         return 1.0

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.studies.fitresult import Fitted, Profile
-from fingerspice.studies.fittask import Task, followed
+from fingerspice.studies.fitestimates import Profile
+from fingerspice.studies.fitresult import Fitted
+from fingerspice.studies.fittask import Problem, followed
 
 # A profile is followed to this factor of the value, and no further.
 _FARTHEST = 1e3
@@ -22,23 +23,46 @@ _ROUGHLY = 1e-4
 _SKEWED = 1.2
 
 
-def profile_of(task: Task, best: Fitted, path: str, error: float) -> Profile:
-    """The profile of one parameter; `error` is the standard error of its logarithm at the best fit.
+@dataclass(frozen=True)
+class _Held:
+    """A problem of which one value is held."""
 
-    The interval holds all values at which the objective exceeds its least value by no more than the 95 % quantile of
-    chi squared with one degree of freedom, or, where sigma is estimated, of F (Bates and Watts, Nonlinear regression
-    analysis, 1988, section 6.1).
+    whole: Problem
+    place: int
+    value: float
+
+    @property
+    def bounds(self) -> FloatArray:
+        return np.delete(self.whole.bounds, self.place, axis=0)
+
+    def residuals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        residual, by = self.whole.residuals(np.insert(values, self.place, self.value))
+        return residual, np.delete(by, self.place, axis=1)
+
+
+def limit_of(objective: float, freedom: int, *, given: bool) -> float:
+    """The objective at the ends of a 95 % interval; `given` says whether sigma was, or is estimated.
+
+    It exceeds the least objective by the 95 % quantile of chi squared with one degree of freedom, or, where sigma is
+    estimated, of F (Bates and Watts, Nonlinear regression analysis, 1988, section 6.1).
     """
     from scipy.stats import chi2, f
 
-    freedom = task.target.size - len(task.paths)
-    limit = best.objective + float(chi2.ppf(0.95, 1))
-    if task.data.sigma is None:
-        limit = best.objective * (1.0 + float(f.ppf(0.95, 1, freedom)) / freedom) if freedom > 0 else math.inf
-    here = math.log(best.values[task.paths.index(path)])
-    box = task.bounds[task.paths.index(path)]
+    if given:
+        return objective + float(chi2.ppf(0.95, 1))
+    return objective * (1.0 + float(f.ppf(0.95, 1, freedom)) / freedom) if freedom > 0 else math.inf
+
+
+def profile_of(task: Problem, paths: Sequence[str], best: Fitted, path: str, error: float, limit: float) -> Profile:
+    """The profile of one of the parameters `paths`; its interval holds all values with objectives up to `limit`.
+
+    `error` is the standard error of its logarithm at the best fit.
+    """
+    place = paths.index(path)
+    here = math.log(best.values[place])
+    box = task.bounds[place]
     known = {here: best.objective}
-    low, high = (_end(task, best, path, sign, error, limit, box, known) for sign in (-1.0, 1.0))
+    low, high = (_end(task, best, place, sign, error, limit, box, known) for sign in (-1.0, 1.0))
     at = sorted(known)
     reach = [here - math.log(low) if low > 0.0 else math.inf, math.log(high) - here]
     open_below, open_above = (known_end is None for known_end in (_crossed(known, limit, here, s) for s in (-1, 1)))
@@ -56,17 +80,17 @@ def _crossed(known: dict[float, float], limit: float, here: float, sign: int) ->
 
 
 def _end(
-    task: Task, best: Fitted, path: str, sign: float, error: float, limit: float, box: FloatArray,
+    task: Problem, best: Fitted, place: int, sign: float, error: float, limit: float, box: FloatArray,
     known: dict[float, float],
 ) -> float:  # fmt: skip
     """The end of the interval on one side, with all objectives on the way put into `known` (by the logarithm)."""
     from scipy.optimize import brentq
 
-    here = math.log(best.values[task.paths.index(path)])
+    here = math.log(best.values[place])
     with np.errstate(divide="ignore"):
         wall = float(np.log(box[0 if sign < 0.0 else 1]))
     farthest = min(math.log(_FARTHEST), abs(wall - here))
-    look = _held(task, best, path, known)
+    look = _held(task, best, place, known)
     near, far = 0.0, min(max(1.5 * error, 1e-6), 0.5, farthest)
     while look(here + sign * far) <= limit:
         if far >= farthest:
@@ -81,19 +105,14 @@ def _end(
     return math.exp(here + sign * end)
 
 
-def _held(task: Task, best: Fitted, path: str, known: dict[float, float]) -> Callable[[float], float]:
+def _held(task: Problem, best: Fitted, place: int, known: dict[float, float]) -> Callable[[float], float]:
     """The least objective with the parameter held, as a function of its logarithm."""
-    k = task.paths.index(path)
-    others = tuple(one for one in task.paths if one != path)
-    latest = {"begin": np.delete(best.values, k)}
+    latest = {"begin": np.delete(best.values, place)}
 
     def look(x: float) -> float:
         if x not in known:
-            held = replace(
-                task, circuit=task.circuit.varied({path: math.exp(x)}), paths=others,
-                bounds=np.delete(task.bounds, k, axis=0),
-            )  # fmt: skip
-            if others:
+            held = _Held(task, place, math.exp(x))
+            if best.values.size > 1:
                 # From where the last value was fitted, which lies on the way.
                 found = followed(held, latest["begin"], _ROUGHLY)
                 known[x], latest["begin"] = found.objective, found.values

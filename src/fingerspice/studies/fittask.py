@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
@@ -14,6 +17,7 @@ from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.results.outcome import SolveError
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.fitdata import IMPEDANCE, Data
+from fingerspice.studies.fitgroups import Unknown, members_of
 from fingerspice.studies.fitresult import Fitted
 from fingerspice.studies.phasors import phasor
 from fingerspice.studies.steady import steady_state
@@ -26,6 +30,17 @@ REFUSED = 1e6
 CLOSE = 1e-8
 
 
+class Problem(Protocol):
+    """What least squares need: residuals over their scale with derivatives by logarithms, and bounds of the values."""
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Smallest and largest values, shape (n_parameter, 2)."""
+
+    def residuals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals, shape (n,), and their derivatives, shape (n, n_parameter)."""
+
+
 @dataclass(frozen=True)
 class Task:
     """What is fitted.
@@ -35,7 +50,7 @@ class Task:
     circuit : Circuit
         With the values to start from.
     data : Data
-    paths : tuple of str
+    unknowns : tuple of Unknown
     bounds : ndarray, shape (n_parameter, 2)
         Smallest and largest values.
     average : str
@@ -51,7 +66,7 @@ class Task:
 
     circuit: Circuit
     data: Data
-    paths: tuple[str, ...]
+    unknowns: tuple[Unknown, ...]
     bounds: FloatArray
     average: str
     skin: str
@@ -64,12 +79,18 @@ class Task:
     @property
     def initial(self) -> FloatArray:
         """Values to start from."""
-        return np.array([self.circuit.parameters[path].value for path in self.paths])
+        return np.array([self.circuit.parameters[one.path].value for one in self.unknowns])
+
+    @cached_property
+    def members(self) -> NDArray[np.bool_]:
+        """Whether each unknown belongs to each measurement, shape (n_parameter, n)."""
+        return members_of(self.unknowns, self.data.groups, self.data.values.size)
 
     def scene(self, values: FloatArray, row: int) -> Circuit:
         """The circuit of one measurement."""
         changes = {path: float(x[row]) for path, x in self.data.conditions.items()}
-        changed = self.circuit.varied(changes | dict(zip(self.paths, values.tolist(), strict=True)))
+        changes |= {self.unknowns[k].path: float(values[k]) for k in np.flatnonzero(self.members[:, row])}
+        changed = self.circuit.varied(changes)
         if self.skin == "follow":
             fundamental = build_stack(changed).waveform.fundamental if is_stack(changed) else None
             skins = {f"{e.name}.f": fundamental.frequency for e in changed.by_device("SKIN") if fundamental is not None}
@@ -79,21 +100,22 @@ class Task:
     def predict(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Predicted data (n,), and their derivatives by the logarithms of the parameters (n, n_parameter)."""
         if self.exact:
-            return self._predicted(values, self.paths)
-        middle, _ = self._predicted(values, ())
+            return self._predicted(values, exact=True)
+        middle, _ = self._predicted(values, exact=False)
         by = np.empty((middle.size, values.size))
         for k in range(values.size):
             pair = []
             for sign in (-1.0, 1.0):
                 moved = values.copy()
                 moved[k] *= 1.0 + sign * _STEP
-                pair.append(self._predicted(moved, ())[0])
+                pair.append(self._predicted(moved, exact=False)[0])
             by[:, k] = (pair[1] - pair[0]) / (2.0 * _STEP)
         return middle, by
 
-    def _predicted(self, values: FloatArray, paths: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
+    def _predicted(self, values: FloatArray, *, exact: bool) -> tuple[FloatArray, FloatArray]:
         data, how = self.data, {"rtol": self.rtol, "charge_law": self.charge_law, "charge": False}
         if data.t is not None:
+            paths = tuple(one.path for one in self.unknowns) if exact else ()
             run = simulate(self.scene(values, 0), t_eval=data.t, sensitivities=paths, **how)  # type: ignore[arg-type]
             slopes = [getattr(run.sensitivities[path], data.signal) for path in paths]
             return np.asarray(getattr(run, data.signal)), np.array(slopes).reshape(len(paths), -1).T * values[
@@ -101,15 +123,17 @@ class Task:
             ]
         if data.signal == IMPEDANCE:
             return self._impedance(values), np.empty((self.target.size, 0))
-        name, found, by = data.name, np.empty(data.values.size), np.empty((data.values.size, len(paths)))
+        name, found, by = data.name, np.empty(data.values.size), np.zeros((data.values.size, values.size))
         for row in range(data.values.size):
             circuit = self.scene(values, row)
+            felt = np.flatnonzero(self.members[:, row]) if exact else ()
+            paths = tuple(self.unknowns[k].path for k in felt)
             if self.average == "periodic":
                 one = steady_state(circuit, sensitivities=paths, points=4, **how)  # type: ignore[arg-type]
             else:
                 one = simulate(circuit, sensitivities=paths, t_eval=[0.0], t_stop=_end(circuit), **how)  # type: ignore[arg-type,assignment]
             found[row] = getattr(one, name)
-            for k, path in enumerate(paths):
+            for k, path in zip(felt, paths, strict=True):
                 by[row, k] = getattr(one.sensitivities[path], name) * values[k]
         return found, by
 
@@ -142,7 +166,7 @@ def _end(circuit: Circuit) -> float:
     return circuit.tran.stop
 
 
-def followed(task: Task, begin: FloatArray, close: float = CLOSE) -> Fitted:
+def followed(task: Problem, begin: FloatArray, close: float = CLOSE) -> Fitted:
     """Where least squares lead from a start; `close` is the relative error of the last step."""
     from scipy.optimize import least_squares
 

@@ -28,6 +28,9 @@ MOST_POLES = 12
 _DENSE, _BEYOND = 8, 2.0
 # Misfit (rms), of a fit or of the data to any material, above which a warning is given, and above which it is refused.
 NOTABLE, TOO_MUCH = 0.1, 0.3
+# Misfit of the data to any material from which on it is examined for a course over frequency, which noise has not: so
+# many frequencies are needed, and neighbouring misfits are then correlated by more than this.
+_SMALL, _FEWEST, _COURSE = 0.03, 10, 0.5
 # Range allowed of data in Hz, ohm m and 1: wide enough for any material, and narrow enough to avoid overflow.
 _LEAST, _MOST = 1e-20, 1e20
 
@@ -80,12 +83,16 @@ class Consistency:
         Misfit ``|y_fit / y - 1|`` of the best sum of Debye terms with densely placed poles.
     frequency, misfit : ndarray, shape (n,)
         The misfit at each frequency (Hz).
+    systematic : float
+        Correlation of the complex misfits of neighbouring frequencies: about 0 for noise, near 1 for a drift or a wrong
+        scale of a column.
     """
 
     rms: float
     largest: float
     frequency: FloatArray
     misfit: FloatArray
+    systematic: float
 
 
 @dataclass(frozen=True, repr=False)
@@ -181,7 +188,8 @@ def fit_material(
     Warns
     -----
     FingerspiceWarning
-        If the misfit is above 10 %, either of the data to any causal and passive material, or of the fit to the data.
+        If the misfit is above 10 %, either of the data to any causal and passive material, or of the fit to the data;
+        or if the former is above 3 % and has a course over frequency, which noise has not.
 
     Examples
     --------
@@ -251,11 +259,15 @@ def _admittivity(table: FloatArray) -> tuple[FloatArray, ComplexArray]:
 
 def _doubt(table: FloatArray, found: Consistency) -> str:
     """Warn about data that no material can have, or refuse them, with likely slips; returns the warning, else ''."""
-    if found.rms <= NOTABLE:
+    course = found.rms > _SMALL and found.frequency.size >= _FEWEST and found.systematic > _COURSE
+    if found.rms <= NOTABLE and not course:
         return ""
     slips = likely_slips(table, lambda other: _consistency(*_admittivity(other)).rms, found.rms)
     said = f"the data are {100.0 * found.rms:.2g} % (rms) from any causal and passive material (Kramers-Kronig)"
-    said += f"; likely {' or '.join(slips)}" if slips else ""
+    if slips:
+        said += f"; likely {' or '.join(slips)}"
+    elif course:
+        said += ", not by noise but along a smooth course, as of a drift or of a wrong scale of a column"
     if found.rms > TOO_MUCH:
         raise InputError(f"{said}; allowed: at most {100.0 * TOO_MUCH:g} %, columns of {ALLOWED}")
     warnings.warn(said, FingerspiceWarning, stacklevel=3)
@@ -321,8 +333,11 @@ def _fit(f: FloatArray, y: ComplexArray, count: int) -> tuple[Ladder, FloatArray
 
 
 def _consistency(f: FloatArray, y: ComplexArray) -> Consistency:
+    """The linear Kramers-Kronig test (Boukamp, J. Electrochem. Soc. 142, 1885, 1995), with weights that are passive."""
     low, high = np.log10(2.0 * np.pi * f[[0, -1]])
     count = round(_DENSE * (high - low + 2.0 * _BEYOND)) + 1
     _, left = _weights(f, y, np.logspace(low - _BEYOND, high + _BEYOND, count))
     misfit = np.abs(left)
-    return Consistency(float(np.sqrt(np.mean(misfit**2))), float(misfit.max()), f, misfit)
+    power = float(np.sum(misfit**2))
+    neighbours = float(np.sum((left[1:] * left[:-1].conj()).real)) / power if power > 0.0 else 0.0
+    return Consistency(float(np.sqrt(np.mean(misfit**2))), float(misfit.max()), f, misfit, neighbours)

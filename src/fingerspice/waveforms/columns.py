@@ -118,11 +118,51 @@ def read_text_columns(path: Path) -> Columns:
     InputError
         If the rows are not finite numbers, the same count in each row; the message names the line.
     """
+    return _parsed(path, _lines(path))
+
+
+def read_labelled_columns(path: Path, label: str) -> tuple[Columns, tuple[str, ...]]:
+    """Columns of a text file of which the one named `label` holds words; it becomes the number of the word.
+
+    Returns
+    -------
+    Columns
+    tuple of str
+        The words, in the order of the file.
+
+    Raises
+    ------
+    InputError
+        As `read_text_columns`, and if the header has no such column.
+    """
+    lines, words, place = _lines(path), dict[str, int](), -1
+    separator: str | None = None
+    for number, line in enumerate(lines):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        if place < 0:
+            separator = "\t" if "\t" in line else "," if "," in line else None
+            names = [_unit(cell)[0].lower() for cell in _cells(line, separator)]
+            if label.lower() not in names:
+                raise InputError(f"'{path}' has no column {label!r} in its header; it has {', '.join(names)}")
+            place = names.index(label.lower())
+            continue
+        cells = _cells(line, separator)
+        if place < len(cells):
+            cells[place] = str(words.setdefault(cells[place], len(words)))
+            lines[number] = (separator or " ").join(cells)
+    return _parsed(path, lines), tuple(words)
+
+
+def _lines(path: Path) -> list[str]:
     data = path.read_bytes()
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     if b"\0" in data and not wide:
         raise InputError(f"'{path}' is no text; allowed: a table as text, or an NPZ file")
-    lines = data.decode("utf-16" if wide else "utf-8-sig", "replace").splitlines()
+    return data.decode("utf-16" if wide else "utf-8-sig", "replace").splitlines()
+
+
+def _parsed(path: Path, lines: list[str]) -> Columns:
     numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
     rows = [(number, line) for number, line in numbered if not line.lstrip().startswith("#")]
     first = next((i for i, (_, line) in enumerate(rows) if _begins_with_number(line)), None)

@@ -1,0 +1,108 @@
+"""Weights of the steps of `engine.lockstep`: integrals of a mode's decay with the polynomials of an Adams method."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit, jit_rows
+from fingerspice.engine.lockstep import DECAY, DRIVE, LANES, PREDICT, Marks, Weights
+
+
+@jit
+def moment_integrals(y: float) -> tuple[float, float, float, float]:
+    """Integrals of exp(-y (1 - s)) s^k over [0, 1] for k = 0, 1, 2, 3, y >= 0."""
+    if y < 0.3:
+        # k = 3: the sum of (-y)^j 3! / (j + 4)! from its last term on; then a recursion down to k = 0, which damps
+        # rounding.
+        total = 0.0
+        for j in range(11, -1, -1):
+            total = 1.0 - y * total * (1.0 / (j + 5.0))
+        third = total / 4.0
+        second = (1.0 - y * third) / 3.0
+        first = 0.5 * (1.0 - y * second)
+        return 1.0 - y * first, first, second, third
+    zeroth = -math.expm1(-y) / y
+    first = (1.0 - zeroth) / y
+    second = (1.0 - 2.0 * first) / y
+    return zeroth, first, second, (1.0 - 3.0 * second) / y
+
+
+def _basis(nodes: tuple[float, ...], rows: int) -> NDArray[np.float64]:
+    """Powers, lowest first, of the Lagrange polynomials of some nodes; rows beyond them are 0."""
+    out = np.zeros((rows, 4))
+    for i, node in enumerate(nodes):
+        others = [x for x in nodes if x != node]
+        powers = np.poly(others) / np.prod([node - x for x in others]) if others else np.ones(1)
+        out[i, : powers.size] = powers[::-1]
+    return out
+
+
+# Steps by the values that they have: none before the start of the step (the first of all), one (the second), two at
+# equal distances, and the first and second step after the step has been doubled. The distances are in steps.
+_BEFORE = ((), (-1.0,), (-1.0, -2.0), (-0.5, -1.0), (-1.0, -1.5))
+#: For each kind of step, the polynomials of predictor (3) and corrector (4) by powers, shape (5, 7, 4).
+_POLYNOMIALS = np.stack([
+    np.concatenate([_basis((0.0, *before), 3), _basis((1.0, 0.0, *before), 4)]) for before in _BEFORE
+])  # fmt: skip
+#: Kinds of the first, second and further steps: of the first piece, and of the others.
+_KINDS = np.array([[0, 1, 2], [3, 4, 2]])
+
+
+@jit_rows
+def _double(moments: FloatArray, longer: FloatArray) -> None:
+    """Moments over twice the length of a step, shape (5, LANES): exp(-y), then those of `moment_integrals`."""
+    for i in range(LANES):
+        e, m0, m1, m2, m3 = moments[0, i], moments[1, i], moments[2, i], moments[3, i], moments[4, i]
+        longer[0, i] = e * e
+        longer[1, i] = 0.5 * (e * m0 + m0)
+        longer[2, i] = 0.25 * (e * m1 + m0 + m1)
+        longer[3, i] = 0.125 * (e * m2 + m0 + 2.0 * m1 + m2)
+        longer[4, i] = 0.0625 * (e * m3 + m0 + 3.0 * (m1 + m2) + m3)
+
+
+@jit_rows
+def _weigh_rows(
+    kind: FloatArray, h: FloatArray, drive: FloatArray, moments: FloatArray, g: FloatArray, mode: int, n_modes: int
+) -> None:  # fmt: skip
+    """Weights of a step of length h (LANES,) for one mode, from its moments and the polynomials of its kind."""
+    for i in range(LANES):
+        g[(DECAY * n_modes + mode) * LANES + i] = moments[0, i]
+        g[(DRIVE * n_modes + mode) * LANES + i] = drive[i] * h[i] * moments[1, i]
+    for row in range(7):
+        for i in range(LANES):
+            total = kind[row, 0] * moments[1, i]
+            for k in range(1, 4):
+                total += kind[row, k] * moments[1 + k, i]
+            g[((PREDICT + row) * n_modes + mode) * LANES + i] = h[i] * total
+
+
+@jit
+def weigh(
+    shortest: FloatArray, rates: FloatArray, drive: FloatArray, g: Weights, scratch: FloatArray, marks: Marks
+) -> None:  # fmt: skip
+    """Weights of every lane for a step of length 0 and for the pieces, the first of steps of length `shortest` (s).
+
+    `rates` and `drive` have shape (n_mode, LANES); `scratch` (11, LANES) is overwritten.
+    """
+    m_all = len(marks[0])
+    still, moving = g
+    still[:] = 0.0
+    still[DECAY * m_all * LANES : (DECAY + 1) * m_all * LANES] = 1.0
+    h = scratch[10]
+    for m in range(m_all):
+        now, longer = scratch[:5], scratch[5:10]
+        for i in range(LANES):
+            h[i] = shortest[i]
+            now[1, i], now[2, i], now[3, i], now[4, i] = moment_integrals(rates[m, i] * h[i])
+            now[0, i] = 1.0 - rates[m, i] * h[i] * now[1, i]
+        for piece in range(moving.shape[0]):
+            for step in range(3):
+                kind = _POLYNOMIALS[_KINDS[min(piece, 1), step]]
+                _weigh_rows(kind, h, drive[m], now, moving[piece, step], m, m_all)
+            _double(now, longer)
+            now, longer = longer, now
+            h *= 2.0

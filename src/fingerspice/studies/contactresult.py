@@ -1,0 +1,277 @@
+"""The result of a contact's fit: values for the deck with their intervals, and what the data cannot tell."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.files import write_aside
+from fingerspice.base.pages import Page, Shown
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.studies.contactdata import Relation
+from fingerspice.studies.contacttask import FEWEST, ContactTask, pools_of
+from fingerspice.studies.fitestimates import (
+    Estimate,
+    Profile,
+    correlation_of,
+    covariance_of,
+    estimate_lines,
+    estimate_of,
+    lmfit_report,
+    misfit_note,
+    notes_of,
+)
+from fingerspice.studies.fitresult import Fitted
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# The share of an error's variance below which a relation has no part in it.
+_NO_PART = 1e-9
+
+
+@dataclass(frozen=True, repr=False)
+class ContactFit(Shown):
+    """A fit of a contact to data; `circuit` is ready to run.
+
+    Attributes
+    ----------
+    circuit : Circuit
+        With the fitted values.
+    gap : str
+        Name of the GAP.
+    estimates : dict of str to Estimate
+        By path.
+    correlation : ndarray, shape (n_parameter, n_parameter)
+        Of the errors of the logarithms.
+    relations : tuple of Relation
+        The data, by kind.
+    predicted, sigma : tuple of ndarray
+        Values and standard deviations of every relation, as the fit has them.
+    misfits : tuple of float
+        Root mean square of the logarithm of prediction over data, of every relation.
+    objective : float
+        Sum of the squared residuals over sigma.
+    freedom : int
+        Data less parameters.
+    evaluations : int
+    closed : bool
+        Whether the iteration closed.
+    notes : tuple of str
+        What the data do not tell, and which measurement would.
+    reach : dict of str to float
+        Half of each interval in the logarithm over the standard error: Student's t, with the degrees of freedom of the
+        relations that the parameter is known from.
+    profiles : dict of str to Profile
+        By path, as far as they were asked for.
+    """
+
+    circuit: Circuit
+    gap: str
+    estimates: dict[str, Estimate]
+    correlation: FloatArray
+    relations: tuple[Relation, ...]
+    predicted: tuple[FloatArray, ...]
+    sigma: tuple[FloatArray, ...]
+    misfits: tuple[float, ...]
+    objective: float
+    freedom: int
+    evaluations: int
+    closed: bool
+    notes: tuple[str, ...]
+    reach: dict[str, float]
+    profiles: dict[str, Profile] = field(default_factory=dict)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Fitted values by path, as `Circuit.replace` takes them."""
+        return {path: one.value for path, one in self.estimates.items()}
+
+    @property
+    def line(self) -> str:
+        """The fitted parameters as a netlist has them."""
+        return " ".join(f"{path.rpartition('.')[2]}={one.value:.6g}" for path, one in self.estimates.items())
+
+    def _page(self) -> Page:
+        count = sum(one.values.size for one in self.relations)
+        lines = [
+            f"contact of {self.gap}: {len(self.estimates)} parameters fitted to {count} values, "
+            f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}"
+        ]
+        for one, misfit in zip(self.relations, self.misfits, strict=True):
+            known = "sigma as given" if one.sigma is not None else "sigma estimated from the residuals"
+            lines.append(f"{one.name}: {one.values.size} values, residual {100.0 * misfit:.3g} % rms; {known}")
+        own = estimate_lines(self.estimates, self.correlation, self.profiles, self.notes)
+        return Page([*lines, *own, "", f"in the deck: {self.gap} ... {self.line}"])
+
+    def report(self) -> str:
+        """Statistics, parameters and correlations in the layout of lmfit's ``fit_report``."""
+        count = self.freedom + len(self.estimates)
+        return lmfit_report(self.estimates, self.correlation, self.objective, count, self.evaluations)
+
+    def plot(self) -> Figure:
+        """Data and fit of every relation, with the residuals below."""
+        from fingerspice.plots.fits import Curve, Panel, plot_panels
+
+        panels = []
+        for one, fitted, sigma in zip(self.relations, self.predicted, self.sigma, strict=True):
+            x, label, others = _abscissa(one)
+            kinds = np.unique(others)
+            curves = [
+                Curve(f"{_OTHER[label]} = {kind:g}" if kinds.size > 1 else one.name, *(
+                    part[others == kind] for part in (x, one.values, fitted, sigma)
+                ))
+                for kind in kinds
+            ]  # fmt: skip
+            panels.append(Panel(curves, label, one.name, one.unit))
+        return plot_panels(panels)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fit as plain numbers and texts; `parameters` has a row for each."""
+        return {
+            "gap": self.gap,
+            "parameters": [vars(e) for e in self.estimates.values()],
+            "correlation": self.correlation.tolist(),
+            "relations": [
+                {"kind": one.kind, "count": int(one.values.size), "misfit": misfit}
+                for one, misfit in zip(self.relations, self.misfits, strict=True)
+            ],
+            "objective": self.objective,
+            "notes": list(self.notes),
+            "profiles": [
+                {**vars(one), "values": one.values.tolist(), "objective": one.objective.tolist()}
+                for one in self.profiles.values()
+            ],
+        }
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write conditions, data, prediction and sigma as CSV, SI units.
+
+        Raises
+        ------
+        InputError
+            If the folder cannot be written.
+        """
+
+        def write(target: Path) -> None:
+            with target.open("w", newline="", encoding="utf-8") as stream:
+                out = csv.writer(stream, lineterminator="\n")
+                out.writerow(("relation", "fn", "u_gap", "indentation", "measured", "fitted", "sigma"))
+                for one, fitted, sigma in zip(self.relations, self.predicted, self.sigma, strict=True):
+                    table = np.column_stack([one.fn, one.u_gap, one.indentation, one.values, fitted, sigma])
+                    out.writerows((one.kind, *(f"{x:.17g}" for x in row)) for row in table)
+
+        return write_aside(Path(path), write)
+
+
+# The condition that tells curves apart, by the one along the axis.
+_OTHER = {"normal load [N]": "u_gap [V]", "gap voltage [V]": "load [N]", "indentation [mm]": "load [N]"}
+
+
+def _abscissa(one: Relation) -> tuple[FloatArray, str, FloatArray]:
+    """Values along the axis and its label, and those of the condition that tells curves apart."""
+    if one.kind == "indentation":
+        return 1e3 * one.indentation, "indentation [mm]", np.zeros(one.fn.size)
+    if np.unique(one.u_gap).size > np.unique(one.fn).size:
+        return one.u_gap, "gap voltage [V]", one.fn
+    return one.fn, "normal load [N]", one.u_gap
+
+
+def contact_result(circuit: Circuit, task: ContactTask, best: Fitted, freedom: Sequence[float]) -> ContactFit:
+    """The result of a fit; `freedom` has the degrees of freedom of every pool."""
+    covariance = covariance_of(best.by_log)
+    error, reach = _errors(task, best, covariance, freedom)
+    estimates = {
+        path: estimate_of(path, circuit.parameters[path].unit, start, value, off, far, box)
+        for path, start, value, off, far, box in zip(
+            task.paths, task.initial.tolist(), best.values.tolist(), error, reach, task.bounds, strict=True
+        )
+    }
+    correlation = correlation_of(covariance)
+    notes = notes_of(estimates, correlation, error, lambda names: _remedy(task, names))
+    notes += _further_notes(task, best, freedom)
+    predicted = tuple(task.predict(best.values))
+    return ContactFit(
+        circuit, task.gap, estimates, correlation, task.relations, predicted,
+        tuple(
+            one.sigma if one.sigma is not None else share * found
+            for one, share, found in zip(task.relations, task.shares, predicted, strict=True)
+        ),
+        tuple(
+            float(np.sqrt(np.mean(np.log(np.maximum(found, 1e-300) / one.values) ** 2)))
+            for one, found in zip(task.relations, predicted, strict=True)
+        ),
+        best.objective, best.residual.size - len(task.paths), best.evaluations, best.closed, tuple(notes),
+        dict(zip(task.paths, reach, strict=True)),
+    )  # fmt: skip
+
+
+def _errors(
+    task: ContactTask, best: Fitted, covariance: FloatArray, freedom: Sequence[float]
+) -> tuple[list[float], list[float]]:
+    """Standard errors of the logarithms, and Student's t with the degrees of freedom of Satterthwaite.
+
+    (F. E. Satterthwaite, Biometrics Bulletin 2, 110, 1946.) Each pool has its own variance, known from its own
+    residuals, and a part in the variance of a parameter.
+    """
+    from scipy.stats import norm, t
+
+    parts = np.array([np.sum((covariance @ best.by_log[pool.at].T) ** 2, axis=1) for pool in pools_of(task.relations)])
+    error, reach = np.sqrt(np.diag(covariance)).tolist(), []
+    for k in range(len(task.paths)):
+        shares = parts[:, k] / max(float(parts[:, k].sum()), 1e-300)
+        felt = [(share, left) for share, left in zip(shares.tolist(), freedom, strict=True) if share > _NO_PART]
+        inverse = sum(share**2 / left if left >= FEWEST else math.inf for share, left in felt)
+        if math.isinf(inverse):
+            error[k] = math.inf
+        reach.append(float(norm.ppf(0.975) if inverse == 0.0 else t.ppf(0.975, 1.0 / inverse) if inverse < math.inf
+                           else math.inf))  # fmt: skip
+    return error, reach
+
+
+def _further_notes(task: ContactTask, best: Fitted, freedom: Sequence[float]) -> list[str]:
+    found = []
+    for pool, left in zip(pools_of(task.relations), freedom, strict=True):
+        name = " and the ".join(task.relations[i].name for i in pool.members)
+        if left < FEWEST:
+            found.append(
+                f"Of the {name} there are hardly more values ({pool.at.size}) than parameters, which leaves no measure "
+                "of their errors: measure more of them, or give sigma."
+            )
+        if not pool.estimated:
+            own = misfit_note(float(np.sum(best.residual[pool.at] ** 2)), pool.at.size)
+            found += [note.replace("The residuals", f"The residuals of the {name}", 1) for note in own]
+    fitted = {path.rpartition(".")[2] for path in task.paths}
+    if "c2" in fitted and "mu" not in fitted:
+        mu = task.circuit[task.gap].values["mu"]
+        found.append(
+            f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2. Measure the friction force."
+        )
+    return found
+
+
+def _remedy(task: ContactTask, names: tuple[str, ...]) -> str:
+    """The measurement that would tell one parameter, or two apart."""
+    bare = {name.rpartition(".")[2] for name in names}
+    kinds = {one.kind for one in task.relations}
+    loads = np.concatenate([one.fn for one in task.relations if one.kind != "indentation"] or [np.ones(1)])
+    if bare <= {"alpha", "m_exp"}:
+        if float(np.ptp(loads)) == 0.0:
+            return "Measure the area at a second load as well, or fix one of them."
+        return "Measure the area over a wider range of loads, or fix one of them."
+    if bare <= {"beta", "n_exp"}:
+        if "indentation" not in kinds:
+            return "Measure the area against the indentation as well, or fix one of them."
+        return "Measure the area over a wider range of indentations, or fix one of them."
+    if "area" not in kinds and "c2" in bare:
+        return "Measure the area at rest as well, or fix one of them."
+    if bare & {"beta", "n_exp"}:
+        return "Measure the area against the indentation, or under a higher voltage, or fix one of them."
+    return "Measure over a wider range of loads, or fix one of them."

@@ -1,0 +1,206 @@
+"""What every fit reports: parameters with intervals, correlations, profiles, and what the data cannot tell."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.pages import Table
+
+# Two parameters are not told apart if their errors are correlated beyond this and one of them is larger than that; and
+# the error of a parameter, in its logarithm, from which on nothing is known of it.
+_TOGETHER, _NOTABLE, _UNKNOWN = 0.98, 0.05, 0.7
+# Singular values of the derivatives below this share of the largest are rounding.
+_LEAST = 1e-9
+# A value this close to a bound, relative, is at it.
+_AT_BOUND = 1e-6
+# An interval that reaches farther than this, in the logarithm, has no ends.
+_NO_END = 50.0
+# Residuals this unlikely by noise of the given sigma are named.
+_UNLIKELY = 1e-3
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One fitted parameter, in the unit of the netlist.
+
+    Attributes
+    ----------
+    path, unit : str
+    value, initial : float
+    error : float
+        Standard error.
+    low, high : float
+        95 % interval, symmetric in the logarithm.
+    at_bound : bool
+    """
+
+    path: str
+    unit: str
+    value: float
+    initial: float
+    error: float
+    low: float
+    high: float
+    at_bound: bool
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The best fits with one parameter held at each of several values.
+
+    Attributes
+    ----------
+    path : str
+    values : ndarray, shape (n,)
+        Values of the parameter, ascending.
+    objective : ndarray, shape (n,)
+        Sum of the squared residuals at each, as `Fit.objective`.
+    limit : float
+        The objective at the ends of the 95 % interval.
+    low, high : float
+        The interval; 0 or a bound, and infinity or a bound, where the data set no end.
+    shape : str
+        ``"symmetric"`` (in the logarithm), ``"skewed"``, ``"open below"``, ``"open above"`` or ``"open"``.
+    """
+
+    path: str
+    values: FloatArray
+    objective: FloatArray
+    limit: float
+    low: float
+    high: float
+    shape: str
+
+
+def covariance_of(by_log: FloatArray) -> FloatArray:
+    """Covariance of the logarithms of the parameters, for residuals of variance 1.
+
+    Combinations of parameters that no datum feels have a large variance, and not an infinite one, of which no
+    correlation would be known.
+    """
+    _, singular, right = np.linalg.svd(by_log, full_matrices=False)
+    spread = 1.0 / np.maximum(singular, _LEAST * max(float(singular.max()), 1e-300))
+    return np.asarray((right.T * spread**2) @ right)
+
+
+def correlation_of(covariance: FloatArray) -> FloatArray:
+    """The correlations in a covariance."""
+    error = np.sqrt(np.diag(covariance))
+    return np.asarray(covariance / np.outer(error, error))
+
+
+def estimate_of(
+    path: str, unit: str, initial: float, value: float, error: float, reach: float, bounds: FloatArray
+) -> Estimate:
+    """A parameter with the error of its logarithm, and the interval of so many errors."""
+    at_bound = bool(np.any(np.abs(value / bounds[np.isfinite(bounds) & (bounds > 0.0)] - 1.0) < _AT_BOUND))
+    far = math.exp(reach * error) if reach * error < _NO_END else math.inf
+    return Estimate(path, unit, float(value), float(initial), value * error, value / far, value * far, at_bound)
+
+
+def estimate_lines(
+    estimates: Mapping[str, Estimate], correlation: FloatArray, profiles: Mapping[str, Profile], notes: Sequence[str]
+) -> list[str | Table]:
+    """Table of the parameters, correlations, profiles and notes, as a report has them."""
+    rows = [
+        (
+            e.path, f"{e.value:.6g}", f"{e.error:.2g}", f"{100.0 * e.error / e.value:.2g} %",
+            f"{e.low:.4g} to {e.high:.4g}", e.unit, f"{e.initial:.4g}", "at a bound" if e.at_bound else "",
+        )
+        for e in estimates.values()
+    ]  # fmt: skip
+    lines: list[str | Table] = [
+        "", Table(("parameter", "value", "error", "", "95 % interval", "unit", "started at", ""), rows)
+    ]  # fmt: skip
+    pairs = [
+        f"{a}, {b}: {correlation[i, j]:+.3f}"
+        for (i, a), (j, b) in itertools.combinations(enumerate(estimates), 2)
+        if abs(correlation[i, j]) > 0.1
+    ]
+    if pairs:
+        lines += ["", "correlations beyond 0.1: " + "; ".join(pairs)]
+    for one in profiles.values():
+        unit = estimates[one.path].unit
+        lines.append(f"profile of {one.path}: {one.low:.4g} to {one.high:.4g} {unit}, {one.shape}".replace(" ,", ","))
+    return [*lines, *(["", *notes] if notes else [])]
+
+
+def lmfit_report(
+    estimates: Mapping[str, Estimate], correlation: FloatArray, square: float, count: int, evaluations: int
+) -> str:
+    """The layout of lmfit's ``fit_report``, for programs and eyes that know it.
+
+    `square` is the sum of the squared residuals over sigma, `count` the number of data. As there, the criteria of
+    Akaike and Bayes are count log(square / count) + 2 k, and + k log(count), of k parameters.
+    """
+    k, freedom = len(estimates), count - len(estimates)
+    level = count * math.log(max(square, 1e-300) / count)
+    wide = max(map(len, estimates)) + 1
+    lines = [
+        "[[Fit Statistics]]",
+        "    # fitting method   = least_squares",
+        f"    # function evals   = {evaluations}",
+        f"    # data points      = {count}",
+        f"    # variables        = {k}",
+        f"    chi-square         = {square:.8g}",
+        f"    reduced chi-square = {square / freedom if freedom > 0 else math.inf:.8g}",
+        f"    Akaike info crit   = {level + 2.0 * k:.8g}",
+        f"    Bayesian info crit = {level + k * math.log(count):.8g}",
+        "[[Variables]]",
+    ]
+    for name, e in estimates.items():
+        share = 100.0 * e.error / e.value
+        lines.append(
+            f"    {name + ':':<{wide}} {e.value: .8g} +/- {e.error:.8g} ({share:.2f}%) (init = {e.initial:.7g})"
+        )
+    pairs = [(i, j) for i, j in itertools.combinations(range(k), 2) if abs(correlation[i, j]) >= 0.1]
+    if pairs:
+        names = list(estimates)
+        lines.append("[[Correlations]] (unreported correlations are < 0.100)")
+        pairs.sort(key=lambda pair: -abs(correlation[pair]))
+        lines += [f"    C({names[i]}, {names[j]}) = {correlation[i, j]:+.4f}" for i, j in pairs]
+    return "\n".join(lines)
+
+
+def notes_of(
+    estimates: Mapping[str, Estimate], correlation: FloatArray, error: Sequence[float],
+    remedy: Callable[[tuple[str, ...]], str],
+) -> list[str]:  # fmt: skip
+    """What the data do not tell, and what would: `remedy` says it of one or two parameters."""
+    found, names = [], list(estimates)
+    for e in estimates.values():
+        if e.at_bound:
+            own = f"{e.value:g} {e.unit}".rstrip()
+            found.append(f"{e.path} is at its bound, {own}: its interval is not that of a free parameter.")
+    for i, j in itertools.combinations(range(len(names)), 2):
+        if abs(correlation[i, j]) > _TOGETHER and max(error[i], error[j]) > _NOTABLE:
+            found.append(
+                f"{names[i]} and {names[j]} are not told apart (correlation {correlation[i, j]:+.4f}): they change "
+                f"these data in almost the same way, and only a combination of both is known. "
+                f"{remedy((names[i], names[j]))}"
+            )
+    named = " ".join(found)
+    for name, off in zip(names, error, strict=True):
+        if not off < _UNKNOWN and name not in named:
+            found.append(f"Of {name} these data tell next to nothing: its error is larger than itself. "
+                         f"{remedy((name,))}")  # fmt: skip
+    return found
+
+
+def misfit_note(square: float, freedom: int) -> list[str]:
+    """A sentence about residuals that are far larger than their given sigma, else none."""
+    from scipy.stats import chi2
+
+    if freedom < 1 or chi2.sf(square, freedom) > _UNLIKELY:
+        return []
+    return [
+        f"The residuals are {math.sqrt(square / freedom):.2g} times as large as sigma, which noise explains in less "
+        "than one of a thousand cases: the circuit does not describe these data, or sigma is too small, and so are the "
+        "intervals."
+    ]
