@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DECK ?= circuits/fingerpad.cir
 
-.PHONY: run test check figures fuzz stress clean
+.PHONY: run test check docs figures fuzz stress clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -27,6 +27,10 @@ $(VENV)/.test: pyproject.toml | $(BIN)/python
 	$(BIN)/pip install --quiet --editable '.[test]'
 	touch $@
 
+$(VENV)/.docs: pyproject.toml | $(BIN)/python
+	$(BIN)/pip install --quiet --editable '.[docs]'
+	touch $@
+
 run: $(VENV)/.run
 	$(BIN)/fingerspice run $(DECK) --out out
 
@@ -44,11 +48,15 @@ stress: $(VENV)/.test
 fuzz: $(VENV)/.test
 	$(BIN)/python tests/fuzz.py --inputs 1000000
 
-check: $(VENV)/.check
+check: $(VENV)/.check docs
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# The documentation as a site, out/docs/index.html; a warning, such as a link that leads nowhere, is an error.
+docs: $(VENV)/.docs
+	$(BIN)/sphinx-build --builder html --fail-on-warning --keep-going --quiet docs out/docs
+
 clean:
-	rm -rf $(VENV) out .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) out docs/gallery .pytest_cache .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,9 +1,9 @@
 """Tables and pictures of the measured times, from the files in results/ alone.
 
-Run: python benchmarks/report.py [--results FILE] [--page FILE] [--readme FILE]. From work_precision.json come
+Run: python benchmarks/report.py [--results FILE] [--page FILE] [--waits FILE]. From work_precision.json come
 results/work_precision.md (every contestant), the pictures results/work_precision.png and work_precision_networks.png,
 and the tables between the `speed` markers of docs/speed.md; from run_times.json, baseline.json and recordings.json in
-the same folder comes the table between the markers of the README.
+the same folder comes the table between the markers of docs/proof.md.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from work_pictures import COSTS, OURS, picture
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "work_precision.json"
-README, PAGE = HERE.parent / "README.md", HERE.parent / "docs" / "speed.md"
+WAITS, PAGE = (HERE.parent / "docs" / name for name in ("proof.md", "speed.md"))
 BEGIN, END = "<!-- speed:begin -->", "<!-- speed:end -->"
 TARGETS = (1e-3, 1e-6, 1e-10)
 NGSPICE_TARGET = 1e-4
@@ -152,7 +152,7 @@ def conditions(results: Report) -> str:
 
 
 def waits(folder: Path) -> str:
-    """The README's table of waiting times, from the results in a folder."""
+    """The table of waiting times, from the results in a folder."""
     run, base, recorded = (
         json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
         for name in ("run_times", "baseline", "recordings")
@@ -289,7 +289,7 @@ def details(results: Report) -> str:
     return "\n".join(lines)
 
 
-def put_into(text: str, readme: Path) -> None:
+def put_into(text: str, path: Path) -> None:
     """Put the text between the markers of a page.
 
     Raises
@@ -297,12 +297,12 @@ def put_into(text: str, readme: Path) -> None:
     ValueError
         If the page has no markers.
     """
-    page = readme.read_text(encoding="utf-8")
+    page = path.read_text(encoding="utf-8")
     before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
-        raise ValueError(f"{readme} has no lines {BEGIN} and {END}")
-    readme.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", encoding="utf-8")
+        raise ValueError(f"{path} has no lines {BEGIN} and {END}")
+    path.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", encoding="utf-8")
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -310,7 +310,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--page", type=Path, default=PAGE)
-    parser.add_argument("--readme", type=Path, default=README)
+    parser.add_argument("--waits", type=Path, default=WAITS)
     options = parser.parse_args(arguments)
     results = json.loads(options.results.read_text(encoding="utf-8"))
     if "far" not in results:
@@ -324,7 +324,7 @@ def main(arguments: list[str] | None = None) -> None:
         path = options.results.with_name(f"{options.results.stem}_networks.png")
         picture(results, [networks[::2], networks[1::2]], path)
     put_into(page_text(results), options.page)
-    put_into(waits(options.results.parent), options.readme)
+    put_into(waits(options.results.parent), options.waits)
 
 
 if __name__ == "__main__":

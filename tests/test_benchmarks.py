@@ -132,21 +132,21 @@ def test_the_report_needs_nothing_but_the_results(work_precision, tmp_path):
             for error in (1e-4, 1e-7, 1e-11)
         ],
     }  # fmt: skip
-    path, page, readme = (tmp_path / name for name in ("work_precision.json", "speed.md", "README.md"))
+    path, page, waits = (tmp_path / name for name in ("work_precision.json", "speed.md", "proof.md"))
     path.write_text(json.dumps(results))
     for name in ("run_times", "baseline", "throughput", "recordings"):
         (tmp_path / f"{name}.json").write_text((FOLDER / "results" / f"{name}.json").read_text())
-    for written in (page, readme):
+    for written in (page, waits):
         written.write_text(f"before\n{report.BEGIN}\nstale\n{report.END}\nafter\n")
-    report.main(["--results", str(path), "--page", str(page), "--readme", str(readme)])
-    for text in (page.read_text(), readme.read_text()):
+    report.main(["--results", str(path), "--page", str(page), "--waits", str(waits)])
+    for text in (page.read_text(), waits.read_text()):
         assert text.startswith("before\n")
         assert text.endswith("\nafter\n")
         assert "stale" not in text
     assert "| best peer over ours, times | 15 / 15 / 15 |" in page.read_text()
     assert "| best peer over ours, times | 15 / 15 / 15 | 15 / 15 / 15 |" in page.read_text()
     assert "9 of 18 points" in " ".join(page.read_text().split())
-    assert "| `import fingerspice` | " in readme.read_text()
+    assert "| `import fingerspice` | " in waits.read_text()
     for picture in ("work_precision.png", "work_precision_networks.png"):
         assert (tmp_path / picture).stat().st_size > 0
 

@@ -39,7 +39,7 @@ class Capability(Shown):
     """Largest amplitudes of the friction that a voltage allows.
 
     The friction is mean + amplitude sin(2 pi f t), produced by the inverse drive from an uncharged stack for 3 periods,
-    and at least 50 ms, with |U| <= limit all the time; the amplitude is at most the mean less the friction at 0 V.
+    and at least 50 ms, with ``|U| <= limit`` all the time; the amplitude is at most the mean less the friction at 0 V.
 
     Attributes
     ----------

@@ -80,7 +80,7 @@ class Consistency:
     Attributes
     ----------
     rms, largest : float
-        Misfit |y_fit / y - 1| of the best sum of Debye terms with densely placed poles.
+        Misfit ``|y_fit / y - 1|`` of the best sum of Debye terms with densely placed poles.
     frequency, misfit : ndarray, shape (n,)
         The misfit at each frequency (Hz).
     systematic : float
@@ -103,7 +103,7 @@ class MaterialFit(Shown):
     ----------
     ladder : Ladder
     rms, largest : float
-        Misfit |y_fit / y - 1| over the data.
+        Misfit ``|y_fit / y - 1|`` over the data.
     frequency : ndarray, shape (n,)
         Frequencies of the data, Hz.
     misfit : ndarray, shape (n,)
