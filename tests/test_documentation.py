@@ -137,13 +137,13 @@ def test_the_reference_has_every_public_name_and_no_other() -> None:
 def test_the_gallery_has_every_deck_and_every_scene(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.syspath_prepend(str(DOCS))
     gallery = importlib.import_module("gallery")
-    entries = {entry.name: entry for entry in (*gallery.decks(), *gallery.scenes())}
+    entries = {entry.name: entry for _, entry, _ in gallery.entries()}
     decks, scenes = ROOT.glob("circuits/*.cir"), (f"scene-{example.name}" for example in EXAMPLES)
     assert set(entries) == {*(path.stem for path in decks), *scenes}
     assert all(f"]({name}.png)" in gallery.page() for name in entries)
     assert "where fingers feel best" in entries["click"].about
     for name in ("click", "scene-fold"):
-        gallery.draw(entries[name], tmp_path)
+        gallery.draw(entries[name], tmp_path / f"{name}.png")
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
     assert not entries["scene-fold"].run().success
 

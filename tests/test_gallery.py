@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import fingerspice as fs
+from commands import Command
+from fingerspice.explorer.examples import EXAMPLES
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 
@@ -36,3 +39,16 @@ def test_the_recording_is_what_its_script_makes() -> None:
     # The sine of another machine may round differently.
     np.testing.assert_allclose(shipped.values, script.texture(), atol=1)
     assert path.stat().st_size < 100_000
+
+
+def test_the_command_draws_the_decks_below_and_the_scenes(tmp_path: Path, command: Command) -> None:
+    (tmp_path / "circuits").mkdir()
+    shutil.copy(CIRCUITS / "click.cir", tmp_path / "circuits")
+    result = command("figures", "--gallery", "--out", "out")
+    assert result.code == 0
+    drawn = {path.stem for path in (tmp_path / "out" / "gallery").glob("*.png")}
+    assert drawn == {"click", *(f"scene-{one.name}" for one in EXAMPLES)}
+    assert all(name in result.out for name in drawn)
+    result = command("figures", "--gallery", "--only", "4")
+    assert result.code == 2
+    assert "--only and --gallery are both given" in result.err
