@@ -98,6 +98,7 @@ LENT = {
     "circuit.doors.Doors.explore": "explorer.server",
     "results.doors.Doors.plot": "plots.traces",
     "results.doors.Doors.explore": "explorer.server",
+    "results.doors.Doors.sample_gradient": "solve.adjoint",
     "results.spectrum.Spectrum.plot": "plots.spectra",
     "results.phasor_solution.PhasorSolution.plot": "plots.phasors",
 }

@@ -322,3 +322,65 @@ def test_the_example_learns_a_drive() -> None:
     # Where 150 steps lead.
     found = [getattr(module, f"V{k}_amplitude").item() for k in (1, 3, 5, 7)]
     assert found == pytest.approx([169.4, 47.8, 24.8, 15.1], rel=0.1)
+
+
+def samples_of(rows: int = 1) -> torch.Tensor:
+    t = np.arange(200) / 20_000.0
+    phases = np.arange(rows)[:, None]
+    return torch.from_numpy(80.0 + 60.0 * np.sin(2.0 * np.pi * 300.0 * t + phases)).squeeze(0)
+
+
+def test_gradcheck_by_every_sample_of_a_drive() -> None:
+    t = np.linspace(1e-3, 9e-3, 5)
+    drive = fs.torch.Drive(table1(), samples_of(), 20e3, ("f_t", "friction_mean"), t=t, t_stop=9.9e-3, rtol=1e-10)
+    chosen = torch.tensor([0, 17, 100, 198])
+
+    def run(few: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        found = drive(drive.samples.detach().index_copy(0, chosen, few))
+        return found["f_t"], found["friction_mean"]
+
+    few = drive.samples.detach()[chosen].requires_grad_()
+    assert torch.autograd.gradcheck(run, (few,), eps=1e-3, atol=1e-9, rtol=1e-6)
+
+
+def test_several_drives_are_runs_of_their_own() -> None:
+    volts = samples_of(3)
+    drive = fs.torch.Drive(table1(), volts, 20e3, t_stop=9e-3)
+    force = drive()
+    assert force.shape == (3,)
+    force.sum().backward()
+    for i, row in enumerate(volts.numpy()):
+        run = fs.simulate(table1(), sources=fs.Samples(row, 20e3), t_stop=9e-3, t_eval=[9e-3], charge=False)
+        assert force[i].item() == run.f_el_mean
+        np.testing.assert_array_equal(drive.samples.grad[i], run.sample_gradient(f_el_mean=1.0).values)
+
+
+def test_a_drive_is_learned() -> None:
+    # The friction of another drive is met by the gradient alone.
+    t = np.linspace(2e-3, 9.5e-3, 40)
+    how = {"t": t, "t_stop": 9.9e-3, "outputs": "friction", "rtol": 1e-8}
+    goal = fs.torch.Drive(table1(), samples_of(), 20e3, **how)().detach()
+    drive = fs.torch.Drive(table1(), 0.0 * samples_of() + 70.0, 20e3, **how)
+    optimizer = torch.optim.LBFGS(drive.parameters(), max_iter=30, line_search_fn="strong_wolfe")
+    first = (drive() - goal).square().sum().item()
+
+    def misfit() -> torch.Tensor:
+        optimizer.zero_grad()
+        loss = 1e4 * (drive() - goal).square().sum()
+        loss.backward()
+        return loss
+
+    optimizer.step(misfit)
+    assert (drive() - goal).square().sum().item() < 1e-3 * first
+
+
+def test_a_drive_that_cannot_be_run_is_named() -> None:
+    drive = fs.torch.Drive(table1(), samples_of(2), 20e3, t_stop=9e-3)
+    with pytest.raises(InputError, match="drive 1: sample number 3 is nan"):
+        bad = samples_of(2)
+        bad[1, 3] = np.nan
+        drive(bad)
+    with pytest.raises(InputError, match="source is 'Vother'; allowed: one of Vdrive"):
+        fs.torch.Drive(table1(), samples_of(), 20e3, source="Vother")
+    with pytest.raises(InputError, match="unknown output 'force'"):
+        fs.torch.Drive(table1(), samples_of(), 20e3, "force")

@@ -243,6 +243,17 @@ def inverse_areas(u: FloatArray, curve: FloatArray) -> FloatArray:
     return np.asarray(inverse_area_array(np.abs(u), curve)[0])
 
 
+def inverse_areas_with_slopes(u: FloatArray, curve: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """1/A_R (1/m^2) and its slope by |u| (1/(m^2 V)) at gap voltages |u| (V), shape (n,), from a `Contact.curve`."""
+    q, series = inverse_areas(u, curve), curve[2 + N_PACKED :]
+    if series.size < 2 or not series[0] > 0.0 or np.abs(u).max(initial=0.0) > curve[1]:
+        return q, inverse_area_array(np.abs(u), curve)[1]
+    slope, scale = np.empty(u.size), 2.0 / float(curve[1] - curve[0])
+    by_u = np.asarray(scale * np.polynomial.chebyshev.chebder(series), float)
+    chebyshev.evaluate_array(by_u, np.ascontiguousarray(u), float(curve[0]), scale, slope)
+    return q, slope
+
+
 def forces(u: FloatArray, curve: FloatArray, stress: float) -> FloatArray:
     """Force (N) at gap voltages u (V), shape (n,), from a `Contact.curve` and the stress at 1 V, Pa."""
     out = inverse_areas(u, curve)

@@ -10,7 +10,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
 
+    from fingerspice.results.samplegradient import SampleGradient
     from fingerspice.results.solution import Solution
     from fingerspice.sets.citation import Citation
 
@@ -65,6 +67,35 @@ class Doors(Shown):
         from fingerspice.explorer.server import explore
 
         return explore(self)  # type: ignore[arg-type]
+
+    def sample_gradient(self, **of: ArrayLike) -> SampleGradient:
+        """Derivatives of a number that follows from this run by every sample of its source (docs/sensitivities.md).
+
+        For ``J = sum((run.f_t - wanted) ** 2)`` that is ``run.sample_gradient(f_t=2.0 * (run.f_t - wanted))``. The run
+        is a series stack with a GAP whose area follows its voltage, under one recording: `Samples`, or a PWL on an even
+        grid. One sweep back through the run gives the derivatives by all samples (Cao, Li, Petzold and Serban 2003).
+
+        Parameters
+        ----------
+        **of : array_like
+            Derivatives of J by signals of the run, shape (n_t,): ``u_gap``, ``area``, ``f_el``, ``f_t``, ``friction``;
+            and by its means, numbers: ``area_mean``, ``f_el_mean``, ``f_t_mean``, ``friction_mean``.
+
+        Returns
+        -------
+        SampleGradient
+            Shape (n_sample,), with the error stated.
+
+        Raises
+        ------
+        InputError
+            For another circuit, source or run, or an unknown signal.
+        SolveError
+            If the error stays above ten times the run's `rtol` of the largest derivative.
+        """
+        from fingerspice.solve.adjoint import sample_gradient
+
+        return sample_gradient(self, of)  # type: ignore[arg-type]
 
     def cite(self) -> Citation:
         """What to cite for this run: the model's paper, the program, and the sets of parameters that were applied.

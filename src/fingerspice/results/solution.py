@@ -62,6 +62,8 @@ class Solution(Sealed, Doors, Figured):
     circuit, state : Circuit, State
     first, t_stop : float
         TSTART and the end of the run, s.
+    start : str
+        How the run started, as in `simulate`; ``"given"`` where it went on from another one.
     continuous : Recorded or ClosedForm or None
         The run between its outputs; None where only its outputs are known.
     fundamental, period : Fundamental or None, float or None
@@ -94,6 +96,7 @@ class Solution(Sealed, Doors, Figured):
     warnings: tuple[str, ...] = field(default=())
     first: float = 0.0
     t_stop: float = 0.0
+    start: str = "deck"
     continuous: Recorded | ClosedForm | None = None
     stored: Mapping[str, Any] | None = None
     sensitivities: Mapping[str, Sensitivity] = field(default_factory=dict)

@@ -37,6 +37,8 @@ class Problem:
     initial : State
     charge : bool
         Whether charge and current are wanted.
+    start : str
+        How the run starts, as in `simulate`; ``"given"`` for the end of another run.
     begun : ndarray, shape (n_gap, 2), or None
         Error of a periodic start, as its effect on every gap's voltage and force, V and N. The start was computed with
         half of the error asked for; the other half is left to the run.
@@ -50,6 +52,7 @@ class Problem:
     step: float
     initial: State
     charge: bool = True
+    start: str = "deck"
     begun: FloatArray | None = None
 
     @property
@@ -124,4 +127,5 @@ def prepare(
     if asked != stop:
         asked, ends = kept["end"] = stop, on_breakpoint(scene.waveform, stop)
     first = t_start + (circuit.tran.start if circuit.tran else 0.0)
-    return Problem(circuit, scene, t_start, ends, first, step, initial_state(circuit, scene, start), charge)
+    how, initial = start if isinstance(start, str) else "given", initial_state(circuit, scene, start)
+    return Problem(circuit, scene, t_start, ends, first, step, initial, charge, how)

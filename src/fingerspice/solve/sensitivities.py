@@ -18,6 +18,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import Stack, build_stack
 from fingerspice.engine.tangent import Changes, Course, between_nodes, follow
+from fingerspice.numerics.differences import AT, STEP, derivative
 from fingerspice.numerics.lobatto import NODES, POINTS, integral_table
 from fingerspice.physics.contact import N_PACKED, areas
 from fingerspice.results.outcome import Failure, SolveError, Status
@@ -32,9 +33,6 @@ from fingerspice.solve.stackstate import model_of, to_stack
 from fingerspice.solve.track import prepare_system
 from fingerspice.waveforms.recorded import as_samples
 
-# Relative changes of a parameter at which formulas are evaluated, and the weights of a fourth-order difference.
-_STEP = 3e-4
-_AT, _WEIGHTS = (-2.0, -1.0, 1.0, 2.0), (1.0 / 12.0, -8.0 / 12.0, 8.0 / 12.0, -1.0 / 12.0)
 # Error of every sweep relative to what is asked of the run, and the smallest that is more than rounding.
 _SHARE, _FINEST = 1e-2, 1e-13
 _END = integral_table()[:, NODES - 1]
@@ -52,8 +50,7 @@ class _Varied:
 
     def by(self, of: Sequence[FloatArray | float]) -> FloatArray:
         """Derivative by the parameter of what has these values for the circuits."""
-        total = sum(weight * np.asarray(one, float) for weight, one in zip(_WEIGHTS, of, strict=True))
-        return np.asarray(total / (self.step * self.value))
+        return derivative(of, self.step * self.value)
 
 
 def _varied(problem: Problem, path: str) -> _Varied:
@@ -68,11 +65,11 @@ def _varied(problem: Problem, path: str) -> _Varied:
             f"sensitivities names {name}, which is {parameter.value:g}; allowed: parameters whose value is finite and "
             "not 0, as steps are relative to it"
         )
-    step, (element, _, _) = _STEP, name.rpartition(".")
+    step, (element, _, _) = STEP, name.rpartition(".")
     if circuit[element].waveform is not None:
         # A phase is a frequency times all the time since the start.
         step /= max(1.0, 2.0 * math.pi * problem.t_stop / problem.waveform.shortest_time())
-    circuits = tuple(circuit.varied({name: parameter.value * (1.0 + step * at)}) for at in _AT)
+    circuits = tuple(circuit.varied({name: parameter.value * (1.0 + step * at)}) for at in AT)
     return _Varied(name, parameter.unit, parameter.value, step, circuits)
 
 

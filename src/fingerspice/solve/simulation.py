@@ -302,6 +302,7 @@ def solution_of(
         warnings=tuple(run_warnings(problem, run, record)),
         first=max(problem.first, problem.t_start),
         t_stop=problem.t_stop,
+        start=problem.start,
         continuous=run.continuous if run.t_failed is None else None,
     )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,16 +11,12 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from fingerspice.base.errors import InputError
-from fingerspice.circuit.arguments import require_circuit, require_number, times_given
+from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack, is_stack
-from fingerspice.solve.simulation import RTOL_RANGE
 from fingerspice.studies.batch import own_path
-from fingerspice.torch.scenes import MEANS, SIGNALS, Scenes
-from fingerspice.waveforms.waveform import require
-
-# What batches and runs accept both.
-_LEAST_RTOL = 1e-12
+from fingerspice.torch.requests import request, tensor_of
+from fingerspice.torch.scenes import MEANS, Scenes
 
 
 class Simulator(torch.nn.Module):
@@ -78,7 +73,7 @@ class Simulator(torch.nn.Module):
         self.circuit, self.logarithms = circuit, logarithms
         self._alone = isinstance(outputs, str)
         names = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-        self._scenes = _scenes(circuit, names, t, t_stop, periodic, rtol)
+        self._scenes = request(circuit, names, t, t_stop, periodic, rtol)
         self.paths: dict[str, str] = {}
         for path, value in _initial(circuit, parameters).items():
             if logarithms and not bool((value > 0.0).all()):
@@ -125,8 +120,8 @@ class Simulator(torch.nn.Module):
         """
         given = {}
         for path, one in ({} if values is None else values).items():
-            given[own_path(self.circuit, path)] = _tensor(path, one)
-        own = {path: _tensor(path, self.value(path)) for path in self.paths if path not in given}
+            given[own_path(self.circuit, path)] = tensor_of(path, one)
+        own = {path: tensor_of(path, self.value(path)) for path in self.paths if path not in given}
         every = {**own, **given}
         if not every:
             raise InputError("there are no values; allowed: parameters of the module, or values for its call")
@@ -141,33 +136,6 @@ class Simulator(torch.nn.Module):
         return parts[self._scenes.outputs[0]] if self._alone else parts
 
 
-def _scenes(
-    circuit: Circuit, names: tuple[str, ...], t: ArrayLike | None, t_stop: float | None, periodic: bool, rtol: float
-) -> Scenes:
-    """The checked request."""
-    for name in names:
-        if name not in (*MEANS, *SIGNALS):
-            raise InputError(f"unknown output {name!r}; allowed: {', '.join((*MEANS, *SIGNALS))}")
-    require(len(names) > 0, "outputs", "empty", "one or more names")
-    require(len(set(names)) == len(names), "outputs", repr(names), "every name once")
-    signals = [name for name in names if name in SIGNALS]
-    times = times_given("t", t)
-    if signals and (times is None or times.ndim != 1 or not times.size):
-        raise InputError(f"{signals[0]} is asked for, and t is {t!r}; allowed: a row of times in s")
-    if not signals and times is not None:
-        raise InputError(f"t is given, and no signal is asked for; allowed: outputs such as {', '.join(SIGNALS)}")
-    if t_stop is not None:
-        require_number("t_stop", t_stop, "a number in s")
-        require(math.isfinite(t_stop) and t_stop > 0.0, "t_stop", t_stop, "more than 0")
-    elif circuit.tran is not None:
-        t_stop = circuit.tran.stop
-    elif signals or not periodic:
-        raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
-    require_number("rtol", rtol, "1e-12 to 0.1")
-    require(_LEAST_RTOL <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-12 to 0.1")
-    return Scenes(circuit, names, np.zeros(0) if times is None else times, t_stop, bool(periodic), float(rtol))
-
-
 def _initial(circuit: Circuit, parameters: Sequence[str] | Mapping[str, ArrayLike]) -> dict[str, Tensor]:
     """The values to start from, by path in the circuit's own spelling."""
     if isinstance(parameters, str):
@@ -178,20 +146,8 @@ def _initial(circuit: Circuit, parameters: Sequence[str] | Mapping[str, ArrayLik
         if name in found:
             raise InputError(f"{name} is given twice; allowed: once")
         one = parameters[path] if isinstance(parameters, Mapping) else circuit.parameters[name].value
-        found[name] = _tensor(path, one).detach().clone()
+        found[name] = tensor_of(path, one).detach().clone()
     return found
-
-
-def _tensor(path: str, one: Tensor | ArrayLike) -> Tensor:
-    """A value in double precision on the processor."""
-    if not isinstance(one, Tensor):
-        try:
-            one = torch.from_numpy(np.array(one, float))
-        except (TypeError, ValueError):
-            raise InputError(f"{path} is {one!r}; allowed: a tensor or array of numbers") from None
-    if one.is_complex():
-        raise InputError(f"{path} is complex; allowed: real numbers")
-    return one.to("cpu", torch.float64)
 
 
 def _rows(tensors: Sequence[Tensor]) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -1,0 +1,132 @@
+"""Derivatives of a number by every sample of a recording, against fourth-order differences of runs at 1e-12."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import butter, sosfilt
+
+import fingerspice as fs
+from fingerspice.base.errors import InputError
+from scenes import table1, table1_deck
+
+RATE, COUNT = 48_000.0, 300
+T_STOP = (COUNT - 1) / RATE
+TIMES = np.linspace(0.0, T_STOP, 211)
+
+
+def noise(seed: int, peak: float = 120.0, count: int = COUNT) -> np.ndarray:
+    band = butter(4, [50.0, 1000.0], "band", fs=RATE, output="sos")
+    x = sosfilt(band, np.random.default_rng(seed).standard_normal(count))
+    return peak * x / np.abs(x).max()
+
+
+def number(run: fs.Solution, of: dict[str, Any]) -> float:
+    return float(sum(np.sum(weight * getattr(run, name)) for name, weight in of.items()))
+
+
+def check(
+    circuit: fs.Circuit, volts: np.ndarray, of: dict[str, Any], step: float, tol: float, rtol: float = 1e-9, **how: Any
+) -> None:
+    """Derivatives along random directions and by single samples, relative to the largest by a sample."""
+    how = {"t_stop": T_STOP, "t_eval": TIMES, "charge": False, "tier": "coupled", **how}
+
+    def run(x: np.ndarray, rtol: float) -> fs.Solution:
+        return fs.simulate(circuit, sources=fs.Samples(x, RATE), rtol=rtol, **how)
+
+    found = run(volts, rtol).sample_gradient(**of)
+    assert found.values.shape == volts.shape
+    largest = np.abs(found.values).max()
+    assert 0.0 < found.error <= 10.0 * rtol * largest
+    ways = [np.random.default_rng(4).standard_normal(volts.size) / math.sqrt(volts.size)]
+    ways += [np.eye(volts.size)[i] for i in (0, 1, 137, volts.size - 2, volts.size - 1)]
+    for way in ways:
+        near = [number(run(volts + k * step * way, 1e-12), of) for k in (-2, -1, 1, 2)]
+        expected = (near[0] - 8.0 * near[1] + 8.0 * near[2] - near[3]) / (12.0 * step)
+        assert abs(found.values @ way - expected) <= tol * largest
+
+
+@pytest.fixture
+def weights() -> np.ndarray:
+    return np.random.default_rng(5).standard_normal(TIMES.size)
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+@pytest.mark.parametrize("name", ["f_t", "u_gap", "area", "friction"])
+def test_a_sum_over_a_signal(law: str, name: str, weights: np.ndarray) -> None:
+    check(table1(), 100.0 + noise(1, 40.0), {name: weights}, 0.5, 1e-9, charge_law=law, start="dc")
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+def test_means_and_a_signal_together(law: str, weights: np.ndarray) -> None:
+    of = {"f_el_mean": 3.0, "friction_mean": -1.0, "area_mean": 1e3, "f_el": 1e-3 * weights}
+    check(table1(), 100.0 + noise(2, 40.0), of, 0.5, 5e-9, charge_law=law)
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+@pytest.mark.parametrize("of", [{"f_el_mean": 1.0}, {"f_t": np.sin(np.arange(TIMES.size))}], ids=["mean", "signal"])
+def test_voltages_through_zero_where_the_area_has_a_kink(law: str, of: dict[str, Any]) -> None:
+    # A wider difference would move a zero across the time of an output.
+    check(table1(), noise(3), of, 0.05, 1e-6, charge_law=law)
+
+
+def test_a_dispersive_skin(weights: np.ndarray) -> None:
+    text = table1_deck().replace("SKIN d=350u f=100.0", "SKIN_DISPERSIVE d=350u")
+    assert "DISPERSIVE" in text
+    check(fs.parse_netlist(text), 100.0 + noise(6, 40.0), {"f_t": weights}, 0.5, 5e-7, rtol=1e-7)
+
+
+def test_a_source_against_the_loop_a_late_recording_and_means_from_tstart() -> None:
+    text = table1_deck(tran=f"10u {T_STOP!r} 1.00001m uic")
+    turned = fs.parse_netlist(text.replace("Vdrive drive 0", "Vdrive 0 drive"))
+    plain, volts = fs.parse_netlist(text), 50.0 + noise(7)
+    late = {"t_stop": T_STOP, "rtol": 1e-9, "charge": False}
+    one = fs.simulate(plain, sources=fs.Samples(volts, RATE, 3.3e-5), **late)
+    two = fs.simulate(turned, sources=fs.Samples(-volts, RATE, 3.3e-5), **late)
+    first, second = (run.sample_gradient(f_el_mean=1.0) for run in (one, two))
+    np.testing.assert_allclose(second.values, -first.values, rtol=1e-9, atol=1e-9 * np.abs(first.values).max())
+    # The means begin at TSTART, and what is left after the run's end counts for nothing.
+    assert first.values[-1] == 0.0
+    off = [
+        fs.simulate(plain, sources=fs.Samples(volts + d, RATE, 3.3e-5), **late | {"rtol": 1e-12}) for d in (-0.01, 0.01)
+    ]
+    slope = (off[1].f_el_mean - off[0].f_el_mean) / 0.02
+    assert first.values.sum() == pytest.approx(slope, rel=1e-6)
+
+
+def test_points_on_an_even_grid_are_samples() -> None:
+    volts = 100.0 + noise(8, 40.0)
+    times = np.arange(COUNT) / RATE
+    how = {"t_stop": T_STOP, "rtol": 1e-9, "t_eval": TIMES, "charge": False}
+    one = fs.simulate(table1(), sources=fs.Samples(volts, RATE), **how)
+    two = fs.simulate(table1(), sources=fs.PWL(times, volts), **how)
+    found = [run.sample_gradient(f_t=np.ones(TIMES.size)) for run in (one, two)]
+    np.testing.assert_allclose(found[1].values, found[0].values, rtol=1e-6)
+    assert "Vdrive: 300 samples" in repr(found[0])
+
+
+def test_what_has_no_such_derivatives_is_refused() -> None:
+    volts = noise(9)
+    how = {"t_stop": T_STOP, "t_eval": TIMES}
+    run = fs.simulate(table1(), sources=fs.Samples(volts, RATE), **how)
+    for of, said in (
+        ({"force": 1.0}, "unknown signal 'force'; allowed: u_gap"),
+        ({"f_t": 1.0}, r"f_t has the shape \(\); allowed: the shape \(211,\)"),
+        ({"f_el_mean": TIMES}, r"f_el_mean has the shape \(211,\); allowed: the shape \(\)"),
+        ({"f_t": np.full(TIMES.size, np.nan)}, "not finite"),
+        ({"f_t": "high"}, "f_t is 'high'; allowed: numbers"),
+        ({}, "no signal is given; allowed: u_gap"),
+    ):
+        with pytest.raises(InputError, match=said):
+            run.sample_gradient(**of)
+    with pytest.raises(InputError, match="0 sources of the circuit are recordings"):
+        fs.simulate(table1()).sample_gradient(f_el_mean=1.0)
+    further = fs.simulate(table1(), sources=fs.Samples(volts, RATE), start=run, t_stop=2.0 * T_STOP)
+    with pytest.raises(InputError, match="goes on from another one"):
+        further.sample_gradient(f_el_mean=1.0)
+    held = fs.simulate(table1(), sources=fs.Samples(volts, RATE), area="frozen", **how)
+    with pytest.raises(InputError, match="whose area is coupled"):
+        held.sample_gradient(f_el_mean=1.0)
