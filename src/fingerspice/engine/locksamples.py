@@ -33,8 +33,8 @@ from fingerspice.engine.lockstep import (
 from fingerspice.engine.lockweights import moment_integrals
 
 # Rows of the weights, each for every mode. To the middle: decay, source at both ends, nonlinear term at the start and
-# in the middle of the step before. To the end: decay, source at both ends, nonlinear term at start and middle as predicted,
-# and at start, middle and end as corrected; and the integral of |u| that Simpson's rule misses.
+# in the middle of the step before. To the end: decay, source at both ends, nonlinear term at start and middle as
+# predicted, and at start, middle and end as corrected; and the integral of |u| that Simpson's rule misses.
 HALF, HALF_SOURCE, HALF_SOURCE_END, HALF_NOW, HALF_OLD, DECAY, SOURCE, SOURCE_END, PREDICT, PREDICT_MIDDLE = range(10)
 CORRECT, CORRECT_MIDDLE, CORRECT_END, KINK, N_WEIGHTS = 10, 11, 12, 13, 14
 # Rows of the state for every mode: z, the nonlinear term at the start of the step and in its middle, and a guess.

@@ -32,7 +32,7 @@ CLOSING, ROUNDING = 0.02, 1e-11
 _STATED, _STATED_JUMPING = ((5e-6, 0.25), (0.0, 0.5)), 0.5
 # Under a recording the order is 3, which would give a seventh; but 1, which gives 1, for a dispersive skin, some of
 # whose modes decay from each sample on within a part of a step.
-_STATED_RECORDED, _STATED_DISPERSIVE = 0.4, 1.0
+_STATED_RECORDED, _STATED_DISPERSIVE = 0.6, 1.0
 _MOST_GAIN = 24.0
 # Longest first step after a jump of the source, in time constants of the fastest cell.
 _LONGEST_STEP = 1.0
