@@ -23,6 +23,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from scipy.signal import butter, sosfilt
 
 import fingerspice as fs
 from fingerspice.circuit.statespace import build_stack
@@ -51,6 +52,13 @@ def population(n: int, wide: bool) -> dict[str, np.ndarray]:
         "Xgap.fn": rng.uniform(0.1, 2.0, n),
         "Xgap.d": rng.uniform(2e-6, 6e-6, n),
     }
+
+
+def noise(highest: float) -> fs.Samples:
+    """50 ms of noise from 50 Hz on, 150 V, at 48 kHz."""
+    band = butter(4, [50.0, highest], "band", fs=48e3, output="sos")
+    x = sosfilt(band, np.random.default_rng(1).standard_normal(2401))
+    return fs.Samples(150.0 * x / np.abs(x).max(), 48e3)
 
 
 def seconds(action: Callable[[], object], repeats: int) -> dict[str, float]:
@@ -181,6 +189,10 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
             rows += measure("square, wide", square, population(n // 4, True), repeats)
             for deck in ("am_carrier", "fingerpad_dispersive"):
                 rows += measure(deck, fs.read_netlist(circuits / f"{deck}.cir"), fingers, repeats, None)
+            for highest in (1000.0, 8000.0):
+                recorded = sine.replace({"Vdrive": noise(highest)})
+                some = {path: values[:1024] for path, values in fingers.items()}
+                rows += measure(f"recording to {highest:g} Hz", recorded, some, repeats, None)
         rows += growth(sine, 100 if options.quick else 1_000_000)
     results = {"python": platform.python_version(), "machine": platform.machine(), "rows": rows}
     for row in rows:

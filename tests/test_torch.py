@@ -376,9 +376,9 @@ def test_a_drive_is_learned() -> None:
 
 def test_a_drive_that_cannot_be_run_is_named() -> None:
     drive = fs.torch.Drive(table1(), samples_of(2), 20e3, t_stop=9e-3)
+    bad = samples_of(2)
+    bad[1, 3] = np.nan
     with pytest.raises(InputError, match="drive 1: sample number 3 is nan"):
-        bad = samples_of(2)
-        bad[1, 3] = np.nan
         drive(bad)
     with pytest.raises(InputError, match="source is 'Vother'; allowed: one of Vdrive"):
         fs.torch.Drive(table1(), samples_of(), 20e3, source="Vother")

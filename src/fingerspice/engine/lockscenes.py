@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,18 +217,95 @@ def _closed(
 
 
 @jit
-def _results(
+def put_results(
     s: FloatArray, last: FloatArray, closing: FloatArray, steps: tuple[float, float], first: int, out: FloatArray,
-    n_modes: int, count: int,
+    marks: Marks,
 ) -> None:  # fmt: skip
     """Means over the run and over its last period, the peak (V), and the relative error of the periodic state."""
-    own = N_STATE * n_modes
+    own, count = N_STATE * len(marks[0]), len(marks[4])
     for i in range(min(LANES, out.shape[1] - first)):
         for j in range(count):
             out[j, first + i] = s[(own + VALUE + count + j) * LANES + i] / steps[0]
             out[count + j, first + i] = last[j * LANES + i] / steps[1]
         out[2 * count, first + i] = s[(own + PEAK) * LANES + i]
         out[2 * count + 1, first + i] = closing[i]
+
+
+class Block(NamedTuple):
+    """What `fill_block` finds of a block's scenes, and its scratch.
+
+    Attributes
+    ----------
+    start : ndarray, shape (n_mode * LANES,)
+        Modes at the start, V.
+    rates, drive : ndarray, shape (n_mode, LANES)
+        Rates (1/s), and drive of a source of constant pieces.
+    b : ndarray, shape (N_OTHERS * LANES,)
+        The table's further rows.
+    top, tail : ndarray, shape (LANES,)
+        Largest gap voltage that the area's polynomial covers (V), and the relative size of its last coefficient;
+        infinite where the universal curve does not reach so far.
+    """
+
+    start: FloatArray
+    rates: FloatArray
+    drive: FloatArray
+    b: FloatArray
+    top: FloatArray
+    tail: FloatArray
+    column: FloatArray
+    work: FloatArray
+    scratch: Scratch
+
+
+@jit
+def new_block(rows: int, marks: Marks) -> Block:
+    """Arrays for blocks of scenes of a table with so many rows."""
+    m = len(marks[0])
+    return Block(
+        np.empty(m * LANES), np.empty((m, LANES)), np.empty((m, LANES)), np.empty(N_OTHERS * LANES), np.empty(LANES),
+        np.empty(LANES), np.empty(rows), np.empty((2, LANES)), _scratch(m),
+    )  # fmt: skip
+
+
+@jit
+def fill_block(
+    table: FloatArray, pending: NDArray[np.int64], first: int, places: Places,
+    curves: tuple[FloatArray, FloatArray, FloatArray], source: tuple[FloatArray, bool, float], block: Block,
+    c: FloatArray, marks: Marks,
+) -> None:  # fmt: skip
+    """Constants of the scenes from number `first` of `pending` on, into `c` and `block`.
+
+    `source` has the frequencies of the tones, in that of the source; whether it is of constant pieces, or of straight
+    lines; and the largest gap voltage that the area's polynomial covers, as a ratio to its estimate. The other
+    arguments are those of `march`.
+    """
+    m_all, w_all, l_all, d_all = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[3]) - 1
+    cells, area = m_all + 1, area_row(m_all, w_all, l_all)
+    column, b, top = block.column, block.b, block.top
+    for i in range(LANES):
+        column[:] = table[:, pending[min(first + i, pending.size - 1)]]
+        for j in range(N_OTHERS):
+            b[j * LANES + i] = column[CELL_ROWS * cells + j]
+        top[i] = source[2] * _largest_voltage(column, places[0], cells, source[1]) + 1e-12
+        c[SCALE * LANES + i] = 2.0 / top[i]
+    c[area * LANES :] = 0.0
+    for j in range(d_all + 1):
+        _inverse_areas(curves[0].size, curves[1][j], top, b, curves[0], block.work[0], block.work[1])
+        for d in range(d_all + 1):
+            _add_row(curves[2][d, j], block.work[1], c[(area + d) * LANES : (area + d + 1) * LANES])
+    for i in range(LANES):
+        # The coefficients of the two highest powers are 2^(d - 1) and 2^(d - 2) times those of Chebyshev's series.
+        # These fall to about a third from one to the next; the last one alone may be small by chance.
+        tail = max(abs(c[area * LANES + i]), 2.0 / 3.0 * abs(c[(area + 1) * LANES + i])) / 2.0 ** (d_all - 1)
+        covered = b[XI * LANES + i] * top[i] <= LARGEST_X
+        block.tail[i] = tail / c[(area + d_all) * LANES + i] if covered else math.inf
+        column[:] = table[:, pending[min(first + i, pending.size - 1)]]
+        block.scratch[4][0] = c[(area + d_all) * LANES + i]
+        _lane(
+            i, places, column, source[0], source[1], c, block.start, block.rates[:, i], block.drive[:, i],
+            block.scratch, marks,
+        )  # fmt: skip
 
 
 @jit
@@ -268,40 +346,17 @@ def march(
     m_all, w_all, l_all, d_all, count = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[3]) - 1, len(marks[4])
     halves, half, pieces, periodic, tol, covered = how
     jumping = pieces > 0
-    cells, row = m_all + 1, N_WEIGHTS * m_all * LANES
+    row = N_WEIGHTS * m_all * LANES
     c = np.zeros(n_constants(m_all, w_all, l_all, d_all) * LANES)
     g = (np.empty(row), np.empty((pieces if jumping else 4, 3, row)))
     s, last = np.empty(n_state(m_all, l_all, count) * LANES), np.empty(count * LANES)
-    start, back, closing = np.empty(m_all * LANES), np.zeros(m_all * LANES), np.zeros(LANES)
-    rates, drive = np.empty((m_all, LANES)), np.empty((m_all, LANES))
-    scratch = _scratch(m_all)
-    b, top, work = np.empty(N_OTHERS * LANES), np.empty(LANES), np.empty((2, LANES))
+    block, back, closing = new_block(table.shape[0], marks), np.zeros(m_all * LANES), np.zeros(LANES)
+    start, rates, b, top = block.start, block.rates, block.b, block.top
     length, moments = np.empty(LANES), np.empty((11, LANES))
-    column, tail, area = np.empty(table.shape[0]), np.empty(LANES), area_row(m_all, w_all, l_all)
     voltages = np.empty(LANES * traces[0].shape[1]), np.empty(LANES * traces[1].shape[1])
     for first in range(0, pending.size, LANES):
+        fill_block(table, pending, first, places, curves, (source[0], jumping, covered), block, c, marks)
         for i in range(LANES):
-            scene = pending[min(first + i, pending.size - 1)]
-            column[:] = table[:, scene]
-            for j in range(N_OTHERS):
-                b[j * LANES + i] = column[CELL_ROWS * cells + j]
-            top[i] = covered * _largest_voltage(column, places[0], cells, jumping) + 1e-12
-            c[SCALE * LANES + i] = 2.0 / top[i]
-        c[area * LANES :] = 0.0
-        for j in range(d_all + 1):
-            _inverse_areas(curves[0].size, curves[1][j], top, b, curves[0], work[0], work[1])
-            for d in range(d_all + 1):
-                _add_row(curves[2][d, j], work[1], c[(area + d) * LANES : (area + d + 1) * LANES])
-        for i in range(LANES):
-            # The coefficients of the two highest powers are 2^(d - 1) and 2^(d - 2) times those of Chebyshev's series.
-            # These fall to about a third from one to the next; the last one alone may be small by chance.
-            tail[i] = max(abs(c[area * LANES + i]), 2.0 / 3.0 * abs(c[(area + 1) * LANES + i])) / 2.0 ** (d_all - 1)
-            tail[i] /= c[(area + d_all) * LANES + i]
-            if not b[XI * LANES + i] * top[i] <= LARGEST_X:
-                tail[i] = math.inf
-            column[:] = table[:, pending[min(first + i, pending.size - 1)]]
-            scratch[4][0] = c[(area + d_all) * LANES + i]
-            _lane(i, places, column, source[0], jumping, c, start, rates[:, i], drive[:, i], scratch, marks)
             if periodic:
                 period = 2.0 * math.pi / b[OMEGA * LANES + i]
                 for m in range(m_all):
@@ -314,7 +369,7 @@ def march(
             shorter = pieces / (2.0**pieces - 1.0) if jumping else START_TIMES[1]
             for i in range(LANES):
                 length[i] = math.pi / b[OMEGA * LANES + i] / steps * shorter
-            weigh(length, rates, drive, g, moments, marks)
+            weigh(length, rates, block.drive, g, moments, marks)
             for _ in range(MOST_PERIODS if periodic else 1):
                 s[:] = 0.0
                 s[: m_all * LANES] = start
@@ -322,8 +377,8 @@ def march(
                 run(c, g, s, source[1][w], size, last, voltages[w], marks)
                 if not periodic or _closed(s, start, back, c, closing, tol, marks):
                     break
-            _results(s, last, closing, (float(halves * steps), 2.0 * steps), first, out[w], m_all, count)
+            put_results(s, last, closing, (float(halves * steps), 2.0 * steps), first, out[w], marks)
             for i in range(min(LANES, pending.size - first)):
-                out[w, 2 * count + 2, first + i] = tail[i] if out[w, 2 * count, first + i] <= top[i] else math.inf
+                out[w, 2 * count + 2, first + i] = block.tail[i] if out[w, 2 * count, first + i] <= top[i] else math.inf
                 width = traces[w].shape[1]
                 traces[w][first + i] = voltages[w][i * width : (i + 1) * width]

@@ -63,8 +63,9 @@ class ClosedForm:
         pieces = np.maximum(np.ceil(np.diff(edges) / longest), 1.0)
         if pieces.sum() > MOST_PANELS:
             return None
-        cuts = [np.linspace(a, b, int(n) + 1)[:-1] for a, b, n in zip(edges, edges[1:], pieces, strict=False)]
-        marks = np.concatenate([*cuts, edges[-1:]])
+        count = pieces.astype(int)
+        number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        marks = np.append(np.repeat(edges[:-1], count) + number * np.repeat(np.diff(edges) / count, count), edges[-1])
         begin, end = marks[:-1], marks[1:]
         done: list[tuple[FloatArray, FloatArray]] = []
         peaks: dict[str, float] = {}

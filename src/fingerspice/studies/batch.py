@@ -33,8 +33,9 @@ RTOL_RANGE = (1e-12, 0.1)
 # Largest number of failure messages that a Dataset keeps, and of gap voltages (8 GB) that a batch may return.
 MESSAGES, MOST_VOLTAGES = 16, 1e9
 # Largest number of scenes in a job, and the smallest to which a batch is divided so that all threads have jobs; and
-# their number if gap voltages are wanted, so that these stay in the processor's cache.
-CHUNK, SMALL_CHUNK, TRACED = 4096, 256, 256
+# their number if gap voltages are wanted, so that these stay in the processor's cache; and under a recording, whose
+# scenes take long.
+CHUNK, SMALL_CHUNK, TRACED, RECORDED = 4096, 256, 256, 32
 # Relative distance from a whole number within which a number of half periods counts as whole.
 WHOLE = 1e-9
 
@@ -54,9 +55,9 @@ def batch(
 ) -> Dataset:
     """Figures of many scenes, which are one circuit with different values of its parameters.
 
-    Series stacks of two to four layers under the local law, driven by sines, an AM carrier or a square, are integrated
-    in lockstep. Every other scene, and every scene that does not reach `rtol` in lockstep, is run by itself
-    through `simulate` (`steady_state`).
+    Series stacks of two to four layers under the local law, driven by sines, an AM carrier, a square or a recording,
+    are integrated in lockstep. Every other scene, and every scene that does not reach `rtol` in lockstep, is run by
+    itself through `simulate` (`steady_state`).
 
     Parameters
     ----------
@@ -70,7 +71,7 @@ def batch(
         Error of every output, relative to itself; error of ``u_gap``, relative to its peak.
     t_stop, periods : float, optional
         Length of every run in s, or in periods of its own source; the deck's TSTOP by default. Lockstep is possible if
-        the length is a whole number of half periods.
+        the length is a whole number of half periods, or of samples.
     periodic : bool
         Find the periodic state; the figures are then those of one period of it.
     skin : str
@@ -254,9 +255,14 @@ def _lockstep(task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExec
     lower = {path.lower(): array for path, array in scenes.items()}
     traced = "u_gap" in task.outputs
     form = lockstep_form(task.circuit, lower)
-    others = [name for name in task.outputs if not in_lockstep(name)]
-    by_period = traced or not isinstance(form, str)
-    count = task.count(_frequencies(task.circuit, scenes)) if by_period else np.ones(n)
+    recorded = not isinstance(form, str) and form.recording is not None
+    others = [name for name in task.outputs if not in_lockstep(name) or (recorded and name.endswith("_periodic"))]
+    count = np.ones(n)
+    if not isinstance(form, str) and recorded and not traced and task.t_stop is not None:
+        # Half a period is the length of a sample.
+        count = task.count(np.full(n, form.frequency or math.nan))
+    elif traced or not isinstance(form, str):
+        count = task.count(_frequencies(task.circuit, scenes))
     width = math.ceil(float(count.max()) * task.points - 1e-9) if traced else 0
     require(n * width <= MOST_VOLTAGES, "outputs", f"of {n * width:.3g} gap voltages", f"at most {MOST_VOLTAGES:g}")
     found = Answers.empty(task, n, width)
@@ -270,7 +276,8 @@ def _lockstep(task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExec
     jobs = []
     for size in np.unique(halves[good]).astype(int).tolist():
         members = np.flatnonzero(good & (halves == size))
-        chunk = TRACED if traced else int(np.clip(members.size // 16, SMALL_CHUNK, CHUNK))
+        chunk = int(np.clip(members.size // 16, SMALL_CHUNK, CHUNK))
+        chunk = TRACED if traced else RECORDED if recorded else chunk
         jobs += [(size, members[i : i + chunk]) for i in range(0, members.size, chunk)]
 
     def one(job: tuple[int, NDArray[np.int64]]) -> Answers:
@@ -279,7 +286,7 @@ def _lockstep(task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExec
     for (_, members), answer in zip(jobs, pool.map(one, jobs), strict=True):
         found.put(members[answer.done], {k: v[answer.done] for k, v in answer.values.items()},
                   answer.error[answer.done], LOCKSTEP)  # fmt: skip
-    return found, "what does not end after half periods, or does not meet its error in lockstep"
+    return found, "what does not end after half periods or at a sample, or does not meet its error in lockstep"
 
 
 def _one_by_one(

@@ -9,14 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.engine.locksamples import march_samples
 from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, LOSS, OMEGA, REST, STRESS, march
 from fingerspice.engine.lockstep import ALL_MOMENTS, START_TIMES
-from fingerspice.studies.batchscenes import Curves, LockstepForm, curves_of, table_of
+from fingerspice.studies.batchscenes import Curves, LockstepForm, curves_of, peak_of, table_of
 from fingerspice.studies.batchtask import LOCKSTEP, Answers, Task
 
 # Initial number of steps per period, and initial degree of the area's polynomial, by the smallest rtol served.
 _RUNGS = ((5e-4, 32, 8), (5e-5, 48, 8), (5e-6, 80, 12), (5e-7, 144, 12), (0.0, 288, 16))
 _HIGHEST_DEGREE, _MOST_STEPS = 24, 8192
+# Under a recording: initial number of steps a sample, and the largest.
+_PARTS = (2, 16)
 # Largest gap voltage that the area's polynomial covers, as a ratio to its estimate, at first and later.
 _COVERED, _COVERED_LATER = 1.2, 1.5
 # Allowed defect of the periodic state relative to rtol, and the relative round-off added to every stated error.
@@ -27,6 +30,9 @@ CLOSING, ROUNDING = 0.02, 1e-11
 # from the order. As the change may be small by chance, doubling the steps may not reduce the stated error by more than
 # the factor _MOST_GAIN.
 _STATED, _STATED_JUMPING = ((5e-6, 0.25), (0.0, 0.5)), 0.5
+# Under a recording the order is 3, which would give a seventh; but 1, which gives 1, for a dispersive skin, some of
+# whose modes decay from each sample on within a part of a step.
+_STATED_RECORDED, _STATED_DISPERSIVE = 0.6, 1.0
 _MOST_GAIN = 24.0
 # Longest first step after a jump of the source, in time constants of the fastest cell.
 _LONGEST_STEP = 1.0
@@ -62,7 +68,7 @@ def in_lockstep(name: str) -> bool:
 
 def _waves(n: int, form: LockstepForm) -> FloatArray:
     """Sine and cosine of every tone at the times that `engine.lockstep.run` needs; a square's value in both halves."""
-    if n == 0 or form.jumping:
+    if n == 0 or form.jumping or form.recording is not None:
         return np.array([[1.0], [-1.0]])[: 2 * n]
     # The phase in turns is reduced before it is multiplied by 2 pi, so that high tones keep their accuracy.
     times = np.concatenate([np.arange(n), START_TIMES])
@@ -118,7 +124,7 @@ def _climb_one(
     needed = sorted({i for name in figures for i in FIGURES[name.removesuffix("_periodic")][0]} or {0})
     traced, pieces = len(figures) < len(task.outputs), mesh[1]
     steps, degree = next((s, d) for least, s, d in _RUNGS if task.rtol >= least)
-    steps *= max(form.multiples)
+    steps, most = (steps * max(form.multiples), _MOST_STEPS * max(form.multiples)) if form.recording is None else _PARTS
     if pieces > 1:
         steps = 2 * pieces * next(s for least, s in _PIECES if task.rtol >= least)
     if traced:
@@ -127,7 +133,7 @@ def _climb_one(
     shortest = 2.0 * max(pieces, 1) / (2.0 ** max(pieces, 1) - 1.0)
     pending = np.flatnonzero(chosen)
     before, least = None, np.zeros(pending.size)
-    while pending.size and steps <= _MOST_STEPS * max(form.multiples):
+    while pending.size and steps <= most:
         curves = curves_of(form.layer.values["m_exp"], form.layer.values["n_exp"], degree)
         if curves is None:
             break
@@ -162,7 +168,7 @@ class _Run(NamedTuple):
 
 
 class _Level(NamedTuple):
-    """An integration with a given number of steps per period and degree of the area's polynomial."""
+    """An integration with a given number of steps per period (sample) and degree of the area's polynomial."""
 
     task: Task
     form: LockstepForm
@@ -177,18 +183,26 @@ class _Level(NamedTuple):
         sizes = (self.steps // 2 if before is None else 0, self.steps)
         halves, pieces = self.mesh
         out = np.empty((2, 2 * self.moments + 3, pending.size))
+        recording = self.form.recording
         widths = [halves * n // 2 if self.traced else 0 for n in sizes]
         traces = np.empty((pending.size, widths[0])), np.empty((pending.size, widths[1]))
         covered = _COVERED if before is None else _COVERED_LATER
         leaks = np.array(self.form.leaks)
-        waves = _waves(sizes[0], self.form), _waves(sizes[1], self.form)
+        places = self.form.gap_cell, leaks
+        waves = (
+            (_waves(sizes[0], self.form), _waves(sizes[1], self.form)) if recording is None else (np.zeros((0, 1)),) * 2
+        )
         lengths = (self.form.cells - 1, waves[1].shape[1], leaks.size, self.degree + 1, self.moments)
         marks: Any = tuple((0,) * n for n in lengths)
-        march(
-            table, pending, (self.form.gap_cell, leaks), curves, (np.array(self.form.multiples, float), waves),
-            (halves, self.steps // 2, pieces, self.task.periodic, CLOSING * self.task.rtol, covered), out, traces,
-            marks,
-        )  # fmt: skip
+        if recording is not None:
+            values = recording.between(0, halves + 1) / peak_of(recording)
+            march_samples(table, pending, places, curves, values, (sizes, covered), out, marks)
+        else:
+            march(
+                table, pending, places, curves, (np.array(self.form.multiples, float), waves),
+                (halves, self.steps // 2, pieces, self.task.periodic, CLOSING * self.task.rtol, covered), out, traces,
+                marks,
+            )  # fmt: skip
         if before is None:
             return _Run(out[0], out[1], traces[0], traces[1])
         return _Run(before.fine, out[1], before.trace, traces[1])
@@ -197,10 +211,17 @@ class _Level(NamedTuple):
         """Largest stated relative error of the outputs, for each scene."""
         peak, closing, tail = run.fine[2 * self.moments :]
         changes = [np.zeros(peak.size)]
-        parts = (0, 1) if self.mesh[0] > 1 else (0,)
-        for row in (part * self.moments + i for part in parts for i in needed):
-            size = np.abs(run.fine[row])
-            changes.append(np.abs(run.fine[row] - run.coarse[row]) / np.where(size > 0.0, size, 1.0))
+        for row in needed:
+            size, change = np.abs(run.fine[row]), np.abs(run.fine[row] - run.coarse[row])
+            later = row + self.moments
+            if self.form.recording is not None:
+                # The share of the second half of the run: changes of both halves may cancel by chance.
+                second = run.fine[later] - run.coarse[later]
+                change = np.abs(run.fine[row] - run.coarse[row] - second) + np.abs(second)
+            elif self.mesh[0] > 1:
+                last = np.abs(run.fine[later])
+                changes.append(np.abs(run.fine[later] - run.coarse[later]) / np.where(last > 0.0, last, 1.0))
+            changes.append(change / np.where(size > 0.0, size, 1.0))
         if self.traced:
             off = np.abs(run.trace[:, ::2] - run.trace_coarse).max(axis=1)
             changes.append(off / np.where(peak > 0.0, peak, 1.0))
@@ -209,4 +230,6 @@ class _Level(NamedTuple):
         share = next(s for least, s in _STATED if self.task.rtol >= least)
         if self.form.jumping:
             share = _STATED_JUMPING
+        if self.form.recording is not None:
+            share = _STATED_RECORDED if self.form.cells == len(self.form.layers) else _STATED_DISPERSIVE
         return np.asarray(share * change + tail + 2.0 * closing + ROUNDING)

@@ -19,6 +19,8 @@ from fingerspice.physics.ladder import SKIN_LADDER
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 from fingerspice.waveforms.combinations import AM
 from fingerspice.waveforms.periodic import Pulse, Square
+from fingerspice.waveforms.recorded import as_samples
+from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import DC, Sine, Waveform
 
 Value = float | FloatArray
@@ -51,9 +53,12 @@ class LockstepForm:
     multiples : tuple of int
         Frequency of every tone of the sources' sum, in that of the sum.
     frequency : float or None
-        That of the sum, Hz; None for one source of one tone, whose frequency may vary.
+        That of the sum, Hz; None for one source of one tone, whose frequency may vary. For a recording half of its
+        sample rate, so that a sample's length is half a period.
     jumping : bool
         Whether the source is a square.
+    recording : Samples or None
+        The samples of the only source, if it is a recording.
     """
 
     layers: tuple[Element, ...]
@@ -62,6 +67,7 @@ class LockstepForm:
     multiples: tuple[int, ...]
     frequency: float | None
     jumping: bool
+    recording: Samples | None = None
 
     @property
     def layer(self) -> Element:
@@ -104,9 +110,17 @@ def lockstep_form(circuit: Circuit, varied: Mapping[str, object]) -> LockstepFor
     sources = tuple((e, float(turn * stack.sign[stack.gap])) for e, turn in stack.sources if e.waveform != DC(0.0))
     waves = [e.waveform for e, _ in sources]
     jumping = len(waves) == 1 and isinstance(waves[0], Square | Pulse)
-    tones = [hz for wave in waves for hz in _tones(wave)]
-    if not waves or not (_plain_square(waves[0]) if jumping else all(tones) and len(tones) <= _MOST_TONES):
-        return f"the sources are not 1 to {_MOST_TONES} plain sines, and not a square that starts with its period"
+    recording = as_samples(waves[0]) if len(waves) == 1 and waves[0] is not None else None
+    tones = [] if recording else [hz for wave in waves for hz in _tones(wave)]
+    if recording is not None and recording.start != 0.0:
+        return "the recording does not start at 0 s"
+    if recording is None and not (
+        _plain_square(waves[0]) if jumping else tones and all(tones) and len(tones) <= _MOST_TONES
+    ):
+        return (
+            f"the sources are not 1 to {_MOST_TONES} plain sines, not a square that starts with its period, and not a "
+            "recording"
+        )
     multiples: tuple[int, ...] = (1,)
     frequency: float | None = None
     if len(tones) > 1:
@@ -114,14 +128,17 @@ def lockstep_form(circuit: Circuit, varied: Mapping[str, object]) -> LockstepFor
         if period is None or max(tones) * period > _MOST_PERIODS:
             return "the sources' tones have no common period, or one of very many of their own"
         multiples, frequency = tuple(round(hz * period) for hz in tones), 1.0 / period
-    if not _starts_uncharged(circuit, jumping, varied):
+    if recording is not None:
+        frequency = 0.5 * recording.rate
+    charged = jumping if recording is None else recording.between(0, 1)[0] != 0.0
+    if not _starts_uncharged(circuit, charged, varied):
         return "the run does not start uncharged, or its figures start late"
     layers, on = {e.name.lower() for e in stack.layers}, {e.name.lower(): e.waveform for e, _ in sources}
     for path in varied:
         name, _, parameter = path.rpartition(".")
         if (parameter not in _varies(on[name], frequency)) if name in on else parameter in _FORM or name not in layers:
             return f"{path} varies"
-    return LockstepForm(stack.layers, gap, sources, multiples, frequency, jumping)
+    return LockstepForm(stack.layers, gap, sources, multiples, frequency, jumping, recording)
 
 
 def _tones(wave: object) -> tuple[float, ...]:
@@ -142,15 +159,16 @@ def _plain_square(wave: object) -> bool:
 
 def _varies(wave: object, frequency: float | None) -> tuple[str, ...]:
     """Parameters of a source that may vary from scene to scene."""
-    if isinstance(wave, Pulse):
-        return ()
     if isinstance(wave, AM):
         return ("amplitude", "depth", "phase_deg")
+    if not isinstance(wave, Sine | Square):
+        return ()
     may_vary = {"amplitude": True, "frequency": frequency is None, "phase_deg": isinstance(wave, Sine)}
     return tuple(name for name, allowed in may_vary.items() if allowed)
 
 
-def _starts_uncharged(circuit: Circuit, jumping: bool, varied: Mapping[str, object]) -> bool:
+def _starts_uncharged(circuit: Circuit, charged: bool, varied: Mapping[str, object]) -> bool:
+    """Whether the uncharged state starts all runs; `charged`: whether the source is not 0 V there."""
     tran = circuit.tran
     if circuit.initial or any(e.initial is not None for e in circuit.elements) or (tran and tran.start > 0.0):
         return False
@@ -158,7 +176,7 @@ def _starts_uncharged(circuit: Circuit, jumping: bool, varied: Mapping[str, obje
         return True
     # The operating point of sines that start at 0 V is the uncharged state.
     phases = [getattr(e.waveform, "phase_deg", 0.0) for e in circuit.by_device("V") if not isinstance(e.waveform, AM)]
-    return not jumping and not any(phases) and not any(path.endswith(".phase_deg") for path in varied)
+    return not charged and not any(phases) and not any(path.endswith(".phase_deg") for path in varied)
 
 
 def _tones_of(wave: object, given: Mapping[str, Value]) -> list[tuple[Value, Value]]:
@@ -203,11 +221,19 @@ def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray
     frequency = form.frequency or given(first).get("frequency", 1.0 / (_period(first.waveform)))
     rows = [*_contact_rows(dict(form.layer.values) | given(form.layer)), 2.0 * np.pi * np.asarray(frequency)]
     for element, sign in form.sources:
-        for amplitude, phase in _tones_of(element.waveform, given(element)):
+        tones = (
+            _tones_of(element.waveform, given(element)) if form.recording is None else [(peak_of(form.recording), 0.0)]
+        )
+        for amplitude, phase in tones:
             rows += [sign * np.asarray(amplitude), phase]
     for i, row in enumerate(rows):
         out[CELL_ROWS * count + i] = row
     return out
+
+
+def peak_of(recording: Samples) -> float:
+    """Largest sample, V; 1 V if all are 0."""
+    return float(np.abs(recording.values).max()) or 1.0
 
 
 def _period(wave: Waveform | None) -> float:

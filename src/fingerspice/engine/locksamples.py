@@ -1,0 +1,256 @@
+"""Many series stacks at once under one recording, in lockstep; see `engine.lockstep` for lanes, rows and constants.
+
+The recording is a straight line between two samples, to which the response of the modes is exact. Its slope jumps at
+every sample, which leaves no order to a multistep method. So each step takes the exponential Simpson rule of
+`engine.relaxation`, with one evaluation of the nonlinear term in its middle and one at its end: both are predicted,
+evaluated, and the end is corrected. Where the gap voltage changes its sign within a step, what Simpson's rule misses of
+the kink of 1/A is added in closed form, for a voltage that is a straight line in the step.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit, jit_rows
+from fingerspice.engine.lockscenes import OMEGA, Places, fill_block, new_block, put_results
+from fingerspice.engine.lockstep import (
+    GAP,
+    LANES,
+    N_STATE,
+    PEAK,
+    SCALE,
+    SHAPE,
+    VALUE,
+    Marks,
+    area_row,
+    n_constants,
+    n_state,
+)
+from fingerspice.engine.lockweights import moment_integrals
+
+# Rows of the weights, each for every mode. To the middle: decay, source at both ends, nonlinear term at the start and
+# in the middle of the step before. To the end: decay, source at both ends, nonlinear term at start and middle as
+# predicted, and at start, middle and end as corrected; and the integral of |u| that Simpson's rule misses.
+HALF, HALF_SOURCE, HALF_SOURCE_END, HALF_NOW, HALF_OLD, DECAY, SOURCE, SOURCE_END, PREDICT, PREDICT_MIDDLE = range(10)
+CORRECT, CORRECT_MIDDLE, CORRECT_END, KINK, N_WEIGHTS = 10, 11, 12, 13, 14
+# Rows of the state for every mode: z, the nonlinear term at the start of the step and in its middle, and a guess.
+Z, RATE, MIDDLE, GUESS = 0, 1, 2, 3
+
+
+@jit_rows
+def _step(
+    c: FloatArray, g: FloatArray, s: FloatArray, slope: FloatArray, ends: tuple[float, float], weight: float,
+    marks: Marks,
+) -> None:  # fmt: skip
+    """One step of every lane; adds `weight` times the integrals of the integrands over the step to their sums.
+
+    `ends` are the source's values at the ends of the step, `slope` the derivative of 1/A by |u| at 0 V.
+    """
+    modes, _, leaks, powers, moments = marks
+    m_all, l_all, d_all, count = len(modes), len(leaks), len(powers) - 1, len(moments)
+    of_u = SHAPE + m_all
+    of_w = of_u + 1
+    of_z = of_w + l_all
+    of_leak = of_z + l_all * m_all
+    area = of_leak + m_all * l_all
+    own = N_STATE * m_all
+    value, total = own + VALUE, own + VALUE + count
+    current = total + count
+    first, last = ends
+    between = 0.5 * (first + last)
+    for i in range(LANES):
+        u = c[of_u * LANES + i] * between
+        for m in range(m_all):
+            z, now = s[(Z * m_all + m) * LANES + i], s[(RATE * m_all + m) * LANES + i]
+            guess = g[(HALF * m_all + m) * LANES + i] * z + g[(HALF_NOW * m_all + m) * LANES + i] * now
+            guess += g[(HALF_OLD * m_all + m) * LANES + i] * s[(MIDDLE * m_all + m) * LANES + i]
+            guess += g[(HALF_SOURCE * m_all + m) * LANES + i] * first
+            guess += g[(HALF_SOURCE_END * m_all + m) * LANES + i] * last
+            s[(GUESS * m_all + m) * LANES + i] = guess
+            u += c[(SHAPE + m) * LANES + i] * guess
+        v = abs(u) * c[SCALE * LANES + i] - 1.0
+        q = c[area * LANES + i]
+        for d in range(1, d_all):
+            q = q * v + c[(area + d) * LANES + i]
+        q *= v
+        for k in range(l_all):
+            change = c[(of_w + k) * LANES + i] * between
+            for m in range(m_all):
+                change += c[(of_z + k * m_all + m) * LANES + i] * s[(GUESS * m_all + m) * LANES + i]
+            # Beside the term itself, the voltage of the leak, which the kink's term needs.
+            s[(current + k) * LANES + i] = q * change
+            s[(current + l_all + k) * LANES + i] = change
+        force = u * u / (q + c[(area + d_all) * LANES + i])
+        square = u * u
+        u = c[of_u * LANES + i] * last
+        for m in range(m_all):
+            rate = c[(of_leak + m * l_all) * LANES + i] * s[current * LANES + i]
+            for k in range(1, l_all):
+                rate += c[(of_leak + m * l_all + k) * LANES + i] * s[(current + k) * LANES + i]
+            s[(MIDDLE * m_all + m) * LANES + i] = rate
+            kept = g[(DECAY * m_all + m) * LANES + i] * s[(Z * m_all + m) * LANES + i]
+            kept += g[(SOURCE * m_all + m) * LANES + i] * first + g[(SOURCE_END * m_all + m) * LANES + i] * last
+            s[(Z * m_all + m) * LANES + i] = kept
+            guess = kept + g[(PREDICT * m_all + m) * LANES + i] * s[(RATE * m_all + m) * LANES + i]
+            guess += g[(PREDICT_MIDDLE * m_all + m) * LANES + i] * rate
+            s[(GUESS * m_all + m) * LANES + i] = guess
+            u += c[(SHAPE + m) * LANES + i] * guess
+        v = abs(u) * c[SCALE * LANES + i] - 1.0
+        q = c[area * LANES + i]
+        for d in range(1, d_all):
+            q = q * v + c[(area + d) * LANES + i]
+        q *= v
+        # The integral of |u| less Simpson's rule, on a straight line between both ends.
+        before = s[(own + GAP) * LANES + i]
+        size = abs(before) + abs(u)
+        missed = (before * before + u * u) / (2.0 * size + 1e-300) - (size + 2.0 * abs(before + u)) / 6.0
+        missed = slope[i] * missed if before * u < 0.0 else 0.0
+        for k in range(l_all):
+            change = c[(of_w + k) * LANES + i] * last
+            for m in range(m_all):
+                change += c[(of_z + k * m_all + m) * LANES + i] * s[(GUESS * m_all + m) * LANES + i]
+            s[(current + k) * LANES + i] = q * change
+            s[(current + l_all + k) * LANES + i] *= missed
+        u = c[of_u * LANES + i] * last
+        for m in range(m_all):
+            rate = c[(of_leak + m * l_all) * LANES + i] * s[current * LANES + i]
+            kink = c[(of_leak + m * l_all) * LANES + i] * s[(current + l_all) * LANES + i]
+            for k in range(1, l_all):
+                rate += c[(of_leak + m * l_all + k) * LANES + i] * s[(current + k) * LANES + i]
+                kink += c[(of_leak + m * l_all + k) * LANES + i] * s[(current + l_all + k) * LANES + i]
+            z = s[(Z * m_all + m) * LANES + i] + g[(KINK * m_all + m) * LANES + i] * kink
+            z += g[(CORRECT * m_all + m) * LANES + i] * s[(RATE * m_all + m) * LANES + i]
+            z += g[(CORRECT_MIDDLE * m_all + m) * LANES + i] * s[(MIDDLE * m_all + m) * LANES + i]
+            z += g[(CORRECT_END * m_all + m) * LANES + i] * rate
+            s[(Z * m_all + m) * LANES + i] = z
+            s[(RATE * m_all + m) * LANES + i] = rate
+            u += c[(SHAPE + m) * LANES + i] * z
+        s[(own + GAP) * LANES + i] = u
+        s[(own + PEAK) * LANES + i] = max(s[(own + PEAK) * LANES + i], abs(u))
+        latest = u * u / (q + c[(area + d_all) * LANES + i])
+        s[total * LANES + i] += weight * (s[value * LANES + i] + 4.0 * force + latest)
+        s[value * LANES + i] = latest
+        if count > 1:
+            latest *= latest
+            s[(total + 1) * LANES + i] += weight * (s[(value + 1) * LANES + i] + 4.0 * force * force + latest)
+            s[(value + 1) * LANES + i] = latest
+            s[(total + 2) * LANES + i] += weight * (s[(value + 2) * LANES + i] + 4.0 * square + u * u)
+            s[(value + 2) * LANES + i] = u * u
+
+
+@jit
+def _weigh(h: FloatArray, rates: FloatArray, drive: FloatArray, g: FloatArray) -> None:
+    """Weights of a step of length h (LANES,), s; `rates` and `drive` have shape (n_mode, LANES)."""
+    m_all = rates.shape[0]
+    for m in range(m_all):
+        for i in range(LANES):
+            y, length, by = rates[m, i] * h[i], h[i], drive[m, i]
+            m0, m1, _, _ = moment_integrals(0.5 * y)
+            half = 0.5 * length
+            g[(HALF * m_all + m) * LANES + i] = 1.0 - 0.5 * y * m0
+            g[(HALF_SOURCE * m_all + m) * LANES + i] = by * half * (m0 - 0.5 * m1)
+            g[(HALF_SOURCE_END * m_all + m) * LANES + i] = by * half * 0.5 * m1
+            g[(HALF_NOW * m_all + m) * LANES + i] = half * (m0 + m1)
+            g[(HALF_OLD * m_all + m) * LANES + i] = -half * m1
+            g[(KINK * m_all + m) * LANES + i] = length * (1.0 - 0.5 * y * m0)
+            m0, m1, m2, _ = moment_integrals(y)
+            g[(DECAY * m_all + m) * LANES + i] = 1.0 - y * m0
+            g[(SOURCE * m_all + m) * LANES + i] = by * length * (m0 - m1)
+            g[(SOURCE_END * m_all + m) * LANES + i] = by * length * m1
+            g[(PREDICT * m_all + m) * LANES + i] = length * (m0 - 2.0 * m1)
+            g[(PREDICT_MIDDLE * m_all + m) * LANES + i] = length * 2.0 * m1
+            g[(CORRECT * m_all + m) * LANES + i] = length * (m0 - 3.0 * m1 + 2.0 * m2)
+            g[(CORRECT_MIDDLE * m_all + m) * LANES + i] = length * 4.0 * (m1 - m2)
+            g[(CORRECT_END * m_all + m) * LANES + i] = length * (2.0 * m2 - m1)
+
+
+@jit
+def _run(
+    c: FloatArray, still: FloatArray, g: FloatArray, s: FloatArray, slope: FloatArray, values: FloatArray, parts: int,
+    late: FloatArray, marks: Marks,
+) -> None:  # fmt: skip
+    """Integrate a block's scenes from the uncharged state, with so many steps between two samples.
+
+    `late` takes the sums over the second half, as the state holds those over the whole run.
+    """
+    own, count = N_STATE * len(marks[0]), len(marks[4])
+    # A step of length 0 evaluates the nonlinear term and the integrands.
+    _step(c, still, s, slope, (values[0], values[0]), 0.0, marks)
+    for i in range(LANES):
+        s[(own + PEAK) * LANES + i] = abs(s[(own + GAP) * LANES + i])
+        for k in range(count):
+            s[(own + VALUE + count + k) * LANES + i] = 0.0
+    sums = (own + VALUE + count) * LANES
+    for j in range(values.size - 1):
+        if j == (values.size - 1) // 2:
+            late[:] = s[sums : sums + late.size]
+        here, change = values[j], (values[j + 1] - values[j]) / parts
+        for k in range(parts):
+            ends = (here + k * change, here + (k + 1) * change)
+            _step(c, g, s, slope, ends, 1.0 / 6.0, marks)
+    for i in range(late.size):
+        late[i] = s[sums + i] - late[i]
+
+
+@jit
+def _slopes(c: FloatArray, area: int, degree: int, slope: FloatArray) -> None:
+    """Derivative of 1/A by |u| at 0 V, where the polynomial's variable is -1."""
+    for i in range(LANES):
+        total, value = 0.0, c[area * LANES + i]
+        for d in range(1, degree + 1):
+            total = value - total
+            value = c[(area + d) * LANES + i] - value
+        slope[i] = total * c[SCALE * LANES + i]
+
+
+@jit
+def march_samples(
+    table: FloatArray, pending: NDArray[np.int64], places: Places,
+    curves: tuple[FloatArray, FloatArray, FloatArray], values: FloatArray, how: tuple[tuple[int, int], float],
+    out: FloatArray, marks: Marks,
+) -> None:  # fmt: skip
+    """Integrate scenes of a table under one recording, block by block, with each of two numbers of steps a sample.
+
+    Parameters
+    ----------
+    table, pending, places, curves, marks
+        As for `lockscenes.march`, with one wave, whose amplitude is the recording's peak; the table's frequency is half
+        that of the samples.
+    values : ndarray, shape (n,)
+        Samples relative to their peak.
+    how : tuple
+        Steps a sample in both runs, 0 for none in the first; and the largest gap voltage that the area's
+        polynomial covers, as a ratio to its estimate.
+    out : ndarray
+        As for `lockscenes.march`, with the second half of the run in place of the last period.
+    """
+    m_all, l_all, d_all, count = len(marks[0]), len(marks[2]), len(marks[3]) - 1, len(marks[4])
+    area, row = area_row(m_all, 1, l_all), N_WEIGHTS * m_all * LANES
+    block = new_block(table.shape[0], marks)
+    c, still, g = np.zeros(n_constants(m_all, 1, l_all, d_all) * LANES), np.zeros(row), np.empty(row)
+    # The last rows hold the voltages of the leaks.
+    s, slope, none = np.empty((n_state(m_all, l_all, count) + l_all) * LANES), np.empty(LANES), np.full(LANES, 0.0)
+    late, h = np.empty(count * LANES), np.empty(LANES)
+    for kind in (HALF, DECAY):
+        still[kind * m_all * LANES : (kind + 1) * m_all * LANES] = 1.0
+    for first in range(0, pending.size, LANES):
+        fill_block(table, pending, first, places, curves, (np.ones(1), True, how[1]), block, c, marks)
+        _slopes(c, area, d_all, slope)
+        for w in range(2):
+            parts = how[0][w]
+            if parts == 0:
+                continue
+            for i in range(LANES):
+                h[i] = math.pi / block.b[OMEGA * LANES + i] / parts
+            _weigh(h, block.rates, block.drive, g)
+            s[:] = 0.0
+            _run(c, still, g, s, slope, values, parts, late, marks)
+            steps = float((values.size - 1) * parts)
+            put_results(s, late, none, (steps, steps), first, out[w], marks)
+            for i in range(min(LANES, pending.size - first)):
+                covered = out[w, 2 * count, first + i] <= block.top[i]
+                out[w, 2 * count + 2, first + i] = block.tail[i] if covered else math.inf

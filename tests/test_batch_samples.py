@@ -1,0 +1,122 @@
+"""Recordings in lockstep: against single runs at 1e-9, in wide populations, for any threads, order and bad scenes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import butter, sosfilt
+
+import fingerspice as fs
+from fingerspice.base.errors import InputError
+from scenes import table1, table1_deck
+
+RATE, COUNT = 48_000.0, 961
+T_STOP = (COUNT - 1) / RATE
+OUTPUTS = ("f_el_mean", "f_t_rms", "u_gap_rms")
+
+
+def noise(highest: float, peak: float = 150.0, seed: int = 1) -> np.ndarray:
+    band = butter(4, [50.0, highest], "band", fs=RATE, output="sos")
+    x = sosfilt(band, np.random.default_rng(seed).standard_normal(COUNT))
+    x[0] = 0.0
+    return peak * x / np.abs(x).max()
+
+
+def recorded(highest: float = 1000.0, circuit: fs.Circuit | None = None, **how: Any) -> fs.Circuit:
+    return (circuit or table1()).replace({"Vdrive": fs.Samples(noise(highest, **how), RATE)})
+
+
+def people(n: int, seed: int = 2) -> dict[str, np.ndarray]:
+    """Fingers whose resistances vary over two decades."""
+    r = np.random.default_rng(seed)
+    return {
+        "Xgap.d": r.uniform(2e-6, 6e-6, n),
+        "Xgap.r": 1e6 * 10.0 ** r.uniform(-1.0, 1.0, n),
+        "Xcoat.r": 2e5 * 10.0 ** r.uniform(-1.0, 1.0, n),
+        "Xgap.fn": r.uniform(0.2, 2.0, n),
+    }
+
+
+def off(circuit: fs.Circuit, scenes: dict[str, np.ndarray], found: Any) -> np.ndarray:
+    """Largest relative error of the outputs, for each scene."""
+    worst = np.zeros(found.sizes["scene"])
+    for i in range(worst.size):
+        changes = {path: float(values[i]) for path, values in scenes.items()}
+        run = fs.simulate(circuit.replace(changes), t_stop=T_STOP, t_eval=[T_STOP], rtol=1e-10, charge=False)
+        figures = run.summary()
+        true = {"f_el_mean": run.f_el_mean, "f_t_rms": figures["f_t_rms"], "u_gap_rms": run.u_gap_rms}
+        worst[i] = max(abs(float(found[name][i]) / true[name] - 1.0) for name in OUTPUTS)
+    return worst
+
+
+@pytest.mark.parametrize(("highest", "rtol"), [(1000.0, 1e-4), (1000.0, 1e-6), (8000.0, 1e-3), (8000.0, 1e-5)])
+def test_stated_errors_cover_wide_populations(highest: float, rtol: float) -> None:
+    circuit, scenes = recorded(highest), people(40)
+    found = fs.batch(circuit, scenes, outputs=OUTPUTS, t_stop=T_STOP, rtol=rtol)
+    assert (found["status"] == 0).mean() > 0.9
+    true = off(circuit, scenes, found)
+    assert true.max() <= rtol
+    assert (true <= found["error"].to_numpy() + 1e-9).mean() >= 0.95
+
+
+def test_a_dispersive_skin_states_its_error() -> None:
+    text = table1_deck().replace("SKIN d=350u f=100.0", "SKIN_DISPERSIVE d=350u")
+    circuit, scenes = recorded(8000.0, fs.parse_netlist(text)), people(16)
+    found = fs.batch(circuit, scenes, outputs=OUTPUTS, t_stop=T_STOP, rtol=1e-3)
+    assert (found["status"] == 0).all()
+    true = off(circuit, scenes, found)
+    assert true.max() <= 1e-3
+    assert (true <= found["error"].to_numpy()).mean() >= 0.95
+
+
+def test_threads_and_order_change_no_byte() -> None:
+    circuit, scenes = recorded(), people(70)
+    how: dict[str, Any] = {"outputs": OUTPUTS, "t_stop": T_STOP}
+    one = fs.batch(circuit, scenes, threads=1, **how)
+    order = np.random.default_rng(3).permutation(70)
+    other = fs.batch(circuit, {path: values[order] for path, values in scenes.items()}, threads=2, **how)
+    for name in (*OUTPUTS, "error"):
+        assert one[name].to_numpy()[order].tobytes() == other[name].to_numpy().tobytes()
+
+
+def test_a_scene_without_contact_costs_the_others_nothing() -> None:
+    circuit, scenes = recorded(), people(20)
+    alone = fs.batch(circuit, scenes, t_stop=T_STOP)
+    bad = {path: values.copy() for path, values in scenes.items()}
+    bad["Xgap.fn"][7] = 60.0
+    found = fs.batch(circuit, bad, t_stop=T_STOP)
+    assert found["status"][7] >= 2
+    rest = np.arange(20) != 7
+    assert found["f_el_mean"].to_numpy()[rest].tobytes() == alone["f_el_mean"].to_numpy()[rest].tobytes()
+
+
+def test_a_turned_source_points_on_a_grid_and_a_constant_after_the_last_sample() -> None:
+    scenes = people(16)
+    volts = noise(1000.0)
+    forward = fs.batch(recorded(), scenes, t_stop=T_STOP)["f_el_mean"]
+    turned = fs.parse_netlist(table1_deck().replace("Vdrive drive 0", "Vdrive 0 drive"))
+    turned = turned.replace({"Vdrive": fs.Samples(-volts, RATE)})
+    # The layers stand in another order, and sums are rounded differently.
+    np.testing.assert_allclose(fs.batch(turned, scenes, t_stop=T_STOP)["f_el_mean"], forward, rtol=1e-13)
+    points = table1().replace({"Vdrive": fs.PWL(np.arange(COUNT) / RATE, volts)})
+    found = fs.batch(points, scenes, t_stop=T_STOP)
+    assert (found["status"] == 0).all()
+    np.testing.assert_allclose(found["f_el_mean"], forward, rtol=1e-12)
+    # Half of the run is after the recording.
+    longer = fs.batch(recorded(), scenes, t_stop=2.0 * T_STOP, rtol=1e-5)
+    run = fs.simulate(recorded().replace({p: float(v[3]) for p, v in scenes.items()}), t_stop=2.0 * T_STOP, rtol=1e-9)
+    assert longer["f_el_mean"][3] == pytest.approx(run.f_el_mean, rel=1e-5)
+
+
+def test_what_lockstep_does_not_take_is_said() -> None:
+    scenes = people(3)
+    late = table1().replace({"Vdrive": fs.Samples(noise(1000.0), RATE, 1e-3)})
+    found = fs.batch(late, scenes, t_stop=T_STOP)
+    assert found.attrs["n_ordinary"] == 3
+    assert found.attrs["ordinary"] == "the recording does not start at 0 s"
+    found = fs.batch(recorded(), scenes, t_stop=T_STOP + 0.3 / RATE)
+    assert "does not end after half periods or at a sample" in found.attrs["ordinary"]
+    with pytest.raises(InputError, match="0 sources have a period"):
+        fs.batch(recorded(), scenes, periods=2.0)
