@@ -40,6 +40,9 @@ LEAST_RTOL = 1e-7
 # Degree by which the area's polynomial grows from level to level, and the highest one: its coefficients lose a digit in
 # two to the rounding with every power. A run of degree d has this rounding error, relative, besides 2^d times 1e-16.
 _MORE, _HIGHEST, _ROUNDING, _EPS = 4, 20, 1e-13, 1.1e-16
+# The stated error has this many changes from half the steps to all steps, under tones and under squares. Under tones a
+# kink's error is about as large as the change, or larger where that is small by chance.
+_STATED, _STATED_JUMPING = 3.0, 2.0
 # Kinks have order 1, with a factor that depends on where between two steps they fall, so that a change may be small by
 # chance: doubling the steps may not reduce the stated error by more than this factor.
 _MOST_GAIN = 8.0
@@ -169,7 +172,8 @@ def _climb_one(
             _changes(wanted, one[1 if task.periodic else 0], rows, friction_of(form, moved))
             for one in (run.fine, run.coarse)
         )
-        error = np.maximum(_error(own, coarse, run, degree), least)
+        share = _STATED_JUMPING if form.jumping else _STATED
+        error = np.maximum(_error(own, coarse, run, degree, share), least)
         good = (error <= ENOUGH * LIMIT * task.rtol) & short_enough(decays[pending], mesh[1], steps)
         at = place[pending[good]]
         for k, path in enumerate(wanted.paths):
@@ -199,8 +203,8 @@ def _changes(wanted: Gradients, mean: FloatArray, rows: FloatArray, mu: FloatArr
     return _Changes(np.abs(0.5 * (low + high)), (high - low) / (2.0 * STEP))
 
 
-def _error(own: _Changes, coarse: _Changes, run: Run, degree: int) -> FloatArray:
-    """Stated error of every scene: of the steps, the difference's own, the polynomial's and the periodic state's."""
+def _error(own: _Changes, coarse: _Changes, run: Run, degree: int, share: float) -> FloatArray:
+    """Stated error of every scene: of the steps (`share` of their change), the difference, polynomial and period."""
     largest = np.abs(own.relative).max(axis=(0, 1))
     change = np.abs(own.relative - coarse.relative).max(axis=(0, 1))
     # The third derivative of a power that has this slope, at most.
@@ -209,4 +213,4 @@ def _error(own: _Changes, coarse: _Changes, run: Run, degree: int) -> FloatArray
     closing, tail = run.fine[-2:].reshape(2, pairs, -1).max(axis=1)
     # The polynomial's error is one of Chebyshev's, whose slope is larger by its degree.
     tail = degree * (tail + run.coarse[-1].reshape(pairs, -1).max(axis=0))
-    return np.asarray(change + cut + tail + (2.0 * closing + _ROUNDING + 2.0**degree * _EPS) / STEP)
+    return np.asarray(share * change + cut + tail + (2.0 * closing + _ROUNDING + 2.0**degree * _EPS) / STEP)

@@ -178,7 +178,7 @@ def _single(task: Task, wanted: Gradients, changes: Mapping[str, float], frequen
 
 
 def _differentiated(task: Task, wanted: Gradients, circuit: Circuit, frequency: float, rtol: float) -> _Single:
-    paths = tuple(dict.fromkeys(path for path in wanted.paths for path in wanted.together[path]))
+    paths = tuple(dict.fromkeys(other for path in wanted.paths for other in wanted.together[path]))
     ran: Solution | SteadyState
     stop = task.t_stop if task.t_stop is not None else (task.periods or 1.0) / frequency
     if task.periodic:
