@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from fingerspice.results.signals import SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import RTOL_RANGE, simulate
 from fingerspice.studies.batchdifferences import LEAST_RTOL, LIMIT, Gradients, Slopes, climb_gradients
-from fingerspice.studies.batchladder import in_lockstep
+from fingerspice.studies.batchladder import FIGURES, in_lockstep
 from fingerspice.studies.batchscenes import lockstep_form
 from fingerspice.studies.batchsingle import OVER_PEAK, error_of
 from fingerspice.studies.batchtask import FAILED, ONE_BY_ONE, REFUSED, STATUS_NAMES, Answers, Task, jobs_of
@@ -81,6 +81,15 @@ def gradient_request(
     together = {path: (path, *(skins if path == clock else ())) for path in paths}
     longer = clock if task.periods is not None and not task.periodic else None
     return Gradients(tuple(paths), outputs, together, longer, clock)
+
+
+def in_lockstep_by(circuit: Circuit, paths: Iterable[str], outputs: Sequence[str], rtol: float) -> bool:
+    """Whether derivatives of outputs by parameters, with the values of all `paths` varying, can be those of lockstep.
+
+    If not, a batch takes the tangents of single runs, besides a run for every scene's outputs.
+    """
+    form = lockstep_form(circuit, {path.lower(): None for path in paths})
+    return rtol >= LEAST_RTOL and not isinstance(form, str) and all(name in FIGURES for name in outputs)
 
 
 def _turns(circuit: Circuit, path: str) -> bool:
