@@ -216,3 +216,50 @@ def test_networks_are_refused() -> None:
     gap = two.by_device("GAP")[0].name
     with pytest.raises(fs.InputError, match="no series stack with a GAP"):
         fs.batch(two, {f"{gap}.d": [3e-6]}, gradients=(f"{gap}.d",))
+
+
+@pytest.mark.parametrize("periodic", [False, True])
+def test_the_torch_module_has_them_for_many_scenes_and_for_each_alone(periodic: bool) -> None:
+    torch = pytest.importorskip("torch")
+    rng, rtol = np.random.default_rng(4), 1e-6
+    values = {"Xgap.d": torch.tensor(rng.uniform(3e-6, 4e-6, 20)), "Xgap.r": torch.tensor(rng.uniform(5e5, 2e6, 20))}
+
+    def slopes(rtol: float, some: slice) -> Any:
+        given = {path: one[some].clone().requires_grad_() for path, one in values.items()}
+        means = fs.torch.Simulator(table1(), (), periodic=periodic, t_stop=0.05, rtol=rtol)(given)
+        means.sum().backward()
+        return torch.stack([one.grad * one.detach() / means.detach() for one in given.values()])
+
+    many = slopes(rtol, slice(None))
+    assert torch.equal(many[:, 7:8], slopes(rtol, slice(7, 8)))
+    assert float((many - slopes(1e-10, slice(None))).abs().max()) <= ALLOWED * rtol
+
+
+@pytest.mark.parametrize("average", ["periodic", "run"])
+def test_a_fit_by_batches_is_the_fit_by_single_runs(average: str) -> None:
+    rng, fingers = np.random.default_rng(8), {"thumb": 3.2e-6, "index": 3.8e-6}
+    rows = [(name, u, f) for name in fingers for u in (100.0, 200.0) for f in (100.0, 200.0, 1000.0)]
+    columns = {
+        "finger": [r[0] for r in rows],
+        "Vdrive.amplitude": [r[1] for r in rows],
+        "Vdrive.frequency": [r[2] for r in rows],
+    }
+    truth = {
+        **{k: v for k, v in columns.items() if k != "finger"},
+        "Xgap.d": [fingers[r[0]] for r in rows],
+        "Xgap.r": 1.3e6,
+    }
+    force = fs.batch(table1(), truth, rtol=1e-8, periodic=average == "periodic", skin="follow").f_el_mean.values
+    data = {**columns, "f_el_mean": force * (1.0 + 0.02 * rng.standard_normal(len(rows)))}
+
+    def fitted(law: str | None) -> fs.Fit:
+        # A charge law that is named is for `simulate`, and so for single runs.
+        return fs.fit(
+            table1(), data, ["Xgap.d", "Xgap.r"], groups={"finger": ["Xgap.d"]}, average=average, skin="follow",
+            starts=1, charge_law=law, rtol=1e-6,
+        )  # fmt: skip
+
+    batches, singles = fitted(None), fitted("local")
+    for name, one in singles.estimates.items():
+        assert abs(batches.estimates[name].value - one.value) <= 1e-3 * one.error
+        assert batches.estimates[name].error == pytest.approx(one.error, rel=1e-3)

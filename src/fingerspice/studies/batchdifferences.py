@@ -35,8 +35,8 @@ from fingerspice.studies.batchtask import LOCKSTEP, ONE_BY_ONE, Task
 
 #: Error allowed to a derivative, for a change of the parameter by all of itself, in errors allowed to the output.
 LIMIT = 10.0
-#: Smallest rtol at which derivatives are taken in lockstep: their kinks would take too many steps below.
-LEAST_RTOL = 1e-7
+#: Smallest rtol at which derivatives are taken in lockstep: below it their kinks would take too many steps.
+LEAST_RTOL = 5e-7
 # Degree by which the area's polynomial grows from level to level, and the highest one: its coefficients lose a digit in
 # two to the rounding with every power. A run of degree d has this rounding error, relative, besides 2^d times 1e-16.
 _MORE, _HIGHEST, _ROUNDING, _EPS = 4, 20, 1e-13, 1.1e-16

@@ -156,7 +156,7 @@ class Task:
         if self.charge_law is not None or (self.skin == "follow" and paths & skins):
             return False
         alone = self.skin == "own" or len(driving_sources(self.circuit)) == 1
-        return alone and in_lockstep_by(self.circuit, paths, (self.data.name,), self.rtol)
+        return alone and in_lockstep_by(self.circuit, paths, (self.data.name,), max(self.rtol, _SLOPES))
 
     def _in_batches(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As `_predicted`, all measurements at once, and their derivatives with an error that suits least squares."""

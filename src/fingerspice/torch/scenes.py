@@ -70,7 +70,7 @@ class Scenes:
 
     def slopes(self, paths: Sequence[str], wanted: Sequence[str], given: FloatArray) -> FloatArray:
         """Derivatives of `values` by the parameters `wanted`, shape (n_scene, sum of `sizes`, n_wanted)."""
-        if not self.t.size and len(given) > 1 and in_lockstep_by(self.circuit, paths, self.outputs, self.rtol):
+        if not self.t.size and in_lockstep_by(self.circuit, paths, self.outputs, self.rtol):
             found = self._batch(paths, given, wanted)
             return np.stack([found[f"d_{name}"].to_numpy() for name in self.outputs], axis=1)
         out = np.empty((len(given), sum(self.sizes), len(wanted)))
