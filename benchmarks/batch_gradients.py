@@ -2,8 +2,7 @@
 
 A scene is Table 1's stack with another gap, leak and amplitude; its derivatives are those of the mean force by these
 three. A call with derivatives and one without are timed in turn. Usage:
-``python benchmarks/batch_gradients.py [--quick] [--scenes N]``; writes ``benchmarks/results/batch_gradients.json`` unless
-quick.
+``python benchmarks/batch_gradients.py [--quick] [--scenes N]``; writes ``results/batch_gradients.json`` unless quick.
 """
 
 from __future__ import annotations
@@ -64,7 +63,8 @@ def measure(name: str, circuit: fs.Circuit, n: int, repeats: int, periodic: bool
             "scenes": name, "rtol": rtol, "n": n, "plain_s": plain, "one_parameter_s": one, "three_parameters_s": three,
             "runs_per_parameter_of_one": one / plain - 1.0, "runs_per_parameter_of_three": (three / plain - 1.0) / 3.0,
             "scenes_per_s": n / three, "single_scenes_per_s": 1.0 / alone, "largest_error": float(off.max()),
-            "largest_stated_error": float(found.gradient_error.max()), "n_ordinary": found.attrs["n_ordinary_gradients"],
+            "largest_stated_error": float(found.gradient_error.max()),
+            "n_ordinary": found.attrs["n_ordinary_gradients"],
         })  # fmt: skip
     return rows
 

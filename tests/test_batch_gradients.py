@@ -169,7 +169,9 @@ def test_a_scene_without_a_result_has_none_and_costs_the_others_nothing() -> Non
     assert found.attrs["n_ordinary_gradients"] == 1
     refused = fs.batch(table1(), {"Xgap.c2": [1e-3, 1e6]}, gradients=("Xgap.d",), periods=1)
     assert refused.status.values.tolist() == refused.gradient_status.values.tolist() == [0, 2]
+    # What has no outputs is not run again for its derivatives.
     assert len(refused.attrs["failures"]) == 1
+    assert "gradients" not in refused.attrs["failures"][0]
 
 
 def test_the_frequency_of_a_square_is_refused_where_it_moves_the_edges_of_a_run_of_fixed_length() -> None:

@@ -168,10 +168,7 @@ def _climb_one(
         level = Level(closer, form, mesh, steps, degree, 1, False)
         run = level.run(table, np.arange(table.shape[1]), curves, before)
         rows = table[CELL_ROWS * form.cells :]
-        own, coarse = (
-            _changes(wanted, one[1 if task.periodic else 0], rows, friction_of(form, moved))
-            for one in (run.fine, run.coarse)
-        )
+        own, coarse = (_changes(wanted, one[0], rows, friction_of(form, moved)) for one in (run.fine, run.coarse))
         share = _STATED_JUMPING if form.jumping else _STATED
         error = np.maximum(_error(own, coarse, run, degree, share), least)
         good = (error <= ENOUGH * LIMIT * task.rtol) & short_enough(decays[pending], mesh[1], steps)
