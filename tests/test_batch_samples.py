@@ -110,6 +110,15 @@ def test_a_turned_source_points_on_a_grid_and_a_constant_after_the_last_sample()
     assert longer["f_el_mean"][3] == pytest.approx(run.f_el_mean, rel=1e-5)
 
 
+def test_derivatives_are_those_of_single_runs() -> None:
+    circuit = recorded()
+    found = fs.batch(circuit, {"Xgap.d": [3e-6, 4e-6]}, t_stop=T_STOP, gradients=("Xgap.d",))
+    assert found.attrs["ordinary_gradients"] == "the source is a recording"
+    run = fs.simulate(circuit.replace({"Xgap.d": 4e-6}), t_stop=T_STOP, sensitivities=("Xgap.d",), charge=False)
+    slope = run.sensitivities["Xgap.d"].f_el_mean
+    assert found["d_f_el_mean"][1, 0] == pytest.approx(slope, rel=1e-3)
+
+
 def test_what_lockstep_does_not_take_is_said() -> None:
     scenes = people(3)
     late = table1().replace({"Vdrive": fs.Samples(noise(1000.0), RATE, 1e-3)})

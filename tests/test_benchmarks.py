@@ -200,6 +200,14 @@ def test_a_hard_case_is_right_only_with_the_right_answer_or_the_true_reason(monk
     assert verdict("nan", ("failed", "the source gave NaN at 3 ms")) == "right"
 
 
+def test_the_benchmark_of_batch_gradients_runs_and_meets_its_errors(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    for row in importlib.import_module("batch_gradients").main(["--quick"])["rows"]:
+        assert row["largest_error"] <= 10.0 * row["rtol"]
+        assert row["largest_stated_error"] <= 10.0 * row["rtol"]
+        assert row["n_ordinary"] == 0
+
+
 def test_the_batch_benchmark_runs_and_meets_its_errors(monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(FOLDER))
     results = importlib.import_module("batch").main(["--quick"])

@@ -18,10 +18,11 @@ from fingerspice.circuit.arguments import require_circuit, require_number
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.results.signals import SIGNALS
+from fingerspice.studies.batchgradients import gradient_coordinates, gradient_data, gradient_request, gradients_of
 from fingerspice.studies.batchladder import climb, in_lockstep
 from fingerspice.studies.batchscenes import lockstep_form
 from fingerspice.studies.batchsingle import SIGNALS_OF_BATCH, Single, run_single
-from fingerspice.studies.batchtask import LOCKSTEP, STATUS_NAMES, Answers, Task
+from fingerspice.studies.batchtask import LOCKSTEP, STATUS_NAMES, Answers, Task, jobs_of
 from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.waveform import require
 
@@ -32,12 +33,6 @@ _KINDS = ("mean", "rms", "min", "max", "peak", "mean_periodic", "rms_periodic", 
 RTOL_RANGE = (1e-12, 0.1)
 # Largest number of failure messages that a Dataset keeps, and of gap voltages (8 GB) that a batch may return.
 MESSAGES, MOST_VOLTAGES = 16, 1e9
-# Largest number of scenes in a job, and the smallest to which a batch is divided so that all threads have jobs; and
-# their number if gap voltages are wanted, so that these stay in the processor's cache; and under a recording, whose
-# scenes take long.
-CHUNK, SMALL_CHUNK, TRACED, RECORDED = 4096, 256, 256, 32
-# Relative distance from a whole number within which a number of half periods counts as whole.
-WHOLE = 1e-9
 
 
 def batch(
@@ -49,6 +44,7 @@ def batch(
     t_stop: float | None = None,
     periods: float | None = None,
     periodic: bool = False,
+    gradients: Sequence[str] = (),
     skin: str = "own",
     points: int = 200,
     threads: int | None = None,
@@ -74,6 +70,8 @@ def batch(
         the length is a whole number of half periods, or of samples.
     periodic : bool
         Find the periodic state; the figures are then those of one period of it.
+    gradients : sequence of str
+        Parameters by which every mean among the outputs is differentiated, as in `simulate`'s `sensitivities`.
     skin : str
         ``"own"`` (a SKIN keeps its `f`) or ``"follow"`` (its `f` is the source's frequency).
     points : int
@@ -86,12 +84,16 @@ def batch(
     xarray.Dataset
         With dimension ``scene``, the parameters as coordinates, the outputs, ``error`` (stated, relative) and
         ``status``: 0 in lockstep, 1 one by one, 2 refused, 3 failed; the outputs of the last two are NaN. The attribute
-        `n_ordinary` counts the scenes not in lockstep, `ordinary` gives the reason, `failures` has the messages.
+        `n_ordinary` counts the scenes not in lockstep, `ordinary` gives the reason, `failures` has the messages. With
+        `gradients`, also ``d_f_el_mean`` and the like with dimensions ``scene`` and ``parameter``, per unit of the
+        parameter; ``gradient_error`` (stated, of a change by all of a parameter, relative to the output) and
+        ``gradient_status``; the attributes `n_ordinary_gradients` and `ordinary_gradients`.
 
     Raises
     ------
     InputError
-        If a path or output is unknown, arrays have unequal lengths, or a value is NaN or out of range.
+        If a path or output is unknown, arrays have unequal lengths, a value is NaN or out of range, or there are no
+        derivatives by a parameter.
     """
     require_circuit(circuit)
     task = _task(circuit, outputs, rtol, t_stop, periods, periodic, points)
@@ -107,12 +109,25 @@ def batch(
             if f"{element.name}.f" in scenes:
                 raise InputError(f"skin='follow' and {element.name}.f are both given; allowed: one of them")
             changed[f"{element.name}.f"] = frequency
+    paths = gradient_paths(circuit, gradients)
+    wanted = gradient_request(task, paths, scenes, skin) if paths else None
     with ThreadPoolExecutor(threads or _processors()) as pool:
         found, reason = _lockstep(task, changed, pool)
         rest = np.flatnonzero(~found.done)
         _one_by_one(task, changed, rest, found, pool)
-    return _dataset(
-        task, scenes, found, {"skin": skin, "n_ordinary": rest.size, "ordinary": reason if rest.size else ""}
+        attrs = {"skin": skin, "n_ordinary": rest.size, "ordinary": reason if rest.size else ""}
+        if wanted is None:
+            return _dataset(task, scenes, found, attrs)
+        form = lockstep_form(circuit, {})
+        by_period = task.periods is not None or not (isinstance(form, str) or form.recording is not None)
+        frequency = _frequencies(circuit, changed) if by_period else np.ones(found.error.size)
+        slopes, attrs["ordinary_gradients"] = gradients_of(task, wanted, changed, frequency, found, pool)
+    attrs["n_ordinary_gradients"] = int(np.count_nonzero(slopes.status != LOCKSTEP))
+    found.messages |= slopes.messages
+    return (
+        _dataset(task, scenes, found, attrs)
+        .assign(gradient_data(slopes))
+        .assign_coords(gradient_coordinates(task, wanted))
     )
 
 
@@ -202,6 +217,13 @@ def own_path(circuit: Circuit, path: Any) -> str:
     return known[path.lower()]
 
 
+def gradient_paths(circuit: Circuit, gradients: Sequence[str]) -> tuple[str, ...]:
+    """The parameters of a gradient in the circuit's own spelling."""
+    if isinstance(gradients, str):
+        raise InputError(f"gradients is {gradients!r}; allowed: a sequence of paths such as ('Xgap.d',)")
+    return tuple(own_path(circuit, path) for path in gradients)
+
+
 def _check_values(circuit: Circuit, path: str, array: FloatArray) -> None:
     """Refuse NaN and values that the parameter does not accept; the message names the scene."""
     name, _, parameter = path.rpartition(".")
@@ -268,17 +290,7 @@ def _lockstep(task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExec
     found = Answers.empty(task, n, width)
     if isinstance(form, str) or others:
         return found, form if isinstance(form, str) else f"{', '.join(others)} needs a run of its own"
-    # Runs whose length is not a whole number of half periods are left out.
-    halves = np.round(2.0 * count)
-    good = (halves >= 1.0) & (np.abs(2.0 * count - halves) <= WHOLE * halves)
-    if any(name.endswith("_periodic") for name in task.outputs):
-        good &= halves >= 2.0
-    jobs = []
-    for size in np.unique(halves[good]).astype(int).tolist():
-        members = np.flatnonzero(good & (halves == size))
-        chunk = int(np.clip(members.size // 16, SMALL_CHUNK, CHUNK))
-        chunk = TRACED if traced else RECORDED if recorded else chunk
-        jobs += [(size, members[i : i + chunk]) for i in range(0, members.size, chunk)]
+    jobs = jobs_of(task, count, np.ones(n, bool), recorded)
 
     def one(job: tuple[int, NDArray[np.int64]]) -> Answers:
         return climb(task, form, {path: array[job[1]] for path, array in lower.items()}, job[0])

@@ -17,7 +17,7 @@ from fingerspice.studies.batchtask import LOCKSTEP, Answers, Task
 
 # Initial number of steps per period, and initial degree of the area's polynomial, by the smallest rtol served.
 _RUNGS = ((5e-4, 32, 8), (5e-5, 48, 8), (5e-6, 80, 12), (5e-7, 144, 12), (0.0, 288, 16))
-_HIGHEST_DEGREE, _MOST_STEPS = 24, 8192
+HIGHEST_DEGREE, MOST_STEPS = 24, 8192
 # Under a recording: initial number of steps a sample, and the largest.
 _PARTS = (2, 16)
 # Largest gap voltage that the area's polynomial covers, as a ratio to its estimate, at first and later.
@@ -39,9 +39,9 @@ _LONGEST_STEP = 1.0
 # Steps of a piece of a square's half period by the smallest rtol served; and the number by which the first step, with
 # `_PIECE_START` steps a piece, is shorter than the fastest cell's time constant.
 _PIECES = ((5e-5, 8), (5e-7, 12), (0.0, 24))
-_PIECE_START, _MOST_PIECES = 2, 20
+_PIECE_START, MOST_PIECES = 2, 20
 # A scene is accepted if its stated error is at most this fraction of rtol, because the stated error is an estimate.
-_ENOUGH = 0.7
+ENOUGH = 0.7
 _Figure = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
 #: For each figure, the indices of the moments that it needs, and the function that gives it from the moments (4, n),
 #: the load, the stress at 1 V and the friction coefficient.
@@ -89,22 +89,56 @@ def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halv
         Length of the runs in half periods.
     """
     table = table_of(form, scenes)
-    others, cells = CELL_ROWS * form.cells, form.cells
-    mu = np.asarray(scenes.get(f"{form.layer.name.lower()}.mu", form.layer.values["mu"]))
-    mu = np.broadcast_to(mu, table.shape[1:])
+    mu = friction_of(form, scenes)
     found = Answers.empty(task, table.shape[1], halves * task.points // 2)
+    touching, pieces, decays = mesh_of(form, table, most=1 if "u_gap" in task.outputs else MOST_PIECES)
+    for count in np.unique(pieces[touching]).tolist():
+        _climb_one(task, form, _Scenes(table, mu, decays), (halves, count), touching & (pieces == count), found)
+    return found
+
+
+def friction_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray:
+    """Friction coefficient of every scene, shape (n,)."""
+    mu = np.asarray(scenes.get(f"{form.layer.name.lower()}.mu", form.layer.values["mu"]))
+    return np.broadcast_to(mu, next(iter(scenes.values())).shape)
+
+
+def mesh_of(form: LockstepForm, table: FloatArray, most: int) -> tuple[BoolArray, NDArray[np.int64], FloatArray]:
+    """Whether there is contact, pieces of a half period (0: no jumps), and half periods in the fastest time constant.
+
+    Parameters
+    ----------
+    form : LockstepForm
+    table : ndarray, shape (n_row, n)
+    most : int
+        Largest number of pieces. Each is twice as long as the one before, so that gap voltages at equal distances need
+        a single one.
+    """
+    others, cells = CELL_ROWS * form.cells, form.cells
     touching = table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2
     pieces, decays = np.zeros(table.shape[1], int), np.zeros(table.shape[1])
     if form.jumping:
         # The largest leakage rate of a cell is an upper bound of the rates of the modes.
         leaks = table[cells : 2 * cells] / table[others + REST] + table[2 * cells : 3 * cells]
         decays = np.max(leaks / table[:cells], axis=0) * (np.pi / table[others + OMEGA])
-        # Each piece is twice as long as the one before. Gap voltages at equal distances need a single piece.
-        most = 1 if "u_gap" in task.outputs else _MOST_PIECES
         pieces = np.ceil(np.log2(1.0 + _PIECE_START * decays)).clip(1, most).astype(int)
-    for count in np.unique(pieces[touching]).tolist():
-        _climb_one(task, form, _Scenes(table, mu, decays), (halves, count), touching & (pieces == count), found)
-    return found
+    return touching, pieces, decays
+
+
+def first_level(rtol: float, form: LockstepForm, pieces: int) -> tuple[int, int]:
+    """Steps a period and degree of the area's polynomial to begin with."""
+    steps, degree = next((s, d) for least, s, d in _RUNGS if rtol >= least)
+    steps *= max(form.multiples)
+    if pieces > 1:
+        steps = 2 * pieces * next(s for least, s in _PIECES if rtol >= least)
+    return steps, degree
+
+
+def short_enough(decays: FloatArray, pieces: int, steps: int) -> BoolArray:
+    """Whether the first step after a jump is short enough; `decays` as `mesh_of` gives them."""
+    # That step, in half periods, times the number of steps a period.
+    shortest = 2.0 * max(pieces, 1) / (2.0 ** max(pieces, 1) - 1.0)
+    return np.asarray(decays * shortest <= _LONGEST_STEP * steps)
 
 
 class _Scenes(NamedTuple):
@@ -123,24 +157,22 @@ def _climb_one(
     figures = [name for name in task.outputs if name != "u_gap"]
     needed = sorted({i for name in figures for i in FIGURES[name.removesuffix("_periodic")][0]} or {0})
     traced, pieces = len(figures) < len(task.outputs), mesh[1]
-    steps, degree = next((s, d) for least, s, d in _RUNGS if task.rtol >= least)
-    steps, most = (steps * max(form.multiples), _MOST_STEPS * max(form.multiples)) if form.recording is None else _PARTS
-    if pieces > 1:
-        steps = 2 * pieces * next(s for least, s in _PIECES if task.rtol >= least)
+    steps, degree = first_level(task.rtol, form, pieces)
+    most = MOST_STEPS * max(form.multiples)
+    if form.recording is not None:
+        steps, most = _PARTS
     if traced:
         steps = task.points * -(-steps // task.points)
-    # The first step after a jump, in half periods, times the number of steps a period.
-    shortest = 2.0 * max(pieces, 1) / (2.0 ** max(pieces, 1) - 1.0)
     pending = np.flatnonzero(chosen)
     before, least = None, np.zeros(pending.size)
     while pending.size and steps <= most:
         curves = curves_of(form.layer.values["m_exp"], form.layer.values["n_exp"], degree)
         if curves is None:
             break
-        level = _Level(task, form, mesh, steps, degree, ALL_MOMENTS if needed[-1] else 1, traced)
+        level = Level(task, form, mesh, steps, degree, ALL_MOMENTS if needed[-1] else 1, traced)
         now = level.run(table, pending, curves, before)
         error = np.maximum(level.error(now, needed), least)
-        good = (error <= _ENOUGH * task.rtol) & (scenes.decays[pending] * shortest <= _LONGEST_STEP * steps)
+        good = (error <= ENOUGH * task.rtol) & short_enough(scenes.decays[pending], pieces, steps)
         at = pending[good]
         for name in figures:
             part = 1 if name.endswith("_periodic") or task.periodic else 0
@@ -152,13 +184,13 @@ def _climb_one(
             found.values["u_gap"][at] = now.trace[good, :: steps // task.points]
         found.error[at], found.status[at], found.done[at] = error[good], LOCKSTEP, True
         # More steps are no help where the area's polynomial of the highest degree is what limits the error.
-        left = ~good & ((degree < _HIGHEST_DEGREE) | (before is None) | (now.fine[-1] <= _ENOUGH * task.rtol))
-        before = _Run(now.fine[:, left], now.fine[:, left], now.trace[left], now.trace[left])
+        left = ~good & ((degree < HIGHEST_DEGREE) | (before is None) | (now.fine[-1] <= ENOUGH * task.rtol))
+        before = Run(now.fine[:, left], now.fine[:, left], now.trace[left], now.trace[left])
         least = np.where(np.isfinite(error[left]), error[left], 0.0) / _MOST_GAIN
-        pending, steps, degree = pending[left], 2 * steps, _HIGHEST_DEGREE
+        pending, steps, degree = pending[left], 2 * steps, HIGHEST_DEGREE
 
 
-class _Run(NamedTuple):
+class Run(NamedTuple):
     """Results of `march` with half the steps and with all steps, and the gap voltages of both."""
 
     coarse: FloatArray
@@ -167,7 +199,7 @@ class _Run(NamedTuple):
     trace: FloatArray
 
 
-class _Level(NamedTuple):
+class Level(NamedTuple):
     """An integration with a given number of steps per period (sample) and degree of the area's polynomial."""
 
     task: Task
@@ -178,7 +210,7 @@ class _Level(NamedTuple):
     moments: int
     traced: bool
 
-    def run(self, table: FloatArray, pending: NDArray[np.int64], curves: Curves, before: _Run | None) -> _Run:
+    def run(self, table: FloatArray, pending: NDArray[np.int64], curves: Curves, before: Run | None) -> Run:
         """Integrate the scenes `pending`; the results with half the steps come from `before`, or are computed, too."""
         sizes = (self.steps // 2 if before is None else 0, self.steps)
         halves, pieces = self.mesh
@@ -204,10 +236,10 @@ class _Level(NamedTuple):
                 marks,
             )  # fmt: skip
         if before is None:
-            return _Run(out[0], out[1], traces[0], traces[1])
-        return _Run(before.fine, out[1], before.trace, traces[1])
+            return Run(out[0], out[1], traces[0], traces[1])
+        return Run(before.fine, out[1], before.trace, traces[1])
 
-    def error(self, run: _Run, needed: list[int]) -> FloatArray:
+    def error(self, run: Run, needed: list[int]) -> FloatArray:
         """Largest stated relative error of the outputs, for each scene."""
         peak, closing, tail = run.fine[2 * self.moments :]
         changes = [np.zeros(peak.size)]

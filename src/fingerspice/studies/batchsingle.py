@@ -19,7 +19,7 @@ from fingerspice.studies.steady import SteadyState, steady_state
 
 # A run's rtol is relative to peaks, and a batch's to the output itself: the first attempt assumes that an output is at
 # least this fraction of its peak.
-_OVER_PEAK = 0.1
+OVER_PEAK = 0.1
 
 
 class Single(NamedTuple):
@@ -34,7 +34,7 @@ class Single(NamedTuple):
 def run_single(task: Task, changes: Mapping[str, float], frequency: float) -> Single:
     """Run one scene, whose periods are those of `frequency` (Hz); a refusal or failure is returned, not raised."""
     try:
-        circuit, rtol = task.circuit.varied(changes), max(_OVER_PEAK * task.rtol, RTOL_RANGE[0])
+        circuit, rtol = task.circuit.varied(changes), max(OVER_PEAK * task.rtol, RTOL_RANGE[0])
         found = _run(task, circuit, frequency, rtol)
         if found.error > task.rtol and rtol > RTOL_RANGE[0]:
             # The mean is smaller than assumed, relative to the peak: repeat with the rtol that the error asks for.
@@ -67,14 +67,14 @@ def _run(task: Task, circuit: Circuit, frequency: float, rtol: float) -> Single:
         signal = next(s for s in SIGNALS_OF_BATCH if name.startswith(f"{s}_"))
         value = ran._figures.value(signal, name[len(signal) + 1 :])
         values[name] = np.asarray(math.nan if value is None else value, float)
-    return Single(values, _error(ran), ONE_BY_ONE, "")
+    return Single(values, error_of(ran), ONE_BY_ONE, "")
 
 
 #: Signals whose figures a batch has.
 SIGNALS_OF_BATCH = ("f_el", "f_t", "friction", "u_gap", "area")
 
 
-def _error(ran: Solution | SteadyState) -> float:
+def error_of(ran: Solution | SteadyState) -> float:
     """Stated error of the gap voltage relative to its peak, or of the force relative to its mean, if that is larger."""
     error: ErrorEstimate = ran.error
     pairs = (error.u_gap, ran.u_gap_peak), (error.f_el, ran.f_el_mean)

@@ -11,6 +11,12 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.circuit.circuit import Circuit
 
+# Largest number of scenes in a job, and the smallest to which a batch is divided so that all threads have jobs; and
+# their number if gap voltages are wanted, so that these stay in the processor's cache; and under a
+# recording, whose scenes take long.
+CHUNK, SMALL_CHUNK, TRACED, RECORDED = 4096, 256, 256, 32
+# Relative distance from a whole number within which a number of half periods counts as whole.
+WHOLE = 1e-9
 LOCKSTEP, ONE_BY_ONE, REFUSED, FAILED = 0, 1, 2, 3
 STATUS_NAMES = ("lockstep", "one_by_one", "refused", "failed")
 
@@ -32,6 +38,26 @@ class Task:
         if self.t_stop is not None:
             return np.asarray(frequency * self.t_stop)
         return np.full(frequency.shape, self.periods)
+
+
+def jobs_of(
+    task: Task, count: FloatArray, chosen: BoolArray, recorded: bool = False
+) -> list[tuple[int, NDArray[np.int64]]]:
+    """Jobs of the `chosen` scenes whose runs last for whole numbers of half periods: that number, and the scenes.
+
+    `count` (n,) is the number of periods in every run. Under a recording (`recorded`) half a period is a sample.
+    """
+    halves = np.round(2.0 * count)
+    good = chosen & (halves >= 1.0) & (np.abs(2.0 * count - halves) <= WHOLE * halves)
+    if any(name.endswith("_periodic") for name in task.outputs):
+        good &= halves >= 2.0
+    jobs = []
+    for size in np.unique(halves[good]).astype(int).tolist():
+        members = np.flatnonzero(good & (halves == size))
+        chunk = int(np.clip(members.size // 16, SMALL_CHUNK, CHUNK))
+        chunk = TRACED if "u_gap" in task.outputs else RECORDED if recorded else chunk
+        jobs += [(size, members[i : i + chunk]) for i in range(0, members.size, chunk)]
+    return jobs
 
 
 @dataclass

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,8 +17,12 @@ from fingerspice.results.outcome import SolveError
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.batch import batch
+from fingerspice.studies.batchgradients import in_lockstep_by
 from fingerspice.studies.batchtask import REFUSED
 from fingerspice.studies.steady import SteadyState, steady_state
+
+if TYPE_CHECKING:
+    from xarray import Dataset
 
 SIGNALS = ("u_gap", "area", "f_el", "f_t", "friction")
 MEANS = ("f_el_mean", "f_t_mean", "friction_mean", "area_mean")
@@ -65,6 +70,9 @@ class Scenes:
 
     def slopes(self, paths: Sequence[str], wanted: Sequence[str], given: FloatArray) -> FloatArray:
         """Derivatives of `values` by the parameters `wanted`, shape (n_scene, sum of `sizes`, n_wanted)."""
+        if not self.t.size and in_lockstep_by(self.circuit, paths, self.outputs, self.rtol):
+            found = self._batch(paths, given, wanted)
+            return np.stack([found[f"d_{name}"].to_numpy() for name in self.outputs], axis=1)
         out = np.empty((len(given), sum(self.sizes), len(wanted)))
         for i, row in enumerate(given):
             with _named(i):
@@ -76,15 +84,18 @@ class Scenes:
 
     def _means(self, paths: Sequence[str], given: FloatArray) -> FloatArray:
         """Means alone, of all scenes at once."""
-        changes = dict(zip(paths, given.T, strict=True))
+        found = self._batch(paths, given, ())
+        return np.stack([found[name].to_numpy().reshape(len(given)) for name in self.outputs], axis=1)
+
+    def _batch(self, paths: Sequence[str], given: FloatArray, wanted: Sequence[str]) -> Dataset:
         found = batch(
-            self.circuit, changes, outputs=self.outputs, rtol=self.rtol, periodic=self.periodic,
-            t_stop=None if self.periodic else self.t_stop,
+            self.circuit, dict(zip(paths, given.T, strict=True)), outputs=self.outputs, rtol=self.rtol,
+            periodic=self.periodic, t_stop=None if self.periodic else self.t_stop, gradients=wanted,
         )  # fmt: skip
-        bad = np.flatnonzero(found["status"].to_numpy() >= REFUSED)
+        bad = np.flatnonzero(found["gradient_status" if wanted else "status"].to_numpy() >= REFUSED)
         if bad.size:
             raise InputError(f"{bad.size} of {len(given)} scenes cannot be run; {found.attrs['failures'][0]}")
-        return np.stack([found[name].to_numpy().reshape(len(given)) for name in self.outputs], axis=1)
+        return found
 
     def _runs(
         self, paths: Sequence[str], row: FloatArray, wanted: Sequence[str]
