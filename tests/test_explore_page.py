@@ -46,16 +46,16 @@ class Page:
         self.page.on("pageerror", lambda e: self.errors.append(str(e)))
         self.page.on("request", lambda r: self.asked.append(r.url))
         self.page.goto(url)
-        self.page.wait_for_selector("body[data-answers]", timeout=120_000)
+        self.page.wait_for_selector("body[data-figures]", timeout=120_000)
 
     def answers(self) -> int:
-        return int(self.page.get_attribute("body", "data-answers"))
+        return int(self.page.get_attribute("body", "data-figures"))
 
     def after(self, change: Any) -> None:
         """Make a change, and wait for the answer to it."""
         before = self.answers()
         change()
-        self.page.wait_for_selector(f'body:not([data-answers="{before}"])', timeout=60_000)
+        self.page.wait_for_selector(f'body:not([data-figures="{before}"])', timeout=60_000)
         self.page.wait_for_timeout(100)
 
     def typed(self, path: str, text: str) -> None:
