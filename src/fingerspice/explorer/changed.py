@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from fingerspice.base.errors import InputError
-from fingerspice.base.units import parse_number, spice_text
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.provenance import in_force, remembering
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.explorer.request import Request, circuits_of, request_of
+from fingerspice.explorer.sliders import value_text
 from fingerspice.explorer.waveforms import read_source, text_of
 from fingerspice.sets.parameters import ParameterSet, parameters
 from fingerspice.waveforms.waveform import Waveform
@@ -51,7 +50,10 @@ def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]
             changes = one.apply(circuit, to).sets[one.name]
     except InputError as error:
         return {"ok": False, "message": str(error)}
-    overrides = {path: _text(value) for path, value in changes.items() if not isinstance(value, Waveform)}
+    units = {path.lower(): parameter.unit for path, parameter in circuit.parameters.items()}
+    overrides = {
+        path: value_text(value, units[path.lower()]) for path, value in changes.items() if not isinstance(value, Waveform)
+    }
     drives = [
         f"{name}={text_of(wave)}" if len(driving_sources(circuit)) > 1 else text_of(wave)
         for name, wave in changes.items()
@@ -76,17 +78,14 @@ def marked(circuit: Circuit, base: Circuit, request: Request) -> tuple[Circuit, 
     return circuit, lost
 
 
-def sentences(circuit: Circuit) -> list[dict[str, Any]]:
-    """What the page says of each set of a circuit of which a value is still in force."""
-    found = []
-    for name, (kept, changed) in in_force(circuit).items():
-        one = parameters(name)
-        if kept:
-            found.append(
-                {"name": name, "kind": one.kind, "title": one.title, "caveat": one.not_claimed,
-                 "assumed": list(one.assumed), "changed": list(changed)}
-            )  # fmt: skip
-    return found
+def sentences(circuit: Circuit, request: Request) -> list[dict[str, Any]]:
+    """What the page says of each set of a request of which a value is still in force."""
+    force = in_force(circuit)
+    return [
+        {"name": name, "to": to, "title": parameters(name).title, "caveat": parameters(name).not_claimed,
+         "assumed": list(parameters(name).assumed), "changed": list(force[name][1])}
+        for name, to in entries(circuit, request)
+    ]  # fmt: skip
 
 
 def entries(circuit: Circuit, request: Request) -> Iterator[tuple[str, str | None]]:
@@ -108,18 +107,29 @@ def before(circuit: Circuit) -> dict[str, Any]:
         can say, such as a recording or a function, is in none of them.
     """
     known = {path.lower(): (path, parameter) for path, parameter in circuit.parameters.items()}
-    replaced = {e.name.lower(): e for e in circuit.elements if e.waveform is not None}
     given = {path.lower() for path in circuit.overrides}
-    texts = [text for name, e in replaced.items() if name in given and (text := _source_text(circuit, e)) is not None]
+    texts = [text for e in _replaced(circuit) if (text := _source_text(circuit, e)) is not None]
     said = {text.partition("=")[0].lower() for text in texts[:1]}
     overrides = {
-        known[path][0]: _text(known[path][1].value)
+        known[path][0]: value_text(known[path][1].value, known[path][1].unit)
         for path in sorted(given & set(known))
         if path.rpartition(".")[0] not in said
     }
     sets = [entry for name in circuit.sets if (entry := _entry(circuit, name)) is not None]
     found = {"overrides": overrides, "source": texts[0] if texts else "", "sets": ",".join(sets)}
     return {key: value for key, value in found.items() if value}
+
+
+def unsaid(circuit: Circuit) -> list[str]:
+    """Names of sources that had been replaced before the page was opened, and that no text of the page can say."""
+    said = [e.name for e in _replaced(circuit) if _source_text(circuit, e) is not None][:1]
+    return [e.name for e in _replaced(circuit) if e.name not in said]
+
+
+def _replaced(circuit: Circuit) -> list[Element]:
+    """The sources that have another waveform than the deck's."""
+    given = {path.lower() for path in circuit.overrides}
+    return [e for e in circuit.elements if e.waveform is not None and e.name.lower() in given]
 
 
 def _source_text(circuit: Circuit, element: Element) -> str | None:
@@ -135,16 +145,16 @@ def _source_text(circuit: Circuit, element: Element) -> str | None:
 
 
 def _entry(circuit: Circuit, name: str) -> str | None:
-    """The set of that name as in `Request.sets`, applied as narrowly as gives all its values in the circuit."""
+    """The set of that name as in `Request.sets`: applied to all, or as narrowly as gives its values in the circuit."""
     values = circuit.sets[name]
     elements = dict.fromkeys(path.rpartition(".")[0] or path for path in values)
     inside = {e.rpartition(".")[0] for e in elements}
-    for to in (*elements, *sorted(inside - {""}, key=len, reverse=True), None):
+    for to in (None, *elements, *sorted(inside - {""}, key=len, reverse=True)):
         try:
             found = parameters(name).apply(circuit, to).sets[name]
         except InputError:
             continue
-        if values.items() <= found.items():
+        if values == found or (to is not None and values.items() <= found.items()):
             return name if to is None else f"{to}={name}"
     return None
 
@@ -160,10 +170,3 @@ def _named(entry: str) -> tuple[ParameterSet, str | None]:
     to, _, name = (part.strip() for part in entry.rpartition("="))
     return parameters(name), to or None
 
-
-def _text(value: float) -> str:
-    """A value in SPICE's notation where that is the same double, for a field of the page."""
-    if not math.isfinite(value):
-        return "inf"
-    text = spice_text(value)
-    return text if parse_number(text) == value else repr(float(value))

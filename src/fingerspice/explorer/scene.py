@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -57,19 +58,17 @@ def begun(given: dict[str, Any], own: Circuit | None = None) -> tuple[dict[str, 
     The traces can be drawn while the figures are computed, which takes longer than the run.
     """
     answer: dict[str, Any] = {"ok": False, "status": "BAD_INPUT", "message": "", "sliders": [], "traces": []}
-    rest: Callable[[], dict[str, Any]] = dict
-    with warnings.catch_warnings(record=True) as noticed:
-        warnings.simplefilter("ignore")
-        warnings.simplefilter("always", FingerspiceWarning)
+    more: Callable[[], dict[str, Any]] = dict
+    with _noticing(answer):
         try:
             request = request_of(given)
             base, circuit, lost = circuits_of(request, own)
             circuit, without = marked(circuit, base, request)
             answer |= {
-                "title": circuit.title, "sliders": sliders(base, circuit), "sets": sentences(circuit),
+                "title": circuit.title, "sliders": sliders(base, circuit), "sets": sentences(circuit, request),
                 "unknown": [*request.unknown, *lost, *without],
             }  # fmt: skip
-            run, rest = _run(circuit, request)
+            run, more = _run(circuit, request)
             answer |= run
         except InputError as error:
             answer["message"] = str(error)
@@ -77,9 +76,25 @@ def begun(given: dict[str, Any], own: Circuit | None = None) -> tuple[dict[str, 
             answer |= {"status": error.failure.status.name, "message": error.message, "failed_at": error.failure.t}
         except MemoryError:
             answer["message"] = "not enough memory for this scene; allowed: fewer periods or elements"
+
+    def rest() -> dict[str, Any]:
+        found = {"warnings": answer["warnings"]}
+        with _noticing(found):
+            found |= more()
+        return found
+
+    return answer, rest
+
+
+@contextmanager
+def _noticing(answer: dict[str, Any]) -> Iterator[None]:
+    """Add the warnings that are given inside to those of an answer, each once."""
+    with warnings.catch_warnings(record=True) as noticed:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", FingerspiceWarning)
+        yield
     said = [*answer.get("warnings", ()), *(str(w.message) for w in noticed)]
     answer["warnings"] = list(dict.fromkeys(said))
-    return answer, rest
 
 
 def deadline(seconds: float = LONGEST_RUN) -> Callable[[float], None]:

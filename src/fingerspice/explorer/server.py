@@ -169,7 +169,8 @@ def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -
     own = None
     if circuit is not None:
         before = changed.before(circuit)
-        own = {"title": circuit.title, "request": {"deck": circuit.text, **before, **(asked or {})}}
+        asked = {"deck": circuit.text, **before, **(asked or {})}
+        own = {"title": circuit.title, "request": asked, "unsaid": changed.unsaid(circuit)}
     return {"version": __version__, "own": own, "examples": examples, "waveforms": menu(), "sets": changed.menu()}
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.errors import InputError
-from fingerspice.base.units import format_si, parse_number
+from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Tran
 from fingerspice.circuit.provenance import in_force
 from fingerspice.explorer.changed import entries, marked
@@ -73,8 +73,8 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
     lines, changes = _beginning(request.deck, own, name)
     if request.skin == "dispersive":
         lines += _DISPERSIVE.splitlines()
-    for name, to in entries(circuit, request):
-        lines.append(f"circuit = fs.parameters({name!r}).apply(circuit{'' if to is None else f', {to!r}'})")
+    for one, to in entries(circuit, request):
+        lines.append(f"circuit = fs.parameters({one!r}).apply(circuit{'' if to is None else f', {to!r}'})")
     if waveform is not None and name.lower() not in by_sets:
         gain = gain_of(request.source)
         recorded = request.recording.python(gain) if request.recording is not None and gain is not None else None
@@ -110,13 +110,15 @@ def _beginning(deck: str, own: Circuit | None, replaced: str) -> tuple[list[str]
         lines.append(f"circuit = fs.read_netlist({str(mine.path)!r})")
     else:
         lines += ["circuit = fs.parse_netlist(", *(f"    {line!r}" for line in deck.splitlines(keepends=True)), ")"]
-    changes = {}
-    for path, text in mine.overrides.items() if mine is not None else ():
-        try:
-            changes[path] = parse_number(text)
-        except ValueError:
-            if path.lower() != replaced.lower():
-                lines.append(f"# Changed before, in Python: {path} = {' '.join(text.split())}")
+    changes: dict[str, float] = {}
+    if mine is None:
+        return lines, changes
+    known = {path.lower(): parameter.value for path, parameter in mine.parameters.items()}
+    for path, text in mine.overrides.items():
+        if path.lower() in known:
+            changes[path] = known[path.lower()]
+        elif path.lower() != replaced.lower():
+            lines.append(f"# Changed before, in Python: {path} = {' '.join(text.split())}")
     return lines, changes
 
 

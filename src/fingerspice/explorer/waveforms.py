@@ -12,6 +12,7 @@ from fingerspice.base.units import parse_number
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.explorer.recordings import Recording
+from fingerspice.explorer.sliders import value_text
 from fingerspice.netlist.netlist import source_from_text
 from fingerspice.waveforms.combinations import AM
 from fingerspice.waveforms.periodic import Sawtooth, Square, Triangle
@@ -135,7 +136,7 @@ def text_of(waveform: Waveform) -> str | None:
     """The text that `read_source` reads as this waveform; None of one for which the page has no function."""
     for kind, (made, names) in _TEXTS.items():
         if type(waveform) is made:
-            numbers = [repr(float(getattr(waveform, name))) for name in names]
+            numbers = [value_text(getattr(waveform, name), made.units[name]) for name in names]
             return f"{kind}({' '.join(numbers)})"
     return None
 

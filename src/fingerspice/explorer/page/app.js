@@ -26,6 +26,8 @@ let waveforms = null;
 let sets = null;
 let sweep = { key: "", points: [], message: "", level: 0, left: [] };
 let idle = 0;
+/** Timer of the sentence about an answer that takes long. */
+let slow = 0;
 /** Counts the scenes chosen: an answer that comes after another choice belongs to none. */
 let shown = 0;
 let recording = null;
@@ -73,19 +75,21 @@ async function refresh() {
   // The address follows a slider that moves at some distance, since browsers limit how often it changes.
   clearTimeout(address);
   address = setTimeout(keepAddress, 200);
+  if (!slow) slow = setTimeout(() => say("computing; the first run of its kind compiles, which takes up to a minute"), 700);
   if (inFlight) {
     again = true;
     return;
   }
   inFlight = true;
   clearTimeout(idle);
-  const slow = setTimeout(() => say("computing; the first run of its kind compiles, which takes up to a minute"), 700);
   try {
     do {
       again = false;
       const of = shown;
       const parts = await ask("scene", asking());
       const answer = { t: new Float64Array(0), ...(await parts.next()) };
+      clearTimeout(slow);
+      slow = 0;
       // While a slider moves, an answer is shown although it has moved on since; one to another scene is not.
       if (of === shown) show(answer);
       Object.assign(answer, await parts.next());
@@ -95,6 +99,7 @@ async function refresh() {
     say(`no answer from the program that opened this page: is it still running? (${error.message})`, true);
   } finally {
     clearTimeout(slow);
+    slow = 0;
     inFlight = false;
     if (again) refresh();
   }
@@ -114,19 +119,26 @@ function show(answer) {
   if (answer.ok) traces.show(answer, null, pinned);
   else if (good) traces.show(answer, good, pinned);
   else if (usable) traces.show(answer, null, pinned);
-  say(answer.ok ? `${answer.title}: ${answer.error.text}` : answer.message, !answer.ok);
-  const said = [...unknownInLink, ...(answer.unknown || []), ...(answer.warnings || [])];
-  $("warnings").replaceChildren(...said.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+  const values = (of) => JSON.stringify([of.set, of.options.source]);
+  const changed = values(state) !== values(reset(state, examples));
+  say(answer.ok ? `${answer.title}${changed ? " (changed)" : ""}: ${answer.error.text}` : answer.message, !answer.ok);
+  warn(answer);
   if (answer.sliders.length) sliders.update(answer.sliders, replacedSource(answer), state.set);
   controls();
   sets.show(answer);
   document.body.dataset.answers = Number(document.body.dataset.answers || 0) + 1;
 }
 
+function warn(answer) {
+  const said = [...unknownInLink, ...(answer.unknown || []), ...(answer.warnings || [])];
+  $("warnings").replaceChildren(...said.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+}
+
 /** Show what comes after the traces: harmonics, the stack, figures and facts. */
 function showFigures(answer) {
   if (baked) still();
   if (answer.ok && answer.figures) {
+    warn(answer);
     harmonics.show(answer.harmonics);
     stack.show(answer);
     table();
@@ -264,7 +276,9 @@ function setSource(text) {
   const source = now ? replacedSource({ sliders: now.sliders }) : null;
   const replaced = source || (now && now.sliders.length ? now.sliders[0].element : null);
   for (const path of Object.keys(state.set)) if (replaced && path.startsWith(`${replaced}.`)) delete state.set[path];
-  set("source", text);
+  // The deck's own source may have been changed before the page was opened.
+  const own = state.scene === OWN && state.deck === null && examples.find((e) => e.name === OWN).request.source;
+  set("source", text || own || "");
 }
 
 /** Apply a named set of parameters, `entry`: its values become those of the page. */
@@ -324,6 +338,12 @@ async function copied(text, what) {
   }
 }
 
+function share() {
+  const own = state.scene === OWN && state.deck === null ? examples.find((e) => e.name === OWN) : null;
+  const without = own && own.unsaid.length ? `, without ${own.unsaid.join(", ")}, which was changed before this page was opened,` : "";
+  copied(location.href.replace(/#.*$/, "") + toHash(state, examples), `link${without}`);
+}
+
 async function text(what, use) {
   const answer = await askOnce(what, asking());
   if (answer.ok) use(answer.text);
@@ -345,7 +365,7 @@ function listen() {
     }
   });
   $("reset").addEventListener("click", () => choose(reset(state, examples)));
-  $("share").addEventListener("click", () => copied(location.href.replace(/#.*$/, "") + toHash(state, examples), "link"));
+  $("share").addEventListener("click", share);
   $("deck").addEventListener("click", () => text("deck", (x) => save("fingerspice.cir", new Blob([x], { type: "text/plain" }))));
   $("python").addEventListener("click", () => text("python", (x) => copied(x, "Python")));
   $("csv").addEventListener("click", csv);

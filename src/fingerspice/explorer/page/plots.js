@@ -84,12 +84,12 @@ export class Traces {
       box.className = "panel";
       this.parent.append(box);
       const line = (s) => ({ label: s.label, stroke: s.colour, width: s.dashed ? 1.2 : 1.6, dash: s.dashed ? [6, 4] : undefined,
-        points: { show: false }, value: (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5)))) });
+        pxAlign: 0, points: { show: false }, value: (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5)))) });
       const options = {
         width: this.width(), height: panel.height, cursor: { sync: { key: "time" } },
         scales: { x: { time: false } },
         axes: [{ size: i === wanted.length - 1 ? 34 : 30, labelSize: 18, font: "11px sans-serif", labelFont: "12px sans-serif", label: "" },
-          { size: 58, labelSize: 20, space: 24, font: "11px sans-serif", labelFont: "12px sans-serif", label: "" }],
+          { size: 58, labelSize: 20, space: 16, font: "11px sans-serif", labelFont: "12px sans-serif", label: "" }],
         series: [{ label: "time", value: (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5)))) }, ...series.map(line)],
         hooks: { draw: [(u) => this.mark(u)] },
       };

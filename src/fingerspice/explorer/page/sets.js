@@ -37,7 +37,7 @@ export class Sets {
     this.choices(answer.sliders.filter((g) => GIVEN.includes(g.device)));
     this.list.replaceChildren(...(answer.sets || []).map((one) => {
       const item = document.createElement("li");
-      make("b", one.name, item);
+      make("b", one.to ? `${one.name}, ${one.to}` : one.name, item);
       item.append(` ${one.title}. `);
       if (one.assumed.length) make("span", `Assumed, not published: ${one.assumed.join(", ")}. `, item);
       if (one.changed.length) make("span", `Changed since: ${one.changed.join(", ")}. `, item);
