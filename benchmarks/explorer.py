@@ -16,23 +16,29 @@ import time
 import numpy as np
 from playwright.sync_api import sync_playwright
 
-#: Moves the slider of the gap's height; times until the answer is drawn, and until the frame after it.
+#: Moves the slider of the gap's height; times until the traces are drawn, until the frame after them, and until the
+#: figures are there, too.
 MOVES = """async (count) => {
   const slider = document.querySelector('input[type=range][data-path="Xgap.d"]');
-  const drawn = [], shown = [];
+  const changed = (name) => new Promise((done) => new MutationObserver((_, observer) => {
+    observer.disconnect();
+    done(performance.now());
+  }).observe(document.body, { attributes: true, attributeFilter: [name] }));
+  const drawn = [], shown = [], told = [];
   for (let i = 0; i < count; i += 1) {
     slider.value = 300 + (i % 300);
+    const figures = changed("data-figures");
+    const traces = changed("data-answers").then((now) => {
+      drawn.push(now - begin);
+      return new Promise((done) => requestAnimationFrame(() => done(performance.now())));
+    });
     const begin = performance.now();
     slider.dispatchEvent(new Event("input", { bubbles: true }));
-    await new Promise((done) => new MutationObserver((_, observer) => {
-      observer.disconnect();
-      drawn.push(performance.now() - begin);
-      requestAnimationFrame(() => done());
-    }).observe(document.body, { attributes: true, attributeFilter: ["data-answers"] }));
-    shown.push(performance.now() - begin);
+    shown.push((await traces) - begin);
+    told.push((await figures) - begin);
     await new Promise((done) => setTimeout(done, 10));
   }
-  return [drawn, shown];
+  return [drawn, shown, told];
 }"""
 
 
@@ -55,9 +61,9 @@ def main() -> None:
         # The sweep over frequencies is done by then.
         page.wait_for_timeout(5000)
         page.evaluate(MOVES, 30)
-        drawn, shown = page.evaluate(MOVES, 300)
+        drawn, shown, told = page.evaluate(MOVES, 300)
         print(f"command to server {ready:.2f} s, page to first picture {first:.2f} s")
-        for what, times in (("new traces drawn", drawn), ("next frame begun", shown)):
+        for what, times in (("new traces drawn", drawn), ("next frame begun", shown), ("figures shown", told)):
             median, late = np.percentile(times, [50, 99])
             print(f"event to {what}: median {median:.1f} ms, 99th percentile {late:.1f} ms")
         browser.close()

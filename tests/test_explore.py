@@ -8,6 +8,7 @@ import json
 import os
 import re
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -55,8 +56,9 @@ def explorer() -> Iterator[Explorer]:
     running.stop()
 
 
-def array(x: dict[str, str]) -> FloatArray:
-    return np.frombuffer(base64.b64decode(x["f64"]), "<f8")
+def array(x: Any) -> FloatArray:
+    """An array of an answer, or of a page without a server, where it is text."""
+    return x if isinstance(x, np.ndarray) else np.frombuffer(base64.b64decode(x["f64"]), "<f8")
 
 
 def packed(values: list[float]) -> str:
@@ -64,14 +66,32 @@ def packed(values: list[float]) -> str:
 
 
 def asked(explorer: Explorer, what: str, body: bytes | None, **headers: str) -> tuple[int, dict[str, Any]]:
-    """Status and answer of one request, whether refused or not."""
+    """Status and answer of one request, whether refused or not, with all its parts."""
     request = urllib.request.Request(f"{explorer.url}{what}", body, headers)
     try:
         with urllib.request.urlopen(request, timeout=60) as answer:
-            return answer.status, json.load(answer)
+            framed = answer.headers["Content-Type"].startswith("application/octet-stream")
+            return answer.status, unframed(answer.read()) if framed else json.load(answer)
     except urllib.error.HTTPError as error:
         with error:
             return error.code, json.load(error)
+
+
+def unframed(content: bytes) -> dict[str, Any]:
+    """The parts of an answer: two sizes, JSON, and the arrays whose places among all doubles the JSON has."""
+    found: dict[str, Any] = {}
+    while content:
+        length, doubles = struct.unpack("<II", content[:8])
+        end = 8 + length + 8 * doubles
+        numbers = np.frombuffer(content[8 + length : end], "<f8")
+        assert numbers.size == doubles
+
+        def place(x: dict[str, Any], numbers: FloatArray = numbers) -> Any:
+            return numbers[x["f64"][0] :][: x["f64"][1]] if "f64" in x else x
+
+        found |= json.loads(content[8 : 8 + length], object_hook=place)
+        content = content[end:]
+    return found
 
 
 def post(explorer: Explorer, request: Any, what: str = "scene") -> dict[str, Any]:
@@ -412,6 +432,7 @@ def test_a_solution_opens_the_page_as_it_was_run(monkeypatch: pytest.MonkeyPatch
         start = asked(running, "start", None)[1]
         assert start["own"]["request"] == {
             "deck": SINE, "charge_law": "mobile", "area": "frozen", "rtol": 1e-5, "periods": 3.0,
+            "overrides": {"Xgap.d": "5u"},
         }  # fmt: skip
         shown = post(running, start["own"]["request"])
         force = next(trace for trace in shown["traces"] if trace["signal"] == "f_el")
@@ -431,7 +452,8 @@ def raw(explorer: Explorer, method: str, path: str, body: bytes = b"", **headers
     names = {key.replace("_", "-"): value for key, value in headers.items()}
     connection.request(method, path, body, names)
     answer = connection.getresponse()
-    found = answer.status, json.loads(answer.read())
+    content = answer.read()
+    found = answer.status, unframed(content) if answer.status == 200 else json.loads(content)
     connection.close()
     return found
 

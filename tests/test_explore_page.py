@@ -46,16 +46,16 @@ class Page:
         self.page.on("pageerror", lambda e: self.errors.append(str(e)))
         self.page.on("request", lambda r: self.asked.append(r.url))
         self.page.goto(url)
-        self.page.wait_for_selector("body[data-answers]", timeout=120_000)
+        self.page.wait_for_selector("body[data-figures]", timeout=120_000)
 
     def answers(self) -> int:
-        return int(self.page.get_attribute("body", "data-answers"))
+        return int(self.page.get_attribute("body", "data-figures"))
 
     def after(self, change: Any) -> None:
         """Make a change, and wait for the answer to it."""
         before = self.answers()
         change()
-        self.page.wait_for_selector(f'body:not([data-answers="{before}"])', timeout=60_000)
+        self.page.wait_for_selector(f'body:not([data-figures="{before}"])', timeout=60_000)
         self.page.wait_for_timeout(100)
 
     def typed(self, path: str, text: str) -> None:
@@ -144,6 +144,51 @@ def test_pinned_traces_stay_with_the_difference(page: Page) -> None:
     assert "gap voltage, pinned" in page.page.inner_text("#plots")
     a, b = (fs.simulate(SINE.replace({"Xgap.d": d}), rtol=1e-6).f_el_mean for d in (3.5e-6, 4e-6))
     assert page.shown("electroadhesive force")[-1] == f"{100 * (b / a - 1):.2f} %"
+
+
+def test_sets_are_applied_from_the_menu_with_their_caveats_and_the_link_has_their_values(
+    page: Page, browser: Any
+) -> None:
+    for name in ("moist", "Fig4-5kHz"):
+        page.after(lambda name=name: page.page.select_option("#apply", name))
+    moist = fs.parameters("moist")
+    circuit = fs.parameters("Fig4-5kHz").apply(moist.apply(SINE))
+    expected = f"{float(f'{1e3 * fs.simulate(circuit, rtol=1e-6, t_stop=1e-3).f_el_mean_periodic:.5g}')} mN"
+    assert page.shown("electroadhesive force")[1] == expected
+    assert moist.not_claimed in page.page.inner_text("#sets")
+    assert "Assumed, not published: gap.r, gap.mu." in page.page.inner_text("#sets")
+    assert page.page.input_value("#source") == "SIN(0 200 5k)"
+    page.page.wait_for_timeout(500)
+    other = Page(browser, page.page.url)
+    assert other.shown("electroadhesive force")[1] == expected
+    assert other.page.inner_text("#sets") == page.page.inner_text("#sets")
+    other.close()
+    page.typed("Xgap.r", "0.3meg")
+    assert "Changed since: Xgap.r." in page.page.inner_text("#sets")
+    page.after(lambda: page.page.click("#reset"))
+    assert page.page.inner_text("#sets") == ""
+    assert page.page.input_value("#source") == ""
+
+
+def test_traces_follow_a_slider_while_it_moves_and_the_last_place_is_shown(page: Page) -> None:
+    counts = page.page.evaluate("""async () => {
+      const slider = document.querySelector('input[type=range][data-path="Xgap.d"]');
+      const answers = () => Number(document.body.dataset.answers);
+      const before = answers();
+      for (let i = 0; i < 60; i += 1) {
+        slider.value = 400 + i;
+        slider.dispatchEvent(new Event("input", { bubbles: true }));
+        await new Promise((done) => setTimeout(done, 4));
+      }
+      const during = answers() - before;
+      await new Promise((done) => setTimeout(done, 1500));
+      return [during, answers() - before];
+    }""")
+    # Answers come while it moves, and there are fewer requests than events.
+    assert 2 <= counts[0] <= counts[1] < 60
+    shown = page.page.input_value('input[type=text][data-path="Xgap.d"]')
+    expected = fs.simulate(SINE.replace({"Xgap.d": shown}), rtol=1e-6)
+    assert page.shown("electroadhesive force")[1] == f"{float(f'{1e3 * expected.f_el_mean_periodic:.5g}')} mN"
 
 
 def test_a_recording_is_taken_and_a_wrong_file_refused(page: Page, tmp_path: Path) -> None:

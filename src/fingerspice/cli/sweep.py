@@ -102,7 +102,7 @@ def _give(
     told = populations.summary(found)
     shares = [] if indices is None else populations.ranking(indices, output)
     answer.update(
-        scenes=int(found.status.size), failed=int((found.status >= 2).sum()), n=found.attrs.get("n"),
+        sets=found.attrs.get("sets", []), scenes=int(found.status.size), failed=int((found.status >= 2).sum()), n=found.attrs.get("n"),
         seed=found.attrs.get("seed"), figures=told, shares=shares or None,
     )  # fmt: skip
     answer.give(lambda: _told(told) + (f"\n\n{_shared(shares, output)}" if shares else ""), writes)
@@ -115,7 +115,7 @@ def _give_stored(answer: Answering, found: Any, store: Path) -> None:
     about = found.attrs
     answer.data["files"].append(str(store))
     answer.update(
-        scenes=int(found.status.size), n=about.get("n"), seed=about.get("seed"),
+        sets=about.get("sets", []), scenes=int(found.status.size), n=about.get("n"), seed=about.get("seed"),
         store={key: about[key] for key in ("chunks", "chunks_found", "chunks_missing", "seconds")},
     )  # fmt: skip
     said = [f"{about['chunks']:,} pieces ({about['chunks_found']:,} were there already) in {store}"]
@@ -167,10 +167,15 @@ def _beside(file: Path, deck: str) -> Path:
 
 
 def _parameter(path: str, one: Any) -> Any:
-    """Numbers or a distribution from ``{kind = [numbers]}``."""
+    """Numbers or a distribution from ``{kind = [numbers]}``; names of sets as they are."""
     import numpy as np
     from scipy import stats
 
+    from fingerspice.sets.reading import KINDS
+
+    if path in KINDS:
+        # The sweep looks the sets up, and says what is allowed.
+        return one
     if isinstance(one, int | float) and not isinstance(one, bool):
         return float(one)
     allowed = "a number, or one of " + ", ".join(f"{{{kind} = {what}}}" for kind, what in _KINDS.items())
@@ -216,7 +221,7 @@ def _shared(rows: list[dict[str, Any]], output: str) -> str:
     lines: dict[str, dict[str, str]] = {}
     first: dict[str, list[str]] = {}
     for row in rows:
-        place = ", ".join(f"{name} = {value:.4g}" for name, value in row["place"].items())
+        place = ", ".join(f"{name} = {_shown(value)}" for name, value in row["place"].items())
         if place not in lines:
             first.setdefault(row["parameter"], []).append(place)
         told = f"{row['total']:.2f} ({row['low']:.2f}-{row['high']:.2f})"
@@ -232,6 +237,11 @@ def _shared(rows: list[dict[str, Any]], output: str) -> str:
     )
     title = f"share of the variance of {output} that comes from a parameter, its interactions included (95 % interval)"
     return "\n".join([title, head, *body, f"largest share: {most}"])
+
+
+def _shown(value: float | str) -> str:
+    """A number, or the name of a set."""
+    return value if isinstance(value, str) else f"{value:.4g}"
 
 
 def _wide(name: str) -> int:

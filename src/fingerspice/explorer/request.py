@@ -11,6 +11,8 @@ from functools import lru_cache
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import parse_number
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
@@ -28,7 +30,7 @@ from fingerspice.waveforms.waveform import Waveform, require
 LONGEST_DECK, MOST_ELEMENTS, MOST_OVERRIDES = 100_000, 200, 500
 MOST_PERIODS, MOST_TIMES, MOST_BREAKPOINTS = 200.0, 2e5, 2e5
 SKINS = ("own", "follow", "dispersive")
-_LARGEST = 1e300
+_LARGEST, _LONGEST_SETS = 1e300, 2000
 _AREAS = ("coupled", "mean", "frozen")
 
 
@@ -59,6 +61,9 @@ class Request:
         How many of the last periods are shown; None for all of the run.
     recording : Recording or None
         The file dropped on the page, for the source ``RECORDING(gain)``.
+    sets : str
+        Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME`` with commas; they change
+        nothing, and the page shows their caveats.
     unknown : tuple of str
         Names that mean nothing here, each in a sentence.
     """
@@ -73,6 +78,7 @@ class Request:
     periods: float = 5.0
     last: float | None = None
     recording: Recording | None = None
+    sets: str = ""
     unknown: tuple[str, ...] = ()
 
 
@@ -99,9 +105,11 @@ def request_of(given: Any) -> Request:
     require(isinstance(source, str), "source", f"of type {type(source).__name__}", "text such as SQUARE(200 100)")
     for name, allowed in (("charge_law", CHARGE_LAWS), ("skin", SKINS)):
         require(asked.get(name, allowed[0]) in allowed, name, _short(asked.get(name)), " or ".join(allowed))
-    area = asked.get("area", "coupled")
-    known = area in _AREAS if isinstance(area, str) else _is_number(area)
-    require(known, "area", _short(area), ", ".join(_AREAS) + " or a number of m^2")
+    sets = asked.get("sets", "")
+    good = isinstance(sets, str) and len(sets) <= _LONGEST_SETS
+    require(good, "sets", _short(sets), f"names with commas, at most {_LONGEST_SETS:,} characters")
+    if "area" in asked:
+        asked["area"] = _area(asked["area"])
     for name in (name for name in ("rtol", "periods", "last") if name in asked):
         value = asked[name]
         most = 0.1 if name == "rtol" else MOST_PERIODS
@@ -114,11 +122,25 @@ def request_of(given: Any) -> Request:
     return Request(**asked, unknown=unknown)
 
 
+def _area(given: Any) -> str | float:
+    """The area of a run: a mode's name, or a number of m^2, which a link gives as text."""
+    if given in _AREAS:
+        return str(given)
+    try:
+        area = parse_number(given.strip()) if isinstance(given, str) else given
+    except ValueError:
+        area = None
+    require(_is_number(area), "area", _short(given), ", ".join(_AREAS) + " or a number of m^2")
+    return float(area)
+
+
 def asked_by(solution: Solution) -> dict[str, Any]:
     """How a run was made, as far as a request can say it."""
     asked: dict[str, Any] = {"charge_law": solution.charge_law, "rtol": min(max(solution.rtol, 1e-12), 0.1)}
-    if solution.area_mode in _AREAS:
-        asked["area"] = solution.area_mode
+    asked["area"] = solution.area_mode
+    if solution.area_mode not in _AREAS and solution.area is not None:
+        # All areas of such a run are the one number that it was given.
+        asked["area"] = float(np.ravel(solution.area)[0])
     if solution.period:
         asked["periods"] = float(f"{min(max(solution.t_stop / solution.period, 0.01), MOST_PERIODS):.6g}")
     return asked

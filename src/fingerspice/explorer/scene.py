@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.explorer.changed import marked, sentences
 from fingerspice.explorer.request import Request, circuits_of, request_of, times_of
 from fingerspice.explorer.sliders import sliders
 from fingerspice.results.outcome import SolveError
@@ -41,29 +43,58 @@ def scene(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``ok``, ``status`` and ``message``; ``sliders``, ``sources``, ``warnings`` and ``unknown``; of a run ``t`` and
+        ``ok``, ``status`` and ``message``; ``sliders``, ``sets``, ``warnings`` and ``unknown``; of a run ``t`` and
         ``traces`` (arrays in SI units), ``figures``, ``error``, ``plan``, ``harmonics``, ``stacks``, ``period``,
         ``t_stop`` and ``failed_at``. A request that is refused, or a run that fails, says why in ``message``; neither
         raises an exception.
     """
+    first, rest = begun(given, own)
+    return first | rest()
+
+
+def begun(given: dict[str, Any], own: Circuit | None = None) -> tuple[dict[str, Any], Callable[[], dict[str, Any]]]:
+    """The answer of `scene` but for ``figures``, ``harmonics`` and ``stacks``, and a function that gives these.
+
+    The traces can be drawn while the figures are computed, which takes longer than the run.
+    """
     answer: dict[str, Any] = {"ok": False, "status": "BAD_INPUT", "message": "", "sliders": [], "traces": []}
-    with warnings.catch_warnings(record=True) as noticed:
-        warnings.simplefilter("ignore")
-        warnings.simplefilter("always", FingerspiceWarning)
+    more: Callable[[], dict[str, Any]] = dict
+    with _noticing(answer):
         try:
             request = request_of(given)
             base, circuit, lost = circuits_of(request, own)
-            answer |= {"title": circuit.title, "sliders": sliders(base, circuit), "unknown": [*request.unknown, *lost]}
-            answer |= _run(circuit, request)
+            circuit, without = marked(circuit, base, request)
+            answer |= {
+                "title": circuit.title, "sliders": sliders(base, circuit), "sets": sentences(circuit, request),
+                "unknown": [*request.unknown, *lost, *without],
+            }  # fmt: skip
+            run, more = _run(circuit, request)
+            answer |= run
         except InputError as error:
             answer["message"] = str(error)
         except SolveError as error:
             answer |= {"status": error.failure.status.name, "message": error.message, "failed_at": error.failure.t}
         except MemoryError:
             answer["message"] = "not enough memory for this scene; allowed: fewer periods or elements"
+
+    def rest() -> dict[str, Any]:
+        found = {"warnings": answer["warnings"]}
+        with _noticing(found):
+            found |= more()
+        return found
+
+    return answer, rest
+
+
+@contextmanager
+def _noticing(answer: dict[str, Any]) -> Iterator[None]:
+    """Add the warnings that are given inside to those of an answer, each once."""
+    with warnings.catch_warnings(record=True) as noticed:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", FingerspiceWarning)
+        yield
     said = [*answer.get("warnings", ()), *(str(w.message) for w in noticed)]
     answer["warnings"] = list(dict.fromkeys(said))
-    return answer
 
 
 def deadline(seconds: float = LONGEST_RUN) -> Callable[[float], None]:
@@ -82,8 +113,8 @@ def deadline(seconds: float = LONGEST_RUN) -> Callable[[float], None]:
     return check
 
 
-def _run(circuit: Circuit, request: Request) -> dict[str, Any]:
-    """The part of an answer that a run gives."""
+def _run(circuit: Circuit, request: Request) -> tuple[dict[str, Any], Callable[[], dict[str, Any]]]:
+    """The part of an answer that a run gives, in the two parts of `begun`."""
     first, stop, period = times_of(circuit, request)
     solution = simulate(
         circuit, t_stop=stop, t_eval=np.linspace(first, stop, POINTS), charge_law=request.charge_law, area=request.area,
@@ -100,10 +131,11 @@ def _run(circuit: Circuit, request: Request) -> dict[str, Any]:
         "plan": {"tier": solution.plan.tier, "text": "; ".join(solution.plan.reasons)},
         "failed_at": solution.failure.t if solution.failure is not None else None,
     }  # fmt: skip
-    if solution.success:
-        answer |= {"figures": _figures(solution, traces), "harmonics": _harmonics(solution, period)}
-        answer["stacks"] = _stacks(solution)
-    return answer
+    if not solution.success:
+        return answer, dict
+    return answer, lambda: {
+        "figures": _figures(solution, traces), "harmonics": _harmonics(solution, period), "stacks": _stacks(solution)
+    }  # fmt: skip
 
 
 def _traces(solution: Solution, key: str) -> list[dict[str, Any]]:

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-import base64
 import hmac
 import json
-import math
 import secrets
 import socket
 import threading
 import webbrowser
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
+from itertools import chain
 from typing import Any, ClassVar
-
-import numpy as np
 
 from fingerspice import __version__
 from fingerspice.base.errors import InputError, printable
 from fingerspice.base.pages import in_notebook
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.explorer import changed
+from fingerspice.explorer.encoding import as_json, framed
 from fingerspice.explorer.examples import EXAMPLES
 from fingerspice.explorer.request import asked_by
-from fingerspice.explorer.scene import scene
+from fingerspice.explorer.scene import begun
 from fingerspice.explorer.sharing import as_deck, as_python, means
 from fingerspice.explorer.waveforms import menu
 from fingerspice.results.solution import Solution
@@ -49,7 +48,8 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-Answer = tuple[HTTPStatus, str, bytes]
+Answer = tuple[HTTPStatus, str, Iterator[bytes]]
+"""Status, type of content, and its parts as they are found."""
 #: Explorers that this notebook shows, the oldest first: a cell that is run again starts another one.
 _FRAMES: deque[Explorer] = deque()
 
@@ -142,16 +142,23 @@ class Explorer:
         self._server.server_close()
         self._thread.join()
 
-    def answer(self, what: str, given: Any) -> Answer:
-        """The answer to what the page asks for."""
-        run: Callable[[Any, Circuit | None], Any] = _ACTIONS[what]
+    def answers(self, what: str, given: Any) -> Iterator[bytes]:
+        """The answer to what the page asks for, in the parts in which it is found."""
+        rest: Callable[[], dict[str, Any]] | None = None
         # Python's filters of warnings belong to the whole process, and two runs at once would not be faster.
         with self._one_at_a_time:
             try:
-                found = run(given, self.circuit)
+                if what == SCENE:
+                    found, rest = begun(given, self.circuit)
+                else:
+                    found = _ACTIONS[what](given, self.circuit)
             except InputError as error:
                 found = {"ok": False, "message": str(error)}
-        return HTTPStatus.OK, "application/json", as_json(found)
+        yield framed(found)
+        if rest is not None:
+            with self._one_at_a_time:
+                found = rest()
+            yield framed(found)
 
 
 def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -159,8 +166,12 @@ def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -
     examples = [
         {"name": e.name, "title": e.title, "note": e.note, "request": {"deck": e.deck, **e.asked}} for e in EXAMPLES
     ]
-    own = None if circuit is None else {"title": circuit.title, "request": {"deck": circuit.text, **(asked or {})}}
-    return {"version": __version__, "own": own, "examples": examples, "waveforms": menu()}
+    own = None
+    if circuit is not None:
+        before = changed.before(circuit)
+        asked = {"deck": circuit.text, **before, **(asked or {})}
+        own = {"title": circuit.title, "request": asked, "unsaid": changed.unsaid(circuit)}
+    return {"version": __version__, "own": own, "examples": examples, "waveforms": menu(), "sets": changed.menu()}
 
 
 def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: bool = True) -> Explorer:
@@ -200,26 +211,11 @@ def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: 
     return explorer
 
 
-def as_json(data: Any) -> bytes:
-    """Data as JSON: arrays of numbers as base64 of little-endian doubles, and null for what is not finite."""
-
-    def plain(x: Any) -> Any:
-        if isinstance(x, dict):
-            return {key: plain(value) for key, value in x.items()}
-        if isinstance(x, list | tuple):
-            return [plain(value) for value in x]
-        if isinstance(x, np.ndarray):
-            return {"f64": base64.b64encode(np.ascontiguousarray(x, "<f8").tobytes()).decode("ascii")}
-        if isinstance(x, float):
-            return float(x) if math.isfinite(x) else None
-        return x
-
-    return json.dumps(plain(data), allow_nan=False).encode()
-
-
-_ACTIONS: dict[str, Callable[[Any, Circuit | None], Any]] = {
-    "scene": scene,
+#: What the page asks for most, whose answer comes in two parts; and all else that it asks for.
+SCENE = "scene"
+_ACTIONS: dict[str, Callable[[Any, Circuit | None], dict[str, Any]]] = {
     "means": means,
+    "set": changed.applied,
     "deck": lambda given, own: {"ok": True, "text": as_deck(given, own)},
     "python": lambda given, own: {"ok": True, "text": as_python(given, own)},
 }
@@ -276,22 +272,32 @@ class _Handler(BaseHTTPRequestHandler):
         """Nothing is logged: the token stands in every line."""
 
     def do_GET(self) -> None:
-        self._answered(lambda what: self._got(what))
+        self._answered(self._got)
 
     def do_POST(self) -> None:
         self._read = False
-        self._answered(lambda what: self.explorer.answer(self._action(what), self._body()))
+        self._answered(self._run)
 
     def _answered(self, make: Callable[[str], Answer]) -> None:
         try:
             answer = make(self._allowed())
         except _Refused as error:
             self._discard()
-            answer = error.status, "application/json", as_json({"ok": False, "message": error.text})
+            answer = error.status, "application/json", iter([as_json({"ok": False, "message": error.text})])
+        self._send(*answer)
+
+    def _run(self, what: str) -> Answer:
+        if what != SCENE and what not in _ACTIONS:
+            raise _Refused(HTTPStatus.NOT_FOUND, f"nothing of that name; allowed: {', '.join([SCENE, *_ACTIONS])}")
+        return HTTPStatus.OK, "application/octet-stream", self._parts(what, self._body())
+
+    def _parts(self, what: str, given: Any) -> Iterator[bytes]:
+        """The parts of an answer, the last of which says what went wrong if this program did."""
+        try:
+            yield from self.explorer.answers(what, given)
         except Exception as error:
             text = printable(f"this is a fault of fingerspice, please report it ({type(error).__name__}: {error})")
-            answer = HTTPStatus.OK, "application/json", as_json({"ok": False, "status": "FAULT", "message": text})
-        self._send(*answer)
+            yield framed({"ok": False, "status": "FAULT", "message": text})
 
     def _allowed(self) -> str:
         """What is asked for, of a request that may ask."""
@@ -313,16 +319,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _got(self, what: str) -> Answer:
         if what == "start":
-            return HTTPStatus.OK, "application/json", as_json(beginning(self.explorer.circuit, self.explorer.asked))
+            start = as_json(beginning(self.explorer.circuit, self.explorer.asked))
+            return HTTPStatus.OK, "application/json", iter([start])
         name = what or "index.html"
         if name not in self.explorer.files:
             raise _Refused(HTTPStatus.NOT_FOUND, "there is no such file")
-        return HTTPStatus.OK, _TYPES[name.rpartition(".")[2]], self.explorer.files[name]
-
-    def _action(self, what: str) -> str:
-        if what not in _ACTIONS:
-            raise _Refused(HTTPStatus.NOT_FOUND, f"nothing of that name; allowed: {', '.join(_ACTIONS)}")
-        return what
+        return HTTPStatus.OK, _TYPES[name.rpartition(".")[2]], iter([self.explorer.files[name]])
 
     def _body(self) -> Any:
         length = self.headers.get("Content-Length", "")
@@ -346,14 +348,17 @@ class _Handler(BaseHTTPRequestHandler):
             piece = self.rfile.read(min(left, 65_536))
             left = left - len(piece) if piece else 0
 
-    def _send(self, status: HTTPStatus, kind: str, body: bytes) -> None:
+    def _send(self, status: HTTPStatus, kind: str, parts: Iterator[bytes]) -> None:
+        part = next(parts)
         self.send_response(status)
         self.send_header("Content-Type", f"{kind}; charset=utf-8")
-        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Transfer-Encoding", "chunked")
         self.send_header("Content-Security-Policy", _POLICY + (_NOTEBOOKS if self.explorer.framed else "'none'"))
         for name, value in _HEADERS.items():
             self.send_header(name, value)
         if self.close_connection:
             self.send_header("Connection", "close")
         self.end_headers()
-        self.wfile.write(body)
+        for more in chain([part], parts):
+            self.wfile.write(b"%x\r\n%b\r\n" % (len(more), more))
+        self.wfile.write(b"0\r\n\r\n")

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.errors import InputError
-from fingerspice.base.units import format_si, parse_number
+from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Tran
+from fingerspice.circuit.provenance import in_force
+from fingerspice.explorer.changed import entries, marked
 from fingerspice.explorer.request import Request, circuits_of, request_of, times_of
 from fingerspice.explorer.scene import POINTS, deadline
 from fingerspice.explorer.waveforms import gain_of, read_source
@@ -64,18 +66,23 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
         warnings.simplefilter("ignore")
         request = request_of(given)
         base, circuit, _ = circuits_of(request, own)
+        circuit, _ = marked(circuit, base, request)
         first, stop, _ = times_of(circuit, request)
-    lines, changes = _beginning(request.deck, own)
+    by_sets = {path.lower() for kept, _ in in_force(circuit).values() for path in kept}
+    name, waveform = read_source(request.source, base, request.recording) if request.source else ("", None)
+    lines, changes = _beginning(request.deck, own, name)
     if request.skin == "dispersive":
         lines += _DISPERSIVE.splitlines()
-    if request.source:
-        name, waveform = read_source(request.source, base, request.recording)
+    for one, to in entries(circuit, request):
+        lines.append(f"circuit = fs.parameters({one!r}).apply(circuit{'' if to is None else f', {to!r}'})")
+    if waveform is not None and name.lower() not in by_sets:
         gain = gain_of(request.source)
         recorded = request.recording.python(gain) if request.recording is not None and gain is not None else None
         code = recorded or _AS_CODE.sub(r"fs.\1(", repr(waveform))
         lines.append(f"circuit = circuit.replace({{{name!r}: {code}}})")
     known = {path.lower() for path in circuit.parameters}
     changes |= {path: x for path, x in request.overrides.items() if path.lower() in known}
+    changes = {path: x for path, x in changes.items() if path.lower() not in by_sets}
     if request.skin == "follow":
         changes |= {f"{e.name}.f": e.values["f"] for e in circuit.by_device("SKIN")}
     if changes:
@@ -92,19 +99,25 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
     return "\n".join(lines)
 
 
-def _beginning(deck: str, own: Circuit | None) -> tuple[list[str], dict[str, float]]:
-    """The lines that make the circuit of a deck, and the values changed before the page was opened."""
+def _beginning(deck: str, own: Circuit | None, replaced: str) -> tuple[list[str], dict[str, float]]:
+    """The lines that make the circuit of a deck, and the values changed before the page was opened.
+
+    The source of the name `replaced` has got another waveform on the page.
+    """
     lines = ["import dataclasses", "", "import numpy as np", "", "import fingerspice as fs", ""]
     mine = own if own is not None and deck == own.text else None
     if mine is not None and mine.path is not None:
         lines.append(f"circuit = fs.read_netlist({str(mine.path)!r})")
     else:
         lines += ["circuit = fs.parse_netlist(", *(f"    {line!r}" for line in deck.splitlines(keepends=True)), ")"]
-    changes = {}
-    for path, text in mine.overrides.items() if mine is not None else ():
-        try:
-            changes[path] = parse_number(text)
-        except ValueError:
+    changes: dict[str, float] = {}
+    if mine is None:
+        return lines, changes
+    known = {path.lower(): parameter.value for path, parameter in mine.parameters.items()}
+    for path, text in mine.overrides.items():
+        if path.lower() in known:
+            changes[path] = known[path.lower()]
+        elif path.lower() != replaced.lower():
             lines.append(f"# Changed before, in Python: {path} = {' '.join(text.split())}")
     return lines, changes
 

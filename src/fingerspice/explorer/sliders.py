@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from fingerspice.base.units import spice_text
+from fingerspice.base.units import parse_number, spice_text
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import ParameterSpec
 from fingerspice.circuit.topology import driving_sources
@@ -79,11 +79,16 @@ def _unit(e: Element, unit: str, drives: bool) -> str:
     return ("A" if e.device == "I" else "V") if drives else "mm^2"
 
 
+def value_text(value: float, unit: str) -> str:
+    """A value for a field of the page: in SPICE's notation where its unit takes a prefix and that is the same double."""
+    text = spice_text(value) if unit in _PREFIXED and math.isfinite(value) else f"{value:.12g}"
+    return text if not math.isfinite(value) or parse_number(text) == value else repr(float(value))
+
+
 def _slider(path: str, unit: str, value: float, first: bool, limits: tuple[float, float, bool]) -> dict[str, Any]:
     low, high, log = limits
-    text = spice_text(value) if unit in _PREFIXED else f"{value:.12g}"
     return {
-        "path": path, "unit": unit, "value": value if math.isfinite(value) else None, "text": text,
+        "path": path, "unit": unit, "value": value if math.isfinite(value) else None, "text": value_text(value, unit),
         "low": low, "high": high, "log": log, "first": first,
     }  # fmt: skip
 

@@ -8,8 +8,9 @@ import re
 from typing import Any
 
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.explorer.encoding import as_json
 from fingerspice.explorer.scene import scene
-from fingerspice.explorer.server import as_json, beginning, pages
+from fingerspice.explorer.server import beginning, pages
 
 _POLICY = "default-src 'none'; script-src 'unsafe-inline' data:; style-src 'unsafe-inline'; img-src data: blob:"
 _IMPORT = re.compile(r'from "\./(\w+)\.js"')

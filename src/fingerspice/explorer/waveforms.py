@@ -12,11 +12,21 @@ from fingerspice.base.units import parse_number
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.explorer.recordings import Recording
+from fingerspice.explorer.sliders import value_text
 from fingerspice.netlist.netlist import source_from_text
 from fingerspice.waveforms.combinations import AM
-from fingerspice.waveforms.periodic import Sawtooth, Triangle
-from fingerspice.waveforms.waveform import Waveform
+from fingerspice.waveforms.periodic import Sawtooth, Square, Triangle
+from fingerspice.waveforms.waveform import DC, Sine, Waveform
 
+#: By function: its waveform, and the names of its numbers in their order.
+_TEXTS: dict[str, tuple[type[Waveform], tuple[str, ...]]] = {
+    "SIN": (Sine, ("offset", "amplitude", "frequency")),
+    "SQUARE": (Square, ("amplitude", "frequency", "duty")),
+    "AM": (AM, ("amplitude", "carrier", "modulation", "depth")),
+    "TRIANGLE": (Triangle, ("amplitude", "frequency")),
+    "SAWTOOTH": (Sawtooth, ("amplitude", "frequency")),
+    "DC": (DC, ("level",)),
+}
 #: Largest number of characters of a source's text.
 LONGEST = 20_000
 _EXTRA: dict[str, type[Waveform]] = {"AM": AM, "TRIANGLE": Triangle, "SAWTOOTH": Sawtooth}
@@ -120,6 +130,15 @@ def read_source(text: str, circuit: Circuit, recording: Recording | None = None)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FingerspiceWarning)
         return name, source_from_text(text, circuit, files=False)
+
+
+def text_of(waveform: Waveform) -> str | None:
+    """The text that `read_source` reads as this waveform; None of one for which the page has no function."""
+    for kind, (made, names) in _TEXTS.items():
+        if type(waveform) is made:
+            numbers = [value_text(getattr(waveform, name), made.units[name]) for name in names]
+            return f"{kind}({' '.join(numbers)})"
+    return None
 
 
 def gain_of(text: str) -> float | None:

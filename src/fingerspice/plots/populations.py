@@ -48,9 +48,15 @@ def plot_sweep(found: Dataset, output: str, indices: Dataset | None = None) -> P
     factor, unit = drawing.engineering(drawing.peak_of(np.nan_to_num(values)), one.attrs.get("units", ""), 0.05)
     label = f"{output} [{unit}]" if unit else output
     if dims:
-        x, x_label = found[dims[0]].values, f"{dims[0]} [{found[dims[0]].attrs.get('units', '')}]"
+        x, unit = found[dims[0]].values, found[dims[0]].attrs.get("units", "")
+        x_label = f"{dims[0]} [{unit}]" if unit else dims[0]
+        named = x if x.dtype.kind in "OUT" else None
+        x = x if named is None else np.arange(x.size)
         figure = _along(x, x_label, factor * values, label, indices, factor, output)
         for ax in figure.axes:
+            if named is not None:
+                _name_places(ax, [str(name) for name in named])
+                continue
             if x.min() > 0.0 and x.max() > _WIDE * x.min():
                 ax.set_xscale("log")
             ax.set_xlim(x.min(), x.max() if x.size > 1 else None)
@@ -59,6 +65,15 @@ def plot_sweep(found: Dataset, output: str, indices: Dataset | None = None) -> P
     if "scene" in one.dims:
         drawing.caption(figure, f"{found.sizes['scene']:,} scenes, seed {found.attrs.get('seed', 0)}")
     return figure
+
+
+def _name_places(ax: Axes, names: list[str]) -> None:
+    """Names of sets of parameters instead of numbers along an axis, with a mark at each: nothing lies between them."""
+    ax.set_xticks(range(len(names)), names, rotation=20.0 if len(names) > 4 else 0.0)
+    ax.set_xlim(-0.3, len(names) - 0.7)
+    for line in ax.lines:
+        line.set_marker("o")
+        line.set_markersize(4.0)
 
 
 def _along(

@@ -22,6 +22,8 @@ CAPACITY, _AT_ONCE = 512, 16_384
 MOST_NUMBERS = 8_000_000
 #: Largest number of different periods in an extrapolation (`Leap`).
 _MOST_PERIODS = 20_000
+#: Sets of places between the steps whose record is kept, and the most places of one.
+_KNOWN, _MOST_KNOWN = 8, 4096
 _NODES = POINTS[:NODES]
 #: Matrix from Chebyshev coefficients to values at the nodes.
 _FROM_SERIES = chebyshev.chebvander(2.0 * _NODES - 1.0, NODES - 1).T
@@ -160,6 +162,7 @@ class Stretches:
     def __init__(self, blocks: list[Block], make: Callable[[FloatArray, BoolArray, FloatArray], Record]) -> None:
         sizes = [len(b.times) for b in blocks]
         self._make = make
+        self._known: dict[tuple[bytes, bytes], tuple[FloatArray, Record]] = {}
         self.start, self.length, self.reached, self.reach = np.concatenate([b.times for b in blocks]).T
         self.values = np.concatenate([b.values for b in blocks])
         self.count = np.repeat([b.count for b in blocks], sizes)
@@ -224,9 +227,19 @@ class Stretches:
 
     def values_at(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See `measures.Run`; evaluates the polynomials of the steps."""
-        columns = np.einsum("pcn,pqn->cpq", self.values[index], basis(fraction))
-        t, left = self._times(index, fraction)
-        record = self._make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], t.size))
+        # The signals of a run are mostly asked for at the same places, one signal after another.
+        key = index.tobytes(), fraction.tobytes()
+        found = self._known.get(key)
+        if found is None:
+            t, left = self._times(index, fraction)
+            columns = np.einsum("pcn,pqn->cpq", self.values[index], basis(fraction))
+            record = self._make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], t.size))
+            found = t, record
+            if t.size <= _MOST_KNOWN:
+                while len(self._known) >= _KNOWN:
+                    self._known.pop(next(iter(self._known)), None)
+                self._known[key] = found
+        t, record = found
         return t, read(record).reshape(t.shape)
 
 

@@ -127,7 +127,7 @@ def _of_network(problem: Problem) -> _Choice:
         reason = f"{follows}; by how much is not known beforehand: a current source sets no bound"
         return _Choice("coupled", reason, math.nan, area)
     largest = max(_change(curve, scene.u_peak)[0] for curve in scene.net.curves[scene.net.gap >= 0])
-    reason = f"{follows}, {'each' if several else ''} by up to {100.0 * largest:.2g} % of its middle"
+    reason = f"{follows}, {'each ' if several else ''}by up to {_percent(largest)} of its middle"
     return _Choice("coupled", reason, largest, area)
 
 
@@ -142,7 +142,7 @@ def _of_stack(problem: Problem, model: Model, rtol: float) -> _Choice:
     if not model.coupled:
         return _Choice("linear", f"the area is {scene.area_mode}, so the circuit is linear", changed, area)
     free, little = not np.any(model.rate0 > 0.0), changed <= 0.2 * rtol
-    reason = f"the area follows the voltage and moves the leaks by up to {100.0 * changed:.2g} %"
+    reason = f"the area follows the voltage and moves the leaks by up to {_percent(changed)}"
     if not model.mobile and (free or little):
         reason = "only the charge needs the area at every instant; charge=False leaves it out"
         if not problem.charge and free:
@@ -151,6 +151,11 @@ def _of_stack(problem: Problem, model: Model, rtol: float) -> _Choice:
             reason = f"the area changes the leaks by {changed:.2g} at most, against rtol = {rtol:g}"
     tier = "linear" if not (model.mobile or problem.charge) and (free or little) else "coupled"
     return _Choice(tier, reason, changed, area)
+
+
+def _percent(share: float) -> str:
+    """A share in percent to two digits, without an exponent where it has three."""
+    return f"{float(f'{100.0 * share:.2g}'):g} %"
 
 
 def _change(curve: FloatArray, u_peak: float) -> tuple[float, float]:

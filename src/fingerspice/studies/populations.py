@@ -17,6 +17,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies.batch import batch
 from fingerspice.studies.batchtask import REFUSED
 from fingerspice.studies.sweepplan import BITS, Plan, make_plan
+from fingerspice.studies.sweepsets import with_sets
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -55,6 +56,8 @@ def sweep(
     parameters : mapping of str to array_like or distribution
         Path, as in `Circuit.replace`, to numbers in the netlist's unit, or to a frozen distribution of `scipy.stats`.
         Several paths with commas between them are scaled together: their numbers are factors on the circuit's values.
+        A kind of named sets, such as ``finger`` or ``coating``, goes to the name of a set (`fs.parameters`), which is
+        applied first, or to a list of names, which makes a dimension of the grid.
     n : int
         Number of draws, a power of two.
     seed : int
@@ -86,6 +89,7 @@ def sweep(
         As `batch`, for an `n` that is no power of two, and for too many scenes. With `store`, if the folder is there
         and is no store of this sweep, or the scheduler does not answer.
     """
+    circuit, parameters = with_sets(circuit, parameters)
     if store is not None:
         from fingerspice.studies.sweepstored import stored
 
@@ -111,10 +115,11 @@ def _in_memory(circuit: Circuit, plan: Plan, options: Mapping[str, Any]) -> Data
         name: ((*plan.dims, *one.dims[1:]), one.values.reshape((*plan.sizes, *one.shape[1:])), one.attrs)
         for name, one in found.data_vars.items()
     }
-    coords: dict[str, Any] = {name: (name, values, {"units": plan.units[name]}) for name, values in plan.grid.items()}
+    coords: dict[str, Any] = plan.coordinates
     coords |= {name: ("scene", values, {"units": plan.units[name]}) for name, values in draws.items()}
     coords |= {name: one for name, one in found.coords.items() if name == "turn"}
-    return Dataset(data, coords, found.attrs | ({"n": plan.n, "seed": plan.seed} if draws else {}))
+    about = {"n": plan.n, "seed": plan.seed} if draws else {}
+    return Dataset(data, coords, found.attrs | about | ({"sets": list(circuit.sets)} if circuit.sets else {}))
 
 
 def sobol(
@@ -152,6 +157,7 @@ def sobol(
     InputError
         As `sweep`; if nothing is drawn; and if a scene has no result, because indices need all of them.
     """
+    circuit, parameters = with_sets(circuit, parameters)
     plan = make_plan(circuit, parameters, n, seed, MOST_SAMPLES)
     require(bool(plan.drawn), "parameters", "all numbers", "one distribution or more, such as scipy.stats.norm(...)")
     require_number("confidence", confidence, "a number")
@@ -237,7 +243,7 @@ def _as_dataset(plan: Plan, outputs: tuple[str, ...], rows: list[dict[str, Float
             values = np.array([row[kind][i] for row in rows])
             own = ("parameter", "quantile")[: values.ndim - 1]
             data[f"{output}_{kind}"] = ((*dims, *own), values.reshape((*plan.shape, *values.shape[1:])))
-    coords: dict[str, Any] = {path: (path, values, {"units": plan.units[path]}) for path, values in plan.grid.items()}
+    coords: dict[str, Any] = plan.coordinates
     coords |= {"parameter": list(plan.drawn), "quantile": list(QUANTILES)}
     coords["unit"] = ("parameter", [plan.units[name] for name in plan.drawn])
     data["at"] = (("parameter", "quantile"), [law.ppf(QUANTILES) for law in plan.drawn.values()])
@@ -256,7 +262,7 @@ def ranking(found: Dataset, output: str) -> list[dict[str, Any]]:
         first, total, low, high = (
             one[f"{output}_{kind}"].values for kind in ("first", "total", "total_low", "total_high")
         )
-        place = {dim: float(one[dim]) for dim in dims}
+        place = {dim: one[dim].item() for dim in dims}
         rows += [
             {
                 "place": place, "parameter": str(one.parameter.values[j]), "first": float(first[j]),

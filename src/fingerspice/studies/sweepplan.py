@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,6 +16,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.arguments import require_circuit, require_number
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies.batch import own_path
+from fingerspice.studies.sweepsets import SetTable
 from fingerspice.waveforms.waveform import require
 
 # Bits of a Sobol point, and so the largest number of draws of all.
@@ -28,7 +30,8 @@ class Plan:
     """Parameters that make a grid, those that are drawn (`n` draws by `seed`), and those that are one number.
 
     Names are paths, or several paths with commas, whose numbers are factors; `own` has the paths of each and the values
-    that the factors are of.
+    that the factors are of. A kind of named sets, such as ``finger``, is a name as well: its numbers count the sets of
+    its table.
     """
 
     grid: dict[str, FloatArray]
@@ -38,6 +41,7 @@ class Plan:
     units: dict[str, str]
     n: int
     seed: int
+    tables: dict[str, SetTable]
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -60,9 +64,21 @@ class Plan:
 
     def paths(self, values: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
         """Values of each path of these names."""
-        return {
+        found = {
             path: factor * np.asarray(every, float)
-            for name, every in values.items() for path, factor in self.own[name].items()
+            for name, every in values.items() for path, factor in self.own.get(name, {}).items()
+        }  # fmt: skip
+        for name in values.keys() & self.tables.keys():
+            found |= {path: each[np.asarray(values[name], int)] for path, each in self.tables[name].columns.items()}
+        return found
+
+    @property
+    def coordinates(self) -> dict[str, Any]:
+        """Of each dimension of the grid its numbers, or the names of its sets, for a Dataset."""
+        return {
+            name: (name, list(self.tables[name].names)) if name in self.tables
+            else (name, values, {"units": self.units[name]})
+            for name, values in self.grid.items()
         }  # fmt: skip
 
     def spread(self, grid: Mapping[str, FloatArray], draws: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
@@ -158,11 +174,15 @@ def make_plan(circuit: Circuit, parameters: Mapping[str, Any], n: int, seed: int
     fixed: dict[str, FloatArray] = {}
     own: dict[str, dict[str, float]] = {}
     units: dict[str, str] = {}
+    tables = {kind: value for kind, value in parameters.items() if isinstance(value, SetTable)}
+    taken = [path for value in tables.values() for path in value.columns]
     for given, value in parameters.items():
+        if given in tables:
+            grid[given] = np.arange(len(tables[given].names), dtype=float)
+            continue
         paths = [own_path(circuit, one.strip()) for one in str(given).split(",")]
-        twice = [one for i, one in enumerate(paths) if one in paths[:i] or any(one in told for told in own.values())]
-        if twice:
-            raise InputError(f"{twice[0]} is given twice; allowed: once")
+        taken += paths
+        _refuse_twice(taken)
         path = ",".join(paths)
         alone = len(paths) == 1
         own[path] = {one: 1.0 if alone else circuit.parameters[one].value for one in paths}
@@ -179,4 +199,11 @@ def make_plan(circuit: Circuit, parameters: Mapping[str, Any], n: int, seed: int
             ) from None
         require(array.ndim < 2 and array.size > 0, path, f"of shape {array.shape}", "numbers in one row")
         (grid if array.ndim else fixed)[path] = array
-    return Plan(grid, drawn, fixed, own, units, int(n), int(seed))
+    _refuse_twice(taken)
+    return Plan(grid, drawn, fixed, own, units, int(n), int(seed), tables)
+
+
+def _refuse_twice(paths: list[str]) -> None:
+    twice = [path for path, count in Counter(paths).items() if count > 1]
+    if twice:
+        raise InputError(f"{twice[0]} is given twice, where sets that differ in it count; allowed: once")

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 #: The array that marks chunks as done, and its value where a scene has not been run.
 STATUS, MISSING = "status", len(STATUS_NAMES)
+#: Attribute of a coordinate that counts named sets of parameters: their names.
+NAMES = "names"
 #: Attribute of the group with the identity of the sweep, as JSON.
 RUN = "sweep"
 
@@ -153,7 +155,7 @@ class SweepStore:
         return whole.tobytes()
 
     def open(
-        self, run: Mapping[str, Any], about: Mapping[str, Any], grid: Mapping[str, tuple[FloatArray, str]]
+        self, run: Mapping[str, Any], about: Mapping[str, Any], grid: Mapping[str, tuple[FloatArray, dict[str, Any]]]
     ) -> None:
         """Create the store, or make sure that the one there is of this sweep.
 
@@ -164,7 +166,7 @@ class SweepStore:
         about : mapping
             Further attributes of the store.
         grid : mapping
-            Values and unit of each parameter of the grid.
+            Values and attributes (the unit, or `NAMES`) of each parameter of the grid.
 
         Raises
         ------
@@ -193,7 +195,7 @@ class SweepStore:
                 "remove that folder"
             )
 
-    def _create(self, attributes: dict[str, Any], grid: Mapping[str, tuple[FloatArray, str]]) -> None:
+    def _create(self, attributes: dict[str, Any], grid: Mapping[str, tuple[FloatArray, dict[str, Any]]]) -> None:
         """Create the store with its arrays, still without values, under a temporary name, then rename it."""
         zarr = zarr_library()
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -211,10 +213,10 @@ class SweepStore:
                     name, shape=self.sizes[-1:], chunks=self.block[-1:], dtype="<f8", compressors=None,
                     fill_value=math.nan, dimension_names=("scene",), attributes={"units": unit},
                 )  # fmt: skip
-            for name, (values, unit) in grid.items():
+            for name, (values, attributes) in grid.items():
                 group.create_array(
                     name, data=values, chunks=values.shape, compressors=None, dimension_names=(name,),
-                    attributes={"units": unit},
+                    attributes=attributes,
                 )  # fmt: skip
             try:
                 aside.rename(self.path)
@@ -242,6 +244,8 @@ class SweepStore:
         found: Dataset = xarray.open_zarr(self.path, chunks=None, consolidated=False, zarr_format=3)
         del found.attrs[RUN]
         found = found.set_coords(list(self.drawn))
+        named = {str(name): one.attrs[NAMES] for name, one in found.coords.items() if NAMES in one.attrs}
+        found = found.assign_coords(named)
         return found[list(self.arrays)]
 
 

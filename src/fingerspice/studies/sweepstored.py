@@ -18,7 +18,7 @@ from fingerspice.studies.batch import batch, checked_scenes
 from fingerspice.studies.batchtask import LOCKSTEP, REFUSED
 from fingerspice.studies.sweepchunks import Work, programs, run_chunks, scheduled
 from fingerspice.studies.sweepplan import Plan
-from fingerspice.studies.sweepstore import MISSING, STATUS, SweepStore, Variable
+from fingerspice.studies.sweepstore import MISSING, NAMES, STATUS, SweepStore, Variable
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 
@@ -47,7 +47,10 @@ def stored(
     work, about = _work(circuit, plan, options, path)
     if workers is not None or scheduler is not None:
         work = Work(work.circuit, plan, work.draws, {"threads": 1, **options}, work.store, work.programs)
-    grid = {name: (values, plan.units[name]) for name, values in plan.grid.items()}
+    grid = {
+        name: (values, {NAMES: list(plan.tables[name].names)} if name in plan.tables else {"units": plan.units[name]})
+        for name, values in plan.grid.items()
+    }
     with scheduled(scheduler) as client:
         work.store.open(_identity(work, options), about, grid)
         told = run_chunks(work, shard, workers, client)
@@ -93,6 +96,7 @@ def _work(circuit: Circuit, plan: Plan, options: Mapping[str, Any], path: Path) 
             f"chunks of {math.prod(block):,}")  # fmt: skip
     about = {key: value for key, value in first.attrs.items() if key not in ("n_ordinary", "ordinary", "failures")}
     about |= {"n": plan.n, "seed": plan.seed} if plan.drawn else {}
+    about |= {"sets": list(circuit.sets)} if circuit.sets else {}
     draws = plan.sequence(block[-1]) if plan.drawn else None
     return Work(circuit, plan, draws, options, store, programs()), about
 
@@ -121,6 +125,9 @@ def _identity(work: Work, options: Mapping[str, Any]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for name, one in (plan.grid | plan.fixed).items():
         values[name] = hashlib.sha256(one.tobytes()).hexdigest() if one.size > 8 else one.tolist()
+        if name in plan.tables:
+            sets = plan.tables[name]
+            values[name] = [sets.names, {path: each.tolist() for path, each in sets.columns.items()}]
     for name, law in plan.drawn.items():
         # Nine digits are the same on every machine.
         values[name] = [f"{x:.9g}" for x in law.ppf(_PROBES)]

@@ -1,11 +1,12 @@
 // The explorer: a state, a request in flight, and what its answer shows.
 
 import { Sliders, Waveforms } from "./controls.js";
+import { Sets } from "./sets.js";
 import { read } from "./recording.js";
-import { Harmonics, Means, Traces, decoded } from "./plots.js";
+import { Harmonics, Means, Traces } from "./plots.js";
 import { Stack } from "./stack.js";
-import { OWN, fromHash, ofExample, request, toHash } from "./state.js";
-import { numbers, quantity } from "./units.js";
+import { OWN, fromHash, ofExample, request, reset, toHash } from "./state.js";
+import { Parts, quantity, unbaked } from "./units.js";
 
 const $ = (id) => document.getElementById(id);
 let examples = [];
@@ -22,22 +23,35 @@ let means = null;
 let stack = null;
 let sliders = null;
 let waveforms = null;
+let sets = null;
 let sweep = { key: "", points: [], message: "", level: 0, left: [] };
 let idle = 0;
+/** Timer of the sentence about an answer that takes long. */
+let slow = 0;
+/** Counts the scenes chosen: an answer that comes after another choice belongs to none. */
+let shown = 0;
 let recording = null;
 let address = 0;
 let written = "";
 
 /** What a page without a server holds; null of a page with one. */
-const baked = $("baked") ? JSON.parse($("baked").textContent) : null;
+const baked = $("baked") ? unbaked($("baked").textContent) : null;
 
+/** Ask for something: the parts of the answer, each by `next()`. */
 async function ask(what, body) {
   if (baked) {
     const found = what === "scene" && state.deck === null ? baked.scenes[state.scene] : null;
-    return found || { ok: false, message: "this page has no program behind it: fingerspice explore has", sliders: [], traces: [] };
+    const answer = found || { ok: false, message: "this page has no program behind it: fingerspice explore has", sliders: [], traces: [] };
+    return { next: async () => answer };
   }
-  const answer = await fetch(what, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
-  return answer.json();
+  const response = await fetch(what, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+  if (response.ok) return new Parts(response);
+  throw new Error((await response.json()).message);
+}
+
+/** Ask for something that comes in one part. */
+async function askOnce(what, body) {
+  return (await ask(what, body)).next();
 }
 
 /** The request of now, with the recording where the source is one. */
@@ -61,23 +75,31 @@ async function refresh() {
   // The address follows a slider that moves at some distance, since browsers limit how often it changes.
   clearTimeout(address);
   address = setTimeout(keepAddress, 200);
+  if (!slow) slow = setTimeout(() => say("computing; the first run of its kind compiles, which takes up to a minute"), 700);
   if (inFlight) {
     again = true;
     return;
   }
   inFlight = true;
   clearTimeout(idle);
-  const slow = setTimeout(() => say("computing; the first run of its kind compiles, which takes up to a minute"), 700);
   try {
     do {
       again = false;
-      const answer = await ask("scene", asking());
-      if (!again) show(decoded(answer));
+      const of = shown;
+      const parts = await ask("scene", asking());
+      const answer = { t: new Float64Array(0), ...(await parts.next()) };
+      clearTimeout(slow);
+      slow = 0;
+      // While a slider moves, an answer is shown although it has moved on since; one to another scene is not.
+      if (of === shown) show(answer);
+      Object.assign(answer, await parts.next());
+      if (of === shown) showFigures(answer);
     } while (again);
   } catch (error) {
     say(`no answer from the program that opened this page: is it still running? (${error.message})`, true);
   } finally {
     clearTimeout(slow);
+    slow = 0;
     inFlight = false;
     if (again) refresh();
   }
@@ -89,30 +111,44 @@ function say(text, failed = false) {
   $("status").className = failed ? "failed" : "";
 }
 
+/** Show the first part of an answer: traces, and what is said of them. */
 function show(answer) {
   now = answer;
   if (answer.ok) good = answer;
-  say(answer.ok ? `${answer.title}: ${answer.error.text}` : answer.message, !answer.ok);
-  const said = [...unknownInLink, ...(answer.unknown || []), ...(answer.warnings || [])];
-  $("warnings").replaceChildren(...said.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
-  if (answer.sliders.length) sliders.update(answer.sliders, replacedSource(answer), state.set);
-  controls();
   const usable = answer.t.length > 1;
   if (answer.ok) traces.show(answer, null, pinned);
   else if (good) traces.show(answer, good, pinned);
   else if (usable) traces.show(answer, null, pinned);
-  if (answer.ok) {
+  const values = (of) => JSON.stringify([of.set, of.options.source]);
+  const changed = values(state) !== values(reset(state, examples));
+  say(answer.ok ? `${answer.title}${changed ? " (changed)" : ""}: ${answer.error.text}` : answer.message, !answer.ok);
+  warn(answer);
+  if (answer.sliders.length) sliders.update(answer.sliders, replacedSource(answer), state.set);
+  controls();
+  sets.show(answer);
+  document.body.dataset.answers = Number(document.body.dataset.answers || 0) + 1;
+}
+
+function warn(answer) {
+  const said = [...unknownInLink, ...(answer.unknown || []), ...(answer.warnings || [])];
+  $("warnings").replaceChildren(...said.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+}
+
+/** Show what comes after the traces: harmonics, the stack, figures and facts. */
+function showFigures(answer) {
+  if (baked) still();
+  if (answer.ok && answer.figures) {
+    warn(answer);
     harmonics.show(answer.harmonics);
     stack.show(answer);
     table();
-    if (baked) still();
     $("facts").textContent = [
       `Model: ${answer.plan.tier} (${answer.plan.text}).`,
       `Charge law ${answer.charge_law}, area ${answer.area}, method ${answer.method}.`,
       `Run of ${quantity(answer.t_stop, "s")}${answer.period ? `, period ${quantity(answer.period, "s")}` : ""}.`,
     ].join("\n");
-  }
-  document.body.dataset.answers = Number(document.body.dataset.answers || 0) + 1;
+  } else if (answer.message) say(answer.message, true);
+  document.body.dataset.figures = Number(document.body.dataset.figures || 0) + 1;
 }
 
 /** The element whose waveform the page's text replaces. */
@@ -141,7 +177,7 @@ function table() {
     out.append(...texts.map((text) => cell(tag, text)));
     return out;
   };
-  const rows = now.figures.map((f) => {
+  const rows = good.figures.map((f) => {
     const size = Math.max(Math.abs(f.max), Math.abs(f.min));
     // What is left of a mean after the rounding of large values is nought.
     const clean = (x) => (x !== null && Math.abs(x) < 1e-9 * size ? 0 : x);
@@ -159,7 +195,7 @@ function table() {
 
 /** Mean force against frequency: a few points at first, then those between them. */
 async function sweepMore() {
-  if (baked || inFlight || !now || !now.ok || !now.figures.some((f) => f.name.startsWith("f_el"))) return;
+  if (baked || inFlight || !now || !now.ok || !now.figures || !now.figures.some((f) => f.name.startsWith("f_el"))) return;
   const asked = asking();
   const key = JSON.stringify(request(state, examples));
   if (sweep.key !== key) sweep = { key, points: [], message: "", level: 0, left: [] };
@@ -177,10 +213,9 @@ async function sweepMore() {
   const mine = sweep;
   inFlight = true;
   try {
-    const found = await ask("means", { ...asked, frequencies });
+    const found = await askOnce("means", { ...asked, frequencies });
     if (found.ok) {
-      const force = numbers(found.force);
-      mine.points.push(...Array.from(numbers(found.frequency), (f, i) => [f, force[i]]));
+      mine.points.push(...Array.from(found.frequency, (f, i) => [f, found.force[i]]));
       mine.points.sort((a, b) => a[0] - b[0]);
       mine.amplitude = found.amplitude;
     } else {
@@ -200,7 +235,7 @@ async function sweepMore() {
 }
 
 function drawMeans() {
-  const figure = good && good.figures.find((f) => f.signal === "f_el" || f.name.startsWith("f_el"));
+  const figure = good && good.figures && good.figures.find((f) => f.signal === "f_el" || f.name.startsWith("f_el"));
   const force = figure ? figure.mean_periodic : null;
   const here = good && good.frequency && force !== null ? [good.frequency, force] : null;
   means.show(sweep.points, here, sweep.message, sweep.amplitude);
@@ -236,10 +271,37 @@ function set(key, value) {
   refresh();
 }
 
+/** Take another waveform; values of the one before it go. */
+function setSource(text) {
+  const source = now ? replacedSource({ sliders: now.sliders }) : null;
+  const replaced = source || (now && now.sliders.length ? now.sliders[0].element : null);
+  for (const path of Object.keys(state.set)) if (replaced && path.startsWith(`${replaced}.`)) delete state.set[path];
+  // The deck's own source may have been changed before the page was opened.
+  const own = state.scene === OWN && state.deck === null && examples.find((e) => e.name === OWN).request.source;
+  set("source", text || own || "");
+}
+
+/** Apply a named set of parameters, `entry`: its values become those of the page. */
+async function apply(entry) {
+  const of = shown;
+  const answer = await askOnce("set", { ...asking(), apply: entry });
+  if (of !== shown) return;
+  if (!answer.ok) {
+    say(answer.message, true);
+    return;
+  }
+  const before = (state.options.sets || "").split(",").filter((one) => one && one !== answer.set);
+  state.options.sets = [...before, answer.set].join(",");
+  Object.assign(state.set, answer.overrides);
+  if (answer.source === null) refresh();
+  else setSource(answer.source);
+}
+
 function open(hash) {
   [state, unknownInLink] = fromHash(hash, examples);
   written = "";
   good = null;
+  shown += 1;
   refresh();
 }
 
@@ -247,6 +309,7 @@ function choose(next) {
   state = next;
   unknownInLink = [];
   good = null;
+  shown += 1;
   refresh();
 }
 
@@ -275,8 +338,14 @@ async function copied(text, what) {
   }
 }
 
+function share() {
+  const own = state.scene === OWN && state.deck === null ? examples.find((e) => e.name === OWN) : null;
+  const without = own && own.unsaid.length ? `, without ${own.unsaid.join(", ")}, which was changed before this page was opened,` : "";
+  copied(location.href.replace(/#.*$/, "") + toHash(state, examples), `link${without}`);
+}
+
 async function text(what, use) {
-  const answer = await ask(what, asking());
+  const answer = await askOnce(what, asking());
   if (answer.ok) use(answer.text);
   else say(answer.message, true);
 }
@@ -290,13 +359,13 @@ function listen() {
     pinned = pinned ? null : good;
     $("pin").textContent = pinned ? "Unpin" : "Pin";
     $("pin").setAttribute("aria-pressed", String(Boolean(pinned)));
-    if (now && (now.ok || good)) show(now);
+    if (now && (now.ok || good)) {
+      show(now);
+      showFigures(now);
+    }
   });
-  $("reset").addEventListener("click", () => {
-    state.set = {};
-    refresh();
-  });
-  $("share").addEventListener("click", () => copied(location.href.replace(/#.*$/, "") + toHash(state, examples), "link"));
+  $("reset").addEventListener("click", () => choose(reset(state, examples)));
+  $("share").addEventListener("click", share);
   $("deck").addEventListener("click", () => text("deck", (x) => save("fingerspice.cir", new Blob([x], { type: "text/plain" }))));
   $("python").addEventListener("click", () => text("python", (x) => copied(x, "Python")));
   $("csv").addEventListener("click", csv);
@@ -333,12 +402,8 @@ async function start() {
     unknownInLink = [];
     refresh();
   });
-  waveforms = new Waveforms(first.waveforms, (value) => {
-    const source = now ? replacedSource({ sliders: now.sliders }) : null;
-    const replaced = source || (now && now.sliders.length ? now.sliders[0].element : null);
-    for (const path of Object.keys(state.set)) if (replaced && path.startsWith(`${replaced}.`)) delete state.set[path];
-    set("source", value);
-  });
+  waveforms = new Waveforms(first.waveforms, setSource);
+  sets = new Sets(first.sets, apply);
   listen();
   if (location.hash.length > 1) open(location.hash);
   else choose(ofExample(examples[0]));

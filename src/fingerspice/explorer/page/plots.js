@@ -1,6 +1,6 @@
 // Traces against time, harmonics, and mean force against frequency.
 
-import { numbers, quantity, scale } from "./units.js";
+import { quantity, scale } from "./units.js";
 
 const COLOURS = ["#0a5a9c", "#b3400d", "#2c7a3f", "#7b3f9e", "#8a6d00", "#00707a", "#9c1f56", "#444"];
 const GREY = "#9aa3ad";
@@ -10,12 +10,6 @@ const PANELS = [
   { title: "area", signals: ["area"], unit: "m^2", height: 140 },
   { title: "friction", signals: ["friction"], unit: "1", height: 140 },
 ];
-
-/** A run of the server with its arrays as numbers. */
-export function decoded(answer) {
-  const traces = answer.traces.map((x) => ({ ...x, values: numbers(x.values) }));
-  return { ...answer, t: answer.t ? numbers(answer.t) : new Float64Array(0), traces };
-}
 
 /** Values at other times, by straight lines; null outside. */
 function resampled(times, x, values) {
@@ -52,7 +46,7 @@ export class Traces {
   show(now, good, pinned) {
     const base = good || now;
     const inPeriods = pinned && base.period && pinned.period && Math.abs(pinned.period / base.period - 1) > 1e-9;
-    const x = (run) => (inPeriods ? Array.from(run.t, (t) => (t - run.t[0]) / run.period) : Array.from(run.t));
+    const x = (run) => (inPeriods ? run.t.map((t) => (t - run.t[0]) / run.period) : run.t);
     const layers = [{ run: base, grey: Boolean(good) }];
     if (good && now.t.length > 1) layers.push({ run: now });
     if (pinned) layers.push({ run: pinned, dashed: true });
@@ -64,7 +58,7 @@ export class Traces {
       const series = layers.flatMap(({ run, grey, dashed }) =>
         run.traces.filter((t) => panel.signals.includes(t.signal)).map((t, i) => ({
           label: `${name(t)}${dashed ? ", pinned" : ""}${grey ? ", before" : ""}`, colour: grey ? GREY : COLOURS[i % COLOURS.length], dashed,
-          values: run === base ? Array.from(t.values) : resampled(times, x(run), t.values),
+          values: run === base ? t.values : resampled(times, x(run), t.values),
         })));
       if (series.length) wanted.push({ panel, series });
     }
@@ -90,12 +84,12 @@ export class Traces {
       box.className = "panel";
       this.parent.append(box);
       const line = (s) => ({ label: s.label, stroke: s.colour, width: s.dashed ? 1.2 : 1.6, dash: s.dashed ? [6, 4] : undefined,
-        points: { show: false }, value: (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5)))) });
+        pxAlign: 0, points: { show: false }, value: (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5)))) });
       const options = {
         width: this.width(), height: panel.height, cursor: { sync: { key: "time" } },
         scales: { x: { time: false } },
         axes: [{ size: i === wanted.length - 1 ? 34 : 30, labelSize: 18, font: "11px sans-serif", labelFont: "12px sans-serif", label: "" },
-          { size: 58, labelSize: 20, space: 24, font: "11px sans-serif", labelFont: "12px sans-serif", label: "" }],
+          { size: 58, labelSize: 20, space: 16, font: "11px sans-serif", labelFont: "12px sans-serif", label: "" }],
         series: [{ label: "time", value: (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5)))) }, ...series.map(line)],
         hooks: { draw: [(u) => this.mark(u)] },
       };
@@ -202,8 +196,8 @@ export class Harmonics extends Small {
       this.clear();
       return;
     }
-    const lists = harmonics.map((h) => Array.from(numbers(h.amplitude)));
-    const frequency = Array.from(numbers(harmonics[0].frequency));
+    const lists = harmonics.map((h) => Array.from(h.amplitude));
+    const frequency = Array.from(harmonics[0].frequency);
     const [by, unit] = scale(extreme(lists), "N");
     const [fBy, fUnit] = scale(frequency[0], "Hz");
     const bars = uPlot.paths.bars({ size: [0.5, 24] });

@@ -1,6 +1,6 @@
 // A drawing of the stack that moves with the traces in slow motion.
 
-import { numbers, quantity } from "./units.js";
+import { quantity } from "./units.js";
 
 /** Seconds in which the traces shown go by. */
 const DURATION = 8;
@@ -33,7 +33,7 @@ export class Stack {
   show(answer) {
     this.stacks = (answer.stacks || []).map((s) => {
       const area = answer.traces.find((t) => t.signal === "area" && (t.element === s.gap || !t.element));
-      return { area: area.values, layers: s.layers.map((layer) => ({ ...layer, values: numbers(layer.values) })) };
+      return { area: area.values, layers: s.layers };
     });
     this.t = answer.t;
     if (!this.stacks.length) {

@@ -1,7 +1,7 @@
 // What the page shows, and its form as the part of the address after the #.
 
 /** Keys of a request other than the deck and the values, with their kinds. */
-const OPTIONS = { source: "text", charge_law: "text", area: "text", skin: "text", rtol: "number", periods: "number", last: "number" };
+const OPTIONS = { source: "text", charge_law: "text", area: "text", skin: "text", rtol: "number", periods: "number", last: "number", sets: "text" };
 const VALUE = "set.";
 /** Name of the scene for which the page was opened. */
 export const OWN = "own";
@@ -17,7 +17,18 @@ export function ofExample(example) {
   for (const [key, value] of Object.entries(example.request)) {
     if (key in OPTIONS) state.options[key] = String(value);
   }
+  Object.assign(state.set, example.request.overrides);
   return state;
+}
+
+/** A state with the values and the source of its scene, and with the run as it is. */
+export function reset(state, examples) {
+  const example = examples.find((e) => e.name === state.scene);
+  const first = state.deck === null ? ofExample(example) : blank(state.scene);
+  const kept = { ...state.options };
+  for (const key of ["source", "sets"]) delete kept[key];
+  const { source, sets } = first.options;
+  return { ...state, set: first.set, options: { ...kept, ...(source && { source }), ...(sets && { sets }) } };
 }
 
 /** The address of a state; the deck of the user's own circuit stands in it, since another explorer has another one. */
@@ -51,6 +62,10 @@ export function fromHash(hash, examples) {
     if (key.startsWith(VALUE)) state.set[key.slice(VALUE.length)] = value;
     else if (key in OPTIONS) state.options[key] = value;
     else unknown.push(`unknown name "${key}" in the link, which is left out`);
+  }
+  const own = state.scene === OWN ? examples.find((e) => e.name === OWN).request : {};
+  for (const path of Object.keys(own.overrides || {})) {
+    if (!(path in state.set)) unknown.push(`${path} was changed before this page was opened, and the link says nothing of it: it stays so`);
   }
   return [state, unknown];
 }

@@ -47,12 +47,55 @@ export function quantity(value, unit, digits = 4) {
   return `${Number((value * factor).toPrecision(digits))} ${name}`.trim();
 }
 
-/** The numbers of an array from the server. */
-export function numbers(given) {
-  const text = atob(given.f64);
-  const bytes = new Uint8Array(text.length);
-  for (let i = 0; i < text.length; i += 1) bytes[i] = text.charCodeAt(i);
-  return new Float64Array(bytes.buffer);
+/** Data of a JSON text whose arrays are given by what `array` makes of their entries. */
+function withArrays(text, array) {
+  return JSON.parse(text, (_, x) => (x && x.f64 !== undefined ? array(x.f64) : x));
+}
+
+/** Data with arrays from a page without a server, which holds them as text. */
+export function unbaked(text) {
+  return withArrays(text, (given) => {
+    const letters = atob(given);
+    const bytes = new Uint8Array(letters.length);
+    for (let i = 0; i < letters.length; i += 1) bytes[i] = letters.charCodeAt(i);
+    return new Float64Array(bytes.buffer);
+  });
+}
+
+/** The parts of an answer of the server, each as soon as it is there: two sizes, JSON, and arrays that are not copied. */
+export class Parts {
+  constructor(response) {
+    this.reader = response.body.getReader();
+    this.piece = new Uint8Array(0);
+  }
+
+  /** So many bytes in a buffer of their own; null where the answer ends before them. */
+  async bytes(count) {
+    const out = new Uint8Array(count);
+    for (let at = 0; at < count; ) {
+      if (!this.piece.length) {
+        const { done, value } = await this.reader.read();
+        if (done) return null;
+        this.piece = value;
+      }
+      const some = this.piece.subarray(0, count - at);
+      out.set(some, at);
+      at += some.length;
+      this.piece = this.piece.subarray(some.length);
+    }
+    return out.buffer;
+  }
+
+  /** The next part; an empty one after the last. */
+  async next() {
+    const sizes = await this.bytes(8);
+    if (!sizes) return {};
+    const [length, doubles] = [0, 4].map((at) => new DataView(sizes).getUint32(at, true));
+    const buffer = await this.bytes(length + 8 * doubles);
+    if (!buffer) throw new Error("its answer breaks off");
+    const text = new TextDecoder().decode(new Uint8Array(buffer, 0, length));
+    return withArrays(text, ([at, count]) => new Float64Array(buffer, length + 8 * at, count));
+  }
 }
 
 /** An array of numbers for the server. */

@@ -1,0 +1,220 @@
+"""Named sets of parameters on the explorer's page, and what was changed before it was opened."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import re
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+from commands import Command
+from fingerspice.explorer.changed import applied, before, unsaid
+from fingerspice.explorer.encoding import framed
+from fingerspice.explorer.examples import EXAMPLES
+from fingerspice.explorer.request import asked_by
+from fingerspice.explorer.scene import scene
+from fingerspice.explorer.sharing import as_python
+from fingerspice.explorer.waveforms import read_source, text_of
+
+CIRCUITS = Path(__file__).parents[1] / "circuits"
+DECKS = {example.name: example.deck for example in EXAMPLES}
+SINE, FINGERS = DECKS["sine"], DECKS["two-fingers"]
+
+
+def on_page(request: dict[str, Any], *entries: str) -> dict[str, Any]:
+    """The request after the sets have been chosen in the page's menu one after the other, as the page joins them."""
+    for entry in entries:
+        found = applied({**request, "apply": entry})
+        assert found["ok"], found["message"]
+        sets = [one for one in (request.get("sets", ""), found["set"]) if one]
+        request = {
+            **request, "overrides": {**request.get("overrides", {}), **found["overrides"]}, "sets": ",".join(sets),
+            **({"source": found["source"]} if found["source"] else {}),
+        }  # fmt: skip
+    return request
+
+
+def force(answer: dict[str, Any]) -> Any:
+    assert answer["ok"], answer["message"]
+    return next(trace["values"] for trace in answer["traces"] if trace["signal"] == "f_el")
+
+
+def run_as_python(request: dict[str, Any], own: fs.Circuit | None = None) -> fs.Solution:
+    names: dict[str, Any] = {}
+    with contextlib.redirect_stdout(io.StringIO()):
+        exec(as_python(request, own), names)
+    solution = names["solution"]
+    assert isinstance(solution, fs.Solution)
+    return solution
+
+
+@pytest.mark.parametrize("name", list(fs.parameters()))
+def test_a_set_chosen_on_the_page_gives_what_it_gives_to_the_circuit(name: str) -> None:
+    request = on_page({"deck": SINE, "rtol": 1e-5}, name)
+    shown = scene(request)
+    circuit = fs.parameters(name).apply(fs.parse_netlist(SINE))
+    expected = fs.simulate(circuit, t_eval=shown["t"], t_stop=shown["t_stop"], rtol=1e-5, charge=False)
+    np.testing.assert_array_equal(force(shown), expected.f_el)
+    (told,) = shown["sets"]
+    assert (told["name"], told["caveat"]) == (name, fs.parameters(name).not_claimed)
+    assert told["assumed"] == list(fs.parameters(name).assumed)
+    # The link has the values: without the set's name it is the same scene, of which nothing is said.
+    bare = scene({**request, "sets": ""})
+    np.testing.assert_array_equal(force(bare), force(shown))
+    assert bare["sets"] == []
+
+
+def test_the_copied_python_applies_the_sets_and_can_be_cited() -> None:
+    request = on_page({"deck": SINE, "rtol": 1e-5}, "moist", "3M-insulating", "Fig4-5kHz")
+    request["overrides"]["Xgap.mu"] = "0.6"
+    text = as_python(request)
+    assert text.count("fs.parameters(") == 3
+    assert "circuit.replace({'Xgap.mu': 0.6})" in text
+    solution = run_as_python(request)
+    shown = scene(request)
+    np.testing.assert_array_equal(force(shown), solution.f_el)
+    assert [one["changed"] for one in shown["sets"]] == [["Xgap.mu"], [], []]
+    assert any("The set moist" in sentence and "changed since: Xgap.mu" in sentence for sentence in solution.cite().statements)
+
+
+def test_a_set_goes_to_one_finger_of_two() -> None:
+    request = on_page({"deck": FINGERS, "rtol": 1e-5}, "Xlight=dry")
+    assert {path.partition(".")[0] for path in request["overrides"]} == {"Xlight"}
+    (told,) = scene(request)["sets"]
+    assert (told["name"], told["to"]) == ("dry", "Xlight")
+    expected = fs.parameters("dry").apply(fs.parse_netlist(FINGERS), "Xlight")
+    np.testing.assert_array_equal(
+        scene(request)["figures"][3]["mean"],
+        scene({"deck": FINGERS, "rtol": 1e-5, "overrides": before(expected)["overrides"]})["figures"][3]["mean"],
+    )
+    assert run_as_python(request).circuit.sets.keys() == {"dry"}
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ("moits", "unknown set 'moits'; nearest: 'moist'"),
+        ("Xnone=moist", "lacks; allowed"),
+        (None, "allowed: the name of a set"),
+        ("Fig4-100Hz", "the circuit has Vdrive, Vfast; allowed: one of these names"),
+    ],
+)
+def test_a_set_that_does_not_fit_is_refused_in_a_sentence(entry: Any, words: str) -> None:
+    found = applied({"deck": DECKS["tones"], "apply": entry})
+    assert (found["ok"], words in found["message"]) == (False, True), found["message"]
+
+
+def test_one_source_of_several_gets_a_drive_by_its_name() -> None:
+    request = on_page({"deck": DECKS["tones"], "rtol": 1e-4}, "Vfast=Fig4-100Hz")
+    assert request["source"] == "Vfast=SIN(0 200 100)"
+    assert scene(request)["sets"][0]["name"] == "Fig4-100Hz"
+
+
+def test_a_set_in_a_link_that_means_nothing_is_said_and_the_rest_is_shown() -> None:
+    shown = scene({"deck": SINE, "sets": "moits, dry", "rtol": 1e-4})
+    assert shown["ok"]
+    assert "set 'moits', which is left out: unknown set 'moits'; nearest: 'moist', 'light'" in shown["unknown"]
+    # The values in which dry differs from the deck are not in the link.
+    assert [(one["name"], one["changed"]) for one in shown["sets"]] == [("dry", ["Xgap.r", "Xgap.mu"])]
+
+
+def test_what_was_changed_before_is_in_the_link_so_that_another_explorer_shows_the_same() -> None:
+    circuit = fs.parse_netlist(SINE)
+    for name in ("moist", "3M-insulating", "Fig5-5kHz"):
+        circuit = fs.parameters(name).apply(circuit)
+    circuit = circuit.replace({"Xgap.fn": 0.1 + 0.2, "Vdrive.amplitude": 100.0})
+    asked = before(circuit)
+    assert (asked["source"], asked["sets"]) == ("Vdrive=SQUARE(100 5k 0.5)", "moist,3M-insulating,Fig5-5kHz")
+    request = {"deck": SINE, "rtol": 1e-5, **asked}
+    here, elsewhere = scene(request, circuit), scene(request)
+    np.testing.assert_array_equal(force(here), force(elsewhere))
+    expected = fs.simulate(circuit, t_eval=here["t"], t_stop=here["t_stop"], rtol=1e-5, charge=False)
+    np.testing.assert_array_equal(force(here), expected.f_el)
+    np.testing.assert_array_equal(run_as_python(request, circuit).f_el, expected.f_el)
+    assert unsaid(circuit) == []
+
+
+def test_a_source_that_no_link_can_carry_is_named() -> None:
+    circuit = fs.parse_netlist(SINE).replace({"Vdrive": lambda t: 100.0 * math.sin(600.0 * t)})
+    assert before(circuit) == {}
+    assert unsaid(circuit) == ["Vdrive"]
+
+
+@pytest.mark.parametrize(
+    "waveform",
+    [fs.Sine(1.5, 60.0), fs.Sine(200.0, 1e3, offset=-3.0), fs.Square(200.0, 5e3, 0.3), fs.AM(150.0, 1e4, 100.0, 0.5),
+     fs.Triangle(1 / 3, 70.0), fs.Sawtooth(20.0, 1e3), fs.DC(-5.0)],
+)  # fmt: skip
+def test_a_waveform_is_read_from_its_own_text(waveform: fs.Waveform) -> None:
+    text = text_of(waveform)
+    assert text is not None
+    assert read_source(text, fs.parse_netlist(SINE))[1] == waveform
+    assert text_of(fs.Sine(1.0, 60.0) + fs.Sine(1.0, 70.0)) is None
+
+
+@pytest.mark.parametrize("area", [3.0000001e-5, "mean"])
+def test_a_run_with_a_fixed_area_opens_as_it_was_run(area: float | str) -> None:
+    solution = fs.simulate(fs.parse_netlist(SINE), area=area, rtol=1e-6)
+    asked = asked_by(solution)
+    assert asked["area"] == area
+    # The address has texts, as everything in it.
+    for given in (asked["area"], str(asked["area"])):
+        shown = scene({"deck": SINE, **asked, "area": given})
+        assert shown["area"] == solution.area_mode
+        expected = fs.simulate(fs.parse_netlist(SINE), area=area, rtol=1e-6, t_eval=shown["t"], charge=False)
+        np.testing.assert_array_equal(force(shown), expected.f_el)
+
+
+def test_arrays_are_behind_the_json_and_numbers_that_are_not_finite_are_null() -> None:
+    x, y = np.array([1.0, math.inf]), np.arange(3.0)[::-1]
+    content = framed({"a": [x, {"b": math.nan}], "c": y, "d": x, "e": 0.5})
+    length, count = struct.unpack("<II", content[:8])
+    assert length % 8 == 0
+    assert json.loads(content[8 : 8 + length]) == {
+        "a": [{"f64": [0, 2]}, {"b": None}], "c": {"f64": [2, 3]}, "d": {"f64": [0, 2]}, "e": 0.5,
+    }  # fmt: skip
+    np.testing.assert_array_equal(np.frombuffer(content[8 + length :], "<f8"), [1.0, math.inf, 2.0, 1.0, 0.0])
+    assert count == 5
+
+
+def baked(page: str) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="baked">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    return dict(json.loads(found[1]))
+
+
+def test_the_command_takes_sets_as_run_does(command: Command, tmp_path: Path) -> None:
+    (tmp_path / "pad.cir").write_text(SINE)
+    words = ("--finger", "moist", "--coating", "Xcoat=3M", "--drive", "Fig4-5kHz", "--set", "Xgap.mu=0.5", "--set", "light")
+    result = command("explore", "pad.cir", *words, "--static", "page.html", "--json")
+    assert result.code == 0, result.out
+    assert json.loads(result.out)["sets"] == ["light", "moist", "3M", "Fig4-5kHz"]
+    request = baked((tmp_path / "page.html").read_text())["start"]["own"]["request"]
+    assert (request["source"], request["sets"]) == ("Vdrive=SIN(0 200 5k)", "light,moist,3M,Fig4-5kHz")
+    values = {path: request["overrides"][path] for path in ("Xgap.r", "Xgap.mu", "Xgap.fn", "Xskin.f")}
+    assert values == {"Xgap.r": "100k", "Xgap.mu": "0.5", "Xgap.fn": "0.2", "Xskin.f": "5k"}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--finger", "moist"), "--finger 'moist' is given without a deck"),
+        (("pad.cir", "--finger", "3M"), "the set '3M' is a coating, not a finger"),
+        (("pad.cir", "--set", "moits"), "unknown set 'moits'; nearest: 'moist', 'light'; or PATH=VALUE"),
+    ],
+)
+def test_the_command_refuses_sets_that_mean_nothing(
+    command: Command, tmp_path: Path, words: tuple[str, ...], said: str
+) -> None:
+    (tmp_path / "pad.cir").write_text(SINE)
+    result = command("explore", *words, "--no-browser", "--json")
+    assert result.code == 2
+    assert said in json.loads(result.out)["message"]
