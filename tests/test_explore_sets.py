@@ -82,7 +82,9 @@ def test_the_copied_python_applies_the_sets_and_can_be_cited() -> None:
     shown = scene(request)
     np.testing.assert_array_equal(force(shown), solution.f_el)
     assert [one["changed"] for one in shown["sets"]] == [["Xgap.mu"], [], []]
-    assert any("The set moist" in sentence and "changed since: Xgap.mu" in sentence for sentence in solution.cite().statements)
+    assert any(
+        "The set moist" in sentence and "changed since: Xgap.mu" in sentence for sentence in solution.cite().statements
+    )
 
 
 def test_a_set_goes_to_one_finger_of_two() -> None:
@@ -193,7 +195,18 @@ def baked(page: str) -> dict[str, Any]:
 
 def test_the_command_takes_sets_as_run_does(command: Command, tmp_path: Path) -> None:
     (tmp_path / "pad.cir").write_text(SINE)
-    words = ("--finger", "moist", "--coating", "Xcoat=3M", "--drive", "Fig4-5kHz", "--set", "Xgap.mu=0.5", "--set", "light")
+    words = (
+        "--finger",
+        "moist",
+        "--coating",
+        "Xcoat=3M",
+        "--drive",
+        "Fig4-5kHz",
+        "--set",
+        "Xgap.mu=0.5",
+        "--set",
+        "light",
+    )
     result = command("explore", "pad.cir", *words, "--static", "page.html", "--json")
     assert result.code == 0, result.out
     assert json.loads(result.out)["sets"] == ["light", "moist", "3M", "Fig4-5kHz"]

@@ -102,8 +102,8 @@ def _give(
     told = populations.summary(found)
     shares = [] if indices is None else populations.ranking(indices, output)
     answer.update(
-        sets=found.attrs.get("sets", []), scenes=int(found.status.size), failed=int((found.status >= 2).sum()), n=found.attrs.get("n"),
-        seed=found.attrs.get("seed"), figures=told, shares=shares or None,
+        sets=found.attrs.get("sets", []), scenes=int(found.status.size), failed=int((found.status >= 2).sum()),
+        n=found.attrs.get("n"), seed=found.attrs.get("seed"), figures=told, shares=shares or None,
     )  # fmt: skip
     answer.give(lambda: _told(told) + (f"\n\n{_shared(shares, output)}" if shares else ""), writes)
 

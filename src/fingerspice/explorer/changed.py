@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any
 
 from fingerspice.base.errors import InputError
@@ -52,7 +53,9 @@ def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]
         return {"ok": False, "message": str(error)}
     units = {path.lower(): parameter.unit for path, parameter in circuit.parameters.items()}
     overrides = {
-        path: value_text(value, units[path.lower()]) for path, value in changes.items() if not isinstance(value, Waveform)
+        path: value_text(value, units[path.lower()])
+        for path, value in changes.items()
+        if not isinstance(value, Waveform)
     }
     drives = [
         f"{name}={text_of(wave)}" if len(driving_sources(circuit)) > 1 else text_of(wave)
@@ -70,7 +73,7 @@ def marked(circuit: Circuit, base: Circuit, request: Request) -> tuple[Circuit, 
     circuit, lost = circuit._with(sets={}), []
     for entry in filter(None, map(str.strip, request.sets.split(","))):
         try:
-            name, changes = base.remember(("set", entry), lambda entry=entry: _changes(base, entry))
+            name, changes = base.remember(("set", entry), partial(_changes, base, entry))
         except InputError as error:
             lost.append(f"set {entry!r}, which is left out: {error}")
             continue
@@ -169,4 +172,3 @@ def _named(entry: str) -> tuple[ParameterSet, str | None]:
     """A set, and the element to which alone its values go."""
     to, _, name = (part.strip() for part in entry.rpartition("="))
     return parameters(name), to or None
-

@@ -62,8 +62,8 @@ class Request:
     recording : Recording or None
         The file dropped on the page, for the source ``RECORDING(gain)``.
     sets : str
-        Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME`` with commas; they change
-        nothing, and the page shows their caveats.
+        Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME`` with commas; they
+        change nothing, and the page shows their caveats.
     unknown : tuple of str
         Names that mean nothing here, each in a sentence.
     """
@@ -131,6 +131,7 @@ def _area(given: Any) -> str | float:
     except ValueError:
         area = None
     require(_is_number(area), "area", _short(given), ", ".join(_AREAS) + " or a number of m^2")
+    assert area is not None
     return float(area)
 
 

@@ -80,7 +80,7 @@ def _unit(e: Element, unit: str, drives: bool) -> str:
 
 
 def value_text(value: float, unit: str) -> str:
-    """A value for a field of the page: in SPICE's notation where its unit takes a prefix and that is the same double."""
+    """A value for a field of the page: in SPICE's notation if its unit takes a prefix and that is the same double."""
     text = spice_text(value) if unit in _PREFIXED and math.isfinite(value) else f"{value:.12g}"
     return text if not math.isfinite(value) or parse_number(text) == value else repr(float(value))
 

@@ -51,7 +51,7 @@ def plot_sweep(found: Dataset, output: str, indices: Dataset | None = None) -> P
         x, unit = found[dims[0]].values, found[dims[0]].attrs.get("units", "")
         x_label = f"{dims[0]} [{unit}]" if unit else dims[0]
         named = x if x.dtype.kind in "OUT" else None
-        x = x if named is None else np.arange(x.size)
+        x = np.asarray(x if named is None else np.arange(x.size), float)
         figure = _along(x, x_label, factor * values, label, indices, factor, output)
         for ax in figure.axes:
             if named is not None:

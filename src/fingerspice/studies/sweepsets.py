@@ -31,8 +31,8 @@ def with_sets(circuit: Circuit, asked: Mapping[str, Any]) -> tuple[Circuit, dict
     ----------
     circuit : Circuit
     asked : mapping
-        As `parameters` of `sweep`: under a kind of sets, such as ``finger``, stands the name of a set (or ELEMENT=NAME),
-        or a list of these, which becomes a `SetTable`.
+        As `parameters` of `sweep`: under a kind of sets, such as ``finger``, stands the name of a set (or
+        ELEMENT=NAME), or a list of these, which becomes a `SetTable`.
 
     Raises
     ------
