@@ -132,6 +132,17 @@ class Drive(torch.nn.Module):
         return parts[scenes.outputs[0]] if self._alone else parts
 
 
+def _backward(ctx: Any, by_output: Tensor) -> tuple[None, Tensor]:
+    """Derivatives by the samples, from one sweep back through every run."""
+    scenes, out = ctx.driven.scenes, np.zeros((len(ctx.runs), ctx.shape[-1]))
+    edges = np.cumsum([0, *scenes.sizes])
+    for i, (run, row) in enumerate(zip(ctx.runs, by_output.reshape(len(ctx.runs), -1).numpy(), strict=True)):
+        parts = zip(scenes.outputs, edges, edges[1:], strict=False)
+        weights = {name: row[a] if name in MEANS else row[a:b] for name, a, b in parts}
+        out[i] = run.sample_gradient(**weights).values
+    return None, torch.from_numpy(out).reshape(ctx.shape)
+
+
 # The methods have the names and signatures that torch calls.
 class _Run(torch.autograd.Function):
     """The outputs of drives of shape (..., n): a tensor of shape (..., number of outputs)."""
@@ -143,13 +154,5 @@ class _Run(torch.autograd.Function):
         rows = [np.concatenate([np.ravel(getattr(run, name)) for name in driven.scenes.outputs]) for run in runs]
         return torch.from_numpy(np.stack(rows)).reshape(*samples.shape[:-1], -1)
 
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, by_output: Tensor) -> tuple[None, Tensor]:
-        scenes, out = ctx.driven.scenes, np.zeros((len(ctx.runs), ctx.shape[-1]))
-        edges = np.cumsum([0, *scenes.sizes])
-        for i, (run, row) in enumerate(zip(ctx.runs, by_output.reshape(len(ctx.runs), -1).numpy(), strict=True)):
-            parts = zip(scenes.outputs, edges, edges[1:], strict=False)
-            weights = {name: row[a] if name in MEANS else row[a:b] for name, a, b in parts}
-            out[i] = run.sample_gradient(**weights).values
-        return None, torch.from_numpy(out).reshape(ctx.shape)
+    # Not a decorator: without torch, types are not known.
+    backward: Any = staticmethod(torch.autograd.function.once_differentiable(_backward))
