@@ -33,6 +33,7 @@ MANY_PARAMETERS = {
     "cli.app.ac",
     "cli.app.plan",
     "cli.app.compare",
+    "cli.explore.explore",
     "cli.limits.limits",
     "cli.design.design",
     "cli.fit.fit",
