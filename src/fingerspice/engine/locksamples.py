@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.lockscenes import OMEGA, Places, fill_block, new_block, put_results
+from fingerspice.engine.lockscenes import OMEGA, Block, Places, fill_block, put_results
 from fingerspice.engine.lockstep import (
     GAP,
-    LANES,
     N_STATE,
     PEAK,
     SCALE,
@@ -27,7 +26,6 @@ from fingerspice.engine.lockstep import (
     VALUE,
     Marks,
     area_row,
-    n_constants,
     n_state,
 )
 from fingerspice.engine.lockweights import moment_integrals
@@ -50,8 +48,8 @@ def _step(
 
     `ends` are the source's values at the ends of the step, `slope` the derivative of 1/A by |u| at 0 V.
     """
-    modes, _, leaks, powers, moments = marks
-    m_all, l_all, d_all, count = len(modes), len(leaks), len(powers) - 1, len(moments)
+    modes, _, leaks, powers, moments, scenes = marks
+    m_all, l_all, d_all, count, lanes = len(modes), len(leaks), len(powers) - 1, len(moments), len(scenes)
     of_u = SHAPE + m_all
     of_w = of_u + 1
     of_z = of_w + l_all
@@ -62,110 +60,110 @@ def _step(
     current = total + count
     first, last = ends
     between = 0.5 * (first + last)
-    for i in range(LANES):
-        u = c[of_u * LANES + i] * between
+    for i in range(lanes):
+        u = c[of_u * lanes + i] * between
         for m in range(m_all):
-            z, now = s[(Z * m_all + m) * LANES + i], s[(RATE * m_all + m) * LANES + i]
-            guess = g[(HALF * m_all + m) * LANES + i] * z + g[(HALF_NOW * m_all + m) * LANES + i] * now
-            guess += g[(HALF_OLD * m_all + m) * LANES + i] * s[(MIDDLE * m_all + m) * LANES + i]
-            guess += g[(HALF_SOURCE * m_all + m) * LANES + i] * first
-            guess += g[(HALF_SOURCE_END * m_all + m) * LANES + i] * last
-            s[(GUESS * m_all + m) * LANES + i] = guess
-            u += c[(SHAPE + m) * LANES + i] * guess
-        v = abs(u) * c[SCALE * LANES + i] - 1.0
-        q = c[area * LANES + i]
+            z, now = s[(Z * m_all + m) * lanes + i], s[(RATE * m_all + m) * lanes + i]
+            guess = g[(HALF * m_all + m) * lanes + i] * z + g[(HALF_NOW * m_all + m) * lanes + i] * now
+            guess += g[(HALF_OLD * m_all + m) * lanes + i] * s[(MIDDLE * m_all + m) * lanes + i]
+            guess += g[(HALF_SOURCE * m_all + m) * lanes + i] * first
+            guess += g[(HALF_SOURCE_END * m_all + m) * lanes + i] * last
+            s[(GUESS * m_all + m) * lanes + i] = guess
+            u += c[(SHAPE + m) * lanes + i] * guess
+        v = abs(u) * c[SCALE * lanes + i] - 1.0
+        q = c[area * lanes + i]
         for d in range(1, d_all):
-            q = q * v + c[(area + d) * LANES + i]
+            q = q * v + c[(area + d) * lanes + i]
         q *= v
         for k in range(l_all):
-            change = c[(of_w + k) * LANES + i] * between
+            change = c[(of_w + k) * lanes + i] * between
             for m in range(m_all):
-                change += c[(of_z + k * m_all + m) * LANES + i] * s[(GUESS * m_all + m) * LANES + i]
+                change += c[(of_z + k * m_all + m) * lanes + i] * s[(GUESS * m_all + m) * lanes + i]
             # Beside the term itself, the voltage of the leak, which the kink's term needs.
-            s[(current + k) * LANES + i] = q * change
-            s[(current + l_all + k) * LANES + i] = change
-        force = u * u / (q + c[(area + d_all) * LANES + i])
+            s[(current + k) * lanes + i] = q * change
+            s[(current + l_all + k) * lanes + i] = change
+        force = u * u / (q + c[(area + d_all) * lanes + i])
         square = u * u
-        u = c[of_u * LANES + i] * last
+        u = c[of_u * lanes + i] * last
         for m in range(m_all):
-            rate = c[(of_leak + m * l_all) * LANES + i] * s[current * LANES + i]
+            rate = c[(of_leak + m * l_all) * lanes + i] * s[current * lanes + i]
             for k in range(1, l_all):
-                rate += c[(of_leak + m * l_all + k) * LANES + i] * s[(current + k) * LANES + i]
-            s[(MIDDLE * m_all + m) * LANES + i] = rate
-            kept = g[(DECAY * m_all + m) * LANES + i] * s[(Z * m_all + m) * LANES + i]
-            kept += g[(SOURCE * m_all + m) * LANES + i] * first + g[(SOURCE_END * m_all + m) * LANES + i] * last
-            s[(Z * m_all + m) * LANES + i] = kept
-            guess = kept + g[(PREDICT * m_all + m) * LANES + i] * s[(RATE * m_all + m) * LANES + i]
-            guess += g[(PREDICT_MIDDLE * m_all + m) * LANES + i] * rate
-            s[(GUESS * m_all + m) * LANES + i] = guess
-            u += c[(SHAPE + m) * LANES + i] * guess
-        v = abs(u) * c[SCALE * LANES + i] - 1.0
-        q = c[area * LANES + i]
+                rate += c[(of_leak + m * l_all + k) * lanes + i] * s[(current + k) * lanes + i]
+            s[(MIDDLE * m_all + m) * lanes + i] = rate
+            kept = g[(DECAY * m_all + m) * lanes + i] * s[(Z * m_all + m) * lanes + i]
+            kept += g[(SOURCE * m_all + m) * lanes + i] * first + g[(SOURCE_END * m_all + m) * lanes + i] * last
+            s[(Z * m_all + m) * lanes + i] = kept
+            guess = kept + g[(PREDICT * m_all + m) * lanes + i] * s[(RATE * m_all + m) * lanes + i]
+            guess += g[(PREDICT_MIDDLE * m_all + m) * lanes + i] * rate
+            s[(GUESS * m_all + m) * lanes + i] = guess
+            u += c[(SHAPE + m) * lanes + i] * guess
+        v = abs(u) * c[SCALE * lanes + i] - 1.0
+        q = c[area * lanes + i]
         for d in range(1, d_all):
-            q = q * v + c[(area + d) * LANES + i]
+            q = q * v + c[(area + d) * lanes + i]
         q *= v
         # The integral of |u| less Simpson's rule, on a straight line between both ends.
-        before = s[(own + GAP) * LANES + i]
+        before = s[(own + GAP) * lanes + i]
         size = abs(before) + abs(u)
         missed = (before * before + u * u) / (2.0 * size + 1e-300) - (size + 2.0 * abs(before + u)) / 6.0
         missed = slope[i] * missed if before * u < 0.0 else 0.0
         for k in range(l_all):
-            change = c[(of_w + k) * LANES + i] * last
+            change = c[(of_w + k) * lanes + i] * last
             for m in range(m_all):
-                change += c[(of_z + k * m_all + m) * LANES + i] * s[(GUESS * m_all + m) * LANES + i]
-            s[(current + k) * LANES + i] = q * change
-            s[(current + l_all + k) * LANES + i] *= missed
-        u = c[of_u * LANES + i] * last
+                change += c[(of_z + k * m_all + m) * lanes + i] * s[(GUESS * m_all + m) * lanes + i]
+            s[(current + k) * lanes + i] = q * change
+            s[(current + l_all + k) * lanes + i] *= missed
+        u = c[of_u * lanes + i] * last
         for m in range(m_all):
-            rate = c[(of_leak + m * l_all) * LANES + i] * s[current * LANES + i]
-            kink = c[(of_leak + m * l_all) * LANES + i] * s[(current + l_all) * LANES + i]
+            rate = c[(of_leak + m * l_all) * lanes + i] * s[current * lanes + i]
+            kink = c[(of_leak + m * l_all) * lanes + i] * s[(current + l_all) * lanes + i]
             for k in range(1, l_all):
-                rate += c[(of_leak + m * l_all + k) * LANES + i] * s[(current + k) * LANES + i]
-                kink += c[(of_leak + m * l_all + k) * LANES + i] * s[(current + l_all + k) * LANES + i]
-            z = s[(Z * m_all + m) * LANES + i] + g[(KINK * m_all + m) * LANES + i] * kink
-            z += g[(CORRECT * m_all + m) * LANES + i] * s[(RATE * m_all + m) * LANES + i]
-            z += g[(CORRECT_MIDDLE * m_all + m) * LANES + i] * s[(MIDDLE * m_all + m) * LANES + i]
-            z += g[(CORRECT_END * m_all + m) * LANES + i] * rate
-            s[(Z * m_all + m) * LANES + i] = z
-            s[(RATE * m_all + m) * LANES + i] = rate
-            u += c[(SHAPE + m) * LANES + i] * z
-        s[(own + GAP) * LANES + i] = u
-        s[(own + PEAK) * LANES + i] = max(s[(own + PEAK) * LANES + i], abs(u))
-        latest = u * u / (q + c[(area + d_all) * LANES + i])
-        s[total * LANES + i] += weight * (s[value * LANES + i] + 4.0 * force + latest)
-        s[value * LANES + i] = latest
+                rate += c[(of_leak + m * l_all + k) * lanes + i] * s[(current + k) * lanes + i]
+                kink += c[(of_leak + m * l_all + k) * lanes + i] * s[(current + l_all + k) * lanes + i]
+            z = s[(Z * m_all + m) * lanes + i] + g[(KINK * m_all + m) * lanes + i] * kink
+            z += g[(CORRECT * m_all + m) * lanes + i] * s[(RATE * m_all + m) * lanes + i]
+            z += g[(CORRECT_MIDDLE * m_all + m) * lanes + i] * s[(MIDDLE * m_all + m) * lanes + i]
+            z += g[(CORRECT_END * m_all + m) * lanes + i] * rate
+            s[(Z * m_all + m) * lanes + i] = z
+            s[(RATE * m_all + m) * lanes + i] = rate
+            u += c[(SHAPE + m) * lanes + i] * z
+        s[(own + GAP) * lanes + i] = u
+        s[(own + PEAK) * lanes + i] = max(s[(own + PEAK) * lanes + i], abs(u))
+        latest = u * u / (q + c[(area + d_all) * lanes + i])
+        s[total * lanes + i] += weight * (s[value * lanes + i] + 4.0 * force + latest)
+        s[value * lanes + i] = latest
         if count > 1:
             latest *= latest
-            s[(total + 1) * LANES + i] += weight * (s[(value + 1) * LANES + i] + 4.0 * force * force + latest)
-            s[(value + 1) * LANES + i] = latest
-            s[(total + 2) * LANES + i] += weight * (s[(value + 2) * LANES + i] + 4.0 * square + u * u)
-            s[(value + 2) * LANES + i] = u * u
+            s[(total + 1) * lanes + i] += weight * (s[(value + 1) * lanes + i] + 4.0 * force * force + latest)
+            s[(value + 1) * lanes + i] = latest
+            s[(total + 2) * lanes + i] += weight * (s[(value + 2) * lanes + i] + 4.0 * square + u * u)
+            s[(value + 2) * lanes + i] = u * u
 
 
 @jit
-def _weigh(h: FloatArray, rates: FloatArray, drive: FloatArray, g: FloatArray) -> None:
-    """Weights of a step of length h (LANES,), s; `rates` and `drive` have shape (n_mode, LANES)."""
-    m_all = rates.shape[0]
+def _weigh(h: FloatArray, rates: FloatArray, drive: FloatArray, g: FloatArray, marks: Marks) -> None:
+    """Weights of a step of length h (lanes,), s; `rates` and `drive` have shape (n_mode, lanes)."""
+    m_all, lanes = len(marks[0]), len(marks[5])
     for m in range(m_all):
-        for i in range(LANES):
+        for i in range(lanes):
             y, length, by = rates[m, i] * h[i], h[i], drive[m, i]
             m0, m1, _, _ = moment_integrals(0.5 * y)
             half = 0.5 * length
-            g[(HALF * m_all + m) * LANES + i] = 1.0 - 0.5 * y * m0
-            g[(HALF_SOURCE * m_all + m) * LANES + i] = by * half * (m0 - 0.5 * m1)
-            g[(HALF_SOURCE_END * m_all + m) * LANES + i] = by * half * 0.5 * m1
-            g[(HALF_NOW * m_all + m) * LANES + i] = half * (m0 + m1)
-            g[(HALF_OLD * m_all + m) * LANES + i] = -half * m1
-            g[(KINK * m_all + m) * LANES + i] = length * (1.0 - 0.5 * y * m0)
+            g[(HALF * m_all + m) * lanes + i] = 1.0 - 0.5 * y * m0
+            g[(HALF_SOURCE * m_all + m) * lanes + i] = by * half * (m0 - 0.5 * m1)
+            g[(HALF_SOURCE_END * m_all + m) * lanes + i] = by * half * 0.5 * m1
+            g[(HALF_NOW * m_all + m) * lanes + i] = half * (m0 + m1)
+            g[(HALF_OLD * m_all + m) * lanes + i] = -half * m1
+            g[(KINK * m_all + m) * lanes + i] = length * (1.0 - 0.5 * y * m0)
             m0, m1, m2, _ = moment_integrals(y)
-            g[(DECAY * m_all + m) * LANES + i] = 1.0 - y * m0
-            g[(SOURCE * m_all + m) * LANES + i] = by * length * (m0 - m1)
-            g[(SOURCE_END * m_all + m) * LANES + i] = by * length * m1
-            g[(PREDICT * m_all + m) * LANES + i] = length * (m0 - 2.0 * m1)
-            g[(PREDICT_MIDDLE * m_all + m) * LANES + i] = length * 2.0 * m1
-            g[(CORRECT * m_all + m) * LANES + i] = length * (m0 - 3.0 * m1 + 2.0 * m2)
-            g[(CORRECT_MIDDLE * m_all + m) * LANES + i] = length * 4.0 * (m1 - m2)
-            g[(CORRECT_END * m_all + m) * LANES + i] = length * (2.0 * m2 - m1)
+            g[(DECAY * m_all + m) * lanes + i] = 1.0 - y * m0
+            g[(SOURCE * m_all + m) * lanes + i] = by * length * (m0 - m1)
+            g[(SOURCE_END * m_all + m) * lanes + i] = by * length * m1
+            g[(PREDICT * m_all + m) * lanes + i] = length * (m0 - 2.0 * m1)
+            g[(PREDICT_MIDDLE * m_all + m) * lanes + i] = length * 2.0 * m1
+            g[(CORRECT * m_all + m) * lanes + i] = length * (m0 - 3.0 * m1 + 2.0 * m2)
+            g[(CORRECT_MIDDLE * m_all + m) * lanes + i] = length * 4.0 * (m1 - m2)
+            g[(CORRECT_END * m_all + m) * lanes + i] = length * (2.0 * m2 - m1)
 
 
 @jit
@@ -177,14 +175,14 @@ def _run(
 
     `late` takes the sums over the second half, as the state holds those over the whole run.
     """
-    own, count = N_STATE * len(marks[0]), len(marks[4])
+    own, count, lanes = N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
     # A step of length 0 evaluates the nonlinear term and the integrands.
     _step(c, still, s, slope, (values[0], values[0]), 0.0, marks)
-    for i in range(LANES):
-        s[(own + PEAK) * LANES + i] = abs(s[(own + GAP) * LANES + i])
+    for i in range(lanes):
+        s[(own + PEAK) * lanes + i] = abs(s[(own + GAP) * lanes + i])
         for k in range(count):
-            s[(own + VALUE + count + k) * LANES + i] = 0.0
-    sums = (own + VALUE + count) * LANES
+            s[(own + VALUE + count + k) * lanes + i] = 0.0
+    sums = (own + VALUE + count) * lanes
     for j in range(values.size - 1):
         if j == (values.size - 1) // 2:
             late[:] = s[sums : sums + late.size]
@@ -197,28 +195,29 @@ def _run(
 
 
 @jit
-def _slopes(c: FloatArray, area: int, degree: int, slope: FloatArray) -> None:
+def _slopes(c: FloatArray, area: int, degree: int, slope: FloatArray, marks: Marks) -> None:
     """Derivative of 1/A by |u| at 0 V, where the polynomial's variable is -1."""
-    for i in range(LANES):
-        total, value = 0.0, c[area * LANES + i]
+    lanes = len(marks[5])
+    for i in range(lanes):
+        total, value = 0.0, c[area * lanes + i]
         for d in range(1, degree + 1):
             total = value - total
-            value = c[(area + d) * LANES + i] - value
-        slope[i] = total * c[SCALE * LANES + i]
+            value = c[(area + d) * lanes + i] - value
+        slope[i] = total * c[SCALE * lanes + i]
 
 
 @jit
 def march_samples(
     table: FloatArray, pending: NDArray[np.int64], places: Places,
     curves: tuple[FloatArray, FloatArray, FloatArray], values: FloatArray, how: tuple[tuple[int, int], float],
-    out: FloatArray, marks: Marks,
+    block: Block, out: FloatArray, marks: Marks,
 ) -> None:  # fmt: skip
     """Integrate scenes of a table under one recording, block by block, with each of two numbers of steps a sample.
 
     Parameters
     ----------
-    table, pending, places, curves, marks
-        As for `lockscenes.march`, with one wave, whose amplitude is the recording's peak; the table's frequency is half
+    table, pending, places, curves, block, marks
+        As for `lockmarch.march`, with one wave, whose amplitude is the recording's peak; the table's frequency is half
         that of the samples.
     values : ndarray, shape (n,)
         Samples relative to their peak.
@@ -226,31 +225,30 @@ def march_samples(
         Steps a sample in both runs, 0 for none in the first; and the largest gap voltage that the area's
         polynomial covers, as a ratio to its estimate.
     out : ndarray
-        As for `lockscenes.march`, with the second half of the run in place of the last period.
+        As for `lockmarch.march`, with the second half of the run in place of the last period.
     """
-    m_all, l_all, d_all, count = len(marks[0]), len(marks[2]), len(marks[3]) - 1, len(marks[4])
-    area, row = area_row(m_all, 1, l_all), N_WEIGHTS * m_all * LANES
-    block = new_block(table.shape[0], marks)
-    c, still, g = np.zeros(n_constants(m_all, 1, l_all, d_all) * LANES), np.zeros(row), np.empty(row)
+    m_all, l_all, d_all, count, lanes = len(marks[0]), len(marks[2]), len(marks[3]) - 1, len(marks[4]), len(marks[5])
+    area, row = area_row(m_all, 1, l_all), N_WEIGHTS * m_all * lanes
+    c, still, g = block.c, np.zeros(row), np.empty(row)
     # The last rows hold the voltages of the leaks.
-    s, slope, none = np.empty((n_state(m_all, l_all, count) + l_all) * LANES), np.empty(LANES), np.full(LANES, 0.0)
-    late, h = np.empty(count * LANES), np.empty(LANES)
+    s, slope, none = np.empty((n_state(m_all, l_all, count) + l_all) * lanes), np.empty(lanes), np.full(lanes, 0.0)
+    late, h = np.empty(count * lanes), np.empty(lanes)
     for kind in (HALF, DECAY):
-        still[kind * m_all * LANES : (kind + 1) * m_all * LANES] = 1.0
-    for first in range(0, pending.size, LANES):
-        fill_block(table, pending, first, places, curves, (np.ones(1), True, how[1]), block, c, marks)
-        _slopes(c, area, d_all, slope)
+        still[kind * m_all * lanes : (kind + 1) * m_all * lanes] = 1.0
+    for first in range(0, pending.size, lanes):
+        fill_block(table, pending, first, places, curves, (np.ones(1), True, how[1]), block, marks)
+        _slopes(c, area, d_all, slope, marks)
         for w in range(2):
             parts = how[0][w]
             if parts == 0:
                 continue
-            for i in range(LANES):
-                h[i] = math.pi / block.b[OMEGA * LANES + i] / parts
-            _weigh(h, block.rates, block.drive, g)
+            for i in range(lanes):
+                h[i] = math.pi / block.b[OMEGA * lanes + i] / parts
+            _weigh(h, block.rates, block.drive, g, marks)
             s[:] = 0.0
             _run(c, still, g, s, slope, values, parts, late, marks)
             steps = float((values.size - 1) * parts)
             put_results(s, late, none, (steps, steps), first, out[w], marks)
-            for i in range(min(LANES, pending.size - first)):
+            for i in range(min(lanes, pending.size - first)):
                 covered = out[w, 2 * count, first + i] <= block.top[i]
                 out[w, 2 * count + 2, first + i] = block.tail[i] if covered else math.inf

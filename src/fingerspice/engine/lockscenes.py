@@ -11,23 +11,16 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.lockstep import (
-    LANES,
     N_STATE,
-    N_WEIGHTS,
     PEAK,
     SCALE,
     SHAPE,
-    START_TIMES,
     VALUE,
     Marks,
-    Z,
     area_row,
     n_constants,
-    n_state,
-    run,
 )  # fmt: skip
-from fingerspice.engine.lockweights import weigh
-from fingerspice.numerics.modes import modes as modes_of
+from fingerspice.numerics.modes import write_modes
 
 # A table of scenes has three rows for every cell: capacitance (F/m^2), total leakage (S), leakage per area (S/m^2).
 CELL_ROWS = 3
@@ -39,43 +32,45 @@ LARGEST_X = 1.3
 """Largest X that the series of the universal curve covers."""
 Places = tuple[int, NDArray[np.int64]]
 """Index of the gap among the cells, and of the cells whose leak has a total resistance."""
-Scratch = tuple[
-    FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray
-]  # fmt: skip
 # A mode's rate nearer than this (relative) to the rate of a cell, a pole of the characteristic equation, has too few
 # correct digits in the difference of both.
 NEAR_POLE = 1e-5
-# Most periods in the search for the periodic state.
-MOST_PERIODS = 16
 
 
 @jit_rows
 def _inverse_areas(
-    n: int, at: float, top: FloatArray, b: FloatArray, series: FloatArray, y: FloatArray, out: FloatArray
+    at: float, top: FloatArray, b: FloatArray, series: FloatArray, y: FloatArray, out: FloatArray, marks: Marks
 ) -> None:  # fmt: skip
     """1/A at the voltages top (1 + at) / 2 of every lane, by the universal curve and the closed form of Eqs. 1 and 3.
 
-    `b` holds the table's further rows (X, A0, stress, ...) for the lanes of the block; `y` (LANES,) is scratch.
+    `b` holds the table's further rows (X, A0, stress, ...) for the lanes of the block; `y` (lanes,) is scratch.
     """
-    for i in range(LANES):
-        x = b[XI * LANES + i] * (0.5 * (1.0 + at) * top[i]) * (2.0 / LARGEST_X) - 1.0
+    lanes = len(marks[5])
+    for i in range(lanes):
+        x = b[XI * lanes + i] * (0.5 * (1.0 + at) * top[i]) * (2.0 / LARGEST_X) - 1.0
         total = series[0]
-        for d in range(1, n):
+        for d in range(1, series.size):
             total = total * x + series[d]
         y[i] = total
-    for i in range(LANES):
+    for i in range(lanes):
         u = 0.5 * (1.0 + at) * top[i]
-        a0 = b[REST * LANES + i] * y[i]
-        load, k = b[LOAD * LANES + i], b[LOSS * LANES + i] / a0
-        sigma = b[STRESS * LANES + i] * u * u
+        a0 = b[REST * lanes + i] * y[i]
+        load, k = b[LOAD * lanes + i], b[LOSS * lanes + i] / a0
+        sigma = b[STRESS * lanes + i] * u * u
         root = math.sqrt(1.0 + 4.0 * k * sigma * (load + sigma * a0))
         out[i] = (1.0 + 2.0 * k * load * sigma + root) / (2.0 * (a0 - k * load * load))
 
 
 @jit_rows
-def _add_row(share: float, x: FloatArray, out: FloatArray) -> None:
-    for i in range(LANES):
+def _add_row(share: float, x: FloatArray, out: FloatArray, marks: Marks) -> None:
+    for i in range(len(marks[5])):
         out[i] += share * x[i]
+
+
+@jit
+def _read_column(table: FloatArray, scene: int, column: FloatArray) -> None:
+    for j in range(column.size):
+        column[j] = table[j, scene]
 
 
 @jit
@@ -116,11 +111,25 @@ def _three_modes(r: FloatArray, k: FloatArray, rates: FloatArray) -> bool:
     return True
 
 
+class Scratch(NamedTuple):
+    """Arrays for the cells and modes of one lane, used by all in turn; all are overwritten."""
+
+    k: FloatArray
+    r: FloatArray
+    moved: FloatArray
+    u: FloatArray
+    inverse: FloatArray
+    gain: FloatArray
+    feed: FloatArray
+    shape: FloatArray
+    floats: FloatArray
+    whole: NDArray[np.int64]
+
+
 @jit
-def _modes(
-    r: FloatArray, k: FloatArray, rates: FloatArray, gain: FloatArray, feed: FloatArray, shape: FloatArray
-) -> None:
-    """As `numerics.modes.modes`, into given arrays, and without its iteration for three cells with different rates."""
+def _modes(rates: FloatArray, scratch: Scratch) -> None:
+    """As `numerics.modes.write_modes`, and without its iteration for three cells with different rates."""
+    k, r, _, _, _, gain, feed, shape, floats, whole = scratch
     if r.size == 3 and _three_modes(r, k, rates):
         for m in range(2):
             norm = 0.0
@@ -131,15 +140,7 @@ def _modes(
             for j in range(3):
                 feed[j, m] = -shape[j, m] / k[j] / norm
         return
-    found = modes_of(r, k)
-    rates[:], gain[:], feed[:], shape[:] = found[0], found[1], found[2], found[3]
-
-
-@jit
-def _scratch(m: int) -> Scratch:
-    """Scratch for the cells and modes of one lane, used by all in turn: allocation for each would double the time."""
-    row = np.empty((5, m + 1))
-    return row[0], row[1], row[2], row[3], row[4], np.empty(m), np.empty((m + 1, m)), np.empty((m + 1, m))
+    write_modes(r, k, (rates, gain, feed, shape), floats, whole)
 
 
 @jit
@@ -152,7 +153,8 @@ def _lane(
     m_all, w_all, l_all = len(marks[0]), len(marks[1]), leaks.size
     cells = m_all + 1
     others = CELL_ROWS * cells
-    k, r, moved, u, inverse, gain, feed, shape = scratch
+    k, r, moved, u, inverse, gain, feed, shape, _, _ = scratch
+    lanes = len(marks[5])
     total = 0.0
     for j in range(cells):
         total += 1.0 / t[j]
@@ -160,17 +162,17 @@ def _lane(
         k[j] = 1.0 / (t[j] * total)
         moved[j] = t[cells + j] / t[j]
         r[j] = t[2 * cells + j] / t[j] + inverse[0] * moved[j]
-    _modes(r, k, rates, gain, feed, shape)
+    _modes(rates, scratch)
     of_u, of_w = SHAPE + m_all, SHAPE + m_all + w_all
     of_z = of_w + l_all * w_all
     of_leak = of_z + l_all * m_all
     for m in range(m_all):
-        c[(SHAPE + m) * LANES + i] = shape[gap, m]
-        start[m * LANES + i] = 0.0
+        c[(SHAPE + m) * lanes + i] = shape[gap, m]
+        start[m * lanes + i] = 0.0
         drive[m] = gain[m] * t[others + N_OTHERS] if jumping else 0.0
         for n in range(l_all):
-            c[(of_z + n * m_all + m) * LANES + i] = shape[leaks[n], m]
-            c[(of_leak + m * l_all + n) * LANES + i] = feed[leaks[n], m] * moved[leaks[n]]
+            c[(of_z + n * m_all + m) * lanes + i] = shape[leaks[n], m]
+            c[(of_leak + m * l_all + n) * lanes + i] = feed[leaks[n], m] * moved[leaks[n]]
     for w in range(w_all):
         # The cells' voltages at a unit of the wave: sine, then cosine, of a tone.
         amplitude, phase = t[others + N_OTHERS + w // 2 * 2], t[others + N_OTHERS + w // 2 * 2 + 1]
@@ -184,36 +186,12 @@ def _lane(
                 size = gain[m] * amplitude / (rates[m] * rates[m] + omega * omega)
                 along, across = rates[m] * cosine + omega * sine, rates[m] * sine - omega * cosine
                 if w % 2 == 1:
-                    start[m * LANES + i] -= size * across
+                    start[m * lanes + i] -= size * across
                 for j in range(cells):
                     u[j] += shape[j, m] * size * (along if w % 2 == 0 else across)
-        c[(of_u + w) * LANES + i] = u[gap]
+        c[(of_u + w) * lanes + i] = u[gap]
         for n in range(l_all):
-            c[(of_w + n * w_all + w) * LANES + i] = u[leaks[n]]
-
-
-@jit
-def _closed(
-    s: FloatArray, start: FloatArray, back: FloatArray, c: FloatArray, closing: FloatArray, tol: float, marks: Marks
-) -> bool:  # fmt: skip
-    """Whether a period leads every lane from its start back to it, to `tol`; if not, improve the starts.
-
-    The improvement is a step of Newton's method with the derivative of the period map with the area held. A lane that
-    is within `tol` (relative to its peak gap voltage) keeps its start.
-    """
-    m_all, done = len(marks[0]), True
-    for i in range(LANES):
-        off = 0.0
-        for m in range(m_all):
-            change = (s[(Z * m_all + m) * LANES + i] - start[m * LANES + i]) * back[m * LANES + i]
-            off += abs(c[(SHAPE + m) * LANES + i] * change)
-        closing[i] = off / (s[(N_STATE * m_all + PEAK) * LANES + i] + 1e-300)
-        if closing[i] > tol:
-            done = False
-            for m in range(m_all):
-                change = s[(Z * m_all + m) * LANES + i] - start[m * LANES + i]
-                start[m * LANES + i] += change * back[m * LANES + i]
-    return done
+            c[(of_w + n * w_all + w) * lanes + i] = u[leaks[n]]
 
 
 @jit
@@ -222,12 +200,12 @@ def put_results(
     marks: Marks,
 ) -> None:  # fmt: skip
     """Means over the run and over its last period, the peak (V), and the relative error of the periodic state."""
-    own, count = N_STATE * len(marks[0]), len(marks[4])
-    for i in range(min(LANES, out.shape[1] - first)):
+    own, count, lanes = N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
+    for i in range(min(lanes, out.shape[1] - first)):
         for j in range(count):
-            out[j, first + i] = s[(own + VALUE + count + j) * LANES + i] / steps[0]
-            out[count + j, first + i] = last[j * LANES + i] / steps[1]
-        out[2 * count, first + i] = s[(own + PEAK) * LANES + i]
+            out[j, first + i] = s[(own + VALUE + count + j) * lanes + i] / steps[0]
+            out[count + j, first + i] = last[j * lanes + i] / steps[1]
+        out[2 * count, first + i] = s[(own + PEAK) * lanes + i]
         out[2 * count + 1, first + i] = closing[i]
 
 
@@ -236,17 +214,20 @@ class Block(NamedTuple):
 
     Attributes
     ----------
-    start : ndarray, shape (n_mode * LANES,)
+    c : ndarray, shape (n_constants * lanes,)
+        Constants, as `engine.lockstep` takes them.
+    start : ndarray, shape (n_mode * lanes,)
         Modes at the start, V.
-    rates, drive : ndarray, shape (n_mode, LANES)
+    rates, drive : ndarray, shape (n_mode, lanes)
         Rates (1/s), and drive of a source of constant pieces.
-    b : ndarray, shape (N_OTHERS * LANES,)
+    b : ndarray, shape (N_OTHERS * lanes,)
         The table's further rows.
-    top, tail : ndarray, shape (LANES,)
+    top, tail : ndarray, shape (lanes,)
         Largest gap voltage that the area's polynomial covers (V), and the relative size of its last coefficient;
         infinite where the universal curve does not reach so far.
     """
 
+    c: FloatArray
     start: FloatArray
     rates: FloatArray
     drive: FloatArray
@@ -258,127 +239,63 @@ class Block(NamedTuple):
     scratch: Scratch
 
 
-@jit
+def block_shapes(rows: int, marks: Marks) -> tuple[tuple[int, ...], ...]:
+    """Shapes of the arrays of a `Block` before its scratch, for a table with so many rows."""
+    m_all, w_all, l_all, d_all, _, lanes = (len(mark) for mark in marks)
+    size = n_constants(m_all, w_all, l_all, d_all - 1) * lanes
+    modes = (m_all, lanes)
+    return (size,), (m_all * lanes,), modes, modes, (N_OTHERS * lanes,), (lanes,), (lanes,), (rows,), (2, lanes)
+
+
+def scratch_shapes(marks: Marks) -> tuple[tuple[int, ...], ...]:
+    """Shapes of the arrays of a `Scratch`."""
+    m = len(marks[0])
+    row = (m + 1,)
+    return row, row, row, row, row, (m,), (m + 1, m), (m + 1, m), (2, m + 1), (2, m + 1)
+
+
 def new_block(rows: int, marks: Marks) -> Block:
     """Arrays for blocks of scenes of a table with so many rows."""
-    m = len(marks[0])
-    return Block(
-        np.empty(m * LANES), np.empty((m, LANES)), np.empty((m, LANES)), np.empty(N_OTHERS * LANES), np.empty(LANES),
-        np.empty(LANES), np.empty(rows), np.empty((2, LANES)), _scratch(m),
-    )  # fmt: skip
+    *floats, whole = scratch_shapes(marks)
+    scratch = Scratch._make([*(np.empty(shape) for shape in floats), np.empty(whole, np.int64)])
+    return Block._make([*(np.empty(shape) for shape in block_shapes(rows, marks)), scratch])
 
 
 @jit
 def fill_block(
     table: FloatArray, pending: NDArray[np.int64], first: int, places: Places,
     curves: tuple[FloatArray, FloatArray, FloatArray], source: tuple[FloatArray, bool, float], block: Block,
-    c: FloatArray, marks: Marks,
+    marks: Marks,
 ) -> None:  # fmt: skip
-    """Constants of the scenes from number `first` of `pending` on, into `c` and `block`.
+    """Constants of the scenes from number `first` of `pending` on, into `block`.
 
     `source` has the frequencies of the tones, in that of the source; whether it is of constant pieces, or of straight
     lines; and the largest gap voltage that the area's polynomial covers, as a ratio to its estimate. The other
     arguments are those of `march`.
     """
-    m_all, w_all, l_all, d_all = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[3]) - 1
+    m_all, w_all, l_all, d_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[3]) - 1, len(marks[5])
     cells, area = m_all + 1, area_row(m_all, w_all, l_all)
-    column, b, top = block.column, block.b, block.top
-    for i in range(LANES):
-        column[:] = table[:, pending[min(first + i, pending.size - 1)]]
+    c, start, rates, drive, b, top, tails, column, work, scratch = block
+    for i in range(lanes):
+        _read_column(table, pending[min(first + i, pending.size - 1)], column)
         for j in range(N_OTHERS):
-            b[j * LANES + i] = column[CELL_ROWS * cells + j]
+            b[j * lanes + i] = column[CELL_ROWS * cells + j]
         top[i] = source[2] * _largest_voltage(column, places[0], cells, source[1]) + 1e-12
-        c[SCALE * LANES + i] = 2.0 / top[i]
-    c[area * LANES :] = 0.0
+        c[SCALE * lanes + i] = 2.0 / top[i]
+    c[area * lanes :] = 0.0
     for j in range(d_all + 1):
-        _inverse_areas(curves[0].size, curves[1][j], top, b, curves[0], block.work[0], block.work[1])
+        _inverse_areas(curves[1][j], top, b, curves[0], work[0], work[1], marks)
         for d in range(d_all + 1):
-            _add_row(curves[2][d, j], block.work[1], c[(area + d) * LANES : (area + d + 1) * LANES])
-    for i in range(LANES):
+            _add_row(curves[2][d, j], work[1], c[(area + d) * lanes : (area + d + 1) * lanes], marks)
+    for i in range(lanes):
         # The coefficients of the two highest powers are 2^(d - 1) and 2^(d - 2) times those of Chebyshev's series.
         # These fall to about a third from one to the next; the last one alone may be small by chance.
-        tail = max(abs(c[area * LANES + i]), 2.0 / 3.0 * abs(c[(area + 1) * LANES + i])) / 2.0 ** (d_all - 1)
-        covered = b[XI * LANES + i] * top[i] <= LARGEST_X
-        block.tail[i] = tail / c[(area + d_all) * LANES + i] if covered else math.inf
-        column[:] = table[:, pending[min(first + i, pending.size - 1)]]
-        block.scratch[4][0] = c[(area + d_all) * LANES + i]
+        tail = max(abs(c[area * lanes + i]), 2.0 / 3.0 * abs(c[(area + 1) * lanes + i])) / 2.0 ** (d_all - 1)
+        covered = b[XI * lanes + i] * top[i] <= LARGEST_X
+        tails[i] = tail / c[(area + d_all) * lanes + i] if covered else math.inf
+        _read_column(table, pending[min(first + i, pending.size - 1)], column)
+        scratch[4][0] = c[(area + d_all) * lanes + i]
         _lane(
-            i, places, column, source[0], source[1], c, block.start, block.rates[:, i], block.drive[:, i],
-            block.scratch, marks,
+            i, places, column, source[0], source[1], c, start, rates[:, i], drive[:, i], scratch,
+            marks,
         )  # fmt: skip
-
-
-@jit
-def march(
-    table: FloatArray, pending: NDArray[np.int64], places: Places,
-    curves: tuple[FloatArray, FloatArray, FloatArray], source: tuple[FloatArray, tuple[FloatArray, FloatArray]],
-    how: tuple[int, int, int, bool, float, float], out: FloatArray, traces: tuple[FloatArray, FloatArray],
-    marks: Marks,
-) -> None:  # fmt: skip
-    """Integrate scenes of a table, block by block, with each of two numbers of steps; the first may be none.
-
-    Parameters
-    ----------
-    table : ndarray, shape (n_row, n_scene)
-        `CELL_ROWS` for all cells, `N_OTHERS` rows, and two for every tone.
-    pending : ndarray, shape (n,)
-        Indices of the scenes to integrate.
-    places : tuple
-        Index of the gap among the cells, and of those with a total leakage, one for every leak of the marks.
-    curves : tuple of ndarray
-        Polynomial coefficients of the universal curve over X, highest power first; Chebyshev points; and the matrix
-        from values at these points to polynomial coefficients (d + 1, d + 1), highest power first.
-    source : tuple of ndarray
-        Frequencies of the tones, in that of the source; and the waves as `lockstep.run` takes them, for both numbers of
-        steps.
-    how : tuple
-        Number of half periods; of steps in each, in the second run (the first run has half as many, or none if its
-        waves are empty); of pieces of each if the source jumps to its negative after each, else 0; whether the periodic
-        state is wanted; its tolerance, relative to the peak gap voltage; and the largest gap voltage that the area's
-        polynomial covers, as a ratio to its estimate.
-    out : ndarray, shape (2, 2 n_moment + 3, n)
-        For each run the means over it and over its last period, the peak (V), the relative error of the periodic
-        state, and the relative size of the last coefficient of the area's series. The latter is infinite where the
-        polynomial does not cover the voltages met.
-    traces : tuple of ndarray, each of shape (n, steps)
-        Gap voltage before every step of each run, V; (n, 0) for none.
-    """
-    m_all, w_all, l_all, d_all, count = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[3]) - 1, len(marks[4])
-    halves, half, pieces, periodic, tol, covered = how
-    jumping = pieces > 0
-    row = N_WEIGHTS * m_all * LANES
-    c = np.zeros(n_constants(m_all, w_all, l_all, d_all) * LANES)
-    g = (np.empty(row), np.empty((pieces if jumping else 4, 3, row)))
-    s, last = np.empty(n_state(m_all, l_all, count) * LANES), np.empty(count * LANES)
-    block, back, closing = new_block(table.shape[0], marks), np.zeros(m_all * LANES), np.zeros(LANES)
-    start, rates, b, top = block.start, block.rates, block.b, block.top
-    length, moments = np.empty(LANES), np.empty((11, LANES))
-    voltages = np.empty(LANES * traces[0].shape[1]), np.empty(LANES * traces[1].shape[1])
-    for first in range(0, pending.size, LANES):
-        fill_block(table, pending, first, places, curves, (source[0], jumping, covered), block, c, marks)
-        for i in range(LANES):
-            if periodic:
-                period = 2.0 * math.pi / b[OMEGA * LANES + i]
-                for m in range(m_all):
-                    back[m * LANES + i] = -1.0 / math.expm1(-rates[m, i] * period)
-        for w in range(2):
-            if source[1][w].size == 0:
-                continue
-            steps = half // 2 if w == 0 else half
-            # All pieces together are 2^pieces - 1 times the first, which has steps / pieces of the shortest steps.
-            shorter = pieces / (2.0**pieces - 1.0) if jumping else START_TIMES[1]
-            for i in range(LANES):
-                length[i] = math.pi / b[OMEGA * LANES + i] / steps * shorter
-            weigh(length, rates, block.drive, g, moments, marks)
-            for _ in range(MOST_PERIODS if periodic else 1):
-                s[:] = 0.0
-                s[: m_all * LANES] = start
-                size = (halves, steps, jumping)
-                run(c, g, s, source[1][w], size, last, voltages[w], marks)
-                if not periodic or _closed(s, start, back, c, closing, tol, marks):
-                    break
-            put_results(s, last, closing, (float(halves * steps), 2.0 * steps), first, out[w], marks)
-            for i in range(min(LANES, pending.size - first)):
-                out[w, 2 * count + 2, first + i] = block.tail[i] if out[w, 2 * count, first + i] <= top[i] else math.inf
-                width = traces[w].shape[1]
-                traces[w][first + i] = voltages[w][i * width : (i + 1) * width]

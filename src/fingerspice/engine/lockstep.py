@@ -8,9 +8,9 @@ source, without a drive, as z is then what is left beside the steady response; o
 pieces. Each step predicts with order 3, evaluates the nonlinear term once, and corrects with order 4.
 
 A block holds `LANES` scenes, one in each lane, and every quantity is a row with one entry for each lane. The only loop
-over the lanes is in a function of its own, whose inner loops have constant lengths: `modes` and `powers` are tuples of
-which only the length counts. So it is compiled into vector instructions without a branch, and no lane's result depends
-on the others.
+over the lanes is in a function of its own, whose loops have constant lengths: those of tuples without content. So it is
+compiled into vector instructions without a branch, and no lane's result depends on the others. On a graphics card a
+block is one scene, in a thread of its own (`engine.lockcard`).
 """
 
 from __future__ import annotations
@@ -24,13 +24,15 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
 
 LANES = 16
-"""Scenes of a block."""
+"""Scenes of a block on the processor."""
 START_TIMES = (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0, 1.5, 2.0)
 """Times of the shorter steps at the start of a run without jumps, in steps."""
 START = len(START_TIMES) - 1
 
-Marks = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...], tuple[int, ...], tuple[int, ...]]
-"""Tuples of which only the lengths count: of the modes, waves, leaks, powers of the polynomial and moments."""
+Mark = tuple[tuple[()], ...]
+"""A tuple of which only the length counts, which compiled code knows as a constant; it is passed without any cost."""
+Marks = tuple[Mark, Mark, Mark, Mark, Mark, Mark]
+"""Marks for the modes, waves, leaks, powers of the polynomial, moments and lanes."""
 
 Weights = tuple[FloatArray, NDArray[np.float64]]
 """Weights of a step of length 0; and for every piece of a window those of its first and second step and of all others,
@@ -50,6 +52,11 @@ Z, RATE, OLD, OLDER, KEPT, GUESS, N_STATE = 0, 1, 2, 3, 4, 5, 6
 GAP, PEAK, VALUE = 0, 1, 2
 ALL_MOMENTS = 3
 """Number of the integrands u^2 A, (u^2 A)^2 and u^2. (A itself has a kink where u is 0: its sum is of order 2 only.)"""
+
+
+def marks_of(modes: int, waves: int, leaks: int, powers: int, moments: int, lanes: int = LANES) -> Marks:
+    """The marks of these lengths."""
+    return ((),) * modes, ((),) * waves, ((),) * leaks, ((),) * powers, ((),) * moments, ((),) * lanes
 
 
 @jit
@@ -78,8 +85,9 @@ def _step(
 
     `source` holds the waves at the end of the step, and `before` the first of them at its start.
     """
-    modes, waves, leaks, powers, moments = marks
+    modes, waves, leaks, powers, moments, scenes = marks
     m_all, w_all, l_all, d_all, count = len(modes), len(waves), len(leaks), len(powers) - 1, len(moments)
+    lanes = len(scenes)
     of_u = SHAPE + m_all
     of_w = of_u + w_all
     of_z = of_w + l_all * w_all
@@ -88,65 +96,66 @@ def _step(
     own = N_STATE * m_all
     value, total = own + VALUE, own + VALUE + count
     current = total + count
-    for i in range(LANES):
-        wave = c[of_u * LANES + i] * source[0]
+    for i in range(lanes):
+        wave = c[of_u * lanes + i] * source[0]
         for w in range(1, w_all):
-            wave += c[(of_u + w) * LANES + i] * source[w]
+            wave += c[(of_u + w) * lanes + i] * source[w]
         u = wave
         for m in range(m_all):
-            kept = g[(DECAY * m_all + m) * LANES + i] * s[(Z * m_all + m) * LANES + i]
-            kept += g[(DRIVE * m_all + m) * LANES + i] * before
-            guess = kept + g[(PREDICT * m_all + m) * LANES + i] * s[(RATE * m_all + m) * LANES + i]
-            guess += g[(PREDICT_OLD * m_all + m) * LANES + i] * s[(OLD * m_all + m) * LANES + i]
-            guess += g[(PREDICT_OLDER * m_all + m) * LANES + i] * s[(OLDER * m_all + m) * LANES + i]
-            s[(KEPT * m_all + m) * LANES + i] = kept
-            s[(GUESS * m_all + m) * LANES + i] = guess
-            u += c[(SHAPE + m) * LANES + i] * guess
-        v = abs(u) * c[SCALE * LANES + i] - 1.0
-        q = c[area * LANES + i]
+            kept = g[(DECAY * m_all + m) * lanes + i] * s[(Z * m_all + m) * lanes + i]
+            kept += g[(DRIVE * m_all + m) * lanes + i] * before
+            guess = kept + g[(PREDICT * m_all + m) * lanes + i] * s[(RATE * m_all + m) * lanes + i]
+            guess += g[(PREDICT_OLD * m_all + m) * lanes + i] * s[(OLD * m_all + m) * lanes + i]
+            guess += g[(PREDICT_OLDER * m_all + m) * lanes + i] * s[(OLDER * m_all + m) * lanes + i]
+            s[(KEPT * m_all + m) * lanes + i] = kept
+            s[(GUESS * m_all + m) * lanes + i] = guess
+            u += c[(SHAPE + m) * lanes + i] * guess
+        v = abs(u) * c[SCALE * lanes + i] - 1.0
+        q = c[area * lanes + i]
         for d in range(1, d_all):
-            q = q * v + c[(area + d) * LANES + i]
+            q = q * v + c[(area + d) * lanes + i]
         q *= v
         for k in range(l_all):
-            change = c[(of_w + k * w_all) * LANES + i] * source[0]
+            change = c[(of_w + k * w_all) * lanes + i] * source[0]
             for w in range(1, w_all):
-                change += c[(of_w + k * w_all + w) * LANES + i] * source[w]
+                change += c[(of_w + k * w_all + w) * lanes + i] * source[w]
             for m in range(m_all):
-                change += c[(of_z + k * m_all + m) * LANES + i] * s[(GUESS * m_all + m) * LANES + i]
-            s[(current + k) * LANES + i] = q * change
+                change += c[(of_z + k * m_all + m) * lanes + i] * s[(GUESS * m_all + m) * lanes + i]
+            s[(current + k) * lanes + i] = q * change
         u = wave
         for m in range(m_all):
-            rate = c[(of_leak + m * l_all) * LANES + i] * s[current * LANES + i]
+            rate = c[(of_leak + m * l_all) * lanes + i] * s[current * lanes + i]
             for k in range(1, l_all):
-                rate += c[(of_leak + m * l_all + k) * LANES + i] * s[(current + k) * LANES + i]
-            now, old = s[(RATE * m_all + m) * LANES + i], s[(OLD * m_all + m) * LANES + i]
-            z = s[(KEPT * m_all + m) * LANES + i] + g[(CORRECT * m_all + m) * LANES + i] * rate
-            z += g[(CORRECT_NOW * m_all + m) * LANES + i] * now
-            z += g[(CORRECT_OLD * m_all + m) * LANES + i] * old
-            z += g[(CORRECT_OLDER * m_all + m) * LANES + i] * s[(OLDER * m_all + m) * LANES + i]
-            s[(Z * m_all + m) * LANES + i] = z
-            s[(OLDER * m_all + m) * LANES + i] = old
-            s[(OLD * m_all + m) * LANES + i] = now
-            s[(RATE * m_all + m) * LANES + i] = rate
-            u += c[(SHAPE + m) * LANES + i] * z
-        s[(own + GAP) * LANES + i] = u
-        s[(own + PEAK) * LANES + i] = max(s[(own + PEAK) * LANES + i], abs(u))
-        a = 1.0 / (q + c[(area + d_all) * LANES + i])
+                rate += c[(of_leak + m * l_all + k) * lanes + i] * s[(current + k) * lanes + i]
+            now, old = s[(RATE * m_all + m) * lanes + i], s[(OLD * m_all + m) * lanes + i]
+            z = s[(KEPT * m_all + m) * lanes + i] + g[(CORRECT * m_all + m) * lanes + i] * rate
+            z += g[(CORRECT_NOW * m_all + m) * lanes + i] * now
+            z += g[(CORRECT_OLD * m_all + m) * lanes + i] * old
+            z += g[(CORRECT_OLDER * m_all + m) * lanes + i] * s[(OLDER * m_all + m) * lanes + i]
+            s[(Z * m_all + m) * lanes + i] = z
+            s[(OLDER * m_all + m) * lanes + i] = old
+            s[(OLD * m_all + m) * lanes + i] = now
+            s[(RATE * m_all + m) * lanes + i] = rate
+            u += c[(SHAPE + m) * lanes + i] * z
+        s[(own + GAP) * lanes + i] = u
+        s[(own + PEAK) * lanes + i] = max(s[(own + PEAK) * lanes + i], abs(u))
+        a = 1.0 / (q + c[(area + d_all) * lanes + i])
         force = u * u * a
-        s[value * LANES + i] = force
-        s[total * LANES + i] += weight * force
+        s[value * lanes + i] = force
+        s[total * lanes + i] += weight * force
         if count > 1:
-            s[(value + 1) * LANES + i] = force * force
-            s[(total + 1) * LANES + i] += weight * (force * force)
-            s[(value + 2) * LANES + i] = u * u
-            s[(total + 2) * LANES + i] += weight * (u * u)
+            s[(value + 1) * lanes + i] = force * force
+            s[(total + 1) * lanes + i] += weight * (force * force)
+            s[(value + 2) * lanes + i] = u * u
+            s[(total + 2) * lanes + i] += weight * (u * u)
 
 
 @jit_rows
-def _add_latest(first: int, count: int, weight: float, s: FloatArray) -> None:
+def _add_latest(first: int, count: int, weight: float, s: FloatArray, marks: Marks) -> None:
     """Add `weight` times the latest values to the sums."""
-    for i in range(count * LANES):
-        s[(first + count) * LANES + i] += weight * s[first * LANES + i]
+    lanes = len(marks[5])
+    for i in range(count * lanes):
+        s[(first + count) * lanes + i] += weight * s[first * lanes + i]
 
 
 @jit
@@ -162,12 +171,13 @@ def quadrature(k: int, steps: int) -> float:
 
 
 @jit
-def _record(s: FloatArray, gap: int, trace: FloatArray, at: int) -> None:
-    """Write the gap voltages, row `gap` of the state, into column `at` of the trace, shape (LANES, n)."""
+def _record(s: FloatArray, gap: int, trace: FloatArray, at: int, marks: Marks) -> None:
+    """Write the gap voltages, row `gap` of the state, into column `at` of the trace, shape (lanes, n)."""
     if trace.size > 0:
-        stride = trace.size // LANES
-        for i in range(LANES):
-            trace[i * stride + at] = s[gap * LANES + i]
+        lanes = len(marks[5])
+        stride = trace.size // lanes
+        for i in range(lanes):
+            trace[i * stride + at] = s[gap * lanes + i]
 
 
 @jit
@@ -187,15 +197,15 @@ def _window(
         Number of steps, and how many of this length precede them.
     unit : float
         Length of a step, in that of the sums.
-    trace : ndarray, shape (LANES * n,) or (0,)
+    trace : ndarray, shape (lanes * n,) or (0,)
         Takes the gap voltages before the steps, from `at` on unless that is negative.
     """
     count, own = len(marks[4]), N_STATE * len(marks[0])
     place, stride, period = places
-    _add_latest(own + VALUE, count, unit * quadrature(0, steps[0]), s)
+    _add_latest(own + VALUE, count, unit * quadrature(0, steps[0]), s, marks)
     for k in range(steps[0]):
         if at >= 0:
-            _record(s, own + GAP, trace, at + k)
+            _record(s, own + GAP, trace, at + k, marks)
         before = wave[place, 0]
         place = place + stride if place + stride != period else 0
         weight = unit * quadrature(k + 1, steps[0])
@@ -208,10 +218,10 @@ def _ease_in(
 ) -> None:  # fmt: skip
     """The first two steps of a run, in `START` shorter ones, as the first of all has no step before it."""
     period, gap = wave.shape[0] - START - 1, N_STATE * len(marks[0]) + GAP
-    _record(s, gap, trace, 0)
+    _record(s, gap, trace, 0, marks)
     _window(c, g[0], s, wave, (period, 1, period), (4, 0), 0.125, trace, -1, marks)
     _window(c, g[1], s, wave, (period + 4, 1, period), (2, 0), 0.25, trace, -1, marks)
-    _record(s, gap, trace, 1)
+    _record(s, gap, trace, 1, marks)
     _window(c, g[2], s, wave, (period + 6, 1, period), (2, 0), 0.5, trace, -1, marks)
 
 
@@ -235,21 +245,22 @@ def run(
         many steps, which are twice as long in every piece as in the one before.
     last : ndarray
         Takes the sums over the last period, as the state holds those over the whole run; NaN in a shorter run.
-    trace : ndarray, shape (LANES * steps,) or (0,)
+    trace : ndarray, shape (lanes * steps,) or (0,)
         The gap voltage before each step, V.
     """
     halves, half, turned = how
-    count, own, pieces = len(marks[4]), N_STATE * len(marks[0]), g[1].shape[0]
-    sums = (own + VALUE + count) * LANES
-    for i in range(count * LANES):
+    count, own, pieces, lanes = len(marks[4]), N_STATE * len(marks[0]), g[1].shape[0], len(marks[5])
+    sums = (own + VALUE + count) * lanes
+    for i in range(count * lanes):
         s[sums + i] = 0.0
         last[i] = math.nan
-    for i in range(LANES):
-        s[(own + PEAK) * LANES + i] = 0.0
+    for i in range(lanes):
+        s[(own + PEAK) * lanes + i] = 0.0
     done = 0
     while done < halves:
         if done == halves - 2:
-            last[:] = s[sums : sums + last.size]
+            for i in range(last.size):
+                last[i] = s[sums + i]
         if turned or done == 0:
             # A step of length 0 evaluates the nonlinear term and the integrands.
             _step(c, g[0], s, wave[done % 2 if turned else 0], 0.0, 0.0, marks)

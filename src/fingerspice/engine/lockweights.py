@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.lockstep import DECAY, DRIVE, LANES, PREDICT, Marks, Weights
+from fingerspice.engine.lockstep import DECAY, DRIVE, PREDICT, Marks, Weights
 
 
 @jit
@@ -53,9 +53,9 @@ _KINDS = np.array([[0, 1, 2], [3, 4, 2]])
 
 
 @jit_rows
-def _double(moments: FloatArray, longer: FloatArray) -> None:
-    """Moments over twice the length of a step, shape (5, LANES): exp(-y), then those of `moment_integrals`."""
-    for i in range(LANES):
+def _double(moments: FloatArray, longer: FloatArray, marks: Marks) -> None:
+    """Moments over twice the length of a step, shape (5, lanes): exp(-y), then those of `moment_integrals`."""
+    for i in range(len(marks[5])):
         e, m0, m1, m2, m3 = moments[0, i], moments[1, i], moments[2, i], moments[3, i], moments[4, i]
         longer[0, i] = e * e
         longer[1, i] = 0.5 * (e * m0 + m0)
@@ -66,18 +66,19 @@ def _double(moments: FloatArray, longer: FloatArray) -> None:
 
 @jit_rows
 def _weigh_rows(
-    kind: FloatArray, h: FloatArray, drive: FloatArray, moments: FloatArray, g: FloatArray, mode: int, n_modes: int
+    kind: int, h: FloatArray, drive: FloatArray, moments: FloatArray, g: FloatArray, mode: int, marks: Marks
 ) -> None:  # fmt: skip
-    """Weights of a step of length h (LANES,) for one mode, from its moments and the polynomials of its kind."""
-    for i in range(LANES):
-        g[(DECAY * n_modes + mode) * LANES + i] = moments[0, i]
-        g[(DRIVE * n_modes + mode) * LANES + i] = drive[i] * h[i] * moments[1, i]
+    """Weights of a step of length h (lanes,) for one mode, from its moments and the polynomials of its kind."""
+    n_modes, lanes = len(marks[0]), len(marks[5])
+    for i in range(lanes):
+        g[(DECAY * n_modes + mode) * lanes + i] = moments[0, i]
+        g[(DRIVE * n_modes + mode) * lanes + i] = drive[i] * h[i] * moments[1, i]
     for row in range(7):
-        for i in range(LANES):
-            total = kind[row, 0] * moments[1, i]
+        for i in range(lanes):
+            total = _POLYNOMIALS[kind, row, 0] * moments[1, i]
             for k in range(1, 4):
-                total += kind[row, k] * moments[1 + k, i]
-            g[((PREDICT + row) * n_modes + mode) * LANES + i] = h[i] * total
+                total += _POLYNOMIALS[kind, row, k] * moments[1 + k, i]
+            g[((PREDICT + row) * n_modes + mode) * lanes + i] = h[i] * total
 
 
 @jit
@@ -86,23 +87,23 @@ def weigh(
 ) -> None:  # fmt: skip
     """Weights of every lane for a step of length 0 and for the pieces, the first of steps of length `shortest` (s).
 
-    `rates` and `drive` have shape (n_mode, LANES); `scratch` (11, LANES) is overwritten.
+    `rates` and `drive` have shape (n_mode, lanes); `scratch` (11, lanes) is overwritten.
     """
-    m_all = len(marks[0])
+    m_all, lanes = len(marks[0]), len(marks[5])
     still, moving = g
     still[:] = 0.0
-    still[DECAY * m_all * LANES : (DECAY + 1) * m_all * LANES] = 1.0
+    still[DECAY * m_all * lanes : (DECAY + 1) * m_all * lanes] = 1.0
     h = scratch[10]
     for m in range(m_all):
         now, longer = scratch[:5], scratch[5:10]
-        for i in range(LANES):
+        for i in range(lanes):
             h[i] = shortest[i]
             now[1, i], now[2, i], now[3, i], now[4, i] = moment_integrals(rates[m, i] * h[i])
             now[0, i] = 1.0 - rates[m, i] * h[i] * now[1, i]
         for piece in range(moving.shape[0]):
             for step in range(3):
-                kind = _POLYNOMIALS[_KINDS[min(piece, 1), step]]
-                _weigh_rows(kind, h, drive[m], now, moving[piece, step], m, m_all)
-            _double(now, longer)
+                _weigh_rows(_KINDS[min(piece, 1), step], h, drive[m], now, moving[piece, step], m, marks)
+            _double(now, longer, marks)
             now, longer = longer, now
-            h *= 2.0
+            for i in range(lanes):
+                h[i] *= 2.0

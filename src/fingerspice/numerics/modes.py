@@ -56,16 +56,14 @@ def _root_between(r: FloatArray, k: FloatArray, i: int) -> tuple[int, float]:
 
 
 @jit
-def _ascending(r: FloatArray) -> NDArray[np.int64]:
-    """Indices that put the few rates in ascending order; equal ones stay in theirs."""
-    order = np.empty(r.size, np.int64)
+def _ascending(r: FloatArray, order: NDArray[np.int64]) -> None:
+    """Write the indices that put the few rates in ascending order; equal ones stay in theirs."""
     for i in range(r.size):
         place = i
         while place > 0 and r[order[place - 1]] > r[i]:
             order[place] = order[place - 1]
             place -= 1
         order[place] = i
-    return order
 
 
 @jit
@@ -87,17 +85,27 @@ def modes(r: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
         x = shape @ w.
     """
     n = r.size - 1
-    order = _ascending(r)
-    rates = np.zeros(n)
-    gain = np.zeros(n)
-    feed = np.zeros((n + 1, n))
-    shape = np.zeros((n + 1, n))
+    rates, gain, feed, shape = np.empty(n), np.empty(n), np.empty((n + 1, n)), np.empty((n + 1, n))
+    write_modes(r, k, (rates, gain, feed, shape), np.empty((2, n + 1)), np.empty((2, n + 1), np.int64))
+    return rates, gain, feed, shape
+
+
+@jit
+def write_modes(
+    r: FloatArray, k: FloatArray, found: tuple[FloatArray, FloatArray, FloatArray, FloatArray], floats: FloatArray,
+    whole: NDArray[np.int64],
+) -> None:  # fmt: skip
+    """As `modes`, into given arrays; `floats` and `whole`, of shape (2, n + 1), are overwritten."""
+    n = r.size - 1
+    rates, gain, feed, shape = found
+    gain[:] = 0.0
+    shape[:] = 0.0
     # Equal rates act as one element on the rest; between themselves they relax with that very rate.
-    poles = np.empty(n + 1)
-    shares = np.empty(n + 1)
-    group = np.empty(n + 1, np.int64)
+    poles, shares = floats[0], floats[1]
+    order, group = whole[0], whole[1]
+    _ascending(r, order)
     count = 0
-    found = 0
+    at = 0
     for m in range(n + 1):
         i = order[m]
         if count > 0 and r[i] <= poles[count - 1] * (1.0 + 4e-16):
@@ -105,13 +113,13 @@ def modes(r: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
             # Mode of this element against the group so far, orthogonal in 1/k.
             for j in range(n + 1):
                 if group[j] == count - 1 and j != i and _seen(order, j, i):
-                    shape[j, found] = k[j] / share
-            shape[i, found] = -1.0
+                    shape[j, at] = k[j] / share
+            shape[i, at] = -1.0
             norm = 1.0 / share + 1.0 / k[i]
             for j in range(n + 1):
-                feed[j, found] = -shape[j, found] / k[j] / norm
-            rates[found] = r[i]
-            found += 1
+                feed[j, at] = -shape[j, at] / k[j] / norm
+            rates[at] = r[i]
+            at += 1
             shares[count - 1] += k[i]
         else:
             poles[count] = r[i]
@@ -122,17 +130,16 @@ def modes(r: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
     shares = shares[:count]
     for i in range(count - 1):
         origin, x = _root_between(poles, shares, i)
-        rates[found] = poles[origin] + x
+        rates[at] = poles[origin] + x
         norm = 0.0
         for g in range(count):
             norm += shares[g] / (poles[g] - poles[origin] - x) ** 2
-        gain[found] = -1.0 / norm
+        gain[at] = -1.0 / norm
         for j in range(n + 1):
             inverse = 1.0 / (poles[group[j]] - poles[origin] - x)
-            shape[j, found] = k[j] * inverse
-            feed[j, found] = -inverse / norm
-        found += 1
-    return rates, gain, feed, shape
+            shape[j, at] = k[j] * inverse
+            feed[j, at] = -inverse / norm
+        at += 1
 
 
 @jit

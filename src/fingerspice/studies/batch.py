@@ -7,12 +7,14 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.base.arrays import FloatArray
+from fingerspice.base.card import require_card
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.arguments import require_circuit, require_number
 from fingerspice.circuit.circuit import Circuit
@@ -48,6 +50,7 @@ def batch(
     skin: str = "own",
     points: int = 200,
     threads: int | None = None,
+    device: str = "cpu",
 ) -> Dataset:
     """Figures of many scenes, which are one circuit with different values of its parameters.
 
@@ -78,13 +81,16 @@ def batch(
         Number of gap voltages per period, even.
     threads : int, optional
         Number of threads; all processors by default. The result does not depend on it.
+    device : str
+        ``"cuda"`` does lockstep on an NVIDIA graphics card, but for recordings and ``u_gap``.
 
     Returns
     -------
     xarray.Dataset
         With dimension ``scene``, the parameters as coordinates, the outputs, ``error`` (stated, relative) and
         ``status``: 0 in lockstep, 1 one by one, 2 refused, 3 failed; the outputs of the last two are NaN. The attribute
-        `n_ordinary` counts the scenes not in lockstep, `ordinary` gives the reason, `failures` has the messages. With
+        `n_ordinary` counts the scenes not in lockstep, `ordinary` gives the reason, `failures` has the messages,
+        `device` says where lockstep was done. With
         `gradients`, also ``d_f_el_mean`` and the like with dimensions ``scene`` and ``parameter``, per unit of the
         parameter; ``gradient_error`` (stated, of a change by all of a parameter, relative to the output) and
         ``gradient_status``; the attributes `n_ordinary_gradients` and `ordinary_gradients`.
@@ -92,11 +98,14 @@ def batch(
     Raises
     ------
     InputError
-        If a path or output is unknown, arrays have unequal lengths, a value is NaN or out of range, or there are no
-        derivatives by a parameter.
+        If a path or output is unknown, arrays have unequal lengths, a value is NaN or out of range, there are no
+        derivatives by a parameter, or there is no graphics card.
     """
     require_circuit(circuit)
-    task = _task(circuit, outputs, rtol, t_stop, periods, periodic, points)
+    require(device in ("cpu", "cuda"), "device", repr(device), "'cpu' or 'cuda'")
+    if device == "cuda":
+        require_card()
+    task = replace(_task(circuit, outputs, rtol, t_stop, periods, periodic, points), device=device)
     require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
     if threads is not None:
         require_number("threads", threads, "a whole number")
@@ -112,10 +121,10 @@ def batch(
     paths = gradient_paths(circuit, gradients)
     wanted = gradient_request(task, paths, scenes, skin) if paths else None
     with ThreadPoolExecutor(threads or _processors()) as pool:
-        found, reason = _lockstep(task, changed, pool)
+        found, reason, where = _lockstep(task, changed, pool)
         rest = np.flatnonzero(~found.done)
         _one_by_one(task, changed, rest, found, pool)
-        attrs = {"skin": skin, "n_ordinary": rest.size, "ordinary": reason if rest.size else ""}
+        attrs = {"skin": skin, "n_ordinary": rest.size, "ordinary": reason if rest.size else "", "device": where}
         if wanted is None:
             return _dataset(task, scenes, found, attrs)
         form = lockstep_form(circuit, {})
@@ -271,11 +280,11 @@ def _frequencies(circuit: Circuit, scenes: Mapping[str, FloatArray], of_skin: bo
     return np.full(n, 1.0 / period)
 
 
-def _lockstep(task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExecutor) -> tuple[Answers, str]:
-    """The results of lockstep, and the reason why the other scenes have none."""
+def _lockstep(task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExecutor) -> tuple[Answers, str, str]:
+    """The results of lockstep, the reason why the other scenes have none, and the device that was used."""
     n = next(iter(scenes.values())).size
     lower = {path.lower(): array for path, array in scenes.items()}
-    traced = "u_gap" in task.outputs
+    traced = task.traced
     form = lockstep_form(task.circuit, lower)
     recorded = not isinstance(form, str) and form.recording is not None
     others = [name for name in task.outputs if not in_lockstep(name) or (recorded and name.endswith("_periodic"))]
@@ -289,7 +298,7 @@ def _lockstep(task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExec
     require(n * width <= MOST_VOLTAGES, "outputs", f"of {n * width:.3g} gap voltages", f"at most {MOST_VOLTAGES:g}")
     found = Answers.empty(task, n, width)
     if isinstance(form, str) or others:
-        return found, form if isinstance(form, str) else f"{', '.join(others)} needs a run of its own"
+        return found, form if isinstance(form, str) else f"{', '.join(others)} needs a run of its own", "cpu"
     jobs = jobs_of(task, count, np.ones(n, bool), recorded)
 
     def one(job: tuple[int, NDArray[np.int64]]) -> Answers:
@@ -298,7 +307,8 @@ def _lockstep(task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExec
     for (_, members), answer in zip(jobs, pool.map(one, jobs), strict=True):
         found.put(members[answer.done], {k: v[answer.done] for k, v in answer.values.items()},
                   answer.error[answer.done], LOCKSTEP)  # fmt: skip
-    return found, "what does not end after half periods or at a sample, or does not meet its error in lockstep"
+    reason = "what does not end after half periods or at a sample, or does not meet its error in lockstep"
+    return found, reason, task.device if task.on_card(recorded) else "cpu"
 
 
 def _one_by_one(
@@ -307,7 +317,7 @@ def _one_by_one(
     """Run the scenes `rest`, each by itself."""
     if not rest.size:
         return
-    by_period = (task.periods is not None and not task.periodic) or "u_gap" in task.outputs
+    by_period = (task.periods is not None and not task.periodic) or task.traced
     frequency = _frequencies(task.circuit, scenes) if by_period else np.ones(next(iter(scenes.values())).size)
 
     def one(i: int) -> Single:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.engine.lockcard import Lengths, march_on_card
+from fingerspice.engine.lockmarch import march, new_stepping
 from fingerspice.engine.locksamples import march_samples
-from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, LOSS, OMEGA, REST, STRESS, march
-from fingerspice.engine.lockstep import ALL_MOMENTS, START_TIMES
+from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, LOSS, OMEGA, REST, STRESS, new_block
+from fingerspice.engine.lockstep import ALL_MOMENTS, START_TIMES, marks_of
 from fingerspice.studies.batchscenes import Curves, LockstepForm, curves_of, peak_of, table_of
 from fingerspice.studies.batchtask import LOCKSTEP, Answers, Task
 
@@ -68,7 +70,7 @@ def in_lockstep(name: str) -> bool:
 
 def _waves(n: int, form: LockstepForm) -> FloatArray:
     """Sine and cosine of every tone at the times that `engine.lockstep.run` needs; a square's value in both halves."""
-    if n == 0 or form.jumping or form.recording is not None:
+    if n == 0 or form.jumping:
         return np.array([[1.0], [-1.0]])[: 2 * n]
     # The phase in turns is reduced before it is multiplied by 2 pi, so that high tones keep their accuracy.
     times = np.concatenate([np.arange(n), START_TIMES])
@@ -91,7 +93,7 @@ def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halv
     table = table_of(form, scenes)
     mu = friction_of(form, scenes)
     found = Answers.empty(task, table.shape[1], halves * task.points // 2)
-    touching, pieces, decays = mesh_of(form, table, most=1 if "u_gap" in task.outputs else MOST_PIECES)
+    touching, pieces, decays = mesh_of(form, table, most=1 if task.traced else MOST_PIECES)
     for count in np.unique(pieces[touching]).tolist():
         _climb_one(task, form, _Scenes(table, mu, decays), (halves, count), touching & (pieces == count), found)
     return found
@@ -213,31 +215,45 @@ class Level(NamedTuple):
     def run(self, table: FloatArray, pending: NDArray[np.int64], curves: Curves, before: Run | None) -> Run:
         """Integrate the scenes `pending`; the results with half the steps come from `before`, or are computed, too."""
         sizes = (self.steps // 2 if before is None else 0, self.steps)
+        covered = _COVERED if before is None else _COVERED_LATER
+        if self.form.recording is not None:
+            return self._recorded(table, pending, curves, (sizes, covered), before)
         halves, pieces = self.mesh
-        out = np.empty((2, 2 * self.moments + 3, pending.size))
-        recording = self.form.recording
+        places = self.form.gap_cell, np.array(self.form.leaks)
+        waves = _waves(sizes[0], self.form), _waves(sizes[1], self.form)
+        source = np.array(self.form.multiples, float), waves
+        how = halves, self.steps // 2, pieces, self.task.periodic, CLOSING * self.task.rtol, covered
         widths = [halves * n // 2 if self.traced else 0 for n in sizes]
         traces = np.empty((pending.size, widths[0])), np.empty((pending.size, widths[1]))
-        covered = _COVERED if before is None else _COVERED_LATER
-        leaks = np.array(self.form.leaks)
-        places = self.form.gap_cell, leaks
-        waves = (
-            (_waves(sizes[0], self.form), _waves(sizes[1], self.form)) if recording is None else (np.zeros((0, 1)),) * 2
-        )
-        lengths = (self.form.cells - 1, waves[1].shape[1], leaks.size, self.degree + 1, self.moments)
-        marks: Any = tuple((0,) * n for n in lengths)
-        if recording is not None:
-            values = recording.between(0, halves + 1) / peak_of(recording)
-            march_samples(table, pending, places, curves, values, (sizes, covered), out, marks)
+        lengths = self._lengths(waves[1].shape[1])
+        if self.task.on_card(recorded=False):
+            most = MOST_PIECES if self.form.jumping else 0
+            out = march_on_card(table, pending, places, curves, source, how, most, lengths)
         else:
-            march(
-                table, pending, places, curves, (np.array(self.form.multiples, float), waves),
-                (halves, self.steps // 2, pieces, self.task.periodic, CLOSING * self.task.rtol, covered), out, traces,
-                marks,
-            )  # fmt: skip
+            marks, out = marks_of(*lengths), np.empty((2, 2 * self.moments + 3, pending.size))
+            block, stepping = new_block(table.shape[0], marks), new_stepping(pieces, marks)
+            march(table, pending, places, curves, source, how, block, stepping, out, traces, marks)
         if before is None:
             return Run(out[0], out[1], traces[0], traces[1])
         return Run(before.fine, out[1], before.trace, traces[1])
+
+    def _lengths(self, waves: int) -> Lengths:
+        """Numbers of modes, waves, leaks, powers and moments."""
+        return self.form.cells - 1, waves, len(self.form.leaks), self.degree + 1, self.moments
+
+    def _recorded(
+        self, table: FloatArray, pending: NDArray[np.int64], curves: Curves, how: tuple[tuple[int, int], float],
+        before: Run | None,
+    ) -> Run:  # fmt: skip
+        """As `run`, under a recording."""
+        recording = self.form.recording
+        assert recording is not None
+        marks, out = marks_of(*self._lengths(1)), np.empty((2, 2 * self.moments + 3, pending.size))
+        places, block = (self.form.gap_cell, np.array(self.form.leaks)), new_block(table.shape[0], marks)
+        values = recording.between(0, self.mesh[0] + 1) / peak_of(recording)
+        march_samples(table, pending, places, curves, values, how, block, out, marks)
+        none = np.empty((pending.size, 0))
+        return Run(out[0] if before is None else before.fine, out[1], none, none)
 
     def error(self, run: Run, needed: list[int]) -> FloatArray:
         """Largest stated relative error of the outputs, for each scene."""

@@ -50,11 +50,11 @@ def _run(task: Task, circuit: Circuit, frequency: float, rtol: float) -> Single:
     ran: Solution | SteadyState
     if task.periodic:
         ran = steady_state(circuit, rtol=rtol, points=task.points, charge=False)
-        trace = ran.solution if "u_gap" in task.outputs else None
+        trace = ran.solution if task.traced else None
     else:
         stop = task.t_stop if task.t_stop is not None else (task.periods or 1.0) / frequency
         t = None
-        if "u_gap" in task.outputs:
+        if task.traced:
             t = np.arange(math.ceil(stop * frequency * task.points - 1e-9)) / (frequency * task.points)
         ran = trace = simulate(circuit, t_stop=stop, t_eval=t, rtol=rtol, charge=False)
     values = {}

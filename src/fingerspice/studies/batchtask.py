@@ -12,9 +12,9 @@ from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.circuit.circuit import Circuit
 
 # Largest number of scenes in a job, and the smallest to which a batch is divided so that all threads have jobs; and
-# their number if gap voltages are wanted, so that these stay in the processor's cache; and under a
-# recording, whose scenes take long.
-CHUNK, SMALL_CHUNK, TRACED, RECORDED = 4096, 256, 256, 32
+# their number if gap voltages are wanted, so that these stay in the processor's cache; under a recording, whose scenes
+# take long; and on a graphics card, which is slow to start.
+CHUNK, SMALL_CHUNK, TRACED, RECORDED, ON_CARD = 4096, 256, 256, 32, 262_144
 # Relative distance from a whole number within which a number of half periods counts as whole.
 WHOLE = 1e-9
 LOCKSTEP, ONE_BY_ONE, REFUSED, FAILED = 0, 1, 2, 3
@@ -32,6 +32,16 @@ class Task:
     periods: float | None
     periodic: bool
     points: int
+    device: str = "cpu"
+
+    @property
+    def traced(self) -> bool:
+        """Whether gap voltages are wanted."""
+        return "u_gap" in self.outputs
+
+    def on_card(self, recorded: bool) -> bool:
+        """Whether lockstep is done on a graphics card; recordings, and gap voltages, stay on the processor."""
+        return self.device == "cuda" and not recorded and not self.traced
 
     def count(self, frequency: FloatArray) -> FloatArray:
         """Number of periods in runs with sources of these frequencies (Hz)."""
@@ -55,7 +65,7 @@ def jobs_of(
     for size in np.unique(halves[good]).astype(int).tolist():
         members = np.flatnonzero(good & (halves == size))
         chunk = int(np.clip(members.size // 16, SMALL_CHUNK, CHUNK))
-        chunk = TRACED if "u_gap" in task.outputs else RECORDED if recorded else chunk
+        chunk = TRACED if task.traced else RECORDED if recorded else ON_CARD if task.on_card(recorded) else chunk
         jobs += [(size, members[i : i + chunk]) for i in range(0, members.size, chunk)]
     return jobs
 

@@ -1,0 +1,197 @@
+"""Scenes of a batch in lockstep under sines or a square: the loop over blocks of scenes, and the runs of a block."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit
+from fingerspice.engine.lockscenes import OMEGA, Block, Places, fill_block, put_results
+from fingerspice.engine.lockstep import (
+    N_STATE,
+    N_WEIGHTS,
+    PEAK,
+    SHAPE,
+    START_TIMES,
+    Marks,
+    Z,
+    n_state,
+    run,
+)  # fmt: skip
+from fingerspice.engine.lockweights import weigh
+
+# Most periods in the search for the periodic state.
+MOST_PERIODS = 16
+Source = tuple[FloatArray, tuple[FloatArray, FloatArray]]
+How = tuple[int, int, int, bool, float, float]
+
+
+class Stepping(NamedTuple):
+    """Arrays for the steps of a block of scenes; all are overwritten.
+
+    Attributes
+    ----------
+    still, moving : ndarray
+        Weights, as `lockstep.run` takes them.
+    s : ndarray, shape (n_state * lanes,)
+        State.
+    last : ndarray, shape (n_moment * lanes,)
+        Sums over the last period.
+    back : ndarray, shape (n_mode * lanes,)
+        Derivative of the start in the search for the periodic state by what a period leaves open, with the area held.
+    closing : ndarray, shape (lanes,)
+        What the periodic state is off, relative to the peak gap voltage.
+    length : ndarray, shape (lanes,)
+        Length of the shortest step, s.
+    moments : ndarray, shape (11, lanes)
+        Scratch of `lockweights.weigh`.
+    """
+
+    still: FloatArray
+    moving: NDArray[np.float64]
+    s: FloatArray
+    last: FloatArray
+    back: FloatArray
+    closing: FloatArray
+    length: FloatArray
+    moments: FloatArray
+
+
+def stepping_shapes(pieces: int, marks: Marks) -> tuple[tuple[int, ...], ...]:
+    """Shapes of the arrays of a `Stepping`, for weights of so many pieces (4 without jumps)."""
+    m_all, _, l_all, _, count, lanes = (len(mark) for mark in marks)
+    row, modes = N_WEIGHTS * m_all * lanes, (m_all * lanes,)
+    sums = (count * lanes,)
+    return (
+        (row,),
+        (pieces, 3, row),
+        (n_state(m_all, l_all, count) * lanes,),
+        sums,
+        modes,
+        (lanes,),
+        (lanes,),
+        (11, lanes),
+    )
+
+
+def new_stepping(pieces: int, marks: Marks) -> Stepping:
+    """Arrays for the steps of blocks of scenes, whose half periods have so many pieces (0 without jumps)."""
+    return Stepping._make(np.empty(shape) for shape in stepping_shapes(pieces or 4, marks))
+
+
+@jit
+def _closed(
+    s: FloatArray, start: FloatArray, back: FloatArray, c: FloatArray, closing: FloatArray, tol: float, marks: Marks
+) -> bool:  # fmt: skip
+    """Whether a period leads every lane from its start back to it, to `tol`; if not, improve the starts.
+
+    The improvement is a step of Newton's method with the derivative of the period map with the area held. A lane that
+    is within `tol` (relative to its peak gap voltage) keeps its start.
+    """
+    m_all, lanes, done = len(marks[0]), len(marks[5]), True
+    for i in range(lanes):
+        off = 0.0
+        for m in range(m_all):
+            change = (s[(Z * m_all + m) * lanes + i] - start[m * lanes + i]) * back[m * lanes + i]
+            off += abs(c[(SHAPE + m) * lanes + i] * change)
+        closing[i] = off / (s[(N_STATE * m_all + PEAK) * lanes + i] + 1e-300)
+        if closing[i] > tol:
+            done = False
+            for m in range(m_all):
+                change = s[(Z * m_all + m) * lanes + i] - start[m * lanes + i]
+                start[m * lanes + i] += change * back[m * lanes + i]
+    return done
+
+
+@jit
+def march_block(
+    table: FloatArray, pending: NDArray[np.int64], first: int, places: Places,
+    curves: tuple[FloatArray, FloatArray, FloatArray], source: Source, how: How, block: Block, stepping: Stepping,
+    out: FloatArray, voltages: tuple[FloatArray, FloatArray], marks: Marks,
+) -> None:  # fmt: skip
+    """Integrate the scenes from number `first` of `pending` on, as many as there are lanes; see `march`.
+
+    `voltages` take the gap voltages before the steps of both runs, each of shape (lanes * steps,) or (0,).
+    """
+    halves, half, pieces, periodic, tol, covered = how
+    m_all, count, lanes, jumping = len(marks[0]), len(marks[4]), len(marks[5]), pieces > 0
+    # Unpacked by position, as a compiler for graphics cards may know plain tuples only.
+    c, start, rates, drive, b, top, tails, _, _, _ = block
+    still, moving, s, last, back, closing, length, moments = stepping
+    fill_block(table, pending, first, places, curves, (source[0], jumping, covered), block, marks)
+    for i in range(lanes):
+        closing[i] = 0.0
+        if periodic:
+            period = 2.0 * math.pi / b[OMEGA * lanes + i]
+            for m in range(m_all):
+                back[m * lanes + i] = -1.0 / math.expm1(-rates[m, i] * period)
+    g = (still, moving[: pieces if jumping else 4])
+    for w in range(2):
+        if source[1][w].size == 0:
+            continue
+        steps = half // 2 if w == 0 else half
+        # All pieces together are 2^pieces - 1 times the first, which has steps / pieces of the shortest steps.
+        shorter = pieces / (2.0**pieces - 1.0) if jumping else START_TIMES[1]
+        for i in range(lanes):
+            length[i] = math.pi / b[OMEGA * lanes + i] / steps * shorter
+        weigh(length, rates, drive, g, moments, marks)
+        for _ in range(MOST_PERIODS if periodic else 1):
+            for i in range(s.size):
+                s[i] = start[i] if i < start.size else 0.0
+            run(c, g, s, source[1][w], (halves, steps, jumping), last, voltages[w], marks)
+            if not periodic or _closed(s, start, back, c, closing, tol, marks):
+                break
+        put_results(s, last, closing, (float(halves * steps), 2.0 * steps), first, out[w], marks)
+        for i in range(min(lanes, pending.size - first)):
+            within = out[w, 2 * count, first + i] <= top[i]
+            out[w, 2 * count + 2, first + i] = tails[i] if within else math.inf
+
+
+@jit
+def march(
+    table: FloatArray, pending: NDArray[np.int64], places: Places,
+    curves: tuple[FloatArray, FloatArray, FloatArray], source: Source, how: How, block: Block, stepping: Stepping,
+    out: FloatArray, traces: tuple[FloatArray, FloatArray], marks: Marks,
+) -> None:  # fmt: skip
+    """Integrate scenes of a table, block by block, with each of two numbers of steps; the first may be none.
+
+    Parameters
+    ----------
+    table : ndarray, shape (n_row, n_scene)
+        `CELL_ROWS` for all cells, `N_OTHERS` rows, and two for every tone.
+    pending : ndarray, shape (n,)
+        Indices of the scenes to integrate.
+    places : tuple
+        Index of the gap among the cells, and of those with a total leakage, one for every leak of the marks.
+    curves : tuple of ndarray
+        Polynomial coefficients of the universal curve over X, highest power first; Chebyshev points; and the matrix
+        from values at these points to polynomial coefficients (d + 1, d + 1), highest power first.
+    source : tuple of ndarray
+        Frequencies of the tones, in that of the source; and the waves as `lockstep.run` takes them, for both numbers of
+        steps.
+    how : tuple
+        Number of half periods; of steps in each, in the second run (the first run has half as many, or none if its
+        waves are empty); of pieces of each if the source jumps to its negative after each, else 0; whether the periodic
+        state is wanted; its tolerance, relative to the peak gap voltage; and the largest gap voltage that the area's
+        polynomial covers, as a ratio to its estimate.
+    block, stepping
+        From `lockscenes.new_block` and `new_stepping`.
+    out : ndarray, shape (2, 2 n_moment + 3, n)
+        For each run the means over it and over its last period, the peak (V), the relative error of the periodic
+        state, and the relative size of the last coefficient of the area's series. The latter is infinite where the
+        polynomial does not cover the voltages met.
+    traces : tuple of ndarray, each of shape (n, steps)
+        Gap voltage before every step of each run, V; (n, 0) for none.
+    """
+    lanes = len(marks[5])
+    voltages = np.empty(lanes * traces[0].shape[1]), np.empty(lanes * traces[1].shape[1])
+    for first in range(0, pending.size, lanes):
+        march_block(table, pending, first, places, curves, source, how, block, stepping, out, voltages, marks)
+        for w in range(2):
+            width = traces[w].shape[1]
+            for i in range(min(lanes, pending.size - first) if width > 0 else 0):
+                traces[w][first + i] = voltages[w][i * width : (i + 1) * width]
