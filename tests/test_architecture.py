@@ -60,6 +60,7 @@ LARGER = {
     "engine.exponential.converge": (34, 30),
     "engine.exponential.assess": (45, 14),
     "engine.growth.carry": (45, 15),
+    "engine.lockcard.thread_kernel.kernel": (28, 17),
     "engine.march.march": (301, 19),
     "engine.netassess.assess": (60, 20),
     "engine.netcharge.charge_rows": (29, 21),
