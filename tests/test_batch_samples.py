@@ -61,6 +61,18 @@ def test_stated_errors_cover_wide_populations(highest: float, rtol: float) -> No
     assert (true <= found["error"].to_numpy() + 1e-9).mean() >= 0.95
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_stated_errors_cover_fingers_that_differ_little(seed: int) -> None:
+    # Their errors go up and down together, so that an estimate that is small by chance is so for all of them.
+    r = np.random.default_rng(1)
+    scenes = {"Xgap.d": r.uniform(3e-6, 4e-6, 24), "Xgap.r": 1e6 * 10.0 ** r.uniform(-0.5, 0.5, 24)}
+    circuit = recorded(8000.0, seed=seed)
+    found = fs.batch(circuit, scenes, outputs=OUTPUTS, t_stop=T_STOP, rtol=1e-6)
+    true = off(circuit, scenes, found)
+    assert true.max() <= 1e-6
+    assert (true <= found["error"].to_numpy() + 1e-9).mean() >= 0.95
+
+
 def test_a_dispersive_skin_states_its_error() -> None:
     text = table1_deck().replace("SKIN d=350u f=100.0", "SKIN_DISPERSIVE d=350u")
     circuit, scenes = recorded(8000.0, fs.parse_netlist(text)), people(16)

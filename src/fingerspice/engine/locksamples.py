@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.lockscenes import OMEGA, Block, Places, fill_block, put_results
+from fingerspice.engine.lockscenes import OMEGA, Block, Places, fill_block
 from fingerspice.engine.lockstep import (
     GAP,
     N_STATE,
@@ -35,6 +35,8 @@ from fingerspice.engine.lockweights import moment_integrals
 # predicted, and at start, middle and end as corrected; and the integral of |u| that Simpson's rule misses.
 HALF, HALF_SOURCE, HALF_SOURCE_END, HALF_NOW, HALF_OLD, DECAY, SOURCE, SOURCE_END, PREDICT, PREDICT_MIDDLE = range(10)
 CORRECT, CORRECT_MIDDLE, CORRECT_END, KINK, N_WEIGHTS = 10, 11, 12, 13, 14
+# Parts of the run whose shares of the means are kept, because the errors of all of them may cancel by chance.
+N_PORTION = 16
 # Rows of the state for every mode: z, the nonlinear term at the start of the step and in its middle, and a guess.
 Z, RATE, MIDDLE, GUESS = 0, 1, 2, 3
 
@@ -169,11 +171,11 @@ def _weigh(h: FloatArray, rates: FloatArray, drive: FloatArray, g: FloatArray, m
 @jit
 def _run(
     c: FloatArray, still: FloatArray, g: FloatArray, s: FloatArray, slope: FloatArray, values: FloatArray, parts: int,
-    late: FloatArray, marks: Marks,
+    portions: FloatArray, marks: Marks,
 ) -> None:  # fmt: skip
     """Integrate a block's scenes from the uncharged state, with so many steps between two samples.
 
-    `late` takes the sums over the second half, as the state holds those over the whole run.
+    `portions` takes the sums over each portion of the run, as the state holds those over the whole run.
     """
     own, count, lanes = N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
     # A step of length 0 evaluates the nonlinear term and the integrands.
@@ -182,16 +184,17 @@ def _run(
         s[(own + PEAK) * lanes + i] = abs(s[(own + GAP) * lanes + i])
         for k in range(count):
             s[(own + VALUE + count + k) * lanes + i] = 0.0
-    sums = (own + VALUE + count) * lanes
-    for j in range(values.size - 1):
-        if j == (values.size - 1) // 2:
-            late[:] = s[sums : sums + late.size]
-        here, change = values[j], (values[j + 1] - values[j]) / parts
-        for k in range(parts):
-            ends = (here + k * change, here + (k + 1) * change)
-            _step(c, g, s, slope, ends, 1.0 / 6.0, marks)
-    for i in range(late.size):
-        late[i] = s[sums + i] - late[i]
+    sums, intervals = (own + VALUE + count) * lanes, values.size - 1
+    for p in range(N_PORTION):
+        for i in range(count * lanes):
+            portions[p, i] = -s[sums + i]
+        for j in range(p * intervals // N_PORTION, (p + 1) * intervals // N_PORTION):
+            here, change = values[j], (values[j + 1] - values[j]) / parts
+            for k in range(parts):
+                ends = (here + k * change, here + (k + 1) * change)
+                _step(c, g, s, slope, ends, 1.0 / 6.0, marks)
+        for i in range(count * lanes):
+            portions[p, i] += s[sums + i]
 
 
 @jit
@@ -204,6 +207,22 @@ def _slopes(c: FloatArray, area: int, degree: int, slope: FloatArray, marks: Mar
             total = value - total
             value = c[(area + d) * lanes + i] - value
         slope[i] = total * c[SCALE * lanes + i]
+
+
+@jit
+def _put_results(
+    s: FloatArray, portions: FloatArray, steps: float, block: Block, first: int, out: FloatArray, marks: Marks
+) -> None:
+    """Write a block's columns of `out`, which `march_samples` describes."""
+    own, count, lanes = N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
+    for i in range(min(lanes, out.shape[1] - first)):
+        for j in range(count):
+            out[j, first + i] = s[(own + VALUE + count + j) * lanes + i] / steps
+            for p in range(N_PORTION):
+                out[(1 + p) * count + j, first + i] = portions[p, j * lanes + i] / steps
+        peak = s[(own + PEAK) * lanes + i]
+        out[-3, first + i], out[-2, first + i] = peak, 0.0
+        out[-1, first + i] = block.tail[i] if peak <= block.top[i] else math.inf
 
 
 @jit
@@ -224,15 +243,15 @@ def march_samples(
     how : tuple
         Steps a sample in both runs, 0 for none in the first; and the largest gap voltage that the area's
         polynomial covers, as a ratio to its estimate.
-    out : ndarray
-        As for `lockmarch.march`, with the second half of the run in place of the last period.
+    out : ndarray, shape (2, (1 + N_PORTION) * n_moment + 3, n)
+        As for `lockmarch.march`, with the shares of the run's portions in place of the last period.
     """
     m_all, l_all, d_all, count, lanes = len(marks[0]), len(marks[2]), len(marks[3]) - 1, len(marks[4]), len(marks[5])
     area, row = area_row(m_all, 1, l_all), N_WEIGHTS * m_all * lanes
     c, still, g = block.c, np.zeros(row), np.empty(row)
     # The last rows hold the voltages of the leaks.
-    s, slope, none = np.empty((n_state(m_all, l_all, count) + l_all) * lanes), np.empty(lanes), np.full(lanes, 0.0)
-    late, h = np.empty(count * lanes), np.empty(lanes)
+    s, slope = np.empty((n_state(m_all, l_all, count) + l_all) * lanes), np.empty(lanes)
+    portions, h = np.empty((N_PORTION, count * lanes)), np.empty(lanes)
     for kind in (HALF, DECAY):
         still[kind * m_all * lanes : (kind + 1) * m_all * lanes] = 1.0
     for first in range(0, pending.size, lanes):
@@ -246,9 +265,5 @@ def march_samples(
                 h[i] = math.pi / block.b[OMEGA * lanes + i] / parts
             _weigh(h, block.rates, block.drive, g, marks)
             s[:] = 0.0
-            _run(c, still, g, s, slope, values, parts, late, marks)
-            steps = float((values.size - 1) * parts)
-            put_results(s, late, none, (steps, steps), first, out[w], marks)
-            for i in range(min(lanes, pending.size - first)):
-                covered = out[w, 2 * count, first + i] <= block.top[i]
-                out[w, 2 * count + 2, first + i] = block.tail[i] if covered else math.inf
+            _run(c, still, g, s, slope, values, parts, portions, marks)
+            _put_results(s, portions, float((values.size - 1) * parts), block, first, out[w], marks)

@@ -19,6 +19,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, STRESS
 from fingerspice.numerics.differences import STEP
 from fingerspice.studies.batchladder import (
+    COVERED,
     ENOUGH,
     FIGURES,
     MOST_PIECES,
@@ -142,22 +143,24 @@ def climb_gradients(
         touching = touching & np.isfinite(value) & (value != 0.0)
     for count in np.unique(pieces[touching]).tolist():
         chosen = np.flatnonzero(touching & (pieces == count))
-        some = {path: array[chosen] for path, array in scenes.items()}
-        _climb_one(task, wanted, form, some, (halves, count), (chosen, decays[chosen]), found)
+        for covered in COVERED:
+            some = {path: array[chosen] for path, array in scenes.items()}
+            which = chosen, decays[chosen]
+            chosen = _climb_one(task, wanted, form, some, (halves, count), covered, which, found)
     return found
 
 
 def _climb_one(
     task: Task, wanted: Gradients, form: LockstepForm, scenes: Mapping[str, FloatArray], mesh: tuple[int, int],
-    which: tuple[NDArray[np.int64], FloatArray], found: Slopes,
-) -> None:  # fmt: skip
-    """Differentiate `scenes`, at `which` places of `found`; `mesh` as in `batchladder`."""
+    covered: float, which: tuple[NDArray[np.int64], FloatArray], found: Slopes,
+) -> NDArray[np.int64]:  # fmt: skip
+    """Differentiate `scenes`, at `which` places of `found`; the rest is as in `batchladder`."""
     steps, degree = first_level(task.rtol, form, mesh[1])
     (place, decays), pairs = which, 2 * len(wanted.paths)
     # What ends the search for a periodic state moves a difference by 1 / STEP of itself.
     closer = replace(task, rtol=task.rtol * STEP)
     before: Run | None = None
-    pending, least = np.arange(place.size), np.zeros(place.size)
+    pending, least, outside = np.arange(place.size), np.zeros(place.size), [place[:0]]
     while pending.size and steps <= MOST_STEPS * max(form.multiples):
         curves = curves_of(form.layer.values["m_exp"], form.layer.values["n_exp"], degree)
         if curves is None:
@@ -165,7 +168,7 @@ def _climb_one(
         some = {path: array[pending] for path, array in scenes.items()}
         moved = _moved(wanted, some)
         table = table_of(form, moved)
-        level = Level(closer, form, mesh, steps, degree, 1, False)
+        level = Level(closer, form, mesh, steps, degree, covered, 1, False)
         run = level.run(table, np.arange(table.shape[1]), curves, before)
         rows = table[CELL_ROWS * form.cells :]
         own, coarse = (_changes(wanted, one[0], rows, friction_of(form, moved)) for one in (run.fine, run.coarse))
@@ -177,10 +180,14 @@ def _climb_one(
             for j, name in enumerate(wanted.outputs):
                 found.values[name][at, k] = own.change[j, k, good] / some[path.lower()][good]
         found.error[at], found.status[at], found.done[at] = error[good], LOCKSTEP, True
-        left = np.tile(~good, pairs)
-        before = Run(run.fine[:, left], run.fine[:, left], run.trace[left], run.trace[left])
-        least = np.where(np.isfinite(error[~good]), error[~good], 0.0) / _MOST_GAIN
-        pending, steps, degree = pending[~good], 2 * steps, max(degree, min(degree + _MORE, _HIGHEST))
+        beyond = np.isinf(run.fine[-1]).reshape(pairs, -1).any(axis=0)
+        outside.append(place[pending[beyond]])
+        left = ~good & ~beyond
+        runs = np.tile(left, pairs)
+        before = Run(run.fine[:, runs], run.fine[:, runs], run.trace[runs], run.trace[runs])
+        least = np.where(np.isfinite(error[left]), error[left], 0.0) / _MOST_GAIN
+        pending, steps, degree = pending[left], 2 * steps, max(degree, min(degree + _MORE, _HIGHEST))
+    return np.concatenate(outside)
 
 
 def _moved(wanted: Gradients, scenes: Mapping[str, FloatArray]) -> dict[str, FloatArray]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine.lockcard import Lengths, march_on_card
 from fingerspice.engine.lockmarch import march, new_stepping
-from fingerspice.engine.locksamples import march_samples
+from fingerspice.engine.locksamples import N_PORTION, march_samples
 from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, LOSS, OMEGA, REST, STRESS, new_block
 from fingerspice.engine.lockstep import ALL_MOMENTS, START_TIMES, marks_of
 from fingerspice.studies.batchscenes import Curves, LockstepForm, curves_of, peak_of, table_of
@@ -22,19 +22,21 @@ _RUNGS = ((5e-4, 32, 8), (5e-5, 48, 8), (5e-6, 80, 12), (5e-7, 144, 12), (0.0, 2
 HIGHEST_DEGREE, MOST_STEPS = 24, 8192
 # Under a recording: initial number of steps a sample, and the largest.
 _PARTS = (2, 16)
-# Largest gap voltage that the area's polynomial covers, as a ratio to its estimate, at first and later.
-_COVERED, _COVERED_LATER = 1.2, 1.5
+# Largest gap voltage that the area's polynomial covers, as a ratio to its estimate: the second one for scenes that the
+# first did not cover. It is the same for all numbers of steps, whose results are compared, because the linear part of
+# the equations has the area of its middle, so that the error of a step depends on it.
+COVERED = 1.2, 1.8
 # Allowed defect of the periodic state relative to rtol, and the relative round-off added to every stated error.
 CLOSING, ROUNDING = 0.02, 1e-11
-# The stated error is this share of the change from half the steps to all steps, by the smallest rtol served. The order
-# is 4, which would give a fifteenth. But the kink of 1/A where the gap voltage is 0 has order 2, with a factor that
-# depends on where between two steps it falls: that is most of a small error. Pieces of 4 and of 8 steps are still far
-# from the order. As the change may be small by chance, doubling the steps may not reduce the stated error by more than
+# The error is estimated as this share of the change from half the steps to all steps, by the smallest rtol served. The
+# order is 4, which would give a fifteenth. But the kink of 1/A where the gap voltage is 0 has order 2, with a factor
+# that depends on where between two steps it falls: that is most of a small error. Pieces of 4 and of 8 steps are still
+# far from the order. As the change may be small by chance, doubling the steps may not reduce the estimate by more than
 # the factor _MOST_GAIN.
-_STATED, _STATED_JUMPING = ((5e-6, 0.25), (0.0, 0.5)), 0.5
-# Under a recording the order is 3, which would give a seventh; but 1, which gives 1, for a dispersive skin, some of
-# whose modes decay from each sample on within a part of a step.
-_STATED_RECORDED, _STATED_DISPERSIVE = 0.6, 1.0
+_STATED, _STATED_JUMPING = ((5e-6, 0.25), (5e-7, 0.5), (0.0, 0.8)), 0.5
+# Under a recording the order is 3, which would give a seventh, and 2 for what the zeros of the gap voltage leave; but
+# 1, which gives 1, for a dispersive skin, some of whose modes decay from each sample on within a part of a step.
+_STATED_RECORDED, _STATED_DISPERSIVE = 0.5, 1.0
 _MOST_GAIN = 24.0
 # Longest first step after a jump of the source, in time constants of the fastest cell.
 _LONGEST_STEP = 1.0
@@ -42,7 +44,7 @@ _LONGEST_STEP = 1.0
 # `_PIECE_START` steps a piece, is shorter than the fastest cell's time constant.
 _PIECES = ((5e-5, 8), (5e-7, 12), (0.0, 24))
 _PIECE_START, MOST_PIECES = 2, 20
-# A scene is accepted if its stated error is at most this fraction of rtol, because the stated error is an estimate.
+# A scene is accepted if its estimate is at most this fraction of rtol; the error stated is the estimate divided by it.
 ENOUGH = 0.7
 _Figure = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
 #: For each figure, the indices of the moments that it needs, and the function that gives it from the moments (4, n),
@@ -95,7 +97,9 @@ def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halv
     found = Answers.empty(task, table.shape[1], halves * task.points // 2)
     touching, pieces, decays = mesh_of(form, table, most=1 if task.traced else MOST_PIECES)
     for count in np.unique(pieces[touching]).tolist():
-        _climb_one(task, form, _Scenes(table, mu, decays), (halves, count), touching & (pieces == count), found)
+        pending = np.flatnonzero(touching & (pieces == count))
+        for covered in COVERED:
+            pending = _climb_one(task, form, _Scenes(table, mu, decays), (halves, count), covered, pending, found)
     return found
 
 
@@ -152,9 +156,13 @@ class _Scenes(NamedTuple):
 
 
 def _climb_one(
-    task: Task, form: LockstepForm, scenes: _Scenes, mesh: tuple[int, int], chosen: BoolArray, found: Answers
-) -> None:  # fmt: skip
-    """Integrate the `chosen` scenes; `mesh` is the number of half periods, and of pieces of each (0: no jumps)."""
+    task: Task, form: LockstepForm, scenes: _Scenes, mesh: tuple[int, int], covered: float,
+    pending: NDArray[np.int64], found: Answers,
+) -> NDArray[np.int64]:  # fmt: skip
+    """Integrate the scenes `pending`, and return those whose gap voltage the area's polynomial does not serve.
+
+    `mesh` is the number of half periods, and of pieces of each (0: no jumps).
+    """
     others, table = CELL_ROWS * form.cells, scenes.table
     figures = [name for name in task.outputs if name != "u_gap"]
     needed = sorted({i for name in figures for i in FIGURES[name.removesuffix("_periodic")][0]} or {0})
@@ -165,15 +173,15 @@ def _climb_one(
         steps, most = _PARTS
     if traced:
         steps = task.points * -(-steps // task.points)
-    pending = np.flatnonzero(chosen)
-    before, least = None, np.zeros(pending.size)
+    before, last, outside = None, np.full(pending.size, np.inf), [pending[:0]]
     while pending.size and steps <= most:
         curves = curves_of(form.layer.values["m_exp"], form.layer.values["n_exp"], degree)
         if curves is None:
             break
-        level = Level(task, form, mesh, steps, degree, ALL_MOMENTS if needed[-1] else 1, traced)
+        level = Level(task, form, mesh, steps, degree, covered, ALL_MOMENTS if needed[-1] else 1, traced)
         now = level.run(table, pending, curves, before)
-        error = np.maximum(level.error(now, needed), least)
+        error = level.error(now, needed)
+        error = np.where(np.isfinite(last), np.maximum(error, last / _MOST_GAIN), error)
         good = (error <= ENOUGH * task.rtol) & short_enough(scenes.decays[pending], pieces, steps)
         at = pending[good]
         for name in figures:
@@ -184,12 +192,16 @@ def _climb_one(
             found.values[name][at] = figure(moments, load, stress, scenes.mu[at])
         if traced:
             found.values["u_gap"][at] = now.trace[good, :: steps // task.points]
-        found.error[at], found.status[at], found.done[at] = error[good], LOCKSTEP, True
+        found.error[at], found.status[at], found.done[at] = error[good] / ENOUGH, LOCKSTEP, True
         # More steps are no help where the area's polynomial of the highest degree is what limits the error.
-        left = ~good & ((degree < HIGHEST_DEGREE) | (before is None) | (now.fine[-1] <= ENOUGH * task.rtol))
+        # A scene whose estimate grows from twice the steps, too: the explicit steps may be unstable around that area.
+        beyond = np.isinf(now.fine[-1]) | ~good & (error > last)
+        outside.append(pending[beyond])
+        left = ~good & ~beyond & ((degree < HIGHEST_DEGREE) | (before is None) | (now.fine[-1] <= ENOUGH * task.rtol))
         before = Run(now.fine[:, left], now.fine[:, left], now.trace[left], now.trace[left])
-        least = np.where(np.isfinite(error[left]), error[left], 0.0) / _MOST_GAIN
+        last = error[left]
         pending, steps, degree = pending[left], 2 * steps, HIGHEST_DEGREE
+    return np.concatenate(outside)
 
 
 class Run(NamedTuple):
@@ -202,27 +214,27 @@ class Run(NamedTuple):
 
 
 class Level(NamedTuple):
-    """An integration with a given number of steps per period (sample) and degree of the area's polynomial."""
+    """An integration with a given number of steps per period (sample), and the area's polynomial."""
 
     task: Task
     form: LockstepForm
     mesh: tuple[int, int]
     steps: int
     degree: int
+    covered: float
     moments: int
     traced: bool
 
     def run(self, table: FloatArray, pending: NDArray[np.int64], curves: Curves, before: Run | None) -> Run:
         """Integrate the scenes `pending`; the results with half the steps come from `before`, or are computed, too."""
         sizes = (self.steps // 2 if before is None else 0, self.steps)
-        covered = _COVERED if before is None else _COVERED_LATER
         if self.form.recording is not None:
-            return self._recorded(table, pending, curves, (sizes, covered), before)
+            return self._recorded(table, pending, curves, sizes, before)
         halves, pieces = self.mesh
         places = self.form.gap_cell, np.array(self.form.leaks)
         waves = _waves(sizes[0], self.form), _waves(sizes[1], self.form)
         source = np.array(self.form.multiples, float), waves
-        how = halves, self.steps // 2, pieces, self.task.periodic, CLOSING * self.task.rtol, covered
+        how = halves, self.steps // 2, pieces, self.task.periodic, CLOSING * self.task.rtol, self.covered
         widths = [halves * n // 2 if self.traced else 0 for n in sizes]
         traces = np.empty((pending.size, widths[0])), np.empty((pending.size, widths[1]))
         lengths = self._lengths(waves[1].shape[1])
@@ -242,30 +254,32 @@ class Level(NamedTuple):
         return self.form.cells - 1, waves, len(self.form.leaks), self.degree + 1, self.moments
 
     def _recorded(
-        self, table: FloatArray, pending: NDArray[np.int64], curves: Curves, how: tuple[tuple[int, int], float],
+        self, table: FloatArray, pending: NDArray[np.int64], curves: Curves, sizes: tuple[int, int],
         before: Run | None,
     ) -> Run:  # fmt: skip
         """As `run`, under a recording."""
         recording = self.form.recording
         assert recording is not None
-        marks, out = marks_of(*self._lengths(1)), np.empty((2, 2 * self.moments + 3, pending.size))
+        rows = (1 + N_PORTION) * self.moments + 3
+        marks, out = marks_of(*self._lengths(1)), np.empty((2, rows, pending.size))
         places, block = (self.form.gap_cell, np.array(self.form.leaks)), new_block(table.shape[0], marks)
         values = recording.between(0, self.mesh[0] + 1) / peak_of(recording)
-        march_samples(table, pending, places, curves, values, how, block, out, marks)
+        march_samples(table, pending, places, curves, values, (sizes, self.covered), block, out, marks)
         none = np.empty((pending.size, 0))
         return Run(out[0] if before is None else before.fine, out[1], none, none)
 
     def error(self, run: Run, needed: list[int]) -> FloatArray:
-        """Largest stated relative error of the outputs, for each scene."""
-        peak, closing, tail = run.fine[2 * self.moments :]
+        """Largest estimated relative error of the outputs, for each scene."""
+        peak, closing, tail = run.fine[-3:]
         changes = [np.zeros(peak.size)]
         for row in needed:
             size, change = np.abs(run.fine[row]), np.abs(run.fine[row] - run.coarse[row])
             later = row + self.moments
             if self.form.recording is not None:
-                # The share of the second half of the run: changes of both halves may cancel by chance.
-                second = run.fine[later] - run.coarse[later]
-                change = np.abs(run.fine[row] - run.coarse[row] - second) + np.abs(second)
+                # Each zero of the gap voltage adds an error as if by chance, so that the sum of all may be small by
+                # chance with half the steps, and not with all of them. The root of the sum of their squares is not.
+                portions = slice(later, -3, self.moments)
+                change = np.maximum(change, np.linalg.norm(run.fine[portions] - run.coarse[portions], axis=0))
             elif self.mesh[0] > 1:
                 last = np.abs(run.fine[later])
                 changes.append(np.abs(run.fine[later] - run.coarse[later]) / np.where(last > 0.0, last, 1.0))
