@@ -12,9 +12,9 @@ from numpy.polynomial import Polynomial
 from scipy.optimize import brentq
 
 from fingerspice.engine import charge, netcharge, netrows, readout, rows
-from fingerspice.engine.exponential import N_PLACES
 from fingerspice.engine.model import Model
 from fingerspice.engine.netrows import Form
+from fingerspice.engine.readout import N_PLACES
 from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS
 
 PLACES = np.array([0, FIRST, FIRST + 1, FIRST + 2, END])

@@ -9,7 +9,7 @@ import pytest
 
 import fingerspice as fs
 from fingerspice.engine import netassess, nodes, rows
-from fingerspice.engine.exponential import N_PLACES
+from fingerspice.engine.readout import N_PLACES
 from fingerspice.numerics.lobatto import END, FIRST, MISS, POINTS, ROWS
 
 PLACES = [0, FIRST, FIRST + 1, FIRST + 2, END]

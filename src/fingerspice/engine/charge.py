@@ -7,11 +7,12 @@ import math
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.exponential import N_PLACES, between, row_of
+from fingerspice.base.compiled import jit, jit_rows, jit_within
+from fingerspice.engine.exponential import between
 from fingerspice.engine.model import Model
-from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, PEAK_Q, SPREAD
-from fingerspice.engine.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U
+from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, N_PLACES, PEAK_Q, SPREAD, row_of
+from fingerspice.engine.system import System
+from fingerspice.engine.work import DQ, SLOPE, SOURCE, X_GAP, Q, U, Work
 from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, FIRST, NODES, POINTS
 
 # The interpolation error of a rate changes its sign at every node, so that its integral is at most this fraction of its
@@ -23,10 +24,9 @@ LOBE, _STEEP_LOBE, _STEEP = 0.15, 0.3, 10.0
 _DERIVATIVE_BETWEEN = np.ascontiguousarray(BETWEEN.T @ DERIVATIVE)
 
 
-@jit
+@jit_within
 def charge_step(
-    model: Model, rates: FloatArray, gain: FloatArray, gap: FloatArray, slow_share: FloatArray, w: FloatArray,
-    pull: FloatArray, r: FloatArray, integral: FloatArray, h: float, z0: float, places: FloatArray, theta: float,
+    system: System, work: Work, level: int, integral: FloatArray, h: float, z0: float, theta: float,
     control: FloatArray, z: FloatArray, current: FloatArray,
 ) -> None:  # fmt: skip
     """Charge z (C) and current (A) at the nodes of a step of length h (s) that starts with the charge z0.
@@ -34,9 +34,11 @@ def charge_step(
     Both are computed through the layer that leaks slowest: the sum over all leaks would be a small difference of large
     currents. The charge that this layer stores follows from its voltages, not from the integral of w': for a fast mode
     that has decayed w' still contains its rate times the error of w, and quadrature over a step much longer than the
-    mode's time constant would turn this into charge. `places` holds the error of the modes (see `exponential.assess`),
-    of which the part up to fraction `theta` of the step counts.
+    mode's time constant would turn this into charge. `work.places` holds the error of the modes (see
+    `exponential.assess`), of which the part up to fraction `theta` of the step counts.
     """
+    model, r, w, pull = system.model, work.r, work.w, work.pull
+    rates, gain, gap, slow_share = system.rates[level], system.gain[level], system.gap[level], system.slow[level]
     n = rates.size
     slow = model.slow
     voltage = np.empty(NODES)
@@ -72,7 +74,8 @@ def charge_step(
     for j in range(NODES):
         z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
         control[PEAK_Q] = max(control[PEAK_Q], abs(z[j]))
-    _account(model, gap, slow_share, w, r, h, places, theta, missed, missed if theta < 1.0 else kept, control)
+    kept = missed if theta < 1.0 else kept
+    _account(model, gap, slow_share, w, r, h, work.places, theta, missed, kept, control)
 
 
 @jit

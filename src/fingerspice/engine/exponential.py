@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.base.compiled import jit, jit_inline, jit_rows
-from fingerspice.engine.rows import DQ, GUESS, SOURCE, X_GAP, Q, U, evaluate, moved
+from fingerspice.base.compiled import jit, jit_rows, jit_within
+from fingerspice.engine.rows import evaluate, moved
+from fingerspice.engine.system import System
+from fingerspice.engine.work import DQ, GUESS, SOURCE, X_GAP, Q, U, Work
 from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
 
 # Step lengths whose tables are kept; fewer where there are many modes, each of which takes 2 kB for a step length.
 N_SLOTS, FEWEST_SLOTS, MOST_ENTRIES = 192, 8, 8_192
-# Places of a step at which the error is known: its start, the three points between nodes, its end.
-N_PLACES = 5
 
 
 class Tables(NamedTuple):
@@ -112,23 +112,20 @@ def _linear(
             w[k, i] = base[k, i]
 
 
-@jit_inline
+@jit_within
 def converge(
-    mobile: bool, coupled: bool, k_gap: float, area0: float, q0: float, gain: FloatArray, gap: FloatArray,
-    push: FloatArray, tap: FloatArray, tap_k: FloatArray, feed: FloatArray, tapped: FloatArray, powers: FloatArray,
-    slopes: FloatArray, lo: float, scale: float, curve: FloatArray, sign: float, decay: FloatArray, phi: FloatArray,
-    w0: FloatArray, tol: float,
-    base: FloatArray, w: FloatArray, pull: FloatArray, used: FloatArray,
-    pull_before: FloatArray, left_before: FloatArray, weight: FloatArray, r: FloatArray,
+    system: System, tables: Tables, work: Work, slot: int, level: int, sign: float, tol: float
 ) -> tuple[int, bool]:  # fmt: skip
-    """Fill `w` with the collocation solution of a step, iterating on the nonlinear term.
+    """Fill `work.w` with the collocation solution of a step, iterating on the nonlinear term.
 
-    Returns the number of evaluations at all rows, and whether the iteration converged to `tol` (V). `pull` is the
-    nonlinear term at that solution, `used` the term from which the solution was computed. Their difference is measured,
-    with `weight` for each mode, by how far it moves the gap voltage.
+    Returns the number of evaluations at all rows, and whether the iteration converged to `tol` (V). `work.pull` is the
+    nonlinear term at that solution, `work.used` the term from which the solution was computed. Their difference is
+    measured, with `work.weight` for each mode, by how far it moves the gap voltage.
     """
-    _linear(gain, decay, phi, w0, r[SOURCE], base, w)
-    for k in range(w0.size):
+    r, base, w, pull, used, weight = work.r, work.base, work.w, work.pull, work.used, work.weight
+    decay, phi = tables.decay[slot], tables.phi[slot]
+    _linear(system.gain[level], decay, phi, work.w0, r[SOURCE], base, w)
+    for k in range(work.w0.size):
         for i in range(ROWS):
             used[k, i] = 0.0
     slow = False
@@ -137,16 +134,13 @@ def converge(
     for iteration in range(1, 41):
         if iteration > 1:
             if slow:
-                step = mix(pull, used, weight, pull_before, left_before)
+                step = mix(pull, used, weight, work.pull_before, work.left_before)
             else:
-                step = plain(pull, used, weight, pull_before, left_before)
+                step = plain(pull, used, weight, work.pull_before, work.left_before)
             respond(used, phi, base, w)
-        if not evaluate(
-            mobile, k_gap, area0, q0, gap, push, tap, tap_k, feed, tapped, powers, slopes, lo, scale, curve, sign, w,
-            pull, r,
-        ):  # fmt: skip
+        if not evaluate(system, work, level, sign):
             return iteration, False
-        if not coupled:
+        if not system.model.coupled:
             return 1, True
         if iteration == 1:
             for i in range(ROWS):
@@ -275,25 +269,20 @@ def largest(first: float, second: float, third: float) -> float:
     return out if abs(out) > abs(third) else third
 
 
-@jit_inline
+@jit_within
 def assess(
-    mobile: bool, area0: float, gain: FloatArray, gap: FloatArray, phi: FloatArray, miss: FloatArray,
-    error: FloatArray, carried: FloatArray, w: FloatArray, pull: FloatArray, used: FloatArray, r: FloatArray,
-    places: FloatArray, sums: FloatArray,
+    system: System, tables: Tables, work: Work, slot: int, level: int, error: FloatArray
 ) -> tuple[float, float, float]:  # fmt: skip
     """Error of a converged step: interpolation error between the nodes, residual of the iteration, earlier error.
 
     Parameters
     ----------
+    system, tables, work, slot, level
+        As in `converge`. `work.carried` is the error of the modes propagated to the points between nodes and to the end
+        (see `engine.growth`); `work.places` is filled with their error at the start, the points between and the end,
+        that of the dense output included.
     error : ndarray, shape (n,)
         Error of the modes at the start of the step, signed.
-    carried : ndarray, shape (n, 4)
-        This error propagated to the points between nodes and the end (see `engine.growth`).
-    places : ndarray, shape (n, N_PLACES)
-        Filled with the error of the modes at the start, the points between and the end; that of the dense output is
-        included.
-    sums : ndarray, shape (4, 4)
-        Scratch.
 
     Returns
     -------
@@ -302,6 +291,11 @@ def assess(
         controls, and the whole error, with the residual of the iteration and the errors of earlier steps. Largest
         ratio of a move of the gap voltage to the move of a state voltage that causes it.
     """
+    r, w, pull, used, carried, places, sums = (
+        work.r, work.w, work.pull, work.used, work.carried, work.places, work.sums
+    )  # fmt: skip
+    gain, gap, phi, miss = system.gain[level], system.gap[level], tables.phi[slot], tables.miss[slot]
+    mobile, area0 = system.model.mobile, system.model.area0
     source_first, source_second, source_third = between(r[SOURCE])
     # Outputs are read from the polynomial through the gap voltages at the nodes: its interpolation error counts.
     sums[0, 0], sums[0, 1], sums[0, 2] = between(r[U])
@@ -347,11 +341,3 @@ def assess(
     missed = abs(largest(area_first / MISS[0], area_second / MISS[1], area_third / MISS[2]))
     charged = swing * missed / r[Q, 0]
     return max(step, charged), run, magnified
-
-
-@jit
-def row_of(place: int) -> int:
-    """Row of the work arrays that belongs to one of the `N_PLACES` places of the error."""
-    if place == 0:
-        return 0
-    return END if place == N_PLACES - 1 else FIRST + place - 1

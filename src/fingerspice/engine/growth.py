@@ -15,7 +15,8 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.model import Model, branch_area
-from fingerspice.engine.rows import DQ, SOURCE, X_GAP, Q, U
+from fingerspice.engine.system import System
+from fingerspice.engine.work import DQ, SOURCE, X_GAP, Q, U, Work
 from fingerspice.numerics.lobatto import END, NODES, POINTS
 
 # Loop gain of the feedback through the area over a step: up to the first value the feedback is neglected, and up to the
@@ -26,15 +27,14 @@ _MOST = 10.0
 _MIDDLE = NODES // 2
 
 
-@jit
-def _answer(
-    model: Model, push: FloatArray, tap: FloatArray, tap_k: FloatArray, feed: FloatArray, w: FloatArray,
-    r: FloatArray, j: int, slope: float, forced: FloatArray,
-) -> float:  # fmt: skip
+@jit_within
+def _answer(system: System, work: Work, level: int, j: int, slope: float, forced: FloatArray) -> float:
     """Forcing G of the modes by a unit error of the gap voltage at node j, into `forced` (n,).
 
     Returns the error of the gap voltage for a unit error of gap @ w. `slope` is that of 1/A at the node, 1/(m^2 V).
     """
+    model, r, w = system.model, work.r, work.w
+    push, tap, tap_k, feed = system.push[level], system.tap[level], system.tap_k, system.feed[level]
     q = r[Q, j]
     for k in range(push.size):
         forced[k] = -push[k] * r[SOURCE, j] / (model.area0 * q * q) if model.mobile else 0.0
@@ -60,14 +60,13 @@ def _slope(model: Model, sign: float, r: FloatArray, j: int) -> float:
 
 
 @jit_within
-def loop_gain(
-    mobile: bool, area0: float, push: FloatArray, tap: FloatArray, tap_k: FloatArray, feed: FloatArray,
-    weight: FloatArray, w: FloatArray, r: FloatArray,
-) -> float:  # fmt: skip
-    """Loop gain of the feedback through the area over a step, from its middle and its end; `weight`: see `weigh`.
+def loop_gain(system: System, work: Work, level: int) -> float:
+    """Loop gain of the feedback through the area over a step, from its middle and its end.
 
     Up to `SLIGHT` the feedback may be neglected. Every step needs this, and few need `carry`.
     """
+    mobile, area0, r, w, weight = system.model.mobile, system.model.area0, work.r, work.w, work.weight
+    push, tap, tap_k, feed = system.push[level], system.tap[level], system.tap_k, system.feed[level]
     gain = 0.0
     for j in (_MIDDLE, END):
         # The mean slope of 1/A is enough to decide whether the feedback matters.
@@ -92,23 +91,23 @@ def loop_gain(
     return gain
 
 
-@jit
+@jit_within
 def carry(
-    model: Model, rates: FloatArray, gap: FloatArray, push: FloatArray, tap: FloatArray, tap_k: FloatArray,
-    feed: FloatArray, decay: FloatArray, h: float, sign: float, gain: float, w: FloatArray, r: FloatArray,
-    error: FloatArray, carried: FloatArray,
+    system: System, work: Work, level: int, decay: FloatArray, h: float, sign: float, gain: float, error: FloatArray
 ) -> None:  # fmt: skip
-    """Propagate the error of the modes (n,) through a step whose loop gain is `gain`.
+    """Propagate the error of the modes (n,) through a step of length h (s) whose loop gain is `gain`.
 
-    The error at the points between nodes and at the end goes into `carried` (n, 4). See `exponential.converge` for the
-    other arguments.
+    The error at the points between nodes and at the end goes into `work.carried`. `decay` is that of the modes at the
+    rows of the step.
     """
+    model, r, carried = system.model, work.r, work.carried
+    rates, gap = system.rates[level], system.gap[level]
     n = gap.size
     forced = np.zeros(n)
     # Exponential trapezoidal rule: the only implicit unknown is the error `moved` of the gap voltage.
     stride = _MIDDLE if gain <= _MODERATE else 1
     moved = 0.0
-    factor = _answer(model, push, tap, tap_k, feed, w, r, 0, _slope(model, sign, r, 0), forced)
+    factor = _answer(system, work, level, 0, _slope(model, sign, r, 0), forced)
     for k in range(n):
         carried[k, 3] = error[k]
         moved += factor * gap[k] * error[k]
@@ -118,7 +117,7 @@ def carry(
         for k in range(n):
             fade = decay[k, _MIDDLE] if stride == _MIDDLE else math.exp(-rates[k] * dt)
             carried[k, 3] = carried[k, 3] * fade + 0.5 * _reach(rates[k], dt, fade) * forced[k] * moved
-        factor = _answer(model, push, tap, tap_k, feed, w, r, j, _slope(model, sign, r, j), forced)
+        factor = _answer(system, work, level, j, _slope(model, sign, r, j), forced)
         known = 0.0
         loop = 0.0
         for k in range(n):

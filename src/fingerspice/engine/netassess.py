@@ -8,8 +8,9 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.exponential import N_PLACES, between, largest, left_over
+from fingerspice.engine.exponential import between, largest, left_over
 from fingerspice.engine.netrows import combine
+from fingerspice.engine.readout import N_PLACES
 from fingerspice.engine.zeros import first_wrong, leaves
 from fingerspice.numerics.lobatto import DERIVATIVE, END, MISS, NODES, POINTS, ROWS
 

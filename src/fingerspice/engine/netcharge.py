@@ -9,9 +9,9 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.charge import LOBE
-from fingerspice.engine.exponential import N_PLACES, between, row_of
+from fingerspice.engine.exponential import between
 from fingerspice.engine.netrows import AREA, MORE, SLOPE, Form, Work
-from fingerspice.engine.readout import ERROR_Q
+from fingerspice.engine.readout import ERROR_Q, N_PLACES, row_of
 from fingerspice.numerics.lobatto import DERIVATIVE, NODES, POINTS, ROWS
 
 # Largest integral within a step of a function that changes its sign at every node, as the node polynomial does, over

@@ -11,8 +11,9 @@ import math
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
 from fingerspice.engine.coupling import Coupling
-from fingerspice.engine.exponential import N_PLACES, respond
+from fingerspice.engine.exponential import respond
 from fingerspice.engine.netrows import CHI_S, ETA_S, LIN, PULL, RHO, U_S, Form, W, Work, evaluate
+from fingerspice.engine.readout import N_PLACES
 from fingerspice.numerics.lobatto import END, NODES, ROWS
 from fingerspice.numerics.small import copy_to
 

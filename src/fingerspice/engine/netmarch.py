@@ -11,7 +11,7 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine import netassess, netrows
 from fingerspice.engine.coupling import take_coupling
-from fingerspice.engine.exponential import N_PLACES, Tables, make_tables, weigh
+from fingerspice.engine.exponential import Tables, make_tables, weigh
 from fingerspice.engine.netassess import account, assess, charged, first_zero, load, store, turn_at_start, write_columns
 from fingerspice.engine.netcharge import charge_error
 from fingerspice.engine.netgrowth import carry
@@ -30,6 +30,7 @@ from fingerspice.engine.readout import (
     KEPT,
     MAGNIFIED,
     N_CONTROL,
+    N_PLACES,
     NFEV,
     OUTPUT,
     RECORDED,

@@ -22,9 +22,9 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.coupling import STIFF, Coupling, answer_alone, answer_mobile, answer_together, new_coupling
-from fingerspice.engine.exponential import N_PLACES
-from fingerspice.engine.readout import WRITTEN_AT_ONCE
-from fingerspice.engine.rows import N_FLAT, polynomial_rows
+from fingerspice.engine.readout import N_PLACES, WRITTEN_AT_ONCE
+from fingerspice.engine.rows import polynomial_rows
+from fingerspice.engine.work import N_FLAT
 from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, NODES, ROWS
 from fingerspice.physics.contact import inverse_area
 

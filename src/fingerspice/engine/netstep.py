@@ -7,6 +7,7 @@ import math
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine import netrows, rows
+from fingerspice.engine import work as stack_work
 from fingerspice.engine.coupling import Coupling, answer_mobile, cell_currents, take_coupling
 from fingerspice.engine.exponential import distance, mix, plain, respond
 from fingerspice.engine.netassess import moved
@@ -28,8 +29,8 @@ def source_rows(
             sources.terms[row - e], sources.series[row - e], sources.edges[row + 1] - start, t - start, h, slopes, r[e]
         )
         for i in range(ROWS):
-            s[e, i] = r[e, rows.SOURCE, i]
-            ds[e, i] = r[e, rows.SLOPE, i]
+            s[e, i] = r[e, stack_work.SOURCE, i]
+            ds[e, i] = r[e, stack_work.SLOPE, i]
 
 
 @jit

@@ -6,8 +6,9 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.exponential import N_PLACES, between, row_of
-from fingerspice.engine.rows import DQ, SOURCE, X_GAP, Q
+from fingerspice.engine.exponential import between
+from fingerspice.engine.readout import N_PLACES, row_of
+from fingerspice.engine.work import DQ, SOURCE, X_GAP, Q
 from fingerspice.numerics.lobatto import ROWS
 
 

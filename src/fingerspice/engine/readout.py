@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.numerics.lobatto import BARYCENTRIC, FIRST, NODES, POINTS, ROWS, SECOND, THIRD, TO_SERIES
+from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, SECOND, THIRD, TO_SERIES
 
 # Entries of `control`.
 T, H, SIGN, U_BEFORE, U_GAP = 0, 1, 2, 3, 4
@@ -38,6 +38,8 @@ N_CONTROL = 23
 # Entries of `counters`: rows evaluated, steps accepted and rejected, zeros, outputs written, steps kept, recorded.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT, RECORDED = 0, 1, 2, 3, 4, 5, 6
 N_COUNTERS = 7
+# Places of a step at which the error is known: its start, the three points between nodes, its end.
+N_PLACES = 5
 # Number of last steps tried that are kept, as rows: start and length (s), error over the one allowed, number.
 TRIED = 8
 # Most steps, accepted and rejected, in a window of the source, which has a few thousand periods at most. A run that
@@ -62,18 +64,15 @@ class Steps(NamedTuple):
         the rounding of the time. No capacity: nothing is recorded.
     values : ndarray, shape (capacity, n_column, NODES)
         Recorded voltages, or the state of a network, at the nodes of the whole length.
-    paused : ndarray, shape (6,)
-        State of a loop that stopped because all places are taken; its first entry is 1 then, else 0.
     """
 
     times: FloatArray
     values: FloatArray
-    paused: FloatArray
 
 
 def new_steps(capacity: int, columns: int) -> Steps:
     """Room for so many steps."""
-    return Steps(np.empty((capacity, 4)), np.empty((capacity, columns, NODES)), np.zeros(6))
+    return Steps(np.empty((capacity, 4)), np.empty((capacity, columns, NODES)))
 
 
 @jit
@@ -131,6 +130,14 @@ def at(values: FloatArray, basis: FloatArray) -> float:
     for j in range(NODES):
         total += basis[j] * values[j]
     return total
+
+
+@jit
+def row_of(place: int) -> int:
+    """Row of the work arrays that belongs to one of the `N_PLACES` places of the error."""
+    if place == 0:
+        return 0
+    return END if place == N_PLACES - 1 else FIRST + place - 1
 
 
 @jit

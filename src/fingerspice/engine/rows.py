@@ -1,7 +1,4 @@
-"""Evaluations of a step at all its rows at once: the source, the area and the nonlinear term.
-
-These functions take plain arrays: a tuple of arrays handed to a compiled function costs more than the work done here.
-"""
+"""Evaluations of a stack's step at all its rows at once: the source, the area and the nonlinear term."""
 
 from __future__ import annotations
 
@@ -10,16 +7,12 @@ import math
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit, jit_fused, jit_inline, jit_rows
-from fingerspice.engine.system import DEGREE
+from fingerspice.base.compiled import jit, jit_fused, jit_rows, jit_within
+from fingerspice.engine.system import DEGREE, System
+from fingerspice.engine.work import DQ, FREE, GUESS, MORE, SCRATCH, SLOPE, SOURCE, X_GAP, Q, U, Work
 from fingerspice.numerics import chebyshev
 from fingerspice.numerics.lobatto import POINTS, ROWS
 from fingerspice.physics.contact import inverse_area
-
-# Rows of the work array `r` (N_FLAT, ROWS): source (V) and its slope (V/s), k_gap U, gap voltage and its guess (V),
-# gap w, 1/A (1/m^2), its slope by the gap voltage, and two rows of scratch.
-SOURCE, SLOPE, FREE, U, GUESS, X_GAP, Q, DQ, SCRATCH, MORE = range(10)
-N_FLAT = 10
 
 _PI_HIGH = 3.141592653589793
 _PI_LOW = 1.2246467991473532e-16
@@ -216,30 +209,28 @@ def _push(push: FloatArray, q0: float, area0: float, source: FloatArray, q: Floa
             pull[k, i] += (1.0 / q[i] - 1.0 / q0) * factor * source[i]
 
 
-@jit_inline
-def evaluate(
-    mobile: bool, k_gap: float, area0: float, q0: float, gap: FloatArray, push: FloatArray, tap: FloatArray,
-    tap_k: FloatArray, feed: FloatArray, tapped: FloatArray,
-    powers: FloatArray, slopes: FloatArray, lo: float, scale: float, curve: FloatArray, sign: float,
-    w: FloatArray, pull: FloatArray, r: FloatArray,
-) -> bool:  # fmt: skip
-    """Gap voltage, 1/A and nonlinear term from the modes w (see `fingerspice.engine.system.System`).
+@jit_within
+def evaluate(system: System, work: Work, level: int, sign: float) -> bool:
+    """Gap voltage, 1/A and nonlinear term, into `work.r` and `work.pull`, from the modes `work.w`.
 
-    With `scale` 0 the area comes from `curve`, else from the polynomial or series. Under `mobile`, r[GUESS] holds a
-    guess of the gap voltage; False where the area equation was not solved on the branch connected to it.
+    If `system.scale` is 0 the area comes from Eq. 4, else from the polynomial or series. Under `mobile`, r[GUESS] holds
+    a guess of the gap voltage; False where the area equation was not solved on the branch connected to it.
     """
-    _gap_voltage(k_gap, gap, w, r[SOURCE], r[X_GAP], r[U])
+    model, r, w, pull = system.model, work.r, work.w, work.pull
+    mobile, q0 = model.mobile, system.q0[level]
+    _gap_voltage(model.k_gap, system.gap[level], w, r[SOURCE], r[X_GAP], r[U])
     if mobile:
-        if not _solve_mobile(area0, powers, slopes, lo, scale, curve, sign, r):
+        if not _solve_mobile(
+            model.area0, system.powers, system.slopes, system.lo, system.scale, model.curve, sign, r
+        ):  # fmt: skip
             return False
-        _pull(tap, tap_k, feed, q0, r[SOURCE], r[Q], w, tapped, pull)
-        _push(push, q0, area0, r[SOURCE], r[Q], pull)
-        return True
-    if scale > 0.0:
-        polynomial_rows(powers, lo, scale, r[U], sign, r[Q])
+    elif system.scale > 0.0:
+        polynomial_rows(system.powers, system.lo, system.scale, r[U], sign, r[Q])
     else:
-        _long_area(curve, sign, r)
-    _pull(tap, tap_k, feed, q0, r[SOURCE], r[Q], w, tapped, pull)
+        _long_area(model.curve, sign, r)
+    _pull(system.tap[level], system.tap_k, system.feed[level], q0, r[SOURCE], r[Q], w, work.tapped, pull)
+    if mobile:
+        _push(system.push[level], q0, model.area0, r[SOURCE], r[Q], pull)
     return True
 
 

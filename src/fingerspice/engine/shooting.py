@@ -6,8 +6,8 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
-from fingerspice.engine.exponential import Tables
-from fingerspice.engine.march import DONE, march
+from fingerspice.engine.loop import march
+from fingerspice.engine.loopstate import DONE, N_PLACE, N_STEP, LoopState
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.readout import (
     BRANCH_LENGTH,
@@ -25,8 +25,8 @@ from fingerspice.engine.readout import (
     T,
 )  # fmt: skip
 from fingerspice.engine.repeat import Kept
+from fingerspice.engine.stackstep import Stack
 from fingerspice.engine.system import System
-from fingerspice.engine.work import Work
 from fingerspice.numerics.lobatto import NODES, ROWS
 from fingerspice.numerics.small import inverse
 
@@ -44,12 +44,11 @@ _CRUDE_TOL = 1e-4
 
 @jit
 def _map(
-    system: System, pace: Pace, tables: Tables, work: Work, integral: FloatArray, edges: FloatArray, terms: FloatArray,
-    series: FloatArray, u_before: float, turned: float, w: FloatArray, counters: IntArray, end: FloatArray,
+    stack: Stack, pace: Pace, u_before: float, turned: float, w: FloatArray, counters: IntArray, end: FloatArray,
     figures: FloatArray,
 ) -> int:  # fmt: skip
     """Integrate modes w over the table; `end` receives them at its end, times `turned`, `figures` peaks and errors."""
-    n = w.size
+    n, system, edges = w.size, stack.system, stack.edges
     control = np.zeros(N_CONTROL)
     control[T] = edges[0]
     control[U_BEFORE] = u_before
@@ -60,12 +59,12 @@ def _map(
         for k in range(n):
             y[i] += system.live[0, i, k] * w[k]
     count = np.zeros(N_COUNTERS, np.int64)
-    code = march(
-        system, pace, tables, work, integral, edges, terms, series, edges[-1], y, np.zeros(n + 1), control, count,
-        np.zeros(0), np.zeros(0, np.bool_), np.zeros((n, 0)),
-        Kept(np.zeros((0, 4)), np.zeros((0, n, ROWS))),
-        Steps(np.zeros((0, 4)), np.zeros((0, n, NODES)), np.zeros(6)), np.zeros((TRIED, 4)),
+    state = LoopState(
+        y, np.zeros(n + 1), control, count, np.zeros(N_STEP), np.zeros(N_PLACE, np.int64), np.zeros(0),
+        np.zeros(0, np.bool_), np.zeros((n, 0)), Kept(np.zeros((0, 4)), np.zeros((0, n, ROWS))),
+        Steps(np.zeros((0, 4)), np.zeros((0, n, NODES))), np.zeros((TRIED, 4)),
     )  # fmt: skip
+    code = march(stack, pace, state, edges[-1])
     for k in range(n):
         end[k] = 0.0
         for i in range(n):
@@ -82,16 +81,15 @@ def _map(
 
 @jit
 def close_period(
-    system: System, pace: Pace, tables: Tables, work: Work, integral: FloatArray, edges: FloatArray, terms: FloatArray,
-    series: FloatArray, u_before: float, turned: float, scale: float, known: bool, w: FloatArray, slope: FloatArray,
-    counters: IntArray, figures: FloatArray,
+    stack: Stack, pace: Pace, u_before: float, turned: float, scale: float, known: bool, w: FloatArray,
+    slope: FloatArray, counters: IntArray, figures: FloatArray,
 ) -> tuple[int, float]:  # fmt: skip
     """Find modes that a period maps onto themselves. A mode that does not decay keeps its first value.
 
     Parameters
     ----------
-    system, pace, tables, work, integral, edges, terms, series
-        As `march`; the edges span one period, or half of one.
+    stack, pace
+        As in `march`; the edges of its source span one period, or half of one.
     u_before : float
         Source voltage just before the period, V.
     turned : float
@@ -116,7 +114,7 @@ def close_period(
     defect : float
         Largest change of a live voltage over the last period integrated, V.
     """
-    n = w.size
+    n, system, edges = w.size, stack.system, stack.edges
     end = np.zeros(n)
     out = np.zeros(n)
     move = np.zeros(n)
@@ -136,9 +134,7 @@ def close_period(
     if not known:
         # First solve with the area fixed: near enough for the slope of the map to be that at the solution.
         crude = Pace(_CRUDE_TOL * scale, pace.h_max, pace.controlled, False)
-        code = _map(
-            system, crude, tables, work, integral, edges, terms, series, u_before, turned, w, counters, end, unused
-        )
+        code = _map(stack, crude, u_before, turned, w, counters, end, unused)
         if code != DONE:
             return code, worst
         figures[5] = unused[5] * (fine.tol / crude.tol) ** (1.0 / NODES)
@@ -150,7 +146,7 @@ def close_period(
         # The slope is needed no more accurately than the first guess is.
         here = fine if first else plain
         code = _map(
-            system, here, tables, work, integral, edges, terms, series, u_before, turned, w, counters, end, figures
+            stack, here, u_before, turned, w, counters, end, figures
         )  # fmt: skip
         if code != DONE:
             return code, worst
@@ -172,8 +168,7 @@ def close_period(
                 move_by = 0.01 * scale / max(np.abs(system.live[0, :, j]).max(), 1e-300)
                 shifted[j] += move_by
                 code = _map(
-                    system, here, tables, work, integral, edges, terms, series, u_before, turned, shifted, counters,
-                    out, unused,
+                    stack, here, u_before, turned, shifted, counters, out, unused
                 )  # fmt: skip
                 if code != DONE:
                     return code, worst

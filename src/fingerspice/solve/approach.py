@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.engine import march, readout
+from fingerspice.engine import loopstate, readout
 from fingerspice.engine import repeat as repetition
 from fingerspice.engine.network import Sources
 from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
@@ -100,7 +100,7 @@ def _period(track: Track, sources: Sources, stop: float, x: FloatArray, steps: i
     probe.keep(steps)
     code = probe.advance(sources, stop)
     track.counters[: readout.OUTPUT] += probe.counters[: readout.OUTPUT]
-    if code != march.DONE or not probe.keeps_all:
+    if code != loopstate.DONE or not probe.keeps_all:
         raise _LostError
     times = probe.kept.times[: int(probe.counters[readout.KEPT])]
     return _Period(probe, np.append(times[:1, 0], times[:, 2]), np.append(repetition.AT_EDGE, times[:, 3]))

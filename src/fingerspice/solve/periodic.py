@@ -9,9 +9,11 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
-from fingerspice.engine import march, shooting
+from fingerspice.engine import shooting
+from fingerspice.engine.loopstate import OUT_OF_RANGE
 from fingerspice.engine.model import choose_branch, gap_voltage
 from fingerspice.engine.pace import Pace
+from fingerspice.engine.stackstep import Stack
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import ErrorEstimate, SolveError, State, Status
 from fingerspice.solve.diagnosis import period_failure
@@ -147,10 +149,11 @@ def _close(problem: Problem, table: SourceTable, before: float, half: bool, rtol
             w = np.zeros(n)
         pace = Pace(max(tol, FINEST * scale), longest, True, False)
         code, defect = shooting.close_period(
-            system, pace, prepared.tables, prepared.work, prepared.integral, table.edges, table.terms, table.series,
-            before, turned, scale, known, w, slope, counts, figures,
+            Stack(
+                system, prepared.tables, prepared.work, prepared.integral, table.edges, table.terms, table.series
+            ), pace, before, turned, scale, known, w, slope, counts, figures,
         )  # fmt: skip
-        if code == march.OUT_OF_RANGE:
+        if code == OUT_OF_RANGE:
             prepared = prepare_system(scene, rtol, 1.5 * system.u_top)
             known = False
             continue

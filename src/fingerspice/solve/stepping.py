@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.engine import readout
+from fingerspice.engine import loopstate, readout
 from fingerspice.engine import repeat as repetition
+from fingerspice.engine.loopstate import LoopState
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import Pace
 from fingerspice.results.outcome import Status
@@ -65,6 +66,7 @@ class Stepping(Integration):
 
     settling: Settling
     control: FloatArray
+    error: FloatArray
     trial, asked = math.inf, math.inf
 
     def __init__(
@@ -76,6 +78,7 @@ class Stepping(Integration):
         longest = h_fixed or min(LONGEST_STEP * problem.waveform.shortest_time(), span, problem.max_step)
         self.pace = Pace(tol, longest, h_fixed == 0.0, problem.charge)
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
+        self.step, self.place = np.zeros(loopstate.N_STEP), np.zeros(loopstate.N_PLACE, np.int64)
         self.out = np.empty((width, t_out.size))
         self.repeated = 0
         self.recorder = Recorder(shown)
@@ -84,6 +87,13 @@ class Stepping(Integration):
     @property
     def t(self) -> float:
         return float(self.control[readout.T])
+
+    def loop_state(self) -> LoopState:
+        """The integration as the compiled loop takes and updates it."""
+        return LoopState(
+            self.y, self.error, self.control, self.counters, self.step, self.place, self.t_out, self.left, self.out,
+            self.kept, self.recorder.room, self.tried,
+        )  # fmt: skip
 
     @abstractmethod
     def _to(self, sources: Sources, t_end: float) -> Status:

@@ -1,4 +1,4 @@
-"""One integration of a series stack by exponential steps: the driver of `engine.march.march`."""
+"""One integration of a series stack by exponential steps: as `engine.loop` takes it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from typing import Literal
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.engine import march, readout
+from fingerspice.engine import loopstate, readout
 from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
+from fingerspice.engine.loop import march
 from fingerspice.engine.model import Model, dot, gap_voltage, write_row_at
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import end_row
 from fingerspice.engine.segment import Segment, source
+from fingerspice.engine.stackstep import Stack
 from fingerspice.engine.system import System, area_error, area_missed, area_range, build_system
 from fingerspice.engine.work import Work, new_work
 from fingerspice.numerics.lobatto import integral_table
@@ -124,26 +126,23 @@ class Track(Stepping):
     def advance(self, sources: Sources, t_end: float) -> int:
         """March to `t_end` (s) through the source's table."""
         p = self.prepared
-        mine = (self.y, self.error, self.control, self.counters)
+        stack = Stack(p.system, p.tables, p.work, p.integral, sources.edges, sources.terms, sources.series)
         while True:
-            code = march.march(
-                p.system, self.pace, p.tables, p.work, p.integral, sources.edges, sources.terms, sources.series, t_end,
-                *mine, self.t_out, self.left, self.out, self.kept, self.recorder.room, self.tried,
-            )  # fmt: skip
-            if code != march.PAUSED:
-                return int(code)
+            code = int(march(stack, self.pace, self.loop_state(), t_end))
+            if code != loopstate.PAUSED:
+                return code
             self.recorder.drain(self.counters)
 
     def _to(self, sources: Sources, t_end: float) -> Status:
         code = self.advance(sources, t_end)
-        if code == march.OUT_OF_RANGE:
+        if code == loopstate.OUT_OF_RANGE:
             raise OutOfRangeError(self.prepared.system.u_top)
-        if code == march.DONE:
+        if code == loopstate.DONE:
             return Status.SUCCESS
         if self.t > sources.edges[0]:
             # The loop updates the source's value at edges and at `t_end` only: a failed call leaves an old value.
             self.control[readout.U_BEFORE], _ = source(*_segment(sources, self.t, "left"))
-        return Status.TOO_MANY_STEPS if code == march.TOO_MANY else self.stuck()
+        return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
 
     def _look(self) -> bool:
         c = self.control

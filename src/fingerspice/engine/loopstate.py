@@ -1,0 +1,125 @@
+"""What the loop of exponential steps and its two kinds of circuits share: the run in progress and the step at hand.
+
+The step at hand is in arrays, because its parts are functions of their own, and because a run may pause between two
+steps and continue in a later call.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.compiled import jit_within
+from fingerspice.engine.readout import KEPT, OUTPUT, RECORDED, Steps, record, series_of, write_outputs
+from fingerspice.engine.repeat import Kept
+from fingerspice.numerics.small import copy_to
+
+# Codes returned by the loop: the end is reached; no step is short enough (a fold, or an error that cannot be met); a
+# gap voltage is beyond the range of the area's polynomial; too many steps; `Steps` is full, or Python may react to
+# Ctrl-C (call again); the areas need a reference that has not been made yet.
+DONE, NO_STEP, OUT_OF_RANGE, TOO_MANY, PAUSED, REFERENCE = range(6)
+# Codes of the parts of a step, beside these: go on with the next part; start again with this step; try another length.
+GO_ON, AGAIN, RETRY = -1, -2, -3
+
+# Entries of `LoopState.step`: length being tried, that wanted before a boundary or a zero cut it short, and that to
+# which the exponential tables in use belong, s; fraction of the length that counts, and the time then reached, s; error
+# of the step, which controls its length, and of the whole run, V; largest ratio of a move of the gap voltage to the
+# move of a state voltage.
+LENGTH, WANTED, TABLED, THETA, T_NEW, STEP_ERROR, RUN_ERROR, GROWN = range(8)
+# The source's segment at hand and the time since its start, the end of the step's range, and the time since which
+# evaluations are counted, s; fraction of the step at which the gap voltage dips off its branch, or 0.
+START, EDGE, SINCE, STOP, BEGUN, BELOW = range(8, 14)
+N_STEP = 14
+# Entries of `LoopState.place`: whether the run is paused; number of the segment, the reference area, and the tables;
+# entry of `control` for the length of a first step after an edge or a zero, -1 for other steps; lengths tried; branches
+# left in a row without a step; whether the iteration converged, and did at the last length that was rejected; first
+# node off its branch, or 0; the area whose gap voltage ends the step by a zero, or -1.
+IS_PAUSED, INDEX, LEVEL, SLOT, FRESH, TRIES, FLIPS, CONVERGED, TRUSTED, WRONG, CROSSED = range(11)
+# Evaluations at the last edge of the source; most steps of this call; number of iterations without convergence, and of
+# steps accepted before this call.
+EVALUATED, MOST, UNCONVERGED, ACCEPTED_BEFORE = range(11, 15)
+N_PLACE = 15
+
+
+class LoopState(NamedTuple):
+    """An integration in progress; the loop updates all arrays.
+
+    Attributes
+    ----------
+    y : ndarray
+        State voltages (V), areas with a time constant, and charges (C).
+    error : ndarray
+        Estimated error of the modes, signed; of a stack, then the number of the reference area that they belong to.
+    control, counters : ndarray
+        Bookkeeping, see `engine.readout`.
+    step, place : ndarray, shape (N_STEP,) and (N_PLACE,)
+        The step at hand; its entries are named above.
+    t_out, left, out : ndarray
+        Output times (s, ascending), whether the left-hand limit is meant, and the columns to fill.
+    kept : Kept
+        Takes the first steps, for repeated periods, until it is full; `counters` tells how many steps there were.
+    steps : Steps
+        Takes all steps, for figures of the run.
+    tried : ndarray, shape (TRIED, 4)
+        Ring buffer of the last steps tried: start and length (s), ratio of the error to the allowed one, number from 1.
+    """
+
+    y: FloatArray
+    error: FloatArray
+    control: FloatArray
+    counters: IntArray
+    step: FloatArray
+    place: IntArray
+    t_out: FloatArray
+    left: NDArray[np.bool_]
+    out: FloatArray
+    kept: Kept
+    steps: Steps
+    tried: FloatArray
+
+
+@jit_within
+def is_wanted(s: LoopState, t_new: float) -> bool:
+    """Whether a step that ends at `t_new` (s) has outputs, or is recorded or kept."""
+    first = s.counters[OUTPUT]
+    return s.steps.times.shape[0] > 0 or s.kept.times.size > 0 or (first < s.t_out.size and s.t_out[first] <= t_new)
+
+
+@jit_within
+def write_step(
+    s: LoopState, t: float, mark: float, values: FloatArray, coefficients: FloatArray, outputs: FloatArray
+) -> None:
+    """Record a finished step that began at t (s), keep it for repetition, and write its outputs.
+
+    Parameters
+    ----------
+    mark : float
+        What the step ends with: `repeat.AT_ZERO`, `repeat.AT_EDGE`, or 0.
+    values, coefficients : ndarray, shape (n_column, ROWS)
+        The columns at the rows of the step; takes their Chebyshev coefficients.
+    outputs : ndarray, shape (2, WRITTEN_AT_ONCE)
+        Scratch.
+    """
+    counters, kept_times = s.counters, s.kept.times
+    h, theta, t_new = s.step[LENGTH], s.step[THETA], s.step[T_NEW]
+    if s.steps.times.shape[0] > 0:
+        record(s.steps.times, s.steps.values, counters[RECORDED], t, h, t_new, theta, values)
+        counters[RECORDED] += 1
+    first = counters[OUTPUT]
+    has_outputs = first < s.t_out.size and s.t_out[first] <= t_new
+    if not has_outputs and kept_times.size == 0:
+        return
+    for c in range(s.out.shape[0]):
+        series_of(values[c], coefficients[c])
+    place = counters[KEPT]
+    counters[KEPT] += 1
+    if place < kept_times.shape[0]:
+        kept_times[place, 0], kept_times[place, 1], kept_times[place, 2], kept_times[place, 3] = t, h, t_new, mark
+        copy_to(s.kept.series[place], coefficients[: s.out.shape[0]])
+    if has_outputs:
+        counters[OUTPUT] += write_outputs(
+            t, h, theta, t_new, 0.0, False, coefficients, outputs, first, 0, s.t_out, s.left, s.out
+        )  # fmt: skip

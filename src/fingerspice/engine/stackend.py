@@ -1,0 +1,176 @@
+"""The end of a step of a series stack, and what remains of it: outputs, errors, the state; see `engine.stackstep`."""
+
+from __future__ import annotations
+
+from fingerspice.base.compiled import jit_within
+from fingerspice.engine.charge import charge_step
+from fingerspice.engine.loopstate import (
+    BELOW,
+    CROSSED,
+    FLIPS,
+    FRESH,
+    GO_ON,
+    GROWN,
+    LENGTH,
+    LEVEL,
+    NO_STEP,
+    OUT_OF_RANGE,
+    RUN_ERROR,
+    SINCE,
+    START,
+    STOP,
+    T_NEW,
+    THETA,
+    WRONG,
+    LoopState,
+    is_wanted,
+    write_step,
+)
+from fingerspice.engine.model import dot, turns_at_zero
+from fingerspice.engine.nodes import node_error
+from fingerspice.engine.pace import Pace
+from fingerspice.engine.readout import (
+    ACCEPTED,
+    ALLOWED,
+    BRANCH_LENGTH,
+    BRANCH_START,
+    ERROR_V,
+    H_AFTER_ZERO,
+    LAST_Q,
+    MAGNIFIED,
+    MARGIN,
+    N_PLACES,
+    PEAK_U,
+    SIGN,
+    U_BEFORE,
+    U_GAP,
+    ZEROS,
+    H,
+    T,
+    account,
+    at,
+    basis_at,
+    error_at,
+    layers,
+)
+from fingerspice.engine.repeat import AT_EDGE, AT_ZERO
+from fingerspice.engine.stackstep import Stack, flip, source_voltage
+from fingerspice.engine.work import DQ, SOURCE, X_GAP, Q, U
+from fingerspice.engine.zeros import zero
+from fingerspice.numerics.lobatto import END
+
+
+@jit_within
+def complete_stack(c: Stack, pace: Pace, s: LoopState) -> int:
+    """End an accepted step at a zero or an edge, write its outputs, account for its errors, and move to its end."""
+    step, place, control, t = s.step, s.place, s.control, s.control[T]
+    h, since, length = step[LENGTH], step[SINCE], step[STOP] - step[START]
+    reached = since + h
+    step[THETA], place[CROSSED] = 1.0, -1
+    if reached >= length or length - reached <= 1e-12 * h:
+        reached = length
+        step[THETA] = min(1.0, (length - since) / h)
+    if (place[WRONG] > 0 or step[BELOW] > 0.0) and place[FLIPS] < 2:
+        crossing = zero(c.work.r[U], control[SIGN], place[WRONG], step[BELOW], c.work.coefficients[0])
+        if since + crossing * h <= reached and crossing <= step[THETA]:
+            step[THETA], reached, place[CROSSED] = crossing, since + crossing * h, 0
+            if reached <= since:
+                return flip(s)
+    place[FLIPS] = 0
+    step[T_NEW] = step[STOP] if reached == length else step[START] + reached
+    _write(c, pace, s, t)
+    _account(c, s)
+    _move(c, pace.charge, s)
+    if place[CROSSED] >= 0 and not _cross(c, s):
+        return NO_STEP
+    control[T], step[SINCE] = step[T_NEW], reached
+    if control[T] >= step[STOP]:
+        control[U_BEFORE] = source_voltage(c, s, control[T] - step[START])
+    s.counters[ACCEPTED] += 1
+    return OUT_OF_RANGE if control[PEAK_U] > c.system.u_top else GO_ON
+
+
+@jit_within
+def _write(c: Stack, pace: Pace, s: LoopState, t: float) -> None:
+    """Charge of a step that began at t (s), and its outputs."""
+    system, work, step, place, level = c.system, c.work, s.step, s.place, s.place[LEVEL]
+    model, shown, values = system.model, system.shown[level], work.values
+    n_shown = shown.shape[0]
+    if pace.charge:
+        charge_step(
+            system, work, level, c.integral, step[LENGTH], s.y[work.w0.size], step[THETA], s.control, values[n_shown],
+            values[n_shown + 1],
+        )  # fmt: skip
+    if not is_wanted(s, step[T_NEW]):
+        return
+    layers(model.mobile, model.area0, system.k_shown, shown, work.w, work.r[SOURCE], work.r[Q], values)
+    mark = AT_ZERO if place[CROSSED] >= 0 else (AT_EDGE if step[T_NEW] == step[STOP] else 0.0)
+    write_step(s, t, mark, values, work.coefficients, work.outputs)
+
+
+@jit_within
+def _account(c: Stack, s: LoopState) -> None:
+    """Peaks of a step, and the errors of the run in it."""
+    system, work, step, control, level = c.system, c.work, s.step, s.control, s.place[LEVEL]
+    model, r = system.model, c.work.r
+    control[MAGNIFIED] = max(control[MAGNIFIED], step[GROWN])
+    account(
+        model.mobile and model.coupled, model.area0, system.stress, r[U], r[Q], r[X_GAP], r[DQ], step[THETA],
+        step[RUN_ERROR], control,
+    )  # fmt: skip
+    v_error = node_error(
+        model.mobile, model.area0, system.node[level], system.k_node, system.gap[level], work.w, r, work.places
+    )  # fmt: skip
+    control[ERROR_V] = max(control[ERROR_V], v_error)
+
+
+@jit_within
+def _move(c: Stack, charge: bool, s: LoopState) -> None:
+    """State and error at the end of a step, or where it is cut short."""
+    system, work, control, theta, y = c.system, c.work, s.control, s.step[THETA], s.y
+    n, r, w, w0, places, basis, error = work.w0.size, work.r, work.w, work.w0, work.places, work.basis, s.error
+    n_shown = system.shown.shape[1]
+    if theta < 1.0:
+        basis_at(theta, basis)
+        for k in range(n):
+            w0[k] = at(w[k], basis)
+        error_at(places, theta, error)
+        if charge:
+            y[n], control[LAST_Q] = at(work.values[n_shown], basis), at(r[Q], basis)
+        control[U_GAP] = 0.0 if s.place[CROSSED] >= 0 else at(r[U], basis)
+    else:
+        for k in range(n):
+            w0[k], error[k] = w[k, END], places[k, N_PLACES - 1]
+        if charge:
+            y[n], control[LAST_Q] = work.values[n_shown, END], r[Q, END]
+        control[U_GAP] = r[U, END]
+    live = system.live[s.place[LEVEL]]
+    for i in range(n):
+        y[i] = 0.0
+        for k in range(n):
+            y[i] += live[i, k] * w0[k]
+
+
+@jit_within
+def _cross(c: Stack, s: LoopState) -> bool:
+    """Change the branch at a zero of the gap voltage, which ends a step; False at a fold there."""
+    step, control, model, t_new = s.step, s.control, c.system.model, s.step[T_NEW]
+    control[SIGN] = -control[SIGN]
+    control[BRANCH_LENGTH] = t_new - control[BRANCH_START]
+    control[BRANCH_START] = t_new
+    s.counters[ZEROS] += 1
+    if turns_at_zero(model, dot(model.gap, s.y), control[SIGN]):
+        control[T] = t_new
+        control[SIGN] = -control[SIGN]
+        control[MARGIN] = 0.0
+        return False
+    # The area has a kink here, which excites fast modes again: the first step is chosen as after other zeros.
+    if step[BELOW] > 0.0:
+        # The gap voltage returns to 0 V soon.
+        control[H] = 2.0 * (step[BELOW] - step[THETA]) * step[LENGTH]
+        control[ALLOWED] = 0.0
+    elif control[H_AFTER_ZERO] > 0.0:
+        control[H] = control[H_AFTER_ZERO]
+        control[ALLOWED] = 0.0
+    s.place[FRESH] = H_AFTER_ZERO
+    return True
