@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 import fingerspice as fs
-from fingerspice.engine import loop, netmarch
+from fingerspice.engine import loop
 from timing import median_seconds
 
 HERE = Path(__file__).resolve().parent
@@ -40,7 +40,7 @@ Report = dict[str, Any]
 def counted() -> Iterator[list[int]]:
     """Count the calls from Python to the compiled loops in the block."""
     calls = [0]
-    originals = {module: module.march for module in (loop, netmarch)}
+    originals = {module: module.march for module in (loop,)}
 
     def counting(inner: Callable[..., int]) -> Callable[..., int]:
         def outer(*arguments: Any) -> int:

@@ -11,9 +11,9 @@ import pytest
 from numpy.polynomial import Polynomial
 from scipy.optimize import brentq
 
-from fingerspice.engine import charge, netcharge, netrows, readout, rows
+from fingerspice.engine import charge, netcharge, netform, readout, work
 from fingerspice.engine.model import Model
-from fingerspice.engine.netrows import Form
+from fingerspice.engine.netform import Form
 from fingerspice.engine.readout import N_PLACES
 from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS
 
@@ -140,9 +140,9 @@ def engine_account(
     u, _, area = step.at(POINTS, 0.0)
     w = np.array([m(POINTS) for m in step.modes])
     places = np.array([e(POINTS[PLACES]) for e in step.errors])
-    r = np.zeros((rows.N_FLAT, ROWS))
-    r[rows.SOURCE], r[rows.U], r[rows.Q] = step.source(POINTS), u, 1.0 / area
-    r[rows.DQ], r[rows.X_GAP] = -slope_at(u) / area**2, step.gap @ w
+    r = np.zeros((work.N_FLAT, ROWS))
+    r[work.SOURCE], r[work.U], r[work.Q] = step.source(POINTS), u, 1.0 / area
+    r[work.DQ], r[work.X_GAP] = -slope_at(u) / area**2, step.gap @ w
     control = np.zeros(readout.N_CONTROL)
     control[readout.COLLECTED] = collected
     control[readout.LAST_Q] = 0.0 if last_area is None else 1.0 / last_area
@@ -203,9 +203,9 @@ def test_what_a_stack_s_polynomials_miss_between_nodes_does_not_leak(law: str) -
     w[:, FIRST:] += missed
     places = np.zeros((2, N_PLACES))
     places[:, 1 : N_PLACES - 1] = missed
-    r = np.zeros((rows.N_FLAT, ROWS))
-    r[rows.SOURCE], r[rows.U], r[rows.Q] = step.source(POINTS), u, 1.0 / area
-    r[rows.DQ], r[rows.X_GAP] = -slope_at(u) / area**2, step.gap @ w
+    r = np.zeros((work.N_FLAT, ROWS))
+    r[work.SOURCE], r[work.U], r[work.Q] = step.source(POINTS), u, 1.0 / area
+    r[work.DQ], r[work.X_GAP] = -slope_at(u) / area**2, step.gap @ w
     control = np.zeros(readout.N_CONTROL)
     charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, 0.0, control)
     leaked = size * H * 3e-7 * np.abs(step.slow).sum()
@@ -301,12 +301,12 @@ def engine_charge(
     """What stayed (2,) and `control` after the engine's account of a step."""
     _, u, area = step.at(POINTS, 0.0)
     areas = np.zeros((8, 1, ROWS))
-    areas[netrows.AREA], areas[netrows.MORE] = area, area - A0
-    areas[netrows.SLOPE] = 0.0 if step.slow else slope_at(u[0])
+    areas[netform.AREA], areas[netform.MORE] = area, area - A0
+    areas[netform.SLOPE] = 0.0 if step.slow else slope_at(u[0])
     z = np.array([[step.charge(x, 0.0) for x in POINTS]])
     control, collected = np.zeros(readout.N_CONTROL), np.array([[before], [0.0]])
     form = form_of(step)
-    work = netrows.new_work(len(places), len(places), form.c.size, form.cell.size, 1, 1)
+    work = netform.new_work(len(places), len(places), form.c.size, form.cell.size, 1, 1)
     work.places[:], work.off[:, : len(places)] = places, missed
     netcharge.charge_error(
         form, work, H, step.lost[None, :], step.g, theta, np.ascontiguousarray(u), areas, z, collected, control

@@ -7,16 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from fingerspice.engine.coupling import (
-    STIFF,
-    Coupling,
-    answer_alone,
-    answer_mobile,
-    answer_together,
-    cell_currents,
-    fill_coupling,
-    new_coupling,
-)
+from fingerspice.engine.coupling import STIFF, Coupling, fill_coupling, new_coupling
+from fingerspice.engine.currents import Moving, answer_alone, answer_mobile, answer_together, cell_currents
 from fingerspice.numerics.lobatto import ROWS
 from fingerspice.numerics.small import diagonalise
 
@@ -141,10 +133,12 @@ def test_currents_and_the_distance_to_the_fold_under_mobile(seed: int, sizes: tu
     chi = np.ascontiguousarray(x.held @ given.w + x.from_slopes @ given.s)
     rho, share, known = np.zeros((n_f, ROWS)), np.zeros((n_f, ROWS)), np.zeros((n_area, ROWS))
     least, first = np.zeros(ROWS), np.searchsorted(given.home, np.arange(n_area + 1))
+    moving = Moving(
+        given.u[given.cell].copy(), given.more, given.slope, given.rate, chi, eta_of(x, given), rho, known, share
+    )  # fmt: skip
     answer_mobile(
-        n_area > 1, x.answer, x.gap, x.leak, x.cross, given.home, first, given.cell, given.u[given.cell].copy(),
-        given.more, given.slope, given.rate, chi, eta_of(x, given), rho, known, share,
-        np.zeros((n_f, n_area + 1, ROWS)), np.zeros((n_f, n_f + 1, ROWS)), least,
+        n_area > 1, x, given.home, first, given.cell, moving, np.zeros((n_f, n_area + 1, ROWS)),
+        np.zeros((n_f, n_f + 1, ROWS)), least,
     )  # fmt: skip
     want, distance = given.solved(mobile=True)
     np.testing.assert_allclose(currents_of(x, rho), want, rtol=0.0, atol=1e-10 * np.abs(want).max())

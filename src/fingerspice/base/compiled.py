@@ -14,25 +14,27 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from numba import njit, types
-from numba.core import cgutils, config
+from numba import njit
+from numba.core import config
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Flags, compile_extra
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.typing.templates import make_concrete_template
-from numba.extending import intrinsic
-from numba.np.arrayobj import make_array
 
 from fingerspice.base.announcing import Compiling
 from fingerspice.base.errors import InputError
 
-Lent = TypeVar("Lent")
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGE = Path(__file__).resolve().parents[1]
 #: Folders whose functions compiled code of other files may call.
 SHARED_FOLDERS = ("engine", "numerics", "physics")
-_SOURCES = [Path(__file__).resolve(), *sorted(p for name in SHARED_FOLDERS for p in (_PACKAGE / name).rglob("*.py"))]
+_OWN = Path(__file__).resolve()
+_SOURCES = [
+    _OWN,
+    _OWN.with_name("borrowing.py"),
+    *sorted(p for name in SHARED_FOLDERS for p in (_PACKAGE / name).rglob("*.py")),
+]
 # By content, so that a package that is copied, or packed into an image, keeps its compiled code.
 _STAMP = hashlib.sha256(b"".join(p.name.encode() + p.read_bytes() for p in _SOURCES)).hexdigest()
 _COMPILER = Compiling()
@@ -207,6 +209,29 @@ def _cached(*, noalias: bool = False, **options: Any) -> Callable[[Function], Fu
     return compile_when_called
 
 
+def jit_by_kind(**functions: Callable[..., Any]) -> Callable[[Function], Function]:
+    """A function that stands for one of several in compiled code, chosen by the class of its first argument.
+
+    Parameters
+    ----------
+    **functions
+        Compiled functions by the names of the classes, which are named tuples. All take the same arguments as the
+        function decorated, whose body is never run.
+    """
+
+    def stands_for(function: Function) -> Function:
+        chosen: Any = njit(function)
+
+        def called(args: Any) -> Any:
+            return functions[args[0].instance_class.__name__]
+
+        chosen.get_call_template = lambda args, kws: called(args).get_call_template(args, kws)
+        chosen.get_overload = lambda args: called(args).get_overload(args)
+        return cast(Function, chosen)
+
+    return stands_for
+
+
 if cast(Any, config).DISABLE_JIT:
     raise InputError("NUMBA_DISABLE_JIT is set: uncompiled, a run of seconds would take a day; allowed: unset, or 0")
 _drop_stale_cache()
@@ -221,33 +246,3 @@ jit_rows = _cached(fastmath={"contract", "reassoc"}, noalias=True)
 jit_within = _cached(forceinline=True)
 # Inlined by numba before compilation, for the same reason.
 jit_inline = _cached(inline="always")
-
-
-@intrinsic
-def _borrow(typing: Any, value: Any) -> Any:
-    """The same array, or tuple of arrays, without a reference count, which costs an atomic operation for each view.
-
-    The argument must outlive the result: borrow only arguments of the function, never arrays that it allocates, because
-    these are freed after their last use by name.
-    """
-
-    make: Any = make_array
-    null: Any = cgutils.get_null_value
-
-    def lent(context: Any, builder: Any, kind: Any, item: Any) -> Any:
-        if isinstance(kind, types.Array):
-            view = make(kind)(context, builder, item)
-            view.meminfo, view.parent = null(view.meminfo.type), null(view.parent.type)
-            return view._getvalue()
-        if isinstance(kind, types.BaseTuple):
-            for i, part in enumerate(cast(Any, kind).types):
-                item = builder.insert_value(item, lent(context, builder, part, builder.extract_value(item, i)), i)
-        return item
-
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        return lent(context, builder, signature.args[0], values[0])
-
-    return value(value), generate
-
-
-borrow: Callable[[Lent], Lent] = cast(Any, _borrow)

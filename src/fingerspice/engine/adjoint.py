@@ -25,7 +25,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import borrow, jit, jit_within
+from fingerspice.base.borrowing import borrow
+from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.adjointsteps import MOST_PARTS, SHORTEST, Course, Wanted, crosses, cut, parabola
 from fingerspice.engine.system import System
 from fingerspice.numerics.moments import moments

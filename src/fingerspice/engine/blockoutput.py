@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import borrow, jit, jit_within
+from fingerspice.base.borrowing import borrow
+from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.blockcharge import (
     Course,
     bend_at,

@@ -1,18 +1,13 @@
 """The loop of exponential steps: it tries lengths until the error of a step is small enough, and goes on to the end.
 
 What a step consists of depends on the circuit: a stack has one area and one source (`engine.stackstep`), a network any
-number of both (`engine.netstep`). The functions at the end of this file stand for those of the circuit at hand, which
-the compiler chooses by its type.
+number of both (`engine.meshstep`). The first functions below stand for those of the circuit at hand.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
-from numba.extending import overload
-
-from fingerspice.base.compiled import borrow, jit, jit_within
+from fingerspice.base.borrowing import borrow
+from fingerspice.base.compiled import jit, jit_by_kind, jit_within
 from fingerspice.engine.loopstate import (
     CONVERGED,
     DONE,
@@ -26,9 +21,11 @@ from fingerspice.engine.loopstate import (
     WANTED,
     LoopState,
 )  # fmt: skip
+from fingerspice.engine.mesh import Mesh, begin_mesh, start_mesh
+from fingerspice.engine.meshstep import attempt_mesh, beyond_mesh, complete_mesh, end_mesh, refuse_mesh
 from fingerspice.engine.pace import Pace, accept, allowed_factor, rung, shorten
 from fingerspice.engine.readout import ACCEPTED, REJECTED, H, T, note
-from fingerspice.engine.stackend import complete_stack
+from fingerspice.engine.stackend import complete_stack, end_stack
 from fingerspice.engine.stackstep import (
     Stack,
     attempt_stack,
@@ -38,7 +35,47 @@ from fingerspice.engine.stackstep import (
     start_stack,
 )  # fmt: skip
 
-Circuit = Stack
+Circuit = Stack | Mesh
+
+
+@jit_by_kind(Stack=start_stack, Mesh=start_mesh)
+def start(circuit: Circuit, state: LoopState) -> None:
+    """Begin a call of the loop."""
+
+
+@jit_by_kind(Stack=begin_stack, Mesh=begin_mesh)
+def begin(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
+    """Find where the next step starts, and the length to try first."""
+    raise NotImplementedError
+
+
+@jit_by_kind(Stack=attempt_stack, Mesh=attempt_mesh)
+def attempt(circuit: Circuit, pace: Pace, state: LoopState) -> int:
+    """Solve a step of the length to be tried, and estimate its error."""
+    raise NotImplementedError
+
+
+@jit_by_kind(Stack=refuse_stack, Mesh=refuse_mesh)
+def refuse(circuit: Circuit, state: LoopState) -> int:
+    """Why no shorter step would do after one that was rejected; GO_ON if one may."""
+    raise NotImplementedError
+
+
+@jit_by_kind(Stack=beyond_stack, Mesh=beyond_mesh)
+def beyond(circuit: Circuit, pace: Pace, state: LoopState) -> float:
+    """Fraction of a rejected step at which the next one should end, if it went far beyond a zero; or 2."""
+    raise NotImplementedError
+
+
+@jit_by_kind(Stack=complete_stack, Mesh=complete_mesh)
+def complete(circuit: Circuit, pace: Pace, state: LoopState) -> int:
+    """End an accepted step, write its outputs, account for its errors, and move to its end."""
+    raise NotImplementedError
+
+
+@jit_by_kind(Stack=end_stack, Mesh=end_mesh)
+def end(circuit: Circuit, state: LoopState) -> None:
+    """End a call of the loop."""
 
 
 @jit
@@ -47,7 +84,7 @@ def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
 
     Parameters
     ----------
-    circuit : Stack
+    circuit : Stack or Mesh
         The circuit, its sources, tables and scratch arrays.
     pace : Pace
         Rules for the lengths of the steps.
@@ -63,6 +100,7 @@ def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
     """
     # Arrays without a reference count: it would cost an atomic operation at every access to a tuple.
     circuit, state = borrow(circuit), borrow(state)
+    state.place[TRUSTED] = 1
     start(circuit, state)
     while True:
         code = begin(circuit, pace, state, t_end)
@@ -71,6 +109,7 @@ def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
         if code == GO_ON:
             code = complete(circuit, pace, state)
         if code >= DONE:
+            end(circuit, state)
             return code
 
 
@@ -78,7 +117,7 @@ def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
 def _find_length(circuit: Circuit, pace: Pace, state: LoopState) -> int:
     """Solve a step with ever shorter lengths until its error is small enough, and choose the next step's length."""
     step, place, control, counters = state.step, state.place, state.control, state.counters
-    step[WANTED], place[TRIES], place[TRUSTED] = control[H], 1, 1
+    step[WANTED], place[TRIES] = control[H], 1
     while True:
         code = attempt(circuit, pace, state)
         if code == RETRY:
@@ -99,68 +138,8 @@ def _find_length(circuit: Circuit, pace: Pace, state: LoopState) -> int:
         code = refuse(circuit, state)
         if code != GO_ON:
             return code
-        end = beyond(circuit, state)
-        if end < 2.0:
-            step[LENGTH] = rung(h * min(0.9, end))
+        reach = beyond(circuit, pace, state)
+        if reach < 2.0:
+            step[LENGTH] = rung(h * min(0.9, reach))
         else:
             step[LENGTH] = step[WANTED] = shorten(h, factor, control)
-
-
-def start(circuit: Circuit, state: LoopState) -> None:
-    """Begin a call of the loop."""
-    raise NotImplementedError
-
-
-def begin(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
-    """Find where the next step starts, and the length to try first."""
-    raise NotImplementedError
-
-
-def attempt(circuit: Circuit, pace: Pace, state: LoopState) -> int:
-    """Solve a step of the length to be tried, and estimate its error."""
-    raise NotImplementedError
-
-
-def refuse(circuit: Circuit, state: LoopState) -> int:
-    """Why no shorter step would do after one that was rejected; GO_ON if one may."""
-    raise NotImplementedError
-
-
-def beyond(circuit: Circuit, state: LoopState) -> float:
-    """Fraction of a rejected step at which the next one should end, if it went far beyond a zero; or 2."""
-    raise NotImplementedError
-
-
-def complete(circuit: Circuit, pace: Pace, state: LoopState) -> int:
-    """End an accepted step, write its outputs, account for its errors, and move to its end."""
-    raise NotImplementedError
-
-
-@overload(start, inline="always", strict=False)
-def _start(circuit: Any, state: Any) -> Callable[..., Any]:
-    return lambda circuit, state: start_stack(circuit, state)
-
-
-@overload(begin, inline="always", strict=False)
-def _begin(circuit: Any, pace: Any, state: Any, t_end: Any) -> Callable[..., Any]:
-    return lambda circuit, pace, state, t_end: begin_stack(circuit, pace, state, t_end)
-
-
-@overload(attempt, inline="always", strict=False)
-def _attempt(circuit: Any, pace: Any, state: Any) -> Callable[..., Any]:
-    return lambda circuit, pace, state: attempt_stack(circuit, pace, state)
-
-
-@overload(refuse, inline="always", strict=False)
-def _refuse(circuit: Any, state: Any) -> Callable[..., Any]:
-    return lambda circuit, state: refuse_stack(circuit, state)
-
-
-@overload(beyond, inline="always", strict=False)
-def _beyond(circuit: Any, state: Any) -> Callable[..., Any]:
-    return lambda circuit, state: beyond_stack(circuit, state)
-
-
-@overload(complete, inline="always", strict=False)
-def _complete(circuit: Any, pace: Any, state: Any) -> Callable[..., Any]:
-    return lambda circuit, pace, state: complete_stack(circuit, pace, state)

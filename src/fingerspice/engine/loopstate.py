@@ -38,10 +38,13 @@ N_STEP = 14
 # left in a row without a step; whether the iteration converged, and did at the last length that was rejected; first
 # node off its branch, or 0; the area whose gap voltage ends the step by a zero, or -1.
 IS_PAUSED, INDEX, LEVEL, SLOT, FRESH, TRIES, FLIPS, CONVERGED, TRUSTED, WRONG, CROSSED = range(11)
-# Evaluations at the last edge of the source; most steps of this call; number of iterations without convergence, and of
-# steps accepted before this call.
-EVALUATED, MOST, UNCONVERGED, ACCEPTED_BEFORE = range(11, 15)
-N_PLACE = 15
+# Evaluations at the last edge of the source; most steps; in this call, number of iterations without convergence, of
+# steps accepted before it, and of those at which it pauses.
+EVALUATED, MOST, UNCONVERGED, ACCEPTED_BEFORE, PAUSE_AT = range(11, 16)
+# Of a network: whether the call has begun; is within a jump of the sources; at an edge; whether no voltage follows a
+# source at once; whether the areas are coupled; and whether no mode counts as stiff.
+HAS_BEGUN, IN_JUMP, AT_EDGE, SMOOTH, SEVERAL, WHOLE = range(16, 22)
+N_PLACE = 22
 
 
 class LoopState(NamedTuple):

@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.exponential import between, largest, left_over
+from fingerspice.base.compiled import jit, jit_rows, jit_within
+from fingerspice.engine.exponential import Tables, between, largest, left_over
+from fingerspice.engine.netform import LIN, PULL, USED, Form, Leaks, W, Work
 from fingerspice.engine.netrows import combine
 from fingerspice.engine.readout import N_PLACES
 from fingerspice.engine.zeros import first_wrong, leaves
@@ -91,22 +92,26 @@ def _largest_voltage(shape: FloatArray, follow: FloatArray, m: int, off: FloatAr
     return largest_one
 
 
-@jit
+@jit_within
 def assess(
-    rates: FloatArray, h: float, shape: FloatArray, follow: FloatArray, gap: FloatArray, size: FloatArray,
-    phi: FloatArray, miss: FloatArray, error: FloatArray, carried: FloatArray, w: FloatArray, lin: FloatArray,
-    pull: FloatArray, used: FloatArray, s: FloatArray, magnified: float, off: FloatArray, places: FloatArray,
-    run: FloatArray,
+    form: Form, work: Work, leaks: Leaks, tables: Tables, slot: int, h: float, error: FloatArray, magnified: float
 ) -> float:  # fmt: skip
     """Error of a converged step, V, from the interpolation errors between its nodes; see `exponential.assess`.
 
-    `places` (m, N_PLACES) receives the errors of the modes, `run` (n_area, N_PLACES) those of the gaps' voltages; both
-    contain the residual of the iteration and the errors of earlier steps. `off` (5, m + n_s) receives the interpolation
-    errors of the modes, and of the sources behind them, at the points between the nodes and at the end; its last row is
-    that of a decay which is over before the first node.
+    `work.places` receives the errors of the modes, `work.run` those of the gaps' voltages; both contain the residual of
+    the iteration and the errors of earlier steps. `work.off` receives the interpolation errors of the modes, and of the
+    sources behind them, at the points between the nodes and at the end; its last row is that of a decay which is over
+    before the first node.
     """
+    modes, s, off, places, run, carried, size = (
+        work.modes, work.s, work.off, work.places, work.run, work.carried, work.size
+    )  # fmt: skip
+    w, lin, pull, used = modes[W], modes[LIN], modes[PULL], modes[USED]
+    shape, follow, gap, rates, phi, miss = (
+        form.shape, form.follow, form.gap, leaks.rates, tables.phi[slot], tables.miss[slot]
+    )  # fmt: skip
     n, m = shape.shape[0], w.shape[0]
-    left = np.zeros(4)
+    left = work.room[2]
     for j in range(s.shape[0]):
         off[0, m + j], off[1, m + j], off[2, m + j] = between(s[j])
     for k in range(w.shape[0]):

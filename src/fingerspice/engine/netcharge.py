@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.base.compiled import jit, jit_rows
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.charge import LOBE
 from fingerspice.engine.exponential import between
-from fingerspice.engine.netrows import AREA, MORE, SLOPE, Form, Work
+from fingerspice.engine.netform import AREA, CELL_U, MORE, SLOPE, D, Form, J, Leaks, W, Work
 from fingerspice.engine.readout import ERROR_Q, N_PLACES, row_of
 from fingerspice.numerics.lobatto import DERIVATIVE, NODES, POINTS, ROWS
 
@@ -49,17 +49,18 @@ def _leaks(
             leak[i] += c * (more[i] - more[0]) * slope / h
 
 
-@jit
+@jit_within
 def charge_rows(
-    mobile: bool, h: float, stored: FloatArray, stored_s: FloatArray, lost: FloatArray, lost_s: FloatArray,
-    through: FloatArray, c: FloatArray, g: FloatArray, home: IntArray, integral: FloatArray, w: FloatArray,
-    rate: FloatArray, s: FloatArray, ds: FloatArray, u: FloatArray, more: FloatArray, j: FloatArray, room: FloatArray,
-    z: FloatArray, current: FloatArray,
+    form: Form, work: Work, leaks: Leaks, h: float, integral: FloatArray, z: FloatArray, current: FloatArray
 ) -> None:  # fmt: skip
     """Charge since the start of a step and current of each source at the nodes, into `z` and `current` (n_s, ROWS).
 
-    `rate` (m, ROWS) holds the derivatives of the modes; `room` (3, ROWS) is scratch.
+    The derivatives of the modes, and the voltages and currents of the cells, have been put into `work`.
     """
+    mobile, stored, stored_s, lost, lost_s = form.mobile, form.stored, form.stored_s, leaks.lost, leaks.lost_s
+    through, c, g, home = form.through, form.c, leaks.g, form.home
+    w, rate, s, ds = work.modes[W], work.modes[D], work.s, work.ds
+    u, more, j, room = work.cells[CELL_U], work.areas[MORE], work.cells[J], work.room
     n = stored.shape[1]
     collected, leak, moved = room[0], room[1], room[2]
     for a in range(stored.shape[0]):

@@ -10,9 +10,9 @@ import math
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
-from fingerspice.engine.coupling import Coupling
-from fingerspice.engine.exponential import respond
-from fingerspice.engine.netrows import CHI_S, ETA_S, LIN, PULL, RHO, U_S, Form, W, Work, evaluate
+from fingerspice.engine.exponential import Tables, respond
+from fingerspice.engine.netform import CHI_S, ETA_S, PULL, RHO, U_S, Form, Leaks, W, Work
+from fingerspice.engine.netrows import evaluate
 from fingerspice.engine.readout import N_PLACES
 from fingerspice.numerics.lobatto import END, NODES, ROWS
 from fingerspice.numerics.small import copy_to
@@ -41,8 +41,8 @@ def _difference(a: FloatArray, b: FloatArray, factor: float, out: FloatArray) ->
 
 @jit_within
 def carry(
-    form: Form, work: Work, several: bool, h: float, rates: FloatArray, pace: FloatArray, coupling: Coupling,
-    decay: FloatArray, phi: FloatArray, error: FloatArray, sign: FloatArray, answer: float,
+    form: Form, work: Work, leaks: Leaks, tables: Tables, slot: int, several: bool, h: float, error: FloatArray,
+    sign: FloatArray, answer: float,
 ) -> None:  # fmt: skip
     """Carry the error of the modes (m,) from the start of a converged step to the points between and the end.
 
@@ -51,6 +51,7 @@ def carry(
     `room` are overwritten, nothing else.
     """
     base, forced, off, shifted, d, pull = work.spare
+    decay, phi = tables.decay[slot], tables.phi[slot]
     if answer <= _SLIGHT:
         for k in range(error.size):
             for p in range(N_PLACES - 1):
@@ -76,8 +77,7 @@ def carry(
                 before = max(before, abs(off[k, END]))
             _shift(modes[W], step, off, shifted)
             if not evaluate(
-                form, coupling, several, h, rates, pace, sign, shifted, modes[LIN], d, pull, cells, areas, work.matrix,
-                work.mixed, work.room[1],
+                form, work, leaks, several, h, sign, shifted, d, pull, cells, areas, work.room[1]
             ):  # fmt: skip
                 break
             _difference(pull, modes[PULL], 1.0 / step, forced)

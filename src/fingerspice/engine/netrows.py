@@ -1,192 +1,38 @@
-"""A network in modal form around reference areas, and what an exponential step of it evaluates at all its rows.
-
-With its areas fixed at A0 every network is linear: x = shape v - follow s with v' = -rates v + gain s. The change of an
-area adds a current j in each cell whose area follows a voltage,
-
-    v' = -rates v + gain s + feed j,    j = (A - A0) (c u' + g u)  [mobile: + c u A'],    u = tap v + tap_s s.
-
-j contains the derivatives of the voltages, but linearly and at the same time only, so that each row of a step solves
-for them (see `fingerspice.engine.coupling`); the fold is where this equation has no solution. An area with a time
-constant is one more mode, of rate 1 / tau. Within a jump of the sources the independent variable is the fraction of the
-jump, and nothing leaks: all rates are zero.
-
-These functions take plain arrays, as those of `fingerspice.engine.rows` do.
-"""
+"""What an exponential step of a network evaluates at all its rows: the areas, and the currents that they add."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.coupling import STIFF, Coupling, answer_alone, answer_mobile, answer_together, new_coupling
-from fingerspice.engine.readout import N_PLACES, WRITTEN_AT_ONCE
+from fingerspice.engine.coupling import STIFF
+from fingerspice.engine.currents import Moving, answer_alone, answer_mobile, answer_together
+from fingerspice.engine.netform import (
+    AREA,
+    CHI,
+    CHI_S,
+    ETA,
+    ETA_S,
+    KNOWN,
+    LIN,
+    MORE,
+    RATE,
+    RHO,
+    SHARE,
+    SLOPE,
+    U_S,
+    Form,
+    Leaks,
+    U,
+    Work,
+)
 from fingerspice.engine.rows import polynomial_rows
-from fingerspice.engine.work import N_FLAT
 from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, NODES, ROWS
 from fingerspice.physics.contact import inverse_area
 
-# Blocks of the modes' rows.
-W, BASE, LIN, D, PULL, USED, PULL_BEFORE, LEFT_BEFORE = range(8)
-# Blocks of the cells' rows: the parts of eta and chi that follow the sources, eta and chi, rho, shares of A', voltages,
-# currents.
-ETA_S, CHI_S, ETA, CHI, RHO, SHARE, CELL_U, J = range(8)
-# Blocks of the areas' rows: A, dA/du, the part of A' that depends on time, A - A0, A'; gap voltages, their guess, and
-# their part that follows the sources.
-AREA, SLOPE, RATE, MORE, KNOWN, U, GUESS, U_S = range(8)
-
 # From values at the nodes to slopes at all rows, per step length: slopes = values @ TO_RATES.
 TO_RATES = np.ascontiguousarray(np.vstack([DERIVATIVE, BETWEEN.T @ DERIVATIVE]).T)
-
-
-class Form(NamedTuple):
-    """See the module. n live voltages, m modes with those of slow areas behind, n_f cells whose area moves.
-
-    Attributes
-    ----------
-    numbers : ndarray, shape (size,)
-        All numbers that depend on the reference areas; the arrays named in `REFERRED` are views of it, so that a change
-        of the reference areas is one copy.
-    rates : ndarray, shape (m,)
-    gain : ndarray, shape (m, n_s)
-    shape, inverse : ndarray, shape (n, n)
-        v = inverse (x + follow s).
-    follow : ndarray, shape (n, n_s)
-    feed : ndarray, shape (m, n_f)
-    tap, tap_s : ndarray, shape (n_f, n) and (n_f, n_s)
-    c, g : ndarray, shape (n_f,)
-        Capacitance and leak of the cells per area.
-    home : ndarray of int, shape (n_f,)
-        The area of each of these cells, ascending.
-    first : ndarray of int, shape (n_area + 1,)
-        First of these cells of each area.
-    cell : ndarray of int, shape (n_area,)
-        The cell whose voltage the area follows; -1 if the area is fixed.
-    area0, unit : ndarray, shape (n_area,)
-        Reference area, and the area at 0 V, m^2: areas with a time constant are states in units of it.
-    slow : ndarray of int, shape (n_area,)
-        The mode of each area that has a time constant, else -1; `pace` (n_area,) is its rate, 1/s.
-    gap, gap_s : ndarray, shape (n_area, n) and (n_area, n_s)
-        Voltage of each area's GAP from x and s; zero without one.
-    node, node_s : ndarray, shape (n_node, n) and (n_node, n_s)
-        Voltage of each node from the same.
-    size : ndarray, shape (n,)
-        Euclidean norm of the state voltages (V) for one unit of each mode.
-    mobile : bool
-        Charge law.
-    stress : ndarray, shape (n_area,)
-        Force per area and squared gap voltage, Pa/V^2.
-    powers, slopes : ndarray, shape (n_area, DEGREE + 1)
-        1/A as in `engine.system.System`, with `lo`, `scale` (n_area,); `curves` solve Eq. 4 where these do not reach.
-    stored, stored_s, lost, lost_s : ndarray, shape (n_s, n) and (n_s, n_s)
-        Current that each source delivers at the reference areas: stored v' + stored_s s' + lost v + lost_s s.
-    through : ndarray, shape (n_s, n_f)
-        Share of the current j of each cell that the source delivers in addition.
-    """
-
-    numbers: FloatArray
-    rates: FloatArray
-    gain: FloatArray
-    shape: FloatArray
-    inverse: FloatArray
-    follow: FloatArray
-    feed: FloatArray
-    tap: FloatArray
-    tap_s: FloatArray
-    area0: FloatArray
-    gap: FloatArray
-    gap_s: FloatArray
-    node: FloatArray
-    node_s: FloatArray
-    size: FloatArray
-    stored: FloatArray
-    stored_s: FloatArray
-    lost: FloatArray
-    lost_s: FloatArray
-    mobile: bool
-    c: FloatArray
-    g: FloatArray
-    home: IntArray
-    first: IntArray
-    cell: IntArray
-    unit: FloatArray
-    slow: IntArray
-    pace: FloatArray
-    stress: FloatArray
-    powers: FloatArray
-    slopes: FloatArray
-    lo: FloatArray
-    scale: FloatArray
-    curves: FloatArray
-    through: FloatArray
-
-
-#: The fields of a `Form` that belong to its reference areas, in the order in which they stand in its `numbers`.
-REFERRED = Form._fields[1:19]
-
-
-class Work(NamedTuple):
-    """Arrays that steps work in; those with ROWS behind hold one value for each row of a step.
-
-    `own` is the coupling of the step at hand, and `at` (1,) the number of the reference in use.
-    """
-
-    r: FloatArray
-    s: FloatArray
-    ds: FloatArray
-    modes: FloatArray
-    cells: FloatArray
-    areas: FloatArray
-    matrix: FloatArray
-    mixed: FloatArray
-    own: Coupling
-    at: IntArray
-    w0: FloatArray
-    places: FloatArray
-    weight: FloatArray
-    values: FloatArray
-    coefficients: FloatArray
-    outputs: FloatArray
-    room: FloatArray
-    off: FloatArray
-    slips: FloatArray
-    cell_slips: FloatArray
-    carried: FloatArray
-    spare: FloatArray
-    spare_cells: FloatArray
-    spare_areas: FloatArray
-
-
-def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: int) -> Work:
-    """Work arrays for so many live voltages, modes, cells whose area moves, areas, sources and output columns."""
-    return Work(
-        np.zeros((sources, N_FLAT, ROWS)),
-        np.zeros((sources, ROWS)),
-        np.zeros((sources, ROWS)),
-        np.zeros((8, modes, ROWS)),
-        np.zeros((8, cells, ROWS)),
-        np.zeros((8, areas, ROWS)),
-        np.zeros((cells, cells + 1, ROWS)),
-        np.zeros((cells, areas + 1, ROWS)),
-        new_coupling(n, cells, sources),
-        np.zeros(1, np.int64),
-        np.zeros(modes),
-        np.zeros((modes, N_PLACES)),
-        np.zeros(modes),
-        np.zeros((columns, ROWS)),
-        np.zeros((columns, ROWS)),
-        np.zeros((2, WRITTEN_AT_ONCE)),
-        np.zeros((4, ROWS)),
-        np.zeros((N_PLACES, modes + sources)),
-        np.zeros((2, modes, N_PLACES)),
-        np.zeros((2, N_PLACES, cells + areas)),
-        np.zeros((modes, N_PLACES - 1)),
-        np.zeros((6, modes, ROWS)),
-        np.zeros((8, cells, ROWS)),
-        np.zeros((8, areas, ROWS)),
-    )
 
 
 @jit_rows
@@ -315,16 +161,15 @@ def _subtract(area: FloatArray, area0: float, more: FloatArray) -> None:
 
 @jit_within
 def evaluate(
-    form: Form, coupling: Coupling, several: bool, h: float, rates: FloatArray, pace: FloatArray, sign: FloatArray,
-    w: FloatArray, lin: FloatArray, d: FloatArray, pull: FloatArray, cells: FloatArray, areas: FloatArray,
-    matrix: FloatArray, mixed: FloatArray, least: FloatArray,
+    form: Form, work: Work, leaks: Leaks, several: bool, h: float, sign: FloatArray, w: FloatArray, d: FloatArray,
+    pull: FloatArray, cells: FloatArray, areas: FloatArray, least: FloatArray,
 ) -> bool:  # fmt: skip
     """Forcing of the modes by the areas, into `pull` (m, ROWS), from the modes w (m, ROWS).
 
-    `lin` is gain s, and `d` receives the derivatives of stiff modes. `cells` and `areas` are blocks of rows, whose
-    parts that follow the sources are given. False beyond a fold; under `mobile`, `least` (ROWS,) receives the distance
-    to it.
+    `d` receives the derivatives of stiff modes. `cells` and `areas` are blocks of rows, whose parts that follow the
+    sources are given. False beyond a fold; under `mobile`, `least` (ROWS,) receives the distance to it.
     """
+    coupling, lin, rates, pace = work.own, work.modes[LIN], leaks.rates, leaks.pace
     mobile = form.mobile
     n = form.gap.shape[1]
     stiff = coupling.key[1] > 0
@@ -351,9 +196,9 @@ def evaluate(
         combine(coupling.from_stiff, d[:n], eta)
     if mobile:
         combine_from(coupling.held, w, cells[CHI_S], chi)
+        rows = Moving(u, more, slope, rate, chi, eta, rho, areas[KNOWN], cells[SHARE])
         answer_mobile(
-            several, coupling.answer, coupling.gap, coupling.leak, coupling.cross, form.home, form.first, form.cell, u,
-            more, slope, rate, chi, eta, rho, areas[KNOWN], cells[SHARE], mixed, matrix, least,
+            several, coupling, form.home, form.first, form.cell, rows, work.mixed, work.matrix, least
         )  # fmt: skip
         for i in range(ROWS):
             # NaN is no solution either.
@@ -368,11 +213,9 @@ def evaluate(
 
 
 @jit_within
-def follow_sources(
-    form: Form, coupling: Coupling, gain: FloatArray, s: FloatArray, ds: FloatArray, lin: FloatArray,
-    cells: FloatArray, areas: FloatArray,
-) -> None:  # fmt: skip
+def follow_sources(form: Form, work: Work, gain: FloatArray) -> None:
     """The parts of a step's rows that depend on the sources alone; see `evaluate`."""
+    coupling, s, ds, lin, cells, areas = work.own, work.s, work.ds, work.modes[LIN], work.cells, work.areas
     n = form.gap.shape[1]
     clear(lin)
     combine(gain, s, lin)

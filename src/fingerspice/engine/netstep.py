@@ -6,15 +6,16 @@ import math
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine import netrows, rows
+from fingerspice.engine import netform, rows
 from fingerspice.engine import work as stack_work
-from fingerspice.engine.coupling import Coupling, answer_mobile, cell_currents, take_coupling
-from fingerspice.engine.exponential import distance, mix, plain, respond
+from fingerspice.engine.currents import cell_currents
+from fingerspice.engine.exponential import Tables, distance, mix, plain, respond
 from fingerspice.engine.netassess import moved
 from fingerspice.engine.netcharge import charge_rows
-from fingerspice.engine.netrows import Form, Work, clear, combine, evaluate, mode_rates, wanted
+from fingerspice.engine.netform import Form, Leaks, Work
+from fingerspice.engine.netrows import clear, combine, evaluate, mode_rates, wanted
 from fingerspice.engine.network import Sources
-from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import POINTS, ROWS
 
 
 @jit
@@ -52,8 +53,8 @@ def _free(decay: FloatArray, w0: FloatArray, out: FloatArray) -> None:
 
 @jit_within
 def solve_step(
-    form: Form, work: Work, own: Coupling, several: bool, h: float, rates: FloatArray, area_pace: FloatArray,
-    sign: FloatArray, decay: FloatArray, phi: FloatArray, tol: float,
+    form: Form, work: Work, leaks: Leaks, tables: Tables, slot: int, several: bool, h: float, sign: FloatArray,
+    tol: float,
 ) -> tuple[int, bool, float]:  # fmt: skip
     """Collocation solution of a step from the modes `work.w0`, by iteration on the currents that the areas add.
 
@@ -62,13 +63,14 @@ def solve_step(
     """
     modes, cells, areas, weight = work.modes, work.cells, work.areas, work.weight
     w, base, lin, pull, used = (
-        modes[netrows.W], modes[netrows.BASE], modes[netrows.LIN], modes[netrows.PULL], modes[netrows.USED]
+        modes[netform.W], modes[netform.BASE], modes[netform.LIN], modes[netform.PULL], modes[netform.USED]
     )  # fmt: skip
-    pull_before, left_before = modes[netrows.PULL_BEFORE], modes[netrows.LEFT_BEFORE]
-    u, guess = areas[netrows.U], areas[netrows.GUESS]
+    pull_before, left_before = modes[netform.PULL_BEFORE], modes[netform.LEFT_BEFORE]
+    u, guess = areas[netform.U], areas[netform.GUESS]
+    decay, phi = tables.decay[slot], tables.phi[slot]
     clear(used)
     clear(guess)
-    clear(cells[netrows.RHO])
+    clear(cells[netform.RHO])
     _free(decay, work.w0, w)
     respond(lin, phi, w, base)
     current = base
@@ -84,8 +86,7 @@ def solve_step(
             respond(used, phi, base, w)
             current = w
         if not evaluate(
-            form, own, several, h, rates, area_pace, sign, current, lin, modes[netrows.D], pull, cells, areas,
-            work.matrix, work.mixed, work.room[3],
+            form, work, leaks, several, h, sign, current, modes[netform.D], pull, cells, areas, work.room[3]
         ):  # fmt: skip
             return iteration, False, answer
         change = moved(u, guess)
@@ -105,58 +106,22 @@ def solve_step(
 
 @jit_within
 def step_charges(
-    form: Form, work: Work, own: Coupling, h: float, rates: FloatArray, g: FloatArray, lost: FloatArray,
-    lost_s: FloatArray, integral: FloatArray, sign: FloatArray, z: FloatArray, current: FloatArray,
+    form: Form, work: Work, leaks: Leaks, h: float, integral: FloatArray, sign: FloatArray, z: FloatArray,
+    current: FloatArray,
 ) -> None:  # fmt: skip
     """Charges gained since the start of a converged step, and currents, of the sources at its nodes."""
     modes, cells, areas = work.modes, work.cells, work.areas
-    w, cell_u = modes[netrows.W], cells[netrows.CELL_U]
-    mode_rates(h, rates, w, modes[netrows.LIN], modes[netrows.PULL], False, modes[netrows.D])
+    w, cell_u = modes[netform.W], cells[netform.CELL_U]
+    mode_rates(h, leaks.rates, w, modes[netform.LIN], modes[netform.PULL], False, modes[netform.D])
     clear(cell_u)
     combine(form.tap, w[: form.shape.shape[0]], cell_u)
     combine(form.tap_s, work.s, cell_u)
-    cell_currents(own.root, cells[netrows.RHO], cells[netrows.J])
+    cell_currents(work.own.root, cells[netform.RHO], cells[netform.J])
     if not form.mobile:
         for a in range(form.cell.size):
             if form.cell[a] >= 0 and form.slow[a] < 0:
                 wanted(
                     True, sign[a], form.powers[a], form.slopes[a], form.lo[a], form.scale[a], form.curves[a],
-                    areas[netrows.U, a], areas[netrows.AREA, a], areas[netrows.SLOPE, a],
+                    areas[netform.U, a], areas[netform.AREA, a], areas[netform.SLOPE, a],
                 )  # fmt: skip
-    charge_rows(
-        form.mobile, h, form.stored, form.stored_s, lost, lost_s, form.through, form.c, g, form.home, integral, w,
-        modes[netrows.D], work.s, work.ds, cell_u, areas[netrows.MORE], cells[netrows.J], work.room, z, current,
-    )  # fmt: skip
-
-
-@jit
-def all_zero(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> bool:
-    """Whether all entries are 0."""
-    for x in (a, b, c, d):
-        for i in range(x.shape[0]):
-            for j in range(x.shape[1]):
-                if x[i, j] != 0.0:
-                    return False
-    return True
-
-
-@jit
-def magnified_whole(form: Form, work: Work, which: int, several: bool) -> float:
-    """Inverse distance of a step to the fold with all modes, also those that the step takes for stiff.
-
-    `work.own` becomes coupling number `which`, in which no mode is taken for stiff.
-    """
-    whole, areas, spare = work.own, work.areas, work.spare_cells
-    take_coupling(whole, which, 0.0, form.rates, form.feed, form.tap, form.tap_s, form.c, form.g, form.home, form.cell)
-    clear(spare[netrows.CHI])
-    clear(spare[netrows.ETA])
-    combine(whole.held, work.modes[netrows.W][: form.shape.shape[0]], spare[netrows.CHI])
-    combine(whole.from_slopes, work.s, spare[netrows.CHI])
-    answer_mobile(
-        several, whole.answer, whole.gap, whole.leak, whole.cross, form.home, form.first, form.cell,
-        areas[netrows.U], areas[netrows.MORE], areas[netrows.SLOPE], areas[netrows.RATE], spare[netrows.CHI],
-        spare[netrows.ETA], spare[netrows.RHO], work.spare_areas[netrows.KNOWN], spare[netrows.SHARE], work.mixed,
-        work.matrix, work.room[3],
-    )  # fmt: skip
-    least: float = work.room[3, :NODES].min()
-    return 1.0 / least
+    charge_rows(form, work, leaks, h, integral, z, current)

@@ -9,7 +9,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
-from fingerspice.engine.netrows import Form
+from fingerspice.engine.netform import Form
 from fingerspice.numerics.small import copy_to
 
 # Ratio of neighbouring reference areas, and the ratio of an area to its reference beyond which another one is taken.

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import borrow, jit
+from fingerspice.base.borrowing import borrow
+from fingerspice.base.compiled import jit
 from fingerspice.engine.readout import WRITTEN_AT_ONCE, write_outputs
 from fingerspice.numerics.chebyshev import to_powers
 from fingerspice.numerics.lobatto import NODES, ROWS

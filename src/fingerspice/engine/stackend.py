@@ -174,3 +174,8 @@ def _cross(c: Stack, s: LoopState) -> bool:
         control[ALLOWED] = 0.0
     s.place[FRESH] = H_AFTER_ZERO
     return True
+
+
+@jit_within
+def end_stack(c: Stack, s: LoopState) -> None:
+    """End a call of the loop: nothing is left to do."""

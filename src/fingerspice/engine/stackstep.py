@@ -282,7 +282,7 @@ def refuse_stack(c: Stack, s: LoopState) -> int:
 
 
 @jit_within
-def beyond_stack(c: Stack, s: LoopState) -> float:
+def beyond_stack(c: Stack, pace: Pace, s: LoopState) -> float:
     """Fraction of a rejected step at which the next one should end, soon after a zero far beyond which it went; or 2.
 
     There the branch of the area has no meaning, and the error says nothing.

@@ -20,7 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.base.compiled import borrow, jit, jit_rows
+from fingerspice.base.borrowing import borrow
+from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.exponential import Tables, distance, make_tables, mix, plain, respond, weigh
 from fingerspice.engine.system import System
 from fingerspice.numerics.lobatto import BARYCENTRIC, END, NODES, POINTS, ROWS

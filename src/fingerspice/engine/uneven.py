@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
+from fingerspice.base.borrowing import borrow
+from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockcharge import Charges, Course
 from fingerspice.engine.blockforms import (
     BLOCK,

@@ -1,4 +1,4 @@
-"""One integration of a network by exponential steps: the driver of `engine.netmarch.march`."""
+"""One integration of a network by exponential steps: as `engine.loop` takes it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.engine import netassess, netmarch, readout
-from fingerspice.engine.netrows import new_work
+from fingerspice.engine import loop, loopstate, netassess, readout
+from fingerspice.engine.mesh import Mesh
+from fingerspice.engine.netform import new_work
 from fingerspice.engine.network import Sources
 from fingerspice.engine.system import area_missed
 from fingerspice.numerics.lobatto import integral_table
@@ -36,7 +37,7 @@ class March(Stepping, NetworkIntegration):
         scene, size = problem.scene, problem.initial.y.size
         n_s, n_area = len(scene.waveforms), scene.net.gap.size
         self.u_scale, self.decade = u_scale, int(np.floor(np.log10(rtol)))
-        self.control = np.zeros(netmarch.MOST + 1)
+        self.control = np.zeros(readout.N_CONTROL)
         self.control[readout.T] = problem.t_start
         self.control[readout.MAGNIFIED] = 1.0
         self.collected = np.zeros((2, n_s))
@@ -58,20 +59,21 @@ class March(Stepping, NetworkIntegration):
 
     def _march(self, sources: Sources, t_end: float) -> int:
         taken = int(self.counters[readout.ACCEPTED] + self.counters[readout.REJECTED])
-        self.control[netmarch.MOST] = taken + MOST_STEPS * (4.0 + sources.edges.size + (t_end - self.t) / self.shortest)
+        more = MOST_STEPS * (4.0 + sources.edges.size + (t_end - self.t) / self.shortest)
+        self.place[loopstate.MOST] = taken + int(more)
         while True:
             known = self.references
-            code = netmarch.march(
-                self.form, known.arrays, self.pace, known.tables, self.work, self.integral, sources, self.u_scale,
-                t_end, self.y, self.error, self.sign, self.s_before, self.branch, self.control, self.counters, self.met,
-                self.collected, self.t_out, self.left, self.out, self.kept, self.recorder.room, self.tried,
+            mesh = Mesh(
+                self.form, known.arrays, known.tables, self.work, self.integral, sources, self.u_scale, self.sign,
+                self.s_before, self.branch, self.met, self.collected,
             )  # fmt: skip
+            code = int(loop.march(mesh, self.pace, self.loop_state(), t_end))
             if self.counters[readout.RECORDED] >= len(self.recorder.room.times):
                 self.recorder.drain(self.counters)
-            if code == netmarch.REFERENCE:
+            if code == loopstate.REFERENCE:
                 self._add_reference()
-            elif code != netmarch.PAUSED:
-                return int(code)
+            elif code != loopstate.PAUSED:
+                return code
 
     def _look(self) -> bool:
         state = np.append(self.y[: self.n], self.u_scale * self.y[self.n : self.n + self.n_slow])
@@ -94,12 +96,12 @@ class March(Stepping, NetworkIntegration):
 
     def _to(self, sources: Sources, t_end: float) -> Status:
         code = self._march(sources, t_end)
-        if code == netmarch.DONE:
+        if code == loopstate.DONE:
             return Status.SUCCESS
-        return Status.TOO_MANY_STEPS if code == netmarch.TOO_MANY else self.stuck()
+        return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
 
     def jump(self, after: FloatArray) -> bool:
-        return self._march(held_at(self.t, after), self.t) == netmarch.DONE
+        return self._march(held_at(self.t, after), self.t) == loopstate.DONE
 
     def _add_reference(self) -> None:
         """Add the reference areas that the compiled loop needs next, and that it has written to `wanted`."""

@@ -15,7 +15,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray, views_of
 from fingerspice.circuit.network import Modes, network_modes
 from fingerspice.engine.exponential import Tables, new_tables
-from fingerspice.engine.netrows import REFERRED, Form
+from fingerspice.engine.netform import REFERRED, Form
 from fingerspice.engine.references import LEVEL_RATIO, References
 from fingerspice.engine.system import area_error, area_polynomials
 from fingerspice.solve.runs import kept_with

@@ -12,10 +12,9 @@ from typing import Literal
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.engine import loopstate, readout
+from fingerspice.engine import loop, loopstate, readout
 from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import new_tables
-from fingerspice.engine.loop import march
 from fingerspice.engine.model import Model, dot, gap_voltage, write_row_at
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import end_row
@@ -128,7 +127,7 @@ class Track(Stepping):
         p = self.prepared
         stack = Stack(p.system, p.tables, p.work, p.integral, sources.edges, sources.terms, sources.series)
         while True:
-            code = int(march(stack, self.pace, self.loop_state(), t_end))
+            code = int(loop.march(stack, self.pace, self.loop_state(), t_end))
             if code != loopstate.PAUSED:
                 return code
             self.recorder.drain(self.counters)

@@ -1,0 +1,289 @@
+"""A network as the loop of exponential steps takes it, and where its steps start: edges and jumps of the sources."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit, jit_within
+from fingerspice.engine import netform
+from fingerspice.engine.exponential import Tables
+from fingerspice.engine.loopstate import (
+    ACCEPTED_BEFORE,
+    AT_EDGE,
+    CROSSED,
+    DONE,
+    FLIPS,
+    FRESH,
+    GO_ON,
+    HAS_BEGUN,
+    IN_JUMP,
+    LENGTH,
+    MOST,
+    PAUSE_AT,
+    PAUSED,
+    REFERENCE,
+    SEVERAL,
+    SMOOTH,
+    STOP,
+    TABLED,
+    TOO_MANY,
+    UNCONVERGED,
+    LoopState,
+)
+from fingerspice.engine.netassess import load
+from fingerspice.engine.netform import Form, Leaks, Work
+from fingerspice.engine.network import Sources, at_sources
+from fingerspice.engine.pace import Pace, choose_step
+from fingerspice.engine.readout import (
+    ACCEPTED,
+    ALLOWED,
+    BRANCH_LENGTH,
+    BRANCH_START,
+    ERROR_Q,
+    H_AFTER_EDGE,
+    MAGNIFIED,
+    RECORDED,
+    REJECTED,
+    TOO_LONG,
+    H,
+    T,
+)
+from fingerspice.engine.references import References, far_from, find, go_over, start_at
+from fingerspice.numerics.small import copy_to
+from fingerspice.physics.contact import inverse_area
+
+# Relative change of a source at an edge that counts as rounding error, not as a jump.
+_ROUNDING, _UNNOTICED = 1e-14, 1e-9
+# Number of modes times steps between two pauses, in which Python can react to Ctrl-C.
+_AT_ONCE = 40_000
+# A step that is to reach a zero of a gap voltage is this much longer, relative to the branch.
+_BEYOND = 1.02
+
+
+class Mesh(NamedTuple):
+    """A network and its sources, as the loop takes them; it updates all but `sources`.
+
+    Within a jump of the sources the independent variable is the fraction of the jump, and time stands still: the same
+    network, in which nothing leaks.
+
+    Attributes
+    ----------
+    form, references, tables, work
+        The network in modal form around a reference, whose number is in `work.at`; all references; tables of
+        exponentials, and scratch arrays.
+    integral : ndarray
+        `lobatto.integral_table()`.
+    sources : Sources
+    u_scale : float
+        Largest voltage, V; the error of an area with a time constant is measured as a fraction of it.
+    sign, s_before : ndarray
+        Branch of each area (0: to be chosen), and the sources' values just before the time reached.
+    branch : ndarray, shape (n_area, 2)
+        Time at which each area's branch began, and length of the branch before, s.
+    peaks, collected : ndarray
+        As described in `netassess` and `netcharge.charge_error`.
+    """
+
+    form: Form
+    references: References
+    tables: Tables
+    work: Work
+    integral: FloatArray
+    sources: Sources
+    u_scale: float
+    sign: FloatArray
+    s_before: FloatArray
+    branch: FloatArray
+    peaks: FloatArray
+    collected: FloatArray
+
+
+@jit_within
+def leaks_of(c: Mesh, s: LoopState) -> Leaks:
+    """What leaks at present: nothing within a jump of the sources."""
+    form, none = c.form, c.work.jump.leaks
+    if s.place[IN_JUMP] > 0:
+        return Leaks(none.rates, none.gain, none.g, none.pace, none.lost, none.lost_s)
+    return Leaks(form.rates, form.gain, form.g, form.pace, form.lost, form.lost_s)
+
+
+@jit_within
+def branch_of(c: Mesh, s: LoopState) -> FloatArray:
+    """Where the areas' branches began: in time, or within a jump."""
+    return c.work.jump.branch if s.place[IN_JUMP] > 0 else c.branch
+
+
+@jit_within
+def start_mesh(c: Mesh, s: LoopState) -> None:
+    """Begin a call of the loop."""
+    form, work, place, counters = c.form, c.work, s.place, s.counters
+    n = form.shape.shape[0]
+    s.step[TABLED], place[FLIPS], place[FRESH], place[CROSSED] = 0.0, 0, -1, -1
+    place[IN_JUMP], place[HAS_BEGUN], place[UNCONVERGED] = 0, 0, 0
+    place[ACCEPTED_BEFORE], place[PAUSE_AT] = counters[ACCEPTED], counters[ACCEPTED] + 1 + _AT_ONCE // form.rates.size
+    place[SEVERAL] = 0
+    for b in range(1, form.home.size):
+        place[SEVERAL] |= int(form.home[b] != form.home[0])
+    place[SMOOTH] = int(
+        _all_zero(form.tap_s) and _all_zero(form.stored_s) and _all_zero(form.follow) and _all_zero(form.gap_s)
+    )
+    for i in range(work.segment.size):
+        work.segment[i] = 0
+    work.areas[:] = 0.0
+    start_at(form.area0, work.areas[netform.AREA])
+    for k in range(work.size.size):
+        work.size[k] = form.size[k] if k < n else c.u_scale
+
+
+@jit
+def _all_zero(x: FloatArray) -> bool:
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            if x[i, j] != 0.0:
+                return False
+    return True
+
+
+@jit_within
+def begin_mesh(c: Mesh, pace: Pace, s: LoopState, t_end: float) -> int:
+    """Where the next step starts: at an edge of a source, within a jump, or later; and its length."""
+    form, work, step, place, control, counters = c.form, c.work, s.step, s.place, s.control, s.counters
+    if place[IN_JUMP] > 0 and control[T] >= 1.0:
+        _leave_jump(c, s)
+    if counters[ACCEPTED] + counters[REJECTED] > place[MOST]:
+        return TOO_MANY
+    step[STOP], place[AT_EDGE] = 1.0, 0
+    if place[IN_JUMP] > 0:
+        copy_to(work.now, c.s_before)
+    else:
+        if place[HAS_BEGUN] > 0 and control[T] >= t_end:
+            return DONE
+        if counters[ACCEPTED] >= place[PAUSE_AT] or counters[RECORDED] >= s.steps.times.shape[0] > 0:
+            return PAUSED
+        _look_at_sources(c, s, t_end)
+        if place[IN_JUMP] == 0 and control[T] >= t_end:
+            return DONE
+    t = control[T]
+    if place[AT_EDGE] > 0:
+        # Step lengths after a jump are often those after the previous jump.
+        control[H], control[TOO_LONG], control[ALLOWED] = control[H_AFTER_EDGE], 0.0, 0.0
+        place[FRESH] = H_AFTER_EDGE
+    load(form.inverse, form.follow, s.y, work.now, work.w0)
+    _choose_branches(c, s, t)
+    if place[IN_JUMP] == 0 and far_from(form, work.here) and not _take_reference(c, s):
+        return REFERENCE
+    rates = leaks_of(c, s).rates
+    longest = Pace(pace.tol, 1.0, True, pace.charge) if place[IN_JUMP] > 0 else pace
+    is_series = c.sources.series.shape[1] > 0 and place[IN_JUMP] == 0
+    # If all rates are zero, the time constant is infinite.
+    step[LENGTH] = choose_step(longest, 1.0 / rates.max(), True, is_series, t, step[STOP] - t, control)
+    place[CROSSED] = -1
+    return GO_ON
+
+
+@jit_within
+def _look_at_sources(c: Mesh, s: LoopState, t_end: float) -> None:
+    """The sources' segments and values at the present time, and the next edge; a jump of any of them is entered."""
+    work, place, sources, before, t = c.work, s.place, c.sources, c.s_before, s.control[T]
+    segment, now, stop = work.segment, work.now, t_end
+    for i in range(now.size):
+        while sources.edges[sources.first[i] + segment[i] + 1] <= t:
+            segment[i] += 1
+        place[AT_EDGE] |= int(sources.edges[sources.first[i] + segment[i]] == t)
+        stop = min(stop, sources.edges[sources.first[i] + segment[i] + 1])
+    s.step[STOP] = stop
+    at_sources(sources, segment, t, 0.0, now, work.slopes_now)
+    # The time at which a call starts may differ from an edge by rounding.
+    least = _ROUNDING if place[AT_EDGE] > 0 else (math.inf if place[HAS_BEGUN] > 0 else _UNNOTICED)
+    place[HAS_BEGUN] = 1
+    jumps = False
+    for i in range(now.size):
+        jumps |= abs(now[i] - before[i]) > least * max(abs(now[i]), abs(before[i]))
+    if jumps and place[SMOOTH] > 0:
+        copy_to(before, now)
+    elif jumps:
+        _enter_jump(c, s)
+
+
+@jit_within
+def _enter_jump(c: Mesh, s: LoopState) -> None:
+    """Go on in the fraction of a jump from the sources' values before it to those now."""
+    jump, place, control = c.work.jump, s.place, s.control
+    place[IN_JUMP], place[AT_EDGE] = 1, 0
+    copy_to(jump.control, control)
+    copy_to(jump.sign, c.sign)
+    copy_to(jump.before, c.s_before)
+    copy_to(jump.after, c.work.now)
+    jump.branch[:] = 0.0
+    control[:] = 0.0
+    control[ERROR_Q], control[MAGNIFIED] = jump.control[ERROR_Q], jump.control[MAGNIFIED]
+    s.step[TABLED], s.step[STOP] = 0.0, 1.0
+    copy_to(c.work.now, jump.before)
+
+
+@jit_within
+def _leave_jump(c: Mesh, s: LoopState) -> None:
+    """Go on in time after a jump."""
+    jump = c.work.jump
+    resume_time(c, s)
+    copy_to(c.s_before, jump.after)
+    for a in range(c.sign.size):
+        if c.sign[a] != jump.sign[a]:
+            c.branch[a, 0], c.branch[a, 1] = s.control[T], math.inf
+    s.step[TABLED] = 0.0
+
+
+@jit_within
+def resume_time(c: Mesh, s: LoopState) -> None:
+    """Take the bookkeeping of before a jump, with the errors that the jump has added."""
+    jump, control = c.work.jump, s.control
+    jump.control[ERROR_Q], jump.control[MAGNIFIED] = control[ERROR_Q], control[MAGNIFIED]
+    copy_to(control, jump.control)
+    s.place[IN_JUMP] = 0
+
+
+@jit_within
+def _choose_branches(c: Mesh, s: LoopState, t: float) -> None:
+    """The areas at the start of a step and, where it is not known yet, the branch of each; the next zero to expect."""
+    form, work, control, sign = c.form, c.work, s.control, c.sign
+    branch, in_jump, w0, now = branch_of(c, s), s.place[IN_JUMP] > 0, c.work.w0, c.work.now
+    ahead = math.inf
+    control[BRANCH_START], control[BRANCH_LENGTH] = t, math.inf
+    for a in range(sign.size):
+        if form.cell[a] < 0:
+            sign[a] = 1.0
+            continue
+        voltage = 0.0
+        for k in range(form.gap.shape[1]):
+            voltage += form.gap[a, k] * w0[k]
+        for e in range(now.size):
+            voltage += form.gap_s[a, e] * now[e]
+        if sign[a] == 0.0:
+            sign[a] = 1.0 if voltage >= 0.0 else -1.0
+            branch[a, 0], branch[a, 1] = t, math.inf
+        if not in_jump:
+            slow = form.slow[a]
+            work.here[a] = (
+                form.unit[a] * s.y[slow] if slow >= 0 else 1.0 / inverse_area(abs(voltage), form.curves[a])[0]
+            )
+        end = branch[a, 0] + _BEYOND * branch[a, 1] - t
+        if 0.0 < end < ahead:
+            ahead = end
+            control[BRANCH_START], control[BRANCH_LENGTH] = branch[a, 0], branch[a, 1]
+
+
+@jit_within
+def _take_reference(c: Mesh, s: LoopState) -> bool:
+    """Go over to the reference nearest to the present areas; False if it has not been made yet."""
+    form, work = c.form, c.work
+    found = find(c.references, form, work.here)
+    if found < 0:
+        return False
+    go_over(c.references, found, form, s.error)
+    work.at[0], s.step[TABLED] = found, 0.0
+    copy_to(work.size[: form.shape.shape[0]], form.size)
+    start_at(form.area0, work.areas[netform.AREA])
+    load(form.inverse, form.follow, s.y, work.now, work.w0)
+    return True

@@ -1,0 +1,300 @@
+"""A step of a network, for the loop of exponential steps (`engine.loop`): any number of areas and sources.
+
+The functions that the loop calls take the run in progress as `s` (see `engine.loopstate`) and the network as `c`.
+"""
+
+from __future__ import annotations
+
+import math
+
+from fingerspice.base.compiled import jit_within
+from fingerspice.engine import netform
+from fingerspice.engine.coupling import take_coupling
+from fingerspice.engine.currents import Moving, answer_mobile
+from fingerspice.engine.exponential import make_tables, weigh
+from fingerspice.engine.loopstate import (
+    ACCEPTED_BEFORE,
+    AGAIN,
+    CONVERGED,
+    CROSSED,
+    FLIPS,
+    FRESH,
+    GO_ON,
+    GROWN,
+    IN_JUMP,
+    LENGTH,
+    NO_STEP,
+    RETRY,
+    SEVERAL,
+    SLOT,
+    SMOOTH,
+    STEP_ERROR,
+    STOP,
+    T_NEW,
+    TABLED,
+    THETA,
+    TRUSTED,
+    UNCONVERGED,
+    WHOLE,
+    LoopState,
+    is_wanted,
+    write_step,
+)
+from fingerspice.engine.mesh import Mesh, branch_of, leaks_of, resume_time
+from fingerspice.engine.netassess import (
+    account,
+    account_nodes,
+    assess,
+    charged,
+    first_zero,
+    store,
+    turn_at_start,
+    write_columns,
+)
+from fingerspice.engine.netcharge import charge_error
+from fingerspice.engine.netgrowth import carry
+from fingerspice.engine.netrows import clear, combine, follow_sources
+from fingerspice.engine.netstep import ramp_rows, solve_step, source_rows, step_charges
+from fingerspice.engine.network import at_sources
+from fingerspice.engine.pace import Pace
+from fingerspice.engine.readout import (
+    ACCEPTED,
+    ALLOWED,
+    H_AFTER_ZERO,
+    MAGNIFIED,
+    N_PLACES,
+    NFEV,
+    ZEROS,
+    H,
+    T,
+    at,
+    basis_at,
+    error_at,
+)
+from fingerspice.engine.zeros import first_wrong
+from fingerspice.numerics.lobatto import END, NODES, POINTS
+
+# Distance to the fold below which another method takes over, because it needs fewer evaluations there.
+_NEAR_FOLD = 0.02
+# Step lengths at which the iteration did not converge: if there are more than this number and this share of the steps
+# taken, an implicit method is faster, and the error of such steps exceeds their estimate (a hundredfold behind a fold
+# that a resistor bridges).
+_UNCONVERGED, _UNCONVERGED_SHARE = 40, 0.2
+
+
+@jit_within
+def _take_coupling(c: Mesh, s: LoopState) -> None:
+    """The coupling of the areas for steps of the length to be tried."""
+    form, work, leaks = c.form, c.work, leaks_of(c, s)
+    which = 2 * work.at[0] + int(s.place[IN_JUMP] > 0)
+    take_coupling(
+        work.own, which, s.step[LENGTH], leaks.rates, form.feed, form.tap, form.tap_s, form.c, leaks.g, form.home,
+        form.cell,
+    )  # fmt: skip
+
+
+@jit_within
+def attempt_mesh(c: Mesh, pace: Pace, s: LoopState) -> int:
+    """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
+    form, work, step, place, tables, tol = c.form, c.work, s.step, s.place, c.tables, pace.tol
+    leaks, branch, t, in_jump, several = (
+        leaks_of(c, s), branch_of(c, s), s.control[T], s.place[IN_JUMP] > 0, s.place[SEVERAL] > 0
+    )  # fmt: skip
+    h = step[LENGTH]
+    if h != step[TABLED]:
+        place[SLOT] = make_tables(
+            leaks.rates, -1 if in_jump else work.at[0], h, tables.h, tables.level, tables.used, tables.decay,
+            tables.phi, tables.miss,
+        )  # fmt: skip
+        step[TABLED] = h
+        _take_coupling(c, s)
+        place[WHOLE] = int(work.own.key[1] == 0)
+        weigh(leaks.rates, work.size, tables.decay[place[SLOT]], h, work.weight)
+    if in_jump:
+        ramp_rows(t, h, work.jump.before, work.jump.after, work.s, work.ds)
+    else:
+        slopes = pace.charge or place[SMOOTH] == 0
+        source_rows(c.sources, work.segment, t, h, slopes, work.r, work.s, work.ds)
+    follow_sources(form, work, leaks.gain)
+    passes, closed, answer = solve_step(
+        form, work, leaks, tables, place[SLOT], several, h, c.sign, 0.3 * tol
+    )  # fmt: skip
+    s.counters[NFEV] += passes * NODES
+    place[CONVERGED], step[STEP_ERROR], step[GROWN] = int(closed), math.inf, 1.0
+    # An iteration that has not converged says nothing about the sign of the gap voltage.
+    if not closed:
+        return GO_ON
+    u = work.areas[netform.U]
+    if place[FLIPS] <= c.sign.size and turn_at_start(form.cell, u, c.sign, tol, t, branch):
+        place[FLIPS] += 1
+        return RETRY
+    if form.mobile:
+        step[GROWN] = 1.0 / work.room[3].min()
+    carry(form, work, leaks, tables, place[SLOT], several, h, s.error, c.sign, answer)
+    error = assess(form, work, leaks, tables, place[SLOT], h, s.error, step[GROWN])
+    step[STEP_ERROR] = max(error, charged(form.cell, u, work.areas[netform.AREA])) if pace.charge else error
+    return GO_ON
+
+
+@jit_within
+def refuse_mesh(c: Mesh, s: LoopState) -> int:
+    """Why no shorter step would do after one that was rejected; GO_ON if one may."""
+    step, place, t = s.step, s.place, s.control[T]
+    place[UNCONVERGED] += int(place[CONVERGED] == 0)
+    # The error of a shorter step says nothing about the length at which the iteration converges.
+    place[TRUSTED] = place[CONVERGED]
+    accepted = s.counters[ACCEPTED] - place[ACCEPTED_BEFORE]
+    stuck = place[UNCONVERGED] > _UNCONVERGED + _UNCONVERGED_SHARE * accepted
+    # A step of this length is rounding of the time: if it is rejected, there is a singularity.
+    lost = step[LENGTH] <= 1e-13 * max(abs(t), 1e-3 * (step[STOP] - t))
+    return NO_STEP if stuck or lost or (place[WHOLE] > 0 and 1.0 / step[GROWN] < _NEAR_FOLD) else GO_ON
+
+
+@jit_within
+def beyond_mesh(c: Mesh, pace: Pace, s: LoopState) -> float:
+    """Fraction of a rejected step at which the next one should end, soon after a zero far beyond which it went; or 2.
+
+    There the branch of an area has no meaning, and the error says nothing.
+    """
+    form, u, end = c.form, c.work.areas[netform.U], 1.0
+    for a in range(c.sign.size):
+        if form.cell[a] >= 0 and c.sign[a] * u[a, END] < form.lo[a]:
+            found = first_wrong(u[a], c.sign[a], pace.tol)
+            if found > 1:
+                end = min(end, 1.1 * POINTS[found])
+    return end if end < 1.0 else 2.0
+
+
+@jit_within
+def complete_mesh(c: Mesh, pace: Pace, s: LoopState) -> int:
+    """End an accepted step at a zero or an edge, write its outputs, account for its errors, and move to its end."""
+    work, step, place, control, t = c.work, s.step, s.place, s.control, s.control[T]
+    h, stop = step[LENGTH], step[STOP]
+    step[T_NEW], step[THETA], place[CROSSED] = t + h, 1.0, -1
+    if step[T_NEW] >= stop or stop - step[T_NEW] <= 1e-12 * h:
+        step[T_NEW], step[THETA] = stop, min(1.0, (stop - t) / h)
+    if place[FLIPS] <= c.sign.size:
+        place[CROSSED], step[THETA], step[T_NEW] = first_zero(
+            c.form.cell, work.areas[netform.U], c.sign, pace.tol, t, h, step[THETA], step[T_NEW], work.room[0]
+        )  # fmt: skip
+    a = place[CROSSED]
+    if a >= 0 and step[T_NEW] <= t:
+        branch = branch_of(c, s)
+        c.sign[a], branch[a, 0], branch[a, 1] = -c.sign[a], t, math.inf
+        place[FLIPS] += 1
+        return AGAIN
+    if c.form.mobile and place[WHOLE] == 0:
+        step[GROWN] = _magnified_whole(c, s)
+        _take_coupling(c, s)
+    if not 0.0 < step[GROWN] < math.inf:
+        return NO_STEP
+    control[MAGNIFIED] = max(control[MAGNIFIED], step[GROWN])
+    place[FLIPS] = 0
+    basis_at(step[THETA], work.basis)
+    _write(c, pace, s, t)
+    _account(c, s)
+    _move(c, s)
+    if a >= 0:
+        _cross(c, s, a)
+    control[T] = step[T_NEW]
+    s.counters[ACCEPTED] += 1
+    return GO_ON
+
+
+@jit_within
+def _magnified_whole(c: Mesh, s: LoopState) -> float:
+    """Inverse distance of a step to the fold with all modes, also those that the step takes for stiff.
+
+    The coupling in use becomes that in which no mode is taken for stiff.
+    """
+    form, work = c.form, c.work
+    own, areas, spare = work.own, work.areas, work.spare_cells
+    which = 2 * work.at[0] + int(s.place[IN_JUMP] > 0)
+    take_coupling(own, which, 0.0, form.rates, form.feed, form.tap, form.tap_s, form.c, form.g, form.home, form.cell)
+    clear(spare[netform.CHI])
+    clear(spare[netform.ETA])
+    combine(own.held, work.modes[netform.W][: form.shape.shape[0]], spare[netform.CHI])
+    combine(own.from_slopes, work.s, spare[netform.CHI])
+    rows = Moving(
+        areas[netform.U], areas[netform.MORE], areas[netform.SLOPE], areas[netform.RATE], spare[netform.CHI],
+        spare[netform.ETA], spare[netform.RHO], work.spare_areas[netform.KNOWN], spare[netform.SHARE],
+    )  # fmt: skip
+    answer_mobile(
+        s.place[SEVERAL] > 0, own, form.home, form.first, form.cell, rows, work.mixed, work.matrix, work.room[3]
+    )  # fmt: skip
+    least: float = work.room[3, :NODES].min()
+    return 1.0 / least
+
+
+@jit_within
+def _write(c: Mesh, pace: Pace, s: LoopState, t: float) -> None:
+    """Charges of a step that began at t (s or, in a jump, a fraction), and its outputs."""
+    form, work, step, values = c.form, c.work, s.step, c.work.values
+    leaks, first_z, n_y = leaks_of(c, s), s.y.size - c.s_before.size, s.y.size
+    if pace.charge:
+        step_charges(form, work, leaks, step[LENGTH], c.integral, c.sign, values[first_z:n_y], values[n_y:])
+        charge_error(
+            form, work, step[LENGTH], leaks.lost, leaks.g, step[THETA], work.cells[netform.CELL_U], work.areas,
+            values[first_z:], c.collected, s.control,
+        )  # fmt: skip
+    for e in range(c.s_before.size):
+        work.gained[e] = at(values[first_z + e], work.basis) if pace.charge else 0.0
+    if s.place[IN_JUMP] > 0 or not is_wanted(s, step[T_NEW]):
+        return
+    write_columns(
+        form.shape.shape[0], first_z, pace.charge, form.shape, form.follow, work.modes[netform.W], work.s, s.y, values
+    )  # fmt: skip
+    write_step(s, t, 0.0, values, work.coefficients, work.outputs)
+
+
+@jit_within
+def _account(c: Mesh, s: LoopState) -> None:
+    """Peaks of a step, and the errors of the run in it."""
+    form, work, areas = c.form, c.work, c.work.areas
+    for a in range(c.sign.size):
+        if form.stress[a] > 0.0:
+            account(
+                areas[netform.U, a], areas[netform.AREA, a], form.stress[a], s.step[THETA], work.run[a], work.places,
+                form.slow[a], c.peaks[a],
+            )  # fmt: skip
+    account_nodes(form.node, form.node_s, work.places, work.off, c.peaks[c.sign.size])
+
+
+@jit_within
+def _move(c: Mesh, s: LoopState) -> None:
+    """State and error at the end of a step, or where it is cut short."""
+    form, work, theta, t_new = c.form, c.work, s.step[THETA], s.step[T_NEW]
+    w, w0, before, after = work.modes[netform.W], work.w0, work.jump.before, work.jump.after
+    for k in range(w0.size):
+        w0[k] = at(w[k], work.basis)
+    if theta < 1.0:
+        error_at(work.places, theta, s.error)
+    else:
+        for k in range(w0.size):
+            s.error[k] = work.places[k, N_PLACES - 1]
+    if s.place[IN_JUMP] > 0:
+        for e in range(before.size):
+            c.s_before[e] = before[e] + t_new * (after[e] - before[e])
+    else:
+        at_sources(c.sources, work.segment, t_new, 0.0, c.s_before, work.slopes_now)
+    store(form.shape, form.follow, w0, c.s_before, work.gained, s.y)
+
+
+@jit_within
+def _cross(c: Mesh, s: LoopState, a: int) -> None:
+    """Change the branch of area a at a zero of its gap voltage, which ends a step."""
+    control, branch, t_new = s.control, branch_of(c, s), s.step[T_NEW]
+    c.sign[a] = -c.sign[a]
+    branch[a, 0], branch[a, 1] = t_new, t_new - branch[a, 0]
+    s.counters[ZEROS] += 1
+    # The area has a kink here, which excites the fast modes again.
+    if control[H_AFTER_ZERO] > 0.0:
+        control[H], control[ALLOWED] = control[H_AFTER_ZERO], 0.0
+    s.place[FRESH] = H_AFTER_ZERO
+
+
+@jit_within
+def end_mesh(c: Mesh, s: LoopState) -> None:
+    """End a call of the loop: if it stopped within a jump, the time is that of the jump."""
+    if s.place[IN_JUMP] > 0:
+        resume_time(c, s)
