@@ -161,12 +161,10 @@ def one_step(stages: int, law: str, h: float) -> np.ndarray:
     one.room.s[:], one.room.ds[:] = one.s_before, (U0 * 2.0 * math.pi * F * math.cos(math.radians(PHASE)),)
     assert rates(one.net, one.room, False, one.y, one.sign, one.work.rate)
     start = one.work.rate.copy()
-    linearise(one.net, one.room, one.work, False, one.y, one.sign, one.scale)
+    linearise(one.nodal(sources), one.y)
     guess(scheme, one.work, start, h, 0.0)
     # The tolerance only says when the collocation equations are solved.
-    norm = step(
-        one.net, one.room, scheme, one.work, sources, False, 0.0, h, one.y, one.sign, one.scale, 1e-12, one.counters
-    )
+    norm = step(one.nodal(sources)._replace(tol=1e-12), 0.0, h, one.y, one.counters)
     assert norm > 0.0
     dense_polynomial(one.work.k, scheme.dense, h, one.work.poly)
     out = np.empty((INSIDE.size, one.y.size))

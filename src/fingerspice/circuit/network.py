@@ -11,7 +11,6 @@ The same law on the cuts of the voltage sources gives the currents that these de
 
 from __future__ import annotations
 
-from collections import defaultdict
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -22,6 +21,7 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.reduction import Tree, eliminate, source_currents
 from fingerspice.circuit.statespace import Stack, contact_of, layer_constants
 from fingerspice.circuit.topology import Area, find_branches
 from fingerspice.physics.contact import Contact
@@ -207,54 +207,29 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     currents = [e for e in branches if e.device == "I"]
     resistors = [e for e in branches if e.device == "R"]
 
-    tree = _Tree()
+    tree = Tree()
     in_tree = [tree.add(e.nodes[0], e.nodes[1]) for e in voltages]
     assert all(in_tree)
     live = [tree.add(*cell.nodes) for cell in cells]
     passive = [tree.add(e.nodes[0], e.nodes[1]) for e in resistors]
-    n_v, n, n_r = len(voltages), sum(live), sum(passive)
+    n_v, n_i, n_e, n_r = len(voltages), len(currents), len(voltages) + sum(live), sum(passive)
     potential = tree.potentials()
 
     def rows(pairs: list[tuple[str, ...]]) -> FloatArray:
         """Matrix from the voltages of the tree's branches, in the tree's order, to the voltages between node pairs."""
         out = [potential[a] - potential[b] for a, b, *_ in pairs]
-        return np.array(out).reshape(len(pairs), n_v + n + n_r)
+        return np.array(out).reshape(len(pairs), n_e + n_r)
 
     across = rows([cell.nodes for cell in cells])
-    over_resistors, over_currents = rows([e.nodes for e in resistors]), rows([e.nodes for e in currents])
     conductance = np.array([1.0 / e.values["value"] for e in resistors])
-    # Given the tree's voltages e = (s, x), the voltages of its resistors minimise the dissipated power.
-    e, r = slice(0, n_v + n), slice(n_v + n, None)
-    weight = np.sqrt(conductance)[:, None]
-    orthogonal, upper = np.linalg.qr(weight * over_resistors[:, r])
-    from_e = -np.linalg.solve(upper, orthogonal.T @ (weight * over_resistors[:, e])) if n_r else np.zeros((0, n_v + n))
-    back = np.linalg.solve(upper.T, over_currents[:, r].T) if n_r else np.zeros((0, len(currents)))
-    from_i = -np.linalg.solve(upper, back) if n_r else back
-    by_e = over_resistors[:, e] + over_resistors[:, r] @ from_e
-    by_i = over_resistors[:, r] @ from_i
-    # Currents into the cuts of the tree's sources and capacitors, from the resistors (by e) and the current sources.
-    into_e = by_e.T @ (conductance[:, None] * by_e)
-    into_i = over_resistors[:, e].T @ (conductance[:, None] * by_i) + over_currents[:, e].T
-    s, x = slice(0, n_v), slice(n_v, n_v + n)
-    n_i = len(currents)
-    # The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
-    # capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
-    factor = weight * by_e
-    together = -np.linalg.lstsq(factor[:, x], factor[:, s], rcond=None)[0].T if factor.size else np.zeros((n_v, n))
-    delivered = np.zeros((n_v + n_i, n + n_v + n_i))
-    delivered[:n_v] = np.hstack([into_e[s, x], into_e[s, s], into_i[s]])
-    delivered[:n_v] += together @ np.hstack([into_e[x, x], into_e[x, s], into_i[x]])
-    largest = np.linalg.norm(factor[:, s], axis=0)[:, None] * np.linalg.norm(factor, axis=0)
-    rounding = np.abs(np.hstack([delivered[:n_v, :n], delivered[:n_v, n : n + n_v]])) <= 1e-13 * np.hstack(
-        [largest[:, x], largest[:, s]]
-    )
-    delivered[:n_v, : n + n_v][rounding] = 0.0
+    found = eliminate(rows([e.nodes for e in resistors]), rows([e.nodes for e in currents]), conductance, n_e)
+    delivered, together = source_currents(found, n_v)
+    s, x = slice(0, n_v), slice(n_v, n_e)
     through = np.zeros((n_v + n_i, len(cells)))
     through[:n_v] = across[:, s].T + together @ across[:, x].T
-    delivered[n_v:, n + n_v :] = np.eye(n_i)
     names = tree.names
-    at_node = np.array([potential[name] for name in names]).reshape(len(names), n_v + n + n_r)
-    whole = at_node[:, e] + at_node[:, r] @ from_e
+    at_node = np.array([potential[name] for name in names]).reshape(len(names), n_e + n_r)
+    whole = at_node[:, :n_e] + at_node[:, n_e:] @ found.from_e
     written = {node: name for el in branches for node, name in zip(el.nodes, el.node_names, strict=True)}
     shown = [i for i, name in enumerate(names) if name in written and name != "0"]
     return Network(
@@ -268,14 +243,14 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
         gaps=tuple(next((i for i, c in enumerate(cells) if c.element is a.gap), None) for a in areas),
         p=np.ascontiguousarray(across[:, x]),
         q=np.hstack([across[:, s], np.zeros((len(cells), n_i))]),
-        k=into_e[x, x],
-        b=np.hstack([into_e[x, s], into_i[x]]),
+        k=found.into_e[x, x],
+        b=np.hstack([found.into_e[x, s], found.into_i[x]]),
         through=through,
         delivered=delivered,
-        resistor_factor=weight * by_e[:, x],
-        resistor_factor_s=np.hstack([weight * by_e[:, s], np.zeros((len(resistors), n_i))]),
+        resistor_factor=found.factor[:, x],
+        resistor_factor_s=np.hstack([found.factor[:, s], np.zeros((len(resistors), n_i))]),
         node_names=tuple(written[names[i]] for i in shown),
-        nodes=np.hstack([whole[shown][:, x], whole[shown][:, s], (at_node[:, r] @ from_i)[shown]]),
+        nodes=np.hstack([whole[shown][:, x], whole[shown][:, s], (at_node[:, n_e:] @ found.from_i)[shown]]),
     )
 
 
@@ -294,49 +269,6 @@ def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
         Cell(element, (path[i], path[i + 1]), float(c), float(g), float(g_area), area)
         for i, (c, g, g_area) in enumerate(constants)
     ]
-
-
-class _Tree:
-    """A spanning tree that grows branch by branch."""
-
-    def __init__(self) -> None:
-        self._parent: dict[str, str] = {}
-        self._branches: dict[str, list[tuple[str, int, float]]] = defaultdict(list)
-        self._count = 0
-
-    @property
-    def names(self) -> list[str]:
-        return list(self._branches)
-
-    def _root(self, node: str) -> str:
-        while self._parent.setdefault(node, node) != node:
-            self._parent[node] = self._parent[self._parent[node]]
-            node = self._parent[node]
-        return node
-
-    def add(self, p: str, n: str) -> bool:
-        """Add a branch if it closes no loop, and return whether it was added."""
-        a, b = self._root(p), self._root(n)
-        if a == b:
-            return False
-        self._parent[a] = b
-        self._branches[p].append((n, self._count, -1.0))
-        self._branches[n].append((p, self._count, 1.0))
-        self._count += 1
-        return True
-
-    def potentials(self) -> dict[str, FloatArray]:
-        """Voltage of every node against ground, as a row of coefficients of the branch voltages."""
-        out = {"0": np.zeros(self._count)}
-        todo = ["0"]
-        while todo:
-            node = todo.pop()
-            for other, branch, sign in self._branches[node]:
-                if other not in out:
-                    out[other] = out[node].copy()
-                    out[other][branch] = sign
-                    todo.append(other)
-        return out
 
 
 @dataclass(frozen=True)

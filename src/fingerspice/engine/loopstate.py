@@ -8,12 +8,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit_within
-from fingerspice.engine.readout import KEPT, OUTPUT, RECORDED, Steps, record, series_of, write_outputs
+from fingerspice.engine.readout import KEPT, OUTPUT, RECORDED, Outputs, Steps, record, series_of, write_outputs
 from fingerspice.engine.repeat import Kept
 from fingerspice.numerics.small import copy_to
 
@@ -60,8 +57,7 @@ class LoopState(NamedTuple):
         Bookkeeping, see `engine.readout`.
     step, place : ndarray, shape (N_STEP,) and (N_PLACE,)
         The step at hand; its entries are named above.
-    t_out, left, out : ndarray
-        Output times (s, ascending), whether the left-hand limit is meant, and the columns to fill.
+    outputs : Outputs
     kept : Kept
         Takes the first steps, for repeated periods, until it is full; `counters` tells how many steps there were.
     steps : Steps
@@ -76,9 +72,7 @@ class LoopState(NamedTuple):
     counters: IntArray
     step: FloatArray
     place: IntArray
-    t_out: FloatArray
-    left: NDArray[np.bool_]
-    out: FloatArray
+    outputs: Outputs
     kept: Kept
     steps: Steps
     tried: FloatArray
@@ -88,12 +82,16 @@ class LoopState(NamedTuple):
 def is_wanted(s: LoopState, t_new: float) -> bool:
     """Whether a step that ends at `t_new` (s) has outputs, or is recorded or kept."""
     first = s.counters[OUTPUT]
-    return s.steps.times.shape[0] > 0 or s.kept.times.size > 0 or (first < s.t_out.size and s.t_out[first] <= t_new)
+    return (
+        s.steps.times.shape[0] > 0
+        or s.kept.times.size > 0
+        or (first < s.outputs.t.size and s.outputs.t[first] <= t_new)
+    )
 
 
 @jit_within
 def write_step(
-    s: LoopState, t: float, mark: float, values: FloatArray, coefficients: FloatArray, outputs: FloatArray
+    s: LoopState, t: float, mark: float, values: FloatArray, coefficients: FloatArray, work: FloatArray
 ) -> None:
     """Record a finished step that began at t (s), keep it for repetition, and write its outputs.
 
@@ -103,7 +101,7 @@ def write_step(
         What the step ends with: `repeat.AT_ZERO`, `repeat.AT_EDGE`, or 0.
     values, coefficients : ndarray, shape (n_column, ROWS)
         The columns at the rows of the step; takes their Chebyshev coefficients.
-    outputs : ndarray, shape (2, WRITTEN_AT_ONCE)
+    work : ndarray, shape (2, WRITTEN_AT_ONCE)
         Scratch.
     """
     counters, kept_times = s.counters, s.kept.times
@@ -112,17 +110,17 @@ def write_step(
         record(s.steps.times, s.steps.values, counters[RECORDED], t, h, t_new, theta, values)
         counters[RECORDED] += 1
     first = counters[OUTPUT]
-    has_outputs = first < s.t_out.size and s.t_out[first] <= t_new
+    has_outputs = first < s.outputs.t.size and s.outputs.t[first] <= t_new
     if not has_outputs and kept_times.size == 0:
         return
-    for c in range(s.out.shape[0]):
+    for c in range(s.outputs.columns.shape[0]):
         series_of(values[c], coefficients[c])
     place = counters[KEPT]
     counters[KEPT] += 1
     if place < kept_times.shape[0]:
         kept_times[place, 0], kept_times[place, 1], kept_times[place, 2], kept_times[place, 3] = t, h, t_new, mark
-        copy_to(s.kept.series[place], coefficients[: s.out.shape[0]])
+        copy_to(s.kept.series[place], coefficients[: s.outputs.columns.shape[0]])
     if has_outputs:
         counters[OUTPUT] += write_outputs(
-            t, h, theta, t_new, 0.0, False, coefficients, outputs, first, 0, s.t_out, s.left, s.out
+            t, h, theta, t_new, 0.0, False, coefficients, work, first, 0, s.outputs
         )  # fmt: skip

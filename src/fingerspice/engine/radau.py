@@ -55,6 +55,7 @@ class Work(NamedTuple):
     weight: FloatArray
     newton: ComplexArray
     rate: FloatArray
+    start: FloatArray
     stage: FloatArray
     y1: FloatArray
     residual: FloatArray
@@ -64,6 +65,34 @@ class Work(NamedTuple):
     ds: FloatArray
 
 
+class Nodal(NamedTuple):
+    """A network and its sources, as the implicit steps take them.
+
+    Attributes
+    ----------
+    net, scheme, sources
+        The network, the Runge-Kutta scheme and the sources; `room` and `work` are scratch arrays.
+    jump : bool
+        Whether the sources' "time" is the fraction of a jump.
+    sign : ndarray, shape (n_area,)
+        Branch of each area; 0: to be chosen.
+    scale : ndarray, shape (size,)
+        Size of each entry of the state, to which its error is relative.
+    tol : float
+        Error allowed in a step, as a fraction of `scale`.
+    """
+
+    net: Net
+    room: Room
+    scheme: Scheme
+    work: Work
+    sources: Sources
+    jump: bool
+    sign: FloatArray
+    scale: FloatArray
+    tol: float
+
+
 @jit
 def new_work(net: Net, stages: int, n_eigen: int, size: int) -> Work:
     """Room for steps of a state of `size`."""
@@ -71,18 +100,19 @@ def new_work(net: Net, stages: int, n_eigen: int, size: int) -> Work:
     m = size - n_s
     return Work(
         np.zeros((stages, size)), np.zeros((size, stages)), np.zeros((m, m)), np.zeros((m, m)), np.zeros(m),
-        np.zeros((n_eigen, m, m), np.complex128), np.zeros(size), np.zeros(size), np.zeros(size),
+        np.zeros((n_eigen, m, m), np.complex128), np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size),
         np.zeros((stages, m)), np.zeros(n_s, np.int64), np.zeros(1), np.zeros((stages, n_s)), np.zeros((stages, n_s)),
     )  # fmt: skip
 
 
 @jit
-def linearise(net: Net, room: Room, work: Work, jump: bool, y: FloatArray, sign: FloatArray, scale: FloatArray) -> None:
+def linearise(c: Nodal, y: FloatArray) -> None:
     """Derivatives of the residual by the state (by differences) and by its time derivative, at `work.rate`.
 
     Only for the part of the state on which the residual depends; each row is divided by its largest capacitance,
     because currents are tiny beside the derivatives of areas. The sources are those in `room`.
     """
+    net, room, work, jump, sign, scale = c.net, c.room, c.work, c.jump, c.sign, c.scale
     n = net.k.shape[0]
     m = work.slope.shape[0]
     capacitances(net, room, y, sign)
@@ -154,10 +184,9 @@ def _stage(scheme: Scheme, work: Work, i: int, h: float, y: FloatArray) -> None:
 
 
 @jit
-def _residuals(
-    net: Net, room: Room, scheme: Scheme, work: Work, jump: bool, h: float, y: FloatArray, sign: FloatArray
-) -> None:
+def _residuals(c: Nodal, h: float, y: FloatArray) -> None:
     """Weighted residuals of all stages into `work.residual`, and the charges' rates into `work.k`."""
+    net, room, scheme, work, jump, sign = c.net, c.room, c.scheme, c.work, c.jump, c.sign
     stages, m = work.residual.shape
     for i in range(stages):
         _stage(scheme, work, i, h, y)
@@ -172,23 +201,23 @@ def _residuals(
 
 
 @jit
-def step(
-    net: Net, room: Room, scheme: Scheme, work: Work, sources: Sources, jump: bool, t: float, h: float, y: FloatArray,
-    sign: FloatArray, scale: FloatArray, tol: float, counters: IntArray,
-) -> float:  # fmt: skip
+def step(c: Nodal, t: float, h: float, y: FloatArray, counters: IntArray) -> float:
     """Collocation over [t, t + h] with `work.slope` as Newton's matrix: stages in `work.k`, the end in `work.y1`.
 
     `work.k` holds a guess of the stages. Returns the error over `tol` times `scale`; inf where it does not converge.
     """
+    net, room, scheme, work, jump, sign, scale, tol = (
+        c.net, c.room, c.scheme, c.work, c.jump, c.sign, c.scale, c.tol
+    )  # fmt: skip
     stages, m = work.residual.shape
     if not _prepare_newton(scheme, work, h):
         return math.inf
     k = work.k
     for i in range(stages):
-        at_sources(sources, work.place, work.base[0], t + scheme.c[i] * h, work.s[i], work.ds[i])
+        at_sources(c.sources, work.place, work.base[0], t + scheme.c[i] * h, work.s[i], work.ds[i])
     before = math.inf
     for iteration in range(12):
-        _residuals(net, room, scheme, work, jump, h, y, sign)
+        _residuals(c, h, y)
         counters[NFEV] += stages
         _solve_newton(scheme, work)
         change = 0.0
@@ -210,7 +239,7 @@ def step(
         return math.inf
     if y.size > m and scale[m] < math.inf:
         # The charges' derivatives belong to the last iteration but one: evaluate them again if charges are wanted.
-        _residuals(net, room, scheme, work, jump, h, y, sign)
+        _residuals(c, h, y)
         counters[NFEV] += stages
     norm = 0.0
     for j in range(y.size):

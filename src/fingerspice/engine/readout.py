@@ -97,6 +97,22 @@ def note(tried: FloatArray, number: int, t: float, h: float, error: float) -> No
     tried[place, 3] = number + 1
 
 
+class Outputs(NamedTuple):
+    """Where a run's outputs go.
+
+    Attributes
+    ----------
+    t, left : ndarray, shape (n_out,)
+        Output times (s, ascending), and whether the left-hand limit is meant.
+    columns : ndarray, shape (n_column, n_out)
+        To be filled.
+    """
+
+    t: FloatArray
+    left: NDArray[np.bool_]
+    columns: FloatArray
+
+
 @jit_rows
 def series_of(values: FloatArray, out: FloatArray) -> None:
     """Chebyshev coefficients (ROWS,) of the polynomial through values at the nodes."""
@@ -231,7 +247,7 @@ def _outputs_within(first: int, guess: int, low: float, high: float, t_out: Floa
 @jit
 def write_outputs(
     t: float, h: float, reached: float, t_new: float, slack: float, powers: bool, series: FloatArray, work: FloatArray,
-    first: int, guess: int, t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray,
+    first: int, guess: int, outputs: Outputs,
 ) -> int:  # fmt: skip
     """Outputs of one step from number `first` on: right-hand ones in [t, t_new), left-hand ones in (t, t_new].
 
@@ -239,7 +255,8 @@ def write_outputs(
     `guess` is the expected number. Places after the last output are overwritten: they belong to later steps.
     `work` has shape (2, WRITTEN_AT_ONCE). Returns how many there were.
     """
-    count = _outputs_within(first, guess, t_new - slack, t_new + slack, t_out, left)
+    t_out, out = outputs.t, outputs.columns
+    count = _outputs_within(first, guess, t_new - slack, t_new + slack, t_out, outputs.left)
     groups = (count + _GROUP - 1) // _GROUP
     scale = 2.0 / h
     top = 2.0 * reached - 1.0

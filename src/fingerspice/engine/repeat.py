@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit
-from fingerspice.engine.readout import WRITTEN_AT_ONCE, write_outputs
+from fingerspice.engine.readout import WRITTEN_AT_ONCE, Outputs, write_outputs
 from fingerspice.numerics.chebyshev import to_powers
 from fingerspice.numerics.lobatto import NODES, ROWS
 from fingerspice.numerics.small import copy_to
@@ -67,8 +67,7 @@ def _calls(periods: int, steps: int) -> Iterator[tuple[int, int]]:
 
 
 def repeat(
-    kept: Kept, count: int, period: float, periods: int, drifts: FloatArray, first: int, t_out: FloatArray,
-    left: NDArray[np.bool_], out: FloatArray,
+    kept: Kept, count: int, period: float, periods: int, drifts: FloatArray, first: int, outputs: Outputs
 ) -> int:  # fmt: skip
     """Write the outputs of the periods that follow the kept one.
 
@@ -82,7 +81,7 @@ def repeat(
         How often to repeat it.
     drifts : ndarray, shape (n_column,)
         Gain of each column in a period; only charges have one, C.
-    first, t_out, left, out
+    first, outputs
         As `readout.write_outputs`.
 
     Returns
@@ -92,20 +91,20 @@ def repeat(
     """
     walk = _new_walk(count)
     for begin, end in _calls(periods, count):
-        first = _repeat(kept, walk, period, begin + 1, end + 1, drifts, first, t_out, left, out)
-        if first >= t_out.size:
+        first = _repeat(kept, walk, period, begin + 1, end + 1, drifts, first, outputs)
+        if first >= outputs.t.size:
             break
     return first
 
 
 @jit
 def _repeat(
-    kept: Kept, walk: _Walk, period: float, begin: int, end: int, drifts: FloatArray, first: int, t_out: FloatArray,
-    left: NDArray[np.bool_], out: FloatArray,
+    kept: Kept, walk: _Walk, period: float, begin: int, end: int, drifts: FloatArray, first: int, outputs: Outputs
 ) -> int:  # fmt: skip
     """As `repeat`, of the periods from `begin` to before `end`."""
     times, series = borrow(kept.times), borrow(kept.series)
-    t_out, left, out, drifts = borrow(t_out), borrow(left), borrow(out), borrow(drifts)
+    outputs, drifts = borrow(outputs), borrow(drifts)
+    t_out, out = outputs.t, outputs.columns
     held, as_powers = borrow(walk.held), borrow(walk.as_powers)
     if begin == 1:
         _make_powers(series, np.zeros((0, 0, 0, 0)), as_powers)
@@ -125,7 +124,7 @@ def _repeat(
             # Mostly a period has as many outputs as the one before.
             held[i] = write_outputs(
                 times[i, 0] + shift, h, min(reached, 1.0), stop, slack, as_powers[i], series[i], work, first, held[i],
-                t_out, left, out,
+                outputs,
             )  # fmt: skip
             first += held[i]
         for c in range(out.shape[0]):
@@ -157,28 +156,48 @@ def _make_powers(series: FloatArray, by: FloatArray, made: NDArray[np.bool_]) ->
                 copy_to(by[m, i, c, :NODES], room)
 
 
+class PeriodMap(NamedTuple):
+    """Affine map from the start of a period to its steps and its end, made at a period from live voltages `x`.
+
+    Attributes
+    ----------
+    marks : ndarray, shape (n_step + 1,)
+        Where the steps begin and end in the first period, if that starts from `x` without charge, s.
+    marks_by : ndarray, shape (n_step + 1, n)
+        Its derivative by the live voltages at the start, s/V.
+    series : ndarray, shape (n_step, n_column, ROWS)
+        Chebyshev coefficients of that period's outputs, each over its step.
+    by : ndarray, shape (n, n_step, n_column, ROWS)
+        Their derivative.
+    slope : ndarray, shape (n + 1, n)
+        That of live voltages and charge at the end.
+    x : ndarray, shape (n,)
+        V.
+    end : ndarray, shape (n + 1,)
+        Live voltages (V) and charge (C) where the period from `x` ends.
+    """
+
+    marks: FloatArray
+    marks_by: FloatArray
+    series: FloatArray
+    by: FloatArray
+    slope: FloatArray
+    x: FloatArray
+    end: FloatArray
+
+
 def approach(
-    marks: FloatArray, marks_by: FloatArray, series: FloatArray, by: FloatArray, slope: FloatArray, x: FloatArray,
-    end: FloatArray, state: FloatArray, shown: int, still: float, period: float, periods: int, first: int,
-    t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray,
+    one: PeriodMap, state: FloatArray, shown: int, still: float, period: float, periods: int, first: int,
+    outputs: Outputs,
 ) -> int:  # fmt: skip
     """Write the outputs of periods that follow one another by an affine map.
 
     Parameters
     ----------
-    marks : ndarray, shape (n_step + 1,)
-        Where the steps begin and end in the first period, if that starts from live voltages `x` (n,) without charge, s.
-    marks_by : ndarray, shape (n_step + 1, n)
-        Its derivative by the live voltages at the start, s/V.
-    series : ndarray, shape (n_step, n_column, ROWS)
-        Chebyshev coefficients of that period's outputs, each over its step; used up.
-    by : ndarray, shape (n, n_step, n_column, ROWS)
-        Their derivative; used up.
-    slope : ndarray, shape (n + 1, n)
-        That of live voltages and charge at the end.
-    end, state : ndarray, shape (n + 1,)
-        Live voltages (V) and charge (C): `end` where the period from `x` ends; `state` where the first period starts,
-        and on return where the last one ends.
+    one : PeriodMap
+        Its `series` and `by` are used up.
+    state : ndarray, shape (n + 1,)
+        Live voltages (V) and charge (C) where the first period starts, and on return where the last one ends.
     shown : int
         Columns that are voltages; after them come charge and current, if wanted.
     still : float
@@ -187,7 +206,7 @@ def approach(
         s.
     periods : int
         How many there are.
-    first, t_out, left, out
+    first, outputs
         As `readout.write_outputs`.
 
     Returns
@@ -195,13 +214,12 @@ def approach(
     int
         The first output that is left.
     """
-    walk = _new_walk(series.shape[0])
-    formed = _Formed(np.full(x.size, np.inf), np.zeros(marks.size), np.zeros_like(series), np.ones(1, np.bool_))
-    for begin, stop in _calls(periods, series.shape[0]):
-        first = _approach(
-            marks, marks_by, series, by, slope, x, end, state, shown, still, period, begin, stop, walk, formed, first,
-            t_out, left, out,
-        )  # fmt: skip
+    walk = _new_walk(one.series.shape[0])
+    formed = _Formed(
+        np.full(one.x.size, np.inf), np.zeros(one.marks.size), np.zeros_like(one.series), np.ones(1, np.bool_)
+    )  # fmt: skip
+    for begin, stop in _calls(periods, one.series.shape[0]):
+        first = _approach(one, state, shown, still, period, begin, stop, walk, formed, first, outputs)
     return first
 
 
@@ -227,11 +245,11 @@ class _Formed(NamedTuple):
 
 @jit
 def _approach(
-    marks: FloatArray, marks_by: FloatArray, series: FloatArray, by: FloatArray, slope: FloatArray, x: FloatArray,
-    end: FloatArray, state: FloatArray, shown: int, still: float, period: float, begin: int, stop: int, walk: _Walk,
-    formed: _Formed, first: int, t_out: FloatArray, left: NDArray[np.bool_], out: FloatArray,
+    one: PeriodMap, state: FloatArray, shown: int, still: float, period: float, begin: int, stop: int, walk: _Walk,
+    formed: _Formed, first: int, outputs: Outputs,
 ) -> int:  # fmt: skip
     """As `approach`, of the periods from `begin` to before `stop`."""
+    marks, series, by, slope, x, end, t_out = one.marks, one.series, one.by, one.slope, one.x, one.end, outputs.t
     n = x.size
     work = np.zeros((2, WRITTEN_AT_ONCE))
     held, stops, made = walk.held, formed.stops, formed.series
@@ -251,7 +269,7 @@ def _approach(
         close = marks[-1] + shift
         if first < t_out.size and t_out[first] <= close + _SLACK * abs(close):
             if formed.stale[0]:
-                _form(marks, marks_by, series, by, formed.at, stops, made)
+                _form(marks, one.marks_by, series, by, formed.at, stops, made)
                 formed.stale[0] = False
             for i in range(series.shape[0]):
                 since, until = stops[i] + shift, stops[i + 1] + shift
@@ -259,7 +277,7 @@ def _approach(
                     made[i, shown, 0] += state[n]
                 held[i] = write_outputs(
                     since, until - since, 1.0, until, _SLACK * abs(until), walk.as_powers[i], made[i], work, first,
-                    held[i], t_out, left, out,
+                    held[i], outputs,
                 )  # fmt: skip
                 first += held[i]
                 if series.shape[1] > shown:

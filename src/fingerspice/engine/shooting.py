@@ -21,6 +21,7 @@ from fingerspice.engine.readout import (
     PEAK_U,
     TRIED,
     U_BEFORE,
+    Outputs,
     Steps,
     T,
 )  # fmt: skip
@@ -60,8 +61,8 @@ def _map(
             y[i] += system.live[0, i, k] * w[k]
     count = np.zeros(N_COUNTERS, np.int64)
     state = LoopState(
-        y, np.zeros(n + 1), control, count, np.zeros(N_STEP), np.zeros(N_PLACE, np.int64), np.zeros(0),
-        np.zeros(0, np.bool_), np.zeros((n, 0)), Kept(np.zeros((0, 4)), np.zeros((0, n, ROWS))),
+        y, np.zeros(n + 1), control, count, np.zeros(N_STEP), np.zeros(N_PLACE, np.int64),
+        Outputs(np.zeros(0), np.zeros(0, np.bool_), np.zeros((n, 0))), Kept(np.zeros((0, 4)), np.zeros((0, n, ROWS))),
         Steps(np.zeros((0, 4)), np.zeros((0, n, NODES))), np.zeros((TRIED, 4)),
     )  # fmt: skip
     code = march(stack, pace, state, edges[-1])

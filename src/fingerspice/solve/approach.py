@@ -73,8 +73,9 @@ class _Period:
         left[:, -1] = True
         out = np.empty((self.track.out.shape[0], t.size))
         kept, count = self.track.kept, self.marks.size - 1
+        outputs = readout.Outputs(t.ravel(), left.ravel(), out)
         # `repeat` overwrites the steps' series, so that this method can be called only once.
-        if repetition.repeat(kept, count, 0.0, 1, np.zeros(len(out)), 0, t.ravel(), left.ravel(), out) < t.size:
+        if repetition.repeat(kept, count, 0.0, 1, np.zeros(len(out)), 0, outputs) < t.size:
             raise _LostError
         return np.ascontiguousarray(out.reshape(-1, *t.shape).swapaxes(0, 1) @ TO_SERIES)
 
@@ -110,6 +111,21 @@ def _moved(slope: FloatArray, shift: FloatArray, periods: int) -> FloatArray:
     """Sum of slope^i shift for i = 0 ... periods - 1."""
     n = shift.size
     return np.asarray(np.linalg.matrix_power(np.block([[slope, shift[:, None]], [np.zeros(n), 1.0]]), periods)[:n, n])
+
+
+def _missed_within(
+    one: repetition.PeriodMap, marks: FloatArray, series: FloatArray, delta: FloatArray, shown: int
+) -> float:
+    """Bound of the error of the map within a period, V, whose start differs by `delta` (V) and which was integrated.
+
+    `marks` and `series` are those of that period; `shown` columns are voltages.
+    """
+    missed = series - one.series - np.tensordot(delta, one.by, 1)
+    marks_missed = marks - one.marks - one.marks_by @ delta
+    # The sum of the moduli of its Chebyshev coefficients bounds a polynomial.
+    off = float(np.abs(missed[:, :shown]).sum(axis=-1).max(initial=0.0))
+    steepest = np.abs(one.series[:, :shown]) @ np.arange(series.shape[-1]) * 2.0 / np.diff(one.marks)[:, None]
+    return off + float((steepest.max(axis=1) * np.maximum(abs(marks_missed[1:]), abs(marks_missed[:-1]))).max())
 
 
 def leap(track: Track, sources: Sources, settling: Settling) -> None:
@@ -150,12 +166,8 @@ def _leap(track: Track, sources: Sources, settling: Settling, stop: float) -> No
     # Defect of the map at the present state: the integrated period minus the period that the map predicts.
     delta = x0 - base_x
     missed = end - base.track.y - slope @ delta
-    marks_missed = here.marks - marks - marks_by @ delta
-    missed_series = series_here - series - np.tensordot(delta, by, 1)
-    # The sum of the moduli of its Chebyshev coefficients bounds a polynomial.
-    off = float(np.abs(missed_series[:, : track.shown]).sum(axis=-1).max(initial=0.0))
-    steepest = np.abs(series[:, : track.shown]) @ np.arange(series.shape[-1]) * 2.0 / np.diff(marks)[:, None]
-    late = float((steepest.max(axis=1) * np.maximum(abs(marks_missed[1:]), abs(marks_missed[:-1]))).max())
+    one = repetition.PeriodMap(marks, marks_by, series, by, slope, base_x, base.track.y)
+    within = _missed_within(one, here.marks, series_here, delta, track.shown)
     later = max(float(np.abs(missed[:n]).max()), float(np.abs(_moved(slope[:n], missed[:n], left)).max()))
     slowest = np.abs(np.linalg.eigvals(slope[:n]))
     slowest = float(slowest[slowest < 1.0 - 1e-9].max(initial=0.0))
@@ -165,7 +177,7 @@ def _leap(track: Track, sources: Sources, settling: Settling, stop: float) -> No
     noise = base.off + (np.array(offs) - here.off).T @ (delta / settling.probe)
     later += SAFETY * max(float(np.abs(noise).max()), float(np.abs(_moved(slope[:n], noise, left)).max()))
     still = _STILL * settling.allowed
-    error = max(float(track.control[readout.MAGNIFIED]) * (later + still) + off + late, owed / track.capacitance)
+    error = max(float(track.control[readout.MAGNIFIED]) * (later + still) + within, owed / track.capacitance)
     if not error <= settling.allowed:
         settling.stumbled(error / settling.allowed)
         return
@@ -177,8 +189,7 @@ def _leap(track: Track, sources: Sources, settling: Settling, stop: float) -> No
         x0.copy(), still, settling.period, left,
     ))  # fmt: skip
     track.counters[readout.OUTPUT] = repetition.approach(
-        marks, marks_by, series, by, slope, base_x, base.track.y, state, track.shown, still,
-        settling.period, left, int(track.counters[readout.OUTPUT]), track.t_out, track.left, track.out,
+        one, state, track.shown, still, settling.period, left, int(track.counters[readout.OUTPUT]), track.outputs
     )  # fmt: skip
     control, before = base.track.control, here.track.control
     for peak in (readout.PEAK_U, readout.PEAK_F, readout.PEAK_Q, readout.ERROR_U, readout.ERROR_F, readout.ERROR_V):

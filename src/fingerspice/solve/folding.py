@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -188,6 +190,16 @@ def _ahead(problem: Problem, state: StackState, begun: _Start, margin: float, rt
     return None
 
 
+def _jacobian(slope: Callable[[float, FloatArray], FloatArray], s: float, z: FloatArray) -> FloatArray:
+    """Derivative of a slope by plain differences: scipy enlarges its own without limit for what nothing depends on."""
+    here, columns = slope(s, z), []
+    for i in range(z.size):
+        moved = z.copy()
+        moved[i] += 1e-7 * abs(z[i]) + 1e-13
+        columns.append((slope(s, moved) - here) / (moved[i] - z[i]))
+    return np.array(columns).T
+
+
 def _path(problem: Problem, state: StackState, begun: _Start, rtol: float) -> _Path | None:
     t, y, model, n = state.t, state.y, model_of(problem.scene), state.y.size
     segment, end, sign, u = begun
@@ -232,19 +244,10 @@ def _path(problem: Problem, state: StackState, begun: _Start, rtol: float) -> _P
     for event in events:
         event.terminal = True
 
-    def jacobian(s: float, z: FloatArray) -> FloatArray:
-        # Plain differences: scipy enlarges its own without limit for entries on which nothing depends (the charge).
-        here, columns = slope(s, z), []
-        for i in range(z.size):
-            moved = z.copy()
-            moved[i] += 1e-7 * abs(z[i]) + 1e-13
-            columns.append((slope(s, moved) - here) / (moved[i] - z[i]))
-        return np.array(columns).T
-
     # Near the fold the mode that folds may be the stiffest of all: an explicit method would need too many steps.
     found = solve_ivp(
         slope, (0.0, LONGEST), begin, "Radau",
-        rtol=rtol, atol=rtol, jac=jacobian, events=events, dense_output=True,
+        rtol=rtol, atol=rtol, jac=partial(_jacobian, slope), events=events, dense_output=True,
     )  # fmt: skip
     if found.status < 1:
         raise _LostError

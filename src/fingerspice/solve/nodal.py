@@ -11,9 +11,9 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine import collocation
-from fingerspice.engine.collocation import advance
+from fingerspice.engine.collocation import Passage, advance
 from fingerspice.engine.network import Sources, new_room
-from fingerspice.engine.radau import Scheme, new_work
+from fingerspice.engine.radau import Nodal, Scheme, new_work
 from fingerspice.engine.readout import TRIED
 from fingerspice.numerics.radau_tableau import radau
 from fingerspice.physics.contact import inverse_area
@@ -98,13 +98,19 @@ class Collocation(NetworkIntegration):
         """Fraction of the run that is done."""
         return (self.t - self.problem.t_start) / (self.problem.t_stop - self.problem.t_start)
 
+    def nodal(self, sources: Sources) -> Nodal:
+        """The network with these sources, as the compiled steps take it."""
+        return Nodal(
+            self.net, self.room, self.scheme, self.work, sources, False, self.sign, self.scale, self.tol
+        )  # fmt: skip
+
     def through(self, sources: Sources, t_end: float) -> Status:
         while True:
-            code = advance(
-                self.net, self.room, self.scheme, self.work, sources, False, self.problem.charge, t_end, self.y,
-                self.sign, self.s_before, self.scale, self.tol, self.control, self.counters, self.peaks, self.t_out,
+            run = Passage(
+                self.y, self.s_before, self.control, self.counters, self.peaks, self.problem.charge, self.t_out,
                 self.left, self.rows, self.tried,
             )  # fmt: skip
+            code = advance(self.nodal(sources), run, t_end)
             if code == collocation.DONE:
                 return Status.SUCCESS
             if code == collocation.PAUSED:
@@ -118,11 +124,12 @@ class Collocation(NetworkIntegration):
 
     def jump(self, after: FloatArray) -> bool:
         control = np.zeros(collocation.N_CONTROL)
-        code = advance(
-            self.net, self.room, self.scheme._replace(h_max=1.0), self.work, ramp(self.s_before, after), True, False,
-            1.0, self.y, self.sign, self.s_before.copy(), self.scale, self.tol, control, self.counters, self.peaks,
-            np.empty(0), np.empty(0, bool), np.empty((0, self.y.size)), np.zeros((TRIED, 4)),
+        run = Passage(
+            self.y, self.s_before.copy(), control, self.counters, self.peaks, False, np.empty(0), np.empty(0, bool),
+            np.empty((0, self.y.size)), np.zeros((TRIED, 4)),
         )  # fmt: skip
+        nodal = self.nodal(ramp(self.s_before, after))
+        code = advance(nodal._replace(scheme=self.scheme._replace(h_max=1.0), jump=True), run, 1.0)
         self.s_before[:] = after
         self.control[collocation.H] = self.control[collocation.H_AFTER_JUMP]
         self.control[collocation.JUMPED] = 1.0

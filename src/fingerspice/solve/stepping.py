@@ -15,6 +15,7 @@ from fingerspice.engine import repeat as repetition
 from fingerspice.engine.loopstate import LoopState
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import Pace
+from fingerspice.engine.readout import Outputs
 from fingerspice.results.outcome import Status
 from fingerspice.results.record import bare_record
 from fingerspice.results.steps import Recorded, Recorder
@@ -91,9 +92,14 @@ class Stepping(Integration):
     def loop_state(self) -> LoopState:
         """The integration as the compiled loop takes and updates it."""
         return LoopState(
-            self.y, self.error, self.control, self.counters, self.step, self.place, self.t_out, self.left, self.out,
-            self.kept, self.recorder.room, self.tried,
+            self.y, self.error, self.control, self.counters, self.step, self.place, self.outputs, self.kept,
+            self.recorder.room, self.tried,
         )  # fmt: skip
+
+    @property
+    def outputs(self) -> Outputs:
+        """Where the compiled loops write outputs."""
+        return Outputs(self.t_out, self.left, self.out)
 
     @abstractmethod
     def _to(self, sources: Sources, t_end: float) -> Status:
@@ -188,7 +194,7 @@ class Stepping(Integration):
             drifts[-2 * n_s : -n_s] = drift
         self.counters[readout.OUTPUT] = repetition.repeat(
             self.kept, int(self.counters[readout.KEPT]), period, periods, drifts, int(self.counters[readout.OUTPUT]),
-            self.t_out, self.left, self.out,
+            self.outputs,
         )  # fmt: skip
         self.y[-n_s:] += periods * drift
         self.recorder.drain(self.counters)
