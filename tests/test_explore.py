@@ -28,11 +28,13 @@ from hypothesis import strategies as st
 import fingerspice as fs
 from commands import Command
 from fingerspice.base.arrays import FloatArray
+from fingerspice.circuit.devices import DEVICES
 from fingerspice.explorer.examples import EXAMPLES
 from fingerspice.explorer.request import LONGEST_DECK
 from fingerspice.explorer.scene import POINTS, scene
 from fingerspice.explorer.server import MOST_BYTES, Explorer, pages
 from fingerspice.explorer.sharing import as_deck, as_python, means
+from fingerspice.explorer.sliders import _MEANINGS
 from fingerspice.explorer.waveforms import WAVEFORMS
 
 ROOT = Path(__file__).parents[1]
@@ -149,6 +151,11 @@ def test_every_example_shows_what_it_promises(example: Any) -> None:
         assert "no solution" in answer["message"]
         assert 0.0 < answer["failed_at"] < 1e-3
         assert answer["sliders"]
+        # It fails before the periods that are shown, so that all there is of it is shown instead.
+        shown = scene({"deck": example.deck, **example.asked, "last": 2})
+        assert shown["status"] == "FOLD"
+        assert shown["t"].size > POINTS // 2
+        assert 0.99 * answer["failed_at"] < shown["t"][-1] <= answer["failed_at"]
         return
     assert answer["ok"], answer["message"]
     assert answer["warnings"] == []
@@ -192,6 +199,15 @@ def test_sliders_show_every_parameter_within_its_range() -> None:
     unmoved = scene({"deck": BY_NAME["ungrounded"].deck})
     ranges = {s["path"]: (s["low"], s["high"]) for group in unmoved["sliders"] for s in group["sliders"]}
     assert ranges == {path: (s["low"], s["high"]) for path, s in sliders.items()}
+
+
+def test_every_slider_of_an_element_says_what_it_moves() -> None:
+    assert set(_MEANINGS) == {name for name, spec in DEVICES.items() if spec.parameters}
+    for name, meanings in _MEANINGS.items():
+        assert set(meanings) == {p.name for p in DEVICES[name].parameters}, name
+    groups = scene({"deck": BY_NAME["ungrounded"].deck})["sliders"]
+    meanings = {s["path"]: s["meaning"] for group in groups for s in group["sliders"]}
+    assert (meanings["Xgap.d"], meanings["Cbody.value"]) == ("gap height", "capacitance")
 
 
 def test_both_ends_of_every_slider_give_a_run_or_a_sentence() -> None:
@@ -544,6 +560,37 @@ def test_the_command_serves_until_it_is_interrupted_and_leaves_no_file(tmp_path:
         out, err = process.communicate(timeout=20)
     assert (process.returncode, out, err) == (0, "", "")
     assert os.listdir(tmp_path) == ["pad.cir"]
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux's /proc")
+def test_the_memory_of_the_command_stays_as_it_is_while_a_slider_moves(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "fingerspice", "explore", "--no-browser", "--json"]
+    with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        assert process.stdout is not None
+        said = ""
+        while not said.endswith("}\n"):
+            said += process.stdout.readline()
+        _, _, host, token, _ = json.loads(said)["url"].split("/")
+        connection = http.client.HTTPConnection(host)
+
+        def memory() -> float:
+            """Resident memory, MB."""
+            status = Path(f"/proc/{process.pid}/status").read_text()
+            return int(status.partition("VmRSS:")[2].split()[0]) / 1024.0
+
+        def move(start: int, stop: int) -> None:
+            for i in range(start, stop):
+                request = {"deck": SINE, "overrides": {"Xgap.d": 3e-6 + 1e-10 * i}, "last": 2}
+                connection.request("POST", f"/{token}/scene", json.dumps(request))
+                assert connection.getresponse().read()
+
+        move(0, 200)
+        before = memory()
+        move(200, 800)
+        # An answer holds 0.1 MB of arrays, and its run 0.5 MB.
+        assert memory() - before < 60.0
+        connection.close()
+        process.send_signal(signal.SIGINT)
 
 
 def test_the_command_refuses_a_deck_that_is_none(command: Command) -> None:

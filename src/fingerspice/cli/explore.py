@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 import threading
 from pathlib import Path
@@ -17,6 +18,9 @@ from fingerspice.cli.terminal import Answering
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
+
+#: Objects, made and not deleted, after which garbage is looked for while the page is served.
+_COLLECT_AFTER = 5000
 
 
 def explore(
@@ -60,6 +64,8 @@ def explore(
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: ended.set())
         answer.give(lambda: f"the explorer is at {explorer.url}\nCtrl-C ends it")
+    # A command looks for garbage seldom (see `main`). A run leaves half a megabyte of it, and this program has many.
+    gc.set_threshold(_COLLECT_AFTER)
     if not no_browser:
         explorer.open()
     ended.wait()
