@@ -212,7 +212,7 @@ def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: 
 
 
 def _handed_on(what: str, given: Any, own: Circuit | None) -> dict[str, Any]:
-    """What the page hands on. The studies that this needs are not loaded before, so that the first picture comes sooner."""
+    """What the page hands on; the studies that it takes are loaded only now, so that the first picture comes sooner."""
     from fingerspice.explorer import sharing
 
     if what == "means":
