@@ -30,8 +30,8 @@ from commands import Command
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.devices import DEVICES
 from fingerspice.explorer.examples import EXAMPLES
-from fingerspice.explorer.request import LONGEST_DECK
-from fingerspice.explorer.scene import POINTS, scene
+from fingerspice.explorer.request import LONGEST_DECK, MOST_POINTS, POINTS
+from fingerspice.explorer.scene import scene
 from fingerspice.explorer.server import MOST_BYTES, Explorer, pages
 from fingerspice.explorer.sharing import as_deck, as_python, means
 from fingerspice.explorer.sliders import _MEANINGS
@@ -162,7 +162,11 @@ def test_every_example_shows_what_it_promises(example: Any) -> None:
     assert answer["unknown"] == []
     names = {trace["signal"] for trace in answer["traces"]}
     assert names == {"u_source", "u_gap", "f_el", "area", "friction"}
-    assert all(trace["values"].shape == answer["t"].shape == (POINTS,) for trace in answer["traces"])
+    assert all(trace["values"].shape == answer["t"].shape for trace in answer["traces"])
+    assert answer["t"].size >= POINTS
+    # No peak is missed between the points of the source's curve.
+    shown, largest = np.abs(answer["traces"][0]["values"]).max(), answer["figures"][0]
+    assert shown >= 0.98 * max(abs(largest["max"]), abs(largest["min"]))
     fingers = 2 if example.name == "two-fingers" else 1
     assert len([t for t in answer["traces"] if t["signal"] == "f_el"]) == len(answer["stacks"]) == fingers
     assert ".tran" in as_deck({"deck": example.deck, **example.asked})
@@ -217,6 +221,16 @@ def test_both_ends_of_every_slider_give_a_run_or_a_sentence() -> None:
             answer = scene({"deck": SINE, "overrides": {slider["path"]: slider[end]}, "rtol": 1e-4, "periods": 1})
             assert answer["ok"] or len(answer["message"]) > 20, (slider["path"], end)
             assert answer["status"] != "FAULT"
+
+
+def test_curves_have_more_points_where_the_source_oscillates_often_and_too_few_are_told() -> None:
+    few, many, most = (scene({"deck": SINE, "periods": n, "rtol": 1e-4}) for n in (100, 200, 5))
+    assert (few["t"].size, many["t"].size, most["t"].size) == (POINTS, 3200, POINTS)
+    carrier = scene({"deck": SINE, "source": "AM(200 100k 50)", "periods": 1, "rtol": 1e-3, "skin": "dispersive"})
+    assert carrier["t"].size == MOST_POINTS
+    (said,) = [w for w in carrier["warnings"] if "points" in w]
+    assert said.startswith("the curves have 12,000 points for 5,002 oscillations of the source, too few")
+    assert not any("points" in w for one in (few, many, most) for w in one["warnings"])
 
 
 def test_unknown_names_are_said_and_the_rest_is_shown() -> None:
@@ -543,6 +557,23 @@ def test_no_request_gives_a_fault_a_hang_or_a_file(request: Any, explorer: Explo
     assert time.monotonic() - begin < 60.0
 
 
+def test_many_interrupts_at_once_end_the_command() -> None:
+    # An event that a handler sets would be waited for by itself, where the second signal comes during the first.
+    for pause in (0.0, 2e-5, 1e-4):
+        words = [sys.executable, "-m", "fingerspice", "explore", "--no-browser", "--json"]
+        with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+            try:
+                assert process.stdout is not None
+                while process.stdout.readline() not in ("}\n", ""):
+                    pass
+                for _ in range(5):
+                    process.send_signal(signal.SIGINT)
+                    time.sleep(pause)
+                assert process.wait(20) == 0
+            finally:
+                process.kill()
+
+
 def test_the_command_serves_until_it_is_interrupted_and_leaves_no_file(tmp_path: Path) -> None:
     (tmp_path / "pad.cir").write_text(SINE)
     words = [sys.executable, "-m", "fingerspice", "explore", "pad.cir", "--no-browser", "--json"]
@@ -557,7 +588,10 @@ def test_the_command_serves_until_it_is_interrupted_and_leaves_no_file(tmp_path:
         with urllib.request.urlopen(said["url"] + "start") as answer:
             assert json.load(answer)["own"]["request"]["deck"] == SINE
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=20)
+        try:
+            out, err = process.communicate(timeout=20)
+        finally:
+            process.kill()
     assert (process.returncode, out, err) == (0, "", "")
     assert os.listdir(tmp_path) == ["pad.cir"]
 

@@ -14,15 +14,15 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.explorer.changed import marked, sentences
-from fingerspice.explorer.request import Request, circuits_of, request_of, times_of
+from fingerspice.explorer.request import Request, circuits_of, points_of, request_of, times_of
 from fingerspice.explorer.sliders import sliders
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.signals import SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import simulate
 
-#: Points of each trace, traces of each kind, and harmonics.
-POINTS, MOST_TRACES, HARMONICS = 2000, 8, 20
+#: Traces of each kind, and harmonics.
+MOST_TRACES, HARMONICS = 8, 20
 #: Longest time of a run after its compilation, s.
 LONGEST_RUN = 10.0
 _SHOWN = ("u_source", "u_gap", "f_el", "area", "friction")
@@ -120,11 +120,13 @@ def _run(circuit: Circuit, request: Request) -> tuple[dict[str, Any], Callable[[
     if solution.failure is not None and solution.failure.t and solution.t.size < 2:
         # The run has failed before the part of it that is shown: then what there is of it is shown.
         solution = _simulated(circuit, request, stop, 0.0, solution.failure.t)
+    _, too_few = points_of(circuit, first, stop)
+    cautions = [*solution.warnings, *([too_few] if too_few else [])]
     keys = _SHOWN if solution.gaps else _WITHOUT_GAP
     traces = [one for key in keys for one in _traces(solution, key)]
     answer: dict[str, Any] = {
         "ok": solution.success, "status": solution.status.name, "message": solution.message, "t": solution.t,
-        "traces": traces, "warnings": list(solution.warnings), "period": period, "t_stop": stop,
+        "traces": traces, "warnings": cautions, "period": period, "t_stop": stop,
         "frequency": None if solution.fundamental is None else solution.fundamental.frequency,
         "charge_law": solution.charge_law, "method": solution.method, "area": solution.area_mode,
         "error": {"u_gap": solution.error.u_gap, "f_el": solution.error.f_el, "text": _error_text(solution)},
@@ -140,9 +142,10 @@ def _run(circuit: Circuit, request: Request) -> tuple[dict[str, Any], Callable[[
 
 def _simulated(circuit: Circuit, request: Request, stop: float, first: float, last: float) -> Solution:
     """A run to `stop` as the page asks for it, with outputs between two times (all in s)."""
+    times = np.linspace(first, last, points_of(circuit, first, last)[0])
     return simulate(
-        circuit, t_stop=stop, t_eval=np.linspace(first, last, POINTS), charge_law=request.charge_law, area=request.area,
-        rtol=request.rtol, charge=False, throw=False, progress=deadline(),
+        circuit, t_stop=stop, t_eval=times, charge_law=request.charge_law, area=request.area, rtol=request.rtol,
+        charge=False, throw=False, progress=deadline(),
     )  # fmt: skip
 
 
