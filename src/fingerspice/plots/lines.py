@@ -187,8 +187,8 @@ def _envelope_spans(t: FloatArray, start: float, stop: float, turns: FloatArray)
     parts = (stop - start) / (2.0 * float(np.median(lengths)))
     edges = np.linspace(start, stop, max(1, int(min(parts, _PARTS))) + 1)
     middle = 0.5 * (edges[:-1] + edges[1:])
-    # A span contains an oscillation, and so a maximum and a minimum, also where oscillations are longer than most, as at
-    # the beginning of a chirp. A pause between bursts is no oscillation: what is beside it is much shorter.
+    # A span contains an oscillation, and so a maximum and a minimum, also where oscillations are longer than most, as
+    # at the beginning of a chirp. A pause between bursts is no oscillation: what is beside it is much shorter.
     beside = np.pad(lengths, 1, mode="edge")
     oscillation = 2.0 * np.minimum(np.minimum(beside[:-2], beside[2:]), lengths)
     here = np.clip(np.searchsorted(turns, middle) - 1, 0, lengths.size - 1)

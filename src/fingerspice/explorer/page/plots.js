@@ -98,7 +98,7 @@ export class Traces {
       const font = { font: "11px sans-serif", labelFont: "12px sans-serif" };
       const options = {
         width: this.width(), height: panel.height + (last ? BELOW : 0), cursor: { sync: { key: "time" } },
-        scales: { x: { time: false } },
+        scales: { x: { time: false } }, legend: { markers: { dash: (u, k) => (u.series[k].dash ? "dashed" : "solid") } },
         axes: [last ? { ...font, size: 32, labelSize: 18, label: "time" } : { ...font, size: 6, values: (_, splits) => splits.map(() => "") },
           { ...font, size: 58, labelSize: 20, space: 16, label: "" }],
         series: [{ label: "time", value: (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5)))) }, ...series.map(line)],
