@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -238,3 +239,16 @@ def test_the_coverage_of_fits_runs_and_writes_nothing_when_quick(monkeypatch, ca
     assert set(results["coverage"]) == {"given", "equal", "shares", "contact"}
     assert results["named"]["gap and alpha at one voltage and frequency"] == results["named"]["of"]
     assert results["named"]["gap and resistance at several"] == 0
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
+def test_the_explorers_figures_are_measured_and_the_page_has_those_of_the_file(monkeypatch, capsys):
+    pytest.importorskip("playwright.sync_api", reason="needs Playwright for Python")
+    monkeypatch.syspath_prepend(str(FOLDER))
+    explorer = importlib.import_module("explorer")
+    before = explorer.RESULTS.stat().st_mtime_ns
+    results = explorer.main(["--quick"])
+    assert all(0.0 < median <= late for median, late in results["event_ms"].values())
+    assert list(results["memory_MB"]) == ["1", "10", "50", "100"]
+    assert explorer.RESULTS.stat().st_mtime_ns == before
+    assert explorer.table(json.loads(explorer.RESULTS.read_text())) in explorer.PAGE.read_text()

@@ -28,11 +28,13 @@ from hypothesis import strategies as st
 import fingerspice as fs
 from commands import Command
 from fingerspice.base.arrays import FloatArray
+from fingerspice.circuit.devices import DEVICES
 from fingerspice.explorer.examples import EXAMPLES
-from fingerspice.explorer.request import LONGEST_DECK
-from fingerspice.explorer.scene import POINTS, scene
+from fingerspice.explorer.request import LONGEST_DECK, MOST_POINTS, POINTS
+from fingerspice.explorer.scene import scene
 from fingerspice.explorer.server import MOST_BYTES, Explorer, pages
 from fingerspice.explorer.sharing import as_deck, as_python, means
+from fingerspice.explorer.sliders import _MEANINGS
 from fingerspice.explorer.waveforms import WAVEFORMS
 
 ROOT = Path(__file__).parents[1]
@@ -149,13 +151,22 @@ def test_every_example_shows_what_it_promises(example: Any) -> None:
         assert "no solution" in answer["message"]
         assert 0.0 < answer["failed_at"] < 1e-3
         assert answer["sliders"]
+        # It fails before the periods that are shown, so that all there is of it is shown instead.
+        shown = scene({"deck": example.deck, **example.asked, "last": 2})
+        assert shown["status"] == "FOLD"
+        assert shown["t"].size > POINTS // 2
+        assert 0.99 * answer["failed_at"] < shown["t"][-1] <= answer["failed_at"]
         return
     assert answer["ok"], answer["message"]
     assert answer["warnings"] == []
     assert answer["unknown"] == []
     names = {trace["signal"] for trace in answer["traces"]}
     assert names == {"u_source", "u_gap", "f_el", "area", "friction"}
-    assert all(trace["values"].shape == answer["t"].shape == (POINTS,) for trace in answer["traces"])
+    assert all(trace["values"].shape == answer["t"].shape for trace in answer["traces"])
+    assert answer["t"].size >= POINTS
+    # No peak is missed between the points of the source's curve.
+    shown, largest = np.abs(answer["traces"][0]["values"]).max(), answer["figures"][0]
+    assert shown >= 0.98 * max(abs(largest["max"]), abs(largest["min"]))
     fingers = 2 if example.name == "two-fingers" else 1
     assert len([t for t in answer["traces"] if t["signal"] == "f_el"]) == len(answer["stacks"]) == fingers
     assert ".tran" in as_deck({"deck": example.deck, **example.asked})
@@ -194,6 +205,15 @@ def test_sliders_show_every_parameter_within_its_range() -> None:
     assert ranges == {path: (s["low"], s["high"]) for path, s in sliders.items()}
 
 
+def test_every_slider_of_an_element_says_what_it_moves() -> None:
+    assert set(_MEANINGS) == {name for name, spec in DEVICES.items() if spec.parameters}
+    for name, meanings in _MEANINGS.items():
+        assert set(meanings) == {p.name for p in DEVICES[name].parameters}, name
+    groups = scene({"deck": BY_NAME["ungrounded"].deck})["sliders"]
+    meanings = {s["path"]: s["meaning"] for group in groups for s in group["sliders"]}
+    assert (meanings["Xgap.d"], meanings["Cbody.value"]) == ("gap height", "capacitance")
+
+
 def test_both_ends_of_every_slider_give_a_run_or_a_sentence() -> None:
     groups = scene({"deck": SINE})["sliders"]
     for slider in (s for group in groups for s in group["sliders"]):
@@ -201,6 +221,16 @@ def test_both_ends_of_every_slider_give_a_run_or_a_sentence() -> None:
             answer = scene({"deck": SINE, "overrides": {slider["path"]: slider[end]}, "rtol": 1e-4, "periods": 1})
             assert answer["ok"] or len(answer["message"]) > 20, (slider["path"], end)
             assert answer["status"] != "FAULT"
+
+
+def test_curves_have_more_points_where_the_source_oscillates_often_and_too_few_are_told() -> None:
+    few, many, most = (scene({"deck": SINE, "periods": n, "rtol": 1e-4}) for n in (100, 200, 5))
+    assert (few["t"].size, many["t"].size, most["t"].size) == (POINTS, 3200, POINTS)
+    carrier = scene({"deck": SINE, "source": "AM(200 100k 50)", "periods": 1, "rtol": 1e-3, "skin": "dispersive"})
+    assert carrier["t"].size == MOST_POINTS
+    (said,) = [w for w in carrier["warnings"] if "points" in w]
+    assert said.startswith("the curves have 12,000 points for 5,002 oscillations of the source, too few")
+    assert not any("points" in w for one in (few, many, most) for w in one["warnings"])
 
 
 def test_unknown_names_are_said_and_the_rest_is_shown() -> None:
@@ -527,6 +557,23 @@ def test_no_request_gives_a_fault_a_hang_or_a_file(request: Any, explorer: Explo
     assert time.monotonic() - begin < 60.0
 
 
+def test_many_interrupts_at_once_end_the_command() -> None:
+    # An event that a handler sets would be waited for by itself, where the second signal comes during the first.
+    for pause in (0.0, 2e-5, 1e-4):
+        words = [sys.executable, "-m", "fingerspice", "explore", "--no-browser", "--json"]
+        with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+            try:
+                assert process.stdout is not None
+                while process.stdout.readline() not in ("}\n", ""):
+                    pass
+                for _ in range(5):
+                    process.send_signal(signal.SIGINT)
+                    time.sleep(pause)
+                assert process.wait(20) == 0
+            finally:
+                process.kill()
+
+
 def test_the_command_serves_until_it_is_interrupted_and_leaves_no_file(tmp_path: Path) -> None:
     (tmp_path / "pad.cir").write_text(SINE)
     words = [sys.executable, "-m", "fingerspice", "explore", "pad.cir", "--no-browser", "--json"]
@@ -541,9 +588,43 @@ def test_the_command_serves_until_it_is_interrupted_and_leaves_no_file(tmp_path:
         with urllib.request.urlopen(said["url"] + "start") as answer:
             assert json.load(answer)["own"]["request"]["deck"] == SINE
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=20)
+        try:
+            out, err = process.communicate(timeout=20)
+        finally:
+            process.kill()
     assert (process.returncode, out, err) == (0, "", "")
     assert os.listdir(tmp_path) == ["pad.cir"]
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux's /proc")
+def test_the_memory_of_the_command_stays_as_it_is_while_a_slider_moves(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "fingerspice", "explore", "--no-browser", "--json"]
+    with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        assert process.stdout is not None
+        said = ""
+        while not said.endswith("}\n"):
+            said += process.stdout.readline()
+        _, _, host, token, _ = json.loads(said)["url"].split("/")
+        connection = http.client.HTTPConnection(host)
+
+        def memory() -> float:
+            """Resident memory, MB."""
+            status = Path(f"/proc/{process.pid}/status").read_text()
+            return int(status.partition("VmRSS:")[2].split()[0]) / 1024.0
+
+        def move(start: int, stop: int) -> None:
+            for i in range(start, stop):
+                request = {"deck": SINE, "overrides": {"Xgap.d": 3e-6 + 1e-10 * i}, "last": 2}
+                connection.request("POST", f"/{token}/scene", json.dumps(request))
+                assert connection.getresponse().read()
+
+        move(0, 200)
+        before = memory()
+        move(200, 800)
+        # An answer holds 0.1 MB of arrays, and its run 0.5 MB.
+        assert memory() - before < 60.0
+        connection.close()
+        process.send_signal(signal.SIGINT)
 
 
 def test_the_command_refuses_a_deck_that_is_none(command: Command) -> None:

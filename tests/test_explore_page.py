@@ -138,6 +138,45 @@ def test_a_fold_shows_its_sentence_and_keeps_the_last_good_traces(page: Page) ->
     assert page.status().startswith("Table 1")
 
 
+def test_a_scene_that_fails_at_once_shows_its_run_until_then_and_nothing_of_the_scene_before(page: Page) -> None:
+    page.page.wait_for_selector("#means canvas")
+    page.after(lambda: page.page.select_option("#scene", "fold"))
+    assert "no solution" in page.status()
+    assert page.page.locator("#plots canvas").count() == 4
+    assert "before" not in page.page.inner_text("#plots")
+    assert [page.page.inner_text(f"#{part}") for part in ("stack", "harmonics", "means", "figures", "facts")] == [
+        ""
+    ] * 5
+    page.after(lambda: page.page.select_option("#scene", "sine"))
+    assert "load" in page.page.inner_text("#sliders")
+    assert page.shown("gap voltage")
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (1920, 1080)])
+def test_all_traces_and_the_first_sliders_are_seen_at_once(page: Page, width: int, height: int) -> None:
+    page.page.set_viewport_size({"width": width, "height": height})
+    page.page.click("#pin")
+    page.typed("Xgap.d", "4u")
+    seen = """(selectors) => selectors.every((one) => {
+      const box = document.querySelector(one).getBoundingClientRect();
+      return box.top >= 0 && box.bottom <= innerHeight && box.left >= 0 && box.right <= innerWidth;
+    })"""
+    sliders = [f'input[data-path="{path}"]' for path in ("Vdrive.amplitude", "Xgap.d", "Xgap.fn", "Xcoat.d", "Xskin.d")]
+    assert page.page.evaluate(seen, ["#drop", "#kind", "#plots", *sliders])
+    # With pinned traces the table has most columns.
+    assert page.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_a_mistyped_value_is_told_with_what_is_allowed_and_a_unit_is_taken(page: Page) -> None:
+    field = page.page.locator('input[type=text][data-path="Xgap.d"]')
+    field.fill("3,5u")
+    field.press("Enter")
+    assert page.status() == 'Xgap.d is "3,5u"; allowed: a number such as 3.5u, 0.2meg, 1e-6 or inf'
+    page.typed("Xgap.d", "4um")
+    expected = fs.simulate(SINE.replace({"Xgap.d": 4e-6}), rtol=1e-6)
+    assert page.shown("electroadhesive force")[1] == f"{float(f'{1e3 * expected.f_el_mean_periodic:.5g}')} mN"
+
+
 def test_pinned_traces_stay_with_the_difference(page: Page) -> None:
     page.page.click("#pin")
     page.typed("Xgap.d", "4u")
@@ -195,6 +234,14 @@ def test_a_recording_is_taken_and_a_wrong_file_refused(page: Page, tmp_path: Pat
     page.after(lambda: page.page.set_input_files("#file", CIRCUITS / "texture.wav"))
     assert page.page.input_value("#source") == "RECORDING(150)"
     wave = fs.Samples.from_wav(CIRCUITS / "texture.wav", 150.0)
+    assert page.shown("source voltage")[3] == f"{float(f'{wave.values.max():.5g}'):g} V"
+    page.after(lambda: page.page.select_option("#scene", "square"))
+    dropped = """(bytes) => {
+      const data = new DataTransfer();
+      data.items.add(new File([Uint8Array.from(bytes)], "texture.wav"));
+      document.body.dispatchEvent(new DragEvent("drop", { dataTransfer: data, bubbles: true, cancelable: true }));
+    }"""
+    page.after(lambda: page.page.evaluate(dropped, list((CIRCUITS / "texture.wav").read_bytes())))
     assert page.shown("source voltage")[3] == f"{float(f'{wave.values.max():.5g}'):g} V"
     (tmp_path / "wrong.csv").write_text("t,u\n0,1\n1,x\n")
     page.page.set_input_files("#file", tmp_path / "wrong.csv")

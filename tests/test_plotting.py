@@ -352,6 +352,26 @@ def test_a_long_run_is_an_envelope_beside_its_last_oscillations() -> None:
     assert len(labels(run.plot(window=(0.0, 0.002)))) == 4
 
 
+def test_an_envelope_is_smooth_where_oscillations_are_longer_than_most_and_falls_between_bursts() -> None:
+
+    def run(source: fs.Waveform, stop: float, step: float) -> fs.Solution:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", fs.FingerspiceWarning)
+            return simulate(
+                table1(), sources={"Vdrive": source}, t_stop=stop, t_eval=np.arange(0.0, stop, step), rtol=1e-4
+            )
+
+    chirp = run(fs.Chirp(150.0, 20.0, 2000.0, 0.3), 0.3, 2e-5)
+    t, upper = curve(traces.plot_solution(chirp, "u_source").axes[0], "source")
+    # After the first ten oscillations or so every part of it reaches the amplitude.
+    assert upper[t > 45.0].min() > 0.97 * 150.0
+    burst = fs.Repeat(fs.Burst(fs.Sine(200.0, 5000.0), 2e-3), 10e-3)
+    bursts = run(burst, 0.05, 5e-6)
+    t, upper = curve(traces.plot_solution(bursts, "u_source").axes[0], "source")
+    assert upper[(t % 10.0 > 3.0) & (t % 10.0 < 9.0)].max() < 1e-9
+    assert upper[(t % 10.0 > 0.5) & (t % 10.0 < 1.5)].min() > 199.0
+
+
 def test_the_caption_names_source_and_changes(sine: fs.Solution) -> None:
     assert "Vdrive: Sine(200 V, 100 Hz)" in small_print(sine.plot())
     changed = simulate(table1().replace({"Xgap.d": 5e-6}))

@@ -17,7 +17,7 @@ from matplotlib.transforms import Bbox
 import fingerspice as fs
 from commands import Command
 from fingerspice.plots.placement import place
-from fingerspice.plots.schematic import MOST_ELEMENTS, Schematic
+from fingerspice.plots.schematic import MOST_ELEMENTS, Schematic, put_beside
 from scenes import table1
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
@@ -168,6 +168,26 @@ def test_a_circuit_too_large_for_a_picture_is_refused() -> None:
         fs.parse_netlist(f"Large\nV1 a 0 1\n{rows}.tran 1u 1m\n").draw()
     figure = fs.parse_netlist(f"Large\nV1 a 0 1\n{rows[: rows.rindex('R199')]}.tran 1u 1m\n").draw()
     assert np.prod(figure.get_size_inches()) < 1000.0
+
+
+def test_the_picture_of_a_run_has_the_schematic_small_on_its_right() -> None:
+    circuit = fs.read_netlist(CIRCUITS / "fingerpad.cir")
+    picture = fs.simulate(circuit).plot()
+    width, height = picture.get_size_inches()
+    whole = put_beside(picture, circuit)
+    whole.draw_without_rendering()
+    *panels, schematic = whole.axes
+    assert tuple(whole.get_size_inches()) == pytest.approx((width + 0.7 * circuit.draw().get_size_inches()[0], height))
+    edge = schematic.get_position().x0
+    renderer = whole.canvas.get_renderer()  # type: ignore[attr-defined]
+    rights = [ax.get_tightbbox(renderer).x1 / whole.bbox.width for ax in panels]
+    assert 0.9 * edge < max(rights) < edge
+    (shown,) = schematic.images
+    # It is drawn as it is: dark strokes on white, in its own proportions.
+    assert shown.get_array().min() < 0.2 < 0.9 < shown.get_array().mean()
+    high, wide = shown.get_array().shape[:2]
+    box = schematic.get_position()
+    assert box.width * whole.bbox.width / (box.height * whole.bbox.height) == pytest.approx(wide / high, rel=0.01)
 
 
 def test_run_writes_the_schematic_beside_its_picture_and_keeps_that_of_another_circuit(

@@ -39,7 +39,9 @@ Source = Annotated[
 Stop = Annotated[str | None, typer.Option(metavar="TIME", help="End of the run, s: 50m; TSTOP by default.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON (docs/json.md), nothing else on stdout.")]
 NoPlot = Annotated[bool, typer.Option("--no-plot", help="Write no picture.")]
-Schematic = Annotated[bool, typer.Option("--schematic", help="Draw the circuit, too: NAME_schematic.svg.")]
+Schematic = Annotated[
+    bool, typer.Option("--schematic", help="Draw the circuit, too: small in the picture, and NAME_schematic.svg.")
+]
 Streamed = Annotated[
     bool,
     typer.Option("--stream", help="Write a long run piece by piece to a Zarr store, which a second call goes on with."),

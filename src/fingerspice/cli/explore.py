@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import signal
-import threading
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,6 +18,9 @@ from fingerspice.cli.terminal import Answering
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
+
+#: Objects, made and not deleted, after which garbage is looked for while the page is served.
+_COLLECT_AFTER = 5000
 
 
 def explore(
@@ -52,17 +56,21 @@ def explore(
         with Answering("explore", as_json) as answer:
             _write(answer, _circuit(answer, deck, changes, finger=finger, coating=coating, drive=drive), deck, static)
         return
-    ended = threading.Event()
+    ended: list[int] = []
     with Answering("explore", as_json) as answer:
         circuit = _circuit(answer, deck, changes, finger=finger, coating=coating, drive=drive)
         explorer = Explorer(circuit, port)
         answer.update(url=explorer.url)
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: ended.set())
+            signal.signal(number, lambda number, _: ended.append(number))
         answer.give(lambda: f"the explorer is at {explorer.url}\nCtrl-C ends it")
+    # A command looks for garbage seldom (see `main`). A run leaves half a megabyte of it, and this program has many.
+    gc.set_threshold(_COLLECT_AFTER)
     if not no_browser:
         explorer.open()
-    ended.wait()
+    # An event does not do here: a signal that comes while its lock is held would wait for that lock for ever.
+    while not ended:
+        time.sleep(0.1)
     explorer.stop()
 
 

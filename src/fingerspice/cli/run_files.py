@@ -13,6 +13,8 @@ from fingerspice.cli.result_files import Results
 from fingerspice.cli.terminal import progress
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from fingerspice.base.arrays import FloatArray
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.results.phasor_solution import PhasorSolution
@@ -31,12 +33,19 @@ def written(
     results.open()
     writes: list[Callable[[], Path]] = [partial(solution.to_csv if data.suffix == ".csv" else solution.to_netcdf, data)]
     if picture is not None:
-        writes.append(lambda: save(solution.plot(), picture, about=results.about))
+        writes.append(lambda: save(_pictured(solution, results, schematic), picture, about=results.about))
     if schematic is not None:
         # An SVG file knows no names of our own, and keeps all of them as one text.
         about = {"Description": json.dumps(results.about)}
         writes.append(lambda: results.circuit.draw().write(schematic, about))
     return writes
+
+
+def _pictured(solution: Solution, results: Results, schematic: Path | None) -> Figure:
+    """The picture of a run, with the circuit beside it where the circuit is drawn, too."""
+    from fingerspice.plots.schematic import put_beside
+
+    return solution.plot() if schematic is None else put_beside(solution.plot(), results.circuit)
 
 
 def large_sweep(

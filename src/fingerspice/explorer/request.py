@@ -29,6 +29,10 @@ from fingerspice.waveforms.waveform import Waveform, require
 #: Limits of a deck and of its run: each answer has to come within seconds.
 LONGEST_DECK, MOST_ELEMENTS, MOST_OVERRIDES = 100_000, 200, 500
 MOST_PERIODS, MOST_TIMES, MOST_BREAKPOINTS = 200.0, 2e5, 2e5
+#: Points of a curve, and most of them where a source oscillates often; points of an oscillation, and of what lies
+#: between two jumps or samples.
+POINTS, MOST_POINTS = 2000, 12_000
+_OF_OSCILLATION, _OF_PIECE = 16, 2
 SKINS = ("own", "follow", "dispersive")
 _LARGEST, _LONGEST_SETS = 1e300, 2000
 _AREAS = ("coupled", "mean", "frozen")
@@ -232,6 +236,21 @@ def times_of(circuit: Circuit, request: Request) -> tuple[float, float, float | 
     allowed = f"at most {MOST_TIMES:g} of each on this page"
     require(count <= MOST_TIMES and edges <= MOST_BREAKPOINTS, "the run", too_long, allowed)
     return first, stop, period
+
+
+def points_of(circuit: Circuit, first: float, last: float) -> tuple[int, str]:
+    """The number of points of a curve between two times (s), and a warning where they are too few for its shape."""
+    waveform = waveform_of(circuit)
+    count, edges = (last - first) / waveform.shortest_time(), (last - first) * waveform.breakpoint_rate()
+    wanted = max(_OF_OSCILLATION * count, _OF_PIECE * edges)
+    points = int(min(max(POINTS, math.ceil(wanted)), MOST_POINTS))
+    if 2.0 * points >= wanted:
+        return points, ""
+    many = f"{count:,.0f} oscillations" if _OF_OSCILLATION * count >= _OF_PIECE * edges else f"{edges:,.0f} samples"
+    return points, (
+        f"the curves have {points:,} points for {many} of the source, too few for their shape; the figures in the "
+        "table do not suffer; fewer periods, or only the last one, show more"
+    )
 
 
 @lru_cache(maxsize=32)

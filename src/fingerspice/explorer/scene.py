@@ -14,15 +14,15 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.explorer.changed import marked, sentences
-from fingerspice.explorer.request import Request, circuits_of, request_of, times_of
+from fingerspice.explorer.request import Request, circuits_of, points_of, request_of, times_of
 from fingerspice.explorer.sliders import sliders
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.signals import SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import simulate
 
-#: Points of each trace, traces of each kind, and harmonics.
-POINTS, MOST_TRACES, HARMONICS = 2000, 8, 20
+#: Traces of each kind, and harmonics.
+MOST_TRACES, HARMONICS = 8, 20
 #: Longest time of a run after its compilation, s.
 LONGEST_RUN = 10.0
 _SHOWN = ("u_source", "u_gap", "f_el", "area", "friction")
@@ -116,15 +116,17 @@ def deadline(seconds: float = LONGEST_RUN) -> Callable[[float], None]:
 def _run(circuit: Circuit, request: Request) -> tuple[dict[str, Any], Callable[[], dict[str, Any]]]:
     """The part of an answer that a run gives, in the two parts of `begun`."""
     first, stop, period = times_of(circuit, request)
-    solution = simulate(
-        circuit, t_stop=stop, t_eval=np.linspace(first, stop, POINTS), charge_law=request.charge_law, area=request.area,
-        rtol=request.rtol, charge=False, throw=False, progress=deadline(),
-    )  # fmt: skip
+    solution = _simulated(circuit, request, stop, first, stop)
+    if solution.failure is not None and solution.failure.t and solution.t.size < 2:
+        # The run has failed before the part of it that is shown: then what there is of it is shown.
+        solution = _simulated(circuit, request, stop, 0.0, solution.failure.t)
+    _, too_few = points_of(circuit, first, stop)
+    cautions = [*solution.warnings, *([too_few] if too_few else [])]
     keys = _SHOWN if solution.gaps else _WITHOUT_GAP
     traces = [one for key in keys for one in _traces(solution, key)]
     answer: dict[str, Any] = {
         "ok": solution.success, "status": solution.status.name, "message": solution.message, "t": solution.t,
-        "traces": traces, "warnings": list(solution.warnings), "period": period, "t_stop": stop,
+        "traces": traces, "warnings": cautions, "period": period, "t_stop": stop,
         "frequency": None if solution.fundamental is None else solution.fundamental.frequency,
         "charge_law": solution.charge_law, "method": solution.method, "area": solution.area_mode,
         "error": {"u_gap": solution.error.u_gap, "f_el": solution.error.f_el, "text": _error_text(solution)},
@@ -136,6 +138,15 @@ def _run(circuit: Circuit, request: Request) -> tuple[dict[str, Any], Callable[[
     return answer, lambda: {
         "figures": _figures(solution, traces), "harmonics": _harmonics(solution, period), "stacks": _stacks(solution)
     }  # fmt: skip
+
+
+def _simulated(circuit: Circuit, request: Request, stop: float, first: float, last: float) -> Solution:
+    """A run to `stop` as the page asks for it, with outputs between two times (all in s)."""
+    times = np.linspace(first, last, points_of(circuit, first, last)[0])
+    return simulate(
+        circuit, t_stop=stop, t_eval=times, charge_law=request.charge_law, area=request.area, rtol=request.rtol,
+        charge=False, throw=False, progress=deadline(),
+    )  # fmt: skip
 
 
 def _traces(solution: Solution, key: str) -> list[dict[str, Any]]:
@@ -164,9 +175,9 @@ def _stacks(solution: Solution) -> list[dict[str, Any]]:
 
 def _error_text(solution: Solution) -> str:
     error = solution.error
-    said = f"gap voltage within {format_si(error.u_gap, 'V', 2)}" if solution.gaps else ""
-    force = f", force within {format_si(error.f_el, 'N', 2)}" if solution.gaps else ""
-    return f"{said}{force}" or f"voltages within {format_si(error.u_gap, 'V', 2)}"
+    voltage, force = format_si(error.u_gap, "V", 2), format_si(error.f_el, "N", 2)
+    said = f"{voltage} in the gap voltage, {force} in the force" if solution.gaps else f"{voltage} in the voltages"
+    return f"stated error {said}".replace(" u", " µ")
 
 
 def _figures(solution: Solution, traces: list[dict[str, Any]]) -> list[dict[str, Any]]:

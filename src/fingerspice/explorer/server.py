@@ -10,6 +10,7 @@ import threading
 import webbrowser
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
@@ -25,7 +26,6 @@ from fingerspice.explorer.encoding import as_json, framed
 from fingerspice.explorer.examples import EXAMPLES
 from fingerspice.explorer.request import asked_by
 from fingerspice.explorer.scene import begun
-from fingerspice.explorer.sharing import as_deck, as_python, means
 from fingerspice.explorer.waveforms import menu
 from fingerspice.results.solution import Solution
 
@@ -211,13 +211,20 @@ def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: 
     return explorer
 
 
+def _handed_on(what: str, given: Any, own: Circuit | None) -> dict[str, Any]:
+    """What the page hands on; the studies that it takes are loaded only now, so that the first picture comes sooner."""
+    from fingerspice.explorer import sharing
+
+    if what == "means":
+        return sharing.means(given, own)
+    return {"ok": True, "text": (sharing.as_deck if what == "deck" else sharing.as_python)(given, own)}
+
+
 #: What the page asks for most, whose answer comes in two parts; and all else that it asks for.
 SCENE = "scene"
 _ACTIONS: dict[str, Callable[[Any, Circuit | None], dict[str, Any]]] = {
-    "means": means,
     "set": changed.applied,
-    "deck": lambda given, own: {"ok": True, "text": as_deck(given, own)},
-    "python": lambda given, own: {"ok": True, "text": as_python(given, own)},
+    **{what: partial(_handed_on, what) for what in ("means", "deck", "python")},
 }
 
 

@@ -15,8 +15,8 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Tran
 from fingerspice.circuit.provenance import in_force
 from fingerspice.explorer.changed import entries, marked
-from fingerspice.explorer.request import Request, circuits_of, request_of, times_of
-from fingerspice.explorer.scene import POINTS, deadline
+from fingerspice.explorer.request import Request, circuits_of, points_of, request_of, times_of, waveform_of
+from fingerspice.explorer.scene import deadline
 from fingerspice.explorer.waveforms import gain_of, read_source
 from fingerspice.results.outcome import SolveError
 from fingerspice.studies.export import export_netlist
@@ -90,7 +90,7 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
         lines.append(f"circuit = circuit.replace({{{inside}}})")
     lines += [
         "solution = fs.simulate(",
-        f"    circuit, t_stop={stop!r}, t_eval=np.linspace({first!r}, {stop!r}, {POINTS}),",
+        f"    circuit, t_stop={stop!r}, t_eval=np.linspace({first!r}, {stop!r}, {points_of(circuit, first, stop)[0]}),",
         f"    charge_law={request.charge_law!r}, area={request.area!r}, rtol={request.rtol!r},",
         ")",
         "print(solution)",
@@ -126,7 +126,7 @@ def _timed(circuit: Circuit, request: Request) -> Circuit:
     """The circuit with the length of the page's run, and as many outputs."""
     first, stop, _ = times_of(circuit, request)
     uic = circuit.tran is None or circuit.tran.uic
-    return dataclasses.replace(circuit, tran=Tran((stop - first) / POINTS, stop, uic=uic))
+    return dataclasses.replace(circuit, tran=Tran((stop - first) / points_of(circuit, first, stop)[0], stop, uic=uic))
 
 
 def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
@@ -157,6 +157,8 @@ def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
             gaps = circuit.by_device("GAP")
             if not gaps:
                 raise InputError("the circuit has no GAP, and so no force")
+            if waveform_of(circuit).fundamental is None:
+                raise InputError("the source has no one amplitude that sines could have; allowed: a periodic source")
             (found,) = large_signal(
                 circuit, np.asarray(frequencies, float), charge_law=request.charge_law, finger=gaps[0].name,
                 rtol=max(request.rtol, _RTOL), progress=deadline(),

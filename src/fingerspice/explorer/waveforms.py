@@ -77,8 +77,8 @@ WAVEFORMS: dict[str, tuple[str, tuple[Argument, ...]]] = {
     "CHIRP": (
         "Chirp",
         (
-            *(_volt(value=150.0), _hz("from", 20.0), _hz("to", 2e3)),
-            Argument("duration", "s", 0.3, 1e-2, 3.0, True),
+            *(_volt(value=150.0), _hz("from", 20.0), _hz("to", 1e3)),
+            Argument("duration", "s", 0.05, 1e-2, 3.0, True),
         ),
     ),
     "EXP": (

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.circuit.describe import drive_text, heading
 from fingerspice.plots import drawing
 from fingerspice.results.outcome import Status
@@ -171,19 +171,32 @@ def draw_line(
         t, x = drawing.thin(t, x)
         ax.plot(scale * t, x, label=trace.label, **{"solid_joinstyle": "round", **trace.style})
         return
-    # Each part is at least one oscillation long, so that it contains a maximum and a minimum.
-    parts = (stop - start) / (2.0 * float(np.median(np.diff(envelope))))
-    edges = np.linspace(start, stop, max(1, int(min(parts, _PARTS))) + 1)
-    begin = np.searchsorted(t, edges[:-1])
-    kept = np.diff(np.append(begin, t.size)) > 0
-    begin, middle = begin[kept], 0.5 * (edges[:-1] + edges[1:])[kept]
-    low, high = np.minimum.reduceat(x, begin), np.maximum.reduceat(x, begin)
+    middle, spans = _envelope_spans(t, start, stop, envelope)
+    low, high = np.minimum.reduceat(x, spans)[::2], np.maximum.reduceat(x, spans)[::2]
     pale = "alpha" in trace.style
     color = trace.style["color"]
     ax.fill_between(scale * middle, low, high, color=color, alpha=0.3 if pale else 0.2, linewidth=0.0)
     edge = {**trace.style, "linewidth": 1.6 if pale else 0.7 * trace.style["linewidth"]}
     ax.plot(scale * middle, low, **edge)
     ax.plot(scale * middle, high, **edge, label=trace.label)
+
+
+def _envelope_spans(t: FloatArray, start: float, stop: float, turns: FloatArray) -> tuple[FloatArray, IntArray]:
+    """The middles (s) of an envelope's parts, and the first output and the one after the last of each part's span."""
+    lengths = np.diff(turns)
+    parts = (stop - start) / (2.0 * float(np.median(lengths)))
+    edges = np.linspace(start, stop, max(1, int(min(parts, _PARTS))) + 1)
+    middle = 0.5 * (edges[:-1] + edges[1:])
+    # A span contains an oscillation, and so a maximum and a minimum, also where oscillations are longer than most, as
+    # at the beginning of a chirp. A pause between bursts is no oscillation: what is beside it is much shorter.
+    beside = np.pad(lengths, 1, mode="edge")
+    oscillation = 2.0 * np.minimum(np.minimum(beside[:-2], beside[2:]), lengths)
+    here = np.clip(np.searchsorted(turns, middle) - 1, 0, lengths.size - 1)
+    half = 0.5 * np.maximum(edges[1] - edges[0], oscillation[here])
+    first = np.searchsorted(t, np.maximum(middle - half, start))
+    after = np.minimum(np.searchsorted(t, np.minimum(middle + half, stop)), t.size - 1)
+    kept = after > first
+    return middle[kept], np.column_stack([first, after])[kept].ravel()
 
 
 def draw_mean(ax: Axes, trace: Trace, factor: float, unit: str, *, told: bool = True) -> None:

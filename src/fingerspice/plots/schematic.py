@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
@@ -19,6 +19,9 @@ from fingerspice.plots.picture import Picture
 from fingerspice.plots.placement import GROUND, Place, Placement, place
 from fingerspice.plots.symbols import Stroke, ground, symbol
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 #: Largest number of elements that a picture can show.
 MOST_ELEMENTS = 200
 #: Letters in a line of values and in a name, and lines of values at most.
@@ -26,6 +29,8 @@ _LETTERS, _LONGEST, _LINES = 34, 40, 7
 #: Inches: height of a line of text, from a symbol to its label, around everything, and around a label in its row.
 _LINE, _BESIDE, _MARGIN, _ROOM = 0.135, 0.08, 0.15, 0.1
 _PER_INCH = 72.0
+#: Size of a schematic beside a run's picture, over its own, and its resolution there, dots per inch of its own size.
+_SMALL, _SMALL_DPI = 0.7, 200
 _TINTS = {"LAYER": drawing.SKY, "SLAB": drawing.SKY, "SKIN": drawing.ORANGE, "SKIN_DISPERSIVE": drawing.ORANGE}
 
 
@@ -86,6 +91,30 @@ class _Sheet:
     y: list[float]
     width: float
     height: float
+
+
+def put_beside(picture: Figure, circuit: Circuit) -> Figure:
+    """The picture of a run with the circuit's schematic, small, on its right."""
+    from matplotlib import image
+
+    schematic = draw_circuit(circuit)
+    content = io.BytesIO()
+    schematic.savefig(content, format="png", dpi=_SMALL_DPI)
+    content.seek(0)
+    width, height = picture.get_size_inches()
+    wide, high = schematic.get_size_inches()
+    shrunk = min(_SMALL, height / high)
+    total = width + shrunk * wide
+    picture.set_size_inches(total, height)
+    engine: Any = picture.get_layout_engine()
+    engine.set(rect=(0.0, 0.0, width / total, 1.0))
+    # Axes without a grid take no part in the layout.
+    ax = picture.add_axes(
+        (width / total, 1.0 - shrunk * high / height, shrunk * wide / total, shrunk * high / height), label="schematic"
+    )
+    ax.set_axis_off()
+    ax.imshow(image.imread(content), aspect="auto", interpolation="antialiased")
+    return picture
 
 
 def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:

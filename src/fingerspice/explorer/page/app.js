@@ -119,6 +119,8 @@ function show(answer) {
   if (answer.ok) traces.show(answer, null, pinned);
   else if (good) traces.show(answer, good, pinned);
   else if (usable) traces.show(answer, null, pinned);
+  else traces.clear();
+  if (!answer.ok && !good) clear();
   const values = (of) => JSON.stringify([of.set, of.options.source]);
   const changed = values(state) !== values(reset(state, examples));
   say(answer.ok ? `${answer.title}${changed ? " (changed)" : ""}: ${answer.error.text}` : answer.message, !answer.ok);
@@ -127,6 +129,15 @@ function show(answer) {
   controls();
   sets.show(answer);
   document.body.dataset.answers = Number(document.body.dataset.answers || 0) + 1;
+}
+
+/** Take away what belongs to another scene. */
+function clear() {
+  harmonics.show([]);
+  stack.show({});
+  means.clear();
+  $("figures").replaceChildren();
+  $("facts").textContent = "";
 }
 
 function warn(answer) {
@@ -185,7 +196,8 @@ function table() {
     const texts = [f.element ? `${f.label} ${f.element}` : f.label, ...figures];
     if (pinned) {
       const before = old.has(f.name) ? old.get(f.name).mean : null;
-      const usable = before !== null && f.mean !== null && Math.abs(before) > 1e-9 * size;
+      // The mean of what goes to and fro is a small rest, whose change says nothing.
+      const usable = before !== null && f.mean !== null && Math.abs(before) > 0.01 * size;
       texts.push(quantity(clean(before), f.unit, 5), usable ? `${(100 * (f.mean / before - 1)).toFixed(2)} %` : "–");
     }
     return row("td", texts);
@@ -218,6 +230,8 @@ async function sweepMore() {
       mine.points.push(...Array.from(found.frequency, (f, i) => [f, found.force[i]]));
       mine.points.sort((a, b) => a[0] - b[0]);
       mine.amplitude = found.amplitude;
+      // The mean force is that of the first finger.
+      mine.finger = good && good.stacks.length > 1 ? found.gap : "";
     } else {
       mine.message = found.message;
     }
@@ -238,7 +252,7 @@ function drawMeans() {
   const figure = good && good.figures && good.figures.find((f) => f.signal === "f_el" || f.name.startsWith("f_el"));
   const force = figure ? figure.mean_periodic : null;
   const here = good && good.frequency && force !== null ? [good.frequency, force] : null;
-  means.show(sweep.points, here, sweep.message, sweep.amplitude);
+  means.show(sweep.points, here, sweep.message, sweep.amplitude, sweep.finger);
 }
 
 function controls() {
@@ -397,12 +411,13 @@ async function start() {
   harmonics = new Harmonics($("harmonics"));
   stack = new Stack($("stack"), (at) => traces.point(at));
   means = new Means($("means"));
+  const wrong = (sentence) => say(sentence, true);
   sliders = new Sliders($("sliders"), (path, value) => {
     state.set[path] = value;
     unknownInLink = [];
     refresh();
-  });
-  waveforms = new Waveforms(first.waveforms, setSource);
+  }, wrong);
+  waveforms = new Waveforms(first.waveforms, setSource, wrong);
   sets = new Sets(first.sets, apply);
   listen();
   if (location.hash.length > 1) open(location.hash);

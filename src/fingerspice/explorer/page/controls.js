@@ -27,11 +27,15 @@ function make(tag, properties = {}, parent = null) {
   return element;
 }
 
-/** One slider; `changed(text)` is called with the new value as text. */
-export function slider(s, name, changed) {
+/** One slider; `changed(text)` is called with the new value as text, `wrong(sentence)` where a typed one is no number. */
+export function slider(s, name, changed, wrong) {
   const row = make("div", { className: "slider" });
   const id = `slider${(count += 1)}`;
-  make("label", { htmlFor: id, textContent: s.name, title: name }, row);
+  const label = make("label", { htmlFor: id, title: s.meaning ? `${name}: ${s.meaning}` : name }, row);
+  if (s.meaning) {
+    label.append(`${s.meaning} `);
+    make("code", { textContent: s.name }, label);
+  } else label.textContent = s.name;
   const range = make("input", { type: "range", id, min: 0, max: STEPS, step: 1 }, row);
   const field = make("input", { type: "text", autocomplete: "off", spellcheck: false }, row);
   field.setAttribute("aria-label", `${name}, typed`);
@@ -53,7 +57,10 @@ export function slider(s, name, changed) {
   field.addEventListener("change", () => {
     const value = parse(field.value);
     field.classList.toggle("invalid", value === null);
-    if (value === null) return;
+    if (value === null) {
+      wrong(`${name} is "${field.value}"; allowed: a number such as 3.5u, 0.2meg, 1e-6 or inf`);
+      return;
+    }
     range.value = place(value, s);
     changed(field.value.trim());
   });
@@ -63,9 +70,10 @@ export function slider(s, name, changed) {
 
 /** The sliders of all elements, made anew where their names or ranges have changed. */
 export class Sliders {
-  constructor(parent, changed) {
+  constructor(parent, changed, wrong) {
     this.parent = parent;
     this.changed = changed;
+    this.wrong = wrong;
     this.key = "";
     this.byPath = new Map();
   }
@@ -98,7 +106,7 @@ export class Sliders {
       make("summary", { textContent: "more values" }, more);
       for (const s of group.sliders) {
         const name = s.path.slice(group.element.length + 1);
-        const control = slider({ ...s, name }, s.path, (text) => this.changed(s.path, text));
+        const control = slider({ ...s, name }, s.path, (text) => this.changed(s.path, text), this.wrong);
         this.byPath.set(s.path, control);
         (s.first ? box : more).append(control.row);
       }
@@ -109,9 +117,10 @@ export class Sliders {
 
 /** The menu of waveforms with the sliders of the one chosen, which are the numbers in the source's text. */
 export class Waveforms {
-  constructor(menu, changed) {
+  constructor(menu, changed, wrong) {
     this.menu = menu;
     this.changed = changed;
+    this.wrong = wrong;
     this.kind = document.getElementById("kind");
     this.field = document.getElementById("source");
     this.box = document.getElementById("arguments");
@@ -165,7 +174,7 @@ export class Waveforms {
         const words = now.values.map((value, k) => (k === i ? word : spice(value, now.one.arguments[k].unit, 12)));
         this.field.value = `${now.before}(${words.join(" ")})`;
         this.changed(this.field.value);
-      });
+      }, this.wrong);
       this.box.append(control.row);
       return control;
     });

@@ -5,10 +5,10 @@ import { quantity, scale } from "./units.js";
 const COLOURS = ["#0a5a9c", "#b3400d", "#2c7a3f", "#7b3f9e", "#8a6d00", "#00707a", "#9c1f56", "#444"];
 const GREY = "#9aa3ad";
 const PANELS = [
-  { title: "voltage", signals: ["u_source", "u_gap", "u_layer", "v"], unit: "V", height: 190 },
-  { title: "force", signals: ["f_el"], unit: "N", height: 150 },
-  { title: "area", signals: ["area"], unit: "m^2", height: 140 },
-  { title: "friction", signals: ["friction"], unit: "1", height: 140 },
+  { title: "voltage", signals: ["u_source", "u_gap", "u_layer", "v"], unit: "V", height: 145 },
+  { title: "force", signals: ["f_el"], unit: "N", height: 115 },
+  { title: "area", signals: ["area"], unit: "m^2", height: 105 },
+  { title: "friction", signals: ["friction"], unit: "1", height: 105 },
 ];
 
 /** Values at other times, by straight lines; null outside. */
@@ -29,6 +29,9 @@ function extreme(lists) {
   for (const list of lists) for (const x of list) if (x !== null && Math.abs(x) > most) most = Math.abs(x);
   return most;
 }
+
+/** Height of the axis of time, which the last panel has below it. */
+const BELOW = 46;
 
 const name = (trace) => (trace.element ? `${trace.label} ${trace.element}` : trace.label);
 
@@ -69,10 +72,16 @@ export class Traces {
     wanted.forEach(({ panel, series }, i) => {
       const plot = this.plots[i];
       const [by, named] = scale(extreme(series.map((s) => s.values)), panel.unit);
-      plot.axes[0].label = inPeriods ? "time (periods)" : `time (${unit})`;
+      // All panels have one axis of time, below the last of them.
+      if (i === wanted.length - 1) plot.axes[0].label = inPeriods ? "time (periods)" : `time (${unit})`;
       plot.axes[1].label = named ? `${panel.title} (${named})` : panel.title;
       plot.setData([scaled, ...series.map((s) => s.values.map((v) => (v === null ? null : v * by)))]);
     });
+  }
+
+  /** No run: no panels. */
+  clear() {
+    this.build([], "");
   }
 
   build(wanted, key) {
@@ -85,11 +94,13 @@ export class Traces {
       this.parent.append(box);
       const line = (s) => ({ label: s.label, stroke: s.colour, width: s.dashed ? 1.2 : 1.6, dash: s.dashed ? [6, 4] : undefined,
         pxAlign: 0, points: { show: false }, value: (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5)))) });
+      const last = i === wanted.length - 1;
+      const font = { font: "11px sans-serif", labelFont: "12px sans-serif" };
       const options = {
-        width: this.width(), height: panel.height, cursor: { sync: { key: "time" } },
-        scales: { x: { time: false } },
-        axes: [{ size: i === wanted.length - 1 ? 34 : 30, labelSize: 18, font: "11px sans-serif", labelFont: "12px sans-serif", label: "" },
-          { size: 58, labelSize: 20, space: 16, font: "11px sans-serif", labelFont: "12px sans-serif", label: "" }],
+        width: this.width(), height: panel.height + (last ? BELOW : 0), cursor: { sync: { key: "time" } },
+        scales: { x: { time: false } }, legend: { markers: { dash: (u, k) => (u.series[k].dash ? "dashed" : "solid") } },
+        axes: [last ? { ...font, size: 32, labelSize: 18, label: "time" } : { ...font, size: 6, values: (_, splits) => splits.map(() => "") },
+          { ...font, size: 58, labelSize: 20, space: 16, label: "" }],
         series: [{ label: "time", value: (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5)))) }, ...series.map(line)],
         hooks: { draw: [(u) => this.mark(u)] },
       };
@@ -130,19 +141,28 @@ export class Traces {
     for (const plot of this.plots) plot.setSize({ width: this.width(), height: plot.height });
   }
 
-  /** The panels as one picture. */
+  /** The panels as one picture, each with the names of its curves above it. */
   picture() {
-    const parts = this.plots.map((p) => p.ctx.canvas);
+    const ratio = window.devicePixelRatio || 1;
+    const head = 20 * ratio;
     const canvas = document.createElement("canvas");
-    canvas.width = Math.max(...parts.map((c) => c.width));
-    canvas.height = parts.reduce((sum, c) => sum + c.height, 0);
+    canvas.width = Math.max(...this.plots.map((p) => p.ctx.canvas.width));
+    canvas.height = this.plots.reduce((sum, p) => sum + p.ctx.canvas.height + head, 0);
     const context = canvas.getContext("2d");
     context.fillStyle = "#fff";
     context.fillRect(0, 0, canvas.width, canvas.height);
+    context.font = `${12 * ratio}px sans-serif`;
+    context.textBaseline = "bottom";
     let top = 0;
-    for (const part of parts) {
-      context.drawImage(part, 0, top);
-      top += part.height;
+    for (const plot of this.plots) {
+      let left = 62 * ratio;
+      for (const series of plot.series.slice(1).filter((s) => s.show)) {
+        context.fillStyle = series.stroke();
+        context.fillText(series.label, left, top + head);
+        left += context.measureText(series.label).width + 24 * ratio;
+      }
+      context.drawImage(plot.ctx.canvas, 0, top + head);
+      top += plot.ctx.canvas.height + head;
     }
     return canvas;
   }
@@ -176,7 +196,8 @@ class Small {
       this.parent.append(Object.assign(document.createElement("h2"), { textContent: this.title }));
       const axis = { font: "11px sans-serif", labelFont: "12px sans-serif", labelSize: 18, label: "" };
       this.plot = new uPlot({ width: this.width(), height: 190, scales,
-        axes: [{ ...axis, size: 30 }, { ...axis, size: 52, space: 28 }], legend: { show: false }, cursor: { show: false },
+        axes: [{ ...axis, size: 30 }, { ...axis, size: 52, space: 28 }], cursor: { show: false },
+        legend: { show: series.length > 1 && Boolean(series[0].label), live: false },
         series: [{}, ...series] }, data, this.parent);
     }
     this.plot.axes[0].label = labels[0];
@@ -200,8 +221,9 @@ export class Harmonics extends Small {
     const frequency = Array.from(harmonics[0].frequency);
     const [by, unit] = scale(extreme(lists), "N");
     const [fBy, fUnit] = scale(frequency[0], "Hz");
-    const bars = uPlot.paths.bars({ size: [0.5, 24] });
-    const series = harmonics.map((_, i) => ({ stroke: COLOURS[i], fill: `${COLOURS[i]}80`, paths: bars, points: { show: false } }));
+    // Of several fingers, the bars of the later ones are narrower and stand inside those before them.
+    const bars = harmonics.map((_, i) => uPlot.paths.bars({ size: [0.5 / (i + 1), 24 / (i + 1)] }));
+    const series = harmonics.map((h, i) => ({ label: h.element, stroke: COLOURS[i], fill: `${COLOURS[i]}80`, paths: bars[i], points: { show: false } }));
     const data = [frequency.map((f) => f * fBy), ...lists.map((l) => l.map((a) => a * by))];
     this.draw(series, data, [`frequency (${fUnit})`, `amplitude (${unit})`],
       { x: { time: false, range: (u) => [0, u.data[0][u.data[0].length - 1] + u.data[0][0]] }, y: { range: (u, low, high) => [0, high * 1.05 || 1] } });
@@ -215,8 +237,8 @@ export class Means extends Small {
   }
 
   /** `points` are pairs of frequency (Hz) and force (N), ascending; `here` is one such pair or null. */
-  show(points, here, text, amplitude) {
-    const title = `mean force of a sine${amplitude ? ` of ${amplitude}` : ""} against its frequency`;
+  show(points, here, text, amplitude, finger) {
+    const title = `mean force${finger ? ` at ${finger}` : ""} of a sine${amplitude ? ` of ${amplitude}` : ""} against its frequency`;
     if (title !== this.title) this.clear();
     this.title = title;
     const all = [...points.map(([f, y]) => [f, y, null]), ...(here ? [[here[0], null, here[1]]] : [])].sort((a, b) => a[0] - b[0]);

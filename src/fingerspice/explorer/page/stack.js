@@ -4,13 +4,22 @@ import { quantity } from "./units.js";
 
 /** Seconds in which the traces shown go by. */
 const DURATION = 8;
-const HEIGHT = 190;
+/** Heights: of the drawing, of the finger above the layers and of the screen below them, and of the scale of colours. */
+const HEIGHT = 236;
+const FINGER = 26;
+const SCREEN = 22;
+const SCALE = 30;
+const INK = "#1c2430";
 
 /** White for no voltage, red for positive and blue for negative ones. */
 function colour(share) {
   const s = Math.min(Math.abs(share), 1);
   const [r, g, b] = share > 0 ? [196, 62, 28] : [20, 90, 170];
   return `rgb(${[r, g, b].map((c) => Math.round(255 - s * (255 - c))).join(",")})`;
+}
+
+function largestOf(values) {
+  return values.reduce((most, u) => Math.max(most, Math.abs(u)), 0);
 }
 
 /** Layers as bars: height by thickness (logarithmic), colour by voltage, width by the ridge contact area. */
@@ -20,7 +29,6 @@ export class Stack {
     this.point = point;
     this.stacks = [];
     this.playing = false;
-    this.at = 0;
     this.canvas = document.createElement("canvas");
     this.canvas.setAttribute("role", "img");
     this.button = Object.assign(document.createElement("button"), { type: "button", textContent: "Play in slow motion" });
@@ -33,7 +41,7 @@ export class Stack {
   show(answer) {
     this.stacks = (answer.stacks || []).map((s) => {
       const area = answer.traces.find((t) => t.signal === "area" && (t.element === s.gap || !t.element));
-      return { area: area.values, layers: s.layers };
+      return { area: area.values, layers: s.layers, gap: s.layers.find((l) => l.name === s.gap) };
     });
     this.t = answer.t;
     if (!this.stacks.length) {
@@ -43,10 +51,15 @@ export class Stack {
     }
     if (!this.canvas.isConnected) this.parent.replaceChildren(this.title, this.canvas, this.note, this.button);
     const layers = this.stacks.flatMap((s) => s.layers);
-    this.largest = Math.max(1e-12, ...layers.map((layer) => layer.values.reduce((most, u) => Math.max(most, Math.abs(u)), 0)));
+    this.largest = Math.max(1e-12, ...layers.map((layer) => largestOf(layer.values)));
     this.widest = Math.max(...this.stacks.map((s) => s.area.reduce((most, a) => Math.max(most, a), 0)));
-    this.canvas.setAttribute("aria-label", `Layers: ${layers.map((l) => `${l.name}, ${quantity(l.d, "m")}`).join("; ")}`);
-    if (!this.playing) this.draw();
+    this.canvas.setAttribute("aria-label", `The finger above, the screen below; layers: ${layers.map((l) => `${l.name}, ${quantity(l.d, "m")}`).join("; ")}`);
+    if (this.playing) return;
+    // At rest the drawing shows the moment at which the first gap has most voltage.
+    const voltage = this.stacks[0].gap.values;
+    const most = largestOf(voltage);
+    this.at = voltage.findIndex((u) => Math.abs(u) === most);
+    this.draw();
   }
 
   play(on) {
@@ -84,24 +97,63 @@ export class Stack {
     c.textBaseline = "middle";
     const column = width / this.stacks.length;
     this.stacks.forEach((stack, i) => this.column(c, stack, i * column, column, at));
-    this.note.textContent = `t = ${quantity(this.t[at], "s")}; width: contact area; colour: voltage, up to ${quantity(this.largest, "V", 3)}; heights logarithmic`;
+    c.fillStyle = "#d5dae0";
+    c.fillRect(0, HEIGHT - SCALE - SCREEN, width, SCREEN);
+    c.fillStyle = INK;
+    c.fillText("screen with its electrode", width / 2, HEIGHT - SCALE - SCREEN / 2, width - 8);
+    this.scale(c, width);
+    const areas = this.stacks.map((stack) => quantity(stack.area[at], "m^2", 4)).join(" and ");
+    this.note.textContent = `t = ${quantity(this.t[at], "s")}. Width: contact area, ${areas}. Heights are logarithmic, not to scale.`;
+  }
+
+  /** What the colours mean. */
+  scale(c, width) {
+    const [top, height] = [HEIGHT - SCALE + 6, 8];
+    for (let x = 0; x < width - 2; x += 1) {
+      c.fillStyle = colour((2 * x) / (width - 2) - 1);
+      c.fillRect(x + 1, top, 1, height);
+    }
+    c.strokeStyle = "#55606e";
+    c.strokeRect(0.5, top, width - 1, height);
+    c.fillStyle = INK;
+    const end = quantity(this.largest, "V", 3);
+    const below = top + height + 8;
+    c.fillText("0 V across the layer", width / 2, below, width - 140);
+    c.textAlign = "left";
+    c.fillText(`−${end}`, 1, below);
+    c.textAlign = "right";
+    c.fillText(`+${end}`, width - 1, below);
+    c.textAlign = "center";
   }
 
   column(c, stack, left, column, at) {
     const heights = stack.layers.map((layer) => Math.max(1, Math.log10(layer.d / 1e-8)));
     const total = heights.reduce((sum, h) => sum + h, 0);
     const width = (column - 16) * (stack.area[at] / this.widest);
-    let top = 4;
+    const middle = left + column / 2;
+    const room = HEIGHT - FINGER - SCREEN - SCALE;
+    c.fillStyle = "#ecd9c9";
+    c.strokeStyle = "#55606e";
+    c.beginPath();
+    c.ellipse(middle, FINGER, (column - 8) / 2, FINGER - 1, 0, Math.PI, 2 * Math.PI);
+    c.fill();
+    c.fillStyle = INK;
+    c.fillText("finger", middle, FINGER / 2 + 3, column - 16);
+    let top = FINGER;
     // The finger is above and the screen below: the layers begin at the drive.
     [...stack.layers].map((layer, i) => [layer, heights[i]]).reverse().forEach(([layer, share]) => {
-      const height = ((HEIGHT - 8) * share) / total;
-      c.fillStyle = colour(layer.values[at] / this.largest);
-      c.strokeStyle = "#55606e";
-      const x = left + (column - width) / 2;
-      c.fillRect(x, top, width, height - 1);
-      c.strokeRect(x, top, width, height - 1);
-      c.fillStyle = Math.abs(layer.values[at]) > 0.6 * this.largest ? "#fff" : "#1c2430";
-      c.fillText(`${layer.name}  ${quantity(layer.values[at], "V", 3)}`, left + column / 2, top + height / 2, width - 8);
+      const height = (room * share) / total;
+      // What is left of a voltage after the rounding of larger ones is nought.
+      const u = Math.abs(layer.values[at]) < 1e-9 * this.largest ? 0 : layer.values[at];
+      c.fillStyle = colour(u / this.largest);
+      c.fillRect(middle - width / 2, top, width, height);
+      c.strokeRect(middle - width / 2, top, width, height);
+      c.fillStyle = Math.abs(u) > 0.6 * this.largest ? "#fff" : INK;
+      const [name, value] = [`${layer.name} (${quantity(layer.d, "m", 3)})`, quantity(u, "V", 3)];
+      const wide = c.measureText(`${name}: ${value}`).width < width - 8;
+      // A narrow column has its name and its voltage one below the other, where the layer is high enough.
+      const lines = wide || height < 26 ? [`${name}: ${value}`] : [c.measureText(name).width < width - 8 ? name : layer.name, value];
+      lines.forEach((line, i) => c.fillText(line, middle, top + height / 2 + 13 * (i - (lines.length - 1) / 2), width - 6));
       top += height;
     });
   }

@@ -1,9 +1,9 @@
 // Numbers in SPICE's notation, and quantities with a prefix.
 
 const SCALES = { t: 1e12, g: 1e9, meg: 1e6, k: 1e3, m: 1e-3, u: 1e-6, "µ": 1e-6, n: 1e-9, p: 1e-12, f: 1e-15 };
-const NUMBER = /^([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)(meg|[tgkmunpfµ])?$/i;
+const NUMBER = /^([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)(meg|[tgkmunpfµ])?[a-z]*$/i;
 
-/** The value of a text such as 3.5u or 0.2meg; null where it is none. */
+/** The value of a text such as 3.5u, 0.2meg or, with a unit, 3.5um; null where it is none. */
 export function parse(text) {
   const word = text.trim();
   if (/^inf$/i.test(word)) return Infinity;
