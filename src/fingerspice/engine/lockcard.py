@@ -76,8 +76,8 @@ def thread_kernel(lengths: Lengths, rows: int, pieces: int) -> Callable[..., Non
         stepping = (
             cuda.local.array(row, np.float64), cuda.local.array((most, 3, row), np.float64),
             cuda.local.array(states, np.float64), cuda.local.array(sums, np.float64),
-            cuda.local.array(modes, np.float64), cuda.local.array(1, np.float64), cuda.local.array(1, np.float64),
-            cuda.local.array((11, 1), np.float64),
+            cuda.local.array(modes, np.float64), cuda.local.array(modes, np.float64), cuda.local.array(1, np.float64),
+            cuda.local.array(1, np.float64), cuda.local.array((11, 1), np.float64),
         )  # fmt: skip
         nothing = block[6][:0]
         how = (halves, half, count if jumping else 0, periodic, tol, covered)

@@ -195,18 +195,27 @@ def _lane(
 
 
 @jit
-def put_results(
-    s: FloatArray, last: FloatArray, closing: FloatArray, steps: tuple[float, float], first: int, out: FloatArray,
-    marks: Marks,
+def put_result(
+    i: int, s: FloatArray, last: FloatArray, closing: float, lengths: tuple[int, int, int], first: int,
+    out: FloatArray, marks: Marks,
 ) -> None:  # fmt: skip
-    """Means over the run and over its last period, the peak (V), and the relative error of the periodic state."""
+    """Lane i's means over the run and its last period, its peak (V), and the relative error of the periodic state.
+
+    `lengths` are the number of periods that the last period stands for beside itself; that of half periods of the run;
+    and of the steps in each.
+    """
     own, count, lanes = N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
-    for i in range(min(lanes, out.shape[1] - first)):
-        for j in range(count):
-            out[j, first + i] = s[(own + VALUE + count + j) * lanes + i] / steps[0]
-            out[count + j, first + i] = last[j * lanes + i] / steps[1]
-        out[2 * count, first + i] = s[(own + PEAK) * lanes + i]
-        out[2 * count + 1, first + i] = closing[i]
+    ahead, halves, steps = lengths
+    if first + i >= out.shape[1]:
+        return
+    for j in range(count):
+        total = s[(own + VALUE + count + j) * lanes + i]
+        if ahead > 0:
+            total += ahead * last[j * lanes + i]
+        out[j, first + i] = total / (halves * steps)
+        out[count + j, first + i] = last[j * lanes + i] / (2 * steps)
+    out[2 * count, first + i] = s[(own + PEAK) * lanes + i]
+    out[2 * count + 1, first + i] = closing
 
 
 class Block(NamedTuple):

@@ -96,8 +96,10 @@ def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halv
     mu = friction_of(form, scenes)
     found = Answers.empty(task, table.shape[1], halves * task.points // 2)
     touching, pieces, decays = mesh_of(form, table, most=1 if task.traced else MOST_PIECES)
+    # Scenes that settle after about as many periods share a block, which ends when all of its scenes have settled.
+    order = np.argsort(_leakage_rates(form, table).min(axis=0)) if halves > 4 else np.arange(mu.size)
     for count in np.unique(pieces[touching]).tolist():
-        pending = np.flatnonzero(touching & (pieces == count))
+        pending = order[(touching & (pieces == count))[order]]
         for covered in COVERED:
             pending = _climb_one(task, form, _Scenes(table, mu, decays), (halves, count), covered, pending, found)
     return found
@@ -120,15 +122,21 @@ def mesh_of(form: LockstepForm, table: FloatArray, most: int) -> tuple[BoolArray
         Largest number of pieces. Each is twice as long as the one before, so that gap voltages at equal distances need
         a single one.
     """
-    others, cells = CELL_ROWS * form.cells, form.cells
+    others = CELL_ROWS * form.cells
     touching = table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2
     pieces, decays = np.zeros(table.shape[1], int), np.zeros(table.shape[1])
     if form.jumping:
         # The largest leakage rate of a cell is an upper bound of the rates of the modes.
-        leaks = table[cells : 2 * cells] / table[others + REST] + table[2 * cells : 3 * cells]
-        decays = np.max(leaks / table[:cells], axis=0) * (np.pi / table[others + OMEGA])
+        decays = np.max(_leakage_rates(form, table), axis=0) * np.pi
         pieces = np.ceil(np.log2(1.0 + _PIECE_START * decays)).clip(1, most).astype(int)
     return touching, pieces, decays
+
+
+def _leakage_rates(form: LockstepForm, table: FloatArray) -> FloatArray:
+    """Leakage rate of every cell with its area at rest, in periods over 2 pi: shape (n_cell, n)."""
+    others, cells = CELL_ROWS * form.cells, form.cells
+    leaks = table[cells : 2 * cells] / table[others + REST] + table[2 * cells : 3 * cells]
+    return np.asarray(leaks / (table[:cells] * table[others + OMEGA]))
 
 
 def first_level(rtol: float, form: LockstepForm, pieces: int) -> tuple[int, int]:
