@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
-from fingerspice.engine.lockscenes import OMEGA, Block, Places, fill_block, put_result
+from fingerspice.engine.lockscenes import CELL_ROWS, OMEGA, Block, Places, aligned, fill_block, put_result
 from fingerspice.engine.lockstep import (
     N_STATE,
     N_WEIGHTS,
@@ -91,7 +91,7 @@ def stepping_shapes(pieces: int, marks: Marks) -> tuple[tuple[int, ...], ...]:
 
 def new_stepping(pieces: int, marks: Marks) -> Stepping:
     """Arrays for the steps of blocks of scenes, whose half periods have so many pieces (0 without jumps)."""
-    return Stepping._make(np.empty(shape) for shape in stepping_shapes(pieces or 4, marks))
+    return Stepping._make(aligned(stepping_shapes(pieces or 4, marks)))
 
 
 @jit
@@ -132,7 +132,7 @@ def _settled(i: int, c: FloatArray, stepping: Stepping, steps: int, marks: Marks
     for m in range(m_all):
         at = m * lanes + i
         off += abs(c[(SHAPE + m) * lanes + i] * (s[Z * m_all * lanes + at] - before[at]) * back[at])
-    return off * s[(N_STATE * m_all + PEAK) * lanes + i] / (last[i] / steps * c[held * lanes + i] + 1e-300)
+    return float(off * s[(N_STATE * m_all + PEAK) * lanes + i] / (last[i] / steps * c[held * lanes + i] + 1e-300))
 
 
 @jit
@@ -188,12 +188,12 @@ def march_block(
     halves, half, pieces, periodic, tol, covered = how
     m_all, count, lanes, jumping = len(marks[0]), len(marks[4]), len(marks[5]), pieces > 0
     # Unpacked by position, as a compiler for graphics cards may know plain tuples only.
-    c, start, rates, drive, b, top, tails, _, _, _ = block
+    c, start, rates, drive, t, top, tails, _ = block
     still, moving, s, _, _, back, closing, length, moments = stepping
-    sums = (N_STATE * m_all + VALUE + count) * lanes
+    sums, omega = (N_STATE * m_all + VALUE + count) * lanes, (CELL_ROWS * (m_all + 1) + OMEGA) * lanes
     fill_block(table, pending, first, places, curves, (source[0], jumping, covered), block, marks)
     for i in range(lanes):
-        period = 2.0 * math.pi / b[OMEGA * lanes + i]
+        period = 2.0 * math.pi / t[omega + i]
         for m in range(m_all):
             if periodic:
                 back[m * lanes + i] = -1.0 / math.expm1(-rates[m, i] * period)
@@ -207,7 +207,7 @@ def march_block(
         # All pieces together are 2^pieces - 1 times the first, which has steps / pieces of the shortest steps.
         shorter = pieces / (2.0**pieces - 1.0) if jumping else START_TIMES[1]
         for i in range(lanes):
-            length[i] = math.pi / b[OMEGA * lanes + i] / steps * shorter
+            length[i] = math.pi / t[omega + i] / steps * shorter
         weigh(length, rates, drive, g, moments, marks)
         for _ in range(MOST_PERIODS):
             for i in range(s.size):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
 
-LANES = 16
+LANES = 32
 """Scenes of a block on the processor."""
 START_TIMES = (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0, 1.5, 2.0)
 """Times of the shorter steps at the start of a run without jumps, in steps."""
