@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.card import card_compiler, for_card
 from fingerspice.engine.lockmarch import How, Source, march_block, stepping_shapes
-from fingerspice.engine.lockscenes import Places, block_shapes, scratch_shapes
+from fingerspice.engine.lockmodes import scratch_shapes
+from fingerspice.engine.lockscenes import Places, block_shapes
 from fingerspice.engine.lockstep import Marks, marks_of
 
 Lengths = tuple[int, int, int, int, int]
@@ -50,7 +51,7 @@ def thread_kernel(lengths: Lengths, rows: int, pieces: int) -> Callable[..., Non
     marks: Marks = marks_of(*lengths, lanes=1)
     modes = lengths[0]
     (constants,), *_ = block_shapes(rows, marks)
-    (cells,), _, _, _, _, (both,), _, _, (points,), *_ = scratch_shapes(marks)
+    (cells,), _, _, _, _, (both,), _, (points,), *_ = scratch_shapes(marks)
     (row,), (most, _, _), (states,), (sums,), *_ = stepping_shapes(pieces or 4, marks)
     jumping = pieces > 0
 
@@ -64,18 +65,16 @@ def thread_kernel(lengths: Lengths, rows: int, pieces: int) -> Callable[..., Non
         scratch = (
             cuda.local.array(cells, np.float64), cuda.local.array(cells, np.float64),
             cuda.local.array(cells, np.float64), cuda.local.array(1, np.float64), cuda.local.array(modes, np.float64),
-            cuda.local.array(both, np.float64), cuda.local.array(both, np.float64), cuda.local.array(1, np.float64),
-            cuda.local.array(points, np.float64), cuda.local.array(cells, np.float64),
-            cuda.local.array(cells, np.float64), cuda.local.array(modes, np.float64),
-            cuda.local.array(modes, np.float64), cuda.local.array((cells, modes), np.float64),
-            cuda.local.array((cells, modes), np.float64), cuda.local.array((2, cells), np.float64),
-            cuda.local.array((2, cells), np.int64),
+            cuda.local.array(both, np.float64), cuda.local.array(both, np.float64),
+            cuda.local.array(points, np.float64), cuda.local.array((2, cells), np.float64),
+            cuda.local.array((2, modes), np.float64), cuda.local.array((2, cells, modes), np.float64),
+            cuda.local.array((2, cells), np.float64), cuda.local.array((2, cells), np.int64),
         )  # fmt: skip
         block = (
             cuda.local.array(constants, np.float64), cuda.local.array(modes, np.float64),
             cuda.local.array((modes, 1), np.float64), cuda.local.array((modes, 1), np.float64),
-            cuda.local.array(rows, np.float64), cuda.local.array(1, np.float64), cuda.local.array(1, np.float64),
-            scratch,
+            cuda.local.array(rows, np.float64), cuda.local.array(1, np.float64),
+            cuda.local.array(1, np.float64), scratch,
         )  # fmt: skip
         stepping = (
             cuda.local.array(row, np.float64), cuda.local.array((most, 3, row), np.float64),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
+from fingerspice.engine.lockmodes import Scratch, find_modes, find_rates, link, scratch_shapes
 from fingerspice.engine.lockstep import (
     N_STATE,
     PEAK,
@@ -21,7 +22,6 @@ from fingerspice.engine.lockstep import (
     area_row,
     n_constants,
 )  # fmt: skip
-from fingerspice.numerics.modes import write_modes
 
 # A table of scenes has three rows for every cell: capacitance (F/m^2), total leakage (S), leakage per area (S/m^2).
 CELL_ROWS = 3
@@ -34,9 +34,6 @@ LARGEST_X = 1.3
 """Largest X that the series of the universal curve covers."""
 Places = tuple[int, NDArray[np.int64]]
 """Index of the gap among the cells, and of the cells whose leak has a total resistance."""
-# A mode's rate nearer than this (relative) to the rate of a cell, a pole of the characteristic equation, has too few
-# correct digits in the difference of both.
-NEAR_POLE = 1e-5
 
 
 @jit_rows
@@ -111,120 +108,6 @@ def _polynomials(matrix: FloatArray, values: FloatArray, area: int, c: FloatArra
             for j in range(1, count):
                 total += matrix[d, j] * values[j * lanes + i]
             c[(area + d) * lanes + i] = total
-
-
-@jit_rows
-def _rates(
-    k: FloatArray, moved: FloatArray, r: FloatArray, inverse: FloatArray, rates: FloatArray, near: FloatArray,
-    marks: Marks,
-) -> None:  # fmt: skip
-    """Rates of the cells, into `r`, and of the modes of two or three cells; `inverse` is 1/A.
-
-    On entry `r` holds the leakage rates by area. `near` is 1 where a mode's rate is too near to that of a cell, and for
-    more cells, whose modes need an iteration.
-    """
-    m_all, lanes = len(marks[0]), len(marks[5])
-    cells = m_all + 1
-    for i in range(lanes):
-        for j in range(cells):
-            r[j * lanes + i] += inverse[i] * moved[j * lanes + i]
-        unclear = 0.0 if m_all <= 2 else 1.0
-        if m_all == 1:
-            rates[0, i] = k[i] * r[lanes + i] + k[lanes + i] * r[i]
-        if m_all == 2:
-            r0, r1, r2 = r[i], r[lanes + i], r[2 * lanes + i]
-            k0, k1, k2 = k[i], k[lanes + i], k[2 * lanes + i]
-            middle = 0.5 * (k0 * (r1 + r2) + k1 * (r0 + r2) + k2 * (r0 + r1))
-            product = k0 * r1 * r2 + k1 * r0 * r2 + k2 * r0 * r1
-            faster = middle + math.sqrt(max(middle * middle - product, 0.0))
-            rates[0, i], rates[1, i] = product / faster, faster
-        if m_all <= 2:
-            for m in range(m_all):
-                for j in range(cells):
-                    rate = r[j * lanes + i]
-                    apart = abs(rate - rates[m, i]) > NEAR_POLE * max(rate, rates[m, i])
-                    unclear = unclear if apart else 1.0
-        near[i] = unclear
-
-
-@jit_rows
-def _shapes(
-    k: FloatArray, r: FloatArray, rates: FloatArray, gain: FloatArray, feed: FloatArray, shape: FloatArray,
-    marks: Marks,
-) -> None:  # fmt: skip
-    """Modes of all lanes with such rates; `feed` and `shape` have a row for every mode of every cell."""
-    m_all, lanes = len(marks[0]), len(marks[5])
-    for i in range(lanes):
-        for m in range(m_all):
-            norm = 0.0
-            for j in range(m_all + 1):
-                inverse = 1.0 / (r[j * lanes + i] - rates[m, i])
-                norm += k[j * lanes + i] * inverse * inverse
-                shape[(j * m_all + m) * lanes + i] = k[j * lanes + i] * inverse
-                feed[(j * m_all + m) * lanes + i] = inverse
-            gain[m * lanes + i] = -1.0 / norm
-            for j in range(m_all + 1):
-                feed[(j * m_all + m) * lanes + i] *= -1.0 / norm
-
-
-class Scratch(NamedTuple):
-    """Arrays for the cells and modes of a block, and those of one lane for `numerics.modes.write_modes`."""
-
-    k: FloatArray
-    moved: FloatArray
-    r: FloatArray
-    near: FloatArray
-    gain: FloatArray
-    feed: FloatArray
-    shape: FloatArray
-    y: FloatArray
-    values: FloatArray
-    own_r: FloatArray
-    own_k: FloatArray
-    own_rates: FloatArray
-    own_gain: FloatArray
-    own_feed: FloatArray
-    own_shape: FloatArray
-    floats: FloatArray
-    whole: NDArray[np.int64]
-
-
-@jit
-def _modes(rates: FloatArray, scratch: Scratch, marks: Marks) -> None:
-    """Modes of all lanes: in closed form, and by iteration where this would lose digits or there is none."""
-    k, _, r, near, gain, feed, shape, _, _, r1, k1, rates1, gain1, feed1, shape1, floats, whole = scratch
-    m_all, lanes = len(marks[0]), len(marks[5])
-    if m_all <= 2:
-        _shapes(k, r, rates, gain, feed, shape, marks)
-    for i in range(lanes):
-        if near[i] > 0.0:
-            for j in range(m_all + 1):
-                r1[j], k1[j] = r[j * lanes + i], k[j * lanes + i]
-            write_modes(r1, k1, (rates1, gain1, feed1, shape1), floats, whole)
-            for m in range(m_all):
-                rates[m, i], gain[m * lanes + i] = rates1[m], gain1[m]
-                for j in range(m_all + 1):
-                    shape[(j * m_all + m) * lanes + i] = shape1[j, m]
-                    feed[(j * m_all + m) * lanes + i] = feed1[j, m]
-
-
-@jit_rows
-def _link(
-    gap: int, leaks: NDArray[np.int64], moved: FloatArray, feed: FloatArray, shape: FloatArray, c: FloatArray,
-    marks: Marks,
-) -> None:  # fmt: skip
-    """Constants by which the modes have to do with gap and leaks."""
-    m_all, w_all, l_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[5])
-    of_z = SHAPE + m_all + w_all + l_all * w_all
-    of_leak = of_z + l_all * m_all
-    for i in range(lanes):
-        for m in range(m_all):
-            c[(SHAPE + m) * lanes + i] = shape[(gap * m_all + m) * lanes + i]
-            for n in range(l_all):
-                c[(of_z + n * m_all + m) * lanes + i] = shape[(leaks[n] * m_all + m) * lanes + i]
-                c[(of_leak + m * l_all + n) * lanes + i] = (
-                    feed[(leaks[n] * m_all + m) * lanes + i] * moved[leaks[n] * lanes + i]
-                )
 
 
 @jit_rows
@@ -343,14 +226,6 @@ def block_shapes(rows: int, marks: Marks) -> tuple[tuple[int, ...], ...]:
     return (size,), (m_all * lanes,), modes, modes, (rows * lanes,), (lanes,), (lanes,)
 
 
-def scratch_shapes(marks: Marks) -> tuple[tuple[int, ...], ...]:
-    """Shapes of the arrays of a `Scratch`."""
-    m, lanes = len(marks[0]), len(marks[5])
-    row, own, both = ((m + 1) * lanes,), (m + 1,), ((m + 1) * m * lanes,)
-    block = (row, row, row, (lanes,), (m * lanes,), both, both, (lanes,), (len(marks[3]) * lanes,))
-    return *block, own, own, (m,), (m,), (m + 1, m), (m + 1, m), (2, m + 1), (2, m + 1)
-
-
 def aligned(shapes: Iterable[tuple[int, ...]]) -> list[FloatArray]:
     """Arrays that begin at multiples of 64 bytes, as a vector across two lines of the cache takes twice as long."""
     whole = [(shape, math.prod(shape)) for shape in shapes]
@@ -386,7 +261,7 @@ def fill_block(
     m_all, w_all, l_all, d_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[3]) - 1, len(marks[5])
     area = area_row(m_all, w_all, l_all)
     c, start, rates, drive, t, top, tails, scratch = block
-    k, moved, r, near, gain, feed, shape, y, values, _, _, _, _, _, _, _, _ = scratch
+    k, moved, r, near, gain, feed, shape, values, _, _, _, _, _ = scratch
     gap, leaks = places
     for i in range(lanes):
         scene = pending[min(first + i, pending.size - 1)]
@@ -395,7 +270,7 @@ def fill_block(
     _divide(t, gap, source[1], source[2], k, moved, r, top, marks)
     b = t[CELL_ROWS * (m_all + 1) * lanes :]
     for j in range(d_all + 1):
-        _inverse_areas(curves[1][j], top, b, curves[0], y, values[j * lanes : (j + 1) * lanes], marks)
+        _inverse_areas(curves[1][j], top, b, curves[0], near, values[j * lanes : (j + 1) * lanes], marks)
     _polynomials(curves[2], values, area, c, marks)
     for i in range(lanes):
         c[SCALE * lanes + i] = 2.0 / top[i]
@@ -404,9 +279,9 @@ def fill_block(
         tail = max(abs(c[area * lanes + i]), 2.0 / 3.0 * abs(c[(area + 1) * lanes + i])) / 2.0 ** (d_all - 1)
         covered = b[XI * lanes + i] * top[i] <= LARGEST_X
         tails[i] = tail / c[(area + d_all) * lanes + i] if covered else math.inf
-    _rates(k, moved, r, c[(area + d_all) * lanes : (area + d_all + 1) * lanes], rates, near, marks)
-    _modes(rates, scratch, marks)
-    _link(gap, leaks, moved, feed, shape, c, marks)
+    find_rates(k, moved, r, c[(area + d_all) * lanes : (area + d_all + 1) * lanes], rates, near, marks)
+    find_modes(rates, scratch, marks)
+    link(gap, leaks, moved, feed, shape, c, marks)
     if source[1]:
         _drive(t, k, gain, start, drive, c, gap, leaks, marks)
     else:
