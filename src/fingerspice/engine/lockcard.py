@@ -82,11 +82,10 @@ def thread_kernel(lengths: Lengths, rows: int, pieces: int) -> Callable[..., Non
             cuda.local.array(modes, np.float64), cuda.local.array(modes, np.float64), cuda.local.array(1, np.float64),
             cuda.local.array(1, np.float64), cuda.local.array((11, 1), np.float64),
         )  # fmt: skip
-        nothing = block[5][:0]
         how = (halves, half, count if jumping else 0, periodic, tol, covered)
         integrate(
             table, pending, first, (gap, leaks), (series, nodes, matrix), (tones, (coarse, fine)), how, block,
-            stepping, out, (nothing, nothing), marks,
+            stepping, out, (block[5][:0], block[5][:0]), marks,
         )  # fmt: skip
 
     return kernel
