@@ -130,9 +130,11 @@ class Track(Stepping):
                 p.system, self.pace, p.tables, p.work, p.integral, sources.edges, sources.terms, sources.series, t_end,
                 *mine, self.t_out, self.left, self.out, self.kept, self.recorder.room, self.tried,
             )  # fmt: skip
+            # Also where the loop is done: one that begins with full arrays would pause before it has found its segment.
+            if self.counters[readout.RECORDED] >= len(self.recorder.room.times):
+                self.recorder.drain(self.counters)
             if code != march.PAUSED:
                 return int(code)
-            self.recorder.drain(self.counters)
 
     def _to(self, sources: Sources, t_end: float) -> Status:
         code = self.advance(sources, t_end)
