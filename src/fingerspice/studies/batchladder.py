@@ -18,7 +18,7 @@ from fingerspice.studies.batchscenes import Curves, LockstepForm, curves_of, pea
 from fingerspice.studies.batchtask import LOCKSTEP, Answers, Task
 
 # Initial number of steps per period, and initial degree of the area's polynomial, by the smallest rtol served.
-_RUNGS = ((5e-4, 32, 8), (5e-5, 48, 8), (5e-6, 80, 12), (5e-7, 144, 12), (0.0, 288, 16))
+_RUNGS = ((5e-4, 32, 8), (5e-5, 48, 8), (5e-6, 80, 12), (5e-7, 144, 12), (0.0, 144, 16))
 HIGHEST_DEGREE, MOST_STEPS = 24, 8192
 # Under a recording: initial number of steps a sample, and the largest.
 _PARTS = (2, 16)
@@ -42,6 +42,9 @@ _STIFF, _STATED_STIFF = 2.0, 0.8
 # 1, which gives 1, for a dispersive skin, some of whose modes decay from each sample on within a part of a step.
 _STATED_RECORDED, _STATED_DISPERSIVE = 0.5, 1.0
 _MOST_GAIN = 24.0
+# Under sines and below this rtol, where the kinks are most of the error, no scene is accepted before the steps have
+# been doubled once, with a smaller such factor.
+_DOUBTFUL, _GAIN_IN_DOUBT = 5e-7, 12.0
 # Longest first step after a jump of the source, in time constants of the fastest cell.
 _LONGEST_STEP = 1.0
 # Steps of a piece of a square's half period by the smallest rtol served; and the number by which the first step, with
@@ -185,6 +188,8 @@ def _climb_one(
         steps, most = _PARTS
     if traced:
         steps = task.points * -(-steps // task.points)
+    doubtful = task.rtol < _DOUBTFUL and not form.jumping and form.recording is None
+    gain = _GAIN_IN_DOUBT if doubtful else _MOST_GAIN
     before, last, outside = None, np.full(pending.size, np.inf), [pending[:0]]
     while pending.size and steps <= most:
         curves = curves_of(form.layer.values["m_exp"], form.layer.values["n_exp"], degree)
@@ -193,8 +198,9 @@ def _climb_one(
         level = Level(task, form, mesh, steps, degree, covered, ALL_MOMENTS if needed[-1] else 1, traced)
         now = level.run(table, pending, curves, before)
         error = level.error(now, needed, scenes.decays[pending])
-        error = np.where(np.isfinite(last), np.maximum(error, last / _MOST_GAIN), error)
+        error = np.where(np.isfinite(last), np.maximum(error, last / gain), error)
         good = (error <= ENOUGH * task.rtol) & short_enough(scenes.decays[pending], pieces, steps)
+        good &= before is not None or not doubtful
         at = pending[good]
         for name in figures:
             part = 1 if name.endswith("_periodic") or task.periodic else 0
