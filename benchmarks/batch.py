@@ -146,6 +146,21 @@ def growth(circuit: fs.Circuit, largest: int) -> list[dict[str, Any]]:
     return rows
 
 
+def waveforms(circuit: fs.Circuit, n: int, repeats: int) -> list[dict[str, Any]]:
+    """Gap voltages per second where all of them are returned, 200 a period of 5 periods, at 1e-4."""
+    parameters, rows = population(n, False), []
+    for threads in (1, 2):
+
+        def call(threads: int = threads) -> Any:
+            return fs.batch(circuit, parameters, outputs=("u_gap",), periods=PERIODS, rtol=1e-4, threads=threads)
+
+        took = seconds(call, repeats)
+        rows.append({"scenes": f"{PLAIN}, u_gap", "who": "fs.batch", "rtol": 1e-4, "threads": threads, "n": n, **took,
+                     "scenes_per_s": n / took["least_s"],
+                     "voltages_per_s": n * 200 * PERIODS / took["least_s"]})  # fmt: skip
+    return rows
+
+
 def peers(
     circuit: fs.Circuit, parameters: dict[str, np.ndarray], expected: np.ndarray, repeats: int
 ) -> list[dict[str, Any]]:
@@ -193,6 +208,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
                 recorded = sine.replace({"Vdrive": noise(highest)})
                 some = {path: values[:1024] for path, values in fingers.items()}
                 rows += measure(f"recording to {highest:g} Hz", recorded, some, repeats, None)
+        rows += waveforms(sine, 64 if options.quick else 8192, repeats)
         rows += growth(sine, 100 if options.quick else 1_000_000)
     results = {"python": platform.python_version(), "machine": platform.machine(), "rows": rows}
     for row in rows:

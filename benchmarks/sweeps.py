@@ -69,6 +69,19 @@ def measured(n: int, repeats: int, folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def indices(n: int, repeats: int) -> dict[str, Any]:
+    """Seconds of Sobol indices of four parameters, with their intervals, by one thread."""
+    circuit, parameters = fs.read_netlist(DECK), {**PARAMETERS, "Xgap.alpha": stats.lognorm(0.1, scale=54.4)}
+    times = []
+    for _ in range(repeats + 1):
+        begin = time.perf_counter()
+        fs.sobol(circuit, parameters, n=n, outputs=("f_el_mean",), periods=5, threads=1)
+        times.append(time.perf_counter() - begin)
+    row = {"who": "Sobol indices, 1 thread", "n": n * (len(parameters) + 2), "median_s": float(np.median(times[1:]))}
+    print(row)
+    return row
+
+
 def digest(store: Path) -> str:
     """Digest of all files of a store, with their names."""
     told = hashlib.sha256()
@@ -106,7 +119,8 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     options = parser.parse_args(arguments)
     n, repeats, kills = (1 << 12, 1, 1) if options.quick else (1 << 20, 7, options.kills)
     with tempfile.TemporaryDirectory() as name:
-        rows, found = measured(n, repeats, Path(name)), killed(8 * n, kills, Path(name))
+        rows = [*measured(n, repeats, Path(name)), indices(64 if options.quick else 4096, repeats)]
+        found = killed(16 * n, kills, Path(name))
     results = {"python": platform.python_version(), "machine": platform.machine(), "rows": rows, "killed": found}
     if not options.quick:
         (HERE / "results" / "sweeps.json").write_text(json.dumps(results, indent=1) + "\n")

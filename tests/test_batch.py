@@ -12,7 +12,8 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
-from fingerspice.engine.lockweights import moment_integrals
+from fingerspice.engine.lockstep import marks_of
+from fingerspice.engine.lockweights import moment_integrals, weigh
 from fingerspice.studies.batchscenes import LockstepForm, lockstep_form, table_of
 from scenes import table1
 
@@ -196,6 +197,37 @@ def test_neither_threads_nor_the_order_of_scenes_change_a_byte() -> None:
     assert run(2, np.random.default_rng(0).permutation(300)) == first
 
 
+# A finger that forgets its start within a period of 100 Hz, and one whose layers leak for about 200 of them.
+SETTLING: dict[str, list[float]] = {"Xgap.r": [3e5, 1e9], "Xcoat.r": [2e5, 1e9]}
+
+
+@pytest.mark.parametrize("circuit", [table1(), square()], ids=["sine", "square"])
+def test_a_run_that_has_settled_ends_and_one_that_has_not_goes_on(circuit: Circuit) -> None:
+    outputs = ("f_el_mean", "f_el_mean_periodic", "f_t_rms")
+    found = {n: fs.batch(circuit, SETTLING, outputs=outputs, periods=n, rtol=1e-6) for n in (20, 60, 60.5)}
+    # The last period is the very same one in a run of 20 and of 60 periods. An odd number of half periods begins with
+    # one of them.
+    quick, slow = (np.array([found[n].f_el_mean_periodic.values[i] for n in (20, 60, 60.5)]) for i in (0, 1))
+    assert quick[0] == quick[1]
+    assert quick[2] == pytest.approx(quick[1], rel=1e-6)
+    assert abs(slow[1] / slow[0] - 1.0) > 1e-6
+    for n, batch in found.items():
+        for i in range(2):
+            one = circuit.varied({path: values[i] for path, values in SETTLING.items()})
+            expected = fs.simulate(one, t_stop=n / 100.0, rtol=1e-11, charge=False).summary()
+            for name in outputs:
+                assert abs(batch[name][i] / expected[name] - 1.0) <= batch.error[i] <= 1e-6
+
+
+@pytest.mark.parametrize("circuit", [table1(), square()], ids=["sine", "square"])
+def test_no_scene_s_bytes_depend_on_when_those_beside_it_settle(circuit: Circuit) -> None:
+    mixed = {path: np.array(values * 20) for path, values in SETTLING.items()}
+    together = fs.batch(circuit, mixed, periods=12, rtol=1e-5).f_el_mean.values
+    for i in range(2):
+        alone = fs.batch(circuit, {path: [values[i]] for path, values in SETTLING.items()}, periods=12, rtol=1e-5)
+        assert np.all(together[i::2] == alone.f_el_mean.values[0])
+
+
 def test_one_bad_scene_costs_the_others_nothing() -> None:
     c2 = np.full(40, 5000.0)
     good = fs.batch(table1(), {"Xgap.c2": c2}, periods=2)
@@ -346,3 +378,23 @@ def test_weights_of_a_step_are_integrals_of_the_decay(y: float) -> None:
     for k, found in enumerate(moment_integrals(y)):
         expected = quad(lambda s, k=k: np.exp(-y * (1.0 - s)) * s**k, 0.0, 1.0, epsabs=1e-13, epsrel=1e-13)[0]
         assert found == pytest.approx(expected, rel=2e-13)
+
+
+@pytest.mark.parametrize("y", [0.0, 1e-6, 0.3, 5.0, 19.0, 19.4, 200.0])
+def test_an_exponential_adams_step_is_exact_for_a_cubic(y: float) -> None:
+    h, lanes = 2e-3, 8
+    marks = marks_of(1, 1, 1, 1, 1, lanes)
+    still, moving = np.empty(9 * lanes), np.empty((1, 3, 9 * lanes))
+    rates = np.full((1, lanes), y / h)
+    weigh(np.full(lanes, h), rates, np.full((1, lanes), 2.0), (still, moving), np.empty((11, lanes)), marks)
+    decay, drive, *_, end, now, old, older = moving[0, 2].reshape(9, lanes)[:, 3]
+    assert decay == pytest.approx(np.exp(-y), rel=1e-13, abs=1e-15)
+
+    def integral(n: Any) -> float:
+        return float(h * quad(lambda s: np.exp(-y * (1.0 - s)) * n(s), 0.0, 1.0, epsabs=1e-14, points=[0.9])[0])
+
+    assert drive == pytest.approx(2.0 * integral(lambda s: 1.0), rel=1e-11)
+    found = sum(
+        weight * (1.0 + s - 2.0 * s**3) for weight, s in zip((end, now, old, older), (1, 0, -1, -2), strict=True)
+    )
+    assert found == pytest.approx(integral(lambda s: 1.0 + s - 2.0 * s**3), rel=1e-10)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
+from fingerspice.results.steps import Recorder
+from fingerspice.solve import stepping
 from scenes import deck, table1
 
 AREA = 34.9715871843e-6
@@ -95,3 +98,16 @@ def test_figures_of_the_coupled_state_are_the_reference_s(law: str) -> None:
     first = 2j * np.mean(want.u_gap * np.exp(-2j * np.pi * F * t))
     assert got["u_gap_amplitude"] == pytest.approx(abs(first), rel=1e-6)
     assert got["u_gap_phase_deg"] == pytest.approx(math.degrees(np.angle(first)), abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["fingerpad_dispersive", "am_carrier"])
+def test_where_the_recorded_steps_fill_their_arrays_changes_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # With room for one step they are full, too, where a period ends within the present window of the source.
+    circuit = fs.read_netlist(f"circuits/{name}.cir")
+    plain = fs.simulate(circuit, t_stop=0.1, rtol=1e-6, charge=False)
+    for capacity in (1, 7):
+        monkeypatch.setattr(stepping, "Recorder", partial(Recorder, capacity=capacity))
+        run = fs.simulate(circuit, t_stop=0.1, rtol=1e-6, charge=False)
+        assert run.stats["steps"] == plain.stats["steps"]
+        np.testing.assert_array_equal(run.u_gap, plain.u_gap)
+        assert run.f_el_mean == pytest.approx(plain.f_el_mean, rel=1e-13)

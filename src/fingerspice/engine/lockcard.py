@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.card import card_compiler, for_card
 from fingerspice.engine.lockmarch import How, Source, march_block, stepping_shapes
+from fingerspice.engine.lockmodes import scratch_shapes
 from fingerspice.engine.lockscenes import Places, block_shapes
 from fingerspice.engine.lockstep import Marks, marks_of
 
@@ -48,8 +49,9 @@ def thread_kernel(lengths: Lengths, rows: int, pieces: int) -> Callable[..., Non
     global cuda
     cuda, integrate = card_compiler(), for_card(march_block)
     marks: Marks = marks_of(*lengths, lanes=1)
-    modes, cells = lengths[0], lengths[0] + 1
-    (constants,), *_, (others,), _, _, _, _ = block_shapes(rows, marks)
+    modes = lengths[0]
+    (constants,), *_ = block_shapes(rows, marks)
+    (cells,), _, _, _, _, (both,), _, (points,), *_ = scratch_shapes(marks)
     (row,), (most, _, _), (states,), (sums,), *_ = stepping_shapes(pieces or 4, marks)
     jumping = pieces > 0
 
@@ -62,28 +64,28 @@ def thread_kernel(lengths: Lengths, rows: int, pieces: int) -> Callable[..., Non
             return
         scratch = (
             cuda.local.array(cells, np.float64), cuda.local.array(cells, np.float64),
-            cuda.local.array(cells, np.float64), cuda.local.array(cells, np.float64),
-            cuda.local.array(cells, np.float64), cuda.local.array(modes, np.float64),
-            cuda.local.array((cells, modes), np.float64), cuda.local.array((cells, modes), np.float64),
+            cuda.local.array(cells, np.float64), cuda.local.array(1, np.float64), cuda.local.array(modes, np.float64),
+            cuda.local.array(both, np.float64), cuda.local.array(both, np.float64),
+            cuda.local.array(points, np.float64), cuda.local.array((2, cells), np.float64),
+            cuda.local.array((2, modes), np.float64), cuda.local.array((2, cells, modes), np.float64),
             cuda.local.array((2, cells), np.float64), cuda.local.array((2, cells), np.int64),
         )  # fmt: skip
         block = (
             cuda.local.array(constants, np.float64), cuda.local.array(modes, np.float64),
             cuda.local.array((modes, 1), np.float64), cuda.local.array((modes, 1), np.float64),
-            cuda.local.array(others, np.float64), cuda.local.array(1, np.float64), cuda.local.array(1, np.float64),
-            cuda.local.array(rows, np.float64), cuda.local.array((2, 1), np.float64), scratch,
+            cuda.local.array(rows, np.float64), cuda.local.array(1, np.float64),
+            cuda.local.array(1, np.float64), scratch,
         )  # fmt: skip
         stepping = (
             cuda.local.array(row, np.float64), cuda.local.array((most, 3, row), np.float64),
             cuda.local.array(states, np.float64), cuda.local.array(sums, np.float64),
-            cuda.local.array(modes, np.float64), cuda.local.array(1, np.float64), cuda.local.array(1, np.float64),
-            cuda.local.array((11, 1), np.float64),
+            cuda.local.array(modes, np.float64), cuda.local.array(modes, np.float64), cuda.local.array(1, np.float64),
+            cuda.local.array(1, np.float64), cuda.local.array((11, 1), np.float64),
         )  # fmt: skip
-        nothing = block[6][:0]
         how = (halves, half, count if jumping else 0, periodic, tol, covered)
         integrate(
             table, pending, first, (gap, leaks), (series, nodes, matrix), (tones, (coarse, fine)), how, block,
-            stepping, out, (nothing, nothing), marks,
+            stepping, out, (block[5][:0], block[5][:0]), marks,
         )  # fmt: skip
 
     return kernel

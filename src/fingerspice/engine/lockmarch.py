@@ -10,15 +10,18 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
-from fingerspice.engine.lockscenes import OMEGA, Block, Places, fill_block, put_results
+from fingerspice.engine.lockscenes import CELL_ROWS, OMEGA, Block, Places, aligned, fill_block, put_result
 from fingerspice.engine.lockstep import (
     N_STATE,
     N_WEIGHTS,
     PEAK,
     SHAPE,
     START_TIMES,
+    VALUE,
     Marks,
+    Weights,
     Z,
+    area_row,
     n_state,
     run,
 )  # fmt: skip
@@ -26,6 +29,8 @@ from fingerspice.engine.lockweights import weigh
 
 # Most periods in the search for the periodic state.
 MOST_PERIODS = 16
+# Whether a run has settled is judged as if its modes decayed slower than with the area held, by this factor.
+SLOWER = 0.5
 Source = tuple[FloatArray, tuple[FloatArray, FloatArray]]
 How = tuple[int, int, int, bool, float, float]
 
@@ -41,10 +46,14 @@ class Stepping(NamedTuple):
         State.
     last : ndarray, shape (n_moment * lanes,)
         Sums over the last period.
+    before : ndarray, shape (n_mode * lanes,)
+        Modes at the start of the last period.
     back : ndarray, shape (n_mode * lanes,)
-        Derivative of the start in the search for the periodic state by what a period leaves open, with the area held.
+        In the search for the periodic state, the derivative of the start by what a period leaves open, with the area
+        held. In a run from rest, an upper bound of the modes' time constants, in periods.
     closing : ndarray, shape (lanes,)
-        What the periodic state is off, relative to the peak gap voltage.
+        What the periodic state is off, relative to the peak gap voltage; or half of what the mean force is off because
+        the last period stands for those after it, relative to that force, and infinite while it does not.
     length : ndarray, shape (lanes,)
         Length of the shortest step, s.
     moments : ndarray, shape (11, lanes)
@@ -55,6 +64,7 @@ class Stepping(NamedTuple):
     moving: NDArray[np.float64]
     s: FloatArray
     last: FloatArray
+    before: FloatArray
     back: FloatArray
     closing: FloatArray
     length: FloatArray
@@ -72,6 +82,7 @@ def stepping_shapes(pieces: int, marks: Marks) -> tuple[tuple[int, ...], ...]:
         (n_state(m_all, l_all, count) * lanes,),
         sums,
         modes,
+        modes,
         (lanes,),
         (lanes,),
         (11, lanes),
@@ -80,7 +91,7 @@ def stepping_shapes(pieces: int, marks: Marks) -> tuple[tuple[int, ...], ...]:
 
 def new_stepping(pieces: int, marks: Marks) -> Stepping:
     """Arrays for the steps of blocks of scenes, whose half periods have so many pieces (0 without jumps)."""
-    return Stepping._make(np.empty(shape) for shape in stepping_shapes(pieces or 4, marks))
+    return Stepping._make(aligned(stepping_shapes(pieces or 4, marks)))
 
 
 @jit
@@ -108,6 +119,63 @@ def _closed(
 
 
 @jit
+def _settled(i: int, c: FloatArray, stepping: Stepping, steps: int, marks: Marks) -> float:
+    """Half of what lane i's mean force is off, relative to it, if the last period stands for all that follow.
+
+    What a mode was off the periodic state, on average over the period, is at most its change over the period times its
+    time constant in periods. The mean force changes by at most twice the peak voltage times this, and the area; `steps`
+    is the number of steps of a period.
+    """
+    s, last, before, back = stepping[2], stepping[3], stepping[4], stepping[5]
+    m_all, lanes = len(marks[0]), len(marks[5])
+    off, held = 0.0, area_row(m_all, len(marks[1]), len(marks[2])) + len(marks[3]) - 1
+    for m in range(m_all):
+        at = m * lanes + i
+        off += abs(c[(SHAPE + m) * lanes + i] * (s[Z * m_all * lanes + at] - before[at]) * back[at])
+    return float(off * s[(N_STATE * m_all + PEAK) * lanes + i] / (last[i] / steps * c[held * lanes + i] + 1e-300))
+
+
+@jit
+def _from_rest(
+    c: FloatArray, g: Weights, wave: FloatArray, how: tuple[int, int, bool], tol: float, stepping: Stepping,
+    trace: FloatArray, out: FloatArray, first: int, marks: Marks,
+) -> None:  # fmt: skip
+    """Run a block's scenes period by period, until the run ends or all have settled; see `march` for the arguments.
+
+    A scene that has settled takes part in further periods only if others of its block do, and its results stay those
+    at which it settled: no result depends on the scenes beside it. A first range of half a period makes the rest whole.
+    """
+    halves, steps, jumping = how
+    s, last, before, closing = stepping[2], stepping[3], stepping[4], stepping[6]
+    m_all, count, lanes = len(marks[0]), len(marks[4]), len(marks[5])
+    sums = (N_STATE * m_all + VALUE + count) * lanes
+    for i in range(lanes):
+        closing[i] = math.inf
+    done, left = 0, lanes
+    while left > 0:
+        upto = done + 2 - halves % 2 if done == 0 else done + 2
+        for i in range(before.size):
+            before[i] = s[Z * m_all * lanes + i]
+        for i in range(last.size):
+            last[i] = -s[sums + i] if done > 0 else 0.0
+        run(c, g, s, wave, (done, upto, steps, jumping), trace, marks)
+        for i in range(last.size):
+            last[i] = last[i] + s[sums + i] if upto - done == 2 else math.nan
+        done = upto
+        ahead = (halves - done) // 2
+        for i in range(lanes):
+            if closing[i] < math.inf:
+                continue
+            off = 0.0
+            if ahead > 0:
+                off = _settled(i, c, stepping, 2 * steps, marks)
+            if ahead == 0 or (trace.size == 0 and off <= tol):
+                closing[i] = off
+                left -= 1
+                put_result(i, s, last, off, (ahead, halves, steps), first, out, marks)
+
+
+@jit
 def march_block(
     table: FloatArray, pending: NDArray[np.int64], first: int, places: Places,
     curves: tuple[FloatArray, FloatArray, FloatArray], source: Source, how: How, block: Block, stepping: Stepping,
@@ -120,15 +188,17 @@ def march_block(
     halves, half, pieces, periodic, tol, covered = how
     m_all, count, lanes, jumping = len(marks[0]), len(marks[4]), len(marks[5]), pieces > 0
     # Unpacked by position, as a compiler for graphics cards may know plain tuples only.
-    c, start, rates, drive, b, top, tails, _, _, _ = block
-    still, moving, s, last, back, closing, length, moments = stepping
+    c, start, rates, drive, t, top, tails, _ = block
+    still, moving, s, _, _, back, closing, length, moments = stepping
+    sums, omega = (N_STATE * m_all + VALUE + count) * lanes, (CELL_ROWS * (m_all + 1) + OMEGA) * lanes
     fill_block(table, pending, first, places, curves, (source[0], jumping, covered), block, marks)
     for i in range(lanes):
-        closing[i] = 0.0
-        if periodic:
-            period = 2.0 * math.pi / b[OMEGA * lanes + i]
-            for m in range(m_all):
+        period = 2.0 * math.pi / t[omega + i]
+        for m in range(m_all):
+            if periodic:
                 back[m * lanes + i] = -1.0 / math.expm1(-rates[m, i] * period)
+            else:
+                back[m * lanes + i] = 1.0 / (SLOWER * rates[m, i] * period + 1e-300)
     g = (still, moving[: pieces if jumping else 4])
     for w in range(2):
         if source[1][w].size == 0:
@@ -137,15 +207,21 @@ def march_block(
         # All pieces together are 2^pieces - 1 times the first, which has steps / pieces of the shortest steps.
         shorter = pieces / (2.0**pieces - 1.0) if jumping else START_TIMES[1]
         for i in range(lanes):
-            length[i] = math.pi / b[OMEGA * lanes + i] / steps * shorter
+            length[i] = math.pi / t[omega + i] / steps * shorter
         weigh(length, rates, drive, g, moments, marks)
-        for _ in range(MOST_PERIODS if periodic else 1):
+        for _ in range(MOST_PERIODS):
             for i in range(s.size):
                 s[i] = start[i] if i < start.size else 0.0
-            run(c, g, s, source[1][w], (halves, steps, jumping), last, voltages[w], marks)
-            if not periodic or _closed(s, start, back, c, closing, tol, marks):
+            if not periodic:
+                way = (halves, steps, jumping)
+                _from_rest(c, g, source[1][w], way, tol, stepping, voltages[w], out[w], first, marks)
                 break
-        put_results(s, last, closing, (float(halves * steps), 2.0 * steps), first, out[w], marks)
+            run(c, g, s, source[1][w], (0, halves, steps, jumping), voltages[w], marks)
+            done = _closed(s, start, back, c, closing, tol, marks)
+            for i in range(lanes):
+                put_result(i, s, s[sums:], closing[i], (0, halves, steps), first, out[w], marks)
+            if done:
+                break
         for i in range(min(lanes, pending.size - first)):
             within = out[w, 2 * count, first + i] <= top[i]
             out[w, 2 * count + 2, first + i] = tails[i] if within else math.inf

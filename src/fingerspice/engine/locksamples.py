@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.lockscenes import OMEGA, Block, Places, fill_block
+from fingerspice.engine.lockscenes import CELL_ROWS, OMEGA, Block, Places, fill_block
 from fingerspice.engine.lockstep import (
     GAP,
     N_STATE,
@@ -248,6 +248,7 @@ def march_samples(
     """
     m_all, l_all, d_all, count, lanes = len(marks[0]), len(marks[2]), len(marks[3]) - 1, len(marks[4]), len(marks[5])
     area, row = area_row(m_all, 1, l_all), N_WEIGHTS * m_all * lanes
+    omega = (CELL_ROWS * (m_all + 1) + OMEGA) * lanes
     c, still, g = block.c, np.zeros(row), np.empty(row)
     # The last rows hold the voltages of the leaks.
     s, slope = np.empty((n_state(m_all, l_all, count) + l_all) * lanes), np.empty(lanes)
@@ -262,7 +263,7 @@ def march_samples(
             if parts == 0:
                 continue
             for i in range(lanes):
-                h[i] = math.pi / block.b[OMEGA * lanes + i] / parts
+                h[i] = math.pi / block.t[omega + i] / parts
             _weigh(h, block.rates, block.drive, g, marks)
             s[:] = 0.0
             _run(c, still, g, s, slope, values, parts, portions, marks)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
+from fingerspice.engine.lockmodes import Scratch, find_modes, find_rates, link, scratch_shapes
 from fingerspice.engine.lockstep import (
     N_STATE,
     PEAK,
@@ -20,21 +22,57 @@ from fingerspice.engine.lockstep import (
     area_row,
     n_constants,
 )  # fmt: skip
-from fingerspice.numerics.modes import write_modes
 
 # A table of scenes has three rows for every cell: capacitance (F/m^2), total leakage (S), leakage per area (S/m^2).
 CELL_ROWS = 3
 # Its further rows.
 XI, REST, STRESS, LOAD, LOSS, OMEGA, N_OTHERS = 0, 1, 2, 3, 4, 5, 6
 """X of Eq. 4 at 1 V, A0 at 0 V (m^2), stress at 1 V (Pa), load (N), c2 mu^2; the source's angular frequency (rad/s).
-After them come amplitude (V) and phase (rad) of each of its tones."""
+After them come the amplitudes (V) of the sine and of the cosine in each of its tones; a square's or recording's is the
+first of both."""
 LARGEST_X = 1.3
 """Largest X that the series of the universal curve covers."""
 Places = tuple[int, NDArray[np.int64]]
 """Index of the gap among the cells, and of the cells whose leak has a total resistance."""
-# A mode's rate nearer than this (relative) to the rate of a cell, a pole of the characteristic equation, has too few
-# correct digits in the difference of both.
-NEAR_POLE = 1e-5
+
+
+@jit_rows
+def _divide(
+    t: FloatArray, gap: int, jumping: bool, covered: float, k: FloatArray, moved: FloatArray, own: FloatArray,
+    top: FloatArray, marks: Marks,
+) -> None:  # fmt: skip
+    """Shares of the cells in a voltage step, their leakage rates by total resistance and by area, and the largest u.
+
+    That is an estimate of the largest gap voltage with the area at rest, times `covered`. The gap's share of the source
+    is between the capacitive and the resistive divider's; the jump of a square adds the difference of both, which is
+    left of the half period before.
+    """
+    cells, tones, lanes = len(marks[0]) + 1, (len(marks[1]) + 1) // 2, len(marks[5])
+    others, turned = CELL_ROWS * cells, 1.0 if jumping else 0.0
+    for i in range(lanes):
+        elastance, resistance, area = 0.0, 0.0, t[(others + REST) * lanes + i]
+        for j in range(cells):
+            inverse = 1.0 / t[j * lanes + i]
+            total, per_area = t[(cells + j) * lanes + i], t[(2 * cells + j) * lanes + i]
+            moved[j * lanes + i] = total * inverse
+            own[j * lanes + i] = per_area * inverse
+            k[j * lanes + i] = inverse
+            elastance += inverse
+            resistance += 1.0 / (total + area * per_area + 1e-300)
+        for j in range(cells):
+            k[j * lanes + i] /= elastance
+        amplitude = 0.0
+        for tone in range(tones):
+            along, across = (
+                t[(others + N_OTHERS + 2 * tone) * lanes + i],
+                t[(others + N_OTHERS + 2 * tone + 1) * lanes + i],
+            )
+            amplitude += math.sqrt(along * along + across * across)
+        at_once = 1.0 / (t[gap * lanes + i] * elastance)
+        leak = t[(cells + gap) * lanes + i] + area * t[(2 * cells + gap) * lanes + i]
+        at_last = 1.0 / ((leak + 1e-300) * resistance)
+        share = max(at_once, at_last) + turned * abs(at_once - at_last)
+        top[i] = covered * (amplitude * share) + 1e-12
 
 
 @jit_rows
@@ -45,168 +83,111 @@ def _inverse_areas(
 
     `b` holds the table's further rows (X, A0, stress, ...) for the lanes of the block; `y` (lanes,) is scratch.
     """
-    lanes = len(marks[5])
+    lanes, half = len(marks[5]), 0.5 * (1.0 + at)
     for i in range(lanes):
-        x = b[XI * lanes + i] * (0.5 * (1.0 + at) * top[i]) * (2.0 / LARGEST_X) - 1.0
-        total = series[0]
-        for d in range(1, series.size):
-            total = total * x + series[d]
-        y[i] = total
+        y[i] = series[0]
+    for d in range(1, series.size):
+        for i in range(lanes):
+            x = b[XI * lanes + i] * (half * top[i]) * (2.0 / LARGEST_X) - 1.0
+            y[i] = y[i] * x + series[d]
     for i in range(lanes):
-        u = 0.5 * (1.0 + at) * top[i]
-        a0 = b[REST * lanes + i] * y[i]
-        load, k = b[LOAD * lanes + i], b[LOSS * lanes + i] / a0
+        u, a = half * top[i], b[REST * lanes + i] * y[i]
+        load, loss = b[LOAD * lanes + i], b[LOSS * lanes + i]
         sigma = b[STRESS * lanes + i] * u * u
-        root = math.sqrt(1.0 + 4.0 * k * sigma * (load + sigma * a0))
-        out[i] = (1.0 + 2.0 * k * load * sigma + root) / (2.0 * (a0 - k * load * load))
+        root = math.sqrt(a * a + 4.0 * loss * sigma * a * (load + sigma * a))
+        out[i] = (a + 2.0 * loss * load * sigma + root) / (2.0 * (a * a - loss * load * load))
 
 
 @jit_rows
-def _add_row(share: float, x: FloatArray, out: FloatArray, marks: Marks) -> None:
-    for i in range(len(marks[5])):
-        out[i] += share * x[i]
+def _polynomials(matrix: FloatArray, values: FloatArray, area: int, c: FloatArray, marks: Marks) -> None:
+    """Coefficients of 1/A of every lane, from row `area` of the constants on, from its values at Chebyshev's points."""
+    count, lanes = len(marks[3]), len(marks[5])
+    for d in range(count):
+        for i in range(lanes):
+            total = matrix[d, 0] * values[i]
+            for j in range(1, count):
+                total += matrix[d, j] * values[j * lanes + i]
+            c[(area + d) * lanes + i] = total
 
 
-@jit
-def _read_column(table: FloatArray, scene: int, column: FloatArray) -> None:
-    for j in range(column.size):
-        column[j] = table[j, scene]
+@jit_rows
+def _respond(
+    t: FloatArray, tones: FloatArray, k: FloatArray, gain: FloatArray, rates: FloatArray, start: FloatArray,
+    c: FloatArray, gap: int, leaks: NDArray[np.int64], marks: Marks,
+) -> None:  # fmt: skip
+    """Response to the tones, in the constants of the block, and the modes at the start, which are the rest beside it.
 
-
-@jit
-def _largest_voltage(t: FloatArray, gap: int, cells: int, jumping: bool) -> float:
-    """Estimate of the largest gap voltage (V) of the scene with column t of the table, its area at rest held.
-
-    The gap's share of the source is between the capacitive and the resistive divider's; the jump of a square adds the
-    difference of both, which is left of the half period before.
+    A tone's response in a mode is gain (rate - i omega) / (rate^2 + omega^2) of it.
     """
-    elastance, resistance = 0.0, 0.0
-    area = t[CELL_ROWS * cells + REST]
-    for j in range(cells):
-        elastance += 1.0 / t[j]
-        resistance += 1.0 / (t[cells + j] + area * t[2 * cells + j] + 1e-300)
-    at_once = 1.0 / (t[gap] * elastance)
-    at_last = 1.0 / ((t[cells + gap] + area * t[2 * cells + gap] + 1e-300) * resistance)
-    share = max(at_once, at_last) + (abs(at_once - at_last) if jumping else 0.0)
-    amplitude = 0.0
-    for row in range(CELL_ROWS * cells + N_OTHERS, t.size, 2):
-        amplitude += abs(t[row])
-    return float(amplitude * share)
-
-
-@jit
-def _three_modes(r: FloatArray, k: FloatArray, rates: FloatArray) -> bool:
-    """The two rates of the modes of three cells from a quadratic; False where one is too near to a cell's own rate."""
-    b = k[0] * (r[1] + r[2]) + k[1] * (r[0] + r[2]) + k[2] * (r[0] + r[1])
-    c = k[0] * r[1] * r[2] + k[1] * r[0] * r[2] + k[2] * r[0] * r[1]
-    square = b * b - 4.0 * c
-    if not square > 0.0:
-        return False
-    rates[1] = 0.5 * (b + math.sqrt(square))
-    rates[0] = c / rates[1]
-    for m in range(2):
-        for j in range(3):
-            if not abs(r[j] - rates[m]) > NEAR_POLE * max(r[j], rates[m]):
-                return False
-    return True
-
-
-class Scratch(NamedTuple):
-    """Arrays for the cells and modes of one lane, used by all in turn; all are overwritten."""
-
-    k: FloatArray
-    r: FloatArray
-    moved: FloatArray
-    u: FloatArray
-    inverse: FloatArray
-    gain: FloatArray
-    feed: FloatArray
-    shape: FloatArray
-    floats: FloatArray
-    whole: NDArray[np.int64]
-
-
-@jit
-def _modes(rates: FloatArray, scratch: Scratch) -> None:
-    """As `numerics.modes.write_modes`, and without its iteration for three cells with different rates."""
-    k, r, _, _, _, gain, feed, shape, floats, whole = scratch
-    if r.size == 3 and _three_modes(r, k, rates):
-        for m in range(2):
-            norm = 0.0
-            for j in range(3):
-                shape[j, m] = k[j] / (r[j] - rates[m])
-                norm += shape[j, m] * shape[j, m] / k[j]
-            gain[m] = -1.0 / norm
-            for j in range(3):
-                feed[j, m] = -shape[j, m] / k[j] / norm
-        return
-    write_modes(r, k, (rates, gain, feed, shape), floats, whole)
-
-
-@jit
-def _lane(
-    i: int, places: Places, t: FloatArray, tones: FloatArray, jumping: bool, c: FloatArray, start: FloatArray,
-    rates: FloatArray, drive: FloatArray, scratch: Scratch, marks: Marks,
-) -> None:  # fmt: skip
-    """Constants and start of lane i from its column t of the table, with 1/A0 already in `scratch`."""
-    gap, leaks = places
-    m_all, w_all, l_all = len(marks[0]), len(marks[1]), leaks.size
-    cells = m_all + 1
-    others = CELL_ROWS * cells
-    k, r, moved, u, inverse, gain, feed, shape, _, _ = scratch
-    lanes = len(marks[5])
-    total = 0.0
-    for j in range(cells):
-        total += 1.0 / t[j]
-    for j in range(cells):
-        k[j] = 1.0 / (t[j] * total)
-        moved[j] = t[cells + j] / t[j]
-        r[j] = t[2 * cells + j] / t[j] + inverse[0] * moved[j]
-    _modes(rates, scratch)
-    of_u, of_w = SHAPE + m_all, SHAPE + m_all + w_all
+    m_all, w_all, l_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[5])
+    others, of_u = CELL_ROWS * (m_all + 1), SHAPE + m_all
+    of_w = of_u + w_all
     of_z = of_w + l_all * w_all
-    of_leak = of_z + l_all * m_all
-    for m in range(m_all):
-        c[(SHAPE + m) * lanes + i] = shape[gap, m]
-        start[m * lanes + i] = 0.0
-        drive[m] = gain[m] * t[others + N_OTHERS] if jumping else 0.0
-        for n in range(l_all):
-            c[(of_z + n * m_all + m) * lanes + i] = shape[leaks[n], m]
-            c[(of_leak + m * l_all + n) * lanes + i] = feed[leaks[n], m] * moved[leaks[n]]
-    for w in range(w_all):
-        # The cells' voltages at a unit of the wave: sine, then cosine, of a tone.
-        amplitude, phase = t[others + N_OTHERS + w // 2 * 2], t[others + N_OTHERS + w // 2 * 2 + 1]
-        omega = tones[w // 2] * t[others + OMEGA]
-        sine, cosine = (0.0, 1.0) if jumping else (math.sin(phase), math.cos(phase))
-        for j in range(cells):
-            u[j] = k[j] * amplitude * (cosine if w % 2 == 0 else sine)
-        if not jumping:
+    for i in range(lanes):
+        for m in range(m_all):
+            start[m * lanes + i] = 0.0
+        for tone in range(w_all // 2):
+            row = others + N_OTHERS + 2 * tone
+            sine, cosine = t[row * lanes + i], t[(row + 1) * lanes + i]
+            omega = tones[tone] * t[(others + OMEGA) * lanes + i]
+            u_sine, u_cosine = k[gap * lanes + i] * sine, k[gap * lanes + i] * cosine
+            for n in range(l_all):
+                c[(of_w + n * w_all + 2 * tone) * lanes + i] = k[leaks[n] * lanes + i] * sine
+                c[(of_w + n * w_all + 2 * tone + 1) * lanes + i] = k[leaks[n] * lanes + i] * cosine
             for m in range(m_all):
-                # z is the mode less its steady response to the tone, gain (rate - i omega) / (rate^2 + omega^2) of it.
-                size = gain[m] * amplitude / (rates[m] * rates[m] + omega * omega)
-                along, across = rates[m] * cosine + omega * sine, rates[m] * sine - omega * cosine
-                if w % 2 == 1:
-                    start[m * lanes + i] -= size * across
-                for j in range(cells):
-                    u[j] += shape[j, m] * size * (along if w % 2 == 0 else across)
-        c[(of_u + w) * lanes + i] = u[gap]
+                rate = rates[m, i]
+                size = gain[m * lanes + i] / (rate * rate + omega * omega)
+                along, across = size * (rate * sine + omega * cosine), size * (rate * cosine - omega * sine)
+                start[m * lanes + i] -= across
+                u_sine += c[(SHAPE + m) * lanes + i] * along
+                u_cosine += c[(SHAPE + m) * lanes + i] * across
+                for n in range(l_all):
+                    c[(of_w + n * w_all + 2 * tone) * lanes + i] += c[(of_z + n * m_all + m) * lanes + i] * along
+                    c[(of_w + n * w_all + 2 * tone + 1) * lanes + i] += c[(of_z + n * m_all + m) * lanes + i] * across
+            c[(of_u + 2 * tone) * lanes + i] = u_sine
+            c[(of_u + 2 * tone + 1) * lanes + i] = u_cosine
+
+
+@jit_rows
+def _drive(
+    t: FloatArray, k: FloatArray, gain: FloatArray, start: FloatArray, drive: FloatArray, c: FloatArray, gap: int,
+    leaks: NDArray[np.int64], marks: Marks,
+) -> None:  # fmt: skip
+    """Constants of a source of constant pieces or straight lines: the cells' voltages at once, and the modes' drive."""
+    m_all, l_all, lanes = len(marks[0]), len(marks[2]), len(marks[5])
+    of_u, row = SHAPE + m_all, CELL_ROWS * (m_all + 1) + N_OTHERS
+    for i in range(lanes):
+        amplitude = t[row * lanes + i]
+        c[of_u * lanes + i] = k[gap * lanes + i] * amplitude
         for n in range(l_all):
-            c[(of_w + n * w_all + w) * lanes + i] = u[leaks[n]]
+            c[(of_u + 1 + n) * lanes + i] = k[leaks[n] * lanes + i] * amplitude
+        for m in range(m_all):
+            start[m * lanes + i] = 0.0
+            drive[m, i] = gain[m * lanes + i] * amplitude
 
 
 @jit
-def put_results(
-    s: FloatArray, last: FloatArray, closing: FloatArray, steps: tuple[float, float], first: int, out: FloatArray,
-    marks: Marks,
+def put_result(
+    i: int, s: FloatArray, last: FloatArray, closing: float, lengths: tuple[int, int, int], first: int,
+    out: FloatArray, marks: Marks,
 ) -> None:  # fmt: skip
-    """Means over the run and over its last period, the peak (V), and the relative error of the periodic state."""
+    """Lane i's means over the run and its last period, its peak (V), and the relative error of the periodic state.
+
+    `lengths` are the number of periods that the last period stands for beside itself; that of half periods of the run;
+    and of the steps in each.
+    """
     own, count, lanes = N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
-    for i in range(min(lanes, out.shape[1] - first)):
-        for j in range(count):
-            out[j, first + i] = s[(own + VALUE + count + j) * lanes + i] / steps[0]
-            out[count + j, first + i] = last[j * lanes + i] / steps[1]
-        out[2 * count, first + i] = s[(own + PEAK) * lanes + i]
-        out[2 * count + 1, first + i] = closing[i]
+    ahead, halves, steps = lengths
+    if first + i >= out.shape[1]:
+        return
+    for j in range(count):
+        total = s[(own + VALUE + count + j) * lanes + i]
+        if ahead > 0:
+            total += ahead * last[j * lanes + i]
+        out[j, first + i] = total / (halves * steps)
+        out[count + j, first + i] = last[j * lanes + i] / (2 * steps)
+    out[2 * count, first + i] = s[(own + PEAK) * lanes + i]
+    out[2 * count + 1, first + i] = closing
 
 
 class Block(NamedTuple):
@@ -220,8 +201,8 @@ class Block(NamedTuple):
         Modes at the start, V.
     rates, drive : ndarray, shape (n_mode, lanes)
         Rates (1/s), and drive of a source of constant pieces.
-    b : ndarray, shape (N_OTHERS * lanes,)
-        The table's further rows.
+    t : ndarray, shape (n_row * lanes,)
+        The scenes' columns of the table.
     top, tail : ndarray, shape (lanes,)
         Largest gap voltage that the area's polynomial covers (V), and the relative size of its last coefficient;
         infinite where the universal curve does not reach so far.
@@ -231,11 +212,9 @@ class Block(NamedTuple):
     start: FloatArray
     rates: FloatArray
     drive: FloatArray
-    b: FloatArray
+    t: FloatArray
     top: FloatArray
     tail: FloatArray
-    column: FloatArray
-    work: FloatArray
     scratch: Scratch
 
 
@@ -244,21 +223,27 @@ def block_shapes(rows: int, marks: Marks) -> tuple[tuple[int, ...], ...]:
     m_all, w_all, l_all, d_all, _, lanes = (len(mark) for mark in marks)
     size = n_constants(m_all, w_all, l_all, d_all - 1) * lanes
     modes = (m_all, lanes)
-    return (size,), (m_all * lanes,), modes, modes, (N_OTHERS * lanes,), (lanes,), (lanes,), (rows,), (2, lanes)
+    return (size,), (m_all * lanes,), modes, modes, (rows * lanes,), (lanes,), (lanes,)
 
 
-def scratch_shapes(marks: Marks) -> tuple[tuple[int, ...], ...]:
-    """Shapes of the arrays of a `Scratch`."""
-    m = len(marks[0])
-    row = (m + 1,)
-    return row, row, row, row, row, (m,), (m + 1, m), (m + 1, m), (2, m + 1), (2, m + 1)
+def aligned(shapes: Iterable[tuple[int, ...]]) -> list[FloatArray]:
+    """Arrays that begin at multiples of 64 bytes, as a vector across two lines of the cache takes twice as long."""
+    whole = [(shape, math.prod(shape)) for shape in shapes]
+    raw = np.empty(8 + sum(size + 8 for _, size in whole))
+    at, out = -(raw.ctypes.data // raw.itemsize) % 8, []
+    for shape, size in whole:
+        out.append(raw[at : at + size].reshape(shape))
+        at += -(-size // 8) * 8
+    return out
 
 
 def new_block(rows: int, marks: Marks) -> Block:
     """Arrays for blocks of scenes of a table with so many rows."""
     *floats, whole = scratch_shapes(marks)
-    scratch = Scratch._make([*(np.empty(shape) for shape in floats), np.empty(whole, np.int64)])
-    return Block._make([*(np.empty(shape) for shape in block_shapes(rows, marks)), scratch])
+    shapes = block_shapes(rows, marks)
+    arrays = aligned([*shapes, *floats])
+    scratch = Scratch._make([*arrays[len(shapes) :], np.empty(whole, np.int64)])
+    return Block._make([*arrays[: len(shapes)], scratch])
 
 
 @jit
@@ -274,28 +259,31 @@ def fill_block(
     arguments are those of `march`.
     """
     m_all, w_all, l_all, d_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[3]) - 1, len(marks[5])
-    cells, area = m_all + 1, area_row(m_all, w_all, l_all)
-    c, start, rates, drive, b, top, tails, column, work, scratch = block
+    area = area_row(m_all, w_all, l_all)
+    c, start, rates, drive, t, top, tails, scratch = block
+    k, moved, r, near, gain, feed, shape, values, _, _, _, _, _ = scratch
+    gap, leaks = places
     for i in range(lanes):
-        _read_column(table, pending[min(first + i, pending.size - 1)], column)
-        for j in range(N_OTHERS):
-            b[j * lanes + i] = column[CELL_ROWS * cells + j]
-        top[i] = source[2] * _largest_voltage(column, places[0], cells, source[1]) + 1e-12
-        c[SCALE * lanes + i] = 2.0 / top[i]
-    c[area * lanes :] = 0.0
+        scene = pending[min(first + i, pending.size - 1)]
+        for row in range(table.shape[0]):
+            t[row * lanes + i] = table[row, scene]
+    _divide(t, gap, source[1], source[2], k, moved, r, top, marks)
+    b = t[CELL_ROWS * (m_all + 1) * lanes :]
     for j in range(d_all + 1):
-        _inverse_areas(curves[1][j], top, b, curves[0], work[0], work[1], marks)
-        for d in range(d_all + 1):
-            _add_row(curves[2][d, j], work[1], c[(area + d) * lanes : (area + d + 1) * lanes], marks)
+        _inverse_areas(curves[1][j], top, b, curves[0], near, values[j * lanes : (j + 1) * lanes], marks)
+    _polynomials(curves[2], values, area, c, marks)
     for i in range(lanes):
+        c[SCALE * lanes + i] = 2.0 / top[i]
         # The coefficients of the two highest powers are 2^(d - 1) and 2^(d - 2) times those of Chebyshev's series.
         # These fall to about a third from one to the next; the last one alone may be small by chance.
         tail = max(abs(c[area * lanes + i]), 2.0 / 3.0 * abs(c[(area + 1) * lanes + i])) / 2.0 ** (d_all - 1)
         covered = b[XI * lanes + i] * top[i] <= LARGEST_X
         tails[i] = tail / c[(area + d_all) * lanes + i] if covered else math.inf
-        _read_column(table, pending[min(first + i, pending.size - 1)], column)
-        scratch[4][0] = c[(area + d_all) * lanes + i]
-        _lane(
-            i, places, column, source[0], source[1], c, start, rates[:, i], drive[:, i], scratch,
-            marks,
-        )  # fmt: skip
+    find_rates(k, moved, r, c[(area + d_all) * lanes : (area + d_all + 1) * lanes], rates, near, marks)
+    find_modes(rates, scratch, marks)
+    link(gap, leaks, moved, feed, shape, c, marks)
+    if source[1]:
+        _drive(t, k, gain, start, drive, c, gap, leaks, marks)
+    else:
+        drive[:] = 0.0
+        _respond(t, source[0], k, gain, rates, start, c, gap, leaks, marks)

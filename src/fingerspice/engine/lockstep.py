@@ -15,15 +15,13 @@ block is one scene, in a thread of its own (`engine.lockcard`).
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
 
-LANES = 16
+LANES = 32
 """Scenes of a block on the processor."""
 START_TIMES = (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0, 1.5, 2.0)
 """Times of the shorter steps at the start of a run without jumps, in steps."""
@@ -227,60 +225,48 @@ def _ease_in(
 
 @jit
 def run(
-    c: FloatArray, g: Weights, s: FloatArray, wave: FloatArray, how: tuple[int, int, bool], last: FloatArray,
-    trace: FloatArray, marks: Marks,
+    c: FloatArray, g: Weights, s: FloatArray, wave: FloatArray, how: tuple[int, int, int, bool], trace: FloatArray,
+    marks: Marks,
 ) -> None:  # fmt: skip
-    """Integrate a block's scenes over some half periods, from the modes in the state `s` on.
+    """Integrate a block's scenes over some half periods, from the state `s` on.
 
     Parameters
     ----------
     c, g, s : ndarray
-        Constants, weights and state, each flat.
+        Constants, weights and state, each flat. At the start of a run the state needs the modes only.
     wave : ndarray, shape (n + START + 1, len(waves)) or (2, 1)
         Waves at the n steps of a period, and at the times of the shorter steps at the start (`START_TIMES`); for a
         turned source its values in both halves of a period.
     how : tuple
-        Number of half periods; of steps in each; and whether the source is turned: it is constant for a half period,
-        then jumps to its negative, and the method restarts. Such a half period has the pieces that `g` has: of equally
-        many steps, which are twice as long in every piece as in the one before.
-    last : ndarray
-        Takes the sums over the last period, as the state holds those over the whole run; NaN in a shorter run.
+        Number of half periods that lie behind, 0 at the start of a run; and of those when this ends; number of steps in
+        each; and whether the source is turned: it is constant for a half period, then jumps to its negative, and the
+        method restarts. Such a half period has the pieces that `g` has: of equally many steps, which are twice as long
+        in every piece as in the one before. Without jumps, all of these half periods are a range of Gregory's rule.
     trace : ndarray, shape (lanes * steps,) or (0,)
-        The gap voltage before each step, V.
+        The gap voltage before each step of the run, V.
     """
-    halves, half, turned = how
+    done, halves, half, turned = how
     count, own, pieces, lanes = len(marks[4]), N_STATE * len(marks[0]), g[1].shape[0], len(marks[5])
-    sums = (own + VALUE + count) * lanes
-    for i in range(count * lanes):
-        s[sums + i] = 0.0
-        last[i] = math.nan
-    for i in range(lanes):
-        s[(own + PEAK) * lanes + i] = 0.0
-    done = 0
-    while done < halves:
-        if done == halves - 2:
-            for i in range(last.size):
-                last[i] = s[sums + i]
-        if turned or done == 0:
-            # A step of length 0 evaluates the nonlinear term and the integrands.
-            _step(c, g[0], s, wave[done % 2 if turned else 0], 0.0, 0.0, marks)
-        if turned:
-            steps, unit = half // pieces, pieces / (2.0**pieces - 1.0)
-            for piece in range(pieces):
-                at = done * half + piece * steps
-                _window(c, g[1][piece], s, wave, (done % 2, 0, -1), (steps, 0), unit, trace, at, marks)
-                unit *= 2.0
-            done += 1
-            continue
-        # A source without jumps is integrated in one piece up to the last period.
-        ahead = halves if halves <= 2 else (halves - 2 if done == 0 else 2)
+    if done == 0:
+        for i in range(count * lanes):
+            s[(own + VALUE + count) * lanes + i] = 0.0
+        for i in range(lanes):
+            s[(own + PEAK) * lanes + i] = 0.0
+    if not turned:
         begun = 0
         if done == 0:
+            _step(c, g[0], s, wave[0], 0.0, 0.0, marks)
             _ease_in(c, g[1], s, wave, trace, marks)
             begun = 2
+        steps, before = (halves - done) * half - begun, 0 if done == 0 else 2
         place = (done % 2 * half + begun) % (2 * half)
-        steps, before = ahead * half - begun, 0 if done == 0 else 2
         _window(c, g[1][3], s, wave, (place, 1, 2 * half), (steps, before), 1.0, trace, done * half + begun, marks)
-        done += ahead
-    for i in range(last.size):
-        last[i] = s[sums + i] - last[i]
+        return
+    for window in range(done, halves):
+        # A step of length 0 evaluates the nonlinear term and the integrands.
+        _step(c, g[0], s, wave[window % 2], 0.0, 0.0, marks)
+        steps, unit = half // pieces, pieces / (2.0**pieces - 1.0)
+        for piece in range(pieces):
+            at = window * half + piece * steps
+            _window(c, g[1][piece], s, wave, (window % 2, 0, -1), (steps, 0), unit, trace, at, marks)
+            unit *= 2.0

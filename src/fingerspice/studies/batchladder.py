@@ -18,7 +18,7 @@ from fingerspice.studies.batchscenes import Curves, LockstepForm, curves_of, pea
 from fingerspice.studies.batchtask import LOCKSTEP, Answers, Task
 
 # Initial number of steps per period, and initial degree of the area's polynomial, by the smallest rtol served.
-_RUNGS = ((5e-4, 32, 8), (5e-5, 48, 8), (5e-6, 80, 12), (5e-7, 144, 12), (0.0, 288, 16))
+_RUNGS = ((5e-4, 32, 8), (5e-5, 48, 8), (5e-6, 80, 12), (5e-7, 144, 12), (0.0, 144, 16))
 HIGHEST_DEGREE, MOST_STEPS = 24, 8192
 # Under a recording: initial number of steps a sample, and the largest.
 _PARTS = (2, 16)
@@ -26,18 +26,25 @@ _PARTS = (2, 16)
 # first did not cover. It is the same for all numbers of steps, whose results are compared, because the linear part of
 # the equations has the area of its middle, so that the error of a step depends on it.
 COVERED = 1.2, 1.8
-# Allowed defect of the periodic state relative to rtol, and the relative round-off added to every stated error.
-CLOSING, ROUNDING = 0.02, 1e-11
+# Allowed defect of the periodic state relative to rtol, that of a run from rest that ends when it has settled, and the
+# relative round-off added to every stated error.
+CLOSING, SETTLED, ROUNDING = 0.02, 0.05, 1e-11
 # The error is estimated as this share of the change from half the steps to all steps, by the smallest rtol served. The
 # order is 4, which would give a fifteenth. But the kink of 1/A where the gap voltage is 0 has order 2, with a factor
 # that depends on where between two steps it falls: that is most of a small error. Pieces of 4 and of 8 steps are still
 # far from the order. As the change may be small by chance, doubling the steps may not reduce the estimate by more than
 # the factor _MOST_GAIN.
 _STATED, _STATED_JUMPING = ((5e-6, 0.25), (5e-7, 0.5), (0.0, 0.8)), 0.5
+# Where a step is longer than this many of the fastest time constants, the start of a run from rest is not resolved, and
+# the change is no larger than the error.
+_STIFF, _STATED_STIFF = 2.0, 0.8
 # Under a recording the order is 3, which would give a seventh, and 2 for what the zeros of the gap voltage leave; but
 # 1, which gives 1, for a dispersive skin, some of whose modes decay from each sample on within a part of a step.
 _STATED_RECORDED, _STATED_DISPERSIVE = 0.5, 1.0
 _MOST_GAIN = 24.0
+# Under sines and below this rtol, where the kinks are most of the error, no scene is accepted before the steps have
+# been doubled once, with a smaller such factor.
+_DOUBTFUL, _GAIN_IN_DOUBT = 5e-7, 12.0
 # Longest first step after a jump of the source, in time constants of the fastest cell.
 _LONGEST_STEP = 1.0
 # Steps of a piece of a square's half period by the smallest rtol served; and the number by which the first step, with
@@ -96,8 +103,10 @@ def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halv
     mu = friction_of(form, scenes)
     found = Answers.empty(task, table.shape[1], halves * task.points // 2)
     touching, pieces, decays = mesh_of(form, table, most=1 if task.traced else MOST_PIECES)
+    # Scenes that settle after about as many periods share a block, which ends when all of its scenes have settled.
+    order = np.argsort(_leakage_rates(form, table).min(axis=0)) if halves > 4 else np.arange(mu.size)
     for count in np.unique(pieces[touching]).tolist():
-        pending = np.flatnonzero(touching & (pieces == count))
+        pending = order[(touching & (pieces == count))[order]]
         for covered in COVERED:
             pending = _climb_one(task, form, _Scenes(table, mu, decays), (halves, count), covered, pending, found)
     return found
@@ -110,7 +119,7 @@ def friction_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatAr
 
 
 def mesh_of(form: LockstepForm, table: FloatArray, most: int) -> tuple[BoolArray, NDArray[np.int64], FloatArray]:
-    """Whether there is contact, pieces of a half period (0: no jumps), and half periods in the fastest time constant.
+    """Whether there is contact, pieces of a half period (0: no jumps), and half a period in the fastest time constants.
 
     Parameters
     ----------
@@ -120,15 +129,21 @@ def mesh_of(form: LockstepForm, table: FloatArray, most: int) -> tuple[BoolArray
         Largest number of pieces. Each is twice as long as the one before, so that gap voltages at equal distances need
         a single one.
     """
-    others, cells = CELL_ROWS * form.cells, form.cells
+    others = CELL_ROWS * form.cells
     touching = table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2
-    pieces, decays = np.zeros(table.shape[1], int), np.zeros(table.shape[1])
+    pieces = np.zeros(table.shape[1], int)
+    # The largest leakage rate of a cell is an upper bound of the rates of the modes.
+    decays = np.max(_leakage_rates(form, table), axis=0) * np.pi
     if form.jumping:
-        # The largest leakage rate of a cell is an upper bound of the rates of the modes.
-        leaks = table[cells : 2 * cells] / table[others + REST] + table[2 * cells : 3 * cells]
-        decays = np.max(leaks / table[:cells], axis=0) * (np.pi / table[others + OMEGA])
         pieces = np.ceil(np.log2(1.0 + _PIECE_START * decays)).clip(1, most).astype(int)
     return touching, pieces, decays
+
+
+def _leakage_rates(form: LockstepForm, table: FloatArray) -> FloatArray:
+    """Leakage rate of every cell with its area at rest, in periods over 2 pi: shape (n_cell, n)."""
+    others, cells = CELL_ROWS * form.cells, form.cells
+    leaks = table[cells : 2 * cells] / table[others + REST] + table[2 * cells : 3 * cells]
+    return np.asarray(leaks / (table[:cells] * table[others + OMEGA]))
 
 
 def first_level(rtol: float, form: LockstepForm, pieces: int) -> tuple[int, int]:
@@ -141,14 +156,14 @@ def first_level(rtol: float, form: LockstepForm, pieces: int) -> tuple[int, int]
 
 
 def short_enough(decays: FloatArray, pieces: int, steps: int) -> BoolArray:
-    """Whether the first step after a jump is short enough; `decays` as `mesh_of` gives them."""
+    """Whether the first step after a jump, if there is one, is short enough; `decays` as `mesh_of` gives them."""
     # That step, in half periods, times the number of steps a period.
-    shortest = 2.0 * max(pieces, 1) / (2.0 ** max(pieces, 1) - 1.0)
+    shortest = 2.0 * pieces / (2.0**pieces - 1.0) if pieces > 0 else 0.0
     return np.asarray(decays * shortest <= _LONGEST_STEP * steps)
 
 
 class _Scenes(NamedTuple):
-    """Table of scenes, friction coefficient, and half periods in time constants of the fastest cell (0: no jumps)."""
+    """Table of scenes, friction coefficient, and half a period in time constants of the fastest cell."""
 
     table: FloatArray
     mu: FloatArray
@@ -173,6 +188,8 @@ def _climb_one(
         steps, most = _PARTS
     if traced:
         steps = task.points * -(-steps // task.points)
+    doubtful = task.rtol < _DOUBTFUL and not form.jumping and form.recording is None
+    gain = _GAIN_IN_DOUBT if doubtful else _MOST_GAIN
     before, last, outside = None, np.full(pending.size, np.inf), [pending[:0]]
     while pending.size and steps <= most:
         curves = curves_of(form.layer.values["m_exp"], form.layer.values["n_exp"], degree)
@@ -180,9 +197,10 @@ def _climb_one(
             break
         level = Level(task, form, mesh, steps, degree, covered, ALL_MOMENTS if needed[-1] else 1, traced)
         now = level.run(table, pending, curves, before)
-        error = level.error(now, needed)
-        error = np.where(np.isfinite(last), np.maximum(error, last / _MOST_GAIN), error)
+        error = level.error(now, needed, scenes.decays[pending])
+        error = np.where(np.isfinite(last), np.maximum(error, last / gain), error)
         good = (error <= ENOUGH * task.rtol) & short_enough(scenes.decays[pending], pieces, steps)
+        good &= before is not None or not doubtful
         at = pending[good]
         for name in figures:
             part = 1 if name.endswith("_periodic") or task.periodic else 0
@@ -234,7 +252,8 @@ class Level(NamedTuple):
         places = self.form.gap_cell, np.array(self.form.leaks)
         waves = _waves(sizes[0], self.form), _waves(sizes[1], self.form)
         source = np.array(self.form.multiples, float), waves
-        how = halves, self.steps // 2, pieces, self.task.periodic, CLOSING * self.task.rtol, self.covered
+        tol = (CLOSING if self.task.periodic else SETTLED) * self.task.rtol
+        how = halves, self.steps // 2, pieces, self.task.periodic, tol, self.covered
         widths = [halves * n // 2 if self.traced else 0 for n in sizes]
         traces = np.empty((pending.size, widths[0])), np.empty((pending.size, widths[1]))
         lengths = self._lengths(waves[1].shape[1])
@@ -268,8 +287,8 @@ class Level(NamedTuple):
         none = np.empty((pending.size, 0))
         return Run(out[0] if before is None else before.fine, out[1], none, none)
 
-    def error(self, run: Run, needed: list[int]) -> FloatArray:
-        """Largest estimated relative error of the outputs, for each scene."""
+    def error(self, run: Run, needed: list[int], decays: FloatArray) -> FloatArray:
+        """Largest estimated relative error of the outputs, for each scene; `decays` as `mesh_of` gives them."""
         peak, closing, tail = run.fine[-3:]
         changes = [np.zeros(peak.size)]
         for row in needed:
@@ -289,9 +308,11 @@ class Level(NamedTuple):
             changes.append(off / np.where(peak > 0.0, peak, 1.0))
         # The area's polynomial of the run with half the steps may be another one.
         change = np.max(changes, axis=0) + run.coarse[-1]
-        share = next(s for least, s in _STATED if self.task.rtol >= least)
+        least = next(s for least, s in _STATED if self.task.rtol >= least)
+        share = np.where(2.0 * decays > _STIFF * self.steps, max(least, _STATED_STIFF), least)
         if self.form.jumping:
-            share = _STATED_JUMPING
+            share = np.full(peak.size, _STATED_JUMPING)
         if self.form.recording is not None:
-            share = _STATED_RECORDED if self.form.cells == len(self.form.layers) else _STATED_DISPERSIVE
+            own = _STATED_RECORDED if self.form.cells == len(self.form.layers) else _STATED_DISPERSIVE
+            share = np.full(peak.size, own)
         return np.asarray(share * change + tail + 2.0 * closing + ROUNDING)

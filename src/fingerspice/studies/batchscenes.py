@@ -225,7 +225,7 @@ def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray
             _tones_of(element.waveform, given(element)) if form.recording is None else [(peak_of(form.recording), 0.0)]
         )
         for amplitude, phase in tones:
-            rows += [sign * np.asarray(amplitude), phase]
+            rows += [sign * amplitude * np.cos(phase), sign * amplitude * np.sin(phase)]
     for i, row in enumerate(rows):
         out[CELL_ROWS * count + i] = row
     return out

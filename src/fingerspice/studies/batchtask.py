@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.circuit.circuit import Circuit
 
-# Largest number of scenes in a job, and the smallest to which a batch is divided so that all threads have jobs; and
-# their number if gap voltages are wanted, so that these stay in the processor's cache; under a recording, whose scenes
-# take long; and on a graphics card, which is slow to start.
-CHUNK, SMALL_CHUNK, TRACED, RECORDED, ON_CARD = 4096, 256, 256, 32, 262_144
+# Smallest and largest number of scenes in a job, of which there are 8 or more between these limits; the number if gap
+# voltages are wanted, so that these stay in the processor's cache; the limits under a recording, whose scenes take
+# long; and the number on a graphics card, which is slow to start.
+JOBS, CHUNKS, TRACED, RECORDED, ON_CARD = 8, (512, 4096), 256, (32, 128), 262_144
 # Relative distance from a whole number within which a number of half periods counts as whole.
 WHOLE = 1e-9
 LOCKSTEP, ONE_BY_ONE, REFUSED, FAILED = 0, 1, 2, 3
@@ -64,8 +64,8 @@ def jobs_of(
     jobs = []
     for size in np.unique(halves[good]).astype(int).tolist():
         members = np.flatnonzero(good & (halves == size))
-        chunk = int(np.clip(members.size // 16, SMALL_CHUNK, CHUNK))
-        chunk = TRACED if task.traced else RECORDED if recorded else ON_CARD if task.on_card(recorded) else chunk
+        chunk = int(np.clip(members.size // JOBS, *(RECORDED if recorded else CHUNKS)))
+        chunk = TRACED if task.traced and not recorded else ON_CARD if task.on_card(recorded) else chunk
         jobs += [(size, members[i : i + chunk]) for i in range(0, members.size, chunk)]
     return jobs
 
