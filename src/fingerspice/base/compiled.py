@@ -105,7 +105,7 @@ class _Cache(FunctionCache):
 
 
 _ONCE = (
-    "compiling what this needs, 20 s for a series stack and 50 s for a network, only once: later runs find "
+    "compiling what this needs, 20 s for a series stack and 30 s for a network, only once: later runs find "
     "it on the disk"
 )
 _EVERY_TIME = (
@@ -120,6 +120,13 @@ class _Body(JITCodeLibrary):
     def _finalize_final_module(self) -> None:
         cast(Any, self)._finalize_dynamic_globals()
         self._finalized = True
+
+
+class _Inlined(_Body):
+    """As `_Body`, of a function that is always put into its callers, and is optimised with these."""
+
+    def _optimize_final_module(self) -> None:
+        return
 
 
 class _Flags(Flags):
@@ -180,7 +187,8 @@ class _Called:
         of.targetdescr.options.parse_as_flags(flags, of.targetoptions)
         flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
         flags.noalias = self.noalias
-        library = cast(Any, _Body)(context.codegen(), of.py_func.__qualname__)
+        kind = _Inlined if of.targetoptions.get("forceinline") else _Body
+        library = cast(Any, kind)(context.codegen(), of.py_func.__qualname__)
         cres = cast(Any, compile_extra)(of.typingctx, context, of.py_func, args, None, flags, {}, library)
         key = object()
         context.insert_user_function(key, cres.fndesc, [cres.library])
