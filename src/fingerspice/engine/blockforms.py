@@ -10,7 +10,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.engine.blockrows import PAD
 
 # Number of steps in a block, and of step lengths: that of a sample and its halvings.
-BLOCK, LEVELS = 512, 7
+BLOCK, LEVELS = 256, 7
 # Largest degree of the polynomial for 1/A.
 MOST_DEGREE = 28
 # Places of a step besides its ends: its middle, and the two at which the error is measured.
@@ -117,7 +117,7 @@ class Shown(NamedTuple):
     stress : float
         Force per area and squared gap voltage, Pa/V^2.
     kink : ndarray, shape (T,)
-        Derivative by |u_gap| at 0 V of the factor of each drive.
+        Derivative by |u_gap| at 0 V of the factor of each drive. N counts as a factor times xi.
     area_kink : float
         dA/d|u| at 0 V, m^2/V.
     moved : ndarray

@@ -100,6 +100,20 @@ def product_of(n: int, x: FloatArray, y: FloatArray, out: FloatArray) -> None:
 
 
 @jit_rows
+def add_to_all(n: int, a: float, x: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = a + x[i]
+
+
+@jit_rows
+def settle(n: int, rest: float, error: FloatArray, w: FloatArray) -> None:
+    """Correct w by its error, of which the share `rest` is left."""
+    for i in range(n):
+        w[i] += error[i]
+        error[i] *= rest
+
+
+@jit_rows
 def sign_as(n: int, x: FloatArray, out: FloatArray) -> None:
     """Give each entry the sign of x."""
     for i in range(n):
@@ -237,44 +251,54 @@ def crossing(a: float, m: float, b: float) -> tuple[float, float]:
 
 
 @jit_rows
-def kink_rows(
-    n: int, kink: float, u: FloatArray, middle: FloatArray, x: FloatArray, at: FloatArray, out: FloatArray
-) -> None:  # fmt: skip
-    """Fraction of each step at which u crosses 0 V, into `at`, and the jump of the slope of kink |u| x, into `out`.
-
-    The jump is 0 where u does not cross 0 V.
-    """
+def kink_rows(n: int, u: FloatArray, middle: FloatArray, at: FloatArray, jump: FloatArray) -> None:
+    """`crossing` of every step: the fraction into `at`, the jump into `jump`."""
     for i in range(n):
-        place, jump = crossing(u[i], middle[i], u[i + 1])
-        at[i], out[i] = place, kink * jump * (x[i] + place * (x[i + 1] - x[i]))
+        at[i], jump[i] = crossing(u[i], middle[i], u[i + 1])
+
+
+@jit_inline
+def after_kink(y: float, rest: float) -> tuple[float, float]:
+    """Integrals of exp(-rate (1 - x)) times (x - at) and times (x - at)^2 over [at, 1].
+
+    `rest` is 1 - at, and y = rate rest. The integrals are rest^2 (y - 1 + exp(-y)) / y^2 and, with an s of 2,
+    rest^3 (y^2 - s y + s - s exp(-y)) / y^3. Rational approximations, right to 3e-4, are enough, as the correction
+    itself is small.
+    """
+    ramp = rest * rest * (1.0 + y * (0.32058491 + 0.06524308 * y))
+    ramp /= 2.0 + y * (1.31296923 + y * (0.38813995 + 0.06524308 * y))
+    square = rest * rest * rest * (1.0 + y * (0.30348723 + 0.04368492 * y))
+    square /= 3.0 + y * (1.66284145 + y * (0.39159498 + 0.04368492 * y))
+    return ramp, square
 
 
 @jit_rows
 def add_kinks(
-    n: int, z: float, weight: FloatArray, feed: float, at: FloatArray, jump: FloatArray, out: FloatArray
+    n: int, z: float, weight: FloatArray, at: FloatArray, jump: FloatArray, x: FloatArray, out: FloatArray
 ) -> None:
-    """Add a mode's exact response to a jump of the forcing's slope, less that to the parabola through 0, 1/2 and 1.
+    """Add a mode's exact response to what |u| x has besides a smooth part, less that to its parabola.
 
-    The mode has rate z per step; `weight` (2,) are its quadrature weights at 1/2 and 1. The response to the ramp that
-    begins at the jump is the square of the rest of the step times (y - 1 + exp(-y)) / y^2, y = z rest. A rational
-    approximation, right to 3e-4, is enough, as the correction itself is small.
+    |u| is bent at the fraction `at` of a step by `jump`; u and x (n + 1,) are straight beside it, so that |u| x has the
+    additional part jump (t - at) (x_at + slope (t - at)) from there on. The parabola passes through 0, 1/2 and 1. The
+    mode has rate z per step; `weight` (2,) are its quadrature weights at 1/2 and 1.
     """
     by_middle, by_end = weight[0], weight[1]
     for i in range(n):
-        rest = 1.0 - at[i]
-        y = z * rest
-        ramp = rest * rest * (1.0 + y * (0.32058491 + 0.06524308 * y))
-        ramp /= 2.0 + y * (1.31296923 + y * (0.38813995 + 0.06524308 * y))
-        out[i] += feed * jump[i] * (ramp - by_middle * max(0.5 - at[i], 0.0) - by_end * rest)
+        rest, early, slope = 1.0 - at[i], max(0.5 - at[i], 0.0), x[i + 1] - x[i]
+        ramp, square = after_kink(z * rest, rest)
+        ramp -= by_middle * early + by_end * rest
+        square -= by_middle * early * early + by_end * rest * rest
+        out[i] += jump[i] * ((x[i] + at[i] * slope) * ramp + slope * square)
 
 
 @jit_rows
 def kink_at(
-    n: int, kink: float, place: float, u: FloatArray, middle: FloatArray, x: FloatArray, out: FloatArray
+    n: int, kink: float, place: float, at: FloatArray, jump: FloatArray, x: FloatArray, out: FloatArray
 ) -> None:  # fmt: skip
     """Subtract from interpolation errors at fraction `place` of the steps the known part that the kink causes."""
     m, r = 4.0 * place * (1.0 - place), place * (2.0 * place - 1.0)
     for i in range(n):
-        at, jump = crossing(u[i], middle[i], u[i + 1])
-        known = jump * (max(place - at, 0.0) - m * max(0.5 - at, 0.0) - r * (1.0 - at))
-        out[i] -= kink * known * (x[i] + at * (x[i + 1] - x[i]))
+        since, early, rest, slope = max(place - at[i], 0.0), max(0.5 - at[i], 0.0), 1.0 - at[i], x[i + 1] - x[i]
+        ramp = since - m * early - r * rest
+        square = since * since - m * early * early - r * rest * rest
+        out[i] -= kink * jump[i] * ((x[i] + at[i] * slope) * ramp + slope * square)

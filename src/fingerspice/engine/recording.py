@@ -28,11 +28,12 @@ from fingerspice.engine.blockforms import (
     Form,
 )
 from fingerspice.engine.blockoutput import write_block
-from fingerspice.engine.blockrows import add, add_two, area_rows, modes_into, recursion, scaled
+from fingerspice.engine.blockrows import add, add_to_all, add_two, area_rows, modes_into, recursion, scaled, settle
 from fingerspice.engine.model import ramp
 from fingerspice.engine.relaxation import (
     FIRST_NEWTON,
     LEAST_MARGIN,
+    NEWTON,
     SPARE,
     look_at_ends,
     misfit,
@@ -42,6 +43,8 @@ from fingerspice.engine.relaxation import (
 
 # Codes returned by `march`.
 DONE, NOT_CLOSED, TOO_COARSE = range(3)
+# Share of the error seen at the quarters that may be left once the modes are corrected for it.
+REST = 0.5
 # Largest ratio of 1/A to that of the reference in use.
 _FARTHEST = 1.2
 
@@ -157,6 +160,16 @@ def _largest_error(c: Course, rows: FloatArray, n: int) -> float:
 
 
 @jit_within
+def correct(c: Course, r: int, n: int) -> None:
+    """Correct the modes by the error seen, of which `REST` is left in `Room.own`; 1/A at the ends of the steps."""
+    form, room = c.form, c.room
+    for k in range(c.w.size):
+        settle(n + 1, REST, room.own[k], room.w[k])
+    look_at_ends(form, room, r, n + 1, NEWTON)
+    add_to_all(n + 1, form.q0[r], room.z, c.charges.q[0])
+
+
+@jit_within
 def accept(c: Course, r: int, n: int, local: float, left_over: float, magnified: float) -> None:
     """Account for the peaks and errors of an accepted block, and move to its end.
 
@@ -176,7 +189,7 @@ def accept(c: Course, r: int, n: int, local: float, left_over: float, magnified:
     control[PEAK_U], control[PEAK_F] = max(control[PEAK_U], peak), max(control[PEAK_F], force)
     off_u = local + magnified * carried
     # The force is proportional to the square of the voltage, and depends a little on the area.
-    off = magnified * worst + steepest * (left_over + magnified * carried)
+    off = REST * magnified * worst + steepest * (left_over + magnified * carried)
     control[ERROR_U] = max(control[ERROR_U], off_u)
     control[ERROR_F] = max(control[ERROR_F], 2.2 * off)
     # An error of the gap voltage changes the area, and thereby other voltages.
@@ -230,11 +243,11 @@ def march(
         closed, local, magnified = left_over < math.inf, math.inf, steepest
         if closed:
             misfit(form, room, r, level, h, c.shown.kink, n)
-            area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
             if form.mobile:
+                area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
                 # The gap voltage contains the state times 1/A, and a near fold magnifies its error.
                 magnified = form.area0 * largest_of(n + 1, c.charges.q[0]) / margin
-            local = left_over + magnified * _block_error(c, r, level, n)
+            local = left_over + REST * magnified * _block_error(c, r, level, n)
         if not local <= tol:
             if level + 1 == LEVELS or margin <= LEAST_MARGIN:
                 return TOO_COARSE if closed else NOT_CLOSED
@@ -247,6 +260,7 @@ def march(
             c.spare[2, k] = form.decay[r, level, k] ** n
         for i in range(n):
             c.charges.h[i] = h
+        correct(c, r, n)
         if c.shown.charge:
             project_for_charge(form, room, r, level, n)
         accept(c, r, n, local, left_over, magnified)

@@ -11,8 +11,9 @@ In a network the area also changes the finger's displacement current, as in `sol
 follows from xi = tap w + tap U, which is 0 with it, by u + kappa N(u) = xi, and N is one more drive and part of each
 tap. 1/A and N are polynomials in |xi|, and what is said here of u holds for xi.
 
-1/A has a kink where the gap voltage is 0. In a step across it the parabola misses kappa times |u| less the parabola of
-|u|, with kappa = dg/d|u|. The response to this difference is known in closed form, and is added.
+1/A has a kink where the gap voltage is 0, so that g contains kink |u| x, with x the voltage that q multiplies. u and x are
+almost straight lines across the kink. The part of |u| x that begins there, a straight line and a square, is known; the
+modes' response to it, less that to the parabola through it, is known in closed form, and is added.
 
 In a network a mode may decay within a small part of a step. After each sample, where the slope of the source jumps, N
 then has a part a exp(-rate t) that no parabola shows. Its size a follows from the slope of N at the start of the step,
@@ -65,7 +66,7 @@ _SLOWEST = 0.05
 _KINKED = 2
 # Newton steps for the gap voltage under `mobile`, in the first sweep and in later ones; and the smallest distance to
 # the fold at which they are safe.
-FIRST_NEWTON, _NEWTON, LEAST_MARGIN = 6, 2, 0.2
+FIRST_NEWTON, NEWTON, LEAST_MARGIN = 6, 2, 0.2
 # If the error is below this fraction of the one allowed, the next block has steps twice as long, whose error is sixteen
 # times as large.
 SPARE = 0.02
@@ -108,7 +109,7 @@ def _drives(
 def drives_at(form: Form, r: int, n: int, room: Room, place: int) -> float:
     """Gap voltages and drives at one place within the steps, from its projections; the least distance to the fold."""
     return _drives(
-        form, form.q0[r], n, _NEWTON, room.s_within, room.within[place], room.u_within[place], room.z, room.slope,
+        form, form.q0[r], n, NEWTON, room.s_within, room.within[place], room.u_within[place], room.z, room.slope,
         room.g_within[place],
     )  # fmt: skip
 
@@ -173,13 +174,14 @@ def project_for_charge(form: Form, room: Room, r: int, level: int, n: int) -> No
 @jit_within
 def _kinks(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
     """Add the response to the kink that the parabolas miss to `room.inc`."""
-    for t in range(kink.size):
-        kink_rows(n, h * kink[t], room.u, room.u_within[MIDDLE], room.end[1 + t], room.crossed, room.jumps)
-        for k in range(form.rates.shape[1]):
-            add_kinks(
-                n, form.rates[r, k] * h, form.share[r, level, k], form.feed[r, k, t], room.crossed, room.jumps,
-                room.inc[k, PAD:],
-            )  # fmt: skip
+    x = room.slope
+    kink_rows(n, room.u, room.u_within[MIDDLE], room.crossed, room.jumps)
+    for k in range(form.rates.shape[1]):
+        scaled(n + 1, 0.0, room.s, x)
+        for t in range(kink.size):
+            add(n + 1, h * form.feed[r, k, t] * kink[t], room.end[1 + t], x)
+        z, share = form.rates[r, k] * h, form.share[r, level, k]
+        add_kinks(n, z, share, room.crossed, room.jumps, x, room.inc[k, PAD:])
 
 
 @jit_within
@@ -232,7 +234,7 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
             _kinks(form, room, r, level, h, kink, n)
         for k in range(modes):
             recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.w[k])
-        newton = FIRST_NEWTON if sweep == 0 else _NEWTON
+        newton = FIRST_NEWTON if sweep == 0 else NEWTON
         margin = _look(form, room, r, level, MIDDLE, n, newton)
         margin = min(margin, look_at_ends(form, room, r, n + 1, newton))
         if fades:
@@ -259,6 +261,8 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
 def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
     """Error of the modes that each step adds, into `room.inc`: Boole's rule less Simpson's."""
     crossing = crosses(n, room.u)
+    if crossing:
+        kink_rows(n, room.u, room.u_within[MIDDLE], room.crossed, room.jumps)
     for k in range(form.rates.shape[1]):
         for i in range(n):
             room.inc[k, PAD + i] = 0.0
@@ -267,7 +271,7 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
             weight = PARABOLA[place]
             both_ends(n, weight[0], weight[2], room.u, room.u_within[place])
             add(n, weight[1], room.u_within[MIDDLE], room.u_within[place])
-        _look(form, room, r, level, place, n, _NEWTON)
+        _look(form, room, r, level, place, n, NEWTON)
         for t in range(room.g.shape[0]):
             off, weight = room.g_within[place, t], PARABOLA[place]
             add_three(
@@ -279,6 +283,6 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
                 shown = weight[0] + weight[1] * math.exp(-0.5 * faded) + weight[2] * math.exp(-faded)
                 add(n, shown - math.exp(-faded * PLACES[place]), room.pulse, off)
             if crossing:
-                kink_at(n, kink[t], PLACES[place], room.u, room.u_within[MIDDLE], room.end[1 + t], off)
+                kink_at(n, kink[t], PLACES[place], room.crossed, room.jumps, room.end[1 + t], off)
             for k in range(form.rates.shape[1]):
                 add(n, form.defect[r, level, k, t, place - FIRST_QUARTER], off, room.inc[k, PAD:])

@@ -30,7 +30,7 @@ from fingerspice.engine.blockoutput import write_points, write_samples
 from fingerspice.engine.blockrows import (
     add,
     add_three,
-    area_rows,
+    after_kink,
     change_of,
     crosses,
     kink_at,
@@ -38,7 +38,7 @@ from fingerspice.engine.blockrows import (
     modes_into,
     scaled,
 )
-from fingerspice.engine.recording import DONE, NOT_CLOSED, TOO_COARSE, accept, go_over, largest_of, nearest
+from fingerspice.engine.recording import DONE, NOT_CLOSED, REST, TOO_COARSE, accept, correct, go_over, largest_of, nearest
 from fingerspice.engine.relaxation import PARABOLA, SPARE, drives_at, look_at_ends, project_at_ends
 from fingerspice.engine.unevenweights import END, EVERY_PLACE, Steps, weigh
 
@@ -80,15 +80,15 @@ def _between(n: int, at: float, s: FloatArray, out: FloatArray) -> None:
 
 @jit_rows
 def _add_kinks(
-    n: int, rate: float, h: FloatArray, c: FloatArray, feed: float, at: FloatArray, jump: FloatArray, out: FloatArray
+    n: int, rate: float, h: FloatArray, c: FloatArray, at: FloatArray, jump: FloatArray, x: FloatArray, out: FloatArray
 ) -> None:
     """As `blockrows.add_kinks`, for steps of different lengths with the weights c (3, n) of their parabolas."""
     for i in range(n):
-        rest = 1.0 - at[i]
-        y = rate * h[i] * rest
-        ramp = rest * rest * (1.0 + y * (0.32058491 + 0.06524308 * y))
-        ramp /= 2.0 + y * (1.31296923 + y * (0.38813995 + 0.06524308 * y))
-        out[i] += feed * jump[i] * (h[i] * ramp - c[1, i] * max(0.5 - at[i], 0.0) - c[2, i] * rest)
+        rest, early, slope = 1.0 - at[i], max(0.5 - at[i], 0.0), x[i + 1] - x[i]
+        ramp, square = after_kink(rate * h[i] * rest, rest)
+        ramp = h[i] * ramp - c[1, i] * early - c[2, i] * rest
+        square = h[i] * square - c[1, i] * early * early - c[2, i] * rest * rest
+        out[i] += jump[i] * ((x[i] + at[i] * slope) * ramp + slope * square)
 
 
 @jit_rows
@@ -140,13 +140,15 @@ def _relax(
             modes_into(n, 0, form.feed[r, k], room.g_within[MIDDLE], steps.forced_within[k])
             _increments(n, steps.parabola[k, END], steps.forced[k], steps.forced_within[k], room.inc[k])
         if sweep >= _KINKED and crosses(n, room.u):
-            for t in range(drives):
-                kink_rows(n, kink[t], room.u, room.u_within[MIDDLE], room.end[1 + t], room.crossed, room.jumps)
-                for k in range(modes):
-                    _add_kinks(
-                        n, form.rates[r, k], h, steps.parabola[k, END], form.feed[r, k, t], room.crossed,
-                        room.jumps, room.inc[k],
-                    )  # fmt: skip
+            kink_rows(n, room.u, room.u_within[MIDDLE], room.crossed, room.jumps)
+            for k in range(modes):
+                x = room.slope
+                scaled(n + 1, 0.0, room.s, x)
+                for t in range(drives):
+                    add(n + 1, form.feed[r, k, t] * kink[t], room.end[1 + t], x)
+                _add_kinks(
+                    n, form.rates[r, k], h, steps.parabola[k, END], room.crossed, room.jumps, x, room.inc[k]
+                )  # fmt: skip
         for k in range(modes):
             _pass(n, steps.decay[k, END], room.inc[k], room.w[k])
         _look(form, room, steps, r, MIDDLE, n, 1 + drives)
@@ -170,6 +172,8 @@ def _misfit(form: Form, room: Room, steps: Steps, r: int, kink: FloatArray, n: i
     """Error of the modes into `Room.own`, that of the gap voltage into `Room.before`, and the largest of that (V)."""
     modes = form.rates.shape[1]
     bends = crosses(n, room.u)
+    if bends:
+        kink_rows(n, room.u, room.u_within[MIDDLE], room.crossed, room.jumps)
     for k in range(modes):
         scaled(n, 0.0, room.s, room.inc[k])
     scaled(n + 1, 0.0, room.s, steps.low)
@@ -181,7 +185,7 @@ def _misfit(form: Form, room: Room, steps: Steps, r: int, kink: FloatArray, n: i
                 n, -weight[0], room.g[t], -weight[1], room.g_within[MIDDLE, t], -weight[2], room.g[t, 1:], off
             )  # fmt: skip
             if bends:
-                kink_at(n, kink[t], PLACES[place], room.u, room.u_within[MIDDLE], room.end[1 + t], off)
+                kink_at(n, kink[t], PLACES[place], room.crossed, room.jumps, room.end[1 + t], off)
             for k in range(modes):
                 feed = form.feed[r, k, t]
                 _add_product(n, feed, steps.quarter[k, 1, place - FIRST_QUARTER], off, room.inc[k])
@@ -263,8 +267,7 @@ def march(
         c.counters[SWEEPS] += sweeps
         closed, local = left_over < math.inf, math.inf
         if closed:
-            local = left_over + _misfit(form, room, steps, r, c.shown.kink, n, taps)
-            area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
+            local = left_over + REST * _misfit(form, room, steps, r, c.shown.kink, n, taps)
         if not local <= tol:
             if level == MOST_HALVINGS:
                 return TOO_COARSE if closed else NOT_CLOSED
@@ -277,6 +280,7 @@ def march(
             for i in range(n):
                 passed *= steps.decay[k, END, i]
             c.spare[2, k] = passed
+        correct(c, r, n)
         if c.shown.charge:
             _look(form, room, steps, r, MIDDLE, n, taps)
             for p in range(1 + drives, taps):
