@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockforms import BLOCK, COLLECTED, ERROR_Q, MIDDLE, PEAK_Q, PLACES, Form, Room, Shown, Z
-from fingerspice.engine.blockrows import area_rows, crossing, modes_into, scaled
+from fingerspice.engine.blockkinks import crossing
+from fingerspice.engine.blockrows import (
+    area_rows,
+    modes_into,
+    scaled,
+)
 from fingerspice.engine.model import Model
 
 
@@ -119,7 +124,7 @@ def _charge_rows(
             + 7.0 * (r4 + turn * (a4 - a0) * d4)
         ) / 90.0
         # Both rules miss a part of the integral at the area's kink; this part is known and added.
-        at, jump = crossing(u[i], middle[i], u[i + 1])
+        at, jump, _ = crossing(u[i], middle[i], u[i + 1])
         rest, early = 1.0 - at, max(0.5 - at, 0.0)
         by_simpson = (4.0 * early + rest) / 6.0
         by_boole = (32.0 * (max(0.25 - at, 0.0) + max(0.75 - at, 0.0)) + 12.0 * early + 7.0 * rest) / 90.0

@@ -17,7 +17,13 @@ from fingerspice.engine.blockcharge import (
     steepness,
 )
 from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, OUTPUT, REFERENCE, U_GAP, Z
-from fingerspice.engine.blockrows import add, crossing, modes_into, scaled
+from fingerspice.engine.blockkinks import crossing
+from fingerspice.engine.blockrows import (
+    add,
+    modes_into,
+    of_source_and_modes,
+    scaled,
+)
 from fingerspice.engine.relaxation import FIRST_NEWTON, look_at_ends
 from fingerspice.numerics.moments import moments
 
@@ -69,7 +75,7 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
                 gone = form.rates[r, form.fast] * h * at
                 true = (math.exp(-gone) - true) / (z - gone)
             w[k] += form.feed[r, k, drives - 1] * pulse * h * at * (true - shown)
-    zero, jump = crossing(room.u[i], room.u_within[MIDDLE, i], room.u[i + 1])
+    zero, jump, bend = crossing(room.u[i], room.u_within[MIDDLE, i], room.u[i + 1])
     if jump > 0.0:
         early, rest, since = max(0.5 - zero, 0.0), 1.0 - zero, max(at - zero, 0.0)
         for k in range(w.size):
@@ -82,7 +88,8 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
             bent = since * since * since * found[2] - by_middle * early * early - by_end * rest * rest
             for t in range(drives):
                 slope = room.end[1 + t, i + 1] - room.end[1 + t, i]
-                own = (room.end[1 + t, i] + zero * slope) * ramp + slope * bent
+                there = room.end[1 + t, i] + zero * slope
+                own = there * ramp + (slope + bend * there) * bent
                 w[k] += form.feed[r, k, t] * c.shown.kink[t] * h * jump * own
 
 
@@ -221,19 +228,20 @@ def _every(sub: int, count: int, x: FloatArray, out: FloatArray) -> None:
 @jit_within
 def write_samples(c: Course, r: int, sub: int, count: int, out: FloatArray) -> None:
     """Write the outputs at the first `count` samples of a block; a sample has `sub` steps."""
-    form, room, shown, n, row = c.form, c.room, c.shown, count * sub, c.room.before
+    form, room, shown, n = c.form, c.room, c.shown, count * sub
     for column in range(shown.k.size):
+        row = out[column] if sub == 1 else room.before
         if form.mobile:
             scaled(n, 0.0, room.s, row)
             modes_into(n, 0, shown.columns[r, column], room.w, row)
             for i in range(n):
                 row[i] = shown.k[column] * room.s[i] + form.area0 * c.charges.q[0, i] * row[i]
         else:
-            scaled(n, shown.k[column], room.s, row)
-            modes_into(n, 0, shown.columns[r, column], room.w, row)
+            of_source_and_modes(n, shown.k[column], room.s, shown.columns[r, column], room.w, row)
             if form.bend.size > 0:
                 add(n, shown.bend[column], room.g[room.g.shape[0] - 1], row)
-        _every(sub, count, row, out[column])
+        if sub > 1:
+            _every(sub, count, row, out[column])
     if shown.charge:
         current_block(c, r, n)
         _every(sub, count, c.charges.z, out[shown.k.size])

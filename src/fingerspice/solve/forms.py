@@ -32,6 +32,9 @@ from fingerspice.solve.track import Prepared, as_recorded, on_branch, prepare_sy
 AREA_SHARE = 0.02
 # Time constants in a step from which on a fast mode is taken apart from the parabola, which resolves slower ones.
 FADED = 5.0
+# Time constants in a step up to which the quarters show the error of a mode well, and the share of the error that is
+# left once the modes are corrected for it: with faster modes, and without.
+RESOLVED, RESTS = 1.0, (0.7, 0.25)
 # Matrix from values at Chebyshev nodes to the Chebyshev coefficients of the antiderivative of their interpolant.
 _POINTS = 40
 _AT = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
@@ -115,13 +118,13 @@ def weighted(
     pulse, *pulses = (feed[:, None, :, -1] * h * one for one in passed) if faded.any() else [np.zeros(z.shape)] * 4
     pulse_within = np.stack([np.einsum("rpk,rsk->rsp", taps, one) for one in pulses], axis=2)
     five = (0.0, 0.25, 0.5, 0.75, 1.0)
-    quarters, early = (weights(z, five, until)[..., None, [1, 3]] for until in (1.0, 0.5))
+    quarters = weights(z, five)[..., None, [1, 3]]
     return Form(
         rates=np.ascontiguousarray(rates), gain=np.ascontiguousarray(gain), decay=np.exp(-z),
         source=by_step * weights(z, (0.0, 1.0)), drive=drives * weights(z, (0.0, 0.5, 1.0))[..., None, :],
         feed=np.ascontiguousarray(feed), taps=np.ascontiguousarray(taps), tap_s=tap_s, within=inner, within_s=inner_s,
         within_g=inner_g, share=np.ascontiguousarray(weights(z, (0.0, 0.5, 1.0))[..., 1:]), defect=drives * quarters,
-        early=np.einsum("rk,rsktj->rstj", taps[:, 0], drives * early), fast=fast, faded=faded, pulse=pulse,
+        rest=np.where(z.max(axis=-1) > RESOLVED, *RESTS), fast=fast, faded=faded, pulse=pulse,
         pulse_within=pulse_within, **others,
     )  # fmt: skip
 
