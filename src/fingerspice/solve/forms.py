@@ -114,8 +114,9 @@ def weighted(
     )
     faded = np.zeros(z.shape[:2]) if fast < 0 else np.where(z[..., fast] > FADED, z[..., fast], 0.0)
     # To the modes at fractions of a step, from the part exp(-faded x) of the last drive.
-    passed = [_pulse(z, faded, at) for at in (1.0, *PLACES)]
-    pulse, *pulses = (feed[:, None, :, -1] * h * one for one in passed) if faded.any() else [np.zeros(z.shape)] * 4
+    pulse, *pulses = [np.zeros(z.shape)] * 4
+    if faded.any():
+        pulse, *pulses = (feed[:, None, :, -1] * h * _pulse(z, faded, at) for at in (1.0, *PLACES))
     pulse_within = np.stack([np.einsum("rpk,rsk->rsp", taps, one) for one in pulses], axis=2)
     five = (0.0, 0.25, 0.5, 0.75, 1.0)
     quarters = weights(z, five)[..., None, [1, 3]]
