@@ -75,7 +75,14 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
                 gone = form.rates[r, form.fast] * h * at
                 true = (math.exp(-gone) - true) / (z - gone)
             w[k] += form.feed[r, k, drives - 1] * pulse * h * at * (true - shown)
-    zero, jump, bend = crossing(room.u[i], room.u_within[MIDDLE, i], room.u[i + 1])
+    start, middle, stop = room.u[i], room.u_within[MIDDLE, i], room.u[i + 1]
+    if form.mobile:
+        # As in `relaxation`: u as it would be with the area at 0 V.
+        share = form.area0 * inverse_area_at(form, 0.0)[0]
+        start = form.k_gap * room.s[i] + share * room.end[0, i]
+        middle = 0.5 * form.k_gap * (room.s[i] + room.s[i + 1]) + share * room.within[MIDDLE, 0, i]
+        stop = form.k_gap * room.s[i + 1] + share * room.end[0, i + 1]
+    zero, jump, bend = crossing(start, middle, stop)
     if jump > 0.0:
         early, rest, since = max(0.5 - zero, 0.0), 1.0 - zero, max(at - zero, 0.0)
         for k in range(w.size):

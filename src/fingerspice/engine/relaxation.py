@@ -31,6 +31,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_within
+from fingerspice.engine.blockcharge import inverse_area_at
 from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, PLACES, Form, Room
 from fingerspice.engine.blockkinks import add_kinks, crosses, kink_at, kink_rows
 from fingerspice.engine.blockrows import (
@@ -47,6 +48,7 @@ from fingerspice.engine.blockrows import (
     modes_into_three,
     newton_rows,
     of_source_and_modes,
+    of_two,
     product_of,
     products_of,
     pulse_rows,
@@ -200,10 +202,26 @@ def project_for_charge(form: Form, room: Room, r: int, level: int, n: int) -> No
 
 
 @jit_within
+def _find_kinks(form: Form, room: Room, n: int) -> None:
+    """Crossings of 0 V, and the jumps of the slope of |u| there.
+
+    Under `mobile` u is bent there, too. What it would be with the area at 0 V is not, and crosses 0 V at the same time.
+    """
+    if not form.mobile:
+        kink_rows(n, room.u, room.u_within[MIDDLE], room.crossed, room.jumps, room.bends)
+        return
+    share, middle = form.area0 * inverse_area_at(form, 0.0)[0], room.other[PAD:]
+    of_two(n + 1, form.k_gap, room.s, share, room.end[0], room.slope)
+    both_ends(n, 0.5 * form.k_gap, 0.5 * form.k_gap, room.s, middle)
+    add(n, share, room.within[MIDDLE, 0], middle)
+    kink_rows(n, room.slope, middle, room.crossed, room.jumps, room.bends)
+
+
+@jit_within
 def _kinks(form: Form, room: Room, r: int, level: int, h: float, n: int) -> None:
     """Add the response to the kink that the parabolas miss to `room.inc`."""
     x = room.slope
-    kink_rows(n, room.u, room.u_within[MIDDLE], room.crossed, room.jumps, room.bends)
+    _find_kinks(form, room, n)
     for k in range(form.rates.shape[1]):
         sum_of(n + 1, room.kinked[k], room.end[1:], x)
         z, share = form.rates[r, k] * h, form.share[r, level, k]
@@ -292,7 +310,7 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
     """Error of the modes that each step adds, into `room.inc`: Boole's rule less Simpson's."""
     crossing = crosses(n, room.u)
     if crossing:
-        kink_rows(n, room.u, room.u_within[MIDDLE], room.crossed, room.jumps, room.bends)
+        _find_kinks(form, room, n)
     for k in range(form.rates.shape[1]):
         scaled(n, 0.0, room.s, room.inc[k, PAD:])
     for place in (FIRST_QUARTER, LAST_QUARTER):
