@@ -34,7 +34,7 @@ AREA_SHARE = 0.02
 FADED = 5.0
 # Time constants in a step up to which the quarters show the error of a mode well, and the share of the error that is
 # left once the modes are corrected for it: with faster modes, and without.
-RESOLVED, RESTS = 1.0, (0.7, 0.25)
+RESOLVED, RESTS = 1.0, (0.7, 0.3)
 # Matrix from values at Chebyshev nodes to the Chebyshev coefficients of the antiderivative of their interpolant.
 _POINTS = 40
 _AT = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
