@@ -186,8 +186,7 @@ def charge_block(c: Course, r: int, n: int, local: float) -> None:
         area_rows(n, form.area, form.scale, form.shift, 0.0, room.u_within[place], own.q[1 + place])
     _charge_rows(
         n, own.h, slow, form.area0 if form.mobile else 0.0, c.shown.area_kink, room.s, room.u,
-        room.u_within[MIDDLE],
-        room.end[v:], room.within[:, v:], own.q, own.steps,
+        room.u_within[MIDDLE], room.end[v:], room.within[:, v:], own.q, own.steps,
     )  # fmt: skip
     scaled(n + 1, 0.0, room.s, own.error)
     modes_into(n + 1, 0, c.shown.slow[r], room.own, own.error)

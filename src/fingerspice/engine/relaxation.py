@@ -136,7 +136,8 @@ def _project(form: Form, room: Room, r: int, level: int, place: int, n: int, p: 
 @jit_within
 def _row_within(form: Form, room: Room, place: int, p: int) -> FloatArray:
     """Where projection p goes: the first one is the gap voltage, but for `mobile`."""
-    return room.within[place, p] if form.mobile or p > 0 else room.u_within[place]
+    row: FloatArray = room.within[place, p] if form.mobile or p > 0 else room.u_within[place]
+    return row
 
 
 @jit_within
