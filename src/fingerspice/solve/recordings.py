@@ -22,7 +22,7 @@ from fingerspice.engine.unevenweights import new_steps
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.refined import ClosedForm
-from fingerspice.solve.forms import RESTS, Follower, followed
+from fingerspice.solve.forms import Follower, followed
 from fingerspice.solve.marching import solve as solve_ordinary
 from fingerspice.solve.netforms import finger
 from fingerspice.solve.pieces import Piece, driving, pieces_of, spacing_of
@@ -31,10 +31,7 @@ from fingerspice.solve.runs import Progress, Run, excess_of, kept_with
 from fingerspice.waveforms.ramps import PWL
 
 # Error allowed in a block, relative to the error asked for; ratio of stated to estimated error; attempts at a piece.
-SHARE, SAFETY, ATTEMPTS = 0.3, 2.0, 4
-# Ratio of the two for the charge in addition, where a sample is too long for the fastest modes: the quarters of a step
-# then show only a part of the error of its integral.
-UNSEEN = 5.0
+SHARE, SAFETY, ATTEMPTS = 0.3, 1.75, 4
 # The error of a piece is related to the peaks up to its end, or to this share of the largest gap voltage that the
 # source may cause: noise before the first loud sound need not be exact relative to itself.
 LEAST_PEAK = 1e-3
@@ -203,8 +200,7 @@ class March:
         node_error += 4e-16 * (peak_u + u_peak) + missed * peak_u + self.one.missed_u
         charge_error = None
         if self.problem.charge:
-            safety = SAFETY * (UNSEEN if self.course.form.rest.max() > RESTS[1] else 1.0)
-            charge_error = safety * float(control[blockforms.ERROR_Q]) + self.led[3]
+            charge_error = SAFETY * float(control[blockforms.ERROR_Q]) + self.led[3]
             charge_error += self.one.charge_error(self.problem, self.course, peak_u)
         return np.array([[peak_u, peak_f, u_error, f_error]]), node_error, charge_error
 
