@@ -38,6 +38,35 @@ def missed_at(at: float, early: float, late: float) -> float:
 
 
 @jit
+def _crossing_of(c: Course, i: int) -> tuple[float, float, float]:
+    """`crossing` of step i, as in `relaxation`."""
+    form, room = c.form, c.room
+    start, middle, stop = room.u[i], room.u_within[MIDDLE, i], room.u[i + 1]
+    if form.mobile:
+        share = form.area0 * inverse_area_at(form, 0.0)[0]
+        start = form.k_gap * room.s[i] + share * room.end[0, i]
+        middle = 0.5 * form.k_gap * (room.s[i] + room.s[i + 1]) + share * room.within[MIDDLE, 0, i]
+        stop = form.k_gap * room.s[i + 1] + share * room.end[0, i + 1]
+    return crossing(start, middle, stop)
+
+
+@jit
+def _add_kink(c: Course, i: int, at: float, g: FloatArray) -> None:
+    """Add to the drives at fraction `at` of step i what their kink has besides the parabola through it."""
+    zero, jump, bend = _crossing_of(c, i)
+    if jump == 0.0:
+        return
+    middle, last = 4.0 * at * (1.0 - at), at * (2.0 * at - 1.0)
+    since, early, rest = max(at - zero, 0.0), max(0.5 - zero, 0.0), 1.0 - zero
+    ramp = since - middle * early - last * rest
+    square = since * since - middle * early * early - last * rest * rest
+    for t in range(g.size):
+        x, slope = c.room.end[1 + t, i], c.room.end[1 + t, i + 1] - c.room.end[1 + t, i]
+        there = x + zero * slope
+        g[t] += c.shown.kink[t] * jump * (there * ramp + (slope + bend * there) * square)
+
+
+@jit
 def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> None:
     """Modes at fraction `at` > 0 of step i, along the polynomials through the drives at all five places."""
     form, room, found = c.form, c.room, c.spare[2, :5]
@@ -75,14 +104,7 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
                 gone = form.rates[r, form.fast] * h * at
                 true = (math.exp(-gone) - true) / (z - gone)
             w[k] += form.feed[r, k, drives - 1] * pulse * h * at * (true - shown)
-    start, middle, stop = room.u[i], room.u_within[MIDDLE, i], room.u[i + 1]
-    if form.mobile:
-        # As in `relaxation`: u as it would be with the area at 0 V.
-        share = form.area0 * inverse_area_at(form, 0.0)[0]
-        start = form.k_gap * room.s[i] + share * room.end[0, i]
-        middle = 0.5 * form.k_gap * (room.s[i] + room.s[i + 1]) + share * room.within[MIDDLE, 0, i]
-        stop = form.k_gap * room.s[i + 1] + share * room.end[0, i + 1]
-    zero, jump, bend = crossing(start, middle, stop)
+    zero, jump, bend = _crossing_of(c, i)
     if jump > 0.0:
         early, rest, since = max(0.5 - zero, 0.0), 1.0 - zero, max(at - zero, 0.0)
         for k in range(w.size):
@@ -180,6 +202,7 @@ def _write_point(
     for k in range(w.size):
         w[k] = room.w[k, i]
     if at > 0.0:
+        _add_kink(c, i, at, g)
         _modes_at(c, r, h, i, at, w)
         if form.fast >= 0:
             _follow_fast(c, r, h * at, source, w, g)

@@ -64,8 +64,9 @@ from fingerspice.engine.blockrows import (
 PARABOLA = np.array([[0.0, 1.0, 0.0], [0.375, 0.75, -0.125], [-0.125, 0.75, 0.375]])
 # Most sweeps of a block, and the fraction of the error allowed that the last one may leave.
 MOST_SWEEPS, LEFT = 40, 0.5
-# Smallest ratio assumed between the errors of two sweeps: the first sweeps may converge faster than the later ones.
-SLOWEST = 0.01
+# Smallest ratio assumed between the errors of two sweeps, and its factor in networks: the first sweeps may converge
+# faster than the later ones, and in networks other voltages than that of the gap converge more slowly.
+SLOWEST, SLOWER = 0.01, 4.0
 # First sweep in which the places of the kinks and the rate of convergence are known well enough.
 KINKED = 1
 # Newton steps for the gap voltage under `mobile`, in the first sweep and in later ones; and the smallest distance to
@@ -73,7 +74,7 @@ KINKED = 1
 FIRST_NEWTON, NEWTON, LEAST_MARGIN = 6, 2, 0.2
 # If the error is below this fraction of the one allowed, the next block has steps twice as long, whose error is sixteen
 # times as large.
-SPARE = 0.02
+SPARE = 0.04
 
 
 @jit_within
@@ -269,6 +270,7 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
         for t in range(drives):
             room.kinked[k, t] = h * form.feed[r, k, t] * kink[t]
     last, margin, over = math.inf, 1.0, 1.0 / tol if tol > 0.0 else 1.0
+    slowest = SLOWEST * (SLOWER if form.bend.size > 0 else 1.0)
     fades = form.faded[r, level] > 0.0
     scaled(n, 0.0, room.s, room.pulse)
     for sweep in range(MOST_SWEEPS):
@@ -295,7 +297,7 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
             return math.inf, margin, sweep
         change = change_of(n + 1, over, room.u, room.before) / over
         if sweep > 0:
-            ratio = max(change / last, SLOWEST) if last > 0.0 else 0.0
+            ratio = max(change / last, slowest) if last > 0.0 else 0.0
             if not ratio < 0.9 and change > tol:
                 return math.inf, margin, sweep
             # The remaining error falls by about the same ratio.
