@@ -43,7 +43,7 @@ def test_more_voltage_makes_more() -> None:
 
 def test_it_is_refused_in_one_sentence() -> None:
     circuits = Path(__file__).parents[1] / "circuits"
-    with pytest.raises(fs.InputError, match="series stack"):
+    with pytest.raises(fs.InputError, match="has Rout, Ccable beside it"):
         fs.capability(fs.read_netlist(circuits / "amplifier.cir"), 150.0)
     with pytest.raises(fs.InputError, match="one finger"):
         fs.capability(fs.read_netlist(circuits / "two_fingers.cir"), 150.0)

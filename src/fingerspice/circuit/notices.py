@@ -8,7 +8,7 @@ from functools import partial
 
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.loop import network_of
-from fingerspice.circuit.spectrum import energy_outside, skin_error
+from fingerspice.circuit.spectrum import energy_outside, skin_error, surely_wide
 from fingerspice.waveforms.waveform import Waveform
 
 # Half-width of a band around a frequency, relative to the frequency, in which the skin's data change by 3 %; and the
@@ -41,6 +41,8 @@ def directive_warnings(circuit: Circuit) -> tuple[str, ...]:
 
 def _is_near(wave: Waveform, stop: float, f: float) -> bool:
     """Whether nearly all of a source's energy is close to a frequency (Hz), as for a carrier with a slow envelope."""
+    if surely_wide(wave, stop, f):
+        return False
     band = f * (1.0 - _BAND), f * (1.0 + _BAND)
     return sum(energy_outside(wave, stop, band)) < _OUTSIDE
 

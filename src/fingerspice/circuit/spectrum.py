@@ -14,6 +14,7 @@ from fingerspice.circuit.response import areas_at_rest, with_skin_held
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.physics.phasor import layer_gains
+from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import Waveform
 
 # Largest number of samples of a spectrum, and largest number of periods over which a periodic source is evaluated.
@@ -22,6 +23,10 @@ _PERIODS = 16
 # Number of pieces that represent a long run of a source without period, and number of frequencies at which gains are
 # computed.
 _PIECES, _GRID = 4, 49
+# Least length of a piece of a recording, s: two periods of the lowest frequency of the skin's data.
+_LEAST = 2.0 / SKIN_BAND[0]
+# Number of samples of a recording up to which straight lines between them are looked at instead.
+_FEW = 4096
 # A warning is given if more than this fraction of the source's energy is outside the band of the skin's data.
 NOTABLE = 0.01
 # The area's harmonics also drive currents through the skin. Skin data held at the fundamental cause an additional
@@ -73,6 +78,25 @@ def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatA
     return np.arange(total.size) / length, total
 
 
+def _recorded(wave: Waveform, t_stop: float) -> tuple[FloatArray, FloatArray] | None:
+    """As `_energies`, from the samples themselves: pieces spread over the run to `t_stop` (s); None for few samples."""
+    last = min(wave.count, math.floor((t_stop - wave.start) * wave.rate) + 1) if isinstance(wave, Samples) else 0
+    if not isinstance(wave, Samples) or last < _FEW:
+        return None
+    # Key and value are one entry, because another thread may replace it at any time.
+    kept: tuple[float, tuple[FloatArray, FloatArray]] | None = wave.kept.get("spectrum")
+    if kept is not None and kept[0] == t_stop:
+        return kept[1]
+    count = min(last, 2 ** math.ceil(math.log2(_LEAST * wave.rate)), _MOST_SAMPLES)
+    starts = np.unique(np.linspace(0, last - count, min(_PIECES, math.ceil(last / count))).astype(int))
+    pieces = [np.abs(np.fft.rfft(wave.between(i, i + count) * _window(count))) ** 2 for i in starts.tolist()]
+    total = np.sum(pieces, axis=0)
+    total[1:] *= 2.0
+    found = np.arange(total.size) * (wave.rate / count), np.asarray(total)
+    wave.kept["spectrum"] = t_stop, found
+    return found
+
+
 def energy_outside(
     waveform: Waveform, t_stop: float, band: tuple[float, float] = SKIN_BAND
 ) -> tuple[float, float]:  # fmt: skip
@@ -87,6 +111,20 @@ def energy_outside(
     # The window spreads a line over the neighbouring bins, so one bin below the band counts as inside.
     below = f < low - (0.0 if waveform.period is not None else f[1] if f.size > 1 else 0.0)
     return (float(energy[below].sum() / total), float(energy[f > high].sum() / total)) if total > 0.0 else (0.0, 0.0)
+
+
+def surely_wide(waveform: Waveform, t_stop: float, frequency: float) -> bool:
+    """Whether a fifth of a recording's energy is clearly more than half an octave away from a frequency (Hz).
+
+    This is seen without the fine spectrum that a narrow band needs.
+    """
+    found = _recorded(waveform, t_stop)
+    if found is None:
+        return False
+    f, energy = found
+    blurred = 2.0 * f[1]
+    far = (f < frequency / 1.4 - blurred) | (f > 1.4 * frequency + blurred)
+    return bool(energy[far].sum() > 0.2 * energy.sum() > 0.0)
 
 
 def _shared_out(f: FloatArray, energy: FloatArray, grid: FloatArray) -> FloatArray:
@@ -106,7 +144,7 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
     """
     networks = network_of(circuit), network_of(with_skin_held(circuit))
     gaps = [gap for gap in networks[0].gaps if gap is not None]
-    f, energy = _energies(waveform, t_stop, SKIN_BAND[1])
+    f, energy = _recorded(waveform, t_stop) or _energies(waveform, t_stop, SKIN_BAND[1])
     grid = np.geomspace(*SKIN_BAND, _GRID)
     areas = areas_at_rest(networks[0])
     try:

@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockforms import BLOCK, COLLECTED, ERROR_Q, MIDDLE, PEAK_Q, PLACES, Form, Room, Shown, Z
-from fingerspice.engine.blockrows import area_rows, crossing, modes_into, scaled
+from fingerspice.engine.blockkinks import crossing
+from fingerspice.engine.blockrows import (
+    area_rows,
+    modes_into,
+    scaled,
+)
 from fingerspice.engine.model import Model
 
 
@@ -76,7 +81,9 @@ def _charge_rows(
     n: int, h: FloatArray, slow: FloatArray, area0: float, kink: float, s: FloatArray, u: FloatArray,
     middle: FloatArray, ends: FloatArray, within: FloatArray, q: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
-    """Charge gained in each step without c r G(u), its rates, and its error by Boole's rule, into `steps` (`Charges`).
+    """Charge gained in each step without c r G(u), its rates, and its error, into `steps` (`Charges`).
+
+    The charge is that of Boole's rule, and its error is taken as the difference to Simpson's rule.
 
     `ends` (2, n) and `within` (3, 2, n) hold two voltages of the slowest layer: its part v, which does not follow u,
     and the voltage that drives its leakage current (under `mobile` the modes' part of it alone). The displacement
@@ -119,15 +126,16 @@ def _charge_rows(
             + 7.0 * (r4 + turn * (a4 - a0) * d4)
         ) / 90.0
         # Both rules miss a part of the integral at the area's kink; this part is known and added.
-        at, jump = crossing(u[i], middle[i], u[i + 1])
+        at, jump, _ = crossing(u[i], middle[i], u[i + 1])
         rest, early = 1.0 - at, max(0.5 - at, 0.0)
         by_simpson = (4.0 * early + rest) / 6.0
         by_boole = (32.0 * (max(0.25 - at, 0.0) + max(0.75 - at, 0.0)) + 12.0 * early + 7.0 * rest) / 90.0
         bent = kink * jump * (g_area * (l0 + at * (l4 - l0)) + turn * (v4 - v0))
         steps[0, i], steps[1, i], steps[2, i] = r0, m2, m4
         kinked = bent * (0.5 * rest * rest - by_simpson)
-        steps[3, i] = c * (area0 if mobile else a0) * (v4 - v0) + h[i] * (simpson + kinked)
-        steps[4, i] = h[i] * (boole - simpson - bent * (by_boole - by_simpson))
+        off = boole - simpson - bent * (by_boole - by_simpson)
+        steps[3, i] = c * (area0 if mobile else a0) * (v4 - v0) + h[i] * (simpson + kinked + off)
+        steps[4, i] = h[i] * off
 
 
 @jit_rows
@@ -177,8 +185,8 @@ def charge_block(c: Course, r: int, n: int, local: float) -> None:
     for place in range(len(PLACES)):
         area_rows(n, form.area, form.scale, form.shift, 0.0, room.u_within[place], own.q[1 + place])
     _charge_rows(
-        n, own.h, slow, form.area0 if form.mobile else 0.0, c.shown.area_kink, room.s, room.u, room.u_within[MIDDLE],
-        room.end[v:], room.within[:, v:], own.q, own.steps,
+        n, own.h, slow, form.area0 if form.mobile else 0.0, c.shown.area_kink, room.s, room.u,
+        room.u_within[MIDDLE], room.end[v:], room.within[:, v:], own.q, own.steps,
     )  # fmt: skip
     scaled(n + 1, 0.0, room.s, own.error)
     modes_into(n + 1, 0, c.shown.slow[r], room.own, own.error)

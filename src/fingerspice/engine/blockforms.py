@@ -10,7 +10,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.engine.blockrows import PAD
 
 # Number of steps in a block, and of step lengths: that of a sample and its halvings.
-BLOCK, LEVELS = 512, 7
+BLOCK, LEVELS = 256, 7
 # Largest degree of the polynomial for 1/A.
 MOST_DEGREE = 28
 # Places of a step besides its ends: its middle, and the two at which the error is measured.
@@ -52,8 +52,8 @@ class Form(NamedTuple):
         The weights of 1/2 and 1 in the integral of a parabola over a step, in units of its length.
     defect : ndarray, shape (r, LEVELS, m, T, 2)
         Contribution of the interpolation errors at the quarters to the error of a mode.
-    early : ndarray, shape (r, LEVELS, T, 2)
-        Their contribution to the error of the gap voltage in the middle of the step.
+    rest : ndarray, shape (r, LEVELS)
+        Share of the error seen at the quarters that may be left once the modes are corrected for it.
     area : ndarray, shape (4 k + 1,)
         1/A as a polynomial in `scale` |u| + `shift`.
     kappa : float
@@ -85,7 +85,7 @@ class Form(NamedTuple):
     within_g: FloatArray
     share: FloatArray
     defect: FloatArray
-    early: FloatArray
+    rest: FloatArray
     area: FloatArray
     scale: float
     shift: float
@@ -117,7 +117,7 @@ class Shown(NamedTuple):
     stress : float
         Force per area and squared gap voltage, Pa/V^2.
     kink : ndarray, shape (T,)
-        Derivative by |u_gap| at 0 V of the factor of each drive.
+        Derivative by |u_gap| at 0 V of the factor of each drive. N counts as a factor times xi.
     area_kink : float
         dA/d|u| at 0 V, m^2/V.
     moved : ndarray
@@ -153,7 +153,10 @@ class Shown(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Rows of a block to work in: of the source, modes, increments, projections, drives, and single ones."""
+    """Rows of a block to work in: of the source, modes, increments, projections, drives, and single ones.
+
+    `kinked` is no row: the weights (m, T) of the kink of each drive in each mode.
+    """
 
     s: FloatArray
     s_within: FloatArray
@@ -172,7 +175,9 @@ class Room(NamedTuple):
     before: FloatArray
     crossed: FloatArray
     jumps: FloatArray
+    bends: FloatArray
     pulse: FloatArray
+    kinked: FloatArray
 
 
 def new_room(modes: int, drives: int, projections: int) -> Room:
@@ -182,4 +187,5 @@ def new_room(modes: int, drives: int, projections: int) -> Room:
         np.zeros(n), np.zeros(n), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n),
         np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)),
         np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
+        np.zeros(n), np.zeros((modes, drives)),
     )  # fmt: skip

@@ -6,7 +6,7 @@ import math
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
-from fingerspice.base.compiled import jit, jit_within
+from fingerspice.base.compiled import jit, jit_inline, jit_within
 from fingerspice.engine.blockcharge import (
     Course,
     bend_at,
@@ -17,16 +17,60 @@ from fingerspice.engine.blockcharge import (
     moved_with,
     steepness,
 )
-from fingerspice.engine.blockforms import MIDDLE, OUTPUT, REFERENCE, U_GAP, Z
-from fingerspice.engine.blockrows import add, crossing, modes_into, scaled
+from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, OUTPUT, REFERENCE, U_GAP, Z
+from fingerspice.engine.blockkinks import crossing
+from fingerspice.engine.blockrows import (
+    add,
+    modes_into,
+    of_source_and_modes,
+    scaled,
+)
 from fingerspice.engine.relaxation import FIRST_NEWTON, look_at_ends
 from fingerspice.numerics.moments import moments
 
 
+@jit_inline
+def missed_at(at: float, early: float, late: float) -> float:
+    """What a drive has besides its parabola at a fraction of a step, from what it has at the quarters of the step.
+
+    A polynomial of fourth degree, which is 0 at the ends and in the middle.
+    """
+    return -128.0 / 3.0 * at * (at - 0.5) * (at - 1.0) * ((early + late) * at - (0.75 * early + 0.25 * late))
+
+
+@jit
+def _crossing_of(c: Course, i: int) -> tuple[float, float, float]:
+    """`crossing` of step i, as in `relaxation`."""
+    form, room = c.form, c.room
+    start, middle, stop = room.u[i], room.u_within[MIDDLE, i], room.u[i + 1]
+    if form.mobile:
+        share = form.area0 * inverse_area_at(form, 0.0)[0]
+        start = form.k_gap * room.s[i] + share * room.end[0, i]
+        middle = 0.5 * form.k_gap * (room.s[i] + room.s[i + 1]) + share * room.within[MIDDLE, 0, i]
+        stop = form.k_gap * room.s[i + 1] + share * room.end[0, i + 1]
+    return crossing(start, middle, stop)
+
+
+@jit
+def _add_kink(c: Course, i: int, at: float, g: FloatArray) -> None:
+    """Add to the drives at fraction `at` of step i what their kink has besides the parabola through it."""
+    zero, jump, bend = _crossing_of(c, i)
+    if jump == 0.0:
+        return
+    middle, last = 4.0 * at * (1.0 - at), at * (2.0 * at - 1.0)
+    since, early, rest = max(at - zero, 0.0), max(0.5 - zero, 0.0), 1.0 - zero
+    ramp = since - middle * early - last * rest
+    square = since * since - middle * early * early - last * rest * rest
+    for t in range(g.size):
+        x, slope = c.room.end[1 + t, i], c.room.end[1 + t, i + 1] - c.room.end[1 + t, i]
+        there = x + zero * slope
+        g[t] += c.shown.kink[t] * jump * (there * ramp + (slope + bend * there) * square)
+
+
 @jit
 def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> None:
-    """Modes at fraction `at` > 0 of step i, along the parabolas through the drives."""
-    form, room, found = c.form, c.room, c.spare[2, :3]
+    """Modes at fraction `at` > 0 of step i, along the polynomials through the drives at all five places."""
+    form, room, found = c.form, c.room, c.spare[2, :5]
     drives = room.g.shape[0]
     pulse = room.pulse[i] if form.fast >= 0 else 0.0
     half = math.exp(-0.5 * form.rates[r, max(form.fast, 0)] * h)
@@ -36,12 +80,21 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
         moments(z, found)
         # Constant, linear and square coefficient of the mode's forcing, a parabola in the fraction of the step.
         whole, linear, square = form.gain[r, k] * room.s[i], form.gain[r, k] * (room.s[i + 1] - room.s[i]), 0.0
+        both, mostly_early = 0.0, 0.0
         for t in range(drives):
             g0, g1, g2 = room.g[t, i], room.g_within[MIDDLE, t, i], room.g[t, i + 1]
             whole += form.feed[r, k, t] * g0
             linear += form.feed[r, k, t] * (4.0 * g1 - 3.0 * g0 - g2)
             square += form.feed[r, k, t] * 2.0 * (g0 - 2.0 * g1 + g2)
-        w[k] = w[k] * math.exp(-z) + h * at * (whole * found[0] + at * (linear * found[1] + at * square * found[2]))
+            early, late = room.g_within[FIRST_QUARTER, t, i], room.g_within[LAST_QUARTER, t, i]
+            both += form.feed[r, k, t] * (early + late)
+            mostly_early += form.feed[r, k, t] * (0.75 * early + 0.25 * late)
+        # The parabola and what it misses at the quarters, as in `missed_at`.
+        linear += 64.0 / 3.0 * mostly_early
+        square -= 64.0 / 3.0 * (both + 3.0 * mostly_early)
+        cubic, fourth = 128.0 / 3.0 * (1.5 * both + mostly_early), -128.0 / 3.0 * both
+        forced = linear * found[1] + at * (square * found[2] + at * (cubic * found[3] + at * fourth * found[4]))
+        w[k] = w[k] * math.exp(-z) + h * at * (whole * found[0] + at * forced)
         if pulse != 0.0:
             # The parabola through the part of N that is exp(-rate t), and its response.
             shown = found[0] + at * (
@@ -52,19 +105,22 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
                 gone = form.rates[r, form.fast] * h * at
                 true = (math.exp(-gone) - true) / (z - gone)
             w[k] += form.feed[r, k, drives - 1] * pulse * h * at * (true - shown)
-    zero, jump = crossing(room.u[i], room.u_within[MIDDLE, i], room.u[i + 1])
+    zero, jump, bend = _crossing_of(c, i)
     if jump > 0.0:
         early, rest, since = max(0.5 - zero, 0.0), 1.0 - zero, max(at - zero, 0.0)
         for k in range(w.size):
             # The kink's correction as in `add_kinks`, but up to fraction `at` instead of the end of the step.
             moments(form.rates[r, k] * h * at, found)
             one, two = at * at * found[1], at * at * at * found[2]
-            own = -4.0 * (one - two) * early - (2.0 * two - one) * rest
+            by_middle, by_end = 4.0 * (one - two), 2.0 * two - one
             moments(form.rates[r, k] * h * since, found)
-            own += since * since * found[1]
+            ramp = since * since * found[1] - by_middle * early - by_end * rest
+            bent = since * since * since * found[2] - by_middle * early * early - by_end * rest * rest
             for t in range(drives):
-                x = room.end[1 + t, i] + zero * (room.end[1 + t, i + 1] - room.end[1 + t, i])
-                w[k] += form.feed[r, k, t] * c.shown.kink[t] * x * h * jump * own
+                slope = room.end[1 + t, i + 1] - room.end[1 + t, i]
+                there = room.end[1 + t, i] + zero * slope
+                own = there * ramp + (slope + bend * there) * bent
+                w[k] += form.feed[r, k, t] * c.shown.kink[t] * h * jump * own
 
 
 @jit
@@ -139,6 +195,7 @@ def _write_point(
     first, middle, last = (2.0 * at - 1.0) * (at - 1.0), 4.0 * at * (1.0 - at), at * (2.0 * at - 1.0)
     for t in range(g.size):
         g[t] = first * room.g[t, i] + middle * room.g_within[MIDDLE, t, i] + last * room.g[t, i + 1]
+        g[t] += missed_at(at, room.g_within[FIRST_QUARTER, t, i], room.g_within[LAST_QUARTER, t, i])
     if form.fast >= 0:
         faded = form.rates[r, form.fast] * h
         parabola = first + middle * math.exp(-0.5 * faded) + last * math.exp(-faded)
@@ -146,6 +203,7 @@ def _write_point(
     for k in range(w.size):
         w[k] = room.w[k, i]
     if at > 0.0:
+        _add_kink(c, i, at, g)
         _modes_at(c, r, h, i, at, w)
         if form.fast >= 0:
             _follow_fast(c, r, h * at, source, w, g)
@@ -201,19 +259,20 @@ def _every(sub: int, count: int, x: FloatArray, out: FloatArray) -> None:
 @jit_within
 def write_samples(c: Course, r: int, sub: int, count: int, out: FloatArray) -> None:
     """Write the outputs at the first `count` samples of a block; a sample has `sub` steps."""
-    form, room, shown, n, row = c.form, c.room, c.shown, count * sub, c.room.before
+    form, room, shown, n = c.form, c.room, c.shown, count * sub
     for column in range(shown.k.size):
+        row = out[column] if sub == 1 else room.before
         if form.mobile:
             scaled(n, 0.0, room.s, row)
             modes_into(n, 0, shown.columns[r, column], room.w, row)
             for i in range(n):
                 row[i] = shown.k[column] * room.s[i] + form.area0 * c.charges.q[0, i] * row[i]
         else:
-            scaled(n, shown.k[column], room.s, row)
-            modes_into(n, 0, shown.columns[r, column], room.w, row)
+            of_source_and_modes(n, shown.k[column], room.s, shown.columns[r, column], room.w, row)
             if form.bend.size > 0:
                 add(n, shown.bend[column], room.g[room.g.shape[0] - 1], row)
-        _every(sub, count, row, out[column])
+        if sub > 1:
+            _every(sub, count, row, out[column])
     if shown.charge:
         current_block(c, r, n)
         _every(sub, count, c.charges.z, out[shown.k.size])

@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit_inline, jit_rows, jit_within
+from fingerspice.base.compiled import jit_rows, jit_within
 
 # Zeros in front of a row that `recursion` works on, because it reads entries before the first.
-PAD = 8
+PAD = 16
 
 
 @jit_rows
@@ -41,22 +41,9 @@ def both_ends(n: int, a: float, b: float, x: FloatArray, out: FloatArray) -> Non
 
 
 @jit_rows
-def add_six(
-    n: int, a: FloatArray, x: FloatArray, x_m: FloatArray, b: FloatArray, y: FloatArray, y_m: FloatArray,
-    out: FloatArray,
-) -> None:  # fmt: skip
-    a0, a1, a2, b0, b1, b2 = a[0], a[1], a[2], b[0], b[1], b[2]
+def of_two(n: int, a: float, x: FloatArray, b: float, y: FloatArray, out: FloatArray) -> None:
     for i in range(n):
-        out[i] += a0 * x[i] + a1 * x_m[i] + a2 * x[i + 1] + b0 * y[i] + b1 * y_m[i] + b2 * y[i + 1]
-
-
-@jit_rows
-def of_step(
-    n: int, share: FloatArray, s: FloatArray, c: float, w: FloatArray, d: float, v: FloatArray, out: FloatArray
-) -> None:  # fmt: skip
-    a, b = share[0], share[1]
-    for i in range(n):
-        out[i] = a * s[i] + b * s[i + 1] + c * w[i] + d * v[i]
+        out[i] = a * x[i] + b * y[i]
 
 
 @jit_rows
@@ -66,14 +53,115 @@ def of_end(n: int, a: float, s: FloatArray, c: float, w: FloatArray, d: float, v
 
 
 @jit_within
-def drives_into(n: int, c: FloatArray, g: FloatArray, middle: FloatArray, out: FloatArray) -> None:
-    """Add the sum over the drives: c (T, 3) weights their values at the start, middle and end of each step."""
+def of_source_and_modes(n: int, a: float, s: FloatArray, c: FloatArray, w: FloatArray, out: FloatArray) -> None:
+    """a s and the sum of c_k w_k over all modes."""
+    if c.size > 1:
+        of_end(n, a, s, c[0], w[0], c[1], w[1], out)
+    else:
+        of_two(n, a, s, c[0], w[0], out)
+    modes_into(n, 2, c, w, out)
+
+
+@jit_rows
+def of_step(
+    n: int, by_s: FloatArray, by_g: FloatArray, s: FloatArray, g: FloatArray, middle: FloatArray, out: FloatArray
+) -> None:  # fmt: skip
+    """Source and first two drives, with their weights at the start, (the middle) and the end of each step."""
+    for i in range(n):
+        total = by_s[0] * s[i] + by_s[1] * s[i + 1]
+        total += by_g[0, 0] * g[0, i] + by_g[0, 1] * middle[0, i] + by_g[0, 2] * g[0, i + 1]
+        out[i] = total + by_g[1, 0] * g[1, i] + by_g[1, 1] * middle[1, i] + by_g[1, 2] * g[1, i + 1]
+
+
+@jit_within
+def forced_by(
+    n: int, by_s: FloatArray, by_g: FloatArray, s: FloatArray, g: FloatArray, middle: FloatArray, out: FloatArray
+) -> None:  # fmt: skip
+    """Source and all drives, with weights by_s (2,) and by_g (T, 3) as in `of_step`."""
     t = 0
-    while t + 1 < c.shape[0]:
-        add_six(n, c[t], g[t], middle[t], c[t + 1], g[t + 1], middle[t + 1], out)
-        t += 2
-    if t < c.shape[0]:
+    if by_g.shape[0] > 1:
+        of_step(n, by_s, by_g, s, g, middle, out)
+        t = 2
+    else:
+        both_ends(n, by_s[0], by_s[1], s, out)
+    drives_into(n, t, by_g, g, middle, out)
+
+
+@jit_within
+def drives_into(n: int, first: int, c: FloatArray, g: FloatArray, middle: FloatArray, out: FloatArray) -> None:
+    """Add the sum over the drives from `first` on, with weights c (T, 3) as in `of_step`."""
+    for t in range(first, c.shape[0]):
         add_three(n, c[t, 0], g[t], c[t, 1], middle[t], c[t, 2], g[t, 1:], out)
+
+
+@jit_rows
+def three_at_ends(
+    n: int, by_s: FloatArray, by_w: FloatArray, s: FloatArray, w: FloatArray, x: FloatArray, y: FloatArray,
+    z: FloatArray,
+) -> None:  # fmt: skip
+    """Three projections of the source and the first two modes at the ends of the steps: by_s (3,), by_w (3, m)."""
+    for i in range(n):
+        x[i] = by_s[0] * s[i] + by_w[0, 0] * w[0, i] + by_w[0, 1] * w[1, i]
+        y[i] = by_s[1] * s[i] + by_w[1, 0] * w[0, i] + by_w[1, 1] * w[1, i]
+        z[i] = by_s[2] * s[i] + by_w[2, 0] * w[0, i] + by_w[2, 1] * w[1, i]
+
+
+@jit_rows
+def three_within(
+    n: int, by_s: FloatArray, by_w: FloatArray, by_g: FloatArray, s: FloatArray, w: FloatArray, g: FloatArray,
+    middle: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray,
+) -> None:  # fmt: skip
+    """Three projections of the source, the first two modes and drives within steps, with weights of the steps' ends.
+
+    by_s (3, 2), by_w (3, m), by_g (3, T, 3) as in `of_step`.
+    """
+    for i in range(n):
+        s0, s1, w0, w1 = s[i], s[i + 1], w[0, i], w[1, i]
+        a0, a1, a2, b0, b1, b2 = g[0, i], middle[0, i], g[0, i + 1], g[1, i], middle[1, i], g[1, i + 1]
+        total = by_s[0, 0] * s0 + by_s[0, 1] * s1 + by_w[0, 0] * w0 + by_w[0, 1] * w1
+        total += by_g[0, 0, 0] * a0 + by_g[0, 0, 1] * a1 + by_g[0, 0, 2] * a2
+        x[i] = total + by_g[0, 1, 0] * b0 + by_g[0, 1, 1] * b1 + by_g[0, 1, 2] * b2
+        total = by_s[1, 0] * s0 + by_s[1, 1] * s1 + by_w[1, 0] * w0 + by_w[1, 1] * w1
+        total += by_g[1, 0, 0] * a0 + by_g[1, 0, 1] * a1 + by_g[1, 0, 2] * a2
+        y[i] = total + by_g[1, 1, 0] * b0 + by_g[1, 1, 1] * b1 + by_g[1, 1, 2] * b2
+        total = by_s[2, 0] * s0 + by_s[2, 1] * s1 + by_w[2, 0] * w0 + by_w[2, 1] * w1
+        total += by_g[2, 0, 0] * a0 + by_g[2, 0, 1] * a1 + by_g[2, 0, 2] * a2
+        z[i] = total + by_g[2, 1, 0] * b0 + by_g[2, 1, 1] * b1 + by_g[2, 1, 2] * b2
+
+
+@jit_rows
+def add_to_three(
+    n: int, k: int, by_w: FloatArray, w: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray
+) -> None:  # fmt: skip
+    """Add modes k and k + 1 to three projections, by_w (3, m)."""
+    for i in range(n):
+        w0, w1 = w[k, i], w[k + 1, i]
+        x[i] += by_w[0, k] * w0 + by_w[0, k + 1] * w1
+        y[i] += by_w[1, k] * w0 + by_w[1, k + 1] * w1
+        z[i] += by_w[2, k] * w0 + by_w[2, k + 1] * w1
+
+
+@jit_within
+def modes_into_three(n: int, c: FloatArray, w: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray) -> None:
+    """Add the modes from the third on to three projections, c (3, m)."""
+    k = 2
+    while k + 1 < c.shape[1]:
+        add_to_three(n, k, c, w, x, y, z)
+        k += 2
+    if k < c.shape[1]:
+        add(n, c[0, k], w[k], x)
+        add(n, c[1, k], w[k], y)
+        add(n, c[2, k], w[k], z)
+
+
+@jit_within
+def sum_of(n: int, c: FloatArray, x: FloatArray, out: FloatArray) -> None:
+    """The sum of c_k x_k over all rows of x."""
+    if c.size > 1:
+        of_two(n, c[0], x[0], c[1], x[1], out)
+    else:
+        scaled(n, c[0], x[0], out)
+    modes_into(n, 2, c, x, out)
 
 
 @jit_within
@@ -100,6 +188,27 @@ def product_of(n: int, x: FloatArray, y: FloatArray, out: FloatArray) -> None:
 
 
 @jit_rows
+def products_of(n: int, x: FloatArray, y: FloatArray, out: FloatArray, z: FloatArray, other: FloatArray) -> None:
+    """x y into `out`, and x z into `other`."""
+    for i in range(n):
+        out[i], other[i] = x[i] * y[i], x[i] * z[i]
+
+
+@jit_rows
+def add_to_all(n: int, a: float, x: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = a + x[i]
+
+
+@jit_rows
+def settle(n: int, rest: float, error: FloatArray, w: FloatArray) -> None:
+    """Correct w by its error, of which the share `rest` is left."""
+    for i in range(n):
+        w[i] += error[i]
+        error[i] *= rest
+
+
+@jit_rows
 def sign_as(n: int, x: FloatArray, out: FloatArray) -> None:
     """Give each entry the sign of x."""
     for i in range(n):
@@ -123,35 +232,37 @@ def pulse_rows(
 
 
 @jit_rows
-def _doubled(n: int, decay: float, by: int, x: FloatArray, out: FloatArray) -> None:
-    """Decayed sums over twice as many increments: each sum plus that of the `by` increments before it."""
+def _of_four(n: int, decay: float, x: FloatArray, out: FloatArray) -> None:
+    """Decayed sums of four successive increments."""
+    two = decay * decay
+    three = two * decay
     for i in range(n):
-        out[PAD + i] = x[PAD + i] + decay * x[PAD + i - by]
+        out[PAD + i] = x[PAD + i] + decay * x[PAD + i - 1] + two * x[PAD + i - 2] + three * x[PAD + i - 3]
 
 
 @jit_rows
-def _by_eight(n: int, decay: float, x: FloatArray, w: FloatArray) -> None:
-    """Each entry of w from the one eight places before it and a sum of eight increments."""
+def _by_sixteen(n: int, four: float, x: FloatArray, w: FloatArray) -> None:
+    """Each entry of w from the one sixteen places before it and four sums of four increments."""
+    eight = four * four
+    twelve, sixteen = eight * four, eight * eight
     for i in range(min(n, PAD)):
-        w[i + 1] = x[i + PAD]
+        w[i + 1] = x[PAD + i] + four * x[PAD + i - 4] + eight * x[PAD + i - 8] + twelve * x[PAD + i - 12]
     for i in range(n - PAD):
-        w[i + 1 + PAD] = x[i + 2 * PAD] + decay * w[i + 1]
+        total = x[2 * PAD + i] + four * x[2 * PAD + i - 4] + eight * x[2 * PAD + i - 8] + twelve * x[2 * PAD + i - 12]
+        w[i + 1 + PAD] = total + sixteen * w[i + 1]
 
 
 @jit_within
 def recursion(n: int, decay: float, inc: FloatArray, other: FloatArray, w: FloatArray) -> None:
-    """Compute w[i + 1] = decay w[i] + inc[i], eight entries at a time.
+    """Compute w[i + 1] = decay w[i] + inc[i], sixteen entries at a time.
 
-    Decayed sums of 2, 4 and 8 successive increments come first, so that each entry then depends on the one eight places
-    before it, no longer on its neighbour. `inc` and `other` have `PAD` zeros in front; both are overwritten.
+    Decayed sums of successive increments come first, so that each entry then depends on the one sixteen places before
+    it, no longer on its neighbour. `inc` and `other` have `PAD` zeros in front; both are overwritten.
     """
     inc[PAD] += decay * w[0]
+    _of_four(n, decay, inc, other)
     two = decay * decay
-    four = two * two
-    _doubled(n, decay, 1, inc, other)
-    _doubled(n, two, 2, other, inc)
-    _doubled(n, four, 4, inc, other)
-    _by_eight(n, four * four, other, w)
+    _by_sixteen(n, two * two, other, w)
 
 
 @jit_rows
@@ -160,10 +271,23 @@ def area_rows(n: int, area: FloatArray, scale: float, shift: float, q0: float, u
     d = area.size - 1
     a, b, c, e, f = area[d], area[d - 1], area[d - 2], area[d - 3], area[d - 4]
     last = f - q0 if d == 4 else f
+    if d < 8:
+        for i in range(n):
+            x = abs(u[i]) * scale + shift
+            z[i] = (((a * x + b) * x + c) * x + e) * x + last
+        return
+    a4, a5, a6, a7 = area[d - 5], area[d - 6], area[d - 7], area[d - 8] - (q0 if d == 8 else 0.0)
+    if d < 12:
+        for i in range(n):
+            x = abs(u[i]) * scale + shift
+            z[i] = (((((((a * x + b) * x + c) * x + e) * x + f) * x + a4) * x + a5) * x + a6) * x + a7
+        return
+    a8, a9, a10, a11 = area[d - 9], area[d - 10], area[d - 11], area[d - 12] - (q0 if d == 12 else 0.0)
     for i in range(n):
         x = abs(u[i]) * scale + shift
-        z[i] = (((a * x + b) * x + c) * x + e) * x + last
-    for j in range(d - 4, 0, -4):
+        total = (((((((a * x + b) * x + c) * x + e) * x + f) * x + a4) * x + a5) * x + a6) * x + a7
+        z[i] = (((total * x + a8) * x + a9) * x + a10) * x + a11
+    for j in range(d - 12, 0, -4):
         b, c, e, f = area[j - 1], area[j - 2], area[j - 3], area[j - 4]
         last = f - q0 if j == 4 else f
         for i in range(n):
@@ -200,81 +324,18 @@ def newton_rows(
 
 
 @jit_rows
-def change_of(n: int, u: FloatArray, before: FloatArray) -> float:
-    """Upper bound of |u - before|, at most n^(1/8) times its maximum: twice that for 256 steps, 2.2 times for 512.
+def change_of(n: int, over: float, u: FloatArray, before: FloatArray) -> float:
+    """Upper bound of |u - before| times `over`, at most n^(1/16) times its maximum: 1.4 times that for 256 steps.
 
-    It is the eighth root of the sum of eighth powers, as vector instructions add several at once. `before` becomes u.
+    It is the sixteenth root of the sum of sixteenth powers, as vector instructions add several at once. `over` keeps
+    the powers within the range of numbers. `before` becomes u.
     """
     total = 0.0
     for i in range(n):
-        d = u[i] - before[i]
+        d = (u[i] - before[i]) * over
         before[i] = u[i]
         d *= d
         d *= d
+        d *= d
         total += d * d
-    return float(total**0.125)
-
-
-@jit_rows
-def crosses(n: int, u: FloatArray) -> bool:
-    """Whether some step crosses 0 V."""
-    found = False
-    for i in range(n):
-        found |= u[i] * u[i + 1] < 0.0
-    return found
-
-
-@jit_inline
-def crossing(a: float, m: float, b: float) -> tuple[float, float]:
-    """Fraction of a step at which u crosses 0 V, and the jump of the slope of |u| there (V per step; 0 if no crossing).
-
-    u is given at 0, 1/2 and 1 as a, m and b, and taken as straight in between.
-    """
-    early = a * m < 0.0
-    before, after = (a, m) if early else (m, b)
-    size = abs(before) + abs(after) + 1e-300
-    return (0.0 if early else 0.5) + 0.5 * abs(before) / size, 4.0 * size if a * b < 0.0 else 0.0
-
-
-@jit_rows
-def kink_rows(
-    n: int, kink: float, u: FloatArray, middle: FloatArray, x: FloatArray, at: FloatArray, out: FloatArray
-) -> None:  # fmt: skip
-    """Fraction of each step at which u crosses 0 V, into `at`, and the jump of the slope of kink |u| x, into `out`.
-
-    The jump is 0 where u does not cross 0 V.
-    """
-    for i in range(n):
-        place, jump = crossing(u[i], middle[i], u[i + 1])
-        at[i], out[i] = place, kink * jump * (x[i] + place * (x[i + 1] - x[i]))
-
-
-@jit_rows
-def add_kinks(
-    n: int, z: float, weight: FloatArray, feed: float, at: FloatArray, jump: FloatArray, out: FloatArray
-) -> None:
-    """Add a mode's exact response to a jump of the forcing's slope, less that to the parabola through 0, 1/2 and 1.
-
-    The mode has rate z per step; `weight` (2,) are its quadrature weights at 1/2 and 1. The response to the ramp that
-    begins at the jump is the square of the rest of the step times (y - 1 + exp(-y)) / y^2, y = z rest. A rational
-    approximation, right to 3e-4, is enough, as the correction itself is small.
-    """
-    by_middle, by_end = weight[0], weight[1]
-    for i in range(n):
-        rest = 1.0 - at[i]
-        y = z * rest
-        ramp = rest * rest * (1.0 + y * (0.32058491 + 0.06524308 * y))
-        ramp /= 2.0 + y * (1.31296923 + y * (0.38813995 + 0.06524308 * y))
-        out[i] += feed * jump[i] * (ramp - by_middle * max(0.5 - at[i], 0.0) - by_end * rest)
-
-
-@jit_rows
-def kink_at(
-    n: int, kink: float, place: float, u: FloatArray, middle: FloatArray, x: FloatArray, out: FloatArray
-) -> None:  # fmt: skip
-    """Subtract from interpolation errors at fraction `place` of the steps the known part that the kink causes."""
-    m, r = 4.0 * place * (1.0 - place), place * (2.0 * place - 1.0)
-    for i in range(n):
-        at, jump = crossing(u[i], middle[i], u[i + 1])
-        known = jump * (max(place - at, 0.0) - m * max(0.5 - at, 0.0) - r * (1.0 - at))
-        out[i] -= kink * known * (x[i] + at * (x[i + 1] - x[i]))
+    return float(total**0.0625)

@@ -14,8 +14,6 @@ from fingerspice.engine.blockforms import (
     ERROR_Q,
     ERROR_U,
     ERROR_V,
-    FIRST_QUARTER,
-    LAST_QUARTER,
     LEVEL,
     LEVELS,
     MARGIN,
@@ -29,11 +27,12 @@ from fingerspice.engine.blockforms import (
     Form,
 )
 from fingerspice.engine.blockoutput import write_block
-from fingerspice.engine.blockrows import add, add_two, area_rows, modes_into, recursion, scaled
+from fingerspice.engine.blockrows import add, add_to_all, area_rows, modes_into, recursion, scaled, settle
 from fingerspice.engine.model import ramp
 from fingerspice.engine.relaxation import (
     FIRST_NEWTON,
     LEAST_MARGIN,
+    NEWTON,
     SPARE,
     look_at_ends,
     misfit,
@@ -133,14 +132,7 @@ def _block_error(c: Course, r: int, level: int, n: int) -> float:
         recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.own[k])
     scaled(n + 1, 0.0, room.s, room.before)
     modes_into(n + 1, 0, form.taps[r, 0], room.own, room.before)
-    worst = largest_of(n + 1, room.before)
-    # In the middle of a step the interpolation error of its parabola has not cancelled yet.
-    for t in range(room.g.shape[0]):
-        early = form.early[r, level, t]
-        add_two(
-            n, early[0], room.g_within[FIRST_QUARTER, t], early[1], room.g_within[LAST_QUARTER, t], room.before
-        )  # fmt: skip
-    return max(worst, largest_of(n, room.before))
+    return largest_of(n + 1, room.before)
 
 
 @jit_within
@@ -158,11 +150,22 @@ def _largest_error(c: Course, rows: FloatArray, n: int) -> float:
 
 
 @jit_within
-def accept(c: Course, r: int, n: int, local: float, left_over: float, magnified: float) -> None:
+def correct(c: Course, r: int, n: int, rest: float) -> None:
+    """Correct the modes by the error seen, of which the share `rest` is left in `Room.own`; 1/A at the steps' ends."""
+    form, room = c.form, c.room
+    for k in range(c.w.size):
+        settle(n + 1, rest, room.own[k], room.w[k])
+    look_at_ends(form, room, r, n + 1, NEWTON)
+    add_to_all(n + 1, form.q0[r], room.z, c.charges.q[0])
+
+
+@jit_within
+def accept(c: Course, r: int, n: int, rest: float, local: float, left_over: float, magnified: float) -> None:
     """Account for the peaks and errors of an accepted block, and move to its end.
 
-    `local` is the error of the gap voltage that the block adds, V; `left_over` is its part from the iteration. Row 2 of
-    `Course.spare` has the decay of every mode over the block, and `Charges.h` the lengths of its steps.
+    `rest` is the share of the error in `Room.before` that is left. `local` is the error of the gap voltage that the
+    block adds, V; `left_over` is its part from the iteration. Row 2 of `Course.spare` has the decay of every mode over
+    the block, and `Charges.h` the lengths of its steps.
     """
     room, control = c.room, c.control
     carried = 0.0
@@ -177,7 +180,7 @@ def accept(c: Course, r: int, n: int, local: float, left_over: float, magnified:
     control[PEAK_U], control[PEAK_F] = max(control[PEAK_U], peak), max(control[PEAK_F], force)
     off_u = local + magnified * carried
     # The force is proportional to the square of the voltage, and depends a little on the area.
-    off = magnified * worst + steepest * (left_over + magnified * carried)
+    off = rest * magnified * worst + steepest * (left_over + magnified * carried)
     control[ERROR_U] = max(control[ERROR_U], off_u)
     control[ERROR_F] = max(control[ERROR_F], 2.2 * off)
     # An error of the gap voltage changes the area, and thereby other voltages.
@@ -212,7 +215,7 @@ def march(
     while at < stop:
         level, r = int(control[LEVEL]), int(control[REFERENCE])
         sub = 1 << level
-        h, count = spacing / sub, min(BLOCK >> level, stop - at)
+        h, count, rest = spacing / sub, min(BLOCK >> level, stop - at), form.rest[r, level]
         n = count * sub
         _sources(values, at, count, sub, room.s)
         for k in range(c.w.size):
@@ -231,11 +234,11 @@ def march(
         closed, local, magnified = left_over < math.inf, math.inf, steepest
         if closed:
             misfit(form, room, r, level, h, c.shown.kink, n)
-            area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
             if form.mobile:
+                area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
                 # The gap voltage contains the state times 1/A, and a near fold magnifies its error.
                 magnified = form.area0 * largest_of(n + 1, c.charges.q[0]) / margin
-            local = left_over + magnified * _block_error(c, r, level, n)
+            local = left_over + rest * magnified * _block_error(c, r, level, n)
         if not local <= tol:
             if level + 1 == LEVELS or margin <= LEAST_MARGIN:
                 return TOO_COARSE if closed else NOT_CLOSED
@@ -248,9 +251,10 @@ def march(
             c.spare[2, k] = form.decay[r, level, k] ** n
         for i in range(n):
             c.charges.h[i] = h
+        correct(c, r, n, rest)
         if c.shown.charge:
             project_for_charge(form, room, r, level, n)
-        accept(c, r, n, local, left_over, magnified)
+        accept(c, r, n, rest, local, left_over, magnified)
         write_block(c, r, sub, count, h, start + at * spacing, t_out, out)
         at += count
         if level > 0 and local < SPARE * tol:

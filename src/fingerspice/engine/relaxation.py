@@ -11,8 +11,9 @@ In a network the area also changes the finger's displacement current, as in `sol
 follows from xi = tap w + tap U, which is 0 with it, by u + kappa N(u) = xi, and N is one more drive and part of each
 tap. 1/A and N are polynomials in |xi|, and what is said here of u holds for xi.
 
-1/A has a kink where the gap voltage is 0. In a step across it the parabola misses kappa times |u| less the parabola of
-|u|, with kappa = dg/d|u|. The response to this difference is known in closed form, and is added.
+1/A has a kink where the gap voltage is 0, so that g contains kink |u| x, with x the voltage that q multiplies. u and x
+are almost straight lines across the kink. What begins of |u| x there, a straight line and a square, is known; the
+modes' response to it, less that to the parabola through it, is known in closed form, and is added.
 
 In a network a mode may decay within a small part of a step. After each sample, where the slope of the source jumps, N
 then has a part a exp(-rate t) that no parabola shows. Its size a follows from the slope of N at the start of the step,
@@ -30,45 +31,50 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_within
+from fingerspice.engine.blockcharge import inverse_area_at
 from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, PLACES, Form, Room
+from fingerspice.engine.blockkinks import add_kinks, crosses, kink_at, kink_rows
 from fingerspice.engine.blockrows import (
     PAD,
     add,
-    add_kinks,
     add_three,
     add_two,
     area_rows,
     both_ends,
     change_of,
-    crosses,
     drives_into,
-    kink_at,
-    kink_rows,
+    forced_by,
     modes_into,
+    modes_into_three,
     newton_rows,
-    of_end,
-    of_step,
+    of_source_and_modes,
+    of_two,
     product_of,
+    products_of,
     pulse_rows,
     recursion,
     scaled,
     sign_as,
+    sum_of,
+    three_at_ends,
+    three_within,
 )
 
 # Weights of the parabola through 0, 1/2 and 1 at these places.
 PARABOLA = np.array([[0.0, 1.0, 0.0], [0.375, 0.75, -0.125], [-0.125, 0.75, 0.375]])
 # Most sweeps of a block, and the fraction of the error allowed that the last one may leave.
-_MOST_SWEEPS, _LEFT = 40, 0.25
-# Smallest ratio assumed between the errors of two sweeps: the first sweeps may converge faster than the later ones.
-_SLOWEST = 0.05
+MOST_SWEEPS, LEFT = 40, 0.5
+# Smallest ratio assumed between the errors of two sweeps, and its factor in networks: the first sweeps may converge
+# faster than the later ones, and in networks other voltages than that of the gap converge more slowly.
+SLOWEST, SLOWER = 0.01, 4.0
 # First sweep in which the places of the kinks and the rate of convergence are known well enough.
-_KINKED = 2
+KINKED = 1
 # Newton steps for the gap voltage under `mobile`, in the first sweep and in later ones; and the smallest distance to
 # the fold at which they are safe.
-FIRST_NEWTON, _NEWTON, LEAST_MARGIN = 6, 2, 0.2
+FIRST_NEWTON, NEWTON, LEAST_MARGIN = 6, 2, 0.2
 # If the error is below this fraction of the one allowed, the next block has steps twice as long, whose error is sixteen
 # times as large.
-SPARE = 0.02
+SPARE = 0.04
 
 
 @jit_within
@@ -76,7 +82,10 @@ def _drives(
     form: Form, q0: float, n: int, newton: int, s: FloatArray, x: FloatArray, u: FloatArray, z: FloatArray,
     slope: FloatArray, g: FloatArray,
 ) -> float:  # fmt: skip
-    """Gap voltages and drives from the projections x (P, n); the least distance to the fold."""
+    """Drives from the projections x (P, n); the least distance to the fold.
+
+    The gap voltages u follow from the first projection under `mobile`, and are given otherwise.
+    """
     margin = 1.0
     drives = g.shape[0]
     if form.mobile:
@@ -85,9 +94,6 @@ def _drives(
                 n, form.area, form.scale, form.shift, form.k_gap, form.area0, s, x[0], u, z, slope
             )  # fmt: skip
         drives -= 1
-    else:
-        for i in range(n):
-            u[i] = x[0, i]
     area_rows(n, form.area, form.scale, form.shift, q0, u, z)
     if form.bend.size > 0:
         drives -= 1
@@ -95,7 +101,11 @@ def _drives(
         sign_as(n, u, g[drives])
         for t in range(drives):
             add(n, form.bent[t], g[drives], x[1 + t])
-    for t in range(drives):
+    t = 0
+    while t + 1 < drives:
+        products_of(n, z, x[1 + t], g[t], x[2 + t], g[1 + t])
+        t += 2
+    if t < drives:
         product_of(n, z, x[1 + t], g[t])
     if form.mobile:
         last, share = g[drives], x[1 + drives]
@@ -106,9 +116,9 @@ def _drives(
 
 @jit_within
 def drives_at(form: Form, r: int, n: int, room: Room, place: int) -> float:
-    """Gap voltages and drives at one place within the steps, from its projections; the least distance to the fold."""
+    """Drives at one place within the steps, from its projections and gap voltages; the least distance to the fold."""
     return _drives(
-        form, form.q0[r], n, _NEWTON, room.s_within, room.within[place], room.u_within[place], room.z, room.slope,
+        form, form.q0[r], n, NEWTON, room.s_within, room.within[place], room.u_within[place], room.z, room.slope,
         room.g_within[place],
     )  # fmt: skip
 
@@ -116,23 +126,46 @@ def drives_at(form: Form, r: int, n: int, room: Room, place: int) -> float:
 @jit_within
 def _project(form: Form, room: Room, r: int, level: int, place: int, n: int, p: int) -> None:
     """Projection p at one place within the steps."""
-    x, c = room.within[place, p], form.within[r, level, place, p]
-    if c.size > 1:
-        of_step(n, form.within_s[r, level, place, p], room.s, c[0], room.w[0], c[1], room.w[1], x)
-    else:
-        both_ends(n, form.within_s[r, level, place, p, 0], form.within_s[r, level, place, p, 1], room.s, x)
-        add(n, c[0], room.w[0], x)
-    modes_into(n, 2, c, room.w, x)
-    drives_into(n, form.within_g[r, level, place, p], room.g, room.g_within[MIDDLE], x)
+    x = _row_within(form, room, place, p)
+    by_s, by_g = form.within_s[r, level, place, p], form.within_g[r, level, place, p]
+    forced_by(n, by_s, by_g, room.s, room.g, room.g_within[MIDDLE], x)
+    modes_into(n, 0, form.within[r, level, place, p], room.w, x)
     if form.faded[r, level] > 0.0:
         add(n, form.pulse_within[r, level, place, p], room.pulse, x)
 
 
 @jit_within
+def _row_within(form: Form, room: Room, place: int, p: int) -> FloatArray:
+    """Where projection p goes: the first one is the gap voltage, but for `mobile`."""
+    row: FloatArray = room.within[place, p] if form.mobile or p > 0 else room.u_within[place]
+    return row
+
+
+@jit_within
+def _project_three(form: Form, room: Room, r: int, level: int, place: int, n: int) -> None:
+    """The first three projections at one place within the steps, of two modes and two drives or more."""
+    x, y, z = _row_within(form, room, place, 0), room.within[place, 1], room.within[place, 2]
+    by_w, by_g = form.within[r, level, place], form.within_g[r, level, place]
+    three_within(n, form.within_s[r, level, place], by_w, by_g, room.s, room.w, room.g, room.g_within[MIDDLE], x, y, z)
+    modes_into_three(n, by_w, room.w, x, y, z)
+    drives_into(n, 2, by_g[0], room.g, room.g_within[MIDDLE], x)
+    drives_into(n, 2, by_g[1], room.g, room.g_within[MIDDLE], y)
+    drives_into(n, 2, by_g[2], room.g, room.g_within[MIDDLE], z)
+    if form.faded[r, level] > 0.0:
+        by_pulse = form.pulse_within[r, level, place]
+        add(n, by_pulse[0], room.pulse, x)
+        add(n, by_pulse[1], room.pulse, y)
+        add(n, by_pulse[2], room.pulse, z)
+
+
+@jit_within
 def _look(form: Form, room: Room, r: int, level: int, place: int, n: int, newton: int) -> float:
     """Gap voltages and drives at one place within the steps; the least distance to the fold."""
-    g = room.g_within[place]
-    for p in range(1 + g.shape[0]):
+    g, first = room.g_within[place], 0
+    if form.rates.shape[1] > 1 and g.shape[0] > 1:
+        _project_three(form, room, r, level, place, n)
+        first = 3
+    for p in range(first, 1 + g.shape[0]):
         _project(form, room, r, level, place, n, p)
     if form.mobile:
         both_ends(n, 1.0 - PLACES[place], PLACES[place], room.s, room.s_within)
@@ -144,19 +177,19 @@ def _look(form: Form, room: Room, r: int, level: int, place: int, n: int, newton
 @jit_within
 def project_at_ends(form: Form, room: Room, r: int, n: int, p: int) -> None:
     """Projection p at the ends of the steps."""
-    c, x = form.taps[r, p], room.end[p]
-    if c.size > 1:
-        of_end(n, form.tap_s[p], room.s, c[0], room.w[0], c[1], room.w[1], x)
-    else:
-        scaled(n, form.tap_s[p], room.s, x)
-        add(n, c[0], room.w[0], x)
-    modes_into(n, 2, c, room.w, x)
+    c, x = form.taps[r, p], room.end[p] if form.mobile or p > 0 else room.u
+    of_source_and_modes(n, form.tap_s[p], room.s, c, room.w, x)
 
 
 @jit_within
 def look_at_ends(form: Form, room: Room, r: int, n: int, newton: int) -> float:
     """Gap voltages and drives at the ends of the steps."""
-    for p in range(1 + room.g.shape[0]):
+    first = 0
+    if form.rates.shape[1] > 1 and room.g.shape[0] > 1:
+        first, x = 3, room.end[0] if form.mobile else room.u
+        three_at_ends(n, form.tap_s, form.taps[r], room.s, room.w, x, room.end[1], room.end[2])
+        modes_into_three(n, form.taps[r], room.w, x, room.end[1], room.end[2])
+    for p in range(first, 1 + room.g.shape[0]):
         project_at_ends(form, room, r, n, p)
     return _drives(form, form.q0[r], n, newton, room.s, room.end, room.u, room.z, room.slope, room.g)
 
@@ -171,15 +204,30 @@ def project_for_charge(form: Form, room: Room, r: int, level: int, n: int) -> No
 
 
 @jit_within
-def _kinks(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
+def _find_kinks(form: Form, room: Room, n: int) -> None:
+    """Crossings of 0 V, and the jumps of the slope of |u| there.
+
+    Under `mobile` u is bent there, too. What it would be with the area at 0 V is not, and crosses 0 V at the same time.
+    """
+    if not form.mobile:
+        kink_rows(n, room.u, room.u_within[MIDDLE], room.crossed, room.jumps, room.bends)
+        return
+    share, middle = form.area0 * inverse_area_at(form, 0.0)[0], room.other[PAD:]
+    of_two(n + 1, form.k_gap, room.s, share, room.end[0], room.slope)
+    both_ends(n, 0.5 * form.k_gap, 0.5 * form.k_gap, room.s, middle)
+    add(n, share, room.within[MIDDLE, 0], middle)
+    kink_rows(n, room.slope, middle, room.crossed, room.jumps, room.bends)
+
+
+@jit_within
+def _kinks(form: Form, room: Room, r: int, level: int, h: float, n: int) -> None:
     """Add the response to the kink that the parabolas miss to `room.inc`."""
-    for t in range(kink.size):
-        kink_rows(n, h * kink[t], room.u, room.u_within[MIDDLE], room.end[1 + t], room.crossed, room.jumps)
-        for k in range(form.rates.shape[1]):
-            add_kinks(
-                n, form.rates[r, k] * h, form.share[r, level, k], form.feed[r, k, t], room.crossed, room.jumps,
-                room.inc[k, PAD:],
-            )  # fmt: skip
+    x = room.slope
+    _find_kinks(form, room, n)
+    for k in range(form.rates.shape[1]):
+        sum_of(n + 1, room.kinked[k], room.end[1:], x)
+        z, share = form.rates[r, k] * h, form.share[r, level, k]
+        add_kinks(n, z, share, room.crossed, room.jumps, room.bends, x, room.inc[k, PAD:])
 
 
 @jit_within
@@ -218,21 +266,26 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
         room.u[i] = room.before[i] = form.k_gap * room.s[i] + charged
     for i in range(n):
         room.u_within[MIDDLE, i] = 0.5 * (room.u[i] + room.u[i + 1])
-    last, margin = math.inf, 1.0
+    for k in range(modes):
+        for t in range(drives):
+            room.kinked[k, t] = h * form.feed[r, k, t] * kink[t]
+    last, margin, over = math.inf, 1.0, 1.0 / tol if tol > 0.0 else 1.0
+    slowest = SLOWEST * (SLOWER if form.bend.size > 0 else 1.0)
     fades = form.faded[r, level] > 0.0
     scaled(n, 0.0, room.s, room.pulse)
-    for sweep in range(_MOST_SWEEPS):
+    for sweep in range(MOST_SWEEPS):
         for k in range(modes):
             own = room.inc[k, PAD:]
-            both_ends(n, form.source[r, level, k, 0], form.source[r, level, k, 1], room.s, own)
-            drives_into(n, form.drive[r, level, k], room.g, room.g_within[MIDDLE], own)
+            forced_by(
+                n, form.source[r, level, k], form.drive[r, level, k], room.s, room.g, room.g_within[MIDDLE], own
+            )  # fmt: skip
             if fades:
                 add(n, form.pulse[r, level, k], room.pulse, own)
-        if sweep >= _KINKED and crosses(n, room.u):
-            _kinks(form, room, r, level, h, kink, n)
+        if sweep >= KINKED and crosses(n, room.u):
+            _kinks(form, room, r, level, h, n)
         for k in range(modes):
             recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.w[k])
-        newton = FIRST_NEWTON if sweep == 0 else _NEWTON
+        newton = FIRST_NEWTON if sweep == 0 else NEWTON
         margin = _look(form, room, r, level, MIDDLE, n, newton)
         margin = min(margin, look_at_ends(form, room, r, n + 1, newton))
         if fades:
@@ -242,32 +295,33 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
         if not abs(room.u[n]) < math.inf:
             # A NaN within the block has been carried to its end by the recursion.
             return math.inf, margin, sweep
-        change = change_of(n + 1, room.u, room.before)
+        change = change_of(n + 1, over, room.u, room.before) / over
         if sweep > 0:
-            ratio = max(change / last, _SLOWEST) if last > 0.0 else 0.0
+            ratio = max(change / last, slowest) if last > 0.0 else 0.0
             if not ratio < 0.9 and change > tol:
                 return math.inf, margin, sweep
             # The remaining error falls by about the same ratio.
-            left = 2.0 * change * ratio
-            if left <= _LEFT * tol and sweep >= _KINKED:
+            left = change * ratio
+            if left <= LEFT * tol and sweep >= KINKED:
                 return left, margin, sweep
         last = change
-    return math.inf, margin, _MOST_SWEEPS
+    return math.inf, margin, MOST_SWEEPS
 
 
 @jit_within
 def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
     """Error of the modes that each step adds, into `room.inc`: Boole's rule less Simpson's."""
     crossing = crosses(n, room.u)
+    if crossing:
+        _find_kinks(form, room, n)
     for k in range(form.rates.shape[1]):
-        for i in range(n):
-            room.inc[k, PAD + i] = 0.0
+        scaled(n, 0.0, room.s, room.inc[k, PAD:])
     for place in (FIRST_QUARTER, LAST_QUARTER):
         if form.mobile:
             weight = PARABOLA[place]
             both_ends(n, weight[0], weight[2], room.u, room.u_within[place])
             add(n, weight[1], room.u_within[MIDDLE], room.u_within[place])
-        _look(form, room, r, level, place, n, _NEWTON)
+        _look(form, room, r, level, place, n, NEWTON)
         for t in range(room.g.shape[0]):
             off, weight = room.g_within[place, t], PARABOLA[place]
             add_three(
@@ -279,6 +333,9 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
                 shown = weight[0] + weight[1] * math.exp(-0.5 * faded) + weight[2] * math.exp(-faded)
                 add(n, shown - math.exp(-faded * PLACES[place]), room.pulse, off)
             if crossing:
-                kink_at(n, kink[t], PLACES[place], room.u, room.u_within[MIDDLE], room.end[1 + t], off)
-            for k in range(form.rates.shape[1]):
-                add(n, form.defect[r, level, k, t, place - FIRST_QUARTER], off, room.inc[k, PAD:])
+                kink_at(n, kink[t], PLACES[place], room.crossed, room.jumps, room.bends, room.end[1 + t], off)
+    early, late = room.g_within[FIRST_QUARTER], room.g_within[LAST_QUARTER]
+    for k in range(form.rates.shape[1]):
+        by = form.defect[r, level, k]
+        for t in range(room.g.shape[0]):
+            add_two(n, by[t, 0], early[t], by[t, 1], late[t], room.inc[k, PAD:])

@@ -27,26 +27,40 @@ from fingerspice.engine.blockforms import (
     Form,
     Room,
 )
+from fingerspice.engine.blockkinks import after_kink, crosses, kink_at, kink_rows
 from fingerspice.engine.blockoutput import write_points, write_samples
 from fingerspice.engine.blockrows import (
-    add,
     add_three,
-    area_rows,
     change_of,
-    crosses,
-    kink_at,
-    kink_rows,
     modes_into,
     scaled,
+    sum_of,
 )
-from fingerspice.engine.recording import DONE, NOT_CLOSED, TOO_COARSE, accept, go_over, largest_of, nearest
-from fingerspice.engine.relaxation import PARABOLA, SPARE, drives_at, look_at_ends, project_at_ends
+from fingerspice.engine.recording import (
+    DONE,
+    NOT_CLOSED,
+    TOO_COARSE,
+    accept,
+    correct,
+    go_over,
+    largest_of,
+    nearest,
+)
+from fingerspice.engine.relaxation import (
+    KINKED,
+    LEFT,
+    MOST_SWEEPS,
+    PARABOLA,
+    SLOWEST,
+    SPARE,
+    drives_at,
+    look_at_ends,
+    project_at_ends,
+)
 from fingerspice.engine.unevenweights import END, EVERY_PLACE, Steps, weigh
 
 # Largest number of halvings of a step.
 MOST_HALVINGS = 4
-# As in `engine.relaxation`.
-_MOST_SWEEPS, _LEFT, _SLOWEST, _KINKED = 40, 0.25, 0.05, 2
 
 
 @jit_rows
@@ -81,15 +95,24 @@ def _between(n: int, at: float, s: FloatArray, out: FloatArray) -> None:
 
 @jit_rows
 def _add_kinks(
-    n: int, rate: float, h: FloatArray, c: FloatArray, feed: float, at: FloatArray, jump: FloatArray, out: FloatArray
+    n: int,
+    rate: float,
+    h: FloatArray,
+    c: FloatArray,
+    at: FloatArray,
+    jump: FloatArray,
+    bend: FloatArray,
+    x: FloatArray,
+    out: FloatArray,
 ) -> None:
     """As `blockrows.add_kinks`, for steps of different lengths with the weights c (3, n) of their parabolas."""
     for i in range(n):
-        rest = 1.0 - at[i]
-        y = rate * h[i] * rest
-        ramp = rest * rest * (1.0 + y * (0.32058491 + 0.06524308 * y))
-        ramp /= 2.0 + y * (1.31296923 + y * (0.38813995 + 0.06524308 * y))
-        out[i] += feed * jump[i] * (h[i] * ramp - c[1, i] * max(0.5 - at[i], 0.0) - c[2, i] * rest)
+        rest, early, slope = 1.0 - at[i], max(0.5 - at[i], 0.0), x[i + 1] - x[i]
+        ramp, square = after_kink(rate * h[i] * rest, rest)
+        ramp = h[i] * ramp - c[1, i] * early - c[2, i] * rest
+        square = h[i] * square - c[1, i] * early * early - c[2, i] * rest * rest
+        there = x[i] + at[i] * slope
+        out[i] += jump[i] * (there * ramp + (slope + bend[i] * there) * square)
 
 
 @jit_rows
@@ -112,6 +135,7 @@ def _look(form: Form, room: Room, steps: Steps, r: int, place: int, n: int, last
         )  # fmt: skip
     for p in range(last):
         modes_into(n, 0, form.taps[r, p], steps.w, x[p])
+    scaled(n, 1.0, x[0], room.u_within[place])
     drives_at(form, r, n, room, place)
 
 
@@ -131,8 +155,11 @@ def _relax(
         room.u[i] = room.before[i] = form.k_gap * room.s[i] + charged
     for i in range(n):
         room.u_within[MIDDLE, i] = 0.5 * (room.u[i] + room.u[i + 1])
-    last = math.inf
-    for sweep in range(_MOST_SWEEPS):
+    for k in range(modes):
+        for t in range(drives):
+            room.kinked[k, t] = form.feed[r, k, t] * kink[t]
+    last, over = math.inf, 1.0 / tol if tol > 0.0 else 1.0
+    for sweep in range(MOST_SWEEPS):
         for k in range(modes):
             scaled(n + 1, form.gain[r, k], room.s, steps.forced[k])
             modes_into(n + 1, 0, form.feed[r, k], room.g, steps.forced[k])
@@ -140,30 +167,30 @@ def _relax(
             scaled(n, form.gain[r, k], steps.low, steps.forced_within[k])
             modes_into(n, 0, form.feed[r, k], room.g_within[MIDDLE], steps.forced_within[k])
             _increments(n, steps.parabola[k, END], steps.forced[k], steps.forced_within[k], room.inc[k])
-        if sweep >= _KINKED and crosses(n, room.u):
-            for t in range(drives):
-                kink_rows(n, kink[t], room.u, room.u_within[MIDDLE], room.end[1 + t], room.crossed, room.jumps)
-                for k in range(modes):
-                    _add_kinks(
-                        n, form.rates[r, k], h, steps.parabola[k, END], form.feed[r, k, t], room.crossed,
-                        room.jumps, room.inc[k],
-                    )  # fmt: skip
+        if sweep >= KINKED and crosses(n, room.u):
+            kink_rows(n, room.u, room.u_within[MIDDLE], room.crossed, room.jumps, room.bends)
+            for k in range(modes):
+                sum_of(n + 1, room.kinked[k], room.end[1:], room.slope)
+                _add_kinks(
+                    n, form.rates[r, k], h, steps.parabola[k, END], room.crossed, room.jumps, room.bends, room.slope,
+                    room.inc[k],
+                )  # fmt: skip
         for k in range(modes):
             _pass(n, steps.decay[k, END], room.inc[k], room.w[k])
         _look(form, room, steps, r, MIDDLE, n, 1 + drives)
         look_at_ends(form, room, r, n + 1, 0)
         if not abs(room.u[n]) < math.inf:
             return math.inf, sweep
-        change = change_of(n + 1, room.u, room.before)
+        change = change_of(n + 1, over, room.u, room.before) / over
         if sweep > 0:
-            ratio = max(change / last, _SLOWEST) if last > 0.0 else 0.0
+            ratio = max(change / last, SLOWEST) if last > 0.0 else 0.0
             if not ratio < 0.9 and change > tol:
                 return math.inf, sweep
-            left = 2.0 * change * ratio
-            if left <= _LEFT * tol and sweep >= _KINKED:
+            left = change * ratio
+            if left <= LEFT * tol and sweep >= KINKED:
                 return left, sweep
         last = change
-    return math.inf, _MOST_SWEEPS
+    return math.inf, MOST_SWEEPS
 
 
 @jit_within
@@ -171,9 +198,10 @@ def _misfit(form: Form, room: Room, steps: Steps, r: int, kink: FloatArray, n: i
     """Error of the modes into `Room.own`, that of the gap voltage into `Room.before`, and the largest of that (V)."""
     modes = form.rates.shape[1]
     bends = crosses(n, room.u)
+    if bends:
+        kink_rows(n, room.u, room.u_within[MIDDLE], room.crossed, room.jumps, room.bends)
     for k in range(modes):
         scaled(n, 0.0, room.s, room.inc[k])
-    scaled(n + 1, 0.0, room.s, steps.low)
     for place in (FIRST_QUARTER, LAST_QUARTER):
         _look(form, room, steps, r, place, n, taps)
         for t in range(room.g.shape[0]):
@@ -182,21 +210,16 @@ def _misfit(form: Form, room: Room, steps: Steps, r: int, kink: FloatArray, n: i
                 n, -weight[0], room.g[t], -weight[1], room.g_within[MIDDLE, t], -weight[2], room.g[t, 1:], off
             )  # fmt: skip
             if bends:
-                kink_at(n, kink[t], PLACES[place], room.u, room.u_within[MIDDLE], room.end[1 + t], off)
+                kink_at(n, kink[t], PLACES[place], room.crossed, room.jumps, room.bends, room.end[1 + t], off)
             for k in range(modes):
                 feed = form.feed[r, k, t]
-                _add_product(n, feed, steps.quarter[k, 1, place - FIRST_QUARTER], off, room.inc[k])
-                share = form.taps[r, 0, k] * feed
-                _add_product(n, share, steps.quarter[k, 0, place - FIRST_QUARTER], off, steps.low)
+                _add_product(n, feed, steps.quarter[k, place - FIRST_QUARTER], off, room.inc[k])
     scaled(n + 1, 0.0, room.s, room.before)
     for k in range(modes):
         room.own[k, 0] = 0.0
         _pass(n, steps.decay[k, END], room.inc[k], room.own[k])
     modes_into(n + 1, 0, form.taps[r, 0], room.own, room.before)
-    worst = largest_of(n + 1, room.before)
-    # In the middle of a step the interpolation error of its parabola has not cancelled yet.
-    add(n, 1.0, steps.low, room.before)
-    return max(worst, largest_of(n, room.before))
+    return largest_of(n + 1, room.before)
 
 
 @jit
@@ -245,7 +268,8 @@ def march(
     taps = form.tap_s.size if c.shown.charge else 1 + drives
     while at < stop:
         level, r = int(control[LEVEL]), int(control[REFERENCE])
-        sub = 1 << level
+        # Longer steps than the mean have faster modes by far less than the difference between both shares.
+        sub, rest = 1 << level, form.rest[r, level]
         count = min(BLOCK >> level, stop - at)
         n = count * sub
         _load(times, values, at, count, sub, room, c.charges)
@@ -264,8 +288,7 @@ def march(
         c.counters[SWEEPS] += sweeps
         closed, local = left_over < math.inf, math.inf
         if closed:
-            local = left_over + _misfit(form, room, steps, r, c.shown.kink, n, taps)
-            area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
+            local = left_over + rest * _misfit(form, room, steps, r, c.shown.kink, n, taps)
         if not local <= tol:
             if level == MOST_HALVINGS:
                 return TOO_COARSE if closed else NOT_CLOSED
@@ -278,11 +301,12 @@ def march(
             for i in range(n):
                 passed *= steps.decay[k, END, i]
             c.spare[2, k] = passed
+        correct(c, r, n, rest)
         if c.shown.charge:
             _look(form, room, steps, r, MIDDLE, n, taps)
             for p in range(1 + drives, taps):
                 project_at_ends(form, room, r, n + 1, p)
-        accept(c, r, n, local, left_over, 1.0)
+        accept(c, r, n, rest, local, left_over, 1.0)
         _write(c, r, sub, count, t_out, out)
         at += count
         if level > 0 and local < SPARE * tol:

@@ -41,8 +41,8 @@ class Steps(NamedTuple):
         Over the part of a step up to the place.
     parabola : ndarray, shape (m, 4, 3, n)
         Contribution of a forcing at 0, 1/2 and 1, s.
-    quarter : ndarray, shape (m, 2, 2, n)
-        Contribution of the errors at the quarters to the middle and to the end, s.
+    quarter : ndarray, shape (m, 2, n)
+        Contribution of the errors at the quarters to the end, s.
     forced, forced_within : ndarray, shape (m, n)
         Forcing of the modes at the ends and in the middle of the steps.
     w : ndarray, shape (m, n)
@@ -66,7 +66,7 @@ def new_steps(modes: int) -> Steps:
     """Room for the weights of so many modes."""
     n = BLOCK + 8
     return Steps(
-        np.zeros((modes, 4, n)), np.zeros((modes, 4, 3, n)), np.zeros((modes, 2, 2, n)),
+        np.zeros((modes, 4, n)), np.zeros((modes, 4, 3, n)), np.zeros((modes, 2, n)),
         np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((5, n)), np.zeros(n),
     )  # fmt: skip
 
@@ -133,11 +133,10 @@ def _parabolas(n: int, at: float, h: FloatArray, m: FloatArray, out: FloatArray)
 
 
 @jit_rows
-def _quartics(n: int, at: float, h: FloatArray, m: FloatArray, c: FloatArray, out: FloatArray) -> None:
-    """Weights up to the place `at` of a quartic with the coefficients c, from that of the power 1 on."""
-    c1, c2, c3, c4 = c[0] * at * at, c[1] * at**3, c[2] * at**4, c[3] * at**5
+def _quartics(n: int, h: FloatArray, m: FloatArray, c: FloatArray, out: FloatArray) -> None:
+    """Weights of a quartic with the coefficients c, from that of the power 1 on."""
     for i in range(n):
-        out[i] = h[i] * (c1 * m[1, i] + c2 * m[2, i] + c3 * m[3, i] + c4 * m[4, i])
+        out[i] = h[i] * (c[0] * m[1, i] + c[1] * m[2, i] + c[2] * m[3, i] + c[3] * m[4, i])
 
 
 @jit_within
@@ -155,12 +154,12 @@ def weigh(form: Form, steps: Steps, h: FloatArray, r: int, n: int) -> None:
                 term *= y / j
             terms += 1
         for place in range(EVERY_PLACE.size):
-            at, inner = EVERY_PLACE[place], place in (FIRST_QUARTER, LAST_QUARTER)
-            m = steps.moments[:3] if inner else steps.moments
-            _series(n, terms, _THREE if inner else _FIVE, rate * at, h, m[m.shape[0] - 1])
+            at, last = EVERY_PLACE[place], place == END
+            m = steps.moments if last else steps.moments[:3]
+            _series(n, terms, _FIVE if last else _THREE, rate * at, h, m[m.shape[0] - 1])
             _early(n, rate * at, h, decay[place], m)
             if rate * at * longest >= _LATE:
                 _late(n, rate * at, h, decay[place], m)
             _parabolas(n, at, h, m, steps.parabola[k, place])
-            for quarter in range(0 if inner else 2):
-                _quartics(n, at, h, m, _QUARTERS[quarter], steps.quarter[k, 1 if place == END else 0, quarter])
+            for quarter in range(2 if last else 0):
+                _quartics(n, h, m, _QUARTERS[quarter], steps.quarter[k, quarter])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -207,8 +207,7 @@ def _finished(
         largest = max(largest, float(np.abs(rows[:, : problem.network.k.shape[0]]).max(initial=0.0)))
     rounding = (ROUNDING_OF_MATRICES if problem.scene.stack is None else ROUNDING) * largest
     gaps = []
-    for u, f in gap_signals(run.record(problem)):
-        peak, force = float(np.abs(u).max(initial=0.0)), float(f.max(initial=0.0))
+    for peak, force in _peaks(run.record(problem)):
         share = rounding / peak if peak > 0.0 else 0.0
         gaps.append((peak, force, rounding + bound * peak, (2.0 * share + 3.0 * bound) * force))
     run.gaps = np.array(gaps or [(0.0, 0.0, rounding, 0.0)])
@@ -218,6 +217,20 @@ def _finished(
         look = partial(_look, dataclasses.replace(problem, charge=False), solve)
         run.continuous = ClosedForm(look, problem.waveform, problem.t_start, problem.first, problem.t_stop)
     return run
+
+
+def _peaks(record: Record) -> Iterator[tuple[float, float]]:
+    """Largest voltage (V) and force (N) of every gap, as of `gap_signals`."""
+    for i, (place, (_, contact)) in enumerate(zip(record.network.fingers, record.fingers, strict=True)):
+        u = record.finger_voltage(i)
+        peak = max(float(u.max(initial=0.0)), -float(u.min(initial=0.0)))
+        if record.net.gap[place] < 0 and record.net.slow[place] < 0:
+            # The area is fixed: the force grows with the voltage.
+            yield peak, float(contact.stress(peak) * record.net.area0[place])
+        else:
+            yield peak, float(record.finger_force(i).max(initial=0.0))
+    if not record.fingers:
+        yield from ((float(np.abs(u).max(initial=0.0)), 0.0) for u, _ in gap_signals(record))
 
 
 def _look(problem: Problem, solve: Callable[..., Run], t: FloatArray, left: BoolArray) -> Record:

@@ -32,6 +32,10 @@ from fingerspice.solve.track import Prepared, as_recorded, on_branch, prepare_sy
 AREA_SHARE = 0.02
 # Time constants in a step from which on a fast mode is taken apart from the parabola, which resolves slower ones.
 FADED = 5.0
+# Time constants in a step up to which the quarters show the error of a mode well, and the share of the error that may be
+# left once the modes are corrected for it: with faster modes, or under `mobile`, where the gap voltage itself has a kink;
+# and otherwise.
+RESOLVED, RESTS = 1.0, (0.7, 0.3)
 # Matrix from values at Chebyshev nodes to the Chebyshev coefficients of the antiderivative of their interpolant.
 _POINTS = 40
 _AT = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
@@ -111,17 +115,21 @@ def weighted(
     )
     faded = np.zeros(z.shape[:2]) if fast < 0 else np.where(z[..., fast] > FADED, z[..., fast], 0.0)
     # To the modes at fractions of a step, from the part exp(-faded x) of the last drive.
-    passed = [_pulse(z, faded, at) for at in (1.0, *PLACES)]
-    pulse, *pulses = (feed[:, None, :, -1] * h * one for one in passed) if faded.any() else [np.zeros(z.shape)] * 4
+    pulse, *pulses = [np.zeros(z.shape)] * 4
+    if faded.any():
+        pulse, *pulses = (feed[:, None, :, -1] * h * _pulse(z, faded, at) for at in (1.0, *PLACES))
     pulse_within = np.stack([np.einsum("rpk,rsk->rsp", taps, one) for one in pulses], axis=2)
     five = (0.0, 0.25, 0.5, 0.75, 1.0)
-    quarters, early = (weights(z, five, until)[..., None, [1, 3]] for until in (1.0, 0.5))
+    quarters = weights(z, five)[..., None, [1, 3]]
+    # In a network a mode may follow the last drive at once, and all of the error counts.
+    badly_seen = others["mobile"] | (z.max(axis=-1) > RESOLVED)
+    rest = np.ones(z.shape[:2]) if others["bend"].size else np.where(badly_seen, *RESTS)
     return Form(
         rates=np.ascontiguousarray(rates), gain=np.ascontiguousarray(gain), decay=np.exp(-z),
         source=by_step * weights(z, (0.0, 1.0)), drive=drives * weights(z, (0.0, 0.5, 1.0))[..., None, :],
         feed=np.ascontiguousarray(feed), taps=np.ascontiguousarray(taps), tap_s=tap_s, within=inner, within_s=inner_s,
         within_g=inner_g, share=np.ascontiguousarray(weights(z, (0.0, 0.5, 1.0))[..., 1:]), defect=drives * quarters,
-        early=np.einsum("rk,rsktj->rstj", taps[:, 0], drives * early), fast=fast, faded=faded, pulse=pulse,
+        rest=rest, fast=fast, faded=faded, pulse=pulse,
         pulse_within=pulse_within, **others,
     )  # fmt: skip
 
@@ -224,7 +232,7 @@ class Followed(Follower):
         control[blockforms.Z] = start.y[-1] - self._charge_with(start.u_gap)
         return Course(
             system.model, form, self.shown, blockforms.new_room(m, drives, drives + 3), new_charges(),
-            np.zeros((3, max(m, drives, 3))), system.project[r] @ start.y[:-1], np.zeros(m), control, counters,
+            np.zeros((3, max(m, drives, 5))), system.project[r] @ start.y[:-1], np.zeros(m), control, counters,
         )  # fmt: skip
 
     def rows(self, problem: Problem, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:

@@ -139,7 +139,7 @@ class Finger(Follower):
         control[blockforms.U_GAP] = one.taps[0] @ w + one.tap_s[0] * s[reduced.source]
         return Course(
             self._model, form, self.shown, blockforms.new_room(m, drives, drives + 1), new_charges(),
-            np.zeros((3, max(m, drives, 3))), w, np.zeros(m), control, counters,
+            np.zeros((3, max(m, drives, 5))), w, np.zeros(m), control, counters,
         )  # fmt: skip
 
     def rows(self, problem: Problem, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
@@ -184,7 +184,12 @@ def finger(problem: Problem, rtol: float) -> Finger | None:
         return None
     area, bend, scale, missed, missed_bend = curves
     q_rest, q_top = float(polyval(-1.0, area)), float(polyval(1.0, area))
-    shown = _shown(problem, reduced, modal, float(polyval(-1.0, polyder(area))) * scale, 1.0 / q_rest, 1.0 / q_top)
+    # 1/A - q0 has the kink of 1/A, and N the part N''(0) xi |xi| / 2.
+    kinks = np.append(
+        np.full(reduced.leaking.size, scale * float(polyval(-1.0, polyder(area)))),
+        0.5 * scale**2 * float(polyval(-1.0, polyder(bend, 2))),
+    )
+    shown = _shown(problem, reduced, modal, kinks, 1.0 / q_rest, 1.0 / q_top)
     return Finger(
         shown,
         share,
@@ -202,9 +207,9 @@ def finger(problem: Problem, rtol: float) -> Finger | None:
 
 
 def _shown(
-    problem: Problem, reduced: Reduced, modal: Modal, kink: float, at_rest: float, at_top: float
+    problem: Problem, reduced: Reduced, modal: Modal, kinks: FloatArray, at_rest: float, at_top: float
 ) -> blockforms.Shown:
-    """Constants of the outputs; `kink` is the slope of 1/A by xi at 0 V, with the areas (m^2) there and at the top."""
+    """Constants of the outputs, from the kinks of the drives and the areas (m^2) at 0 V and at the top."""
     contact, n, m = problem.network.contacts[reduced.moving], reduced.absorbed.size, modal.rates.size
     assert contact is not None
     moves = max(abs(area - 1.0 / reduced.q0) for area in (at_rest, at_top)) * np.array(
@@ -213,7 +218,7 @@ def _shown(
     none = np.zeros((1, m, m))
     return blockforms.Shown(
         modal.columns[None], modal.k, modal.nodes[None], none[0, :1], none, none, float(contact.stress(1.0)),
-        np.append(np.full(reduced.leaking.size, kink), 0.0), 0.0, np.zeros(1), False, modal.bends, m - n,
+        kinks, 0.0, np.zeros(1), False, modal.bends, m - n,
         float(problem.network.capacitance(reduced.area0).sum()), moves,
     )  # fmt: skip
 

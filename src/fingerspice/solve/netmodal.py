@@ -39,7 +39,7 @@ class Modal:
     drives : ndarray, shape (m, T)
         By (q - q0) times each tap, and last by N.
     taps, tap_s : ndarray, shape (1 + T, m) and (1 + T,)
-        xi, the voltages of the cells with a fixed leak, and a row of zeros for N.
+        xi, the voltages of the cells with a fixed leak, and xi again for N.
     columns, bends, k : ndarray, shape (C, m), (C,) and (C,)
         State voltages and charges from w, N and the source.
     nodes : ndarray, shape (n_node, m)
@@ -142,8 +142,8 @@ class Reduced:
         drives = np.column_stack([self._leaks(-modes.take[:, self.fed]), -modes.rates * self.absorbed])
         return Modal(
             rates=modes.rates, gain=modes.gains[:, source], drives=drives,
-            taps=np.vstack([self.tap[self.gap], self.tap[cells], np.zeros(n)]),
-            tap_s=np.concatenate([self.tap_s[[self.gap], source], self.tap_s[cells, source], [0.0]]),
+            taps=np.vstack([self.tap[self.gap], self.tap[cells], self.tap[self.gap]]),
+            tap_s=self.tap_s[[self.gap, *cells, self.gap], source],
             columns=modes.shape, bends=modes.shape @ self.absorbed, k=-modes.follow[:, source],
             nodes=network.nodes[:, :n] @ modes.shape,
         )  # fmt: skip

@@ -9,8 +9,9 @@ import numpy as np
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.times import check_length, check_outputs
+from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import misses, same_time
-from fingerspice.waveforms.waveform import Waveform
+from fingerspice.waveforms.waveform import DC, Waveform
 
 # Resolution of a time in units of its rounding error; a difference of a source's two limits at an edge is no jump if
 # the source changes as much within this resolution beside the edge.
@@ -23,7 +24,12 @@ _NONE = np.empty(0)
 
 
 def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
-    """Times (s), each set to the breakpoint from which it differs by rounding only: 5 ms means the jump at 5 ms."""
+    """Times (s), each set to the breakpoint from which it differs by rounding only: 5 ms means the jump at 5 ms.
+
+    Recordings have no jumps, so that rounding changes nothing.
+    """
+    if all(isinstance(wave, Samples | DC) for wave in problem.waveforms):
+        return t
     span = problem.t_start, problem.t_stop
     windows = 1 + int((span[1] - span[0]) * problem.waveform.breakpoint_rate() / _BREAKPOINTS_AT_ONCE)
     moved = t

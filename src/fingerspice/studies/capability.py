@@ -18,6 +18,7 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.describe import head_lines, heading
+from fingerspice.circuit.topology import find_branches
 from fingerspice.solve.runs import Progress
 from fingerspice.studies.inversion import Inverter, Limits, inverter_of, the_finger
 from fingerspice.studies.wanted import ForceCurve
@@ -162,9 +163,11 @@ def capability(
     require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
     finger = the_finger(circuit)
     if not finger.direct:
+        others = [e.name for e in find_branches(circuit)[1] if e.device != "V" and not e.spec.is_layer]
         raise InputError(
-            "a map of the friction needs a series stack driven by its source at once; allowed for any network with one "
-            "finger: inverse_drive (design)"
+            "a map of the friction needs a chain of layers that a V source drives at once, and this circuit has "
+            f"{', '.join(others) or 'branches'} beside it; allowed for any network with one finger: inverse_drive "
+            "(design)"
         )
     contact = finger.contact
     if contact.mu == 0.0:

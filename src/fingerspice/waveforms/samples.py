@@ -215,15 +215,20 @@ class Samples(Ramps):
 
     def _values(self, flat: FloatArray, side: str) -> FloatArray:
         flat = np.ascontiguousarray(flat)
+        first = round(min(max(self._number_of(float(flat[0])), 0.0), float(self.count))) if flat.size else 0
+        if first + flat.size <= self.count and np.array_equal(flat, self._times_of(first, first + flat.size)):
+            return self.values[first : first + flat.size].copy()
         return _along(self.values, self._number, self.start, self.rate, flat, side == "left")
 
 
 def _check_samples(values: FloatArray, first: int) -> None:
     """Refuse samples (V) that are not finite or too large; `first` is the number of the first of them."""
-    bad = np.flatnonzero(~np.isfinite(values))
-    if bad.size:
+    # An extreme value is NaN if any value is.
+    ends = [values.min(), values.max()]
+    if not np.all(np.isfinite(ends)):
+        bad = np.flatnonzero(~np.isfinite(values))
         raise InputError(f"sample number {first + bad[0]} is {values[bad[0]]}; allowed: finite numbers")
-    check_range("a sample", values, "V")
+    check_range("a sample", ends, "V")
 
 
 class _WavFile(Samples):
