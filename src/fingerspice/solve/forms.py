@@ -32,9 +32,9 @@ from fingerspice.solve.track import Prepared, as_recorded, on_branch, prepare_sy
 AREA_SHARE = 0.02
 # Time constants in a step from which on a fast mode is taken apart from the parabola, which resolves slower ones.
 FADED = 5.0
-# Time constants in a step up to which the quarters show the error of a mode well. The share of the error that may be left
-# once the modes are corrected for it: with faster modes, or under `mobile`, where the gap voltage itself has a kink; and
-# otherwise.
+# Time constants in a step up to which the quarters show the error of a mode well. The share of the error that may be
+# left once the modes are corrected for it: with faster modes, or under `mobile`, where the gap voltage itself has a
+# kink; and otherwise.
 RESOLVED, RESTS = 1.0, (0.7, 0.3)
 # Matrix from values at Chebyshev nodes to the Chebyshev coefficients of the antiderivative of their interpolant.
 _POINTS = 40
