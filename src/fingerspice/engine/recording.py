@@ -33,6 +33,7 @@ from fingerspice.engine.relaxation import (
     FIRST_NEWTON,
     LEAST_MARGIN,
     NEWTON,
+    SLOWER,
     SPARE,
     look_at_ends,
     misfit,
@@ -184,7 +185,9 @@ def accept(c: Course, r: int, n: int, rest: float, local: float, left_over: floa
     control[ERROR_U] = max(control[ERROR_U], off_u)
     control[ERROR_F] = max(control[ERROR_F], 2.2 * off)
     # An error of the gap voltage changes the area, and thereby other voltages.
-    node_error = left_over + magnified * _largest_error(c, c.shown.node[r], n)
+    # The sweeps leave larger errors at the nodes of a network than in the gap.
+    node_error = left_over * (SLOWER if c.form.bend.size > 0 else 1.0)
+    node_error += magnified * _largest_error(c, c.shown.node[r], n)
     control[ERROR_V] = max(control[ERROR_V], c.shown.moves[0] * off_u + node_error)
     first = c.shown.k.size - c.shown.flows
     if c.shown.flows > 0:

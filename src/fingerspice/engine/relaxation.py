@@ -64,9 +64,9 @@ from fingerspice.engine.blockrows import (
 PARABOLA = np.array([[0.0, 1.0, 0.0], [0.375, 0.75, -0.125], [-0.125, 0.75, 0.375]])
 # Most sweeps of a block, and the fraction of the error allowed that the last one may leave.
 MOST_SWEEPS, LEFT = 40, 0.5
-# Smallest ratio assumed between the errors of two sweeps, and its factor in networks: the first sweeps may converge
-# faster than the later ones, and in networks other voltages than that of the gap converge more slowly.
-SLOWEST, SLOWER = 0.01, 4.0
+# Smallest ratio assumed between the errors of two sweeps, because the first sweeps may converge faster than the later
+# ones; and its factor in networks, which converge more slowly.
+SLOWEST, SLOWER = 0.01, 1.8
 # First sweep in which the places of the kinks and the rate of convergence are known well enough.
 KINKED = 1
 # Newton steps for the gap voltage under `mobile`, in the first sweep and in later ones; and the smallest distance to

@@ -32,8 +32,8 @@ from fingerspice.solve.track import Prepared, as_recorded, on_branch, prepare_sy
 AREA_SHARE = 0.02
 # Time constants in a step from which on a fast mode is taken apart from the parabola, which resolves slower ones.
 FADED = 5.0
-# Time constants in a step up to which the quarters show the error of a mode well. The share of the error that may be
-# left once the modes are corrected for it: with faster modes, or under `mobile`, where the gap voltage itself has a
+# Time constants in a step up to which the quarters show the error of a mode well, and the share of the error that may
+# be left once the modes are corrected for it: with faster modes, or under `mobile`, where the gap voltage itself has a
 # kink; and otherwise.
 RESOLVED, RESTS = 1.0, (0.7, 0.3)
 # Matrix from values at Chebyshev nodes to the Chebyshev coefficients of the antiderivative of their interpolant.
@@ -121,15 +121,13 @@ def weighted(
     pulse_within = np.stack([np.einsum("rpk,rsk->rsp", taps, one) for one in pulses], axis=2)
     five = (0.0, 0.25, 0.5, 0.75, 1.0)
     quarters = weights(z, five)[..., None, [1, 3]]
-    # In a network a mode may follow the last drive at once, and all of the error counts.
     badly_seen = others["mobile"] | (z.max(axis=-1) > RESOLVED)
-    rest = np.ones(z.shape[:2]) if others["bend"].size else np.where(badly_seen, *RESTS)
     return Form(
         rates=np.ascontiguousarray(rates), gain=np.ascontiguousarray(gain), decay=np.exp(-z),
         source=by_step * weights(z, (0.0, 1.0)), drive=drives * weights(z, (0.0, 0.5, 1.0))[..., None, :],
         feed=np.ascontiguousarray(feed), taps=np.ascontiguousarray(taps), tap_s=tap_s, within=inner, within_s=inner_s,
         within_g=inner_g, share=np.ascontiguousarray(weights(z, (0.0, 0.5, 1.0))[..., 1:]), defect=drives * quarters,
-        rest=rest, fast=fast, faded=faded, pulse=pulse,
+        rest=np.where(badly_seen, *RESTS), fast=fast, faded=faded, pulse=pulse,
         pulse_within=pulse_within, **others,
     )  # fmt: skip
 
