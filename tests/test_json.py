@@ -61,6 +61,8 @@ def answer(result: Result, command: str) -> Any:
         (["limits", "pad.cir", "--no-plot", "--points", "3", "--span", "1.01", "--set", "Xgap.d=100n"], 0),
         (["limits", "rc.cir", "--no-plot"], 2),
         (["design", "none.csv", "pad.cir"], 2),
+        (["fit", "none.csv", "pad.cir", "--free", "Xgap.d"], 2),
+        (["fit-contact", "none.csv", "pad.cir"], 2),
         (["export", "pad.cir", "-o", "x.cir"], 0),
         (["export", "pad.cir"], 2),
         (["figures", "--only", "2"], 0),

@@ -42,6 +42,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "fit": (
         "parameters",
         "correlation",
+        "groups",
         "signal",
         "count",
         "residual_rms",
@@ -50,6 +51,7 @@ OWN: dict[str, tuple[str, ...]] = {
         "notes",
         "profiles",
     ),
+    "fit-contact": ("gap", "parameters", "correlation", "relations", "objective", "notes", "profiles"),
     "sweep": ("scenes", "failed", "n", "seed", "figures", "shares", "store"),
     "export": (),
     "figures": (),
