@@ -1323,6 +1323,14 @@ def _first_zero(stack: _Stack, nodes: _Nodes, step: _Step, scale: float, us: np.
     return float(brentq(value, low, float(grid[bad]), xtol=1e-15, rtol=1e-15))
 
 
+class NoStepError(RuntimeError):
+    """The collocation finds no step beyond the time `t`, s, and no fold there either."""
+
+    def __init__(self, t: float, message: str) -> None:
+        self.t = t
+        super().__init__(message)
+
+
 class _Run:
     """The state of one transient while it is computed."""
 
@@ -1446,7 +1454,7 @@ class _Run:
         stack = self.stack
         rise = stack.rise(float(u[stack.gap]), self.stored(u), s) if stack.mobile else math.inf
         if not rise < 1e-3:
-            raise RuntimeError(f"collocation failed at t = {t} s ({reason}), u = {u} V, {rise} from a fold")
+            raise NoStepError(t, f"collocation failed at t = {t} s ({reason}), u = {u} V, {rise} from a fold")
         self.fold = Fold(t, float(u[stack.gap]), float(source(np.float64(t))), rise)
 
 
