@@ -11,6 +11,7 @@ from numpy.polynomial import chebyshev
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.readout import RECORDED, Steps, new_steps
+from fingerspice.engine.repeat import PeriodMap
 from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS
 from fingerspice.results.measures import Panels, Read
 from fingerspice.results.record import Record
@@ -54,15 +55,9 @@ class Block:
 
 @dataclass(frozen=True)
 class Leap:
-    """Periods that follow one another by an affine map; fields as the arguments of `engine.repeat.approach`."""
+    """Periods that follow one another by the affine map `one`, from live voltages `start` (V); see `engine.repeat`."""
 
-    marks: FloatArray
-    marks_by: FloatArray
-    series: FloatArray
-    by: FloatArray
-    slope: FloatArray
-    x: FloatArray
-    end: FloatArray
+    one: PeriodMap
     start: FloatArray
     still: float
     period: float
@@ -70,9 +65,9 @@ class Leap:
 
     def blocks(self) -> list[Block] | None:
         """The periods one by one until they no longer change; None where too many of them differ."""
-        n = self.x.size
+        n = self.one.x.size
         out: list[Block] = []
-        delta = self.start[:n] - self.x
+        delta = self.start[:n] - self.one.x
         last = None
         for k in range(self.periods):
             if last is not None and float(np.abs(delta - last).max(initial=0.0)) <= self.still:
@@ -82,12 +77,12 @@ class Leap:
             if k >= _MOST_PERIODS:
                 return None
             out.append(self._block(delta, k * self.period))
-            last, delta = delta, self.end[:n] - self.x + self.slope[:n] @ delta
+            last, delta = delta, self.one.end[:n] - self.one.x + self.one.slope[:n] @ delta
         return out
 
     def _block(self, delta: FloatArray, shift: float) -> Block:
-        marks = self.marks + self.marks_by @ delta
-        series = self.series + np.tensordot(delta, self.by, 1)
+        marks = self.one.marks + self.one.marks_by @ delta
+        series = self.one.series + np.tensordot(delta, self.one.by, 1)
         times = np.column_stack([marks[:-1], np.diff(marks), marks[1:], np.ones(marks.size - 1)])
         return Block(times, series[:, :, :NODES] @ _FROM_SERIES, 1, shift, self.period)
 

@@ -184,10 +184,8 @@ def _leap(track: Track, sources: Sources, settling: Settling, stop: float) -> No
     state = np.append(x0, track.y[n])
     shown = slice(0, track.shown)
     track.recorder.drain(track.counters)
-    track.recorder.parts.append(Leap(
-        marks, marks_by, series[:, shown].copy(), by[:, :, shown].copy(), slope, base_x, base.track.y.copy(),
-        x0.copy(), still, settling.period, left,
-    ))  # fmt: skip
+    recorded = one._replace(series=series[:, shown].copy(), by=by[:, :, shown].copy(), end=one.end.copy())
+    track.recorder.parts.append(Leap(recorded, x0.copy(), still, settling.period, left))
     track.counters[readout.OUTPUT] = repetition.approach(
         one, state, track.shown, still, settling.period, left, int(track.counters[readout.OUTPUT]), track.outputs
     )  # fmt: skip
