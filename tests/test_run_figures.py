@@ -100,14 +100,15 @@ def test_figures_of_the_coupled_state_are_the_reference_s(law: str) -> None:
     assert got["u_gap_phase_deg"] == pytest.approx(math.degrees(np.angle(first)), abs=1e-4)
 
 
-@pytest.mark.parametrize("name", ["fingerpad_dispersive", "am_carrier"])
+@pytest.mark.parametrize("name", ["fingerpad_dispersive", "am_carrier", "amplifier", "two_fingers"])
 def test_where_the_recorded_steps_fill_their_arrays_changes_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     # With room for one step they are full, too, where a period ends within the present window of the source.
     circuit = fs.read_netlist(f"circuits/{name}.cir")
-    plain = fs.simulate(circuit, t_stop=0.1, rtol=1e-6, charge=False)
+    stop = 0.02 if name in ("amplifier", "two_fingers") else 0.1
+    plain = fs.simulate(circuit, t_stop=stop, rtol=1e-6, charge=False)
     for capacity in (1, 7):
         monkeypatch.setattr(stepping, "Recorder", partial(Recorder, capacity=capacity))
-        run = fs.simulate(circuit, t_stop=0.1, rtol=1e-6, charge=False)
+        run = fs.simulate(circuit, t_stop=stop, rtol=1e-6, charge=False)
         assert run.stats["steps"] == plain.stats["steps"]
         np.testing.assert_array_equal(run.u_gap, plain.u_gap)
-        assert run.f_el_mean == pytest.approx(plain.f_el_mean, rel=1e-13)
+        np.testing.assert_allclose(run.f_el_mean, plain.f_el_mean, rtol=1e-13)

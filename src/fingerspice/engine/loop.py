@@ -6,14 +6,19 @@ number of both (`engine.meshstep`). The first functions below stand for those of
 
 from __future__ import annotations
 
+import math
+
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit, jit_by_kind, jit_within
 from fingerspice.engine.loopstate import (
     CONVERGED,
     DONE,
+    EXCESSIVE,
     FRESH,
     GO_ON,
     LENGTH,
+    LOOKED_AT,
     RETRY,
     STEP_ERROR,
     TRIES,
@@ -21,16 +26,19 @@ from fingerspice.engine.loopstate import (
     WANTED,
     LoopState,
 )  # fmt: skip
-from fingerspice.engine.mesh import Mesh, begin_mesh, start_mesh
+from fingerspice.engine.mesh import Mesh, begin_mesh, edges_of_mesh, start_mesh, worst_of_mesh
 from fingerspice.engine.meshstep import attempt_mesh, beyond_mesh, complete_mesh, end_mesh, refuse_mesh
 from fingerspice.engine.pace import Pace, accept, allowed_factor, rung, shorten
 from fingerspice.engine.readout import ACCEPTED, REJECTED, H, T, note
-from fingerspice.engine.stackend import complete_stack, end_stack
+from fingerspice.engine.repeat import SAME_TIME
+from fingerspice.engine.settling import ACCEPTABLE, NEXT, TRIAL, Looks, look, next_stop, take_result
+from fingerspice.engine.stackend import complete_stack, end_stack, worst_of_stack
 from fingerspice.engine.stackstep import (
     Stack,
     attempt_stack,
     begin_stack,
     beyond_stack,
+    edges_of_stack,
     refuse_stack,
     start_stack,
 )  # fmt: skip
@@ -76,6 +84,42 @@ def complete(circuit: Circuit, pace: Pace, state: LoopState) -> int:
 @jit_by_kind(Stack=end_stack, Mesh=end_mesh)
 def end(circuit: Circuit, state: LoopState) -> None:
     """End a call of the loop."""
+
+
+@jit_by_kind(Stack=worst_of_stack, Mesh=worst_of_mesh)
+def worst(circuit: Circuit, state: LoopState) -> float:
+    """Largest ratio of the estimated error to the peak so far, over the voltages and forces of all gaps."""
+    raise NotImplementedError
+
+
+@jit_by_kind(Stack=edges_of_stack, Mesh=edges_of_mesh)
+def edges(circuit: Circuit) -> FloatArray:
+    """Edges of the sources, s."""
+    raise NotImplementedError
+
+
+@jit
+def march_on(circuit: Circuit, pace: Pace, state: LoopState, looks: Looks, t_end: float) -> int:
+    """As `march`, and look for the periodic state on the way.
+
+    Returns with EXCESSIVE where a trial of the error fails, and with LOOKED_AT where a look has found something.
+    """
+    circuit, state, looks = borrow(circuit), borrow(state), borrow(looks)
+    take_result(looks)
+    while True:
+        stop = next_stop(looks, edges(circuit), t_end)
+        code = march(circuit, pace, state, stop)
+        if code != DONE:
+            return code
+        slack = SAME_TIME * abs(stop)
+        if stop >= looks.values[TRIAL] - slack:
+            looks.values[TRIAL] = math.inf
+            if worst(circuit, state) > looks.values[ACCEPTABLE]:
+                return EXCESSIVE
+        if stop >= looks.values[NEXT] - slack and look(looks, state):
+            return LOOKED_AT
+        if state.control[T] >= t_end:
+            return DONE
 
 
 @jit

@@ -16,8 +16,9 @@ from fingerspice.numerics.small import copy_to
 
 # Codes returned by the loop: the end is reached; no step is short enough (a fold, or an error that cannot be met); a
 # gap voltage is beyond the range of the area's polynomial; too many steps; `Steps` is full, or Python may react to
-# Ctrl-C (call again); the areas need a reference that has not been made yet.
-DONE, NO_STEP, OUT_OF_RANGE, TOO_MANY, PAUSED, REFERENCE = range(6)
+# Ctrl-C (call again); the areas need a reference that has not been made yet; the stated error is too large already; the
+# periodic state was looked for, and the caller has something to do (see `engine.settling`).
+DONE, NO_STEP, OUT_OF_RANGE, TOO_MANY, PAUSED, REFERENCE, EXCESSIVE, LOOKED_AT = range(8)
 # Codes of the parts of a step, beside these: go on with the next part; start again with this step; try another length.
 GO_ON, AGAIN, RETRY = -1, -2, -3
 

@@ -12,13 +12,13 @@ from fingerspice.engine.exponential import Tables
 from fingerspice.engine.loopstate import (
     ACCEPTED_BEFORE,
     AT_EDGE,
-    CROSSED,
     DONE,
     FLIPS,
     FRESH,
     GO_ON,
     HAS_BEGUN,
     IN_JUMP,
+    IS_PAUSED,
     LENGTH,
     MOST,
     PAUSE_AT,
@@ -32,7 +32,7 @@ from fingerspice.engine.loopstate import (
     UNCONVERGED,
     LoopState,
 )
-from fingerspice.engine.netassess import load
+from fingerspice.engine.netassess import ERROR_F, ERROR_U, PEAK_F, PEAK_U, load
 from fingerspice.engine.netform import Form, Leaks, Work
 from fingerspice.engine.network import Sources, at_sources
 from fingerspice.engine.pace import Pace, choose_step
@@ -101,6 +101,25 @@ class Mesh(NamedTuple):
 
 
 @jit_within
+def edges_of_mesh(c: Mesh) -> FloatArray:
+    """Edges of all sources, s, one source after the other."""
+    return c.sources.edges
+
+
+@jit_within
+def worst_of_mesh(c: Mesh, s: LoopState) -> float:
+    """Largest ratio of the estimated error to the peak so far, over the voltages and forces of all areas."""
+    worst = 0.0
+    for a in range(c.sign.size):
+        peaks = c.peaks[a]
+        if peaks[PEAK_U] > _UNNOTICED * c.u_scale:
+            worst = max(worst, peaks[ERROR_U] / peaks[PEAK_U])
+            if peaks[PEAK_F] > 0.0:
+                worst = max(worst, peaks[ERROR_F] / peaks[PEAK_F])
+    return worst
+
+
+@jit_within
 def leaks_of(c: Mesh, s: LoopState) -> Leaks:
     """What leaks at present: nothing within a jump of the sources."""
     form, none = c.form, c.work.jump.leaks
@@ -117,12 +136,18 @@ def branch_of(c: Mesh, s: LoopState) -> FloatArray:
 
 @jit_within
 def start_mesh(c: Mesh, s: LoopState) -> None:
-    """Begin a call of the loop."""
+    """Begin a call of the loop, or go on after a pause, which changes nothing."""
     form, work, place, counters = c.form, c.work, s.place, s.counters
     n = form.shape.shape[0]
-    s.step[TABLED], place[FLIPS], place[FRESH], place[CROSSED] = 0.0, 0, -1, -1
+    place[PAUSE_AT] = counters[ACCEPTED] + 1 + _AT_ONCE // form.rates.size
+    # Other runs may have used the tables since the last call.
+    s.step[TABLED] = 0.0
+    if place[IS_PAUSED] > 0:
+        place[IS_PAUSED] = 0
+        return
+    place[FLIPS], place[FRESH] = 0, -1
     place[IN_JUMP], place[HAS_BEGUN], place[UNCONVERGED] = 0, 0, 0
-    place[ACCEPTED_BEFORE], place[PAUSE_AT] = counters[ACCEPTED], counters[ACCEPTED] + 1 + _AT_ONCE // form.rates.size
+    place[ACCEPTED_BEFORE] = counters[ACCEPTED]
     place[SEVERAL] = 0
     for b in range(1, form.home.size):
         place[SEVERAL] |= int(form.home[b] != form.home[0])
@@ -161,6 +186,7 @@ def begin_mesh(c: Mesh, pace: Pace, s: LoopState, t_end: float) -> int:
         if place[HAS_BEGUN] > 0 and control[T] >= t_end:
             return DONE
         if counters[ACCEPTED] >= place[PAUSE_AT] or counters[RECORDED] >= s.steps.times.shape[0] > 0:
+            place[IS_PAUSED] = 1
             return PAUSED
         _look_at_sources(c, s, t_end)
         if place[IN_JUMP] == 0 and control[T] >= t_end:
@@ -179,7 +205,6 @@ def begin_mesh(c: Mesh, pace: Pace, s: LoopState, t_end: float) -> int:
     is_series = c.sources.series.shape[1] > 0 and place[IN_JUMP] == 0
     # If all rates are zero, the time constant is infinite.
     step[LENGTH] = choose_step(longest, 1.0 / rates.max(), True, is_series, t, step[STOP] - t, control)
-    place[CROSSED] = -1
     return GO_ON
 
 

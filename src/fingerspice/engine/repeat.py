@@ -20,8 +20,9 @@ from fingerspice.numerics.chebyshev import to_powers
 from fingerspice.numerics.lobatto import NODES, ROWS
 from fingerspice.numerics.small import copy_to
 
-# Relative distance within which the end of a step, shifted by whole periods, counts as equal to an output time.
-_SLACK = 8e-16
+# Relative distance within which two times count as equal: a few units in the last place. So much the end of a step,
+# shifted by whole periods, may miss an output time.
+SAME_TIME = 8e-16
 AT_ZERO, AT_EDGE = 1.0, 2.0
 # Number of steps in one compiled call.
 AT_ONCE = 1_000_000
@@ -116,7 +117,7 @@ def _repeat(
             if first >= t_out.size:
                 break
             stop = times[i, 2] + shift
-            slack = _SLACK * abs(stop)
+            slack = SAME_TIME * abs(stop)
             if t_out[first] > stop + slack:
                 continue
             h = times[i, 1]
@@ -267,7 +268,7 @@ def _approach(
             copy_to(formed.at, delta)
             formed.stale[0] = True
         close = marks[-1] + shift
-        if first < t_out.size and t_out[first] <= close + _SLACK * abs(close):
+        if first < t_out.size and t_out[first] <= close + SAME_TIME * abs(close):
             if formed.stale[0]:
                 _form(marks, one.marks_by, series, by, formed.at, stops, made)
                 formed.stale[0] = False
@@ -276,7 +277,7 @@ def _approach(
                 if series.shape[1] > shown:
                     made[i, shown, 0] += state[n]
                 held[i] = write_outputs(
-                    since, until - since, 1.0, until, _SLACK * abs(until), walk.as_powers[i], made[i], work, first,
+                    since, until - since, 1.0, until, SAME_TIME * abs(until), walk.as_powers[i], made[i], work, first,
                     held[i], outputs,
                 )  # fmt: skip
                 first += held[i]

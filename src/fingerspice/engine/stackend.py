@@ -34,12 +34,15 @@ from fingerspice.engine.readout import (
     ALLOWED,
     BRANCH_LENGTH,
     BRANCH_START,
+    ERROR_F,
+    ERROR_U,
     ERROR_V,
     H_AFTER_ZERO,
     LAST_Q,
     MAGNIFIED,
     MARGIN,
     N_PLACES,
+    PEAK_F,
     PEAK_U,
     SIGN,
     U_BEFORE,
@@ -179,3 +182,12 @@ def _cross(c: Stack, s: LoopState) -> bool:
 @jit_within
 def end_stack(c: Stack, s: LoopState) -> None:
     """End a call of the loop: nothing is left to do."""
+
+
+@jit_within
+def worst_of_stack(c: Stack, s: LoopState) -> float:
+    """Largest ratio of the estimated error to the peak so far, of the gap's voltage and force."""
+    control = s.control
+    of_voltage = control[ERROR_U] / control[PEAK_U] if control[PEAK_U] > 0.0 else 0.0
+    of_force = control[ERROR_F] / control[PEAK_F] if control[PEAK_F] > 0.0 else 0.0
+    return max(of_voltage, of_force)

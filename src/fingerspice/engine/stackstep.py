@@ -103,6 +103,12 @@ class Stack(NamedTuple):
 
 
 @jit_within
+def edges_of_stack(c: Stack) -> FloatArray:
+    """Edges of the source, s."""
+    return c.edges
+
+
+@jit_within
 def start_stack(c: Stack, s: LoopState) -> None:
     """Begin a call of the loop: find the segment of the source, unless the run was paused."""
     step, place, control, counters = s.step, s.place, s.control, s.counters

@@ -21,11 +21,13 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.engine import loopstate, readout
 from fingerspice.engine import repeat as repetition
 from fingerspice.engine.network import Sources
+from fingerspice.engine.settling import no_looks
 from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
 from fingerspice.results.steps import Leap, Recorder
 from fingerspice.solve.settling import Settling
 from fingerspice.solve.stepping import FINEST, KEPT_STEPS, SAFETY
 from fingerspice.solve.track import Track
+from fingerspice.waveforms.sampling import same_time
 
 # Step tolerance within the integrated periods, relative to the run's: their error recurs in every extrapolated period.
 _FINER = 0.01
@@ -99,7 +101,7 @@ def _period(track: Track, sources: Sources, stop: float, x: FloatArray, steps: i
     probe.recorder = Recorder(track.shown, 0)
     probe.t_out, probe.left, probe.out = np.zeros(0), np.zeros(0, bool), np.empty((track.out.shape[0], 0))
     probe.keep(steps)
-    code = probe.advance(sources, stop)
+    code = probe.march(sources, stop, no_looks())
     track.counters[: readout.OUTPUT] += probe.counters[: readout.OUTPUT]
     if code != loopstate.DONE or not probe.keeps_all:
         raise _LostError
@@ -130,7 +132,10 @@ def _missed_within(
 
 def leap(track: Track, sources: Sources, settling: Settling) -> None:
     """Extrapolate all following periods with one affine map, if its error allows it; see `Settling.may_leap`."""
-    stop = settling.snapped(sources.edges, track.t + settling.period)
+    stop = track.t + settling.period
+    edge = float(sources.edges[np.abs(sources.edges - stop).argmin()])
+    # An edge may differ from the end of the period by rounding only.
+    stop = edge if abs(edge - stop) <= same_time(edge) else stop
     if stop > sources.edges[-1]:
         return
     try:
@@ -140,7 +145,7 @@ def leap(track: Track, sources: Sources, settling: Settling) -> None:
 
 
 def _leap(track: Track, sources: Sources, settling: Settling, stop: float) -> None:
-    left = settling.periods_left(track.t)
+    left = settling.left
     x0 = track.y[:-1].copy()
     n = x0.size
     here = _period(track, sources, stop, x0)

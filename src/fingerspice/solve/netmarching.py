@@ -11,6 +11,7 @@ from fingerspice.engine import loop, loopstate, netassess, readout
 from fingerspice.engine.mesh import Mesh
 from fingerspice.engine.netform import new_work
 from fingerspice.engine.network import Sources
+from fingerspice.engine.settling import Looks, no_looks
 from fingerspice.engine.system import area_missed
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.results.outcome import Status
@@ -53,11 +54,12 @@ class March(Stepping, NetworkIntegration):
         self.form = self.references.form()
         cells = self.form.c.size
         self.work = new_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
-        self.settling = Settling(problem, self.form.rates.copy(), self.pace.tol)
+        scale = np.append(np.ones(self.n), np.full(self.n_slow, u_scale))
+        self.settling = Settling(problem, self.form.rates.copy(), self.pace.tol, scale, leaps=False)
         if not repeat:
-            self.settling.next = math.inf
+            self.settling.stop_looking()
 
-    def _march(self, sources: Sources, t_end: float) -> int:
+    def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
         taken = int(self.counters[readout.ACCEPTED] + self.counters[readout.REJECTED])
         more = MOST_STEPS * (4.0 + sources.edges.size + (t_end - self.t) / self.shortest)
         self.place[loopstate.MOST] = taken + int(more)
@@ -67,17 +69,13 @@ class March(Stepping, NetworkIntegration):
                 self.form, known.arrays, known.tables, self.work, self.integral, sources, self.u_scale, self.sign,
                 self.s_before, self.branch, self.met, self.collected,
             )  # fmt: skip
-            code = int(loop.march(mesh, self.pace, self.loop_state(), t_end))
+            code = int(loop.march_on(mesh, self.pace, self.loop_state(), looks, t_end))
             if self.counters[readout.RECORDED] >= len(self.recorder.room.times):
                 self.recorder.drain(self.counters)
             if code == loopstate.REFERENCE:
                 self._add_reference()
             elif code != loopstate.PAUSED:
                 return code
-
-    def _look(self) -> bool:
-        state = np.append(self.y[: self.n], self.u_scale * self.y[self.n : self.n + self.n_slow])
-        return self.settling.look(state, float(self.control[readout.MAGNIFIED]))
 
     def _collected(self) -> FloatArray:
         return self.collected.copy()
@@ -94,14 +92,11 @@ class March(Stepping, NetworkIntegration):
         held = float(self.problem.network.capacitance(self.problem.scene.area0).sum())
         self.control[readout.ERROR_Q] += alike * float((np.abs(missed) + np.sqrt(spread)).max()) + held * off
 
-    def _to(self, sources: Sources, t_end: float) -> Status:
-        code = self._march(sources, t_end)
-        if code == loopstate.DONE:
-            return Status.SUCCESS
+    def _failed(self, code: int, sources: Sources) -> Status:
         return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
 
     def jump(self, after: FloatArray) -> bool:
-        return self._march(held_at(self.t, after), self.t) == loopstate.DONE
+        return self.march(held_at(self.t, after), self.t, no_looks()) == loopstate.DONE
 
     def _add_reference(self) -> None:
         """Add the reference areas that the compiled loop needs next, and that it has written to `wanted`."""

@@ -16,13 +16,13 @@ from fingerspice.engine.loopstate import LoopState
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.readout import Outputs
+from fingerspice.engine.settling import Looks
 from fingerspice.results.outcome import Status
 from fingerspice.results.record import bare_record
 from fingerspice.results.steps import Recorded, Recorder
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Integration, Run, excess_of
 from fingerspice.solve.settling import Settling
-from fingerspice.waveforms.sampling import same_time
 
 # Ratio of stated to estimated error: the largest error of a step may lie beside the points at which it is estimated,
 # and contributions of opposite sign may cancel at these points.
@@ -36,8 +36,6 @@ FINEST = 4e-15
 LONGEST_STEP = 0.6
 # Most steps of a period that is kept for repetition: 1 MB.
 KEPT_STEPS = 2000
-# Number of the source's periods after which a run's error is first compared with its peaks.
-TRIAL_PERIODS = 2.0
 
 
 class OutOfRangeError(Exception):
@@ -60,15 +58,16 @@ class Stepping(Integration):
         Output rows as columns.
     repeated : int
         Number of periods that were not integrated but repeat or extrapolate another.
-    trial : float
-        Time (s) at which the stated error is first compared with `asked`. The tolerance was chosen before the peaks of
-        the gaps were known; if it proves too large, the run ends here and not at its end before it is repeated.
+    asked : float
+        With this the stated error is compared after a few periods, where `try_out` was called. The tolerance was chosen
+        before the peaks of the gaps were known; if it proves too large, the run ends there and not at its end before it
+        is repeated.
     """
 
     settling: Settling
     control: FloatArray
     error: FloatArray
-    trial, asked = math.inf, math.inf
+    asked = math.inf
 
     def __init__(
         self, problem: Problem, tol: float, t_out: FloatArray, left: BoolArray, shown: int, width: int,
@@ -101,13 +100,18 @@ class Stepping(Integration):
         """Where the compiled loops write outputs."""
         return Outputs(self.t_out, self.left, self.out)
 
-    @abstractmethod
-    def _to(self, sources: Sources, t_end: float) -> Status:
-        """Integrate to `t_end` (s) without looking for a periodic state."""
+    def try_out(self, asked: float) -> None:
+        """Compare the stated error with `asked` after a few periods, if many are left."""
+        self.asked = asked
+        self.settling.try_out(asked / SAFETY)
 
     @abstractmethod
-    def _look(self) -> bool:
-        """Whether the run has reached its periodic state; see `Settling.look`."""
+    def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
+        """Step to `t_end` (s) in the compiled loop, or to a look that has found something: a code of `loopstate`."""
+
+    @abstractmethod
+    def _failed(self, code: int, sources: Sources) -> Status:
+        """Status of a run whose loop ended with a code other than DONE."""
 
     @abstractmethod
     def _collected(self) -> Any:
@@ -132,33 +136,25 @@ class Stepping(Integration):
     def leap(self, sources: Sources) -> None:
         """Extrapolate the following periods with one affine map, if its error allows it; a network does not."""
 
-    def try_out(self, asked: float) -> None:
-        """Compare the stated error with `asked` after a few periods, if many are left."""
-        start = self.settling.start
-        if self.settling.periods_left(start) > 10.0 * TRIAL_PERIODS:
-            self.trial, self.asked = start + TRIAL_PERIODS * self.settling.period, asked
-
     def through(self, sources: Sources, t_end: float) -> Status:
-        edges, settling = sources.edges if sources.first.size == 2 else np.sort(sources.edges), self.settling
         while True:
-            stop = min(settling.snapped(edges, min(settling.next, self.trial)), t_end)
-            status = self._to(sources, stop)
-            if status is not Status.SUCCESS:
-                return status
-            if stop >= self.trial - same_time(stop):
-                self.trial = math.inf
+            code = self.march(sources, t_end, self.settling.looks)
+            if code == loopstate.LOOKED_AT:
+                self._settle(sources)
+            elif code == loopstate.EXCESSIVE:
                 if excess_of(self.stated_gaps(), self.problem.largest) > self.asked:
                     return Status.ERROR_NOT_MET
-            if stop >= settling.next - same_time(stop):
-                self._settle(sources)
-            if self.t >= t_end:
-                return status
+            elif code != loopstate.DONE:
+                return self._failed(code, sources)
+            if code == loopstate.DONE or self.t >= t_end:
+                return Status.SUCCESS
 
     def _settle(self, sources: Sources) -> None:
-        """Test for the periodic state; once it is reached, keep the next period and then repeat it to the end."""
-        if not self._look():
+        """Once the periodic state is reached, keep the next period and then repeat it to the end."""
+        settling = self.settling
+        if not settling.has_settled:
             self.keep(0)
-            if self.settling.may_leap:
+            if settling.may_leap:
                 self.leap(sources)
         elif not len(self.kept.times):
             self.keep(KEPT_STEPS)
@@ -167,7 +163,7 @@ class Stepping(Integration):
             if self.keeps_all:
                 self._repeat()
             self.keep(0)
-            self.settling.next = np.inf
+            settling.stop_looking()
 
     def keep(self, steps: int) -> None:
         """Keep the steps from now on, at most `steps` of them."""
@@ -186,7 +182,7 @@ class Stepping(Integration):
     def _repeat(self) -> None:
         """Repeat the kept period in place of all whole periods that follow."""
         settling, n_s = self.settling, self.s_before.size
-        periods, period = settling.periods_left(self.t), settling.period
+        periods, period = settling.left, settling.period
         charge, collected = self.before
         drift = self.y[-n_s:] - charge
         drifts = np.zeros(len(self.out))

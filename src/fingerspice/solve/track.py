@@ -19,6 +19,7 @@ from fingerspice.engine.model import Model, dot, gap_voltage, write_row_at
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import end_row
 from fingerspice.engine.segment import Segment, source
+from fingerspice.engine.settling import Looks
 from fingerspice.engine.stackstep import Stack
 from fingerspice.engine.system import System, area_error, area_missed, area_range, build_system
 from fingerspice.engine.work import Work, new_work
@@ -107,9 +108,9 @@ class Track(Stepping):
         self.control[readout.MARGIN] = 1.0
         if model_of(scene).mobile and problem.initial.sign[0] != 0.0:
             self.control[readout.U_GAP], self.control[readout.SIGN] = start.u_gap, math.copysign(1.0, start.u_gap)
-        self.settling = Settling(problem, prepared.system.rates, tol)
+        self.settling = Settling(problem, prepared.system.rates, tol, np.ones(n), leaps=True)
         if h_fixed > 0.0 or not repeat:
-            self.settling.next = math.inf
+            self.settling.stop_looking()
 
     @property
     def shown(self) -> int:
@@ -122,32 +123,22 @@ class Track(Stepping):
         model = self.prepared.system.model
         return float(model.slow[-3]) * model.area0
 
-    def advance(self, sources: Sources, t_end: float) -> int:
-        """March to `t_end` (s) through the source's table."""
+    def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
         p = self.prepared
         stack = Stack(p.system, p.tables, p.work, p.integral, sources.edges, sources.terms, sources.series)
         while True:
-            code = int(loop.march(stack, self.pace, self.loop_state(), t_end))
+            code = int(loop.march_on(stack, self.pace, self.loop_state(), looks, t_end))
             if code != loopstate.PAUSED:
                 return code
             self.recorder.drain(self.counters)
 
-    def _to(self, sources: Sources, t_end: float) -> Status:
-        code = self.advance(sources, t_end)
+    def _failed(self, code: int, sources: Sources) -> Status:
         if code == loopstate.OUT_OF_RANGE:
             raise OutOfRangeError(self.prepared.system.u_top)
-        if code == loopstate.DONE:
-            return Status.SUCCESS
         if self.t > sources.edges[0]:
             # The loop updates the source's value at edges and at `t_end` only: a failed call leaves an old value.
             self.control[readout.U_BEFORE], _ = source(*_segment(sources, self.t, "left"))
         return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
-
-    def _look(self) -> bool:
-        c = self.control
-        return self.settling.look(
-            self.y[:-1], float(c[readout.MAGNIFIED]), float(c[readout.PEAK_U]), int(self.counters[readout.ACCEPTED])
-        )
 
     def leap(self, sources: Sources) -> None:
         from fingerspice.solve.approach import leap

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
+from fingerspice.engine.repeat import SAME_TIME
 from fingerspice.waveforms.bounds import in_windows, runs_through
 from fingerspice.waveforms.refining import POINTS, Refiner
 from fingerspice.waveforms.waveform import Waveform, blank_terms, require
@@ -149,7 +150,7 @@ class SourceTable:
 
 def same_time(t: float) -> float:
     """Distance (s) within which two times near `t` count as equal: a few units in the last place of t."""
-    return 8e-16 * abs(t)
+    return SAME_TIME * abs(t)
 
 
 @jit
