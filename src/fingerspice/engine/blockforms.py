@@ -19,7 +19,9 @@ MIDDLE, FIRST_QUARTER, LAST_QUARTER = 0, 1, 2
 
 # Entries of `control`: halvings of a sample, reference, and as in `engine.readout`.
 LEVEL, REFERENCE, PEAK_U, PEAK_F, ERROR_U, ERROR_F, MARGIN, Z, PEAK_Q, ERROR_Q, COLLECTED, U_GAP, ERROR_V = range(13)
-N_CONTROL = 13
+# Error of the charge by leakage whose sign is not known, C.
+LEAKED = 13
+N_CONTROL = 14
 # Entries of `counters`.
 OUTPUT, STEPS, REFUSED, SWEEPS = range(4)
 N_COUNTERS = 4

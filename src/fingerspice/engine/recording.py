@@ -195,7 +195,7 @@ def accept(c: Course, r: int, n: int, rest: float, local: float, left_over: floa
         charge_error += c.shown.capacitance * left_over + c.shown.moves[1] * off_u
         control[ERROR_Q] = max(control[ERROR_Q], charge_error)
     if c.shown.charge:
-        charge_block(c, r, n, local)
+        charge_block(c, r, n, local, left_over)
     for k in range(c.w.size):
         c.w[k] = room.w[k, n]
         c.error[k] = c.error[k] * c.spare[2, k] + room.own[k, n]
