@@ -175,7 +175,7 @@ class Circuit(Doors):
     path: Path | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
     sets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    related: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    related: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     _memory: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:

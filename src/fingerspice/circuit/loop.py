@@ -28,7 +28,7 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
 
     def make() -> Network:
         if is_stack(circuit):
-            return loop_network(build_stack(circuit, skin_at))
+            return _of_stack(circuit, build_stack(circuit, skin_at), skin_at)
         network: Network = circuit.remember("network", lambda: _network(circuit))
         return network
 
@@ -50,6 +50,21 @@ def _network(circuit: Circuit) -> Network:
     return found
 
 
+def _of_stack(circuit: Circuit, stack: Stack, skin_at: float | None) -> Network:
+    """The network of a stack, taken from that of a related circuit's stack if the two differ in their sources only."""
+    key = ("loop network", skin_at)
+    before: Network | None = circuit.related.get(key)
+    if before is not None and before.stack is not None and before.stack.c is stack.c:
+        return dataclasses.replace(before, sources=(_source(stack),), stack=stack)
+    circuit.related[key] = found = loop_network(stack)
+    return found
+
+
+def _source(stack: Stack) -> Element:
+    """The voltage around a stack's loop."""
+    return Element("loop", "V", ("1", "0"), ("1", "0"), _NOTHING, stack.waveform)
+
+
 def loop_network(stack: Stack) -> Network:
     """The network of a stack, its cells in the order of `Stack.state_order`, with voltages from p to n."""
     ends, order = ("1", "0"), stack.state_order
@@ -64,7 +79,7 @@ def loop_network(stack: Stack) -> Network:
     p, q, nodes = _voltages(hops, tuple(stack.layer_of(i) for i in order), tuple(sign[i] for i in order))
     gap = None if stack.gap_layer is None else stack.layers[stack.gap_layer]
     return Network(
-        sources=(Element("loop", "V", ends, ends, _NOTHING, stack.waveform),),
+        sources=(_source(stack),),
         n_voltage=1,
         cells=tuple(Cell(layer, ends, *constants[i], 0) for layer, i in zip(layers, order, strict=True)),
         layers=stack.layers,

@@ -10,9 +10,12 @@ sum v_x = 0 fixes the neutral gauge of the leaked charges. So N layers have N - 
 
 from __future__ import annotations
 
+import copy
 import math
+import operator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +76,11 @@ class Stack:
         return tuple((h.element, -h.sign) for h in self.hops if h.element.device == "V")
 
     @cached_property
+    def kept(self) -> dict[Any, Any]:
+        """Whatever else has been computed from the layers alone."""
+        return {}
+
+    @cached_property
     def first_cell(self) -> NDArray[np.intp]:
         """Index of the first cell of each layer."""
         return np.concatenate([[0], np.cumsum(self.cells)[:-1]]).astype(np.intp)
@@ -116,6 +124,14 @@ class Stack:
         """
         left_out = next((i for i in reversed(range(self.c.size)) if i != self.gap), 0)
         return (*(i for i in range(self.c.size) if i != left_out), left_out)
+
+    def between(self, hops: tuple[Hop, ...]) -> Stack:
+        """The stack of the same layers between other sources; it keeps what has been computed from the layers."""
+        changed = copy.copy(self)
+        vars(changed).update(hops=hops)
+        for name in ("waveform", "by_layer"):
+            vars(changed).pop(name, None)
+        return changed
 
     @cached_property
     def by_layer(self) -> Stack:
@@ -246,18 +262,34 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
     InputError
         As `topology.find_branches`, and if the circuit is not a series stack.
     """
-    stack: Stack = circuit.remember(("stack", skin_at), lambda: _build(circuit, skin_at))
+
+    def make() -> Stack:
+        key, loop = ("stack", skin_at, circuit.work), _loop(circuit)
+        before: Stack | None = circuit.related.get(key)
+        if before is not None and loop is not None and all(map(operator.is_, before.layers, layers_of(loop))):
+            found = before.between(loop.hops)
+        else:
+            found = _build(circuit, loop, skin_at)
+        # The latest one, because runs have computed more from it.
+        circuit.related[key] = found
+        return found
+
+    stack: Stack = circuit.remember(("stack", skin_at), make)
     return stack
 
 
-def _build(circuit: Circuit, skin_at: float | None) -> Stack:
-    loop = _loop(circuit)
+def layers_of(loop: Loop) -> list[Element]:
+    """Layers of a loop in its order."""
+    return [h.element for h in loop.hops if h.element.spec.is_layer]
+
+
+def _build(circuit: Circuit, loop: Loop | None, skin_at: float | None) -> Stack:
     if loop is None:
         raise InputError(
             "this needs a series chain of LAYER, SLAB, SKIN and GAP driven by V sources, and the circuit is another "
             "network; allowed for any network: simulate (run), plan, phasor (ac) and export"
         )
-    layers = [h.element for h in loop.hops if h.element.spec.is_layer]
+    layers = layers_of(loop)
     parts = [layer_constants(e, skin_at) for e in layers]
     cells = tuple(len(part) for part in parts)
     constants = np.concatenate(parts)

@@ -21,7 +21,9 @@ MIDDLE, FIRST_QUARTER, LAST_QUARTER = 0, 1, 2
 LEVEL, REFERENCE, PEAK_U, PEAK_F, ERROR_U, ERROR_F, MARGIN, Z, PEAK_Q, ERROR_Q, COLLECTED, U_GAP, ERROR_V = range(13)
 # Error of the charge by leakage whose sign is not known, C.
 LEAKED = 13
-N_CONTROL = 14
+# Mean 1/A of the last block, 1/m^2; 0 before the first.
+MEAN_Q = 14
+N_CONTROL = 15
 # Entries of `counters`.
 OUTPUT, STEPS, REFUSED, SWEEPS = range(4)
 N_COUNTERS = 4

@@ -52,6 +52,11 @@ def new_tables(n: int) -> Tables:
     )
 
 
+def forget(tables: Tables) -> None:
+    """Empty the tables."""
+    tables.used[:] = 0
+
+
 @jit
 def make_tables(
     rates: FloatArray, level: int, h: float, keys_h: FloatArray, keys_level: IntArray, count: IntArray,

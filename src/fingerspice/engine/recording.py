@@ -17,6 +17,7 @@ from fingerspice.engine.blockforms import (
     LEVEL,
     LEVELS,
     MARGIN,
+    MEAN_Q,
     PEAK_F,
     PEAK_U,
     REFERENCE,
@@ -27,7 +28,7 @@ from fingerspice.engine.blockforms import (
     Form,
 )
 from fingerspice.engine.blockoutput import write_block
-from fingerspice.engine.blockrows import add, add_to_all, area_rows, modes_into, recursion, scaled, settle
+from fingerspice.engine.blockrows import add, add_to_all, area_rows, largest_of, modes_into, recursion, scaled, settle
 from fingerspice.engine.model import ramp
 from fingerspice.engine.relaxation import (
     FIRST_NEWTON,
@@ -43,16 +44,14 @@ from fingerspice.engine.relaxation import (
 
 # Codes returned by `march`.
 DONE, NOT_CLOSED, TOO_COARSE = range(3)
-# Largest ratio of 1/A to that of the reference in use.
-_FARTHEST = 1.2
 
 
 @jit_rows
 def peaks_of(
     n: int, stress: float, u: FloatArray, q: FloatArray, error: FloatArray
-) -> tuple[float, float, float, float]:  # fmt: skip
-    """The largest |u|, force, force over voltage, and that times the error of the voltage in its place."""
-    peak, force, steepest, worst = 0.0, 0.0, 0.0, 0.0
+) -> tuple[float, float, float, float, float]:  # fmt: skip
+    """The largest |u|, force, force over voltage, and that times the error of the voltage in its place; the mean q."""
+    peak, force, steepest, worst, total = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         x = abs(u[i])
         slope = stress * x / q[i]
@@ -61,25 +60,15 @@ def peaks_of(
         force = slope * x if slope * x > force else force
         off = slope * abs(error[i])
         worst = off if off > worst else worst
-    return peak, force, steepest, worst
-
-
-@jit_rows
-def largest_of(n: int, x: FloatArray) -> float:
-    largest = 0.0
-    for i in range(n):
-        a = abs(x[i])
-        largest = a if a > largest else largest
-    return largest
+        total += q[i]
+    return peak, force, steepest, worst, total / n
 
 
 @jit
-def nearest(form: Form, q: float, r: int) -> int:
-    """The reference for a value of 1/A: the present one, unless it is too far away."""
-    if max(q / form.q0[r], form.q0[r] / q) <= _FARTHEST:
-        return r
-    best = r
-    for one in range(form.q0.size):
+def nearest(form: Form, q: float) -> int:
+    """The reference for a value of 1/A."""
+    best = 0
+    for one in range(1, form.q0.size):
         if abs(math.log(q / form.q0[one])) < abs(math.log(q / form.q0[best])):
             best = one
     return best
@@ -177,7 +166,7 @@ def accept(c: Course, r: int, n: int, rest: float, local: float, left_over: floa
         gap = room.slope
         scaled(n + 1, 1.0, room.u, gap)
         add(n + 1, -c.form.kappa, room.g[room.g.shape[0] - 1], gap)
-    peak, force, steepest, worst = peaks_of(n + 1, c.shown.stress, gap, c.charges.q[0], room.before)
+    peak, force, steepest, worst, control[MEAN_Q] = peaks_of(n + 1, c.shown.stress, gap, c.charges.q[0], room.before)
     control[PEAK_U], control[PEAK_F] = max(control[PEAK_U], peak), max(control[PEAK_F], force)
     off_u = local + magnified * carried
     # The force is proportional to the square of the voltage, and depends a little on the area.
@@ -225,7 +214,8 @@ def march(
             room.w[k, 0] = c.w[k]
         room.u[0] = control[U_GAP]
         look_at_ends(form, room, r, 1, FIRST_NEWTON)
-        to = nearest(form, form.q0[r] + room.z[0], r)
+        # Near the area of the last block the drives are small, and the sweeps converge fast.
+        to = nearest(form, control[MEAN_Q] if control[MEAN_Q] > 0.0 else form.q0[r] + room.z[0])
         if to != r:
             go_over(c, r, to, c.w)
             go_over(c, r, to, c.error)

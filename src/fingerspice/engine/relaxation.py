@@ -44,6 +44,7 @@ from fingerspice.engine.blockrows import (
     change_of,
     drives_into,
     forced_by,
+    largest_of,
     modes_into,
     modes_into_three,
     newton_rows,
@@ -63,10 +64,10 @@ from fingerspice.engine.blockrows import (
 # Weights of the parabola through 0, 1/2 and 1 at these places.
 PARABOLA = np.array([[0.0, 1.0, 0.0], [0.375, 0.75, -0.125], [-0.125, 0.75, 0.375]])
 # Most sweeps of a block, and the fraction of the error allowed that the last one may leave.
-MOST_SWEEPS, LEFT = 40, 0.5
-# Smallest ratio assumed between the errors of two sweeps, because the first sweeps may converge faster than the later
-# ones; and its factor in networks, which converge more slowly.
-SLOWEST, SLOWER = 0.01, 1.8
+MOST_SWEEPS, LEFT = 40, 0.8
+# Each sweep reduces the error by about the largest relative distance of the areas from the reference, and in networks
+# by some more. So much is assumed at least, and no more than can be seen.
+LEAST_RATIO, SLOWER, MOST_RATIO = 0.001, 1.8, 0.9
 # First sweep in which the places of the kinks and the rate of convergence are known well enough.
 KINKED = 1
 # Newton steps for the gap voltage under `mobile`, in the first sweep and in later ones; and the smallest distance to
@@ -245,6 +246,16 @@ def _pulses(form: Form, room: Room, r: int, level: int, h: float, n: int) -> Non
 
 
 @jit_within
+def least_ratio(form: Form, room: Room, r: int, n: int) -> float:
+    """Least ratio to expect between the errors of two sweeps.
+
+    The first changes tell too little: they begin at the guess, and hold the corrections at the kinks.
+    """
+    strayed = largest_of(n + 1, room.z) / form.q0[r] * (SLOWER if form.bend.size > 0 else 1.0)
+    return float(min(max(strayed, LEAST_RATIO), MOST_RATIO))
+
+
+@jit_within
 def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int, tol: float) -> tuple[
     float, float, int
 ]:  # fmt: skip
@@ -270,7 +281,6 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
         for t in range(drives):
             room.kinked[k, t] = h * form.feed[r, k, t] * kink[t]
     last, margin, over = math.inf, 1.0, 1.0 / tol if tol > 0.0 else 1.0
-    slowest = SLOWEST * (SLOWER if form.bend.size > 0 else 1.0)
     fades = form.faded[r, level] > 0.0
     scaled(n, 0.0, room.s, room.pulse)
     for sweep in range(MOST_SWEEPS):
@@ -297,11 +307,10 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
             return math.inf, margin, sweep
         change = change_of(n + 1, over, room.u, room.before) / over
         if sweep > 0:
-            ratio = max(change / last, slowest) if last > 0.0 else 0.0
-            if not ratio < 0.9 and change > tol:
+            ratio = change / last if last > 0.0 else 0.0
+            if not ratio < MOST_RATIO and change > tol:
                 return math.inf, margin, sweep
-            # The remaining error falls by about the same ratio.
-            left = change * ratio
+            left = change * max(ratio, least_ratio(form, room, r, n))
             if left <= LEFT * tol and sweep >= KINKED:
                 return left, margin, sweep
         last = change

@@ -32,7 +32,7 @@ DEGREE = 27
 # circuits magnify an error of the area a thousandfold, and terms cost little.
 _LONG_SIZES, _LONG_ROUNDING = (48, 64, 96, 128, 160), 9e-13
 # Ratio of neighbouring reference values of 1/A: the nonlinear term is at most an eighth of the linear leak.
-_LEVEL_RATIO = 1.28
+LEVEL_RATIO = 1.28
 
 
 # Error of the polynomial over the error asked for, and the smallest error asked of it: below rounding the long series
@@ -100,7 +100,7 @@ class System(NamedTuple):
 
 def build_system(
     model: Model, tol: float, q_range: tuple[float, float], grouping: FloatArray, nodes: FloatArray,
-    stress: float = 0.0,
+    stress: float = 0.0, ratio: float = LEVEL_RATIO,
 ) -> System:  # fmt: skip
     """Modal form of a model.
 
@@ -117,10 +117,12 @@ def build_system(
         Voltages of the nodes from the live ones and U.
     stress : float
         Force per area and squared gap voltage, Pa/V^2.
+    ratio : float
+        Largest ratio of neighbouring reference areas.
     """
     forms = _forms(
         model.mobile, model.area0, q_range[0], q_range[1], model.rate, model.rate0, model.k, model.gap, model.slow,
-        grouping, nodes,
+        grouping, nodes, ratio,
     )  # fmt: skip
     return System(model, *forms, *_polynomial(model, tol), float(model.curve[1]), stress)
 
@@ -128,14 +130,14 @@ def build_system(
 @jit
 def _forms(
     mobile: bool, area0: float, lowest: float, highest: float, rate: FloatArray, rate0: FloatArray, k: FloatArray,
-    gap: FloatArray, slow: FloatArray, grouping: FloatArray, nodes: FloatArray,
+    gap: FloatArray, slow: FloatArray, grouping: FloatArray, nodes: FloatArray, ratio: float,
 ) -> tuple[
     FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray,
     FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray,
 ]:  # fmt: skip
     """The arrays of a `System` from `q0` to `k_node`, for reference areas whose 1/A is from `lowest` to `highest`."""
     n = gap.size
-    levels = max(1, math.ceil(math.log(highest / lowest) / math.log(_LEVEL_RATIO)))
+    levels = max(1, math.ceil(math.log(highest / lowest) / math.log(ratio)))
     leaking = np.flatnonzero(rate0 > 0.0)
     tap_k = np.zeros(leaking.size)
     q0, rates, gain, push, own, slowest = (

@@ -17,6 +17,7 @@ from fingerspice.engine.blockforms import (
     FIRST_QUARTER,
     LAST_QUARTER,
     LEVEL,
+    MEAN_Q,
     MIDDLE,
     OUTPUT,
     PLACES,
@@ -32,6 +33,7 @@ from fingerspice.engine.blockoutput import write_points, write_samples
 from fingerspice.engine.blockrows import (
     add_three,
     change_of,
+    largest_of,
     modes_into,
     scaled,
     sum_of,
@@ -43,17 +45,17 @@ from fingerspice.engine.recording import (
     accept,
     correct,
     go_over,
-    largest_of,
     nearest,
 )
 from fingerspice.engine.relaxation import (
     KINKED,
     LEFT,
+    MOST_RATIO,
     MOST_SWEEPS,
     PARABOLA,
-    SLOWEST,
     SPARE,
     drives_at,
+    least_ratio,
     look_at_ends,
     project_at_ends,
 )
@@ -183,10 +185,10 @@ def _relax(
             return math.inf, sweep
         change = change_of(n + 1, over, room.u, room.before) / over
         if sweep > 0:
-            ratio = max(change / last, SLOWEST) if last > 0.0 else 0.0
-            if not ratio < 0.9 and change > tol:
+            ratio = change / last if last > 0.0 else 0.0
+            if not ratio < MOST_RATIO and change > tol:
                 return math.inf, sweep
-            left = change * ratio
+            left = change * max(ratio, least_ratio(form, room, r, n))
             if left <= LEFT * tol and sweep >= KINKED:
                 return left, sweep
         last = change
@@ -277,7 +279,7 @@ def march(
             room.w[k, 0] = c.w[k]
         room.u[0] = control[U_GAP]
         look_at_ends(form, room, r, 1, 0)
-        to = nearest(form, form.q0[r] + room.z[0], r)
+        to = nearest(form, control[MEAN_Q] if control[MEAN_Q] > 0.0 else form.q0[r] + room.z[0])
         if to != r:
             go_over(c, r, to, c.w)
             go_over(c, r, to, c.error)

@@ -14,7 +14,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
 from fingerspice.engine.blockforms import BLOCK, FIRST_QUARTER, LAST_QUARTER, MIDDLE, PLACES, Form
-from fingerspice.engine.recording import largest_of
+from fingerspice.engine.blockrows import largest_of
 
 # Place that is the end of a step, beside `PLACES`.
 END = 3

@@ -26,10 +26,12 @@ from fingerspice.results.outcome import State
 from fingerspice.results.record import sided
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.stackstate import StackState, from_stack
-from fingerspice.solve.track import Prepared, as_recorded, on_branch, prepare_system
+from fingerspice.solve.track import as_recorded, on_branch, system_of
 
 # Truncation error allowed for the polynomial of 1/A, relative to the error asked for.
 AREA_SHARE = 0.02
+# Largest ratio of neighbouring reference areas: the closer the reference, the fewer sweeps.
+REFERENCE_RATIO = 1.015
 # Time constants in a step from which on a fast mode is taken apart from the parabola, which resolves slower ones.
 FADED = 5.0
 # Time constants in a step up to which the quarters show the error of a mode well, and the share of the error that may
@@ -199,20 +201,16 @@ class Followed(Follower):
 
     Attributes
     ----------
-    prepared : Prepared
+    system : System
     area : ndarray
         Polynomial of 1/A, see `Form.area`.
     at_rest : float
         Variable of that polynomial at 0 V.
     """
 
-    prepared: Prepared
+    system: System
     area: FloatArray
     at_rest: float
-
-    @property
-    def system(self) -> System:
-        return self.prepared.system
 
     def _charge_with(self, u_gap: float) -> float:
         """Part of the charge (C) that is a function of the gap voltage (V)."""
@@ -254,8 +252,7 @@ class Followed(Follower):
 
 def followed(problem: Problem, rtol: float) -> Followed | None:
     """The scene prepared for recordings; None where no polynomial represents 1/A well enough."""
-    prepared = prepare_system(problem.scene, rtol)
-    system = prepared.system
+    system = system_of(problem.scene, int(np.floor(np.log10(rtol))), ratio=REFERENCE_RATIO)
     found = _area(system, AREA_SHARE * rtol)
     if found is None:
         return None
@@ -271,4 +268,4 @@ def followed(problem: Problem, rtol: float) -> Followed | None:
         -kink / q_rest**2, _moved(system, area, at_rest), problem.charge, np.zeros(0), 0, 0.0,
         np.array([1.0 if system.model.mobile else 0.0, 0.0]),
     )  # fmt: skip
-    return Followed(shown, system.model.k_gap, system.u_top, q_rest, missed, 0.0, prepared, area, at_rest)
+    return Followed(shown, system.model.k_gap, system.u_top, q_rest, missed, 0.0, system, area, at_rest)

@@ -274,6 +274,7 @@ def _fixed_areas(network: Network, area: str | float) -> tuple[tuple[float | Non
 
 
 def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:
+    """The model of a stack for compiled code; only the range of the area's curve depends on the source."""
     if fixed is not None:
         area0 = fixed
         curve = fixed_area_curve(fixed)
@@ -281,6 +282,9 @@ def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:
         assert stack.contact is not None
         area0 = stack.contact.area_at_rest
         curve = stack.contact.curve(u_top)
+    before: Model | None = None if fixed is not None else stack.kept.get(("model", law))
+    if before is not None:
+        return before._replace(curve=curve)
     order = list(stack.state_order)
     probe = int(np.argmin(stack.c)) if stack.gap is None else stack.gap
     k = stack.k[order]
@@ -288,7 +292,7 @@ def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:
     slow = int(np.argmin(leaks))
     rates, _, _, _ = modes(np.ascontiguousarray(leaks[order]), np.ascontiguousarray(k))
     fastest = float(rates.max(initial=0.0))
-    return Model(
+    model = Model(
         mobile=law == "mobile",
         coupled=fixed is None,
         k=np.ascontiguousarray(k),
@@ -302,6 +306,9 @@ def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:
         tau=1.0 / fastest if fastest > 0.0 else math.inf,
         curve=curve,
     )
+    if fixed is None:
+        stack.kept["model", law] = model
+    return model
 
 
 def _row(order: list[int], layer: int) -> FloatArray:

@@ -14,14 +14,14 @@ import numpy as np
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine import loop, loopstate, readout
 from fingerspice.engine.exponential import Tables as StepTables
-from fingerspice.engine.exponential import new_tables
+from fingerspice.engine.exponential import forget, new_tables
 from fingerspice.engine.model import Model, dot, gap_voltage, write_row_at
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import end_row
 from fingerspice.engine.segment import Segment, source
 from fingerspice.engine.settling import Looks
 from fingerspice.engine.stackstep import Stack
-from fingerspice.engine.system import System, area_error, area_missed, area_range, build_system
+from fingerspice.engine.system import LEVEL_RATIO, System, area_error, area_missed, area_range, build_system
 from fingerspice.engine.work import Work, new_work
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.physics.contact import inverse_areas
@@ -49,16 +49,55 @@ MOST_SYSTEMS = 64
 CHARGE_SAFETY = 1.75
 
 
-@dataclasses.dataclass(frozen=True)
-class Prepared:
-    """A scene's modal system with its step tables and scratch arrays, for one thread."""
+@dataclasses.dataclass
+class _Scratch:
+    """A thread's step tables and scratch arrays for a number of modes, and the system whose tables they are.
 
-    system: System
+    Fresh arrays would cost a third of the set-up of a changed circuit, as the memory has to be mapped anew.
+    """
+
     tables: StepTables
     work: Work
+    of: System | None = None
+
+
+class _OfThread(threading.local):
+    """The present thread's scratch by its number of modes."""
+
+    def __init__(self) -> None:
+        self.by_size: dict[int, _Scratch] = {}
+
+    def __getitem__(self, n: int) -> _Scratch:
+        if n not in self.by_size:
+            self.by_size[n] = _Scratch(new_tables(n), new_work(n))
+        return self.by_size[n]
+
+
+_SCRATCH = _OfThread()
+
+
+@dataclasses.dataclass(frozen=True)
+class Prepared:
+    """A scene's modal system with scratch arrays, for one thread."""
+
+    system: System
     integral: FloatArray
     # Relative truncation error of the area's polynomial.
     area_error: float
+    scratch: _Scratch
+
+    @property
+    def tables(self) -> StepTables:
+        """Step tables, for the next call of a compiled loop: another system's run may use them after that."""
+        if self.scratch.of is not self.system:
+            self.scratch.of = self.system
+            forget(self.scratch.tables)
+        return self.scratch.tables
+
+    @property
+    def work(self) -> Work:
+        """Scratch arrays, for the next call of a compiled loop."""
+        return self.scratch.work
 
 
 def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
@@ -72,6 +111,14 @@ def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
 
 
 def _prepare(scene: Scene, decade: int, u_top: float) -> Prepared:
+    system = system_of(scene, decade, u_top)
+    return Prepared(
+        system, integral_table(), area_missed(system.model.curve, decade), _SCRATCH[system.model.gap.size]
+    )  # fmt: skip
+
+
+def system_of(scene: Scene, decade: int, u_top: float = 0.0, ratio: float = LEVEL_RATIO) -> System:
+    """The modal system of a scene for tolerances of a decade, with neighbouring reference areas in at most `ratio`."""
     model, (contact,) = model_of(scene), scene.network.contacts
     assert scene.stack is not None
     if u_top > 0.0:
@@ -81,8 +128,7 @@ def _prepare(scene: Scene, decade: int, u_top: float) -> Prepared:
     u_max, n = max(scene.u_peak, u_top), model.gap.size
     nodes = scene.network.nodes[:, : n + 1] * np.append(scene.turn, 1.0)
     u_range = area_range(model, u_max)
-    system = build_system(model, area_error(decade), u_range, scene.stack.grouping, nodes, stress)
-    return Prepared(system, new_tables(n), new_work(n), integral_table(), area_missed(model.curve, decade))
+    return build_system(model, area_error(decade), u_range, scene.stack.grouping, nodes, stress, ratio)
 
 
 class Track(Stepping):
