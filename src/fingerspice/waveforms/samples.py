@@ -163,14 +163,20 @@ class Samples(Ramps):
         """Number of samples."""
         return self.values.size
 
+    def __repr__(self) -> str:
+        return f"Samples(<{self.count} samples>, {self.rate!r}, {self.start!r})"
+
     def digest(self) -> str:
         """SHA-256 of the samples, rate and start, as a key of caches."""
         return hashlib.sha256(repr((self.rate, self.start)).encode() + self.values.tobytes()).hexdigest()
 
     def between(self, first: int, last: int) -> FloatArray:
-        """Samples number `first` to `last` - 1, V, shape (last - first,); beyond the ends, the first or last sample."""
+        """Samples number `first` to `last` - 1, V, shape (last - first,); beyond the ends, the first or last sample.
+
+        They may be those of `values` themselves, which are read-only.
+        """
         if first >= 0 and last <= self.count:
-            return self.values[first:last].copy()
+            return self.values[first:last]
         return np.asarray(self.values[np.clip(np.arange(first, last), 0, self.count - 1)])
 
     def part(self, t0: float, t1: float) -> Samples:
