@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.response import areas_at_rest, with_skin_held
 from fingerspice.circuit.statespace import build_stack
@@ -160,6 +160,8 @@ def _squared_gains(circuit: Circuit) -> tuple[FloatArray, FloatArray] | None:
     those held at one; None if they cannot be computed. Circuits that differ in their sources only share them."""
     drives = {e.name for e in driving_sources(circuit)}
     passive = tuple(e for e in circuit.elements if e.name not in drives)
+    before: tuple[Element, ...]
+    found: tuple[FloatArray, FloatArray] | None
     before, found = circuit.related.get("squared gains", ((), None))
     if len(before) == len(passive) and all(a is b for a, b in zip(before, passive, strict=True)):
         return found

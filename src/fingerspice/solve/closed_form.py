@@ -148,10 +148,7 @@ def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatAr
     assert isinstance(wave, Samples)
     count = round((problem.t_stop - wave.start) * wave.rate) + 1
     u, rates, gains = wave.values[:count], modes.rates, np.ascontiguousarray(modes.gains[:, 0])
-    live, end = np.empty((modes.rates.size, u.size)), v0
-    for i, out in enumerate(live):
-        direct = -float(modes.follow[i, 0])
-        _, end = hold.first_order_hold(u, 1.0 / wave.rate, rates, gains, direct, modes.shape[i], v0, out=out)
+    live, end = hold.first_order_hold(u, 1.0 / wave.rate, rates, gains, -modes.follow[:, 0], modes.shape, v0)
     s = np.array([[float(wave.value(problem.t_stop, "left"))]])
     return live.T, _Answer(end[None], s, np.zeros((1, 1)), np.zeros((1, 1)))
 
