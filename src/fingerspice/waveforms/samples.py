@@ -174,7 +174,14 @@ class Samples(Ramps):
         return self.values.size
 
     def __repr__(self) -> str:
-        return f"Samples(<{self.count} samples>, {self.rate!r}, {self.start!r})"
+        # Stores of runs that go on are told apart by this text where the samples are part of a sum: it names them all.
+        if "repr" not in self.kept:
+            self.kept["repr"] = f"{str(self)[:-1]}, sha256 {self.digest()[:16]})"
+        text: str = self.kept["repr"]
+        return text
+
+    def __str__(self) -> str:
+        return f"Samples({self.count} samples, rate={self.rate!r}, start={self.start!r})"
 
     def digest(self) -> str:
         """SHA-256 of the samples, rate and start, as a key of caches."""
@@ -262,6 +269,8 @@ class _WavFile(Samples):
 
     def __repr__(self) -> str:
         return f"Samples.from_wav({str(self.layout.path)!r}, {self.gain!r}, {self.layout.channel}, at_once=False)"
+
+    __str__ = __repr__
 
     @cached_property
     def values(self) -> FloatArray:
