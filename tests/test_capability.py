@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import cmath
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ import fingerspice as fs
 from commands import Command
 from scenes import table1
 
+CIRCUITS = Path(__file__).parents[1] / "circuits"
 pytestmark = pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
 
 
@@ -41,12 +44,79 @@ def test_more_voltage_makes_more() -> None:
     assert 0.0 < with_carrier.largest[0] <= 0.5 * (with_carrier.largest_mean - 0.15) * 1.001
 
 
+def voltage_by_search(circuit: fs.Circuit, mean: float, amplitude: float, f: float, carrier: float) -> float:
+    """Largest voltage of the periodic modulated carrier whose friction is mean + amplitude sin(2 pi f t), N.
+
+    It is searched for directly, without the inverse drive: the envelope is a short Fourier series, whose coefficients
+    are varied until the mean friction of each of the carrier's periods is the wanted one.
+    """
+    order, per = 3, round(carrier / f)
+    t = np.arange(32 * per + 1) / (32.0 * carrier)
+    # Means over a period of the carrier flatten the sine a little.
+    flat = np.sin(np.pi / per) / (np.pi / per)
+    wanted = mean + amplitude * flat * np.sin(2.0 * np.pi * (np.arange(per) + 0.5) / per)
+
+    def source(x: np.ndarray) -> fs.Waveform:
+        pairs = [complex(*x[i : i + 2]) for i in range(1, x.size, 2)]
+        tones = (fs.Sine(abs(z), k * f, phase_deg=math.degrees(cmath.phase(z))) for k, z in enumerate(pairs, 1))
+        return fs.Sum((fs.DC(float(x[0])), *tones)) * fs.Sine(1.0, carrier)
+
+    def misses(x: np.ndarray) -> np.ndarray:
+        run = fs.simulate(circuit, sources=source(x), start="periodic", t_stop=1.0 / f, t_eval=t, rtol=1e-5)
+        pieces = np.asarray(run.f_t)[:-1].reshape(per, 32)
+        # The first point of each period is also the last one of the period before: the trapezoidal rule.
+        ends = np.asarray(run.f_t)[::32]
+        means = pieces.mean(1) + 0.5 * np.diff(ends) / 32.0
+        return (means - wanted) / amplitude
+
+    x = np.append([110.0, 20.0], np.zeros(2 * order - 1))
+    for _ in range(8):
+        now = misses(x)
+        if np.abs(now).max() < 1e-3:
+            break
+        slopes = np.stack([misses(x + step) - now for step in 0.1 * np.eye(x.size)], axis=1) / 0.1
+        x = x - np.linalg.lstsq(slopes, now, rcond=None)[0]
+    assert np.abs(misses(x)).max() < 1e-3
+    fine = np.linspace(0.0, 1.0 / f, 400 * per + 1)
+    return float(np.abs(source(x).value(fine)).max())
+
+
+@pytest.mark.parametrize("f", [125.0, 250.0])
+def test_behind_an_amplifier_it_is_what_a_direct_search_over_carriers_finds(f: float) -> None:
+    circuit = fs.read_netlist(CIRCUITS / "amplifier.cir")
+    found = fs.capability(circuit, 150.0, carrier=2000.0, frequency=[f], means=5)
+    mean, amplitude = float(found.mean[3]), float(found.amplitude[3, 0])
+    assert amplitude < 0.9 * (mean - found.smallest_mean)
+    assert voltage_by_search(circuit, mean, amplitude, f, 2000.0) == pytest.approx(150.0, rel=5e-3)
+
+
+@pytest.mark.parametrize(("deck", "carrier"), [("amplifier", None), ("ungrounded_user", 2000.0)])
+def test_in_a_network_an_amplitude_is_reached_and_a_larger_one_is_not(deck: str, carrier: float | None) -> None:
+    circuit = fs.read_netlist(CIRCUITS / f"{deck}.cir")
+    found = fs.capability(circuit, 150.0, carrier=carrier, frequency=[100.0], means=5)
+    mean, largest = float(found.mean[3]), float(found.amplitude[3, 0])
+    assert 0.0 < largest < 0.95 * (mean - found.smallest_mean)
+    rate = 8000.0 if carrier is None else 32.0 * carrier
+    for factor in (0.98, 1.02):
+        wanted = fs.Sum((fs.DC(mean), fs.Sine(factor * largest, 100.0)))
+        drive = fs.inverse_drive(circuit, friction=wanted, duration=0.05, rate=rate, carrier=carrier)
+        assert (drive.peak > 150.0) is (factor > 1.0)
+        assert drive.peak == pytest.approx(150.0, rel=1e-2)
+    # The largest constant friction, held by the limit from the end of the rise on.
+    held = fs.inverse_drive(
+        circuit, friction=fs.DC(found.largest_mean), duration=0.05, rate=rate, carrier=carrier, limit=150.0
+    )
+    assert held.worst < 1e-3 * found.largest_mean
+    assert fs.inverse_drive(
+        circuit, friction=fs.DC(found.largest_mean), duration=0.05, rate=rate, carrier=carrier
+    ).peak == pytest.approx(150.0, rel=2e-3)
+
+
 def test_it_is_refused_in_one_sentence() -> None:
-    circuits = Path(__file__).parents[1] / "circuits"
-    with pytest.raises(fs.InputError, match="has Rout, Ccable beside it"):
-        fs.capability(fs.read_netlist(circuits / "amplifier.cir"), 150.0)
+    with pytest.raises(fs.InputError, match="is that of one V source; this circuit has Idrive"):
+        fs.capability(fs.read_netlist(CIRCUITS / "current_drive.cir"), 150.0)
     with pytest.raises(fs.InputError, match="one finger"):
-        fs.capability(fs.read_netlist(circuits / "two_fingers.cir"), 150.0)
+        fs.capability(fs.read_netlist(CIRCUITS / "two_fingers.cir"), 150.0)
     with pytest.raises(fs.InputError, match="limit is -1 V"):
         fs.capability(table1(), -1.0)
     with pytest.raises(fs.InputError, match="a quarter of the carrier"):

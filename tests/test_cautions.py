@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 import analytic as ref
 import fingerspice as fs
 from fingerspice.circuit.spectrum import energy_outside, skin_error
+from fingerspice.waveforms.waveform import as_waveform
 from scenes import deck, table1, table1_deck
 
 every_kind = pytest.mark.parametrize("beside", ["", "Rbeside drive 0 1meg"], ids=["stack", "network"])
@@ -132,6 +133,21 @@ def test_the_error_of_a_long_recording_is_that_of_its_pieces(seconds: float) -> 
     # Below 10 Hz there is nothing, and above a kilohertz only what straight lines add.
     assert energy_outside(repeated, seconds)[0] < 1e-3
     assert sum(energy_outside(repeated, seconds, (40.0, 1100.0))) < 1e-2
+
+
+def test_the_error_of_skin_data_at_one_frequency_follows_the_circuit_not_the_one_before() -> None:
+    circuit, wave = table1(), noise(50.0, 1000.0, 8000.0, 2.0)
+    changes: list[dict[str, Any]] = [{}, {"Xgap.d": 7e-6}, {"Vdrive": wave}, {"Xskin.f": 1000.0}, {}]
+    for change in changes:
+        one = circuit.replace(change)
+        fresh = fs.parse_netlist(table1_deck()).replace(change)
+        assert skin_error(one, wave, 2.0) == skin_error(fresh, wave, 2.0)
+    errors = {skin_error(circuit.replace(change), wave, 2.0) for change in changes}
+    assert len(errors) == 3
+
+
+def test_a_source_that_is_not_finite_has_no_error_of_its_skin() -> None:
+    assert skin_error(table1(), as_waveform(lambda t: math.nan * t), 2.0) is None
 
 
 def test_directives_without_effect_are_warned_about_but_not_those_for_ngspice() -> None:

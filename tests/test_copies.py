@@ -35,6 +35,18 @@ def test_a_copys_arrays_are_read_only_and_the_same(deck: str, how: str, looked_a
         np.testing.assert_array_equal(arrays[name], values)
 
 
+@pytest.mark.parametrize("area", ["coupled", "frozen"])
+def test_the_times_asked_for_stay_the_callers_own(area: str) -> None:
+    circuit = fs.read_netlist(CIRCUITS / "fingerpad.cir")
+    t = np.arange(49) / 48e3
+    solution = fs.simulate(
+        circuit, sources=fs.Samples(np.sin(np.arange(49.0)), 48e3), t_stop=1e-3, t_eval=t, area=area, charge=False
+    )
+    t += 1.0
+    np.testing.assert_array_equal(solution.t, np.arange(49) / 48e3)
+    np.testing.assert_array_equal(solution.u_source, np.sin(np.arange(49.0)))
+
+
 def test_samples_stay_read_only_in_a_copy() -> None:
     samples = pickle.loads(pickle.dumps(fs.Samples(np.arange(3.0), 1e3)))
     assert not samples.values.flags.writeable

@@ -224,9 +224,9 @@ def test_samples_at_their_own_times_are_the_closed_form_by_a_recursion(rate: flo
     t = np.arange(400) / rate
     source = fs.Samples(values, rate)
     quick = linear(source, t, stop, charge=False, charge_law=law)
-    assert held == [400, 400]
+    assert held == [400]
     slow = linear(source, t, stop, charge_law=law)
-    assert held == [400, 400]
+    assert held == [400]
     scale = np.abs(values).max()
     assert np.abs(quick.u_layer - slow.u_layer).max() <= 1e-12 * scale
     segments = ref.pwl_segments([*zip(t.tolist(), values.tolist(), strict=True)])

@@ -163,3 +163,24 @@ def test_the_stated_error_covers_the_true_one_where_the_area_is_a_long_series(
     exact = ref.transient(segments, t, law=law, params=ref.TABLE1, freq=100.0, stages=16, tol=1e-13)
     assert np.abs(solution.u_gap - exact.u_gap).max() <= solution.error.u_gap <= rtol * np.abs(exact.u_gap).max()
     assert np.abs(solution.f_el - exact.force).max() <= solution.error.f_el <= rtol * exact.force.max()
+
+
+@pytest.mark.parametrize("law", ["local", "mobile"])
+@pytest.mark.parametrize("rtol", [1e-3, 1e-6])
+def test_the_errors_of_area_and_friction_follow_from_those_of_voltage_and_force(rtol: float, law: str) -> None:
+    t = np.sort(np.random.default_rng(5).uniform(0.0, 2.0 / 300.0, 400))
+    exact = ref.transient(triangle(200.0, 300.0), t, law=law, freq=100.0)
+    corners = np.array([0.0, 0.25, 0.75, 1.25, 1.75, 2.0]) / 300.0
+    source = fs.PWL(corners, 200.0 * np.array([0.0, 1.0, -1.0, 1.0, -1.0, 0.0]))
+    run = fs.simulate(
+        table1(), sources=source, t_stop=2.0 / 300.0, t_eval=t, rtol=rtol, charge_law=law, start="uncharged"
+    )
+    u = np.linspace(0.0, np.abs(exact.u_gap).max(), 2001)
+    slope = np.abs(np.diff(ref.area(u)) / np.diff(u)).max()
+    mu = ref.TABLE1.mu0
+    friction = mu * (ref.TABLE1.force_normal + exact.force)
+    rounding = 1e-13 * friction.max(), 1e-13 * exact.area.max()
+    assert np.abs(run.f_t - friction).max() <= mu * run.error.f_el + rounding[0]
+    assert np.abs(run.area - exact.area).max() <= slope * run.error.u_gap + rounding[1]
+    # This keeps the area to rtol as well.
+    assert slope * run.error.u_gap < rtol * exact.area.max()

@@ -268,6 +268,8 @@ def test_memory_does_not_grow_with_an_input_that_needs_converting():
         ({"rates": [np.inf]}, "rates"),
         ({"rates": 1.0, "gains": 1.0, "weights": 1.0, "w0": 0.0}, "shape"),
         ({"gains": [1.0, 2.0]}, "shape"),
+        ({"weights": [[1.0]]}, "shape"),
+        ({"direct": [0.0, 1.0]}, "shape"),
         ({"out": np.empty(4)}, "output"),
         ({"out": np.empty(3, np.float32)}, "output"),
         ({"out": np.empty(6)[::2]}, "output"),
@@ -278,6 +280,19 @@ def test_what_cannot_be_answered_is_refused(change, message):
     arguments = {"u": np.ones(3), "dt": 1.0} | modes
     with pytest.raises(ValueError, match=message):
         first_order_hold(**(arguments | change))
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_several_outputs_are_each_that_of_a_call_of_its_own(n):
+    rates, gains, _, _, w0 = system(n)
+    rng = np.random.default_rng(n)
+    u, direct, weights = rng.standard_normal(2 * BLOCK + 7), rng.standard_normal(3), rng.standard_normal((3, n))
+    together, end = first_order_hold(u, DT, rates, gains, direct, weights, w0)
+    assert together.shape == (3, u.size)
+    for i in range(3):
+        alone, w = first_order_hold(u, DT, rates, gains, direct[i], weights[i], w0)
+        np.testing.assert_array_equal(together[i], alone)
+        np.testing.assert_array_equal(end, w)
 
 
 def test_an_output_that_would_overwrite_the_input_is_refused():

@@ -255,7 +255,7 @@ def test_design_writes_drive_prediction_and_picture(command: Command) -> None:
         ("time friction\n0 0,2\n1 0,2\n", [], "decimal comma"),
         ("time,friction\n0,0.2\n1,nan\n", [], "line 3: column 'friction' is nan"),
         ("time,friction\n1,0.2\n0,0.2\n", [], "line 3: the time 0 s follows 1 s"),
-        ("time,volts\n1,0.2\n2,0.2\n", [], "one column named force or friction"),
+        ("time,volts\n1,0.2\n2,0.2\n", [], "no column named force or friction"),
         ("time,friction (V)\n1,0.2\n2,0.2\n", [], "the unit of column 'friction' is 'V'"),
         ("time,friction\n0,0.2\n0.1,0.2\n0.2,0.2\n", ["--rate", "1k"], "its times are at 10 Hz"),
         ("friction\n0.2\n0.2\n", [], "no column of times and no rate"),

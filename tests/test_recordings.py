@@ -53,6 +53,23 @@ def test_samples_are_followed_as_the_reference_follows_them(law: str, rtol: floa
     assert np.abs(run.q_source - exact.q).max() <= run.error.q_source + 1e-12 * np.abs(exact.q).max()
 
 
+def test_two_sources_of_a_circuit_may_have_recordings_at_different_rates() -> None:
+    waves = fs.Samples(recording(volts=100.0), RATE), fs.Samples(recording(110, volts=100.0), 5512.5)
+    lines = table1_deck().splitlines()
+    lines[2:3] = ["Vone drive mid DC 0", "Vtwo mid 0 DC 0"]
+    knots = np.unique(np.concatenate([np.arange(160) / RATE, np.arange(110) / 5512.5]))
+    knots, t = knots[knots < 0.019], np.random.default_rng(1).uniform(0.0, 0.018, 100)
+    t.sort()
+    segments = analytic.pwl_segments(list(zip(knots.tolist(), sum(w(knots) for w in waves).tolist(), strict=True)))
+    exact = analytic.transient(segments, t.tolist(), law="local", freq=100.0)
+    run = fs.simulate(
+        fs.parse_netlist("\n".join(lines)), sources=dict(zip(("Vone", "Vtwo"), waves, strict=True)), t_stop=0.018,
+        t_eval=t, rtol=1e-6, start="uncharged",
+    )  # fmt: skip
+    peak = np.abs(exact.u_gap).max()
+    assert np.abs(run.u_gap - exact.u_gap).max() <= min(1e-6 * peak, run.error.u_gap)
+
+
 def test_stated_errors_cover_the_true_ones_and_what_was_asked_is_met() -> None:
     found = [x for number in range(100, 118) for x in recording_errors.judge(recording_errors.draw(number, 300))]
     assert len(found) > 100

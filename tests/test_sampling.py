@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import fingerspice as fs
 from fingerspice.engine.segment import Segment, source
-from fingerspice.waveforms.sampling import SourceTable, source_table
+from fingerspice.waveforms.sampling import SourceTable, on_grid, source_table
 from scenes import table1
 
 STEP = 1e-5
@@ -281,3 +281,14 @@ def test_jumps_that_are_many_but_far_apart_are_still_followed() -> None:
     held = np.random.default_rng(1).normal(size=200)
     with pytest.warns(fs.FingerspiceWarning, match="and 197 more times"):
         source_table(fs.Function(lambda t: held[(np.asarray(t) * 1e4).astype(int)]), 0.0, 0.0199, TOL, STEP)
+
+
+@given(st.integers(1, 5000), st.integers(0, 4999), st.floats(1.0, 1e6), st.floats(-1.0, 1.0))
+def test_times_on_a_grid_are_told_from_others(count: int, which: int, rate: float, start: float) -> None:
+    t = start + np.arange(count) / rate
+    slack = 4.0 * np.spacing(np.abs(t).max())
+    assert on_grid(t, start, 1.0 / rate, slack)
+    for off in (1e-3 / rate, np.nan):
+        moved = t.copy()
+        moved[which % count] += off
+        assert not on_grid(moved, start, 1.0 / rate, slack)

@@ -8,9 +8,11 @@ import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.io import wavfile
 
 import fingerspice as fs
 from commands import Command
@@ -214,6 +216,42 @@ def test_arrays_of_numpy_are_columns(tmp_path: Path) -> None:
     assert "is a table with a rate; allowed: one with times" in refusal(lambda: fs.PWL.from_table(path))
 
 
+@pytest.mark.parametrize("at_once", [True, False])
+def test_a_sample_that_is_no_number_is_refused_with_its_file(at_once: bool, tmp_path: Path) -> None:
+    path, values = tmp_path / "a.wav", np.zeros(9, np.float32)
+    values[7] = np.nan
+    wavfile.write(path, 48_000, values)
+    assert f"'{path}': sample number 7 is nan; allowed: finite numbers" in refusal(
+        lambda: fs.Samples.from_wav(path, 1.0, at_once=at_once)
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ((["a", "b"], 1e3), "the samples are no row of real numbers; allowed: one row of two or more, in V"),
+        (([[1], [1, 2]], 1e3), "the samples are no row of real numbers"),
+        (([1j, 2j], 1e3), "the samples are no row of real numbers"),
+        (([[1.0, 2.0]], 1e3), "samples is shape (1, 2); allowed: one row of two or more"),
+        (([1.0, 2.0], "48k"), "sample rate is '48k'; allowed: a number of Hz"),
+        (([1.0, 2.0], None), "sample rate is None; allowed: a number of Hz"),
+        (([1.0, 2.0], 1e3, "0"), "start is '0'; allowed: a number of s"),
+    ],
+)
+def test_what_makes_no_samples_is_refused(given: tuple[Any, ...], said: str) -> None:
+    assert said in refusal(lambda: fs.Samples(*given))
+
+
+def test_a_channel_and_a_gain_are_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "a.wav"
+    wavfile.write(path, 48_000, np.zeros((9, 2), np.int16))
+    for at_once in (True, False):
+        said = refusal(lambda once=at_once: fs.Samples.from_wav(path, 1.0, "left", at_once=once))
+        assert said == f"'{path}' has no channel 'left'; allowed: channel=0 to 1"
+        said = refusal(lambda once=at_once: fs.Samples.from_wav(path, "150", 0, at_once=once))
+        assert said == "gain is '150'; allowed: a finite number of V at full scale"
+
+
 BAD_TABLES: list[tuple[str, dict[str, object], str]] = [
     ("", {}, "'a.csv' is empty"),
     ("\n\n", {}, "'a.csv' holds no rows of numbers"),
@@ -237,10 +275,17 @@ BAD_TABLES: list[tuple[str, dict[str, object], str]] = [
     ("t,u\n0,1\n1,2\n", {"value": 2}, "'a.csv' has no column 2; it has 2 columns (t, u)"),
     ("t,u\n0,1\n1,2\n", {"time": "t", "value": "t"}, "the column 't' is both time and value; allowed: two columns"),
     ("t,a,b\n0,1,2\n", {}, "'a.csv' has 3 columns (t, a, b); allowed: name the column of the value"),
-    ("0,1,2\n", {}, "'a.csv' has 3 columns without a header (0 to 2); allowed: name the column of the time"),
+    ("0,1,2\n", {}, "'a.csv' has 3 columns without a header (0 to 2); allowed: the number of the column of the time"),
+    ("0,1,2\n", {"time": 0}, "(0 to 2); allowed: the number of the column of the value"),
+    (
+        "1,0\n0,1\n",
+        {},
+        "line 2: the time 0 s follows 1 s (without a header, the first of two columns is the times); all",
+    ),
+    ("1,0\n0,1\n", {"time": 0}, "line 2: the time 0 s follows 1 s; allowed: not decreasing"),
     ("u,u\n0,1\n", {"value": "u"}, "'a.csv' has several columns 'u'"),
     ("t (h),u\n0,1\n", {}, "the unit of column 't' is 'h'; allowed: s, ms, us, ns"),
-    ("t,u (N)\n0,1\n", {}, "the unit of column 'u' is 'N'; allowed: v, mv"),
+    ("t,u (N)\n0,1\n", {}, "the unit of column 'u' is 'N'; allowed: V, mV, uV, kV, A"),
     ("1\n2\n", {}, "'a.csv' has one column and no rate; allowed: a column of times too, or rate= in Hz"),
     ("a\0b", {}, "'a.csv' is no text; allowed: a table as text, or an NPZ file"),
 ]
@@ -260,7 +305,11 @@ def test_rates_that_contradict_the_times_are_refused(tmp_path: Path, monkeypatch
     Path("a.csv").write_text("t,u\n0,1\n0.001,2\n0.0025,2\n")
     said = "'a.csv', line 4: the time 0.0025 s is not that of sample 2 at 1000 Hz, 0.002 s; allowed: times or a rate"
     assert said in refusal(lambda: fs.Samples.from_table("a.csv", 1000.0))
-    assert "the rate is -1 Hz; allowed: > 0" in refusal(lambda: fs.Samples.from_table("a.csv", -1.0, "u"))
+    for way in ({}, {"value": "u"}, {"value": 1}):
+        assert said in refusal(lambda way=way: fs.Samples.from_table("a.csv", 1000.0, **way))
+    for rate in (-1.0, 0, np.nan, "1k"):
+        allowed = f"the rate is {rate!r}; allowed: a number of Hz, > 0"
+        assert allowed in refusal(lambda rate=rate: fs.Samples.from_table("a.csv", rate, "u"))
     assert "is a table with times; allowed: one with a rate" in refusal(lambda: fs.Samples.from_table("a.csv"))
     np.savez("a.npz", u=np.zeros(30), t=np.arange(30) / 44100, rate=48000)
     assert "row 2: the time 4.53515e-05 s is not that of sample 2 at 48000 Hz, 4.16667e-05 s" in refusal(
@@ -293,8 +342,10 @@ def test_arrays_that_are_no_columns_are_refused(arrays: dict[str, np.ndarray], s
 def test_a_broken_npz_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     np.savez(path, t=np.arange(300.0), u=np.arange(300.0))
-    path.write_bytes(path.read_bytes()[:900])
-    assert "cannot be read as NPZ" in refusal(lambda: fs.PWL.from_table(path))
+    whole = path.read_bytes()
+    for broken in (whole[:900], b"junk" + whole[4:900], b"time,voltage\n0,1\n"):
+        path.write_bytes(broken)
+        assert "cannot be read as NPZ" in refusal(lambda: fs.PWL.from_table(path))
     with zipfile.ZipFile(path, "w") as file:
         file.writestr("readme.txt", "no array")
     assert "the array 'readme.txt' is of another kind; allowed: real numbers" in refusal(
@@ -344,6 +395,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     Path("decks/mono.wav").write_bytes(wav(packed(data, 16), 16))
     Path("decks/data/stereo one.wav").write_bytes(wav(packed(data, 16), 16, channels=2, rate=4000))
     Path("decks/table.csv").write_text("time (ms),left,right\n0,0,5\n1,100,6\n3,-100,7\n")
+    Path("decks/plain.csv").write_text("left,right\n0,5\n100,6\n-100,7\n")
     Path("decks/points.txt").write_text("0 0\n1m 100\n3m -100\n")
     np.savez("decks/rate.npz", u=data[:100] / 2**15, rate=8000)
     return tmp_path
@@ -384,7 +436,7 @@ def test_decks_name_files_beside_them(folder: Path) -> None:
     same(source("PWL FILE=points.txt td=2m r=0"), fs.PWL((2e-3, 3e-3, 5e-3), points.values, 2e-3))
     same(source("TABLE(rate.npz)"), fs.Samples.from_table("decks/rate.npz"))
     same(source("TABLE(rate.npz upsample=4)"), fs.Samples.from_table("decks/rate.npz").upsampled(4))
-    same(source("TABLE(table.csv rate=500 value=left)"), fs.Samples([0.0, 100.0, -100.0], 500.0))
+    same(source("TABLE(plain.csv rate=1k value=left)"), fs.Samples([0.0, 100.0, -100.0], 1000.0))
     # In an included file names count from its own folder.
     Path("decks/data/part.inc").write_text('Vpart part 0 WAVEFILE("stereo one.wav" 7 0)\nRpart part 0 1k\n')
     Path("decks/pad.cir").write_text(table1_deck("DC 1", extra=".include data/part.inc"))

@@ -357,7 +357,7 @@ def test_a_store_of_another_run_is_refused(scene: Path, command: Command, monkey
         result = command(*arguments)
         (line,) = [line for line in result.lines if not line.startswith("fingerspice: warning")]
         assert result.code == 2
-        assert f"out/long.zarr holds a run of another {what}" in line
+        assert f"out/long.zarr holds a run of {'other' if what == 'signals' else 'another'} {what}" in line
         assert tree(scene / "out") == before
     assert command(*others["rtol"], "--overwrite").code == 0
 

@@ -366,3 +366,14 @@ def test_the_text_of_a_long_pwl_is_short_and_tells_points_apart() -> None:
     assert repr(one) == repr(same) != repr(other)
     assert repr(one).startswith("PWL(10001 points, 0 s to 1 s, sha256 ")
     assert repr(fs.PWL((0.0, 1.0), (0.0, 2.0))) == "PWL(times=(0.0, 1.0), values=(0.0, 2.0), repeat=None)"
+
+
+def test_the_text_of_a_recording_tells_it_from_others() -> None:
+    values = np.arange(3000.0)
+    other = values.copy()
+    other[1500] += 1e-9
+    texts = {repr(fs.Samples(*given)) for given in ((values, 1e3), (other, 1e3), (values, 2e3), (values, 1e3, 1.0))}
+    assert len(texts) == 4
+    assert repr(fs.Samples(values, 1e3)) in texts
+    assert all(len(text) < 100 for text in texts)
+    assert len({repr(fs.Samples(x, 1e3) + fs.Sine(1.0, 50.0)) for x in (values, other)}) == 2

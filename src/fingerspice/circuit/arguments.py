@@ -117,7 +117,7 @@ def require_area(area: Any) -> None:
 
 
 def times_given(what: str, given: ArrayLike | None) -> FloatArray | None:
-    """Times as an array, s.
+    """Times as an array of their own, s: results keep it, and the caller's array stays writable.
 
     Raises
     ------
@@ -125,6 +125,6 @@ def times_given(what: str, given: ArrayLike | None) -> FloatArray | None:
         If they are not numbers.
     """
     try:
-        return None if given is None else np.asarray(given, float)
+        return None if given is None else np.array(given, float)
     except (TypeError, ValueError):
         raise InputError(f"{what} is {given!r}; allowed: numbers in s") from None

@@ -292,7 +292,7 @@ class Circuit(Doors):
                 traps |= {path.lower(): trap} if trap else {}
             else:
                 raise InputError(self._unknown_path(path))
-            overrides[path] = value if isinstance(value, str) else getattr(value, "__name__", repr(value))
+            overrides[path] = value if isinstance(value, str) else getattr(value, "__name__", str(value))
         changed = self._with(elements=tuple(elements.values()), overrides=overrides)
         check(changed)
         before, after = unusual_of_changed(self, changed)

@@ -7,11 +7,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
-from fingerspice.circuit.circuit import Circuit
+from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.response import areas_at_rest, with_skin_held
 from fingerspice.circuit.statespace import build_stack
+from fingerspice.circuit.topology import driving_sources
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.physics.phasor import layer_gains
 from fingerspice.waveforms.samples import Samples
@@ -89,8 +90,10 @@ def _recorded(wave: Waveform, t_stop: float) -> tuple[FloatArray, FloatArray] | 
         return kept[1]
     count = min(last, 2 ** math.ceil(math.log2(_LEAST * wave.rate)), _MOST_SAMPLES)
     starts = np.unique(np.linspace(0, last - count, min(_PIECES, math.ceil(last / count))).astype(int))
-    pieces = [np.abs(np.fft.rfft(wave.between(i, i + count) * _window(count))) ** 2 for i in starts.tolist()]
-    total = np.sum(pieces, axis=0)
+    total = np.zeros(count // 2 + 1)
+    for i in starts.tolist():
+        lines = np.fft.rfft(wave.between(i, i + count) * _window(count))
+        total += lines.real**2 + lines.imag**2
     total[1:] *= 2.0
     found = np.arange(total.size) * (wave.rate / count), np.asarray(total)
     wave.kept["spectrum"] = t_stop, found
@@ -127,12 +130,51 @@ def surely_wide(waveform: Waveform, t_stop: float, frequency: float) -> bool:
     return bool(energy[far].sum() > 0.2 * energy.sum() > 0.0)
 
 
-def _shared_out(f: FloatArray, energy: FloatArray, grid: FloatArray) -> FloatArray:
-    """Energy on a geometric grid (Hz): each line is divided between its two neighbours by linear weights in log f."""
-    place = np.log(np.clip(f, grid[0], grid[-1]) / grid[0]) / math.log(grid[1] / grid[0])
-    low = np.minimum(place.astype(int), grid.size - 2)
-    above = energy * (place - low)
-    return np.asarray(np.bincount(low, energy - above, grid.size) + np.bincount(low + 1, above, grid.size), float)
+@lru_cache(maxsize=4)
+def _places(step: float, count: int) -> tuple[IntArray, FloatArray, IntArray]:
+    """Where the lines at 0, `step`, ... (Hz), `count` of them, lie in the grid of gains, which is even in log f.
+
+    Cached, because the logarithms cost as much as the Fourier transform: the number of the grid's frequency below each
+    line that is not empty of lines, how far each line is above its own, and the first line of each.
+    """
+    f = np.clip(step * np.arange(count), *SKIN_BAND)
+    place = np.log(f / SKIN_BAND[0]) * ((_GRID - 1) / math.log(SKIN_BAND[1] / SKIN_BAND[0]))
+    below = np.minimum(place.astype(int), _GRID - 2)
+    cells, first = np.unique(below, return_index=True)
+    return cells, place - below, first
+
+
+def _shared_out(step: float, energy: FloatArray) -> FloatArray:
+    """Energy at the frequencies of the gains: each line, at a multiple of `step` (Hz), is divided between its two
+    neighbours by linear weights in log f."""
+    cells, above, first = _places(step, energy.size)
+    out = np.zeros(_GRID)
+    high = np.add.reduceat(energy * above, first)
+    out[cells] = np.add.reduceat(energy, first) - high
+    out[cells + 1] += high
+    return out
+
+
+def _squared_gains(circuit: Circuit) -> tuple[FloatArray, FloatArray] | None:
+    """Squared gains from the one source to each gap (_GRID, n_gap), with the skin's own data at each frequency and with
+    those held at one; None if they cannot be computed. Circuits that differ in their sources only share them."""
+    drives = {e.name for e in driving_sources(circuit)}
+    passive = tuple(e for e in circuit.elements if e.name not in drives)
+    before: tuple[Element, ...]
+    found: tuple[FloatArray, FloatArray] | None
+    before, found = circuit.related.get("squared gains", ((), None))
+    if len(before) == len(passive) and all(a is b for a, b in zip(before, passive, strict=True)):
+        return found
+    networks = network_of(circuit), network_of(with_skin_held(circuit))
+    gaps = [gap for gap in networks[0].gaps if gap is not None]
+    grid, areas = np.geomspace(*SKIN_BAND, _GRID), areas_at_rest(networks[0])
+    try:
+        own, held = (np.abs(n.phasors(grid, areas, np.ones(1, complex))[:, gaps]) ** 2 for n in networks)
+        found = own, held
+    except np.linalg.LinAlgError:
+        found = None
+    circuit.related["squared gains"] = passive, found
+    return found
 
 
 def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | None:
@@ -142,16 +184,11 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
     at rest and the source's spectrum over the run to `t_stop` (s); of several fingers the largest error counts. Outside
     the band of the skin's data the response at the band's ends is used. None if the response cannot be computed.
     """
-    networks = network_of(circuit), network_of(with_skin_held(circuit))
-    gaps = [gap for gap in networks[0].gaps if gap is not None]
+    squares = _squared_gains(circuit)
     f, energy = _recorded(waveform, t_stop) or _energies(waveform, t_stop, SKIN_BAND[1])
-    grid = np.geomspace(*SKIN_BAND, _GRID)
-    areas = areas_at_rest(networks[0])
-    try:
-        squares = [np.abs(n.phasors(grid, areas, np.ones(1, complex))[:, gaps]) ** 2 for n in networks]
-    except np.linalg.LinAlgError:
+    if squares is None or f.size < 2:
         return None
-    near = _shared_out(f, energy, grid)
+    near = _shared_out(float(f[1]), energy)
     right, held = (near @ square for square in squares)
     if not (right.size and np.all(right > 0.0) and np.all(np.isfinite(held / right))):
         return None

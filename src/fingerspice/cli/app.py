@@ -128,7 +128,7 @@ def run(
 
       fingerspice run circuits/fingerpad.cir --finger moist --coating 3M-insulating --drive Fig4-5kHz
 
-      fingerspice run long.cir --stream --rtol 1e-5 --signals u_gap,friction
+      fingerspice run long.cir --stream --rtol 1e-5 --signals u_gap,f_t
     """
     from fingerspice.results.report import summary_table
     from fingerspice.solve.simulation import simulate

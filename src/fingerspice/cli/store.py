@@ -88,7 +88,8 @@ class Store:
             held = attributes[RUN].get(key)
             if held != own:
                 said = "" if len(f"{held}{own}") > 80 else f" ({held}, and this one {own})"
-                raise InputError(f"{self.path} holds a run of another {key.replace('_', ' ')}{said}; {ways}")
+                other = "other" if key == "signals" else "another"
+                raise InputError(f"{self.path} holds a run of {other} {key.replace('_', ' ')}{said}; {ways}")
         self.done, self.mark, self.so_far = attributes[DONE], attributes[MARK], attributes[SO_FAR]
         for file, size in self._files(attributes):
             if not file.is_file() or file.stat().st_size != size:

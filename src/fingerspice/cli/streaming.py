@@ -59,7 +59,8 @@ def run_streamed(
     answer.update(**store.so_far)
     took, made = time.perf_counter() - begun, (store.chunks - first) / store.chunks
     span = run.problem.t_stop - run.problem.t_start
-    said = [f"{run.outputs.total:,} outputs of {span:g} s in {store.chunks:,} pieces: {path}"]
+    pieces = f"{store.chunks:,} piece{'s' if store.chunks > 1 else ''}"
+    said = [f"{run.outputs.total:,} outputs of {span:g} s in {pieces}: {path}"]
     if made > 0.0:
         said.append(f"{made * span / took:,.3g} times real time")
     error = store.so_far["error"]

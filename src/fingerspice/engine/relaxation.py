@@ -20,7 +20,9 @@ then has a part a exp(-rate t) that no parabola shows. Its size a follows from t
 and the response to it is known in closed form, too.
 
 The error is measured at 1/4 and 3/4 of every step, where the interpolation error of the parabola gives the quadrature
-error (Boole's rule against Simpson's). If it is too large, the block is repeated with steps half as long.
+error (Boole's rule against Simpson's). If it is too large, the block is repeated with steps half as long. Otherwise
+the modes are corrected by the error seen (`correct` in `engine.recording`), and the share `Form.rest` of it counts as
+left.
 """
 
 from __future__ import annotations

@@ -68,26 +68,27 @@ def _step(v: Lanes, e: float, x: Lanes) -> Lanes:
 
 
 @jit
-def _add(y: FloatArray, i: int, g: float, v: Lanes, h: float, w: Lanes) -> None:
+def _store(y: FloatArray, i: int, v: Lanes) -> None:
     n = _STRETCH
-    y[i] += g * v[0] + h * w[0]
-    y[n + i] += g * v[1] + h * w[1]
-    y[2 * n + i] += g * v[2] + h * w[2]
-    y[3 * n + i] += g * v[3] + h * w[3]
-    y[4 * n + i] += g * v[4] + h * w[4]
-    y[5 * n + i] += g * v[5] + h * w[5]
-    y[6 * n + i] += g * v[6] + h * w[6]
-    y[7 * n + i] += g * v[7] + h * w[7]
+    y[i] = v[0]
+    y[n + i] = v[1]
+    y[2 * n + i] = v[2]
+    y[3 * n + i] = v[3]
+    y[4 * n + i] = v[4]
+    y[5 * n + i] = v[5]
+    y[6 * n + i] = v[6]
+    y[7 * n + i] = v[7]
 
 
 @jit
 def _sweep(
-    x: FloatArray, y: FloatArray, i0: int, i1: int, e: float, f: float, g: float, h: float, v: Lanes, w: Lanes
+    x: FloatArray, i0: int, i1: int, e: float, f: float, v: Lanes, w: Lanes, a: FloatArray, b: FloatArray
 ) -> tuple[Lanes, Lanes]:
-    """Advance two modes over the samples i0 to i1 of every stretch, adding g and h times their states to y."""
+    """Advance two modes over the samples i0 to i1 of every stretch, writing their states into a and b."""
     for i in range(i0, i1):
         sample = _load(x, i)
-        _add(y, i, g, v, h, w)
+        _store(a, i, v)
+        _store(b, i, w)
         v = _step(v, e, sample)
         w = _step(w, f, sample)
     return v, w
@@ -111,16 +112,17 @@ def _hold(
     count: int,
     z: FloatArray,
     gains: FloatArray,
-    direct: float,
+    direct: FloatArray,
     weights: FloatArray,
     state: FloatArray,
     is_first: bool,
     y: FloatArray,
+    place: int,
 ) -> None:
-    """Outputs y of whole blocks u of which `count` samples are real; the number of modes is even.
+    """Outputs y (n_y, m), from column `place` on, of whole blocks u of which `count` samples are real.
 
-    `z` is rate dt and `gains` gain dt. `state` (n + 1,) holds w, then the sample, at the last time before u, and is
-    taken to the last of u; with `is_first`, w is that at the first sample of u.
+    The number of modes is even. `z` is rate dt and `gains` gain dt. `state` (n + 1,) holds w, then the sample, at the
+    last time before u, and is taken to the last of u; with `is_first`, w is that at the first sample of u.
     """
     n = z.size
     # w <- exp(-z) w + start u_before + end u. With v = w - end u each sample enters once, v <- exp(-z) v + once u, and
@@ -132,38 +134,42 @@ def _hold(
     # The decay over c stretches.
     whole = np.empty((n, _LANES))
     rest = np.empty((n, _LANES))
-    through = direct
+    through = direct.copy()
     for k in range(n):
         start[k], end[k] = hold_weights(z[k])
         start[k] *= gains[k]
         end[k] *= gains[k]
         once[k] = start[k] + math.exp(-z[k]) * end[k]
-        through += weights[k] * end[k]
+        for j in range(through.size):
+            through[j] += weights[j, k] * end[k]
         for i in range(_STRETCH):
             fall[k, i] = _flushed(math.exp(-z[k] * i))
         for c in range(_LANES):
             whole[k, c], rest[k, c] = _decay(z[k] * (_STRETCH * c))
+    a = np.empty(BLOCK)
+    b = np.empty(BLOCK)
     inherited = np.empty((2, _LANES))
     last = np.empty(2)
     for s in range(0, u.size, BLOCK):
         x = u[s : s + BLOCK]
-        out = y[s : s + BLOCK]
         # The state goes over to the next block at the last real sample of this one.
         stop = min(BLOCK, count - s) - 1
         lane = stop // _STRETCH
         depth = stop % _STRETCH
-        for i in range(BLOCK):
-            out[i] = through * x[i]
+        for j in range(through.size):
+            # The compiler makes vector instructions only of loops over whole arrays, without other indices.
+            out = y[j][place + s : place + s + BLOCK]
+            g = through[j]
+            for i in range(BLOCK):
+                out[i] = g * x[i]
         for pair in range(0, n, 2):
             e = fall[pair, 1]
             f = fall[pair + 1, 1]
-            g = weights[pair] * once[pair]
-            h = weights[pair + 1] * once[pair + 1]
             v = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-            v, w = _sweep(x, out, 0, depth, e, f, g, h, v, v)
+            v, w = _sweep(x, 0, depth, e, f, v, v, a, b)
             last[0] = v[lane]
             last[1] = w[lane]
-            v, w = _sweep(x, out, depth, _STRETCH, e, f, g, h, v, w)
+            v, w = _sweep(x, depth, _STRETCH, e, f, v, w, a, b)
             for j in range(2):
                 k = pair + j
                 kept, left = _decay(z[k])
@@ -188,11 +194,21 @@ def _hold(
                 else:
                     state[k] = kept * begin + to_last
             for c in range(_LANES):
-                part = out[c * _STRETCH : (c + 1) * _STRETCH]
-                g = weights[pair] * inherited[0, c]
-                h = weights[pair + 1] * inherited[1, c]
+                g = once[pair]
+                h = once[pair + 1]
+                v_begin = inherited[0, c]
+                w_begin = inherited[1, c]
+                v_part = a[c * _STRETCH : (c + 1) * _STRETCH]
+                w_part = b[c * _STRETCH : (c + 1) * _STRETCH]
                 for i in range(_STRETCH):
-                    part[i] += g * fall[pair, i] + h * fall[pair + 1, i]
+                    v_part[i] = g * v_part[i] + v_begin * fall[pair, i]
+                    w_part[i] = h * w_part[i] + w_begin * fall[pair + 1, i]
+            for j in range(through.size):
+                out = y[j][place + s : place + s + BLOCK]
+                g = weights[j, pair]
+                h = weights[j, pair + 1]
+                for i in range(BLOCK):
+                    out[i] += g * a[i] + h * b[i]
         state[n] = x[stop]
 
 
@@ -201,7 +217,7 @@ def first_order_hold(
     dt: float,
     rates: ArrayLike,
     gains: ArrayLike,
-    direct: float,
+    direct: ArrayLike,
     weights: ArrayLike,
     w0: ArrayLike,
     u_before: float | None = None,
@@ -209,8 +225,8 @@ def first_order_hold(
 ) -> tuple[FloatArray, FloatArray]:
     """Output of a linear system for a sampled input, exact for the straight lines that join the samples.
 
-    Solves w_k' = -rate_k w_k + gain_k U(t) and gives y = direct U + sum of weight_k w_k at the samples. Nothing in y
-    depends on later samples; a sample that is not finite leaves nothing finite from there on.
+    Solves w_k' = -rate_k w_k + gain_k U(t) and gives y = direct U + sum of weight_k w_k at the samples, or several such
+    y. Nothing in y depends on later samples; a sample that is not finite leaves nothing finite from there on.
 
     Parameters
     ----------
@@ -218,53 +234,72 @@ def first_order_hold(
         Samples, real. Any strides; what is not double precision is converted piece by piece.
     dt : float
         Time between samples, s.
-    rates, gains, weights : array_like, shape (n,)
-        Decay rates (>= 0, 1/s), input gains (1/s for a w in the unit of U) and output weights of the modes.
-    direct : float
+    rates, gains : array_like, shape (n,)
+        Decay rates (>= 0, 1/s) and input gains (1/s for a w in the unit of U) of the modes.
+    direct : float or array_like, shape (n_y,)
         Share of the input that appears in the output at once.
+    weights : array_like, shape (n,) or (n_y, n)
+        Output weights of the modes.
     w0 : array_like, shape (n,)
         State at the first sample or, with `u_before`, one step before it.
     u_before : float, optional
         Sample one step before the first: with it and the state returned for the input so far, an input may be given
         in parts. Parts that are multiples of `BLOCK` give the same bits as the whole.
-    out : ndarray, shape (m,), optional
+    out : ndarray, shape (m,) or (n_y, m), optional
         Where to write y: double precision, contiguous.
 
     Returns
     -------
-    y : ndarray, shape (m,)
+    y : ndarray, shape (m,) or (n_y, m)
     w_end : ndarray, shape (n,)
         State at the last sample.
     """
     u = np.asarray(u)
     if u.ndim != 1 or not np.can_cast(u.dtype, np.float64, "same_kind"):
         raise ValueError(f"samples of shape {u.shape} and type {u.dtype}; allowed: a row of real numbers")
-    given = [np.asarray(x, float) for x in (rates, gains, weights, w0)]
-    n = given[0].size
-    if any(x.shape != (n,) for x in given):
-        raise ValueError(f"rates, gains, weights and state of shape {[x.shape for x in given]}; allowed: (n,) all")
+    given, through = [np.asarray(x, float) for x in (rates, gains, w0, weights)], np.asarray(direct, float)
+    n, shape = given[0].size, through.shape + u.shape
+    if any(x.shape != (n,) for x in given[:3]) or given[3].shape != (*through.shape, n) or through.ndim > 1:
+        raise ValueError(
+            f"rates, gains, state and weights of shape {[x.shape for x in given]}; allowed: (n,), and {through.shape} "
+            "of direct before the n of weights"
+        )
     # Modes are advanced in pairs: a last one without gain or weight completes an odd number.
-    modes = np.zeros((4, n + n % 2))
-    modes[:, :n] = given
+    modes, by = np.zeros((3, n + n % 2)), np.zeros((through.size, n + n % 2))
+    modes[:, :n], by[:, :n] = given[:3], given[3]
     if not (0.0 < dt < math.inf and np.all((modes[0] >= 0.0) & (modes[0] < math.inf))):
         raise ValueError(f"time step {dt!r} s, rates {given[0]} 1/s; allowed: finite, > 0 and >= 0")
     if out is None:
-        out = np.empty(u.size)
-    elif out.shape != u.shape or out.dtype != np.float64 or not out.flags.carray or np.may_share_memory(out, u):
-        raise ValueError(f"output of shape {out.shape}, type {out.dtype}; allowed: contiguous float64 {u.shape}, not u")
-    state = np.append(modes[3], 0.0 if u_before is None else u_before)
+        out = np.empty(shape)
+    elif out.shape != shape or out.dtype != np.float64 or not out.flags.carray or np.may_share_memory(out, u):
+        raise ValueError(f"output of shape {out.shape}, type {out.dtype}; allowed: contiguous float64 {shape}, not u")
+    state = np.append(modes[2], 0.0 if u_before is None else u_before)
+    rows = out.reshape(through.size, u.size)
+    _by_pieces(u, modes[:2] * dt, through.reshape(-1), by, state, u_before is None, rows)
+    return out, state[:n].copy()
+
+
+def _by_pieces(
+    u: FloatArray,
+    modes: FloatArray,
+    through: FloatArray,
+    by: FloatArray,
+    state: FloatArray,
+    is_first: bool,
+    rows: FloatArray,
+) -> None:
+    """As `_hold` for any number of samples of any type and strides; `modes` (2, n) is rate dt and gain dt."""
     for s in range(0, u.size, _PIECE):
         piece = u[s : s + _PIECE]
         whole = piece.size - piece.size % BLOCK
         tail = np.zeros(BLOCK)
         tail[: piece.size - whole] = piece[whole:]
-        y_tail = np.empty(BLOCK)
-        for x, count, y in ((piece[:whole], whole, out[s : s + whole]), (tail, piece.size - whole, y_tail)):
+        end = np.empty((through.size, BLOCK))
+        for x, count, y, place in ((piece[:whole], whole, rows, s), (tail, piece.size - whole, end, 0)):
             if count > 0:
                 x = np.require(x, float, ["C", "A"]).view()
                 # Constant arrays and others alike: one compiled form.
                 x.flags.writeable = False
-                _hold(x, count, modes[0] * dt, modes[1] * dt, float(direct), modes[2], state, u_before is None, y)
-                u_before = state[-1]
-        out[s + whole : s + piece.size] = y_tail[: piece.size - whole]
-    return out, state[:n].copy()
+                _hold(x, count, modes[0], modes[1], through, by, state, is_first, y, place)
+                is_first = False
+        rows[:, s + whole : s + piece.size] = end[:, : piece.size - whole]

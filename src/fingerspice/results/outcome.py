@@ -158,6 +158,9 @@ class ErrorEstimate:
     applies to gap voltage and force only, and a node may have a transient that no gap feels. It is None in runs that
     start from the periodic state, because the error of that state is estimated at the gaps only.
 
+    Area and friction have none of their own: friction is mu (F_N + F_el), with mu times the error of the force, and an
+    area without `tau` is a curve over the gap voltage, with at most that voltage's error times its largest slope.
+
     Without a GAP, `u_gap` is the error of the voltage across the layer with the smallest capacitance, and `f_el` is 0.
     `q_source` is None where the charge was left out, or where its error is not estimated: only the coupled tier's own
     steps and the algebraic tier estimate it, and they do not in runs that start from the periodic state.

@@ -22,7 +22,7 @@ from fingerspice.solve.runs import Run, gap_signals, kept_with
 from fingerspice.solve.sources import Tables, after_the_end, joined, segment_index
 from fingerspice.solve.stackstate import StackState, from_stack, from_written, model_of, row_width
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.sampling import same_time
+from fingerspice.waveforms.sampling import on_grid, same_time
 
 # Round-off of the closed forms relative to the run's largest voltage: for a stack, whose modes follow from a secular
 # equation, and for a network, whose modes follow from matrices.
@@ -139,8 +139,7 @@ def _is_sample_by_sample(problem: Problem, t_out: FloatArray) -> bool:
         return False
     if wave.start != problem.t_start or t_out[-1] < problem.t_stop * (1.0 - 1e-12):
         return False
-    grid = wave.start + np.arange(t_out.size) / wave.rate
-    return bool(np.all(np.abs(t_out - grid) <= same_time(problem.t_stop)))
+    return bool(on_grid(t_out, wave.start, 1.0 / wave.rate, same_time(problem.t_stop)))
 
 
 def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatArray, _Answer]:
@@ -149,10 +148,7 @@ def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatAr
     assert isinstance(wave, Samples)
     count = round((problem.t_stop - wave.start) * wave.rate) + 1
     u, rates, gains = wave.values[:count], modes.rates, np.ascontiguousarray(modes.gains[:, 0])
-    live, end = np.empty((modes.rates.size, u.size)), v0
-    for i, out in enumerate(live):
-        direct = -float(modes.follow[i, 0])
-        _, end = hold.first_order_hold(u, 1.0 / wave.rate, rates, gains, direct, modes.shape[i], v0, out=out)
+    live, end = hold.first_order_hold(u, 1.0 / wave.rate, rates, gains, -modes.follow[:, 0], modes.shape, v0)
     s = np.array([[float(wave.value(problem.t_stop, "left"))]])
     return live.T, _Answer(end[None], s, np.zeros((1, 1)), np.zeros((1, 1)))
 

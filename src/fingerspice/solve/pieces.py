@@ -60,7 +60,8 @@ class Piece:
         assert isinstance(wave, Samples)
         if self.first == self.last:
             return wave.value([self.start, self.start + self.spacing])
-        return wave.between(self.first, self.last + 1)
+        # Compiled code is compiled for arrays that may be written, and recordings are read-only.
+        return np.require(wave.between(self.first, self.last + 1), requirements="W")
 
 
 def driving(problem: Problem) -> Samples | PWL | None:

@@ -244,7 +244,10 @@ def run_problem(
     run.stats["wall_s"] = time.perf_counter() - begin  # type: ignore[assignment]
     record = run.record(problem)
     # Report the times asked for, not the breakpoints to which `at_breakpoints` has moved some of them.
-    t = np.concatenate([t_out[: run.t.size], run.t[t_out.size :]]) if run.status is Status.SUCCESS else run.t.copy()
+    if run.status is not Status.SUCCESS:
+        t = run.t.copy()
+    else:
+        t = t_out if run.t.size == t_out.size else np.concatenate([t_out[: run.t.size], run.t[t_out.size :]])
     return solution_of(problem, plan, run, record, t, rtol, name)
 
 

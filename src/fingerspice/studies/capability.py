@@ -18,10 +18,12 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.describe import head_lines, heading
-from fingerspice.circuit.topology import find_branches
 from fingerspice.solve.runs import Progress
-from fingerspice.studies.inversion import Inverter, Limits, inverter_of, the_finger
-from fingerspice.studies.wanted import ForceCurve
+from fingerspice.studies.drive_shapes import rise
+from fingerspice.studies.inverse import LEAD, Task
+from fingerspice.studies.inversion import Finger, Inverter, Limits, inverter_of, the_finger
+from fingerspice.studies.wanted import ForceCurve, Profile
+from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -31,16 +33,19 @@ if TYPE_CHECKING:
 _PER_PERIOD, _PER_CARRIER, _LEAST_RATE = 64, 32, 8000.0
 # Duration of a force: this many periods of the modulation, and at least this many seconds.
 _PERIODS, _LASTS = 3.0, 0.05
-# Relative accuracy of the amplitudes.
+# Relative accuracy of the amplitudes of a stack, and of the voltage of another network, whose drives are corrected this
+# many times at most.
 _EXACT = 1e-3
+_MOST = 8
 
 
 @dataclass(frozen=True, repr=False)
 class Capability(Shown):
     """Largest amplitudes of the friction that a voltage allows.
 
-    The friction is mean + amplitude sin(2 pi f t), produced by the inverse drive from an uncharged stack for 3 periods,
-    and at least 50 ms, with ``|U| <= limit`` all the time; the amplitude is at most the mean less the friction at 0 V.
+    The friction is mean + amplitude sin(2 pi f t), produced by the inverse drive from an uncharged circuit for 3
+    periods, and at least 50 ms, with ``|U| <= limit`` all the time; the amplitude is at most the mean less the friction
+    at 0 V. In a network other than a series stack the force first rises for 2 ms, as in `inverse_drive`.
 
     Attributes
     ----------
@@ -124,12 +129,13 @@ def capability(
     charge_law: str | None = None,
     progress: Progress | None = None,
 ) -> Capability:
-    """Map the friction that a series stack can produce with a source of at most `limit` (V).
+    """Map the friction that a screen can produce with a source of at most `limit` (V).
 
     Parameters
     ----------
     circuit : Circuit
-        A series stack with one GAP and one V source.
+        A circuit with one GAP and one V source. A series stack takes seconds, and another network up to minutes,
+        because its drives are corrected by forward runs.
     limit : float
         Largest voltage of the source, V.
     carrier : float, optional
@@ -146,7 +152,9 @@ def capability(
     Raises
     ------
     InputError
-        If the circuit is not such a stack, or a number is out of range.
+        If the circuit is not such a one, if its source does not drive the gap, or if a number is out of range.
+    SolveError
+        If a forward run fails.
     """
     require_circuit(circuit)
     require(math.isfinite(limit) and limit > 0.0, "limit", f"{limit:g} V", "> 0")
@@ -162,13 +170,6 @@ def capability(
     law = charge_law or circuit.charge_law or "local"
     require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
     finger = the_finger(circuit)
-    if not finger.direct:
-        others = [e.name for e in find_branches(circuit)[1] if e.device != "V" and not e.spec.is_layer]
-        raise InputError(
-            "a map of the friction needs a chain of layers that a V source drives at once, and this circuit has "
-            f"{', '.join(others) or 'branches'} beside it; allowed for any network with one finger: inverse_drive "
-            "(design)"
-        )
     contact = finger.contact
     if contact.mu == 0.0:
         raise InputError(f"{finger.gap.name} has mu=0 and no friction; allowed: mu > 0")
@@ -177,7 +178,7 @@ def capability(
     area = finger.area
     most = float(contact.stress(10.0 * limit)) * (float(contact.area(10.0 * limit)) if area is None else area)
     curve = ForceCurve(contact, area, points, 0.4 * most)
-    search = _Search(curve, inverter_of(circuit, 10.0 * limit, law), limit, carrier)
+    search = _Search(circuit, finger, curve, inverter_of(circuit, 10.0 * limit, law), law, limit, carrier)
     largest = search.largest_mean(0.4 * most)
     force = np.linspace(0.0, largest, means)
     amplitude = np.zeros((means, f.size))
@@ -192,31 +193,69 @@ def capability(
     )
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Search:
-    """Search for the largest forces whose inverse drive stays within the voltage limit."""
+    """Search for the largest forces whose inverse drive stays within the voltage limit.
 
+    For a series stack the inverter's drive is exact. For another network it is that of the linear response, whose peak
+    is off by `ratio`: this changes little from a force to the next, so that few drives have to be corrected by forward
+    runs.
+    """
+
+    circuit: Circuit
+    finger: Finger
     curve: ForceCurve
     inverter: Inverter
+    law: str
     limit: float
     carrier: float | None
-
-    def holds(self, mean: float, amplitude: float, frequency: float) -> bool:
-        """Whether the drive of a mean force (N) with this modulation (N, Hz) stays within the limit."""
-        rate = max(_PER_PERIOD * frequency, _LEAST_RATE) if self.carrier is None else _PER_CARRIER * self.carrier
-        t = np.arange(math.ceil(max(_PERIODS / frequency, _LASTS) * rate)) / rate
-        u = self.curve.amplitude(np.maximum(mean + amplitude * np.sin(2.0 * np.pi * frequency * t), 0.0))
-        if self.carrier is not None:
-            u *= np.sin(2.0 * np.pi * self.carrier * t)
-        return not self.inverter.drive(u, 1.0 / rate, Limits(self.limit))[1].any()
+    ratio: float = 1.0
 
     def largest_mean(self, most: float) -> float:
         """Largest constant force, N, to the relative accuracy `_EXACT`."""
-        return _largest(lambda x: self.holds(x, 0.0, 1.0 / _LASTS), most)
+        return self._within(lambda x: self.wanted(x, 0.0, 1.0 / _LASTS), most)
 
     def amplitude(self, mean: float, frequency: float) -> float:
         """Largest amplitude (N) around a mean force (N)."""
-        return _largest(lambda x: self.holds(mean, x, frequency), mean)
+        return self._within(lambda x: self.wanted(mean, x, frequency), mean)
+
+    def wanted(self, mean: float, amplitude: float, frequency: float) -> Samples:
+        """A mean force (N) with a modulation (N, Hz), sampled at the rate of the drive."""
+        rate = max(_PER_PERIOD * frequency, _LEAST_RATE) if self.carrier is None else _PER_CARRIER * self.carrier
+        t = np.arange(math.ceil(max(_PERIODS / frequency, _LASTS) * rate)) / rate
+        return Samples(np.maximum(mean + amplitude * np.sin(2.0 * np.pi * frequency * t), 0.0), rate)
+
+    def _within(self, wanted: Callable[[float], Samples], most: float) -> float:
+        """Largest number up to `most` (N) for which the drive of the wanted force stays within the limit."""
+        for _ in range(_MOST):
+            found = _largest(lambda x: self.ratio * self._peak(wanted(x)) <= self.limit, most)
+            if self.finger.direct or found == 0.0:
+                break
+            peak = self._corrected_peak(wanted(found))
+            before, self.ratio = self.ratio, peak / self._peak(wanted(found))
+            if abs(self.ratio / before - 1.0) < 0.5 * _EXACT or (found == most and peak <= self.limit):
+                break
+        return found
+
+    def _lead(self, rate: float) -> int:
+        """Number of samples in which the force rises before the wanted one begins."""
+        return 0 if self.finger.direct else round(LEAD * rate)
+
+    def _peak(self, force: Samples) -> float:
+        """Largest voltage (V) of the inverter's drive for a force."""
+        u, lead = self.curve.amplitude(force.values), self._lead(force.rate)
+        u = np.append(u[0] * rise(lead), u)
+        if self.carrier is not None:
+            u *= np.sin(2.0 * np.pi * self.carrier * (np.arange(u.size) - lead) / force.rate)
+        return float(np.abs(self.inverter.drive(u, 1.0 / force.rate, Limits())[0]).max())
+
+    def _corrected_peak(self, force: Samples) -> float:
+        """Largest voltage (V) of the drive for a force, corrected by forward runs."""
+        profile = Profile(force, (force.count - 1) / force.rate, force.rate)
+        task = Task(
+            self.circuit, self.finger, "force", profile, force.rate, self.carrier, self._lead(force.rate), self.law
+        )  # fmt: skip
+        return task.solve(Limits(), 0.3 * _EXACT).peak
 
 
 def _largest(holds: Callable[[float], bool], most: float) -> float:

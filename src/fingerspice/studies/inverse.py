@@ -255,7 +255,7 @@ def inverse_drive(
     rate = _rate(rate, carrier, profile)
     begin = (0.0 if finger.direct else LEAD) if lead is None else lead
     require(0.0 <= begin < 1e3, "lead", f"{begin:g} s", "0 or more, less than 1000")
-    task = _Task(circuit, finger, kind, profile, rate, carrier, round(begin * rate), law)
+    task = Task(circuit, finger, kind, profile, rate, carrier, round(begin * rate), law)
     found = task.solve(Limits(limit or math.inf, slew or math.inf))
     if limit is None and found.peak > HUGE:
         _warn_of(found.peak)
@@ -288,7 +288,7 @@ def _rate(rate: float | None, carrier: float | None, profile: Profile) -> float:
     return rate
 
 
-class _Task:
+class Task:
     """The wanted force and the gap voltage that produces it, for one circuit, with the iteration for its drive."""
 
     def __init__(
@@ -314,25 +314,25 @@ class _Task:
             u *= np.sin(2.0 * np.pi * carrier / rate * (np.arange(u.size) - lead))
         self.target = u
 
-    def solve(self, limits: Limits) -> InverseDrive:
-        """The drive, corrected by the errors of the gap voltage that forward runs show."""
+    def solve(self, limits: Limits, close: float = CLOSE) -> InverseDrive:
+        """The drive, corrected by the errors of the gap voltage that forward runs show, until they are `close`."""
         peak = float(np.abs(self.target).max())
         inverter = inverter_of(self.circuit, peak, self.law)
         target, best, least, done = self.target, None, math.inf, -1
         wish, levelled = target.copy(), self.carrier is None
         while best is None or done < CORRECTIONS:
             drive, held = inverter.drive(wish, 1.0 / self.rate, limits)
-            u, force = self._forward(drive, inverter)
+            u, force = self._forward(drive, inverter, close * RTOL / CLOSE)
             miss = np.where(held, 0.0, target - u)
             size = float(np.abs(miss[self.lead :]).max()) / max(peak, 1e-300)
             done += 1
             stalled = size > STALLED * least
             if size < least:
                 best, least = (drive, held, force, done), size
-            if (size <= CLOSE or stalled) and levelled:
+            if (size <= close or stalled) and levelled:
                 break
             wish = wish + miss
-            if size <= CLOSE or stalled:
+            if size <= close or stalled:
                 # The gap voltage is linear between samples, not a sine, which changes the mean force: now that the
                 # force is known, scale the envelope once.
                 factor, levelled, least = np.where(held, 1.0, self._level(force)), True, math.inf
@@ -340,14 +340,14 @@ class _Task:
         assert best is not None
         return self._result(limits, *best)
 
-    def _forward(self, drive: FloatArray, inverter: Inverter) -> tuple[FloatArray, FloatArray]:
+    def _forward(self, drive: FloatArray, inverter: Inverter, rtol: float) -> tuple[FloatArray, FloatArray]:
         """Gap voltage at the samples (V), along the inverter's direction, and force at the fine times (N)."""
         t = np.arange(self.fine * (drive.size - 1) + 1) / (self.fine * self.rate)
         with warnings.catch_warnings():
             # The reader has given the deck's warnings, and warnings about an uncorrected drive do not concern the user.
             warnings.simplefilter("ignore", FingerspiceWarning)
             run = simulate(
-                self._driven(drive), t_stop=float(t[-1]), t_eval=t, charge_law=self.law, rtol=RTOL, start="uncharged",
+                self._driven(drive), t_stop=float(t[-1]), t_eval=t, charge_law=self.law, rtol=rtol, start="uncharged",
                 charge=False,
             )  # fmt: skip
         u, force = run.u_gap, run.f_el

@@ -142,6 +142,8 @@ class NetworkInverter:
         self._leak, self._c = network.leak(areas), network.capacitance(areas)
         self._network = network
         self._gap = next(g for g in network.gaps if g is not None)
+        # The last number of frequencies and interval (s), and the response there: it takes longer than the transforms.
+        self._last: tuple[tuple[int, float], NDArray[np.complex128]] | None = None
 
     def response(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Ratio of the gap voltage to the source voltage at complex frequencies (1/s), shape (n,).
@@ -172,9 +174,10 @@ class NetworkInverter:
         m = next_fast_len(2 * n, real=True)
         damp = np.exp(-_DAMPING / (m * h) * h * np.arange(m))
         spectrum = rfft(np.append(u, np.full(m - n, u[-1])) * damp)
-        s = _DAMPING / (m * h) + 2j * np.pi * np.arange(spectrum.size) / (m * h)
-        gain = self.response(s)
-        wish = irfft(spectrum / gain, m)[:n] / damp[:n]
+        if self._last is None or self._last[0] != (m, h):
+            s = _DAMPING / (m * h) + 2j * np.pi * np.arange(spectrum.size) / (m * h)
+            self._last = (m, h), self.response(s)
+        wish = irfft(spectrum / self._last[1], m)[:n] / damp[:n]
         out, held = np.empty(n), np.empty(n, np.bool_)
         hold(wish, limits.voltage, limits.slew * h, out, held)
         return out, held

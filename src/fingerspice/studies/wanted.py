@@ -86,8 +86,8 @@ def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Profi
     kinds = [name.lower() for name in found.names]
     named = [kind for kind in ("force", "friction") if kind in kinds]
     if len(named) != 1:
-        has = "columns for both" if named else "neither"
-        raise InputError(f"'{path}' has {has}; it has {found.listed()}; allowed: one column named force or friction")
+        has = "columns force and friction" if named else "no column named force or friction"
+        raise InputError(f"'{path}' has {has}; it has {found.listed()}; allowed: one column of these names")
     values = found.newtons(kinds.index(named[0]))
     if values.size < 2:
         raise InputError(f"'{path}' has one row; allowed: two or more")

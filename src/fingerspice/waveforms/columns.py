@@ -17,9 +17,9 @@ from fingerspice.base.units import parse_number
 
 _UNIT = re.compile(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
-_VOLTS = {"v": 1.0, "mv": 1e-3, "uv": 1e-6, "µv": 1e-6, "μv": 1e-6, "kv": 1e3}
-_AMPERES = {"a": 1.0, "ma": 1e-3, "ua": 1e-6, "µa": 1e-6, "μa": 1e-6, "na": 1e-9}
-_NEWTONS = {"n": 1.0, "mn": 1e-3, "un": 1e-6, "µn": 1e-6, "μn": 1e-6, "kn": 1e3}
+_VOLTS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6, "μV": 1e-6, "kV": 1e3}
+_AMPERES = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6, "μA": 1e-6, "nA": 1e-9}
+_NEWTONS = {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "µN": 1e-6, "μN": 1e-6, "kN": 1e3}
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 # Largest number of column names shown in a message.
 _SHOWN = 8
@@ -103,11 +103,12 @@ class Columns:
 
     def _scaled(self, column: int, known: dict[str, float]) -> FloatArray:
         unit = self.units[column] if self.units else ""
-        if unit and unit.lower() not in known:
+        factors = {name.lower(): factor for name, factor in known.items()}
+        if unit and unit.lower() not in factors:
             allowed = ", ".join(name for name in known if name.isascii())
             problem = f"'{self.file}': the unit of column {self.names[column]!r} is {unit!r}"
             raise InputError(f"{problem}; allowed: {allowed}")
-        return np.asarray(self.data[:, column] * (known[unit.lower()] if unit else 1.0))
+        return np.asarray(self.data[:, column] * (factors[unit.lower()] if unit else 1.0))
 
 
 def read_text_columns(path: Path) -> Columns:

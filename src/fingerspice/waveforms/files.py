@@ -94,9 +94,9 @@ def read_wav(path: str | Path, channel: int | None = None) -> Recording:
     if channel is None and channels > 1:
         raise InputError(f"'{path}' has {channels} channels and none is chosen; allowed: channel=0 to {channels - 1}")
     number = 0 if channel is None else channel
-    if isinstance(number, bool) or number != int(number) or not 0 <= number < channels:
+    if isinstance(number, bool | str) or number != int(number) or not 0 <= number < channels:
         allowed = "channel=0, its only one" if channels == 1 else f"channel=0 to {channels - 1}"
-        raise InputError(f"'{path}' has no channel {number}; allowed: {allowed}")
+        raise InputError(f"'{path}' has no channel {number!r}; allowed: {allowed}")
     check_count(str(path), data.shape[0])
     return Recording(_shares(data[:, int(number)]), float(rate))
 
@@ -186,7 +186,7 @@ def wav_layout(path: str | Path, channel: int | None) -> WavLayout | None:
     number = 0 if channel is None and channels == 1 else channel
     if not whole or offset + length > size or length < 2 * block or rate == 0:
         return None
-    if number is None or isinstance(number, bool) or number != int(number) or not 0 <= number < channels:
+    if number is None or isinstance(number, bool | str) or number != int(number) or not 0 <= number < channels:
         return None
     kind = f"{order}{'f' if tag == 3 else 'u' if width == 1 else 'i'}{width}"
     return WavLayout(path, rate, channels, int(number), length // block, kind, offset)
@@ -244,7 +244,8 @@ def read_table(
 
     Numbers in a text have decimal points and may have SPICE's scales (``1m``); commas, tabs or blanks separate them.
     Lines that begin with ``#`` are comments. The line before the first numbers may name the columns, with units in
-    brackets: ``time (ms), drive [kV]``; the units s and V are assumed where none is given. An NPZ file holds one array
+    brackets: ``time (ms), drive [kV]``; the units s and V are assumed where none is given. Of two columns the one named
+    ``t`` or ``time`` is the times, or else the first one, with a header or without. An NPZ file holds one array
     per column, and may hold a number named ``rate`` instead of times.
 
     Parameters
@@ -265,7 +266,7 @@ def read_table(
     """
     path = checked_file(path, MAX_BYTES)
     with path.open("rb") as file:
-        packed = file.read(4) == b"PK\x03\x04"
+        packed = file.read(4) == b"PK\x03\x04" or path.suffix.lower() == ".npz"
     if not packed:
         checked_file(path, MAX_TEXT_BYTES)
     found, own_rate = _npz_columns(path) if packed else (read_text_columns(path), None)
@@ -276,21 +277,24 @@ def read_table(
         raise InputError(f"'{path}': the rate given is {rate:g} Hz, and its own is {own_rate:g} Hz; allowed: one rate")
     rate = own_rate if rate is None else rate
     columns = found.data.shape[1]
-    timed = time is not None or (columns == 2 and value is None) or (rate is None and columns > 1)
-    if not timed:
-        if rate is None:
-            raise InputError(f"'{path}' has one column and no rate; allowed: a column of times too, or rate= in Hz")
-        _check_rate(path, rate)
+    if rate is None and columns == 1:
+        raise InputError(f"'{path}' has one column and no rate; allowed: a column of times too, or rate= in Hz")
+    if rate is not None and (isinstance(rate, str) or not (math.isfinite(rate) and rate > 0.0)):
+        raise InputError(f"'{path}': the rate is {rate!r}; allowed: a number of Hz, > 0")
+    # A column that is named as times is one even beside a rate, which it may contradict.
+    named = columns > 1 and any(name.lower() in _TIME_NAMES for name in found.names)
+    if rate is not None and not (named or (columns == 2 and value is None)):
         return Recording(found.volts(_only(found, value, "value", 1)), rate)
     t = found.seconds(_chosen_time(found, time))
     values = found.volts(_only(found, value, "value", 2, other=_chosen_time(found, time)))
     back = np.flatnonzero(t[1:] < t[:-1])
     if back.size:
         i = int(back[0])
-        raise InputError(f"{found.place(i + 1)}: the time {t[i + 1]:g} s follows {t[i]:g} s; allowed: not decreasing")
+        taken = "" if found.names or time is not None else " (without a header, the first of two columns is the times)"
+        problem = f"{found.place(i + 1)}: the time {t[i + 1]:g} s follows {t[i]:g} s{taken}"
+        raise InputError(f"{problem}; allowed: not decreasing")
     if rate is None:
         return Recording(values, None, t)
-    _check_rate(path, rate)
     late = np.abs((t - t[0]) * rate - np.arange(t.size)) > _JITTER
     if late.any():
         i = int(np.argmax(late))
@@ -338,11 +342,6 @@ def check_count(what: str, count: int) -> None:
         raise InputError(f"'{what}' has {count:,} samples; allowed: at most {MAX_SAMPLES:,}")
 
 
-def _check_rate(path: Path, rate: float) -> None:
-    if not (math.isfinite(rate) and rate > 0.0):
-        raise InputError(f"'{path}': the rate is {rate:g} Hz; allowed: > 0")
-
-
 def _chosen_time(found: Columns, time: str | int | None) -> int:
     """Index of the column of times: as given, else the only one named ``t`` or ``time``, else the first of two."""
     if time is None:
@@ -359,7 +358,8 @@ def _only(found: Columns, column: str | int | None, role: str, most: int, other:
             raise InputError(f"'{found.file}': the column {column!r} is both time and value; allowed: two columns")
         return index
     if found.data.shape[1] > most:
-        raise InputError(f"'{found.file}' has {found.listed()}; allowed: name the column of the {role}")
+        way = "name the column" if found.names else "the number of the column"
+        raise InputError(f"'{found.file}' has {found.listed()}; allowed: {way} of the {role}")
     return 0 if other is None else 1 - other
 
 

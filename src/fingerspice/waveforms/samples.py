@@ -72,7 +72,10 @@ class Samples(Ramps):
     _number: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
-        values = np.array(self.values, float)
+        try:
+            values = np.array(self.values, float)
+        except (TypeError, ValueError):
+            raise InputError("the samples are no row of real numbers; allowed: one row of two or more, in V") from None
         values.flags.writeable = False
         object.__setattr__(self, "values", values)
         require(
@@ -82,6 +85,9 @@ class Samples(Ramps):
             "one row of two or more",
         )
         _check_samples(values, 0)
+        for what, number, unit in (("sample rate", self.rate, "Hz"), ("start", self.start, "s")):
+            good = isinstance(number, (int, float, np.integer, np.floating))
+            require(good, what, repr(number), f"a number of {unit}")
         check_finite(self)
         require(self.rate > 0.0, "sample rate", f"{self.rate:g} Hz", "> 0")
 
@@ -109,13 +115,17 @@ class Samples(Ramps):
             If the file cannot be read or is broken, if it has several channels and none is chosen, or if it has no
             such channel.
         """
-        require(math.isfinite(gain), "gain", gain, "a finite number of V at full scale")
-        if not at_once:
-            layout = wav_layout(path, channel)
+        good = isinstance(gain, (int, float, np.integer, np.floating)) and math.isfinite(gain)
+        require(good, "gain", repr(gain), "a finite number of V at full scale")
+        layout = None if at_once else wav_layout(path, channel)
+        recording = read_wav(path, channel) if layout is None else None
+        try:
             if layout is not None:
                 return _WavFile(layout, gain)
-        recording = read_wav(path, channel)
-        return cls(gain * recording.values, recording.rate)  # type: ignore[arg-type]
+            assert recording is not None
+            return cls(gain * recording.values, recording.rate)  # type: ignore[arg-type]
+        except InputError as error:
+            raise InputError(f"'{path}': {error}") from None
 
     @classmethod
     def from_table(cls, path: str | Path, rate: float | None = None, value: str | int | None = None) -> Samples:
@@ -163,14 +173,27 @@ class Samples(Ramps):
         """Number of samples."""
         return self.values.size
 
+    def __repr__(self) -> str:
+        # Stores of runs that go on are told apart by this text where the samples are part of a sum: it names them all.
+        if "repr" not in self.kept:
+            self.kept["repr"] = f"{str(self)[:-1]}, sha256 {self.digest()[:16]})"
+        text: str = self.kept["repr"]
+        return text
+
+    def __str__(self) -> str:
+        return f"Samples({self.count} samples, rate={self.rate!r}, start={self.start!r})"
+
     def digest(self) -> str:
         """SHA-256 of the samples, rate and start, as a key of caches."""
         return hashlib.sha256(repr((self.rate, self.start)).encode() + self.values.tobytes()).hexdigest()
 
     def between(self, first: int, last: int) -> FloatArray:
-        """Samples number `first` to `last` - 1, V, shape (last - first,); beyond the ends, the first or last sample."""
+        """Samples number `first` to `last` - 1, V, shape (last - first,); beyond the ends, the first or last sample.
+
+        They may be those of `values` themselves, which are read-only.
+        """
         if first >= 0 and last <= self.count:
-            return self.values[first:last].copy()
+            return self.values[first:last]
         return np.asarray(self.values[np.clip(np.arange(first, last), 0, self.count - 1)])
 
     def part(self, t0: float, t1: float) -> Samples:
@@ -246,6 +269,8 @@ class _WavFile(Samples):
 
     def __repr__(self) -> str:
         return f"Samples.from_wav({str(self.layout.path)!r}, {self.gain!r}, {self.layout.channel}, at_once=False)"
+
+    __str__ = __repr__
 
     @cached_property
     def values(self) -> FloatArray:

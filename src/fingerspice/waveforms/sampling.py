@@ -20,11 +20,14 @@ from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
 from fingerspice.engine.repeat import SAME_TIME
 from fingerspice.waveforms.bounds import in_windows, runs_through
+from fingerspice.waveforms.ramps import Ramps
 from fingerspice.waveforms.refining import POINTS, Refiner
 from fingerspice.waveforms.waveform import Waveform, blank_terms, require
 
 #: Longest segment of an oscillation, in periods; longer ones are divided, since a phase's rounding error grows with it.
 _PERIODS_PER_SEGMENT = 64.0
+# Number of times compared between two looks whether one has missed.
+_AT_ONCE = 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +157,19 @@ def same_time(t: float) -> float:
 
 
 @jit
+def on_grid(t: FloatArray, start: float, step: float, slack: float) -> bool:
+    """Whether the times `t` (s) are start, start + step, ..., each to within `slack` (s)."""
+    for first in range(0, t.size, _AT_ONCE):
+        # Counted, not compared one by one: only so the compiler makes vector instructions of it.
+        missed = 0
+        for i in range(first, min(first + _AT_ONCE, t.size)):
+            missed += not abs(t[i] - (start + i * step)) <= slack
+        if missed > 0:
+            return False
+    return True
+
+
+@jit
 def misses(t: FloatArray, marks: FloatArray, slack: float) -> BoolArray:
     """For each mark, whether a time lies within the relative distance `slack` of it without being equal to it.
 
@@ -195,6 +211,8 @@ def on_breakpoint(waveform: Waveform, t: float) -> float:
 
 def is_sampled(waveform: Waveform) -> bool:
     """Whether a waveform has no terms and is therefore represented by Chebyshev series."""
+    if isinstance(waveform, Ramps):
+        return False
     found = waveform.kept.get("sampled")
     if found is None:
         found = waveform.kept["sampled"] = waveform.terms(np.zeros(1), np.ones(1)) is None
