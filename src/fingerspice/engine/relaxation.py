@@ -4,8 +4,8 @@ In modes around a reference q0 of q = 1/A a stack is w' = -rates w + gain U + su
 term of the area, g_t = (q - q0) (tap_t w + tap_k U), is a few per cent of the leaks. Between two samples U is a
 straight line, to which the response is exact, and g is so smooth that a parabola through three nodes suffices: the
 exponential Simpson rule, of fourth order. All steps of a block are solved together: from g at all nodes the modes
-follow by a recursion, from the modes the gap voltage and the next g. Each sweep reduces the error to about |q - q0| / q0,
-and is a set of loops over rows of hundreds of steps, which use the processor's vectors fully.
+follow by a recursion, from the modes the gap voltage and the next g. Each sweep reduces the error to a share of about
+|q - q0| / q0, and is a set of loops over rows of hundreds of steps, which use the processor's vectors fully.
 
 In a network the area also changes the finger's displacement current, as in `solve.netforms`: there the gap voltage u
 follows from xi = tap w + tap U, which is 0 with it, by u + kappa N(u) = xi, and N is one more drive and part of each
