@@ -18,7 +18,7 @@ from fingerspice.studies.batchscenes import Curves, LockstepForm, curves_of, pea
 from fingerspice.studies.batchtask import LOCKSTEP, Answers, Task
 
 # Initial number of steps per period, and initial degree of the area's polynomial, by the smallest rtol served.
-_RUNGS = ((5e-4, 32, 8), (5e-5, 48, 8), (5e-6, 80, 12), (5e-7, 144, 12), (0.0, 144, 16))
+_RUNGS = ((5e-4, 40, 8), (5e-5, 64, 8), (5e-6, 96, 12), (5e-7, 144, 12), (0.0, 144, 16))
 HIGHEST_DEGREE, MOST_STEPS = 24, 8192
 # Under a recording: initial number of steps a sample, and the largest.
 _PARTS = (2, 16)
