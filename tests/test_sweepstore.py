@@ -28,8 +28,8 @@ from fingerspice.studies.sweepstore import SweepStore
 from processes import ended, no_room, start
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
-# How often whole commands and workers of Dask are killed, each of which takes seconds to start: FINGERSPICE_KILLS=20 by
-# hand. Processes of a sweep's own are always killed 20 times.
+# How often a whole program is killed, which takes seconds to start: FINGERSPICE_KILLS=20 by hand. Workers are always
+# killed 20 times.
 KILLS = int(os.environ.get("FINGERSPICE_KILLS", "5"))
 PARAMETERS: dict[str, Any] = {
     "source.frequency": [100.0, 1000.0, 5000.0],
@@ -246,7 +246,7 @@ def test_shards_by_separate_processes_make_the_whole(
     assert tree(path) == whole
 
 
-def test_dask_workers_that_are_killed_cost_nothing(
+def test_dask_workers_that_are_killed_20_times_cost_nothing(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     distributed = pytest.importorskip("distributed")
@@ -258,9 +258,9 @@ def test_dask_workers_that_are_killed_cost_nothing(
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=logging.CRITICAL
     ) as cluster:
-        with killing(workers, path, KILLS) as killed:
+        with killing(workers, path, 20) as killed:
             found = fs.sweep(circuit, PARAMETERS, store=path, scheduler=cluster.scheduler_address, **HOW)
-        assert len(killed) == KILLS
+        assert len(killed) == 20
         assert found.attrs["chunks_missing"] == 0
         assert tree(path) == whole
         # What a worker refuses is told as it is.
