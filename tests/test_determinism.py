@@ -269,7 +269,7 @@ def test_nothing_is_left_in_shared_arrays_from_one_call_to_the_next(
 ) -> None:
     from fingerspice.solve.track import Track
 
-    advance, calls = Track.advance, []
+    march, calls = Track.march, []
 
     def spoilt(self: Track, *arguments: Any) -> int:
         calls.append(1)
@@ -278,9 +278,9 @@ def test_nothing_is_left_in_shared_arrays_from_one_call_to_the_next(
         # Tables of steps may be thrown out at any time.
         self.prepared.tables.h[:] = 0.0
         self.prepared.tables.level[:] = -1
-        return advance(self, *arguments)
+        return march(self, *arguments)
 
-    monkeypatch.setattr(Track, "advance", spoilt)
+    monkeypatch.setattr(Track, "march", spoilt)
     for name in ("coupled", "mobile", "function"):
         assert simulated(name) == right[name]
     assert len(calls) > 3

@@ -65,6 +65,14 @@ def test_intervals_cover_the_truth(circuit: fs.Circuit, data: dict[str, np.ndarr
     assert 51 <= covered <= 60
 
 
+def test_noise_may_take_a_signal_over_time_below_0(circuit: fs.Circuit) -> None:
+    t = np.linspace(0.0, 0.02, 41)
+    force = fs.simulate(circuit, t_eval=t, rtol=1e-9).f_el + 5e-3 * np.random.default_rng(2).standard_normal(t.size)
+    assert force.min() < 0.0
+    found = fs.fit(circuit, {"t": t, "f_el": force}, ["Xgap.d"])
+    assert found.estimates["Xgap.d"].value == pytest.approx(circuit.parameters["Xgap.d"].value, rel=1e-2)
+
+
 def test_a_signal_over_time(circuit: fs.Circuit) -> None:
     t = np.linspace(0.0, 0.02, 41)
     force = fs.simulate(circuit.replace({"Xgap.d": 3.1e-6, "Xgap.r": 1.4e6}), t_eval=t, rtol=1e-9).f_el
@@ -124,6 +132,10 @@ def test_the_command_reads_a_table_with_units(command: Command, tmp_path: Path) 
         ({"Vdrive.amplitude": [1.0, 2.0]}, ["Xgap.d"], "no measured column"),
         ({"f_el_mean": [1e-2], "Xgap.d": [3e-6]}, ["Xgap.d"], "is a condition of the data"),
         ({"f_el_mean": [1e-2], "sigma": [0.0]}, ["Xgap.d"], "smallest sigma is 0"),
+        ({"f_el_mean": [1e-2, -2e-2]}, ["Xgap.d"], r"f_el_mean is -0\.02 N in row 1; allowed: 0 or more, as the el"),
+        ({"friction_mean": [-0.5, 0.5]}, ["Xgap.d"], r"friction_mean is -0\.5 in row 0; allowed: 0 or more"),
+        ({"t": [0.0, 0.5], "f_t": [1e-3, -2e-3]}, ["Xgap.d"], r"f_t is -0\.0005 N on average; allowed: 0 or more"),
+        ({"frequency": [1.0, 2.0], "impedance": [1e6, 0.0]}, ["Xgap.r"], "is 0 ohm in row 1; allowed: magnitudes ab"),
         ({"t": [1.0, 0.5], "f_el": [0.0, 0.0]}, ["Xgap.d"], "rising times"),
         ([1.0, 2.0], ["Xgap.d"], "data is a list"),
         ({"f_el_mean": [1e-2]}, "Xgap.d", "a sequence of paths"),
@@ -140,6 +152,13 @@ def test_bad_tables(circuit: fs.Circuit, tmp_path: Path) -> None:
     table.write_text("Vdrive.amplitude (A),f_el_mean (mN)\n100,1\n200,4\n")
     with pytest.raises(InputError, match=r"the unit of column 'Vdrive.amplitude' is 'A'; allowed: V"):
         fs.fit(circuit, table, ["Xgap.d"])
+    table.write_text("Vdrive.amplitude (V),f_el_mean (mN)\n100,1\n200,-4\n")
+    with pytest.raises(InputError, match=r"data\.csv': f_el_mean is -0\.004 N in row 2; allowed: 0 or more") as told:
+        fs.fit(circuit, table, ["Xgap.d"])
+    assert "\n" not in str(told.value)
+    table.write_text("frequency (Hz),impedance (kohm)\n100,-1\n200,4\n")
+    with pytest.raises(InputError, match=r"impedance is -1000 ohm in row 1; allowed: magnitudes above 0"):
+        fs.fit(circuit, table, ["Xgap.r"])
     table.write_text("100,1\n200,4\n")
     with pytest.raises(InputError, match="has no header"):
         fs.fit(circuit, table, ["Xgap.d"])

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,13 @@ import fingerspice as fs
 from commands import Command, tree
 from fingerspice.studies import sweepchunks, sweepstored
 from fingerspice.studies.sweepplan import make_plan
+from fingerspice.studies.sweepstore import SweepStore
 from processes import ended, no_room, start
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
+# How often a whole program is killed, which takes seconds to start: FINGERSPICE_KILLS=20 by hand. Workers are always
+# killed 20 times.
+KILLS = int(os.environ.get("FINGERSPICE_KILLS", "5"))
 PARAMETERS: dict[str, Any] = {
     "source.frequency": [100.0, 1000.0, 5000.0],
     "Xgap.d": stats.lognorm(0.1, scale=3.5e-6),
@@ -64,19 +68,24 @@ def marks(store: Path) -> int:
 
 
 @contextmanager
-def killing(pids: Callable[[], list[int]], pause: float) -> Iterator[list[int]]:
-    """Kills one of these processes after the other while the context lasts; the list has those that were killed."""
+def killing(pids: Callable[[], list[int]], store: Path, most: int) -> Iterator[list[int]]:
+    """Kills so many of these processes while the context lasts, each after chunks have been written since the last one.
+
+    The list has those killed.
+    """
     killed: list[int] = []
     over = threading.Event()
 
     def kill() -> None:
-        while not over.wait(pause):
-            for pid in pids()[:1]:
-                try:
-                    os.kill(pid, signal.SIGKILL)
-                    killed.append(pid)
-                except OSError:
-                    continue
+        seen = 0
+        while len(killed) < most and not over.wait(0.005):
+            alive, now = [pid for pid in pids() if pid not in killed], marks(store)
+            if now < seen + 6 or not alive:
+                continue
+            seen = now
+            with suppress(OSError):
+                os.kill(alive[0], signal.SIGKILL)
+                killed.append(alive[0])
 
     thread = threading.Thread(target=kill, daemon=True)
     thread.start()
@@ -139,23 +148,17 @@ def test_scenes_without_a_result_are_named_by_their_number_in_the_sweep(circuit:
     np.testing.assert_array_equal(stored.status.values, memory.status.values)
 
 
-def test_workers_that_are_killed_cost_nothing(
+def test_workers_that_are_killed_20_times_cost_nothing(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
 ) -> None:
     path = tmp_path / "s.zarr"
 
     def children() -> list[int]:
-        # Not before they are at work: two chunks and more are there since the last kill.
-        now = marks(path)
-        if now < children.seen + 8 or now > 180:  # type: ignore[attr-defined]
-            return []
-        children.seen = now  # type: ignore[attr-defined]
         return [one.pid for one in multiprocessing.active_children() if one.pid]
 
-    children.seen = 0  # type: ignore[attr-defined]
-    with killing(children, 0.01) as killed:
+    with killing(children, path, 20) as killed:
         found = fs.sweep(circuit, PARAMETERS, store=path, workers=2, **HOW)
-    assert len(killed) >= 3
+    assert len(killed) == 20
     assert found.attrs["chunks_missing"] == 0
     assert tree(path) == whole
     assert not multiprocessing.active_children()
@@ -207,10 +210,6 @@ def _environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
 
 
-# By hand: FINGERSPICE_KILLS=20.
-KILLS = int(os.environ.get("FINGERSPICE_KILLS", "5"))
-
-
 def test_a_sweep_killed_again_and_again_comes_to_the_same_bytes(
     whole: dict[str, bytes | None], tmp_path: Path, script: list[str]
 ) -> None:
@@ -247,33 +246,62 @@ def test_shards_by_separate_processes_make_the_whole(
     assert tree(path) == whole
 
 
-def test_dask_workers_that_are_killed_cost_nothing(
+def test_dask_workers_that_are_killed_20_times_cost_nothing(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     distributed = pytest.importorskip("distributed")
     path = tmp_path / "s.zarr"
-    seen = 0
 
     def workers() -> list[int]:
-        nonlocal seen
-        now = marks(path)
-        if now < seen + 8 or now > 180:
-            return []
-        seen = now
         return [one.pid for one in cluster.workers.values() if one.pid]
 
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=logging.CRITICAL
     ) as cluster:
-        with killing(workers, 0.01) as killed:
+        with killing(workers, path, 20) as killed:
             found = fs.sweep(circuit, PARAMETERS, store=path, scheduler=cluster.scheduler_address, **HOW)
-        assert len(killed) >= 3
+        assert len(killed) == 20
         assert found.attrs["chunks_missing"] == 0
         assert tree(path) == whole
         # What a worker refuses is told as it is.
         monkeypatch.setattr(sweepstored, "programs", lambda: "fingerspice 0.0")
         with pytest.raises(fs.InputError, match="a worker has fingerspice"):
             fs.sweep(circuit, PARAMETERS, store=tmp_path / "o.zarr", scheduler=cluster.scheduler_address, **HOW)
+
+
+def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
+    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    distributed = pytest.importorskip("distributed")
+    path, computed, write = tmp_path / "s.zarr", sweepchunks._computed, SweepStore.write
+    begun, written, at_once = 0, 0, 0
+
+    def computing(*given: Any) -> Any:
+        nonlocal begun
+        begun += 1
+        return computed(*given)
+
+    def writing(*given: Any) -> None:
+        nonlocal written, at_once
+        until = time.monotonic() + 10.0
+        # Every chunk but the last waits here until its worker, which has one thread, computes another one.
+        while begun < written + 2 and written < 191 and time.monotonic() < until:
+            time.sleep(1e-3)
+        at_once = max(at_once, begun - written)
+        assert time.monotonic() < until
+        written += 1
+        write(*given)
+
+    monkeypatch.setattr(sweepchunks, "_computed", computing)
+    monkeypatch.setattr(SweepStore, "write", writing)
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs=logging.CRITICAL
+    ) as cluster:
+        fs.sweep(circuit, PARAMETERS, store=path, scheduler=cluster.scheduler_address, **HOW)
+    assert (begun, written) == (192, 192)
+    # One is written, one waits to be written, one is computed: not more, however slow the disk is.
+    assert at_once <= 3
+    assert tree(path) == whole
 
 
 def test_a_scheduler_that_does_not_answer_is_refused_within_seconds(circuit: fs.Circuit, tmp_path: Path) -> None:

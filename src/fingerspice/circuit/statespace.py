@@ -129,15 +129,18 @@ class Stack:
         """The stack of the same layers between other sources; it keeps what has been computed from the layers."""
         changed = copy.copy(self)
         vars(changed).update(hops=hops)
-        for name in ("waveform", "by_layer"):
+        for name in ("waveform", "_of_whole_layers"):
             vars(changed).pop(name, None)
         return changed
 
-    @cached_property
+    @property
     def by_layer(self) -> Stack:
         """The stack with each layer as one capacitor without leak: its voltages are those that a run records."""
-        if len(self.layers) == self.c.size:
-            return self
+        # Not cached where it is this one: an object that holds itself is freed by garbage collection only.
+        return self if len(self.layers) == self.c.size else self._of_whole_layers
+
+    @cached_property
+    def _of_whole_layers(self) -> Stack:
         c, none = 1.0 / np.add.reduceat(1.0 / self.c, self.first_cell), np.zeros(len(self.layers))
         one, sign = (1,) * len(self.layers), self.sign[self.first_cell]
         return replace(self, cells=one, sign=sign, c=c, g_total=none, g_area=none, gap=self.gap_layer)

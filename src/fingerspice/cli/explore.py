@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import signal
 import time
 from pathlib import Path
@@ -18,9 +17,6 @@ from fingerspice.cli.terminal import Answering
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
-
-#: Objects, made and not deleted, after which garbage is looked for while the page is served.
-_COLLECT_AFTER = 5000
 
 
 def explore(
@@ -64,8 +60,6 @@ def explore(
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda number, _: ended.append(number))
         answer.give(lambda: f"the explorer is at {explorer.url}\nCtrl-C ends it")
-    # A command looks for garbage seldom (see `main`). A run leaves half a megabyte of it, and this program has many.
-    gc.set_threshold(_COLLECT_AFTER)
     if not no_browser:
         explorer.open()
     # An event does not do here: a signal that comes while its lock is held would wait for that lock for ever.

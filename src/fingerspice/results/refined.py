@@ -47,12 +47,11 @@ class ClosedForm:
     stop: float
     error: float = 0.0
 
-    def run(self, readers: Callable[[], Mapping[str, Read]], since: float, until: float) -> Refined | None:
+    def run(self, readers: Mapping[str, Read], since: float, until: float) -> Refined | None:
         """Panels between two times (s), on each of which a polynomial represents every voltage; None if too many.
 
         `readers` gives, by name, the functions that read signals from a record.
         """
-        every = readers()
         longest = _LONGEST * self.waveform.shortest_time()
         rate = self.waveform.breakpoint_rate() + 1.0 / longest
         # Each evaluation computes the run from its start, so that the segments before `since` count too.
@@ -70,7 +69,7 @@ class ClosedForm:
         done: list[tuple[FloatArray, FloatArray]] = []
         peaks: dict[str, float] = {}
         for _ in range(_MOST_ROUNDS):
-            wrong = self._is_rough(every, begin, end, peaks)
+            wrong = self._is_rough(readers, begin, end, peaks)
             done.append((begin[~wrong], end[~wrong]))
             if not wrong.any():
                 break
@@ -79,7 +78,7 @@ class ClosedForm:
             if begin.size + sum(x.size for x, _ in done) > MOST_PANELS:
                 return None
         begin, end = (np.sort(np.concatenate(x)) for x in zip(*done, strict=True))
-        return self._cut_at_zeros(every, Refined(self.look, begin, end))
+        return self._cut_at_zeros(readers, Refined(self.look, begin, end))
 
     def _is_rough(
         self, readers: Mapping[str, Read], begin: FloatArray, end: FloatArray, peaks: dict[str, float]

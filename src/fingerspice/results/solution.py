@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -230,7 +231,8 @@ class Solution(Sealed, Doors, Figured):
 
     @cached_property
     def _figures(self) -> Figures | KeptFigures:
-        return Figures(self) if self.stored is None else KeptFigures(self.all_signals, self.stored)
+        # Of a copy, as two objects that hold each other stay in memory until Python looks for such cycles.
+        return Figures(copy(self)) if self.stored is None else KeptFigures(self.all_signals, self.stored)
 
     def __getstate__(self) -> dict[str, Any]:
         return {key: value for key, value in vars(self).items() if key not in ("_figures", "all_signals", "_summary")}

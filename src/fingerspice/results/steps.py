@@ -136,7 +136,7 @@ class Recorded:
     stop: float
     make: Callable[[FloatArray, BoolArray, FloatArray], Record]
 
-    def run(self, readers: Callable[[], Mapping[str, Read]], since: float, until: float) -> Stretches | None:
+    def run(self, readers: Mapping[str, Read], since: float, until: float) -> Stretches | None:
         """The steps as one array; None where they are too many."""
         return self._stretches
 

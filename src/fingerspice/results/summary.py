@@ -123,7 +123,7 @@ class Figures:
     def _between(self, since: float, until: float) -> Span | None:
         """The run between two times (s); None where it is not known between its outputs."""
         continuous = self.solution.continuous
-        run = None if continuous is None else continuous.run(lambda: self._readers, since, until)
+        run = None if continuous is None else continuous.run(self._readers, since, until)
         return None if run is None else _Steps(Stretch(run, since, until, self.solution.rtol))
 
     @cached_property

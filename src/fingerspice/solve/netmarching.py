@@ -107,10 +107,10 @@ class March(Stepping, NetworkIntegration):
             levels = tuple(map(int, known.arrays.levels[at[0]]))
             self.references = known = known_references(self.problem.scene, self.decade, anew=True)
             if levels != (0,) * len(levels):
-                known.add(levels)
+                known.add(self.problem.scene, levels)
             at[0] = known.count - 1
             self.work.own.keys[:] = self.work.own.key[:] = -1
-        known.add(wanted)
+        known.add(self.problem.scene, wanted)
 
     def stated_gaps(self) -> FloatArray:
         return self._stated()[list(self.problem.scene.network.fingers)]

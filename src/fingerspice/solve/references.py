@@ -46,8 +46,6 @@ class Known:
         The fields of a `Form` that are the same for all references.
     """
 
-    scene: Scene
-    decade: int
     arrays: References
     tables: Tables
     magnified: FloatArray
@@ -63,7 +61,9 @@ class Known:
         most: int = MOST_NUMBERS // self.arrays.numbers.shape[1]
         return self.count >= max(2, min(MOST_REFERENCES, most))
 
-    def add(self, levels: tuple[int, ...]) -> None:
+    # The scene, with which this is cached, is not an attribute: two objects that hold each other are freed by garbage
+    # collection only.
+    def add(self, scene: Scene, levels: tuple[int, ...]) -> None:
         """Add the reference whose areas are the scene's areas (fixed, or at 0 V) times LEVEL_RATIO to these powers."""
         arrays, one = self.arrays, self.count
         if one == len(arrays.levels):
@@ -71,9 +71,9 @@ class Known:
             self.arrays = arrays = arrays._replace(
                 levels=np.vstack([arrays.levels, more[0]]), numbers=np.vstack([arrays.numbers, more[1]])
             )
-        area = self.scene.area0 * LEVEL_RATIO ** np.array(levels, float)
-        key = ("referred", self.scene.fixed, area.tobytes())
-        found = kept_with(self.scene.network.kept, key, MOST_KEPT, lambda: _referred(self.scene, area))
+        area = scene.area0 * LEVEL_RATIO ** np.array(levels, float)
+        key = ("referred", scene.fixed, area.tobytes())
+        found = kept_with(scene.network.kept, key, MOST_KEPT, lambda: _referred(scene, area))
         arrays.numbers[one], magnified = found
         arrays.levels[one] = levels
         arrays.used[0] += 1
@@ -107,8 +107,8 @@ def _make(scene: Scene, decade: int) -> Known:
         np.zeros(n_area, np.int64),
     )
     n_modes = shapes[0][0]
-    known = Known(scene, decade, room, new_tables(n_modes), np.zeros(n_area + 1), shapes, _fixed(scene, decade))
-    known.add((0,) * n_area)
+    known = Known(room, new_tables(n_modes), np.zeros(n_area + 1), shapes, _fixed(scene, decade))
+    known.add(scene, (0,) * n_area)
     return known
 
 

@@ -120,13 +120,16 @@ class Scene:
         """The network with its area curves, for compiled code."""
         return _net(self)
 
-    @cached_property
+    @property
     def shown(self) -> Scene:
         """The scene in whose form exponential steps record a stack: a voltage for each layer, not for each cell."""
-        stack = self.stack
-        if stack is None or stack.by_layer is stack:
-            return self
-        return replace(self, network=loop_network(stack.by_layer), prepared={})
+        # Not cached where it is this one: an object that holds itself is freed by garbage collection only.
+        return self if self.stack is None or self.stack.by_layer is self.stack else self._of_whole_layers
+
+    @cached_property
+    def _of_whole_layers(self) -> Scene:
+        assert self.stack is not None
+        return replace(self, network=loop_network(self.stack.by_layer), prepared={})
 
     @cached_property
     def area0(self) -> FloatArray:

@@ -339,7 +339,7 @@ def sensitivities_of(
     stretches, record, rtol = None, solution.record, solution.rtol
     assert isinstance(record, Record)
     if isinstance(solution.continuous, Recorded):
-        stretches = solution.continuous.run(dict, problem.t_start, problem.t_stop)
+        stretches = solution.continuous.run({}, problem.t_start, problem.t_stop)
     if stretches is None:
         raise InputError(
             "sensitivities need the steps of the run, and it has too many of them to be kept; allowed: a shorter run"

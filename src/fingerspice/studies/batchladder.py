@@ -17,8 +17,9 @@ from fingerspice.engine.lockstep import ALL_MOMENTS, START_TIMES, marks_of
 from fingerspice.studies.batchscenes import Curves, LockstepForm, curves_of, peak_of, table_of
 from fingerspice.studies.batchtask import LOCKSTEP, Answers, Task
 
-# Initial number of steps per period, and initial degree of the area's polynomial, by the smallest rtol served.
-_RUNGS = ((5e-4, 32, 8), (5e-5, 48, 8), (5e-6, 80, 12), (5e-7, 144, 12), (0.0, 144, 16))
+# By the smallest rtol served: initial number of steps per period, with which nearly all scenes meet it, under one tone
+# and (of the highest) under several; and initial degree of the area's polynomial.
+_RUNGS = ((5e-4, 40, 32, 8), (5e-5, 64, 48, 8), (5e-6, 96, 96, 12), (5e-7, 144, 144, 12), (0.0, 144, 144, 16))
 HIGHEST_DEGREE, MOST_STEPS = 24, 8192
 # Under a recording: initial number of steps a sample, and the largest.
 _PARTS = (2, 16)
@@ -148,8 +149,9 @@ def _leakage_rates(form: LockstepForm, table: FloatArray) -> FloatArray:
 
 def first_level(rtol: float, form: LockstepForm, pieces: int) -> tuple[int, int]:
     """Steps a period and degree of the area's polynomial to begin with."""
-    steps, degree = next((s, d) for least, s, d in _RUNGS if rtol >= least)
-    steps *= max(form.multiples)
+    highest = max(form.multiples)
+    _, one, several, degree = next(rung for rung in _RUNGS if rtol >= rung[0])
+    steps = one if highest == 1 else several * highest
     if pieces > 1:
         steps = 2 * pieces * next(s for least, s in _PIECES if rtol >= least)
     return steps, degree

@@ -80,7 +80,8 @@ def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path, by: s
     Raises
     ------
     InputError
-        If a column or unit is unknown, columns have different lengths, or a value is no finite number.
+        If a column or unit is unknown, columns have different lengths, or a value is no finite number or has a sign
+        that it cannot have.
     """
     columns, groups, place = _columns(circuit, given, by)
     names = {
@@ -96,8 +97,7 @@ def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path, by: s
     sigma, t, phase = columns.pop(SIGMA, None), columns.pop(TIME, None), columns.pop(PHASE, None)
     if phase is not None and measured[0] != IMPEDANCE:
         raise InputError(f"{place} have the column {PHASE} beside {measured[0]}; allowed: beside {IMPEDANCE}")
-    if measured[0] == IMPEDANCE and not np.all(values > 0.0):
-        raise InputError(f"{place}: the smallest {IMPEDANCE} is {values.min():g} ohm; allowed: magnitudes above 0")
+    _refuse_signs(measured[0], values, place, first=1 if isinstance(given, (str, Path)) else 0)
     if sigma is not None and not np.all(sigma > 0.0):
         raise InputError(f"{place}: the smallest sigma is {sigma.min():g}; allowed: more than 0")
     if t is not None and (measured[0].endswith("_mean") or np.any(np.diff(t) <= 0.0)):
@@ -108,6 +108,24 @@ def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path, by: s
     if t is not None and groups is not None:
         raise InputError(f"{place} have times and groups; allowed: groups of means or of impedances")
     return Data(names[measured[0]], values, sigma, conditions, t, phase, groups)
+
+
+def _refuse_signs(name: str, values: FloatArray, place: str, first: int) -> None:
+    """Refuse magnitudes of an impedance that are not above 0, and signals that are negative on average.
+
+    A signal over time may be below 0 now and then, by noise. Rows count from `first`.
+    """
+    if name == IMPEDANCE or name.endswith("_mean"):
+        bad = np.flatnonzero(values <= 0.0 if name == IMPEDANCE else values < 0.0)
+        told = [(f"in row {i + first}", values[i]) for i in bad[:1]]
+    else:
+        told = [("on average", values.mean())] if name in MEANS and values.mean() < 0.0 else []
+    allowed = "magnitudes above 0" if name == IMPEDANCE else "0 or more"
+    if name.startswith("f_el"):
+        allowed += ", as the electroadhesive force counts as positive where it pulls towards the screen"
+    for where, value in told:
+        size = f"{value:g} {MEASURED[name.removesuffix('_mean')]}".rstrip()
+        raise InputError(f"{place}: {name} is {size} {where}; allowed: {allowed}")
 
 
 def _columns(

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 # Chunks that a process has at once: it computes one while another one is waiting for the disk.
 AT_ONCE = 2
 _FREE = nullcontext()
+_WRITING = Lock()
 # Workers that may be lost one after another while no chunk is finished.
 MOST_LOST = 20
 # Chunks that a scheduler is given at once, and how long it may take to answer, s.
@@ -71,10 +72,13 @@ def programs() -> str:
     return f"fingerspice {__version__}, NumPy {np.__version__}, SciPy {scipy.__version__}"
 
 
-def run_chunk(work: Work, index: int, computing: AbstractContextManager[Any] = _FREE) -> Done:
+def run_chunk(
+    work: Work, index: int, computing: AbstractContextManager[Any] = _FREE, writing: AbstractContextManager[Any] = _FREE
+) -> Done:
     """Run the scenes of a chunk, write them to the store, and mark the chunk as done.
 
-    Scenes are run within `computing`: a lock, where several chunks of a process are to be computed one after another.
+    Scenes are run within `computing`: a lock, where several chunks of a process are to be computed one after another;
+    and written within `writing`.
 
     Raises
     ------
@@ -97,7 +101,8 @@ def run_chunk(work: Work, index: int, computing: AbstractContextManager[Any] = _
             # No scene of the chunk has a result.
             own = np.full((own.size, *more), np.nan)
         values[name] = own.reshape((*shape, *more))
-    store.write(index, values | draws)
+    with writing:
+        store.write(index, values | draws)
     return Done(index, found.sizes["scene"], [_by_its_number(told, work, part) for told in found.attrs["failures"]])
 
 
@@ -325,7 +330,7 @@ def scheduled(address: str | None) -> Iterator[Any]:
 
 def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[Done]:
     """Chunks by the workers of a Dask scheduler, which gives the chunks of a lost worker to others."""
-    from distributed import KilledWorker, as_completed
+    from distributed import KilledWorker, TimeoutError, as_completed
 
     # Held by the scheduler, not by a worker, with which it could be lost.
     held = client.submit(_same, work, pure=False)
@@ -335,7 +340,7 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[D
     while todo or running:
         while todo and len(running) < AHEAD:
             index = todo.popleft()
-            future = client.submit(run_chunk, held, index, pure=False)
+            future = client.submit(_run_and_write_aside, held, index, pure=False)
             running[future] = index
             waiting.add(future)
         future = next(waiting)
@@ -344,8 +349,9 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[D
             answer = future.result(timeout=PATIENCE)
         except InputError:
             raise
-        except KilledWorker as error:
-            # The scheduler gives a chunk up that several workers were lost with.
+        except (KilledWorker, TimeoutError) as error:
+            # The scheduler gives a chunk up that several workers were lost with; and an answer that is lost with its
+            # worker does not come before the chunk has been run again.
             lost += 1
             if lost >= MOST_LOST:
                 raise InputError(f"workers are lost one after another: {error}") from None
@@ -362,3 +368,18 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[D
 
 def _same(work: Work) -> Work:
     return work
+
+
+def _run_and_write_aside(work: Work, index: int) -> Done:
+    """A task of Dask: its worker computes the next chunk while this one is written."""
+    return run_chunk(work, index, writing=_aside())
+
+
+@contextmanager
+def _aside() -> Iterator[None]:
+    """What a task does in here takes no thread of its worker; one task at a time, so that chunks cannot pile up."""
+    from distributed import secede
+
+    with _WRITING:
+        secede()
+        yield
