@@ -67,8 +67,9 @@ from fingerspice.engine.blockrows import (
 PARABOLA = np.array([[0.0, 1.0, 0.0], [0.375, 0.75, -0.125], [-0.125, 0.75, 0.375]])
 # Most sweeps of a block, and the fraction of the error allowed that the last one may leave.
 MOST_SWEEPS, LEFT = 40, 0.8
-# Each sweep reduces the error by about the largest relative distance of the areas from the reference, and in networks
-# by some more. So much is assumed at least, and no more than can be seen.
+# Each sweep reduces the error by about the largest relative distance of the areas from the reference; in networks and
+# under `mobile` the ratio is up to twice as large, and near a fold larger still. So much is assumed at least, and no
+# more than can be seen.
 LEAST_RATIO, SLOWER, MOST_RATIO = 0.001, 1.8, 0.9
 # First sweep in which the places of the kinks and the rate of convergence are known well enough.
 KINKED = 1
@@ -248,12 +249,14 @@ def _pulses(form: Form, room: Room, r: int, level: int, h: float, n: int) -> Non
 
 
 @jit_within
-def least_ratio(form: Form, room: Room, r: int, n: int) -> float:
-    """Least ratio to expect between the errors of two sweeps.
+def least_ratio(form: Form, room: Room, r: int, n: int, margin: float) -> float:
+    """Least ratio to expect between the errors of two sweeps, at this distance to the fold.
 
     The first changes tell too little: they begin at the guess, and hold the corrections at the kinks.
     """
-    strayed = largest_of(n + 1, room.z) / form.q0[r] * (SLOWER if form.bend.size > 0 else 1.0)
+    strayed = largest_of(n + 1, room.z) / form.q0[r]
+    if form.mobile or form.bend.size > 0:
+        strayed *= SLOWER / margin
     return float(min(max(strayed, LEAST_RATIO), MOST_RATIO))
 
 
@@ -312,7 +315,7 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
             ratio = change / last if last > 0.0 else 0.0
             if not ratio < MOST_RATIO and change > tol:
                 return math.inf, margin, sweep
-            left = change * max(ratio, least_ratio(form, room, r, n))
+            left = change * max(ratio, least_ratio(form, room, r, n, margin))
             if left <= LEFT * tol and sweep >= KINKED:
                 return left, margin, sweep
         last = change

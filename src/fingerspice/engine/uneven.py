@@ -188,7 +188,7 @@ def _relax(
             ratio = change / last if last > 0.0 else 0.0
             if not ratio < MOST_RATIO and change > tol:
                 return math.inf, sweep
-            left = change * max(ratio, least_ratio(form, room, r, n))
+            left = change * max(ratio, least_ratio(form, room, r, n, 1.0))
             if left <= LEFT * tol and sweep >= KINKED:
                 return left, sweep
         last = change
