@@ -40,7 +40,7 @@ Report = dict[str, Any]
 def counted() -> Iterator[list[int]]:
     """Count the calls from Python to the compiled loops in the block."""
     calls = [0]
-    originals = {module: module.march for module in (loop,)}
+    originals = {module: module.march_on for module in (loop,)}
 
     def counting(inner: Callable[..., int]) -> Callable[..., int]:
         def outer(*arguments: Any) -> int:
@@ -50,12 +50,12 @@ def counted() -> Iterator[list[int]]:
         return outer
 
     for module, original in originals.items():
-        module.march = counting(original)  # type: ignore[assignment]
+        module.march_on = counting(original)  # type: ignore[assignment]
     try:
         yield calls
     finally:
         for module, original in originals.items():
-            module.march = original
+            module.march_on = original
 
 
 def scene(deck: Path, law: str, rtol: float) -> Report:

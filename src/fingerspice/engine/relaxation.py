@@ -65,12 +65,12 @@ from fingerspice.engine.blockrows import (
 
 # Weights of the parabola through 0, 1/2 and 1 at these places.
 PARABOLA = np.array([[0.0, 1.0, 0.0], [0.375, 0.75, -0.125], [-0.125, 0.75, 0.375]])
-# Most sweeps of a block, and the fraction of the error allowed that the last one may leave.
-MOST_SWEEPS, LEFT = 40, 0.8
-# Each sweep reduces the error by about the largest relative distance of the areas from the reference; in networks and
-# under `mobile` the ratio is up to twice as large, and near a fold larger still. So much is assumed at least, and no
-# more than can be seen.
-LEAST_RATIO, SLOWER, MOST_RATIO = 0.001, 1.8, 0.9
+# Most sweeps of a block, and the fraction of the error allowed that the last one may leave: of a stack and a network.
+MOST_SWEEPS, LEFT, LEFT_IN_NETWORKS = 40, 0.8, 0.5
+# Each sweep reduces the error of a stack by about the largest relative distance of the areas from the reference; under
+# `mobile` the ratio is up to twice as large, and near a fold larger still. So much is assumed at least, in networks a
+# fixed share, and no more than can be seen.
+LEAST_RATIO, SLOWER, OF_NETWORKS, MOST_RATIO = 0.001, 1.8, 0.018, 0.9
 # First sweep in which the places of the kinks and the rate of convergence are known well enough.
 KINKED = 1
 # Newton steps for the gap voltage under `mobile`, in the first sweep and in later ones; and the smallest distance to
@@ -254,9 +254,9 @@ def least_ratio(form: Form, room: Room, r: int, n: int, margin: float) -> float:
 
     The first changes tell too little: they begin at the guess, and hold the corrections at the kinks.
     """
-    strayed = largest_of(n + 1, room.z) / form.q0[r]
-    if form.mobile or form.bend.size > 0:
-        strayed *= SLOWER / margin
+    if form.bend.size > 0:
+        return OF_NETWORKS
+    strayed = largest_of(n + 1, room.z) / form.q0[r] * (SLOWER / margin if form.mobile else 1.0)
     return float(min(max(strayed, LEAST_RATIO), MOST_RATIO))
 
 
@@ -316,7 +316,7 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
             if not ratio < MOST_RATIO and change > tol:
                 return math.inf, margin, sweep
             left = change * max(ratio, least_ratio(form, room, r, n, margin))
-            if left <= LEFT * tol and sweep >= KINKED:
+            if left <= (LEFT_IN_NETWORKS if form.bend.size > 0 else LEFT) * tol and sweep >= KINKED:
                 return left, margin, sweep
         last = change
     return math.inf, margin, MOST_SWEEPS
