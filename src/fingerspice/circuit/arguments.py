@@ -125,6 +125,6 @@ def times_given(what: str, given: ArrayLike | None) -> FloatArray | None:
         If they are not numbers.
     """
     try:
-        return None if given is None else np.array(given, float)
+        return None if given is None else np.asarray(given, float).copy()
     except (TypeError, ValueError):
         raise InputError(f"{what} is {given!r}; allowed: numbers in s") from None
