@@ -122,7 +122,7 @@ def march_on(circuit: Circuit, pace: Pace, state: LoopState, looks: Looks, t_end
             return DONE
 
 
-@jit
+@jit_within
 def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
     """Step to `t_end` (s) through the source's segments, writing outputs on the way.
 
