@@ -53,7 +53,7 @@ CHARGE_SAFETY = 1.75
 class _Scratch:
     """A thread's step tables and scratch arrays for a number of modes, and the system whose tables they are.
 
-    Fresh arrays would cost a third of the set-up of a changed circuit, as the memory has to be mapped anew.
+    Fresh arrays would cost a changed circuit some 50 us of its set-up, as the memory has to be mapped anew.
     """
 
     tables: StepTables
