@@ -21,7 +21,6 @@ from fingerspice.engine.blockforms import (
     BLOCK,
     COLLECTED,
     ERROR_Q,
-    LEAKED,
     MIDDLE,
     PEAK_Q,
     PLACES,
@@ -153,17 +152,19 @@ def _charge_rows(
 @jit_rows
 def _leaked_error(
     n: int, h: FloatArray, slow: FloatArray, q: FloatArray, error: FloatArray, off: FloatArray
-) -> float:  # fmt: skip
-    """Add to each step's error of the charge (C) the leakage that the error of the slow layer's voltage causes.
-
-    Returns the charge that leaks in the block for each volt of that layer, C/V.
-    """
-    g_area, g_total, per_volt = slow[slow.size - 2], slow[slow.size - 1], 0.0
+) -> None:  # fmt: skip
+    """Add to each step's error of the charge (C) the leakage that the error of the slow layer's voltage causes."""
+    g_area, g_total = slow[slow.size - 2], slow[slow.size - 1]
     for i in range(n):
-        leaked = h[i] * (g_area / q[i] + g_total)
-        off[i] += 0.5 * leaked * (error[i] + error[i + 1])
-        per_volt += leaked
-    return per_volt
+        off[i] += 0.5 * h[i] * (g_area / q[i] + g_total) * (error[i] + error[i + 1])
+
+
+@jit
+def _add_decaying(n: int, start: float, decay: float, out: FloatArray) -> None:
+    """Add a geometric series."""
+    for i in range(n):
+        out[i] += start
+        start *= decay
 
 
 @jit
@@ -193,11 +194,11 @@ def moved_rows(
 
 
 @jit_within
-def charge_block(c: Course, r: int, n: int, local: float, left_over: float) -> None:
+def charge_block(c: Course, r: int, n: int, local: float) -> None:
     """Charge at the ends of a block's steps, and its error; `Room.own` holds the error of the modes.
 
-    `local` is the error of the gap voltage (V) that this block itself makes, and `left_over` its part from the
-    iteration. The projections that only the charge needs are known, and `Charges.h`.
+    `local` is the error of the gap voltage (V) that this block itself makes. The projections that only the charge needs
+    are known, and `Charges.h`.
     """
     form, room, own, slow, v = c.form, c.room, c.charges, c.model.slow, c.form.tap_s.size - 2
     for place in range(len(PLACES)):
@@ -208,17 +209,18 @@ def charge_block(c: Course, r: int, n: int, local: float, left_over: float) -> N
     )  # fmt: skip
     scaled(n + 1, 0.0, room.s, own.error)
     modes_into(n + 1, 0, c.shown.slow[r], room.own, own.error)
-    per_volt = _leaked_error(n, own.h, slow, own.q[0], own.error, own.steps[4])
+    for k in range(c.w.size):
+        # Errors of earlier blocks decay, as if all steps were equally long.
+        _add_decaying(n + 1, c.shown.slow[r, k] * c.error[k], c.spare[2, k] ** (1.0 / n), own.error)
+    _leaked_error(n, own.h, slow, own.q[0], own.error, own.steps[4])
     control = c.control
-    # The iteration may leave an error of the same sign in all blocks, which grows from 0 to `left_over` within each.
-    control[LEAKED] += 0.5 * per_volt * left_over
     z, collected, worst, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]
-    stored, leaked = slow[slow.size - 3], control[LEAKED]
+    stored = slow[slow.size - 3]
     for i in range(n):
         own.z[i] = z
         z += own.steps[3, i]
         collected += own.steps[4, i]
-        now = abs(collected) + leaked + stored * (abs(own.error[i + 1]) + local) / own.q[0, i + 1]
+        now = abs(collected) + stored * (abs(own.error[i + 1]) + local) / own.q[0, i + 1]
         worst = now if now > worst else worst
         peak = abs(z) if abs(z) > peak else peak
     own.z[n] = z

@@ -19,10 +19,10 @@ MIDDLE, FIRST_QUARTER, LAST_QUARTER = 0, 1, 2
 
 # Entries of `control`: halvings of a sample, reference, and as in `engine.readout`.
 LEVEL, REFERENCE, PEAK_U, PEAK_F, ERROR_U, ERROR_F, MARGIN, Z, PEAK_Q, ERROR_Q, COLLECTED, U_GAP, ERROR_V = range(13)
-# Error of the charge by leakage whose sign is not known, C.
-LEAKED = 13
 # Mean 1/A of the last block, 1/m^2; 0 before the first.
-MEAN_Q = 14
+MEAN_Q = 13
+# Part of a change that a sweep is expected to leave, over the areas' distance from the reference; 0 if not known.
+RATIO = 14
 N_CONTROL = 15
 # Entries of `counters`.
 OUTPUT, STEPS, REFUSED, SWEEPS = range(4)
@@ -159,6 +159,8 @@ class Shown(NamedTuple):
 class Room(NamedTuple):
     """Rows of a block to work in: of the source, modes, increments, projections, drives, and single ones.
 
+    `changed`, `changed_within` (the middle) and `changed_pulse` are drives with their sign reversed as a sweep finds
+    them, and then their changes; `further` is what a further sweep would change in the modes, and `own` their error.
     `kinked` is no row: the weights (m, T) of the kink of each drive in each mode.
     """
 
@@ -182,6 +184,10 @@ class Room(NamedTuple):
     bends: FloatArray
     pulse: FloatArray
     kinked: FloatArray
+    changed: FloatArray
+    changed_within: FloatArray
+    changed_pulse: FloatArray
+    further: FloatArray
 
 
 def new_room(modes: int, drives: int, projections: int) -> Room:
@@ -191,5 +197,6 @@ def new_room(modes: int, drives: int, projections: int) -> Room:
         np.zeros(n), np.zeros(n), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n),
         np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)),
         np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
-        np.zeros(n), np.zeros((modes, drives)),
+        np.zeros(n), np.zeros((modes, drives)), np.zeros((drives, n)), np.zeros((drives, n)), np.zeros(n),
+        np.zeros((modes, n)),
     )  # fmt: skip

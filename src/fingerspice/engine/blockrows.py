@@ -41,6 +41,12 @@ def both_ends(n: int, a: float, b: float, x: FloatArray, out: FloatArray) -> Non
 
 
 @jit_rows
+def add_both_ends(n: int, a: float, x: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] += a * (x[i] + x[i + 1])
+
+
+@jit_rows
 def of_two(n: int, a: float, x: FloatArray, b: float, y: FloatArray, out: FloatArray) -> None:
     for i in range(n):
         out[i] = a * x[i] + b * y[i]
@@ -330,6 +336,13 @@ def largest_of(n: int, x: FloatArray) -> float:
         a = abs(x[i])
         largest = a if a > largest else largest
     return largest
+
+
+@jit_rows
+def moduli_of(n: int, a: float, x: FloatArray, y: FloatArray) -> None:
+    """a |x| + |y| into x."""
+    for i in range(n):
+        x[i] = a * abs(x[i]) + abs(y[i])
 
 
 @jit_rows

@@ -6,35 +6,28 @@ import math
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
-from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.blockcharge import Course, charge_block, steepness
+from fingerspice.base.compiled import jit
+from fingerspice.engine.blockcharge import Course, steepness
+from fingerspice.engine.blockerror import accept, correct, error_left, further_sweep, learn, quadrature_error
 from fingerspice.engine.blockforms import (
     BLOCK,
-    ERROR_F,
-    ERROR_Q,
-    ERROR_U,
-    ERROR_V,
     LEVEL,
     LEVELS,
     MARGIN,
     MEAN_Q,
-    PEAK_F,
-    PEAK_U,
+    RATIO,
     REFERENCE,
     REFUSED,
-    STEPS,
     SWEEPS,
     U_GAP,
     Form,
 )
 from fingerspice.engine.blockoutput import write_block
-from fingerspice.engine.blockrows import add, add_to_all, area_rows, largest_of, modes_into, recursion, scaled, settle
+from fingerspice.engine.blockrows import area_rows, largest_of
 from fingerspice.engine.model import ramp
 from fingerspice.engine.relaxation import (
     FIRST_NEWTON,
     LEAST_MARGIN,
-    NEWTON,
-    SLOWER,
     SPARE,
     look_at_ends,
     misfit,
@@ -44,24 +37,6 @@ from fingerspice.engine.relaxation import (
 
 # Codes returned by `march`.
 DONE, NOT_CLOSED, TOO_COARSE = range(3)
-
-
-@jit_rows
-def peaks_of(
-    n: int, stress: float, u: FloatArray, q: FloatArray, error: FloatArray
-) -> tuple[float, float, float, float, float]:  # fmt: skip
-    """The largest |u|, force, force over voltage, and that times the error of the voltage in its place; the mean q."""
-    peak, force, steepest, worst, total = 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(n):
-        x = abs(u[i])
-        slope = stress * x / q[i]
-        peak = x if x > peak else peak
-        steepest = slope if slope > steepest else steepest
-        force = slope * x if slope * x > force else force
-        off = slope * abs(error[i])
-        worst = off if off > worst else worst
-        total += q[i]
-    return peak, force, steepest, worst, total / n
 
 
 @jit
@@ -113,85 +88,6 @@ def _sources(values: FloatArray, at: int, count: int, sub: int, s: FloatArray) -
     s[count * sub] = values[at + count]
 
 
-@jit_within
-def _block_error(c: Course, r: int, level: int, n: int) -> float:
-    """Largest error of the gap voltage that a block adds, V; the errors of the modes go into `Room.own`."""
-    form, room = c.form, c.room
-    for k in range(c.w.size):
-        room.own[k, 0] = 0.0
-        recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.own[k])
-    scaled(n + 1, 0.0, room.s, room.before)
-    modes_into(n + 1, 0, form.taps[r, 0], room.own, room.before)
-    return largest_of(n + 1, room.before)
-
-
-@jit_within
-def _largest_error(c: Course, rows: FloatArray, n: int) -> float:
-    """The largest error in a block of any of the quantities `rows` (n_row, m) @ modes."""
-    room, worst = c.room, 0.0
-    for i in range(rows.shape[0]):
-        scaled(n + 1, 0.0, room.s, room.before)
-        modes_into(n + 1, 0, rows[i], room.own, room.before)
-        carried = 0.0
-        for k in range(c.w.size):
-            carried += abs(rows[i, k] * c.error[k])
-        worst = max(worst, largest_of(n + 1, room.before) + carried)
-    return worst
-
-
-@jit_within
-def correct(c: Course, r: int, n: int, rest: float) -> None:
-    """Correct the modes by the error seen, of which the share `rest` is left in `Room.own`; 1/A at the steps' ends."""
-    form, room = c.form, c.room
-    for k in range(c.w.size):
-        settle(n + 1, rest, room.own[k], room.w[k])
-    look_at_ends(form, room, r, n + 1, NEWTON)
-    add_to_all(n + 1, form.q0[r], room.z, c.charges.q[0])
-
-
-@jit_within
-def accept(c: Course, r: int, n: int, rest: float, local: float, left_over: float, magnified: float) -> None:
-    """Account for the peaks and errors of an accepted block, and move to its end.
-
-    `rest` is the share of the error in `Room.before` that is left. `local` is the error of the gap voltage that the
-    block adds, V; `left_over` is its part from the iteration. Row 2 of `Course.spare` has the decay of every mode over
-    the block, and `Charges.h` the lengths of its steps.
-    """
-    room, control = c.room, c.control
-    carried = 0.0
-    for k in range(c.w.size):
-        carried += abs(c.form.taps[r, 0, k] * c.error[k])
-    gap = room.u
-    if c.form.bend.size > 0:
-        gap = room.slope
-        scaled(n + 1, 1.0, room.u, gap)
-        add(n + 1, -c.form.kappa, room.g[room.g.shape[0] - 1], gap)
-    peak, force, steepest, worst, control[MEAN_Q] = peaks_of(n + 1, c.shown.stress, gap, c.charges.q[0], room.before)
-    control[PEAK_U], control[PEAK_F] = max(control[PEAK_U], peak), max(control[PEAK_F], force)
-    off_u = local + magnified * carried
-    # The force is proportional to the square of the voltage, and depends a little on the area.
-    off = rest * magnified * worst + steepest * (left_over + magnified * carried)
-    control[ERROR_U] = max(control[ERROR_U], off_u)
-    control[ERROR_F] = max(control[ERROR_F], 2.2 * off)
-    # An error of the gap voltage changes the area, and thereby other voltages.
-    # The sweeps leave larger errors at the nodes of a network than in the gap.
-    node_error = left_over * (SLOWER if c.form.bend.size > 0 else 1.0)
-    node_error += magnified * _largest_error(c, c.shown.node[r], n)
-    control[ERROR_V] = max(control[ERROR_V], c.shown.moves[0] * off_u + node_error)
-    first = c.shown.k.size - c.shown.flows
-    if c.shown.flows > 0:
-        charge_error = _largest_error(c, c.shown.columns[r, first:], n)
-        charge_error += c.shown.capacitance * left_over + c.shown.moves[1] * off_u
-        control[ERROR_Q] = max(control[ERROR_Q], charge_error)
-    if c.shown.charge:
-        charge_block(c, r, n, local, left_over)
-    for k in range(c.w.size):
-        c.w[k] = room.w[k, n]
-        c.error[k] = c.error[k] * c.spare[2, k] + room.own[k, n]
-    control[U_GAP] = room.u[n]
-    c.counters[STEPS] += n
-
-
 @jit
 def march(
     c: Course, values: FloatArray, at: int, stop: int, start: float, spacing: float, tol: float, t_out: FloatArray,
@@ -221,17 +117,27 @@ def march(
             go_over(c, r, to, c.error)
             control[REFERENCE] = to
             continue
-        left_over, margin, sweeps = relax(form, room, r, level, h, c.shown.kink, n, tol)
+        change, margin, sweeps = relax(form, room, r, level, h, c.shown.kink, n, tol, control[RATIO])
         c.counters[SWEEPS] += sweeps
         # An error of xi is one of the gap voltage, enlarged where the area at 0 V is smaller than the reference.
-        closed, local, magnified = left_over < math.inf, math.inf, steepest
+        closed, local, seen, magnified = change < math.inf, math.inf, 0.0, steepest
         if closed:
             misfit(form, room, r, level, h, c.shown.kink, n)
             if form.mobile:
                 area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
                 # The gap voltage contains the state times 1/A, and a near fold magnifies its error.
                 magnified = form.area0 * largest_of(n + 1, c.charges.q[0]) / margin
-            local = left_over + rest * magnified * _block_error(c, r, level, n)
+            seen = magnified * quadrature_error(c, r, level, n)
+            local = rest * seen
+        if local <= tol:
+            correct(c, r, n, rest)
+            further_sweep(c, r, level, n)
+            left = magnified * error_left(c, r, n, rest)
+            local += left
+            if learn(c, r, n, tol, change, seen, left, local) and not local <= tol:
+                # More sweeps leave less.
+                c.counters[REFUSED] += n
+                continue
         if not local <= tol:
             if level + 1 == LEVELS or margin <= LEAST_MARGIN:
                 return TOO_COARSE if closed else NOT_CLOSED
@@ -244,10 +150,9 @@ def march(
             c.spare[2, k] = form.decay[r, level, k] ** n
         for i in range(n):
             c.charges.h[i] = h
-        correct(c, r, n, rest)
         if c.shown.charge:
             project_for_charge(form, room, r, level, n)
-        accept(c, r, n, rest, local, left_over, magnified)
+        accept(c, r, n, local, magnified)
         write_block(c, r, sub, count, h, start + at * spacing, t_out, out)
         at += count
         if level > 0 and local < SPARE * tol:

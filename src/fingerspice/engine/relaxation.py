@@ -21,7 +21,7 @@ and the response to it is known in closed form, too.
 
 The error is measured at 1/4 and 3/4 of every step, where the interpolation error of the parabola gives the quadrature
 error (Boole's rule against Simpson's). If it is too large, the block is repeated with steps half as long. Otherwise
-the modes are corrected by the error seen (`correct` in `engine.recording`), and the share `Form.rest` of it counts as
+the modes are corrected by the error seen (`correct` in `engine.blockerror`), and the share `Form.rest` of it counts as
 left.
 """
 
@@ -65,11 +65,11 @@ from fingerspice.engine.blockrows import (
 
 # Weights of the parabola through 0, 1/2 and 1 at these places.
 PARABOLA = np.array([[0.0, 1.0, 0.0], [0.375, 0.75, -0.125], [-0.125, 0.75, 0.375]])
-# Most sweeps of a block, and the fraction of the error allowed that the last one may leave: of a stack and a network.
-MOST_SWEEPS, LEFT, LEFT_IN_NETWORKS = 40, 0.8, 0.5
+# Most sweeps of a block, and the fraction of the error allowed that the last one may leave.
+MOST_SWEEPS, LEFT = 40, 0.8
 # Each sweep reduces the error of a stack by about the largest relative distance of the areas from the reference; under
 # `mobile` the ratio is up to twice as large, and near a fold larger still. So much is assumed at least, in networks a
-# fixed share, and no more than can be seen.
+# fixed share, until a block has shown what it is (`learn` in `engine.blockerror`).
 LEAST_RATIO, SLOWER, OF_NETWORKS, MOST_RATIO = 0.001, 1.8, 0.018, 0.9
 # First sweep in which the places of the kinks and the rate of convergence are known well enough.
 KINKED = 1
@@ -249,25 +249,38 @@ def _pulses(form: Form, room: Room, r: int, level: int, h: float, n: int) -> Non
 
 
 @jit_within
-def least_ratio(form: Form, room: Room, r: int, n: int, margin: float) -> float:
-    """Least ratio to expect between the errors of two sweeps, at this distance to the fold.
-
-    The first changes tell too little: they begin at the guess, and hold the corrections at the kinks.
-    """
-    if form.bend.size > 0:
-        return OF_NETWORKS
-    strayed = largest_of(n + 1, room.z) / form.q0[r] * (SLOWER / margin if form.mobile else 1.0)
-    return float(min(max(strayed, LEAST_RATIO), MOST_RATIO))
+def keep_drives(room: Room, n: int) -> None:
+    """Keep the drives, with their sign reversed, before a sweep computes new ones."""
+    for t in range(room.g.shape[0]):
+        scaled(n + 1, -1.0, room.g[t], room.changed[t])
+        scaled(n, -1.0, room.g_within[MIDDLE, t], room.changed_within[t])
 
 
 @jit_within
-def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int, tol: float) -> tuple[
-    float, float, int
-]:  # fmt: skip
+def ratio_of(form: Form, room: Room, r: int, n: int, margin: float, known: float, seen: float) -> float:
+    """Ratio to expect between the errors of two sweeps, at this distance to the fold.
+
+    `known` is what a block before has shown, over the areas' distance from the reference, or 0. `seen` is the ratio of
+    the last two changes, which tells too little alone: the first changes begin at the guess, and hold the corrections
+    at the kinks.
+    """
+    strayed = largest_of(n + 1, room.z) / form.q0[r]
+    if known > 0.0:
+        return float(min(max(known * strayed, LEAST_RATIO), MOST_RATIO))
+    if form.bend.size > 0:
+        return max(seen, OF_NETWORKS)
+    strayed *= SLOWER / margin if form.mobile else 1.0
+    return float(max(seen, min(max(strayed, LEAST_RATIO), MOST_RATIO)))
+
+
+@jit_within
+def relax(
+    form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int, tol: float, known: float
+) -> tuple[float, float, int]:
     """Solve n steps of length h from `room.w[:, 0]` and `room.g[:, 0]`, for the source in `room.s`.
 
-    Returns the error that the last sweep leaves (V; inf if the sweeps do not converge), the least distance to the fold,
-    and the number of sweeps.
+    `known` is as in `ratio_of`. Returns the change by the last sweep (V; inf if the sweeps do not converge), the least
+    distance to the fold, and the number of sweeps.
     """
     modes, drives = form.rates.shape[1], room.g.shape[0]
     for t in range(drives):
@@ -301,9 +314,11 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
         for k in range(modes):
             recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.w[k])
         newton = FIRST_NEWTON if sweep == 0 else NEWTON
+        keep_drives(room, n)
         margin = _look(form, room, r, level, MIDDLE, n, newton)
         margin = min(margin, look_at_ends(form, room, r, n + 1, newton))
         if fades:
+            scaled(n, -1.0, room.pulse, room.changed_pulse)
             _pulses(form, room, r, level, h, n)
         if sweep > 0 and not margin > LEAST_MARGIN:
             return math.inf, margin, sweep
@@ -315,9 +330,8 @@ def relax(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray
             ratio = change / last if last > 0.0 else 0.0
             if not ratio < MOST_RATIO and change > tol:
                 return math.inf, margin, sweep
-            left = change * max(ratio, least_ratio(form, room, r, n, margin))
-            if left <= (LEFT_IN_NETWORKS if form.bend.size > 0 else LEFT) * tol and sweep >= KINKED:
-                return left, margin, sweep
+            if change * ratio_of(form, room, r, n, margin, known, ratio) <= LEFT * tol and sweep >= KINKED:
+                return change, margin, sweep
         last = change
     return math.inf, margin, MOST_SWEEPS
 

@@ -12,6 +12,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockcharge import Charges, Course
+from fingerspice.engine.blockerror import accept, correct, error_left, learn
 from fingerspice.engine.blockforms import (
     BLOCK,
     FIRST_QUARTER,
@@ -21,6 +22,7 @@ from fingerspice.engine.blockforms import (
     MIDDLE,
     OUTPUT,
     PLACES,
+    RATIO,
     REFERENCE,
     REFUSED,
     SWEEPS,
@@ -42,8 +44,6 @@ from fingerspice.engine.recording import (
     DONE,
     NOT_CLOSED,
     TOO_COARSE,
-    accept,
-    correct,
     go_over,
     nearest,
 )
@@ -55,9 +55,10 @@ from fingerspice.engine.relaxation import (
     PARABOLA,
     SPARE,
     drives_at,
-    least_ratio,
+    keep_drives,
     look_at_ends,
     project_at_ends,
+    ratio_of,
 )
 from fingerspice.engine.unevenweights import END, EVERY_PLACE, Steps, weigh
 
@@ -143,9 +144,9 @@ def _look(form: Form, room: Room, steps: Steps, r: int, place: int, n: int, last
 
 @jit_within
 def _relax(
-    form: Form, room: Room, steps: Steps, h: FloatArray, r: int, kink: FloatArray, n: int, tol: float
+    form: Form, room: Room, steps: Steps, h: FloatArray, r: int, kink: FloatArray, n: int, tol: float, known: float
 ) -> tuple[float, int]:
-    """As `relaxation.relax`, for steps with weights of their own: the error that is left (V), and the sweeps."""
+    """As `relaxation.relax`, for steps with weights of their own: the change by the last sweep (V), and the sweeps."""
     modes, drives = form.rates.shape[1], room.g.shape[0]
     for t in range(drives):
         start = room.g[t, 0]
@@ -179,6 +180,7 @@ def _relax(
                 )  # fmt: skip
         for k in range(modes):
             _pass(n, steps.decay[k, END], room.inc[k], room.w[k])
+        keep_drives(room, n)
         _look(form, room, steps, r, MIDDLE, n, 1 + drives)
         look_at_ends(form, room, r, n + 1, 0)
         if not abs(room.u[n]) < math.inf:
@@ -188,9 +190,8 @@ def _relax(
             ratio = change / last if last > 0.0 else 0.0
             if not ratio < MOST_RATIO and change > tol:
                 return math.inf, sweep
-            left = change * max(ratio, least_ratio(form, room, r, n, 1.0))
-            if left <= LEFT * tol and sweep >= KINKED:
-                return left, sweep
+            if change * ratio_of(form, room, r, n, 1.0, known, ratio) <= LEFT * tol and sweep >= KINKED:
+                return change, sweep
         last = change
     return math.inf, MOST_SWEEPS
 
@@ -222,6 +223,20 @@ def _misfit(form: Form, room: Room, steps: Steps, r: int, kink: FloatArray, n: i
         _pass(n, steps.decay[k, END], room.inc[k], room.own[k])
     modes_into(n + 1, 0, form.taps[r, 0], room.own, room.before)
     return largest_of(n + 1, room.before)
+
+
+@jit_within
+def _further_sweep(c: Course, steps: Steps, r: int, n: int) -> None:
+    """As `blockerror.further_sweep`."""
+    form, room = c.form, c.room
+    for k in range(c.w.size):
+        scaled(n + 1, 0.0, room.s, steps.forced[k])
+        modes_into(n + 1, 0, form.feed[r, k], room.changed, steps.forced[k])
+        scaled(n, 0.0, room.s, steps.forced_within[k])
+        modes_into(n, 0, form.feed[r, k], room.changed_within, steps.forced_within[k])
+        _increments(n, steps.parabola[k, END], steps.forced[k], steps.forced_within[k], room.inc[k])
+        room.further[k, 0] = 0.0
+        _pass(n, steps.decay[k, END], room.inc[k], room.further[k])
 
 
 @jit
@@ -286,11 +301,21 @@ def march(
             control[REFERENCE] = to
             continue
         weigh(form, steps, c.charges.h, r, n)
-        left_over, sweeps = _relax(form, room, steps, c.charges.h, r, c.shown.kink, n, tol)
+        change, sweeps = _relax(form, room, steps, c.charges.h, r, c.shown.kink, n, tol, control[RATIO])
         c.counters[SWEEPS] += sweeps
-        closed, local = left_over < math.inf, math.inf
+        closed, local, seen = change < math.inf, math.inf, 0.0
         if closed:
-            local = left_over + rest * _misfit(form, room, steps, r, c.shown.kink, n, taps)
+            seen = _misfit(form, room, steps, r, c.shown.kink, n, taps)
+            local = rest * seen
+        if local <= tol:
+            correct(c, r, n, rest)
+            _further_sweep(c, steps, r, n)
+            left = error_left(c, r, n, rest)
+            local += left
+            if learn(c, r, n, tol, change, seen, left, local) and not local <= tol:
+                # More sweeps leave less.
+                c.counters[REFUSED] += n
+                continue
         if not local <= tol:
             if level == MOST_HALVINGS:
                 return TOO_COARSE if closed else NOT_CLOSED
@@ -303,12 +328,11 @@ def march(
             for i in range(n):
                 passed *= steps.decay[k, END, i]
             c.spare[2, k] = passed
-        correct(c, r, n, rest)
         if c.shown.charge:
             _look(form, room, steps, r, MIDDLE, n, taps)
             for p in range(1 + drives, taps):
                 project_at_ends(form, room, r, n + 1, p)
-        accept(c, r, n, rest, local, left_over, 1.0)
+        accept(c, r, n, local, 1.0)
         _write(c, r, sub, count, t_out, out)
         at += count
         if level > 0 and local < SPARE * tol:

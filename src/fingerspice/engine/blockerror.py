@@ -1,0 +1,205 @@
+"""What the quadrature and the sweeps leave in a block of a recording: measured, and added up along the recording.
+
+The modes of the last sweep follow from the drives of the sweep before. They are corrected by the quadrature error that
+the quarters of the steps show, and the drives at the ends of the steps are then computed again. The response of the
+modes to the change of the drives is what a further sweep would change. It is not added to the modes but stated: it is
+their error by the sweeps, but for its own response, which is a few per cent of it.
+"""
+
+from __future__ import annotations
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit_rows, jit_within
+from fingerspice.engine.blockcharge import Course, charge_block
+from fingerspice.engine.blockforms import (
+    ERROR_F,
+    ERROR_Q,
+    ERROR_U,
+    ERROR_V,
+    MEAN_Q,
+    MIDDLE,
+    PEAK_F,
+    PEAK_U,
+    RATIO,
+    STEPS,
+    U_GAP,
+)
+from fingerspice.engine.blockrows import (
+    PAD,
+    add,
+    add_both_ends,
+    add_three,
+    add_to_all,
+    largest_of,
+    modes_into,
+    moduli_of,
+    recursion,
+    scaled,
+    settle,
+)
+from fingerspice.engine.relaxation import MOST_RATIO, NEWTON, look_at_ends
+
+# The part of a change that a sweep leaves is taken to be so many times what the block before has shown, and at least
+# this share of the areas' distance from the reference.
+CAUTION, LEAST = 2.0, 0.01
+# Below this share of the error allowed, changes show nothing but rounding.
+SHOWING = 1e-3
+
+
+@jit_rows
+def peaks_of(
+    n: int, stress: float, u: FloatArray, q: FloatArray, error: FloatArray
+) -> tuple[float, float, float, float, float]:  # fmt: skip
+    """The largest |u|, force, force over voltage, and that times the error of the voltage in its place; the mean q."""
+    peak, force, steepest, worst, total = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        x = abs(u[i])
+        slope = stress * x / q[i]
+        peak = x if x > peak else peak
+        steepest = slope if slope > steepest else steepest
+        force = slope * x if slope * x > force else force
+        off = slope * abs(error[i])
+        worst = off if off > worst else worst
+        total += q[i]
+    return peak, force, steepest, worst, total / n
+
+
+@jit_within
+def quadrature_error(c: Course, r: int, level: int, n: int) -> float:
+    """Largest quadrature error seen in the first projection, V; that of the modes into `Room.own`."""
+    form, room = c.form, c.room
+    for k in range(c.w.size):
+        room.own[k, 0] = 0.0
+        recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.own[k])
+    scaled(n + 1, 0.0, room.s, room.before)
+    modes_into(n + 1, 0, form.taps[r, 0], room.own, room.before)
+    return largest_of(n + 1, room.before)
+
+
+@jit_within
+def correct(c: Course, r: int, n: int, rest: float) -> None:
+    """Correct the modes by the error seen, of which the share `rest` is left in `Room.own`; 1/A at the steps' ends.
+
+    `Room.changed` then holds the change of the drives since those that the last sweep began with.
+    """
+    form, room = c.form, c.room
+    for k in range(c.w.size):
+        settle(n + 1, rest, room.own[k], room.w[k])
+    for t in range(room.g.shape[0]):
+        # In the middle, the drives change by the correction as the mean of the ends does.
+        add(n, 1.0, room.g_within[MIDDLE, t], room.changed_within[t])
+        add_both_ends(n, -0.5, room.g[t], room.changed_within[t])
+    look_at_ends(form, room, r, n + 1, NEWTON)
+    for t in range(room.g.shape[0]):
+        add_both_ends(n, 0.5, room.g[t], room.changed_within[t])
+        add(n + 1, 1.0, room.g[t], room.changed[t])
+    add_to_all(n + 1, form.q0[r], room.z, c.charges.q[0])
+
+
+@jit_within
+def further_sweep(c: Course, r: int, level: int, n: int) -> None:
+    """What a further sweep would change in the modes, into `Room.further`."""
+    form, room = c.form, c.room
+    fades = form.faded[r, level] > 0.0
+    if fades:
+        add(n, 1.0, room.pulse, room.changed_pulse)
+    for k in range(c.w.size):
+        inc = room.inc[k, PAD:]
+        scaled(n, 0.0, room.s, inc)
+        for t in range(room.g.shape[0]):
+            by = form.drive[r, level, k, t]
+            add_three(
+                n, by[0], room.changed[t], by[1], room.changed_within[t], by[2], room.changed[t, 1:], inc
+            )  # fmt: skip
+        if fades:
+            add(n, form.pulse[r, level, k], room.changed_pulse, inc)
+        room.further[k, 0] = 0.0
+        recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.further[k])
+
+
+@jit_within
+def error_left(c: Course, r: int, n: int, rest: float) -> float:
+    """Largest change of the first projection by a further sweep, V.
+
+    `Room.own` becomes the error of the modes that the block adds, and `Room.before` that of the first projection.
+    """
+    room = c.room
+    scaled(n + 1, 0.0, room.s, room.slope)
+    modes_into(n + 1, 0, c.form.taps[r, 0], room.further, room.slope)
+    for k in range(c.w.size):
+        add(n + 1, 1.0, room.further[k], room.own[k])
+    moduli_of(n + 1, rest, room.before, room.slope)
+    return largest_of(n + 1, room.slope)
+
+
+@jit_within
+def learn(
+    c: Course, r: int, n: int, tol: float, change: float, seen: float, left: float, local: float
+) -> bool:  # fmt: skip
+    """Learn which part of a change a sweep leaves, and tell whether more sweeps would reduce the error much.
+
+    All in V: the change by the last sweep, the quadrature error seen, what a further sweep would change, and all of the
+    error. If that is above `tol`, so large a change is not taken for the last one again.
+    """
+    strayed = largest_of(n + 1, c.room.z) / c.form.q0[r]
+    if not change + seen > SHOWING * tol or not strayed > 0.0:
+        return False
+    ratio = max(CAUTION * left / ((change + seen) * strayed), LEAST)
+    if local > tol and change > 0.0:
+        ratio = max(ratio, CAUTION * tol / (change * strayed))
+    c.control[RATIO] = ratio
+    return bool(change > seen and ratio * strayed < MOST_RATIO)
+
+
+@jit_within
+def _largest_error(c: Course, rows: FloatArray, n: int) -> float:
+    """The largest error in a block of any of the quantities `rows` (n_row, m) @ modes."""
+    room, worst = c.room, 0.0
+    for i in range(rows.shape[0]):
+        scaled(n + 1, 0.0, room.s, room.slope)
+        modes_into(n + 1, 0, rows[i], room.own, room.slope)
+        carried = 0.0
+        for k in range(c.w.size):
+            carried += abs(rows[i, k] * c.error[k])
+        worst = max(worst, largest_of(n + 1, room.slope) + carried)
+    return worst
+
+
+@jit_within
+def accept(c: Course, r: int, n: int, local: float, magnified: float) -> None:
+    """Account for the peaks and errors of an accepted block, and move to its end.
+
+    `local` is the error of the gap voltage that the block adds, V, and `magnified` the ratio of that to an error of the
+    first projection. Row 2 of `Course.spare` has the decay of every mode over the block, and `Charges.h` the lengths of
+    its steps.
+    """
+    room, control = c.room, c.control
+    carried = 0.0
+    for k in range(c.w.size):
+        carried += abs(c.form.taps[r, 0, k] * c.error[k])
+    gap = room.u
+    if c.form.bend.size > 0:
+        gap = room.slope
+        scaled(n + 1, 1.0, room.u, gap)
+        add(n + 1, -c.form.kappa, room.g[room.g.shape[0] - 1], gap)
+    peak, force, steepest, worst, control[MEAN_Q] = peaks_of(n + 1, c.shown.stress, gap, c.charges.q[0], room.before)
+    control[PEAK_U], control[PEAK_F] = max(control[PEAK_U], peak), max(control[PEAK_F], force)
+    off_u = local + magnified * carried
+    # The force is proportional to the square of the voltage, and depends a little on the area.
+    off = magnified * (worst + steepest * carried)
+    control[ERROR_U] = max(control[ERROR_U], off_u)
+    control[ERROR_F] = max(control[ERROR_F], 2.2 * off)
+    # An error of the gap voltage changes the area, and thereby other voltages.
+    node_error = magnified * _largest_error(c, c.shown.node[r], n)
+    control[ERROR_V] = max(control[ERROR_V], c.shown.moves[0] * off_u + node_error)
+    first = c.shown.k.size - c.shown.flows
+    if c.shown.flows > 0:
+        charge_error = _largest_error(c, c.shown.columns[r, first:], n)
+        control[ERROR_Q] = max(control[ERROR_Q], charge_error + c.shown.moves[1] * off_u)
+    if c.shown.charge:
+        charge_block(c, r, n, local)
+    for k in range(c.w.size):
+        c.w[k] = room.w[k, n]
+        c.error[k] = c.error[k] * c.spare[2, k] + room.own[k, n]
+    control[U_GAP] = room.u[n]
+    c.counters[STEPS] += n
