@@ -197,8 +197,9 @@ def moved_rows(
 def charge_block(c: Course, r: int, n: int, local: float) -> None:
     """Charge at the ends of a block's steps, and its error; `Room.own` holds the error of the modes.
 
-    `local` is the error of the gap voltage (V) that this block itself makes. The projections that only the charge needs
-    are known, and `Charges.h`.
+    `local` is the error of the gap voltage (V) that this block itself makes: under `mobile` it changes the area, with
+    which the modes' part of the slowest layer's voltage grows. The projections that only the charge needs are known,
+    and `Charges.h`.
     """
     form, room, own, slow, v = c.form, c.room, c.charges, c.model.slow, c.form.tap_s.size - 2
     for place in range(len(PLACES)):
@@ -215,12 +216,17 @@ def charge_block(c: Course, r: int, n: int, local: float) -> None:
     _leaked_error(n, own.h, slow, own.q[0], own.error, own.steps[4])
     control = c.control
     z, collected, worst, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]
-    stored = slow[slow.size - 3]
+    stored, moved = slow[slow.size - 3], 0.0
+    if form.mobile:
+        # 1/A changes most per volt at 0 V.
+        at_rest, _ = inverse_area_at(form, 0.0)
+        moved = abs(c.shown.area_kink) * at_rest * at_rest * form.area0 * local
     for i in range(n):
         own.z[i] = z
         z += own.steps[3, i]
         collected += own.steps[4, i]
-        now = abs(collected) + stored * (abs(own.error[i + 1]) + local) / own.q[0, i + 1]
+        layer = abs(own.error[i + 1]) + moved * abs(room.end[v + 1, i + 1])
+        now = abs(collected) + stored * layer / own.q[0, i + 1]
         worst = now if now > worst else worst
         peak = abs(z) if abs(z) > peak else peak
     own.z[n] = z
