@@ -226,7 +226,8 @@ def charge_block(c: Course, r: int, n: int, local: float) -> None:
         z += own.steps[3, i]
         collected += own.steps[4, i]
         layer = abs(own.error[i + 1]) + moved * abs(room.end[v + 1, i + 1])
-        now = abs(collected) + stored * layer / own.q[0, i + 1]
+        # Within a step, the error may be larger than at its end by what the whole step adds.
+        now = abs(collected) + abs(own.steps[4, i]) + stored * layer / own.q[0, i + 1]
         worst = now if now > worst else worst
         peak = abs(z) if abs(z) > peak else peak
     own.z[n] = z
