@@ -31,6 +31,7 @@ from fingerspice.engine.blockforms import (
 )
 from fingerspice.engine.blockkinks import crossing
 from fingerspice.engine.blockrows import (
+    add,
     area_rows,
     modes_into,
     scaled,
@@ -64,8 +65,9 @@ class Charges(NamedTuple):
 
 
 class Course(NamedTuple):
-    """State and scratch arrays of the loop along a recording; `w` and `error` (m,) are the modes and their error.
+    """State and scratch arrays of the loop along a recording.
 
+    `w` (m,) are the modes, and the rows of `error` (2, m) the parts of their error that quadrature and sweeps leave;
     `spare` (3, n) is scratch for single outputs; `engine.relaxation` lists the entries of `control` and `counters`.
     """
 
@@ -195,7 +197,7 @@ def moved_rows(
 
 @jit_within
 def charge_block(c: Course, r: int, n: int, local: float) -> None:
-    """Charge at the ends of a block's steps, and its error; `Room.own` holds the error of the modes.
+    """Charge at the ends of a block's steps, and its error; `Room.own` and `Room.further` hold that of the modes.
 
     `local` is the error of the gap voltage (V) that this block itself makes: under `mobile` it changes the area, with
     which the modes' part of the slowest layer's voltage grows. The projections that only the charge needs are known,
@@ -211,8 +213,10 @@ def charge_block(c: Course, r: int, n: int, local: float) -> None:
     scaled(n + 1, 0.0, room.s, own.error)
     modes_into(n + 1, 0, c.shown.slow[r], room.own, own.error)
     for k in range(c.w.size):
+        add(n + 1, c.shown.slow[r, k], room.further[k], own.error)
         # Errors of earlier blocks decay, as if all steps were equally long.
-        _add_decaying(n + 1, c.shown.slow[r, k] * c.error[k], c.spare[2, k] ** (1.0 / n), own.error)
+        carried = c.shown.slow[r, k] * (c.error[0, k] + c.error[1, k])
+        _add_decaying(n + 1, carried, c.spare[2, k] ** (1.0 / n), own.error)
     _leaked_error(n, own.h, slow, own.q[0], own.error, own.steps[4])
     control = c.control
     z, collected, worst, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]

@@ -121,13 +121,11 @@ def further_sweep(c: Course, r: int, level: int, n: int) -> None:
 def error_left(c: Course, r: int, n: int, rest: float) -> float:
     """Largest change of the first projection by a further sweep, V.
 
-    `Room.own` becomes the error of the modes that the block adds, and `Room.before` that of the first projection.
+    `Room.before` becomes the error of the first projection that the block adds.
     """
     room = c.room
     scaled(n + 1, 0.0, room.s, room.slope)
     modes_into(n + 1, 0, c.form.taps[r, 0], room.further, room.slope)
-    for k in range(c.w.size):
-        add(n + 1, 1.0, room.further[k], room.own[k])
     moduli_of(n + 1, rest, room.before, room.slope)
     return largest_of(n + 1, room.slope)
 
@@ -156,27 +154,34 @@ def _largest_error(c: Course, rows: FloatArray, n: int) -> float:
     """The largest error in a block of any of the quantities `rows` (n_row, m) @ modes."""
     room, worst = c.room, 0.0
     for i in range(rows.shape[0]):
+        scaled(n + 1, 0.0, room.s, room.before)
         scaled(n + 1, 0.0, room.s, room.slope)
-        modes_into(n + 1, 0, rows[i], room.own, room.slope)
-        carried = 0.0
-        for k in range(c.w.size):
-            carried += abs(rows[i, k] * c.error[k])
-        worst = max(worst, largest_of(n + 1, room.slope) + carried)
+        modes_into(n + 1, 0, rows[i], room.own, room.before)
+        modes_into(n + 1, 0, rows[i], room.further, room.slope)
+        moduli_of(n + 1, 1.0, room.before, room.slope)
+        worst = max(worst, largest_of(n + 1, room.before) + _carried(c, rows[i]))
     return worst
 
 
 @jit_within
-def accept(c: Course, r: int, n: int, local: float, magnified: float) -> None:
+def _carried(c: Course, row: FloatArray) -> float:
+    """Most that the errors of earlier blocks add to the quantity `row` (m,) @ modes."""
+    total = 0.0
+    for k in range(c.w.size):
+        total += abs(row[k] * c.error[0, k]) + abs(row[k] * c.error[1, k])
+    return total
+
+
+@jit_within
+def accept(c: Course, r: int, n: int, local: float, magnified: float, share: float) -> None:
     """Account for the peaks and errors of an accepted block, and move to its end.
 
-    `local` is the error of the gap voltage that the block adds, V, and `magnified` the ratio of that to an error of the
-    first projection. Row 2 of `Course.spare` has the decay of every mode over the block, and `Charges.h` the lengths of
-    its steps.
+    `local` is the error of the gap voltage that the block adds, V, `magnified` the ratio of that to an error of the
+    first projection, and `share` the part of a change that a sweep leaves. Row 2 of `Course.spare` has the decay of
+    every mode over the block, and `Charges.h` the lengths of its steps.
     """
     room, control = c.room, c.control
-    carried = 0.0
-    for k in range(c.w.size):
-        carried += abs(c.form.taps[r, 0, k] * c.error[k])
+    carried = _carried(c, c.form.taps[r, 0])
     gap = room.u
     if c.form.bend.size > 0:
         gap = room.slope
@@ -194,12 +199,14 @@ def accept(c: Course, r: int, n: int, local: float, magnified: float) -> None:
     control[ERROR_V] = max(control[ERROR_V], c.shown.moves[0] * off_u + node_error)
     first = c.shown.k.size - c.shown.flows
     if c.shown.flows > 0:
-        charge_error = _largest_error(c, c.shown.columns[r, first:], n)
+        # A charge may be a small difference of large ones, whose errors a further sweep would show up to a share only.
+        charge_error = _largest_error(c, c.shown.columns[r, first:], n) + share * c.shown.capacitance * local
         control[ERROR_Q] = max(control[ERROR_Q], charge_error + c.shown.moves[1] * off_u)
     if c.shown.charge:
         charge_block(c, r, n, local)
     for k in range(c.w.size):
         c.w[k] = room.w[k, n]
-        c.error[k] = c.error[k] * c.spare[2, k] + room.own[k, n]
+        c.error[0, k] = c.error[0, k] * c.spare[2, k] + room.own[k, n]
+        c.error[1, k] = c.error[1, k] * c.spare[2, k] + room.further[k, n]
     control[U_GAP] = room.u[n]
     c.counters[STEPS] += n

@@ -160,7 +160,8 @@ class Room(NamedTuple):
     """Rows of a block to work in: of the source, modes, increments, projections, drives, and single ones.
 
     `changed`, `changed_within` (the middle) and `changed_pulse` are drives with their sign reversed as a sweep finds
-    them, and then their changes; `further` is what a further sweep would change in the modes, and `own` their error.
+    them, and then their changes; `further` is what a further sweep would change in the modes, and `own` their
+    quadrature error.
     `kinked` is no row: the weights (m, T) of the kink of each drive in each mode.
     """
 

@@ -114,7 +114,8 @@ def march(
         to = nearest(form, control[MEAN_Q] if control[MEAN_Q] > 0.0 else form.q0[r] + room.z[0])
         if to != r:
             go_over(c, r, to, c.w)
-            go_over(c, r, to, c.error)
+            for part in range(c.error.shape[0]):
+                go_over(c, r, to, c.error[part])
             control[REFERENCE] = to
             continue
         change, margin, sweeps = relax(form, room, r, level, h, c.shown.kink, n, tol, control[RATIO])
@@ -129,6 +130,7 @@ def march(
                 magnified = form.area0 * largest_of(n + 1, c.charges.q[0]) / margin
             seen = magnified * quadrature_error(c, r, level, n)
             local = rest * seen
+        left = 0.0
         if local <= tol:
             correct(c, r, n, rest)
             further_sweep(c, r, level, n)
@@ -152,7 +154,7 @@ def march(
             c.charges.h[i] = h
         if c.shown.charge:
             project_for_charge(form, room, r, level, n)
-        accept(c, r, n, local, magnified)
+        accept(c, r, n, local, magnified, left / (change + seen) if left > 0.0 else 0.0)
         write_block(c, r, sub, count, h, start + at * spacing, t_out, out)
         at += count
         if level > 0 and local < SPARE * tol:

@@ -297,7 +297,8 @@ def march(
         to = nearest(form, control[MEAN_Q] if control[MEAN_Q] > 0.0 else form.q0[r] + room.z[0])
         if to != r:
             go_over(c, r, to, c.w)
-            go_over(c, r, to, c.error)
+            for part in range(c.error.shape[0]):
+                go_over(c, r, to, c.error[part])
             control[REFERENCE] = to
             continue
         weigh(form, steps, c.charges.h, r, n)
@@ -307,6 +308,7 @@ def march(
         if closed:
             seen = _misfit(form, room, steps, r, c.shown.kink, n, taps)
             local = rest * seen
+        left = 0.0
         if local <= tol:
             correct(c, r, n, rest)
             _further_sweep(c, steps, r, n)
@@ -332,7 +334,7 @@ def march(
             _look(form, room, steps, r, MIDDLE, n, taps)
             for p in range(1 + drives, taps):
                 project_at_ends(form, room, r, n + 1, p)
-        accept(c, r, n, local, 1.0)
+        accept(c, r, n, local, 1.0, left / (change + seen) if left > 0.0 else 0.0)
         _write(c, r, sub, count, t_out, out)
         at += count
         if level > 0 and local < SPARE * tol:

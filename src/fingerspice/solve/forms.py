@@ -228,7 +228,7 @@ class Followed(Follower):
         control[blockforms.Z] = start.y[-1] - self._charge_with(start.u_gap)
         return Course(
             system.model, form, self.shown, blockforms.new_room(m, drives, drives + 3), new_charges(),
-            np.zeros((3, max(m, drives, 5))), system.project[r] @ start.y[:-1], np.zeros(m), control, counters,
+            np.zeros((3, max(m, drives, 5))), system.project[r] @ start.y[:-1], np.zeros((2, m)), control, counters,
         )  # fmt: skip
 
     def rows(self, problem: Problem, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:

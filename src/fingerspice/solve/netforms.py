@@ -139,7 +139,7 @@ class Finger(Follower):
         control[blockforms.U_GAP] = one.taps[0] @ w + one.tap_s[0] * s[reduced.source]
         return Course(
             self._model, form, self.shown, blockforms.new_room(m, drives, drives + 1), new_charges(),
-            np.zeros((3, max(m, drives, 5))), w, np.zeros(m), control, counters,
+            np.zeros((3, max(m, drives, 5))), w, np.zeros((2, m)), control, counters,
         )  # fmt: skip
 
     def rows(self, problem: Problem, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
