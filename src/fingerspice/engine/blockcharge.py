@@ -31,7 +31,6 @@ from fingerspice.engine.blockforms import (
 )
 from fingerspice.engine.blockkinks import crossing
 from fingerspice.engine.blockrows import (
-    add,
     area_rows,
     modes_into,
     scaled,
@@ -197,7 +196,7 @@ def moved_rows(
 
 @jit_within
 def charge_block(c: Course, r: int, n: int, local: float) -> None:
-    """Charge at the ends of a block's steps, and its error; `Room.own` and `Room.further` hold that of the modes.
+    """Charge at the ends of a block's steps, and its error; `Room.own` holds that of the modes.
 
     `local` is the error of the gap voltage (V) that this block itself makes: under `mobile` it changes the area, with
     which the modes' part of the slowest layer's voltage grows. The projections that only the charge needs are known,
@@ -213,7 +212,6 @@ def charge_block(c: Course, r: int, n: int, local: float) -> None:
     scaled(n + 1, 0.0, room.s, own.error)
     modes_into(n + 1, 0, c.shown.slow[r], room.own, own.error)
     for k in range(c.w.size):
-        add(n + 1, c.shown.slow[r, k], room.further[k], own.error)
         # Errors of earlier blocks decay, as if all steps were equally long.
         carried = c.shown.slow[r, k] * (c.error[0, k] + c.error[1, k])
         _add_decaying(n + 1, carried, c.spare[2, k] ** (1.0 / n), own.error)

@@ -37,7 +37,7 @@ from fingerspice.engine.blockrows import (
     scaled,
     settle,
 )
-from fingerspice.engine.relaxation import MOST_RATIO, NEWTON, look_at_ends
+from fingerspice.engine.relaxation import LEFT, MOST_RATIO, NEWTON, look_at_ends
 
 # The part of a change that a sweep leaves is taken to be so many times what the block before has shown, and at least
 # this share of the areas' distance from the reference.
@@ -146,20 +146,41 @@ def learn(
     if local > tol and change > 0.0:
         ratio = max(ratio, CAUTION * tol / (change * strayed))
     c.control[RATIO] = ratio
-    return bool(change > seen and ratio * strayed < MOST_RATIO)
+    # More sweeps do not reduce what the correction by the quadrature error changes.
+    stays = local - left * change / (change + seen)
+    return bool(stays <= LEFT * tol and ratio * strayed < MOST_RATIO)
 
 
 @jit_within
-def _largest_error(c: Course, rows: FloatArray, n: int) -> float:
-    """The largest error in a block of any of the quantities `rows` (n_row, m) @ modes."""
+def _largest_sum(c: Course, row: FloatArray, modes: FloatArray, n: int, out: FloatArray) -> float:
+    """Largest modulus of the sum `row` (m,) @ `modes` (m, n + 1), which `out` becomes."""
+    scaled(n + 1, row[0], modes[0], out)
+    modes_into(n + 1, 1, row, modes, out)
+    return largest_of(n + 1, out)
+
+
+@jit_within
+def _node_error(c: Course, r: int, n: int) -> float:
+    """Largest error of a node's voltage in a block; `Room.own` becomes all of the error that the block adds."""
     room, worst = c.room, 0.0
-    for i in range(rows.shape[0]):
-        scaled(n + 1, 0.0, room.s, room.before)
-        scaled(n + 1, 0.0, room.s, room.slope)
-        modes_into(n + 1, 0, rows[i], room.own, room.before)
-        modes_into(n + 1, 0, rows[i], room.further, room.slope)
+    for k in range(c.w.size):
+        add(n + 1, 1.0, room.further[k], room.own[k])
+    for i in range(c.shown.node.shape[1]):
+        row = c.shown.node[r, i]
+        worst = max(worst, _largest_sum(c, row, room.own, n, room.slope) + _carried(c, row))
+    return worst
+
+
+@jit_within
+def _charge_error(c: Course, r: int, n: int) -> float:
+    """Largest error in a block of the charges of a network, whose parts have unrelated signs."""
+    room, worst = c.room, 0.0
+    for i in range(c.shown.k.size - c.shown.flows, c.shown.k.size):
+        row = c.shown.columns[r, i]
+        _largest_sum(c, row, room.own, n, room.before)
+        _largest_sum(c, row, room.further, n, room.slope)
         moduli_of(n + 1, 1.0, room.before, room.slope)
-        worst = max(worst, largest_of(n + 1, room.before) + _carried(c, rows[i]))
+        worst = max(worst, largest_of(n + 1, room.before) + _carried(c, row))
     return worst
 
 
@@ -194,19 +215,18 @@ def accept(c: Course, r: int, n: int, local: float, magnified: float, share: flo
     off = magnified * (worst + steepest * carried)
     control[ERROR_U] = max(control[ERROR_U], off_u)
     control[ERROR_F] = max(control[ERROR_F], 2.2 * off)
-    # An error of the gap voltage changes the area, and thereby other voltages.
-    node_error = magnified * _largest_error(c, c.shown.node[r], n)
-    control[ERROR_V] = max(control[ERROR_V], c.shown.moves[0] * off_u + node_error)
-    first = c.shown.k.size - c.shown.flows
     if c.shown.flows > 0:
         # A charge may be a small difference of large ones, whose errors a further sweep would show up to a share only.
-        charge_error = _largest_error(c, c.shown.columns[r, first:], n) + share * c.shown.capacitance * local
+        charge_error = _charge_error(c, r, n) + share * c.shown.capacitance * local
         control[ERROR_Q] = max(control[ERROR_Q], charge_error + c.shown.moves[1] * off_u)
+    # An error of the gap voltage changes the area, and thereby other voltages.
+    node_error = magnified * _node_error(c, r, n)
+    control[ERROR_V] = max(control[ERROR_V], c.shown.moves[0] * off_u + node_error)
     if c.shown.charge:
         charge_block(c, r, n, local)
     for k in range(c.w.size):
         c.w[k] = room.w[k, n]
-        c.error[0, k] = c.error[0, k] * c.spare[2, k] + room.own[k, n]
+        c.error[0, k] = c.error[0, k] * c.spare[2, k] + room.own[k, n] - room.further[k, n]
         c.error[1, k] = c.error[1, k] * c.spare[2, k] + room.further[k, n]
     control[U_GAP] = room.u[n]
     c.counters[STEPS] += n

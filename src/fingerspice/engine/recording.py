@@ -41,11 +41,10 @@ DONE, NOT_CLOSED, TOO_COARSE = range(3)
 
 @jit
 def nearest(form: Form, q: float) -> int:
-    """The reference for a value of 1/A."""
+    """The reference for a value of 1/A, by the geometric means of neighbours; references are in rising order."""
     best = 0
-    for one in range(1, form.q0.size):
-        if abs(math.log(q / form.q0[one])) < abs(math.log(q / form.q0[best])):
-            best = one
+    while best + 1 < form.q0.size and q * q > form.q0[best] * form.q0[best + 1]:
+        best += 1
     return best
 
 

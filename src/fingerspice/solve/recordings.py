@@ -31,7 +31,9 @@ from fingerspice.solve.runs import Progress, Run, excess_of, kept_with
 from fingerspice.waveforms.ramps import PWL
 
 # Error allowed in a block, relative to the error asked for; ratio of stated to estimated error; attempts at a piece.
-SHARE, SAFETY, ATTEMPTS = 0.3, 1.75, 4
+SHARE, SAFETY, ATTEMPTS = 0.25, 1.75, 4
+# Share of the error asked for that another attempt at a piece is to have.
+ENOUGH = 0.7
 # The error of a piece is related to the peaks up to its end, or to this share of the largest gap voltage that the
 # source may cause: noise before the first loud sound need not be exact relative to itself.
 LEAST_PEAK = 1e-3
@@ -117,7 +119,7 @@ class March:
             refused = self.course.counters[blockforms.REFUSED]
             self.recall(before)
             self.course.counters[blockforms.REFUSED] = refused
-            self.share *= min(0.3, 0.5 / excess)
+            self.share *= ENOUGH / excess
         return Outcome.NOT_MET
 
     def _lead(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
