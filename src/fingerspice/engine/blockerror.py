@@ -160,15 +160,23 @@ def _largest_sum(c: Course, row: FloatArray, modes: FloatArray, n: int, out: Flo
 
 
 @jit_within
-def _node_error(c: Course, r: int, n: int) -> float:
-    """Largest error of a node's voltage in a block; `Room.own` becomes all of the error that the block adds."""
-    room, worst = c.room, 0.0
+def _node_error(c: Course, r: int, n: int, known: float) -> float:
+    """Largest error of a node's voltage in a block, or `known` (V) if it is not larger.
+
+    `Room.own` becomes all of the error that the block adds.
+    """
+    room, largest = c.room, c.spare[0]
     for k in range(c.w.size):
         add(n + 1, 1.0, room.further[k], room.own[k])
+        largest[k] = largest_of(n + 1, room.own[k])
     for i in range(c.shown.node.shape[1]):
-        row = c.shown.node[r, i]
-        worst = max(worst, _largest_sum(c, row, room.own, n, room.slope) + _carried(c, row))
-    return worst
+        row, most = c.shown.node[r, i], 0.0
+        for k in range(c.w.size):
+            most += abs(row[k]) * largest[k]
+        carried = _carried(c, row)
+        if most + carried > known:
+            known = max(known, _largest_sum(c, row, room.own, n, room.slope) + carried)
+    return known
 
 
 @jit_within
@@ -220,8 +228,9 @@ def accept(c: Course, r: int, n: int, local: float, magnified: float, share: flo
         charge_error = _charge_error(c, r, n) + share * c.shown.capacitance * local
         control[ERROR_Q] = max(control[ERROR_Q], charge_error + c.shown.moves[1] * off_u)
     # An error of the gap voltage changes the area, and thereby other voltages.
-    node_error = magnified * _node_error(c, r, n)
-    control[ERROR_V] = max(control[ERROR_V], c.shown.moves[0] * off_u + node_error)
+    moved = c.shown.moves[0] * off_u
+    node_error = _node_error(c, r, n, max(control[ERROR_V] - moved, 0.0) / magnified)
+    control[ERROR_V] = max(control[ERROR_V], moved + magnified * node_error)
     if c.shown.charge:
         charge_block(c, r, n, local)
     for k in range(c.w.size):

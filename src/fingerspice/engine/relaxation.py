@@ -314,7 +314,8 @@ def relax(
         for k in range(modes):
             recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.w[k])
         newton = FIRST_NEWTON if sweep == 0 else NEWTON
-        keep_drives(room, n)
+        if sweep >= KINKED:
+            keep_drives(room, n)
         margin = _look(form, room, r, level, MIDDLE, n, newton)
         margin = min(margin, look_at_ends(form, room, r, n + 1, newton))
         if fades:

@@ -180,7 +180,8 @@ def _relax(
                 )  # fmt: skip
         for k in range(modes):
             _pass(n, steps.decay[k, END], room.inc[k], room.w[k])
-        keep_drives(room, n)
+        if sweep >= KINKED:
+            keep_drives(room, n)
         _look(form, room, steps, r, MIDDLE, n, 1 + drives)
         look_at_ends(form, room, r, n + 1, 0)
         if not abs(room.u[n]) < math.inf:
