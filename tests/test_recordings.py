@@ -70,10 +70,10 @@ def test_two_sources_of_a_circuit_may_have_recordings_at_different_rates() -> No
     assert np.abs(run.u_gap - exact.u_gap).max() <= min(1e-6 * peak, run.error.u_gap)
 
 
-@pytest.mark.parametrize("number", [57, 129, 158, 176])
+@pytest.mark.parametrize("number", [17, 57, 129, 158, 176])
 def test_what_the_sweeps_leave_is_stated(number: int) -> None:
-    # The first changes from sweep to sweep had promised 4 to 8 times less than the next sweep changed, and the charge
-    # (57) is off by what an error of the same sign in every block leaks.
+    # The first changes from sweep to sweep had promised 4 to 8 times less than the next sweep changed, near a fold (17)
+    # all changes did, and the charge (57) is off by what an error of the same sign in every block leaks.
     found = recording_errors.judge(recording_errors.draw(number))
     assert len(found) == 16
     assert [x for x in found if not x.covered] == []
@@ -87,7 +87,8 @@ def test_stated_errors_cover_the_true_ones_and_what_was_asked_is_met() -> None:
         if x.quantity in ("u_gap", "f_el"):
             assert x.true <= x.rtol
     ratios = [x.ratio for x in found if x.ratio is not None and x.quantity == "u_gap"]
-    assert np.median(ratios) <= 10.0
+    assert np.median(ratios) <= 4.0
+    assert np.mean(np.array(ratios) <= 10.0) >= 0.8
 
 
 @pytest.mark.parametrize("law", ["local", "mobile"])

@@ -229,13 +229,13 @@ def _misfit(form: Form, room: Room, steps: Steps, r: int, kink: FloatArray, n: i
 @jit_within
 def _further_sweep(c: Course, steps: Steps, r: int, n: int) -> None:
     """As `blockerror.further_sweep`."""
-    form, room = c.form, c.room
+    form, room, forced, within = c.form, c.room, c.room.slope, steps.low
     for k in range(c.w.size):
-        scaled(n + 1, 0.0, room.s, steps.forced[k])
-        modes_into(n + 1, 0, form.feed[r, k], room.changed, steps.forced[k])
-        scaled(n, 0.0, room.s, steps.forced_within[k])
-        modes_into(n, 0, form.feed[r, k], room.changed_within, steps.forced_within[k])
-        _increments(n, steps.parabola[k, END], steps.forced[k], steps.forced_within[k], room.inc[k])
+        scaled(n + 1, 0.0, room.s, forced)
+        modes_into(n + 1, 0, form.feed[r, k], room.changed, forced)
+        scaled(n, 0.0, room.s, within)
+        modes_into(n, 0, form.feed[r, k], room.changed_within, within)
+        _increments(n, steps.parabola[k, END], forced, within, room.inc[k])
         room.further[k, 0] = 0.0
         _pass(n, steps.decay[k, END], room.inc[k], room.further[k])
 
