@@ -25,6 +25,7 @@ from fingerspice import __version__
 from fingerspice.base.announcing import Bar
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
+from fingerspice.base.heap import keep_freed_memory
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies import sweepplan
 from fingerspice.studies.batch import MESSAGES, batch
@@ -372,6 +373,7 @@ def _same(work: Work) -> Work:
 
 def _run_and_write_aside(work: Work, index: int) -> Done:
     """A task of Dask: its worker computes the next chunk while this one is written."""
+    keep_freed_memory()
     return run_chunk(work, index, writing=_aside())
 
 
