@@ -55,7 +55,7 @@ class Stepping(NamedTuple):
         What the periodic state is off, relative to the peak gap voltage; or half of what the mean force is off because
         the last period stands for those after it, relative to that force, and infinite while it does not.
     length : ndarray, shape (lanes,)
-        Length of the shortest step, s.
+        Length of the shortest step, s; in a run from rest, then the number of half periods after which it has settled.
     moments : ndarray, shape (11, lanes)
         Scratch of `lockweights.weigh`.
     """
@@ -119,12 +119,13 @@ def _closed(
 
 
 @jit
-def _settled(i: int, c: FloatArray, stepping: Stepping, steps: int, marks: Marks) -> float:
+def _settled(i: int, c: FloatArray, stepping: Stepping, steps: int, traced: bool, marks: Marks) -> float:
     """Half of what lane i's mean force is off, relative to it, if the last period stands for all that follow.
 
     What a mode was off the periodic state, on average over the period, is at most its change over the period times its
-    time constant in periods. The mean force changes by at most twice the peak voltage times this, and the area; `steps`
-    is the number of steps of a period.
+    time constant in periods, and so is what it changes in all later ones. The mean force changes by at most twice the
+    peak voltage times this, and the area; `steps` is the number of steps of a period. If gap voltages are wanted, then
+    at least what these change, relative to their peak.
     """
     s, last, before, back = stepping[2], stepping[3], stepping[4], stepping[5]
     m_all, lanes = len(marks[0]), len(marks[5])
@@ -132,7 +133,9 @@ def _settled(i: int, c: FloatArray, stepping: Stepping, steps: int, marks: Marks
     for m in range(m_all):
         at = m * lanes + i
         off += abs(c[(SHAPE + m) * lanes + i] * (s[Z * m_all * lanes + at] - before[at]) * back[at])
-    return float(off * s[(N_STATE * m_all + PEAK) * lanes + i] / (last[i] / steps * c[held * lanes + i] + 1e-300))
+    peak = s[(N_STATE * m_all + PEAK) * lanes + i]
+    of_force = off * peak / (last[i] / steps * c[held * lanes + i] + 1e-300)
+    return float(max(of_force, off / (peak + 1e-300)) if traced else of_force)
 
 
 @jit
@@ -146,7 +149,7 @@ def _from_rest(
     at which it settled: no result depends on the scenes beside it. A first range of half a period makes the rest whole.
     """
     halves, steps, jumping = how
-    s, last, before, closing = stepping[2], stepping[3], stepping[4], stepping[6]
+    s, last, before, closing, settled = stepping[2], stepping[3], stepping[4], stepping[6], stepping[7]
     m_all, count, lanes = len(marks[0]), len(marks[4]), len(marks[5])
     sums = (N_STATE * m_all + VALUE + count) * lanes
     for i in range(lanes):
@@ -168,11 +171,16 @@ def _from_rest(
                 continue
             off = 0.0
             if ahead > 0:
-                off = _settled(i, c, stepping, 2 * steps, marks)
-            if ahead == 0 or (trace.size == 0 and off <= tol):
-                closing[i] = off
+                off = _settled(i, c, stepping, 2 * steps, trace.size > 0, marks)
+            if ahead == 0 or off <= tol:
+                closing[i], settled[i] = off, done
                 left -= 1
                 put_result(i, s, last, off, (ahead, halves, steps), first, out, marks)
+    width = trace.size // lanes
+    for i in range(lanes if width > 0 else 0):
+        # The last period, again and again.
+        for j in range(i * width + int(settled[i]) * steps, (i + 1) * width):
+            trace[j] = trace[j - 2 * steps]
 
 
 @jit
@@ -271,3 +279,27 @@ def march(
             width = traces[w].shape[1]
             for i in range(min(lanes, pending.size - first) if width > 0 else 0):
                 traces[w][first + i] = voltages[w][i * width : (i + 1) * width]
+
+
+@jit
+def trace_changes(fine: FloatArray, coarse: FloatArray, out: FloatArray) -> None:
+    """Largest difference of gap voltages (n, 2 steps) and (n, steps) at the same times, for each scene, into `out`."""
+    for i in range(fine.shape[0]):
+        largest = 0.0
+        for j in range(coarse.shape[1]):
+            off = abs(fine[i, 2 * j] - coarse[i, j])
+            largest = off if off > largest else largest
+        out[i] = largest
+
+
+@jit
+def put_traces(
+    traces: FloatArray, chosen: NDArray[np.int64], stride: int, at: NDArray[np.int64], out: FloatArray
+) -> None:
+    """Every `stride`-th gap voltage of the `chosen` scenes, into the rows `at` of `out`, which are NaN beyond them."""
+    for k in range(chosen.size):
+        count, trace, row = traces.shape[1] // stride, traces[chosen[k]], out[at[k]]
+        for j in range(count):
+            row[j] = trace[j * stride]
+        for j in range(count, row.size):
+            row[j] = math.nan

@@ -122,6 +122,7 @@ def batch(
     wanted = gradient_request(task, paths, scenes, skin) if paths else None
     with ThreadPoolExecutor(threads or _processors()) as pool:
         found, reason, where = _lockstep(task, changed, pool)
+        found.fill()
         rest = np.flatnonzero(~found.done)
         _one_by_one(task, changed, rest, found, pool)
         attrs = {"skin": skin, "n_ordinary": rest.size, "ordinary": reason if rest.size else "", "device": where}
@@ -301,12 +302,12 @@ def _lockstep(task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExec
         return found, form if isinstance(form, str) else f"{', '.join(others)} needs a run of its own", "cpu"
     jobs = jobs_of(task, count, np.ones(n, bool), recorded)
 
-    def one(job: tuple[int, NDArray[np.int64]]) -> Answers:
-        return climb(task, form, {path: array[job[1]] for path, array in lower.items()}, job[0])
+    def one(job: tuple[int, NDArray[np.int64]]) -> None:
+        halves, members = job
+        climb(task, form, {path: array[members] for path, array in lower.items()}, halves, members, found)
 
-    for (_, members), answer in zip(jobs, pool.map(one, jobs), strict=True):
-        found.put(members[answer.done], {k: v[answer.done] for k, v in answer.values.items()},
-                  answer.error[answer.done], LOCKSTEP)  # fmt: skip
+    # Jobs have no scene in common, so that threads write to different places.
+    list(pool.map(one, jobs))
     reason = "what does not end after half periods or at a sample, or does not meet its error in lockstep"
     return found, reason, task.device if task.on_card(recorded) else "cpu"
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine.lockcard import Lengths, march_on_card
-from fingerspice.engine.lockmarch import march, new_stepping
+from fingerspice.engine.lockmarch import march, new_stepping, put_traces, trace_changes
 from fingerspice.engine.locksamples import N_PORTION, march_samples
 from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, LOSS, OMEGA, REST, STRESS, new_block
 from fingerspice.engine.lockstep import ALL_MOMENTS, START_TIMES, marks_of
@@ -88,8 +88,11 @@ def _waves(n: int, form: LockstepForm) -> FloatArray:
     return np.stack([np.sin(turns), np.cos(turns)], axis=2).reshape(times.size, -1)
 
 
-def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halves: int) -> Answers:
-    """Integrate scenes in lockstep, doubling the steps; scenes whose error stays too large are marked as not done.
+def climb(
+    task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halves: int, members: NDArray[np.int64],
+    found: Answers,
+) -> None:  # fmt: skip
+    """Integrate scenes in lockstep, doubling the steps; scenes whose error stays too large stay not done.
 
     Parameters
     ----------
@@ -99,18 +102,22 @@ def climb(task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], halv
         Values by path in lower case.
     halves : int
         Length of the runs in half periods.
+    members : ndarray, shape (n,)
+        Their places among the answers.
+    found : Answers
+        Takes the results.
     """
     table = table_of(form, scenes)
     mu = friction_of(form, scenes)
-    found = Answers.empty(task, table.shape[1], halves * task.points // 2)
     touching, pieces, decays = mesh_of(form, table, most=1 if task.traced else MOST_PIECES)
     # Scenes that settle after about as many periods share a block, which ends when all of its scenes have settled.
     order = np.argsort(_leakage_rates(form, table).min(axis=0)) if halves > 4 else np.arange(mu.size)
     for count in np.unique(pieces[touching]).tolist():
         pending = order[(touching & (pieces == count))[order]]
         for covered in COVERED:
-            pending = _climb_one(task, form, _Scenes(table, mu, decays), (halves, count), covered, pending, found)
-    return found
+            pending = _climb_one(
+                task, form, _Scenes(table, mu, decays, members), (halves, count), covered, pending, found
+            )
 
 
 def friction_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray:
@@ -165,11 +172,12 @@ def short_enough(decays: FloatArray, pieces: int, steps: int) -> BoolArray:
 
 
 class _Scenes(NamedTuple):
-    """Table of scenes, friction coefficient, and half a period in time constants of the fastest cell."""
+    """Table of scenes, friction coefficient, half a period in time constants of the fastest cell, places of answers."""
 
     table: FloatArray
     mu: FloatArray
     decays: FloatArray
+    members: NDArray[np.int64]
 
 
 def _climb_one(
@@ -204,15 +212,16 @@ def _climb_one(
         good = (error <= ENOUGH * task.rtol) & short_enough(scenes.decays[pending], pieces, steps)
         good &= before is not None or not doubtful
         at = pending[good]
+        places = scenes.members[at]
         for name in figures:
             part = 1 if name.endswith("_periodic") or task.periodic else 0
             moments = now.fine[part * level.moments : (part + 1) * level.moments, good]
             figure = FIGURES[name.removesuffix("_periodic")][1]
             load, stress = table[others + LOAD, at], table[others + STRESS, at]
-            found.values[name][at] = figure(moments, load, stress, scenes.mu[at])
+            found.values[name][places] = figure(moments, load, stress, scenes.mu[at])
         if traced:
-            found.values["u_gap"][at] = now.trace[good, :: steps // task.points]
-        found.error[at], found.status[at], found.done[at] = error[good] / ENOUGH, LOCKSTEP, True
+            put_traces(now.trace, np.flatnonzero(good), steps // task.points, places, found.values["u_gap"])
+        found.error[places], found.status[places], found.done[places] = error[good] / ENOUGH, LOCKSTEP, True
         # More steps are no help where the area's polynomial of the highest degree is what limits the error.
         # A scene whose estimate grows from twice the steps, too: the explicit steps may be unstable around that area.
         beyond = np.isinf(now.fine[-1]) | ~good & (error > last)
@@ -306,7 +315,8 @@ class Level(NamedTuple):
                 changes.append(np.abs(run.fine[later] - run.coarse[later]) / np.where(last > 0.0, last, 1.0))
             changes.append(change / np.where(size > 0.0, size, 1.0))
         if self.traced:
-            off = np.abs(run.trace[:, ::2] - run.trace_coarse).max(axis=1)
+            off = np.empty(peak.size)
+            trace_changes(run.trace, run.trace_coarse, off)
             changes.append(off / np.where(peak > 0.0, peak, 1.0))
         # The area's polynomial of the run with half the steps may be another one.
         change = np.max(changes, axis=0) + run.coarse[-1]

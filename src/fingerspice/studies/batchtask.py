@@ -77,7 +77,7 @@ class Answers:
     Attributes
     ----------
     values : dict of str to ndarray, shape (n,) or (n, n_t)
-        Outputs; NaN for a scene without a result.
+        Outputs; NaN for a scene without a result, but for gap voltages, which are filled last (`fill`).
     error : ndarray, shape (n,)
         Stated relative error.
     status : ndarray, shape (n,)
@@ -98,17 +98,15 @@ class Answers:
     def empty(cls, task: Task, n: int, width: int) -> Answers:
         """Answers of n scenes, none of them done, with room for `width` gap voltages each."""
         shapes = {name: (n, width) if name == "u_gap" else (n,) for name in task.outputs}
-        values = {name: np.full(shape, np.nan) for name, shape in shapes.items()}
+        values = {
+            name: np.full(shape, np.nan) if len(shape) == 1 else np.empty(shape) for name, shape in shapes.items()
+        }
         return cls(values, np.full(n, np.nan), np.full(n, ONE_BY_ONE, np.int8), np.zeros(n, bool), {})
 
-    def put(self, at: NDArray[np.int64], values: Mapping[str, FloatArray], error: FloatArray, status: int) -> None:
-        """Enter the results of the scenes `at`."""
-        for name, found in values.items():
-            if found.ndim == 2:
-                self.values[name][at, : found.shape[1]] = found
-            else:
-                self.values[name][at] = found
-        self.error[at], self.status[at], self.done[at] = error, status, True
+    def fill(self) -> None:
+        """Gap voltages of the scenes without a result so far: NaN."""
+        if "u_gap" in self.values:
+            self.values["u_gap"][~self.done] = np.nan
 
     def put_single(self, i: int, values: Mapping[str, FloatArray], error: float, status: int) -> None:
         """Enter the result of one scene; several gaps have one column each."""
