@@ -147,6 +147,27 @@ SOURCES = {
 }
 
 
+def test_gap_voltages_of_a_settled_run_are_those_of_its_last_period() -> None:
+    # A slow skin, of which some scenes settle within few periods and others within many, in one block.
+    rng = np.random.default_rng(2)
+    parameters = {"Xgap.d": 3.5e-6 * rng.lognormal(0.0, 0.1, 24), "Xgap.r": rng.uniform(2e5, 5e6, 24)}
+    for periods in (9.0, 12.5):
+        found = fs.batch(table1(), parameters, outputs=("u_gap", "f_el_mean"), periods=periods, points=64, rtol=1e-4)
+        alone = fs.batch(table1(), {path: x[5:6] for path, x in parameters.items()}, outputs=("u_gap", "f_el_mean"),
+                         periods=periods, points=64, rtol=1e-4)  # fmt: skip
+        np.testing.assert_array_equal(found.u_gap[5], alone.u_gap[0])
+        covered = []
+        for i in range(24):
+            changed = table1().varied({path: float(x[i]) for path, x in parameters.items()})
+            frequency = changed["Vdrive"].waveform.frequency  # type: ignore[union-attr]
+            t = np.arange(int(64 * periods)) / (64 * frequency)
+            run = fs.simulate(changed, t_stop=periods / frequency, t_eval=t, rtol=1e-10, charge=False)
+            off = float(np.abs(found.u_gap.values[i, : t.size] - run.u_gap).max() / np.abs(run.u_gap).max())
+            assert off <= 1e-4
+            covered.append(off <= float(found.error[i]))
+        assert np.mean(covered) >= 0.95
+
+
 @pytest.mark.parametrize(
     ("source", "skin"),
     [("three sines", ""), ("AM", ""), ("AM", DISPERSIVE), ("sine", DISPERSIVE), ("square", DISPERSIVE)],
