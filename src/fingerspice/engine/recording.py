@@ -153,7 +153,7 @@ def march(
             c.charges.h[i] = h
         if c.shown.charge:
             project_for_charge(form, room, r, level, n)
-        accept(c, r, n, local, magnified, left / (change + seen) if left > 0.0 else 0.0)
+        accept(c, r, n, local, magnified, left / max(change + seen, left) if left > 0.0 else 0.0)
         write_block(c, r, sub, count, h, start + at * spacing, t_out, out)
         at += count
         if level > 0 and local < SPARE * tol:

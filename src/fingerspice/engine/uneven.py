@@ -335,7 +335,7 @@ def march(
             _look(form, room, steps, r, MIDDLE, n, taps)
             for p in range(1 + drives, taps):
                 project_at_ends(form, room, r, n + 1, p)
-        accept(c, r, n, local, 1.0, left / (change + seen) if left > 0.0 else 0.0)
+        accept(c, r, n, local, 1.0, left / max(change + seen, left) if left > 0.0 else 0.0)
         _write(c, r, sub, count, t_out, out)
         at += count
         if level > 0 and local < SPARE * tol:
