@@ -2,7 +2,8 @@
 
 Run: python benchmarks/work_precision.py [--quick] [--repeats 7] [--limit 6] [--problems NAME ...]
 [--contestants WORD ...] [--output FILE], then python benchmarks/report.py. A full run takes about half an hour and
-writes results/work_precision.json; a selection is only printed, unless --output says where to keep it.
+writes results/work_precision.json, for which all libraries have to be there; a selection is only printed, unless
+--output says where to keep it.
 
 The problems are the stacks of `problems.py` and the networks of `network_problems.py`, with 100 outputs per period.
 Every contestant gets the compiled right-hand side of `right_hand_side.py` and `network_rates.py`, pieces split at the
@@ -300,6 +301,11 @@ def main(arguments: list[str] | None = None) -> list[Report]:
         problems = [every()[name] for name in options.problems or every()]
         whole = not (options.problems or options.contestants)
         path = options.output or (RESULTS if whole else None)
+        absent = [name for name, version in versions.items() if version == "absent"]
+        if path == RESULTS and absent:
+            # A table without the best peer would flatter.
+            parser.error(f"{', '.join(absent)} not installed; allowed: all contestants, or --output for another file "
+                         "(pip builds numbalsoda with gfortran)")  # fmt: skip
         results = measure(problems, field, versions, options.repeats, options.limit, path)
     return list(results["points"])
 

@@ -63,6 +63,13 @@ def test_every_contestant_is_as_right_as_its_setting_promises(work_precision, ca
     assert (written.stat().st_mtime_ns if written.exists() else None) == before
 
 
+def test_results_are_kept_only_with_all_contestants(work_precision, monkeypatch, capsys):
+    monkeypatch.setattr(work_precision, "contestants", lambda: ([], {"fingerspice": "0.1.0", "numbalsoda": "absent"}))
+    with pytest.raises(SystemExit):
+        work_precision.main([])
+    assert "numbalsoda not installed" in capsys.readouterr().err
+
+
 def test_the_peers_area_series_and_rates_are_the_packages_model(work_precision):
     problems = importlib.import_module("problems")
     right_hand_side = importlib.import_module("right_hand_side")
