@@ -114,12 +114,11 @@ def climb(
     touching, pieces, decays = mesh_of(form, table, most=1 if task.traced else MOST_PIECES)
     # Scenes that settle after about as many periods share a block, which ends when all of its scenes have settled.
     order = np.argsort(_leakage_rates(form, table).min(axis=0)) if halves > 4 else np.arange(mu.size)
+    every = _Scenes(table, mu, decays, members)
     for count in np.unique(pieces[touching]).tolist():
         pending = order[(touching & (pieces == count))[order]]
         for covered in COVERED:
-            pending = _climb_one(
-                task, form, _Scenes(table, mu, decays, members), (halves, count), covered, pending, found
-            )
+            pending = _climb_one(task, form, every, (halves, count), covered, pending, found)
 
 
 def friction_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray:

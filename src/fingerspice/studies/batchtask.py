@@ -97,10 +97,7 @@ class Answers:
     @classmethod
     def empty(cls, task: Task, n: int, width: int) -> Answers:
         """Answers of n scenes, none of them done, with room for `width` gap voltages each."""
-        shapes = {name: (n, width) if name == "u_gap" else (n,) for name in task.outputs}
-        values = {
-            name: np.full(shape, np.nan) if len(shape) == 1 else np.empty(shape) for name, shape in shapes.items()
-        }
+        values = {name: np.empty((n, width)) if name == "u_gap" else np.full(n, np.nan) for name in task.outputs}
         return cls(values, np.full(n, np.nan), np.full(n, ONE_BY_ONE, np.int8), np.zeros(n, bool), {})
 
     def fill(self) -> None:
