@@ -67,7 +67,8 @@ class Course(NamedTuple):
     """State and scratch arrays of the loop along a recording.
 
     `w` (m,) are the modes, and the rows of `error` (2, m) the parts of their error that quadrature and sweeps leave;
-    `spare` (3, n) is scratch for single outputs; `engine.relaxation` lists the entries of `control` and `counters`.
+    `spare` (3, n) is scratch for single outputs; `engine.blockforms` lists the entries of `control`,
+    `counters` and `checks` (LEVELS, 5).
     """
 
     model: Model
@@ -80,6 +81,7 @@ class Course(NamedTuple):
     error: FloatArray
     control: FloatArray
     counters: NDArray[np.int64]
+    checks: FloatArray
 
 
 def new_charges() -> Charges:
@@ -152,12 +154,13 @@ def _charge_rows(
 
 @jit_rows
 def _leaked_error(
-    n: int, h: FloatArray, slow: FloatArray, q: FloatArray, error: FloatArray, off: FloatArray
+    n: int, h: FloatArray, slow: FloatArray, q: FloatArray, error: FloatArray, of_seen: float, seen: FloatArray,
+    off: FloatArray,
 ) -> None:  # fmt: skip
-    """Add to each step's error of the charge (C) the leakage that the error of the slow layer's voltage causes."""
+    """Each step's error of the charge (C): a share of that seen, and leakage by the error of the slow layer's voltage."""
     g_area, g_total = slow[slow.size - 2], slow[slow.size - 1]
     for i in range(n):
-        off[i] += 0.5 * h[i] * (g_area / q[i] + g_total) * (error[i] + error[i + 1])
+        off[i] = of_seen * seen[i] + 0.5 * h[i] * (g_area / q[i] + g_total) * (error[i] + error[i + 1])
 
 
 @jit
@@ -195,12 +198,12 @@ def moved_rows(
 
 
 @jit_within
-def charge_block(c: Course, r: int, n: int, local: float) -> None:
-    """Charge at the ends of a block's steps, and its error; `Room.own` holds that of the modes.
+def charge_block(c: Course, r: int, n: int, of_seen: float, local: float, others: bool) -> None:
+    """Charge at the ends of a block's steps, and its error: the share `of_seen` of what is seen of it and of the modes.
 
     `local` is the error of the gap voltage (V) that this block itself makes: under `mobile` it changes the area, with
-    which the modes' part of the slowest layer's voltage grows. The projections that only the charge needs are known,
-    and `Charges.h`.
+    which the modes' part of the slowest layer's voltage grows. Errors of `others`, by the sweeps and of earlier blocks,
+    are added. The projections that only the charge needs are known, and `Charges.h`.
     """
     form, room, own, slow, v = c.form, c.room, c.charges, c.model.slow, c.form.tap_s.size - 2
     for place in range(len(PLACES)):
@@ -211,11 +214,14 @@ def charge_block(c: Course, r: int, n: int, local: float) -> None:
     )  # fmt: skip
     scaled(n + 1, 0.0, room.s, own.error)
     modes_into(n + 1, 0, c.shown.slow[r], room.own, own.error)
-    for k in range(c.w.size):
-        # Errors of earlier blocks decay, as if all steps were equally long.
-        carried = c.shown.slow[r, k] * (c.error[0, k] + c.error[1, k])
-        _add_decaying(n + 1, carried, c.spare[2, k] ** (1.0 / n), own.error)
-    _leaked_error(n, own.h, slow, own.q[0], own.error, own.steps[4])
+    scaled(n + 1, of_seen, own.error, own.error)
+    if others:
+        modes_into(n + 1, 0, c.shown.slow[r], room.further, own.error)
+        for k in range(c.w.size):
+            # Errors of earlier blocks decay, as if all steps were equally long.
+            carried = c.shown.slow[r, k] * (c.error[0, k] + c.error[1, k])
+            _add_decaying(n + 1, carried, c.spare[2, k] ** (1.0 / n), own.error)
+    _leaked_error(n, own.h, slow, own.q[0], own.error, of_seen, own.steps[4], own.current)
     control = c.control
     z, collected, worst, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]
     stored, moved = slow[slow.size - 3], 0.0
@@ -226,10 +232,12 @@ def charge_block(c: Course, r: int, n: int, local: float) -> None:
     for i in range(n):
         own.z[i] = z
         z += own.steps[3, i]
-        collected += own.steps[4, i]
+        collected += own.current[i]
         layer = abs(own.error[i + 1]) + moved * abs(room.end[v + 1, i + 1])
-        # Within a step, the error may be larger than at its end by what the whole step adds.
-        now = abs(collected) + abs(own.steps[4, i]) + stored * layer / own.q[0, i + 1]
+        now = abs(collected) + stored * layer / own.q[0, i + 1]
+        if others:
+            # Within a step, the quadrature is not corrected.
+            now += abs(own.steps[4, i])
         worst = now if now > worst else worst
         peak = abs(z) if abs(z) > peak else peak
     own.z[n] = z

@@ -8,21 +8,33 @@ their error by the sweeps, but for its own response, which is a few per cent of 
 
 from __future__ import annotations
 
+import math
+
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
 from fingerspice.engine.blockcharge import Course, charge_block
+from fingerspice.engine.blockcheck import FORCE, gap_into, in_place
 from fingerspice.engine.blockforms import (
+    CHECKED,
     ERROR_F,
     ERROR_Q,
     ERROR_U,
     ERROR_V,
+    LEAST_SHARE,
+    LEVEL,
     MEAN_Q,
     MIDDLE,
+    OF_CHARGE,
+    OF_FORCE,
+    OF_GAP,
+    OF_NODES,
     PEAK_F,
     PEAK_U,
     RATIO,
+    REFUSED,
     STEPS,
     U_GAP,
+    UNTIL_CHECK,
 )
 from fingerspice.engine.blockrows import (
     PAD,
@@ -32,10 +44,8 @@ from fingerspice.engine.blockrows import (
     add_to_all,
     largest_of,
     modes_into,
-    moduli_of,
     recursion,
     scaled,
-    settle,
 )
 from fingerspice.engine.relaxation import LEFT, MOST_RATIO, NEWTON, look_at_ends
 
@@ -44,21 +54,29 @@ from fingerspice.engine.relaxation import LEFT, MOST_RATIO, NEWTON, look_at_ends
 CAUTION, LEAST = 2.0, 0.01
 # Below this share of the error allowed, changes show nothing but rounding.
 SHOWING = 1e-3
+# Steps twice as long are taken where their error, sixteen times as large, is expected to be below this fraction of the
+# one allowed.
+SPARE = 0.64
 
 
 @jit_rows
 def peaks_of(
-    n: int, stress: float, u: FloatArray, q: FloatArray, error: FloatArray
+    n: int, stress: float, u: FloatArray, q: FloatArray, kappa: float, q0: float, a: float, seen: FloatArray,
+    left: FloatArray,
 ) -> tuple[float, float, float, float, float]:  # fmt: skip
-    """The largest |u|, force, force over voltage, and that times the error of the voltage in its place; the mean q."""
+    """The largest |u|, force, and derivative of force / 2 by xi, also times the error of xi in its place; the mean q.
+
+    The error is a |seen| + |left|. The derivative does not contain that of the area.
+    """
     peak, force, steepest, worst, total = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         x = abs(u[i])
-        slope = stress * x / q[i]
+        here = stress * x * x / q[i]
+        slope = stress * x / (q[i] + kappa * (1.0 - q[i] / q0))
         peak = x if x > peak else peak
         steepest = slope if slope > steepest else steepest
-        force = slope * x if slope * x > force else force
-        off = slope * abs(error[i])
+        force = here if here > force else force
+        off = slope * (a * abs(seen[i]) + abs(left[i]))
         worst = off if off > worst else worst
         total += q[i]
     return peak, force, steepest, worst, total / n
@@ -77,14 +95,14 @@ def quadrature_error(c: Course, r: int, level: int, n: int) -> float:
 
 
 @jit_within
-def correct(c: Course, r: int, n: int, rest: float) -> None:
-    """Correct the modes by the error seen, of which the share `rest` is left in `Room.own`; 1/A at the steps' ends.
+def correct(c: Course, r: int, n: int) -> None:
+    """Correct the modes by the error seen; 1/A at the steps' ends.
 
     `Room.changed` then holds the change of the drives since those that the last sweep began with.
     """
     form, room = c.form, c.room
     for k in range(c.w.size):
-        settle(n + 1, rest, room.own[k], room.w[k])
+        add(n + 1, 1.0, room.own[k], room.w[k])
     for t in range(room.g.shape[0]):
         # In the middle, the drives change by the correction as the mean of the ends does.
         add(n, 1.0, room.g_within[MIDDLE, t], room.changed_within[t])
@@ -118,15 +136,11 @@ def further_sweep(c: Course, r: int, level: int, n: int) -> None:
 
 
 @jit_within
-def error_left(c: Course, r: int, n: int, rest: float) -> float:
-    """Largest change of the first projection by a further sweep, V.
-
-    `Room.before` becomes the error of the first projection that the block adds.
-    """
+def error_left(c: Course, r: int, n: int) -> float:
+    """Largest change of the first projection by a further sweep, into `Room.slope`, V."""
     room = c.room
     scaled(n + 1, 0.0, room.s, room.slope)
     modes_into(n + 1, 0, c.form.taps[r, 0], room.further, room.slope)
-    moduli_of(n + 1, rest, room.before, room.slope)
     return largest_of(n + 1, room.slope)
 
 
@@ -161,34 +175,27 @@ def _largest_sum(c: Course, row: FloatArray, modes: FloatArray, n: int, out: Flo
 
 @jit_within
 def _node_error(c: Course, r: int, n: int, known: float) -> float:
-    """Largest error of a node's voltage in a block, or `known` (V) if it is not larger.
-
-    `Room.own` becomes all of the error that the block adds.
-    """
+    """Largest error of a node's voltage by sweeps and earlier blocks, or `known` (V) if it is not larger."""
     room, largest = c.room, c.spare[0]
     for k in range(c.w.size):
-        add(n + 1, 1.0, room.further[k], room.own[k])
-        largest[k] = largest_of(n + 1, room.own[k])
+        largest[k] = largest_of(n + 1, room.further[k])
     for i in range(c.shown.node.shape[1]):
-        row, most = c.shown.node[r, i], 0.0
+        row, most = c.shown.node[r, i], _carried(c, c.shown.node[r, i])
+        carried = most
         for k in range(c.w.size):
             most += abs(row[k]) * largest[k]
-        carried = _carried(c, row)
-        if most + carried > known:
-            known = max(known, _largest_sum(c, row, room.own, n, room.slope) + carried)
+        if most > known:
+            known = max(known, _largest_sum(c, row, room.further, n, room.slope) + carried)
     return known
 
 
 @jit_within
 def _charge_error(c: Course, r: int, n: int) -> float:
-    """Largest error in a block of the charges of a network, whose parts have unrelated signs."""
-    room, worst = c.room, 0.0
+    """Largest error of a network's charges in a block by sweeps and earlier blocks, C."""
+    worst = 0.0
     for i in range(c.shown.k.size - c.shown.flows, c.shown.k.size):
         row = c.shown.columns[r, i]
-        _largest_sum(c, row, room.own, n, room.before)
-        _largest_sum(c, row, room.further, n, room.slope)
-        moduli_of(n + 1, 1.0, room.before, room.slope)
-        worst = max(worst, largest_of(n + 1, room.before) + _carried(c, row))
+        worst = max(worst, _largest_sum(c, row, c.room.further, n, c.room.slope) + _carried(c, row))
     return worst
 
 
@@ -202,40 +209,68 @@ def _carried(c: Course, row: FloatArray) -> float:
 
 
 @jit_within
-def accept(c: Course, r: int, n: int, local: float, magnified: float, share: float) -> None:
+def accept(
+    c: Course, r: int, level: int, n: int, seen: float, left: float, magnified: float, share: float
+) -> None:  # fmt: skip
     """Account for the peaks and errors of an accepted block, and move to its end.
 
-    `local` is the error of the gap voltage that the block adds, V, `magnified` the ratio of that to an error of the
-    first projection, and `share` the part of a change that a sweep leaves. Row 2 of `Course.spare` has the decay of
-    every mode over the block, and `Charges.h` the lengths of its steps.
+    `seen` and `left` are the errors of the gap voltage by the quadrature and by the sweeps, V, `magnified` the ratio of
+    such an error to one of the first projection, and `share` the part of a change that a sweep leaves. Row 2 of
+    `Course.spare` has the decay of every mode over the block, and `Charges.h` the lengths of its steps.
     """
-    room, control = c.room, c.control
+    room, control, checked = c.room, c.control, c.checks[level]
     carried = _carried(c, c.form.taps[r, 0])
     gap = room.u
     if c.form.bend.size > 0:
-        gap = room.slope
-        scaled(n + 1, 1.0, room.u, gap)
-        add(n + 1, -c.form.kappa, room.g[room.g.shape[0] - 1], gap)
-    peak, force, steepest, worst, control[MEAN_Q] = peaks_of(n + 1, c.shown.stress, gap, c.charges.q[0], room.before)
+        gap = room.s_within
+        gap_into(c, n + 1, gap)
+    peak, force, steepest, worst, control[MEAN_Q] = peaks_of(
+        n + 1, c.shown.stress, gap, c.charges.q[0], c.form.kappa, c.form.q0[r], checked[OF_FORCE], room.before,
+        room.slope,
+    )  # fmt: skip
     control[PEAK_U], control[PEAK_F] = max(control[PEAK_U], peak), max(control[PEAK_F], force)
-    off_u = local + magnified * carried
+    quadrature, others = checked[OF_GAP] * seen, left + magnified * carried
+    control[ERROR_U] = max(control[ERROR_U], quadrature + others)
     # The force is proportional to the square of the voltage, and depends a little on the area.
-    off = magnified * (worst + steepest * carried)
-    control[ERROR_U] = max(control[ERROR_U], off_u)
-    control[ERROR_F] = max(control[ERROR_F], 2.2 * off)
+    control[ERROR_F] = max(control[ERROR_F], FORCE * in_place(c, magnified) * (worst + steepest * carried))
     if c.shown.flows > 0:
         # A charge may be a small difference of large ones, whose errors a further sweep would show up to a share only.
-        charge_error = _charge_error(c, r, n) + share * c.shown.capacitance * local
-        control[ERROR_Q] = max(control[ERROR_Q], charge_error + c.shown.moves[1] * off_u)
+        error = _charge_error(c, r, n) + share * c.shown.capacitance * (quadrature + left)
+        error += checked[OF_CHARGE] * seen + c.shown.moves[1] * others
+        control[ERROR_Q] = max(control[ERROR_Q], error)
     # An error of the gap voltage changes the area, and thereby other voltages.
-    moved = c.shown.moves[0] * off_u
-    node_error = _node_error(c, r, n, max(control[ERROR_V] - moved, 0.0) / magnified)
-    control[ERROR_V] = max(control[ERROR_V], moved + magnified * node_error)
+    known = checked[OF_NODES] * seen + c.shown.moves[0] * others
+    error = _node_error(c, r, n, max(control[ERROR_V] - known, 0.0) / magnified)
+    control[ERROR_V] = max(control[ERROR_V], known + magnified * error)
     if c.shown.charge:
-        charge_block(c, r, n, local)
+        charge_block(c, r, n, checked[OF_CHARGE], quadrature + left, True)
     for k in range(c.w.size):
         c.w[k] = room.w[k, n]
-        c.error[0, k] = c.error[0, k] * c.spare[2, k] + room.own[k, n] - room.further[k, n]
+        c.error[0, k] = c.error[0, k] * c.spare[2, k] + checked[OF_GAP] * room.own[k, n]
         c.error[1, k] = c.error[1, k] * c.spare[2, k] + room.further[k, n]
     control[U_GAP] = room.u[n]
     c.counters[STEPS] += n
+    checked[UNTIL_CHECK] -= 1.0
+
+
+@jit_within
+def is_hopeful(seen: float, tol: float) -> bool:
+    """Whether a check may tell anything about a block with this error seen (V)."""
+    return SHOWING * tol < seen and LEAST_SHARE * seen <= tol
+
+
+@jit_within
+def refine(c: Course, level: int, most: int, n: int, local: float, tol: float) -> None:
+    """Go to shorter steps, with at most `most` halvings, as the error `local` (V) of a block is above `tol`."""
+    halvings = max(1.0, math.ceil(0.25 * math.log2(local / tol))) if local < math.inf else 1.0
+    c.control[LEVEL] = min(float(most), level + halvings)
+    c.counters[REFUSED] += n
+
+
+@jit_within
+def coarsen(c: Course, level: int, seen: float, left: float, tol: float) -> None:
+    """Go to steps twice as long, if those would meet `tol`, after a block with these errors (V)."""
+    if level > 0:
+        share = max(c.checks[level, OF_GAP], c.checks[level - 1, OF_GAP] if c.checks[level - 1, CHECKED] > 0.0 else 0.0)
+        if 16.0 * share * seen + left < SPARE * tol:
+            c.control[LEVEL] = level - 1.0

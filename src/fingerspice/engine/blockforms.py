@@ -24,6 +24,14 @@ MEAN_Q = 13
 # Part of a change that a sweep is expected to leave, over the areas' distance from the reference; 0 if not known.
 RATIO = 14
 N_CONTROL = 15
+# Entries of a row of `Course.checks`, one for each step length. What is left, once it is corrected, of the errors seen
+# of gap voltage and force, and of a stack's charge, as shares; what is left of the error of nodes and of a network's
+# charges, over the error seen of the gap voltage (V/V and C/V). The largest of these (V), and the number of blocks until
+# the next check, now and after the last one.
+OF_GAP, OF_FORCE, OF_NODES, OF_CHARGE, CHECKED, UNTIL_CHECK, WAITED = range(7)
+N_SHARES, N_CHECKS = 4, 7
+# Share that is assumed at least, and before the first check.
+LEAST_SHARE, UNCHECKED = 0.02, 1.0
 # Entries of `counters`.
 OUTPUT, STEPS, REFUSED, SWEEPS = range(4)
 N_COUNTERS = 4
@@ -56,8 +64,6 @@ class Form(NamedTuple):
         The weights of 1/2 and 1 in the integral of a parabola over a step, in units of its length.
     defect : ndarray, shape (r, LEVELS, m, T, 2)
         Contribution of the interpolation errors at the quarters to the error of a mode.
-    rest : ndarray, shape (r, LEVELS)
-        Share of the error seen at the quarters that may be left once the modes are corrected for it.
     area : ndarray, shape (4 k + 1,)
         1/A as a polynomial in `scale` |u| + `shift`.
     kappa : float
@@ -89,7 +95,6 @@ class Form(NamedTuple):
     within_g: FloatArray
     share: FloatArray
     defect: FloatArray
-    rest: FloatArray
     area: FloatArray
     scale: float
     shift: float
@@ -114,6 +119,8 @@ class Shown(NamedTuple):
     k : ndarray, shape (C,)
     node : ndarray, shape (r, n_node, m)
         Voltages of the nodes, as `columns`.
+    node_bend : ndarray, shape (n_node,)
+        Share of N in them; no entry in a stack.
     slow : ndarray, shape (r, m)
         The slowest layer's share of each mode (see `Model.slow`).
     live, project : ndarray, shape (r, m, m)
@@ -142,6 +149,7 @@ class Shown(NamedTuple):
     columns: FloatArray
     k: FloatArray
     node: FloatArray
+    node_bend: FloatArray
     slow: FloatArray
     live: FloatArray
     project: FloatArray
@@ -162,6 +170,7 @@ class Room(NamedTuple):
     `changed`, `changed_within` (the middle) and `changed_pulse` are drives with their sign reversed as a sweep finds
     them, and then their changes; `further` is what a further sweep would change in the modes, and `own` their
     quadrature error.
+    `kept` are the gap voltages, forces, nodes' voltages and charges of a solution to be checked.
     `kinked` is no row: the weights (m, T) of the kink of each drive in each mode.
     """
 
@@ -189,15 +198,26 @@ class Room(NamedTuple):
     changed_within: FloatArray
     changed_pulse: FloatArray
     further: FloatArray
+    kept: FloatArray
 
 
-def new_room(modes: int, drives: int, projections: int) -> Room:
-    """Room for a form of so many."""
+def new_room(modes: int, drives: int, projections: int, shown: Shown) -> Room:
+    """Room for a form of so many, and for what is shown of it."""
     n = BLOCK + PAD
+    kept = 2 + shown.node.shape[1] + shown.flows + int(shown.charge)
     return Room(
         np.zeros(n), np.zeros(n), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n),
         np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)),
         np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
         np.zeros(n), np.zeros((modes, drives)), np.zeros((drives, n)), np.zeros((drives, n)), np.zeros(n),
-        np.zeros((modes, n)),
+        np.zeros((modes, n)), np.zeros((kept, n)),
     )  # fmt: skip
+
+
+def new_checks(shown: Shown) -> FloatArray:
+    """Nothing checked yet."""
+    checks = np.zeros((LEVELS, N_CHECKS))
+    checks[:, :N_SHARES] = UNCHECKED
+    if shown.flows > 0:
+        checks[:, OF_CHARGE] = UNCHECKED * shown.capacitance
+    return checks

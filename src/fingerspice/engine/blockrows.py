@@ -207,14 +207,6 @@ def add_to_all(n: int, a: float, x: FloatArray, out: FloatArray) -> None:
 
 
 @jit_rows
-def settle(n: int, rest: float, error: FloatArray, w: FloatArray) -> None:
-    """Correct w by its error, of which the share `rest` is left."""
-    for i in range(n):
-        w[i] += error[i]
-        error[i] *= rest
-
-
-@jit_rows
 def sign_as(n: int, x: FloatArray, out: FloatArray) -> None:
     """Give each entry the sign of x."""
     for i in range(n):
@@ -336,13 +328,6 @@ def largest_of(n: int, x: FloatArray) -> float:
         a = abs(x[i])
         largest = a if a > largest else largest
     return largest
-
-
-@jit_rows
-def moduli_of(n: int, a: float, x: FloatArray, y: FloatArray) -> None:
-    """a |x| + |y| into x."""
-    for i in range(n):
-        x[i] = a * abs(x[i]) + abs(y[i])
 
 
 @jit_rows

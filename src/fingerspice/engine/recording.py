@@ -6,21 +6,38 @@ import math
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
-from fingerspice.base.compiled import jit
+from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.blockcharge import Course, steepness
-from fingerspice.engine.blockerror import accept, correct, error_left, further_sweep, learn, quadrature_error
+from fingerspice.engine.blockcheck import OF_SWEEPS, compare, is_due, is_louder, keep, note
+from fingerspice.engine.blockerror import (
+    accept,
+    coarsen,
+    correct,
+    error_left,
+    further_sweep,
+    is_hopeful,
+    learn,
+    quadrature_error,
+    refine,
+)
 from fingerspice.engine.blockforms import (
     BLOCK,
+    COLLECTED,
+    ERROR_Q,
     LEVEL,
     LEVELS,
     MARGIN,
     MEAN_Q,
+    N_SHARES,
+    OF_GAP,
+    PEAK_Q,
     RATIO,
     REFERENCE,
     REFUSED,
     SWEEPS,
     U_GAP,
     Form,
+    Z,
 )
 from fingerspice.engine.blockoutput import write_block
 from fingerspice.engine.blockrows import area_rows, largest_of
@@ -28,7 +45,6 @@ from fingerspice.engine.model import ramp
 from fingerspice.engine.relaxation import (
     FIRST_NEWTON,
     LEAST_MARGIN,
-    SPARE,
     look_at_ends,
     misfit,
     project_for_charge,
@@ -63,6 +79,23 @@ def go_over(c: Course, r: int, to: int, w: FloatArray) -> None:
 
 
 @jit
+def change_reference(c: Course, r: int) -> bool:
+    """Go over to another reference if it is nearer to the area of the last block, or of the start of this one.
+
+    Near the reference the drives are small, and the sweeps converge fast.
+    """
+    control = c.control
+    to = nearest(c.form, control[MEAN_Q] if control[MEAN_Q] > 0.0 else c.form.q0[r] + c.room.z[0])
+    if to == r:
+        return False
+    go_over(c, r, to, c.w)
+    for part in range(c.error.shape[0]):
+        go_over(c, r, to, c.error[part])
+    control[REFERENCE] = to
+    return True
+
+
+@jit
 def jump(c: Course, to: float) -> bool:
     """Take a jump of the source to `to` (V); False where it meets a fold."""
     r, model = int(c.control[REFERENCE]), c.model
@@ -87,6 +120,77 @@ def _sources(values: FloatArray, at: int, count: int, sub: int, s: FloatArray) -
     s[count * sub] = values[at + count]
 
 
+@jit_within
+def _solve(c: Course, r: int, level: int, h: float, n: int, tol: float) -> tuple[float, float, float, float]:
+    """Solve a block of n steps of length h (s) from its start in `Room` on, under the source in `Room.s`.
+
+    Returns the change by the last sweep (V), the least distance to the fold, the quadrature error seen (V; both errors
+    inf if the sweeps do not converge), and the ratio of an error of the gap voltage to one of the first projection.
+    """
+    form, room = c.form, c.room
+    change, margin, sweeps = relax(form, room, r, level, h, c.shown.kink, n, tol, c.control[RATIO])
+    c.counters[SWEEPS] += sweeps
+    # An error of xi is one of the gap voltage, enlarged where the area at 0 V is smaller than the reference.
+    magnified = steepness(form, 0.0)
+    if not change < math.inf:
+        return change, margin, math.inf, magnified
+    misfit(form, room, r, level, h, c.shown.kink, n)
+    if form.mobile:
+        area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
+        # The gap voltage contains the state times 1/A, and a near fold magnifies its error.
+        magnified = form.area0 * largest_of(n + 1, c.charges.q[0]) / margin
+    return change, margin, magnified * quadrature_error(c, r, level, n), magnified
+
+
+@jit_within
+def begin_block(c: Course, r: int, w: FloatArray, u: float) -> None:
+    """Begin a block at the modes w and the gap voltage u (V)."""
+    for k in range(w.size):
+        c.room.w[k, 0] = w[k]
+    c.room.u[0] = u
+    look_at_ends(c.form, c.room, r, 1, FIRST_NEWTON)
+
+
+@jit_within
+def _finish(c: Course, r: int, level: int, h: float, n: int) -> None:
+    """Correct a solution, and prepare what its charge follows from."""
+    correct(c, r, n)
+    for i in range(n):
+        c.charges.h[i] = h
+    if c.shown.charge:
+        project_for_charge(c.form, c.room, r, level, n)
+
+
+@jit_within
+def _check(
+    c: Course, values: FloatArray, at: int, count: int, r: int, level: int, h: float, tol: float, seen: float,
+    magnified: float,
+) -> None:  # fmt: skip
+    """Solve `count` samples again by steps half as long, and note what the correction of the last solution leaves."""
+    control, m, sub, half = c.control, c.w.size, 1 << level, BLOCK >> (level + 1)
+    errors, w, off, u = c.spare[0, :N_SHARES], c.spare[1, :m], c.spare[2, :N_SHARES], control[U_GAP]
+    z, collected, error, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]
+    _finish(c, r, level, h, count * sub)
+    keep(c, r, count * sub, seen, magnified, errors)
+    control[Z], off[:], w[:] = z, 0.0, c.w
+    for done in range(0, count, half):
+        part = min(half, count - done)
+        n = 2 * part * sub
+        _sources(values, at + done, part, 2 * sub, c.room.s)
+        begin_block(c, r, w, u)
+        change, _, _, _ = _solve(c, r, level + 1, 0.5 * h, n, OF_SWEEPS * tol)
+        if not change < math.inf:
+            off[:] = errors
+            break
+        _finish(c, r, level + 1, 0.5 * h, n)
+        compare(c, r, done * sub, n, off)
+        for k in range(m):
+            w[k] = c.room.w[k, n]
+        u = c.room.u[n]
+    note(c, level, errors, off)
+    control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q] = z, collected, error, peak
+
+
 @jit
 def march(
     c: Course, values: FloatArray, at: int, stop: int, start: float, spacing: float, tol: float, t_out: FloatArray,
@@ -98,42 +202,29 @@ def march(
     """
     c, values = borrow(c), borrow(values)
     form, room, control = c.form, c.room, c.control
-    steepest = steepness(form, 0.0)
+    # Where a block was checked last: none is checked twice at a step length.
+    last = (-1, 0)
     while at < stop:
         level, r = int(control[LEVEL]), int(control[REFERENCE])
-        sub = 1 << level
-        h, count, rest = spacing / sub, min(BLOCK >> level, stop - at), form.rest[r, level]
+        sub, checked = 1 << level, (at, level) != last and is_due(c, level)
+        h, count = spacing / sub, min(BLOCK >> level, stop - at)
         n = count * sub
         _sources(values, at, count, sub, room.s)
-        for k in range(c.w.size):
-            room.w[k, 0] = c.w[k]
-        room.u[0] = control[U_GAP]
-        look_at_ends(form, room, r, 1, FIRST_NEWTON)
-        # Near the area of the last block the drives are small, and the sweeps converge fast.
-        to = nearest(form, control[MEAN_Q] if control[MEAN_Q] > 0.0 else form.q0[r] + room.z[0])
-        if to != r:
-            go_over(c, r, to, c.w)
-            for part in range(c.error.shape[0]):
-                go_over(c, r, to, c.error[part])
-            control[REFERENCE] = to
+        begin_block(c, r, c.w, control[U_GAP])
+        if change_reference(c, r):
             continue
-        change, margin, sweeps = relax(form, room, r, level, h, c.shown.kink, n, tol, control[RATIO])
-        c.counters[SWEEPS] += sweeps
-        # An error of xi is one of the gap voltage, enlarged where the area at 0 V is smaller than the reference.
-        closed, local, seen, magnified = change < math.inf, math.inf, 0.0, steepest
-        if closed:
-            misfit(form, room, r, level, h, c.shown.kink, n)
-            if form.mobile:
-                area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
-                # The gap voltage contains the state times 1/A, and a near fold magnifies its error.
-                magnified = form.area0 * largest_of(n + 1, c.charges.q[0]) / margin
-            seen = magnified * quadrature_error(c, r, level, n)
-            local = rest * seen
+        change, margin, seen, magnified = _solve(c, r, level, h, n, OF_SWEEPS * tol if checked else tol)
+        if (at, level) != last and is_hopeful(seen, tol) and (checked or is_louder(c, level, seen)):
+            if checked:
+                _check(c, values, at, count, r, level, h, tol, seen, magnified)
+                last = (at, level)
+            continue
         left = 0.0
+        local = c.checks[level, OF_GAP] * seen
         if local <= tol:
-            correct(c, r, n, rest)
+            correct(c, r, n)
             further_sweep(c, r, level, n)
-            left = magnified * error_left(c, r, n, rest)
+            left = magnified * error_left(c, r, n)
             local += left
             if learn(c, r, n, tol, change, seen, left, local) and not local <= tol:
                 # More sweeps leave less.
@@ -141,10 +232,8 @@ def march(
                 continue
         if not local <= tol:
             if level + 1 == LEVELS or margin <= LEAST_MARGIN:
-                return TOO_COARSE if closed else NOT_CLOSED
-            halvings = max(1.0, math.ceil(0.25 * math.log2(local / tol))) if closed else 1.0
-            control[LEVEL] = min(LEVELS - 1.0, level + halvings)
-            c.counters[REFUSED] += n
+                return TOO_COARSE if change < math.inf else NOT_CLOSED
+            refine(c, level, LEVELS - 1, n, local, tol)
             continue
         control[MARGIN] = min(control[MARGIN], margin)
         for k in range(c.w.size):
@@ -153,9 +242,8 @@ def march(
             c.charges.h[i] = h
         if c.shown.charge:
             project_for_charge(form, room, r, level, n)
-        accept(c, r, n, local, magnified, left / max(change + seen, left) if left > 0.0 else 0.0)
+        accept(c, r, level, n, seen, left, magnified, left / max(change + seen, left) if left > 0.0 else 0.0)
         write_block(c, r, sub, count, h, start + at * spacing, t_out, out)
         at += count
-        if level > 0 and local < SPARE * tol:
-            control[LEVEL] -= 1.0
+        coarsen(c, level, seen, left, tol)
     return DONE

@@ -21,8 +21,8 @@ and the response to it is known in closed form, too.
 
 The error is measured at 1/4 and 3/4 of every step, where the interpolation error of the parabola gives the quadrature
 error (Boole's rule against Simpson's). If it is too large, the block is repeated with steps half as long. Otherwise
-the modes are corrected by the error seen (`correct` in `engine.blockerror`), and the share `Form.rest` of it counts as
-left.
+the modes are corrected by the error seen (`correct` in `engine.blockerror`), and the share of it that is left is
+measured on some blocks (`engine.blockcheck`).
 """
 
 from __future__ import annotations
@@ -76,9 +76,6 @@ KINKED = 1
 # Newton steps for the gap voltage under `mobile`, in the first sweep and in later ones; and the smallest distance to
 # the fold at which they are safe.
 FIRST_NEWTON, NEWTON, LEAST_MARGIN = 6, 2, 0.2
-# If the error is below this fraction of the one allowed, the next block has steps twice as long, whose error is sixteen
-# times as large.
-SPARE = 0.04
 
 
 @jit_within

@@ -12,15 +12,20 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockcharge import Charges, Course
-from fingerspice.engine.blockerror import accept, correct, error_left, learn
+from fingerspice.engine.blockcheck import OF_SWEEPS, compare, is_due, is_louder, keep, note
+from fingerspice.engine.blockerror import accept, coarsen, correct, error_left, is_hopeful, learn, refine
 from fingerspice.engine.blockforms import (
     BLOCK,
+    COLLECTED,
+    ERROR_Q,
     FIRST_QUARTER,
     LAST_QUARTER,
     LEVEL,
-    MEAN_Q,
     MIDDLE,
+    N_SHARES,
+    OF_GAP,
     OUTPUT,
+    PEAK_Q,
     PLACES,
     RATIO,
     REFERENCE,
@@ -29,6 +34,7 @@ from fingerspice.engine.blockforms import (
     U_GAP,
     Form,
     Room,
+    Z,
 )
 from fingerspice.engine.blockkinks import after_kink, crosses, kink_at, kink_rows
 from fingerspice.engine.blockoutput import write_points, write_samples
@@ -44,8 +50,8 @@ from fingerspice.engine.recording import (
     DONE,
     NOT_CLOSED,
     TOO_COARSE,
-    go_over,
-    nearest,
+    begin_block,
+    change_reference,
 )
 from fingerspice.engine.relaxation import (
     KINKED,
@@ -53,7 +59,6 @@ from fingerspice.engine.relaxation import (
     MOST_RATIO,
     MOST_SWEEPS,
     PARABOLA,
-    SPARE,
     drives_at,
     keep_drives,
     look_at_ends,
@@ -272,6 +277,59 @@ def _write(c: Course, r: int, sub: int, count: int, t_out: FloatArray, out: Floa
     c.counters[OUTPUT] = last
 
 
+@jit_within
+def _solve(
+    c: Course, steps: Steps, r: int, n: int, tol: float, taps: int
+) -> tuple[float, float]:  # fmt: skip
+    """Solve a block of n steps as `recording._solve` does: the change by the last sweep and the error seen, V."""
+    weigh(c.form, steps, c.charges.h, r, n)
+    change, sweeps = _relax(c.form, c.room, steps, c.charges.h, r, c.shown.kink, n, tol, c.control[RATIO])
+    c.counters[SWEEPS] += sweeps
+    if not change < math.inf:
+        return change, math.inf
+    return change, _misfit(c.form, c.room, steps, r, c.shown.kink, n, taps)
+
+
+@jit_within
+def _finish(c: Course, steps: Steps, r: int, n: int, taps: int) -> None:
+    """As `recording._finish`."""
+    correct(c, r, n)
+    if c.shown.charge:
+        _look(c.form, c.room, steps, r, MIDDLE, n, taps)
+        for p in range(1 + c.room.g.shape[0], taps):
+            project_at_ends(c.form, c.room, r, n + 1, p)
+
+
+@jit_within
+def _check(
+    c: Course, steps: Steps, times: FloatArray, values: FloatArray, at: int, count: int, r: int, level: int, tol: float,
+    seen: float, taps: int,
+) -> None:  # fmt: skip
+    """As `recording._check`."""
+    control, m, sub, half = c.control, c.w.size, 1 << level, BLOCK >> (level + 1)
+    errors, w, off, u = c.spare[0, :N_SHARES], c.spare[1, :m], c.spare[2, :N_SHARES], control[U_GAP]
+    z, collected, error, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]
+    _finish(c, steps, r, count * sub, taps)
+    keep(c, r, count * sub, seen, 1.0, errors)
+    control[Z], off[:], w[:] = z, 0.0, c.w
+    for done in range(0, count, half):
+        part = min(half, count - done)
+        n = 2 * part * sub
+        _load(times, values, at + done, part, 2 * sub, c.room, c.charges)
+        begin_block(c, r, w, u)
+        change, _ = _solve(c, steps, r, n, OF_SWEEPS * tol, taps)
+        if not change < math.inf:
+            off[:] = errors
+            break
+        _finish(c, steps, r, n, taps)
+        compare(c, r, done * sub, n, off)
+        for k in range(m):
+            w[k] = c.room.w[k, n]
+        u = c.room.u[n]
+    note(c, level, errors, off)
+    control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q] = z, collected, error, peak
+
+
 @jit
 def march(
     c: Course, steps: Steps, times: FloatArray, values: FloatArray, tol: float, t_out: FloatArray, out: FloatArray
@@ -282,38 +340,29 @@ def march(
     """
     c, steps, times, values = borrow(c), borrow(steps), borrow(times), borrow(values)
     form, room, control = c.form, c.room, c.control
-    at, stop, drives = 0, values.size - 1, room.g.shape[0]
+    at, last, stop, drives = 0, (-1, 0), values.size - 1, room.g.shape[0]
     taps = form.tap_s.size if c.shown.charge else 1 + drives
     while at < stop:
         level, r = int(control[LEVEL]), int(control[REFERENCE])
-        # Longer steps than the mean have faster modes by far less than the difference between both shares.
-        sub, rest = 1 << level, form.rest[r, level]
+        sub, checked = 1 << level, (at, level) != last and is_due(c, level)
         count = min(BLOCK >> level, stop - at)
         n = count * sub
         _load(times, values, at, count, sub, room, c.charges)
-        for k in range(c.w.size):
-            room.w[k, 0] = c.w[k]
-        room.u[0] = control[U_GAP]
-        look_at_ends(form, room, r, 1, 0)
-        to = nearest(form, control[MEAN_Q] if control[MEAN_Q] > 0.0 else form.q0[r] + room.z[0])
-        if to != r:
-            go_over(c, r, to, c.w)
-            for part in range(c.error.shape[0]):
-                go_over(c, r, to, c.error[part])
-            control[REFERENCE] = to
+        begin_block(c, r, c.w, control[U_GAP])
+        if change_reference(c, r):
             continue
-        weigh(form, steps, c.charges.h, r, n)
-        change, sweeps = _relax(form, room, steps, c.charges.h, r, c.shown.kink, n, tol, control[RATIO])
-        c.counters[SWEEPS] += sweeps
-        closed, local, seen = change < math.inf, math.inf, 0.0
-        if closed:
-            seen = _misfit(form, room, steps, r, c.shown.kink, n, taps)
-            local = rest * seen
+        change, seen = _solve(c, steps, r, n, OF_SWEEPS * tol if checked else tol, taps)
+        if (at, level) != last and is_hopeful(seen, tol) and (checked or is_louder(c, level, seen)):
+            if checked:
+                _check(c, steps, times, values, at, count, r, level, tol, seen, taps)
+                last = (at, level)
+            continue
         left = 0.0
+        local = c.checks[level, OF_GAP] * seen
         if local <= tol:
-            correct(c, r, n, rest)
+            correct(c, r, n)
             _further_sweep(c, steps, r, n)
-            left = error_left(c, r, n, rest)
+            left = error_left(c, r, n)
             local += left
             if learn(c, r, n, tol, change, seen, left, local) and not local <= tol:
                 # More sweeps leave less.
@@ -321,10 +370,8 @@ def march(
                 continue
         if not local <= tol:
             if level == MOST_HALVINGS:
-                return TOO_COARSE if closed else NOT_CLOSED
-            halvings = max(1.0, math.ceil(0.25 * math.log2(local / tol))) if closed else 1.0
-            control[LEVEL] = min(float(MOST_HALVINGS), level + halvings)
-            c.counters[REFUSED] += n
+                return TOO_COARSE if change < math.inf else NOT_CLOSED
+            refine(c, level, MOST_HALVINGS, n, local, tol)
             continue
         for k in range(c.w.size):
             passed = 1.0
@@ -335,9 +382,8 @@ def march(
             _look(form, room, steps, r, MIDDLE, n, taps)
             for p in range(1 + drives, taps):
                 project_at_ends(form, room, r, n + 1, p)
-        accept(c, r, n, local, 1.0, left / max(change + seen, left) if left > 0.0 else 0.0)
+        accept(c, r, level, n, seen, left, 1.0, left / max(change + seen, left) if left > 0.0 else 0.0)
         _write(c, r, sub, count, t_out, out)
         at += count
-        if level > 0 and local < SPARE * tol:
-            control[LEVEL] -= 1.0
+        coarsen(c, level, seen, left, tol)
     return DONE

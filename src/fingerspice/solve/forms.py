@@ -34,10 +34,6 @@ AREA_SHARE = 0.02
 REFERENCE_RATIO = 1.015
 # Time constants in a step from which on a fast mode is taken apart from the parabola, which resolves slower ones.
 FADED = 5.0
-# Time constants in a step up to which the quarters show the error of a mode well, and the share of the error that may
-# be left once the modes are corrected for it: with faster modes, or under `mobile`, where the gap voltage itself has a
-# kink; and otherwise.
-RESOLVED, RESTS = 1.0, (0.7, 0.3)
 # Matrix from values at Chebyshev nodes to the Chebyshev coefficients of the antiderivative of their interpolant.
 _POINTS = 40
 _AT = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
@@ -123,14 +119,12 @@ def weighted(
     pulse_within = np.stack([np.einsum("rpk,rsk->rsp", taps, one) for one in pulses], axis=2)
     five = (0.0, 0.25, 0.5, 0.75, 1.0)
     quarters = weights(z, five)[..., None, [1, 3]]
-    badly_seen = others["mobile"] | (z.max(axis=-1) > RESOLVED)
     return Form(
         rates=np.ascontiguousarray(rates), gain=np.ascontiguousarray(gain), decay=np.exp(-z),
         source=by_step * weights(z, (0.0, 1.0)), drive=drives * weights(z, (0.0, 0.5, 1.0))[..., None, :],
         feed=np.ascontiguousarray(feed), taps=np.ascontiguousarray(taps), tap_s=tap_s, within=inner, within_s=inner_s,
         within_g=inner_g, share=np.ascontiguousarray(weights(z, (0.0, 0.5, 1.0))[..., 1:]), defect=drives * quarters,
-        rest=np.where(badly_seen, *RESTS), fast=fast, faded=faded, pulse=pulse,
-        pulse_within=pulse_within, **others,
+        fast=fast, faded=faded, pulse=pulse, pulse_within=pulse_within, **others,
     )  # fmt: skip
 
 
@@ -227,8 +221,9 @@ class Followed(Follower):
         control[blockforms.MARGIN], control[blockforms.REFERENCE], control[blockforms.U_GAP] = 1.0, r, start.u_gap
         control[blockforms.Z] = start.y[-1] - self._charge_with(start.u_gap)
         return Course(
-            system.model, form, self.shown, blockforms.new_room(m, drives, drives + 3), new_charges(),
+            system.model, form, self.shown, blockforms.new_room(m, drives, drives + 3, self.shown), new_charges(),
             np.zeros((3, max(m, drives, 5))), system.project[r] @ start.y[:-1], np.zeros((2, m)), control, counters,
+            blockforms.new_checks(self.shown),
         )  # fmt: skip
 
     def rows(self, problem: Problem, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
@@ -264,8 +259,8 @@ def followed(problem: Problem, rtol: float) -> Followed | None:
     if system.model.mobile:
         kinks = np.append(kinks, -kink / q_rest**2)
     shown = blockforms.Shown(
-        system.shown, system.k_shown, system.node, system.slow, system.live, system.project, system.stress, kinks,
-        -kink / q_rest**2, _moved(system, area, at_rest), problem.charge, np.zeros(0), 0, 0.0,
+        system.shown, system.k_shown, system.node, np.zeros(0), system.slow, system.live, system.project,
+        system.stress, kinks, -kink / q_rest**2, _moved(system, area, at_rest), problem.charge, np.zeros(0), 0, 0.0,
         np.array([1.0 if system.model.mobile else 0.0, 0.0]),
     )  # fmt: skip
     return Followed(shown, system.model.k_gap, system.u_top, q_rest, missed, 0.0, system, area, at_rest)

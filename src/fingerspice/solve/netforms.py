@@ -138,8 +138,8 @@ class Finger(Follower):
         control[blockforms.MARGIN] = 1.0
         control[blockforms.U_GAP] = one.taps[0] @ w + one.tap_s[0] * s[reduced.source]
         return Course(
-            self._model, form, self.shown, blockforms.new_room(m, drives, drives + 1), new_charges(),
-            np.zeros((3, max(m, drives, 5))), w, np.zeros((2, m)), control, counters,
+            self._model, form, self.shown, blockforms.new_room(m, drives, drives + 1, self.shown), new_charges(),
+            np.zeros((3, max(m, drives, 5))), w, np.zeros((2, m)), control, counters, blockforms.new_checks(self.shown),
         )  # fmt: skip
 
     def rows(self, problem: Problem, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
@@ -212,12 +212,13 @@ def _shown(
     """Constants of the outputs, from the kinks of the drives and the areas (m^2) at 0 V and at the top."""
     contact, n, m = problem.network.contacts[reduced.moving], reduced.absorbed.size, modal.rates.size
     assert contact is not None
+    nodes = modal.nodes[:, :n] @ reduced.absorbed
     moves = max(abs(area - 1.0 / reduced.q0) for area in (at_rest, at_top)) * np.array(
-        [np.abs(modal.nodes[:, :n] @ reduced.absorbed).max(initial=0.0), np.abs(modal.bends[n:]).max(initial=0.0)]
+        [np.abs(nodes).max(initial=0.0), np.abs(modal.bends[n:]).max(initial=0.0)]
     )
     none = np.zeros((1, m, m))
     return blockforms.Shown(
-        modal.columns[None], modal.k, modal.nodes[None], none[0, :1], none, none, float(contact.stress(1.0)),
+        modal.columns[None], modal.k, modal.nodes[None], nodes, none[0, :1], none, none, float(contact.stress(1.0)),
         kinks, 0.0, np.zeros(1), False, modal.bends, m - n,
         float(problem.network.capacitance(reduced.area0).sum()), moves,
     )  # fmt: skip

@@ -95,6 +95,7 @@ class March:
         if piece.spacing != self.spacing:
             # The source may jump where the spacing changes, and does so at the start of the run.
             self.course, self.spacing = self.course._replace(form=self._form(piece.spacing)), piece.spacing
+            self.course.checks[:] = blockforms.new_checks(one.shown)
             if not recording.jump(self.course, float(values[0])):
                 return Outcome.LOST
         self.loudest = max(self.loudest, float(values.max()), -float(values.min()))
@@ -147,7 +148,7 @@ class March:
 
     def _parts(self) -> tuple[FloatArray | IntArray, ...]:
         c = self.course
-        return c.w, c.error, c.control, c.counters
+        return c.w, c.error, c.control, c.counters, c.checks
 
     def mark(self) -> list[FloatArray | IntArray]:
         """A copy of the state of the integration, which `recall` restores."""

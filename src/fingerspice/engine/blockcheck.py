@@ -1,0 +1,175 @@
+"""Share of the quadrature error seen that is left in a block of a recording once it is corrected: measured.
+
+The quarters of the steps show the quadrature error, by which the modes are corrected. What the correction leaves is a
+small share of it: of smooth drives hardly anything, and at a kink of 1/A as much as the place within the step decides.
+The share is therefore measured. Some blocks, more of them at the beginning, are solved twice, with sweeps that leave
+next to nothing. In the second solution the steps are half as long, and a sixteenth of the error remains. The largest
+difference between both, over the largest error seen, is the share of the blocks that follow at this step length. Gap
+voltage, force, nodes and charges have shares of their own.
+"""
+
+from __future__ import annotations
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit_rows, jit_within
+from fingerspice.engine.blockcharge import Course, charge_block
+from fingerspice.engine.blockforms import (
+    CHECKED,
+    COLLECTED,
+    ERROR_Q,
+    LEAST_SHARE,
+    LEVELS,
+    N_SHARES,
+    OF_CHARGE,
+    OF_FORCE,
+    OF_GAP,
+    OF_NODES,
+    UNTIL_CHECK,
+    WAITED,
+)
+from fingerspice.engine.blockrows import add, modes_into, scaled
+
+# The share stated is so many times the one measured, and at least so much of the one stated before.
+CAUTION, REMEMBERED = 1.3, 0.7
+# From one check to the next the number of blocks grows by this factor, up to the largest; and an error seen that is so
+# many times the largest one checked is checked at once.
+RARER, MOST_WAIT, LOUDER = 4.0, 128.0, 2.0
+# Share of the error allowed that the sweeps may leave in both solutions of a check.
+OF_SWEEPS = 0.03
+# Upper bound of the derivative of the force by the gap voltage, over force / voltage: 2, and the area's share in it.
+FORCE = 2.2
+
+
+@jit_rows
+def _forces(n: int, stress: float, q: FloatArray, u: FloatArray) -> None:
+    """Turn gap voltages into forces."""
+    for i in range(n):
+        u[i] *= stress * u[i] / q[i]
+
+
+@jit_rows
+def _enlarge(n: int, area0: float, q: FloatArray, x: FloatArray) -> None:
+    for i in range(n):
+        x[i] *= area0 * q[i]
+
+
+@jit_rows
+def _largest_product(n: int, u: FloatArray, q: FloatArray, kappa: float, q0: float, error: FloatArray) -> float:
+    """Largest |u error| / q, where an error of xi is less of one of u (see `blockerror.peaks_of`)."""
+    largest = 0.0
+    for i in range(n):
+        a = abs(u[i] * error[i]) / (q[i] + kappa * (1.0 - q[i] / q0))
+        largest = a if a > largest else largest
+    return largest
+
+
+@jit_rows
+def _largest_difference(n: int, x: FloatArray, y: FloatArray) -> float:
+    """Largest |x - y|, with every second entry of y."""
+    largest = 0.0
+    for i in range(n):
+        a = abs(x[i] - y[2 * i])
+        largest = a if a > largest else largest
+    return largest
+
+
+@jit_within
+def in_place(c: Course, magnified: float) -> float:
+    """The ratio `magnified` of errors, where it is not known in every place, as it is in a network."""
+    return 1.0 if c.form.bend.size > 0 else magnified
+
+
+@jit_within
+def gap_into(c: Course, n: int, out: FloatArray) -> None:
+    """The gap voltages at the ends of the steps, V."""
+    scaled(n, 1.0, c.room.u, out)
+    if c.form.bend.size > 0:
+        add(n, -c.form.kappa, c.room.g[c.room.g.shape[0] - 1], out)
+
+
+@jit_within
+def is_due(c: Course, level: int) -> bool:
+    """Whether the next block at this step length is to be checked."""
+    return level + 1 < LEVELS and not c.checks[level, UNTIL_CHECK] > 0.0
+
+
+@jit_within
+def is_louder(c: Course, level: int, seen: float) -> bool:
+    """Whether the error seen (V) tells less about this block than a check would; then one is due."""
+    if level + 1 == LEVELS or not seen > LOUDER * c.checks[level, CHECKED]:
+        return False
+    c.checks[level, UNTIL_CHECK] = 0.0
+    return True
+
+
+@jit_within
+def _row(c: Course, r: int, j: int, n: int, out: FloatArray) -> None:
+    """Row j of what is compared in n places: gap voltage, force, voltages of the nodes but for the source, charges."""
+    form, room, shown, q = c.form, c.room, c.shown, c.charges.q[0]
+    node, charge = j - 2, j - 2 - shown.node.shape[1]
+    if charge >= 0 and shown.charge:
+        scaled(n, 1.0, c.charges.z, out)
+    elif charge >= 0:
+        column = shown.k.size - shown.flows + charge
+        scaled(n, shown.k[column], room.s, out)
+        modes_into(n, 0, shown.columns[r, column], room.w, out)
+        add(n, shown.bend[column], room.g[room.g.shape[0] - 1], out)
+    elif node >= 0:
+        scaled(n, 0.0, room.s, out)
+        modes_into(n, 0, shown.node[r, node], room.w, out)
+        if form.bend.size > 0:
+            add(n, shown.node_bend[node], room.g[room.g.shape[0] - 1], out)
+        if form.mobile:
+            _enlarge(n, form.area0, q, out)
+    else:
+        gap_into(c, n, out)
+        if j == 1:
+            _forces(n, shown.stress, q, out)
+
+
+@jit_within
+def keep(c: Course, r: int, n: int, seen: float, magnified: float, errors: FloatArray) -> None:
+    """Keep what a corrected solution of n steps shows, and note the errors seen, of which shares are left, in `errors`.
+
+    `seen` is that of the gap voltage (V), and `magnified` is as in `blockerror.accept`. The projections that the charge
+    needs are known.
+    """
+    room, control = c.room, c.control
+    if c.shown.charge:
+        control[COLLECTED] = control[ERROR_Q] = 0.0
+        charge_block(c, r, n, 1.0, seen, False)
+    for j in range(room.kept.shape[0]):
+        _row(c, r, j, n + 1, room.kept[j])
+    steepest = _largest_product(n + 1, room.kept[0], c.charges.q[0], c.form.kappa, c.form.q0[r], room.before)
+    errors[OF_GAP] = errors[OF_NODES] = errors[OF_CHARGE] = seen
+    errors[OF_FORCE] = FORCE * in_place(c, magnified) * c.shown.stress * steepest
+    if c.shown.charge:
+        errors[OF_CHARGE] = control[ERROR_Q]
+
+
+@jit_within
+def compare(c: Course, r: int, first: int, n: int, errors: FloatArray) -> None:
+    """Note the largest differences of n steps to what was kept, from its step `first` on, in `errors`."""
+    room = c.room
+    if c.shown.charge:
+        charge_block(c, r, n, 1.0, 0.0, False)
+    for j in range(room.kept.shape[0]):
+        _row(c, r, j, n + 1, room.slope)
+        charge = j >= 2 + c.shown.node.shape[1]
+        kind = (OF_GAP, OF_FORCE)[j] if j < 2 else OF_CHARGE if charge else OF_NODES
+        errors[kind] = max(errors[kind], _largest_difference(n // 2 + 1, room.kept[j, first:], room.slope))
+
+
+@jit_within
+def note(c: Course, level: int, seen: FloatArray, off: FloatArray) -> None:
+    """Note which shares of the errors `seen` were left after the correction: `off`."""
+    noted = c.checks[level]
+    for kind in range(N_SHARES):
+        least = LEAST_SHARE
+        if kind == OF_CHARGE and c.shown.flows > 0:
+            least *= c.shown.capacitance
+        share = max(least, CAUTION * off[kind] / seen[kind]) if seen[kind] > 0.0 else least
+        noted[kind] = max(share, REMEMBERED * noted[kind]) if noted[CHECKED] > 0.0 else share
+    noted[CHECKED] = max(seen[OF_GAP], noted[CHECKED])
+    noted[WAITED] = min(max(1.0, RARER * noted[WAITED]), MOST_WAIT)
+    noted[UNTIL_CHECK] = noted[WAITED]
