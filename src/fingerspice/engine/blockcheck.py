@@ -27,15 +27,18 @@ from fingerspice.engine.blockforms import (
     UNTIL_CHECK,
     WAITED,
 )
-from fingerspice.engine.blockrows import add, modes_into, scaled
+from fingerspice.engine.blockrows import add, largest_of, modes_into, scaled
 
 # The share stated is so many times the one measured, and at least so much of the one stated before.
 CAUTION, REMEMBERED = 1.3, 0.7
 # From one check to the next the number of blocks grows by this factor, up to the largest; and an error seen that is so
 # many times the largest one checked is checked at once.
 RARER, MOST_WAIT, LOUDER = 4.0, 128.0, 2.0
-# Share of the error allowed that the sweeps may leave in both solutions of a check.
-OF_SWEEPS = 0.03
+# Share of the error seen that the sweeps may leave in both solutions of a check.
+OF_SWEEPS = 0.005
+# Shares of the gap voltage below which the error seen is rounding, and of what the sweeps leave below which the error
+# left by quadrature does not matter.
+ROUNDING, MATTERS = 1e-12, 0.1
 # Upper bound of the derivative of the force by the gap voltage, over force / voltage: 2, and the area's share in it.
 FORCE = 2.2
 
@@ -88,18 +91,18 @@ def gap_into(c: Course, n: int, out: FloatArray) -> None:
 
 
 @jit_within
-def is_due(c: Course, level: int) -> bool:
-    """Whether the next block at this step length is to be checked."""
-    return level + 1 < LEVELS and not c.checks[level, UNTIL_CHECK] > 0.0
+def is_due(c: Course, level: int, n: int, seen: float, left: float, tol: float) -> bool:
+    """Whether to check a block with these errors of the gap voltage by quadrature and sweeps (V).
 
-
-@jit_within
-def is_louder(c: Course, level: int, seen: float) -> bool:
-    """Whether the error seen (V) tells less about this block than a check would; then one is due."""
-    if level + 1 == LEVELS or not seen > LOUDER * c.checks[level, CHECKED]:
+    So it is after so many blocks, or if the error is larger than any checked, and if it is neither rounding, nor far
+    from what is allowed, nor of no importance beside what the sweeps leave.
+    """
+    noted = c.checks[level]
+    if noted[UNTIL_CHECK] > 0.0 and not seen > LOUDER * noted[CHECKED]:
         return False
-    c.checks[level, UNTIL_CHECK] = 0.0
-    return True
+    matters = c.shown.flows > 0 or noted[OF_GAP] * seen > MATTERS * left
+    shows = seen > ROUNDING * largest_of(n + 1, c.room.u) and LEAST_SHARE * seen <= tol
+    return level + 1 < LEVELS and matters and shows
 
 
 @jit_within
@@ -161,15 +164,15 @@ def compare(c: Course, r: int, first: int, n: int, errors: FloatArray) -> None:
 
 
 @jit_within
-def note(c: Course, level: int, seen: FloatArray, off: FloatArray) -> None:
-    """Note which shares of the errors `seen` were left after the correction: `off`."""
+def note(c: Course, level: int, closed: bool, seen: FloatArray, off: FloatArray) -> None:
+    """Note which shares of the errors `seen` were left after the correction: `off`; none if a solution is not `closed`."""
     noted = c.checks[level]
-    for kind in range(N_SHARES):
-        least = LEAST_SHARE
-        if kind == OF_CHARGE and c.shown.flows > 0:
-            least *= c.shown.capacitance
-        share = max(least, CAUTION * off[kind] / seen[kind]) if seen[kind] > 0.0 else least
-        noted[kind] = max(share, REMEMBERED * noted[kind]) if noted[CHECKED] > 0.0 else share
-    noted[CHECKED] = max(seen[OF_GAP], noted[CHECKED])
+    if closed:
+        for kind in range(N_SHARES):
+            share = CAUTION * off[kind] / seen[kind] if seen[kind] > 0.0 else 0.0
+            if kind != OF_CHARGE or c.shown.charge:
+                share = max(share, LEAST_SHARE)
+            noted[kind] = max(share, REMEMBERED * noted[kind]) if noted[CHECKED] > 0.0 else share
+        noted[CHECKED] = max(seen[OF_GAP], noted[CHECKED])
     noted[WAITED] = min(max(1.0, RARER * noted[WAITED]), MOST_WAIT)
     noted[UNTIL_CHECK] = noted[WAITED]

@@ -20,7 +20,6 @@ from fingerspice.engine.blockforms import (
     ERROR_Q,
     ERROR_U,
     ERROR_V,
-    LEAST_SHARE,
     LEVEL,
     MEAN_Q,
     MIDDLE,
@@ -251,12 +250,6 @@ def accept(
     control[U_GAP] = room.u[n]
     c.counters[STEPS] += n
     checked[UNTIL_CHECK] -= 1.0
-
-
-@jit_within
-def is_hopeful(seen: float, tol: float) -> bool:
-    """Whether a check may tell anything about a block with this error seen (V)."""
-    return SHOWING * tol < seen and LEAST_SHARE * seen <= tol
 
 
 @jit_within

@@ -8,14 +8,13 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.blockcharge import Course, steepness
-from fingerspice.engine.blockcheck import OF_SWEEPS, compare, is_due, is_louder, keep, note
+from fingerspice.engine.blockcheck import OF_SWEEPS, compare, is_due, keep, note
 from fingerspice.engine.blockerror import (
     accept,
     coarsen,
     correct,
     error_left,
     further_sweep,
-    is_hopeful,
     learn,
     quadrature_error,
     refine,
@@ -163,31 +162,36 @@ def _finish(c: Course, r: int, level: int, h: float, n: int) -> None:
 
 @jit_within
 def _check(
-    c: Course, values: FloatArray, at: int, count: int, r: int, level: int, h: float, tol: float, seen: float,
-    magnified: float,
+    c: Course, values: FloatArray, at: int, count: int, r: int, level: int, h: float, seen: float
 ) -> None:  # fmt: skip
-    """Solve `count` samples again by steps half as long, and note what the correction of the last solution leaves."""
+    """Solve `count` samples by steps of length h and half of it, and note what is left of errors such as `seen` (V)."""
     control, m, sub, half = c.control, c.w.size, 1 << level, BLOCK >> (level + 1)
     errors, w, off, u = c.spare[0, :N_SHARES], c.spare[1, :m], c.spare[2, :N_SHARES], control[U_GAP]
     z, collected, error, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]
-    _finish(c, r, level, h, count * sub)
-    keep(c, r, count * sub, seen, magnified, errors)
-    control[Z], off[:], w[:] = z, 0.0, c.w
-    for done in range(0, count, half):
+    tol = OF_SWEEPS * seen
+    _sources(values, at, count, sub, c.room.s)
+    begin_block(c, r, c.w, u)
+    change, _, seen, magnified = _solve(c, r, level, h, count * sub, tol)
+    closed, off[:], w[:] = change < math.inf, 0.0, c.w
+    if closed:
+        _finish(c, r, level, h, count * sub)
+        keep(c, r, count * sub, seen, magnified, errors)
+        control[Z] = z
+    for done in range(0, count if closed else 0, half):
         part = min(half, count - done)
         n = 2 * part * sub
         _sources(values, at + done, part, 2 * sub, c.room.s)
         begin_block(c, r, w, u)
-        change, _, _, _ = _solve(c, r, level + 1, 0.5 * h, n, OF_SWEEPS * tol)
-        if not change < math.inf:
-            off[:] = errors
+        change, _, _, _ = _solve(c, r, level + 1, 0.5 * h, n, tol)
+        closed = change < math.inf
+        if not closed:
             break
         _finish(c, r, level + 1, 0.5 * h, n)
         compare(c, r, done * sub, n, off)
         for k in range(m):
             w[k] = c.room.w[k, n]
         u = c.room.u[n]
-    note(c, level, errors, off)
+    note(c, level, closed, errors, off)
     control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q] = z, collected, error, peak
 
 
@@ -206,19 +210,14 @@ def march(
     last = (-1, 0)
     while at < stop:
         level, r = int(control[LEVEL]), int(control[REFERENCE])
-        sub, checked = 1 << level, (at, level) != last and is_due(c, level)
+        sub = 1 << level
         h, count = spacing / sub, min(BLOCK >> level, stop - at)
         n = count * sub
         _sources(values, at, count, sub, room.s)
         begin_block(c, r, c.w, control[U_GAP])
         if change_reference(c, r):
             continue
-        change, margin, seen, magnified = _solve(c, r, level, h, n, OF_SWEEPS * tol if checked else tol)
-        if (at, level) != last and is_hopeful(seen, tol) and (checked or is_louder(c, level, seen)):
-            if checked:
-                _check(c, values, at, count, r, level, h, tol, seen, magnified)
-                last = (at, level)
-            continue
+        change, margin, seen, magnified = _solve(c, r, level, h, n, tol)
         left = 0.0
         local = c.checks[level, OF_GAP] * seen
         if local <= tol:
@@ -230,6 +229,10 @@ def march(
                 # More sweeps leave less.
                 c.counters[REFUSED] += n
                 continue
+        if (at, level) != last and is_due(c, level, n, seen, left, tol):
+            _check(c, values, at, count, r, level, h, seen)
+            last = (at, level)
+            continue
         if not local <= tol:
             if level + 1 == LEVELS or margin <= LEAST_MARGIN:
                 return TOO_COARSE if change < math.inf else NOT_CLOSED

@@ -12,8 +12,8 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockcharge import Charges, Course
-from fingerspice.engine.blockcheck import OF_SWEEPS, compare, is_due, is_louder, keep, note
-from fingerspice.engine.blockerror import accept, coarsen, correct, error_left, is_hopeful, learn, refine
+from fingerspice.engine.blockcheck import OF_SWEEPS, compare, is_due, keep, note
+from fingerspice.engine.blockerror import accept, coarsen, correct, error_left, learn, refine
 from fingerspice.engine.blockforms import (
     BLOCK,
     COLLECTED,
@@ -302,31 +302,37 @@ def _finish(c: Course, steps: Steps, r: int, n: int, taps: int) -> None:
 
 @jit_within
 def _check(
-    c: Course, steps: Steps, times: FloatArray, values: FloatArray, at: int, count: int, r: int, level: int, tol: float,
+    c: Course, steps: Steps, times: FloatArray, values: FloatArray, at: int, count: int, r: int, level: int,
     seen: float, taps: int,
 ) -> None:  # fmt: skip
     """As `recording._check`."""
     control, m, sub, half = c.control, c.w.size, 1 << level, BLOCK >> (level + 1)
     errors, w, off, u = c.spare[0, :N_SHARES], c.spare[1, :m], c.spare[2, :N_SHARES], control[U_GAP]
     z, collected, error, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]
-    _finish(c, steps, r, count * sub, taps)
-    keep(c, r, count * sub, seen, 1.0, errors)
-    control[Z], off[:], w[:] = z, 0.0, c.w
-    for done in range(0, count, half):
+    tol = OF_SWEEPS * seen
+    _load(times, values, at, count, sub, c.room, c.charges)
+    begin_block(c, r, c.w, u)
+    change, seen = _solve(c, steps, r, count * sub, tol, taps)
+    closed, off[:], w[:] = change < math.inf, 0.0, c.w
+    if closed:
+        _finish(c, steps, r, count * sub, taps)
+        keep(c, r, count * sub, seen, 1.0, errors)
+        control[Z] = z
+    for done in range(0, count if closed else 0, half):
         part = min(half, count - done)
         n = 2 * part * sub
         _load(times, values, at + done, part, 2 * sub, c.room, c.charges)
         begin_block(c, r, w, u)
-        change, _ = _solve(c, steps, r, n, OF_SWEEPS * tol, taps)
-        if not change < math.inf:
-            off[:] = errors
+        change, _ = _solve(c, steps, r, n, tol, taps)
+        closed = change < math.inf
+        if not closed:
             break
         _finish(c, steps, r, n, taps)
         compare(c, r, done * sub, n, off)
         for k in range(m):
             w[k] = c.room.w[k, n]
         u = c.room.u[n]
-    note(c, level, errors, off)
+    note(c, level, closed, errors, off)
     control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q] = z, collected, error, peak
 
 
@@ -344,19 +350,14 @@ def march(
     taps = form.tap_s.size if c.shown.charge else 1 + drives
     while at < stop:
         level, r = int(control[LEVEL]), int(control[REFERENCE])
-        sub, checked = 1 << level, (at, level) != last and is_due(c, level)
+        sub = 1 << level
         count = min(BLOCK >> level, stop - at)
         n = count * sub
         _load(times, values, at, count, sub, room, c.charges)
         begin_block(c, r, c.w, control[U_GAP])
         if change_reference(c, r):
             continue
-        change, seen = _solve(c, steps, r, n, OF_SWEEPS * tol if checked else tol, taps)
-        if (at, level) != last and is_hopeful(seen, tol) and (checked or is_louder(c, level, seen)):
-            if checked:
-                _check(c, steps, times, values, at, count, r, level, tol, seen, taps)
-                last = (at, level)
-            continue
+        change, seen = _solve(c, steps, r, n, tol, taps)
         left = 0.0
         local = c.checks[level, OF_GAP] * seen
         if local <= tol:
@@ -368,6 +369,10 @@ def march(
                 # More sweeps leave less.
                 c.counters[REFUSED] += n
                 continue
+        if (at, level) != last and is_due(c, level, n, seen, left, tol):
+            _check(c, steps, times, values, at, count, r, level, seen, taps)
+            last = (at, level)
+            continue
         if not local <= tol:
             if level == MOST_HALVINGS:
                 return TOO_COARSE if change < math.inf else NOT_CLOSED
