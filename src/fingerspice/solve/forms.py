@@ -29,7 +29,7 @@ from fingerspice.solve.stackstate import StackState, from_stack
 from fingerspice.solve.track import as_recorded, on_branch, system_of
 
 # Truncation error allowed for the polynomial of 1/A, relative to the error asked for.
-AREA_SHARE = 0.02
+AREA_SHARE = 0.003
 # Largest ratio of neighbouring reference areas: the closer the reference, the fewer sweeps.
 REFERENCE_RATIO = 1.015
 # Time constants in a step from which on a fast mode is taken apart from the parabola, which resolves slower ones.

@@ -41,7 +41,7 @@ LEAST_PEAK = 1e-3
 # and add up, a later piece cannot make up for errors of the earlier ones.
 BEGINNINGS = (1.0, 0.03)
 # Error allowed in the piece that the ordinary engine integrates, relative to the error asked for.
-LED_SHARE = 0.1
+LED_SHARE = 0.03
 # Number of forms cached with a scene, of up to 0.2 MB each: one for each tolerance, sample spacing and thread.
 MOST_FORMS = 16
 
