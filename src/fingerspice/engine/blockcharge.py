@@ -157,7 +157,7 @@ def _leaked_error(
     n: int, h: FloatArray, slow: FloatArray, q: FloatArray, error: FloatArray, of_seen: float, seen: FloatArray,
     off: FloatArray,
 ) -> None:  # fmt: skip
-    """Each step's error of the charge (C): a share of that seen, and leakage by the error of the slow layer's voltage."""
+    """Error of the charge in each step (C): a share of that seen, and leakage by the error of the slow layer."""
     g_area, g_total = slow[slow.size - 2], slow[slow.size - 1]
     for i in range(n):
         off[i] = of_seen * seen[i] + 0.5 * h[i] * (g_area / q[i] + g_total) * (error[i] + error[i + 1])

@@ -26,7 +26,9 @@ from fingerspice.engine.blockforms import (
     OF_NODES,
     UNTIL_CHECK,
     WAITED,
+    WITHIN,
 )
+from fingerspice.engine.blockoutput import APART, gaps_within
 from fingerspice.engine.blockrows import add, largest_of, modes_into, scaled
 
 # The share stated is so many times the one measured, and at least so much of the one stated before.
@@ -131,41 +133,54 @@ def _row(c: Course, r: int, j: int, n: int, out: FloatArray) -> None:
 
 
 @jit_within
-def keep(c: Course, r: int, n: int, seen: float, magnified: float, errors: FloatArray) -> None:
+def keep(
+    c: Course, r: int, h: float, n: int, sub: int, seen: float, magnified: float, errors: FloatArray
+) -> None:  # fmt: skip
     """Keep what a corrected solution of n steps shows, and note the errors seen, of which shares are left, in `errors`.
 
-    `seen` is that of the gap voltage (V), and `magnified` is as in `blockerror.accept`. The projections that the charge
-    needs are known.
+    `sub` steps of length h (s) make a sample. `seen` is the error of the gap voltage (V), and `magnified` is as in
+    `blockerror.accept`. The projections that the charge needs are known.
     """
     room, control = c.room, c.control
     if c.shown.charge:
         control[COLLECTED] = control[ERROR_Q] = 0.0
         charge_block(c, r, n, 1.0, seen, False)
-    for j in range(room.kept.shape[0]):
+    for j in range(room.kept.shape[0] - 1):
         _row(c, r, j, n + 1, room.kept[j])
+    if c.form.bend.size > 0:
+        gaps_within(c, r, h, 0, n // sub, sub, 1.0, room.kept[room.kept.shape[0] - 1])
     steepest = _largest_product(n + 1, room.kept[0], c.charges.q[0], c.form.kappa, c.form.q0[r], room.before)
-    errors[OF_GAP] = errors[OF_NODES] = errors[OF_CHARGE] = seen
+    errors[:] = seen
     errors[OF_FORCE] = FORCE * in_place(c, magnified) * c.shown.stress * steepest
     if c.shown.charge:
         errors[OF_CHARGE] = control[ERROR_Q]
 
 
 @jit_within
-def compare(c: Course, r: int, first: int, n: int, errors: FloatArray) -> None:
-    """Note the largest differences of n steps to what was kept, from its step `first` on, in `errors`."""
+def compare(c: Course, r: int, h: float, first: int, n: int, sub: int, errors: FloatArray) -> None:
+    """Note the largest differences of n steps to what was kept, from its step `first` on, in `errors`.
+
+    `sub` of the steps, which have the length h (s), make a sample.
+    """
     room = c.room
     if c.shown.charge:
         charge_block(c, r, n, 1.0, 0.0, False)
-    for j in range(room.kept.shape[0]):
+    last = room.kept.shape[0] - 1
+    for j in range(last):
         _row(c, r, j, n + 1, room.slope)
         charge = j >= 2 + c.shown.node.shape[1]
         kind = (OF_GAP, OF_FORCE)[j] if j < 2 else OF_CHARGE if charge else OF_NODES
         errors[kind] = max(errors[kind], _largest_difference(n // 2 + 1, room.kept[j, first:], room.slope))
+    if c.form.bend.size > 0:
+        count, sample = n // sub, 2 * first // sub
+        gaps_within(c, r, h, sample, count, sub, 2.0, room.slope)
+        for place in range((sample + APART - 1) // APART, (sample + count - 1) // APART + 1):
+            errors[WITHIN] = max(errors[WITHIN], abs(room.kept[last, place] - room.slope[place]))
 
 
 @jit_within
 def note(c: Course, level: int, closed: bool, seen: FloatArray, off: FloatArray) -> None:
-    """Note which shares of the errors `seen` were left after the correction: `off`; none if a solution is not `closed`."""
+    """Note which shares of the errors `seen` the correction left, `off`; none if a solution was not `closed`."""
     noted = c.checks[level]
     if closed:
         for kind in range(N_SHARES):

@@ -34,6 +34,7 @@ from fingerspice.engine.blockforms import (
     STEPS,
     U_GAP,
     UNTIL_CHECK,
+    WITHIN,
 )
 from fingerspice.engine.blockrows import (
     PAD,
@@ -229,16 +230,18 @@ def accept(
     )  # fmt: skip
     control[PEAK_U], control[PEAK_F] = max(control[PEAK_U], peak), max(control[PEAK_F], force)
     quadrature, others = checked[OF_GAP] * seen, left + magnified * carried
-    control[ERROR_U] = max(control[ERROR_U], quadrature + others)
+    within = max(checked[OF_GAP], checked[WITHIN]) * seen
+    control[ERROR_U] = max(control[ERROR_U], within + others)
     # The force is proportional to the square of the voltage, and depends a little on the area.
-    control[ERROR_F] = max(control[ERROR_F], FORCE * in_place(c, magnified) * (worst + steepest * carried))
+    worst = in_place(c, magnified) * worst + steepest * (within - quadrature)
+    control[ERROR_F] = max(control[ERROR_F], FORCE * (worst + in_place(c, magnified) * steepest * carried))
     if c.shown.flows > 0:
         # A charge may be a small difference of large ones, whose errors a further sweep would show up to a share only.
         error = _charge_error(c, r, n) + share * c.shown.capacitance * (quadrature + left)
         error += checked[OF_CHARGE] * seen + c.shown.moves[1] * others
         control[ERROR_Q] = max(control[ERROR_Q], error)
     # An error of the gap voltage changes the area, and thereby other voltages.
-    known = checked[OF_NODES] * seen + c.shown.moves[0] * others
+    known = checked[OF_NODES] * seen + (within - quadrature) + c.shown.moves[0] * others
     error = _node_error(c, r, n, max(control[ERROR_V] - known, 0.0) / magnified)
     control[ERROR_V] = max(control[ERROR_V], known + magnified * error)
     if c.shown.charge:

@@ -26,10 +26,10 @@ RATIO = 14
 N_CONTROL = 15
 # Entries of a row of `Course.checks`, one for each step length. What is left, once it is corrected, of the errors seen
 # of gap voltage and force, and of a stack's charge, as shares; what is left of the error of nodes and of a network's
-# charges, over the error seen of the gap voltage (V/V and C/V). The largest of these (V), and the number of blocks until
-# the next check, now and after the last one.
-OF_GAP, OF_FORCE, OF_NODES, OF_CHARGE, CHECKED, UNTIL_CHECK, WAITED = range(7)
-N_SHARES, N_CHECKS = 4, 7
+# charges, and of the gap voltage within a network's steps, over the error seen of the gap voltage (V/V and C/V). The
+# largest of these (V), and the number of blocks until the next check, now and after the last one.
+OF_GAP, OF_FORCE, OF_NODES, OF_CHARGE, WITHIN, CHECKED, UNTIL_CHECK, WAITED = range(8)
+N_SHARES, N_CHECKS = 5, 8
 # Share that is assumed at least, and before the first check.
 LEAST_SHARE, UNCHECKED = 0.02, 1.0
 # Entries of `counters`.
@@ -170,7 +170,8 @@ class Room(NamedTuple):
     `changed`, `changed_within` (the middle) and `changed_pulse` are drives with their sign reversed as a sweep finds
     them, and then their changes; `further` is what a further sweep would change in the modes, and `own` their
     quadrature error.
-    `kept` are the gap voltages, forces, nodes' voltages and charges of a solution to be checked.
+    `kept` are the gap voltages, forces, nodes' voltages and charges of a solution to be checked, and gap voltages
+    within some of its steps.
     `kinked` is no row: the weights (m, T) of the kink of each drive in each mode.
     """
 
@@ -204,7 +205,7 @@ class Room(NamedTuple):
 def new_room(modes: int, drives: int, projections: int, shown: Shown) -> Room:
     """Room for a form of so many, and for what is shown of it."""
     n = BLOCK + PAD
-    kept = 2 + shown.node.shape[1] + shown.flows + int(shown.charge)
+    kept = 3 + shown.node.shape[1] + shown.flows + int(shown.charge)
     return Room(
         np.zeros(n), np.zeros(n), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n),
         np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)),
@@ -218,6 +219,7 @@ def new_checks(shown: Shown) -> FloatArray:
     """Nothing checked yet."""
     checks = np.zeros((LEVELS, N_CHECKS))
     checks[:, :N_SHARES] = UNCHECKED
+    checks[:, WITHIN] = 0.0
     if shown.flows > 0:
         checks[:, OF_CHARGE] = UNCHECKED * shown.capacitance
     return checks

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit, jit_inline, jit_within
@@ -27,6 +29,11 @@ from fingerspice.engine.blockrows import (
 )
 from fingerspice.engine.relaxation import FIRST_NEWTON, look_at_ends
 from fingerspice.numerics.moments import moments
+
+# Fractions of a step at which checks compare what is within steps, in one of so many samples: after each sample, fast
+# modes of a network decay.
+APART = 4
+PLACES_WITHIN = (0.015625, 0.0625, 0.1875, 0.4375)
 
 
 @jit_inline
@@ -185,12 +192,12 @@ def _write_flows(
 
 
 @jit
-def _write_point(
-    c: Course, r: int, h: float, i: int, at: float, slope: float, out: FloatArray, place: int
-) -> None:  # fmt: skip
-    """Write one output at fraction `at` of step i; `slope` is the source's slope there, V/s."""
-    form, room, shown, model = c.form, c.room, c.shown, c.model
-    w, g = c.spare[0, : c.w.size], c.spare[1, : room.g.shape[0]]
+def _gap_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, g: FloatArray) -> tuple[float, float, float]:
+    """Gap voltage (in a network xi) at fraction `at` of step i, source (V), and enlargement of the modes' parts by 1/A.
+
+    The modes and drives there go into w and g.
+    """
+    form, room, model = c.form, c.room, c.model
     source = room.s[i] + at * (room.s[i + 1] - room.s[i])
     first, middle, last = (2.0 * at - 1.0) * (at - 1.0), 4.0 * at * (1.0 - at), at * (2.0 * at - 1.0)
     for t in range(g.size):
@@ -220,6 +227,33 @@ def _write_point(
             b = model.area0 * x_gap
             u -= (u - model.k_gap * source - b * q) / (1.0 - b * dq)
         scale = model.area0 * inverse_area_at(form, u)[0]
+    return u, source, scale
+
+
+@jit
+def gaps_within(c: Course, r: int, h: float, first: int, count: int, sub: int, stretch: float, out: FloatArray) -> None:
+    """Gap voltages of a network (V) within steps of length h (s), after one in `APART` of `count` samples.
+
+    `sub` steps make a sample, and `first` is the number of the first sample. The places in the steps are
+    `PLACES_WITHIN` x `stretch`.
+    """
+    w, g = np.empty(c.w.size), np.empty(c.room.g.shape[0])
+    for j in range(count):
+        place, rest = divmod(first + j, APART)
+        if rest == 0:
+            at = PLACES_WITHIN[place % len(PLACES_WITHIN)] * stretch
+            xi, _, _ = _gap_at(c, r, h, j * sub, at, w, g)
+            out[place] = xi - c.form.kappa * bend_at(c.form, xi)
+
+
+@jit
+def _write_point(
+    c: Course, r: int, h: float, i: int, at: float, slope: float, out: FloatArray, place: int
+) -> None:  # fmt: skip
+    """Write one output at fraction `at` of step i; `slope` is the source's slope there, V/s."""
+    form, room, shown = c.form, c.room, c.shown
+    w, g = c.spare[0, : c.w.size], c.spare[1, : room.g.shape[0]]
+    u, source, scale = _gap_at(c, r, h, i, at, w, g)
     n = shown.k.size
     bent = bend_at(form, u) if form.bend.size > 0 else 0.0
     for column in range(n):

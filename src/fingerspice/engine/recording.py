@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit, jit_within
@@ -35,6 +37,7 @@ from fingerspice.engine.blockforms import (
     REFUSED,
     SWEEPS,
     U_GAP,
+    WITHIN,
     Form,
     Z,
 )
@@ -166,16 +169,16 @@ def _check(
 ) -> None:  # fmt: skip
     """Solve `count` samples by steps of length h and half of it, and note what is left of errors such as `seen` (V)."""
     control, m, sub, half = c.control, c.w.size, 1 << level, BLOCK >> (level + 1)
-    errors, w, off, u = c.spare[0, :N_SHARES], c.spare[1, :m], c.spare[2, :N_SHARES], control[U_GAP]
+    errors, off, w, u = np.zeros(N_SHARES), np.zeros(N_SHARES), c.w.copy(), control[U_GAP]
     z, collected, error, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]
     tol = OF_SWEEPS * seen
     _sources(values, at, count, sub, c.room.s)
     begin_block(c, r, c.w, u)
     change, _, seen, magnified = _solve(c, r, level, h, count * sub, tol)
-    closed, off[:], w[:] = change < math.inf, 0.0, c.w
+    closed = change < math.inf
     if closed:
         _finish(c, r, level, h, count * sub)
-        keep(c, r, count * sub, seen, magnified, errors)
+        keep(c, r, h, count * sub, sub, seen, magnified, errors)
         control[Z] = z
     for done in range(0, count if closed else 0, half):
         part = min(half, count - done)
@@ -187,7 +190,7 @@ def _check(
         if not closed:
             break
         _finish(c, r, level + 1, 0.5 * h, n)
-        compare(c, r, done * sub, n, off)
+        compare(c, r, 0.5 * h, done * sub, n, 2 * sub, off)
         for k in range(m):
             w[k] = c.room.w[k, n]
         u = c.room.u[n]
@@ -219,7 +222,7 @@ def march(
             continue
         change, margin, seen, magnified = _solve(c, r, level, h, n, tol)
         left = 0.0
-        local = c.checks[level, OF_GAP] * seen
+        local = max(c.checks[level, OF_GAP], c.checks[level, WITHIN]) * seen
         if local <= tol:
             correct(c, r, n)
             further_sweep(c, r, level, n)

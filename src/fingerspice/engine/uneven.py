@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit, jit_rows, jit_within
@@ -32,6 +34,7 @@ from fingerspice.engine.blockforms import (
     REFUSED,
     SWEEPS,
     U_GAP,
+    WITHIN,
     Form,
     Room,
     Z,
@@ -307,16 +310,16 @@ def _check(
 ) -> None:  # fmt: skip
     """As `recording._check`."""
     control, m, sub, half = c.control, c.w.size, 1 << level, BLOCK >> (level + 1)
-    errors, w, off, u = c.spare[0, :N_SHARES], c.spare[1, :m], c.spare[2, :N_SHARES], control[U_GAP]
+    errors, off, w, u = np.zeros(N_SHARES), np.zeros(N_SHARES), c.w.copy(), control[U_GAP]
     z, collected, error, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]
     tol = OF_SWEEPS * seen
     _load(times, values, at, count, sub, c.room, c.charges)
     begin_block(c, r, c.w, u)
     change, seen = _solve(c, steps, r, count * sub, tol, taps)
-    closed, off[:], w[:] = change < math.inf, 0.0, c.w
+    closed = change < math.inf
     if closed:
         _finish(c, steps, r, count * sub, taps)
-        keep(c, r, count * sub, seen, 1.0, errors)
+        keep(c, r, 0.0, count * sub, sub, seen, 1.0, errors)
         control[Z] = z
     for done in range(0, count if closed else 0, half):
         part = min(half, count - done)
@@ -328,7 +331,7 @@ def _check(
         if not closed:
             break
         _finish(c, steps, r, n, taps)
-        compare(c, r, done * sub, n, off)
+        compare(c, r, 0.0, done * sub, n, 2 * sub, off)
         for k in range(m):
             w[k] = c.room.w[k, n]
         u = c.room.u[n]
@@ -359,7 +362,7 @@ def march(
             continue
         change, seen = _solve(c, steps, r, n, tol, taps)
         left = 0.0
-        local = c.checks[level, OF_GAP] * seen
+        local = max(c.checks[level, OF_GAP], c.checks[level, WITHIN]) * seen
         if local <= tol:
             correct(c, r, n)
             _further_sweep(c, steps, r, n)
