@@ -176,27 +176,35 @@ def _largest_sum(c: Course, row: FloatArray, modes: FloatArray, n: int, out: Flo
 @jit_within
 def _node_error(c: Course, r: int, n: int, known: float) -> float:
     """Largest error of a node's voltage by sweeps and earlier blocks, or `known` (V) if it is not larger."""
-    room, largest = c.room, c.spare[0]
-    for k in range(c.w.size):
-        largest[k] = largest_of(n + 1, room.further[k])
     for i in range(c.shown.node.shape[1]):
-        row, most = c.shown.node[r, i], _carried(c, c.shown.node[r, i])
-        carried = most
-        for k in range(c.w.size):
-            most += abs(row[k]) * largest[k]
-        if most > known:
-            known = max(known, _largest_sum(c, row, room.further, n, room.slope) + carried)
+        row = c.shown.node[r, i]
+        carried = _carried(c, row)
+        if carried + _most(c, row) > known:
+            known = max(known, _largest_sum(c, row, c.room.further, n, c.room.slope) + carried)
     return known
 
 
 @jit_within
-def _charge_error(c: Course, r: int, n: int) -> float:
-    """Largest error of a network's charges in a block by sweeps and earlier blocks, C."""
+def _charge_error(c: Course, r: int, n: int, share: float) -> float:
+    """Largest error of a network's charges in a block by sweeps and earlier blocks, C.
+
+    A charge may be a small difference of large ones, whose errors a further sweep shows but for the part `share`.
+    """
     worst = 0.0
     for i in range(c.shown.k.size - c.shown.flows, c.shown.k.size):
         row = c.shown.columns[r, i]
-        worst = max(worst, _largest_sum(c, row, c.room.further, n, c.room.slope) + _carried(c, row))
+        swept = _largest_sum(c, row, c.room.further, n, c.room.slope) + share * _most(c, row)
+        worst = max(worst, swept + _carried(c, row))
     return worst
+
+
+@jit_within
+def _most(c: Course, row: FloatArray) -> float:
+    """Most that a further sweep may change in the quantity `row` (m,) @ modes, by the largest changes of modes."""
+    total = 0.0
+    for k in range(c.w.size):
+        total += abs(row[k]) * c.spare[0, k]
+    return total
 
 
 @jit_within
@@ -235,10 +243,10 @@ def accept(
     # The force is proportional to the square of the voltage, and depends a little on the area.
     worst = in_place(c, magnified) * worst + steepest * (within - quadrature)
     control[ERROR_F] = max(control[ERROR_F], FORCE * (worst + in_place(c, magnified) * steepest * carried))
+    for k in range(c.w.size):
+        c.spare[0, k] = largest_of(n + 1, room.further[k])
     if c.shown.flows > 0:
-        # A charge may be a small difference of large ones, whose errors a further sweep would show up to a share only.
-        error = _charge_error(c, r, n) + share * c.shown.capacitance * (quadrature + left)
-        error += checked[OF_CHARGE] * seen + c.shown.moves[1] * others
+        error = _charge_error(c, r, n, share) + checked[OF_CHARGE] * seen + c.shown.moves[1] * others
         control[ERROR_Q] = max(control[ERROR_Q], error)
     # An error of the gap voltage changes the area, and thereby other voltages.
     known = checked[OF_NODES] * seen + (within - quadrature) + c.shown.moves[0] * others
