@@ -60,7 +60,7 @@ def _enlarge(n: int, area0: float, q: FloatArray, x: FloatArray) -> None:
 
 @jit_rows
 def _largest_product(n: int, u: FloatArray, q: FloatArray, kappa: float, q0: float, error: FloatArray) -> float:
-    """Largest |u error| / q, where an error of xi is less of one of u (see `blockerror.peaks_of`)."""
+    """Largest |u error| / q, where an error of xi is less of one of u (see `blockerror.accept`)."""
     largest = 0.0
     for i in range(n):
         a = abs(u[i] * error[i]) / (q[i] + kappa * (1.0 - q[i] / q0))

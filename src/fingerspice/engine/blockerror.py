@@ -60,26 +60,26 @@ SPARE = 0.64
 
 
 @jit_rows
-def peaks_of(
+def _force_rows(
     n: int, stress: float, u: FloatArray, q: FloatArray, kappa: float, q0: float, a: float, seen: FloatArray,
-    left: FloatArray,
-) -> tuple[float, float, float, float, float]:  # fmt: skip
-    """The largest |u|, force, and derivative of force / 2 by xi, also times the error of xi in its place; the mean q.
+    left: FloatArray, slope: FloatArray, force: FloatArray, off: FloatArray,
+) -> float:  # fmt: skip
+    """Half the derivative of the force by xi, the force, and the error of the force, each in its row; the mean q.
 
-    The error is a |seen| + |left|. The derivative does not contain that of the area.
+    The error of xi is a |seen| + |left|. The derivative does not contain that of the area.
     """
-    peak, force, steepest, worst, total = 0.0, 0.0, 0.0, 0.0, 0.0
+    total = 0.0
     for i in range(n):
         x = abs(u[i])
-        here = stress * x * x / q[i]
-        slope = stress * x / (q[i] + kappa * (1.0 - q[i] / q0))
-        peak = x if x > peak else peak
-        steepest = slope if slope > steepest else steepest
-        force = here if here > force else force
-        off = slope * (a * abs(seen[i]) + abs(left[i]))
-        worst = off if off > worst else worst
+        slope[i] = stress * x / q[i]
+        force[i] = slope[i] * x
         total += q[i]
-    return peak, force, steepest, worst, total / n
+    if kappa != 0.0:
+        for i in range(n):
+            slope[i] *= q[i] / (q[i] + kappa * (1.0 - q[i] / q0))
+    for i in range(n):
+        off[i] = slope[i] * (a * abs(seen[i]) + abs(left[i]))
+    return total / n
 
 
 @jit_within
@@ -232,11 +232,13 @@ def accept(
     if c.form.bend.size > 0:
         gap = room.s_within
         gap_into(c, n + 1, gap)
-    peak, force, steepest, worst, control[MEAN_Q] = peaks_of(
+    control[MEAN_Q] = _force_rows(
         n + 1, c.shown.stress, gap, c.charges.q[0], c.form.kappa, c.form.q0[r], checked[OF_FORCE], room.before,
-        room.slope,
+        room.slope, room.crossed, room.jumps, room.bends,
     )  # fmt: skip
-    control[PEAK_U], control[PEAK_F] = max(control[PEAK_U], peak), max(control[PEAK_F], force)
+    steepest, worst = largest_of(n + 1, room.crossed), largest_of(n + 1, room.bends)
+    control[PEAK_U] = max(control[PEAK_U], largest_of(n + 1, gap))
+    control[PEAK_F] = max(control[PEAK_F], largest_of(n + 1, room.jumps))
     quadrature, others = checked[OF_GAP] * seen, left + magnified * carried
     within = max(checked[OF_GAP], checked[WITHIN]) * seen
     control[ERROR_U] = max(control[ERROR_U], within + others)

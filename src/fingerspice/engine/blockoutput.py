@@ -23,6 +23,7 @@ from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, O
 from fingerspice.engine.blockkinks import crossing
 from fingerspice.engine.blockrows import (
     add,
+    largest_off,
     modes_into,
     of_source_and_modes,
     scaled,
@@ -320,14 +321,16 @@ def write_block(
     """Write the outputs of a block of `count` samples from its start (s) on, without those at its very end."""
     shown, n, first = c.shown, count * sub, c.counters[OUTPUT]
     slack = 8e-16 * (abs(start) + n * h)
-    last, aligned = first, True
-    while last < t_out.size and t_out[last] < start + n * h - slack:
-        j = last - first
-        aligned &= j < count and abs(t_out[last] - (start + j * sub * h)) <= slack
-        last += 1
+    end, size, last = start + n * h - slack, t_out.size, first + count
+    aligned = last <= size and t_out[last - 1] < end and (last == size or t_out[last] >= end)
+    aligned = aligned and largest_off(count, start, sub * h, t_out[first:last]) <= slack
+    if not aligned:
+        last = first
+        while last < size and t_out[last] < end:
+            last += 1
     if last == first:
         return
-    if not aligned or last - first != count or shown.flows > 0:
+    if not aligned or shown.flows > 0:
         for i in range(n + 1):
             c.charges.t[i] = start + i * h
         write_points(c, r, n, slack, t_out, out, last)
