@@ -56,7 +56,7 @@ CAUTION, LEAST = 2.0, 0.01
 SHOWING = 1e-3
 # Steps twice as long are taken where their error, sixteen times as large, is expected to be below this fraction of the
 # one allowed.
-SPARE = 0.64
+SPARE = 1.0
 
 
 @jit_rows

@@ -31,9 +31,9 @@ from fingerspice.solve.runs import Progress, Run, excess_of, kept_with
 from fingerspice.waveforms.ramps import PWL
 
 # Error allowed in a block, relative to the error asked for; ratio of stated to estimated error; attempts at a piece.
-SHARE, SAFETY, ATTEMPTS = 0.25, 1.75, 4
+SHARE, SAFETY, ATTEMPTS = 0.28, 1.75, 4
 # Share of the error asked for that another attempt at a piece is to have.
-ENOUGH = 0.7
+ENOUGH = 0.85
 # The error of a piece is related to the peaks up to its end, or to this share of the largest gap voltage that the
 # source may cause: noise before the first loud sound need not be exact relative to itself.
 LEAST_PEAK = 1e-3
