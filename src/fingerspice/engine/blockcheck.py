@@ -10,10 +10,13 @@ voltage, force, nodes and charges have shares of their own.
 
 from __future__ import annotations
 
+import numpy as np
+
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
 from fingerspice.engine.blockcharge import Course, charge_block
 from fingerspice.engine.blockforms import (
+    BLOCK,
     CHECKED,
     COLLECTED,
     ERROR_Q,
@@ -28,7 +31,7 @@ from fingerspice.engine.blockforms import (
     WAITED,
     WITHIN,
 )
-from fingerspice.engine.blockoutput import APART, gaps_within
+from fingerspice.engine.blockoutput import APART, show_within
 from fingerspice.engine.blockrows import add, largest_of, modes_into, scaled
 
 # The share stated is so many times the one measured, and at least so much of the one stated before.
@@ -145,10 +148,11 @@ def keep(
     if c.shown.charge:
         control[COLLECTED] = control[ERROR_Q] = 0.0
         charge_block(c, r, n, 1.0, seen, False)
-    for j in range(room.kept.shape[0] - 1):
+    last = room.kept.shape[0] - 2
+    for j in range(last):
         _row(c, r, j, n + 1, room.kept[j])
     if c.form.bend.size > 0:
-        gaps_within(c, r, h, 0, n // sub, sub, 1.0, room.kept[room.kept.shape[0] - 1])
+        show_within(c, r, h, 0, n // sub, sub, 1.0, room.kept[last:])
     steepest = _largest_product(n + 1, room.kept[0], c.charges.q[0], c.form.kappa, c.form.q0[r], room.before)
     errors[:] = seen
     errors[OF_FORCE] = FORCE * in_place(c, magnified) * c.shown.stress * steepest
@@ -165,7 +169,7 @@ def compare(c: Course, r: int, h: float, first: int, n: int, sub: int, errors: F
     room = c.room
     if c.shown.charge:
         charge_block(c, r, n, 1.0, 0.0, False)
-    last = room.kept.shape[0] - 1
+    last = room.kept.shape[0] - 2
     for j in range(last):
         _row(c, r, j, n + 1, room.slope)
         charge = j >= 2 + c.shown.node.shape[1]
@@ -173,9 +177,11 @@ def compare(c: Course, r: int, h: float, first: int, n: int, sub: int, errors: F
         errors[kind] = max(errors[kind], _largest_difference(n // 2 + 1, room.kept[j, first:], room.slope))
     if c.form.bend.size > 0:
         count, sample = n // sub, 2 * first // sub
-        gaps_within(c, r, h, sample, count, sub, 2.0, room.slope)
+        within = np.empty((2, BLOCK // APART))
+        show_within(c, r, h, sample, count, sub, 2.0, within)
         for place in range((sample + APART - 1) // APART, (sample + count - 1) // APART + 1):
-            errors[WITHIN] = max(errors[WITHIN], abs(room.kept[last, place] - room.slope[place]))
+            errors[WITHIN] = max(errors[WITHIN], abs(room.kept[last, place] - within[0, place]))
+            errors[OF_FORCE] = max(errors[OF_FORCE], abs(room.kept[last + 1, place] - within[1, place]))
 
 
 @jit_within

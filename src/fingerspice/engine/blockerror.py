@@ -243,8 +243,8 @@ def accept(
     within = max(checked[OF_GAP], checked[WITHIN]) * seen
     control[ERROR_U] = max(control[ERROR_U], within + others)
     # The force is proportional to the square of the voltage, and depends a little on the area.
-    worst = in_place(c, magnified) * worst + steepest * (within - quadrature)
-    control[ERROR_F] = max(control[ERROR_F], FORCE * (worst + in_place(c, magnified) * steepest * carried))
+    off = FORCE * in_place(c, magnified) * (worst + steepest * carried)
+    control[ERROR_F] = max(control[ERROR_F], off)
     for k in range(c.w.size):
         c.spare[0, k] = largest_of(n + 1, room.further[k])
     if c.shown.flows > 0:

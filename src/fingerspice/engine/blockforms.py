@@ -170,8 +170,8 @@ class Room(NamedTuple):
     `changed`, `changed_within` (the middle) and `changed_pulse` are drives with their sign reversed as a sweep finds
     them, and then their changes; `further` is what a further sweep would change in the modes, and `own` their
     quadrature error.
-    `kept` are the gap voltages, forces, nodes' voltages and charges of a solution to be checked, and gap voltages
-    within some of its steps.
+    `kept` are the gap voltages, forces, nodes' voltages and charges of a solution to be checked, and at last gap
+    voltages and forces within some of its steps.
     `kinked` is no row: the weights (m, T) of the kink of each drive in each mode.
     """
 
@@ -205,7 +205,7 @@ class Room(NamedTuple):
 def new_room(modes: int, drives: int, projections: int, shown: Shown) -> Room:
     """Room for a form of so many, and for what is shown of it."""
     n = BLOCK + PAD
-    kept = 3 + shown.node.shape[1] + shown.flows + int(shown.charge)
+    kept = 4 + shown.node.shape[1] + shown.flows + int(shown.charge)
     return Room(
         np.zeros(n), np.zeros(n), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n),
         np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)),

@@ -232,11 +232,11 @@ def _gap_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, g: Fl
 
 
 @jit
-def gaps_within(c: Course, r: int, h: float, first: int, count: int, sub: int, stretch: float, out: FloatArray) -> None:
-    """Gap voltages of a network (V) within steps of length h (s), after one in `APART` of `count` samples.
+def show_within(c: Course, r: int, h: float, first: int, count: int, sub: int, stretch: float, out: FloatArray) -> None:
+    """Gap voltages (V) and forces (N) of a network within steps of length h (s), into the two rows of `out`.
 
-    `sub` steps make a sample, and `first` is the number of the first sample. The places in the steps are
-    `PLACES_WITHIN` x `stretch`.
+    They are those after one in `APART` of `count` samples, at `PLACES_WITHIN` x `stretch`. `sub` steps make a sample,
+    and `first` is the number of the first sample.
     """
     w, g = np.empty(c.w.size), np.empty(c.room.g.shape[0])
     for j in range(count):
@@ -244,7 +244,9 @@ def gaps_within(c: Course, r: int, h: float, first: int, count: int, sub: int, s
         if rest == 0:
             at = PLACES_WITHIN[place % len(PLACES_WITHIN)] * stretch
             xi, _, _ = _gap_at(c, r, h, j * sub, at, w, g)
-            out[place] = xi - c.form.kappa * bend_at(c.form, xi)
+            u = xi - c.form.kappa * bend_at(c.form, xi)
+            q, _ = inverse_area_at(c.form, xi)
+            out[0, place], out[1, place] = u, c.shown.stress * u * u / q
 
 
 @jit
