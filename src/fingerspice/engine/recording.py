@@ -23,15 +23,12 @@ from fingerspice.engine.blockerror import (
 )
 from fingerspice.engine.blockforms import (
     BLOCK,
-    COLLECTED,
-    ERROR_Q,
     LEVEL,
     LEVELS,
     MARGIN,
     MEAN_Q,
     N_SHARES,
     OF_GAP,
-    PEAK_Q,
     RATIO,
     REFERENCE,
     REFUSED,
@@ -39,7 +36,6 @@ from fingerspice.engine.blockforms import (
     U_GAP,
     WITHIN,
     Form,
-    Z,
 )
 from fingerspice.engine.blockoutput import write_block
 from fingerspice.engine.blockrows import area_rows, largest_of
@@ -170,7 +166,7 @@ def _check(
     """Solve `count` samples by steps of length h and half of it, and note what is left of errors such as `seen` (V)."""
     control, m, sub, half = c.control, c.w.size, 1 << level, BLOCK >> (level + 1)
     errors, off, w, u = np.zeros(N_SHARES), np.zeros(N_SHARES), c.w.copy(), control[U_GAP]
-    z, collected, error, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]
+    before = control.copy()
     tol = OF_SWEEPS * seen
     _sources(values, at, count, sub, c.room.s)
     begin_block(c, r, c.w, u)
@@ -179,7 +175,7 @@ def _check(
     if closed:
         _finish(c, r, level, h, count * sub)
         keep(c, r, h, count * sub, sub, seen, magnified, errors)
-        control[Z] = z
+        control[:] = before
     for done in range(0, count if closed else 0, half):
         part = min(half, count - done)
         n = 2 * part * sub
@@ -195,7 +191,7 @@ def _check(
             w[k] = c.room.w[k, n]
         u = c.room.u[n]
     note(c, level, closed, errors, off)
-    control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q] = z, collected, error, peak
+    control[:] = before
 
 
 @jit

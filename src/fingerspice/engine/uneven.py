@@ -18,8 +18,6 @@ from fingerspice.engine.blockcheck import OF_SWEEPS, compare, is_due, keep, note
 from fingerspice.engine.blockerror import accept, coarsen, correct, error_left, learn, refine
 from fingerspice.engine.blockforms import (
     BLOCK,
-    COLLECTED,
-    ERROR_Q,
     FIRST_QUARTER,
     LAST_QUARTER,
     LEVEL,
@@ -27,7 +25,6 @@ from fingerspice.engine.blockforms import (
     N_SHARES,
     OF_GAP,
     OUTPUT,
-    PEAK_Q,
     PLACES,
     RATIO,
     REFERENCE,
@@ -37,7 +34,6 @@ from fingerspice.engine.blockforms import (
     WITHIN,
     Form,
     Room,
-    Z,
 )
 from fingerspice.engine.blockkinks import after_kink, crosses, kink_at, kink_rows
 from fingerspice.engine.blockoutput import write_points, write_samples
@@ -311,7 +307,7 @@ def _check(
     """As `recording._check`."""
     control, m, sub, half = c.control, c.w.size, 1 << level, BLOCK >> (level + 1)
     errors, off, w, u = np.zeros(N_SHARES), np.zeros(N_SHARES), c.w.copy(), control[U_GAP]
-    z, collected, error, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]
+    before = control.copy()
     tol = OF_SWEEPS * seen
     _load(times, values, at, count, sub, c.room, c.charges)
     begin_block(c, r, c.w, u)
@@ -320,7 +316,7 @@ def _check(
     if closed:
         _finish(c, steps, r, count * sub, taps)
         keep(c, r, 0.0, count * sub, sub, seen, 1.0, errors)
-        control[Z] = z
+        control[:] = before
     for done in range(0, count if closed else 0, half):
         part = min(half, count - done)
         n = 2 * part * sub
@@ -336,7 +332,7 @@ def _check(
             w[k] = c.room.w[k, n]
         u = c.room.u[n]
     note(c, level, closed, errors, off)
-    control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q] = z, collected, error, peak
+    control[:] = before
 
 
 @jit
