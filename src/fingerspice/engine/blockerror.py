@@ -52,6 +52,8 @@ from fingerspice.engine.relaxation import LEFT, MOST_RATIO, NEWTON, look_at_ends
 # The part of a change that a sweep leaves is taken to be so many times what the block before has shown, and at least
 # this share of the areas' distance from the reference.
 CAUTION, LEAST = 2.0, 0.01
+# Parts of a block at whose starts the errors of earlier blocks are taken for the force: eight, by three square roots.
+PARTS = 8
 # Below this share of the error allowed, changes show nothing but rounding.
 SHOWING = 1e-3
 # Steps twice as long are taken where their error, sixteen times as large, is expected to be below this fraction of the
@@ -217,6 +219,23 @@ def _carried(c: Course, row: FloatArray) -> float:
 
 
 @jit_within
+def _force_error(c: Course, r: int, n: int) -> float:
+    """Largest error of the force but for `FORCE`, from `_force_rows`, with the decaying errors of earlier blocks."""
+    room, left, worst, first = c.room, c.spare[1], 0.0, 0
+    for k in range(c.w.size):
+        left[k] = abs(c.form.taps[r, 0, k]) * (abs(c.error[0, k]) + abs(c.error[1, k]))
+    for part in range(PARTS):
+        carried, stop = 0.0, (part + 1) * n // PARTS
+        for k in range(c.w.size):
+            carried += left[k]
+            left[k] *= math.sqrt(math.sqrt(math.sqrt(c.spare[2, k])))
+        count = stop + 1 - first
+        off = largest_of(count, room.bends[first:]) + carried * largest_of(count, room.crossed[first:])
+        worst, first = max(worst, off), stop
+    return worst
+
+
+@jit_within
 def accept(
     c: Course, r: int, level: int, n: int, seen: float, left: float, magnified: float, share: float
 ) -> None:  # fmt: skip
@@ -236,15 +255,12 @@ def accept(
         n + 1, c.shown.stress, gap, c.charges.q[0], c.form.kappa, c.form.q0[r], checked[OF_FORCE], room.before,
         room.slope, room.crossed, room.jumps, room.bends,
     )  # fmt: skip
-    steepest, worst = largest_of(n + 1, room.crossed), largest_of(n + 1, room.bends)
     control[PEAK_U] = max(control[PEAK_U], largest_of(n + 1, gap))
     control[PEAK_F] = max(control[PEAK_F], largest_of(n + 1, room.jumps))
     quadrature, others = checked[OF_GAP] * seen, left + magnified * carried
     within = max(checked[OF_GAP], checked[WITHIN]) * seen
     control[ERROR_U] = max(control[ERROR_U], within + others)
-    # The force is proportional to the square of the voltage, and depends a little on the area.
-    off = FORCE * in_place(c, magnified) * (worst + steepest * carried)
-    control[ERROR_F] = max(control[ERROR_F], off)
+    control[ERROR_F] = max(control[ERROR_F], FORCE * in_place(c, magnified) * _force_error(c, r, n))
     for k in range(c.w.size):
         c.spare[0, k] = largest_of(n + 1, room.further[k])
     if c.shown.flows > 0:
