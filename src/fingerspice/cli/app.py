@@ -139,6 +139,8 @@ def run(
         circuit, start = options.with_times(circuit, stop, start)
         if circuit.tran is None:
             raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
+        if stop is None:
+            options.warn_of_rest(circuit, source)
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         if stream or chunk or signals or netcdf:
             options.check_streamed(stream, csv=csv, feel=feel, schematic=schematic)

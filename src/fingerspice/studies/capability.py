@@ -17,7 +17,7 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
-from fingerspice.circuit.describe import head_lines, heading
+from fingerspice.circuit.describe import heading
 from fingerspice.solve.runs import Progress
 from fingerspice.studies.drive_shapes import rise
 from fingerspice.studies.inverse import LEAD, Task
@@ -102,7 +102,7 @@ class Capability(Shown):
             f"up to {format_si(self.limit, 'V')} {wave} the friction's mean is from "
             f"{format_si(self.smallest_mean, 'N')} to {format_si(self.largest_mean, 'N')}"
         )
-        return Page([*head_lines(self.circuit), said, "", Table(("modulation", "largest amplitude", "at mean"), rows)])
+        return Page([heading(self.circuit), said, "", Table(("modulation", "largest amplitude", "at mean"), rows)])
 
     def plot(self) -> Picture:
         """Picture with a map of the amplitude over frequency and mean, and the largest amplitude over frequency."""
