@@ -139,7 +139,9 @@ def test_the_command_writes_table_and_picture(command: Command) -> None:
     assert Path("maps/pad_capability.png").read_bytes().startswith(b"\x89PNG")
     head = Path("maps/pad_capability.csv").read_text().splitlines()[0]
     assert head == "frequency (Hz),mean friction (N),largest amplitude (N)"
-    said = command("limits", "pad.cir", "--capability", "--limit", "120", "--out", "maps", "--overwrite", "--no-plot").out
+    said = command(
+        "limits", "pad.cir", "--capability", "--limit", "120", "--out", "maps", "--overwrite", "--no-plot"
+    ).out
     # The deck's own drive has no part in it.
     assert said.splitlines()[1].startswith("up to 120 V without a carrier the friction's mean is from")
     assert command("limits", "pad.cir", "--limit", "120").code == 2

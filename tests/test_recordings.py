@@ -114,9 +114,10 @@ def test_a_run_goes_on_where_another_has_ended() -> None:
     first = follow(samples, 0.5 * stop, t_eval=[0.0], rtol=1e-8)
     second = follow(samples, stop, t_eval=t, rtol=1e-8, start=first)
     assert (first.method, second.method) == ("relaxation", "relaxation")
-    for name in ("u_gap", "q_source"):
-        peak = np.abs(getattr(whole, name)).max()
-        assert np.abs(getattr(whole, name) - getattr(second, name)).max() <= 1e-7 * peak
+    assert np.abs(whole.u_gap - second.u_gap).max() <= 1e-7 * np.abs(whole.u_gap).max()
+    # Charge is not what `rtol` is asked of, and both runs have blocks of their own.
+    off = np.abs(whole.q_source - second.q_source).max()
+    assert off <= whole.error.q_source + second.error.q_source <= 1e-5 * np.abs(whole.q_source).max()
 
 
 def test_what_is_no_recording_is_stepped_as_ever() -> None:
