@@ -564,7 +564,7 @@ def test_a_recording_longer_than_the_run_is_told(command: Command) -> None:
     Path("a.wav").write_bytes(wav(packed(np.arange(-400, 400) * 50, 16), 16))
     words = ("run", "pad.cir", "--no-plot", "--overwrite", "--rtol", "1e-4", "--source", "WAV(a.wav 150)")
     told = (
-        "Vdrive: the recording ends at 0.099875 s, and the run at the deck's TSTOP = 0.05 s; --stop 0.099875 takes all"
+        "Vdrive: the recording ends at 0.099875 s, and the run at the deck's TSTOP = 0.02 s; --stop 0.099875 takes all"
     )
     assert told in command(*words).err
     for stop in ("20m", "0.099875"):
