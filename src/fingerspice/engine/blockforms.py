@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.engine.blockrows import PAD
 
 # Number of steps in a block, and of step lengths: that of a sample and its halvings.
@@ -23,7 +23,9 @@ LEVEL, REFERENCE, PEAK_U, PEAK_F, ERROR_U, ERROR_F, MARGIN, Z, PEAK_Q, ERROR_Q, 
 MEAN_Q = 13
 # Part of a change that a sweep is expected to leave, over the areas' distance from the reference; 0 if not known.
 RATIO = 14
-N_CONTROL = 15
+# How blocks are corrected: 0 not at all, 1 with the response to kinks, 2 by the quadrature error, too.
+CORRECTING = 15
+N_CONTROL = 16
 # Entries of a row of `Course.checks`, one for each step length. What is left, once it is corrected, of the errors seen
 # of gap voltage and force, and of a stack's charge, as shares; what is left of the error of nodes and of a network's
 # charges, and of the gap voltage within a network's steps, over the error seen of the gap voltage (V/V and C/V). The
@@ -171,7 +173,8 @@ class Room(NamedTuple):
     them, and then their changes; `further` is what a further sweep would change in the modes, and `own` their
     quadrature error.
     `kept` are the gap voltages, forces, nodes' voltages and charges of a solution to be checked, and at last gap
-    voltages and forces within some of its steps.
+    voltages and forces within some of its steps. `where` are the numbers of the steps that cross 0 V, and `crossed`,
+    `jumps` and `bends` describe their kinks, one after the other.
     `kinked` is no row: the weights (m, T) of the kink of each drive in each mode.
     """
 
@@ -200,6 +203,7 @@ class Room(NamedTuple):
     changed_pulse: FloatArray
     further: FloatArray
     kept: FloatArray
+    where: IntArray
 
 
 def new_room(modes: int, drives: int, projections: int, shown: Shown) -> Room:
@@ -211,7 +215,7 @@ def new_room(modes: int, drives: int, projections: int, shown: Shown) -> Room:
         np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)),
         np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
         np.zeros(n), np.zeros((modes, drives)), np.zeros((drives, n)), np.zeros((drives, n)), np.zeros(n),
-        np.zeros((modes, n)), np.zeros((kept, n)),
+        np.zeros((modes, n)), np.zeros((kept, n)), np.zeros(n, np.int64),
     )  # fmt: skip
 
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit_inline, jit_rows
 
 
 @jit_rows
-def crosses(n: int, u: FloatArray) -> bool:
-    """Whether some step crosses 0 V."""
-    found = False
+def find_crossings(n: int, u: FloatArray, where: IntArray) -> int:
+    """Find the steps that cross 0 V: their numbers into `where`, and how many there are."""
+    m = 0
     for i in range(n):
-        found |= u[i] * u[i + 1] < 0.0
-    return found
+        where[m] = i
+        m += 1 if u[i] * u[i + 1] < 0.0 else 0
+    return m
 
 
 @jit_inline
@@ -38,11 +39,20 @@ def crossing(a: float, m: float, b: float) -> tuple[float, float, float]:
 
 @jit_rows
 def kink_rows(
-    n: int, u: FloatArray, middle: FloatArray, at: FloatArray, jump: FloatArray, bend: FloatArray
+    m: int, where: IntArray, u: FloatArray, middle: FloatArray, at: FloatArray, jump: FloatArray,
+    bend: FloatArray,
 ) -> None:  # fmt: skip
-    """`crossing` of every step."""
-    for i in range(n):
-        at[i], jump[i], bend[i] = crossing(u[i], middle[i], u[i + 1])
+    """`crossing` of m steps, whose numbers are `where`."""
+    for j in range(m):
+        i = where[j]
+        at[j], jump[j], bend[j] = crossing(u[i], middle[i], u[i + 1])
+
+
+@jit_rows
+def add_where(m: int, where: IntArray, part: FloatArray, out: FloatArray) -> None:
+    """Add `part` (m,) to the entries `where` of a row."""
+    for j in range(m):
+        out[where[j]] += part[j]
 
 
 @jit_inline
@@ -61,36 +71,38 @@ def after_kink(y: float, rest: float) -> tuple[float, float]:
 
 
 @jit_rows
-def add_kinks(
-    n: int, z: float, weight: FloatArray, at: FloatArray, jump: FloatArray, bend: FloatArray, x: FloatArray,
-    out: FloatArray,
+def respond_to_kinks(
+    m: int, where: IntArray, z: float, weight: FloatArray, at: FloatArray, jump: FloatArray, bend: FloatArray,
+    x: FloatArray, part: FloatArray,
 ) -> None:  # fmt: skip
-    """Add a mode's exact response to what |u| x has besides a smooth part, less that to its parabola.
+    """A mode's exact response to what |u| x has besides a smooth part, less that to its parabola, in m steps `where`.
 
     From the fraction `at` of a step on, that part is jump (t (1 + bend t) x_at + t^2 slope), with t the fraction since
     then and x (n + 1,) a straight line. The parabola passes through 0, 1/2 and 1. The mode has rate z per step;
     `weight` (2,) are its quadrature weights at 1/2 and 1.
     """
     by_middle, by_end = weight[0], weight[1]
-    for i in range(n):
-        rest, early, slope = 1.0 - at[i], max(0.5 - at[i], 0.0), x[i + 1] - x[i]
+    for j in range(m):
+        i = where[j]
+        rest, early, slope = 1.0 - at[j], max(0.5 - at[j], 0.0), x[i + 1] - x[i]
         ramp, square = after_kink(z * rest, rest)
         ramp -= by_middle * early + by_end * rest
         square -= by_middle * early * early + by_end * rest * rest
-        there = x[i] + at[i] * slope
-        out[i] += jump[i] * (there * ramp + (slope + bend[i] * there) * square)
+        there = x[i] + at[j] * slope
+        part[j] = jump[j] * (there * ramp + (slope + bend[j] * there) * square)
 
 
 @jit_rows
 def kink_at(
-    n: int, kink: float, place: float, at: FloatArray, jump: FloatArray, bend: FloatArray, x: FloatArray,
-    out: FloatArray,
+    m: int, where: IntArray, kink: float, place: float, at: FloatArray, jump: FloatArray, bend: FloatArray,
+    x: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Subtract from interpolation errors at fraction `place` of the steps the known part that the kink causes."""
-    m, r = 4.0 * place * (1.0 - place), place * (2.0 * place - 1.0)
-    for i in range(n):
-        since, early, rest, slope = max(place - at[i], 0.0), max(0.5 - at[i], 0.0), 1.0 - at[i], x[i + 1] - x[i]
-        ramp = since - m * early - r * rest
-        square = since * since - m * early * early - r * rest * rest
-        there = x[i] + at[i] * slope
-        out[i] -= kink * jump[i] * (there * ramp + (slope + bend[i] * there) * square)
+    """Subtract from interpolation errors at fraction `place` of steps the known part that kinks in m of them cause."""
+    half, last = 4.0 * place * (1.0 - place), place * (2.0 * place - 1.0)
+    for j in range(m):
+        i = where[j]
+        since, early, rest, slope = max(place - at[j], 0.0), max(0.5 - at[j], 0.0), 1.0 - at[j], x[i + 1] - x[i]
+        ramp = since - half * early - last * rest
+        square = since * since - half * early * early - last * rest * rest
+        there = x[i] + at[j] * slope
+        out[i] -= kink * jump[j] * (there * ramp + (slope + bend[j] * there) * square)

@@ -22,7 +22,8 @@ and the response to it is known in closed form, too.
 The error is measured at 1/4 and 3/4 of every step, where the interpolation error of the parabola gives the quadrature
 error (Boole's rule against Simpson's). If it is too large, the block is repeated with steps half as long. Otherwise
 the modes are corrected by the error seen (`correct` in `engine.blockerror`), and the share of it that is left is
-measured on some blocks (`engine.blockcheck`).
+measured on some blocks (`engine.blockcheck`). In a stack whose charge is not wanted, blocks go without the corrections
+for kinks and quadrature as long as the errors seen are small enough to be left and stated.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_within
 from fingerspice.engine.blockcharge import inverse_area_at
 from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, PLACES, Form, Room
-from fingerspice.engine.blockkinks import add_kinks, crosses, kink_at, kink_rows
+from fingerspice.engine.blockkinks import add_where, find_crossings, kink_at, kink_rows, respond_to_kinks
 from fingerspice.engine.blockrows import (
     PAD,
     add,
@@ -205,30 +206,37 @@ def project_for_charge(form: Form, room: Room, r: int, level: int, n: int) -> No
 
 
 @jit_within
-def _find_kinks(form: Form, room: Room, n: int) -> None:
-    """Crossings of 0 V, and the jumps of the slope of |u| there.
+def find_kinks(form: Form, room: Room, n: int) -> int:
+    """Crossings of 0 V, and the jumps of the slope of |u| there; how many steps have one.
 
     Under `mobile` u is bent there, too. What it would be with the area at 0 V is not, and crosses 0 V at the same time.
     """
     if not form.mobile:
-        kink_rows(n, room.u, room.u_within[MIDDLE], room.crossed, room.jumps, room.bends)
-        return
+        count = find_crossings(n, room.u, room.where)
+        kink_rows(count, room.where, room.u, room.u_within[MIDDLE], room.crossed, room.jumps, room.bends)
+        return count
     share, middle = form.area0 * inverse_area_at(form, 0.0)[0], room.other[PAD:]
     of_two(n + 1, form.k_gap, room.s, share, room.end[0], room.slope)
     both_ends(n, 0.5 * form.k_gap, 0.5 * form.k_gap, room.s, middle)
     add(n, share, room.within[MIDDLE, 0], middle)
-    kink_rows(n, room.slope, middle, room.crossed, room.jumps, room.bends)
+    count = find_crossings(n, room.slope, room.where)
+    kink_rows(count, room.where, room.slope, middle, room.crossed, room.jumps, room.bends)
+    return count
 
 
 @jit_within
-def _kinks(form: Form, room: Room, r: int, level: int, h: float, n: int) -> None:
+def _add_kinks(form: Form, room: Room, r: int, level: int, h: float, n: int) -> None:
     """Add the response to the kink that the parabolas miss to `room.inc`."""
-    x = room.slope
-    _find_kinks(form, room, n)
+    x, part, count = room.slope, room.other[PAD:], find_kinks(form, room, n)
+    if count == 0:
+        return
     for k in range(form.rates.shape[1]):
         sum_of(n + 1, room.kinked[k], room.end[1:], x)
-        z, share = form.rates[r, k] * h, form.share[r, level, k]
-        add_kinks(n, z, share, room.crossed, room.jumps, room.bends, x, room.inc[k, PAD:])
+        respond_to_kinks(
+            count, room.where, form.rates[r, k] * h, form.share[r, level, k], room.crossed, room.jumps, room.bends, x,
+            part,
+        )  # fmt: skip
+        add_where(count, room.where, part, room.inc[k, PAD:])
 
 
 @jit_within
@@ -272,12 +280,14 @@ def ratio_of(form: Form, room: Room, r: int, n: int, margin: float, known: float
 
 @jit_within
 def relax(
-    form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int, tol: float, known: float
-) -> tuple[float, float, int]:
+    form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int, tol: float, known: float,
+    kinked: bool,
+) -> tuple[float, float, float, int]:  # fmt: skip
     """Solve n steps of length h from `room.w[:, 0]` and `room.g[:, 0]`, for the source in `room.s`.
 
-    `known` is as in `ratio_of`. Returns the change by the last sweep (V; inf if the sweeps do not converge), the least
-    distance to the fold, and the number of sweeps.
+    `known` is as in `ratio_of`, and `kinked` tells whether to add the response to kinks. Returns the change by the last
+    sweep (V; inf if the sweeps do not converge), its ratio to the one before if both follow sweeps with kinks (else
+    inf), the least distance to the fold, and the number of sweeps.
     """
     modes, drives = form.rates.shape[1], room.g.shape[0]
     for t in range(drives):
@@ -306,8 +316,8 @@ def relax(
             )  # fmt: skip
             if fades:
                 add(n, form.pulse[r, level, k], room.pulse, own)
-        if sweep >= KINKED and crosses(n, room.u):
-            _kinks(form, room, r, level, h, n)
+        if kinked and sweep >= KINKED:
+            _add_kinks(form, room, r, level, h, n)
         for k in range(modes):
             recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.w[k])
         newton = FIRST_NEWTON if sweep == 0 else NEWTON
@@ -319,27 +329,30 @@ def relax(
             scaled(n, -1.0, room.pulse, room.changed_pulse)
             _pulses(form, room, r, level, h, n)
         if sweep > 0 and not margin > LEAST_MARGIN:
-            return math.inf, margin, sweep
+            return math.inf, math.inf, margin, sweep
         if not abs(room.u[n]) < math.inf:
             # A NaN within the block has been carried to its end by the recursion.
-            return math.inf, margin, sweep
+            return math.inf, math.inf, margin, sweep
         change = change_of(n + 1, over, room.u, room.before) / over
         if sweep > 0:
             ratio = change / last if last > 0.0 else 0.0
             if not ratio < MOST_RATIO and change > tol:
-                return math.inf, margin, sweep
+                return math.inf, math.inf, margin, sweep
             if change * ratio_of(form, room, r, n, margin, known, ratio) <= LEFT * tol and sweep >= KINKED:
-                return change, margin, sweep
+                return change, ratio if sweep > KINKED else math.inf, margin, sweep
         last = change
-    return math.inf, margin, MOST_SWEEPS
+    return math.inf, math.inf, margin, MOST_SWEEPS
 
 
 @jit_within
-def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
-    """Error of the modes that each step adds, into `room.inc`: Boole's rule less Simpson's."""
-    crossing = crosses(n, room.u)
-    if crossing:
-        _find_kinks(form, room, n)
+def misfit(
+    form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int, kinked: bool
+) -> None:  # fmt: skip
+    """Error of the modes that each step adds, into `room.inc`: Boole's rule less Simpson's.
+
+    `kinked` tells whether the modes contain the response to kinks.
+    """
+    count = find_kinks(form, room, n) if kinked else 0
     for k in range(form.rates.shape[1]):
         scaled(n, 0.0, room.s, room.inc[k, PAD:])
     for place in (FIRST_QUARTER, LAST_QUARTER):
@@ -358,8 +371,9 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
                 faded = form.faded[r, level]
                 shown = weight[0] + weight[1] * math.exp(-0.5 * faded) + weight[2] * math.exp(-faded)
                 add(n, shown - math.exp(-faded * PLACES[place]), room.pulse, off)
-            if crossing:
-                kink_at(n, kink[t], PLACES[place], room.crossed, room.jumps, room.bends, room.end[1 + t], off)
+            kink_at(
+                count, room.where, kink[t], PLACES[place], room.crossed, room.jumps, room.bends, room.end[1 + t], off
+            )  # fmt: skip
     early, late = room.g_within[FIRST_QUARTER], room.g_within[LAST_QUARTER]
     for k in range(form.rates.shape[1]):
         by = form.defect[r, level, k]

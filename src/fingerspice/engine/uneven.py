@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockcharge import Charges, Course
@@ -35,7 +35,7 @@ from fingerspice.engine.blockforms import (
     Form,
     Room,
 )
-from fingerspice.engine.blockkinks import after_kink, crosses, kink_at, kink_rows
+from fingerspice.engine.blockkinks import add_where, after_kink, kink_at
 from fingerspice.engine.blockoutput import write_points, write_samples
 from fingerspice.engine.blockrows import (
     add_three,
@@ -59,6 +59,7 @@ from fingerspice.engine.relaxation import (
     MOST_SWEEPS,
     PARABOLA,
     drives_at,
+    find_kinks,
     keep_drives,
     look_at_ends,
     project_at_ends,
@@ -101,25 +102,19 @@ def _between(n: int, at: float, s: FloatArray, out: FloatArray) -> None:
 
 
 @jit_rows
-def _add_kinks(
-    n: int,
-    rate: float,
-    h: FloatArray,
-    c: FloatArray,
-    at: FloatArray,
-    jump: FloatArray,
-    bend: FloatArray,
-    x: FloatArray,
-    out: FloatArray,
-) -> None:
-    """As `blockrows.add_kinks`, for steps of different lengths with the weights c (3, n) of their parabolas."""
-    for i in range(n):
-        rest, early, slope = 1.0 - at[i], max(0.5 - at[i], 0.0), x[i + 1] - x[i]
+def _respond_to_kinks(
+    m: int, where: IntArray, rate: float, h: FloatArray, c: FloatArray, at: FloatArray, jump: FloatArray,
+    bend: FloatArray, x: FloatArray, part: FloatArray,
+) -> None:  # fmt: skip
+    """As `blockkinks.respond_to_kinks`, for steps of different lengths with the weights c (3, n) of their parabolas."""
+    for j in range(m):
+        i = where[j]
+        rest, early, slope = 1.0 - at[j], max(0.5 - at[j], 0.0), x[i + 1] - x[i]
         ramp, square = after_kink(rate * h[i] * rest, rest)
         ramp = h[i] * ramp - c[1, i] * early - c[2, i] * rest
         square = h[i] * square - c[1, i] * early * early - c[2, i] * rest * rest
-        there = x[i] + at[i] * slope
-        out[i] += jump[i] * (there * ramp + (slope + bend[i] * there) * square)
+        there = x[i] + at[j] * slope
+        part[j] = jump[j] * (there * ramp + (slope + bend[j] * there) * square)
 
 
 @jit_rows
@@ -174,14 +169,14 @@ def _relax(
             scaled(n, form.gain[r, k], steps.low, steps.forced_within[k])
             modes_into(n, 0, form.feed[r, k], room.g_within[MIDDLE], steps.forced_within[k])
             _increments(n, steps.parabola[k, END], steps.forced[k], steps.forced_within[k], room.inc[k])
-        if sweep >= KINKED and crosses(n, room.u):
-            kink_rows(n, room.u, room.u_within[MIDDLE], room.crossed, room.jumps, room.bends)
-            for k in range(modes):
-                sum_of(n + 1, room.kinked[k], room.end[1:], room.slope)
-                _add_kinks(
-                    n, form.rates[r, k], h, steps.parabola[k, END], room.crossed, room.jumps, room.bends, room.slope,
-                    room.inc[k],
-                )  # fmt: skip
+        count = find_kinks(form, room, n) if sweep >= KINKED else 0
+        for k in range(modes if count > 0 else 0):
+            sum_of(n + 1, room.kinked[k], room.end[1:], room.slope)
+            _respond_to_kinks(
+                count, room.where, form.rates[r, k], h, steps.parabola[k, END], room.crossed, room.jumps, room.bends,
+                room.slope, room.other,
+            )  # fmt: skip
+            add_where(count, room.where, room.other, room.inc[k])
         for k in range(modes):
             _pass(n, steps.decay[k, END], room.inc[k], room.w[k])
         if sweep >= KINKED:
@@ -205,9 +200,7 @@ def _relax(
 def _misfit(form: Form, room: Room, steps: Steps, r: int, kink: FloatArray, n: int, taps: int) -> float:
     """Error of the modes into `Room.own`, that of the gap voltage into `Room.before`, and the largest of that (V)."""
     modes = form.rates.shape[1]
-    bends = crosses(n, room.u)
-    if bends:
-        kink_rows(n, room.u, room.u_within[MIDDLE], room.crossed, room.jumps, room.bends)
+    count = find_kinks(form, room, n)
     for k in range(modes):
         scaled(n, 0.0, room.s, room.inc[k])
     for place in (FIRST_QUARTER, LAST_QUARTER):
@@ -217,8 +210,9 @@ def _misfit(form: Form, room: Room, steps: Steps, r: int, kink: FloatArray, n: i
             add_three(
                 n, -weight[0], room.g[t], -weight[1], room.g_within[MIDDLE, t], -weight[2], room.g[t, 1:], off
             )  # fmt: skip
-            if bends:
-                kink_at(n, kink[t], PLACES[place], room.crossed, room.jumps, room.bends, room.end[1 + t], off)
+            kink_at(
+                count, room.where, kink[t], PLACES[place], room.crossed, room.jumps, room.bends, room.end[1 + t], off
+            )  # fmt: skip
             for k in range(modes):
                 feed = form.feed[r, k, t]
                 _add_product(n, feed, steps.quarter[k, place - FIRST_QUARTER], off, room.inc[k])
@@ -308,7 +302,7 @@ def _check(
     control, m, sub, half = c.control, c.w.size, 1 << level, BLOCK >> (level + 1)
     errors, off, w, u = np.zeros(N_SHARES), np.zeros(N_SHARES), c.w.copy(), control[U_GAP]
     before = control.copy()
-    tol = OF_SWEEPS * seen
+    tol, found = OF_SWEEPS * seen, seen
     _load(times, values, at, count, sub, c.room, c.charges)
     begin_block(c, r, c.w, u)
     change, seen = _solve(c, steps, r, count * sub, tol, taps)
@@ -331,7 +325,7 @@ def _check(
         for k in range(m):
             w[k] = c.room.w[k, n]
         u = c.room.u[n]
-    note(c, level, closed, errors, off)
+    note(c, level, closed, found, errors, off)
     control[:] = before
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -45,6 +46,12 @@ def _fill(z: FloatArray, basis: FloatArray, until: float, out: FloatArray) -> No
                 out[i, a] += basis[a, j] * until ** (j + 1) * found[j]
 
 
+@lru_cache(maxsize=16)
+def _basis(nodes: tuple[float, ...]) -> FloatArray:
+    """Coefficients of the Lagrange polynomials of these nodes, shape (n_nodes, n_nodes)."""
+    return np.ascontiguousarray(np.linalg.inv(np.vander(nodes, increasing=True)).T)
+
+
 def weights(z: FloatArray, nodes: tuple[float, ...], until: float = 1.0) -> FloatArray:
     """Weights of values at `nodes` in the integral of exp(-z (until - x)) f(x) over [0, until], f their polynomial.
 
@@ -61,7 +68,6 @@ def weights(z: FloatArray, nodes: tuple[float, ...], until: float = 1.0) -> Floa
     -------
     ndarray, shape (*z.shape, n_nodes)
     """
-    basis = np.ascontiguousarray(np.linalg.inv(np.vander(nodes, increasing=True)).T)
     out = np.empty((z.size, len(nodes)))
-    _fill(np.ravel(z), basis, until, out)
+    _fill(np.ravel(z), _basis(nodes), until, out)
     return out.reshape(*z.shape, len(nodes))

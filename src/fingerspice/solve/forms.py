@@ -118,12 +118,12 @@ def weighted(
         pulse, *pulses = (feed[:, None, :, -1] * h * _pulse(z, faded, at) for at in (1.0, *PLACES))
     pulse_within = np.stack([np.einsum("rpk,rsk->rsp", taps, one) for one in pulses], axis=2)
     five = (0.0, 0.25, 0.5, 0.75, 1.0)
-    quarters = weights(z, five)[..., None, [1, 3]]
+    quarters, simpson = weights(z, five)[..., None, [1, 3]], weights(z, (0.0, 0.5, 1.0))
     return Form(
         rates=np.ascontiguousarray(rates), gain=np.ascontiguousarray(gain), decay=np.exp(-z),
-        source=by_step * weights(z, (0.0, 1.0)), drive=drives * weights(z, (0.0, 0.5, 1.0))[..., None, :],
+        source=by_step * weights(z, (0.0, 1.0)), drive=drives * simpson[..., None, :],
         feed=np.ascontiguousarray(feed), taps=np.ascontiguousarray(taps), tap_s=tap_s, within=inner, within_s=inner_s,
-        within_g=inner_g, share=np.ascontiguousarray(weights(z, (0.0, 0.5, 1.0))[..., 1:]), defect=drives * quarters,
+        within_g=inner_g, share=np.ascontiguousarray(simpson[..., 1:]), defect=drives * quarters,
         fast=fast, faded=faded, pulse=pulse, pulse_within=pulse_within, **others,
     )  # fmt: skip
 
