@@ -294,11 +294,13 @@ def _every(sub: int, count: int, x: FloatArray, out: FloatArray) -> None:
 
 
 @jit_within
-def write_samples(c: Course, r: int, sub: int, count: int, out: FloatArray) -> None:
-    """Write the outputs at the first `count` samples of a block; a sample has `sub` steps."""
+def write_samples(c: Course, r: int, sub: int, count: int, out: FloatArray, first: int) -> None:
+    """Write the outputs at the first `count` samples of a block, from number `first` on; a sample has `sub` steps."""
     form, room, shown, n = c.form, c.room, c.shown, count * sub
+    last = first + count
     for column in range(shown.k.size):
-        row = out[column] if sub == 1 else room.before
+        # A row of a row-major array is known to be contiguous, unlike one of a slice of that array.
+        row = out[column, first:last] if sub == 1 else room.before
         if form.mobile:
             scaled(n, 0.0, room.s, row)
             modes_into(n, 0, shown.columns[r, column], room.w, row)
@@ -309,11 +311,11 @@ def write_samples(c: Course, r: int, sub: int, count: int, out: FloatArray) -> N
             if form.bend.size > 0:
                 add(n, shown.bend[column], room.g[room.g.shape[0] - 1], row)
         if sub > 1:
-            _every(sub, count, row, out[column])
+            _every(sub, count, row, out[column, first:last])
     if shown.charge:
         current_block(c, r, n)
-        _every(sub, count, c.charges.z, out[shown.k.size])
-        _every(sub, count, c.charges.current, out[shown.k.size + 1])
+        _every(sub, count, c.charges.z, out[shown.k.size, first:last])
+        _every(sub, count, c.charges.current, out[shown.k.size + 1, first:last])
 
 
 @jit_within
@@ -337,7 +339,7 @@ def write_block(
             c.charges.t[i] = start + i * h
         write_points(c, r, n, slack, t_out, out, last)
     else:
-        write_samples(c, r, sub, count, out[:, first:last])
+        write_samples(c, r, sub, count, out, first)
     c.counters[OUTPUT] = last
 
 

@@ -264,7 +264,7 @@ def _write(c: Course, r: int, sub: int, count: int, t_out: FloatArray, out: Floa
     if last == first:
         return
     if aligned and last - first == count:
-        write_samples(c, r, sub, count, out[:, first:last])
+        write_samples(c, r, sub, count, out, first)
     else:
         write_points(c, r, n, slack, t_out, out, last)
     c.counters[OUTPUT] = last
