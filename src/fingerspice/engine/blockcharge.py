@@ -93,18 +93,18 @@ def new_charges() -> Charges:
 @jit_rows
 def _charge_rows(
     n: int, h: FloatArray, slow: FloatArray, area0: float, kink: float, s: FloatArray, u: FloatArray,
-    middle: FloatArray, ends: FloatArray, within: FloatArray, v: int, q: FloatArray, steps: FloatArray,
+    middle: FloatArray, ends: FloatArray, within: FloatArray, q: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
     """Charge gained in each step without c r G(u), its rates, and its error, into `steps` (`Charges`).
 
     The charge is that of Boole's rule, and its error is taken as the difference to Simpson's rule.
 
-    Rows v and v + 1 of `ends` (P, n) and `within` (3, P, n) are two voltages of the slowest layer: its part v, which
+    The last two rows of `ends` (P, n) and `within` (3, P, n) are two voltages of the slowest layer: its part v, which
     does not follow u, and the voltage that drives its leakage current (under `mobile` the modes' part of it alone). The
     displacement charge c A dv is exact with the area at the start of the step; the change of the area since then is
     integrated along the polynomial of v. `area0` is the reference area under `mobile`, 0 under `local`.
     """
-    mobile = area0 > 0.0
+    mobile, v = area0 > 0.0, ends.shape[0] - 2
     share, c, g_area, g_total = slow[slow.size - 4], slow[slow.size - 3], slow[slow.size - 2], slow[slow.size - 1]
     for i in range(n):
         s0, s4 = s[i], s[i + 1]
@@ -211,7 +211,7 @@ def charge_block(c: Course, r: int, n: int, of_seen: float, local: float, others
         area_rows(n, form.area, form.scale, form.shift, 0.0, room.u_within[place], own.q[1 + place])
     _charge_rows(
         n, own.h, slow, form.area0 if form.mobile else 0.0, c.shown.area_kink, room.s, room.u,
-        room.u_within[MIDDLE], room.end, room.within, v, own.q, own.steps,
+        room.u_within[MIDDLE], room.end, room.within, own.q, own.steps,
     )  # fmt: skip
     scaled(n + 1, 0.0, room.s, own.error)
     modes_into(n + 1, 0, c.shown.slow[r], room.own, own.error)
