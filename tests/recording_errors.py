@@ -3,10 +3,9 @@
 A recording is noise of a random band at a random rate, with or without an offset; a circuit is a stack of random
 layers, with either charge law, or with `--networks` such a finger behind an amplifier, beside a load or on a floating
 body, with the local law. It is run at each of `RTOLS`, and once at `TIGHT` by the `exponential` method, which
-gives the true errors of gap voltage, force, charge and node voltages. With `--without-charge` the runs have no charge,
-and their blocks are not corrected where errors are small.
+gives the true errors of gap voltage, force, charge and node voltages.
 
-Run: python tests/recording_errors.py [--recordings 100] [--first 0] [--networks] [--without-charge].
+Run: python tests/recording_errors.py [--recordings 100] [--first 0] [--networks].
 A recording is determined by its number alone.
 """
 
@@ -89,11 +88,8 @@ def draw(number: int, count: int = 600, network: bool = False) -> Recording:
     return Recording(number, kind, fs.parse_netlist("\n".join(text)), fs.Samples(values, rate, start), law)
 
 
-def judge(recording: Recording, charge: bool = True) -> list[Beside]:
-    """Stated and true errors of all quantities at all tolerances; none where the samples were not followed.
-
-    Without `charge` the charge is left out of the runs that are judged.
-    """
+def judge(recording: Recording) -> list[Beside]:
+    """Stated and true errors of all quantities at all tolerances; none where the samples were not followed."""
     samples = recording.samples
     stop = samples.start + (samples.values.size - 1.6) / samples.rate
     # Samples and other times.
@@ -103,7 +99,7 @@ def judge(recording: Recording, charge: bool = True) -> list[Beside]:
     def run(rtol: float, method: str) -> fs.Solution:
         return fs.simulate(
             recording.circuit, sources=samples, t_stop=stop, t_eval=t, charge_law=recording.law, rtol=rtol,
-            method=method, jumps="none", start="uncharged", throw=False, charge=charge,
+            method=method, jumps="none", start="uncharged", throw=False,
         )  # fmt: skip
 
     found = []
@@ -114,7 +110,7 @@ def judge(recording: Recording, charge: bool = True) -> list[Beside]:
             return []
         exact = run(TIGHT, "exponential")
     for rtol, one in runs.items():
-        for name in QUANTITIES if charge else (q for q in QUANTITIES if q != "q_source"):
+        for name in QUANTITIES:
             truth, values = (
                 np.column_stack(list(run.node_voltages.values())) if name == "v_nodes" else getattr(run, name)
                 for run in (exact, one)
@@ -132,12 +128,11 @@ def main() -> None:
     parser.add_argument("--recordings", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--networks", action="store_true")
-    parser.add_argument("--without-charge", action="store_true")
     given = parser.parse_args()
     found: list[Beside] = []
     not_followed = 0
     for number in range(given.first, given.first + given.recordings):
-        one = judge(draw(number, network=given.networks), not given.without_charge)
+        one = judge(draw(number, network=given.networks))
         not_followed += not one
         found += one
         for x in one:
@@ -147,8 +142,6 @@ def main() -> None:
     for name in QUANTITIES:
         for rtol in RTOLS:
             these = [x for x in found if x.quantity == name and x.rtol == rtol]
-            if not these:
-                continue
             ratios = np.array([x.ratio for x in these if x.ratio is not None])
             print(
                 f"{name:9} at {rtol:g}: {sum(x.covered for x in these)} of {len(these)} covered, "

@@ -185,13 +185,8 @@ def compare(c: Course, r: int, h: float, first: int, n: int, sub: int, errors: F
 
 
 @jit_within
-def note(
-    c: Course, level: int, closed: bool, found: float, seen: FloatArray, off: FloatArray
-) -> None:  # fmt: skip
-    """Note which shares of the errors `seen` the correction left, `off`; none if a solution was not `closed`.
-
-    `found` is the error of the gap voltage (V) for which the check was made.
-    """
+def note(c: Course, level: int, closed: bool, seen: FloatArray, off: FloatArray) -> None:
+    """Note which shares of the errors `seen` the correction left, `off`; none if a solution was not `closed`."""
     noted = c.checks[level]
     if closed:
         for kind in range(N_SHARES):
@@ -199,6 +194,6 @@ def note(
             if kind != OF_CHARGE or c.shown.charge:
                 share = max(share, LEAST_SHARE)
             noted[kind] = max(share, REMEMBERED * noted[kind]) if noted[CHECKED] > 0.0 else share
-        noted[CHECKED] = max(seen[OF_GAP], found, noted[CHECKED])
+        noted[CHECKED] = max(seen[OF_GAP], noted[CHECKED])
     noted[WAITED] = min(max(1.0, RARER * noted[WAITED]), MOST_WAIT)
     noted[UNTIL_CHECK] = noted[WAITED]

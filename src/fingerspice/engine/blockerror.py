@@ -117,16 +117,15 @@ def correct(c: Course, r: int, n: int) -> None:
 
 
 @jit_within
-def _respond(c: Course, r: int, level: int, n: int, corrected: bool) -> None:
-    """Response of the modes to the change of the drives, into `Room.further`, and to `Room.inc` unless `corrected`."""
+def further_sweep(c: Course, r: int, level: int, n: int) -> None:
+    """What a further sweep would change in the modes, into `Room.further`."""
     form, room = c.form, c.room
     fades = form.faded[r, level] > 0.0
     if fades:
         add(n, 1.0, room.pulse, room.changed_pulse)
     for k in range(c.w.size):
         inc = room.inc[k, PAD:]
-        if corrected:
-            scaled(n, 0.0, room.s, inc)
+        scaled(n, 0.0, room.s, inc)
         for t in range(room.g.shape[0]):
             by = form.drive[r, level, k, t]
             add_three(
@@ -139,33 +138,8 @@ def _respond(c: Course, r: int, level: int, n: int, corrected: bool) -> None:
 
 
 @jit_within
-def uncorrected_error(c: Course, r: int, level: int, n: int) -> float:
-    """Largest error of the first projection by quadrature and sweeps together, V, if neither is corrected.
-
-    That of the modes goes into `Room.own` and `Room.further`, and 1/A at the steps' ends into `Charges.q`.
-    """
-    room = c.room
-    for t in range(room.g.shape[0]):
-        add(n, 1.0, room.g_within[MIDDLE, t], room.changed_within[t])
-        add(n + 1, 1.0, room.g[t], room.changed[t])
-    _respond(c, r, level, n, False)
-    for k in range(c.w.size):
-        scaled(n + 1, 1.0, room.further[k], room.own[k])
-    add_to_all(n + 1, c.form.q0[r], room.z, c.charges.q[0])
-    largest = error_left(c, r, n)
-    scaled(n + 1, 1.0, room.slope, room.before)
-    return largest
-
-
-@jit_within
-def further_sweep(c: Course, r: int, level: int, n: int) -> None:
-    """What a further sweep would change in corrected modes, into `Room.further`."""
-    _respond(c, r, level, n, True)
-
-
-@jit_within
 def error_left(c: Course, r: int, n: int) -> float:
-    """Largest of the first projection of `Room.further`, which goes into `Room.slope`, V."""
+    """Largest change of the first projection by a further sweep, into `Room.slope`, V."""
     room = c.room
     scaled(n + 1, 0.0, room.s, room.slope)
     modes_into(n + 1, 0, c.form.taps[r, 0], room.further, room.slope)
@@ -191,18 +165,6 @@ def learn(
     # More sweeps do not reduce what the correction by the quadrature error changes.
     stays = local - left * change / (change + seen)
     return bool(stays <= LEFT * tol and ratio * strayed < MOST_RATIO)
-
-
-@jit_within
-def learn_most(c: Course, r: int, n: int, tol: float, change: float, ratio: float, found: float) -> None:
-    """As `learn`, where sweeps and quadrature have left the error `found` (V) together: the most that sweeps leave.
-
-    `ratio` is that of the last two changes.
-    """
-    strayed = largest_of(n + 1, c.room.z) / c.form.q0[r]
-    if change > SHOWING * tol and strayed > 0.0:
-        known, most = c.control[RATIO], max(CAUTION * min(found / change, ratio) / strayed, LEAST)
-        c.control[RATIO] = min(known, most) if known > 0.0 else most
 
 
 @jit_within

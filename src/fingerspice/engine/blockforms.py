@@ -23,9 +23,7 @@ LEVEL, REFERENCE, PEAK_U, PEAK_F, ERROR_U, ERROR_F, MARGIN, Z, PEAK_Q, ERROR_Q, 
 MEAN_Q = 13
 # Part of a change that a sweep is expected to leave, over the areas' distance from the reference; 0 if not known.
 RATIO = 14
-# How blocks are corrected: 0 not at all, 1 with the response to kinks, 2 by the quadrature error, too.
-CORRECTING = 15
-N_CONTROL = 16
+N_CONTROL = 15
 # Entries of a row of `Course.checks`, one for each step length. What is left, once it is corrected, of the errors seen
 # of gap voltage and force, and of a stack's charge, as shares; what is left of the error of nodes and of a network's
 # charges, and of the gap voltage within a network's steps, over the error seen of the gap voltage (V/V and C/V). The

@@ -18,14 +18,11 @@ from fingerspice.engine.blockerror import (
     error_left,
     further_sweep,
     learn,
-    learn_most,
     quadrature_error,
     refine,
-    uncorrected_error,
 )
 from fingerspice.engine.blockforms import (
     BLOCK,
-    CORRECTING,
     LEVEL,
     LEVELS,
     MARGIN,
@@ -54,12 +51,6 @@ from fingerspice.engine.relaxation import (
 
 # Codes returned by `march`.
 DONE, NOT_CLOSED, TOO_COARSE = range(3)
-# The most that `blockforms.CORRECTING` may be.
-MOST_CORRECTING = 2
-# Errors below this fraction of the one allowed are small enough to be left uncorrected.
-SMALL = 0.9
-# Fraction of the error allowed that sweeps may leave where they are suspected to be the reason for too large an error.
-LESS = 0.1
 
 
 @jit
@@ -128,58 +119,25 @@ def _sources(values: FloatArray, at: int, count: int, sub: int, s: FloatArray) -
 
 
 @jit_within
-def _solve(
-    c: Course, r: int, level: int, h: float, n: int, tol: float, kinked: bool
-) -> tuple[float, float, float, float]:  # fmt: skip
+def _solve(c: Course, r: int, level: int, h: float, n: int, tol: float) -> tuple[float, float, float, float]:
     """Solve a block of n steps of length h (s) from its start in `Room` on, under the source in `Room.s`.
 
-    Returns the change by the last sweep (V; inf if the sweeps do not converge), its ratio to the one before as `relax`
-    does, the least distance to the fold, and the ratio of an error of the gap voltage to one of the first projection.
-    `Room.inc` becomes the quadrature error that
-    each step adds; `kinked` tells whether to add the response to kinks.
+    Returns the change by the last sweep (V), the least distance to the fold, the quadrature error seen (V; both errors
+    inf if the sweeps do not converge), and the ratio of an error of the gap voltage to one of the first projection.
     """
     form, room = c.form, c.room
-    change, ratio, margin, sweeps = relax(form, room, r, level, h, c.shown.kink, n, tol, c.control[RATIO], kinked)
+    change, margin, sweeps = relax(form, room, r, level, h, c.shown.kink, n, tol, c.control[RATIO])
     c.counters[SWEEPS] += sweeps
     # An error of xi is one of the gap voltage, enlarged where the area at 0 V is smaller than the reference.
     magnified = steepness(form, 0.0)
     if not change < math.inf:
-        return change, ratio, margin, magnified
-    misfit(form, room, r, level, h, c.shown.kink, n, kinked)
+        return change, margin, math.inf, magnified
+    misfit(form, room, r, level, h, c.shown.kink, n)
     if form.mobile:
         area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
         # The gap voltage contains the state times 1/A, and a near fold magnifies its error.
         magnified = form.area0 * largest_of(n + 1, c.charges.q[0]) / margin
-    return change, ratio, margin, magnified
-
-
-@jit_within
-def _assess(
-    c: Course, r: int, level: int, n: int, tol: float, change: float, ratio: float, magnified: float, corrected: bool,
-) -> tuple[float, float, float, bool]:  # fmt: skip
-    """Errors of a solved block (quadrature seen, others left, all; V), and whether to solve it again.
-
-    The first blocks of a piece are not corrected, as long as their errors are small. Then blocks have the response to
-    kinks, and at last they are also corrected by the error seen, of which a share is left.
-    """
-    share = max(c.checks[level, OF_GAP], c.checks[level, WITHIN])
-    if not corrected:
-        seen = magnified * uncorrected_error(c, r, level, n)
-        local = (1.0 + share) * seen
-        again = not local <= SMALL * tol
-        if not again:
-            learn_most(c, r, n, tol, change, ratio, seen)
-        return seen, seen, local, again
-    seen, left = magnified * quadrature_error(c, r, level, n), 0.0
-    local, again = share * seen, False
-    if local <= tol:
-        correct(c, r, n)
-        further_sweep(c, r, level, n)
-        left = magnified * error_left(c, r, n)
-        local += left
-        # More sweeps leave less.
-        again = learn(c, r, n, tol, change, seen, left, local) and not local <= tol
-    return seen, left, local, again
+    return change, margin, magnified * quadrature_error(c, r, level, n), magnified
 
 
 @jit_within
@@ -203,19 +161,18 @@ def _finish(c: Course, r: int, level: int, h: float, n: int) -> None:
 
 @jit_within
 def _check(
-    c: Course, values: FloatArray, at: int, count: int, r: int, level: int, h: float, found: float, kinked: bool
+    c: Course, values: FloatArray, at: int, count: int, r: int, level: int, h: float, seen: float
 ) -> None:  # fmt: skip
-    """Solve `count` samples by steps of length h and half of it, and note what is left of errors as `found` (V)."""
+    """Solve `count` samples by steps of length h and half of it, and note what is left of errors such as `seen` (V)."""
     control, m, sub, half = c.control, c.w.size, 1 << level, BLOCK >> (level + 1)
     errors, off, w, u = np.zeros(N_SHARES), np.zeros(N_SHARES), c.w.copy(), control[U_GAP]
     before = control.copy()
-    tol = OF_SWEEPS * found
+    tol = OF_SWEEPS * seen
     _sources(values, at, count, sub, c.room.s)
     begin_block(c, r, c.w, u)
-    change, _, _, magnified = _solve(c, r, level, h, count * sub, tol, kinked)
+    change, _, seen, magnified = _solve(c, r, level, h, count * sub, tol)
     closed = change < math.inf
     if closed:
-        seen = magnified * quadrature_error(c, r, level, count * sub)
         _finish(c, r, level, h, count * sub)
         keep(c, r, h, count * sub, sub, seen, magnified, errors)
         control[:] = before
@@ -224,17 +181,16 @@ def _check(
         n = 2 * part * sub
         _sources(values, at + done, part, 2 * sub, c.room.s)
         begin_block(c, r, w, u)
-        change, _, _, _ = _solve(c, r, level + 1, 0.5 * h, n, tol, True)
+        change, _, _, _ = _solve(c, r, level + 1, 0.5 * h, n, tol)
         closed = change < math.inf
         if not closed:
             break
-        quadrature_error(c, r, level + 1, n)
         _finish(c, r, level + 1, 0.5 * h, n)
         compare(c, r, 0.5 * h, done * sub, n, 2 * sub, off)
         for k in range(m):
             w[k] = c.room.w[k, n]
         u = c.room.u[n]
-    note(c, level, closed, found, errors, off)
+    note(c, level, closed, errors, off)
     control[:] = before
 
 
@@ -249,10 +205,8 @@ def march(
     """
     c, values = borrow(c), borrow(values)
     form, room, control = c.form, c.room, c.control
-    # Where a block was checked last, none twice at a step length, and where its sweeps were told to leave less.
-    last, swept = (-1, 0), -1
-    # A charge adds up what is left of errors, and in a network errors may be larger within steps than at their ends.
-    control[CORRECTING] = MOST_CORRECTING if c.shown.charge or form.bend.size > 0 else 0.0
+    # Where a block was checked last: none is checked twice at a step length.
+    last = (-1, 0)
     while at < stop:
         level, r = int(control[LEVEL]), int(control[REFERENCE])
         sub = 1 << level
@@ -262,23 +216,20 @@ def march(
         begin_block(c, r, c.w, control[U_GAP])
         if change_reference(c, r):
             continue
-        correcting = int(control[CORRECTING]) if level == 0 else MOST_CORRECTING
-        change, ratio, margin, magnified = _solve(c, r, level, h, n, LESS * tol if at == swept else tol, correcting > 0)
-        seen, left, local, again = math.inf, 0.0, math.inf, False
-        if change < math.inf:
-            seen, left, local, again = _assess(
-                c, r, level, n, tol, change, ratio, magnified, correcting == MOST_CORRECTING
-            )
-        if again:
-            c.counters[REFUSED] += n
-            if correcting < MOST_CORRECTING:
-                # Sweeps may be the reason, and else quadrature.
-                control[CORRECTING] += 0.0 if at != swept else 1.0
-                control[RATIO] *= 2.0
-                swept = at
-            continue
+        change, margin, seen, magnified = _solve(c, r, level, h, n, tol)
+        left = 0.0
+        local = max(c.checks[level, OF_GAP], c.checks[level, WITHIN]) * seen
+        if local <= tol:
+            correct(c, r, n)
+            further_sweep(c, r, level, n)
+            left = magnified * error_left(c, r, n)
+            local += left
+            if learn(c, r, n, tol, change, seen, left, local) and not local <= tol:
+                # More sweeps leave less.
+                c.counters[REFUSED] += n
+                continue
         if (at, level) != last and is_due(c, level, n, seen, left, tol):
-            _check(c, values, at, count, r, level, h, seen, correcting > 0)
+            _check(c, values, at, count, r, level, h, seen)
             last = (at, level)
             continue
         if not local <= tol:

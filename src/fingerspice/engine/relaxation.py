@@ -22,8 +22,7 @@ and the response to it is known in closed form, too.
 The error is measured at 1/4 and 3/4 of every step, where the interpolation error of the parabola gives the quadrature
 error (Boole's rule against Simpson's). If it is too large, the block is repeated with steps half as long. Otherwise
 the modes are corrected by the error seen (`correct` in `engine.blockerror`), and the share of it that is left is
-measured on some blocks (`engine.blockcheck`). In a stack whose charge is not wanted, blocks go without the corrections
-for kinks and quadrature as long as the errors seen are small enough to be left and stated.
+measured on some blocks (`engine.blockcheck`).
 """
 
 from __future__ import annotations
@@ -280,14 +279,12 @@ def ratio_of(form: Form, room: Room, r: int, n: int, margin: float, known: float
 
 @jit_within
 def relax(
-    form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int, tol: float, known: float,
-    kinked: bool,
-) -> tuple[float, float, float, int]:  # fmt: skip
+    form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int, tol: float, known: float
+) -> tuple[float, float, int]:
     """Solve n steps of length h from `room.w[:, 0]` and `room.g[:, 0]`, for the source in `room.s`.
 
-    `known` is as in `ratio_of`, and `kinked` tells whether to add the response to kinks. Returns the change by the last
-    sweep (V; inf if the sweeps do not converge), its ratio to the one before if both follow sweeps with kinks (else
-    inf), the least distance to the fold, and the number of sweeps.
+    `known` is as in `ratio_of`. Returns the change by the last sweep (V; inf if the sweeps do not converge), the least
+    distance to the fold, and the number of sweeps.
     """
     modes, drives = form.rates.shape[1], room.g.shape[0]
     for t in range(drives):
@@ -316,7 +313,7 @@ def relax(
             )  # fmt: skip
             if fades:
                 add(n, form.pulse[r, level, k], room.pulse, own)
-        if kinked and sweep >= KINKED:
+        if sweep >= KINKED:
             _add_kinks(form, room, r, level, h, n)
         for k in range(modes):
             recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.w[k])
@@ -329,30 +326,25 @@ def relax(
             scaled(n, -1.0, room.pulse, room.changed_pulse)
             _pulses(form, room, r, level, h, n)
         if sweep > 0 and not margin > LEAST_MARGIN:
-            return math.inf, math.inf, margin, sweep
+            return math.inf, margin, sweep
         if not abs(room.u[n]) < math.inf:
             # A NaN within the block has been carried to its end by the recursion.
-            return math.inf, math.inf, margin, sweep
+            return math.inf, margin, sweep
         change = change_of(n + 1, over, room.u, room.before) / over
         if sweep > 0:
             ratio = change / last if last > 0.0 else 0.0
             if not ratio < MOST_RATIO and change > tol:
-                return math.inf, math.inf, margin, sweep
+                return math.inf, margin, sweep
             if change * ratio_of(form, room, r, n, margin, known, ratio) <= LEFT * tol and sweep >= KINKED:
-                return change, ratio if sweep > KINKED else math.inf, margin, sweep
+                return change, margin, sweep
         last = change
-    return math.inf, math.inf, margin, MOST_SWEEPS
+    return math.inf, margin, MOST_SWEEPS
 
 
 @jit_within
-def misfit(
-    form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int, kinked: bool
-) -> None:  # fmt: skip
-    """Error of the modes that each step adds, into `room.inc`: Boole's rule less Simpson's.
-
-    `kinked` tells whether the modes contain the response to kinks.
-    """
-    count = find_kinks(form, room, n) if kinked else 0
+def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
+    """Error of the modes that each step adds, into `room.inc`: Boole's rule less Simpson's."""
+    count = find_kinks(form, room, n)
     for k in range(form.rates.shape[1]):
         scaled(n, 0.0, room.s, room.inc[k, PAD:])
     for place in (FIRST_QUARTER, LAST_QUARTER):

@@ -302,7 +302,7 @@ def _check(
     control, m, sub, half = c.control, c.w.size, 1 << level, BLOCK >> (level + 1)
     errors, off, w, u = np.zeros(N_SHARES), np.zeros(N_SHARES), c.w.copy(), control[U_GAP]
     before = control.copy()
-    tol, found = OF_SWEEPS * seen, seen
+    tol = OF_SWEEPS * seen
     _load(times, values, at, count, sub, c.room, c.charges)
     begin_block(c, r, c.w, u)
     change, seen = _solve(c, steps, r, count * sub, tol, taps)
@@ -325,7 +325,7 @@ def _check(
         for k in range(m):
             w[k] = c.room.w[k, n]
         u = c.room.u[n]
-    note(c, level, closed, found, errors, off)
+    note(c, level, closed, errors, off)
     control[:] = before
 
 
