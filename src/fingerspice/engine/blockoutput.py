@@ -117,7 +117,7 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
     if jump > 0.0:
         early, rest, since = max(0.5 - zero, 0.0), 1.0 - zero, max(at - zero, 0.0)
         for k in range(w.size):
-            # The kink's correction as in `add_kinks`, but up to fraction `at` instead of the end of the step.
+            # The kink's correction as in `respond_to_kinks`, but up to fraction `at` instead of the end of the step.
             moments(form.rates[r, k] * h * at, found)
             one, two = at * at * found[1], at * at * at * found[2]
             by_middle, by_end = 4.0 * (one - two), 2.0 * two - one

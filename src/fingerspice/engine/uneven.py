@@ -142,6 +142,21 @@ def _look(form: Form, room: Room, steps: Steps, r: int, place: int, n: int, last
 
 
 @jit_within
+def _add_kinks(form: Form, room: Room, steps: Steps, h: FloatArray, r: int, n: int) -> None:
+    """As `relaxation._add_kinks`."""
+    count = find_kinks(form, room, n)
+    if count == 0:
+        return
+    for k in range(form.rates.shape[1]):
+        sum_of(n + 1, room.kinked[k], room.end[1:], room.slope)
+        _respond_to_kinks(
+            count, room.where, form.rates[r, k], h, steps.parabola[k, END], room.crossed, room.jumps, room.bends,
+            room.slope, room.other,
+        )  # fmt: skip
+        add_where(count, room.where, room.other, room.inc[k])
+
+
+@jit_within
 def _relax(
     form: Form, room: Room, steps: Steps, h: FloatArray, r: int, kink: FloatArray, n: int, tol: float, known: float
 ) -> tuple[float, int]:
@@ -169,14 +184,8 @@ def _relax(
             scaled(n, form.gain[r, k], steps.low, steps.forced_within[k])
             modes_into(n, 0, form.feed[r, k], room.g_within[MIDDLE], steps.forced_within[k])
             _increments(n, steps.parabola[k, END], steps.forced[k], steps.forced_within[k], room.inc[k])
-        count = find_kinks(form, room, n) if sweep >= KINKED else 0
-        for k in range(modes if count > 0 else 0):
-            sum_of(n + 1, room.kinked[k], room.end[1:], room.slope)
-            _respond_to_kinks(
-                count, room.where, form.rates[r, k], h, steps.parabola[k, END], room.crossed, room.jumps, room.bends,
-                room.slope, room.other,
-            )  # fmt: skip
-            add_where(count, room.where, room.other, room.inc[k])
+        if sweep >= KINKED:
+            _add_kinks(form, room, steps, h, r, n)
         for k in range(modes):
             _pass(n, steps.decay[k, END], room.inc[k], room.w[k])
         if sweep >= KINKED:
