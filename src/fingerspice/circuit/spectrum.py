@@ -88,7 +88,8 @@ def _recorded(wave: Waveform, t_stop: float) -> tuple[FloatArray, FloatArray] | 
     kept: tuple[float, tuple[FloatArray, FloatArray]] | None = wave.kept.get("spectrum")
     if kept is not None and kept[0] == t_stop:
         return kept[1]
-    count = min(last, 2 ** math.ceil(math.log2(_LEAST * wave.rate)), _MOST_SAMPLES)
+    # A power of two, as the Fourier transform of a number with a large prime factor takes many times as long.
+    count = min(2 ** int(math.log2(last)), 2 ** math.ceil(math.log2(_LEAST * wave.rate)), _MOST_SAMPLES)
     starts = np.unique(np.linspace(0, last - count, min(_PIECES, math.ceil(last / count))).astype(int))
     total = np.zeros(count // 2 + 1)
     for i in starts.tolist():

@@ -25,6 +25,7 @@ from fingerspice.physics.contact import N_PACKED
 from fingerspice.results.outcome import State
 from fingerspice.results.record import sided
 from fingerspice.solve.problem import Problem
+from fingerspice.solve.scenes import BEYOND_PEAK
 from fingerspice.solve.stackstate import StackState, from_stack
 from fingerspice.solve.track import as_recorded, on_branch, system_of
 
@@ -245,9 +246,16 @@ class Followed(Follower):
         return 4e-16 * held * (1.0 + int(course.counters[blockforms.STEPS]))
 
 
+def rounded_peak(peak: float) -> float:
+    """A peak (V) rounded up to one of four values an octave, so that recordings of about the same peak share forms."""
+    return 2.0 ** (math.ceil(4.0 * math.log2(peak)) / 4.0) if peak > 0.0 else 0.0
+
+
 def followed(problem: Problem, rtol: float) -> Followed | None:
-    """The scene prepared for recordings; None where no polynomial represents 1/A well enough."""
-    system = system_of(problem.scene, int(np.floor(np.log10(rtol))), ratio=REFERENCE_RATIO)
+    """The scene prepared for recordings with about its peak; None where no polynomial represents 1/A well enough."""
+    scene, decade = problem.scene, int(np.floor(np.log10(rtol)))
+    peak = rounded_peak(scene.u_peak)
+    system = system_of(scene, decade, BEYOND_PEAK * peak, REFERENCE_RATIO, peak)
     found = _area(system, AREA_SHARE * rtol)
     if found is None:
         return None

@@ -22,7 +22,7 @@ from fingerspice.engine.unevenweights import new_steps
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.refined import ClosedForm
-from fingerspice.solve.forms import Follower, followed
+from fingerspice.solve.forms import Follower, followed, rounded_peak
 from fingerspice.solve.marching import solve as solve_ordinary
 from fingerspice.solve.netforms import finger
 from fingerspice.solve.pieces import Piece, driving, pieces_of, spacing_of
@@ -42,7 +42,8 @@ LEAST_PEAK = 1e-3
 BEGINNINGS = (1.0, 0.03)
 # Error allowed in the piece that the ordinary engine integrates, relative to the error asked for.
 LED_SHARE = 0.03
-# Number of forms cached with a scene, of up to 0.2 MB each: one for each tolerance, sample spacing and thread.
+# Number of forms cached with a scene or a stack, of up to 0.2 MB each: one for each tolerance, sample spacing, peak and
+# thread.
 MOST_FORMS = 16
 
 
@@ -82,9 +83,8 @@ class March:
         self.least = max(held, LEAST_PEAK * problem.scene.u_peak * one.share)
 
     def _form(self, spacing: float) -> Form:
-        kept, decade = self.problem.scene.prepared, _decade(self.rtol)
-        key = ("form", decade, spacing, self.problem.charge, threading.get_ident())
-        form: Form = kept_with(kept, key, MOST_FORMS, partial(self.one.form, spacing))
+        kept, *key = _kept(self.problem, self.rtol)
+        form: Form = kept_with(kept, ("form", spacing, *key), MOST_FORMS, partial(self.one.form, spacing))
         return form
 
     def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
@@ -224,11 +224,19 @@ def _decade(rtol: float) -> float:
 
 def ready(problem: Problem, rtol: float) -> Follower | None:
     """The scene prepared for this method, cached by decade; None where it does not apply (see `forms`, `netforms`)."""
-    decade, kept = _decade(rtol), problem.scene.prepared
-    key = ("followed", decade, problem.charge, threading.get_ident())
+    kept, *key = _kept(problem, rtol)
     make = followed if problem.scene.stack is not None else finger
-    one: Follower | None = kept_with(kept, key, MOST_FORMS, partial(make, problem, decade))
+    one: Follower | None = kept_with(kept, ("followed", *key), MOST_FORMS, partial(make, problem, _decade(rtol)))
     return one
+
+
+def _kept(problem: Problem, rtol: float) -> tuple[Any, ...]:
+    """Where preparations for a problem are cached, and the key; a stack's hold for all sources of about its peak."""
+    scene = problem.scene
+    key = _decade(rtol), problem.charge, threading.get_ident()
+    if scene.stack is None:
+        return scene.prepared, *key
+    return scene.stack.kept, scene.charge_law, rounded_peak(scene.u_peak), *key
 
 
 def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None) -> Run | None:

@@ -31,6 +31,8 @@ FREEZING_SHARE = 0.3
 LEAST_PEAK = 1e-300
 # Gap voltage (V) that an area's curve covers if the sources' peak is unknown; over a tiny range it would be constant.
 PEAK_UNKNOWN = 1.0
+# Range of an area's curve over the source's peak: the voltage of discharging layers adds to the gap's share of a jump.
+BEYOND_PEAK = 1.3
 # Gap voltage (V) that an area's curve covers under current sources, which do not bound it; beyond the curve, the
 # contact equations are solved at each evaluation.
 DRIVEN_BY_CURRENT = 300.0
@@ -212,8 +214,8 @@ def _scene(circuit: Circuit, law: str, area: str | float, stop: float, skin: Fre
     fixed, mode = _fixed_areas(network, area)
     whole = network.stack is not None
     u_peak = sum(_largest_voltage(waveform, stop, whole) for waveform in network.waveforms[: network.n_voltage])
-    # The voltage of discharging layers adds to the gap's share of a jump, so the curve covers more than the peak.
-    top = 1.3 * u_peak + (DRIVEN_BY_CURRENT if len(network.sources) > network.n_voltage else 0.0) or PEAK_UNKNOWN
+    by_current = DRIVEN_BY_CURRENT if len(network.sources) > network.n_voltage else 0.0
+    top = BEYOND_PEAK * u_peak + by_current or PEAK_UNKNOWN
     model = None if network.stack is None else _model(network.stack, law, fixed[0], top)
     return Scene(network, law, mode, fixed, u_peak, top, model, skin)
 

@@ -117,15 +117,20 @@ def _prepare(scene: Scene, decade: int, u_top: float) -> Prepared:
     )  # fmt: skip
 
 
-def system_of(scene: Scene, decade: int, u_top: float = 0.0, ratio: float = LEVEL_RATIO) -> System:
-    """The modal system of a scene for tolerances of a decade, with neighbouring reference areas in at most `ratio`."""
+def system_of(
+    scene: Scene, decade: int, u_top: float = 0.0, ratio: float = LEVEL_RATIO, u_peak: float = 0.0
+) -> System:  # fmt: skip
+    """The modal system of a scene for tolerances of a decade, with neighbouring reference areas in at most `ratio`.
+
+    The area curve reaches `u_top` (V) and the reference areas `u_peak` (V) if these are above 0.
+    """
     model, (contact,) = model_of(scene), scene.network.contacts
     assert scene.stack is not None
     if u_top > 0.0:
         assert contact is not None
         model = model._replace(curve=contact.curve(u_top))
     stress = 0.0 if contact is None else float(contact.stress(1.0))
-    u_max, n = max(scene.u_peak, u_top), model.gap.size
+    u_max, n = u_peak or max(scene.u_peak, u_top), model.gap.size
     nodes = scene.network.nodes[:, : n + 1] * np.append(scene.turn, 1.0)
     u_range = area_range(model, u_max)
     return build_system(model, area_error(decade), u_range, scene.stack.grouping, nodes, stress, ratio)
