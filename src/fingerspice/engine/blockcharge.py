@@ -24,6 +24,7 @@ from fingerspice.engine.blockforms import (
     MIDDLE,
     PEAK_Q,
     PLACES,
+    SPAN,
     Form,
     Room,
     Shown,
@@ -48,8 +49,9 @@ class Charges(NamedTuple):
     steps : ndarray, shape (5, n)
         Rate of the charge at 0, 1/2 and 1 of each step (A), the charge gained in the step, and the error of this gain
         (C).
-    z, current, error : ndarray, shape (n,)
-        Charge (C) and current (A) at the starts of the steps, and error of the slowest layer's voltage (V).
+    z, rest, current, error : ndarray, shape (n,)
+        Charge (C), that without c r G(u), and current (A) at the starts of the steps, and error of the slowest layer's
+        voltage (V).
     h, t : ndarray, shape (n,)
         Lengths of the steps, and their limits, s; the limits are needed for outputs within steps only.
     """
@@ -57,6 +59,7 @@ class Charges(NamedTuple):
     q: FloatArray
     steps: FloatArray
     z: FloatArray
+    rest: FloatArray
     current: FloatArray
     error: FloatArray
     h: FloatArray
@@ -67,6 +70,7 @@ class Course(NamedTuple):
     """State and scratch arrays of the loop along a recording.
 
     `w` (m,) are the modes, and the rows of `error` (2, m) the parts of their error that quadrature and sweeps leave;
+    `inner` are the rows at samples within steps of several (`engine.blockcoarse`), and
     `spare` (3, n) is scratch for single outputs; `engine.blockforms` lists the entries of `control`,
     `counters` and `checks` (LEVELS, 5).
     """
@@ -75,6 +79,7 @@ class Course(NamedTuple):
     form: Form
     shown: Shown
     room: Room
+    inner: Room
     charges: Charges
     spare: FloatArray
     w: FloatArray
@@ -87,13 +92,14 @@ class Course(NamedTuple):
 def new_charges() -> Charges:
     """Rows for one block, all zero."""
     n = BLOCK + 8
-    return Charges(np.zeros((4, n)), np.zeros((5, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n))
+    return Charges(np.zeros((4, n)), np.zeros((5, n)), *np.zeros((6, n)))
 
 
 @jit_rows
 def _charge_rows(
-    n: int, h: FloatArray, slow: FloatArray, area0: float, kink: float, s: FloatArray, u: FloatArray,
-    middle: FloatArray, ends: FloatArray, within: FloatArray, q: FloatArray, steps: FloatArray,
+    n: int, h: FloatArray, slow: FloatArray, area0: float, kink: float, s: FloatArray, bumped: float,
+    bumps: FloatArray, u: FloatArray, middle: FloatArray, ends: FloatArray, within: FloatArray, q: FloatArray,
+    steps: FloatArray,
 ) -> None:  # fmt: skip
     """Charge gained in each step without c r G(u), its rates, and its error, into `steps` (`Charges`).
 
@@ -102,7 +108,8 @@ def _charge_rows(
     The last two rows of `ends` (P, n) and `within` (3, P, n) are two voltages of the slowest layer: its part v, which
     does not follow u, and the voltage that drives its leakage current (under `mobile` the modes' part of it alone). The
     displacement charge c A dv is exact with the area at the start of the step; the change of the area since then is
-    integrated along the polynomial of v. `area0` is the reference area under `mobile`, 0 under `local`.
+    integrated along the polynomial of v. `area0` is the reference area under `mobile`, 0 under `local`; `bumped` is 1
+    where the source has the triangles `bumps` within the steps, else 0.
     """
     mobile, v = area0 > 0.0, ends.shape[0] - 2
     share, c, g_area, g_total = slow[slow.size - 4], slow[slow.size - 3], slow[slow.size - 2], slow[slow.size - 1]
@@ -117,9 +124,9 @@ def _charge_rows(
         if mobile:
             turn = 0.0
             l0 = share * s0 + area0 * l0 / a0
-            l1 = share * (0.75 * s0 + 0.25 * s4) + area0 * l1 / a1
-            l2 = share * (0.5 * s0 + 0.5 * s4) + area0 * l2 / a2
-            l3 = share * (0.25 * s0 + 0.75 * s4) + area0 * l3 / a3
+            l1 = share * (0.75 * s0 + 0.25 * s4 + bumped * bumps[1, i]) + area0 * l1 / a1
+            l2 = share * (0.5 * s0 + 0.5 * s4 + bumped * bumps[0, i]) + area0 * l2 / a2
+            l3 = share * (0.25 * s0 + 0.75 * s4 + bumped * bumps[2, i]) + area0 * l3 / a3
             l4 = share * s4 + area0 * l4 / a4
         r0 = (g_area * a0 + g_total) * l0
         r1 = (g_area * a1 + g_total) * l1
@@ -210,8 +217,9 @@ def charge_block(c: Course, r: int, n: int, of_seen: float, local: float, others
     for place in range(len(PLACES)):
         area_rows(n, form.area, form.scale, form.shift, 0.0, room.u_within[place], own.q[1 + place])
     _charge_rows(
-        n, own.h, slow, form.area0 if form.mobile else 0.0, c.shown.area_kink, room.s, room.u,
-        room.u_within[MIDDLE], room.end, room.within, own.q, own.steps,
+        n, own.h, slow, form.area0 if form.mobile else 0.0, c.shown.area_kink, room.s,
+        1.0 if c.control[SPAN] > 1.0 else 0.0, room.bumps, room.u, room.u_within[MIDDLE], room.end, room.within, own.q,
+        own.steps,
     )  # fmt: skip
     scaled(n + 1, 0.0, room.s, own.error)
     modes_into(n + 1, 0, c.shown.slow[r], room.own, own.error)
@@ -231,7 +239,7 @@ def charge_block(c: Course, r: int, n: int, of_seen: float, local: float, others
         at_rest, _ = inverse_area_at(form, 0.0)
         moved = abs(c.shown.area_kink) * at_rest * at_rest * form.area0 * local
     for i in range(n):
-        own.z[i] = z
+        own.z[i] = own.rest[i] = z
         z += own.steps[3, i]
         collected += own.current[i]
         layer = abs(own.error[i + 1]) + moved * abs(room.end[v + 1, i + 1])
@@ -245,6 +253,33 @@ def charge_block(c: Course, r: int, n: int, of_seen: float, local: float, others
     if not form.mobile:
         moved_rows(n + 1, c.shown.moved, form.scale, form.shift, room.u, own.current, own.z)
     control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q] = z, collected, worst, peak
+
+
+@jit_rows
+def _within_rows(
+    n: int, at: float, h: float, stored: FloatArray, steps: FloatArray, rest: FloatArray, v0: FloatArray, v: FloatArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """Charge without c r G(u) at fraction `at` of each step, where the part v of the slowest layer's voltage is known.
+
+    `stored` is c A at the start of the step, and the rates are integrated along their parabola.
+    """
+    a, b, e = 1.0 + at * (2.0 / 3.0 * at - 1.5), at * (2.0 - 4.0 / 3.0 * at), at * (2.0 / 3.0 * at - 0.5)
+    for i in range(n):
+        rates = a * steps[0, i] + b * steps[1, i] + e * steps[2, i]
+        out[i] = rest[i] + stored[i] * (v[i] - v0[i]) + h * at * rates
+
+
+@jit_within
+def charge_within(c: Course, at: float, n: int, out: FloatArray) -> None:
+    """Charge (C) at fraction `at` of the steps of a block, whose rows are in `Course.inner`."""
+    form, own, inner, v = c.form, c.charges, c.inner, c.form.tap_s.size - 2
+    held = c.model.slow[c.model.slow.size - 3]
+    for i in range(n):
+        own.error[i] = held * (form.area0 if form.mobile else 1.0 / own.q[0, i])
+    _within_rows(n, at, own.h[0], own.error, own.steps, own.rest, c.room.end[v], inner.end[v], out)
+    if not form.mobile:
+        moved_rows(n, c.shown.moved, form.scale, form.shift, inner.u, own.current, out)
 
 
 @jit
@@ -304,19 +339,22 @@ def current_at(
 
 @jit_rows
 def _current_rows(
-    n: int, slow: FloatArray, over_s: float, h: FloatArray, s: FloatArray, dv: FloatArray, v: FloatArray, q: FloatArray,
+    n: int, slow: FloatArray, over_s: float, slopes: FloatArray, dv: FloatArray, v: FloatArray, q: FloatArray,
     out: FloatArray,
 ) -> None:  # fmt: skip
-    """Right-hand limit of the current (A) at the start of each step, under `local`."""
+    """Right-hand limit of the current (A) in n places, under `local`."""
     c, g_area, g_total = slow[slow.size - 3], slow[slow.size - 2], slow[slow.size - 1]
     for i in range(n):
-        out[i] = (c * dv[i] + g_area * v[i] + (s[i + 1] - s[i]) / h[i] * over_s) / q[i] + g_total * v[i]
+        out[i] = (c * dv[i] + g_area * v[i] + slopes[i] * over_s) / q[i] + g_total * v[i]
 
 
 @jit_within
-def current_block(c: Course, r: int, n: int) -> None:
-    """Right-hand limit of the current (A) at the start of each step, into `Charges.current`."""
-    form, room, shown, own = c.form, c.room, c.shown, c.charges
+def current_block(c: Course, r: int, room: Room, n: int, slopes: FloatArray, q: FloatArray) -> None:
+    """Right-hand limit of the current (A) at one place of n steps, whose rows are in `room`, into `Charges.current`.
+
+    `slopes` (n,) are the source's (V/s), and q (n,) is 1/A.
+    """
+    form, shown, own = c.form, c.shown, c.charges
     m, drives = form.rates.shape[1], room.g.shape[0]
     if form.mobile:
         w, g = c.spare[0, :m], c.spare[1, :drives]
@@ -325,9 +363,9 @@ def current_block(c: Course, r: int, n: int) -> None:
                 w[k] = room.w[k, i]
             for t in range(drives):
                 g[t] = room.g[t, i]
-            own.current[i] = current_at(c, r, w, g, room.s[i], (room.s[i + 1] - room.s[i]) / own.h[i], room.u[i])
+            own.current[i] = current_at(c, r, w, g, room.s[i], slopes[i], room.u[i])
         return
-    share, by_g, by_s = c.spare[0, :m], c.spare[1, :drives], 0.0
+    share, by_g, by_s, dv = c.spare[0, :m], c.spare[1, :drives], 0.0, c.room.before
     for t in range(drives):
         by_g[t] = 0.0
     for k in range(m):
@@ -335,10 +373,7 @@ def current_block(c: Course, r: int, n: int) -> None:
         by_s += form.gain[r, k] * shown.slow[r, k]
         for t in range(drives):
             by_g[t] += shown.slow[r, k] * form.feed[r, k, t]
-    scaled(n, by_s, room.s, room.before)
-    modes_into(n, 0, share, room.w, room.before)
-    modes_into(n, 0, by_g, room.g, room.before)
-    _current_rows(
-        n, c.model.slow, 1.0 / c.model.s, own.h, room.s, room.before, room.end[form.tap_s.size - 1], own.q[0],
-        own.current,
-    )  # fmt: skip
+    scaled(n, by_s, room.s, dv)
+    modes_into(n, 0, share, room.w, dv)
+    modes_into(n, 0, by_g, room.g, dv)
+    _current_rows(n, c.model.slow, 1.0 / c.model.s, slopes, dv, room.end[form.tap_s.size - 1], q, own.current)

@@ -12,7 +12,7 @@ import math
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
-from fingerspice.engine.blockcharge import Course, charge_block
+from fingerspice.engine.blockcharge import Course, charge_block, inverse_area_at
 from fingerspice.engine.blockcheck import FORCE, gap_into, in_place
 from fingerspice.engine.blockforms import (
     CHECKED,
@@ -20,6 +20,7 @@ from fingerspice.engine.blockforms import (
     ERROR_Q,
     ERROR_U,
     ERROR_V,
+    GROWTH,
     LEVEL,
     MEAN_Q,
     MIDDLE,
@@ -27,8 +28,11 @@ from fingerspice.engine.blockforms import (
     OF_FORCE,
     OF_GAP,
     OF_NODES,
+    OF_ORDER,
+    ONE,
     PEAK_F,
     PEAK_U,
+    PLACES,
     RATIO,
     REFUSED,
     STEPS,
@@ -56,9 +60,9 @@ CAUTION, LEAST = 2.0, 0.01
 PARTS = 8
 # Below this share of the error allowed, changes show nothing but rounding.
 SHOWING = 1e-3
-# Steps twice as long are taken where their error, sixteen times as large, is expected to be below this fraction of the
-# one allowed.
-SPARE = 1.0
+# Steps twice as long are taken where their error is expected to be below this fraction of the one allowed. What is
+# known of its growth is forgotten by this factor in each block.
+SPARE, FORGETTING = 1.0, 0.97
 
 
 @jit_rows
@@ -255,8 +259,13 @@ def accept(
         n + 1, c.shown.stress, gap, c.charges.q[0], c.form.kappa, c.form.q0[r], checked[OF_FORCE], room.before,
         room.slope, room.crossed, room.jumps, room.bends,
     )  # fmt: skip
-    control[PEAK_U] = max(control[PEAK_U], largest_of(n + 1, gap))
+    peak = largest_of(n + 1, gap)
     control[PEAK_F] = max(control[PEAK_F], largest_of(n + 1, room.jumps))
+    if level < ONE:
+        for place in range(len(PLACES)):
+            peak = max(peak, largest_of(n, room.u_within[place]))
+        control[PEAK_F] = max(control[PEAK_F], c.shown.stress * peak * peak / inverse_area_at(c.form, peak)[0])
+    control[PEAK_U] = max(control[PEAK_U], peak)
     quadrature, others = checked[OF_GAP] * seen, left + magnified * carried
     within = max(checked[OF_GAP], checked[WITHIN]) * seen
     control[ERROR_U] = max(control[ERROR_U], within + others)
@@ -290,9 +299,22 @@ def refine(c: Course, level: int, most: int, n: int, local: float, tol: float) -
 
 
 @jit_within
-def coarsen(c: Course, level: int, seen: float, left: float, tol: float) -> None:
-    """Go to steps twice as long, if those would meet `tol`, after a block with these errors (V)."""
-    if level > 0:
-        share = max(c.checks[level, OF_GAP], c.checks[level - 1, OF_GAP] if c.checks[level - 1, CHECKED] > 0.0 else 0.0)
-        if 16.0 * share * seen + left < SPARE * tol:
-            c.control[LEVEL] = level - 1.0
+def learn_growth(c: Course, level: int, longer: float, seen: float) -> None:
+    """Learn how much larger the error seen of steps twice as long is, from the two errors of the same samples (V).
+
+    Only where the longer ones have several samples: halvings of a sample follow the order.
+    """
+    if level <= ONE and longer < math.inf and seen > 0.0:
+        c.checks[level, GROWTH] = max(c.checks[level, GROWTH], longer / seen)
+
+
+@jit_within
+def may_coarsen(c: Course, level: int, seen: float, left: float, tol: float) -> bool:
+    """Whether steps twice as long would meet `tol`, after a block with these errors (V)."""
+    if level > c.control[LEVEL]:
+        # At the end of a recording, steps are shorter than they need be.
+        return False
+    checks = c.checks
+    checks[level, GROWTH] = OF_ORDER + FORGETTING * (checks[level, GROWTH] - OF_ORDER)
+    share = max(checks[level, OF_GAP], checks[level - 1, OF_GAP] if checks[level - 1, CHECKED] > 0.0 else 0.0)
+    return bool(checks[level, GROWTH] * share * seen + left < SPARE * tol)

@@ -9,32 +9,68 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.engine.blockrows import PAD
 
-# Number of steps in a block, and of step lengths: that of a sample and its halvings.
-BLOCK, LEVELS = 256, 7
+# Number of steps in a block. Step lengths (levels): several samples, where those vary little, the longest first; then
+# one sample, with the number ONE, and its halvings.
+BLOCK, ONE, LEVELS = 256, 2, 9
 # Largest degree of the polynomial for 1/A.
 MOST_DEGREE = 28
 # Places of a step besides its ends: its middle, and the two at which the error is measured.
 PLACES = (0.5, 0.25, 0.75)
 MIDDLE, FIRST_QUARTER, LAST_QUARTER = 0, 1, 2
 
-# Entries of `control`: halvings of a sample, reference, and as in `engine.readout`.
+# Entries of `control`: step length, reference, and as in `engine.readout`.
 LEVEL, REFERENCE, PEAK_U, PEAK_F, ERROR_U, ERROR_F, MARGIN, Z, PEAK_Q, ERROR_Q, COLLECTED, U_GAP, ERROR_V = range(13)
 # Mean 1/A of the last block, 1/m^2; 0 before the first.
 MEAN_Q = 13
 # Part of a change that a sweep is expected to leave, over the areas' distance from the reference; 0 if not known.
 RATIO = 14
-N_CONTROL = 15
+# Number of samples in each step of the present block, 1 for halvings.
+SPAN = 15
+N_CONTROL = 16
 # Entries of a row of `Course.checks`, one for each step length. What is left, once it is corrected, of the errors seen
 # of gap voltage and force, and of a stack's charge, as shares; what is left of the error of nodes and of a network's
 # charges, and of the gap voltage within a network's steps, over the error seen of the gap voltage (V/V and C/V). The
-# largest of these (V), and the number of blocks until the next check, now and after the last one.
-OF_GAP, OF_FORCE, OF_NODES, OF_CHARGE, WITHIN, CHECKED, UNTIL_CHECK, WAITED = range(8)
-N_SHARES, N_CHECKS = 5, 8
+# largest of these (V), and the number of blocks until the next check, now and after the last one. How many times larger
+# the error seen may be with steps twice as long.
+OF_GAP, OF_FORCE, OF_NODES, OF_CHARGE, WITHIN, CHECKED, UNTIL_CHECK, WAITED, GROWTH = range(9)
+N_SHARES, N_CHECKS = 5, 9
+# By their order, errors grow by so much.
+OF_ORDER = 16.0
 # Share that is assumed at least, and before the first check.
 LEAST_SHARE, UNCHECKED = 0.02, 1.0
 # Entries of `counters`.
 OUTPUT, STEPS, REFUSED, SWEEPS = range(4)
 N_COUNTERS = 4
+
+
+class Coarse(NamedTuple):
+    """Weights of steps of several samples, for each of the `ONE` longest step lengths.
+
+    Within a step the source is the straight line between its ends and three triangles, whose tops are at `PLACES`; the
+    triangles are a quarter of the step wide to either side. A further index is the place within a step.
+
+    Attributes
+    ----------
+    bump : ndarray, shape (r, ONE, m, 3)
+        Contribution of the triangles to a mode at the end of a step.
+    bump_within : ndarray, shape (r, ONE, 3, P, 3)
+        The same to the projections at `PLACES`.
+    decay : ndarray, shape (r, ONE, 3, m)
+        From the start of a step to `PLACES`.
+    source, bump_to, drive, defect : ndarray, shape (r, ONE, 3, m, 2), (..., m, 3), (..., m, T, 3) and (..., m, T, 2)
+        As `Form.source`, `bump`, `Form.drive` and `Form.defect`, up to `PLACES`.
+    share : ndarray, shape (r, ONE, 3, m, 2)
+        As `Form.share`.
+    """
+
+    bump: FloatArray
+    bump_within: FloatArray
+    decay: FloatArray
+    source: FloatArray
+    bump_to: FloatArray
+    drive: FloatArray
+    defect: FloatArray
+    share: FloatArray
 
 
 class Form(NamedTuple):
@@ -78,6 +114,9 @@ class Form(NamedTuple):
         Its rate times the step length; 0 where that is too small.
     pulse, pulse_within : ndarray, shape (r, LEVELS, m) and (r, LEVELS, 3, P)
         What a part exp(-rate t) of N adds to the modes and to the projections, in place of the parabola through it.
+    coarse : Coarse
+    longest : int
+        The longest step length that is used: `ONE` in networks, else 0.
     """
 
     mobile: bool
@@ -107,6 +146,8 @@ class Form(NamedTuple):
     faded: FloatArray
     pulse: FloatArray
     pulse_within: FloatArray
+    coarse: Coarse
+    longest: int
 
 
 class Shown(NamedTuple):
@@ -173,10 +214,12 @@ class Room(NamedTuple):
     `kept` are the gap voltages, forces, nodes' voltages and charges of a solution to be checked, and at last gap
     voltages and forces within some of its steps. `where` are the numbers of the steps that cross 0 V, and `crossed`,
     `jumps` and `bends` describe their kinks, one after the other.
+    `bumps` are the heights (V) of the triangles of `Coarse`, in steps of several samples.
     `kinked` is no row: the weights (m, T) of the kink of each drive in each mode.
     """
 
     s: FloatArray
+    bumps: FloatArray
     s_within: FloatArray
     w: FloatArray
     own: FloatArray
@@ -209,12 +252,19 @@ def new_room(modes: int, drives: int, projections: int, shown: Shown) -> Room:
     n = BLOCK + PAD
     kept = 4 + shown.node.shape[1] + shown.flows + int(shown.charge)
     return Room(
-        np.zeros(n), np.zeros(n), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n),
-        np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)),
-        np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
-        np.zeros(n), np.zeros((modes, drives)), np.zeros((drives, n)), np.zeros((drives, n)), np.zeros(n),
-        np.zeros((modes, n)), np.zeros((kept, n)), np.zeros(n, np.int64),
+        np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)),
+        np.zeros(n), np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)),
+        np.zeros((3, drives, n)), np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
+        np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((modes, drives)), np.zeros((drives, n)), np.zeros((drives, n)),
+        np.zeros(n), np.zeros((modes, n)), np.zeros((kept, n)), np.zeros(n, np.int64),
     )  # fmt: skip
+
+
+def new_control() -> FloatArray:
+    """The entries of `control` at the start of a run."""
+    control = np.zeros(N_CONTROL)
+    control[MARGIN], control[LEVEL], control[SPAN] = 1.0, ONE, 1.0
+    return control
 
 
 def new_checks(shown: Shown) -> FloatArray:
@@ -222,6 +272,7 @@ def new_checks(shown: Shown) -> FloatArray:
     checks = np.zeros((LEVELS, N_CHECKS))
     checks[:, :N_SHARES] = UNCHECKED
     checks[:, WITHIN] = 0.0
+    checks[:, GROWTH] = OF_ORDER
     if shown.flows > 0:
         checks[:, OF_CHARGE] = UNCHECKED * shown.capacitance
     return checks

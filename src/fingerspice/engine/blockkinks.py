@@ -72,20 +72,21 @@ def after_kink(y: float, rest: float) -> tuple[float, float]:
 
 @jit_rows
 def respond_to_kinks(
-    m: int, where: IntArray, z: float, weight: FloatArray, at: FloatArray, jump: FloatArray, bend: FloatArray,
-    x: FloatArray, part: FloatArray,
+    m: int, where: IntArray, z: float, until: float, weight: FloatArray, at: FloatArray, jump: FloatArray,
+    bend: FloatArray, x: FloatArray, part: FloatArray,
 ) -> None:  # fmt: skip
     """A mode's exact response to what |u| x has besides a smooth part, less that to its parabola, in m steps `where`.
 
     From the fraction `at` of a step on, that part is jump (t (1 + bend t) x_at + t^2 slope), with t the fraction since
-    then and x (n + 1,) a straight line. The parabola passes through 0, 1/2 and 1. The mode has rate z per step;
-    `weight` (2,) are its quadrature weights at 1/2 and 1.
+    then and x (n + 1,) a straight line. The parabola passes through 0, 1/2 and 1. The mode has rate z per step. The
+    response is that at the fraction `until`; `weight` (2,) are the weights of 1/2 and 1 in the quadrature up to there.
     """
     by_middle, by_end = weight[0], weight[1]
     for j in range(m):
         i = where[j]
         rest, early, slope = 1.0 - at[j], max(0.5 - at[j], 0.0), x[i + 1] - x[i]
-        ramp, square = after_kink(z * rest, rest)
+        since = max(until - at[j], 0.0)
+        ramp, square = after_kink(z * since, since)
         ramp -= by_middle * early + by_end * rest
         square -= by_middle * early * early + by_end * rest * rest
         there = x[i] + at[j] * slope

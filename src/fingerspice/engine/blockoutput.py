@@ -12,6 +12,7 @@ from fingerspice.base.compiled import jit, jit_inline, jit_within
 from fingerspice.engine.blockcharge import (
     Course,
     bend_at,
+    charge_within,
     current_at,
     current_block,
     inverse_area_at,
@@ -19,7 +20,28 @@ from fingerspice.engine.blockcharge import (
     moved_with,
     steepness,
 )
-from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, OUTPUT, REFERENCE, U_GAP, Z
+from fingerspice.engine.blockcoarse import (
+    bump_at,
+    bump_response,
+    halved,
+    look_within,
+    place_at,
+    slopes_into,
+    span_of,
+    steps_of,
+)
+from fingerspice.engine.blockforms import (
+    FIRST_QUARTER,
+    LAST_QUARTER,
+    MIDDLE,
+    OUTPUT,
+    PLACES,
+    REFERENCE,
+    SPAN,
+    U_GAP,
+    Room,
+    Z,
+)
 from fingerspice.engine.blockkinks import crossing
 from fingerspice.engine.blockrows import (
     add,
@@ -28,7 +50,7 @@ from fingerspice.engine.blockrows import (
     of_source_and_modes,
     scaled,
 )
-from fingerspice.engine.relaxation import FIRST_NEWTON, look_at_ends
+from fingerspice.engine.relaxation import FIRST_NEWTON, find_kinks, look_at_ends
 from fingerspice.numerics.moments import moments
 
 # Fractions of a step at which checks compare what is within steps, in one of so many samples: after each sample, fast
@@ -54,7 +76,8 @@ def _crossing_of(c: Course, i: int) -> tuple[float, float, float]:
     if form.mobile:
         share = form.area0 * inverse_area_at(form, 0.0)[0]
         start = form.k_gap * room.s[i] + share * room.end[0, i]
-        middle = 0.5 * form.k_gap * (room.s[i] + room.s[i + 1]) + share * room.within[MIDDLE, 0, i]
+        bump, _ = bump_at(c, i, 0.5)
+        middle = form.k_gap * (0.5 * (room.s[i] + room.s[i + 1]) + bump) + share * room.within[MIDDLE, 0, i]
         stop = form.k_gap * room.s[i + 1] + share * room.end[0, i + 1]
     return crossing(start, middle, stop)
 
@@ -103,6 +126,7 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
         cubic, fourth = 128.0 / 3.0 * (1.5 * both + mostly_early), -128.0 / 3.0 * both
         forced = linear * found[1] + at * (square * found[2] + at * (cubic * found[3] + at * fourth * found[4]))
         w[k] = w[k] * math.exp(-z) + h * at * (whole * found[0] + at * forced)
+        w[k] += form.gain[r, k] * h * bump_response(c, i, at, form.rates[r, k] * h, found)
         if pulse != 0.0:
             # The parabola through the part of N that is exp(-rate t), and its response.
             shown = found[0] + at * (
@@ -199,7 +223,7 @@ def _gap_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, g: Fl
     The modes and drives there go into w and g.
     """
     form, room, model = c.form, c.room, c.model
-    source = room.s[i] + at * (room.s[i + 1] - room.s[i])
+    source = room.s[i] + at * (room.s[i + 1] - room.s[i]) + bump_at(c, i, at)[0]
     first, middle, last = (2.0 * at - 1.0) * (at - 1.0), 4.0 * at * (1.0 - at), at * (2.0 * at - 1.0)
     for t in range(g.size):
         g[t] = first * room.g[t, i] + middle * room.g_within[MIDDLE, t, i] + last * room.g[t, i + 1]
@@ -283,51 +307,83 @@ def write_points(c: Course, r: int, n: int, slack: float, t_out: FloatArray, out
             i += 1
         since = t_out[place] - t[i]
         at = 0.0 if since <= slack else min(since / h[i], 1.0)
-        _write_point(c, r, h[i], i, at, (s[i + 1] - s[i]) / h[i], out, place)
+        _write_point(c, r, h[i], i, at, (s[i + 1] - s[i] + bump_at(c, i, at)[1]) / h[i], out, place)
 
 
 @jit
-def _every(sub: int, count: int, x: FloatArray, out: FloatArray) -> None:
-    """Copy every entry of x that is at a sample: a sample has `sub` steps."""
+def _spread(step: int, to: int, count: int, x: FloatArray, out: FloatArray) -> None:
+    """Copy every entry of x at the distance `step` to entries of `out` at the distance `to`."""
     for j in range(count):
-        out[j] = x[j * sub]
+        out[j * to] = x[j * step]
 
 
 @jit_within
-def write_samples(c: Course, r: int, sub: int, count: int, out: FloatArray, first: int) -> None:
-    """Write the outputs at the first `count` samples of a block, from number `first` on; a sample has `sub` steps."""
-    form, room, shown, n = c.form, c.room, c.shown, count * sub
-    last = first + count
+def _column(c: Course, r: int, room: Room, column: int, n: int, q: FloatArray, row: FloatArray) -> None:
+    """A recorded voltage at one place of n steps, whose rows are in `room`, into `row`; q (n,) is 1/A."""
+    form, shown = c.form, c.shown
+    if form.mobile:
+        scaled(n, 0.0, room.s, row)
+        modes_into(n, 0, shown.columns[r, column], room.w, row)
+        for i in range(n):
+            row[i] = shown.k[column] * room.s[i] + form.area0 * q[i] * row[i]
+    else:
+        of_source_and_modes(n, shown.k[column], room.s, shown.columns[r, column], room.w, row)
+        if form.bend.size > 0:
+            add(n, shown.bend[column], room.g[room.g.shape[0] - 1], row)
+
+
+@jit_within
+def _write_within(c: Course, r: int, level: int, j: int, n: int, kinks: int, out: FloatArray, first: int) -> None:
+    """Write the outputs at sample j of each of n steps of several samples, from number `first` on.
+
+    `kinks` of the steps have one.
+    """
+    shown, row, span, place = c.shown, c.room.slope, span_of(level), place_at(j, span_of(level))
+    count = (n - 1) * span + 1
+    look_within(c, r, level, place, n, kinks)
+    for column in range(shown.k.size):
+        _column(c, r, c.inner, column, n, c.inner.before, row)
+        _spread(1, span, n, row, out[column, first : first + count])
+    if shown.charge:
+        charge_within(c, PLACES[place], n, row)
+        _spread(1, span, n, row, out[shown.k.size, first : first + count])
+        slopes_into(c, n, j, row)
+        current_block(c, r, c.inner, n, row, c.inner.before)
+        _spread(1, span, n, c.charges.current, out[shown.k.size + 1, first : first + count])
+
+
+@jit_within
+def write_samples(c: Course, r: int, level: int, count: int, out: FloatArray, first: int) -> None:
+    """Write the outputs at the first `count` samples of a block, from number `first` on."""
+    room, shown, n, sub, span = c.room, c.shown, steps_of(level, count), halved(level), span_of(level)
+    last, own = first + count, c.charges
     for column in range(shown.k.size):
         # A row of a row-major array is known to be contiguous, unlike one of a slice of that array.
-        row = out[column, first:last] if sub == 1 else room.before
-        if form.mobile:
-            scaled(n, 0.0, room.s, row)
-            modes_into(n, 0, shown.columns[r, column], room.w, row)
-            for i in range(n):
-                row[i] = shown.k[column] * room.s[i] + form.area0 * c.charges.q[0, i] * row[i]
-        else:
-            of_source_and_modes(n, shown.k[column], room.s, shown.columns[r, column], room.w, row)
-            if form.bend.size > 0:
-                add(n, shown.bend[column], room.g[room.g.shape[0] - 1], row)
-        if sub > 1:
-            _every(sub, count, row, out[column, first:last])
+        whole = sub == 1 and span == 1
+        row = out[column, first:last] if whole else room.before
+        _column(c, r, room, column, n, own.q[0], row)
+        if not whole:
+            _spread(sub, span, count // span, row, out[column, first:last])
     if shown.charge:
-        current_block(c, r, n)
-        _every(sub, count, c.charges.z, out[shown.k.size, first:last])
-        _every(sub, count, c.charges.current, out[shown.k.size + 1, first:last])
+        slopes_into(c, n, 0, room.slope)
+        current_block(c, r, room, n, room.slope, own.q[0])
+        _spread(sub, span, count // span, own.z, out[shown.k.size, first:last])
+        _spread(sub, span, count // span, own.current, out[shown.k.size + 1, first:last])
+    kinks = find_kinks(c.form, room, level, n) if span > 1 else 0
+    for j in range(1, span):
+        _write_within(c, r, level, j, n, kinks, out, first + j)
 
 
 @jit_within
 def write_block(
-    c: Course, r: int, sub: int, count: int, h: float, start: float, t_out: FloatArray, out: FloatArray
+    c: Course, r: int, level: int, count: int, h: float, start: float, t_out: FloatArray, out: FloatArray
 ) -> None:  # fmt: skip
     """Write the outputs of a block of `count` samples from its start (s) on, without those at its very end."""
-    shown, n, first = c.shown, count * sub, c.counters[OUTPUT]
+    shown, n, first = c.shown, steps_of(level, count), c.counters[OUTPUT]
     slack = 8e-16 * (abs(start) + n * h)
     end, size, last = start + n * h - slack, t_out.size, first + count
     aligned = last <= size and t_out[last - 1] < end and (last == size or t_out[last] >= end)
-    aligned = aligned and largest_off(count, start, sub * h, t_out[first:last]) <= slack
+    aligned = aligned and largest_off(count, start, h * n / count, t_out[first:last]) <= slack
     if not aligned:
         last = first
         while last < size and t_out[last] < end:
@@ -339,7 +395,7 @@ def write_block(
             c.charges.t[i] = start + i * h
         write_points(c, r, n, slack, t_out, out, last)
     else:
-        write_samples(c, r, sub, count, out, first)
+        write_samples(c, r, level, count, out, first)
     c.counters[OUTPUT] = last
 
 
@@ -351,6 +407,7 @@ def write_end(c: Course, value: float, slope: float, t_out: FloatArray, out: Flo
     for k in range(c.w.size):
         room.w[k, 0] = c.w[k]
     room.s[0] = room.s[1] = value
+    c.control[SPAN] = 1.0
     room.u[0] = c.control[U_GAP]
     look_at_ends(form, room, r, 1, FIRST_NEWTON)
     c.charges.z[0] = c.control[Z]

@@ -11,24 +11,35 @@ from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.blockcharge import Course, steepness
 from fingerspice.engine.blockcheck import OF_SWEEPS, compare, is_due, keep, note
+from fingerspice.engine.blockcoarse import (
+    fitting,
+    halved,
+    is_smooth,
+    load_source,
+    may_be_longer,
+    most_samples,
+    span_of,
+    steps_of,
+)
 from fingerspice.engine.blockerror import (
     accept,
-    coarsen,
     correct,
     error_left,
     further_sweep,
     learn,
+    learn_growth,
+    may_coarsen,
     quadrature_error,
     refine,
 )
 from fingerspice.engine.blockforms import (
-    BLOCK,
     LEVEL,
     LEVELS,
     MARGIN,
     MEAN_Q,
     N_SHARES,
     OF_GAP,
+    ONE,
     RATIO,
     REFERENCE,
     REFUSED,
@@ -104,23 +115,9 @@ def jump(c: Course, to: float) -> bool:
     return not math.isnan(c.control[U_GAP])
 
 
-@jit
-def _sources(values: FloatArray, at: int, count: int, sub: int, s: FloatArray) -> None:
-    """The source's values at the ends of steps, `sub` of which make a sample's length."""
-    if sub == 1:
-        for j in range(count + 1):
-            s[j] = values[at + j]
-        return
-    for j in range(count):
-        here = values[at + j]
-        for i in range(sub):
-            s[j * sub + i] = here + (i / sub) * (values[at + j + 1] - here)
-    s[count * sub] = values[at + count]
-
-
 @jit_within
 def _solve(c: Course, r: int, level: int, h: float, n: int, tol: float) -> tuple[float, float, float, float]:
-    """Solve a block of n steps of length h (s) from its start in `Room` on, under the source in `Room.s`.
+    """Solve a block of n steps of length h (s) from its start in `Room` on, under the source in `Room`.
 
     Returns the change by the last sweep (V), the least distance to the fold, the quadrature error seen (V; both errors
     inf if the sweeps do not converge), and the ratio of an error of the gap voltage to one of the first projection.
@@ -164,29 +161,29 @@ def _check(
     c: Course, values: FloatArray, at: int, count: int, r: int, level: int, h: float, seen: float
 ) -> None:  # fmt: skip
     """Solve `count` samples by steps of length h and half of it, and note what is left of errors such as `seen` (V)."""
-    control, m, sub, half = c.control, c.w.size, 1 << level, BLOCK >> (level + 1)
+    control, m, n, half = c.control, c.w.size, steps_of(level, count), most_samples(level + 1)
     errors, off, w, u = np.zeros(N_SHARES), np.zeros(N_SHARES), c.w.copy(), control[U_GAP]
     before = control.copy()
     tol = OF_SWEEPS * seen
-    _sources(values, at, count, sub, c.room.s)
+    load_source(c, values, at, count, level)
     begin_block(c, r, c.w, u)
-    change, _, seen, magnified = _solve(c, r, level, h, count * sub, tol)
+    change, _, seen, magnified = _solve(c, r, level, h, n, tol)
     closed = change < math.inf
     if closed:
-        _finish(c, r, level, h, count * sub)
-        keep(c, r, h, count * sub, sub, seen, magnified, errors)
+        _finish(c, r, level, h, n)
+        keep(c, r, h, n, halved(level), seen, magnified, errors)
         control[:] = before
     for done in range(0, count if closed else 0, half):
         part = min(half, count - done)
-        n = 2 * part * sub
-        _sources(values, at + done, part, 2 * sub, c.room.s)
+        n = steps_of(level + 1, part)
+        load_source(c, values, at + done, part, level + 1)
         begin_block(c, r, w, u)
         change, _, _, _ = _solve(c, r, level + 1, 0.5 * h, n, tol)
         closed = change < math.inf
         if not closed:
             break
         _finish(c, r, level + 1, 0.5 * h, n)
-        compare(c, r, 0.5 * h, done * sub, n, 2 * sub, off)
+        compare(c, r, 0.5 * h, steps_of(level, done), n, halved(level + 1), off)
         for k in range(m):
             w[k] = c.room.w[k, n]
         u = c.room.u[n]
@@ -205,18 +202,24 @@ def march(
     """
     c, values = borrow(c), borrow(values)
     form, room, control = c.form, c.room, c.control
-    # Where a block was checked last: none is checked twice at a step length.
-    last = (-1, 0)
+    # Where a block was checked last: none is checked twice at a step length. The same of the last one refused, and the
+    # error it showed (V).
+    last, refused = (-1, 0), (-1, 0, 0.0)
     while at < stop:
-        level, r = int(control[LEVEL]), int(control[REFERENCE])
-        sub = 1 << level
-        h, count = spacing / sub, min(BLOCK >> level, stop - at)
-        n = count * sub
-        _sources(values, at, count, sub, room.s)
+        r, level = int(control[REFERENCE]), fitting(int(control[LEVEL]), stop - at)
+        h, span = spacing * span_of(level) / halved(level), span_of(level)
+        count = min(most_samples(level), (stop - at) // span * span)
+        n = steps_of(level, count)
+        load_source(c, values, at, count, level)
+        if not is_smooth(c, n):
+            control[LEVEL] = level + 1.0
+            continue
         begin_block(c, r, c.w, control[U_GAP])
         if change_reference(c, r):
             continue
         change, margin, seen, magnified = _solve(c, r, level, h, n, tol)
+        if refused[0] == at and refused[1] + 1 == level:
+            learn_growth(c, level, refused[2], seen)
         left = 0.0
         local = max(c.checks[level, OF_GAP], c.checks[level, WITHIN]) * seen
         if local <= tol:
@@ -236,6 +239,7 @@ def march(
             if level + 1 == LEVELS or margin <= LEAST_MARGIN:
                 return TOO_COARSE if change < math.inf else NOT_CLOSED
             refine(c, level, LEVELS - 1, n, local, tol)
+            refused = (at, level, seen)
             continue
         control[MARGIN] = min(control[MARGIN], margin)
         for k in range(c.w.size):
@@ -245,7 +249,8 @@ def march(
         if c.shown.charge:
             project_for_charge(form, room, r, level, n)
         accept(c, r, level, n, seen, left, magnified, left / max(change + seen, left) if left > 0.0 else 0.0)
-        write_block(c, r, sub, count, h, start + at * spacing, t_out, out)
+        write_block(c, r, level, count, h, start + at * spacing, t_out, out)
         at += count
-        coarsen(c, level, seen, left, tol)
+        if level > form.longest and may_coarsen(c, level, seen, left, tol) and (level > ONE or may_be_longer(c, n)):
+            control[LEVEL] = level - 1.0
     return DONE

@@ -34,11 +34,12 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_within
 from fingerspice.engine.blockcharge import inverse_area_at
-from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, PLACES, Form, Room
+from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, ONE, PLACES, Form, Room
 from fingerspice.engine.blockkinks import add_where, find_crossings, kink_at, kink_rows, respond_to_kinks
 from fingerspice.engine.blockrows import (
     PAD,
     add,
+    add_bumps,
     add_three,
     add_two,
     area_rows,
@@ -133,6 +134,8 @@ def _project(form: Form, room: Room, r: int, level: int, place: int, n: int, p: 
     modes_into(n, 0, form.within[r, level, place, p], room.w, x)
     if form.faded[r, level] > 0.0:
         add(n, form.pulse_within[r, level, place, p], room.pulse, x)
+    if level < ONE:
+        add_bumps(n, form.coarse.bump_within[r, level, place, p], room.bumps, x)
 
 
 @jit_within
@@ -157,6 +160,11 @@ def _project_three(form: Form, room: Room, r: int, level: int, place: int, n: in
         add(n, by_pulse[0], room.pulse, x)
         add(n, by_pulse[1], room.pulse, y)
         add(n, by_pulse[2], room.pulse, z)
+    if level < ONE:
+        by_bumps = form.coarse.bump_within[r, level, place]
+        add_bumps(n, by_bumps[0], room.bumps, x)
+        add_bumps(n, by_bumps[1], room.bumps, y)
+        add_bumps(n, by_bumps[2], room.bumps, z)
 
 
 @jit_within
@@ -170,6 +178,8 @@ def _look(form: Form, room: Room, r: int, level: int, place: int, n: int, newton
         _project(form, room, r, level, place, n, p)
     if form.mobile:
         both_ends(n, 1.0 - PLACES[place], PLACES[place], room.s, room.s_within)
+        if level < ONE:
+            add(n, 1.0, room.bumps[place], room.s_within)
     return _drives(
         form, form.q0[r], n, newton, room.s_within, room.within[place], room.u_within[place], room.z, room.slope, g
     )  # fmt: skip
@@ -205,7 +215,7 @@ def project_for_charge(form: Form, room: Room, r: int, level: int, n: int) -> No
 
 
 @jit_within
-def find_kinks(form: Form, room: Room, n: int) -> int:
+def find_kinks(form: Form, room: Room, level: int, n: int) -> int:
     """Crossings of 0 V, and the jumps of the slope of |u| there; how many steps have one.
 
     Under `mobile` u is bent there, too. What it would be with the area at 0 V is not, and crosses 0 V at the same time.
@@ -217,6 +227,8 @@ def find_kinks(form: Form, room: Room, n: int) -> int:
     share, middle = form.area0 * inverse_area_at(form, 0.0)[0], room.other[PAD:]
     of_two(n + 1, form.k_gap, room.s, share, room.end[0], room.slope)
     both_ends(n, 0.5 * form.k_gap, 0.5 * form.k_gap, room.s, middle)
+    if level < ONE:
+        add(n, form.k_gap, room.bumps[MIDDLE], middle)
     add(n, share, room.within[MIDDLE, 0], middle)
     count = find_crossings(n, room.slope, room.where)
     kink_rows(count, room.where, room.slope, middle, room.crossed, room.jumps, room.bends)
@@ -226,14 +238,14 @@ def find_kinks(form: Form, room: Room, n: int) -> int:
 @jit_within
 def _add_kinks(form: Form, room: Room, r: int, level: int, h: float, n: int) -> None:
     """Add the response to the kink that the parabolas miss to `room.inc`."""
-    x, part, count = room.slope, room.other[PAD:], find_kinks(form, room, n)
+    x, part, count = room.slope, room.other[PAD:], find_kinks(form, room, level, n)
     if count == 0:
         return
     for k in range(form.rates.shape[1]):
         sum_of(n + 1, room.kinked[k], room.end[1:], x)
         respond_to_kinks(
-            count, room.where, form.rates[r, k] * h, form.share[r, level, k], room.crossed, room.jumps, room.bends, x,
-            part,
+            count, room.where, form.rates[r, k] * h, 1.0, form.share[r, level, k], room.crossed, room.jumps, room.bends,
+            x, part,
         )  # fmt: skip
         add_where(count, room.where, part, room.inc[k, PAD:])
 
@@ -297,8 +309,9 @@ def relax(
     charged = room.u[0] - form.k_gap * room.s[0]
     for i in range(n + 1):
         room.u[i] = room.before[i] = form.k_gap * room.s[i] + charged
-    for i in range(n):
-        room.u_within[MIDDLE, i] = 0.5 * (room.u[i] + room.u[i + 1])
+    both_ends(n, 0.5, 0.5, room.u, room.u_within[MIDDLE])
+    if level < ONE:
+        add(n, form.k_gap, room.bumps[MIDDLE], room.u_within[MIDDLE])
     for k in range(modes):
         for t in range(drives):
             room.kinked[k, t] = h * form.feed[r, k, t] * kink[t]
@@ -313,6 +326,8 @@ def relax(
             )  # fmt: skip
             if fades:
                 add(n, form.pulse[r, level, k], room.pulse, own)
+            if level < ONE:
+                add_bumps(n, form.coarse.bump[r, level, k], room.bumps, own)
         if sweep >= KINKED:
             _add_kinks(form, room, r, level, h, n)
         for k in range(modes):
@@ -344,7 +359,7 @@ def relax(
 @jit_within
 def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
     """Error of the modes that each step adds, into `room.inc`: Boole's rule less Simpson's."""
-    count = find_kinks(form, room, n)
+    count = find_kinks(form, room, level, n)
     for k in range(form.rates.shape[1]):
         scaled(n, 0.0, room.s, room.inc[k, PAD:])
     for place in (FIRST_QUARTER, LAST_QUARTER):
@@ -352,6 +367,9 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
             weight = PARABOLA[place]
             both_ends(n, weight[0], weight[2], room.u, room.u_within[place])
             add(n, weight[1], room.u_within[MIDDLE], room.u_within[place])
+            if level < ONE:
+                add(n, form.k_gap, room.bumps[place], room.u_within[place])
+                add(n, -form.k_gap * weight[1], room.bumps[MIDDLE], room.u_within[place])
         _look(form, room, r, level, place, n, NEWTON)
         for t in range(room.g.shape[0]):
             off, weight = room.g_within[place, t], PARABOLA[place]

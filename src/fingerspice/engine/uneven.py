@@ -15,15 +15,16 @@ from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockcharge import Charges, Course
 from fingerspice.engine.blockcheck import OF_SWEEPS, compare, is_due, keep, note
-from fingerspice.engine.blockerror import accept, coarsen, correct, error_left, learn, refine
+from fingerspice.engine.blockcoarse import halved, most_samples
+from fingerspice.engine.blockerror import accept, correct, error_left, learn, may_coarsen, refine
 from fingerspice.engine.blockforms import (
-    BLOCK,
     FIRST_QUARTER,
     LAST_QUARTER,
     LEVEL,
     MIDDLE,
     N_SHARES,
     OF_GAP,
+    ONE,
     OUTPUT,
     PLACES,
     RATIO,
@@ -67,8 +68,8 @@ from fingerspice.engine.relaxation import (
 )
 from fingerspice.engine.unevenweights import END, EVERY_PLACE, Steps, weigh
 
-# Largest number of halvings of a step.
-MOST_HALVINGS = 4
+# The shortest step length: four halvings of the distance of two points.
+SHORTEST = ONE + 4
 
 
 @jit_rows
@@ -144,7 +145,7 @@ def _look(form: Form, room: Room, steps: Steps, r: int, place: int, n: int, last
 @jit_within
 def _add_kinks(form: Form, room: Room, steps: Steps, h: FloatArray, r: int, n: int) -> None:
     """As `relaxation._add_kinks`."""
-    count = find_kinks(form, room, n)
+    count = find_kinks(form, room, ONE, n)
     if count == 0:
         return
     for k in range(form.rates.shape[1]):
@@ -209,7 +210,7 @@ def _relax(
 def _misfit(form: Form, room: Room, steps: Steps, r: int, kink: FloatArray, n: int, taps: int) -> float:
     """Error of the modes into `Room.own`, that of the gap voltage into `Room.before`, and the largest of that (V)."""
     modes = form.rates.shape[1]
-    count = find_kinks(form, room, n)
+    count = find_kinks(form, room, ONE, n)
     for k in range(modes):
         scaled(n, 0.0, room.s, room.inc[k])
     for place in (FIRST_QUARTER, LAST_QUARTER):
@@ -261,9 +262,10 @@ def _load(times: FloatArray, values: FloatArray, at: int, count: int, sub: int, 
 
 
 @jit_within
-def _write(c: Course, r: int, sub: int, count: int, t_out: FloatArray, out: FloatArray) -> None:
+def _write(c: Course, r: int, level: int, count: int, t_out: FloatArray, out: FloatArray) -> None:
     """Write the outputs of a block, without those at its very end."""
-    n, first, t = count * sub, c.counters[OUTPUT], c.charges.t
+    sub, first, t = halved(level), c.counters[OUTPUT], c.charges.t
+    n = count * sub
     slack = 8e-16 * abs(t[n])
     last, aligned = first, True
     while last < t_out.size and t_out[last] < t[n] - slack:
@@ -273,7 +275,7 @@ def _write(c: Course, r: int, sub: int, count: int, t_out: FloatArray, out: Floa
     if last == first:
         return
     if aligned and last - first == count:
-        write_samples(c, r, sub, count, out, first)
+        write_samples(c, r, level, count, out, first)
     else:
         write_points(c, r, n, slack, t_out, out, last)
     c.counters[OUTPUT] = last
@@ -308,7 +310,7 @@ def _check(
     seen: float, taps: int,
 ) -> None:  # fmt: skip
     """As `recording._check`."""
-    control, m, sub, half = c.control, c.w.size, 1 << level, BLOCK >> (level + 1)
+    control, m, sub, half = c.control, c.w.size, halved(level), most_samples(level + 1)
     errors, off, w, u = np.zeros(N_SHARES), np.zeros(N_SHARES), c.w.copy(), control[U_GAP]
     before = control.copy()
     tol = OF_SWEEPS * seen
@@ -352,8 +354,8 @@ def march(
     taps = form.tap_s.size if c.shown.charge else 1 + drives
     while at < stop:
         level, r = int(control[LEVEL]), int(control[REFERENCE])
-        sub = 1 << level
-        count = min(BLOCK >> level, stop - at)
+        sub = halved(level)
+        count = min(most_samples(level), stop - at)
         n = count * sub
         _load(times, values, at, count, sub, room, c.charges)
         begin_block(c, r, c.w, control[U_GAP])
@@ -376,9 +378,9 @@ def march(
             last = (at, level)
             continue
         if not local <= tol:
-            if level == MOST_HALVINGS:
+            if level == SHORTEST:
                 return TOO_COARSE if change < math.inf else NOT_CLOSED
-            refine(c, level, MOST_HALVINGS, n, local, tol)
+            refine(c, level, SHORTEST, n, local, tol)
             continue
         for k in range(c.w.size):
             passed = 1.0
@@ -390,7 +392,8 @@ def march(
             for p in range(1 + drives, taps):
                 project_at_ends(form, room, r, n + 1, p)
         accept(c, r, level, n, seen, left, 1.0, left / max(change + seen, left) if left > 0.0 else 0.0)
-        _write(c, r, sub, count, t_out, out)
+        _write(c, r, level, count, t_out, out)
         at += count
-        coarsen(c, level, seen, left, tol)
+        if level > ONE and may_coarsen(c, level, seen, left, tol):
+            control[LEVEL] = level - 1.0
     return DONE

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,7 @@ from numpy.polynomial.polynomial import polyval
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine import blockforms
 from fingerspice.engine.blockcharge import Course, new_charges
-from fingerspice.engine.blockforms import LEVELS, PLACES, Form
+from fingerspice.engine.blockforms import LEVELS, ONE, PLACES, Coarse, Form
 from fingerspice.engine.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.numerics.moments import weights
@@ -35,6 +36,8 @@ AREA_SHARE = 0.003
 REFERENCE_RATIO = 1.015
 # Time constants in a step from which on a fast mode is taken apart from the parabola, which resolves slower ones.
 FADED = 5.0
+# Nodes of the rules, in a step.
+SIMPSON, BOOLE = (0.0, 0.5, 1.0), (0.0, 0.25, 0.5, 0.75, 1.0)
 # Matrix from values at Chebyshev nodes to the Chebyshev coefficients of the antiderivative of their interpolant.
 _POINTS = 40
 _AT = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
@@ -88,7 +91,7 @@ def form_of(system: System, area: FloatArray, spacing: float) -> Form:
     return weighted(
         system.rates, system.gain, feed, np.concatenate(taps, axis=1), np.array(tap_s), spacing, mobile=model.mobile,
         q0=system.q0, area=area, scale=system.scale, shift=-system.lo * system.scale - 1.0, k_gap=model.k_gap,
-        area0=model.area0, kappa=0.0, bend=np.zeros(0), bent=np.zeros(0),
+        area0=model.area0, kappa=0.0, bend=np.zeros(0), bent=np.zeros(0), longest=0,
     )  # fmt: skip
 
 
@@ -97,7 +100,7 @@ def weighted(
     fast: int = -1, **others: Any,
 ) -> Form:  # fmt: skip
     """The form with these parts and `others` (see `Form`), and the weights that follow from them for a spacing (s)."""
-    h = spacing / 2.0 ** np.arange(LEVELS)[:, None]
+    h = spacing * 2.0 ** (ONE - np.arange(LEVELS)[:, None])
     z = rates[:, None, :] * h
     by_step = gain[:, None, :, None] * h[..., None]
     drives = feed[:, None, :, :, None] * h[..., None, None]
@@ -106,7 +109,7 @@ def weighted(
         own = taps[:, None] * np.exp(-z * at)[:, :, None]
         of_s = np.einsum("rpk,rskj->rspj", taps, by_step * weights(z, (0.0, 1.0), at))
         of_s += tap_s[:, None] * np.array([1.0 - at, at])
-        of_g = np.einsum("rpk,rsktj->rsptj", taps, drives * weights(z, (0.0, 0.5, 1.0), at)[..., None, :])
+        of_g = np.einsum("rpk,rsktj->rsptj", taps, drives * weights(z, SIMPSON, at)[..., None, :])
         return own, of_s, of_g
 
     inner, inner_s, inner_g = (
@@ -118,14 +121,40 @@ def weighted(
     if faded.any():
         pulse, *pulses = (feed[:, None, :, -1] * h * _pulse(z, faded, at) for at in (1.0, *PLACES))
     pulse_within = np.stack([np.einsum("rpk,rsk->rsp", taps, one) for one in pulses], axis=2)
-    five = (0.0, 0.25, 0.5, 0.75, 1.0)
-    quarters, simpson = weights(z, five)[..., None, [1, 3]], weights(z, (0.0, 0.5, 1.0))
+    quarters, simpson = weights(z, BOOLE)[..., None, [1, 3]], weights(z, SIMPSON)
     return Form(
         rates=np.ascontiguousarray(rates), gain=np.ascontiguousarray(gain), decay=np.exp(-z),
         source=by_step * weights(z, (0.0, 1.0)), drive=drives * simpson[..., None, :],
         feed=np.ascontiguousarray(feed), taps=np.ascontiguousarray(taps), tap_s=tap_s, within=inner, within_s=inner_s,
         within_g=inner_g, share=np.ascontiguousarray(simpson[..., 1:]), defect=drives * quarters,
-        fast=fast, faded=faded, pulse=pulse, pulse_within=pulse_within, **others,
+        fast=fast, faded=faded, pulse=pulse, pulse_within=pulse_within,
+        coarse=_coarse(z[:, :ONE], by_step[:, :ONE], drives[:, :ONE], taps, tap_s), **others,
+    )  # fmt: skip
+
+
+def _coarse(z: FloatArray, by_step: FloatArray, drives: FloatArray, taps: FloatArray, tap_s: FloatArray) -> Coarse:
+    """Weights of steps of several samples: z (r, ONE, m) are the modes' rates per step, the others as in `weighted`."""
+
+    def bumps(until: float) -> FloatArray:
+        # A triangle is the sum of three straight lines that begin at its corners.
+        lines = np.zeros((5, *z.shape))
+        for i in range(5):
+            if until > 0.25 * i:
+                lines[i] = weights(z, (0.0, 1.0), until - 0.25 * i)[..., 1]
+        first = [round(4.0 * place) - 1 for place in PLACES]
+        return np.asarray(by_step * np.stack([4.0 * (lines[i] - 2.0 * lines[i + 1] + lines[i + 2]) for i in first], -1))
+
+    def to_places(make: Callable[[float], FloatArray]) -> FloatArray:
+        return np.ascontiguousarray(np.stack([make(at) for at in PLACES], axis=2))
+
+    bump_to = to_places(bumps)
+    within = np.einsum("rpk,rslkj->rslpj", taps, bump_to) + tap_s[:, None] * np.eye(3)[:, None]
+    return Coarse(
+        bump=bumps(1.0), bump_within=within, decay=to_places(lambda at: np.exp(-z * at)),
+        source=to_places(lambda at: by_step * weights(z, (0.0, 1.0), at)), bump_to=bump_to,
+        drive=to_places(lambda at: drives * weights(z, SIMPSON, at)[..., None, :]),
+        defect=to_places(lambda at: drives * weights(z, BOOLE, at)[..., None, [1, 3]]),
+        share=to_places(lambda at: weights(z, SIMPSON, at)[..., 1:]),
     )  # fmt: skip
 
 
@@ -136,7 +165,7 @@ def _pulse(z: FloatArray, faded: FloatArray, at: float) -> FloatArray:
     apart = np.where(z == rate, 1.0, z - rate)
     true = np.where(z == rate, at * gone, (np.exp(-rate * at) - gone) / apart)
     at_nodes = np.exp(-rate[..., None] * np.array([0.0, 0.5, 1.0]))
-    shown = (weights(z, (0.0, 0.5, 1.0), at) * at_nodes).sum(axis=-1)
+    shown = (weights(z, SIMPSON, at) * at_nodes).sum(axis=-1)
     return np.asarray(np.where(rate > 0.0, true - shown, 0.0))
 
 
@@ -218,11 +247,12 @@ class Followed(Follower):
         system, start = self.system, problem.inner
         m, drives = system.rates.shape[1], self.shown.kink.size
         r = int(np.argmin(np.abs(np.log(system.q0 / self.q_rest))))
-        control, counters = np.zeros(blockforms.N_CONTROL), np.zeros(blockforms.N_COUNTERS, np.int64)
-        control[blockforms.MARGIN], control[blockforms.REFERENCE], control[blockforms.U_GAP] = 1.0, r, start.u_gap
+        control, counters = blockforms.new_control(), np.zeros(blockforms.N_COUNTERS, np.int64)
+        control[blockforms.REFERENCE], control[blockforms.U_GAP] = r, start.u_gap
         control[blockforms.Z] = start.y[-1] - self._charge_with(start.u_gap)
+        rooms = [blockforms.new_room(m, drives, drives + 3, self.shown) for _ in range(2)]
         return Course(
-            system.model, form, self.shown, blockforms.new_room(m, drives, drives + 3, self.shown), new_charges(),
+            system.model, form, self.shown, rooms[0], rooms[1], new_charges(),
             np.zeros((3, max(m, drives, 5))), system.project[r] @ start.y[:-1], np.zeros((2, m)), control, counters,
             blockforms.new_checks(self.shown),
         )  # fmt: skip

@@ -92,7 +92,7 @@ class Finger(Follower):
             one.rates[None], one.gain[None], one.drives[None], one.taps[None], one.tap_s, spacing, self._fast(spacing),
             mobile=False, q0=np.array([reduced.q0]), area=self.area, scale=self.scale, shift=-1.0,
             k_gap=float(one.tap_s[0]), area0=1.0 / reduced.q0, kappa=reduced.kappa, bend=self.bend,
-            bent=one.taps[1:-1, :n] @ reduced.absorbed,
+            bent=one.taps[1:-1, :n] @ reduced.absorbed, longest=blockforms.ONE,
         )  # fmt: skip
 
     def _fast(self, spacing: float) -> int:
@@ -134,11 +134,11 @@ class Finger(Follower):
         w[:n] = reduced.modes.inverse @ (x + reduced.modes.follow @ s) - reduced.absorbed * bend
         held = one.columns @ w + one.bends * bend + one.k * s[reduced.source]
         w[n:] = start.y[n : start.y.size if m > n else n] - held[n:]
-        control, counters = np.zeros(blockforms.N_CONTROL), np.zeros(blockforms.N_COUNTERS, np.int64)
-        control[blockforms.MARGIN] = 1.0
+        control, counters = blockforms.new_control(), np.zeros(blockforms.N_COUNTERS, np.int64)
         control[blockforms.U_GAP] = one.taps[0] @ w + one.tap_s[0] * s[reduced.source]
+        rooms = [blockforms.new_room(m, drives, drives + 1, self.shown) for _ in range(2)]
         return Course(
-            self._model, form, self.shown, blockforms.new_room(m, drives, drives + 1, self.shown), new_charges(),
+            self._model, form, self.shown, rooms[0], rooms[1], new_charges(),
             np.zeros((3, max(m, drives, 5))), w, np.zeros((2, m)), control, counters, blockforms.new_checks(self.shown),
         )  # fmt: skip
 
