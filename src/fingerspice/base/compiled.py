@@ -115,15 +115,15 @@ _EVERY_TIME = (
 
 
 class _Body(JITCodeLibrary):
-    """Code of a function that compiled code calls, to be put into its callers and never run by itself."""
+    """Code of a function that compiled code calls, never run by itself.
+
+    It is optimised with its callers, whose module holds it, and not before: otherwise a function that others call, and
+    these again others, is optimised as many times.
+    """
 
     def _finalize_final_module(self) -> None:
         cast(Any, self)._finalize_dynamic_globals()
         self._finalized = True
-
-
-class _Inlined(_Body):
-    """As `_Body`, of a function that is always put into its callers, and is optimised with these."""
 
     def _optimize_final_module(self) -> None:
         return
@@ -187,8 +187,7 @@ class _Called:
         of.targetdescr.options.parse_as_flags(flags, of.targetoptions)
         flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
         flags.noalias = self.noalias
-        kind = _Inlined if of.targetoptions.get("forceinline") else _Body
-        library = cast(Any, kind)(context.codegen(), of.py_func.__qualname__)
+        library = cast(Any, _Body)(context.codegen(), of.py_func.__qualname__)
         cres = cast(Any, compile_extra)(of.typingctx, context, of.py_func, args, None, flags, {}, library)
         key = object()
         context.insert_user_function(key, cres.fndesc, [cres.library])

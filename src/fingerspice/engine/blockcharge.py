@@ -205,7 +205,7 @@ def moved_rows(
         z[i] += row[i] if u[i] >= 0.0 else -row[i]
 
 
-@jit_within
+@jit
 def charge_block(c: Course, r: int, n: int, of_seen: float, local: float, others: bool) -> None:
     """Charge at the ends of a block's steps, and its error: the share `of_seen` of what is seen of it and of the modes.
 
@@ -348,7 +348,7 @@ def _current_rows(
         out[i] = (c * dv[i] + g_area * v[i] + slopes[i] * over_s) / q[i] + g_total * v[i]
 
 
-@jit_within
+@jit
 def current_block(c: Course, r: int, room: Room, n: int, slopes: FloatArray, q: FloatArray) -> None:
     """Right-hand limit of the current (A) at one place of n steps, whose rows are in `room`, into `Charges.current`.
 

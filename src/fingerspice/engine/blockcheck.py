@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit_rows, jit_within
+from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockcharge import Course, charge_block
 from fingerspice.engine.blockforms import (
     BLOCK,
@@ -135,7 +135,7 @@ def _row(c: Course, r: int, j: int, n: int, out: FloatArray) -> None:
             _forces(n, shown.stress, q, out)
 
 
-@jit_within
+@jit
 def keep(
     c: Course, r: int, h: float, n: int, sub: int, seen: float, magnified: float, errors: FloatArray
 ) -> None:  # fmt: skip
@@ -160,7 +160,7 @@ def keep(
         errors[OF_CHARGE] = control[ERROR_Q]
 
 
-@jit_within
+@jit
 def compare(c: Course, r: int, h: float, first: int, n: int, sub: int, errors: FloatArray) -> None:
     """Note the largest differences of n steps to what was kept, from its step `first` on, in `errors`.
 

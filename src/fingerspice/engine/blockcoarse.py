@@ -10,7 +10,8 @@ from __future__ import annotations
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockcharge import Course
-from fingerspice.engine.blockforms import BLOCK, FIRST_QUARTER, LAST_QUARTER, MIDDLE, ONE, PLACES, SPAN, Room
+from fingerspice.engine.blockforms import BLOCK, FIRST_QUARTER, LAST_QUARTER, MIDDLE, ONE, PLACES, SPAN
+from fingerspice.engine.blockhats import add_hats
 from fingerspice.engine.blockkinks import add_where, respond_to_kinks
 from fingerspice.engine.blockrows import (
     PAD,
@@ -140,9 +141,9 @@ def _slopes(n: int, s: FloatArray, h: FloatArray, out: FloatArray) -> None:
 
 
 @jit
-def _jumps(room: Room, i: int) -> tuple[float, float, float, float]:
-    """Jumps of the slope of the triangles at 0, 1/4, 1/2 and 3/4 of step i, V per step."""
-    early, middle, late = room.bumps[FIRST_QUARTER, i], room.bumps[MIDDLE, i], room.bumps[LAST_QUARTER, i]
+def _jumps(bumps: FloatArray, i: int) -> tuple[float, float, float, float]:
+    """Jumps of the slope of triangles (3, n) at 0, 1/4, 1/2 and 3/4 of step i, per step."""
+    early, middle, late = bumps[FIRST_QUARTER, i], bumps[MIDDLE, i], bumps[LAST_QUARTER, i]
     return 4.0 * early, 4.0 * (middle - 2.0 * early), 4.0 * (early - 2.0 * middle + late), 4.0 * (middle - 2.0 * late)
 
 
@@ -151,7 +152,7 @@ def bump_at(c: Course, i: int, at: float) -> tuple[float, float]:
     """Height of the triangles at fraction `at` of step i (V), and their slope just after it (V per step)."""
     height, slope = 0.0, 0.0
     if c.control[SPAN] > 1.0:
-        for quarter, jump in enumerate(_jumps(c.room, i)):
+        for quarter, jump in enumerate(_jumps(c.room.bumps, i)):
             since = at - 0.25 * quarter
             # Times are right to rounding only, and the slope is the one after a sample.
             if since > -1e-6:
@@ -161,16 +162,31 @@ def bump_at(c: Course, i: int, at: float) -> tuple[float, float]:
 
 
 @jit
-def bump_response(c: Course, i: int, at: float, z: float, found: FloatArray) -> float:
-    """Integral of exp(-z (at - x)) times the triangles (V) over x from 0 to `at` in step i; `found` (2,) is scratch."""
+def _response(bumps: FloatArray, i: int, at: float, z: float, found: FloatArray) -> float:
+    """Integral of exp(-z (at - x)) times triangles over x from 0 to `at` in step i; `found` (3,) is scratch."""
     total = 0.0
-    if c.control[SPAN] > 1.0:
-        for quarter, jump in enumerate(_jumps(c.room, i)):
-            since = at - 0.25 * quarter
-            if since > 0.0:
-                moments(z * since, found[:2])
-                total += jump * since * since * found[1]
+    for quarter, jump in enumerate(_jumps(bumps, i)):
+        since = at - 0.25 * quarter
+        if since > 0.0:
+            moments(z * since, found[:2])
+            total += jump * since * since * found[1]
     return total
+
+
+@jit
+def bump_response(c: Course, r: int, k: int, h: float, i: int, at: float, found: FloatArray) -> float:
+    """What triangles within step i, of length h (s), add to mode k at the fraction `at`; `found` (3,) is scratch."""
+    if c.control[SPAN] == 1.0:
+        return 0.0
+    form, room, z = c.form, c.room, c.form.rates[r, k] * h
+    total = form.gain[r, k] * _response(room.bumps, i, at, z, found)
+    if not form.mobile:
+        for t in range(room.g.shape[0]):
+            total += form.feed[r, k, t] * _response(room.hats[t], i, at, z, found)
+            moments(z * at, found)
+            parabola = 4.0 * at * at * (found[1] - at * found[2])
+            total -= form.feed[r, k, t] * room.hats[t, MIDDLE, i] * parabola
+    return float(total * h)
 
 
 @jit_within
@@ -189,6 +205,8 @@ def _modes_within(c: Course, r: int, level: int, place: int, n: int, kinks: int)
         )  # fmt: skip
         for t in range(room.g.shape[0]):
             add_two(n, missed[t, 0], early[t], missed[t, 1], late[t], w)
+        if not form.mobile:
+            add_hats(room, coarse.hat_to[r, level, place, k], n, w)
         if kinks > 0:
             sum_of(n + 1, room.kinked[k], room.end[1:], room.slope)
             respond_to_kinks(
@@ -198,7 +216,7 @@ def _modes_within(c: Course, r: int, level: int, place: int, n: int, kinks: int)
             add_where(kinks, room.where, part, w)
 
 
-@jit_within
+@jit
 def look_within(c: Course, r: int, level: int, place: int, n: int, kinks: int) -> None:
     """Source and modes at a place within the steps, `kinks` of which have one, into `Course.inner`.
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit_rows, jit_within
+from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockcharge import Course, charge_block, inverse_area_at
 from fingerspice.engine.blockcheck import FORCE, gap_into, in_place
 from fingerspice.engine.blockforms import (
@@ -100,7 +100,7 @@ def quadrature_error(c: Course, r: int, level: int, n: int) -> float:
     return largest_of(n + 1, room.before)
 
 
-@jit_within
+@jit
 def correct(c: Course, r: int, n: int) -> None:
     """Correct the modes by the error seen; 1/A at the steps' ends.
 
@@ -120,7 +120,7 @@ def correct(c: Course, r: int, n: int) -> None:
     add_to_all(n + 1, form.q0[r], room.z, c.charges.q[0])
 
 
-@jit_within
+@jit
 def further_sweep(c: Course, r: int, level: int, n: int) -> None:
     """What a further sweep would change in the modes, into `Room.further`."""
     form, room = c.form, c.room
@@ -239,7 +239,7 @@ def _force_error(c: Course, r: int, n: int) -> float:
     return worst
 
 
-@jit_within
+@jit
 def accept(
     c: Course, r: int, level: int, n: int, seen: float, left: float, magnified: float, share: float
 ) -> None:  # fmt: skip

@@ -61,6 +61,12 @@ class Coarse(NamedTuple):
         As `Form.source`, `bump`, `Form.drive` and `Form.defect`, up to `PLACES`.
     share : ndarray, shape (r, ONE, 3, m, 2)
         As `Form.share`.
+    hat : ndarray, shape (r, ONE, m, T, 3)
+        Contribution of triangles of the drives to a mode at the end of a step, less that to the parabolas.
+    hat_to : ndarray, shape (r, ONE, 3, m, T, 3)
+        The same up to `PLACES`.
+    slope : ndarray, shape (4 k + 1,)
+        Derivative of 1/A by |u|, a polynomial as `Form.area`.
     """
 
     bump: FloatArray
@@ -71,6 +77,9 @@ class Coarse(NamedTuple):
     drive: FloatArray
     defect: FloatArray
     share: FloatArray
+    hat: FloatArray
+    hat_to: FloatArray
+    slope: FloatArray
 
 
 class Form(NamedTuple):
@@ -214,12 +223,14 @@ class Room(NamedTuple):
     `kept` are the gap voltages, forces, nodes' voltages and charges of a solution to be checked, and at last gap
     voltages and forces within some of its steps. `where` are the numbers of the steps that cross 0 V, and `crossed`,
     `jumps` and `bends` describe their kinks, one after the other.
-    `bumps` are the heights (V) of the triangles of `Coarse`, in steps of several samples.
+    `bumps` are the heights (V) of the triangles of `Coarse`, in steps of several samples, and `hats` those of the
+    triangles that they cause in the drives.
     `kinked` is no row: the weights (m, T) of the kink of each drive in each mode.
     """
 
     s: FloatArray
     bumps: FloatArray
+    hats: FloatArray
     s_within: FloatArray
     w: FloatArray
     own: FloatArray
@@ -252,11 +263,12 @@ def new_room(modes: int, drives: int, projections: int, shown: Shown) -> Room:
     n = BLOCK + PAD
     kept = 4 + shown.node.shape[1] + shown.flows + int(shown.charge)
     return Room(
-        np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros((modes, n)), np.zeros((modes, n)), np.zeros((modes, n)),
-        np.zeros(n), np.zeros((projections, n)), np.zeros((3, projections, n)), np.zeros((drives, n)),
-        np.zeros((3, drives, n)), np.zeros(n), np.zeros((3, n)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
-        np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((modes, drives)), np.zeros((drives, n)), np.zeros((drives, n)),
-        np.zeros(n), np.zeros((modes, n)), np.zeros((kept, n)), np.zeros(n, np.int64),
+        np.zeros(n), np.zeros((3, n)), np.zeros((drives, 3, n)), np.zeros(n), np.zeros((modes, n)),
+        np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n), np.zeros((projections, n)),
+        np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)), np.zeros(n), np.zeros((3, n)),
+        np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
+        np.zeros((modes, drives)), np.zeros((drives, n)), np.zeros((drives, n)), np.zeros(n), np.zeros((modes, n)),
+        np.zeros((kept, n)), np.zeros(n, np.int64),
     )  # fmt: skip
 
 

@@ -126,7 +126,7 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
         cubic, fourth = 128.0 / 3.0 * (1.5 * both + mostly_early), -128.0 / 3.0 * both
         forced = linear * found[1] + at * (square * found[2] + at * (cubic * found[3] + at * fourth * found[4]))
         w[k] = w[k] * math.exp(-z) + h * at * (whole * found[0] + at * forced)
-        w[k] += form.gain[r, k] * h * bump_response(c, i, at, form.rates[r, k] * h, found)
+        w[k] += bump_response(c, r, k, h, i, at, found[:3])
         if pulse != 0.0:
             # The parabola through the part of N that is exp(-rate t), and its response.
             shown = found[0] + at * (
@@ -332,7 +332,7 @@ def _column(c: Course, r: int, room: Room, column: int, n: int, q: FloatArray, r
             add(n, shown.bend[column], room.g[room.g.shape[0] - 1], row)
 
 
-@jit_within
+@jit
 def _write_within(c: Course, r: int, level: int, j: int, n: int, kinks: int, out: FloatArray, first: int) -> None:
     """Write the outputs at sample j of each of n steps of several samples, from number `first` on.
 
@@ -352,7 +352,7 @@ def _write_within(c: Course, r: int, level: int, j: int, n: int, kinks: int, out
         _spread(1, span, n, c.charges.current, out[shown.k.size + 1, first : first + count])
 
 
-@jit_within
+@jit
 def write_samples(c: Course, r: int, level: int, count: int, out: FloatArray, first: int) -> None:
     """Write the outputs at the first `count` samples of a block, from number `first` on."""
     room, shown, n, sub, span = c.room, c.shown, steps_of(level, count), halved(level), span_of(level)
@@ -374,7 +374,7 @@ def write_samples(c: Course, r: int, level: int, count: int, out: FloatArray, fi
         _write_within(c, r, level, j, n, kinks, out, first + j)
 
 
-@jit_within
+@jit
 def write_block(
     c: Course, r: int, level: int, count: int, h: float, start: float, t_out: FloatArray, out: FloatArray
 ) -> None:  # fmt: skip

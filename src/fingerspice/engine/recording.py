@@ -8,7 +8,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
-from fingerspice.base.compiled import jit, jit_within
+from fingerspice.base.compiled import jit
 from fingerspice.engine.blockcharge import Course, steepness
 from fingerspice.engine.blockcheck import OF_SWEEPS, compare, is_due, keep, note
 from fingerspice.engine.blockcoarse import (
@@ -115,7 +115,7 @@ def jump(c: Course, to: float) -> bool:
     return not math.isnan(c.control[U_GAP])
 
 
-@jit_within
+@jit
 def _solve(c: Course, r: int, level: int, h: float, n: int, tol: float) -> tuple[float, float, float, float]:
     """Solve a block of n steps of length h (s) from its start in `Room` on, under the source in `Room`.
 
@@ -137,7 +137,7 @@ def _solve(c: Course, r: int, level: int, h: float, n: int, tol: float) -> tuple
     return change, margin, magnified * quadrature_error(c, r, level, n), magnified
 
 
-@jit_within
+@jit
 def begin_block(c: Course, r: int, w: FloatArray, u: float) -> None:
     """Begin a block at the modes w and the gap voltage u (V)."""
     for k in range(w.size):
@@ -146,7 +146,7 @@ def begin_block(c: Course, r: int, w: FloatArray, u: float) -> None:
     look_at_ends(c.form, c.room, r, 1, FIRST_NEWTON)
 
 
-@jit_within
+@jit
 def _finish(c: Course, r: int, level: int, h: float, n: int) -> None:
     """Correct a solution, and prepare what its charge follows from."""
     correct(c, r, n)
@@ -156,7 +156,7 @@ def _finish(c: Course, r: int, level: int, h: float, n: int) -> None:
         project_for_charge(c.form, c.room, r, level, n)
 
 
-@jit_within
+@jit
 def _check(
     c: Course, values: FloatArray, at: int, count: int, r: int, level: int, h: float, seen: float
 ) -> None:  # fmt: skip

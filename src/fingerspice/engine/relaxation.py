@@ -32,9 +32,10 @@ import math
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit_within
+from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.blockcharge import inverse_area_at
 from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, ONE, PLACES, Form, Room
+from fingerspice.engine.blockhats import add_hats, find_hats, hats_at, look_at_middle
 from fingerspice.engine.blockkinks import add_where, find_crossings, kink_at, kink_rows, respond_to_kinks
 from fingerspice.engine.blockrows import (
     PAD,
@@ -79,7 +80,7 @@ KINKED = 1
 FIRST_NEWTON, NEWTON, LEAST_MARGIN = 6, 2, 0.2
 
 
-@jit_within
+@jit
 def _drives(
     form: Form, q0: float, n: int, newton: int, s: FloatArray, x: FloatArray, u: FloatArray, z: FloatArray,
     slope: FloatArray, g: FloatArray,
@@ -316,7 +317,7 @@ def relax(
         for t in range(drives):
             room.kinked[k, t] = h * form.feed[r, k, t] * kink[t]
     last, margin, over = math.inf, 1.0, 1.0 / tol if tol > 0.0 else 1.0
-    fades = form.faded[r, level] > 0.0
+    fades, hatted = form.faded[r, level] > 0.0, level < ONE and not form.mobile
     scaled(n, 0.0, room.s, room.pulse)
     for sweep in range(MOST_SWEEPS):
         for k in range(modes):
@@ -328,6 +329,8 @@ def relax(
                 add(n, form.pulse[r, level, k], room.pulse, own)
             if level < ONE:
                 add_bumps(n, form.coarse.bump[r, level, k], room.bumps, own)
+                if hatted and sweep >= KINKED:
+                    add_hats(room, form.coarse.hat[r, level, k], n, own)
         if sweep >= KINKED:
             _add_kinks(form, room, r, level, h, n)
         for k in range(modes):
@@ -336,7 +339,11 @@ def relax(
         if sweep >= KINKED:
             keep_drives(room, n)
         margin = _look(form, room, r, level, MIDDLE, n, newton)
+        if hatted:
+            look_at_middle(form, room, n)
         margin = min(margin, look_at_ends(form, room, r, n + 1, newton))
+        if hatted:
+            find_hats(form, room, n)
         if fades:
             scaled(n, -1.0, room.pulse, room.changed_pulse)
             _pulses(form, room, r, level, h, n)
@@ -381,6 +388,8 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
                 faded = form.faded[r, level]
                 shown = weight[0] + weight[1] * math.exp(-0.5 * faded) + weight[2] * math.exp(-faded)
                 add(n, shown - math.exp(-faded * PLACES[place]), room.pulse, off)
+            if level < ONE and not form.mobile:
+                hats_at(n, place, weight[1], room.hats[t], off)
             kink_at(
                 count, room.where, kink[t], PLACES[place], room.crossed, room.jumps, room.bends, room.end[1 + t], off
             )  # fmt: skip

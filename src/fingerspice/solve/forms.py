@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev as series_of
-from numpy.polynomial.polynomial import polyval
+from numpy.polynomial.polynomial import polyder, polyval
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine import blockforms
 from fingerspice.engine.blockcharge import Course, new_charges
-from fingerspice.engine.blockforms import LEVELS, ONE, PLACES, Coarse, Form
+from fingerspice.engine.blockforms import LEVELS, MIDDLE, ONE, PLACES, Coarse, Form
 from fingerspice.engine.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.numerics.moments import weights
@@ -128,33 +128,46 @@ def weighted(
         feed=np.ascontiguousarray(feed), taps=np.ascontiguousarray(taps), tap_s=tap_s, within=inner, within_s=inner_s,
         within_g=inner_g, share=np.ascontiguousarray(simpson[..., 1:]), defect=drives * quarters,
         fast=fast, faded=faded, pulse=pulse, pulse_within=pulse_within,
-        coarse=_coarse(z[:, :ONE], by_step[:, :ONE], drives[:, :ONE], taps, tap_s), **others,
+        coarse=_coarse(z[:, :ONE], by_step[:, :ONE], drives[:, :ONE], taps, tap_s, _derivative(others)), **others,
     )  # fmt: skip
 
 
-def _coarse(z: FloatArray, by_step: FloatArray, drives: FloatArray, taps: FloatArray, tap_s: FloatArray) -> Coarse:
+def _derivative(form: dict[str, Any]) -> FloatArray:
+    """The derivative of 1/A by |u|, with as many coefficients as 1/A has."""
+    return np.append(form["scale"] * polyder(form["area"]), 0.0)
+
+
+def _coarse(
+    z: FloatArray, by_step: FloatArray, drives: FloatArray, taps: FloatArray, tap_s: FloatArray, slope: FloatArray
+) -> Coarse:
     """Weights of steps of several samples: z (r, ONE, m) are the modes' rates per step, the others as in `weighted`."""
 
-    def bumps(until: float) -> FloatArray:
+    def triangles(until: float) -> FloatArray:
         # A triangle is the sum of three straight lines that begin at its corners.
         lines = np.zeros((5, *z.shape))
         for i in range(5):
             if until > 0.25 * i:
                 lines[i] = weights(z, (0.0, 1.0), until - 0.25 * i)[..., 1]
         first = [round(4.0 * place) - 1 for place in PLACES]
-        return np.asarray(by_step * np.stack([4.0 * (lines[i] - 2.0 * lines[i + 1] + lines[i + 2]) for i in first], -1))
+        return np.stack([4.0 * (lines[i] - 2.0 * lines[i + 1] + lines[i + 2]) for i in first], axis=-1)
+
+    def hats(until: float) -> FloatArray:
+        shown = triangles(until)
+        shown[..., MIDDLE] -= weights(z, SIMPSON, until)[..., 1]
+        return np.asarray(drives * shown[..., None, :])
 
     def to_places(make: Callable[[float], FloatArray]) -> FloatArray:
         return np.ascontiguousarray(np.stack([make(at) for at in PLACES], axis=2))
 
-    bump_to = to_places(bumps)
+    bump_to = to_places(lambda at: by_step * triangles(at))
     within = np.einsum("rpk,rslkj->rslpj", taps, bump_to) + tap_s[:, None] * np.eye(3)[:, None]
     return Coarse(
-        bump=bumps(1.0), bump_within=within, decay=to_places(lambda at: np.exp(-z * at)),
+        bump=by_step * triangles(1.0), bump_within=within, decay=to_places(lambda at: np.exp(-z * at)),
         source=to_places(lambda at: by_step * weights(z, (0.0, 1.0), at)), bump_to=bump_to,
         drive=to_places(lambda at: drives * weights(z, SIMPSON, at)[..., None, :]),
         defect=to_places(lambda at: drives * weights(z, BOOLE, at)[..., None, [1, 3]]),
         share=to_places(lambda at: weights(z, SIMPSON, at)[..., 1:]),
+        hat=np.ascontiguousarray(hats(1.0)), hat_to=to_places(hats), slope=slope,
     )  # fmt: skip
 
 
