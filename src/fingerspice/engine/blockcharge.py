@@ -38,6 +38,9 @@ from fingerspice.engine.blockrows import (
 )
 from fingerspice.engine.model import Model
 
+# Slopes, per step, at `PLACES` of the quartic through the values at 0, 1/4, 1/2, 3/4 and 1.
+_SLOPES = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-3.0, -10.0, 18.0, -6.0, 1.0], [-1.0, 6.0, -18.0, 10.0, 3.0]]) / 3.0
+
 
 class Charges(NamedTuple):
     """Rows of a block for the charge.
@@ -161,6 +164,32 @@ def _charge_rows(
 
 
 @jit_rows
+def _hat_rows(
+    n: int, place: int, h: FloatArray, slow: FloatArray, k_gap: float, k_slow: float, slope: FloatArray, u: FloatArray,
+    ends: FloatArray, within: FloatArray, q: FloatArray, bumps: FloatArray, steps: FloatArray,
+) -> None:  # fmt: skip
+    """Add to `steps` what a triangle of the source at a place within each step adds to the charge besides Boole's rule.
+
+    Area and voltages have triangles, too. `slope` is the derivative of 1/A by |u| there, and the shares of the source
+    in u and in the slowest layer's voltage are `k_gap` and `k_slow`. The others are as in `_charge_rows`.
+    """
+    v = ends.shape[0] - 2
+    c, g_area, g_total = slow[slow.size - 3], slow[slow.size - 2], slow[slow.size - 1]
+    b0, b1, b2, b3, b4 = _SLOPES[place]
+    by_boole, by_simpson = (12.0 / 90.0, 4.0 / 6.0) if place == MIDDLE else (32.0 / 90.0, 0.0)
+    for i in range(n):
+        a = 1.0 / q[1 + place, i]
+        by_u = (-slope[i] if u[i] >= 0.0 else slope[i]) * k_gap * a * a
+        rate = (
+            b0 * ends[v, i] + b1 * within[1, v, i] + b2 * within[0, v, i] + b3 * within[2, v, i] + b4 * ends[v, i + 1]
+        )
+        change = by_u * (h[i] * g_area * within[place, v + 1, i] + c * rate)
+        change = (change + h[i] * (g_area * a + g_total) * k_slow) * bumps[place, i]
+        steps[3, i] += change * (0.25 - by_boole)
+        steps[4, i] -= change * (by_boole - by_simpson)
+
+
+@jit_rows
 def _leaked_error(
     n: int, h: FloatArray, slow: FloatArray, q: FloatArray, error: FloatArray, of_seen: float, seen: FloatArray,
     off: FloatArray,
@@ -221,6 +250,13 @@ def charge_block(c: Course, r: int, n: int, of_seen: float, local: float, others
         1.0 if c.control[SPAN] > 1.0 else 0.0, room.bumps, room.u, room.u_within[MIDDLE], room.end, room.within, own.q,
         own.steps,
     )  # fmt: skip
+    for place in range(len(PLACES) if c.control[SPAN] > 1.0 and not form.mobile else 0):
+        u = room.u_within[place]
+        area_rows(n, form.coarse.slope, form.scale, form.shift, 0.0, u, own.current)
+        _hat_rows(
+            n, place, own.h, slow, form.k_gap, form.tap_s[v + 1], own.current, u, room.end, room.within, own.q,
+            room.bumps, own.steps,
+        )  # fmt: skip
     scaled(n + 1, 0.0, room.s, own.error)
     modes_into(n + 1, 0, c.shown.slow[r], room.own, own.error)
     scaled(n + 1, of_seen, own.error, own.error)
