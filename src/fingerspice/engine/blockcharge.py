@@ -40,6 +40,10 @@ from fingerspice.engine.model import Model
 
 # Slopes, per step, at `PLACES` of the quartic through the values at 0, 1/4, 1/2, 3/4 and 1.
 _SLOPES = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-3.0, -10.0, 18.0, -6.0, 1.0], [-1.0, 6.0, -18.0, 10.0, 3.0]]) / 3.0
+# Rows of `Charges.steps` after the rates; the last is the first of three.
+GAINED, MISSED, HATS = 5, 6, 7
+# Share of the triangles' integrals that may be missed: they are known to first order.
+OF_HATS = 0.01
 
 
 class Charges(NamedTuple):
@@ -49,9 +53,9 @@ class Charges(NamedTuple):
     ----------
     q : ndarray, shape (4, n)
         1/A at the ends of the steps and at `PLACES`, 1/m^2.
-    steps : ndarray, shape (5, n)
-        Rate of the charge at 0, 1/2 and 1 of each step (A), the charge gained in the step, and the error of this gain
-        (C).
+    steps : ndarray, shape (10, n)
+        Rate of the charge at 0, 1/4, 1/2, 3/4 and 1 of each step (A), the charge gained in the step, the error of this
+        gain, and, in steps of several samples, the triangles of the rate at `PLACES` times the step length (C).
     z, rest, current, error : ndarray, shape (n,)
         Charge (C), that without c r G(u), and current (A) at the starts of the steps, and error of the slowest layer's
         voltage (V).
@@ -95,14 +99,13 @@ class Course(NamedTuple):
 def new_charges() -> Charges:
     """Rows for one block, all zero."""
     n = BLOCK + 8
-    return Charges(np.zeros((4, n)), np.zeros((5, n)), *np.zeros((6, n)))
+    return Charges(np.zeros((4, n)), np.zeros((10, n)), *np.zeros((6, n)))
 
 
 @jit_rows
 def _charge_rows(
-    n: int, h: FloatArray, slow: FloatArray, area0: float, kink: float, s: FloatArray, bumped: float,
-    bumps: FloatArray, u: FloatArray, middle: FloatArray, ends: FloatArray, within: FloatArray, q: FloatArray,
-    steps: FloatArray,
+    n: int, h: FloatArray, slow: FloatArray, area0: float, kink: float, s: FloatArray, u: FloatArray,
+    middle: FloatArray, ends: FloatArray, within: FloatArray, q: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
     """Charge gained in each step without c r G(u), its rates, and its error, into `steps` (`Charges`).
 
@@ -111,8 +114,7 @@ def _charge_rows(
     The last two rows of `ends` (P, n) and `within` (3, P, n) are two voltages of the slowest layer: its part v, which
     does not follow u, and the voltage that drives its leakage current (under `mobile` the modes' part of it alone). The
     displacement charge c A dv is exact with the area at the start of the step; the change of the area since then is
-    integrated along the polynomial of v. `area0` is the reference area under `mobile`, 0 under `local`; `bumped` is 1
-    where the source has the triangles `bumps` within the steps, else 0.
+    integrated along the polynomial of v. `area0` is the reference area under `mobile`, 0 under `local`.
     """
     mobile, v = area0 > 0.0, ends.shape[0] - 2
     share, c, g_area, g_total = slow[slow.size - 4], slow[slow.size - 3], slow[slow.size - 2], slow[slow.size - 1]
@@ -127,9 +129,9 @@ def _charge_rows(
         if mobile:
             turn = 0.0
             l0 = share * s0 + area0 * l0 / a0
-            l1 = share * (0.75 * s0 + 0.25 * s4 + bumped * bumps[1, i]) + area0 * l1 / a1
-            l2 = share * (0.5 * s0 + 0.5 * s4 + bumped * bumps[0, i]) + area0 * l2 / a2
-            l3 = share * (0.25 * s0 + 0.75 * s4 + bumped * bumps[2, i]) + area0 * l3 / a3
+            l1 = share * (0.75 * s0 + 0.25 * s4) + area0 * l1 / a1
+            l2 = share * (0.5 * s0 + 0.5 * s4) + area0 * l2 / a2
+            l3 = share * (0.25 * s0 + 0.75 * s4) + area0 * l3 / a3
             l4 = share * s4 + area0 * l4 / a4
         r0 = (g_area * a0 + g_total) * l0
         r1 = (g_area * a1 + g_total) * l1
@@ -143,24 +145,20 @@ def _charge_rows(
         d2 = (v0 - 8.0 * v1 + 8.0 * v3 - v4) / 3.0
         d3 = (-v0 + 6.0 * v1 - 18.0 * v2 + 10.0 * v3) / 3.0 + v4
         d4 = v0 - (16.0 * v1 - 36.0 * v2 + 48.0 * v3 - 25.0 * v4) / 3.0
-        boole = (
-            7.0 * r0
-            + 32.0 * (r1 + turn * (a1 - a0) * d1)
-            + 12.0 * (r2 + turn * (a2 - a0) * d2)
-            + 32.0 * (r3 + turn * (a3 - a0) * d3)
-            + 7.0 * (r4 + turn * (a4 - a0) * d4)
-        ) / 90.0
+        r1, r2 = r1 + turn * (a1 - a0) * d1, r2 + turn * (a2 - a0) * d2
+        r3, r4 = r3 + turn * (a3 - a0) * d3, r4 + turn * (a4 - a0) * d4
+        boole = (7.0 * r0 + 32.0 * r1 + 12.0 * r2 + 32.0 * r3 + 7.0 * r4) / 90.0
         # Both rules miss a part of the integral at the area's kink; this part is known and added.
         at, jump, _ = crossing(u[i], middle[i], u[i + 1])
         rest, early = 1.0 - at, max(0.5 - at, 0.0)
         by_simpson = (4.0 * early + rest) / 6.0
         by_boole = (32.0 * (max(0.25 - at, 0.0) + max(0.75 - at, 0.0)) + 12.0 * early + 7.0 * rest) / 90.0
         bent = kink * jump * (g_area * (l0 + at * (l4 - l0)) + turn * (v4 - v0))
-        steps[0, i], steps[1, i], steps[2, i] = r0, m2, m4
+        steps[0, i], steps[1, i], steps[2, i], steps[3, i], steps[4, i] = r0, r1, r2, r3, r4
         kinked = bent * (0.5 * rest * rest - by_simpson)
         off = boole - simpson - bent * (by_boole - by_simpson)
-        steps[3, i] = c * (area0 if mobile else a0) * (v4 - v0) + h[i] * (simpson + kinked + off)
-        steps[4, i] = h[i] * off
+        steps[GAINED, i] = c * (area0 if mobile else a0) * (v4 - v0) + h[i] * (simpson + kinked + off)
+        steps[MISSED, i] = h[i] * off
 
 
 @jit_rows
@@ -185,8 +183,9 @@ def _hat_rows(
         )
         change = by_u * (h[i] * g_area * within[place, v + 1, i] + c * rate)
         change = (change + h[i] * (g_area * a + g_total) * k_slow) * bumps[place, i]
-        steps[3, i] += change * (0.25 - by_boole)
-        steps[4, i] -= change * (by_boole - by_simpson)
+        steps[GAINED, i] += change * (0.25 - by_boole)
+        steps[MISSED, i] -= change * (by_boole - by_simpson)
+        steps[HATS + place, i] = change
 
 
 @jit_rows
@@ -246,11 +245,11 @@ def charge_block(c: Course, r: int, n: int, of_seen: float, local: float, others
     for place in range(len(PLACES)):
         area_rows(n, form.area, form.scale, form.shift, 0.0, room.u_within[place], own.q[1 + place])
     _charge_rows(
-        n, own.h, slow, form.area0 if form.mobile else 0.0, c.shown.area_kink, room.s,
-        1.0 if c.control[SPAN] > 1.0 else 0.0, room.bumps, room.u, room.u_within[MIDDLE], room.end, room.within, own.q,
-        own.steps,
+        n, own.h, slow, form.area0 if form.mobile else 0.0, c.shown.area_kink, room.s, room.u,
+        room.u_within[MIDDLE], room.end, room.within, own.q, own.steps,
     )  # fmt: skip
-    for place in range(len(PLACES) if c.control[SPAN] > 1.0 and not form.mobile else 0):
+    hats = len(PLACES) if c.control[SPAN] > 1.0 else 0
+    for place in range(hats):
         u = room.u_within[place]
         area_rows(n, form.coarse.slope, form.scale, form.shift, 0.0, u, own.current)
         _hat_rows(
@@ -266,7 +265,7 @@ def charge_block(c: Course, r: int, n: int, of_seen: float, local: float, others
             # Errors of earlier blocks decay, as if all steps were equally long.
             carried = c.shown.slow[r, k] * (c.error[0, k] + c.error[1, k])
             _add_decaying(n + 1, carried, c.spare[2, k] ** (1.0 / n), own.error)
-    _leaked_error(n, own.h, slow, own.q[0], own.error, of_seen, own.steps[4], own.current)
+    _leaked_error(n, own.h, slow, own.q[0], own.error, of_seen, own.steps[MISSED], own.current)
     control = c.control
     z, collected, worst, peak = control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q]
     stored, moved = slow[slow.size - 3], 0.0
@@ -276,19 +275,41 @@ def charge_block(c: Course, r: int, n: int, of_seen: float, local: float, others
         moved = abs(c.shown.area_kink) * at_rest * at_rest * form.area0 * local
     for i in range(n):
         own.z[i] = own.rest[i] = z
-        z += own.steps[3, i]
+        z += own.steps[GAINED, i]
         collected += own.current[i]
         layer = abs(own.error[i + 1]) + moved * abs(room.end[v + 1, i + 1])
         now = abs(collected) + stored * layer / own.q[0, i + 1]
         if others:
             # Within a step, the quadrature is not corrected.
-            now += abs(own.steps[4, i])
+            now += abs(own.steps[MISSED, i])
+            for place in range(hats):
+                now += OF_HATS * abs(own.steps[HATS + place, i])
         worst = now if now > worst else worst
         peak = abs(z) if abs(z) > peak else peak
     own.z[n] = z
     if not form.mobile:
         moved_rows(n + 1, c.shown.moved, form.scale, form.shift, room.u, own.current, own.z)
     control[Z], control[COLLECTED], control[ERROR_Q], control[PEAK_Q] = z, collected, worst, peak
+
+
+@jit
+def weights_until(at: float) -> tuple[float, float, float, float, float]:
+    """Weights of the values at 0, 1/4, 1/2, 3/4 and 1 in the integral of their quartic from 0 to `at`."""
+    return (
+        at * (1.0 + at * (-25.0 / 6.0 + at * (70.0 / 9.0 + at * (-20.0 / 3.0 + at * 32.0 / 15.0)))),
+        at * at * (8.0 + at * (-208.0 / 9.0 + at * (24.0 - at * 128.0 / 15.0))),
+        at * at * (-6.0 + at * (76.0 / 3.0 + at * (-32.0 + at * 64.0 / 5.0))),
+        at * at * (8.0 / 3.0 + at * (-112.0 / 9.0 + at * (56.0 / 3.0 - at * 128.0 / 15.0))),
+        at * at * (-0.5 + at * (22.0 / 9.0 + at * (-4.0 + at * 32.0 / 15.0))),
+    )
+
+
+@jit
+def triangle_until(at: float, top: float) -> float:
+    """Integral to `at` of a triangle with this top, of height 1 and half a step wide, less its quartic's."""
+    early, middle, late = max(at - top + 0.25, 0.0), max(at - top, 0.0), max(at - top - 0.25, 0.0)
+    _, a, b, c, _ = weights_until(at)
+    return 2.0 * (early * early - 2.0 * middle * middle + late * late) - (a if top == 0.25 else b if top == 0.5 else c)
 
 
 @jit_rows
@@ -298,12 +319,14 @@ def _within_rows(
 ) -> None:  # fmt: skip
     """Charge without c r G(u) at fraction `at` of each step, where the part v of the slowest layer's voltage is known.
 
-    `stored` is c A at the start of the step, and the rates are integrated along their parabola.
+    `stored` is c A at the start of the step, and the rates are integrated along their quartic and triangles.
     """
-    a, b, e = 1.0 + at * (2.0 / 3.0 * at - 1.5), at * (2.0 - 4.0 / 3.0 * at), at * (2.0 / 3.0 * at - 0.5)
+    a0, a1, a2, a3, a4 = weights_until(at)
+    b0, b1, b2 = triangle_until(at, PLACES[0]), triangle_until(at, PLACES[1]), triangle_until(at, PLACES[2])
     for i in range(n):
-        rates = a * steps[0, i] + b * steps[1, i] + e * steps[2, i]
-        out[i] = rest[i] + stored[i] * (v[i] - v0[i]) + h * at * rates
+        hats = b0 * steps[HATS, i] + b1 * steps[HATS + 1, i] + b2 * steps[HATS + 2, i]
+        rates = a0 * steps[0, i] + a1 * steps[1, i] + a2 * steps[2, i] + a3 * steps[3, i] + a4 * steps[4, i]
+        out[i] = rest[i] + stored[i] * (v[i] - v0[i]) + h * rates + hats
 
 
 @jit_within
@@ -312,10 +335,9 @@ def charge_within(c: Course, at: float, n: int, out: FloatArray) -> None:
     form, own, inner, v = c.form, c.charges, c.inner, c.form.tap_s.size - 2
     held = c.model.slow[c.model.slow.size - 3]
     for i in range(n):
-        own.error[i] = held * (form.area0 if form.mobile else 1.0 / own.q[0, i])
+        own.error[i] = held / own.q[0, i]
     _within_rows(n, at, own.h[0], own.error, own.steps, own.rest, c.room.end[v], inner.end[v], out)
-    if not form.mobile:
-        moved_rows(n, c.shown.moved, form.scale, form.shift, inner.u, own.current, out)
+    moved_rows(n, c.shown.moved, form.scale, form.shift, inner.u, own.current, out)
 
 
 @jit

@@ -1,8 +1,8 @@
-"""Steps of several samples, for recordings that vary little from one sample to the next.
+"""Steps of several samples, for recordings that vary little from one sample to the next, in stacks under `local`.
 
 Such a step has two or four samples. Within it the source is a straight line and three triangles (`blockforms.Coarse`),
-to which the response of the modes is exact, as it is to the straight line alone in steps of one sample. The slope of
-the drives jumps at the samples within the step, which the error at the quarters of the step shows like any other.
+to which the response of the modes is exact, as it is to the straight line alone in steps of one sample. The triangles
+that follow in the drives are known, too (`engine.blockhats`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from fingerspice.engine.blockrows import (
     both_ends,
     forced_by,
     largest_of,
-    scaled,
     sum_of,
 )
 from fingerspice.engine.relaxation import NEWTON, look_at_ends, project_at_ends
@@ -30,7 +29,7 @@ from fingerspice.numerics.moments import moments
 
 # Largest triangle in the middle of a step, over the largest voltage of a block. The errors of gap voltage and force are
 # measured, and would often allow larger ones; that of the charge would then be several times that of single samples.
-SMOOTH = 0.1
+SMOOTH = 0.03
 
 
 @jit
@@ -180,12 +179,11 @@ def bump_response(c: Course, r: int, k: int, h: float, i: int, at: float, found:
         return 0.0
     form, room, z = c.form, c.room, c.form.rates[r, k] * h
     total = form.gain[r, k] * _response(room.bumps, i, at, z, found)
-    if not form.mobile:
-        for t in range(room.g.shape[0]):
-            total += form.feed[r, k, t] * _response(room.hats[t], i, at, z, found)
-            moments(z * at, found)
-            parabola = 4.0 * at * at * (found[1] - at * found[2])
-            total -= form.feed[r, k, t] * room.hats[t, MIDDLE, i] * parabola
+    for t in range(room.g.shape[0]):
+        total += form.feed[r, k, t] * _response(room.hats[t], i, at, z, found)
+        moments(z * at, found)
+        parabola = 4.0 * at * at * (found[1] - at * found[2])
+        total -= form.feed[r, k, t] * room.hats[t, MIDDLE, i] * parabola
     return float(total * h)
 
 
@@ -205,8 +203,7 @@ def _modes_within(c: Course, r: int, level: int, place: int, n: int, kinks: int)
         )  # fmt: skip
         for t in range(room.g.shape[0]):
             add_two(n, missed[t, 0], early[t], missed[t, 1], late[t], w)
-        if not form.mobile:
-            add_hats(room, coarse.hat_to[r, level, place, k], n, w)
+        add_hats(room, coarse.hat_to[r, level, place, k], n, w)
         if kinks > 0:
             sum_of(n + 1, room.kinked[k], room.end[1:], room.slope)
             respond_to_kinks(
@@ -220,16 +217,14 @@ def _modes_within(c: Course, r: int, level: int, place: int, n: int, kinks: int)
 def look_within(c: Course, r: int, level: int, place: int, n: int, kinks: int) -> None:
     """Source and modes at a place within the steps, `kinks` of which have one, into `Course.inner`.
 
-    So do gap voltages, drives and 1/A (`Room.before`) where the charge or the law needs them.
+    If the charge is wanted, so are gap voltages, drives, the voltages of the slowest layer, and 1/A (`Room.before`).
     """
     form, room, inner = c.form, c.room, c.inner
     both_ends(n, 1.0 - PLACES[place], PLACES[place], room.s, inner.s)
     add(n, 1.0, room.bumps[place], inner.s)
     _modes_within(c, r, level, place, n, kinks)
-    if not (form.mobile or c.shown.charge):
+    if not c.shown.charge:
         return
-    # Newton's method begins there under `mobile`.
-    scaled(n, 1.0, room.u_within[place], inner.u)
     look_at_ends(form, inner, r, n, NEWTON)
     for p in range(1 + inner.g.shape[0], form.tap_s.size):
         project_at_ends(form, inner, r, n, p)

@@ -125,7 +125,7 @@ class Form(NamedTuple):
         What a part exp(-rate t) of N adds to the modes and to the projections, in place of the parabola through it.
     coarse : Coarse
     longest : int
-        The longest step length that is used: `ONE` in networks, else 0.
+        The longest step length that is used: 0 in stacks under `local`, else `ONE`.
     """
 
     mobile: bool

@@ -10,6 +10,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit, jit_inline, jit_within
 from fingerspice.engine.blockcharge import (
+    HATS,
     Course,
     bend_at,
     charge_within,
@@ -19,6 +20,8 @@ from fingerspice.engine.blockcharge import (
     moved_rows,
     moved_with,
     steepness,
+    triangle_until,
+    weights_until,
 )
 from fingerspice.engine.blockcoarse import (
     bump_at,
@@ -76,8 +79,7 @@ def _crossing_of(c: Course, i: int) -> tuple[float, float, float]:
     if form.mobile:
         share = form.area0 * inverse_area_at(form, 0.0)[0]
         start = form.k_gap * room.s[i] + share * room.end[0, i]
-        bump, _ = bump_at(c, i, 0.5)
-        middle = form.k_gap * (0.5 * (room.s[i] + room.s[i + 1]) + bump) + share * room.within[MIDDLE, 0, i]
+        middle = 0.5 * form.k_gap * (room.s[i] + room.s[i + 1]) + share * room.within[MIDDLE, 0, i]
         stop = form.k_gap * room.s[i + 1] + share * room.end[0, i + 1]
     return crossing(start, middle, stop)
 
@@ -167,12 +169,13 @@ def _charge_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, u:
         followed = moved_with(shown.moved, form.scale, form.shift, u)
         followed -= moved_with(shown.moved, form.scale, form.shift, room.u[i])
         area = 1.0 / own.q[0, i]
-    rates = (
-        own.steps[0, i] * (1.0 + at * (2.0 / 3.0 * at - 1.5))
-        + own.steps[1, i] * at * (2.0 - 4.0 / 3.0 * at)
-        + own.steps[2, i] * at * (2.0 / 3.0 * at - 0.5)
-    )
-    charge: float = own.z[i] + followed + c.model.slow[c.model.slow.size - 3] * area * stored + h * at * rates
+    rates = 0.0
+    for j, weight in enumerate(weights_until(at)):
+        rates += weight * own.steps[j, i]
+    charge: float = own.z[i] + followed + c.model.slow[c.model.slow.size - 3] * area * stored + h * rates
+    if c.control[SPAN] > 1.0:
+        for place in range(len(PLACES)):
+            charge += triangle_until(at, PLACES[place]) * own.steps[HATS + place, i]
     return charge
 
 
@@ -369,7 +372,7 @@ def write_samples(c: Course, r: int, level: int, count: int, out: FloatArray, fi
         current_block(c, r, room, n, room.slope, own.q[0])
         _spread(sub, span, count // span, own.z, out[shown.k.size, first:last])
         _spread(sub, span, count // span, own.current, out[shown.k.size + 1, first:last])
-    kinks = find_kinks(c.form, room, level, n) if span > 1 else 0
+    kinks = find_kinks(c.form, room, n) if span > 1 else 0
     for j in range(1, span):
         _write_within(c, r, level, j, n, kinks, out, first + j)
 
@@ -414,7 +417,7 @@ def write_end(c: Course, value: float, slope: float, t_out: FloatArray, out: Flo
     if not form.mobile:
         moved_rows(1, c.shown.moved, form.scale, form.shift, room.u, c.charges.current, c.charges.z)
     c.charges.q[0, 0] = 1.0
-    c.charges.steps[:3, 0] = 0.0
+    c.charges.steps[:, 0] = 0.0
     for place in range(c.counters[OUTPUT], t_out.size):
         _write_point(c, r, 1.0, 0, 0.0, slope, out, place)
     c.counters[OUTPUT] = t_out.size

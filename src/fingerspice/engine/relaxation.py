@@ -179,8 +179,6 @@ def _look(form: Form, room: Room, r: int, level: int, place: int, n: int, newton
         _project(form, room, r, level, place, n, p)
     if form.mobile:
         both_ends(n, 1.0 - PLACES[place], PLACES[place], room.s, room.s_within)
-        if level < ONE:
-            add(n, 1.0, room.bumps[place], room.s_within)
     return _drives(
         form, form.q0[r], n, newton, room.s_within, room.within[place], room.u_within[place], room.z, room.slope, g
     )  # fmt: skip
@@ -216,7 +214,7 @@ def project_for_charge(form: Form, room: Room, r: int, level: int, n: int) -> No
 
 
 @jit_within
-def find_kinks(form: Form, room: Room, level: int, n: int) -> int:
+def find_kinks(form: Form, room: Room, n: int) -> int:
     """Crossings of 0 V, and the jumps of the slope of |u| there; how many steps have one.
 
     Under `mobile` u is bent there, too. What it would be with the area at 0 V is not, and crosses 0 V at the same time.
@@ -228,8 +226,6 @@ def find_kinks(form: Form, room: Room, level: int, n: int) -> int:
     share, middle = form.area0 * inverse_area_at(form, 0.0)[0], room.other[PAD:]
     of_two(n + 1, form.k_gap, room.s, share, room.end[0], room.slope)
     both_ends(n, 0.5 * form.k_gap, 0.5 * form.k_gap, room.s, middle)
-    if level < ONE:
-        add(n, form.k_gap, room.bumps[MIDDLE], middle)
     add(n, share, room.within[MIDDLE, 0], middle)
     count = find_crossings(n, room.slope, room.where)
     kink_rows(count, room.where, room.slope, middle, room.crossed, room.jumps, room.bends)
@@ -239,7 +235,7 @@ def find_kinks(form: Form, room: Room, level: int, n: int) -> int:
 @jit_within
 def _add_kinks(form: Form, room: Room, r: int, level: int, h: float, n: int) -> None:
     """Add the response to the kink that the parabolas miss to `room.inc`."""
-    x, part, count = room.slope, room.other[PAD:], find_kinks(form, room, level, n)
+    x, part, count = room.slope, room.other[PAD:], find_kinks(form, room, n)
     if count == 0:
         return
     for k in range(form.rates.shape[1]):
@@ -317,7 +313,7 @@ def relax(
         for t in range(drives):
             room.kinked[k, t] = h * form.feed[r, k, t] * kink[t]
     last, margin, over = math.inf, 1.0, 1.0 / tol if tol > 0.0 else 1.0
-    fades, hatted = form.faded[r, level] > 0.0, level < ONE and not form.mobile
+    fades = form.faded[r, level] > 0.0
     scaled(n, 0.0, room.s, room.pulse)
     for sweep in range(MOST_SWEEPS):
         for k in range(modes):
@@ -329,7 +325,7 @@ def relax(
                 add(n, form.pulse[r, level, k], room.pulse, own)
             if level < ONE:
                 add_bumps(n, form.coarse.bump[r, level, k], room.bumps, own)
-                if hatted and sweep >= KINKED:
+                if sweep >= KINKED:
                     add_hats(room, form.coarse.hat[r, level, k], n, own)
         if sweep >= KINKED:
             _add_kinks(form, room, r, level, h, n)
@@ -339,10 +335,10 @@ def relax(
         if sweep >= KINKED:
             keep_drives(room, n)
         margin = _look(form, room, r, level, MIDDLE, n, newton)
-        if hatted:
+        if level < ONE:
             look_at_middle(form, room, n)
         margin = min(margin, look_at_ends(form, room, r, n + 1, newton))
-        if hatted:
+        if level < ONE:
             find_hats(form, room, n)
         if fades:
             scaled(n, -1.0, room.pulse, room.changed_pulse)
@@ -366,7 +362,7 @@ def relax(
 @jit_within
 def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
     """Error of the modes that each step adds, into `room.inc`: Boole's rule less Simpson's."""
-    count = find_kinks(form, room, level, n)
+    count = find_kinks(form, room, n)
     for k in range(form.rates.shape[1]):
         scaled(n, 0.0, room.s, room.inc[k, PAD:])
     for place in (FIRST_QUARTER, LAST_QUARTER):
@@ -374,9 +370,6 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
             weight = PARABOLA[place]
             both_ends(n, weight[0], weight[2], room.u, room.u_within[place])
             add(n, weight[1], room.u_within[MIDDLE], room.u_within[place])
-            if level < ONE:
-                add(n, form.k_gap, room.bumps[place], room.u_within[place])
-                add(n, -form.k_gap * weight[1], room.bumps[MIDDLE], room.u_within[place])
         _look(form, room, r, level, place, n, NEWTON)
         for t in range(room.g.shape[0]):
             off, weight = room.g_within[place, t], PARABOLA[place]
@@ -388,7 +381,7 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
                 faded = form.faded[r, level]
                 shown = weight[0] + weight[1] * math.exp(-0.5 * faded) + weight[2] * math.exp(-faded)
                 add(n, shown - math.exp(-faded * PLACES[place]), room.pulse, off)
-            if level < ONE and not form.mobile:
+            if level < ONE:
                 hats_at(n, place, weight[1], room.hats[t], off)
             kink_at(
                 count, room.where, kink[t], PLACES[place], room.crossed, room.jumps, room.bends, room.end[1 + t], off

@@ -145,7 +145,7 @@ def _look(form: Form, room: Room, steps: Steps, r: int, place: int, n: int, last
 @jit_within
 def _add_kinks(form: Form, room: Room, steps: Steps, h: FloatArray, r: int, n: int) -> None:
     """As `relaxation._add_kinks`."""
-    count = find_kinks(form, room, ONE, n)
+    count = find_kinks(form, room, n)
     if count == 0:
         return
     for k in range(form.rates.shape[1]):
@@ -210,7 +210,7 @@ def _relax(
 def _misfit(form: Form, room: Room, steps: Steps, r: int, kink: FloatArray, n: int, taps: int) -> float:
     """Error of the modes into `Room.own`, that of the gap voltage into `Room.before`, and the largest of that (V)."""
     modes = form.rates.shape[1]
-    count = find_kinks(form, room, ONE, n)
+    count = find_kinks(form, room, n)
     for k in range(modes):
         scaled(n, 0.0, room.s, room.inc[k])
     for place in (FIRST_QUARTER, LAST_QUARTER):

@@ -91,7 +91,8 @@ def form_of(system: System, area: FloatArray, spacing: float) -> Form:
     return weighted(
         system.rates, system.gain, feed, np.concatenate(taps, axis=1), np.array(tap_s), spacing, mobile=model.mobile,
         q0=system.q0, area=area, scale=system.scale, shift=-system.lo * system.scale - 1.0, k_gap=model.k_gap,
-        area0=model.area0, kappa=0.0, bend=np.zeros(0), bent=np.zeros(0), longest=0,
+        area0=model.area0, kappa=0.0, bend=np.zeros(0), bent=np.zeros(0),
+        longest=ONE if model.mobile else 0,
     )  # fmt: skip
 
 
