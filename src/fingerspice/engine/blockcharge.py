@@ -280,8 +280,8 @@ def charge_block(c: Course, r: int, n: int, of_seen: float, local: float, others
         layer = abs(own.error[i + 1]) + moved * abs(room.end[v + 1, i + 1])
         now = abs(collected) + stored * layer / own.q[0, i + 1]
         if others:
-            # Within a step, the quadrature is not corrected.
-            now += abs(own.steps[MISSED, i])
+            # Within a step, the quadrature misses as much of the integral of the rates' quartic.
+            now += of_seen * abs(own.steps[MISSED, i])
             for place in range(hats):
                 now += OF_HATS * abs(own.steps[HATS + place, i])
         worst = now if now > worst else worst
