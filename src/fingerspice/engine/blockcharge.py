@@ -1,4 +1,4 @@
-"""Charge of the blocks of a recording, and current at the starts of their steps.
+"""Charge of the blocks of a recording.
 
 The charge is computed through the layer that leaks slowest, as in `engine.charge`. Under `local` it is the integral of
 A (c V' + g V) + g0 V, where V is the voltage of that layer. In one step the gap voltage u may pass through most of its
@@ -10,33 +10,15 @@ and v moves as slowly as the layers leak: only A c v' and the leakage currents a
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.blockforms import (
-    BLOCK,
-    COLLECTED,
-    ERROR_Q,
-    MIDDLE,
-    PEAK_Q,
-    PLACES,
-    SPAN,
-    Form,
-    Room,
-    Shown,
-    Z,
-)
+from fingerspice.engine.blockcourse import Course, inverse_area_at
+from fingerspice.engine.blockforms import COLLECTED, ERROR_Q, MIDDLE, PEAK_Q, PLACES, SPAN, Z
 from fingerspice.engine.blockkinks import crossing
-from fingerspice.engine.blockrows import (
-    area_rows,
-    modes_into,
-    scaled,
-)
-from fingerspice.engine.model import Model
+from fingerspice.engine.blockrows import area_rows, modes_into, scaled
 
 # Slopes, per step, at `PLACES` of the quartic through the values at 0, 1/4, 1/2, 3/4 and 1.
 _SLOPES = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-3.0, -10.0, 18.0, -6.0, 1.0], [-1.0, 6.0, -18.0, 10.0, 3.0]]) / 3.0
@@ -44,62 +26,6 @@ _SLOPES = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-3.0, -10.0, 18.0, -6.0, 1.0],
 GAINED, MISSED, HATS = 5, 6, 7
 # Share of the triangles' integrals that may be missed: they are known to first order.
 OF_HATS = 0.01
-
-
-class Charges(NamedTuple):
-    """Rows of a block for the charge.
-
-    Attributes
-    ----------
-    q : ndarray, shape (4, n)
-        1/A at the ends of the steps and at `PLACES`, 1/m^2.
-    steps : ndarray, shape (10, n)
-        Rate of the charge at 0, 1/4, 1/2, 3/4 and 1 of each step (A), the charge gained in the step, the error of this
-        gain, and, in steps of several samples, the triangles of the rate at `PLACES` times the step length (C).
-    z, rest, current, error : ndarray, shape (n,)
-        Charge (C), that without c r G(u), and current (A) at the starts of the steps, and error of the slowest layer's
-        voltage (V).
-    h, t : ndarray, shape (n,)
-        Lengths of the steps, and their limits, s; the limits are needed for outputs within steps only.
-    """
-
-    q: FloatArray
-    steps: FloatArray
-    z: FloatArray
-    rest: FloatArray
-    current: FloatArray
-    error: FloatArray
-    h: FloatArray
-    t: FloatArray
-
-
-class Course(NamedTuple):
-    """State and scratch arrays of the loop along a recording.
-
-    `w` (m,) are the modes, and the rows of `error` (2, m) the parts of their error that quadrature and sweeps leave;
-    `inner` are the rows at samples within steps of several (`engine.blockcoarse`), and
-    `spare` (3, n) is scratch for single outputs; `engine.blockforms` lists the entries of `control`,
-    `counters` and `checks` (LEVELS, 5).
-    """
-
-    model: Model
-    form: Form
-    shown: Shown
-    room: Room
-    inner: Room
-    charges: Charges
-    spare: FloatArray
-    w: FloatArray
-    error: FloatArray
-    control: FloatArray
-    counters: NDArray[np.int64]
-    checks: FloatArray
-
-
-def new_charges() -> Charges:
-    """Rows for one block, all zero."""
-    n = BLOCK + 8
-    return Charges(np.zeros((4, n)), np.zeros((10, n)), *np.zeros((6, n)))
 
 
 @jit_rows
@@ -163,13 +89,13 @@ def _charge_rows(
 
 @jit_rows
 def _hat_rows(
-    n: int, place: int, h: FloatArray, slow: FloatArray, k_gap: float, k_slow: float, slope: FloatArray, u: FloatArray,
+    n: int, place: int, h: FloatArray, slow: FloatArray, k: FloatArray, slope: FloatArray, u: FloatArray,
     ends: FloatArray, within: FloatArray, q: FloatArray, bumps: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
     """Add to `steps` what a triangle of the source at a place within each step adds to the charge besides Boole's rule.
 
-    Area and voltages have triangles, too. `slope` is the derivative of 1/A by |u| there, and the shares of the source
-    in u and in the slowest layer's voltage are `k_gap` and `k_slow`. The others are as in `_charge_rows`.
+    Area and voltages have triangles, too. `slope` is the derivative of 1/A by |u| there, and k are the shares of the
+    source in the projections, of which the first is u. The others are as in `_charge_rows`.
     """
     v = ends.shape[0] - 2
     c, g_area, g_total = slow[slow.size - 3], slow[slow.size - 2], slow[slow.size - 1]
@@ -177,12 +103,12 @@ def _hat_rows(
     by_boole, by_simpson = (12.0 / 90.0, 4.0 / 6.0) if place == MIDDLE else (32.0 / 90.0, 0.0)
     for i in range(n):
         a = 1.0 / q[1 + place, i]
-        by_u = (-slope[i] if u[i] >= 0.0 else slope[i]) * k_gap * a * a
+        by_u = (-slope[i] if u[i] >= 0.0 else slope[i]) * k[0] * a * a
         rate = (
             b0 * ends[v, i] + b1 * within[1, v, i] + b2 * within[0, v, i] + b3 * within[2, v, i] + b4 * ends[v, i + 1]
         )
         change = by_u * (h[i] * g_area * within[place, v + 1, i] + c * rate)
-        change = (change + h[i] * (g_area * a + g_total) * k_slow) * bumps[place, i]
+        change = (change + h[i] * (g_area * a + g_total) * k[v + 1]) * bumps[place, i]
         steps[GAINED, i] += change * (0.25 - by_boole)
         steps[MISSED, i] -= change * (by_boole - by_simpson)
         steps[HATS + place, i] = change
@@ -253,7 +179,7 @@ def charge_block(c: Course, r: int, n: int, of_seen: float, local: float, others
         u = room.u_within[place]
         area_rows(n, form.coarse.slope, form.scale, form.shift, 0.0, u, own.current)
         _hat_rows(
-            n, place, own.h, slow, form.k_gap, form.tap_s[v + 1], own.current, u, room.end, room.within, own.q,
+            n, place, own.h, slow, form.tap_s, own.current, u, room.end, room.within, own.q,
             room.bumps, own.steps,
         )  # fmt: skip
     scaled(n + 1, 0.0, room.s, own.error)
@@ -338,100 +264,3 @@ def charge_within(c: Course, at: float, n: int, out: FloatArray) -> None:
         own.error[i] = held / own.q[0, i]
     _within_rows(n, at, own.h[0], own.error, own.steps, own.rest, c.room.end[v], inner.end[v], out)
     moved_rows(n, c.shown.moved, form.scale, form.shift, inner.u, own.current, out)
-
-
-@jit
-def inverse_area_at(form: Form, u: float) -> tuple[float, float]:
-    """1/A and its derivative with respect to the gap voltage, from the polynomial that the blocks use."""
-    x = abs(u) * form.scale + form.shift
-    q, slope = 0.0, 0.0
-    for j in range(form.area.size - 1, -1, -1):
-        slope = slope * x + q
-        q = q * x + form.area[j]
-    return q, (slope if u >= 0.0 else -slope) * form.scale
-
-
-@jit
-def bend_at(form: Form, xi: float) -> float:
-    """N of `blockforms.Form`, V m^2."""
-    x, value = abs(xi) * form.scale + form.shift, 0.0
-    for j in range(form.bend.size - 1, -1, -1):
-        value = value * x + form.bend[j]
-    return value if xi >= 0.0 else -value
-
-
-@jit
-def steepness(form: Form, xi: float) -> float:
-    """Derivative of the gap voltage by xi; 1 in a stack."""
-    q, _ = inverse_area_at(form, xi)
-    share: float = 1.0 + form.kappa * (1.0 / q - 1.0 / form.q0[0])
-    return 1.0 / share
-
-
-@jit
-def current_at(
-    c: Course, r: int, w: FloatArray, g: FloatArray, source: float, slope: float, u: float
-) -> float:  # fmt: skip
-    """Current (A) from the modes w, the drives g, the source's value (V) and slope (V/s), and the gap voltage u (V)."""
-    model, form, slow = c.model, c.form, c.model.slow
-    n = slow.size - 4
-    dv, v, x_gap, dx_gap = 0.0, 0.0, 0.0, 0.0
-    for k in range(w.size):
-        dw = -form.rates[r, k] * w[k] + form.gain[r, k] * source
-        for t in range(g.size):
-            dw += form.feed[r, k, t] * g[t]
-        dv += c.shown.slow[r, k] * dw
-        v += c.shown.slow[r, k] * w[k]
-        x_gap += form.taps[r, 0, k] * w[k]
-        dx_gap += form.taps[r, 0, k] * dw
-    q, dq = inverse_area_at(form, u)
-    if not form.mobile:
-        leak = (slow[n + 2] + q * slow[n + 3]) * (slow[n] * source + v)
-        return float((slow[n + 1] * dv + leak + slope / model.s) / q)
-    scale = model.area0 * q
-    lam = slow[n + 1] * dv * scale + (slow[n + 2] + q * slow[n + 3]) * (slow[n] * source + v * scale)
-    # i = Q' with Q = A U / S + z, and u' from the area equation.
-    du = (model.k_gap * slope + dx_gap * scale) / (1.0 - x_gap * model.area0 * dq)
-    return float(lam / q + (slope / q - dq * du * source / (q * q)) / model.s)
-
-
-@jit_rows
-def _current_rows(
-    n: int, slow: FloatArray, over_s: float, slopes: FloatArray, dv: FloatArray, v: FloatArray, q: FloatArray,
-    out: FloatArray,
-) -> None:  # fmt: skip
-    """Right-hand limit of the current (A) in n places, under `local`."""
-    c, g_area, g_total = slow[slow.size - 3], slow[slow.size - 2], slow[slow.size - 1]
-    for i in range(n):
-        out[i] = (c * dv[i] + g_area * v[i] + slopes[i] * over_s) / q[i] + g_total * v[i]
-
-
-@jit
-def current_block(c: Course, r: int, room: Room, n: int, slopes: FloatArray, q: FloatArray) -> None:
-    """Right-hand limit of the current (A) at one place of n steps, whose rows are in `room`, into `Charges.current`.
-
-    `slopes` (n,) are the source's (V/s), and q (n,) is 1/A.
-    """
-    form, shown, own = c.form, c.shown, c.charges
-    m, drives = form.rates.shape[1], room.g.shape[0]
-    if form.mobile:
-        w, g = c.spare[0, :m], c.spare[1, :drives]
-        for i in range(n):
-            for k in range(m):
-                w[k] = room.w[k, i]
-            for t in range(drives):
-                g[t] = room.g[t, i]
-            own.current[i] = current_at(c, r, w, g, room.s[i], slopes[i], room.u[i])
-        return
-    share, by_g, by_s, dv = c.spare[0, :m], c.spare[1, :drives], 0.0, c.room.before
-    for t in range(drives):
-        by_g[t] = 0.0
-    for k in range(m):
-        share[k] = -form.rates[r, k] * shown.slow[r, k]
-        by_s += form.gain[r, k] * shown.slow[r, k]
-        for t in range(drives):
-            by_g[t] += shown.slow[r, k] * form.feed[r, k, t]
-    scaled(n, by_s, room.s, dv)
-    modes_into(n, 0, share, room.w, dv)
-    modes_into(n, 0, by_g, room.g, dv)
-    _current_rows(n, c.model.slow, 1.0 / c.model.s, slopes, dv, room.end[form.tap_s.size - 1], q, own.current)

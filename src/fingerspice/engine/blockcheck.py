@@ -14,7 +14,8 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.blockcharge import Course, charge_block
+from fingerspice.engine.blockcharge import charge_block
+from fingerspice.engine.blockcourse import Course
 from fingerspice.engine.blockforms import (
     BLOCK,
     CHECKED,
@@ -31,7 +32,7 @@ from fingerspice.engine.blockforms import (
     WAITED,
     WITHIN,
 )
-from fingerspice.engine.blockoutput import APART, show_within
+from fingerspice.engine.blockpoints import APART, show_within
 from fingerspice.engine.blockrows import add, largest_of, modes_into, scaled
 
 # The share stated is so many times the one measured, and at least so much of the one stated before.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.blockcharge import Course
+from fingerspice.engine.blockcourse import Course
 from fingerspice.engine.blockforms import BLOCK, FIRST_QUARTER, LAST_QUARTER, MIDDLE, ONE, PLACES, SPAN
 from fingerspice.engine.blockhats import add_hats
 from fingerspice.engine.blockkinks import add_where, respond_to_kinks

@@ -12,8 +12,9 @@ import math
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.blockcharge import Course, charge_block, inverse_area_at
+from fingerspice.engine.blockcharge import charge_block
 from fingerspice.engine.blockcheck import FORCE, gap_into, in_place
+from fingerspice.engine.blockcourse import Course, inverse_area_at
 from fingerspice.engine.blockforms import (
     CHECKED,
     ERROR_F,

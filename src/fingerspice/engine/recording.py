@@ -9,7 +9,6 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit
-from fingerspice.engine.blockcharge import Course, steepness
 from fingerspice.engine.blockcheck import OF_SWEEPS, compare, is_due, keep, note
 from fingerspice.engine.blockcoarse import (
     fitting,
@@ -21,6 +20,7 @@ from fingerspice.engine.blockcoarse import (
     span_of,
     steps_of,
 )
+from fingerspice.engine.blockcourse import Course, steepness
 from fingerspice.engine.blockerror import (
     accept,
     correct,
@@ -51,14 +51,7 @@ from fingerspice.engine.blockforms import (
 from fingerspice.engine.blockoutput import write_block
 from fingerspice.engine.blockrows import area_rows, largest_of
 from fingerspice.engine.model import ramp
-from fingerspice.engine.relaxation import (
-    FIRST_NEWTON,
-    LEAST_MARGIN,
-    look_at_ends,
-    misfit,
-    project_for_charge,
-    relax,
-)
+from fingerspice.engine.relaxation import FIRST_NEWTON, LEAST_MARGIN, look_at_ends, misfit, project_for_charge, relax
 
 # Codes returned by `march`.
 DONE, NOT_CLOSED, TOO_COARSE = range(3)

@@ -33,7 +33,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_within
-from fingerspice.engine.blockcharge import inverse_area_at
+from fingerspice.engine.blockcourse import inverse_area_at
 from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, ONE, PLACES, Form, Room
 from fingerspice.engine.blockhats import add_hats, find_hats, hats_at, look_at_middle
 from fingerspice.engine.blockkinks import add_where, find_crossings, kink_at, kink_rows, respond_to_kinks

@@ -13,9 +13,9 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.blockcharge import Charges, Course
 from fingerspice.engine.blockcheck import OF_SWEEPS, compare, is_due, keep, note
 from fingerspice.engine.blockcoarse import halved, most_samples
+from fingerspice.engine.blockcourse import Charges, Course
 from fingerspice.engine.blockerror import accept, correct, error_left, learn, may_coarsen, refine
 from fingerspice.engine.blockforms import (
     FIRST_QUARTER,
@@ -37,7 +37,8 @@ from fingerspice.engine.blockforms import (
     Room,
 )
 from fingerspice.engine.blockkinks import add_where, after_kink, kink_at
-from fingerspice.engine.blockoutput import write_points, write_samples
+from fingerspice.engine.blockoutput import write_samples
+from fingerspice.engine.blockpoints import write_points
 from fingerspice.engine.blockrows import (
     add_three,
     change_of,

@@ -17,7 +17,7 @@ from numpy.polynomial.polynomial import polyder, polyval
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine import blockforms
-from fingerspice.engine.blockcharge import Course, new_charges
+from fingerspice.engine.blockcourse import Course, new_charges
 from fingerspice.engine.blockforms import LEVELS, MIDDLE, ONE, PLACES, Coarse, Form
 from fingerspice.engine.system import System
 from fingerspice.numerics import chebyshev

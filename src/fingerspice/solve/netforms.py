@@ -13,7 +13,7 @@ from numpy.polynomial.polynomial import polyder, polyval
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.engine import blockforms
-from fingerspice.engine.blockcharge import Course, new_charges
+from fingerspice.engine.blockcourse import Course, new_charges
 from fingerspice.engine.blockforms import Form
 from fingerspice.engine.model import Model
 from fingerspice.numerics import chebyshev

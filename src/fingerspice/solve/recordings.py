@@ -17,7 +17,7 @@ import numpy as np
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine import blockforms, recording, uneven
 from fingerspice.engine.blockforms import BLOCK, Form
-from fingerspice.engine.blockoutput import write_end
+from fingerspice.engine.blockpoints import write_end
 from fingerspice.engine.unevenweights import new_steps
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record

@@ -1,0 +1,97 @@
+"""State of the loops over blocks of a recording, and 1/A, N and their slopes at single voltages."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit
+from fingerspice.engine.blockforms import BLOCK, Form, Room, Shown
+from fingerspice.engine.model import Model
+
+
+class Charges(NamedTuple):
+    """Rows of a block for the charge.
+
+    Attributes
+    ----------
+    q : ndarray, shape (4, n)
+        1/A at the ends of the steps and at `PLACES`, 1/m^2.
+    steps : ndarray, shape (10, n)
+        Rate of the charge at 0, 1/4, 1/2, 3/4 and 1 of each step (A), the charge gained in the step, the error of this
+        gain, and, in steps of several samples, the triangles of the rate at `PLACES` times the step length (C).
+    z, rest, current, error : ndarray, shape (n,)
+        Charge (C), that without c r G(u), and current (A) at the starts of the steps, and error of the slowest layer's
+        voltage (V).
+    h, t : ndarray, shape (n,)
+        Lengths of the steps, and their limits, s; the limits are needed for outputs within steps only.
+    """
+
+    q: FloatArray
+    steps: FloatArray
+    z: FloatArray
+    rest: FloatArray
+    current: FloatArray
+    error: FloatArray
+    h: FloatArray
+    t: FloatArray
+
+
+class Course(NamedTuple):
+    """State and scratch arrays of the loop along a recording.
+
+    `w` (m,) are the modes, and the rows of `error` (2, m) the parts of their error that quadrature and sweeps leave;
+    `inner` are the rows at samples within steps of several (`engine.blockcoarse`), and
+    `spare` (3, n) is scratch for single outputs; `engine.blockforms` lists the entries of `control`,
+    `counters` and `checks` (LEVELS, 5).
+    """
+
+    model: Model
+    form: Form
+    shown: Shown
+    room: Room
+    inner: Room
+    charges: Charges
+    spare: FloatArray
+    w: FloatArray
+    error: FloatArray
+    control: FloatArray
+    counters: NDArray[np.int64]
+    checks: FloatArray
+
+
+def new_charges() -> Charges:
+    """Rows for one block, all zero."""
+    n = BLOCK + 8
+    return Charges(np.zeros((4, n)), np.zeros((10, n)), *np.zeros((6, n)))
+
+
+@jit
+def inverse_area_at(form: Form, u: float) -> tuple[float, float]:
+    """1/A and its derivative with respect to the gap voltage, from the polynomial that the blocks use."""
+    x = abs(u) * form.scale + form.shift
+    q, slope = 0.0, 0.0
+    for j in range(form.area.size - 1, -1, -1):
+        slope = slope * x + q
+        q = q * x + form.area[j]
+    return q, (slope if u >= 0.0 else -slope) * form.scale
+
+
+@jit
+def bend_at(form: Form, xi: float) -> float:
+    """N of `blockforms.Form`, V m^2."""
+    x, value = abs(xi) * form.scale + form.shift, 0.0
+    for j in range(form.bend.size - 1, -1, -1):
+        value = value * x + form.bend[j]
+    return value if xi >= 0.0 else -value
+
+
+@jit
+def steepness(form: Form, xi: float) -> float:
+    """Derivative of the gap voltage by xi; 1 in a stack."""
+    q, _ = inverse_area_at(form, xi)
+    share: float = 1.0 + form.kappa * (1.0 / q - 1.0 / form.q0[0])
+    return 1.0 / share
