@@ -50,8 +50,8 @@ tempfile.TemporaryFile = refuse
 # What the package logs, as the command line shows it.
 LOGGED = "import logging; logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
 ONCE = (
-    "compiling what this needs, 20 s for a series stack and 30 s for a network, only once: later runs find "
-    "it on the disk"
+    "compiling what this needs, 20 s for a series stack, 30 s for a network, a minute for recordings, only once: "
+    "later runs find it on the disk"
 )
 
 

@@ -105,8 +105,8 @@ class _Cache(FunctionCache):
 
 
 _ONCE = (
-    "compiling what this needs, 20 s for a series stack and 30 s for a network, only once: later runs find "
-    "it on the disk"
+    "compiling what this needs, 20 s for a series stack, 30 s for a network, a minute for recordings, only once: "
+    "later runs find it on the disk"
 )
 _EVERY_TIME = (
     "compiling, 20 s to a minute, as at every run: no folder for compiled code can be written, neither the package's "

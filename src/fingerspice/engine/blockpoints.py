@@ -13,8 +13,19 @@ from fingerspice.engine.blockcharge import HATS, moved_rows, moved_with, triangl
 from fingerspice.engine.blockcoarse import bump_at, bump_response
 from fingerspice.engine.blockcourse import Course, bend_at, inverse_area_at, steepness
 from fingerspice.engine.blockcurrent import current_at
-from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, OUTPUT, PLACES, REFERENCE, SPAN, U_GAP, Z
-from fingerspice.engine.blockkinks import crossing
+from fingerspice.engine.blockforms import (
+    FIRST_QUARTER,
+    LAST_QUARTER,
+    MIDDLE,
+    OUTPUT,
+    PLACES,
+    REFERENCE,
+    SPAN,
+    U_GAP,
+    Form,
+    Z,
+)
+from fingerspice.engine.blockkinks import after_kink, crossing
 from fingerspice.engine.relaxation import FIRST_NEWTON, look_at_ends
 from fingerspice.numerics.moments import moments
 
@@ -109,9 +120,9 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
             moments(form.rates[r, k] * h * at, found)
             one, two = at * at * found[1], at * at * at * found[2]
             by_middle, by_end = 4.0 * (one - two), 2.0 * two - one
-            moments(form.rates[r, k] * h * since, found)
-            ramp = since * since * found[1] - by_middle * early - by_end * rest
-            bent = since * since * since * found[2] - by_middle * early * early - by_end * rest * rest
+            ramp, bent = after_kink(form.rates[r, k] * h * since, since)
+            ramp -= by_middle * early + by_end * rest
+            bent -= by_middle * early * early + by_end * rest * rest
             for t in range(drives):
                 slope = room.end[1 + t, i + 1] - room.end[1 + t, i]
                 there = room.end[1 + t, i] + zero * slope
@@ -182,13 +193,11 @@ def _write_flows(
 
 
 @jit
-def _gap_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, g: FloatArray) -> tuple[float, float, float]:
-    """Gap voltage (in a network xi) at fraction `at` of step i, source (V), and enlargement of the modes' parts by 1/A.
-
-    The modes and drives there go into w and g.
-    """
-    form, room, model = c.form, c.room, c.model
-    source = room.s[i] + at * (room.s[i + 1] - room.s[i]) + bump_at(c, i, at)[0]
+def _network_drives(
+    c: Course, r: int, h: float, i: int, at: float, source: float, w: FloatArray, g: FloatArray
+) -> None:  # fmt: skip
+    """Drives of a network at fraction `at` of step i, along their polynomials; the modes w there follow a fast N."""
+    form, room = c.form, c.room
     first, middle, last = (2.0 * at - 1.0) * (at - 1.0), 4.0 * at * (1.0 - at), at * (2.0 * at - 1.0)
     for t in range(g.size):
         g[t] = first * room.g[t, i] + middle * room.g_within[MIDDLE, t, i] + last * room.g[t, i + 1]
@@ -197,26 +206,52 @@ def _gap_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, g: Fl
         faded = form.rates[r, form.fast] * h
         parabola = first + middle * math.exp(-0.5 * faded) + last * math.exp(-faded)
         g[g.size - 1] += room.pulse[i] * (math.exp(-faded * at) - parabola)
+    if at > 0.0:
+        _add_kink(c, i, at, g)
+        if form.fast >= 0:
+            _follow_fast(c, r, h * at, source, w, g)
+
+
+@jit
+def _stack_drives(form: Form, r: int, source: float, u: float, w: FloatArray, g: FloatArray) -> None:
+    """Drives of a stack at a gap voltage u (V) and the modes w."""
+    q0, q = form.q0[r], inverse_area_at(form, u)[0]
+    for t in range(g.size):
+        x = form.tap_s[1 + t] * source
+        for k in range(w.size):
+            x += form.taps[r, 1 + t, k] * w[k]
+        g[t] = (1.0 / q - 1.0 / q0) * x if form.mobile and t + 1 == g.size else (q - q0) * x
+
+
+@jit
+def _gap_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, g: FloatArray) -> tuple[float, float, float]:
+    """Gap voltage (in a network xi) at fraction `at` of step i, source (V), and enlargement of the modes' parts by 1/A.
+
+    The modes and drives there go into w and g.
+    """
+    form, room, model = c.form, c.room, c.model
+    source = room.s[i] + at * (room.s[i + 1] - room.s[i]) + bump_at(c, i, at)[0]
     for k in range(w.size):
         w[k] = room.w[k, i]
     if at > 0.0:
-        _add_kink(c, i, at, g)
         _modes_at(c, r, h, i, at, w)
-        if form.fast >= 0:
-            _follow_fast(c, r, h * at, source, w, g)
+    if form.bend.size > 0:
+        _network_drives(c, r, h, i, at, source, w, g)
     x_gap = 0.0
     for k in range(w.size):
         x_gap += form.taps[r, 0, k] * w[k]
     u, scale = model.k_gap * source + x_gap, 1.0
     if form.mobile:
-        u = first * room.u[i]
+        u = (2.0 * at - 1.0) * (at - 1.0) * room.u[i]
         if at > 0.0:
-            u += middle * room.u_within[MIDDLE, i] + last * room.u[i + 1]
+            u += 4.0 * at * (1.0 - at) * room.u_within[MIDDLE, i] + at * (2.0 * at - 1.0) * room.u[i + 1]
         for _ in range(3):
             q, dq = inverse_area_at(form, u)
             b = model.area0 * x_gap
             u -= (u - model.k_gap * source - b * q) / (1.0 - b * dq)
         scale = model.area0 * inverse_area_at(form, u)[0]
+    if form.bend.size == 0:
+        _stack_drives(form, r, source, u, w, g)
     return u, source, scale
 
 
