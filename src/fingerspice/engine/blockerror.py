@@ -61,9 +61,10 @@ CAUTION, LEAST = 2.0, 0.01
 PARTS = 8
 # Below this share of the error allowed, changes show nothing but rounding.
 SHOWING = 1e-3
-# Steps twice as long are taken where their error is expected to be below this fraction of the one allowed. What is
-# known of its growth is forgotten by this factor in each block.
-SPARE, FORGETTING = 1.0, 0.97
+# Steps twice as long are taken where their error is expected to be below this fraction of the one allowed, and those of
+# several samples below the second: many blocks with all of the error allowed would add up to more than was asked for,
+# and a piece would be taken again. What is known of the error's growth is forgotten by the third factor in each block.
+SPARE, SPARE_LONG, FORGETTING = 1.0, 0.3, 0.97
 
 
 @jit_rows
@@ -318,4 +319,4 @@ def may_coarsen(c: Course, level: int, seen: float, left: float, tol: float) -> 
     checks = c.checks
     checks[level, GROWTH] = OF_ORDER + FORGETTING * (checks[level, GROWTH] - OF_ORDER)
     share = max(checks[level, OF_GAP], checks[level - 1, OF_GAP] if checks[level - 1, CHECKED] > 0.0 else 0.0)
-    return bool(checks[level, GROWTH] * share * seen + left < SPARE * tol)
+    return bool(checks[level, GROWTH] * share * seen + left < (SPARE if level > ONE else SPARE_LONG) * tol)
