@@ -35,8 +35,9 @@ _SOURCES = [
     _OWN.with_name("borrowing.py"),
     *sorted(p for name in SHARED_FOLDERS for p in (_PACKAGE / name).rglob("*.py")),
 ]
-# By content, so that a package that is copied, or packed into an image, keeps its compiled code.
-_STAMP = hashlib.sha256(b"".join(p.name.encode() + p.read_bytes() for p in _SOURCES)).hexdigest()
+#: Hash of the compiled code's sources. By content, so that a package that is copied, or packed into an image, keeps its
+#: compiled code.
+STAMP = hashlib.sha256(b"".join(p.name.encode() + p.read_bytes() for p in _SOURCES)).hexdigest()
 _COMPILER = Compiling()
 
 
@@ -44,13 +45,13 @@ def _drop_stale_cache() -> None:
     """Delete cached code in the package that no key matches any more."""
     record = _PACKAGE / "__pycache__" / "compiled.stamp"
     try:
-        if record.is_file() and record.read_text() == _STAMP:
+        if record.is_file() and record.read_text() == STAMP:
             return
         for kind in ("*.nbi", "*.nbc"):
             for file in _PACKAGE.rglob(kind):
                 file.unlink(missing_ok=True)
         record.parent.mkdir(exist_ok=True)
-        record.write_text(_STAMP)
+        record.write_text(STAMP)
     except OSError:
         # A package that cannot be written has its cache elsewhere, and is replaced as a whole.
         return
@@ -86,7 +87,7 @@ class _Cache(FunctionCache):
         self._came = cast(Any, IndexDataCacheFile)(came, place.filename_base, place.locator.get_source_stamp())
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
-        return (*cast(Any, super())._index_key(sig, codegen), _STAMP)
+        return (*cast(Any, super())._index_key(sig, codegen), STAMP)
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
         key = self._index_key(sig, target_context.codegen())

@@ -90,6 +90,7 @@ def _layers(circuit: Circuit) -> bool:
 
 def _identity(run: Stream, circuit: Circuit, how: dict[str, Any], names: list[str]) -> dict[str, Any]:
     """All inputs that determine the bytes of a store, by which a later call recognises its own store."""
+    from fingerspice.base.compiled import STAMP
     from fingerspice.waveforms.samples import Samples
 
     elements, sources = hashlib.sha256(), hashlib.sha256()
@@ -108,7 +109,7 @@ def _identity(run: Stream, circuit: Circuit, how: dict[str, Any], names: list[st
         "charge_law": run.problem.scene.charge_law, "area": run.problem.scene.area_mode, "method": how["method"],
         "start": str(how["start"]), "chunk": run.count, "signals": names, "end": run.problem.t_stop,
         "output_times": [o.start, o.over, o.low, o.total],
-        "program": f"fingerspice {__version__}, NumPy {np.__version__}",
+        "program": f"fingerspice {__version__} ({STAMP[:12]}), NumPy {np.__version__}",
     }  # fmt: skip
 
 

@@ -122,6 +122,7 @@ def weighted(
     if faded.any():
         pulse, *pulses = (feed[:, None, :, -1] * h * _pulse(z, faded, at) for at in (1.0, *PLACES))
     pulse_within = np.stack([np.einsum("rpk,rsk->rsp", taps, one) for one in pulses], axis=2)
+    several = slice(others["longest"], ONE)
     quarters, simpson = weights(z, BOOLE)[..., None, [1, 3]], weights(z, SIMPSON)
     return Form(
         rates=np.ascontiguousarray(rates), gain=np.ascontiguousarray(gain), decay=np.exp(-z),
@@ -129,7 +130,8 @@ def weighted(
         feed=np.ascontiguousarray(feed), taps=np.ascontiguousarray(taps), tap_s=tap_s, within=inner, within_s=inner_s,
         within_g=inner_g, share=np.ascontiguousarray(simpson[..., 1:]), defect=drives * quarters,
         fast=fast, faded=faded, pulse=pulse, pulse_within=pulse_within,
-        coarse=_coarse(z[:, :ONE], by_step[:, :ONE], drives[:, :ONE], taps, tap_s, _derivative(others)), **others,
+        coarse=_coarse(z[:, several], by_step[:, several], drives[:, several], taps, tap_s, _derivative(others)),
+        **others,
     )  # fmt: skip
 
 
