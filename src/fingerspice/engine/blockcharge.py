@@ -88,7 +88,7 @@ def _charge_rows(
 
 
 @jit_rows
-def _hat_rows(
+def _triangle_rows(
     n: int, place: int, h: FloatArray, slow: FloatArray, k: FloatArray, slope: FloatArray, u: FloatArray,
     ends: FloatArray, within: FloatArray, q: FloatArray, bumps: FloatArray, steps: FloatArray,
 ) -> None:  # fmt: skip
@@ -178,7 +178,7 @@ def charge_block(c: Course, r: int, n: int, of_seen: float, local: float, others
     for place in range(hats):
         u = room.u_within[place]
         area_rows(n, form.coarse.slope, form.scale, form.shift, 0.0, u, own.current)
-        _hat_rows(
+        _triangle_rows(
             n, place, own.h, slow, form.tap_s, own.current, u, room.end, room.within, own.q,
             room.bumps, own.steps,
         )  # fmt: skip
@@ -234,8 +234,8 @@ def weights_until(at: float) -> tuple[float, float, float, float, float]:
 def triangle_until(at: float, top: float) -> float:
     """Integral to `at` of a triangle with this top, of height 1 and half a step wide, less its quartic's."""
     early, middle, late = max(at - top + 0.25, 0.0), max(at - top, 0.0), max(at - top - 0.25, 0.0)
-    _, a, b, c, _ = weights_until(at)
-    return 2.0 * (early * early - 2.0 * middle * middle + late * late) - (a if top == 0.25 else b if top == 0.5 else c)
+    whole = 2.0 * (early * early - 2.0 * middle * middle + late * late)
+    return float(whole - weights_until(at)[int(4.0 * top)])
 
 
 @jit_rows

@@ -10,7 +10,7 @@ from __future__ import annotations
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
 from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, Form, Room
-from fingerspice.engine.blockrows import add_bumps, area_rows, scaled
+from fingerspice.engine.blockrows import add_bumps, area_rows
 
 
 @jit_rows
@@ -24,9 +24,10 @@ def _derivatives(
 
 
 @jit_rows
-def _hat_rows(n: int, ends: FloatArray, middle: FloatArray, bumps: FloatArray, hats: FloatArray) -> None:
+def _hat_rows(n: int, ends: FloatArray, bumps: FloatArray, hats: FloatArray) -> None:
+    """Triangles `hats` (3, n), from derivatives at the ends of the steps and, in the row of the middle, there."""
     for i in range(n):
-        here = middle[i]
+        here = hats[MIDDLE, i]
         hats[FIRST_QUARTER, i] = 0.5 * (ends[i] + here) * bumps[FIRST_QUARTER, i]
         hats[MIDDLE, i] = here * bumps[MIDDLE, i]
         hats[LAST_QUARTER, i] = 0.5 * (here + ends[i + 1]) * bumps[LAST_QUARTER, i]
@@ -47,14 +48,12 @@ def look_at_middle(form: Form, room: Room, n: int) -> None:
 @jit_within
 def find_hats(form: Form, room: Room, n: int) -> None:
     """The triangles of the drives, after `look_at_middle`, from a look at the ends of the steps."""
-    # The rows of the kinks and of the fast part of N serve as scratch: a sweep finds kinks anew, and steps of several
-    # samples have no such part.
-    slope, middle, ends = room.slope, room.crossed, room.pulse
+    # The row of the fast part of N serves as scratch: steps of several samples have no such part.
+    slope, ends = room.slope, room.pulse
     area_rows(n + 1, form.coarse.slope, form.scale, form.shift, 0.0, room.u, slope)
     for t in range(room.g.shape[0]):
         _derivatives(n + 1, form.k_gap, form.tap_s[1 + t], slope, room.u, room.z, room.end[1 + t], ends)
-        scaled(n, 1.0, room.hats[t, MIDDLE], middle)
-        _hat_rows(n, ends, middle, room.bumps, room.hats[t])
+        _hat_rows(n, ends, room.bumps, room.hats[t])
 
 
 @jit_within

@@ -136,9 +136,10 @@ class Finger(Follower):
         w[n:] = start.y[n : start.y.size if m > n else n] - held[n:]
         control, counters = blockforms.new_control(), np.zeros(blockforms.N_COUNTERS, np.int64)
         control[blockforms.U_GAP] = one.taps[0] @ w + one.tap_s[0] * s[reduced.source]
-        rooms = [blockforms.new_room(m, drives, drives + 1, self.shown) for _ in range(2)]
+        # The rows at samples within steps of several are never used.
+        room = blockforms.new_room(m, drives, drives + 1, self.shown)
         return Course(
-            self._model, form, self.shown, rooms[0], rooms[1], new_charges(),
+            self._model, form, self.shown, room, room, new_charges(),
             np.zeros((3, max(m, drives, 5))), w, np.zeros((2, m)), control, counters, blockforms.new_checks(self.shown),
         )  # fmt: skip
 
