@@ -1,18 +1,19 @@
-"""A run in closed form between its outputs, evaluated on panels that are refined until polynomials represent it."""
+"""A run that can be computed at any time, on panels that are refined until polynomials represent it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import partial
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS, TO_SERIES
-from fingerspice.results.measures import Panels, Read
-from fingerspice.results.record import Record
+from fingerspice.results.measures import Read
+from fingerspice.results.record import Record, bare_record
+from fingerspice.results.steps import Block, Stretches
 from fingerspice.waveforms.waveform import Waveform
 
 #: Largest interpolation error of a panel between its nodes, relative to the signal's peak.
@@ -26,7 +27,7 @@ _MOST_PASSED, _LONGEST = 200_000, 0.5
 
 @dataclass(frozen=True)
 class ClosedForm:
-    """A run in closed form, which can be evaluated at any time.
+    """A run in closed form, or by a method that computes it anew for any times.
 
     Attributes
     ----------
@@ -38,6 +39,8 @@ class ClosedForm:
         Start of the run, and the interval for figures, s.
     error : float
         Error of the records of `look`, relative to the peaks; the panels' polynomials need not be more accurate.
+    rounding : float
+        Round-off of a voltage, V, below which the polynomials need not be accurate.
     """
 
     look: Callable[[FloatArray, BoolArray], Record]
@@ -46,8 +49,9 @@ class ClosedForm:
     first: float
     stop: float
     error: float = 0.0
+    rounding: float = 0.0
 
-    def run(self, readers: Mapping[str, Read], since: float, until: float) -> Refined | None:
+    def run(self, readers: Mapping[str, Read], since: float, until: float) -> Stretches | None:
         """Panels between two times (s), on each of which a polynomial represents every voltage; None if too many.
 
         `readers` gives, by name, the functions that read signals from a record.
@@ -78,86 +82,55 @@ class ClosedForm:
             if begin.size + sum(x.size for x, _ in done) > MOST_PANELS:
                 return None
         begin, end = (np.sort(np.concatenate(x)) for x in zip(*done, strict=True))
-        return self._cut_at_zeros(readers, Refined(self.look, begin, end))
+        marks = np.append(begin, end[-1])
+        marks = np.unique(np.concatenate([marks, *self._zeros(readers, begin, end)]))
+        begin, end = marks[:-1], marks[1:]
+        _, order, record = self._at_points(begin, end)
+        columns = np.empty((order.size, record.rows.shape[1]))
+        columns[order] = record.rows
+        values = columns.reshape(begin.size, POINTS.size, -1)[:, :NODES].transpose(0, 2, 1)
+        times = np.column_stack([begin, end - begin, end, np.ones(begin.size)])
+        return Stretches([Block(times, values)], partial(bare_record, record.network, record.net))
+
+    def _at_points(self, begin: FloatArray, end: FloatArray) -> tuple[tuple[int, int], IntArray, Record]:
+        """Shape of the points of all panels, their ascending order, and the record in that order."""
+        t = begin[:, None] + POINTS * (end - begin)[:, None]
+        left = np.broadcast_to(POINTS >= 1.0, t.shape)
+        t[left] = np.broadcast_to(end[:, None], t.shape)[left]
+        order = np.lexsort((~left.ravel(), t.ravel()))
+        return (begin.size, POINTS.size), order, self.look(t.ravel()[order], left.ravel()[order])
 
     def _is_rough(
         self, readers: Mapping[str, Read], begin: FloatArray, end: FloatArray, peaks: dict[str, float]
     ) -> BoolArray:
         """Whether some voltage's interpolation error on a panel is too large, shape (p,)."""
-        every = Refined(self.look, begin, end)
+        shape, order, record = self._at_points(begin, end)
         wrong = np.zeros(begin.size, bool)
         for name, read in readers.items():
             if not name.startswith(("u_", "v:")):
                 # Signals that follow from the gap voltage are smooth where it is, except at its zeros.
                 continue
-            _, values = every.at_own_points(read)
+            values = _in_place(read(record), order, shape)
             peaks[name] = max(peaks.get(name, 0.0), float(np.abs(values).max(initial=0.0)))
             missed = np.abs(values[:, :NODES] @ BETWEEN - values[:, NODES:]).max(axis=1)
-            wrong |= missed > max(_MISSED, self.error) * peaks[name]
+            wrong |= missed > max(max(_MISSED, self.error) * peaks[name], self.rounding)
         return wrong & (0.5 * (begin + end) > begin) & (0.5 * (begin + end) < end)
 
-    def _cut_at_zeros(self, readers: Mapping[str, Read], run: Refined) -> Refined:
-        """The panels cut at the zeros of gap voltages, where the area has a kink."""
-        zeros = []
+    def _zeros(self, readers: Mapping[str, Read], begin: FloatArray, end: FloatArray) -> Iterator[FloatArray]:
+        """Zeros of gap voltages (s), where the area has a kink."""
+        shape, order, record = self._at_points(begin, end)
         for name, read in readers.items():
             if name.partition(":")[0] != "u_gap":
                 continue
-            values = run.at_own_points(read)[1][:, :NODES]
-            for i in np.flatnonzero((values.max(axis=1) > 0.0) & (values.min(axis=1) < 0.0)):
+            values = _in_place(read(record), order, shape)[:, :NODES]
+            for i in np.flatnonzero((values.max(axis=1) > self.rounding) & (values.min(axis=1) < -self.rounding)):
                 roots = chebyshev.chebroots(values[i] @ TO_SERIES[:, :NODES])
                 inside = roots.real[(np.abs(roots.imag) < 1e-8) & (np.abs(roots.real) < 1.0)]
-                zeros.append(run.begin[i] + (run.end[i] - run.begin[i]) * 0.5 * (1.0 + inside))
-        if not zeros:
-            return run
-        marks = np.unique(np.concatenate([run.begin, run.end[-1:], *zeros]))
-        return Refined(self.look, marks[:-1], marks[1:])
+                yield begin[i] + (end[i] - begin[i]) * 0.5 * (1.0 + inside)
 
 
-@dataclass(frozen=True)
-class Refined:
-    """Consecutive panels of a run in closed form; see `measures.Run`."""
-
-    look: Callable[[FloatArray, BoolArray], Record]
-    begin: FloatArray
-    end: FloatArray
-
-    def panels(self, since: float, until: float) -> Panels:
-        """The panels between two times (s); the first and last are cut off at these times."""
-        length = self.end - self.begin
-        low = np.maximum((since - self.begin) / length, 0.0)
-        high = np.minimum((until - self.begin) / length, 1.0)
-        some = np.flatnonzero(high > low)
-        return Panels(some, low[some], high[some], (high - low)[some] * length[some])
-
-    @cached_property
-    def _own(self) -> tuple[FloatArray, IntArray, Record]:
-        """Times at the points of all panels, shape (p, ROWS), their ascending order, and the record in that order."""
-        return self._looked_at(slice(None), np.broadcast_to(POINTS, (self.begin.size, POINTS.size)))
-
-    def _looked_at(self, index: IntArray | slice, fraction: FloatArray) -> tuple[FloatArray, IntArray, Record]:
-        begin, end = self.begin[index, None], self.end[index, None]
-        left = fraction >= 1.0
-        t = np.where(left, end, begin + fraction * (end - begin))
-        order = np.lexsort((~left.ravel(), t.ravel()))
-        return t, order, self.look(t.ravel()[order], left.ravel()[order])
-
-    def at_own_points(self, read: Read) -> tuple[FloatArray, FloatArray]:
-        """Times (s) and a signal at the points of every panel, shape (p, ROWS) each."""
-        return _in_place(read, *self._own)
-
-    def at_points(self, read: Read, panels: Panels) -> tuple[FloatArray, FloatArray]:
-        """See `measures.Run`; the record at the points of all panels is computed only once."""
-        if panels.step.size == self.begin.size and not panels.low.any() and (panels.high == 1.0).all():
-            return self.at_own_points(read)
-        return self.values_at(read, panels.step, panels.fractions(POINTS))
-
-    def values_at(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """See `measures.Run`; evaluates the closed form."""
-        return _in_place(read, *self._looked_at(index, fraction))
-
-
-def _in_place(read: Read, t: FloatArray, order: IntArray, record: Record) -> tuple[FloatArray, FloatArray]:
-    """Times, and a signal of a record, whose times ascend, rearranged to the order of these times."""
-    x = np.empty(t.size)
-    x[order] = read(record)
-    return t, x.reshape(t.shape)
+def _in_place(x: FloatArray, order: IntArray, shape: tuple[int, int]) -> FloatArray:
+    """Values at ascending times, rearranged to the order and shape of the panels' points."""
+    out = np.empty(x.size)
+    out[order] = x
+    return out.reshape(shape)

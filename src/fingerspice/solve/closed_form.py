@@ -16,9 +16,8 @@ from fingerspice.engine.network import at_sources
 from fingerspice.numerics import hold, linear
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
-from fingerspice.results.refined import ClosedForm
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Run, gap_signals, kept_with
+from fingerspice.solve.runs import Run, closed_form, gap_signals, kept_with
 from fingerspice.solve.sources import Tables, after_the_end, joined, segment_index
 from fingerspice.solve.stackstate import StackState, from_stack, from_written, model_of, row_width
 from fingerspice.waveforms.samples import Samples
@@ -198,7 +197,7 @@ def _finished(
     status = Status.SUCCESS if tables.not_finite is None else Status.SOURCE_NOT_FINITE
     run = Run(t, left, rows, status, 0, {}, state, t_failed=tables.not_finite)
     run.unseen, run.rough = tables.unseen, tables.rough
-    largest = problem.largest
+    largest = max(problem.largest, problem.scene.u_size)
     if problem.network.n_voltage < len(problem.network.sources):
         largest = max(largest, float(np.abs(rows[:, : problem.network.k.shape[0]]).max(initial=0.0)))
     rounding = (ROUNDING_OF_MATRICES if problem.scene.stack is None else ROUNDING) * largest
@@ -211,7 +210,7 @@ def _finished(
     if not problem.scene.is_sampled:
         # Not for a source given as a user's function: evaluating it between the outputs would cost too much.
         look = partial(_look, dataclasses.replace(problem, charge=False), solve)
-        run.continuous = ClosedForm(look, problem.waveform, problem.t_start, problem.first, problem.t_stop)
+        run.continuous = closed_form(problem, look)
     return run
 
 

@@ -20,9 +20,10 @@ from fingerspice.engine import collocation
 from fingerspice.engine.network import Net, Room, Sources, at_sources, choose_signs, gap_voltage, rates
 from fingerspice.engine.radau import NFEV
 from fingerspice.results.outcome import Status
+from fingerspice.results.record import Record
 from fingerspice.solve.nodal import STAGES, Collocation, radau_scheme, solve_coupled
-from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Progress, Run, gap_signals, integrate, nodes_apart
+from fingerspice.solve.problem import ROUNDING, Problem
+from fingerspice.solve.runs import Progress, Run, closed_form, gap_signals, integrate, nodes_apart
 from fingerspice.solve.sources import Tables, values_at
 
 _QUIET = threading.Lock()
@@ -258,12 +259,18 @@ def solve_foreign(
             gap[2:] += [np.abs(a[:n] - b[:n]).max(initial=0.0) for a, b in zip(mine, theirs, strict=True)]
         run.gaps = gaps
         run.node_error = (reference.node_error or 0.0) + nodes_apart(reference.record(problem), run.record(problem))
-        worst = run.excess(max(u_scale, problem.scene.u_peak)) / rtol
+        worst = run.excess(max(ROUNDING * u_scale, problem.rounding)) / rtol
         if run.status is not Status.SUCCESS:
             if reference.status is Status.FOLD:
                 run.status, run.t_failed = reference.status, reference.t_failed
             return run
         if worst <= 1.0:
+
+            def look(t: FloatArray, left: BoolArray, tol: float = tol) -> Record:
+                again = Foreign(problem, library, name, tol, u_scale, t, left)
+                return integrate(again, Tables(problem, tol), None).record(problem)
+
+            run.continuous = closed_form(problem, look, rtol)
             return run
         if attempt < ATTEMPTS - 1:
             tol = max(tol * min(0.3, 0.5 / worst), 1e-16)

@@ -6,7 +6,7 @@ from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.results.outcome import Status
 from fingerspice.solve.netmarching import March
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import ROUNDING, Progress, Run, integrate
+from fingerspice.solve.runs import Progress, Run, integrate
 from fingerspice.solve.sources import Tables
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, OutOfRangeError, Stepping
 from fingerspice.solve.track import Track, prepare_system, scale_of
@@ -44,13 +44,15 @@ def solve(
     is_stack = problem.scene.stack is not None
     u_scale = scale_of(problem, tables) if is_stack else problem.largest or GUESS
     tol, top, nfev, attempts, tries_out = LOCAL_SHARE * rtol, 0.0, 0, 0, True
+    # The voltages of sources that cancel are rounding errors of those of their parts.
+    finest = FINEST * max(1.0, problem.scene.u_size / u_scale)
     while True:
         one: Stepping
         if is_stack:
             prepared = prepare_system(problem.scene, rtol, top)
-            one = Track(problem, prepared, max(tol, FINEST) * u_scale, t_out, left, repeat)
+            one = Track(problem, prepared, max(tol, finest) * u_scale, t_out, left, repeat)
         else:
-            one = March(problem, max(tol, FINEST), rtol, u_scale, t_out, left, repeat)
+            one = March(problem, max(tol, finest), rtol, u_scale, t_out, left, repeat)
         if tries_out:
             one.try_out(rtol)
         try:
@@ -66,15 +68,15 @@ def solve(
         run.continuous = one.recorded()
         one.stated(run)
         attempts += 1
-        worst = run.excess(problem.largest) / rtol
+        worst = run.excess(problem.rounding) / rtol
         # A trial (`try_out`) that predicts too large an error stops the run early, with ERROR_NOT_MET.
         is_whole = run.status is not Status.ERROR_NOT_MET
         if is_whole and (run.status is not Status.SUCCESS or worst <= 1.0):
             return run
         peak = float(run.gaps[:, 0].max(initial=0.0))
         # A peak smaller than its own error may still vanish with a finer tolerance, so that case is not hopeless.
-        hopeless = rtol * peak < ROUNDING * u_scale and run.error.u_gap < peak
-        if hopeless or tol <= FINEST or attempts >= ATTEMPTS:
+        hopeless = rtol * peak < problem.rounding and run.error.u_gap < peak
+        if hopeless or tol <= finest or attempts >= ATTEMPTS:
             if is_whole:
                 run.status = Status.ERROR_NOT_MET
                 return run

@@ -18,8 +18,18 @@ from fingerspice.engine.readout import TRIED
 from fingerspice.numerics.radau_tableau import radau
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import Status
-from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import PAST_FOLD, NetworkIntegration, Progress, Run, gap_signals, integrate, nodes_apart
+from fingerspice.results.record import Record
+from fingerspice.solve.problem import ROUNDING, Problem
+from fingerspice.solve.runs import (
+    PAST_FOLD,
+    NetworkIntegration,
+    Progress,
+    Run,
+    closed_form,
+    gap_signals,
+    integrate,
+    nodes_apart,
+)
 from fingerspice.solve.sources import Tables, ramp, values_at
 
 # Stages of a run and of the coarser run, and the ratio of the coarser run's tolerance to the run's. The stated error is
@@ -179,19 +189,21 @@ def solve_coupled(
     u_scale = problem.largest
     if problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
         u_scale = _voltage_scale(problem, coarse, max(u_scale, 1.0))
-    tol, nfev = LOCAL_SHARE * rtol, 0
+    finest = FINEST * max(1.0, problem.scene.u_size / u_scale)
+    tol, nfev = max(LOCAL_SHARE * rtol, finest), 0
     folded = math.inf
     nearest: tuple[float, Run] | None = None
     for attempt in range(ATTEMPTS):
+        taken = tol
         beside = _integrate(problem, coarse, BESIDE * tol, u_scale, at[probed], side[probed], None)
         run = _integrate(problem, fine, tol, u_scale, at, side, progress)
         nfev += beside.nfev + run.nfev
         run.nfev = nfev
         worst = _stated(problem, run, _only(run, probed), beside, u_scale, ALIKE * tol) / rtol
-        last = tol <= FINEST or attempt == ATTEMPTS - 1
+        last = tol <= finest or attempt == ATTEMPTS - 1
         if problem.scene.net.mobile and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD:
             # A step has crossed a fold onto a branch of the area equation that no continuous path reaches.
-            tol, run.status = max(0.03 * tol, FINEST), Status.ERROR_NOT_MET
+            tol, run.status = max(0.03 * tol, finest), Status.ERROR_NOT_MET
         elif run.status is Status.FOLD and run.t_failed is not None:
             # The error of the state shifts the fold: reduce the tolerance until the fold's time no longer moves.
             moved, folded = abs(run.t_failed - folded), run.t_failed
@@ -199,13 +211,13 @@ def solve_coupled(
                 nearest = moved, run
             if moved <= FOLD_TIME * folded:
                 break
-            tol = max(0.03 * tol, FINEST)
+            tol = max(0.03 * tol, finest)
         elif run.status is not Status.SUCCESS or (worst <= 1.0 and beside.status is not Status.FOLD):
             break
         else:
             # This branch is also taken where the coarser run has met a fold that this run passed without one.
             run.status = Status.ERROR_NOT_MET if last else run.status
-            tol = max(tol * min(0.3, 0.5 / worst if worst > 0.0 else 0.3), FINEST)
+            tol = max(tol * min(0.3, 0.5 / worst if worst > 0.0 else 0.3), finest)
         if last:
             break
     span = max(folded, min(problem.waveform.shortest_time(), problem.t_stop - problem.t_start))
@@ -220,6 +232,11 @@ def solve_coupled(
     run.end_where_it_stopped()
     if problem.scene.net.mobile and run.t.size:
         run.margin = min(run.margin, float(run.record(problem).fold_margin[-1]))
+
+    def look(t: FloatArray, left: BoolArray) -> Record:
+        return _integrate(problem, fine, taken, u_scale, t, left, None).record(problem)
+
+    run.continuous = closed_form(problem, look, rtol)
     return run
 
 
@@ -289,4 +306,4 @@ def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float
         n_s = problem.initial.s_before.size
         at = slice(problem.initial.y.size - n_s, problem.initial.y.size)
         run.charge_error = float(np.abs(probed.rows[:count, at] - beside.rows[:count, at]).max(initial=0.0))
-    return run.excess(u_scale)
+    return run.excess(max(ROUNDING * u_scale, problem.rounding))

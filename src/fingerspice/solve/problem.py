@@ -20,6 +20,8 @@ from fingerspice.solve.times import run_times
 from fingerspice.waveforms.sampling import on_breakpoint
 from fingerspice.waveforms.waveform import Waveform
 
+# Round-off of a gap voltage relative to the voltages that cancel in it; finer steps cannot reduce the error below that.
+ROUNDING = 2e-14
 # Largest number of breakpoints cached with a waveform (64 kB).
 KEPT_BREAKPOINTS = 8192
 
@@ -72,6 +74,11 @@ class Problem:
         """Larger one of the sources' peak and the largest live voltage of the start, V."""
         n = self.scene.network.k.shape[0]
         return max(self.scene.u_peak, float(np.abs(self.initial.y[:n]).max(initial=0.0)))
+
+    @property
+    def rounding(self) -> float:
+        """Round-off of a gap's voltage, V: a smaller voltage is 0, and has no sign."""
+        return ROUNDING * max(self.largest, self.scene.u_size)
 
     @cached_property
     def inner(self) -> StackState:

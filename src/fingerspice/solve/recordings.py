@@ -21,13 +21,12 @@ from fingerspice.engine.blockpoints import write_end
 from fingerspice.engine.unevenweights import new_steps
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
-from fingerspice.results.refined import ClosedForm
 from fingerspice.solve.forms import Follower, followed, rounded_peak
 from fingerspice.solve.marching import solve as solve_ordinary
 from fingerspice.solve.netforms import finger
 from fingerspice.solve.pieces import Piece, driving, pieces_of, spacing_of
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Progress, Run, excess_of, kept_with
+from fingerspice.solve.runs import Progress, Run, closed_form, excess_of, kept_with
 from fingerspice.waveforms.ramps import PWL
 
 # Error allowed in a block, relative to the error asked for; ratio of stated to estimated error; attempts at a piece.
@@ -113,7 +112,7 @@ class March:
                 return Outcome.LOST
             gaps, _, _ = self.stated()
             gaps[0, 0], gaps[0, 1] = max(gaps[0, 0], self.least), max(gaps[0, 1], self._force(self.least))
-            excess = excess_of(gaps, self.problem.largest) / self.rtol
+            excess = excess_of(gaps, self.problem.rounding) / self.rtol
             if excess <= 1.0:
                 self.t, self.u_last = piece.stop, float(values[-1])
                 return Outcome.MET
@@ -256,13 +255,11 @@ def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, pro
             march.finish(t_out, out)
             run = march.run(t_out, left, march.rows(t_out, left, out))
             run.stats["rejected"] += refused
-            if run.excess(problem.largest) > rtol:
+            if run.excess(problem.rounding) > rtol:
                 # The peaks of the run stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
                 continue
             look = partial(_look, replace(problem, charge=False), rtol)
-            run.continuous = ClosedForm(
-                look, problem.waveform, problem.t_start, problem.first, problem.t_stop, rtol
-            )  # fmt: skip
+            run.continuous = closed_form(problem, look, rtol)
             return run
         refused += int(march.course.counters[blockforms.REFUSED])
     return None

@@ -21,8 +21,6 @@ from fingerspice.solve.sources import Tables, after_the_end, joined, segment_ind
 
 Progress = Callable[[float], None]
 
-# Round-off of a gap voltage relative to the voltages that cancel in it; finer steps cannot reduce the error below that.
-ROUNDING = 2e-14
 # A distance to the fold below this means that the run has stepped over a fold: at the fold it is 0 to rounding.
 PAST_FOLD = -0.01
 # Smallest force (N) whose error is judged; the error of a smaller one may be a denormal number with too few digits.
@@ -136,21 +134,26 @@ class Run:
         gaps[:, 3] += f_el
         self.gaps = gaps
 
-    def excess(self, u_scale: float) -> float:
+    def excess(self, rounding: float) -> float:
         """See `excess_of`."""
-        return excess_of(self.gaps, u_scale)
+        return excess_of(self.gaps, rounding)
 
 
-def excess_of(gaps: FloatArray, u_scale: float) -> float:
+def excess_of(gaps: FloatArray, rounding: float) -> float:
     """Largest ratio of a stated error to its peak, over the voltages and forces of all gaps; for `gaps` see `Run`.
 
-    A gap whose peak is below the round-off of `u_scale`, the circuit's largest voltage (V), is at 0 V and not judged.
+    A gap whose peak is within `rounding` (V) is at 0 V and not judged.
     """
     worst = 0.0
     for u_peak, f_peak, u_error, f_error in gaps.tolist():
-        if u_peak > ROUNDING * u_scale:
+        if u_peak > rounding:
             worst = max(worst, u_error / u_peak, f_error / f_peak if f_peak > LEAST_FORCE else 0.0)
     return worst
+
+
+def closed_form(problem: Problem, look: Callable[[FloatArray, BoolArray], Record], error: float = 0.0) -> ClosedForm:
+    """The run between its outputs, by a method that computes it at any times; see `ClosedForm`."""
+    return ClosedForm(look, problem.waveform, problem.t_start, problem.first, problem.t_stop, error, problem.rounding)
 
 
 class Integration(ABC):

@@ -67,6 +67,8 @@ class Scene:
         Each area if it is fixed, m^2; None if it follows its gap.
     u_peak : float
         Sum of the largest |U| of the voltage sources, V; 0 where it is not known.
+    u_size : float
+        The larger one of `u_peak` and the sum of the peaks of all parts that may cancel in the sources, V.
     u_top : float
         Largest gap voltage that the areas' curves cover, V.
     model : Model or None
@@ -82,6 +84,7 @@ class Scene:
     area_mode: str
     fixed: tuple[float | None, ...]
     u_peak: float
+    u_size: float
     u_top: float
     model: Model | None = None
     skin: Freezing | None = None
@@ -213,11 +216,13 @@ def _scene(circuit: Circuit, law: str, area: str | float, stop: float, skin: Fre
     network = network_of(circuit, None if skin is None else skin.frequency)
     fixed, mode = _fixed_areas(network, area)
     whole = network.stack is not None
-    u_peak = sum(_largest_voltage(waveform, stop, whole) for waveform in network.waveforms[: network.n_voltage])
+    waves = network.waveforms[: network.n_voltage]
+    u_peak = sum(_largest_voltage(waveform, stop, whole) for waveform in waves)
+    u_size = max(u_peak, sum(wave.cancelling(0.0, stop) for wave in waves))
     by_current = DRIVEN_BY_CURRENT if len(network.sources) > network.n_voltage else 0.0
     top = BEYOND_PEAK * u_peak + by_current or PEAK_UNKNOWN
     model = None if network.stack is None else _model(network.stack, law, fixed[0], top)
-    return Scene(network, law, mode, fixed, u_peak, top, model, skin)
+    return Scene(network, law, mode, fixed, u_peak, u_size, top, model, skin)
 
 
 def _freezing(circuit: Circuit, stop: float, rtol: float) -> Freezing | None:

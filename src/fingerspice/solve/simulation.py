@@ -30,7 +30,7 @@ from fingerspice.solve.outputs import asked_for, at_breakpoints
 from fingerspice.solve.periodic import close_period
 from fingerspice.solve.planning import make_plan
 from fingerspice.solve.problem import Problem, prepare
-from fingerspice.solve.runs import ROUNDING, Progress, Run
+from fingerspice.solve.runs import Progress, Run
 from fingerspice.waveforms.waveform import require
 
 RTOL_RANGE = (1e-13, 0.1)
@@ -359,7 +359,7 @@ def state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
     if run.rough > 0.0:
         run.add_error(run.rough)
         run.detail = run.detail or ROUGH.format(run.rough)
-    rounding = ROUNDING * problem.scene.u_peak
+    rounding = problem.rounding
     for gap in run.gaps:
         if gap[0] <= rounding:
             # To round-off the gap is at 0 V: state at least that round-off as its error, and its square for the force.
@@ -367,5 +367,5 @@ def state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
             gap[2:] = np.maximum(gap[2:], (share * gap[0], share**2 * gap[1]))
     # A closed form is not refused for its round-off, however small `rtol` is: no other method has a smaller error.
     judged = plan.tier == "coupled" or plan.error_bound > 0.0 or run.rough > 0.0
-    if run.status is Status.SUCCESS and judged and run.excess(problem.largest) > rtol:
+    if run.status is Status.SUCCESS and judged and run.excess(rounding) > rtol:
         run.status = Status.ERROR_NOT_MET

@@ -142,7 +142,7 @@ class Stepping(Integration):
             if code == loopstate.LOOKED_AT:
                 self._settle(sources)
             elif code == loopstate.EXCESSIVE:
-                if excess_of(self.stated_gaps(), self.problem.largest) > self.asked:
+                if excess_of(self.stated_gaps(), self.problem.rounding) > self.asked:
                     return Status.ERROR_NOT_MET
             elif code != loopstate.DONE:
                 return self._failed(code, sources)

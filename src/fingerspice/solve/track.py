@@ -278,21 +278,21 @@ class Track(Stepping):
         control, model = self.control, model_of(self.problem.scene)
         peak_u, peak_f = float(control[readout.PEAK_U]), float(control[readout.PEAK_F])
         # Round-off adds to the truncation error.
-        floor = 4e-16 * (peak_u + model.k_gap * self.problem.scene.u_peak)
+        floor = 4e-16 * (peak_u + model.k_gap * self.problem.scene.u_size)
         u_error = SAFETY * float(control[readout.ERROR_U]) + floor
         f_error = SAFETY * float(control[readout.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f
         return np.array([[peak_u, peak_f, u_error, f_error]])
 
     def stated(self, run: Run) -> None:
         run.gaps, run.margin = self.stated_gaps(), float(self.control[readout.MARGIN])
-        floor = 4e-16 * (float(self.control[readout.PEAK_U]) + self.problem.scene.u_peak)
+        floor = 4e-16 * (float(self.control[readout.PEAK_U]) + self.problem.scene.u_size)
         run.node_error = SAFETY * float(self.control[readout.ERROR_V]) + floor
         if self.problem.charge:
             run.charge_error = self._charge_error(float(self.control[readout.PEAK_U]))
 
     def _charge_error(self, peak_u: float) -> float:
         """Estimated error of the charge, C; every step adds the round-off of the charge that a layer holds."""
-        held = self.capacitance * (self.problem.scene.u_peak + peak_u)
+        held = self.capacitance * (self.problem.scene.u_size + peak_u)
         steps = 1.0 + float(self.counters[readout.ACCEPTED])
         # The relative error of the area's polynomial is also a relative error of all charge moved.
         moved = held + float(self.control[readout.PEAK_Q])

@@ -15,6 +15,11 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.waveforms.bounds import check_finite
 from fingerspice.waveforms.waveform import DC, Sine, Waveform, blank_terms, require
 
+#: Most cycles of a part in a common period.
+MOST_CYCLES = 10**6
+# Largest relative rounding error of a ratio of two periods.
+_ROUNDING = 2e-15
+
 
 class _Combination(Waveform):
     parts: tuple[Waveform, ...]
@@ -35,7 +40,7 @@ class _Combination(Waveform):
 
     @cached_property
     def period(self) -> float | None:  # type: ignore[override]
-        """Least common period of the parts (s); None unless their periods are in ratios of integers up to 1000."""
+        """Least common period of the parts (s); None unless it has at most `MOST_CYCLES` cycles of each."""
         total: float | None = None
         for part in self.parts:
             if isinstance(part, DC):
@@ -46,8 +51,8 @@ class _Combination(Waveform):
                 total = part.period
                 continue
             ratio = total / part.period
-            fraction = Fraction(ratio).limit_denominator(1000)
-            if fraction.numerator > 1000 or abs(float(fraction) - ratio) > 1e-12 * ratio:
+            fraction = Fraction(ratio).limit_denominator(MOST_CYCLES)
+            if fraction.numerator > MOST_CYCLES or abs(float(fraction) - ratio) > _ROUNDING * ratio:
                 return None
             total *= fraction.denominator
         return total
@@ -64,6 +69,9 @@ class Sum(_Combination):
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         return np.asarray(sum(part.value(t, side) for part in self.parts))
+
+    def cancelling(self, t0: float, t1: float) -> float:
+        return sum(max(part.peak(t0, t1), part.cancelling(t0, t1)) for part in self.parts)
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
         blocks = [part.terms(start, stop) for part in self.parts]
@@ -86,6 +94,9 @@ class Product(_Combination):
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         return np.asarray(math.prod(part.value(t, side) for part in self.parts))
+
+    def cancelling(self, t0: float, t1: float) -> float:
+        return math.prod(max(part.peak(t0, t1), part.cancelling(t0, t1)) for part in self.parts)
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
         out: FloatArray | None = None
@@ -160,5 +171,6 @@ class AM(_Combination):
         return (envelope, Sine(1.0, self.carrier))
 
     value = Product.value
+    cancelling = Product.cancelling
     terms = Product.terms
     tone = Product.tone

@@ -45,6 +45,9 @@ class _Shifted(Waveform):
     def shortest_time(self) -> float:
         return self.waveform.shortest_time()
 
+    def cancelling(self, t0: float, t1: float) -> float:
+        return self.waveform.cancelling(0.0, self._stretch())
+
 
 @dataclass(frozen=True)
 class Burst(_Shifted):

@@ -25,6 +25,8 @@ from fingerspice.base.errors import InputError
 from fingerspice.waveforms.bounds import check_finite
 
 TAU = 2.0 * math.pi
+# Places in [0, 1], both ends among them, one in each of 512 equal parts: so irregular that no carrier is 0 at all.
+_SPREAD = np.append((np.arange(512) + np.modf(np.arange(512) * 0.6180339887498949)[0]) / 512.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -142,11 +144,23 @@ class Waveform:
         if self.period is not None:
             # All periods after `settled` are equal, so that the first of them gives the peak of all.
             t1 = min(t1, max(t0, self.settled) + self.period)
-        values = [self.value(np.linspace(t0, t1, 513))]
+        t = t0 + (t1 - t0) * _SPREAD
+        size = np.abs(self.value(t))
+        quick = self.shortest_time()
+        if quick < (t1 - t0) / 64.0:
+            # A carrier is sampled too coarsely: look at whole cycles of it about the largest values.
+            about = t[np.argsort(size)[-8:], None] + quick * np.linspace(-0.5, 0.5, 65)
+            size = np.append(size, np.abs(self.value(np.clip(about, t0, t1))))
         breakpoints = self.breakpoints(t0, t1)
-        if breakpoints.size:
-            values += [self.value(breakpoints), self.value(breakpoints, "left")]
-        return float(np.abs(np.concatenate(values)).max())
+        values = [size, *(np.abs(self.value(breakpoints, side)) for side in ("right", "left") if breakpoints.size)]
+        return float(np.concatenate(values).max())
+
+    def cancelling(self, t0: float, t1: float) -> float:
+        """Sum of the peaks (V) over [t0, t1] of parts that may cancel in U; 0 for a waveform of one part.
+
+        Rounding errors of U are relative to this sum.
+        """
+        return 0.0
 
     def __add__(self, other: Waveform | float) -> Waveform:
         return _combined("Sum", self, other)
