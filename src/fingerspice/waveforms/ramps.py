@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.arrays import FloatArray, IntArray, read_only
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
 from fingerspice.waveforms.bounds import check_range, in_windows, runs_through
@@ -98,7 +98,7 @@ class Ramps(Waveform):
         if self.period is None:
             times, values = self._listed
             return _between(
-                times, values, np.searchsorted(times, flat, side="right" if side == "right" else "left"), flat
+                times, values, np.searchsorted(times, flat, side="right" if side == "right" else "left"), read_only(flat)
             )
         edges = self._edges(flat.min(), flat.max())
         index = np.searchsorted(edges, flat, side="right" if side == "right" else "left")
