@@ -97,9 +97,8 @@ class Ramps(Waveform):
         """As `value`, at times (n_t,) within one window."""
         if self.period is None:
             times, values = self._listed
-            return _between(
-                times, values, np.searchsorted(times, flat, side="right" if side == "right" else "left"), read_only(flat)
-            )
+            index = np.searchsorted(times, flat, side="right" if side == "right" else "left")
+            return _between(times, values, index, read_only(flat))
         edges = self._edges(flat.min(), flat.max())
         index = np.searchsorted(edges, flat, side="right" if side == "right" else "left")
         bounds = np.concatenate([[-math.inf], edges, [math.inf]])
