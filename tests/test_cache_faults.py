@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import fingerspice as fs
+from fingerspice.base.announcing import LONG
 from processes import ended, no_room, start
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="faults are made by Linux's means")
@@ -49,10 +54,7 @@ tempfile.TemporaryFile = refuse
 """
 # What the package logs, as the command line shows it.
 LOGGED = "import logging; logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
-ONCE = (
-    "compiling what this needs, 20 s for a series stack, 30 s for a network, a minute for recordings, only once: "
-    "later runs find it on the disk"
-)
+ONCE = "compiling a small part, some seconds, only once: later runs find it on the disk"
 
 
 @pytest.fixture
@@ -108,27 +110,74 @@ def test_compiling_is_announced_in_python_too_by_one_line_and_only_once(copy: Pa
 
 
 def test_on_a_terminal_compiling_shows_a_bar_that_goes_away(copy: Path) -> None:
+    seen, out = on_a_terminal(partial(begun, copy))
+    assert float(out) > 0.0
+    assert "compiling a small part, some seconds, only once" in seen
+    assert "\x1b[?25h" in seen.rpartition("compiling")[2]
+
+
+def on_a_terminal(program: Callable[..., subprocess.Popen[str]]) -> tuple[str, str]:
+    """What a program that succeeds writes to a terminal of 80 columns, and to stdout."""
     ours, theirs = os.openpty()
-    process = begun(copy, stderr=theirs)
+    process = program(stderr=theirs)
     os.close(theirs)
     seen = b""
     with suppress(OSError):
         while piece := os.read(ours, 4096):
             seen += piece
     os.close(ours)
-    assert process.wait(timeout=120) == 0
-    assert process.stdout is not None
-    assert float(process.stdout.read()) > 0.0
-    assert b"compiling what this needs" in seen
-    assert b"\x1b[?25h" in seen.rpartition(b"compiling")[2]
-    process.stdout.close()
+    out, _ = process.communicate(timeout=120)
+    assert process.returncode == 0
+    return seen.decode(), out
+
+
+WAITS = """
+import time
+from fingerspice.base.announcing import Bar, Compiling
+sweep, compiling = Bar("sweeping"), Compiling()
+sweep.show(0.25)
+for kind in ("Stack", "Mesh"):
+    with compiling.around():
+        compiling.begins("engine.loop.march_on", kind, True)
+        time.sleep(1.3)
+    sweep.show(0.5)
+with compiling.around():
+    compiling.begins("engine.loop.march_on", "Mesh", True)
+sweep.stop()
+"""
+LINES = [
+    "fingerspice: note: compiling the steps of a series stack, about 35 s, only once: later runs find it on the disk",
+    "fingerspice: note: compiling the steps of a network, about 80 s, only once: later runs find it on the disk",
+]
+
+
+def test_every_wait_is_announced_with_its_own_length_also_behind_another_bar() -> None:
+    program = partial(start, Path.cwd(), entry=[sys.executable, "-c", WAITS], env={**os.environ, "COLUMNS": "80"})
+    _, err = program().communicate(timeout=120)
+    assert err.splitlines() == LINES
+    seen, _ = on_a_terminal(program)
+    seen = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", seen)
+    for line in LINES:
+        assert re.search(re.escape(line[19:].partition(":")[0]) + r"\s+\S+\s+0:00:01", seen)
+    assert " 25 %" in seen
+    assert " 50 %" in seen
+
+
+@pytest.mark.parametrize(("name", "kind"), LONG)
+def test_what_is_said_to_compile_for_long_is_a_function_of_that_kind(name: str, kind: str) -> None:
+    module, _, function = name.rpartition(".")
+    compiled = getattr(importlib.import_module(f"fingerspice.{module}"), function)
+    assert compiled.targetoptions["nogil"]
+    first = next(iter(inspect.signature(compiled.py_func).parameters.values()))
+    assert kind in ("", first.annotation) or (name, first.annotation) == ("engine.loop.march_on", "Circuit")
 
 
 def test_where_compiled_code_cannot_be_kept_it_is_said_what_to_set(copy: Path) -> None:
     code, (said,), out = area(copy, before=SHUT + LOGGED)
     assert code == 0
     assert float(out) > 0.0
-    assert said.startswith("compiling, 20 s to a minute, as at every run: no folder for compiled code can be written")
+    said_first = "compiling a small part, some seconds, at every run: no folder for compiled code can be written"
+    assert said.startswith(said_first)
     assert said.endswith("set NUMBA_CACHE_DIR to one that can")
 
 

@@ -84,3 +84,78 @@ def test_an_engine_that_is_not_to_be_compiled_is_refused_in_one_sentence(tmp_pat
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("fingerspice: NUMBA_DISABLE_JIT is set: ")
     assert done.stderr.count("\n") == 1
+
+
+RUNS = """
+import sys
+import numpy as np
+import fingerspice as fs
+
+stack, network = (fs.read_netlist(f"{sys.argv[1]}/{name}.cir") for name in ("fingerpad", "ungrounded_user"))
+noise = fs.Samples(100.0 * np.random.default_rng(1).standard_normal(480), 48e3)
+few = fs.PWL([0.0, 2e-4, 8e-4], [0.0, 100.0, 50.0])
+given, sealed = np.linspace(0.0, 1e-3, 77), np.linspace(0.0, 1e-3, 77)
+sealed.flags.writeable = False
+for circuit, more in [
+    (stack, {}), (network, {}), (stack, {"sources": noise}), (stack, {"sources": few}), (stack, {"area": 35e-6}),
+    (stack, {"area": 35e-6, "sources": noise}), (stack, {"method": "radau"}),
+]:
+    for t_eval in (None, given, sealed, list(given)):
+        found = fs.simulate(circuit, t_stop=1e-3, t_eval=t_eval, **more)
+        found.f_el, found.f_t, found.f_el_mean
+    for chunk in fs.stream(circuit, t_stop=1e-3, chunk=5e-4, **more):
+        chunk.u_gap
+fs.inverse_drive(stack, duration=5e-3, force=lambda t: 0.02 + 0.01 * np.sin(300.0 * t))
+fs.steady_state(stack)
+twice = 0
+for name, module in list(sys.modules.items()):
+    for function in vars(module).values() if name.startswith("fingerspice.") else ():
+        if hasattr(function, "py_func") and function.py_func.__module__ == name:
+            kinds = [str(types).replace("readonly ", "") for types in function.signatures]
+            if len(kinds) > len(set(kinds)):
+                print(f"{name}.{function.py_func.__name__}", kinds if len(kinds[0]) < 500 else "", file=sys.stderr)
+                twice += 1
+print(twice)
+"""
+
+
+def test_nothing_is_compiled_twice_for_arrays_that_can_and_cannot_be_written():
+    circuits = str(Path(__file__).parents[1] / "circuits")
+    done = subprocess.run([sys.executable, "-c", RUNS, circuits], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "0\n"), done.stderr
+
+
+PRIVATE = """
+import sys
+import numpy as np
+from fingerspice.base.compiled import jit, jit_rows, jit_within
+from fingerspice.base.borrowing import borrow
+
+@jit_within
+def inner(x):
+    return 2.0 * x
+
+@jit_rows
+def row(x, out):
+    for i in range(x.size):
+        out[i] = inner(x[i])
+
+@jit
+def outer(x):
+    x = borrow(x)
+    out = np.empty(x.size)
+    row(x, out)
+    return out.sum()
+"""
+
+
+def test_what_is_built_on_private_classes_of_numba_does_what_it_is_for(tmp_path):
+    (tmp_path / "made.py").write_text(PRIVATE)
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[0]); import numpy as np, made\n"
+        "assert made.outer(np.arange(4.0)) == 12.0\n"
+        # What compiled code calls has no machine code of its own, and the rest is found on the disk.
+        "assert not made.inner.signatures and not made.row.signatures\n"
+        "print(sum(made.outer.stats.cache_hits.values()))"
+    ).replace("sys.argv[0]", repr(str(tmp_path)))
+    assert [printed(code, PACKAGE.parent) for _ in range(2)] == [0.0, 1.0]

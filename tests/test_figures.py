@@ -28,7 +28,52 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def numbers() -> dict[str, float]:
-    return figures.figure_numbers()
+    """The numbers that the paper's text gives about its figures, in SI units."""
+    circuit = table1_circuit()
+    out: dict[str, float] = {"area_unloaded": figures.variations()[1].base * 1e-6}
+    p = fs.phasor(circuit, figures.FREQUENCIES)
+    for i, f in enumerate(figures.FREQUENCIES):
+        out[f"gain_{f:g}Hz"] = float(abs(p.gain[i]))
+        out[f"lead_{f:g}Hz"] = float(np.degrees(np.angle(p.gain[i])))
+    low = circuit.replace({"Vdrive.amplitude": figures.U0_FORCE})
+    f100, f2k, f10k = fs.phasor(low, (100.0, 2000.0, 10000.0)).f_el_mean
+    out |= {"rise": float(f10k / f100), "rise_above_2kHz": float(f10k / f2k)}
+    resistance = figures.variations()[2]
+    for value in resistance.values:
+        a, b = fs.phasor(resistance.apply(low, value), (100.0, 10000.0)).f_el_mean
+        out[f"rise_r_a_{value:g}"] = float(b / a)
+    for name, shape in (("sine", fs.Sine), ("square", fs.Square)):
+        for f in figures.FREQUENCIES:
+            s = figures.time_response(shape, f)
+            assert s.f_el is not None
+            out[f"{name}_{f:g}Hz_min"], out[f"{name}_{f:g}Hz_max"] = float(s.f_el.min()), float(s.f_el.max())
+            out[f"{name}_{f:g}Hz_mean"] = s.summary()["f_el_mean_periodic"]
+    return out | trends()
+
+
+def trends(frequencies: tuple[float, ...] = (10.0, 100.0, 1000.0, 10000.0)) -> dict[str, float]:
+    """Elasticity, range and curvature of Fig. 3's mean force against each of its parameters, at frequencies (Hz)."""
+    circuit = table1_circuit().replace({"Vdrive.amplitude": figures.U0_FORCE})
+    base = fs.phasor(circuit, frequencies).f_el_mean
+    out: dict[str, float] = {}
+    for variation in figures.variations():
+
+        def force(value: float, variation: figures.Variation = variation) -> np.ndarray:
+            return fs.phasor(variation.apply(circuit, value), frequencies).f_el_mean
+
+        step = 1e-3
+        slope = (force(variation.base * (1.0 + step)) - force(variation.base * (1.0 - step))) / (2.0 * step * base)
+        x = np.linspace(min(variation.values), max(variation.values), 11)
+        y = np.array([force(v) for v in x])
+        line = np.column_stack([np.ones_like(x), x])
+        off = np.abs(y - line @ np.linalg.lstsq(line, y, rcond=None)[0]).max(axis=0)
+        change = np.abs(y[-1] - y[0])
+        for i, f in enumerate(frequencies):
+            key = f"{variation.name}_{f:g}Hz"
+            out[f"elasticity_{key}"] = float(slope[i])
+            out[f"bend_{key}"] = float(off[i] / change[i])
+            out[f"span_{key}"] = float(change[i] / base[i])
+    return out
 
 
 def read(path: Path) -> dict[str, np.ndarray]:

@@ -6,6 +6,7 @@ import json
 import logging
 import multiprocessing
 import os
+import re
 import shutil
 import signal
 import sys
@@ -184,6 +185,25 @@ def test_a_chunk_that_always_costs_its_worker_ends_the_sweep(
     monkeypatch.setattr(sweepchunks, "MOST_LOST", 2)
     with pytest.raises(fs.InputError, match="2 workers were lost one after another, the last with code -9"):
         fs.sweep(circuit, {"Xgap.d": Deadly()}, store=tmp_path / "s.zarr", workers=1, **{**HOW, "n": 64})
+
+
+class DeadlyOnce(Deadly):
+    """As `Deadly`, for the one chunk that has the least of 256 points."""
+
+    def ppf(self, points: Any) -> Any:
+        return super().ppf(points) if np.min(points) < 1.0 / 256.0 else 3e-6 + 1e-6 * np.asarray(points)
+
+
+def test_a_chunk_that_costs_three_workers_is_named_and_the_others_are_in_the_store(
+    circuit: fs.Circuit, tmp_path: Path
+) -> None:
+    path = tmp_path / "s.zarr"
+    said = r"3 workers were lost with chunk (\d) of the sweep, the last with code -9; allowed: .* what is written stays"
+    with pytest.raises(fs.InputError, match=said) as told:
+        fs.sweep(circuit, {"Xgap.d": DeadlyOnce()}, store=path, workers=1, **{**HOW, "n": 256})
+    named = int(re.search(said, str(told.value))[1])  # type: ignore[index]
+    assert marks(path) == 3
+    assert not (path / "status" / "c" / str(named)).exists()
 
 
 SCRIPT = """

@@ -9,10 +9,31 @@ from contextlib import contextmanager
 from typing import Any, ClassVar
 
 _LOG = logging.getLogger("fingerspice")
+#: What takes the compiler more than ten seconds, by function and class of its first argument: what it is, and the time
+#: on one core of an x86-64 server of 2026.
+LONG = {
+    ("engine.loop.march_on", "Stack"): "the steps of a series stack, about 35 s",
+    ("engine.loop.march_on", "Mesh"): "the steps of a network, about 80 s",
+    ("engine.recording.march", "Course"): "the steps of a recording, about 70 s",
+    ("engine.blockpoints.write_end", "Course"): "the outputs of a recording, about 35 s",
+    ("engine.uneven.march", "Course"): "the steps of uneven points, about 100 s",
+    ("engine.shooting.close_period", "Stack"): "the periodic state, about 25 s",
+    ("engine.collocation.advance", "Nodal"): "implicit steps, about 15 s",
+    ("engine.lockmarch.march", ""): "scenes in lockstep, about 20 s",
+    ("engine.tangent.follow", "System"): "derivatives, about 15 s",
+}
+_SHORT = "a small part, some seconds"
+_ONCE = "only once: later runs find it on the disk"
+_EVERY_TIME = (
+    "at every run: no folder for compiled code can be written, neither the package's nor the user's; set "
+    "NUMBA_CACHE_DIR to one that can"
+)
 
 
 class Bar:
-    """A progress bar on stderr, removed when stopped; none where stderr is no terminal, or another bar is shown.
+    """A progress bar on stderr, removed when stopped; none where stderr is no terminal.
+
+    There is one bar at a time: an endless one takes the place of any other, which comes back when it is shown next.
 
     Parameters
     ----------
@@ -31,12 +52,16 @@ class Bar:
     def show(self, done: float = 0.0, note: str = "") -> None:
         """Show the bar with this fraction done, and a note behind it."""
         if self._bar is None:
-            if Bar._standing is not None or not sys.stderr.isatty():
+            standing = Bar._standing
+            if not sys.stderr.isatty() or (standing is not None and not self._endless):
                 return
+            if standing is not None:
+                standing.stop()
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-            columns = [TextColumn("{task.description}"), BarColumn()]
+            # All of an endless bar's text has room in 80 columns.
+            columns = [TextColumn("{task.description}"), BarColumn(10 if self._endless else 40)]
             columns += (
                 [TimeElapsedColumn()] if self._endless else [TextColumn("{task.percentage:3.0f} %{task.fields[note]}")]
             )
@@ -54,10 +79,11 @@ class Bar:
 
 
 class Compiling:
-    """Announces that code is compiled: on a terminal by a bar each time, elsewhere by one line in a process."""
+    """Announces that code is compiled: on a terminal by a bar each time, elsewhere by one line for each kind."""
 
     def __init__(self) -> None:
-        self._depth, self._told = 0, False
+        self._depth = 0
+        self._told: set[str] = set()
         self._bar: Bar | None = None
 
     @contextmanager
@@ -72,15 +98,17 @@ class Compiling:
                 self._bar.stop()
                 self._bar = None
 
-    def begins(self, text: str) -> None:
-        """Announce that something is compiled."""
+    def begins(self, function: str, kind: str, kept: bool) -> None:
+        """Announce that a function is compiled, whose first argument is of this kind, and whether that is kept."""
+        what = LONG.get((function, kind), _SHORT)
+        text = f"compiling {what}, {_ONCE if kept else _EVERY_TIME}"
         wanted = _LOG.level in (logging.NOTSET, logging.INFO)
         if wanted and self._bar is None and sys.stderr is not None and sys.stderr.isatty():
-            self._bar = Bar(text, endless=True)
+            self._bar = Bar(text.partition(":")[0], endless=True)
             self._bar.show()
-        elif not self._told and self._bar is None:
+        elif text not in self._told and self._bar is None:
             _tell(text)
-        self._told = True
+        self._told.add(text)
 
 
 def _tell(text: str) -> None:

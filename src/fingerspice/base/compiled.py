@@ -97,22 +97,14 @@ class _Cache(FunctionCache):
                 data = place.load(key)
                 if data is not None:
                     return cast(Any, self._impl).rebuild(target_context, data)
-        _COMPILER.begins(_EVERY_TIME if isinstance(self._impl.locator, _ReadOnly) else _ONCE)
+        name = f"{self._py_func.__module__}.{self._py_func.__qualname__}".removeprefix("fingerspice.")
+        kind = getattr(sig[0], "instance_class", None) if sig else None
+        _COMPILER.begins(name, kind.__name__ if kind else "", not isinstance(self._impl.locator, _ReadOnly))
         return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         with suppress(OSError):
             cast(Any, super()).save_overload(sig, data)
-
-
-_ONCE = (
-    "compiling what this needs, 20 s for a series stack, 30 s for a network, a minute for recordings, only once: "
-    "later runs find it on the disk"
-)
-_EVERY_TIME = (
-    "compiling, 20 s to a minute, as at every run: no folder for compiled code can be written, neither the package's "
-    "nor the user's; set NUMBA_CACHE_DIR to one that can"
-)
 
 
 class _Body(JITCodeLibrary):

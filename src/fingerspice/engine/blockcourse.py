@@ -46,7 +46,7 @@ class Course(NamedTuple):
     `w` (m,) are the modes, and the rows of `error` (2, m) the parts of their error that quadrature and sweeps leave;
     `inner` are the rows at samples within steps of several (`engine.blockcoarse`), and
     `spare` (3, n) is scratch for single outputs; `engine.blockforms` lists the entries of `control`,
-    `counters` and `checks` (LEVELS, 5).
+    `counters` and `checks` (LEVELS, 9).
     """
 
     model: Model

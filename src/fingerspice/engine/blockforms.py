@@ -87,7 +87,7 @@ class Form(NamedTuple):
 
     r references, `LEVELS` step lengths, m modes, T drives g_t, and P projections at the ends and `PLACES` of a step:
     the gap voltage (under `mobile` its modes' part alone), the taps, and what the slowest layer stores and leaks by
-    (see `engine.recording`).
+    (see `engine.blockcharge`).
 
     Attributes
     ----------

@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, read_only
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.materials import EPS0
@@ -232,7 +232,7 @@ def inverse_area(u: float, curve: FloatArray) -> tuple[float, float]:
 
 def inverse_areas(u: FloatArray, curve: FloatArray) -> FloatArray:
     """1/A_R (1/m^2) at gap voltages |u| (V), shape (n,), from a `Contact.curve`."""
-    u = np.ascontiguousarray(u)
+    u = read_only(np.ascontiguousarray(u))
     lo, hi, series = float(curve[0]), float(curve[1]), curve[2 + N_PACKED :]
     if series.size == 1:
         return np.full(u.shape, series[0])
@@ -250,14 +250,14 @@ def inverse_areas_with_slopes(u: FloatArray, curve: FloatArray) -> tuple[FloatAr
         return q, inverse_area_array(np.abs(u), curve)[1]
     slope, scale = np.empty(u.size), 2.0 / float(curve[1] - curve[0])
     by_u = np.asarray(scale * np.polynomial.chebyshev.chebder(series), float)
-    chebyshev.evaluate_array(by_u, np.ascontiguousarray(u), float(curve[0]), scale, slope)
+    chebyshev.evaluate_array(by_u, read_only(np.ascontiguousarray(u)), float(curve[0]), scale, slope)
     return q, slope
 
 
 def forces(u: FloatArray, curve: FloatArray, stress: float) -> FloatArray:
     """Force (N) at gap voltages u (V), shape (n,), from a `Contact.curve` and the stress at 1 V, Pa."""
     out = inverse_areas(u, curve)
-    _force_from_inverse(u, stress, out)
+    _force_from_inverse(read_only(u), stress, out)
     return out
 
 

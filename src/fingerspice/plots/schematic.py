@@ -28,7 +28,6 @@ MOST_ELEMENTS = 200
 _LETTERS, _LONGEST, _LINES = 34, 40, 7
 #: Inches: height of a line of text, from a symbol to its label, around everything, and around a label in its row.
 _LINE, _BESIDE, _MARGIN, _ROOM = 0.135, 0.08, 0.15, 0.1
-_PER_INCH = 72.0
 #: Size of a schematic beside a run's picture, over its own, and its resolution there, dots per inch of its own size.
 _SMALL, _SMALL_DPI = 0.7, 200
 _TINTS = {"LAYER": drawing.SKY, "SLAB": drawing.SKY, "SKIN": drawing.ORANGE, "SKIN_DISPERSIVE": drawing.ORANGE}

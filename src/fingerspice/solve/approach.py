@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, read_only
 from fingerspice.engine import loopstate, readout
 from fingerspice.engine import repeat as repetition
 from fingerspice.engine.network import Sources
@@ -75,7 +75,7 @@ class _Period:
         left[:, -1] = True
         out = np.empty((self.track.out.shape[0], t.size))
         kept, count = self.track.kept, self.marks.size - 1
-        outputs = readout.Outputs(t.ravel(), left.ravel(), out)
+        outputs = readout.Outputs(read_only(t.ravel()), read_only(left.ravel()), out)
         # `repeat` overwrites the steps' series, so that this method can be called only once.
         if repetition.repeat(kept, count, 0.0, 1, np.zeros(len(out)), 0, outputs) < t.size:
             raise _LostError
@@ -99,7 +99,7 @@ def _period(track: Track, sources: Sources, stop: float, x: FloatArray, steps: i
     finest = FINEST * float(track.control[readout.PEAK_U])
     probe.pace = track.pace._replace(tol=max(_FINER * track.pace.tol, finest))
     probe.recorder = Recorder(track.shown, 0)
-    probe.t_out, probe.left, probe.out = np.zeros(0), np.zeros(0, bool), np.empty((track.out.shape[0], 0))
+    probe.t_out, probe.left, probe.out = track.t_out[:0], track.left[:0], np.empty((track.out.shape[0], 0))
     probe.keep(steps)
     code = probe.march(sources, stop, no_looks())
     track.counters[: readout.OUTPUT] += probe.counters[: readout.OUTPUT]

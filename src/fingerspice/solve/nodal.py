@@ -135,7 +135,7 @@ class Collocation(NetworkIntegration):
     def jump(self, after: FloatArray) -> bool:
         control = np.zeros(collocation.N_CONTROL)
         run = Passage(
-            self.y, self.s_before.copy(), control, self.counters, self.peaks, False, np.empty(0), np.empty(0, bool),
+            self.y, self.s_before.copy(), control, self.counters, self.peaks, False, self.t_out[:0], self.left[:0],
             np.empty((0, self.y.size)), np.zeros((TRIED, 4)),
         )  # fmt: skip
         nodal = self.nodal(ramp(self.s_before, after))

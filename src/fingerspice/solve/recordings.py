@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, read_only
 from fingerspice.engine import blockforms, recording, uneven
 from fingerspice.engine.blockforms import BLOCK, Form
 from fingerspice.engine.blockpoints import write_end
@@ -88,7 +88,7 @@ class March:
 
     def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
         """Integrate a piece with the source's `values` (V), and write the outputs before its end as rows of `out`."""
-        one, control = self.one, self.course.control
+        one, control, t_out = self.one, self.course.control, read_only(t_out)
         if piece.led:
             return self._lead(piece, values, t_out, out)
         if piece.spacing != self.spacing:
@@ -177,7 +177,7 @@ class March:
         """Write the outputs at the end of the run."""
         stop, after = self.problem.t_stop, 1e-3 * self.usual
         here, later = self.wave.value([stop, stop + after]).tolist()
-        write_end(self.course, self.u_last, (later - here) / after, t_out, out)
+        write_end(self.course, self.u_last, (later - here) / after, read_only(t_out), out)
 
     def rows(self, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
         """Outputs at times `t` (s) as rows of a record."""

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, read_only
 from fingerspice.engine.network import Sources, at_sources, new_room, rates
 from fingerspice.engine.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, ZEROS
 from fingerspice.results.outcome import ErrorEstimate, State, Status
@@ -174,7 +174,7 @@ class Integration(ABC):
     counters: IntArray
 
     def __init__(self, problem: Problem, t_out: FloatArray, left: BoolArray) -> None:
-        self.problem, self.net, self.t_out, self.left = problem, problem.scene.net, t_out, left
+        self.problem, self.net, self.t_out, self.left = problem, problem.scene.net, read_only(t_out), read_only(left)
         self.n, n_s = map(int, self.net.b.shape)
         self.y, self.sign = problem.initial.y.copy(), problem.initial.sign.copy()
         self.s_before = problem.initial.s_before.copy()

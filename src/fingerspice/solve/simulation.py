@@ -86,7 +86,8 @@ def simulate(
         ``"auto"``, an own stepper (``"exponential"``, ``"radau"``), ``"scipy:NAME"`` or ``"torchdiffeq:NAME"``.
         ``"auto"`` uses exponential steps, and once a period of the source no longer changes the state, it repeats that
         period to the end; the other methods step every period. ``"auto"`` integrates a recording (`Samples`) on a
-        series stack sample by sample (`Solution.method` is then ``"relaxation"``). Where a fast mode that depends on
+        series stack or a network with one finger sample by sample, and a PWL of many points at uneven times on a
+        series stack point by point (`Solution.method` is then ``"relaxation"``). Where a fast mode that depends on
         the area makes only short exponential steps converge, the run is repeated with ``"radau"``, an implicit method.
     tier : str
         ``"auto"``, or the model to take: ``"algebraic"``, ``"linear"`` or ``"coupled"`` (see `Plan`).

@@ -1,7 +1,7 @@
 """Streams: long runs chunk by chunk, in constant memory.
 
-A run is integrated in pieces whose length does not depend on the chunks: a recording on a series stack in the pieces of
-`solve.recordings`, any other run in windows of a fixed number of outputs, each starting from the final state of the
+A run is integrated in pieces whose length does not depend on the chunks: one that `solve.recordings` follows in the
+pieces that it takes, any other run in windows of a fixed number of outputs, each starting from the final state of the
 window before. Chunks are cut from the outputs of the pieces, so that no bit depends on their length.
 """
 
@@ -172,9 +172,10 @@ def stream(
 ) -> Stream:
     """Simulate a circuit in time chunk by chunk, in memory that does not grow with the length of the run.
 
-    The outputs are the same to the last bit whatever the length of the chunks. For a recording on a series stack they
-    also equal those of `simulate` with the same times as `t_eval`. For other runs they do not, because each window of
-    16,384 outputs is a run of its own, which starts from the final state of the window before.
+    The outputs are the same to the last bit whatever the length of the chunks. Where a run is followed sample by sample
+    (recordings on a series stack or a network with one finger, see `simulate`) they also equal those of `simulate` with
+    the same times as `t_eval`. For other runs they do not, because each window of 16,384 outputs is a run of its own,
+    which starts from the final state of the window before.
 
     Parameters
     ----------

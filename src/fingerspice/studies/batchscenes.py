@@ -197,7 +197,7 @@ def _tones_of(wave: object, given: Mapping[str, Value]) -> list[tuple[Value, Val
 
 
 def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray:
-    """The table of some scenes as `engine.lockscenes.march` takes it, shape (n_row, n).
+    """The table of some scenes as `engine.lockmarch.march` takes it, shape (n_row, n).
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 import warnings
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 AT_ONCE = 2
 _FREE = nullcontext()
 _WRITING = Lock()
-# Workers that may be lost one after another while no chunk is finished.
-MOST_LOST = 20
+# Workers that may be lost with one chunk, and one after another while no chunk is finished.
+TRIES, MOST_LOST = 3, 20
 # Chunks that a scheduler is given at once, and how long it may take to answer, s.
 AHEAD, PATIENCE = 4096, 5.0
 
@@ -208,7 +208,7 @@ def _by_processes(work: Work, missing: Sequence[int], count: int) -> Iterator[Do
         sent = bytes(ForkingPickler.dumps(work))
     except (AttributeError, TypeError, ValueError) as error:
         raise InputError(f"the sweep cannot be sent to other processes: {error}") from None
-    todo, lost, left = deque(missing), 0, len(missing)
+    todo, left, lost = deque(missing), len(missing), Counter[int | None]()
     crew = {worker.pipe: worker for worker in (_hired(sent) for _ in range(count))}
     try:
         while left:
@@ -219,7 +219,7 @@ def _by_processes(work: Work, missing: Sequence[int], count: int) -> Iterator[Do
                     answer = pipe.recv()
                 except (EOFError, OSError):
                     del crew[pipe]
-                    lost += 1
+                    lost.update({None, *worker.has})
                     _mourn(worker, lost)
                     todo.extend(worker.has)
                     new = _hired(sent)
@@ -230,13 +230,14 @@ def _by_processes(work: Work, missing: Sequence[int], count: int) -> Iterator[Do
                 worker.ready = True
                 if answer is not None:
                     worker.has.remove(answer.index)
-                while todo and len(worker.has) < AT_ONCE:
+                # A chunk that a worker was lost with is run alone, so that it alone is blamed.
+                while todo and len(worker.has) < (1 if lost.keys() & {todo[0], *worker.has} else AT_ONCE):
                     worker.has.add(todo[0])
                     # A process that is lost meanwhile is found by its closed pipe.
                     with suppress(OSError):
                         pipe.send(todo.popleft())
                 if answer is not None:
-                    lost, left = 0, left - 1
+                    lost[None], left = 0, left - 1
                     yield answer
     finally:
         for worker in crew.values():
@@ -258,8 +259,8 @@ def _hired(sent: bytes) -> _Worker:
     return _Worker(process, own)
 
 
-def _mourn(worker: _Worker, lost: int) -> None:
-    """Refuse to go on where workers cannot start, or too many were lost in a row."""
+def _mourn(worker: _Worker, lost: Counter[int | None]) -> None:
+    """Refuse to go on where workers cannot start, or too many were lost in a row or with one chunk."""
     worker.pipe.close()
     worker.process.join()
     code = worker.process.exitcode
@@ -268,11 +269,18 @@ def _mourn(worker: _Worker, lost: int) -> None:
             f"a worker ended with code {code} before it began; in a script, allowed: workers under "
             "if __name__ == '__main__'"
         )
-    if lost >= MOST_LOST:
-        raise InputError(
-            f"{lost} workers were lost one after another, the last with code {code}; allowed: fewer workers, if the "
-            "memory is too small for these"
-        )
+    _give_up(lost, f", the last with code {code}")
+
+
+def _give_up(lost: Counter[int | None], last: str) -> None:
+    """Refuse to go on where too many workers were lost with one chunk, or in a row (counted under None)."""
+    for index, count in lost.items():
+        if count >= (MOST_LOST if index is None else TRIES):
+            how = "one after another" if index is None else f"with chunk {index} of the sweep"
+            raise InputError(
+                f"{count} workers were lost {how}{last}; allowed: fewer workers, if the memory is too small for these; "
+                "what is written stays, and the same command goes on from there"
+            )
 
 
 def _serve(pipe: Connection) -> None:
@@ -335,7 +343,7 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[D
 
     # Held by the scheduler, not by a worker, with which it could be lost.
     held = client.submit(_same, work, pure=False)
-    todo, lost = deque(missing), 0
+    todo, lost = deque(missing), Counter[int | None]()
     running: dict[Any, int] = {}
     waiting = as_completed(loop=client.loop)
     while todo or running:
@@ -353,9 +361,8 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[D
         except (KilledWorker, TimeoutError) as error:
             # The scheduler gives a chunk up that several workers were lost with; and an answer that is lost with its
             # worker does not come before the chunk has been run again.
-            lost += 1
-            if lost >= MOST_LOST:
-                raise InputError(f"workers are lost one after another: {error}") from None
+            lost.update((None, index))
+            _give_up(lost, f": {error}")
             todo.append(index)
         except Exception as error:
             raise InputError(
@@ -363,7 +370,7 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[D
                 "the same command goes on from there"
             ) from None
         else:
-            lost = 0
+            lost[None] = 0
             yield answer
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.arrays import FloatArray, IntArray, read_only
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
 from fingerspice.waveforms.bounds import check_range, in_windows, runs_through
@@ -97,9 +97,8 @@ class Ramps(Waveform):
         """As `value`, at times (n_t,) within one window."""
         if self.period is None:
             times, values = self._listed
-            return _between(
-                times, values, np.searchsorted(times, flat, side="right" if side == "right" else "left"), flat
-            )
+            index = np.searchsorted(times, flat, side="right" if side == "right" else "left")
+            return _between(times, values, index, read_only(flat))
         edges = self._edges(flat.min(), flat.max())
         index = np.searchsorted(edges, flat, side="right" if side == "right" else "left")
         bounds = np.concatenate([[-math.inf], edges, [math.inf]])

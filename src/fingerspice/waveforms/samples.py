@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, read_only
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
 from fingerspice.waveforms.bounds import check_finite, check_range
@@ -237,7 +237,7 @@ class Samples(Ramps):
         return 0.0 if self.count <= FEW_KNOTS else self.count / ((self.count - 1) / self.rate)
 
     def _values(self, flat: FloatArray, side: str) -> FloatArray:
-        flat = np.ascontiguousarray(flat)
+        flat = read_only(np.ascontiguousarray(flat))
         first = round(min(max(self._number_of(float(flat[0])), 0.0), float(self.count))) if flat.size else 0
         if first + flat.size <= self.count and np.array_equal(flat, self._times_of(first, first + flat.size)):
             return self.values[first : first + flat.size].copy()
