@@ -10,7 +10,19 @@ from typing import NamedTuple
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit_within
-from fingerspice.engine.readout import KEPT, OUTPUT, RECORDED, Outputs, Steps, record, series_of, write_outputs
+from fingerspice.engine.readout import (
+    KEPT,
+    OUTPUT,
+    RECORDED,
+    REJECTED,
+    H,
+    Outputs,
+    Steps,
+    T,
+    record,
+    series_of,
+    write_outputs,
+)
 from fingerspice.engine.repeat import Kept
 from fingerspice.numerics.small import copy_to
 
@@ -77,6 +89,19 @@ class LoopState(NamedTuple):
     kept: Kept
     steps: Steps
     tried: FloatArray
+
+
+@jit_within
+def may_shorten(s: LoopState, since: float) -> bool:
+    """Let a quarter be tried of a step that starts at a zero and is on neither branch; False where it is rounding.
+
+    The rounding of its length is relative to the time `since` (s).
+    """
+    if s.step[LENGTH] <= 1e-13 * max(since, 1e-3 * (s.step[STOP] - s.control[T])):
+        return False
+    s.counters[REJECTED] += 1
+    s.control[H], s.place[FLIPS] = 0.25 * s.step[LENGTH], 0
+    return True
 
 
 @jit_within

@@ -38,6 +38,7 @@ from fingerspice.engine.loopstate import (
     WHOLE,
     LoopState,
     is_wanted,
+    may_shorten,
     write_step,
 )
 from fingerspice.engine.mesh import Mesh, branch_of, leaks_of, resume_time
@@ -71,7 +72,7 @@ from fingerspice.engine.readout import (
     basis_at,
     error_at,
 )
-from fingerspice.engine.zeros import first_wrong
+from fingerspice.engine.zeros import farthest_off, first_wrong
 from fingerspice.numerics.lobatto import END, NODES, POINTS
 
 # Distance to the fold below which another method takes over, because it needs fewer evaluations there.
@@ -173,16 +174,18 @@ def complete_mesh(c: Mesh, pace: Pace, s: LoopState) -> int:
     step[T_NEW], step[THETA], place[CROSSED] = t + h, 1.0, -1
     if step[T_NEW] >= stop or stop - step[T_NEW] <= 1e-12 * h:
         step[T_NEW], step[THETA] = stop, min(1.0, (stop - t) / h)
-    if place[FLIPS] <= c.sign.size:
-        place[CROSSED], step[THETA], step[T_NEW] = first_zero(
-            c.form.cell, work.areas[netform.U], c.sign, pace.tol, t, h, step[THETA], step[T_NEW], work.room[0]
-        )  # fmt: skip
-    a = place[CROSSED]
-    if a >= 0 and step[T_NEW] <= t:
-        branch = branch_of(c, s)
-        c.sign[a], branch[a, 0], branch[a, 1] = -c.sign[a], t, math.inf
-        place[FLIPS] += 1
-        return AGAIN
+    u = work.areas[netform.U]
+    a, theta, t_new = first_zero(c.form.cell, u, c.sign, pace.tol, t, h, step[THETA], step[T_NEW], work.room[0])
+    if a >= 0 and t_new <= t:
+        if place[FLIPS] <= c.sign.size:
+            branch = branch_of(c, s)
+            c.sign[a], branch[a, 0], branch[a, 1] = -c.sign[a], t, math.inf
+            place[FLIPS] += 1
+            return AGAIN
+        if farthest_off(u[a], c.sign[a]) > pace.tol and may_shorten(s, t):
+            return AGAIN
+    elif a >= 0:
+        place[CROSSED], step[THETA], step[T_NEW] = a, theta, t_new
     if c.form.mobile and place[WHOLE] == 0:
         step[GROWN] = _magnified_whole(c, s)
         _take_coupling(c, s)
@@ -194,7 +197,7 @@ def complete_mesh(c: Mesh, pace: Pace, s: LoopState) -> int:
     _write(c, pace, s, t)
     _account(c, s)
     _move(c, s)
-    if a >= 0:
+    if place[CROSSED] >= 0:
         _cross(c, s, a)
     control[T] = step[T_NEW]
     s.counters[ACCEPTED] += 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 from fingerspice.base.compiled import jit_within
 from fingerspice.engine.charge import charge_step
 from fingerspice.engine.loopstate import (
+    AGAIN,
     BELOW,
     CROSSED,
     FLIPS,
@@ -24,6 +25,7 @@ from fingerspice.engine.loopstate import (
     WRONG,
     LoopState,
     is_wanted,
+    may_shorten,
     write_step,
 )
 from fingerspice.engine.model import dot, turns_at_zero
@@ -59,7 +61,7 @@ from fingerspice.engine.readout import (
 from fingerspice.engine.repeat import AT_EDGE, AT_ZERO
 from fingerspice.engine.stackstep import Stack, flip, source_voltage
 from fingerspice.engine.work import DQ, SOURCE, X_GAP, Q, U
-from fingerspice.engine.zeros import zero
+from fingerspice.engine.zeros import farthest_off, zero
 from fingerspice.numerics.lobatto import END
 
 
@@ -73,12 +75,15 @@ def complete_stack(c: Stack, pace: Pace, s: LoopState) -> int:
     if reached >= length or length - reached <= 1e-12 * h:
         reached = length
         step[THETA] = min(1.0, (length - since) / h)
-    if (place[WRONG] > 0 or step[BELOW] > 0.0) and place[FLIPS] < 2:
+    if place[WRONG] > 0 or step[BELOW] > 0.0:
         crossing = zero(c.work.r[U], control[SIGN], place[WRONG], step[BELOW], c.work.coefficients[0])
-        if since + crossing * h <= reached and crossing <= step[THETA]:
-            step[THETA], reached, place[CROSSED] = crossing, since + crossing * h, 0
-            if reached <= since:
+        if since + crossing * h <= since:
+            if place[FLIPS] < 2:
                 return flip(s)
+            if farthest_off(c.work.r[U], control[SIGN]) > pace.tol and may_shorten(s, since):
+                return AGAIN
+        elif since + crossing * h <= reached and crossing <= step[THETA]:
+            step[THETA], reached, place[CROSSED] = crossing, since + crossing * h, 0
     place[FLIPS] = 0
     step[T_NEW] = step[STOP] if reached == length else step[START] + reached
     _write(c, pace, s, t)

@@ -131,6 +131,15 @@ def leaves(u: FloatArray, sign: float, tol: float, series: FloatArray) -> float:
     return zero(u, sign, wrong, below, series) if wrong > 0 or below > 0.0 else 2.0
 
 
+@jit_rows
+def farthest_off(u: FloatArray, sign: float) -> float:
+    """How far the gap voltage is off its branch at the nodes at most, V; negative where it is on it."""
+    off: float = -sign * u[0]
+    for j in range(1, NODES):
+        off = max(off, -sign * u[j])
+    return off
+
+
 @jit
 def first_wrong(u: FloatArray, sign: float, tol: float) -> int:
     """First node past the start at which the gap voltage is off its branch, or 0.
