@@ -107,11 +107,11 @@ class Compiling:
             self._bar = Bar(text.partition(":")[0], endless=True)
             self._bar.show()
         elif text not in self._told and self._bar is None:
-            _tell(text)
+            tell(text)
         self._told.add(text)
 
 
-def _tell(text: str) -> None:
+def tell(text: str) -> None:
     """Log one line, or write it to stderr where no logging was set up."""
     if _LOG.isEnabledFor(logging.INFO) and _LOG.hasHandlers():
         _LOG.info(text)

@@ -29,6 +29,8 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Warnings for every limit of the model that the run exceeds."""
     yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit, problem.t_stop))
     yield from problem.circuit.remember(("source", problem.t_stop), lambda: tuple(_source_warnings(problem)))
+    if run.note and run.status is Status.SUCCESS:
+        yield run.note
     net, several = problem.scene.net, len(record.fingers) > 1
     for finger, (name, contact) in enumerate(record.fingers):
         i, (u_peak, f_peak, u_error, _) = problem.network.fingers[finger], run.gaps[finger].tolist()

@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import time
 from functools import cache
 
 import numpy as np
 
+from fingerspice.base.announcing import tell
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine import collocation
 from fingerspice.engine.collocation import Passage, advance
@@ -49,6 +51,8 @@ PROBES, PROBES_PER_PERIOD, MOST_PROBES = 512, 32, 20_000
 # They are also compared after at most so many edges of the sources, at these fractions of the time to the next edge.
 MOST_EDGES, AFTER_EDGE = 256, np.geomspace(1e-15, 0.3, 30)
 ATTEMPTS = 6
+# Time after which the expected time of a run is announced, s.
+TELL_AFTER = 3.0
 # Difference of a fold's times in two successive runs at which the fold is accepted at once, over its time; and the one
 # at which it is accepted after the last attempt, over its time or the source's shortest time, if that is longer.
 FOLD_TIME, FOLD_SPREAD = 1e-10, 1e-5
@@ -81,6 +85,7 @@ class Collocation(NetworkIntegration):
     ) -> None:
         super().__init__(problem, t_out, left)
         self.scheme, self.tol = scheme, tol
+        self.progress: Progress | None = None
         self.rows = np.full((t_out.size, self.width), np.nan)
         n_s = self.s_before.size
         stored = u_scale * float(np.abs(problem.network.capacitance(problem.scene.area0)).sum()) or u_scale
@@ -126,6 +131,8 @@ class Collocation(NetworkIntegration):
             if code == collocation.PAUSED:
                 if self.steps > FIRST_STEPS + self.done * MOST_STEPS:
                     return Status.TOO_MANY_STEPS
+                if self.progress is not None:
+                    self.progress(self.done)
                 continue
             if code == collocation.STEP_UNDERFLOW or (
                 code == collocation.JUMP and not self.jump(values_at(sources, self.t))
@@ -167,6 +174,7 @@ def _integrate(
     progress: Progress | None,
 ) -> Run:  # fmt: skip
     one, scene = Collocation(problem, scheme, tol, u_scale, t_out, left), problem.scene
+    one.progress = progress
     run = integrate(one, Tables(problem, tol, t_out=t_out), progress)
     run.gaps = np.zeros((len(problem.network.fingers), 4))
     for row, i in zip(run.gaps, problem.network.fingers, strict=True):
@@ -177,12 +185,15 @@ def _integrate(
 
 
 def solve_coupled(
-    problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None = None
-) -> Run:
+    problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None = None,
+    reason: str = "",
+) -> Run:  # fmt: skip
     """Integrate until the stated error is within `rtol` of the peaks of every gap's voltage and force.
 
-    The stated error is the difference from a second run of lower order with a larger tolerance.
+    The stated error is the difference from a second run of lower order with a larger tolerance. `reason` says why this
+    method took over from another; a run that takes long is announced with it, and with its expected time.
     """
+    progress = _announced(progress, reason or "implicit steps")
     longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
     fine, coarse = (radau_scheme(stages)._replace(h_max=longest) for stages in (STAGES, STAGES_BESIDE))
     at, side, probed = _with_probes(problem, t_out, left)
@@ -195,7 +206,7 @@ def solve_coupled(
     nearest: tuple[float, Run] | None = None
     for attempt in range(ATTEMPTS):
         taken = tol
-        beside = _integrate(problem, coarse, BESIDE * tol, u_scale, at[probed], side[probed], None)
+        beside = _integrate(problem, coarse, BESIDE * tol, u_scale, at[probed], side[probed], progress)
         run = _integrate(problem, fine, tol, u_scale, at, side, progress)
         nfev += beside.nfev + run.nfev
         run.nfev = nfev
@@ -237,7 +248,25 @@ def solve_coupled(
         return _integrate(problem, fine, taken, u_scale, t, left, None).record(problem)
 
     run.continuous = closed_form(problem, look, rtol)
+    run.note = f"{reason}; implicit steps took over, {run.stats['steps']} of them" if reason else ""
     return run
+
+
+def _announced(progress: Progress | None, reason: str) -> Progress:
+    """Progress of implicit steps, which tells once how long they are expected to take."""
+    begun, told = time.perf_counter(), False
+
+    def update(done: float) -> None:
+        nonlocal told
+        taken = time.perf_counter() - begun
+        if not told and taken > TELL_AFTER and done > 0.0:
+            # A run consists of the coarser one, which comes first, and the finer one.
+            tell(f"{reason}: implicit steps since {taken:.0f} s, about {2.0 * taken / done:.2g} s in all")
+            told = True
+        if progress is not None:
+            progress(done)
+
+    return update
 
 
 def _voltage_scale(problem: Problem, scheme: Scheme, guess: float) -> float:

@@ -70,6 +70,8 @@ class Run:
         Smallest distance to the fold in the run.
     detail : str
         Message of a method about its failure.
+    note : str
+        Why an implicit method took over; empty where none did.
     tried : ndarray, shape (n, 4)
         The last steps tried, as rows of `results.outcome.last_tried`.
     here : ndarray, shape (width,), or None
@@ -95,6 +97,7 @@ class Run:
     rough: float = 0.0
     margin: float = 1.0
     detail: str = ""
+    note: str = ""
     tried: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
     here: FloatArray | None = None
     continuous: Recorded | ClosedForm | None = None

@@ -325,7 +325,7 @@ def _stepped(
         recorded = solve_recording(problem, rtol, t_out, left, progress)
         if recorded is not None:
             return recorded, "relaxation"
-    is_stack = problem.scene.stack is not None
+    is_stack, reason = problem.scene.stack is not None, ""
     if method != "radau" and (is_stack or problem.scene.coupled):
         run = solve_exponential(problem, rtol, t_out, left, progress, repeat=method == "auto")
         if run.status not in (BEYOND_STACKS if is_stack else BEYOND_NETWORKS) or (is_stack and method == "exponential"):
@@ -336,8 +336,9 @@ def _stepped(
             folded = run_to_fold(problem, t_out, left)
             if folded is not None:
                 return folded, "exponential"
+        reason = f"exponential steps gave up at t = {run.state.t:.4g} s, because {run.status.cause}"
     # The implicit method is the last resort: its step length does not depend on fast modes.
-    run = solve_coupled(problem, rtol, t_out, left, progress)
+    run = solve_coupled(problem, rtol, t_out, left, progress, reason)
     if is_stack and run.status is Status.FOLD:
         from fingerspice.solve.folding import lead_to_fold
 
