@@ -20,11 +20,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.bounds import check_finite
+from fingerspice.waveforms.bounds import take_numbers
 
 TAU = 2.0 * math.pi
+#: Distance of neighbouring doubles, relative to their size.
+DOUBLE = 2.0**-52
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,9 @@ class Waveform:
 
     period: float | None = None
     """Period in s after any delay, or None."""
+
+    precision: float = DOUBLE
+    """Distance of neighbouring numbers of the kind that the values are computed in, relative to their size."""
 
     def __getstate__(self) -> dict[str, Any]:
         return {key: value for key, value in vars(self).items() if key != "kept"}
@@ -179,16 +184,12 @@ def as_waveform(value: Waveform | float | Callable[[float], float]) -> Waveform:
     """
     if isinstance(value, Waveform):
         return value
-    if isinstance(value, (int, float, np.floating, np.integer)):
-        return DC(float(value))
     if callable(value):
         from fingerspice.waveforms.sampling import Function
 
         return Function(value)
-    kind = type(value).__name__
-    if isinstance(value, (np.ndarray, list, tuple)):
-        kind += "; values at a rate are fs.Samples(values, rate)"
-    raise InputError(f"a source must be a waveform, a number or a function of time, got {kind}")
+    allowed = "a waveform, a number or a function of time; values at a rate are fs.Samples(values, rate)"
+    return DC(real_number("a source", value, allowed))
 
 
 def require(condition: bool, what: str, given: Any, allowed: str) -> None:
@@ -233,7 +234,7 @@ class DC(Waveform):
     units: ClassVar[dict[str, str]] = {"level": "V"}
 
     def __post_init__(self) -> None:
-        check_finite(self)
+        take_numbers(self)
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         return np.full(np.shape(t), self.level)
@@ -280,7 +281,7 @@ class Sine(Waveform):
     }
 
     def __post_init__(self) -> None:
-        check_finite(self)
+        take_numbers(self)
         require(self.frequency > 0.0, "sine frequency", f"{self.frequency:g} Hz", "> 0")
 
     @property
@@ -305,7 +306,7 @@ class Sine(Waveform):
         return turns - np.floor(turns)
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
-        since = np.maximum(np.asarray(t, float), self.delay)
+        since = np.maximum(real_numbers("t", t, "times in s"), self.delay)
         wave = np.sin(TAU * self._turns(since) + math.radians(self.phase_deg))
         if self.damping:
             wave = wave * np.exp(-self.damping * (since - self.delay))
