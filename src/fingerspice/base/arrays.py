@@ -52,7 +52,7 @@ def real_number(what: str, given: object, allowed: str) -> float:
 
     Parameters and errors as of `real_numbers`.
     """
-    if isinstance(given, Real) and not isinstance(given, bool):
+    if isinstance(given, Real) and not isinstance(given, (bool, np.timedelta64)):
         with suppress(OverflowError):
             return float(given)
     array = real_numbers(what, given, allowed)

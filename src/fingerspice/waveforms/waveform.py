@@ -237,7 +237,7 @@ class DC(Waveform):
         take_numbers(self)
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
-        return np.full(np.shape(t), self.level)
+        return np.full(real_numbers("t", t, "times in s").shape, self.level)
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         out = blank_terms(start.size, 1)
