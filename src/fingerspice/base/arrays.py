@@ -63,7 +63,7 @@ def real_number(what: str, given: object, allowed: str) -> float:
 
 def whole_number(what: str, given: object, least: int, most: float = math.inf) -> int:
     """A whole number that a user gives, from `least` to `most`; errors as of `real_numbers`."""
-    allowed = f"a whole number, {least} {f'to {most:g}' if most < math.inf else 'or more'}"
+    allowed = f"{least} to {most:g}, a whole number" if most < math.inf else f"a whole number, {least} or more"
     number = real_number(what, given, allowed)
     if not (number.is_integer() and least <= number <= most):
         raise InputError(f"{what} is {given}; allowed: {allowed}")
@@ -81,10 +81,9 @@ def positive_number(what: str, given: object, unit: str = "") -> float:
 
 def positive_row(what: str, given: object, unit: str) -> FloatArray:
     """Finite numbers above 0 that a user gives, one or a row of them, as a row; errors as of `real_numbers`."""
-    allowed = f"positive numbers of {unit}"
-    row = np.atleast_1d(real_numbers(what, given, allowed))
+    row = np.atleast_1d(real_numbers(what, given, f"positive numbers of {unit}"))
     if row.ndim > 1 or not np.all((row > 0.0) & (row < np.inf)):
-        raise InputError(f"{what} is {reprlib.repr(given)}; allowed: {allowed}")
+        raise InputError(f"{what} is {reprlib.repr(given)} {unit}; allowed: positive numbers")
     return row
 
 

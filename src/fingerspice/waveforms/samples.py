@@ -109,7 +109,7 @@ class Samples(Ramps):
             If the file cannot be read or is broken, if it has several channels and none is chosen, or if it has no
             such channel.
         """
-        gain = real_number("gain", gain, "a number of V at full scale")
+        gain = real_number("gain", gain, "a finite number of V at full scale")
         require(math.isfinite(gain), "gain", gain, "a finite number of V at full scale")
         layout = None if at_once else wav_layout(path, channel)
         recording = read_wav(path, channel) if layout is None else None
