@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import fingerspice as fs
 from scenes import table1
@@ -52,9 +54,15 @@ def test_what_is_no_circuit_is_refused_with_how_one_is_made(call: Any, given: An
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"sources": np.zeros(5)}, r"got ndarray; values at a rate are fs\.Samples\(values, rate\)"),
-        ({"sources": (0.0, 1.0)}, r"got tuple; values at a rate are fs\.Samples"),
-        ({"sources": {"Vdrive": Path("x.csv")}}, "a source must be a waveform, a number or a function of time, got"),
+        (
+            {"sources": np.zeros(5)},
+            r"a source is array\(.*, a ndarray; .* values at a rate are fs\.Samples\(values, rate\)",
+        ),
+        ({"sources": (0.0, 1.0)}, r"a source is \(0\.0, 1\.0\), a tuple; .* values at a rate are fs\.Samples"),
+        (
+            {"sources": {"Vdrive": Path("x.csv")}},
+            r"a source is .*x\.csv.*; allowed: a waveform, a number or a function of time",
+        ),
         ({"sources": {"Vdrive2": SQUARE}}, "unknown element 'Vdrive2'; nearest: 'Vdrive'"),
         ({"sources": {"Xgap": SQUARE}}, "sources names 'Xgap', which is a GAP; allowed: a V or I element"),
         ({"sources": {3: SQUARE}}, "sources names 3, a int; allowed: names of V or I elements"),
@@ -80,13 +88,13 @@ def test_one_source_for_a_circuit_of_several_is_refused_with_their_names() -> No
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"t_stop": "50m"}, "t_stop is '50m', a str; allowed: a number in s"),
+        ({"t_stop": "50m"}, "t_stop is '50m'; allowed: a number in s"),
         ({"t_stop": (0.0, 1.0)}, "t_stop is .*, a tuple; allowed: a number in s"),
         ({"t_eval": "50m"}, "t_eval is '50m'; allowed: numbers in s"),
         ({"t_eval": {"a": 1}}, "t_eval is .*; allowed: numbers in s"),
         ({"area": (1e-6, 2e-6)}, "area is .*, a tuple; allowed: 'coupled', 'mean', 'frozen' or a number in m"),
         ({"area": np.zeros(2)}, "area is .*, a ndarray; allowed"),
-        ({"rtol": "1e-6"}, "rtol is 1e-6; allowed"),
+        ({"rtol": "1e-6"}, "rtol is '1e-6'; allowed: 1e-13 to 0.1"),
         ({"method": 3}, "method is 3; allowed: a name"),
         ({"charge_law": 3}, "charge_law is 3; allowed: 'local' or 'mobile'"),
         ({"start": 0.5}, "start is 0.5; allowed: 'deck'"),
@@ -95,3 +103,116 @@ def test_one_source_for_a_circuit_of_several_is_refused_with_their_names() -> No
 def test_arguments_of_another_kind_are_refused_with_one_sentence(given: Any, said: str) -> None:
     with pytest.raises(fs.InputError, match=said):
         fs.simulate(table1(), **given)
+
+
+# Of every kind that a user may have -----------------------------------------------------------------------------------
+
+NO_NUMBERS = [
+    3j, np.complex64(1), True, np.True_, b"3", [1.0], (1.0,), np.ones(1), np.ma.masked, np.ma.array(1.0, mask=True),
+    np.datetime64("2026"), np.timedelta64(1, "s"), np.array(1.0, object), object(), {},
+]  # fmt: skip
+# Calls with one number, each with a number that it takes.
+ONE_NUMBER: dict[str, tuple[Any, float]] = {
+    "a constant": (fs.DC, 2.0),
+    "an amplitude": (lambda x: fs.Sine(x, 100.0), 2.0),
+    "a frequency": (lambda x: fs.Chirp(1.0, x, 10.0, 1.0), 2.0),
+    "a duty": (lambda x: fs.Square(1.0, 100.0, x), 0.5),
+    "a width": (lambda x: fs.Pulse(0.0, 1.0, width=x), 2.0),
+    "a depth": (lambda x: fs.AM(1.0, 1000.0, 10.0, x), 0.5),
+    "a duration": (lambda x: fs.Burst(fs.DC(1.0), x), 2.0),
+    "a rate": (lambda x: repr(fs.Samples([0.0, 1.0], x)), 2.0),
+    "the repeat of a PWL": (lambda x: fs.PWL((0.0, 0.5, 1.0), (0.0, 1.0, 0.0), x), 0.5),
+    "the period of a function": (lambda x: fs.Function(np.sin, (), x).period, 2.0),
+    "a factor": (lambda x: repr(fs.Samples([0.0, 1.0], 9.0).upsampled(x)), 2.0),
+    "a source": (lambda x: table1().replace({"Vdrive": x})["Vdrive"].waveform, 2.0),
+    "a parameter": (lambda x: table1().replace({"Xgap.fn": x})["Xgap"].values["fn"], 2.0),
+    "t_stop": (lambda x: str(fs.plan(table1(), t_stop=x)), 0.5),
+    "rtol": (lambda x: str(fs.plan(table1(), rtol=x)), 2.0**-10),
+    "area": (lambda x: fs.phasor(table1(), 100.0, area=x).gain[0], 2.0**-15),
+    "points": (lambda x: fs.steady_state(table1(), rtol=1e-3, points=x).solution.t.size, 4.0),
+}
+
+
+@pytest.mark.parametrize("name", ONE_NUMBER)
+def test_numbers_of_every_kind_count_as_the_double_and_nothing_else_does(name: str) -> None:
+    call, number = ONE_NUMBER[name]
+    double = call(number)
+    kinds = [np.float64, np.float32, np.array, Fraction, np.longdouble, np.ma.array, torch.tensor]
+    kinds += [int, np.uint8, np.int64] if number.is_integer() else []
+    for kind in kinds:
+        assert call(kind(number)) == double
+    for given in NO_NUMBERS:
+        with pytest.raises(fs.InputError, match="allowed"):
+            call(given)
+
+
+def test_a_gap_of_3_m_is_warned_about_whatever_the_number_is_made_of() -> None:
+    for given in (3.0, 3, np.int8(3), np.array(3), torch.tensor(3), torch.tensor(3.0)):
+        with pytest.warns(fs.FingerspiceWarning, match="Xgap d is 3 m, outside .* was 3u meant"):
+            table1().replace({"Xgap.d": given})
+
+
+ROW = np.array([0.0, 1.0, 2.0])
+NO_ROWS = [
+    ROW + 1j, (ROW + 0j).tolist(), np.ma.array(ROW, mask=[False, True, False]), ROW.astype(str), ["0", "1", "2"],
+    ROW > 0.5, ROW.astype(object), [None, 1.0, 2.0], ROW.astype("M8[s]"), ROW.astype("m8[s]"), [[0.0], [1.0, 2.0]],
+    {0: 1}, object(), torch.tensor(ROW + 1j), torch.tensor(ROW, requires_grad=True),
+]  # fmt: skip
+# Calls with a row of numbers.
+ROWS: dict[str, Any] = {
+    "samples": lambda x: fs.Samples(x, 1.0).values,
+    "times of a PWL": lambda x: fs.PWL(x, [0.0, 1.0, 2.0]).times,
+    "values of a PWL": lambda x: fs.PWL([0.0, 1.0, 2.0], x).values,
+    "breaks": lambda x: fs.Function(np.sin, x).breaks,
+    **{
+        f"times of {type(wave).__name__}": wave
+        for wave in (
+            fs.DC(1.0), fs.Sine(1.0, 0.3), fs.Square(1.0, 0.3), fs.AM(1.0, 3.0, 0.3), fs.Chirp(1.0, 1.0, 2.0, 1.0),
+            fs.Exp(0.0, 1.0, 0.0, 1.0, 1.0, 1.0), fs.Burst(fs.DC(1.0), 1.0), fs.Repeat(fs.Sine(1.0, 0.3), 1.0),
+            fs.Samples([0.0, 1.0], 1.0), fs.PWL([0.0, 1.0], [0.0, 1.0]), fs.Function(np.sin),
+        )
+    },
+    "t_eval": lambda x: fs.simulate(table1(), t_stop=2.0, t_eval=x, area="frozen", sources=fs.DC(0.0)).t,
+    "a batch": lambda x: fs.batch(table1(), {"Vdrive.amplitude": x}, rtol=1e-2, periods=1.0).f_el_mean.to_numpy(),
+    "a sweep": lambda x: fs.sweep(table1(), {"Vdrive.offset": x}, rtol=1e-2, periods=1.0).f_el_mean.to_numpy(),
+    "a force": lambda x: fs.inverse_drive(table1(), force=x, rate=1e3, limit=1.0).drive.values,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_rows_of_every_kind_count_as_those_of_doubles_and_nothing_else_does(name: str) -> None:
+    doubles = ROWS[name](ROW)
+    for given in (ROW.astype(np.uint8), ROW.astype(np.float16), np.ma.array(ROW)):
+        np.testing.assert_array_equal(ROWS[name](given), doubles)
+    for given in NO_ROWS:
+        with pytest.raises(fs.InputError, match="allowed"):
+            ROWS[name](given)
+
+
+def test_a_refused_row_is_named_with_its_kind_and_what_is_allowed() -> None:
+    with pytest.raises(
+        fs.InputError, match=r"samples is \[1j, 2\], a list of complex numbers; allowed: two or more numbers"
+    ):
+        fs.Samples([1j, 2], 1.0)
+    with pytest.raises(fs.InputError, match=r"t_eval is .*, a MaskedArray with masked values; allowed: numbers in s"):
+        fs.simulate(table1(), t_eval=np.ma.array([0.0, 1e-3], mask=[False, True]))
+
+
+@pytest.mark.parametrize("t_stop", [1e-7, 0.3, 1e-3 / 3.0])
+def test_times_that_pass_an_end_by_rounding_are_that_end(t_stop: float) -> None:
+    exact = fs.simulate(table1(), t_stop=t_stop, t_eval=[0.0, t_stop], rtol=1e-6)
+    for off in (1, 2, 3):
+        beyond = t_stop * (1.0 + off * 2.0**-52)
+        near = fs.simulate(table1(), t_stop=t_stop, t_eval=[-1e-17 * t_stop, beyond], rtol=1e-6)
+        np.testing.assert_array_equal(near.t, exact.t)
+        np.testing.assert_array_equal(near.u_gap, exact.u_gap)
+    for t_eval in ([0.0, t_stop * (1.0 + 1e-14)], [-1e-14 * t_stop, t_stop]):
+        with pytest.raises(fs.InputError, match=r"t_eval is .*; allowed: times from 0 s to t_stop"):
+            fs.simulate(table1(), t_stop=t_stop, t_eval=t_eval)
+
+
+def test_a_grid_of_steps_may_end_at_t_stop() -> None:
+    t_eval = np.arange(1001) * 1e-10
+    assert t_eval[-1] > 1e-7
+    assert fs.simulate(table1(), t_stop=1e-7, t_eval=t_eval).t[-1] == 1e-7
+    assert t_eval[-1] > 1e-7  # the caller's own array

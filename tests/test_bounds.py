@@ -103,7 +103,7 @@ def test_the_peak_of_a_periodic_source_is_looked_for_in_one_period() -> None:
         (lambda: fs.Sine(1e99, 100.0), "Sine amplitude is 1e+99 V; allowed: a size up to 1e+12"),
         (lambda: fs.Sine(1.0, 1e-320), "Sine frequency is 9.99989e-321 Hz; allowed: 0, or a size from 1e-30 to 1e+30"),
         (lambda: fs.Sine(1.0, 1.0, phase_deg=1e30), "Sine phase_deg is 1e+30 deg; allowed: a size up to 1e+09"),
-        (lambda: fs.Pulse(0.0, 1.0, 0.0, 1e-300), "pulse rise is 1e-300 s"),
+        (lambda: fs.Pulse(0.0, 1.0, 0.0, 1e-300), "Pulse rise is 1e-300 s"),
         (lambda: fs.PWL((0.0, 1e-300), (0.0, 1.0)), "PWL time is 1e-300 s"),
         (lambda: fs.PWL((0.0, 1.0), (0.0, -1e13)), "PWL value is -1e+13 V"),
         (lambda: fs.Samples(np.array([0.0, 1e300]), 1.0), "a sample is 1e+300 V"),

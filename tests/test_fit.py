@@ -251,6 +251,26 @@ def test_an_impedance_against_frequency(tmp_path: Path, with_phase: bool) -> Non
     assert again.estimates["Xgap.d"].value == pytest.approx(3.1e-6, rel=1e-6)
 
 
+def test_a_complex_impedance_counts_as_a_whole() -> None:
+    quiet = fs.read_netlist(CIRCUITS / "fingerpad.cir").replace({"Vdrive.amplitude": 1.0})
+    f = np.geomspace(20.0, 2e4, 6)
+    z = impedances(quiet.replace({"Xgap.d": 3.1e-6, "Xgap.r": 1.4e6}), f)
+    for given in (z, z.tolist()):
+        found = fs.fit(quiet, {"frequency": f, "impedance": given}, ["Xgap.d", "Xgap.r"], skin="follow")
+        assert found.estimates["Xgap.r"].value == pytest.approx(1.4e6, rel=1e-6)
+        assert found.freedom == 2 * f.size - 2
+    for data, said in (
+        ({"impedance": z, "impedance_phase": np.angle(z)}, "impedance is complex, and impedance_phase is given"),
+        (
+            {"impedance": np.ma.array(z, mask=f > 1e3)},
+            "'impedance' is .*MaskedArray with masked values; allowed: numbers",
+        ),
+        ({"impedance": np.abs(z), "sigma": 1j * np.abs(z)}, "'sigma' is .*of complex numbers; allowed: numbers"),
+    ):
+        with pytest.raises(InputError, match=said):
+            fs.fit(quiet, {"frequency": f, **data}, ["Xgap.d"])
+
+
 def test_intervals_from_noisy_impedances_cover_the_truth() -> None:
     quiet = fs.read_netlist(CIRCUITS / "fingerpad.cir").replace({"Vdrive.amplitude": 1.0})
     f, rng, covered = np.geomspace(20.0, 2e4, 10), np.random.default_rng(5), 0

@@ -276,7 +276,7 @@ def test_a_source_is_changed_by_its_text() -> None:
         ("Xgap.d", "inf", "Xgap d is inf m; allowed: more than 0"),
         ("Xgap.d", "-1u", "Xgap d is -1e-06 m; allowed: more than 0"),
         ("Xgap.d", "{3u}", "'{3u}' is not a number"),
-        ("Xgap.d", (1e-6,), "Xgap.d is (1e-06,); allowed: a number m, or text such as '3.5u'"),
+        ("Xgap.d", (1e-6,), "Xgap.d is (1e-06,), a tuple; allowed: a number m, or text such as '3.5u'"),
         ("Xgap.d", np.array([1e-6]), "allowed: a number m, or text such as '3.5u'"),
         ("Xgap.d", None, "Xgap.d is None; allowed: a number m"),
         ("Xgap.mu", 1j, "Xgap.mu is 1j; allowed: a number, or text"),

@@ -86,6 +86,75 @@ def test_a_function_that_returns_no_number_is_refused_with_what_it_returned(give
         fs.Function(lambda t: given).value([0.001, 0.002])
 
 
+@pytest.mark.parametrize("given", [1.0 + 1j, np.complex64(2), True, np.ma.masked, np.datetime64("2026")])
+def test_a_complex_or_masked_value_is_refused_with_its_time(given: object) -> None:
+    with pytest.raises(fs.InputError, match=r"the source function returned .* at t = 0\.002 s; allowed: one number"):
+        fs.Function(lambda t: np.where(np.asarray(t) == 0.002, given, 1.0) if np.ndim(t) else given).value(0.002)
+    with pytest.raises(fs.InputError, match=r"the source function returned .* allowed: one number"):
+        fs.simulate(table1(), sources=lambda t: 150.0 * np.exp(2j * np.pi * 100.0 * t), t_stop=0.01)
+
+
+def test_a_function_that_works_in_place_leaves_the_times_as_they_are() -> None:
+    def in_place(t):
+        t *= 2.0 * np.pi * 100.0
+        return 150.0 * np.sin(t)
+
+    def of_arrays_only(t):
+        t[t < 0.0] = 0.0
+        return 150.0 * np.sin(2.0 * np.pi * 100.0 * t)
+
+    t = np.linspace(0.0, 0.02, 7)
+    for function in (in_place, of_arrays_only):
+        np.testing.assert_array_equal(fs.Function(function)(t), 150.0 * np.sin(t * (2.0 * np.pi * 100.0)))
+        run = fs.simulate(table1(), sources=function, t_stop=0.02, rtol=1e-6)
+        exact = fs.simulate(table1(), sources=fs.Sine(150.0, 100.0), t_stop=0.02, t_eval=run.t, rtol=1e-9)
+        assert np.abs(run.u_gap - exact.u_gap).max() <= run.error.u_gap + exact.error.u_gap
+    np.testing.assert_array_equal(t, np.linspace(0.0, 0.02, 7))
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float16])
+@pytest.mark.parametrize("rtol", [1e-8, 1e-4])
+@pytest.mark.parametrize("shape", ["sine", "chirp", "sum", "clock"])
+def test_coarser_numbers_than_doubles_are_taken_as_they_are_and_their_rounding_is_stated(
+    kind: type[np.floating], rtol: float, shape: str
+) -> None:
+    def exact(t):
+        if shape == "chirp":
+            return 120.0 * np.sin(2.0 * np.pi * (50.0 + 4000.0 * t) * t)
+        return 80.0 + 60.0 * np.sin(2.0 * np.pi * 150.0 * t) + (30.0 * np.sin(2000.0 * t) if shape == "sum" else 0.0)
+
+    calls = 0
+
+    def coarse(t):
+        nonlocal calls
+        calls += np.size(t)
+        # The time itself may be coarse, too.
+        return exact(np.asarray(t, np.float32) if shape == "clock" else t).astype(kind)
+
+    with pytest.warns(fs.FingerspiceWarning, match="the source function of Vdrive gives numbers rounded to"):
+        run = fs.simulate(table1(), sources=coarse, t_stop=0.03, rtol=rtol)
+    true = fs.simulate(table1(), sources=exact, t_stop=0.03, t_eval=run.t, rtol=1e-9)
+    assert np.abs(run.u_gap - true.u_gap).max() <= run.error.u_gap
+    assert np.abs(run.f_el - true.f_el).max() <= run.error.f_el
+    # Of what single precision has, not of something much coarser.
+    assert run.error.u_gap < 1e3 * max(rtol, np.finfo(kind).eps) * 150.0
+    assert calls < 1_000_000
+
+
+def test_precision_is_that_of_the_coarsest_part() -> None:
+    single = fs.Function(lambda t: np.float32(t))
+    for wave in (
+        single,
+        single + fs.DC(1.0),
+        single * fs.Sine(1.0, 1.0),
+        fs.Burst(single, 1.0),
+        fs.Repeat(single, 1.0),
+    ):
+        wave(np.array([0.25, 0.5]))
+        assert wave.precision == 2.0**-23
+    assert fs.Function(lambda t: t).precision == fs.Sine(1.0, 1.0).precision == 2.0**-52
+
+
 def test_what_cannot_be_called_is_refused_at_once() -> None:
     with pytest.raises(fs.InputError):
         fs.Function(3.0)  # type: ignore[arg-type]

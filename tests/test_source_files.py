@@ -229,13 +229,13 @@ def test_a_sample_that_is_no_number_is_refused_with_its_file(at_once: bool, tmp_
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ((["a", "b"], 1e3), "the samples are no row of real numbers; allowed: one row of two or more, in V"),
-        (([[1], [1, 2]], 1e3), "the samples are no row of real numbers"),
-        (([1j, 2j], 1e3), "the samples are no row of real numbers"),
+        ((["a", "b"], 1e3), "the row of samples is ['a', 'b'], a list of texts; allowed: two or more numbers in V"),
+        (([[1], [1, 2]], 1e3), "the row of samples is [[1], [1, 2]], a list; allowed"),
+        (([1j, 2j], 1e3), "the row of samples is [1j, 2j], a list of complex numbers; allowed"),
         (([[1.0, 2.0]], 1e3), "samples is shape (1, 2); allowed: one row of two or more"),
-        (([1.0, 2.0], "48k"), "sample rate is '48k'; allowed: a number of Hz"),
-        (([1.0, 2.0], None), "sample rate is None; allowed: a number of Hz"),
-        (([1.0, 2.0], 1e3, "0"), "start is '0'; allowed: a number of s"),
+        (([1.0, 2.0], "48k"), "Samples rate is '48k'; allowed: a number of Hz"),
+        (([1.0, 2.0], None), "Samples rate is None; allowed: a number of Hz"),
+        (([1.0, 2.0], 1e3, "0"), "Samples start is '0'; allowed: a number of s"),
     ],
 )
 def test_what_makes_no_samples_is_refused(given: tuple[Any, ...], said: str) -> None:
@@ -307,8 +307,8 @@ def test_rates_that_contradict_the_times_are_refused(tmp_path: Path, monkeypatch
     assert said in refusal(lambda: fs.Samples.from_table("a.csv", 1000.0))
     for way in ({}, {"value": "u"}, {"value": 1}):
         assert said in refusal(lambda way=way: fs.Samples.from_table("a.csv", 1000.0, **way))
-    for rate in (-1.0, 0, np.nan, "1k"):
-        allowed = f"the rate is {rate!r}; allowed: a number of Hz, > 0"
+    for rate, given in ((-1.0, "-1 Hz"), (0, "0 Hz"), (np.nan, "nan Hz"), ("1k", "'1k'")):
+        allowed = f"the rate is {given}; allowed: a number of Hz, > 0"
         assert allowed in refusal(lambda rate=rate: fs.Samples.from_table("a.csv", rate, "u"))
     assert "is a table with times; allowed: one with a rate" in refusal(lambda: fs.Samples.from_table("a.csv"))
     np.savez("a.npz", u=np.zeros(30), t=np.arange(30) / 44100, rate=48000)

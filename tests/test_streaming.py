@@ -173,11 +173,11 @@ def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"chunk": 0.0}, "chunk is 0 s; allowed: > 0 s"),
-        ({"chunk": "1"}, "chunk is '1', a str; allowed: a number in s"),
-        ({"count": 0}, "count is 0; allowed: a whole number from 1 on"),
+        ({"chunk": 0.0}, "chunk is 0 s; allowed: a number of s, > 0"),
+        ({"chunk": "1"}, "chunk is '1'; allowed: a number of s, > 0"),
+        ({"count": 0}, "count is 0; allowed: a whole number, 1 or more"),
         ({"count": 3, "chunk": 1.0}, "count is given beside chunk; allowed: one of them"),
-        ({"step": -1.0}, "step is -1 s; allowed: > 0 s"),
+        ({"step": -1.0}, "step is -1 s; allowed: a number of s, > 0"),
         ({"method": "euler"}, "unknown method 'euler'"),
         ({"rtol": 1.0}, "rtol is 1.0; allowed"),
         ({"count": 10**10, "step": 1e-12, "t_stop": 1.0}, "outputs with"),

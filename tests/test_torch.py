@@ -232,7 +232,7 @@ def test_no_warning_about_values_that_an_optimiser_chooses() -> None:
         (((), ("f_el_mean", "f_el_mean")), {}, "every name once"),
         (((), "u_gap"), {}, "u_gap is asked for, and t is None"),
         (((), "f_el_mean"), {"t": [0.0]}, "t is given, and no signal is asked for"),
-        (((), "f_el_mean"), {"t_stop": -1.0}, "t_stop is -1.0; allowed: more than 0"),
+        (((), "f_el_mean"), {"t_stop": -1.0}, "t_stop is -1 s; allowed: a number of s, > 0"),
         (((), "f_el_mean"), {"rtol": 1e-13}, "rtol is 1e-13; allowed"),
     ],
 )
@@ -249,7 +249,7 @@ def test_refused_when_it_is_made(arguments: tuple[Any, ...], how: dict[str, Any]
         ({"Xgap.d": -1e-6}, r"Xgap.d is -1e-06 in scene 0; allowed"),
         ({"Xgap.d": [3e-6, 4e-6], "Xgap.r": [1e6, 1e6, 1e6]}, r"shapes \(2,\) \(Xgap.d\), \(3,\) \(Xgap.r\); allowed"),
         ({"Xgap.d": 3e-6 + 1j}, "Xgap.d is .*; allowed: a tensor or array of numbers"),
-        ({"Xgap.d": torch.tensor(1j)}, "Xgap.d is complex"),
+        ({"Xgap.d": torch.tensor(1j)}, "Xgap.d is a tensor of torch.complex64; allowed: real numbers"),
         ({"Xgap.mu": [0.3, 50.0]}, "1 of 2 scenes cannot be run; scene 1: .*no contact"),
     ],
 )

@@ -1,18 +1,24 @@
-"""Types of numpy arrays, named once for the whole package; and several arrays in one."""
+"""Types of numpy arrays, named once for the whole package; the numbers that a user gives; and several arrays in one."""
 
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Sequence
+from contextlib import suppress
+from numbers import Real
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.errors import InputError
+
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+_NO_NUMBERS = {"c": "complex numbers", "b": "booleans", "U": "texts", "S": "texts", "M": "dates", "m": "durations"}
 Array = TypeVar("Array", bound=np.ndarray[Any, Any])
 
 
@@ -24,6 +30,73 @@ def read_only(x: Array) -> Array:
     view = x.view()
     view.flags.writeable = False
     return view
+
+
+def real_numbers(what: str, given: object, allowed: str) -> FloatArray:
+    """Numbers that a user gives as doubles, of any shape; they may be the given array itself.
+
+    Parameters
+    ----------
+    what, allowed : str
+        Name of the numbers and what they may be, for the message.
+    given : array_like
+
+    Raises
+    ------
+    InputError
+        If they are complex, masked, or no numbers (texts, booleans, dates, other objects, rows of unequal length).
+    """
+    kind = f", a {type(given).__name__}"
+    # Of tensors that need gradients or are on a card, NumPy makes no array.
+    with suppress(TypeError, ValueError, RuntimeError):
+        array = np.asarray(given)
+        if np.ma.is_masked(given):
+            kind += " with masked values"
+        elif array.dtype.kind in "iuf":
+            return np.asarray(array, float)
+        else:
+            kind = f"{kind} of {_NO_NUMBERS.get(array.dtype.kind, 'objects')}" if array.ndim else ""
+    raise InputError(f"{what} is {reprlib.repr(given)}{kind}; allowed: {allowed}")
+
+
+def real_number(what: str, given: object, allowed: str) -> float:
+    """A number that a user gives, of any type (also an array or a tensor of no dimension), as a double.
+
+    Parameters and errors as of `real_numbers`.
+    """
+    if isinstance(given, Real) and not isinstance(given, (bool, np.timedelta64)):
+        with suppress(OverflowError):
+            return float(given)
+    array = real_numbers(what, given, allowed)
+    if array.ndim:
+        raise InputError(f"{what} is {reprlib.repr(given)}, a {type(given).__name__}; allowed: {allowed}")
+    return float(array)
+
+
+def whole_number(what: str, given: object, least: int, most: float = math.inf) -> int:
+    """A whole number that a user gives, from `least` to `most`; errors as of `real_numbers`."""
+    allowed = f"{least} to {most:g}, a whole number" if most < math.inf else f"a whole number, {least} or more"
+    number = real_number(what, given, allowed)
+    if not (number.is_integer() and least <= number <= most):
+        raise InputError(f"{what} is {given}; allowed: {allowed}")
+    return int(number)
+
+
+def positive_number(what: str, given: object, unit: str = "") -> float:
+    """A finite number above 0 that a user gives; errors as of `real_numbers`."""
+    allowed = f"a number{f' of {unit}' if unit else ''}, > 0"
+    number = real_number(what, given, allowed)
+    if not 0.0 < number < math.inf:
+        raise InputError(f"{what} is {number:g} {unit}".rstrip() + f"; allowed: {allowed}")
+    return number
+
+
+def positive_row(what: str, given: object, unit: str) -> FloatArray:
+    """Finite numbers above 0 that a user gives, one or a row of them, as a row; errors as of `real_numbers`."""
+    row = np.atleast_1d(real_numbers(what, given, f"positive numbers of {unit}"))
+    if row.ndim > 1 or not np.all((row > 0.0) & (row < np.inf)):
+        raise InputError(f"{what} is {reprlib.repr(given)} {unit}; allowed: positive numbers")
+    return row
 
 
 def views_of(shapes: Sequence[tuple[int, ...]]) -> tuple[FloatArray, list[FloatArray]]:

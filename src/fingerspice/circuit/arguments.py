@@ -7,10 +7,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike
-
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import real_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
@@ -92,39 +89,14 @@ def require_circuit(circuit: Any) -> None:
         )
 
 
-def require_number(what: str, given: Any, allowed: str) -> None:
-    """Refuse anything but a real number.
-
-    Raises
-    ------
-    InputError
-        If it is not; the message names the given value.
-    """
-    if isinstance(given, bool) or not isinstance(given, (int, float, np.integer, np.floating)):
-        raise InputError(f"{what} is {given!r}, a {type(given).__name__}; allowed: {allowed}")
-
-
-def require_area(area: Any) -> None:
-    """Refuse an area that is neither a text nor a number; the model checks whether a text names one of its modes.
+def area_given(area: Any) -> str | float:
+    """An area as a text or a number; the model checks whether a text names one of its modes.
 
     Raises
     ------
     InputError
         If it is neither; the message names the given value.
     """
-    if not isinstance(area, str):
-        require_number("area", area, "'coupled', 'mean', 'frozen' or a number in m^2")
-
-
-def times_given(what: str, given: ArrayLike | None) -> FloatArray | None:
-    """Times as an array of their own, s: results keep it, and the caller's array stays writable.
-
-    Raises
-    ------
-    InputError
-        If they are not numbers.
-    """
-    try:
-        return None if given is None else np.asarray(given, float).copy()
-    except (TypeError, ValueError):
-        raise InputError(f"{what} is {given!r}; allowed: numbers in s") from None
+    return (
+        area if isinstance(area, str) else real_number("area", area, "'coupled', 'mean', 'frozen' or a number in m^2")
+    )

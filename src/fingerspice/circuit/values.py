@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from numbers import Real
 from typing import TYPE_CHECKING, Any
 
+from fingerspice.base.arrays import real_number
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import parse_number, suggest_mega, suspicious_mega, unit_read_as_scale
 from fingerspice.circuit.devices import ParameterSpec
@@ -58,11 +58,8 @@ def value_of(path: str, given: Any, spec: ParameterSpec | None, unit: str) -> tu
     InputError
         If the value is not a number, or has a unit that SPICE reads as a scale factor.
     """
-    if isinstance(given, Real) or (hasattr(given, "__float__") and getattr(given, "ndim", 1) == 0):
-        return float(given), None
     if not isinstance(given, str):
-        what = f"a number {unit}".rstrip()
-        raise InputError(f"{path} is {given!r}; allowed: {what}, or text such as '3.5u'")
+        return real_number(path, given, f"a number {unit}".rstrip() + ", or text such as '3.5u'"), None
     text = given.strip()
     if text.lower() in ("inf", "none"):
         return math.inf, None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.describe import changes_text
 from fingerspice.plots import drawing, lines
@@ -145,13 +145,12 @@ def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[floa
     first, last = min((float(t[0]) for t in times), default=0.0), max(lines.end_of(run.solution) for run in runs)
     if window is None:
         return first, last
-    pair = isinstance(window, Sequence) and len(window) == 2
-    good = pair and all(isinstance(x, (int, float, np.number)) for x in window)
-    require(good, "window", repr(window), "two times in s, (start, stop)")
-    start, stop = max(float(window[0]), first), min(float(window[1]), last)
+    ends = real_numbers("window", window, "two times in s, (start, stop)")
+    require(ends.shape == (2,), "window", repr(window), "two times in s, (start, stop)")
+    start, stop = max(float(ends[0]), first), min(float(ends[1]), last)
     shown = any(np.count_nonzero((t >= start) & (t <= stop)) >= 2 for t in times)
     inside = f"ascending, with two outputs or more between them, from {first:g} to {last:g} s"
-    require(start < stop and shown, "window", f"{window[0]:g} to {window[1]:g} s", inside)
+    require(start < stop and shown, "window", f"{ends[0]:g} to {ends[1]:g} s", inside)
     return start, stop
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, positive_number, real_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
@@ -124,8 +124,9 @@ def spectrum_of(
 ) -> Spectrum:
     """See `Solution.spectrum`."""
     require(method in METHODS, "method", repr(method), ", ".join(map(repr, METHODS)))
-    for name, value, unit in (("highest", highest, "Hz"), ("resolution", resolution, "Hz")):
-        require(value is None or 0.0 < value < math.inf, name, value, f"more than 0 {unit}, or None")
+    highest = None if highest is None else positive_number("highest", highest, "Hz")
+    resolution = None if resolution is None else positive_number("resolution", resolution, "Hz")
+    since = None if since is None else real_number("since", since, "a number in s")
     names = solution.all_signals.names(signal)
     if len(names) != 1:
         known = ", ".join(names) or "signals of elements that the circuit has"

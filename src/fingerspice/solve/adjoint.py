@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.arrays import FloatArray, IntArray, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.engine.adjoint import new_room, sweep
 from fingerspice.engine.adjointsteps import Course, Wanted
@@ -131,10 +131,7 @@ def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> _Weights:
         known = signals if name in signals else means if name in means else None
         if known is None:
             raise InputError(f"unknown signal {name!r}; allowed: {', '.join((*SIGNALS, *MEANS))}")
-        try:
-            value = np.asarray(given, float)
-        except (TypeError, ValueError):
-            raise InputError(f"{name} is {given!r}; allowed: numbers, derivatives by the signal") from None
+        value = real_numbers(name, given, "numbers, derivatives by the signal")
         shape = () if known is means else run.t.shape
         if value.shape != shape or not np.isfinite(value).all():
             raise InputError(

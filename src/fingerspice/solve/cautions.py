@@ -16,7 +16,7 @@ from fingerspice.results.outcome import Status
 from fingerspice.results.record import Record
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run
-from fingerspice.waveforms.waveform import DC
+from fingerspice.waveforms.waveform import DC, DOUBLE
 
 BREAKDOWN_VOLTAGE = 300.0
 # Smallest contact area without a warning, relative to the area at 0 V.
@@ -48,6 +48,12 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
             yield (
                 f"the gap takes no more than rounding of the source's voltage: of its {u_peak:.2g} V nothing is "
                 "known but that they are as good as 0"
+            )
+    for e in problem.circuit.by_device("V", "I"):
+        if e.waveform is not None and e.waveform.precision > DOUBLE:
+            yield (
+                f"the source function of {e.name} gives numbers rounded to {e.waveform.precision:.2g} of their size, "
+                f"not doubles: it is rough by {run.rough:.2g} V, which the stated errors contain"
             )
     yield from _fold_warning(run)
     yield from _strength_warnings(problem.network.layers, record)

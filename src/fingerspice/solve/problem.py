@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
+from fingerspice.circuit.arguments import area_given
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.network import Network
 from fingerspice.results.outcome import State
@@ -126,7 +127,7 @@ def prepare(
         For anything in the request that cannot be run.
     """
     t_start = start.state.t if isinstance(start, Solution) else 0.0
-    scene = scene_of(circuit, charge_law, area, t_stop, rtol)
+    scene = scene_of(circuit, charge_law, area_given(area), t_stop, rtol)
     stop, step = run_times(circuit, t_start, t_stop, t_eval)
     # Key and value are one entry, because another thread may replace it at any time.
     kept = scene.waveform.kept

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray, real_number, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_area, require_number, times_given
+from fingerspice.circuit.arguments import Parameters, Sources, overridden
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.notices import circuit_warnings
 from fingerspice.results.outcome import SolveError, Status
@@ -31,7 +31,8 @@ from fingerspice.solve.periodic import close_period
 from fingerspice.solve.planning import make_plan
 from fingerspice.solve.problem import Problem, prepare
 from fingerspice.solve.runs import Progress, Run
-from fingerspice.waveforms.waveform import require
+from fingerspice.solve.times import to_ends
+from fingerspice.waveforms.waveform import DOUBLE, require
 
 RTOL_RANGE = (1e-13, 0.1)
 METHODS, LIBRARIES = ("auto", "exponential", "radau"), ("scipy", "torchdiffeq")
@@ -120,7 +121,9 @@ def simulate(
     """
     require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
     check_method(method)
-    times = times_given("t_eval", t_eval)
+    # Of their own: results keep them, and the caller's array stays writable.
+    times = None if t_eval is None else real_numbers("t_eval", t_eval, "numbers in s").copy()
+    rtol = rtol_given(rtol)
     circuit = overridden(circuit, sources, parameters)
     problem = asked(
         circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=start, charge=charge, rtol=rtol
@@ -148,10 +151,7 @@ def asked(
     InputError
         For a request that cannot be run.
     """
-    _check_rtol(rtol)
-    if t_stop is not None:
-        require_number("t_stop", t_stop, "a number in s")
-    require_area(area)
+    t_stop = None if t_stop is None else real_number("t_stop", t_stop, "a number in s")
     known = isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)
     require(known, "start", repr(start), f"{', '.join(map(repr, STARTS))} or a Solution")
     if isinstance(start, Solution) and start.stored is not None:
@@ -160,17 +160,19 @@ def asked(
     problem = prepare(circuit, t_stop=t_stop, t_eval=t_eval, start=first, rtol=rtol, area=area, **how)
     if start == "periodic":
         problem = close_period(problem, 0.5 * rtol).problem
-        if t_eval is not None and t_eval[0] < problem.t_start:
-            raise InputError(
-                f"t_eval starts at {t_eval[0]:g} s; allowed: from {problem.t_start:g} s on, where the source has "
-                "settled and its periodic state exists"
-            )
+        if t_eval is not None:
+            to_ends(t_eval, problem.t_start, problem.t_stop)
+            allowed = f"from {problem.t_start:g} s on, where the source has settled and its periodic state exists"
+            require(t_eval[0] >= problem.t_start, "the first of t_eval", f"{t_eval[0]:g} s", allowed)
     return problem
 
 
-def _check_rtol(rtol: float) -> None:
-    good = isinstance(rtol, (int, float)) and RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1]
-    require(good, "rtol", rtol, "1e-13 to 0.1")
+def rtol_given(rtol: object, least: float = RTOL_RANGE[0]) -> float:
+    """The largest relative error that a user allows, from `least` on; anything else is refused."""
+    allowed = f"{least:g} to {RTOL_RANGE[1]:g}"
+    number = real_number("rtol", rtol, allowed)
+    require(least <= number <= RTOL_RANGE[1], "rtol", rtol, allowed)
+    return number
 
 
 def check_method(method: str) -> None:
@@ -213,11 +215,9 @@ def plan(
     InputError
         For a request that cannot be run.
     """
-    _check_rtol(rtol)
-    require_area(area)
+    rtol = rtol_given(rtol)
     circuit = overridden(circuit, sources, parameters)
-    if t_stop is None and circuit.tran is None:
-        t_stop = 1.0
+    t_stop = real_number("t_stop", t_stop, "a number in s") if t_stop is not None else None if circuit.tran else 1.0
     for text in circuit_warnings(circuit, t_stop):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     problem = prepare(
@@ -358,8 +358,12 @@ def state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
         run.t_failed, off = run.unseen[:2]
         run.status = Status.SOURCE_UNSEEN if math.isfinite(off) else Status.SOURCE_NOT_FINITE
         run.end_before(run.t_failed)
+    # Of a function that gives coarser numbers than doubles, their rounding is part of the stated error, and no failure.
+    coarse = run.rough if any(wave.precision > DOUBLE for wave in problem.waveforms) else 0.0
     if run.rough > 0.0:
-        run.add_error(run.rough)
+        # What it does to the charge is not known.
+        run.charge_error = None
+        run.add_error(run.rough - coarse)
         run.detail = run.detail or ROUGH.format(run.rough)
     rounding = problem.rounding
     for gap in run.gaps:
@@ -371,3 +375,5 @@ def state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
     judged = plan.tier == "coupled" or plan.error_bound > 0.0 or run.rough > 0.0
     if run.status is Status.SUCCESS and judged and run.excess(rounding) > rtol:
         run.status = Status.ERROR_NOT_MET
+    if coarse:
+        run.add_error(coarse)

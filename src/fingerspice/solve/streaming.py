@@ -7,26 +7,20 @@ window before. Chunks are cut from the outputs of the pieces, so that no bit dep
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
-from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_number
+from fingerspice.base.arrays import FloatArray, positive_number, whole_number
+from fingerspice.circuit.arguments import Parameters, Sources, overridden
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.results.outcome import SolveError, Status
 from fingerspice.results.plan import Plan
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.simulation import (
-    asked,
-    check_method,
-    planned,
-    solution_of,
-)
+from fingerspice.solve.simulation import asked, check_method, planned, rtol_given, solution_of
 from fingerspice.solve.times import check_length, check_outputs
 from fingerspice.solve.windows import BySamples, ByWindows, Mark, Outputs, outputs_of, within
 from fingerspice.waveforms.waveform import require
@@ -206,12 +200,11 @@ def stream(
         While iterating, where the run fails; its `solution` holds the outputs after the last chunk.
     """
     check_method(method)
-    for name, value in (("chunk", chunk), ("step", step)):
-        if value is not None:
-            require_number(name, value, "a number in s")
-            require(0.0 < value < math.inf, name, f"{value:g} s", "> 0 s")
+    rtol = rtol_given(rtol)
+    chunk = None if chunk is None else positive_number("chunk", chunk, "s")
+    step = None if step is None else positive_number("step", step, "s")
     if count is not None:
-        require(isinstance(count, int) and count >= 1, "count", repr(count), "a whole number from 1 on")
+        count = whole_number("count", count, 1)
         require(chunk is None, "count", "given beside chunk", "one of them")
     circuit = overridden(circuit, sources, parameters)
     problem = asked(

@@ -9,6 +9,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.waveforms.sampling import same_time
 from fingerspice.waveforms.waveform import Waveform, require
 
 #: Most periods (or shortest time scales) of the source in a run, and most breakpoints: they take hours and a gigabyte.
@@ -18,7 +19,7 @@ MOST_BYTES = 2e9
 
 
 def run_times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: FloatArray | None) -> tuple[float, float]:
-    """End of the run and output spacing, s."""
+    """End of the run and output spacing, s; times of `t_eval` that pass an end by rounding are set to it, in place."""
     tran = circuit.tran
     if t_stop is None:
         if tran is not None:
@@ -31,6 +32,7 @@ def run_times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: Fl
     if t_eval is not None:
         require(t_eval.ndim == 1 and t_eval.size > 0, "t_eval", f"of shape {t_eval.shape}", "one row of times")
         require(bool(np.all(t_eval[1:] >= t_eval[:-1])), "t_eval", "not in order", "ascending times")
+        to_ends(t_eval, t_start, t_stop)
         require(
             bool(t_eval[0] >= t_start and t_eval[-1] <= t_stop),
             "t_eval",
@@ -39,6 +41,13 @@ def run_times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: Fl
         )
     step = tran.step if tran is not None else (t_stop - t_start) / 1000.0
     return t_stop, step
+
+
+def to_ends(t: FloatArray, t_start: float, t_stop: float) -> None:
+    """Set times (s, ascending) that pass an end of the run by rounding to that end, in place."""
+    slack = same_time(t_stop)
+    t[(t < t_start) & (t >= t_start - slack)] = t_start
+    t[(t > t_stop) & (t <= t_stop + slack)] = t_stop
 
 
 # Most signals that one element adds to the outputs: a GAP adds most, with its two nodes and its area.

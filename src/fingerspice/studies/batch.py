@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, positive_number, real_numbers, whole_number
 from fingerspice.base.card import require_card
 from fingerspice.base.errors import InputError
-from fingerspice.circuit.arguments import require_circuit, require_number
+from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.results.signals import SIGNALS
+from fingerspice.solve.simulation import rtol_given
 from fingerspice.studies.batchgradients import gradient_coordinates, gradient_data, gradient_request, gradients_of
 from fingerspice.studies.batchladder import climb, in_lockstep
 from fingerspice.studies.batchscenes import lockstep_form
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 _KINDS = ("mean", "rms", "min", "max", "peak", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
-RTOL_RANGE = (1e-12, 0.1)
+LEAST_RTOL = 1e-12
 # Largest number of failure messages that a Dataset keeps, and of gap voltages (8 GB) that a batch may return.
 MESSAGES, MOST_VOLTAGES = 16, 1e9
 
@@ -109,8 +110,7 @@ def batch(
     task = replace(_task(circuit, outputs, rtol, t_stop, periods, periodic, points), device=device)
     require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
     if threads is not None:
-        require_number("threads", threads, "a whole number")
-        require(threads >= 1, "threads", threads, "1 or more")
+        threads = whole_number("threads", threads, 1)
     scenes = checked_scenes(circuit, parameters)
     changed = dict(scenes)
     if skin == "follow":
@@ -152,10 +152,8 @@ def _task(
     points: int,
 ) -> Task:  # fmt: skip
     """The checked request."""
-    require_number("rtol", rtol, "1e-12 to 0.1")
-    require(RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-12 to 0.1")
-    require_number("points", points, "an even number")
-    require(points >= 2 and points % 2 == 0, "points", points, "an even number, 2 or more")
+    rtol, points = rtol_given(rtol, LEAST_RTOL), whole_number("points", points, 2)
+    require(points % 2 == 0, "points", points, "an even number, 2 or more")
     if isinstance(outputs, str):
         outputs = (outputs,)
     known = ["u_gap", *(f"{signal}_{kind}" for signal in SIGNALS_OF_BATCH for kind in _KINDS)]
@@ -167,17 +165,15 @@ def _task(
     require(len(outputs) > 0, "outputs", "empty", "one or more names")
     if periods is not None and t_stop is not None:
         raise InputError("t_stop and periods are both given; allowed: one of them")
-    for what, value in (("t_stop", t_stop), ("periods", periods)):
-        if value is not None:
-            require_number(what, value, "a number")
-            require(math.isfinite(value) and value > 0.0, what, value, "more than 0")
+    t_stop = None if t_stop is None else positive_number("t_stop", t_stop, "s")
+    periods = None if periods is None else positive_number("periods", periods)
     if periodic and (periods is not None or t_stop is not None):
         raise InputError("periodic=True takes one period, and t_stop or periods is given; allowed: neither")
     if periods is None and t_stop is None and not periodic:
         if circuit.tran is None:
             raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s, or periods")
         t_stop = circuit.tran.stop
-    return Task(circuit, tuple(outputs), float(rtol), t_stop, 1.0 if periodic else periods, periodic, points)
+    return Task(circuit, tuple(outputs), rtol, t_stop, 1.0 if periodic else periods, periodic, points)
 
 
 def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
@@ -193,10 +189,7 @@ def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dic
     given: dict[str, FloatArray] = {}
     for path, values in parameters.items():
         name = own_path(circuit, path)
-        try:
-            array = np.asarray(values, float)
-        except (TypeError, ValueError):
-            raise InputError(f"{path} is {values!r}; allowed: an array of numbers") from None
+        array = real_numbers(path, values, "an array of numbers")
         require(
             array.ndim <= 1 and array.size > 0, path, f"of shape {array.shape}", "one number, or one row of numbers"
         )

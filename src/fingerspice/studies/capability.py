@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, positive_number, positive_row, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
@@ -157,12 +157,11 @@ def capability(
         If a forward run fails.
     """
     require_circuit(circuit)
-    require(math.isfinite(limit) and limit > 0.0, "limit", f"{limit:g} V", "> 0")
-    require(carrier is None or (math.isfinite(carrier) and carrier > 0.0), "carrier", f"{carrier} Hz", "> 0")
-    require(3 <= means <= 1000, "means", means, "3 to 1000")
+    limit, means = positive_number("limit", limit, "V"), whole_number("means", means, 3, 1000)
+    carrier = None if carrier is None else positive_number("carrier", carrier, "Hz")
     top = 1000.0 if carrier is None else min(1000.0, carrier / 8.0)
-    f = np.geomspace(min(5.0, 0.1 * top), top, 13) if frequency is None else np.atleast_1d(np.asarray(frequency, float))
-    require(bool(np.all(np.isfinite(f) & (f > 0.0))) and f.ndim == 1, "frequency", f"{f.tolist()} Hz", "> 0")
+    own = np.geomspace(min(5.0, 0.1 * top), top, 13)
+    f = positive_row("frequency", own if frequency is None else frequency, "Hz")
     if carrier is not None and f.max() > carrier / 4.0:
         raise InputError(
             f"frequency reaches {f.max():g} Hz; allowed: at most a quarter of the carrier's {carrier:g} Hz"

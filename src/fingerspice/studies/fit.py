@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, whole_number
 from fingerspice.base.errors import InputError
-from fingerspice.circuit.arguments import require_circuit, require_number
+from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack, is_stack
-from fingerspice.solve.simulation import RTOL_RANGE
+from fingerspice.solve.simulation import rtol_given
 from fingerspice.studies.batch import batch
 from fingerspice.studies.fitdata import IMPEDANCE, Data, data_of
 from fingerspice.studies.fitgroups import Unknown, group_column, unknowns_of
@@ -95,11 +95,10 @@ def fit(
     require_circuit(circuit)
     table, unknowns = _request(circuit, data, parameters, groups)
     task = _task(circuit, table, unknowns, bounds, average, skin, charge_law, rtol)
-    require_number("starts", starts, "a whole number")
-    require(starts >= 1, "starts", starts, "1 or more")
+    starts = whole_number("starts", starts, 1)
     names = tuple(one.name for one in task.unknowns)
     wanted = profiled(names, profiles)
-    ends = [followed(task, begin) for begin in _starts(task, int(starts))]
+    ends = [followed(task, begin) for begin in _starts(task, starts)]
     best = min(ends, key=lambda end: end.objective)
     if not best.objective < 0.5 * REFUSED**2:
         raise InputError(
@@ -198,12 +197,11 @@ def _task(
     """The checked request."""
     require(average in ("periodic", "run"), "average", repr(average), "'periodic' or 'run'")
     require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
-    require(RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-13 to 0.1")
     target, scale = _target(table)
     exact = is_stack(circuit) and build_stack(circuit).contact is not None and table.signal != IMPEDANCE
     every = tuple(one.path for one in unknowns)
     box = bounds_of(every, [circuit.parameters[path].value for path in every], bounds or {})
-    return Task(circuit, table, unknowns, box, average, skin, rtol, charge_law, target, scale, exact)
+    return Task(circuit, table, unknowns, box, average, skin, rtol_given(rtol), charge_law, target, scale, exact)
 
 
 def _target(table: Data) -> tuple[FloatArray, FloatArray]:

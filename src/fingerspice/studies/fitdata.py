@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
@@ -72,10 +72,10 @@ def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path, by: s
     """The data that a caller gave: a mapping of columns, or a table with a header.
 
     The columns are one of ``f_el_mean``, ``f_t_mean``, ``friction_mean`` and ``area_mean`` with conditions (paths such
-    as ``Vdrive.amplitude``, ``source.frequency``, ``Xgap.fn``); or ``impedance`` with conditions, and
-    ``impedance_phase`` beside it; or ``t`` with ``f_el``, ``f_t``, ``friction``, ``area`` or ``u_gap``; and ``sigma``,
-    the standard deviation, where it is known. The column `by` has names or numbers that tell which group a measurement
-    belongs to.
+    as ``Vdrive.amplitude``, ``source.frequency``, ``Xgap.fn``); or ``impedance`` with conditions, complex or with
+    ``impedance_phase`` (deg) beside it; or ``t`` with ``f_el``, ``f_t``, ``friction``, ``area`` or ``u_gap``; and
+    ``sigma``, the standard deviation, where it is known. The column `by` has names or numbers that tell which group a
+    measurement belongs to.
 
     Raises
     ------
@@ -133,6 +133,11 @@ def _columns(
 ) -> tuple[dict[str, FloatArray], Groups | None, str]:
     if isinstance(given, (str, Path)):
         return *_from_table(circuit, Path(given), by), f"the data in '{given}'"
+    if isinstance(given, Mapping) and np.iscomplexobj(given.get(IMPEDANCE, 0.0)):
+        if PHASE in given:
+            raise InputError(f"{IMPEDANCE} is complex, and {PHASE} is given; allowed: one of them")
+        z = np.asanyarray(given[IMPEDANCE])
+        given = {**given, IMPEDANCE: np.abs(z), PHASE: np.angle(z, deg=True)}
     if by is None or not isinstance(given, Mapping):
         return number_columns(given), None, "the data"
     if by not in given:
@@ -155,10 +160,7 @@ def number_columns(given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
     """
     if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
         raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, or the path of a table")
-    try:
-        found = {name: np.atleast_1d(np.asarray(x, float)) for name, x in given.items()}
-    except (TypeError, ValueError):
-        raise InputError("data has a column that is no array of numbers; allowed: numbers") from None
+    found = {name: np.atleast_1d(real_numbers(f"data column {name!r}", x, "numbers")) for name, x in given.items()}
     size = max((x.size for x in found.values()), default=0)
     for name, x in found.items():
         if x.ndim != 1 or x.size not in (1, size):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import ComplexArray, FloatArray
+from fingerspice.base.arrays import ComplexArray, FloatArray, positive_number, real_numbers, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown
 from fingerspice.physics.ladder import Ladder
@@ -202,9 +202,8 @@ def fit_material(
     if poles is not None and error is not None:
         raise InputError("poles and error are both given; allowed: one of them")
     if poles is not None:
-        require(1 <= poles <= MOST_POLES, "poles", poles, f"1 to {MOST_POLES}")
-    error = 0.02 if error is None else error
-    require(error > 0.0, "error", f"{error:g}", "more than 0")
+        poles = whole_number("poles", poles, 1, MOST_POLES)
+    error = 0.02 if error is None else positive_number("error", error)
     if isinstance(data, ColeCole):
         low, high = data.band
         f = np.geomspace(low, high, max(2, round(40 * np.log10(high / low)) + 1))
@@ -231,10 +230,7 @@ def fit_material(
 
 def _checked(data: ArrayLike) -> FloatArray:
     """Rows of frequency (Hz, ascending), resistivity (ohm m) and relative permittivity."""
-    try:
-        table = np.asarray(data, float)
-    except (TypeError, ValueError):
-        raise InputError(f"material data are a {type(data).__name__}; allowed: rows of {ALLOWED}, or a file") from None
+    table = real_numbers("material data", data, f"rows of {ALLOWED}, or a file")
     require(
         table.ndim == 2 and table.shape[1] == 3, "material data", f"of shape {table.shape}", "rows of f, rho, eps_r"
     )

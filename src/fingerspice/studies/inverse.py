@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, positive_number, real_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown
-from fingerspice.circuit.arguments import require_circuit, require_number
+from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.drive_shapes import means, rise
@@ -242,10 +242,12 @@ def inverse_drive(
     if (force is None) == (friction is None):
         given = "neither" if force is None else "both"
         raise InputError(f"of force and friction {given} is given; allowed: one of them")
-    for name, number in (("rate", rate), ("carrier", carrier), ("limit", limit), ("slew", slew)):
-        if number is not None:
-            require_number(name, number, "a number")
-            require(math.isfinite(number) and number > 0.0, name, f"{number:g}", "> 0")
+    rate, carrier, limit, slew = (
+        None if number is None else positive_number(name, number, unit)
+        for name, number, unit in (
+            ("rate", rate, "Hz"), ("carrier", carrier, "Hz"), ("limit", limit, "V"), ("slew", slew, "V/s")
+        )
+    )  # fmt: skip
     law = charge_law or circuit.charge_law or "local"
     require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
     finger = the_finger(circuit)
@@ -253,7 +255,7 @@ def inverse_drive(
     assert given_profile is not None
     profile = as_profile(given_profile, kind, rate, duration)
     rate = _rate(rate, carrier, profile)
-    begin = (0.0 if finger.direct else LEAD) if lead is None else lead
+    begin = (0.0 if finger.direct else LEAD) if lead is None else real_number("lead", lead, "a number in s")
     require(0.0 <= begin < 1e3, "lead", f"{begin:g} s", "0 or more, less than 1000")
     task = Task(circuit, finger, kind, profile, rate, carrier, round(begin * rate), law)
     found = task.solve(Limits(limit or math.inf, slew or math.inf))

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, positive_row
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
@@ -24,7 +24,7 @@ from fingerspice.results.phasor_solution import PhasorSolution
 from fingerspice.solve.runs import Progress
 from fingerspice.studies.steady import steady_state
 from fingerspice.studies.sweeps import Drive, sweep_drive, sweep_notes
-from fingerspice.waveforms.waveform import Sine, Waveform, require
+from fingerspice.waveforms.waveform import Sine, Waveform
 
 # Number of outputs in a period; cubics through them interpolate a sine with an error of 1e-9 of its amplitude.
 POINTS = 400
@@ -77,11 +77,8 @@ def large_signal(
     own = sweep_drive(scene.sources, scene.fundamental, swept=True)
     if amplitude is None and math.isnan(own.amplitude):
         raise InputError("the source has no fundamental to take the amplitude of: give the amplitudes in V")
-    given = np.atleast_1d(own.amplitude if amplitude is None else amplitude)
-    f = np.atleast_1d(np.asarray(frequency, float))
-    for what, values, unit in (("frequency", f, "Hz"), ("amplitude", given, "V")):
-        good = bool(np.all(np.isfinite(values) & (np.asarray(values) > 0.0)))
-        require(good, what, f"{values} {unit}", "positive numbers")
+    given = positive_row("amplitude", own.amplitude if amplitude is None else amplitude, "V")
+    f = positive_row("frequency", frequency, "Hz")
     for text in sweep_notes(circuit, f)[1]:
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     drives = [own] if amplitude is None else [Drive(float(a), 0.0, "the amplitude given") for a in given]

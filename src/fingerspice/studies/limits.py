@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, real_number, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import require_circuit
@@ -122,7 +122,7 @@ def fold_limits(
         If a run fails for another reason than a fold.
     """
     require_circuit(circuit)
-    require(3 <= points <= 1000, "points", points, "3 to 1000")
+    points, span = whole_number("points", points, 3, 1000), real_number("span", span, "more than 1, at most 1e6")
     require(1.0 < span <= 1e6, "span", span, "more than 1, at most 1e6")
     gaps = circuit.by_device("GAP")
     if len(gaps) != 1:

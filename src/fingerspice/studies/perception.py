@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, positive_number, real_number, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.results.record import Sealed, sealed
 from fingerspice.waveforms.waveform import require
@@ -55,7 +55,8 @@ class SkinMechanics:
 
     def __post_init__(self) -> None:
         for what, unit in (("mass", "kg"), ("damping", "N s/m"), ("stiffness", "N/m")):
-            value = getattr(self, what)
+            value = real_number(what, getattr(self, what), f"a number of {unit}")
+            object.__setattr__(self, what, value)
             require(0.0 <= value < np.inf, what, f"{value} {unit}", f"finite, 0 or more {unit}")
         require(self.stiffness > 0.0, "stiffness", f"{self.stiffness} N/m", "more than 0 N/m")
 
@@ -113,7 +114,8 @@ class Threshold(Sealed):
 
     def __post_init__(self) -> None:
         for what in ("frequency", "level"):
-            object.__setattr__(self, what, sealed(np.array(getattr(self, what), float)))
+            values = real_numbers(f"threshold's {what}", getattr(self, what), "numbers").copy()
+            object.__setattr__(self, what, sealed(values))
         f, level = self.frequency, self.level
         good = f.ndim == 1 and f.size >= 2 and f.shape == level.shape
         require(good, "threshold", f"shapes {f.shape} and {level.shape}", "two rows of equal length, two or more")
@@ -123,7 +125,7 @@ class Threshold(Sealed):
                 f"threshold {self.name!r}: point {bad[0] + 1} is {f[bad[0]]} Hz, {level[bad[0]]} dB; allowed: finite "
                 "numbers, with frequencies ascending from 0 or more"
             )
-        require(0.0 < self.reference < np.inf, "reference", f"{self.reference} m/s^2", "more than 0 m/s^2")
+        object.__setattr__(self, "reference", positive_number("reference", self.reference, "m/s^2"))
 
     def acceleration(self, frequency: FloatArray) -> FloatArray:
         """Amplitude that is just felt at frequencies (Hz), m/s^2, same shape; NaN beyond the table."""

@@ -8,9 +8,9 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, positive_row
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_area
+from fingerspice.circuit.arguments import Parameters, Sources, area_given, overridden
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.response import linear_scene, with_skin_held
 from fingerspice.circuit.usual import beyond_fingers
@@ -24,14 +24,7 @@ def _frequencies(frequency: ArrayLike | None, fundamental: Fundamental | None) -
         if fundamental is None:
             raise InputError("the source has no fundamental: give the frequencies in Hz")
         frequency = fundamental.frequency
-    f = np.atleast_1d(np.asarray(frequency, float))
-    require(
-        f.ndim == 1 and bool(np.all(np.isfinite(f) & (f > 0.0))),
-        "frequency",
-        f"{frequency} Hz",
-        "positive numbers",
-    )
-    return f
+    return positive_row("frequency", frequency, "Hz")
 
 
 def _check_area(area: str | float, amplitude: float, fixed: bool) -> None:
@@ -96,7 +89,7 @@ def phasor(
         and missing, a frequency or the area is not positive, or a result is not finite.
     """
     require(skin in ("swept", "own"), "skin", repr(skin), "'swept' or 'own'")
-    require_area(area)
+    area = area_given(area)
     circuit = overridden(circuit, sources, parameters)
     scene = linear_scene(circuit if skin == "swept" else with_skin_held(circuit), finger)
     f = _frequencies(frequency, scene.fundamental)

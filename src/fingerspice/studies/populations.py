@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, real_number
 from fingerspice.base.errors import InputError
-from fingerspice.circuit.arguments import require_number
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies.batch import batch
 from fingerspice.studies.batchtask import REFUSED
@@ -160,7 +159,7 @@ def sobol(
     circuit, parameters = with_sets(circuit, parameters)
     plan = make_plan(circuit, parameters, n, seed, MOST_SAMPLES)
     require(bool(plan.drawn), "parameters", "all numbers", "one distribution or more, such as scipy.stats.norm(...)")
-    require_number("confidence", confidence, "a number")
+    confidence = real_number("confidence", confidence, "a number between 0 and 1")
     require(0.0 < confidence < 1.0, "confidence", confidence, "a number between 0 and 1")
     outputs = options.get("outputs", ("f_el_mean",))
     outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown
-from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_area
+from fingerspice.circuit.arguments import Parameters, Sources, overridden
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.loop import network_of
 from fingerspice.results.outcome import ErrorEstimate, SolveError
@@ -24,9 +24,8 @@ from fingerspice.results.summary import Figured, Figures, KeptFigures
 from fingerspice.solve.periodic import close_period
 from fingerspice.solve.problem import Problem, prepare
 from fingerspice.solve.sensitivities import check_request, sensitivities_of
-from fingerspice.solve.simulation import RTOL_RANGE, run_problem
+from fingerspice.solve.simulation import rtol_given, run_problem
 from fingerspice.waveforms.combinations import Sum
-from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -160,9 +159,8 @@ def steady_state(
     SolveError
         If a period cannot be integrated, or Newton's method does not converge.
     """
-    require(RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1], "rtol", rtol, "1e-13 to 0.1")
-    require(points >= 1, "points", points, "1 or more")
-    require_area(area)
+    rtol = rtol_given(rtol)
+    points = whole_number("points", points, 1)
     circuit = overridden(circuit, sources, parameters)
     waves = network_of(circuit).waveforms
     period = (waves[0] if len(waves) == 1 else Sum(waves)).period

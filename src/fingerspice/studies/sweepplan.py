@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, real_numbers, whole_number
 from fingerspice.base.errors import InputError
-from fingerspice.circuit.arguments import require_circuit, require_number
+from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies.batch import own_path
 from fingerspice.studies.sweepsets import SetTable
@@ -164,9 +164,7 @@ def make_plan(circuit: Circuit, parameters: Mapping[str, Any], n: int, seed: int
     require_circuit(circuit)
     if not isinstance(parameters, Mapping) or not parameters:
         raise InputError(f"parameters is {parameters!r}; allowed: a mapping such as {{'Xgap.d': [3e-6, 4e-6]}}")
-    for what, value in (("n", n), ("seed", seed)):
-        require_number(what, value, "a whole number")
-        require(value == int(value) and value >= 0, what, value, "a whole number, 0 or more")
+    n, seed = whole_number("n", n, 0), whole_number("seed", seed, 0)
     power = most.bit_length() - 1
     require(1 < n <= most and n & (n - 1) == 0, "n", n, f"a power of two such as 1024, at most 2^{power}")
     grid: dict[str, FloatArray] = {}
@@ -190,17 +188,12 @@ def make_plan(circuit: Circuit, parameters: Mapping[str, Any], n: int, seed: int
         if hasattr(value, "ppf"):
             drawn[path] = value
             continue
-        try:
-            array = np.asarray(value, float)
-        except (TypeError, ValueError):
-            raise InputError(
-                f"{path} is {value!r}; allowed: a number, an array of numbers, or a frozen distribution of scipy.stats "
-                "such as norm(3.5e-6, 0.3e-6)"
-            ) from None
+        allowed = "a number, an array of numbers, or a frozen distribution of scipy.stats such as norm(3.5e-6, 0.3e-6)"
+        array = real_numbers(path, value, allowed)
         require(array.ndim < 2 and array.size > 0, path, f"of shape {array.shape}", "numbers in one row")
         (grid if array.ndim else fixed)[path] = array
     _refuse_twice(taken)
-    return Plan(grid, drawn, fixed, own, units, int(n), int(seed), tables)
+    return Plan(grid, drawn, fixed, own, units, n, seed, tables)
 
 
 def _refuse_twice(paths: list[str]) -> None:

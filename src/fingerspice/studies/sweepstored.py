@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fingerspice.base.arrays import whole_number
 from fingerspice.base.errors import InputError
-from fingerspice.circuit.arguments import require_number
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies.batch import batch, checked_scenes
 from fingerspice.studies.batchtask import LOCKSTEP, REFUSED
@@ -61,8 +61,7 @@ def stored(
 
 def _check(workers: int | None, scheduler: str | None, shard: tuple[int, int]) -> None:
     if workers is not None:
-        require_number("workers", workers, "a whole number")
-        require(workers >= 1 and workers == int(workers), "workers", workers, "a whole number, 1 or more")
+        whole_number("workers", workers, 1)
         if scheduler is not None:
             raise InputError("workers and scheduler are both given; allowed: one of them")
     good = len(shard) == 2 and all(isinstance(x, int) for x in shard) and 1 <= shard[0] <= shard[1]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, positive_number, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.physics.contact import Contact
 from fingerspice.waveforms.columns import Columns, read_text_columns
@@ -52,12 +52,8 @@ def as_profile(given: Wanted, what: str, rate: float | None, duration: float | N
             end = float(np.asarray(wave.times)[-1])
         if end is None:
             raise InputError(f"{what} is a waveform without an end; allowed: with duration= in s")
-        require(math.isfinite(end) and end > 0.0, "duration", f"{end:g} s", "> 0")
-        return Profile(wave, end, own)
-    try:
-        values = np.asarray(given, float)
-    except (TypeError, ValueError):
-        raise InputError(f"{what} is {type(given).__name__}; allowed: numbers in N, a waveform or a function") from None
+        return Profile(wave, positive_number("duration", end, "s"), own)
+    values = real_numbers(what, given, "numbers in N, a waveform or a function")
     if rate is None:
         raise InputError(f"{what} is an array without a rate; allowed: with rate= in Hz, or fs.Samples({what}, rate)")
     require(values.ndim == 1 and values.size >= 2, what, f"an array of shape {values.shape}", "a row of two or more")

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, positive_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
@@ -101,7 +101,9 @@ class Drive(torch.nn.Module):
         require(source.lower() in known, "source", repr(source), f"one of {', '.join(names)}")
         self._alone = isinstance(outputs, str)
         wanted = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-        self._driven = _Driven(request(circuit, wanted, t, t_stop, False, rtol), known[source.lower()], float(rate))
+        self._driven = _Driven(
+            request(circuit, wanted, t, t_stop, False, rtol), known[source.lower()], positive_number("rate", rate, "Hz")
+        )
         self.samples = torch.nn.Parameter(tensor_of("samples", samples).detach().clone())
 
     def forward(self, samples: Tensor | ArrayLike | None = None) -> Tensor | dict[str, Tensor]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, real_number
 from fingerspice.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,24 +26,29 @@ MOST_LISTED = 20_000_000
 _WINDOW = 1_000_000
 
 
-def check_finite(waveform: Waveform) -> None:
-    """Refuse NaN, inf and numbers out of range in any numeric field of a waveform."""
-    for field in fields(waveform):  # type: ignore[arg-type]
-        value = getattr(waveform, field.name)
-        if isinstance(value, (float, int)):
-            what = f"{type(waveform).__name__} {field.name}"
-            if not math.isfinite(value):
-                raise InputError(f"{what} is {value}; allowed: a finite number")
-            unit = waveform.units.get(field.name, "")
-            largest, smallest = RANGES.get(unit, ANY_RANGE)
-            if value != 0.0 and not smallest <= abs(value) <= largest:
-                check_range(what, value, unit)
+def take_numbers(waveform: Waveform, endless: tuple[str, ...] = ()) -> None:
+    """Make doubles of a waveform's numeric fields; those in `endless` may be infinite.
+
+    Raises
+    ------
+    InputError
+        If one is no number, NaN, infinite, or out of range.
+    """
+    for name in (field.name for field in fields(waveform) if field.name in waveform.units):  # type: ignore[arg-type]
+        what, unit = f"{type(waveform).__name__} {name}", waveform.units[name]
+        value = real_number(what, getattr(waveform, name), f"a number of {unit}" if unit else "a number")
+        if not (math.isfinite(value) or (value == math.inf and name in endless)):
+            raise InputError(f"{what} is {value}; allowed: a finite number")
+        largest, smallest = RANGES.get(unit, ANY_RANGE)
+        if value != 0.0 and not smallest <= abs(value) <= largest:
+            check_range(what, value, unit)
+        object.__setattr__(waveform, name, value)
 
 
 def check_range(what: str, values: ArrayLike, unit: str) -> None:
     """Refuse finite numbers so large or so small that their products and quotients would overflow or underflow."""
     largest, smallest = RANGES.get(unit, ANY_RANGE)
-    size = np.abs(np.asarray(values, float))
+    size = np.abs(values)
     bad = np.flatnonzero(np.isfinite(size) & (((size < smallest) & (size > 0.0)) | (size > largest)))
     if bad.size:
         given = float(np.ravel(values)[bad[0]])

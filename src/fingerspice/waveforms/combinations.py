@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.waveforms.bounds import check_finite
+from fingerspice.waveforms.bounds import take_numbers
 from fingerspice.waveforms.waveform import DC, Sine, Waveform, blank_terms, require
 
 #: Most cycles of a part in a common period.
@@ -33,6 +33,10 @@ class _Combination(Waveform):
 
     def breakpoint_rate(self) -> float:
         return sum(part.breakpoint_rate() for part in self.parts)
+
+    @property
+    def precision(self) -> float:  # type: ignore[override]
+        return max(part.precision for part in self.parts)
 
     @property
     def settled(self) -> float:
@@ -161,7 +165,7 @@ class AM(_Combination):
     }
 
     def __post_init__(self) -> None:
-        check_finite(self)
+        take_numbers(self)
         require(0.0 <= self.depth <= 1.0, "AM depth", f"{self.depth:g}", "0 to 1")
 
     @cached_property

@@ -6,7 +6,6 @@ extensible headers and RF64. Its errors and warnings about broken files become c
 
 from __future__ import annotations
 
-import math
 import struct
 import warnings
 import zipfile
@@ -16,7 +15,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, positive_number
 from fingerspice.base.errors import InputError
 from fingerspice.waveforms.columns import Columns, read_text_columns
 
@@ -275,12 +274,10 @@ def read_table(
         raise InputError(f"'{path}': a rate and a column of times are given; allowed: one of them")
     if rate is not None and own_rate is not None and rate != own_rate:
         raise InputError(f"'{path}': the rate given is {rate:g} Hz, and its own is {own_rate:g} Hz; allowed: one rate")
-    rate = own_rate if rate is None else rate
+    rate = own_rate if rate is None else positive_number(f"'{path}': the rate", rate, "Hz")
     columns = found.data.shape[1]
     if rate is None and columns == 1:
         raise InputError(f"'{path}' has one column and no rate; allowed: a column of times too, or rate= in Hz")
-    if rate is not None and (isinstance(rate, str) or not (math.isfinite(rate) and rate > 0.0)):
-        raise InputError(f"'{path}': the rate is {rate!r}; allowed: a number of Hz, > 0")
     # A column that is named as times is one even beside a rate, which it may contradict.
     named = columns > 1 and any(name.lower() in _TIME_NAMES for name in found.names)
     if rate is not None and not (named or (columns == 2 and value is None)):

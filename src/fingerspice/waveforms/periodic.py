@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.waveforms.bounds import check_finite, check_range, runs_through
+from fingerspice.waveforms.bounds import runs_through, take_numbers
 from fingerspice.waveforms.ramps import Ramps
 from fingerspice.waveforms.waveform import require
 
@@ -33,7 +33,7 @@ class _Periodic(Ramps):
     }
 
     def __post_init__(self) -> None:
-        check_finite(self)
+        take_numbers(self)
         kind = type(self).__name__.lower()
         require(self.frequency > 0.0, f"{kind} frequency", f"{self.frequency:g} Hz", "> 0")
 
@@ -90,7 +90,7 @@ class Square(_Periodic):
         ):
             object.__setattr__(self, name, value)
         self.__post_init__()
-        require(0.0 < duty < 1.0, "square duty", f"{duty:g}", "between 0 and 1")
+        require(0.0 < self.duty < 1.0, "square duty", f"{self.duty:g}", "between 0 and 1")
 
     @property
     def half_wave(self) -> bool:
@@ -152,14 +152,10 @@ class Pulse(Ramps):
     }
 
     def __post_init__(self) -> None:
-        for name in ("v1", "v2", "delay"):
-            require(math.isfinite(getattr(self, name)), f"pulse {name}", getattr(self, name), "a finite number")
+        take_numbers(self, endless=("width", "pulse_period"))
         for name in ("rise", "fall", "width"):
             require(getattr(self, name) >= 0.0, f"pulse {name}", f"{getattr(self, name):g} s", ">= 0")
         require(self.pulse_period > 0.0, "pulse period", f"{self.pulse_period:g} s", "> 0")
-        for name, unit in self.units.items():
-            check_range(f"pulse {name.replace('_', ' ')}", getattr(self, name), unit)
-        require(math.isfinite(self.rise + self.fall), "pulse rise + fall", "infinite", "finite times")
         busy = self.rise + self.width + self.fall
         if math.isfinite(self.pulse_period):
             require(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray, IntArray, read_only
+from fingerspice.base.arrays import FloatArray, IntArray, read_only, real_number, real_numbers
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
 from fingerspice.waveforms.bounds import check_range, in_windows, runs_through
@@ -86,7 +86,7 @@ class Ramps(Waveform):
         return times[(times >= t0) & (times <= t1)]
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
-        t = np.asarray(t, float)
+        t = real_numbers("t", t, "times in s")
         flat = t.ravel()
         out = np.empty(flat.size)
         for window in in_windows(flat, self.breakpoint_rate() if self.period else 0.0):
@@ -197,11 +197,12 @@ class PWL(Ramps):
     repeat: float | None = None
 
     def __post_init__(self) -> None:
-        t = np.asarray(self.times, float)
-        v = np.asarray(self.values, float)
+        t = real_numbers("PWL times", self.times, "numbers in s")
+        v = real_numbers("PWL values", self.values, "numbers in V")
         object.__setattr__(self, "times", tuple(t.tolist()))
         object.__setattr__(self, "values", tuple(v.tolist()))
-        require(t.size >= 1 and t.size == v.size, "PWL", f"{t.size} times and {v.size} values", "as many of each")
+        alike = t.ndim == 1 <= t.size and t.shape == v.shape
+        require(alike, "PWL", f"{t.size} times and {v.size} values", "as many of each, in a row")
         for name, array in (("time", t), ("value", v)):
             bad = np.flatnonzero(~np.isfinite(array))
             if bad.size:
@@ -217,6 +218,7 @@ class PWL(Ramps):
             i = int(np.argmax(thrice))
             raise InputError(f"PWL time {t[i]:g} s stands three times; two equal times are a jump")
         if self.repeat is not None:
+            object.__setattr__(self, "repeat", real_number("PWL repeat", self.repeat, "a number in s"))
             require(
                 t.size > 1 and any(self.repeat == x for x in t[:-1]) and self.repeat < t[-1],
                 "PWL repeat time",

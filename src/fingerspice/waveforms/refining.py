@@ -13,7 +13,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.numerics import chebyshev
-from fingerspice.waveforms.waveform import Waveform
+from fingerspice.waveforms.waveform import DOUBLE, Waveform
 
 POINTS = 20
 # The points `_PROOF` between the nodes, at which a series is compared with the function, are irregular: so no periodic
@@ -24,7 +24,7 @@ _PLACES = np.concatenate([chebyshev.nodes(POINTS, -1.0, 1.0), _PROOF])
 _NODE_STEPS = np.diff(_PLACES[:POINTS])
 
 # After `_IDLE` halvings in a row that do not reduce the misfit, a misfit below `_ROUGHEST` (relative to the largest
-# |U|) is taken for round-off of the function's values.
+# |U|, for values in doubles) is taken for round-off of the function's values.
 _IDLE, _ROUGHEST = 3, 1e-8
 # Smallest change over short series, relative to the largest |U|, that is reported as an edge; at a kink it is smaller.
 _STEEP = 0.05
@@ -139,7 +139,7 @@ class Refiner:
             if series is None:
                 if piece.depth > _DEEP:
                     self._refuse_noise(piece, values)
-                if idle >= _IDLE and misfit <= _ROUGHEST * self.scale:
+                if idle >= _IDLE and misfit <= self._roughest:
                     # Halving divides the misfit of a smooth function by 2^20 and the misfit at a kink by 2. A misfit
                     # that halving does not reduce is round-off of the function's own values.
                     self.rough = max(self.rough, misfit)
@@ -161,7 +161,7 @@ class Refiner:
         """Add an interval's series; if the waveform jumps at its start, return the intervals to refine instead."""
         if piece.hi - piece.lo < 0.75 * self.step:
             self.short.append((piece.lo, float(series.sum() - series @ _AT_START)))
-            if piece.largest > _ROUGHEST * self.scale:
+            if piece.largest > self._roughest:
                 self.narrow.append(0.5 * (piece.lo + piece.hi))
         if self.series and not first and not (self.jumps and self.jumps[-1][0] >= piece.lo):
             # A jump or a steep edge may lie exactly on a cut, so that the points of neither interval show it: refine
@@ -201,10 +201,15 @@ class Refiner:
         proof = np.polynomial.chebyshev.chebval(_PROOF, c)
         if piece.depth == 0:
             self.steepest = float(np.abs(np.diff(values[:POINTS]) / (0.5 * (hi - lo) * _NODE_STEPS)).max())
-        # The rounding of the time itself changes the value by up to `noise`.
-        noise = 2e-15 * max(abs(lo), abs(hi)) * self.steepest
+        # The rounding of the time itself changes the value by up to `noise`; so does that of coarse values.
+        precision = self.waveform.precision
+        noise = 9.0 * precision * max(abs(lo), abs(hi)) * self.steepest
+        if precision > DOUBLE:
+            noise += 4.0 * precision * self.scale
         misfit = float(np.abs(proof - values[POINTS:]).max())
         good = misfit <= max(self.tol * self.scale, noise, _NOTHING)
+        if good and precision > DOUBLE:
+            self.rough = max(self.rough, misfit + 0.5 * precision * self.scale)
         return (c if good else None), values[:POINTS], misfit
 
     def _refuse_noise(self, piece: _Interval, values: FloatArray) -> None:
@@ -223,7 +228,7 @@ class Refiner:
         i = int(np.argmax(np.abs(again - values)))
         remedy = "of noise draw the values once and give fs.Samples(values, rate)"
         # A function of arrays may sum in another order at the second call, so allow the last digits to differ.
-        if abs(again[i] - values[i]) > _ROUGHEST * self.scale:
+        if abs(again[i] - values[i]) > self._roughest:
             raise InputError(
                 f"the source function gives {values[i]:.4g} V and then {again[i]:.4g} V at the same t = {t[i]:.9g} s; "
                 f"allowed: the same value at the same time; {remedy}"
@@ -234,6 +239,11 @@ class Refiner:
                 f"short as {piece.hi - piece.lo:.2g} s were not smooth; allowed: smooth between jumps that are few, or "
                 f"declared by Function(f, breaks=(...)); {remedy}"
             )
+
+    @property
+    def _roughest(self) -> float:
+        """Largest misfit that is taken for round-off, V."""
+        return _ROUGHEST * math.sqrt(self.waveform.precision / DOUBLE) * self.scale
 
     @property
     def _least(self) -> float:

@@ -10,8 +10,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray
-from fingerspice.waveforms.bounds import check_finite, runs_through
+from fingerspice.base.arrays import FloatArray, real_numbers
+from fingerspice.waveforms.bounds import runs_through, take_numbers
 from fingerspice.waveforms.waveform import Waveform, as_waveform, blank_terms, require
 
 # A time within this relative distance of a breakpoint differs from it only by rounding, and is replaced by it.
@@ -42,6 +42,10 @@ class _Shifted(Waveform):
         near = np.where(tau - marks[right - 1] < marks[right] - tau, marks[right - 1], marks[right])
         return np.where(np.abs(tau - near) <= _ROUNDING * np.abs(t), near, tau)
 
+    @property
+    def precision(self) -> float:  # type: ignore[override]
+        return self.waveform.precision
+
     def shortest_time(self) -> float:
         return self.waveform.shortest_time()
 
@@ -70,7 +74,7 @@ class Burst(_Shifted):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "waveform", as_waveform(self.waveform))
-        check_finite(self)
+        take_numbers(self)
         require(self.duration > 0.0, "burst duration", f"{self.duration:g} s", "> 0")
         require(self.delay >= 0.0, "burst delay", f"{self.delay:g} s", ">= 0")
 
@@ -78,7 +82,7 @@ class Burst(_Shifted):
         return self.duration
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
-        t = np.asarray(t, float)
+        t = real_numbers("t", t, "times in s")
         tau = self._inner(t, self.delay)
         on = (tau >= 0.0) & (tau < self.duration) if side == "right" else (tau > 0.0) & (tau <= self.duration)
         return np.where(on, self.waveform.value(np.where(on, tau, 0.0), side), 0.0)
@@ -121,14 +125,14 @@ class Repeat(_Shifted):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "waveform", as_waveform(self.waveform))
-        check_finite(self)
+        take_numbers(self)
         require(self.period > 0.0, "repeat period", f"{self.period:g} s", "> 0")
 
     def _stretch(self) -> float:
         return self.period
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
-        t = np.asarray(t, float)
+        t = real_numbers("t", t, "times in s")
         tau = self._inner(t, np.floor(t / self.period) * self.period)
         # By rounding, the start of a period may count as the end of the period before, or an end as a start.
         first, last = (0.0, self.period) if side == "right" else (self.period, 0.0)

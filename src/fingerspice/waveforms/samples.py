@@ -11,10 +11,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray, read_only
+from fingerspice.base.arrays import FloatArray, read_only, real_number, real_numbers
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.bounds import check_finite, check_range
+from fingerspice.waveforms.bounds import check_range, take_numbers
 from fingerspice.waveforms.files import WavLayout, read_table, read_wav, wav_layout
 from fingerspice.waveforms.ramps import FEW_KNOTS, Ramps
 from fingerspice.waveforms.upsampling import upsample
@@ -72,10 +72,7 @@ class Samples(Ramps):
     _number: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
-        try:
-            values = np.array(self.values, float)
-        except (TypeError, ValueError):
-            raise InputError("the samples are no row of real numbers; allowed: one row of two or more, in V") from None
+        values = real_numbers("the row of samples", self.values, "two or more numbers in V").copy()
         values.flags.writeable = False
         object.__setattr__(self, "values", values)
         require(
@@ -85,10 +82,7 @@ class Samples(Ramps):
             "one row of two or more",
         )
         _check_samples(values, 0)
-        for what, number, unit in (("sample rate", self.rate, "Hz"), ("start", self.start, "s")):
-            good = isinstance(number, (int, float, np.integer, np.floating))
-            require(good, what, repr(number), f"a number of {unit}")
-        check_finite(self)
+        take_numbers(self)
         require(self.rate > 0.0, "sample rate", f"{self.rate:g} Hz", "> 0")
 
     @classmethod
@@ -115,8 +109,8 @@ class Samples(Ramps):
             If the file cannot be read or is broken, if it has several channels and none is chosen, or if it has no
             such channel.
         """
-        good = isinstance(gain, (int, float, np.integer, np.floating)) and math.isfinite(gain)
-        require(good, "gain", repr(gain), "a finite number of V at full scale")
+        gain = real_number("gain", gain, "a finite number of V at full scale")
+        require(math.isfinite(gain), "gain", gain, "a finite number of V at full scale")
         layout = None if at_once else wav_layout(path, channel)
         recording = read_wav(path, channel) if layout is None else None
         try:

@@ -15,14 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray, positive_number, real_numbers
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
 from fingerspice.engine.repeat import SAME_TIME
 from fingerspice.waveforms.bounds import in_windows, runs_through
 from fingerspice.waveforms.ramps import Ramps
 from fingerspice.waveforms.refining import POINTS, Refiner
-from fingerspice.waveforms.waveform import Waveform, blank_terms, require
+from fingerspice.waveforms.waveform import DOUBLE, Waveform, blank_terms, require
 
 #: Longest segment of an oscillation, in periods; longer ones are divided, since a phase's rounding error grows with it.
 _PERIODS_PER_SEGMENT = 64.0
@@ -52,9 +52,9 @@ class Function(Waveform):
 
     def __post_init__(self) -> None:
         require(callable(self.function), "source function", repr(self.function), "a function of time in s")
-        require(self.repeat is None or self.repeat > 0.0, "function period", self.repeat, "> 0 s")
-        breaks = {float(b) for b in self.breaks}
+        breaks = set(real_numbers("function breaks", self.breaks, "times in s").ravel().tolist())
         if self.repeat is not None:
+            object.__setattr__(self, "repeat", positive_number("function period", self.repeat, "s"))
             # The end of a period is the start of the next one.
             breaks = {math.fmod(b, self.repeat) if b >= self.repeat else b for b in breaks}
         object.__setattr__(self, "breaks", tuple(sorted(breaks)))
@@ -64,16 +64,17 @@ class Function(Waveform):
         return self.repeat
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
-        t = np.asarray(t, float)
+        t = real_numbers("t", t, "times in s")
         if side == "left":
             windows = [t.ravel()[window] for window in in_windows(t.ravel(), self.breakpoint_rate())]
             edges = np.concatenate([self.breakpoints(x.min(), x.max()) for x in windows if x.size] or [np.empty(0)])
             t = np.where(np.isin(t, edges), np.nextafter(t, -1), t)
         if t.ndim == 0:
-            return np.asarray(self._scalar(float(t)))
+            return np.asarray(self._scalar(np.float64(t)))
         try:
+            # A function may work in place: it gets times of its own.
+            out = self._taken(self.function(t.copy()))
             # A function written for one number may give wrong values for an array without raising: compare one value.
-            out = np.asarray(self.function(t), float)
             if out.shape == t.shape and (
                 t.size == 0 or np.array_equal(out.flat[t.size // 2], self._scalar(t.flat[t.size // 2]), True)
             ):
@@ -83,11 +84,26 @@ class Function(Waveform):
         return np.array([self._scalar(x) for x in t.ravel()]).reshape(t.shape)
 
     def _scalar(self, t: float) -> float:
-        value = self.function(t)
         try:
-            return float(value)  # type: ignore[arg-type]
-        except (TypeError, ValueError):
+            value = self.function(t)
+        except (TypeError, IndexError):
+            # A function of arrays only.
+            value = self.function(np.array([t]))
+        try:
+            return float(self._taken(value).item())
+        except ValueError:  # InputError is one
             raise InputError(f"the source function returned {value!r} at t = {t:g} s; allowed: one number") from None
+
+    def _taken(self, values: object) -> FloatArray:
+        """What the function returned as doubles; the coarsest precision of its numbers is kept."""
+        found, kind = real_numbers("", values, ""), np.asarray(values).dtype
+        if kind.kind == "f" and kind.itemsize < 8:
+            self.kept["precision"] = max(self.precision, float(np.finfo(kind).eps))
+        return found
+
+    @property
+    def precision(self) -> float:  # type: ignore[override]
+        return self.kept.get("precision", DOUBLE)  # type: ignore[no-any-return]
 
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
         times = np.asarray(self.breaks, float)

@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray
-from fingerspice.waveforms.bounds import check_finite
+from fingerspice.base.arrays import FloatArray, real_numbers
+from fingerspice.waveforms.bounds import take_numbers
 from fingerspice.waveforms.waveform import TAU, Waveform, blank_terms, require
 
 
@@ -48,7 +48,7 @@ class Chirp(Waveform):
     }
 
     def __post_init__(self) -> None:
-        check_finite(self)
+        take_numbers(self)
         require(self.f0 > 0.0 and self.f1 > 0.0, "chirp frequencies", f"{self.f0:g}, {self.f1:g} Hz", "> 0")
         require(self.duration > 0.0, "chirp duration", f"{self.duration:g} s", "> 0")
 
@@ -59,7 +59,7 @@ class Chirp(Waveform):
         return np.asarray(TAU * (turns - np.floor(turns)) + math.radians(self.phase_deg))
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
-        return np.asarray(self.offset + self.amplitude * np.sin(self._phase(np.asarray(t, float))))
+        return np.asarray(self.offset + self.amplitude * np.sin(self._phase(real_numbers("t", t, "times in s"))))
 
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
         return np.array([t for t in (0.0, self.duration) if t0 <= t <= t1])
@@ -103,7 +103,7 @@ class Exp(Waveform):
     }
 
     def __post_init__(self) -> None:
-        check_finite(self)
+        take_numbers(self)
         require(
             self.tau1 > 0.0 and self.tau2 > 0.0,
             "EXP time constants",
@@ -113,7 +113,7 @@ class Exp(Waveform):
         require(self.td2 >= self.td1, "EXP td2", f"{self.td2:g} s", f">= td1 = {self.td1:g} s")
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
-        t = np.asarray(t, float)
+        t = real_numbers("t", t, "times in s")
         rise = -np.expm1(-np.maximum(t - self.td1, 0.0) / self.tau1)
         fall = -np.expm1(-np.maximum(t - self.td2, 0.0) / self.tau2)
         return np.asarray(self.v1 + (self.v2 - self.v1) * (rise - fall))

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, whole_number
 from fingerspice.waveforms.files import check_count
-from fingerspice.waveforms.waveform import require
 
 # Half-width of the filter, in samples, and beta of its Kaiser window. Measured on tones: the gain is 1 within 0.02 % up
 # to 0.46 of the rate.
@@ -23,8 +22,7 @@ def upsample(values: FloatArray, factor: int) -> FloatArray:
     """
     from scipy.signal import firwin, upfirdn
 
-    require(factor == int(factor) and 2 <= factor <= 64, "factor of upsampling", factor, "a whole number from 2 to 64")
-    factor = int(factor)
+    factor = whole_number("factor of upsampling", factor, 2, 64)
     check_count("the upsampled recording", factor * values.size)
     wing = _WING * factor
     taps = factor * firwin(2 * wing + 1, 1.0 / factor, window=("kaiser", _BETA))

@@ -20,13 +20,15 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.bounds import check_finite
+from fingerspice.waveforms.bounds import take_numbers
 
 TAU = 2.0 * math.pi
 # Places in [0, 1], both ends among them, one in each of 512 equal parts: so irregular that no carrier is 0 at all.
 _SPREAD = np.append((np.arange(512) + np.modf(np.arange(512) * 0.6180339887498949)[0]) / 512.0, 1.0)
+#: Distance of neighbouring doubles, relative to their size.
+DOUBLE = 2.0**-52
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,9 @@ class Waveform:
 
     period: float | None = None
     """Period in s after any delay, or None."""
+
+    precision: float = DOUBLE
+    """Distance of neighbouring numbers of the kind that the values are computed in, relative to their size."""
 
     def __getstate__(self) -> dict[str, Any]:
         return {key: value for key, value in vars(self).items() if key != "kept"}
@@ -193,16 +198,12 @@ def as_waveform(value: Waveform | float | Callable[[float], float]) -> Waveform:
     """
     if isinstance(value, Waveform):
         return value
-    if isinstance(value, (int, float, np.floating, np.integer)):
-        return DC(float(value))
     if callable(value):
         from fingerspice.waveforms.sampling import Function
 
         return Function(value)
-    kind = type(value).__name__
-    if isinstance(value, (np.ndarray, list, tuple)):
-        kind += "; values at a rate are fs.Samples(values, rate)"
-    raise InputError(f"a source must be a waveform, a number or a function of time, got {kind}")
+    allowed = "a waveform, a number or a function of time; values at a rate are fs.Samples(values, rate)"
+    return DC(real_number("a source", value, allowed))
 
 
 def require(condition: bool, what: str, given: Any, allowed: str) -> None:
@@ -247,10 +248,10 @@ class DC(Waveform):
     units: ClassVar[dict[str, str]] = {"level": "V"}
 
     def __post_init__(self) -> None:
-        check_finite(self)
+        take_numbers(self)
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
-        return np.full(np.shape(t), self.level)
+        return np.full(real_numbers("t", t, "times in s").shape, self.level)
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         out = blank_terms(start.size, 1)
@@ -294,7 +295,7 @@ class Sine(Waveform):
     }
 
     def __post_init__(self) -> None:
-        check_finite(self)
+        take_numbers(self)
         require(self.frequency > 0.0, "sine frequency", f"{self.frequency:g} Hz", "> 0")
 
     @property
@@ -319,7 +320,7 @@ class Sine(Waveform):
         return turns - np.floor(turns)
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
-        since = np.maximum(np.asarray(t, float), self.delay)
+        since = np.maximum(real_numbers("t", t, "times in s"), self.delay)
         wave = np.sin(TAU * self._turns(since) + math.radians(self.phase_deg))
         if self.damping:
             wave = wave * np.exp(-self.damping * (since - self.delay))
