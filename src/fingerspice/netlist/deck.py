@@ -13,7 +13,7 @@ from pathlib import Path
 
 from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import layer_devices
-from fingerspice.netlist.files import MAX_BYTES, NATIVE_LIBRARIES, read_text
+from fingerspice.netlist.files import MAX_BYTES, NATIVE_LIBRARIES, is_stream, read_stream, read_text
 from fingerspice.netlist.flatten import Directive, Flattener, Statement, directive_of
 from fingerspice.netlist.lexer import Line
 from fingerspice.netlist.reader import DIRECTIVES, Reader, Subcircuit
@@ -92,13 +92,16 @@ def read_deck(path: str | Path) -> Deck:
     Parameters
     ----------
     path : str or Path
-        The file. It may include files from its own folder only.
+        The file. It may include files from its own folder only. Standard input (``-``), a device or a pipe is a deck
+        called ``stdin`` in the working directory.
 
     Raises
     ------
     InputError
         If the file cannot be read (missing, a folder, empty, too large, not text) or has an error.
     """
+    if is_stream(Path(path)):
+        return parse_deck(read_stream(Path(path)), Path("stdin"))
     return parse_deck(read_text(Path(path), str(path)), Path(path))
 
 
