@@ -66,8 +66,8 @@ def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
     Raises
     ------
     InputError
-        If there is neither a source nor a start, a floating node, a loop of voltage sources, a current source without a path, an area that
-        no element or several elements drive, or too many elements; the message names the elements or nodes at fault.
+        If there is neither source nor start, a floating node, a loop of voltage sources, a current source without a
+        path, an area that no element or several elements drive, or too many elements; the message names those at fault.
     """
     _refuse_large(circuit)
     areas = _areas(circuit)

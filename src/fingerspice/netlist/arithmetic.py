@@ -165,7 +165,7 @@ def _refuse_chains(pieces: list[tuple[str, int]]) -> None:
 
 
 def _conditional(pieces: list[tuple[str, int]]) -> str:
-    """Join pieces, and write `a ? b : c` as `((b) if (a) else (c))`; conditions after `:` group to the right, as in C."""
+    """Join pieces, and write `a ? b : c` as `((b) if (a) else (c))`; conditions after `:` group to the right."""
     chunks: list[list[str]] = [[]]
     asked = 0
     for text, position in pieces:

@@ -15,9 +15,8 @@ from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import layer_devices
 from fingerspice.netlist.files import MAX_BYTES, NATIVE_LIBRARIES, is_stream, read_stream, read_text
 from fingerspice.netlist.flatten import Directive, Flattener, Statement, directive_of
-from fingerspice.netlist.lexer import Line
 from fingerspice.netlist.reader import DIRECTIVES, Reader, Subcircuit
-from fingerspice.netlist.scope import Call, Number, Scope, Token, Value
+from fingerspice.netlist.scope import Call, Number, Scope, Token
 from fingerspice.netlist.slips import with_comma
 
 __all__ = [

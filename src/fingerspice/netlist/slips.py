@@ -65,7 +65,7 @@ def decimal_comma(text: str) -> str | None:
 def greek_mu(text: str) -> str | None:
     """A warning about a number with the Greek letter for micro, which ngspice does not read; None if there is none."""
     found = _GREEK_MU.search(text)
-    return f"{found[0]} is {found[1]}u, and {found[1]} in ngspice 39, which reads the micro sign alone" if found else None
+    return f"{found[0]} is {found[1]}u here and {found[1]} in ngspice 39: write {found[1]}u" if found else None
 
 
 def _among_blanks(bare: str) -> Iterator[re.Match[str] | None]:
