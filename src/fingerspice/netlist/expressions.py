@@ -209,6 +209,8 @@ def _look_up(name: str, names: Mapping[str, float], expression: Expression) -> f
     if name in CONSTANTS:
         return CONSTANTS[name]
     hint = f": the function is written {name}(...)" if name in FUNCTIONS else nearest(name, [*CONSTANTS, *names])
+    if name == "time":
+        hint = ": a function of time is SIN, PULSE or PWL, or given in Python, sources={'V1': f}"
     position = expression.positions[name]
     written = expression.text[position : position + len(name)]
     raise Problem(f"parameter '{written}' is not defined{hint}", position)

@@ -158,7 +158,7 @@ class Reader:
             self._include(word, line, rest, folder)
         elif word in UNUSED:
             self.unused[word] = None
-        elif word in SILENT:
+        elif word in SILENT or (word == ".global" and set(line.text[rest:].lower().split()) <= {"gnd", "0"}):
             pass
         elif word in ANALYSES:
             if here is not self.root:
