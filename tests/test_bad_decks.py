@@ -164,7 +164,7 @@ DIRECTIVES = [
     ((".end", ".ac dec 10 20 2"), 8, ["FSTOP is 2; allowed: at least FSTART = 20"]),
     ((".end", ".ic top=3"), 8, [".ic 'top' is not understood; allowed: .ic v(node)=value"]),
     ((".end", ".ic v(top) 3"), 8, ["'.ic v(top) 3' is not understood; allowed: .ic v(node)=value"]),
-    ((".end", ".ic"), 8, ["'.ic' is not understood"]),
+    ((".end", ".ic 3"), 8, ["'.ic 3' is not understood"]),
     ((".end", ".ic v(top)=x"), 8, [".ic v(top) is 'x'; allowed: a number V"]),
     ((".end", ".ic v(tpo)=1"), 8, ["node 'tpo', which is not in the circuit; did you mean 'top'"]),
     ((".end", ".ic v(top)=1\n.ic v(TOP)=2"), 9, [".ic gives node 'top' twice"]),

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
+import math
+import os
 import re
+import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -284,3 +289,46 @@ def test_each_of_several_sources_is_replaced_by_its_name(command: Command) -> No
     none = command(*words, "--source", "SQUARE(100 100)", "--name", "none")
     assert none.code == 2
     assert "the circuit has Vbias, Vdrive; allowed: NAME=SPEC with one of these names" in none.err
+
+
+# decks from elsewhere
+
+
+class Input(io.BytesIO):
+    """Standard input with these bytes."""
+
+    @property
+    def buffer(self) -> io.BytesIO:
+        return self
+
+
+def test_a_deck_from_standard_input_runs_as_that_in_a_file(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("part.inc").write_text(Path("pad.cir").read_text().partition("\n")[2].replace(".end\n", ""))
+    monkeypatch.setattr(sys, "stdin", Input(b"Fingerpad\n.include part.inc\n.end\n"))
+    report = figures(command("run", "-", "--json", "--no-plot"))
+    assert report["files"] == ["out/stdin.nc"]
+    assert row(report, "u_gap") == row(figures(command("run", "pad.cir", "--json", "--no-plot")), "u_gap")
+
+
+def test_a_deck_from_a_pipe_runs_and_one_without_end_or_text_is_refused(command: Command) -> None:
+    os.mkfifo("pipe")
+    writer = threading.Thread(target=lambda: Path("pipe").write_bytes(Path("pad.cir").read_bytes()))
+    writer.start()
+    assert command("plan", "pipe").code == 0
+    writer.join()
+    for path, message in (("/dev/zero", "'/dev/zero' is larger than 64 MiB"), ("/dev/null", "'stdin' is empty")):
+        refused = command("run", path)
+        assert refused.code == 2
+        assert message in refused.err
+
+
+def test_ac_without_a_gap_writes_the_node_voltages(command: Command) -> None:
+    Path("rc.cir").write_text("RC\nV1 in 0 DC 0 AC 1\nR1 in out 1k\nC1 out 0 1u\n.ac dec 1 10 1k\n.end\n")
+    (sweep,) = figures(command("ac", "rc.cir", "--json"))["sweeps"]
+    expected = [1.0 / abs(1.0 + 2j * math.pi * f * 1e-3) for f in (10.0, 100.0, 1000.0)]
+    assert sweep["v:out"] == pytest.approx(expected, rel=1e-12)
+    assert "f_el_mean" not in sweep
+    head = Path("out/rc_ac.csv").read_text().splitlines()[0]
+    assert head.startswith(
+        "frequency [Hz],v:in [V],phase_deg:in [deg],v:out [V],phase_deg:out [deg],amplitude [V],impedance"
+    )

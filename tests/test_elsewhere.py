@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 import warnings
 from pathlib import Path
 
@@ -15,7 +17,7 @@ from deck_edits import DECK, edited
 from fingerspice.circuit.circuit import Tran
 from fingerspice.netlist.library import LIBRARIES, library_text
 from fingerspice.netlist.slips import ELSEWHERE, decimal_comma
-from ngspice_tools import run_ngspice
+from ngspice_tools import call_ngspice, run_ngspice, with_max_step
 
 TRAN = ".tran 10u 50m uic"
 
@@ -300,3 +302,138 @@ def test_a_library_outside_the_decks_folder_is_not_looked_at(tmp_path: Path) -> 
     assert fs.read_netlist(path).warnings == ()
     path.write_text(DECK)
     assert fs.read_netlist(path).warnings == ()
+
+
+# Files of schematic tools --------------------------------------------------------------------------------------
+
+NAMES = ["D[0]", "A<3>", "unconnected-(U1-NC-Pad4)", "/OUT(+)", "Net-(C1-Pad1)", "/sub/a~b", "N$1", "+V"]
+DECKS = {
+    "KiCad, Eagle and busses": "\n".join(
+        [
+            ".title names",
+            "V1 in 0 PULSE(0 1 1u 10n 10n 5u 10u)",
+            *(f"R{i} in {name} 1k\nC{i} {name} 0 {i}n" for i, name in enumerate(NAMES, 1)),
+            ".ic v(unconnected-(U1-NC-Pad4))=0.5",
+            ".tran 10n 20u uic",
+        ]
+    ),
+    "PySpice": """.title Low-Pass RC Filter
+Vinput in 0 DC 0V AC 1V SIN(0V 1V 50kHz 0s 0Hz)
+R1 in out 1kOhm
+C1 out 0 1nF
+.options TEMP = 25°C
+.options TNOM = 25°C
+.ic
+.tran 100ns 40us 0s uic
+""",
+    "start values inside a subcircuit": """starts
+.subckt cell a b params: x0=0.5
+Ra a m 10k
+Cm m 0 1u
+Rb m b 10k
+.ic v(m)={x0} v(b)={x0/2}
+.ends
+V1 in 0 DC 0
+X1 in out cell x0=2V
+Cl out 0 1u
+X2 in top cell
+Rt top 0 5k
+.tran 10u 20m uic
+""",
+    "a discharge without a source": """Human body of 5 kV touches a device of 5 pF
+Cbody b 0 100p IC=5k
+Rbody b d 1.5k
+Cdev d 0 5p
+.tran 0.05n 50n uic
+""",
+    "IC= goes before .ic": """A charged capacitor between resistors
+r1 a 0 1
+r2 b 0 1
+c1 a b 1m ic=1V
+.ic v(a)=10V v(b)=1V
+.tran 10u 10m uic
+""",
+    "xschem": """** sch_path: /home/me/rc.sch
+**.subckt rc
+R1 out IN 10k m=1
+C1 out GND 10n m=1
+V1 IN GND pulse(0 1 1n 1n 1n 5m 10m)
+**** begin user architecture code
+.tran 10u 20m uic
+**** end user architecture code
+**.ends
+.GLOBAL GND
+.end
+""",
+    "Qucs-S": """* Qucs 24.2.0
+V1 _net0 0 DC 10
+R1 _net0 out 1K tc1=0.0 tc2=0.0
+C1 out 0 1U IC=0
+.tran 5e-06 0.005 0 uic
+.END
+""",
+    "KiCad 7": """.title KiCad schematic
+.save all
+.probe alli
+.tran 1u 10m
+V1 /in GND DC 0 SIN( 0 1 1k 0 0 0 ) AC 1
+R1 /in Net-_C1-Pad1_ 1k
+C1 Net-_C1-Pad1_ GND 100n
+.end
+""",
+    "PSpice": """* source FILTER
+V_V1 N14847 0
++PULSE 0V 5V 3.67us 40ns 40ns 3.255us 6.51us
+V_V2 N14651 0 5Vdc
+R_R2 N14847 N14538 2.2k
+C_C1 N14538 0 1n
+R_R3 N14538 N14651 1k
+.TRAN 0.1u 30u uic
+.END
+""",
+    "an electrostatic chuck of two RC layers": """* Johnsen-Rahbek
+.PARAM VCH=500 RB=50MEG CB=2NF RG=2G CG=20NF
+VCHUCK CH 0 PWL(0 0 1M {VCH} 500M {VCH} 501M 0 502M {-VCH/10} 600M {-VCH/10} 601M 0)
+RSUP CH N1 100K
+XL N1 N2 RC R={RB} C={CB}
+XG N2 0 RC R={RG} C={CG}
+.SUBCKT RC A B R=1 C=1
+R1 A B {R}
+C1 A B {C}
+.ENDS RC
+.TRAN 1M 1 uic
+.END
+""",
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*(has no effect here|usual range)")
+@pytest.mark.parametrize("text", DECKS.values(), ids=DECKS)
+def test_decks_of_other_tools_have_ngspices_voltages(text: str, tmp_path: Path) -> None:
+    circuit = fs.parse_netlist(text)
+    stop = circuit.tran.stop
+    block = [
+        ".control",
+        "run",
+        "set wr_singlescale",
+        "set numdgt=15",
+        "set wr_vecnames",
+        "wrdata out.txt all",
+        "quit 0",
+    ]
+    bare = re.sub(r"(?im)^\.end\s*$", "", with_max_step(text, stop / 20_000))
+    (tmp_path / "deck.cir").write_text("\n".join([bare, *block, ".endc", ".end", ""]))
+    call_ngspice(tmp_path, "deck.cir")
+    head, *rows = (tmp_path / "out.txt").read_text().splitlines()
+    names, table = head.split(), np.array([row.split() for row in rows], float)
+    t, first = np.unique(np.minimum(table[:, 0], stop), return_index=True)
+    t, first = t[1:], first[1:]
+    ours = fs.simulate(circuit, t_eval=t, rtol=1e-9).node_voltages
+    for node in {name for e in circuit.elements for name in e.node_names[:2]} - {"0", "GND"}:
+        theirs = table[first, names.index(node.lower().rstrip(")"))]
+        assert np.abs(ours[node] - theirs).max() <= 2e-3 * np.abs(theirs).max(), node
+
+
+def test_a_pulse_charges_what_hangs_on_a_name_with_brackets() -> None:
+    s = fs.simulate(fs.parse_netlist(DECKS["KiCad, Eagle and busses"]), t_eval=[1.005e-6 + 4e-6])
+    assert s.node_voltages["Net-(C1-Pad1)"][0] == pytest.approx(1.0 - math.exp(-4.0 / 5.0), rel=1e-5)

@@ -123,13 +123,15 @@ def test_an_exp_from_zero_is_said_to_be_another_in_ngspice() -> None:
     np.testing.assert_allclose(late, wave.value(np.array([1e-3, 5e-3]) - 10e-6), rtol=1e-4)
 
 
-def test_names_that_ngspice_does_not_take_are_changed() -> None:
+# ngspice 39 stops at a node called temper, and at brackets in the formulas of a layer.
+@pytest.mark.parametrize(("name", "exported"), [("temper", "temper_"), ("Net-(V1-Pad1)", "Net__V1_Pad1_")])
+def test_names_that_ngspice_does_not_take_are_changed(name: str, exported: str) -> None:
     text = (CIRCUITS / "amplifier.cir").read_text()
-    # ngspice 39 stops at a node called temper.
-    circuit = fs.parse_netlist(text.replace(" drive ", " temper "))
-    theirs = run_ngspice(fs.export_netlist(circuit), signals=["v(temper_)"])
-    ours = fs.simulate(circuit, t_eval=np.array([0.3e-3, 0.7e-3])).node_voltages["temper"]
-    np.testing.assert_allclose(np.interp([0.3e-3, 0.7e-3], theirs["time"], theirs["v(temper_)"]), ours, atol=0.02)
+    circuit = fs.parse_netlist(text.replace(" drive ", f" {name} "))
+    signal = f"v({exported})"
+    theirs = run_ngspice(fs.export_netlist(circuit), signals=[signal])
+    ours = fs.simulate(circuit, t_eval=np.array([0.3e-3, 0.7e-3])).node_voltages[name]
+    np.testing.assert_allclose(np.interp([0.3e-3, 0.7e-3], theirs["time"], theirs[signal]), ours, atol=0.02)
 
 
 def test_names_that_become_one_with_their_letter_are_refused() -> None:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import random
+import re
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import fingerspice as fs
 from fingerspice.base.errors import InputError, Where
 from fingerspice.netlist.expressions import evaluate
 from fingerspice.netlist.functions import FUNCTIONS
+from ngspice_tools import call_ngspice
 
 HERE = Where("deck.cir", 3, 10)
 NAMES = {"thick": 2.0, "Rho": 3.0, "if": 5.0}
@@ -57,7 +63,7 @@ def test_arithmetic_means_what_ngspice_means(text: str, value: float) -> None:
         ("PI", math.pi),
         ("2*e", 2 * math.e),
         ("0 ? 1 : 0 ? 2 : 3", 3.0),
-        ("1 ? 2 ? 3 : 4 : 5", 3.0),
+        ("1 ? (2 ? 3 : 4) : 5", 3.0),
         ("max(1 > 2 ? 3 : 4, 1)", 4.0),
         ("thick == 0 ? 1/0 : 7", 7.0),
         ("(2^3)^2", 64.0),
@@ -89,7 +95,7 @@ def test_arithmetic_with_names_conditions_and_nesting(text: str, value: float) -
         ("zzz(2)", 10, "functions are sqrt"),
         ("sqrt", 10, r"written sqrt\(\.\.\.\)"),
         ("sin(1,2)", 10, "takes 1 argument, 2 given"),
-        ("min(1)", 10, "at least 2 arguments"),
+        ("min(1)", 10, "takes 2 arguments, 1 given"),
         ("1/0", 10, "divides by zero"),
         ("exp(1e9)", 10, "too large"),
         ("9.0**9e9", 10, "leaves the domain|too large"),
@@ -101,6 +107,13 @@ def test_arithmetic_with_names_conditions_and_nesting(text: str, value: float) -
         ("2^3^2", 13, "two readings"),
         ("2^-3^2", 14, "two readings"),
         ("1<2<3", 13, "two readings"),
+        ("1 ? 2 ? 3 : 4 : 5", 16, "two readings"),
+        ("2*-(3)+4", 12, "two readings"),
+        ("2*-3^2", 12, "two readings"),
+        ("2---3", 12, "two readings"),
+        ("thick > 1 ? -thick : 3", 22, "two readings"),
+        ("max(1, 2, 3)", 10, r"write max\(max\(a, b\), c\)"),
+        ("5mil*1meg", 10, "milli here: write 127u"),
         ("1 ? 2", 12, "without its ':'"),
         ("1 : 2", 12, r"without its '\?'"),
         ("a=1", 11, "a comparison is =="),
@@ -167,3 +180,97 @@ def test_any_words_give_a_finite_number_or_an_input_error(text: str) -> None:
     except InputError:
         return
     assert math.isfinite(value)
+
+
+# ngspice 39 as the reference -------------------------------------------------------------------------------------
+
+_PARAMETERS = {"x": 2.0, "y": -0.5, "meg": 3.0, "k": 7.0, "e": 1.25}
+_CALLS = ["sqrt(abs({}))", "abs({})", "max({}, {})", "min({}, {})", "int({})", "nint({})", "sgn({})", "pow({}, 2)",
+          "sqr({})", "floor({})", "ceil({})", "exp(min({}, 3))", "ln(abs({}) + 1)", "sin({})", "atan({})",
+          "ternary_fcn({}, {}, {})"]  # fmt: skip
+
+
+def expression(rng: random.Random, depth: int) -> str:
+    """Random arithmetic of numbers, names, signs, operators, functions and conditions, in brackets or not."""
+    kind = rng.random() if depth else 0.0
+    if kind < 0.3:
+        number = rng.choice(["2", "3", ".5", "1.5", "4k", "2meg", "3m", "5u", "1e3", "2e-3", "7kOhm", "2MEG", "1n"])
+        return rng.choice([number, number, *_PARAMETERS, "X"])
+    inner = [expression(rng, depth - 1) for _ in range(3)]
+    if kind < 0.45:
+        return f"({inner[0]})"
+    if kind < 0.55:
+        return f"-{inner[0]}"
+    if kind < 0.65:
+        return rng.choice(_CALLS).format(*inner)
+    if kind < 0.7:
+        return f"{inner[0]} > {inner[1]} ? {inner[2]} : {inner[0]}"
+    blank = rng.choice(["", " "])
+    operator = rng.choice("+-*/^+-*/<>") if kind < 0.95 else rng.choice(["&&", "||", "==", "!=", ">=", "<=", "**"])
+    return f"{inner[0]}{blank}{operator}{blank}{inner[1]}"
+
+
+def deck_of_sources(forms: list[str], *others: str) -> str:
+    """A deck with the parameters, these sources and a load of 1 ohm at the node `n<i>` of each."""
+    given = [f".param {name}={value!r}" for name, value in _PARAMETERS.items()]
+    return "\n".join(["grid", *others, *given, *forms, *(f"R{i} n{i} 0 1" for i in range(len(forms)))])
+
+
+def differing(folder: Path, forms: list[str], *others: str) -> list[tuple[str, float, float]]:
+    """The sources that have another voltage in ngspice, with ours and theirs (V); those refused here are left out."""
+
+    def is_read(form: str) -> bool:
+        try:
+            fs.parse_netlist(deck_of_sources([form], *others))
+        except InputError:
+            return False
+        return True
+
+    read = [form for form in forms if is_read(form.format(i=0))]
+    assert len(read) > 40
+    deck = deck_of_sources([form.format(i=i) for i, form in enumerate(read)], *others)
+    ours = [e.waveform.level for e in fs.parse_netlist(deck).by_device("V")]
+    block = [
+        ".control",
+        "op",
+        "set numdgt=15",
+        *(f"print v(n{i})" for i in range(len(read))),
+        "quit 0",
+        ".endc",
+        ".end\n",
+    ]
+    (folder / "deck.cir").write_text("\n".join([deck, *block]))
+    said = call_ngspice(folder, "deck.cir").stdout
+    theirs = dict(re.findall(r"^v\(n(\d+)\) = (\S+)", said, re.MULTILINE))
+    assert len(theirs) == len(read), said[-2000:]
+    pairs = [(form, here, float(theirs[str(i)])) for i, (form, here) in enumerate(zip(read, ours, strict=True))]
+    return [pair for pair in pairs if not math.isclose(*pair[1:], rel_tol=1e-9) and abs(pair[1]) > 1e-250]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_random_arithmetic_has_ngspices_value_or_is_refused(seed: int, tmp_path: Path) -> None:
+    rng = random.Random(seed)
+    assert differing(tmp_path, [f"V{{i}} n{{i}} 0 '{expression(rng, 3)}'" for _ in range(200)]) == []
+
+
+_SCALES = ("", "t", "g", "meg", "k", "mil", "m", "u", "µ", "n", "p", "f", "a", "x", "q", "MEG", "MIL", "Meg", "M", "K")
+_CELL = (".subckt cell a b w=1", "V1 a b {w}", ".ends")
+
+
+@pytest.mark.parametrize("form", ["V{{i}} n{{i}} 0 {}", "V{{i}} n{{i}} 0 {{{{{}}}}}", "X{{i}} n{{i}} 0 cell w={}"])
+def test_numbers_in_a_grid_of_spellings_have_ngspices_value_or_are_refused(form: str, tmp_path: Path) -> None:
+    parts = itertools.product(("5", "2e-3", "-.5"), _SCALES, ("", "V", "Ohm", "Hz", "s"))
+    forms = [form.format("".join(part)) for part in parts]
+    assert differing(tmp_path, forms, *(_CELL if "cell" in form else ())) == []
+
+
+@pytest.mark.parametrize("name", ["max", "sqrt", "limit", "Gauss"])
+def test_a_parameter_named_like_a_function_is_refused_as_ngspice_does_not_read_it(name: str) -> None:
+    with pytest.raises(InputError, match=f"parameter '{name}' has the name of a function of ngspice"):
+        fs.parse_netlist(f"name\n.param {name}=3\nV1 a 0 {{{name}+1}}\nR1 a 0 1\n.tran 1 1")
+
+
+def test_a_greek_mu_is_micro_with_a_warning_as_ngspice_ignores_it() -> None:
+    with pytest.warns(fs.FingerspiceWarning, match=r"2:1: 5μ is 5u here and 5 in ngspice 39: write 5u"):
+        circuit = fs.parse_netlist("mu\nC1 a 0 5μF\nV1 a 0 1\n.tran 1 1")
+    assert circuit["C1"].values["value"] == 5e-6

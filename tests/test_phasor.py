@@ -5,6 +5,7 @@ from __future__ import annotations
 import cmath
 import math
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from analytic import (
 from fingerspice.circuit.circuit import AcSweep
 from fingerspice.physics.phasor import coupled_area, layer_gains
 from fingerspice.studies.sweeps import sweep_frequencies
+from ngspice_tools import call_ngspice
 from scenes import deck, table1, table1_deck
 
 MM2 = 1e6
@@ -240,10 +242,49 @@ def test_what_has_no_phasor_is_refused_with_what_is_allowed(source, frequency, a
     assert message in str(caught.value)
 
 
-def test_a_stack_without_a_gap_is_refused() -> None:
-    circuit = deck("Vdrive a 0 SIN(0 1 100)", "Xcoat a 0 area LAYER d=1u eps_r=3.9", "Varea area 0 35")
-    with pytest.raises(fs.InputError, match="needs a GAP"):
-        fs.phasor(circuit)
+def test_a_circuit_without_a_gap_has_the_phasors_of_its_nodes() -> None:
+    circuit = deck("V1 in 0 AC 2 30", "R1 in out 1k", "C1 out 0 1u")
+    f = np.array([1.0, 159.0, 1e4])
+    found = fs.phasor(circuit, f)
+    expected = 2.0 * np.exp(1j * np.pi / 6.0) / (1.0 + 2j * np.pi * f * 1e-3)
+    np.testing.assert_allclose(found.v_nodes[:, found.nodes.index("out")], expected, rtol=1e-12)
+    np.testing.assert_allclose(found.impedance, 1e3 + 1.0 / (2j * np.pi * f * 1e-6), rtol=1e-9)
+    assert np.all(np.isnan(found.f_el_mean))
+
+
+def test_a_stack_without_a_gap_divides_its_sine_as_its_admittances_say() -> None:
+    layers = ("Xcoat a b area LAYER d=1u eps_r=4 r=1meg", "Xfilm b 0 area LAYER d=2u eps_r=4")
+    circuit = deck("Vdrive a 0 SIN(0 3 100)", *layers, "Varea area 0 35")
+    capacitance = 8.8541878128e-12 * 4.0 * 35e-6 / 1e-6
+    y = 1e-6 + 2j * np.pi * 100.0 * capacitance
+    expected = 3.0 * y / (y + 2j * np.pi * 100.0 * capacitance / 2.0)
+    assert fs.phasor(circuit).v_nodes[0, 1] == pytest.approx(expected, rel=1e-5)
+
+
+def test_sources_without_ac_are_silent_in_a_circuit_without_a_gap_as_in_ngspice(tmp_path: Path) -> None:
+    lines = (
+        "two",
+        "V1 in 0 DC 5",
+        "V2 mid 0 AC 1 90",
+        "I1 0 out AC 1m",
+        "R1 in out 1k",
+        "R2 mid out 2k",
+        "C1 out 0 1u",
+    )
+    text = "\n".join((*lines, "C2 out b 1n", "R3 b 0 1k"))
+    found = fs.phasor(fs.parse_netlist(text), [10.0, 100.0, 1e3])
+    block = ".ac dec 1 10 1k\n.control\nrun\nset numdgt=15\nwrdata out.txt v(out) v(b)\nquit 0\n.endc\n.end\n"
+    (tmp_path / "deck.cir").write_text(f"{text}\n{block}")
+    call_ngspice(tmp_path, "deck.cir")
+    table = np.loadtxt(tmp_path / "out.txt")
+    for column, node in ((1, "out"), (4, "b")):
+        theirs = table[:, column] + 1j * table[:, column + 1]
+        np.testing.assert_allclose(found.v_nodes[:, found.nodes.index(node)], theirs, rtol=1e-9)
+
+
+def test_a_circuit_without_a_gap_and_without_an_amplitude_is_refused() -> None:
+    with pytest.raises(fs.InputError, match="no source has an amplitude; allowed: AC on a source"):
+        fs.phasor(deck("V1 in 0 5", "R1 in out 1k", "C1 out 0 1u"), 100.0)
 
 
 @pytest.mark.parametrize(

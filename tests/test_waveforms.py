@@ -15,6 +15,7 @@ import fingerspice as fs
 from fingerspice.engine.segment import Segment, source
 from fingerspice.waveforms import combinations, periodic, ramps, repeated, sampling, transients
 from fingerspice.waveforms import waveform as waveforms
+from fingerspice.waveforms.recorded import as_samples
 from fingerspice.waveforms.sampling import source_table
 from fingerspice.waveforms.waveform import as_waveform
 from scenes import table1
@@ -379,3 +380,30 @@ def test_the_text_of_a_recording_tells_it_from_others() -> None:
     assert repr(fs.Samples(values, 1e3)) in texts
     assert all(len(text) < 100 for text in texts)
     assert len({repr(fs.Samples(x, 1e3) + fs.Sine(1.0, 50.0)) for x in (values, other)}) == 2
+
+
+SUMMED = fs.Sine(1.0, 5.0) + fs.Square(1.0, 5.0)
+SIGNED = (
+    fs.Samples([0.0, 2.0, -1.0], 10.0),
+    fs.Sine(3.0, 2.0, 1.0),
+    fs.PWL((0.0, 1.0), (0.0, 2.0)),
+    fs.DC(4.0),
+    SUMMED,
+)
+
+
+@pytest.mark.parametrize("wave", SIGNED)
+def test_a_minus_turns_a_waveform_over_and_subtracts(wave: fs.Waveform) -> None:
+    t = np.linspace(0.0, 0.3, 101)
+    np.testing.assert_array_equal((-wave).value(t), -wave.value(t))
+    np.testing.assert_allclose((1.0 - wave).value(t), 1.0 - wave.value(t), atol=1e-15)
+    np.testing.assert_allclose(
+        (wave - fs.Sine(2.0, 1.0)).value(t), wave.value(t) - fs.Sine(2.0, 1.0).value(t), atol=1e-15
+    )
+
+
+def test_a_recording_turned_over_runs_sample_by_sample_like_the_recording() -> None:
+    samples = fs.Samples(np.sin(np.arange(500.0)), 1e4)
+    turned = as_samples(-samples)
+    assert turned is not None
+    np.testing.assert_array_equal(turned.values, -samples.values)

@@ -15,7 +15,7 @@ PLAIN_UNITS = frozenset(
     (
         *("v", "vdc", "vac", "vpp", "volt", "volts", "h", "henry", "hz", "hertz", "o", "ohm", "ohms", "ω"),
         *("s", "sec", "second", "seconds", "c", "w", "watt", "watts"),
-        *("deg", "degree", "degrees", "rad", "radian", "radians"),
+        *("deg", "degree", "degrees", "rad", "radian", "radians", "°c"),
     )
 )
 
@@ -27,7 +27,7 @@ _MISREAD = {
     "min": ("m (milli)", ""),
 }
 _LETTERS = "a-zµμωΩ"
-_NUMBER = re.compile(rf"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?:e([+-]?[0-9]+))?([{_LETTERS}]*)", re.IGNORECASE)
+_NUMBER = re.compile(rf"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?:e([+-]?[0-9]+))?(°c|[{_LETTERS}]*)", re.IGNORECASE)
 _LETTER_AS_POINT = re.compile(rf"([+-]?[0-9]+)([{_LETTERS}]+)([0-9]+)[{_LETTERS}]*", re.IGNORECASE)
 _MEGA = re.compile(rf"[+-]?[0-9.]+(?:e[+-]?[0-9]+)?(M(?!eg|il)[{_LETTERS}]*)", re.IGNORECASE)
 _DASHES = {0x2212: "-", 0x2013: "-", 0x2010: "-", 0x2011: "-"}

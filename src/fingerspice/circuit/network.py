@@ -170,6 +170,11 @@ class Network:
         driven = (self.b + self.p.T @ (y * self.q)) @ s
         return np.asarray(np.linalg.solve(self.k + self.p.T @ (y * self.p), -driven[..., None])[..., 0])
 
+    def node_phasors(self, frequency: float, area: FloatArray, s: ComplexArray) -> ComplexArray:
+        """Node voltages (n_node,) at a frequency (Hz) and areas (n_area,) in m^2 for source phasors s (n_s,)."""
+        both = np.concatenate([self._live(self.admittances(frequency, area), s), s])
+        return np.asarray(self.nodes[:, : both.size] @ both)
+
     def impedance(self, frequency: float, area: FloatArray) -> complex:
         """Voltage of the one source over the current that it delivers, at a frequency (Hz), ohm."""
         one, y = np.ones(1, complex), self.admittances(frequency, area)
@@ -178,7 +183,7 @@ class Network:
         if self.n_voltage:
             current = self.through[0] @ (y * (self.p @ x + self.q @ one)) + self.delivered[0] @ both
             return complex(1.0 / current) if current != 0.0 else complex(np.inf)
-        source, at = self.sources[0], dict(zip(self.node_names, self.nodes[:, : both.size] @ both, strict=True))
+        source, at = self.sources[0], dict(zip(self.node_names, self.node_phasors(frequency, area, one), strict=True))
         p, n = (at.get(name, 0.0) for name in source.node_names[:2])
         return complex(n - p)
 

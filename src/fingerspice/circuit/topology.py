@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
+from types import MappingProxyType
 
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
@@ -65,21 +66,29 @@ def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
     Raises
     ------
     InputError
-        If there is no source, a floating node, a loop of voltage sources, a current source without a path, an area that
-        no element or several elements drive, or too many elements; the message names the elements or nodes at fault.
+        If there is neither source nor start, a floating node, a loop of voltage sources, a current source without a
+        path, an area that no element or several elements drive, or too many elements; the message names those at fault.
     """
     _refuse_large(circuit)
     areas = _areas(circuit)
     on_areas = {id(area.source) for area in areas}
     branches = [e for e in circuit.elements if id(e) not in on_areas]
     if not any(e.device in "VI" for e in branches):
-        raise InputError(
-            "the circuit has no source; allowed: a V element that drives the stack, such as V1 drive 0 SIN(0 200 100)"
-        )
+        if not circuit.initial and all(e.initial is None for e in branches):
+            raise InputError(
+                "the circuit has no source; allowed: a V element that drives the stack, such as V1 drive 0 "
+                "SIN(0 200 100), or a start, IC= of a capacitor or .ic v(node)="
+            )
+        branches.append(_no_source(branches[0]))
     _refuse_floating(branches)
     _refuse_source_conflicts(branches)
     _refuse_current_without_path(branches)
     return areas, branches
+
+
+def _no_source(beside: Element) -> Element:
+    """A source of 0 A, which a circuit that only its start drives has in place of a source."""
+    return Element("none", "I", beside.nodes[1::-1], beside.node_names[1::-1], MappingProxyType({}), DC(0.0))
 
 
 def driving_sources(circuit: Circuit) -> list[Element]:

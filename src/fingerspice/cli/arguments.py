@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir).")]
+Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir), - for standard input.")]
 Out = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder of the files; out by default.")]
 Name = Annotated[
     str | None, typer.Option("--name", metavar="NAME", help="Name of the files; that of the deck by default.")

@@ -123,7 +123,7 @@ def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
         # In PWL(...) r=10m the text before the = is not a source's name.
         if not (equals and named.replace(".", "").isidentifier()):
             named, spec = "", text
-        known = ", ".join(names.values())
+        known = ", ".join(names.values()) or "no source"
         if not named and len(names) != 1:
             raise InputError(f"--source {text!r}: the circuit has {known}; allowed: NAME=SPEC with one of these names")
         name = names.get(named.lower(), "") if named else next(iter(names.values()))

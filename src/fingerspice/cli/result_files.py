@@ -58,7 +58,8 @@ class Results:
             raise InputError(
                 f"--name is {name!r}; allowed: a file's name without folder and end; --out names the folder"
             )
-        self.deck, self.folder, self.name, self.overwrite = deck, folder or FOLDER, name or deck.stem, overwrite
+        self.deck, self.folder, self.overwrite = deck, folder or FOLDER, overwrite
+        self.name = name or (circuit.path or deck).stem
         self.named = folder is not None
         self.names: list[str] = []
         self.noted = False

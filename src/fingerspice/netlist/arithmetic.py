@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from fingerspice.base.units import parse_number
+from fingerspice.base.units import parse_number, spice_text
 from fingerspice.netlist.functions import FUNCTIONS, Problem
 from fingerspice.netlist.spelling import nearest
 
@@ -17,6 +17,7 @@ from fingerspice.netlist.spelling import nearest
 MAX_DEPTH, MAX_SIGNS = 25, 3
 _COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
 _SPELLING = {"^": "**", "&&": "and", "||": "or"}
+_OPERATORS = (*"+-*/?:", *_SPELLING.values(), *_COMPARISONS)
 
 
 _LEX = re.compile(
@@ -137,10 +138,18 @@ def to_python(lexemes: list[Lexeme], order: Mapping[str, int]) -> str:
 
 
 def _refuse_chains(pieces: list[tuple[str, int]]) -> None:
-    """Refuse `a^b^c`, which ngspice groups to the left, mathematics to the right, and `a<b<c`, which is ambiguous."""
+    """Refuse `a^b^c`, which ngspice groups to the left, mathematics to the right, and `a<b<c`, which is ambiguous.
+
+    Refuse also signs that ngspice moves: after an operator its minus belongs to the next number in the text, wherever
+    that stands, so that `2*-(3)+4` is 2 there, and is applied before a power, so that `2*-3^2` is 18.
+    """
     power = comparison = ""
     previous = ""
-    for text, position in pieces:
+    for index, (text, position) in enumerate(pieces):
+        if text == "-" and previous in _OPERATORS:
+            value, after = (piece for piece, _ in [*pieces[index + 1 :], ("", 0)][:2])
+            if not value[0].isdigit() or (after == "**" and previous != "**"):
+                raise Problem("a '-' after an operator has two readings here: use brackets, as in 2*(-x)", position)
         if (text == "**" and power) or (text in _COMPARISONS and comparison):
             shown = "^" if text == "**" else text
             raise Problem(f"a second '{shown}' in a row has two readings: use brackets", position)
@@ -156,31 +165,35 @@ def _refuse_chains(pieces: list[tuple[str, int]]) -> None:
 
 
 def _conditional(pieces: list[tuple[str, int]]) -> str:
-    """Join pieces, and write `a ? b : c` as `(b) if (a) else (c)`; nested conditions group to the right, as in C."""
-    waiting: list[int] = []  # indices of `?` without their `:`
-    pairs: dict[int, int] = {}
-    for index, (text, position) in enumerate(pieces):
-        if text == "?":
-            waiting.append(index)
-        elif text == ":" and not waiting:
+    """Join pieces, and write `a ? b : c` as `((b) if (a) else (c))`; conditions after `:` group to the right."""
+    chunks: list[list[str]] = [[]]
+    asked = 0
+    for text, position in pieces:
+        waits = len(chunks) % 2 == 0  # for the ':' of a '?'
+        if text == ":" and not waits:
             raise Problem("':' without its '?' (a ? b : c)", position)
-        elif text == ":":
-            pairs[waiting.pop()] = index
-    if waiting:
-        raise Problem("'?' without its ':' (a ? b : c)", pieces[waiting[-1]][1])
-
-    def join(start: int, end: int) -> str:
-        question = next((i for i in range(start, end) if i in pairs), None)
-        if question is None:
-            return " ".join(text for text, _ in pieces[start:end])
-        yes, no = join(question + 1, pairs[question]), join(pairs[question] + 1, end)
-        return f"(({yes}) if ({join(start, question)}) else ({no}))"
-
-    return join(0, len(pieces))
+        if text == "?" and waits:  # ngspice 39 takes 5 as 1?0?5:6:7
+            raise Problem("a condition between '?' and ':' has two readings: use brackets", position)
+        if text in ("?", ":"):
+            asked = position
+            chunks.append([])
+        else:
+            chunks[-1].append(text)
+    if len(chunks) % 2 == 0:
+        raise Problem("'?' without its ':' (a ? b : c)", asked)
+    *others, value = (" ".join(chunk) for chunk in chunks)
+    for yes, test in zip(others[::-2], others[-2::-2], strict=True):
+        value = f"(({yes}) if ({test}) else ({value}))"
+    return value
 
 
 def number_of(lexeme: Lexeme) -> float:
+    """Value of a number; refuses mil, which ngspice's arithmetic takes for milli."""
     try:
-        return parse_number(lexeme.text)
+        value = parse_number(lexeme.text)
     except ValueError as error:
         raise Problem(str(error), lexeme.position) from None
+    if lexeme.text.lower().lstrip("0123456789.e+-").startswith("mil"):
+        problem = f"'{lexeme.text}' differs between simulators, ngspice 39 reads milli here: write {spice_text(value)}"
+        raise Problem(problem, lexeme.position)
+    return value

@@ -13,11 +13,10 @@ from pathlib import Path
 
 from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import layer_devices
-from fingerspice.netlist.files import MAX_BYTES, NATIVE_LIBRARIES, read_text
-from fingerspice.netlist.flatten import Flattener, Statement
-from fingerspice.netlist.lexer import Line, group, lex
+from fingerspice.netlist.files import MAX_BYTES, NATIVE_LIBRARIES, is_stream, read_stream, read_text
+from fingerspice.netlist.flatten import Directive, Flattener, Statement, directive_of
 from fingerspice.netlist.reader import DIRECTIVES, Reader, Subcircuit
-from fingerspice.netlist.scope import Call, Number, Scope, Token, Value
+from fingerspice.netlist.scope import Call, Number, Scope, Token
 from fingerspice.netlist.slips import with_comma
 
 __all__ = [
@@ -35,37 +34,10 @@ __all__ = [
 #: Largest number of characters of a title that are shown; the middle of a longer title is left out.
 LONGEST_TITLE = 200
 
+_TITLE = re.compile(r"^\.title\s+", re.IGNORECASE)
 _VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|chirp|burst|wavefile|table)\b)"
 _ELEMENT_TITLE = re.compile(rf"[rcvi]\w*\s+\S+\s+\S+\s+{_VALUE}", re.IGNORECASE)
 _DEVICE_TITLE = re.compile(rf"x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(layer_devices())})(?:\s|$)", re.IGNORECASE)
-
-
-@dataclass(frozen=True, slots=True)
-class Directive:
-    """A line such as `.tran 10u 50m uic`.
-
-    Attributes
-    ----------
-    name : str
-        Name in lower case, with its dot.
-    args : tuple of Number, Token or Call
-        Words of the line, numbers evaluated.
-    params : dict
-        Values of `key=value` pairs by key in lower case; `.ic v(area)=1` has the key ``v(area)``.
-    param_where : dict
-        Places of the keys.
-    where : Where
-        Place of the dot.
-    text : str
-        The line as written, continuations joined.
-    """
-
-    name: str
-    args: tuple[Number | Token | Call, ...]
-    params: dict[str, Value]
-    param_where: dict[str, Where]
-    where: Where
-    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +53,7 @@ class Deck:
     tran, ac : Directive or None
         The analyses; each may be given once.
     ic, options : tuple of Directive
-        Start values and options, in the order of the file.
+        Start values, as in `Flattener.starts`, and options, in the order of the file.
     includes : tuple of str
         Names, without folder, of the included libraries of native devices, whose files are not read.
     files : tuple of Path
@@ -119,13 +91,16 @@ def read_deck(path: str | Path) -> Deck:
     Parameters
     ----------
     path : str or Path
-        The file. It may include files from its own folder only.
+        The file. It may include files from its own folder only. Standard input (``-``), a device or a pipe is a deck
+        called ``stdin`` in the working directory.
 
     Raises
     ------
     InputError
         If the file cannot be read (missing, a folder, empty, too large, not text) or has an error.
     """
+    if is_stream(Path(path)):
+        return parse_deck(read_stream(Path(path)), Path("stdin"))
     return parse_deck(read_text(Path(path), str(path)), Path(path))
 
 
@@ -153,7 +128,7 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
         raise InputError(f"'{file}' is not text (it holds NUL characters)")
     reader = Reader(file, path)
     lines = reader.split(text.removeprefix("\ufeff"))
-    title = printable(lines[0].strip(), LONGEST_TITLE)
+    title = printable(_TITLE.sub("", lines[0].strip()), LONGEST_TITLE)
     if _reads_like_a_statement(title):
         problem = f"the first line is the title, but '{title}' reads like a statement: add a title above"
         reader.warn(problem, Where(file, 1))
@@ -172,14 +147,14 @@ def _assemble(reader: Reader, title: str, text: str, path: Path | None) -> Deck:
     scope.solve()
     flattener = Flattener()
     flattener.run(reader.root, scope)
-    directives = [_directive(*analysis, scope) for analysis in reader.analyses]
+    directives = [directive_of(*analysis, scope) for analysis in reader.analyses]
     _warn_uncalled(reader, reader.root)
     return Deck(
         title=title,
         statements=tuple(flattener.statements),
         tran=_only(directives, ".tran"),
         ac=_only(directives, ".ac"),
-        ic=tuple(d for d in directives if d.name == ".ic"),
+        ic=tuple(flattener.starts),
         options=tuple(d for d in directives if d.name == ".options"),
         includes=tuple(reader.libraries),
         files=tuple(reader.files),
@@ -189,13 +164,6 @@ def _assemble(reader: Reader, title: str, text: str, path: Path | None) -> Deck:
         text=text,
         path=path,
     )
-
-
-def _directive(name: str, line: Line, rest: int, scope: Scope) -> Directive:
-    words = group(line, lex(line, rest), probes=True)
-    args = scope.words(line, words.words)
-    start = line.start
-    return Directive(name, args, *scope.pairs(line, words), line.where(start), line.text[start:])
 
 
 def _only(directives: list[Directive], name: str) -> Directive | None:

@@ -117,7 +117,7 @@ def read_initial(directives: tuple[Directive, ...], elements: tuple[Element, ...
     area_nodes = {e.nodes[2] for e in elements if e.spec.is_layer}
     out: dict[str, float] = {}
     for directive in directives:
-        if directive.args or not directive.params:
+        if directive.args:
             raise InputError(f"{directive.text.strip()!r} is not understood; {usage}", directive.where)
         for key, value in directive.params.items():
             place = directive.param_where[key]
@@ -125,8 +125,7 @@ def read_initial(directives: tuple[Directive, ...], elements: tuple[Element, ...
                 raise InputError(f".ic {key!r} is not understood; {usage}", place)
             if not isinstance(value, Number):
                 raise InputError(f".ic {key} is {value.text!r}; allowed: a number V", place)
-            node = key[2:-1].strip()
-            node = "0" if node == "gnd" else node
+            node = key[2:-1]
             if node not in nodes:
                 raise InputError(f".ic names node {node!r}, which is not in the circuit{nearest(node, nodes)}", place)
             if node in out:
@@ -149,10 +148,11 @@ def start_volts(what: str, number: Number) -> float:
 
 
 def unused_starts(initial: Mapping[str, float], elements: tuple[Element, ...], uic: bool) -> tuple[str, ...]:
-    """Start values without effect: with ``uic`` at nodes without capacitor or layer; without ``uic`` every ``IC=``."""
+    """Start values without effect: with ``uic`` where no layer or capacitor without ``IC=`` is, else every ``IC=``."""
     layers = [e for e in elements if e.spec.is_layer]
     gaps = {e.nodes[2]: e.values for e in layers if e.device == "GAP" and e.values["a_fix"] == 0.0}
-    taken = {node for e in elements if e.device == "C" or e.spec.is_layer for node in e.nodes[:2]}
+    started = [e for e in elements if e.spec.is_layer or (e.device == "C" and e.initial is None)]
+    taken = {node for e in started for node in e.nodes[:2]}
     out = []
     for node in initial:
         if any(e.nodes[2] == node for e in layers):

@@ -19,8 +19,8 @@ from fingerspice.netlist.spelling import nearest
 
 #: LTspice's parasitics, which become elements: ``rser`` in series at the first node, all others in parallel.
 _PARASITICS = {"V": ("rser", "cpar"), "C": ("rser", "rpar", "cpar")}
-#: Data of a part that LTspice writes and no calculation uses.
-_PART_DATA = {"R": ("tol", "pwr"), "C": ("tol", "v", "irms", "mfg", "pn", "type")}
+#: Data of a part that LTspice and Qucs-S write and no calculation uses.
+_PART_DATA = {"R": ("tol", "pwr", "tc1", "tc2"), "C": ("tol", "v", "irms", "mfg", "pn", "type", "tc1", "tc2")}
 #: Other names of the value; and the parameter that gives the number of equal parts in parallel.
 _VALUE_NAMES = {"R": ("r", "resistance"), "C": ("c", "capacitance")}
 _COPIES = "m"

@@ -209,6 +209,8 @@ def _look_up(name: str, names: Mapping[str, float], expression: Expression) -> f
     if name in CONSTANTS:
         return CONSTANTS[name]
     hint = f": the function is written {name}(...)" if name in FUNCTIONS else nearest(name, [*CONSTANTS, *names])
+    if name == "time":
+        hint = ": a function of time is SIN, PULSE or PWL, or given in Python, sources={'V1': f}"
     position = expression.positions[name]
     written = expression.text[position : position + len(name)]
     raise Problem(f"parameter '{written}' is not defined{hint}", position)
@@ -216,9 +218,10 @@ def _look_up(name: str, names: Mapping[str, float], expression: Expression) -> f
 
 def _call(node: ast.Call, names: Mapping[str, float], expression: Expression) -> float:
     name = node.func.id[2:] if isinstance(node.func, ast.Name) else ""
-    function, fewest, most = FUNCTIONS[name]
-    if not fewest <= len(node.args) <= most:
-        wanted = f"{fewest}" if fewest == most else f"at least {fewest}"
-        plural = "" if wanted == "1" else "s"
-        raise Problem(f"{name} takes {wanted} argument{plural}, {len(node.args)} given: {expression.text}")
+    function, wanted = FUNCTIONS[name]
+    given = len(node.args)
+    if given != wanted:
+        more = f"; write {name}({name}(a, b), c), as ngspice 39 leaves some out" if given > 2 == wanted else ""
+        plural = "" if wanted == 1 else "s"
+        raise Problem(f"{name} takes {wanted} argument{plural}, {given} given: {expression.text}{more}")
     return float(function(*(_walk(argument, names, expression) for argument in node.args)))

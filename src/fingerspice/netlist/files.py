@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import codecs
+import sys
+from contextlib import nullcontext
 from dataclasses import dataclass
 from encodings import cp1252
 from pathlib import Path, PurePath
@@ -53,6 +55,33 @@ def read_text(path: Path, shown: str, where: Where | None = None, root: Path | N
             raise
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise InputError(f"'{shown}' cannot be read: {reason}", where) from None
+    return _decoded(data, shown, where)
+
+
+def is_stream(path: Path) -> bool:
+    """Whether a deck's path means standard input (``-``), a device, or a pipe such as bash's ``<(...)``."""
+    return str(path) == "-" or path.is_relative_to("/dev") or path.is_fifo()
+
+
+def read_stream(path: Path) -> str:
+    """Text of a deck from standard input, a device or a pipe.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, is too large, or is no text.
+    """
+    try:
+        with nullcontext(sys.stdin.buffer) if str(path) == "-" else path.open("rb") as stream:
+            data = stream.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise InputError(f"'{path}' cannot be read: {error.strerror or error}") from None
+    if len(data) > MAX_BYTES:
+        raise InputError(f"'{path}' is larger than {MAX_BYTES >> 20} MiB")
+    return _decoded(data, str(path), None)
+
+
+def _decoded(data: bytes, shown: str, where: Where | None) -> str:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         # LTspice writes UTF-16 if a name has letters that Latin-1 lacks.
         return data.decode("utf-16", "replace")

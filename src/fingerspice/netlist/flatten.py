@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.devices import DEVICES, layer_devices
@@ -79,6 +79,34 @@ class Statement:
     where: Where
 
 
+@dataclass(frozen=True, slots=True)
+class Directive:
+    """A line such as `.tran 10u 50m uic`.
+
+    Attributes
+    ----------
+    name : str
+        Name in lower case, with its dot.
+    args : tuple of Number, Token or Call
+        Words of the line, numbers evaluated.
+    params : dict
+        Values of `key=value` pairs by key in lower case; `.ic v(area)=1` has the key ``v(area)``.
+    param_where : dict
+        Places of the keys.
+    where : Where
+        Place of the dot.
+    text : str
+        The line as written, continuations joined.
+    """
+
+    name: str
+    args: tuple[Number | Token | Call, ...]
+    params: dict[str, Value]
+    param_where: dict[str, Where]
+    where: Where
+    text: str
+
+
 @dataclass(slots=True)
 class _Instance:
     """A subcircuit call that is being expanded, or the deck itself."""
@@ -116,6 +144,14 @@ class _Instance:
         return names
 
 
+def directive_of(name: str, line: Line, rest: int, scope: Scope) -> Directive:
+    """A directive whose arguments start at position `rest`, evaluated in a scope."""
+    words = group(line, lex(line, rest), probes=True)
+    args = scope.words(line, words.words)
+    start = line.start
+    return Directive(name, args, *scope.pairs(line, words), line.where(start), line.text[start:])
+
+
 class Flattener:
     """Turns the element lines of a deck into statements.
 
@@ -123,10 +159,13 @@ class Flattener:
     ----------
     statements : list of Statement
         Statements in the order of the deck; a call is replaced by the statements of its subcircuit.
+    starts : list of Directive
+        The `.ic` lines, also of subcircuits, with the nodes of the flat circuit.
     """
 
     def __init__(self) -> None:
         self.statements: list[Statement] = []
+        self.starts: list[Directive] = []
         self._names: dict[str, Where] = {}
         self._expanded = 0
         self._expanded_text = 0
@@ -138,6 +177,8 @@ class Flattener:
     def _expand(self, instance: _Instance) -> None:
         for line in instance.definition.elements:
             self._element(line, instance)
+        for line, rest in instance.definition.starts:
+            self.starts.append(_flat_start(directive_of(".ic", line, rest, instance.scope), instance))
 
     def _element(self, line: Line, instance: _Instance) -> None:
         lexemes = lex(line) or [Lexeme("", ",", line.start)]  # a line of commas has none
@@ -213,6 +254,17 @@ class Flattener:
         self._expanded_text += called.characters
         if self._expanded_text > MAX_EXPANDED_TEXT:
             raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text", where)
+
+
+def _flat_start(start: Directive, instance: _Instance) -> Directive:
+    """An `.ic` line with the canonical names of its nodes, which are those of a subcircuit's call."""
+    params, places = dict[str, Value](), dict[str, Where]()
+    for key, value in start.params.items():
+        flat = f"v({instance.node(key[2:-1].strip())[0]})" if key.startswith("v(") else key
+        if flat in params:
+            raise InputError(f".ic gives node {flat[2:-1]!r} twice", start.param_where[key])
+        params[flat], places[flat] = value, start.param_where[key]
+    return replace(start, params=params, param_where=places)
 
 
 def _bind(inner: _Instance, line: Line, words: Group, caller: Scope) -> None:

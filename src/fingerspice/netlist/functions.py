@@ -40,22 +40,24 @@ _AS_IN_MATH = (
     *("sqrt", "exp", "log10", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
     *("asinh", "acosh", "atanh", "floor", "ceil"),
 )
-#: From a name to the function, and its smallest and largest number of arguments.
-FUNCTIONS: Mapping[str, tuple[Callable[..., float], int, int]] = {
-    **{name: (getattr(math, name), 1, 1) for name in _AS_IN_MATH},
-    "ln": (math.log, 1, 1),
-    "log": (math.log, 1, 1),
-    "arctan": (math.atan, 1, 1),
-    "abs": (abs, 1, 1),
-    "sqr": (lambda x: x * x, 1, 1),
-    "sgn": (_sgn, 1, 1),
-    "int": (math.trunc, 1, 1),
-    "nint": (round, 1, 1),
-    "min": (min, 2, 99),
-    "max": (max, 2, 99),
-    "pow": (math.pow, 2, 2),
-    "pwr": (_pwr, 2, 2),
-    "atan2": (math.atan2, 2, 2),
-    "hypot": (math.hypot, 2, 2),
-    "ternary_fcn": (lambda condition, yes, no: yes if condition else no, 3, 3),
+#: From a name to the function, and its number of arguments.
+FUNCTIONS: Mapping[str, tuple[Callable[..., float], int]] = {
+    **{name: (getattr(math, name), 1) for name in _AS_IN_MATH},
+    "ln": (math.log, 1),
+    "log": (math.log, 1),
+    "arctan": (math.atan, 1),
+    "abs": (abs, 1),
+    "sqr": (lambda x: x * x, 1),
+    "sgn": (_sgn, 1),
+    "int": (math.trunc, 1),
+    "nint": (round, 1),
+    "min": (min, 2),
+    "max": (max, 2),
+    "pow": (math.pow, 2),
+    "pwr": (_pwr, 2),
+    "atan2": (math.atan2, 2),
+    "hypot": (math.hypot, 2),
+    "ternary_fcn": (lambda condition, yes, no: yes if condition else no, 3),
 }
+#: Names of functions in ngspice 39, where a parameter of such a name is not read: `{max + 1}` is 1.
+RESERVED = frozenset((*FUNCTIONS, "agauss", "aunif", "gauss", "limit", "unif"))

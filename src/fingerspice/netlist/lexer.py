@@ -220,11 +220,13 @@ def group(line: Line, lexemes: list[Lexeme], plain: int = 0, *, probes: bool = F
     inside, brackets = top, list[tuple[Lexeme, Group]]()
     index, count = 0, len(lexemes)
     while index < count:
-        lexeme = lexemes[index]
-        following = lexemes[index + 1].kind if index + 1 < count else ""
+        lexeme, after = lexemes[index], index + 1
+        if len(top.words) < plain and lexeme.kind == "word":
+            lexeme, after = _with_brackets(lexemes, index)
+        following = lexemes[after].kind if after < count else ""
         probe = _probe(lexemes, index) if probes and following == "(" else None
         if probe is not None or (following == "=" and lexeme.kind not in _MARKS):
-            key, equals = probe or (lexeme, index + 1)
+            key, equals = probe or (lexeme, after)
             _assign(line, inside, key, lexemes, equals)
             index = equals + 2
             continue
@@ -233,14 +235,14 @@ def group(line: Line, lexemes: list[Lexeme], plain: int = 0, *, probes: bool = F
         elif lexeme.kind in _MARKS:
             inside = _closed(line, lexeme, brackets)
         elif following == "(" and _may_be_called(lexeme) and len(top.words) >= plain:
-            brackets.append((lexemes[index + 1], inside))
+            brackets.append((lexemes[after], inside))
             inside = _call(line, lexeme, inside, top)
-            index += 1
+            after += 1
         else:
             if inside.params and inside.stray is None:
                 inside.stray = lexeme
             inside.words.append(lexeme)
-        index += 1
+        index = after
     if brackets:
         raise InputError("'(' is never closed", line.where(brackets[-1][0].position))
     return top
@@ -268,16 +270,30 @@ def _call(line: Line, name: Lexeme, inside: Group, top: Group) -> Group:
     return call
 
 
+def _with_brackets(lexemes: list[Lexeme], index: int) -> tuple[Lexeme, int]:
+    """A word with the brackets and words that touch it, as in KiCad's `Net-(C1-Pad1)`, and the index after it."""
+    name, end, depth = lexemes[index].text, index + 1, 0
+    closed = name, end
+    while end < len(lexemes) and lexemes[end].kind in ("(", ")", "word"):
+        piece = lexemes[end]
+        depth += {"(": 1, ")": -1}.get(piece.kind, 0)
+        if depth < 0 or piece.position != lexemes[index].position + len(name):
+            break
+        name, end = name + piece.text, end + 1
+        closed = (name, end) if depth == 0 else closed
+    return lexemes[index]._replace(text=closed[0]), closed[1]
+
+
 def _probe(lexemes: list[Lexeme], index: int) -> tuple[Lexeme, int] | None:
     """`v ( node )` before an `=`, as one lexeme, and the index of that `=`."""
-    end = index + 2
+    end, nodes = index + 2, list[str]()
     while end < len(lexemes) and lexemes[end].kind == "word":
-        end += 1
+        node, end = _with_brackets(lexemes, end)
+        nodes.append(node.text)
     if end + 1 >= len(lexemes) or lexemes[end].kind != ")" or lexemes[end + 1].kind != "=":
         return None
-    nodes = ",".join(lexeme.text for lexeme in lexemes[index + 2 : end])
     name = lexemes[index]
-    return Lexeme("probe", f"{name.text}({nodes})", name.position), end + 1
+    return Lexeme("probe", f"{name.text}({','.join(nodes)})", name.position), end + 1
 
 
 def _assign(line: Line, inside: Group, key: Lexeme, lexemes: list[Lexeme], equals: int) -> None:

@@ -30,6 +30,7 @@ def read_netlist(path: str | Path) -> Circuit:
     Parameters
     ----------
     path : str or Path
+        A file, or ``-`` for standard input.
 
     Raises
     ------

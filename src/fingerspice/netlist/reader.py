@@ -13,7 +13,7 @@ from fingerspice.circuit.devices import layer_devices
 from fingerspice.netlist.files import MAX_BYTES, NATIVE_LIBRARIES, inside, library_changed, read_text
 from fingerspice.netlist.lexer import Group, Lexeme, Line, group, lex, logical_lines, split_lines
 from fingerspice.netlist.scope import Formula, param_formulas
-from fingerspice.netlist.slips import ELSEWHERE, decimal_comma
+from fingerspice.netlist.slips import ELSEWHERE, decimal_comma, greek_mu
 from fingerspice.netlist.spelling import nearest
 
 #: Limits of a netlist with its included files: a word takes up to 500 bytes of memory, and a line 200.
@@ -26,8 +26,8 @@ MAX_INCLUDE_DEPTH = 32
 #: Directives without effect here: those in UNUSED cause a warning; those in SILENT only matter to other simulators.
 UNUSED = (".print", ".plot", ".save", ".probe", ".meas", ".measure", ".title")
 SILENT = (".nodeset", ".backanno")
-ANALYSES = (".tran", ".ac", ".ic", ".options", ".option")
-STRUCTURE = (".param", ".subckt", ".ends", ".include", ".inc", ".lib", ".control", ".end")
+ANALYSES = (".tran", ".ac", ".options", ".option")
+STRUCTURE = (".ic", ".param", ".subckt", ".ends", ".include", ".inc", ".lib", ".control", ".end")
 DIRECTIVES = (*ANALYSES, *STRUCTURE, *UNUSED, *SILENT, ".endc")
 
 
@@ -41,6 +41,7 @@ class Subcircuit:
     defaults: list[Formula] = field(default_factory=list)
     elements: list[Line] = field(default_factory=list)
     params: list[Formula] = field(default_factory=list)
+    starts: list[tuple[Line, int]] = field(default_factory=list)  # .ic lines, and the positions of their arguments
     inner: dict[str, Subcircuit] = field(default_factory=dict)
     skipped: bool = False  # has a native device's name, or is inside such a definition: its body is not read
     called: bool = False
@@ -119,9 +120,10 @@ class Reader:
         if self._words > MAX_WORDS:
             problem = f"the netlist has more than {MAX_WORDS:,} words and brackets; allowed: no more"
             raise InputError(f"{problem}, samples go in by Python: fs.Samples(values, rate)", _place(line))
-        comma = decimal_comma(line.text) if "," in line.text and not self._open[-1].skipped else None
-        if comma:
-            self.warn(comma, _place(line))
+        for sign, slip in (",", decimal_comma), ("μ", greek_mu):
+            note = slip(line.text) if sign in line.text and not self._open[-1].skipped else None
+            if note:
+                self.warn(note, _place(line))
         if word[0] != ".":
             here = self._open[-1]
             if not here.skipped:
@@ -150,11 +152,13 @@ class Reader:
         elif word in (".param", ".params"):
             here.params.extend(param_formulas(line, rest))
             here.characters += len(line.text)
+        elif word == ".ic":
+            here.starts.append((line, rest))
         elif word in (".include", ".inc", ".lib"):
             self._include(word, line, rest, folder)
         elif word in UNUSED:
             self.unused[word] = None
-        elif word in SILENT:
+        elif word in SILENT or (word == ".global" and set(line.text[rest:].lower().split()) <= {"gnd", "0"}):
             pass
         elif word in ANALYSES:
             if here is not self.root:

@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import parse_number, suspicious_mega
 from fingerspice.netlist.expressions import Expression, compile_expression
-from fingerspice.netlist.functions import CONSTANTS
+from fingerspice.netlist.functions import CONSTANTS, RESERVED
 from fingerspice.netlist.lexer import Group, Lexeme, Line
 
 _NUMERIC = re.compile(r"[+-]|\.?[0-9]")
@@ -115,6 +115,9 @@ class Scope:
     def define(self, formula: Formula) -> None:
         """Enter a definition. `solve` evaluates it later, so that the order of definitions does not matter."""
         name = formula.name.lower()
+        if name in RESERVED:
+            problem = f"parameter '{formula.name}' has the name of a function of ngspice; allowed: another name"
+            raise InputError(problem, formula.where)
         if name in self._formulas:
             first = self._formulas[name].where
             raise InputError(f"parameter '{formula.name}' is defined twice, first at {first}", formula.where)
@@ -224,6 +227,8 @@ class Scope:
         if lexeme.kind == "expression":
             return self.number(line, lexeme)
         text = lexeme.text
+        if bare == "arithmetic" and _PLAIN_NUMBER.fullmatch(text):
+            return self.number(line, lexeme)
         if bare != "nothing" and self._is_arithmetic(text):
             if bare == "name" and self._find(text.lower()) is None:
                 raise InputError(f"arithmetic goes in braces: {{{text}}}", where)

@@ -41,6 +41,7 @@ _CALL = re.compile(r"\(([^()]*)\)")
 _COMMA = re.compile(r"(?<![\w.,])([+-]?[0-9]+),([0-9]+[a-zµμ]*)(?![\w.,])", re.IGNORECASE)
 _ASSIGNED = re.compile(rf"=\s*{_COMMA.pattern}", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?\.?[0-9][\w.+-]*")
+_GREEK_MU = re.compile(r"(?<![\w.])([0-9.]+(?:e[+-]?[0-9]+)?)μ", re.IGNORECASE)
 _UNIT = re.compile(r"(?:[tgkmunpfµμ]|meg|mil)?(?:m|v|a|s|n|f|hz|ohm|ω)?", re.IGNORECASE)
 
 
@@ -59,6 +60,12 @@ def decimal_comma(text: str) -> str | None:
                 f"write {whole}.{part}"
             )
     return None
+
+
+def greek_mu(text: str) -> str | None:
+    """A warning about a number with the Greek letter for micro, which ngspice does not read; None if there is none."""
+    found = _GREEK_MU.search(text)
+    return f"{found[0]} is {found[1]}u here and {found[1]} in ngspice 39: write {found[1]}u" if found else None
 
 
 def _among_blanks(bare: str) -> Iterator[re.Match[str] | None]:

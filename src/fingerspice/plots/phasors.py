@@ -34,6 +34,8 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
     -------
     Picture
     """
+    if results[0].nodes:
+        return _plot_nodes(results[0], circuit)
     figure, axes = drawing.new_figure(2, 2, height=4.6, sharex=True)
     forces = np.concatenate([r.f_el_mean for r in results])
     factor, unit = drawing.engineering(drawing.peak_of(forces[np.isfinite(forces)]), "N", 0.05)
@@ -69,6 +71,26 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
     drive = f"{amplitude:.4g} V" if np.isfinite(amplitude) else "no fundamental"
     how = f"source amplitude {drive}" if len(results) == 1 else "several source amplitudes"
     drawing.caption(figure, " · ".join(p for p in (heading(circuit), how, outside) if p))
+    return figure
+
+
+def _plot_nodes(result: PhasorSolution, circuit: Circuit) -> Picture:
+    """Amplitude and phase of every node's voltage against frequency."""
+    assert result.v_nodes is not None
+    figure, axes = drawing.new_figure(2, 1, height=4.6, sharex=True)
+    order = np.argsort(result.frequency)
+    v = result.v_nodes[order]
+    marker = "o" if order.size < 12 else ""
+    for ax, values, label in (axes[0], np.abs(v), "Node voltage [V]"), (axes[1], np.degrees(np.angle(v)), "Phase [°]"):
+        ax.plot(result.frequency[order], values, linewidth=1.5, marker=marker, label=result.nodes)
+        drawing.dress(ax, label)
+        ax.set_xscale("log")
+    if np.all(np.abs(v).max(axis=0) > 0.0):
+        axes[0].set_yscale("log")
+    axes[0].legend(fontsize=drawing.FONT, frameon=False)
+    axes[1].set_xlabel("Frequency [Hz]", fontsize=drawing.FONT)
+    outside = _mark_extrapolation(axes, np.sort(result.frequency), circuit)
+    drawing.caption(figure, " · ".join(p for p in (heading(circuit), result.drive, outside) if p))
     return figure
 
 

@@ -46,7 +46,11 @@ class PhasorSolution(Shown):
     circuit : Circuit or None
         The circuit of the sweep.
     impedance : ndarray of complex or None
-        Voltage of the source over its current, ohm; None for a large-signal sweep.
+        Voltage of the source over its current, ohm; None for a large-signal sweep or several sources.
+    nodes : tuple of str
+        Nodes of a circuit without GAP, for which figures of a gap are NaN; empty with a GAP.
+    v_nodes : ndarray of complex or None, shape (n_frequency, n_node)
+        Their complex amplitudes, V.
     """
 
     frequency: FloatArray
@@ -63,6 +67,8 @@ class PhasorSolution(Shown):
     warnings: tuple[str, ...] = ()
     circuit: Circuit | None = None
     impedance: ComplexArray | None = None
+    nodes: tuple[str, ...] = ()
+    v_nodes: ComplexArray | None = None
 
     def _page(self) -> Page:
         from fingerspice.results.report import phasor_table
@@ -70,7 +76,7 @@ class PhasorSolution(Shown):
         return phasor_table(self, most=20)
 
     def plot(self) -> Figure:
-        """Gain, phase, mean force and area against frequency."""
+        """Gain, phase, mean force and area, or without GAP the node voltages, against frequency."""
         from fingerspice.plots.phasors import plot_phasor
 
         require(self.circuit is not None, "circuit", self.circuit, "a sweep that phasor or large_signal made")

@@ -6,7 +6,7 @@ import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -112,13 +112,20 @@ def plan_text(plan: Plan, circuit: Circuit | None = None) -> Page:
 
 def phasor_dict(result: PhasorSolution) -> dict[str, Any]:
     """A sweep as plain data, SI units."""
-    return {
-        "frequency": result.frequency.tolist(),
+    own: dict[str, Any] = {
         "gain": np.abs(result.gain).tolist(),
         "phase_deg": np.degrees(np.angle(result.gain)).tolist(),
         "u_gap": np.abs(result.u_gap).tolist(),
         "area": result.area.tolist(),
         "f_el_mean": result.f_el_mean.tolist(),
+    }
+    if result.v_nodes is not None:
+        amplitudes, phases = np.abs(result.v_nodes.T), np.degrees(np.angle(result.v_nodes.T))
+        own = {f"v:{node}": v.tolist() for node, v in zip(result.nodes, amplitudes, strict=True)}
+        own |= {f"phase_deg:{node}": phase.tolist() for node, phase in zip(result.nodes, phases, strict=True)}
+    return {
+        "frequency": result.frequency.tolist(),
+        **own,
         "impedance": None if result.impedance is None else np.abs(result.impedance).tolist(),
         "impedance_phase_deg": None if result.impedance is None else np.degrees(np.angle(result.impedance)).tolist(),
         "amplitude": result.amplitude,
@@ -134,28 +141,39 @@ def phasor_tables(results: Sequence[PhasorSolution], circuit: Circuit) -> str:
     return "\n\n".join([heading(circuit), *(phasor_table(r) for r in results)])
 
 
+#: Columns of a sweep: the key of `phasor_dict`, its unit, and heading, factor and format in a table.
+_Column: TypeAlias = tuple[str, str, str, float, str]
+_GAP_COLUMNS: tuple[_Column, ...] = (
+    ("gain", "1", "|u_gap/U|", 1.0, ".5f"),
+    ("phase_deg", "deg", "phase [deg]", 1.0, ".3f"),
+    ("u_gap", "V", "u_gap [V]", 1.0, ".5g"),
+    ("area", "m^2", "area [mm^2]", 1e6, ".5g"),
+    ("f_el_mean", "N", "mean force [N]", 1.0, ".5g"),
+)
+_IMPEDANCE_COLUMNS: tuple[_Column, ...] = (
+    ("impedance", "ohm", "|Z| [ohm]", 1.0, ".5g"),
+    ("impedance_phase_deg", "deg", "phase of Z [deg]", 1.0, ".3f"),
+)
+
+
+def _columns(result: PhasorSolution) -> list[_Column]:
+    """Columns of a sweep; the amplitude, without heading, only belongs into files."""
+    out: list[_Column] = [("frequency", "Hz", "frequency [Hz]", 1.0, ".6g")]
+    for node in result.nodes:
+        out.append((f"v:{node}", "V", f"|v({node})| [V]", 1.0, ".5g"))
+        out.append((f"phase_deg:{node}", "deg", "phase [deg]", 1.0, ".3f"))
+    out.extend(() if result.nodes else _GAP_COLUMNS)
+    out.append(("amplitude", "V", "", 1.0, ""))
+    return [*out, *(() if result.impedance is None else _IMPEDANCE_COLUMNS)]
+
+
 def phasor_table(result: PhasorSolution, most: int = 40) -> Page:
     """A sweep as a table; of a long one, only every n-th row, so that at most `most` rows remain."""
     data = phasor_dict(result)
     keep = range(0, result.frequency.size, max(1, -(-result.frequency.size // most)))
-    rows = [
-        (
-            f"{data['frequency'][i]:.6g}",
-            f"{data['gain'][i]:.5f}",
-            f"{data['phase_deg'][i]:.3f}",
-            f"{data['u_gap'][i]:.5g}",
-            f"{1e6 * data['area'][i]:.5g}",
-            f"{data['f_el_mean'][i]:.5g}",
-            *(
-                ()
-                if result.impedance is None
-                else (f"{data['impedance'][i]:.5g}", f"{data['impedance_phase_deg'][i]:.3f}")
-            ),
-        )
-        for i in keep
-    ]
-    head: tuple[str, ...] = ("frequency [Hz]", "|u_gap/U|", "phase [deg]", "u_gap [V]", "area [mm^2]", "mean force [N]")
-    head += () if result.impedance is None else ("|Z| [ohm]", "phase of Z [deg]")
+    columns = [column for column in _columns(result) if column[2]]
+    head = tuple(heading for _, _, heading, *_ in columns)
+    rows = [tuple(f"{factor * data[key][i]:{form}}" for key, _, _, factor, form in columns) for i in keep]
     drive = f"source amplitude {format_si(result.amplitude, 'V')}, phase {math.degrees(result.phase):.4g} deg"
     said = [f"{drive}: {result.drive}", *result.notes]
     return Page([*said, Table(head, rows)])
@@ -163,17 +181,7 @@ def phasor_table(result: PhasorSolution, most: int = 40) -> Page:
 
 def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:
     """Write sweeps as CSV, one after the other where there are several amplitudes."""
-    units = {
-        "frequency": "Hz",
-        "gain": "1",
-        "phase_deg": "deg",
-        "u_gap": "V",
-        "area": "m^2",
-        "f_el_mean": "N",
-        "amplitude": "V",
-    }
-    if all(result.impedance is not None for result in results):
-        units |= {"impedance": "ohm", "impedance_phase_deg": "deg"}
+    units = {key: unit for key, unit, *_ in _columns(results[0])}
 
     def write(target: Path) -> None:
         with target.open("w", newline="", encoding="utf-8") as stream:

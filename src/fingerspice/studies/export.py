@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -85,9 +86,9 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
 
 
 def _name(name: str) -> str:
-    # In ngspice a dot in a name separates a subcircuit from its element, but this deck is flat: replace it. A node
-    # named temper makes ngspice exit.
-    return "temper_" if name.lower() == "temper" else name.replace(".", "_")
+    # In ngspice a dot in a name separates a subcircuit from its element, but this deck is flat: replace it. In the
+    # library's formulas a bracket or an operator ends a name. A node named temper makes ngspice exit.
+    return "temper_" if name.lower() == "temper" else re.sub(r"\W", "_", name)
 
 
 def _element_name(element: Element) -> str:

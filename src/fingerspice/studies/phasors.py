@@ -12,7 +12,8 @@ from fingerspice.base.arrays import FloatArray, positive_row
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import Parameters, Sources, area_given, overridden
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.response import linear_scene, with_skin_held
+from fingerspice.circuit.network import build_network
+from fingerspice.circuit.response import areas_at_rest, linear_scene, with_skin_held
 from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.results.phasor_solution import PhasorSolution
 from fingerspice.studies.sweeps import sweep_drive, sweep_notes
@@ -70,6 +71,7 @@ def phasor(
         ``AC magnitude [phase]``, as in ngspice; without AC, or without frequencies, it is the source's fundamental.
     sources, parameters
         As in `simulate`.
+        Without a GAP the result has the node voltages, and every source's AC counts.
     area : str or float
         ``"mean"``: the area under the mean stress at the amplitude of the source's fundamental; ``"frozen"``: the area
         at 0 V; or an area in m^2. An area that the deck fixes takes precedence over ``"mean"`` and ``"frozen"``.
@@ -85,12 +87,14 @@ def phasor(
     Raises
     ------
     InputError
-        If the circuit has no GAP, none of several GAPs is named, a network has several sources, a fundamental is needed
-        and missing, a frequency or the area is not positive, or a result is not finite.
+        If none of several GAPs is named, a network with a GAP has several sources, a fundamental is needed and missing,
+        a frequency or the area is not positive, or a result is not finite.
     """
     require(skin in ("swept", "own"), "skin", repr(skin), "'swept' or 'own'")
     area = area_given(area)
     circuit = overridden(circuit, sources, parameters)
+    if finger is None and not circuit.by_device("GAP"):
+        return _of_nodes(circuit if skin == "swept" else with_skin_held(circuit), frequency, area, skin)
     scene = linear_scene(circuit if skin == "swept" else with_skin_held(circuit), finger)
     f = _frequencies(frequency, scene.fundamental)
     drive = sweep_drive(scene.sources, scene.fundamental, frequency is not None)
@@ -113,4 +117,31 @@ def phasor(
     return PhasorSolution(
         f, gain, layers, u_gap, own, force, drive.amplitude, scene.layers, drive.phase, drive.text, notes, warned,
         circuit, impedance,
+    )  # fmt: skip
+
+
+def _of_nodes(circuit: Circuit, frequency: ArrayLike | None, area: str | float, skin: str) -> PhasorSolution:
+    """Node voltages of a circuit without GAP, at the areas that it gives, under the AC of its sources as in ngspice."""
+    network = build_network(circuit)
+    alone = network.sources[0] if len(network.sources) == 1 else None
+    fundamental = None if alone is None or alone.waveform is None else alone.waveform.fundamental
+    f = _frequencies(frequency, fundamental)
+    drive = sweep_drive(tuple((e, 1.0) for e in network.sources), fundamental, frequency is not None)
+    if math.isnan(drive.amplitude):
+        raise InputError("no source has an amplitude; allowed: AC on a source, such as V1 in 0 AC 1, or one sine")
+    s = np.array([drive.amplitude * np.exp(1j * drive.phase)])
+    if alone is None:
+        s = np.array([0.0 if e.ac is None else e.ac.phasor for e in network.sources], complex)
+    areas = areas_at_rest(network) if isinstance(area, str) else np.full(len(network.areas), area)
+    with np.errstate(all="ignore"):
+        v = np.array([network.node_phasors(float(x), areas, s) for x in f])
+        impedance = None if alone is None else np.array([network.impedance(float(x), areas) for x in f])
+    _refuse_no_number(f, v)
+    notes, warned = sweep_notes(circuit, f, skin)
+    for text in warned:
+        warnings.warn(text, FingerspiceWarning, stacklevel=3)
+    none = np.full(f.size, math.nan)
+    return PhasorSolution(
+        f, none + 0j, np.zeros((f.size, 0), complex), none + 0j, none, none, drive.amplitude, (), drive.phase,
+        drive.text, notes, warned, circuit, impedance, network.node_names, v,
     )  # fmt: skip

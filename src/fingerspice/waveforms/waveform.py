@@ -179,6 +179,15 @@ class Waveform:
     def __rmul__(self, other: float) -> Waveform:
         return _combined("Product", other, self)
 
+    def __neg__(self) -> Waveform:
+        return -1.0 * self
+
+    def __sub__(self, other: Waveform | float) -> Waveform:
+        return self + -as_waveform(other)
+
+    def __rsub__(self, other: float) -> Waveform:
+        return other + -self
+
 
 def _combined(kind: str, first: Waveform | float, second: Waveform | float) -> Waveform:
     # Imported here because `combinations` imports this module.
