@@ -139,13 +139,12 @@ def run(
         circuit, start = options.with_times(circuit, stop, start)
         if circuit.tran is None:
             raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
-        if stop is None:
-            options.warn_of_rest(circuit, source)
+        t_stop = None if stop is None else circuit.tran.stop
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         if stream or chunk or signals or netcdf:
             options.check_streamed(stream, csv=csv, feel=feel, schematic=schematic)
             how = {"charge_law": charge_law, "area": area_from_text(area), "rtol": rtol}
-            how |= {"method": method, "start": start}
+            how |= {"method": method, "start": start, "t_stop": t_stop}
             run_streamed(answer, results, circuit, how, chunk=chunk, signals=signals, netcdf=netcdf)
             return
         data = results.file(".csv" if csv else ".nc")
@@ -154,7 +153,7 @@ def run(
         touch = Touch(circuit, None if no_plot else results) if feel else None
         with progress() as update:
             solution = simulate(
-                circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method,
+                circuit, t_stop=t_stop, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method,
                 start=start, jumps=jumps, throw=False, progress=update,
             )  # fmt: skip
         if as_json:

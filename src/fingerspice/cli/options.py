@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -178,24 +177,6 @@ def check_streamed(stream: bool, **others: bool) -> None:
     for name, given in others.items():
         if given:
             raise InputError(f"--{name} does not go with --stream, which writes Zarr; allowed: --netcdf beside it")
-
-
-def warn_of_rest(circuit: Circuit, sources: Sequence[str] | None) -> None:
-    """Warn where a recording given by ``--source`` is longer than the run, which ends at the deck's TSTOP."""
-    from fingerspice.waveforms.samples import Samples
-
-    stop = circuit.tran.stop if circuit.tran is not None else math.inf
-    for element in circuit.elements if sources else ():
-        wave = element.waveform
-        if element.name in circuit.overrides and isinstance(wave, Samples):
-            end = wave.start + (wave.count - 1) / wave.rate
-            if end > stop + 1.0 / wave.rate:
-                warnings.warn(
-                    f"{element.name}: the recording ends at {end:g} s, and the run at the deck's TSTOP = {stop:g} s; "
-                    f"--stop {end:.9g} takes all of it",
-                    FingerspiceWarning,
-                    stacklevel=2,
-                )
 
 
 def time_from_text(option: str, text: str | None) -> float | None:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from fingerspice.circuit.circuit import Element
-from fingerspice.circuit.notices import circuit_warnings
+from fingerspice.circuit.notices import circuit_warnings, course_warnings, driving
 from fingerspice.circuit.spectrum import spectrum_warning
 from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.physics.contact import inverse_area
@@ -16,7 +16,6 @@ from fingerspice.results.outcome import Status
 from fingerspice.results.record import Record
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run
-from fingerspice.waveforms.waveform import DC
 
 BREAKDOWN_VOLTAGE = 300.0
 # Smallest contact area without a warning, relative to the area at 0 V.
@@ -28,7 +27,9 @@ NEAR_FOLD = 0.2
 def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Warnings for every limit of the model that the run exceeds."""
     yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit, problem.t_stop))
-    yield from problem.circuit.remember(("source", problem.t_stop), lambda: tuple(_source_warnings(problem)))
+    key = ("source", problem.t_start, problem.t_stop, problem.by_deck)
+    yield from problem.circuit.remember(key, lambda: tuple(_source_warnings(problem)))
+    yield from _off_warning(problem, run)
     net, several = problem.scene.net, len(record.fingers) > 1
     for finger, (name, contact) in enumerate(record.fingers):
         i, (u_peak, f_peak, u_error, _) = problem.network.fingers[finger], run.gaps[finger].tolist()
@@ -52,18 +53,28 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
 
 
 def _source_warnings(problem: Problem) -> Iterator[str]:
-    """Warnings about sources beyond the band of the skin's data, and about sources that drive sweeps only."""
+    """Warnings about sources that miss the run, and about sources beyond the band of the skin's data."""
+    yield from course_warnings(problem.circuit, problem.t_start, problem.t_stop, problem.by_deck)
     outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
     if outside is not None:
         yield outside
-    areas = {e.nodes[2] for e in problem.circuit.elements if e.spec.is_layer}
-    drives = [e for e in problem.circuit.by_device("V", "I") if areas.isdisjoint(e.nodes)]
-    small = ", ".join(e.name for e in drives if e.ac is not None)
-    if small and all(e.waveform == DC(0.0) for e in drives):
-        yield (
-            f"the sources are 0 all the time: {small} has AC alone, which drives sweeps (fingerspice ac); a sine in "
-            "time is SIN(VO VA FREQ)"
-        )
+
+
+def _off_warning(problem: Problem, run: Run) -> Iterator[str]:
+    """A warning about sources that are 0 in the whole run, unless a charge of the start drives it."""
+    currents = problem.waveforms[problem.network.n_voltage :]
+    peaks = (problem.scene.u_peak, *(wave.peak(problem.t_start, problem.t_stop) for wave in currents))
+    if run.status is Status.SUCCESS and problem.waveforms and not (any(peaks) or run.gaps[:, 0].any()):
+        small = ", ".join(e.name for e in driving(problem.circuit) if e.ac is not None)
+        if small:
+            yield (
+                f"the sources are 0 all the time: {small} has AC alone, which drives sweeps (fingerspice ac); a sine "
+                "in time is SIN(VO VA FREQ)"
+            )
+        elif not problem.initial.y.any() and not any(
+            problem.t_stop <= wave.course[0] < math.inf for wave in problem.waveforms
+        ):
+            yield "the sources are 0 all the time, and nothing is charged: every voltage is 0"
 
 
 def _gap_warnings(where: str, peak: float, unloaded: float, least: float) -> Iterator[str]:
