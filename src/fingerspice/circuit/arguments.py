@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -14,7 +15,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
-from fingerspice.waveforms.waveform import DC, Waveform
+from fingerspice.waveforms.waveform import DC, Waveform, require
 
 #: A waveform, a constant (V, or A of a current source), or a function of time (s).
 Source = Waveform | float | Callable[[float], float]
@@ -105,15 +106,18 @@ def require_number(what: str, given: Any, allowed: str) -> None:
 
 
 def require_area(area: Any) -> None:
-    """Refuse an area that is neither a text nor a number; the model checks whether a text names one of its modes.
+    """Refuse an area that is neither one of the model's modes nor a positive number.
 
     Raises
     ------
     InputError
         If it is neither; the message names the given value.
     """
-    if not isinstance(area, str):
-        require_number("area", area, "'coupled', 'mean', 'frozen' or a number in m^2")
+    if isinstance(area, str):
+        require(area in ("coupled", "mean", "frozen"), "area", repr(area), "'coupled', 'mean', 'frozen' or m^2")
+        return
+    require_number("area", area, "'coupled', 'mean', 'frozen' or a number in m^2")
+    require(math.isfinite(area) and area > 0.0, "area", f"{area:g} m^2", "a positive area in m^2")
 
 
 def times_given(what: str, given: ArrayLike | None) -> FloatArray | None:

@@ -1,4 +1,4 @@
-"""Source functions of a netlist as waveforms: SPICE's own, SQUARE, CHIRP, BURST and recordings; and ``AC``."""
+"""Source functions of a netlist as waveforms: SPICE's own, SQUARE and others, and recordings; and ``AC``."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from fingerspice.netlist.deck import Call, Number, Token
 from fingerspice.netlist.files import SourceFiles
 from fingerspice.netlist.slips import is_unit
 from fingerspice.netlist.spelling import nearest
+from fingerspice.waveforms.combinations import AM
 from fingerspice.waveforms.files import read_table
-from fingerspice.waveforms.periodic import Pulse, Square
+from fingerspice.waveforms.periodic import Pulse, Sawtooth, Square, Triangle
 from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.repeated import Burst, Repeat
 from fingerspice.waveforms.samples import Samples
@@ -31,6 +32,7 @@ _KEPT_BYTES = 2**25  # A larger WAV file is read in parts when needed: 32 MiB ar
 _ALIASES = {"sine": "sin", "wav": "wavefile"}
 _CHIRP = ("amplitude", "f0", "f1", "duration")
 _BURST = ("amplitude", "frequency", "cycles", "every")
+_AM = ("amplitude", "carrier", "envelope", "depth")
 
 
 @dataclass(frozen=True)
@@ -43,11 +45,14 @@ class Context:
         TSTEP and TSTOP of the deck (s), on which SPICE's defaults depend; None without a .tran line.
     files : SourceFiles
         Finds recordings and tables.
+    in_deck : bool
+        Whether the text stands in a deck, which a SPICE may read, too.
     """
 
     step: float | None = None
     stop: float | None = None
     files: SourceFiles = field(default_factory=SourceFiles)
+    in_deck: bool = True
 
 
 @dataclass(frozen=True)
@@ -230,6 +235,19 @@ def _square(call: Call, context: Context) -> Waveform:
     return Square(a.get("amplitude"), a.get("frequency"), a.get("duty", 0.5))
 
 
+def _straight(call: Call, context: Context) -> Waveform:
+    a = _Arguments(call, ("amplitude", "frequency"), 2, context)
+    return (Triangle if _kind(call) == "triangle" else Sawtooth)(a.get("amplitude"), a.get("frequency"))
+
+
+def _am(call: Call, context: Context) -> Waveform:
+    if context.in_deck:
+        raise InputError("AM changed its argument order between ngspice versions; write the waveform as PWL, or give "
+                         "it by --source or in Python", call.where)  # fmt: skip
+    a = _Arguments(call, _AM, 3, context)
+    return AM(a.get("amplitude"), a.get("carrier"), a.get("envelope"), a.get("depth", 1.0))
+
+
 def _chirp(call: Call, context: Context) -> Waveform:
     a = _Arguments(call, _CHIRP, 4, context)
     return Chirp(*(a.get(name) for name in _CHIRP))
@@ -249,6 +267,9 @@ SOURCES: dict[str, Callable[[Call, Context], Waveform]] = {
     "exp": _exp,
     "pwl": _pwl,
     "square": _square,
+    "triangle": _straight,
+    "sawtooth": _straight,
+    "am": _am,
     "chirp": _chirp,
     "burst": _burst,
     "wavefile": _wavefile,
@@ -263,7 +284,6 @@ _OF_FILES = {
 }
 
 _REFUSED = {
-    "am": "AM changed its argument order between ngspice versions; write the waveform as PWL, or give it in Python",
     "sffm": "SFFM changed its argument order between ngspice versions; write the waveform as PWL",
 }
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Element
 from fingerspice.circuit.notices import circuit_warnings, course_warnings, driving
 from fingerspice.circuit.spectrum import spectrum_warning
@@ -16,12 +17,17 @@ from fingerspice.results.outcome import Status
 from fingerspice.results.record import Record
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run
+from fingerspice.solve.sources import shortest_event
+from fingerspice.waveforms.sampling import Function
 
 BREAKDOWN_VOLTAGE = 300.0
 # Smallest contact area without a warning, relative to the area at 0 V.
 LEAST_AREA = 0.2
 # Smallest distance to the fold of the mobile law without a warning: a voltage a few percent larger reaches the fold.
 NEAR_FOLD = 0.2
+# Shortest event (s) in a user's function that may be missed without a warning, half a period of 10 kHz: drives of a
+# screen have few that are shorter.
+_EVENT = 0.5 / 10e3
 
 
 def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
@@ -55,6 +61,13 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
 def _source_warnings(problem: Problem) -> Iterator[str]:
     """Warnings about sources that miss the run, and about sources beyond the band of the skin's data."""
     yield from course_warnings(problem.circuit, problem.t_start, problem.t_stop, problem.by_deck)
+    event = shortest_event(problem)
+    plain = any(isinstance(wave, Function) and not wave.breaks for wave in problem.waveforms)
+    if plain and event > _EVENT:
+        yield (
+            f"the source is a function, which was looked at every {format_si(event, 's')}: an event shorter than that "
+            "may have been missed; give Function(f, breaks=(...)) its edges, or the circuit a .tran of a shorter TSTEP"
+        )
     outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
     if outside is not None:
         yield outside

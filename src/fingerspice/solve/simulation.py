@@ -117,8 +117,7 @@ def simulate(
     SolveError
         Where the run failed and `throw` is set; its `solution` holds the outputs before the failure.
     """
-    require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
-    check_method(method)
+    check_arguments(rtol, method, area, start, jumps)
     times = times_given("t_eval", t_eval)
     circuit = overridden(circuit, sources, parameters)
     problem = asked(
@@ -147,12 +146,9 @@ def asked(
     InputError
         For a request that cannot be run.
     """
-    _check_rtol(rtol)
+    check_arguments(rtol, area=area, start=start)
     if t_stop is not None:
         require_number("t_stop", t_stop, "a number in s")
-    require_area(area)
-    known = isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)
-    require(known, "start", repr(start), f"{', '.join(map(repr, STARTS))} or a Solution")
     if isinstance(start, Solution) and start.stored is not None:
         raise InputError("start is a solution read from a file, which a run cannot go on from; allowed: one just made")
     first = "uncharged" if start == "periodic" else start
@@ -167,9 +163,27 @@ def asked(
     return problem
 
 
-def _check_rtol(rtol: float) -> None:
+def check_arguments(
+    rtol: float,
+    method: str = "auto",
+    area: str | float = "coupled",
+    start: str | Solution = "deck",
+    jumps: str = "both",
+) -> None:
+    """Refuse arguments of `simulate` that no circuit can run with.
+
+    Raises
+    ------
+    InputError
+        For the first of them.
+    """
+    require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
+    check_method(method)
     good = isinstance(rtol, (int, float)) and RTOL_RANGE[0] <= rtol <= RTOL_RANGE[1]
     require(good, "rtol", rtol, "1e-13 to 0.1")
+    require_area(area)
+    known = isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)
+    require(known, "start", repr(start), f"{', '.join(map(repr, STARTS))} or a Solution")
 
 
 def check_method(method: str) -> None:
@@ -212,8 +226,7 @@ def plan(
     InputError
         For a request that cannot be run.
     """
-    _check_rtol(rtol)
-    require_area(area)
+    check_arguments(rtol, area=area)
     circuit = overridden(circuit, sources, parameters)
     if t_stop is None and circuit.tran is None:
         t_stop = 1.0

@@ -37,7 +37,7 @@ def _frequencies(frequency: ArrayLike | None, fundamental: Fundamental | None) -
 def _check_area(area: str | float, amplitude: float, fixed: bool) -> None:
     """Refuse an area that is neither a known mode nor a positive number, and ``"mean"`` without an amplitude."""
     if not isinstance(area, str):
-        require(math.isfinite(area) and area > 0.0, "area", f"{area:g} m^2", "a positive area in m^2")
+        require_area(area)
         return
     require(area in ("mean", "frozen"), "area", repr(area), "'mean', 'frozen' or a number in m^2")
     if area == "mean" and math.isnan(amplitude) and not fixed:
@@ -96,7 +96,6 @@ def phasor(
         and missing, a frequency or the area is not positive, or a result is not finite.
     """
     require(skin in ("swept", "own"), "skin", repr(skin), "'swept' or 'own'")
-    require_area(area)
     circuit = overridden(circuit, sources, parameters)
     scene = linear_scene(circuit if skin == "swept" else with_skin_held(circuit), finger)
     f = _frequencies(frequency, scene.fundamental)
