@@ -505,7 +505,7 @@ def test_chirps_and_bursts_are_those_of_python() -> None:
 
 
 def test_a_deck_with_a_recording_runs_as_the_samples_do(folder: Path) -> None:
-    Path("decks/pad.cir").write_text(table1_deck("WAVEFILE(mono.wav 100)", tran="50u 30m uic"))
+    Path("decks/pad.cir").write_text(table1_deck("WAVEFILE(mono.wav 100)", tran="50u 50m uic"))
     circuit = fs.read_netlist("decks/pad.cir")
     with pytest.warns(fs.FingerspiceWarning, match="has no fundamental"):
         by_deck = fs.simulate(circuit, rtol=1e-6)
