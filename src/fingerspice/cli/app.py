@@ -222,12 +222,12 @@ def ac(
         if area != "coupled":
             if amplitude:
                 raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
-            found = (phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger),)
+            found = [phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger)]
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         data = results.file("_ac.csv")
         picture = None if no_plot else results.file("_ac.png")
         if area == "coupled":
-            found = large_sweep(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger)
+            found = [*large_sweep(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger)]
         results.open()
         writes = [lambda: phasor_csv(found, data)]
         if picture is not None:

@@ -51,9 +51,9 @@ def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | Non
     # `simulate` gives these warnings itself, but commands that do not call it with this circuit would not.
     for text in directive_warnings(circuit):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
-    given = [name.removeprefix(".options ") for name in circuit.unused if name.startswith(".options ")]
-    if given:
-        complain(f"note: .options {', '.join(given)}: of no effect here, where --rtol alone sets the error")
+    others = [name.removeprefix(".options ") for name in circuit.unused if name.startswith(".options ")]
+    if others:
+        complain(f"note: .options {', '.join(others)}: of no effect here, where --rtol alone sets the error")
     return circuit
 
 
