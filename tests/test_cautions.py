@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,11 @@ from scipy.optimize import brentq
 
 import analytic as ref
 import fingerspice as fs
+from fingerspice.circuit.notices import course_warnings
 from fingerspice.circuit.spectrum import energy_outside, skin_error
 from fingerspice.waveforms.waveform import as_waveform
 from scenes import deck, table1, table1_deck
+from waveform_cases import CASES, Case
 
 every_kind = pytest.mark.parametrize("beside", ["", "Rbeside drive 0 1meg"], ids=["stack", "network"])
 
@@ -164,3 +167,90 @@ def test_a_source_that_is_not_named_stays_on_and_is_warned_about() -> None:
     assert run.u_source[0] == 20.0
     assert [text for text in run.warnings if "stays on" in text]
     assert of(circuit, sources={"Vdrive": fs.Sine(100, 5000), "Vbias": 0}) == []
+
+
+# Sources that miss the run ------------------------------------------------------------------------------------
+
+NOISE = np.random.default_rng(0).normal(0.0, 50.0, 2001)
+ROW = np.arange(2001)
+# A source, and what is said of it in a run of 1 ms.
+MISSING = {
+    "a clock's times": (fs.PWL(1.76e9 + 1e-3 * ROW, NOISE), "probably a clock's: subtract the first"),
+    "times in ms": (
+        fs.PWL(0.5 + 1e-3 * ROW, NOISE),
+        "Vdrive changes from 0.5 s to 2.5 s only, and covers nothing of the "
+        "run from 0 s to 0.001 s, in which it stays at 6.287; its times are probably in ms",
+    ),
+    "times in us": (fs.PWL(50.0 + ROW, NOISE), "probably in ms or us"),
+    "a late texture": (fs.Samples(NOISE, 1e6, start=2e-3), "a run to 0.004 s contains it"),
+    "before the run": (fs.Samples(NOISE, 1e6, start=-1.0), "from -1 s to -0.998 s only, and covers nothing"),
+    "a late burst": (fs.Burst(fs.Sine(100.0, 5e3), 1e-3, delay=2e-3), "it stays at 0; a run to 0.003 s contains it"),
+    "a late pulse": (fs.Pulse(5.0, 100.0, delay=2e-3), "from 0.002 s to 0.002 s only, and covers nothing"),
+    "late pulses": (fs.Pulse(5.0, 100.0, 2e-3, 0.0, 0.0, 1e-3, 2e-3), "from 0.002 s on only, and covers nothing"),
+    "a late sine": (fs.Sine(100.0, 1e3, offset=7.0, delay=2e-3), "in which it stays at 7"),
+    "a late step": (fs.Exp(3.0, 100.0, 2e-3, 1e-3, 3e-3, 1e-3), "in which it stays at 3"),
+    "a late part of a sum": (fs.Pulse(0.0, 9.0, delay=2e-3) + 5.0, "in which it stays at 5"),
+    "a short recording": (fs.Samples(NOISE[:101], 1e9), "0.01 % of the run to 0.001 s"),
+    "nothing": (fs.Samples(np.append(np.zeros(2001), NOISE), 1e6), "the sources are 0 all the time, and nothing is"),
+    "nothing of a function": (lambda t: 0.0 * t, "the sources are 0 all the time, and nothing is charged"),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.* has no fundamental")
+@pytest.mark.parametrize("name", MISSING)
+def test_a_source_that_misses_the_run_is_told_with_the_likely_slip(name: str) -> None:
+    source, said = MISSING[name]
+    told = [text for text in of(table1(), sources=source) if "Vdrive rate" not in text and "fundamental" not in text]
+    assert len(told) == 1, told
+    assert said in told[0]
+
+
+@pytest.mark.parametrize("source", [
+    fs.Burst(fs.Sine(100.0, 5e3), 2e-4, delay=1e-4), fs.PWL((0.0, 1e-6, 2e-6), (0.0, 50.0, 0.0)),
+    fs.Samples(NOISE[:101], 1e6, start=5e-4), fs.Pulse(0.0, 100.0, delay=-1.0), fs.DC(5.0),
+])  # fmt: skip
+def test_a_source_shorter_than_the_run_is_ordinary(source: fs.Waveform) -> None:
+    assert [text for text in of(table1(), sources=source) if "fundamental" not in text] == []
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_a_waveform_is_constant_before_and_after_its_course(case: Case) -> None:
+    first, last = case.waveform.course
+    for low, high in ((-1.0, min(first, 1e3)), (max(last, -1.0), 1e3)):
+        if low < high < math.inf:
+            t = np.random.default_rng(3).uniform(low, high, 200)
+            assert np.ptp(case.waveform.value(t)) == 0.0
+
+
+@pytest.mark.parametrize(
+    "path", sorted(Path(__file__).parents[1].joinpath("circuits").glob("*.cir")), ids=lambda p: p.stem
+)
+def test_no_source_of_a_shipped_deck_misses_its_run(path: Path) -> None:
+    circuit = fs.read_netlist(path)
+    assert circuit.tran is not None
+    assert list(course_warnings(circuit, 0.0, circuit.tran.stop, by_deck=True)) == []
+
+
+def test_a_recording_that_the_decks_own_end_cuts_off_is_told() -> None:
+    circuit = table1("PWL(" + " ".join(f"{i * 1e-5:g} {i % 7}" for i in range(150)) + ")", tran="10u 1m uic")
+    said = "the recording ends at 0.00149 s, and the run at the deck's TSTOP = 0.001 s; --stop 0.00149 takes all of it"
+    with pytest.warns(fs.FingerspiceWarning, match=re.escape(said)):
+        run = fs.simulate(circuit, rtol=1e-4)
+    assert any(said in text for text in run.warnings)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*the recording ends")
+        warnings.filterwarnings("ignore", message=".* has no fundamental")
+        fs.simulate(circuit, rtol=1e-4, t_stop=1e-3)
+
+
+@pytest.mark.parametrize(("times", "said"), [
+    ([0.0, 20.0, 40.0], "; its times are probably in ms, and count as s here"),
+    ([0.0, 4e4], "; its times are probably in ms or us, and count as s here"),
+    ([1.76e9, 1.76e9 + 1.0], "; its times are probably a clock's: subtract the first of them"),
+    ([0.0, 0.06], "; a run to 0.06 s contains it"),
+    ([-1.0, 0.01], "t_stop = 0.04 s"),
+])  # fmt: skip
+def test_output_times_outside_the_run_are_refused_with_the_likely_slip(times: list[float], said: str) -> None:
+    with pytest.raises(fs.InputError, match=r"times from 0 s to t_stop = 0\.04 s") as refused:
+        fs.simulate(table1(), t_stop=0.04, t_eval=times)
+    assert str(refused.value).endswith(said)

@@ -187,6 +187,50 @@ def test_a_command_that_is_none_is_refused_with_where_to_look(
     assert tree(folder) == before
 
 
+CHECKED_FIRST = [
+    ("run --rtol 7", "rtol is 7.0; allowed"),
+    ("run --method rk4", "unknown method 'rk4'"),
+    ("run --area frozn", "area is 'frozn'"),
+    ("run --start warm", "start is 'warm'"),
+    ("run --jumps no", "jumps is 'no'"),
+    ("run --stream --netcdf --rtol 7", "rtol is 7.0; allowed"),
+    ("run --stream --netcdf --chunk soon", "--chunk 'soon'"),
+    ("ac --rtol 7 --area coupled", "rtol is 7.0; allowed"),
+    ("ac --area frozn", "area is 'frozn'"),
+    ("ac --sweep dec", "--sweep 'dec'"),
+    ("ac --amplitude 5", "--amplitude goes with --area coupled"),
+    ("compare --rtol 7", "rtol is 7.0; allowed"),
+    ("limits --capability --carrier -5", "--carrier is -5; allowed: > 0"),
+    ("design --limit -3", "--limit is -3; allowed: > 0"),
+]
+
+
+@pytest.mark.parametrize(("words", "said"), CHECKED_FIRST)
+def test_arguments_are_checked_before_files(command: Command, words: str, said: str) -> None:
+    Path("out").mkdir()
+    for end in (".nc", "_ac.csv", "_compare.png", "_capability.csv", "_drive.wav"):
+        Path(f"out/pad{end}").write_text("of someone else")
+    Path("wanted.csv").write_text("time (ms),friction (mN)\n" + "".join(f"{i},{170 + i % 7}\n" for i in range(9)))
+    name, *options = words.split()
+    result = command(name, *(["wanted.csv"] if name == "design" else []), "pad.cir", *options)
+    assert (result.code, result.out) == (2, "")
+    assert said in result.err
+
+
+@pytest.mark.parametrize("out", ["/proc/new", "/proc", f"new/{'x' * 300}/y"])
+def test_a_folder_that_cannot_be_made_is_told_before_the_run(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: str
+) -> None:
+    if out.startswith("/proc") and not Path("/proc/self").exists():
+        pytest.skip("this system has no /proc")
+    monkeypatch.setattr("fingerspice.solve.simulation.simulate", lambda *a, **k: pytest.fail("it ran"))
+    before = tree(tmp_path)
+    result = command("run", "pad.cir", "--out", out)
+    assert result.code == 2
+    assert f"cannot write {out}/pad.nc: " in result.err or "File name too long" in result.err
+    assert tree(tmp_path) == before
+
+
 def test_a_folder_without_permission_is_refused_before_the_run(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -268,3 +268,20 @@ def test_bad_tables_are_refused_in_one_sentence(command: Command, rows: str, wor
     assert result.code == 2
     assert said in result.err
     assert len(result.err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("plot", [[], ["--no-plot"]])
+def test_design_replaces_the_files_it_wrote_and_no_others(command: Command, plot: list[str]) -> None:
+    table(ROWS)
+    words = ("design", "wanted.csv", "pad.cir", "--rate", "10k", *plot)
+    assert command(*words).code == 0
+    again = command(*words)
+    assert again.code == 0, again.err
+    if not plot:
+        other = command(*words, "--set", "Xgap.d=4u")
+        assert other.code == 2
+        assert "pad_drive.wav holds a result of the deck as it is, and this one is with Xgap.d=4u" in other.err
+    Path("out/pad_drive.wav").write_bytes(b"mine")
+    Path("out/pad_drive.csv").write_text("mine")
+    if plot:
+        assert "pad_drive.wav is there already, and nothing says which circuit it is of" in command(*words).err

@@ -12,11 +12,13 @@ from hypothesis import strategies as st
 
 import fingerspice as fs
 from fingerspice.engine.segment import Segment, source
+from fingerspice.solve.sources import LOOKS
 from fingerspice.waveforms.sampling import SourceTable, on_grid, source_table
-from scenes import table1
+from scenes import table1, table1_deck
 
 STEP = 1e-5
 TOL = 1e-10
+WITHOUT_TRAN = table1_deck(tran="1u 1m").replace(".tran 1u 1m\n", "")
 
 
 def read(table: SourceTable, t: np.ndarray) -> np.ndarray:
@@ -361,3 +363,69 @@ def test_times_on_a_grid_are_told_from_others(count: int, which: int, rate: floa
         moved = t.copy()
         moved[which % count] += off
         assert not on_grid(moved, start, 1.0 / rate, slack)
+
+
+def rectangle(start: float, width: float):
+    return lambda t: np.where((t >= start) & (t < start + width), 100.0, 0.0)
+
+
+def triangle(start: float, width: float):
+    return lambda t: 100.0 * np.maximum(0.0, 1.0 - np.abs((t - start) * 2.0 / width - 1.0))
+
+
+@pytest.mark.parametrize("shape", [rectangle, triangle])
+@settings(max_examples=100, derandomize=True, deadline=None)
+@given(length=st.floats(-3.0, 1.0), at=st.floats(0.01, 0.98))
+def test_a_pulse_of_a_tenth_of_a_step_is_found_in_a_run_of_a_thousand_steps(shape, length: float, at: float) -> None:
+    length = 10.0**length
+    step = length / 1000.0
+    wave = fs.Function(lambda t: 50.0 * np.sin(40.0 * t / length) + shape(at * length, 0.1 * step)(t))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        table = source_table(wave, 0.0, length, TOL, step, shortest=length / LOOKS)
+    assert len(caught) >= 1
+    t = at * length + np.array([-0.05, 0.02, 0.05, 0.08, 0.2]) * step
+    np.testing.assert_allclose(read(table, t), wave.value(t), rtol=0, atol=1e-5)
+
+
+def test_a_run_meets_the_pulse_of_a_function_and_plan_and_warning_say_what_it_would_miss() -> None:
+    circuit = fs.parse_netlist(WITHOUT_TRAN)
+    pulse = rectangle(3.21, 2e-3)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        run = fs.simulate(circuit, sources=lambda t: pulse(t) + 1.0, t_stop=20.0, rtol=1e-3)
+    assert any("the source function jumps by 100 V at t = 3.21" in str(w.message) for w in caught)
+    exact = fs.simulate(circuit, sources=fs.Pulse(1.0, 101.0, 3.21, width=2e-3), t_stop=20.0, rtol=1e-6)
+    assert run.summary()["u_gap_max"] == pytest.approx(exact.summary()["u_gap_max"], rel=2e-3)
+    (said,) = [text for text in run.warnings if "looked at every 1 ms" in text]
+    assert "breaks=" in said
+    assert any("an event in it shorter than 1 ms may be missed without breaks=" in text for text in run.plan.reasons)
+
+
+def test_nothing_is_said_of_events_where_the_run_is_short_or_the_edges_are_declared() -> None:
+    circuit = fs.parse_netlist(WITHOUT_TRAN)
+    for wave, stop in (
+        (lambda t: 100.0 * np.sin(600.0 * t), 0.05),
+        (fs.Function(lambda t: 1.0 + 0.0 * t, (0.1,)), 20.0),
+    ):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            fs.simulate(circuit, sources=wave, t_stop=stop, rtol=1e-3)
+        assert not any("looked at" in str(w.message) for w in caught)
+
+
+def test_a_function_of_single_numbers_is_not_called_more_often_for_short_events() -> None:
+    seen = [0, 0]
+
+    def one(t):
+        seen[0] += 1
+        return 100.0 * math.sin(600.0 * t)
+
+    def many(t):
+        seen[1] += np.size(t)
+        return 100.0 * np.sin(600.0 * t)
+
+    circuit = fs.parse_netlist(WITHOUT_TRAN)
+    for function in (one, many):
+        fs.simulate(circuit, sources=function, t_stop=0.05, rtol=1e-4)
+    assert 15_000 < seen[1] - seen[0] < 25_000

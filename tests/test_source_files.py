@@ -15,7 +15,7 @@ import pytest
 from scipy.io import wavfile
 
 import fingerspice as fs
-from commands import Command
+from commands import QUICK, Command
 from deck_edits import edited
 from fingerspice.netlist import files as netlist_files
 from fingerspice.waveforms import files
@@ -505,7 +505,7 @@ def test_chirps_and_bursts_are_those_of_python() -> None:
 
 
 def test_a_deck_with_a_recording_runs_as_the_samples_do(folder: Path) -> None:
-    Path("decks/pad.cir").write_text(table1_deck("WAVEFILE(mono.wav 100)", tran="50u 30m uic"))
+    Path("decks/pad.cir").write_text(table1_deck("WAVEFILE(mono.wav 100)", tran="50u 50m uic"))
     circuit = fs.read_netlist("decks/pad.cir")
     with pytest.warns(fs.FingerspiceWarning, match="has no fundamental"):
         by_deck = fs.simulate(circuit, rtol=1e-6)
@@ -591,3 +591,41 @@ def test_a_name_that_no_file_has_is_refused_in_one_sentence(command: Command) ->
         assert result.code == 2
         assert "cannot be read" in result.err
         assert len(result.lines) == 1
+
+
+def test_a_deck_whose_own_recording_is_longer_than_its_run_is_told_as_well(command: Command) -> None:
+    Path("a.wav").write_bytes(wav(packed(np.arange(-400, 400) * 50, 16), 16))
+    Path("own.cir").write_text(edited(QUICK, ("SIN(0 200 100)", "WAVEFILE(a.wav 150)")))
+    words = ("run", "own.cir", "--no-plot", "--overwrite", "--rtol", "1e-4")
+    assert "the recording ends at 0.099875 s, and the run at the deck's TSTOP = 0.02 s" in command(*words).err
+    assert "the recording ends" not in command(*words, "--stop", "20m").err
+
+
+@pytest.mark.parametrize(
+    ("text", "wave"),
+    [
+        ("AM(200 5k 50)", fs.AM(200.0, 5e3, 50.0)),
+        ("am(200, 5k, 50, 0.5)", fs.AM(200.0, 5e3, 50.0, 0.5)),
+        ("TRIANGLE(200 100)", fs.Triangle(200.0, 100.0)),
+        ("sawtooth(200 100)", fs.Sawtooth(200.0, 100.0)),
+    ],
+)
+def test_the_explorers_waveforms_are_typed_on_the_command_line_and_in_python(
+    command: Command, text: str, wave: fs.Waveform
+) -> None:
+    circuit = fs.read_netlist("pad.cir").replace({"Vdrive": text})
+    assert circuit["Vdrive"].waveform == wave
+    result = command("plan", "pad.cir", "--source", text, "--json")
+    assert result.code == 0, result.err
+    t = np.linspace(0.0, 0.02, 77)
+    np.testing.assert_array_equal(circuit["Vdrive"].waveform.value(t), wave.value(t))
+
+
+def test_options_of_other_simulators_get_a_note_and_no_warning(command: Command) -> None:
+    Path("own.cir").write_text(edited(QUICK, (".end", ".options reltol=1e-4 trtol=7\n.end")))
+    result = command("plan", "own.cir")
+    assert result.code == 0
+    assert (
+        "fingerspice: note: .options reltol, trtol: of no effect here, where --rtol alone sets the error" in result.err
+    )
+    assert "warning" not in result.err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -11,7 +12,7 @@ from fingerspice.base.arrays import real_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
-from fingerspice.waveforms.waveform import DC, Waveform
+from fingerspice.waveforms.waveform import DC, Waveform, require
 
 #: A waveform, a constant (V, or A of a current source), or a function of time (s).
 Source = Waveform | float | Callable[[float], float]
@@ -90,13 +91,16 @@ def require_circuit(circuit: Any) -> None:
 
 
 def area_given(area: Any) -> str | float:
-    """An area as a text or a number; the model checks whether a text names one of its modes.
+    """An area as one of the model's modes or a positive number, m^2.
 
     Raises
     ------
     InputError
         If it is neither; the message names the given value.
     """
-    return (
-        area if isinstance(area, str) else real_number("area", area, "'coupled', 'mean', 'frozen' or a number in m^2")
-    )
+    if isinstance(area, str):
+        require(area in ("coupled", "mean", "frozen"), "area", repr(area), "'coupled', 'mean', 'frozen' or m^2")
+        return area
+    number = real_number("area", area, "'coupled', 'mean', 'frozen' or a number in m^2")
+    require(math.isfinite(number) and number > 0.0, "area", f"{number:g} m^2", "a positive area in m^2")
+    return number

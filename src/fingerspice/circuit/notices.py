@@ -1,4 +1,4 @@
-"""Warnings about a circuit before it runs: directives without effect, and skin data at an unsuitable frequency."""
+"""Warnings about a circuit before it runs: directives without effect, unsuitable skin data, sources that miss it."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import math
 from collections.abc import Iterator
 from functools import partial
 
-from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.spectrum import energy_outside, skin_error, surely_wide
+from fingerspice.waveforms.ramps import PWL
+from fingerspice.waveforms.recorded import as_samples
 from fingerspice.waveforms.waveform import Waveform
 
 # Half-width of a band around a frequency, relative to the frequency, in which the skin's data change by 3 %; and the
@@ -18,6 +20,12 @@ _BAND, _OUTSIDE = 0.05, 0.01
 _UNKNOWN, _LITTLE = "may be 5 to 10 % off", 0.005
 # Directives that only ngspice needs, so that no warning is given about them.
 _FOR_NGSPICE = (".nodeset", ".options")
+# Smallest number of points that make a PWL a recording, which is meant to be run to its end and not to be a step in a
+# longer run; and the smallest fraction of a run that a recording fills without a warning.
+_RECORDED, _FILLED = 100, 0.01
+# Times (s) from `_CLOCK` on are those of a clock (this is a day in 1973, counted from 1970); times beyond the end of a
+# run by a factor of `_OTHER_UNIT` or more are probably in another unit.
+_CLOCK, _OTHER_UNIT = 1e8, 20.0
 
 
 def circuit_warnings(circuit: Circuit, t_stop: float | None) -> tuple[str, ...]:
@@ -37,6 +45,57 @@ def circuit_warnings(circuit: Circuit, t_stop: float | None) -> tuple[str, ...]:
 def directive_warnings(circuit: Circuit) -> tuple[str, ...]:
     """Warnings about directives without effect."""
     return tuple(f"{name} has no effect here" for name in circuit.unused if not name.startswith(_FOR_NGSPICE))
+
+
+def course_warnings(circuit: Circuit, start: float, stop: float, by_deck: bool) -> Iterator[str]:
+    """Warnings about sources that miss the run from `start` to `stop` (s), fill little of it, or are cut off by it.
+
+    A recording is cut off without a warning unless the deck's own TSTOP does it, as `by_deck` says.
+    """
+    drives = driving(circuit)
+    for name, wave in ((e.name, e.waveform) for e in drives if e.waveform is not None):
+        (first, last), count = wave.course, _points(wave)
+        if (count > 1 and last < start == 0.0) or stop <= first < math.inf:
+            until = f" to {last:g} s" if last < math.inf else " on"
+            yield (
+                f"{name} changes from {first:g} s{until} only, and covers nothing of the run from {start:g} s to "
+                f"{stop:g} s, in which it stays at {wave.value(stop, 'left'):.4g}{time_slip(first, last, stop)}"
+            )
+        elif count >= _RECORDED and last - first < _FILLED * (stop - start):
+            yield (
+                f"{name}: the recording, from {first:g} s to {last:g} s, is {100.0 * (last - first) / stop:.2g} % of "
+                f"the run to {stop:g} s, and constant in the rest; its times, or its rate, are probably in another unit"
+            )
+        elif by_deck and count >= _RECORDED and last > stop + (last - first) / (count - 1):
+            yield (
+                f"{name}: the recording ends at {last:g} s, and the run at the deck's TSTOP = {stop:g} s; --stop "
+                f"{last:.9g} takes all of it (in Python t_stop={last:.9g})"
+            )
+
+
+def driving(circuit: Circuit) -> list[Element]:
+    """The V and I elements that do not give an area."""
+    areas = {e.nodes[2] for e in circuit.elements if e.spec.is_layer}
+    return [e for e in circuit.by_device("V", "I") if areas.isdisjoint(e.nodes)]
+
+
+def _points(wave: Waveform) -> int:
+    """Number of points of a recording or table; 0 of other waveforms."""
+    found = as_samples(wave)
+    if found is not None:
+        return found.count
+    return len(wave.times) if isinstance(wave, PWL) and wave.repeat is None else 0
+
+
+def time_slip(first: float, last: float, stop: float) -> str:
+    """End of a message about times from `first` to `last` (s) that are not in a run to `stop`: the likely slip."""
+    if first >= _CLOCK:
+        return "; its times are probably a clock's: subtract the first of them"
+    beyond = (first if first > stop else last) / stop
+    if _OTHER_UNIT <= beyond < math.inf:
+        unit = "ms" if beyond <= 1e3 * (1.0 + 1e-9) else "ms or us"
+        return f"; its times are probably in {unit}, and count as s here"
+    return f"; a run to {last:g} s contains it" if stop < last < math.inf else ""
 
 
 def _is_near(wave: Waveform, stop: float, f: float) -> bool:

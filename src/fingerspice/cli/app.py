@@ -131,7 +131,7 @@ def run(
       fingerspice run long.cir --stream --rtol 1e-5 --signals u_gap,f_t
     """
     from fingerspice.results.report import summary_table
-    from fingerspice.solve.simulation import simulate
+    from fingerspice.solve.simulation import check_arguments, simulate
 
     with Answering("run", as_json, charge_law=charge_law, method=method, rtol=rtol, area=area) as answer:
         circuit = read_circuit(deck, changes, source, finger=finger, coating=coating, drive=drive)
@@ -139,13 +139,14 @@ def run(
         circuit, start = options.with_times(circuit, stop, start)
         if circuit.tran is None:
             raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
-        if stop is None:
-            options.warn_of_rest(circuit, source)
+        t_stop = None if stop is None else circuit.tran.stop
+        fixed = area_from_text(area)
+        check_arguments(rtol, method, fixed, start, jumps)
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         if stream or chunk or signals or netcdf:
             options.check_streamed(stream, csv=csv, feel=feel, schematic=schematic)
-            how = {"charge_law": charge_law, "area": area_from_text(area), "rtol": rtol}
-            how |= {"method": method, "start": start}
+            how = {"charge_law": charge_law, "area": fixed, "rtol": rtol}
+            how |= {"method": method, "start": start, "t_stop": t_stop}
             run_streamed(answer, results, circuit, how, chunk=chunk, signals=signals, netcdf=netcdf)
             return
         data = results.file(".csv" if csv else ".nc")
@@ -154,7 +155,7 @@ def run(
         touch = Touch(circuit, None if no_plot else results) if feel else None
         with progress() as update:
             solution = simulate(
-                circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, method=method,
+                circuit, t_stop=t_stop, charge_law=charge_law, area=fixed, rtol=rtol, method=method,
                 start=start, jumps=jumps, throw=False, progress=update,
             )  # fmt: skip
         if as_json:
@@ -205,6 +206,7 @@ def ac(
       fingerspice ac circuits/fingerpad.cir --area coupled --amplitude 50 --amplitude 200
     """
     from fingerspice.results.report import phasor_csv, phasor_dict, phasor_tables
+    from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.phasors import phasor
     from fingerspice.studies.sweeps import sweep_frequencies
 
@@ -213,18 +215,19 @@ def ac(
         circuit = read_circuit(deck, changes, source)
         answer.update(**answers.of_circuit(circuit, charge_law))
         options.check_finger(finger, circuit)
+        check_arguments(rtol)
+        frequencies = sweep_frequencies(options.sweep(sweep, circuit))
+        if area == "coupled" and skin != "swept":
+            raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
+        if area != "coupled":
+            if amplitude:
+                raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
+            found = [phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger)]
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         data = results.file("_ac.csv")
         picture = None if no_plot else results.file("_ac.png")
-        frequencies = sweep_frequencies(options.sweep(sweep, circuit))
         if area == "coupled":
-            if skin != "swept":
-                raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
-            found = large_sweep(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger)
-        elif amplitude:
-            raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
-        else:
-            found = (phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger),)
+            found = [*large_sweep(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger)]
         results.open()
         writes = [lambda: phasor_csv(found, data)]
         if picture is not None:
@@ -289,6 +292,7 @@ def compare(
 
       fingerspice compare circuits/fingerpad_5khz.cir --json --no-plot
     """
+    from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.comparison import compare as run_comparison
     from fingerspice.studies.reports import comparison_table
 
@@ -296,6 +300,7 @@ def compare(
         circuit = read_circuit(deck, changes, source)
         answer.update(**answers.of_circuit(circuit, charge_law))
         results = Results(deck, circuit, out, name, overwrite, charge_law)
+        check_arguments(rtol)
         picture = None if no_plot else results.file("_compare.png")
         result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
         writes: list[Callable[[], Path]] = []

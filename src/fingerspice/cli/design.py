@@ -16,24 +16,27 @@ from fingerspice.cli.arguments import AsJson, ChargeLaw, Deck, Name, NoPlot, Out
 from fingerspice.cli.options import read_circuit
 from fingerspice.cli.result_files import Results
 from fingerspice.cli.terminal import Answering, progress
+from fingerspice.waveforms.waveform import require
 
 Writes = list[Callable[[], Path]]
 
 
 def number(option: str, text: str | None) -> float | None:
-    """The number of an option, with SPICE's scales; None if the option is not given.
+    """The positive number of an option, with SPICE's scales; None if the option is not given.
 
     Raises
     ------
     InputError
-        If the text is not a number.
+        If the text is not a positive number.
     """
     if text is None:
         return None
     try:
-        return parse_number(text)
+        value = parse_number(text)
     except ValueError as error:
         raise InputError(f"{option}: {error}") from None
+    require(value > 0.0, option, text, "> 0")
+    return value
 
 
 def find_drive(

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
+import tempfile
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fingerspice.base.errors import FingerspiceWarning, InputError, printable
 from fingerspice.base.units import parse_number
+from fingerspice.cli.terminal import complain
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import AcSweep, Circuit
@@ -50,6 +51,9 @@ def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | Non
     # `simulate` gives these warnings itself, but commands that do not call it with this circuit would not.
     for text in directive_warnings(circuit):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    others = [name.removeprefix(".options ") for name in circuit.unused if name.startswith(".options ")]
+    if others:
+        complain(f"note: .options {', '.join(others)}: of no effect here, where --rtol alone sets the error")
     return circuit
 
 
@@ -180,24 +184,6 @@ def check_streamed(stream: bool, **others: bool) -> None:
             raise InputError(f"--{name} does not go with --stream, which writes Zarr; allowed: --netcdf beside it")
 
 
-def warn_of_rest(circuit: Circuit, sources: Sequence[str] | None) -> None:
-    """Warn where a recording given by ``--source`` is longer than the run, which ends at the deck's TSTOP."""
-    from fingerspice.waveforms.samples import Samples
-
-    stop = circuit.tran.stop if circuit.tran is not None else math.inf
-    for element in circuit.elements if sources else ():
-        wave = element.waveform
-        if element.name in circuit.overrides and isinstance(wave, Samples):
-            end = wave.start + (wave.count - 1) / wave.rate
-            if end > stop + 1.0 / wave.rate:
-                warnings.warn(
-                    f"{element.name}: the recording ends at {end:g} s, and the run at the deck's TSTOP = {stop:g} s; "
-                    f"--stop {end:.9g} takes all of it",
-                    FingerspiceWarning,
-                    stacklevel=2,
-                )
-
-
 def time_from_text(option: str, text: str | None) -> float | None:
     """A time in s, such as ``50m``."""
     try:
@@ -230,15 +216,20 @@ def check_output(file: Path, deck: Path | None = None) -> None:
 
 
 def _check_output(file: Path, deck: Path | None) -> None:
-    folder = file.parent
+    folder, names = file.parent, [file.name]
     while not folder.exists() and folder != folder.parent and not folder.is_symlink():
+        names.append(folder.name)
         folder = folder.parent
-    # This raises OSError if the file's name is too long; the check needs a folder that exists.
-    (folder / file.name).exists()
+    # This raises OSError if a name is too long; the check needs a folder that exists.
+    for one in names:
+        (folder / one).exists()
     if not folder.is_dir():
         raise InputError(f"cannot write {file}: {folder} is not a folder; allowed: a folder that can be written")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(f"cannot write {file}: no permission in {folder}; allowed: a folder that can be written")
+    # Some folders, such as those of /proc, take nothing new whatever their permissions say.
+    with tempfile.TemporaryFile(dir=folder):
+        pass
     if file.is_dir():
         raise InputError(f"cannot write {file}: it is a folder; allowed: a file's name")
     if deck is not None and file.exists() and deck.exists() and file.samefile(deck):

@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 #: Folder of the results unless another one is named.
 FOLDER = Path("out")
 #: First bytes of the tables that the commands write.
-_HEADS = (b"t [s],u_source", b"frequency [Hz],gain [1],", b"parameter,value [SI],unit,")
+_HEADS = (
+    b"t [s],u_source", b"frequency [Hz],gain [1],", b"parameter,value [SI],unit,", b"time (s),drive (V)",
+    b"time (s),wanted force (N),",
+)  # fmt: skip
 #: Attributes by which a file identifies its circuit.
 _KNOWN = ("deck_sha256", "overrides", "charge_law")
 
@@ -145,8 +148,8 @@ def _held(file: Path) -> dict[str, str] | None:
 
 
 def _is_table(file: Path) -> bool:
-    """Whether a file begins like the tables that the commands write."""
-    with suppress(OSError), file.open("rb") as stream:
+    """Whether a file begins like the tables that the commands write; a WAV file, whether such a table is beside it."""
+    with suppress(OSError), (file.with_suffix(".csv") if file.suffix == ".wav" else file).open("rb") as stream:
         return stream.read(100).startswith(_HEADS)
     return False
 
@@ -170,6 +173,9 @@ def _of_picture(file: Path) -> dict[str, str] | None:
     from PIL import Image
 
     picture = file.with_suffix(".png")
+    if not picture.is_file():
+        # `design` writes NAME_drive.wav, NAME_drive.csv and NAME_friction.csv with the picture NAME_design.png.
+        picture = file.with_name(f"{file.stem.rpartition('_')[0]}_design.png")
     if not picture.is_file():
         return None
     with Image.open(picture) as image:

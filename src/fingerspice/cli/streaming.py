@@ -43,10 +43,10 @@ def run_streamed(
     path = results.folder / f"{results.name}.zarr"
     # The store is a folder, so check that a file can be written next to it.
     check_output(path.with_suffix(".zarr.part"), results.deck)
-    data = results.file(".nc") if netcdf else None
     names = _names(signals, circuit)
     charge = any(name in ("q_source", "i_source") for name in names)
     run = stream(circuit, chunk=time_from_text("--chunk", chunk), charge=charge, **how)
+    data = results.file(".nc") if netcdf else None
     store = Store(path, _identity(run, circuit, how, names), run.outputs.total, run.count)
     store.open(results.overwrite)
     if store.done and store.done < store.chunks:

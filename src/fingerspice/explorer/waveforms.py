@@ -1,4 +1,4 @@
-"""The page's menu of waveforms: each a function of netlists, or one of three that netlists lack."""
+"""The page's menu of waveforms: each a function that ``--source`` knows, or the recording dropped on the page."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ _TEXTS: dict[str, tuple[type[Waveform], tuple[str, ...]]] = {
 }
 #: Largest number of characters of a source's text.
 LONGEST = 20_000
-_EXTRA: dict[str, type[Waveform]] = {"AM": AM, "TRIANGLE": Triangle, "SAWTOOTH": Sawtooth}
 _CALL = re.compile(r"\s*([A-Za-z]+)\s*\(([^()]*)\)\s*")
 _NAMED = re.compile(r"\s*([\w.]+)\s*=\s*(.*)", re.DOTALL)
 
@@ -125,8 +124,13 @@ def read_source(text: str, circuit: Circuit, recording: Recording | None = None)
     else:
         name = next(iter(names.values()))
     call = _CALL.fullmatch(text)
-    if call is not None and call[1].upper() in (RECORDING, *_EXTRA):
-        return name, _extra(call[1].upper(), call[2], recording)
+    if call is not None and call[1].upper() == RECORDING:
+        gain = _gain(call[2])
+        if recording is None:
+            raise InputError(
+                "the source is a recording, which a link does not carry; allowed: drop its file on the page"
+            )
+        return name, recording.waveform(gain)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FingerspiceWarning)
         return name, source_from_text(text, circuit, files=False)
@@ -145,28 +149,15 @@ def gain_of(text: str) -> float | None:
     """The gain of a source that is a recording; None of another source."""
     named = _NAMED.fullmatch(text)
     call = _CALL.fullmatch(text if named is None else named[2])
-    return _given(RECORDING, call[2])[0] if call is not None and call[1].upper() == RECORDING else None
+    return _gain(call[2]) if call is not None and call[1].upper() == RECORDING else None
 
 
-def _extra(kind: str, text: str, recording: Recording | None) -> Waveform:
-    """One of the waveforms that netlists lack."""
-    numbers = _given(kind, text)
-    if kind != RECORDING:
-        return _EXTRA[kind](*numbers)
-    if recording is None:
-        raise InputError("the source is a recording, which a link does not carry; allowed: drop its file on the page")
-    return recording.waveform(*numbers)
-
-
-def _given(kind: str, text: str) -> list[float]:
-    """The numbers of a call."""
+def _gain(text: str) -> float:
+    """The number of a call of `RECORDING`."""
     words = text.replace(",", " ").split()
-    arguments = WAVEFORMS[kind][1]
-    names = " ".join(a.name for a in arguments)
-    least = sum(not a.optional for a in arguments)
-    if not least <= len(words) <= len(arguments):
-        raise InputError(f"{kind} is given {len(words)} numbers; allowed: {kind}({names})")
+    if len(words) != 1:
+        raise InputError(f"{RECORDING} is given {len(words)} numbers; allowed: {RECORDING}(gain)")
     try:
-        return [parse_number(word) for word in words]
+        return parse_number(words[0])
     except ValueError as error:
-        raise InputError(f"{kind}: {error}") from None
+        raise InputError(f"{RECORDING}: {error}") from None

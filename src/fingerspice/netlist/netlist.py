@@ -163,7 +163,7 @@ def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Wave
     tran = circuit.tran
     line = f".tran {tran.step!r} {tran.stop!r}\n" if tran else ""
     found = SourceFiles(anywhere=files)
-    context = Context(tran.step if tran else None, tran.stop if tran else None, found)
+    context = Context(tran.step if tran else None, tran.stop if tran else None, found, in_deck=False)
     try:
         deck = parse_deck(f"source\nVsource a 0 {text}\n{line}")
         if len(deck.statements) != 1:

@@ -1,4 +1,4 @@
-"""Source functions of a netlist as waveforms: SPICE's own, SQUARE, CHIRP, BURST and recordings; and ``AC``."""
+"""Source functions of a netlist as waveforms: SPICE's own, SQUARE and others, and recordings; and ``AC``."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from fingerspice.netlist.deck import Call, Number, Token
 from fingerspice.netlist.files import SourceFiles
 from fingerspice.netlist.slips import is_unit
 from fingerspice.netlist.spelling import nearest
+from fingerspice.waveforms.combinations import AM
 from fingerspice.waveforms.files import read_table
-from fingerspice.waveforms.periodic import Pulse, Square
+from fingerspice.waveforms.periodic import Pulse, Sawtooth, Square, Triangle
 from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.repeated import Burst, Repeat
 from fingerspice.waveforms.samples import Samples
@@ -29,8 +30,14 @@ _COUNTED = (_SIN, _PULSE)
 _KEPT_BYTES = 2**25  # A larger WAV file is read in parts when needed: 32 MiB are six minutes of 16 bits at 48 kHz.
 #: Names in LTspice, and a short one for the command line.
 _ALIASES = {"sine": "sin", "wav": "wavefile"}
-_CHIRP = ("amplitude", "f0", "f1", "duration")
-_BURST = ("amplitude", "frequency", "cycles", "every")
+#: Functions of a waveform's own numbers: the waveform, the names of the numbers, and how many of them are needed.
+_PLAIN: dict[str, tuple[Callable[..., Waveform], tuple[str, ...], int]] = {
+    "square": (Square, ("amplitude", "frequency", "duty"), 2),
+    "triangle": (Triangle, ("amplitude", "frequency"), 2),
+    "sawtooth": (Sawtooth, ("amplitude", "frequency"), 2),
+    "chirp": (Chirp, ("amplitude", "f0", "f1", "duration"), 4),
+    "am": (AM, ("amplitude", "carrier", "envelope", "depth"), 3),
+}
 
 
 @dataclass(frozen=True)
@@ -43,11 +50,14 @@ class Context:
         TSTEP and TSTOP of the deck (s), on which SPICE's defaults depend; None without a .tran line.
     files : SourceFiles
         Finds recordings and tables.
+    in_deck : bool
+        Whether the text stands in a deck, which a SPICE may read, too.
     """
 
     step: float | None = None
     stop: float | None = None
     files: SourceFiles = field(default_factory=SourceFiles)
+    in_deck: bool = True
 
 
 @dataclass(frozen=True)
@@ -225,18 +235,15 @@ def _table(call: Call, context: Context) -> Waveform:
     return PWL(table.times, table.values)  # type: ignore[arg-type]
 
 
-def _square(call: Call, context: Context) -> Waveform:
-    a = _Arguments(call, ("amplitude", "frequency", "duty"), 2, context)
-    return Square(a.get("amplitude"), a.get("frequency"), a.get("duty", 0.5))
-
-
-def _chirp(call: Call, context: Context) -> Waveform:
-    a = _Arguments(call, _CHIRP, 4, context)
-    return Chirp(*(a.get(name) for name in _CHIRP))
+def _plain(call: Call, context: Context) -> Waveform:
+    """A waveform of its own numbers, in their order."""
+    made, names, required = _PLAIN[_kind(call)]
+    a = _Arguments(call, names, required, context)
+    return made(*(a.get(name) for name in names[: len(call.args)]))
 
 
 def _burst(call: Call, context: Context) -> Waveform:
-    a = _Arguments(call, _BURST, 3, context)
+    a = _Arguments(call, ("amplitude", "frequency", "cycles", "every"), 3, context)
     frequency, every = a.get("frequency"), a.get("every", 0.0)
     tone = Sine(a.get("amplitude"), frequency)
     burst = Burst(tone, a.get("cycles") / frequency)
@@ -244,16 +251,9 @@ def _burst(call: Call, context: Context) -> Waveform:
 
 
 SOURCES: dict[str, Callable[[Call, Context], Waveform]] = {
-    "sin": _sin,
-    "pulse": _pulse,
-    "exp": _exp,
-    "pwl": _pwl,
-    "square": _square,
-    "chirp": _chirp,
-    "burst": _burst,
-    "wavefile": _wavefile,
-    "table": _table,
-}
+    "sin": _sin, "pulse": _pulse, "exp": _exp, "pwl": _pwl, **dict.fromkeys(_PLAIN, _plain), "burst": _burst,
+    "wavefile": _wavefile, "table": _table,
+}  # fmt: skip
 """Source functions by name; an entry is all that a new source function needs."""
 
 _OF_FILES = {
@@ -262,8 +262,8 @@ _OF_FILES = {
     "pwl": "PWL FILE=path",
 }
 
-_REFUSED = {
-    "am": "AM changed its argument order between ngspice versions; write the waveform as PWL, or give it in Python",
+_REFUSED = {  # in decks, which a SPICE may read, too; --source takes an AM
+    "am": "AM changed its argument order between ngspice versions; write the waveform as PWL, or give it by --source",
     "sffm": "SFFM changed its argument order between ngspice versions; write the waveform as PWL",
 }
 
@@ -384,7 +384,7 @@ def _leading_numbers(words: deque[Word]) -> list[Number]:
 
 
 def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:
-    if key in _REFUSED:
+    if key in _REFUSED and (context.in_deck or key not in SOURCES):
         raise InputError(f"{name}: {_REFUSED[key]}", call.where)
     if key not in SOURCES:
         raise InputError(
@@ -397,4 +397,4 @@ def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:
 
 
 def _known() -> str:
-    return ", ".join(s.upper() for s in SOURCES)
+    return ", ".join(s.upper() for s in SOURCES if s not in _REFUSED)

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Element
-from fingerspice.circuit.notices import circuit_warnings
+from fingerspice.circuit.notices import circuit_warnings, course_warnings, driving
 from fingerspice.circuit.spectrum import spectrum_warning
 from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.physics.contact import inverse_area
@@ -16,19 +17,26 @@ from fingerspice.results.outcome import Status
 from fingerspice.results.record import Record
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run
-from fingerspice.waveforms.waveform import DC, DOUBLE
+from fingerspice.solve.sources import shortest_event
+from fingerspice.waveforms.sampling import Function
+from fingerspice.waveforms.waveform import DOUBLE
 
 BREAKDOWN_VOLTAGE = 300.0
 # Smallest contact area without a warning, relative to the area at 0 V.
 LEAST_AREA = 0.2
 # Smallest distance to the fold of the mobile law without a warning: a voltage a few percent larger reaches the fold.
 NEAR_FOLD = 0.2
+# Shortest event (s) in a user's function that may be missed without a warning, half a period of 10 kHz: drives of a
+# screen have few that are shorter.
+_EVENT = 0.5 / 10e3
 
 
 def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Warnings for every limit of the model that the run exceeds."""
     yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit, problem.t_stop))
-    yield from problem.circuit.remember(("source", problem.t_stop), lambda: tuple(_source_warnings(problem)))
+    key = ("source", problem.t_start, problem.t_stop, problem.by_deck)
+    yield from problem.circuit.remember(key, lambda: tuple(_source_warnings(problem)))
+    yield from _off_warning(problem, run)
     if run.note and run.status is Status.SUCCESS:
         yield run.note
     net, several = problem.scene.net, len(record.fingers) > 1
@@ -60,18 +68,35 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
 
 
 def _source_warnings(problem: Problem) -> Iterator[str]:
-    """Warnings about sources beyond the band of the skin's data, and about sources that drive sweeps only."""
+    """Warnings about sources that miss the run, and about sources beyond the band of the skin's data."""
+    yield from course_warnings(problem.circuit, problem.t_start, problem.t_stop, problem.by_deck)
+    event = shortest_event(problem)
+    plain = any(isinstance(wave, Function) and not wave.breaks for wave in problem.waveforms)
+    if plain and event > _EVENT:
+        yield (
+            f"the source is a function, which was looked at every {format_si(event, 's')}: an event shorter than that "
+            "may have been missed; give Function(f, breaks=(...)) its edges, or the circuit a .tran of a shorter TSTEP"
+        )
     outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
     if outside is not None:
         yield outside
-    areas = {e.nodes[2] for e in problem.circuit.elements if e.spec.is_layer}
-    drives = [e for e in problem.circuit.by_device("V", "I") if areas.isdisjoint(e.nodes)]
-    small = ", ".join(e.name for e in drives if e.ac is not None)
-    if small and all(e.waveform == DC(0.0) for e in drives):
-        yield (
-            f"the sources are 0 all the time: {small} has AC alone, which drives sweeps (fingerspice ac); a sine in "
-            "time is SIN(VO VA FREQ)"
-        )
+
+
+def _off_warning(problem: Problem, run: Run) -> Iterator[str]:
+    """A warning about sources that are 0 in the whole run, unless a charge of the start drives it."""
+    currents = problem.waveforms[problem.network.n_voltage :]
+    peaks = (problem.scene.u_peak, *(wave.peak(problem.t_start, problem.t_stop) for wave in currents))
+    if run.status is Status.SUCCESS and problem.waveforms and not (any(peaks) or run.gaps[:, 0].any()):
+        small = ", ".join(e.name for e in driving(problem.circuit) if e.ac is not None)
+        if small:
+            yield (
+                f"the sources are 0 all the time: {small} has AC alone, which drives sweeps (fingerspice ac); a sine "
+                "in time is SIN(VO VA FREQ)"
+            )
+        elif not problem.initial.y.any() and not any(
+            problem.t_stop <= wave.course[0] < math.inf for wave in problem.waveforms
+        ):
+            yield "the sources are 0 all the time, and nothing is charged: every voltage is 0"
 
 
 def _gap_warnings(where: str, peak: float, unloaded: float, least: float) -> Iterator[str]:

@@ -9,12 +9,14 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
+from fingerspice.base.units import format_si
 from fingerspice.engine.model import Model
 from fingerspice.physics.contact import inverse_area_range
 from fingerspice.results.plan import Plan
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import kept_with
 from fingerspice.solve.settling import FEWEST_PERIODS
+from fingerspice.solve.sources import shortest_event
 
 # Number of plans cached with a scene.
 MOST_PLANS = 16
@@ -82,6 +84,9 @@ def _plan(problem: Problem, rtol: float, tier: str, start: str) -> Plan:
         needed += error
     elif scene.stack is not None and problem.circuit.by_device("SKIN_DISPERSIVE"):
         reasons.append(f"skin dispersive: no one frequency serves to rtol = {rtol:g}")
+    if scene.is_sampled:
+        event = format_si(shortest_event(problem), "s")
+        reasons.append(f"a source is a function: an event in it shorter than {event} may be missed without breaks=")
     found = tuple(sorted(map(float, rates)))
     return Plan(chosen, tuple(reasons), start, found, stiff, best.sensitivity, needed, best.area)
 

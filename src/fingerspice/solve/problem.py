@@ -42,6 +42,8 @@ class Problem:
         Whether charge and current are wanted.
     start : str
         How the run starts, as in `simulate`; ``"given"`` for the end of another run.
+    by_deck : bool
+        Whether the run ends at the deck's own TSTOP.
     begun : ndarray, shape (n_gap, 2), or None
         Error of a periodic start, as its effect on every gap's voltage and force, V and N. The start was computed with
         half of the error asked for; the other half is left to the run.
@@ -56,6 +58,7 @@ class Problem:
     initial: State
     charge: bool = True
     start: str = "deck"
+    by_deck: bool = False
     begun: FloatArray | None = None
 
     @property
@@ -136,4 +139,5 @@ def prepare(
         asked, ends = kept["end"] = stop, on_breakpoint(scene.waveform, stop)
     first = t_start + (circuit.tran.start if circuit.tran else 0.0)
     how, initial = start if isinstance(start, str) else "given", initial_state(circuit, scene, start)
-    return Problem(circuit, scene, t_start, ends, first, step, initial, charge, how)
+    by_deck = t_stop is None and circuit.tran is not None
+    return Problem(circuit, scene, t_start, ends, first, step, initial, charge, how, by_deck)

@@ -269,9 +269,7 @@ def _fixed_areas(network: Network, area: str | float) -> tuple[tuple[float | Non
     """Each area (m^2), None for one that follows its gap, and the name of the area mode."""
     given = [a.given for a in network.areas]
     if not isinstance(area, str):
-        require(math.isfinite(area) and area > 0.0, "area", f"{area:g} m^2", "a positive area in m^2")
         return (float(area),) * len(given), f"{area:g} m^2"
-    require(area in ("coupled", "mean", "frozen"), "area", repr(area), "'coupled', 'mean', 'frozen' or m^2")
     if not given:
         return (), "none"
     if all(x is not None for x in given):

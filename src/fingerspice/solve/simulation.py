@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import BoolArray, FloatArray, real_number, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.circuit.arguments import Parameters, Sources, overridden
+from fingerspice.circuit.arguments import Parameters, Sources, area_given, overridden
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.notices import circuit_warnings
 from fingerspice.results.outcome import SolveError, Status
@@ -119,11 +119,9 @@ def simulate(
     SolveError
         Where the run failed and `throw` is set; its `solution` holds the outputs before the failure.
     """
-    require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
-    check_method(method)
+    rtol = check_arguments(rtol, method, area, start, jumps)
     # Of their own: results keep them, and the caller's array stays writable.
     times = None if t_eval is None else real_numbers("t_eval", t_eval, "numbers in s").copy()
-    rtol = rtol_given(rtol)
     circuit = overridden(circuit, sources, parameters)
     problem = asked(
         circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=start, charge=charge, rtol=rtol
@@ -151,9 +149,8 @@ def asked(
     InputError
         For a request that cannot be run.
     """
+    check_arguments(rtol, area=area, start=start)
     t_stop = None if t_stop is None else real_number("t_stop", t_stop, "a number in s")
-    known = isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)
-    require(known, "start", repr(start), f"{', '.join(map(repr, STARTS))} or a Solution")
     if isinstance(start, Solution) and start.stored is not None:
         raise InputError("start is a solution read from a file, which a run cannot go on from; allowed: one just made")
     first = "uncharged" if start == "periodic" else start
@@ -173,6 +170,28 @@ def rtol_given(rtol: object, least: float = RTOL_RANGE[0]) -> float:
     number = real_number("rtol", rtol, allowed)
     require(least <= number <= RTOL_RANGE[1], "rtol", rtol, allowed)
     return number
+
+
+def check_arguments(
+    rtol: float,
+    method: str = "auto",
+    area: str | float = "coupled",
+    start: str | Solution = "deck",
+    jumps: str = "both",
+) -> float:
+    """`rtol` as a number; arguments of `simulate` that no circuit can run with are refused.
+
+    Raises
+    ------
+    InputError
+        For the first of them.
+    """
+    require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
+    check_method(method)
+    area_given(area)
+    known = isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)
+    require(known, "start", repr(start), f"{', '.join(map(repr, STARTS))} or a Solution")
+    return rtol_given(rtol)
 
 
 def check_method(method: str) -> None:
@@ -215,7 +234,7 @@ def plan(
     InputError
         For a request that cannot be run.
     """
-    rtol = rtol_given(rtol)
+    rtol = check_arguments(rtol, area=area)
     circuit = overridden(circuit, sources, parameters)
     t_stop = real_number("t_stop", t_stop, "a number in s") if t_stop is not None else None if circuit.tran else 1.0
     for text in circuit_warnings(circuit, t_stop):

@@ -12,6 +12,7 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.engine.network import Sources, at_sources
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.times import check_length
+from fingerspice.waveforms.refining import WIDEST
 from fingerspice.waveforms.sampling import SourceTable, breakpoints_at, is_sampled, source_table
 from fingerspice.waveforms.waveform import Waveform
 
@@ -19,6 +20,8 @@ PERIODS_PER_WINDOW = 4096.0
 BREAKPOINTS_PER_WINDOW = 2000.0
 # A run of at most KEPT_WINDOWS windows leaves its tables in the waveform's cache, which holds about MOST_KEPT of them.
 KEPT_WINDOWS, MOST_KEPT = 4, 16
+# Number of times, evenly through the run, at which a function of arrays is looked at in any case: they take 1 ms.
+LOOKS = 20_000
 
 
 class Tables:
@@ -77,7 +80,8 @@ class Tables:
 
     def _table(self, wave: Waveform, w0: float, w1: float, place: int) -> SourceTable:
         step, scale = self.problem.step, self.scales[place]
-        table = source_table(wave, w0, w1, self.tol, step, no_chirps=self.no_chirps, scale=scale)
+        table = source_table(wave, w0, w1, self.tol, step, no_chirps=self.no_chirps, scale=scale,
+                             shortest=shortest_event(self.problem))  # fmt: skip
         if self.t_out is not None and self.problem.scene.is_sampled and is_sampled(wave):
             off = table.unseen(wave, self.t_out, self.tol)
             found = [one for one in (self.unseen, off and (*off, place)) if one]
@@ -89,6 +93,14 @@ class Tables:
         if self.kept is None:
             return self.problem.waveform.peak(self.problem.t_start, self.problem.t_stop)
         return max(table.scale for tables in self for table in tables)
+
+
+def shortest_event(problem: Problem) -> float:
+    """Length (s) of the shortest event of a user's function that its samples surely meet."""
+    met = WIDEST * problem.step
+    if any(wave.kept.get("one by one") for wave in problem.waveforms):
+        return met
+    return min(met, (problem.t_stop - problem.t_start) / LOOKS)
 
 
 def windows(problem: Problem) -> list[float]:

@@ -9,6 +9,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.notices import time_slip
 from fingerspice.waveforms.sampling import same_time
 from fingerspice.waveforms.waveform import Waveform, require
 
@@ -33,11 +34,12 @@ def run_times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: Fl
         require(t_eval.ndim == 1 and t_eval.size > 0, "t_eval", f"of shape {t_eval.shape}", "one row of times")
         require(bool(np.all(t_eval[1:] >= t_eval[:-1])), "t_eval", "not in order", "ascending times")
         to_ends(t_eval, t_start, t_stop)
+        first, last = float(t_eval[0]), float(t_eval[-1])
         require(
-            bool(t_eval[0] >= t_start and t_eval[-1] <= t_stop),
+            first >= t_start and last <= t_stop,
             "t_eval",
-            f"{t_eval[0]:g} s to {t_eval[-1]:g} s",
-            f"times from {t_start:g} s to t_stop = {t_stop:g} s",
+            f"{first:g} s to {last:g} s",
+            f"times from {t_start:g} s to t_stop = {t_stop:g} s{time_slip(first, last, t_stop)}",
         )
     step = tran.step if tran is not None else (t_stop - t_start) / 1000.0
     return t_stop, step

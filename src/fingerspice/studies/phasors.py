@@ -29,9 +29,8 @@ def _frequencies(frequency: ArrayLike | None, fundamental: Fundamental | None) -
 
 
 def _check_area(area: str | float, amplitude: float, fixed: bool) -> None:
-    """Refuse an area that is neither a known mode nor a positive number, and ``"mean"`` without an amplitude."""
+    """Refuse an unknown mode of the area, and ``"mean"`` without an amplitude."""
     if not isinstance(area, str):
-        require(math.isfinite(area) and area > 0.0, "area", f"{area:g} m^2", "a positive area in m^2")
         return
     require(area in ("mean", "frozen"), "area", repr(area), "'mean', 'frozen' or a number in m^2")
     if area == "mean" and math.isnan(amplitude) and not fixed:
@@ -91,7 +90,7 @@ def phasor(
         a frequency or the area is not positive, or a result is not finite.
     """
     require(skin in ("swept", "own"), "skin", repr(skin), "'swept' or 'own'")
-    area = area_given(area)
+    area = area if isinstance(area, str) else area_given(area)
     circuit = overridden(circuit, sources, parameters)
     if finger is None and not circuit.by_device("GAP"):
         return _of_nodes(circuit if skin == "swept" else with_skin_held(circuit), frequency, area, skin)

@@ -42,6 +42,11 @@ class _Combination(Waveform):
     def settled(self) -> float:
         return max(part.settled for part in self.parts)
 
+    @property
+    def course(self) -> tuple[float, float]:
+        first, last = zip(*(part.course for part in self.parts), strict=True)
+        return min(first), max(last)
+
     @cached_property
     def period(self) -> float | None:  # type: ignore[override]
         """Least common period of the parts (s); None unless it has at most `MOST_CYCLES` cycles of each."""

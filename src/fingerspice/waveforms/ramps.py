@@ -81,6 +81,16 @@ class Ramps(Waveform):
             return times[max(0, times.searchsorted(t0) - 1) : times.searchsorted(t1, "right") + 1]
         return _once(np.unique(self._times(t0, t1)))
 
+    @property
+    def course(self) -> tuple[float, float]:
+        times, values = self._listed
+        changes = np.flatnonzero(np.diff(values))
+        if changes.size == 0:
+            return math.inf, -math.inf
+        if self.period:
+            return self._first + float(times[changes[0]]), math.inf
+        return float(times[changes[0]]), float(times[changes[-1] + 1])
+
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
         times = self._edges(t0, t1)
         return times[(times >= t0) & (times <= t1)]

@@ -22,6 +22,9 @@ _AT_START = (-1.0) ** np.arange(POINTS)
 _PROOF = 2.0 * np.modf(np.arange(1, 28) * 0.6180339887498949)[0] - 1.0
 _PLACES = np.concatenate([chebyshev.nodes(POINTS, -1.0, 1.0), _PROOF])
 _NODE_STEPS = np.diff(_PLACES[:POINTS])
+# Longest interval, output steps; and the largest distance between neighbouring points in it, which is 0.41 steps.
+_LONGEST = 8.0
+WIDEST = 0.5 * _LONGEST * float(np.diff(np.sort(_PLACES)).max())
 
 # After `_IDLE` halvings in a row that do not reduce the misfit, a misfit below `_ROUGHEST` (relative to the largest
 # |U|, for values in doubles) is taken for round-off of the function's values.
@@ -79,6 +82,8 @@ class Refiner:
         Allowed error of a series, relative to `scale`.
     step : float
         Output step, s.
+    shortest : float
+        Length (s) of the shortest event of the waveform that its samples have to meet.
     scale, steepest : float
         Largest |U| (V) and |dU/dt| (V/s) seen.
     edges : list of float
@@ -102,6 +107,7 @@ class Refiner:
     waveform: Waveform
     tol: float
     step: float
+    shortest: float = math.inf
     scale: float = 0.0
     steepest: float = 0.0
     edges: list[float] = field(default_factory=list)
@@ -120,7 +126,7 @@ class Refiner:
         if not self.edges:
             self.edges.append(a)
         # The ends of a window are breakpoints, where the waveform may jump: series use interior points only.
-        longest = min(8.0 * self.step, 2.0 * self.waveform.shortest_time())
+        longest = min(_LONGEST * self.step, 2.0 * self.waveform.shortest_time())
         count = max(1, math.ceil((b - a) / longest))
         cuts = np.linspace(a, b, count + 1).tolist()
         waiting = [_Interval(lo, hi) for lo, hi in itertools.pairwise(cuts)][::-1]
@@ -192,13 +198,17 @@ class Refiner:
             Largest difference between series and waveform at the points between the nodes, V.
         """
         lo, hi = piece.lo, piece.hi
-        t = piece.points()
+        t, proven = piece.points(), _PROOF
+        count = math.ceil((hi - lo) / self.shortest)
+        if WIDEST * (hi - lo) > _LONGEST * self.shortest:
+            finer = (2.0 * np.arange(count) + 1.0) / count - 1.0
+            t, proven = np.append(t, 0.5 * (lo + hi) + 0.5 * (hi - lo) * finer), np.append(_PROOF, finer)
         values = self.waveform.value(t)
         if not np.all(np.isfinite(values)):
             return None, values, math.inf
         self.scale = max(self.scale, float(np.abs(values).max()))
         c = chebyshev.coefficients(values[:POINTS])
-        proof = np.polynomial.chebyshev.chebval(_PROOF, c)
+        proof = np.polynomial.chebyshev.chebval(proven, c)
         if piece.depth == 0:
             self.steepest = float(np.abs(np.diff(values[:POINTS]) / (0.5 * (hi - lo) * _NODE_STEPS)).max())
         # The rounding of the time itself changes the value by up to `noise`; so does that of coarse values.

@@ -81,6 +81,10 @@ class Burst(_Shifted):
     def _stretch(self) -> float:
         return self.duration
 
+    @property
+    def course(self) -> tuple[float, float]:
+        return self.delay, self.delay + self.duration
+
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         t = real_numbers("t", t, "times in s")
         tau = self._inner(t, self.delay)

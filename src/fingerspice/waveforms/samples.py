@@ -208,6 +208,11 @@ class Samples(Ramps):
     def _times_of(self, low: int, high: int) -> FloatArray:
         return np.asarray(self.start + np.arange(self._number + low, self._number + high) / self.rate)
 
+    @property
+    def course(self) -> tuple[float, float]:
+        # Not from the values, which may lie in a file of an hour.
+        return self.start, self.start + (self.count - 1) / self.rate
+
     def _knots(self) -> tuple[FloatArray, FloatArray]:
         return self._times_of(0, self.count), self.values
 

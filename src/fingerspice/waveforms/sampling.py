@@ -81,6 +81,7 @@ class Function(Waveform):
                 return out
         except (TypeError, ValueError):
             pass
+        self.kept["one by one"] = True
         return np.array([self._scalar(x) for x in t.ravel()]).reshape(t.shape)
 
     def _scalar(self, t: float) -> float:
@@ -236,8 +237,9 @@ def is_sampled(waveform: Waveform) -> bool:
 
 
 def source_table(
-    waveform: Waveform, t0: float, t1: float, tol: float, step: float, *, no_chirps: bool = False, scale: float = 0.0
-) -> SourceTable:
+    waveform: Waveform, t0: float, t1: float, tol: float, step: float, *, no_chirps: bool = False, scale: float = 0.0,
+    shortest: float = math.inf,
+) -> SourceTable:  # fmt: skip
     """Table of a waveform over [t0, t1].
 
     Parameters
@@ -253,6 +255,8 @@ def source_table(
         Whether a term with a changing frequency, which has no closed-form response, is represented by a series too.
     scale : float
         Largest |U| (V) seen in earlier windows; it counts in the largest |U| that `tol` refers to.
+    shortest : float
+        Length (s) of the shortest event that the samples of a function have to meet.
     """
     inner = waveform.breakpoints(t0, t1)
     # A breakpoint that differs from an end of the window only by rounding is that end, and bounds no extra segment.
@@ -267,7 +271,7 @@ def source_table(
             step = 0.1 * waveform.shortest_time()
         else:
             return SourceTable(edges, np.ascontiguousarray(terms), np.zeros((edges.size - 1, 0)))
-    pieces = Refiner(waveform, tol, step, scale)
+    pieces = Refiner(waveform, tol, step, shortest, scale)
     for a, b in itertools.pairwise(edges):
         if not pieces.cover(float(a), float(b)):
             break

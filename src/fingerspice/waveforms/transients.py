@@ -112,6 +112,10 @@ class Exp(Waveform):
         )
         require(self.td2 >= self.td1, "EXP td2", f"{self.td2:g} s", f">= td1 = {self.td1:g} s")
 
+    @property
+    def course(self) -> tuple[float, float]:
+        return self.td1, math.inf
+
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         t = real_numbers("t", t, "times in s")
         rise = -np.expm1(-np.maximum(t - self.td1, 0.0) / self.tau1)

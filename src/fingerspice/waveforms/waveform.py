@@ -120,6 +120,11 @@ class Waveform:
         return 0.0
 
     @property
+    def course(self) -> tuple[float, float]:
+        """Times (s) before the first and after the second of which the waveform is constant."""
+        return -math.inf, math.inf
+
+    @property
     def half_wave(self) -> bool:
         """Whether each half period after `settled` is the negative of the half period before it."""
         return False
@@ -259,6 +264,10 @@ class DC(Waveform):
     def __post_init__(self) -> None:
         take_numbers(self)
 
+    @property
+    def course(self) -> tuple[float, float]:
+        return math.inf, -math.inf
+
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         return np.full(real_numbers("t", t, "times in s").shape, self.level)
 
@@ -314,6 +323,10 @@ class Sine(Waveform):
     @property
     def settled(self) -> float:
         return max(0.0, self.delay)
+
+    @property
+    def course(self) -> tuple[float, float]:
+        return self.delay, math.inf
 
     @property
     def half_wave(self) -> bool:
