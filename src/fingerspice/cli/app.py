@@ -35,6 +35,7 @@ from fingerspice.cli.arguments import (
     Stop,
     Streamed,
 )  # fmt: skip
+from fingerspice.cli.check import check
 from fingerspice.cli.explore import explore
 from fingerspice.cli.figures import figures
 from fingerspice.cli.limits import limits
@@ -341,9 +342,8 @@ def export(
         answer.give(str, [lambda: write_aside(output, lambda path: path.write_text(text, encoding="utf-8"))])
 
 
-app.command()(figures)
-app.command()(explore)
-app.command()(sets)
+for _command in (figures, explore, sets, check):
+    app.command()(_command)
 
 
 @app.callback(invoke_without_command=True)
