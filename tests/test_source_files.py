@@ -762,8 +762,9 @@ def test_results_tell_recordings_apart_by_their_names(command: Command) -> None:
     assert command(*words, "WAV(a.wav 150)").code == 0
     assert "--overwrite" in command(*words, "WAV(b.wav 150)").err
     assert command(*words, "TABLE(a.csv)", "--name", "table").code == 0
-    with pytest.warns(fs.FingerspiceWarning, match="a source that was a function or samples is not kept"):
-        assert fs.load("out/table.nc").circuit.overrides == {"Vdrive": "TABLE(a.csv)"}
+    loaded = fs.load("out/table.nc").circuit
+    assert loaded.overrides == {"Vdrive": "TABLE(a.csv)"}
+    assert loaded["Vdrive"].waveform == fs.PWL.from_table("a.csv")
 
 
 def test_a_recording_longer_than_the_run_is_told(command: Command) -> None:

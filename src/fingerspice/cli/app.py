@@ -342,8 +342,10 @@ def export(
         answer.give(str, [lambda: write_aside(output, lambda path: path.write_text(text, encoding="utf-8"))])
 
 
-for _command in (figures, explore, sets, check):
-    app.command()(_command)
+app.command()(figures)
+app.command()(explore)
+app.command()(sets)
+app.command()(check)
 
 
 @app.callback(invoke_without_command=True)

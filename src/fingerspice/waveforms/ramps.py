@@ -24,7 +24,7 @@ from fingerspice.waveforms.waveform import Waveform, blank_terms, require
 
 # A waveform with at most this many knots is not divided into windows, however close together its knots are.
 FEW_KNOTS = 1000
-# Most points that the text of a PWL shows; from a text with its points a stored run makes the source again.
+# Most points that the text of a PWL shows.
 MOST_SHOWN = 10_000
 
 
