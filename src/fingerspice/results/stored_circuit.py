@@ -100,7 +100,8 @@ def made_again(kept: Mapping[str, Any], arrays: list[FloatArray]) -> Circuit:
         Element(**{
             **one, "nodes": tuple(map(str, one["nodes"])), "node_names": tuple(map(str, one["node_names"])),
             "values": MappingProxyType({name: float(x) for name, x in one["values"].items()}),
-            "waveform": _value(one["waveform"], arrays), "ac": one["ac"] and SmallSignal(**one["ac"]),
+            **{name: _value(one[name], arrays) for name in ("waveform", "initial")},
+            "ac": one["ac"] and SmallSignal(**one["ac"]),
         })
         for one in kept["elements"]
     )  # fmt: skip
@@ -118,8 +119,10 @@ def _value(plain: Any, arrays: list[FloatArray]) -> Any:
     """What `_Writer.plain` was given."""
     if isinstance(plain, list):
         return tuple(_value(part, arrays) for part in plain)
-    if not isinstance(plain, dict):
+    if plain is None or isinstance(plain, (int, float)):
         return plain
+    if not isinstance(plain, dict):
+        raise ValueError(f"{plain!r} is no waveform")
     if "array" in plain:
         return arrays[plain["array"]]
     given = {name: _value(x, arrays) for name, x in plain.items() if name != "kind"}
