@@ -127,6 +127,10 @@ def _value(plain: Any, arrays: list[FloatArray]) -> Any:
         return arrays[plain["array"]]
     given = {name: _value(x, arrays) for name, x in plain.items() if name != "kind"}
     if plain["kind"] != "Function":
+        for name, x in given.items():
+            parts = x if isinstance(x, tuple) else (x,)
+            if any(isinstance(part, Waveform) != (name in ("parts", "waveform")) for part in parts):
+                raise ValueError(f"{name} of {plain['kind']} is {x!r}")
         made: Any = _WAVEFORMS[plain["kind"]]
         return made(**given)
     series = given["series"]
