@@ -90,7 +90,8 @@ def test_a_file_holds_any_source(name: str, tmp_path: Path) -> None:
     held = again.circuit["Vdrive"].waveform
     assert held is not None
     assert held.period == wave.period
-    times = np.linspace(0.0, 0.04, 4001)[:-1]
+    # Not at an edge, where a function may have any value.
+    times = np.linspace(0.0, 0.04, 4001)[:-1] + 3e-7
     # A function is held to the error with which the run represented it.
     np.testing.assert_allclose(held(times), wave(times), rtol=0, atol=0.0 if "function" not in name else 1e-5)
     same_spectra(run, again)

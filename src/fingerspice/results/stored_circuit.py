@@ -62,7 +62,14 @@ class _Writer:
             table = source_table(wave, 0.0, stop, min(1e-3, max(0.05 * self.rtol, 1e-14)), self.step)
         breaks = wave.breakpoints(0.0, stop)
         rows = {"edges": self.plain(table.edges), "series": self.plain(table.series)}
-        return {"kind": "Function", "repeat": wave.period, "breaks": breaks[breaks < stop].tolist(), **rows}
+        name = getattr(getattr(wave, "function", None), "__name__", "")
+        return {
+            "kind": "Function",
+            "name": name,
+            "repeat": wave.period,
+            "breaks": breaks[breaks < stop].tolist(),
+            **rows,
+        }
 
 
 def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str, Any] | str, list[FloatArray]]:
@@ -125,7 +132,7 @@ def _value(plain: Any, arrays: list[FloatArray]) -> Any:
         raise ValueError(f"{plain!r} is no waveform")
     if "array" in plain:
         return arrays[plain["array"]]
-    given = {name: _value(x, arrays) for name, x in plain.items() if name != "kind"}
+    given = {name: _value(x, arrays) for name, x in plain.items() if name not in ("kind", "name")}
     if plain["kind"] != "Function":
         for name, x in given.items():
             parts = x if isinstance(x, tuple) else (x,)
@@ -135,7 +142,10 @@ def _value(plain: Any, arrays: list[FloatArray]) -> Any:
         return made(**given)
     series = given["series"]
     table = SourceTable(given["edges"], blank_terms(len(series), 1), series)
-    return Function(partial(_along, table, given["repeat"]), given["breaks"], given["repeat"])
+    along = partial(_along, table, given["repeat"])
+    # By its name the run's summary shows a function.
+    vars(along).update({"__name__": str(plain["name"])} if plain["name"] else {})
+    return Function(along, given["breaks"], given["repeat"])
 
 
 def _along(table: SourceTable, repeat: float | None, t: FloatArray) -> FloatArray:
