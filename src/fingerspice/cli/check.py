@@ -21,7 +21,7 @@ def check(
 
       fingerspice check out/long.zarr
     """
-    from fingerspice.base.stores import check_store
+    from fingerspice.results.stores import check_store
 
     with Answering("check", as_json) as answer:
         chunks = check_store(store)

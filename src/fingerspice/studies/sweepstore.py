@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import UNFINISHED, settle_on_disk
-from fingerspice.base.stores import CHECKSUM, checksum, fault, zarr_library
+from fingerspice.results.stores import CHECKSUM, checksum, fault, zarr_library
 from fingerspice.studies.batchtask import STATUS_NAMES
 
 if TYPE_CHECKING:
